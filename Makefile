@@ -1,0 +1,55 @@
+# Everything a newcomer needs: `make demo`, `make test`. Each target sets itself up first.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+# One thread a process: the work is parallel over processes, and libraries that spin up
+# threads of their own only fight with it.
+export OMP_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
+
+.PHONY: help install demo test test-all serve check format bench lock clean
+
+help: ## list the targets
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+$(STAMP): requirements/lock.txt pyproject.toml
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@echo "Installing locked packages into $(VENV) ..."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes --requirement requirements/lock.txt
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $@
+
+install: $(STAMP) ## make the virtual environment with locked versions
+
+demo: install ## photos in, lens calibrated, corrected photo out: see demo-output/report.md
+	@$(BIN)/lensmodel demo --output demo-output
+
+test: install ## the tests that need nothing but this repository
+	@$(BIN)/python -m pytest -q -n 2 -m "not slow"
+
+test-all: install ## every test, the slow ones included
+	@$(BIN)/python -m pytest -q -n 2
+
+serve: install ## run the service until interrupted
+	@$(BIN)/lensmodel serve
+
+check: install ## format, lint, types, import layers
+	@$(BIN)/ruff format --check .
+	@$(BIN)/ruff check .
+	@$(BIN)/mypy lensmodel app
+	@$(BIN)/lint-imports
+
+format: install ## let the formatter and the linter mend what they can
+	@$(BIN)/ruff format .
+	@$(BIN)/ruff check --fix .
+
+bench: install ## quality and speed benchmarks, tables on standard output
+	@$(BIN)/lensmodel bench
+
+lock: ## renew requirements/lock.txt from pyproject.toml (needs uv)
+	uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --no-annotate --extra dev --output-file requirements/lock.txt pyproject.toml
+
+clean: ## remove what the targets made
+	rm -rf $(VENV) demo-output bench-output .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,0 +1,121 @@
+"""What can go wrong.
+
+LensModelError
+├── InvalidInputError          the caller can fix it (HTTP 422)
+│   ├── InvalidKernelError
+│   └── UnknownMethodError
+├── UnreadablePhotoError       not an image that we can decode (HTTP 415)
+│   ├── NotAnImageError
+│   ├── TruncatedImageError
+│   ├── UnsupportedFormatError
+│   └── RawDecodeError
+├── ImageTooLargeError         more pixels than the limits allow (HTTP 413)
+│   └── DecompressionBombError
+├── MetadataMissingError       the photo does not say what is needed (HTTP 422)
+├── NotEnoughEvidenceError     the photo or the model cannot answer yet (HTTP 409)
+│   ├── NoUsablePatchesError
+│   ├── NoSamplesError
+│   └── OutsideSupportError
+└── CancelledError             somebody asked to stop
+
+Every text names the offending value and the remedy. `code` is the fixed word by
+which programs tell the cases apart.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+
+class LensModelError(Exception):
+    """Base of every exception that this library raises on purpose."""
+
+    code: ClassVar[str] = "error"
+
+
+class InvalidInputError(LensModelError):
+    """A value outside its range, or of the wrong shape; the text says which and what is allowed."""
+
+    code: ClassVar[str] = "invalid_parameter"
+
+
+class InvalidKernelError(InvalidInputError):
+    """An array that cannot be a PSF."""
+
+
+class UnknownMethodError(InvalidInputError):
+    """A name that is in no registry; the text lists the known ones."""
+
+
+class UnreadablePhotoError(LensModelError):
+    """A file that cannot be decoded as a photo."""
+
+    code: ClassVar[str] = "not_an_image"
+
+
+class NotAnImageError(UnreadablePhotoError):
+    """The first bytes belong to no image format."""
+
+
+class TruncatedImageError(UnreadablePhotoError):
+    """The file ends before its picture does."""
+
+    code: ClassVar[str] = "truncated_image"
+
+
+class UnsupportedFormatError(UnreadablePhotoError):
+    """An image, but of a kind that we do not read."""
+
+    code: ClassVar[str] = "unsupported_format"
+
+
+class RawDecodeError(UnreadablePhotoError):
+    """LibRaw opened the file but what came out is no photograph."""
+
+    code: ClassVar[str] = "raw_decode_failed"
+
+
+class ImageTooLargeError(LensModelError):
+    """More pixels or bytes than the limits allow."""
+
+    code: ClassVar[str] = "image_too_large"
+
+
+class DecompressionBombError(ImageTooLargeError):
+    """A small file that claims a huge picture."""
+
+    code: ClassVar[str] = "decompression_bomb"
+
+
+class MetadataMissingError(LensModelError):
+    """The photo does not say which lens or setting it was taken with."""
+
+    code: ClassVar[str] = "metadata_missing"
+
+
+class NotEnoughEvidenceError(LensModelError):
+    """The photo or the model cannot answer yet."""
+
+    code: ClassVar[str] = "no_samples"
+
+
+class NoUsablePatchesError(NotEnoughEvidenceError):
+    """No part of the photo tells about the blur."""
+
+    code: ClassVar[str] = "no_usable_patches"
+
+
+class NoSamplesError(NotEnoughEvidenceError):
+    """The lens has no PSF samples yet."""
+
+
+class OutsideSupportError(NotEnoughEvidenceError):
+    """The question lies outside what the samples cover."""
+
+    code: ClassVar[str] = "outside_support"
+
+
+class CancelledError(LensModelError):
+    """The work was cancelled by its owner."""
+
+    code: ClassVar[str] = "cancelled"

@@ -1,1 +1,1 @@
-"""The service."""
+"""The service: HTTP, rows, blobs and background jobs around the library `lensmodel`."""

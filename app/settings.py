@@ -1,0 +1,151 @@
+"""What can be configured, read once from the environment (prefix `LENS_`).
+
+Every setting has a default that works on one machine without anything else installed. A second
+machine needs other addresses for the database, the jobs and the storage, and nothing else.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, model_validator
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+PREFIX = "LENS_"
+MIB = 1024 * 1024
+
+
+class Settings(BaseSettings):
+    """Configuration of one process; frozen, passed on, never looked up again.
+
+    Names of the environment that begin with `LENS_` and mean nothing are an error: most likely
+    somebody mistyped a setting that he now believes to be in force.
+    """
+
+    model_config = SettingsConfigDict(env_prefix=PREFIX, extra="forbid", frozen=True)
+
+    data_dir: Path = Field(default=Path("lensmodel-data"), description="Folder of everything that is kept.")
+    database_url: str = Field(
+        default="", description="SQLAlchemy address; empty = sqlite file in the data folder."
+    )
+    jobs_url: str = Field(
+        default="", description="Database of the job engine; empty = sqlite file in the data folder."
+    )
+    storage_url: str = Field(
+        default="", description="file:// or s3:// address of the blobs; empty = in the data folder."
+    )
+    shared_filesystem: bool = Field(default=False, description="The file storage is seen by all machines.")
+    sqlite_synchronous: Literal["NORMAL", "FULL"] = Field(
+        default="NORMAL", description="FULL survives power loss too."
+    )
+
+    host: str = Field(default="127.0.0.1", description="Address to listen on.")
+    port: int = Field(default=8000, ge=0, le=65535)
+    auth: Literal["none"] = Field(
+        default="none", description="Who may ask: none = anybody who reaches the port."
+    )
+    public: bool = Field(
+        default=False, description="Allow an address other than loopback in spite of auth=none."
+    )
+
+    max_upload_mb: int = Field(default=512, ge=1, description="Largest photo file, in MiB.")
+    max_megapixels: float = Field(default=160.0, gt=0, description="Largest photo, in millions of pixels.")
+    max_queued_photos: int = Field(
+        default=500, ge=1, description="Unfinished photos of one owner; more are refused."
+    )
+    max_stored_gb: float = Field(default=200.0, gt=0, description="Photo bytes of one owner, in GiB.")
+    min_free_mb: int = Field(
+        default=256, ge=0, description="Free disk below which uploads are refused, in MiB."
+    )
+
+    worker_slots: int = Field(
+        default_factory=lambda: os.cpu_count() or 1, ge=1, description="CPU jobs at once."
+    )
+    worker_memory_mb: int = Field(
+        default=4096, ge=256, description="Memory of all children of a worker, in MiB."
+    )
+    lease_seconds: float = Field(
+        default=20.0, gt=0, description="A worker silent for so long is taken for dead."
+    )
+    sweep_seconds: float = Field(
+        default=0.5, gt=0, description="How often a worker looks for new work in the tables."
+    )
+    inspect_seconds: float = Field(default=20.0, gt=0)
+    develop_seconds: float = Field(default=180.0, gt=0)
+    patch_seconds: float = Field(default=600.0, gt=0)
+    correct_seconds: float = Field(default=3600.0, gt=0)
+
+    patches: int = Field(default=24, ge=1, le=1000, description="Patches that are used of one photo.")
+    min_good_patches: int = Field(default=1, ge=1, description="Fewer than this and the photo fails.")
+    kernel_size: int = Field(
+        default=31, ge=3, le=255, description="Side of the estimated kernels in pixels, odd."
+    )
+    estimator: str = Field(default="default", description="Name in the registry of blind estimators.")
+    assume_single_copy: bool = Field(
+        default=False, description="Photos without a serial belong to the one lens of that model."
+    )
+
+    model_cache_mb: int = Field(
+        default=1024, ge=1, description="Memory for fitted lens models in one process, in MiB."
+    )
+    long_poll_seconds: float = Field(default=20.0, ge=0, le=60)
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_unknown_names(cls, values: object) -> object:
+        known = {PREFIX + name.upper() for name in cls.model_fields}
+        for name in os.environ:
+            if name.upper().startswith(PREFIX) and name.upper() not in known:
+                near = difflib.get_close_matches(name.upper(), known, n=1)
+                hint = f"did you mean {near[0]}?" if near else "run `lensmodel config` to see all settings"
+                raise ValueError(f"unknown setting {name}: {hint}")
+        return values
+
+    @model_validator(mode="after")
+    def _odd_kernel(self) -> Settings:
+        if self.kernel_size % 2 == 0:
+            raise ValueError(f"kernel_size must be odd, got {self.kernel_size}")
+        return self
+
+    @model_validator(mode="after")
+    def _one_machine_or_many(self) -> Settings:
+        many = not self.database.startswith("sqlite")
+        if many and self.storage.startswith("file://") and not self.shared_filesystem:
+            raise ValueError(
+                "a database server means several machines, but storage_url is a folder of one: "
+                "use s3://..., or set LENS_SHARED_FILESYSTEM=true where all machines see that folder"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _open_only_on_loopback(self) -> Settings:
+        if self.auth == "none" and not self.public and self.host not in {"127.0.0.1", "::1", "localhost"}:
+            raise ValueError(
+                f"host {self.host} can be reached by others and auth=none lets everybody in: "
+                "listen on 127.0.0.1, or set LENS_PUBLIC=true behind a proxy that checks who asks"
+            )
+        return self
+
+    @property
+    def database(self) -> str:
+        """SQLAlchemy address of our tables."""
+        return self.database_url or f"sqlite:///{self.data_dir.resolve() / 'app.db'}"
+
+    @property
+    def jobs(self) -> str:
+        """Address of the job engine's own tables."""
+        return self.jobs_url or f"sqlite:///{self.data_dir.resolve() / 'jobs.db'}"
+
+    @property
+    def storage(self) -> str:
+        """Address of the blobs."""
+        return self.storage_url or f"file://{self.data_dir.resolve() / 'blobs'}"
+
+    @property
+    def max_upload_bytes(self) -> int:
+        """Largest photo file in bytes."""
+        return self.max_upload_mb * MIB

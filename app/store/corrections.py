@@ -1,0 +1,195 @@
+"""Corrections: the same request once, each state change once."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import select, update
+
+from app.ids import new_id
+from app.store.database import Database, insert_new
+from app.store.owners import find, now, owned
+from app.tables import CorrectionRow, GarbageRow, LensRow, OwnerRow, PhotoRow
+
+ACTIVE = ("queued", "running")
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectionPlan:
+    """A correction with the public ids of what it needs: everything a worker has to know."""
+
+    correction: CorrectionRow
+    photo: PhotoRow
+    lens: LensRow
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """A finished file and how to hand it out."""
+
+    key: str
+    etag: str
+    media_type: str
+    size: int
+    name: str
+
+
+def params_hash(params: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of the canonical JSON of the parameters."""
+    return hashlib.sha256(json.dumps(params, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+class CorrectionStore:
+    """Corrections of all owners. `owner=None` asks as the service itself."""
+
+    def __init__(self, database: Database) -> None:
+        self._db = database
+
+    def create(
+        self, photo: PhotoRow, lens: LensRow, version: int, params: Mapping[str, Any]
+    ) -> tuple[CorrectionRow, bool]:
+        """Ask for a correction; the same request finds the one that is there. True if new."""
+        fresh = {
+            "public_id": new_id(),
+            "owner_id": photo.owner_id,
+            "photo_id": photo.id,
+            "lens_id": lens.id,
+            "lens_version": version,
+            "params": dict(params),
+            "params_hash": params_hash(params),
+            "attempt": 0,
+            "state": "queued",
+            "progress_done": 0,
+            "progress_total": 0,
+            "created_at": now(),
+        }
+        with self._db.writing(durable=True) as session:
+            made = insert_new(session, CorrectionRow, [fresh]) == 1
+            row = session.scalars(
+                select(CorrectionRow).where(
+                    CorrectionRow.photo_id == photo.id,
+                    CorrectionRow.lens_id == lens.id,
+                    CorrectionRow.lens_version == version,
+                    CorrectionRow.params_hash == fresh["params_hash"],
+                    CorrectionRow.state.not_in(("failed", "cancelled")),
+                )
+            ).one()
+            return row, made
+
+    def get(self, correction_id: str, owner: str | None = None) -> CorrectionRow | None:
+        """Return one correction, or None."""
+        with self._db.reading() as session:
+            return find(session, CorrectionRow, correction_id, owner)
+
+    def plan(self, correction_id: str, owner: str | None = None) -> CorrectionPlan | None:
+        """Return a correction with its photo and lens, or None."""
+        with self._db.reading() as session:
+            row = find(session, CorrectionRow, correction_id, owner)
+            if row is None:
+                return None
+            photo, lens = session.get(PhotoRow, row.photo_id), session.get(LensRow, row.lens_id)
+            assert photo is not None
+            assert lens is not None
+            return CorrectionPlan(row, photo, lens)
+
+    def page(
+        self, owner: str, *, before: str | None, limit: int, photo: PhotoRow | None = None
+    ) -> list[CorrectionPlan]:
+        """Return corrections, newest first."""
+        query = owned(CorrectionRow, owner).order_by(CorrectionRow.public_id.desc()).limit(limit)
+        if before is not None:
+            query = query.where(CorrectionRow.public_id < before)
+        if photo is not None:
+            query = query.where(CorrectionRow.photo_id == photo.id)
+        with self._db.reading() as session:
+            ids = [row.public_id for row in session.scalars(query)]
+        plans = (self.plan(correction_id, owner) for correction_id in ids)
+        return [plan for plan in plans if plan is not None]
+
+    def to_do(self, limit: int = 100) -> list[tuple[str, int, str]]:
+        """Return `(correction_id, attempt, owner)` of queued corrections, oldest first: the intent sweep."""
+        return self._in_states(("queued",), limit)
+
+    def running(self, limit: int = 1000) -> list[tuple[str, int, str]]:
+        """Return `(correction_id, attempt, owner)` of corrections that a worker is busy with."""
+        return self._in_states(("running",), limit)
+
+    def _in_states(self, states: Sequence[str], limit: int) -> list[tuple[str, int, str]]:
+        query = (
+            select(CorrectionRow.public_id, CorrectionRow.attempt, OwnerRow.name)
+            .join(OwnerRow, OwnerRow.id == CorrectionRow.owner_id)
+            .where(CorrectionRow.state.in_(states))
+            .order_by(CorrectionRow.id)
+            .limit(limit)
+        )
+        with self._db.reading() as session:
+            return [(row[0], row[1], row[2]) for row in session.execute(query)]
+
+    def is_live(self, correction_id: str) -> bool:
+        """Say whether the correction is still wanted: the cancel poll."""
+        row = self.get(correction_id)
+        return row is not None and row.state in ACTIVE
+
+    def set_state(self, correction_id: str, from_states: Sequence[str], to: str, **fields: object) -> bool:
+        """Move a correction from one of `from_states` to `to`; False where it was in none of them."""
+        with self._db.writing() as session:
+            statement = (
+                update(CorrectionRow)
+                .where(CorrectionRow.public_id == correction_id, CorrectionRow.state.in_(from_states))
+                .values(state=to, **fields)
+            )
+            return session.connection().execute(statement).rowcount == 1
+
+    def start(self, correction_id: str) -> bool:
+        """Begin, or begin again after the death of a worker."""
+        return self.set_state(
+            correction_id, ACTIVE, "running", started_at=now(), attempt=CorrectionRow.attempt + 1
+        )
+
+    def progress(self, correction_id: str, done: int, total: int, stage: str = "correcting") -> None:
+        """Say how far a running correction is."""
+        self.set_state(
+            correction_id, ("running",), "running", progress_done=done, progress_total=total, stage=stage
+        )
+
+    def finish(self, correction_id: str, result: Result, report: Mapping[str, Any]) -> bool:
+        """End with a file; False if it was cancelled meanwhile."""
+        return self.set_state(
+            correction_id,
+            ACTIVE,
+            "succeeded",
+            report=dict(report),
+            result_key=result.key,
+            result_etag=result.etag,
+            result_media_type=result.media_type,
+            result_bytes=result.size,
+            result_name=result.name,
+            finished_at=now(),
+        )
+
+    def fail(self, correction_id: str, code: str, detail: str) -> bool:
+        """End with a reason."""
+        return self.set_state(
+            correction_id, ACTIVE, "failed", error_code=code, error_detail=detail, finished_at=now()
+        )
+
+    def cancel(self, correction_id: str, owner: str | None = None) -> bool:
+        """Cancel an unfinished correction; False if it was finished already."""
+        if self.get(correction_id, owner) is None:
+            return False
+        return self.set_state(correction_id, ACTIVE, "cancelled", finished_at=now())
+
+    def delete(self, correction_id: str, owner: str) -> str | None:
+        """Forget a correction; return the prefix of its blobs, None if there is no such correction."""
+        with self._db.writing() as session:
+            row = find(session, CorrectionRow, correction_id, owner)
+            if row is None:
+                return None
+            prefix = f"corrections/{row.public_id}/"
+            insert_new(session, GarbageRow, [{"prefix": prefix, "not_before": now()}])
+            session.delete(row)
+            return prefix

@@ -1,0 +1,105 @@
+"""Connections: who may write, who only reads, and what a transaction means on each database.
+
+On SQLite the driver's own habit is to open a transaction at the first write, so that two
+processes that read, add one and write lose updates silently. Here every writing transaction
+begins with BEGIN IMMEDIATE: one writer at a time, waiting rather than failing. Readers see a
+consistent snapshot (WAL) and cannot write at all.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection, Engine, create_engine, event, make_url
+from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.orm import Session
+
+from app.tables import Base
+
+BUSY_TIMEOUT_MS = 30_000
+
+
+class Database:
+    """The application database of one process.
+
+    Parameters
+    ----------
+    url : str
+        SQLAlchemy address; sqlite or postgresql.
+    synchronous : {"NORMAL", "FULL"}
+        SQLite only. NORMAL never corrupts but can lose the last commits when the power fails.
+    """
+
+    def __init__(self, url: str, *, synchronous: str = "NORMAL") -> None:
+        self.url = make_url(url)
+        self.is_sqlite = self.url.get_backend_name() == "sqlite"
+        if self.is_sqlite:
+            self.path = Path(self.url.database or "")
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self.writer = _sqlite(url, "BEGIN IMMEDIATE", synchronous)
+            self.durable = _sqlite(url, "BEGIN IMMEDIATE", "FULL")
+            self.reader = _sqlite(url, "BEGIN", synchronous, read_only=True)
+        else:
+            self.writer = self.durable = self.reader = create_engine(url, pool_pre_ping=True)
+
+    @contextmanager
+    def reading(self) -> Iterator[Session]:
+        """Give a session that sees one consistent state and cannot change it."""
+        with Session(self.reader, expire_on_commit=False) as session, session.begin():
+            yield session
+
+    @contextmanager
+    def writing(self, *, durable: bool = False) -> Iterator[Session]:
+        """Give a session whose changes are committed together at the end, or not at all.
+
+        `durable` also survives loss of power: for what a caller may rely on afterwards, such as
+        an accepted upload whose card he now formats.
+        """
+        engine = self.durable if durable else self.writer
+        with Session(engine, expire_on_commit=False) as session, session.begin():
+            yield session
+
+    def close(self) -> None:
+        """Close all connections."""
+        for engine in (self.writer, self.durable, self.reader):
+            engine.dispose()
+
+
+def _sqlite(url: str, begin: str, synchronous: str, *, read_only: bool = False) -> Engine:
+    engine = create_engine(
+        url, connect_args={"check_same_thread": False, "timeout": BUSY_TIMEOUT_MS / 1000}, pool_size=10
+    )
+
+    @event.listens_for(engine, "connect")
+    def _connect(connection: sqlite3.Connection, record: object) -> None:
+        del record
+        connection.isolation_level = None  # we say BEGIN ourselves
+        connection.execute(f"PRAGMA busy_timeout={BUSY_TIMEOUT_MS}")
+        connection.execute("PRAGMA journal_mode=WAL")
+        connection.execute(f"PRAGMA synchronous={synchronous}")
+        connection.execute("PRAGMA foreign_keys=ON")
+        if read_only:
+            connection.execute("PRAGMA query_only=ON")
+
+    @event.listens_for(engine, "begin")
+    def _begin(connection: Connection) -> None:
+        connection.exec_driver_sql(begin)
+
+    return engine
+
+
+def insert_new(session: Session, table: type[Base], rows: Sequence[dict[str, Any]]) -> int:
+    """Insert the rows that break no unique key, leave the others; return how many went in."""
+    if not rows:
+        return 0
+    dialect = session.get_bind().dialect.name
+    insert = sqlite.insert if dialect == "sqlite" else postgresql.insert
+    inserted = 0
+    for row in rows:
+        statement = insert(table).values(**row).on_conflict_do_nothing()
+        inserted += max(session.connection().execute(statement).rowcount, 0)
+    return inserted

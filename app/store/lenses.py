@@ -1,0 +1,308 @@
+"""Lenses: which copy it is, what it knows, how it came to know it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from sqlalchemy import delete, func, select, update
+from sqlalchemy.orm import Session
+
+from app.ids import new_id
+from app.store.database import Database, insert_new
+from app.store.owners import find, now, owned
+from app.store.versions import drop_samples, new_version, take_samples
+from app.tables import CorrectionRow, EventRow, GarbageRow, LensRow, PhotoRow, SampleRow
+
+
+def identity_key(maker: str | None, model: str | None, serial: str | None) -> str:
+    """Return the key by which two photos are known to show the same copy.
+
+    Case, punctuation and blanks differ between programs that write the same name; the serial
+    keeps its punctuation, since it may be all that tells two copies apart.
+    """
+    words = [re.sub(r"[\W_]+", "", (text or "").casefold()) for text in (maker, model)]
+    return "|".join([*words, (serial or "").strip().casefold()])
+
+
+def lens_of_photo(session: Session, photo: PhotoRow, *, single_copy: bool) -> LensRow | None:
+    """Find, or for a calibrating photo make, the lens of an inspected photo."""
+    named = photo.given.get("lens_id")
+    if named is not None:
+        lens = session.scalar(
+            select(LensRow).where(
+                LensRow.public_id == named, LensRow.owner_id == photo.owner_id, LensRow.deleted_at.is_(None)
+            )
+        )
+        if lens is not None:
+            return lens
+    if photo.lens_serial is None and not (single_copy and photo.lens_model):
+        return None
+    key = identity_key(photo.lens_maker, photo.lens_model, photo.lens_serial)
+    if photo.calibrate:
+        source = photo.lens_serial_source or "none"
+        fresh = _new_lens(
+            photo.owner_id,
+            key,
+            maker=photo.lens_maker,
+            model=photo.lens_model,
+            serial=photo.lens_serial,
+            source=source,
+        )
+        insert_new(session, LensRow, [fresh])
+    return session.scalar(
+        select(LensRow).where(
+            LensRow.owner_id == photo.owner_id, LensRow.identity_key == key, LensRow.deleted_at.is_(None)
+        )
+    )
+
+
+def _new_lens(
+    owner_id: int, key: str, *, maker: str | None, model: str | None, serial: str | None, source: str
+) -> dict[str, Any]:
+    return {
+        "public_id": new_id(),
+        "owner_id": owner_id,
+        "identity_key": key,
+        "maker": maker,
+        "model": model,
+        "serial": serial,
+        "serial_source": source if serial else "none",
+        "created_at": now(),
+        "version": 0,
+        "rebuild_epoch": 0,
+        "photo_count": 0,
+        "sample_count": 0,
+    }
+
+
+def record_event(
+    session: Session, lens_id: int, version: int, kind: str, photo: PhotoRow | None, *, samples_added: int
+) -> None:
+    """Write one line of the lens's history."""
+    counts = session.execute(
+        select(LensRow.sample_count, LensRow.photo_count).where(LensRow.id == lens_id)
+    ).one()
+    session.add(
+        EventRow(
+            lens_id=lens_id,
+            version=version,
+            kind=kind,
+            photo_public_id=None if photo is None else photo.public_id,
+            epoch=0 if photo is None else photo.epoch,
+            samples_added=samples_added,
+            samples=counts[0],
+            photos=counts[1],
+            created_at=now(),
+        )
+    )
+
+
+def give_back(session: Session, photo: PhotoRow, kind: str) -> None:
+    """Take a counted photo out of its lens: a new version that must be fitted anew."""
+    assert photo.lens_id is not None
+    version = new_version(session, photo.lens_id, rebuild=True)
+    dropped = drop_samples(session, photo)
+    record_event(session, photo.lens_id, version, kind, photo, samples_added=-dropped)
+
+
+def bring_in(session: Session, photo: PhotoRow, kind: str) -> None:
+    """Let the finished samples of a photo join its lens again."""
+    assert photo.lens_id is not None
+    version = new_version(session, photo.lens_id, rebuild=True)
+    added = take_samples(session, photo, version)
+    record_event(session, photo.lens_id, version, kind, photo, samples_added=added)
+
+
+def delete_corrections(session: Session, photo: PhotoRow) -> None:
+    """Remove a photo's corrections; their blobs become garbage."""
+    keys = session.scalars(select(CorrectionRow.public_id).where(CorrectionRow.photo_id == photo.id))
+    rows = [{"prefix": f"corrections/{key}/", "not_before": now()} for key in keys]
+    insert_new(session, GarbageRow, rows)
+    session.execute(delete(CorrectionRow).where(CorrectionRow.photo_id == photo.id))
+
+
+class LensStore:
+    """Lenses of all owners. `owner=None` asks as the service itself."""
+
+    def __init__(self, database: Database) -> None:
+        self._db = database
+
+    def get(self, lens_id: str, owner: str | None = None) -> LensRow | None:
+        """Return one lens, or None."""
+        with self._db.reading() as session:
+            return find(session, LensRow, lens_id, owner)
+
+    def page(
+        self,
+        owner: str,
+        *,
+        before: str | None,
+        limit: int,
+        model: str | None = None,
+        serial: str | None = None,
+    ) -> list[LensRow]:
+        """Return lenses, newest first, optionally of one model or serial, compared without case."""
+        query = owned(LensRow, owner).order_by(LensRow.public_id.desc()).limit(limit)
+        if before is not None:
+            query = query.where(LensRow.public_id < before)
+        if model is not None:
+            query = query.where(func.lower(LensRow.model) == model.lower())
+        if serial is not None:
+            query = query.where(func.lower(LensRow.serial) == serial.lower())
+        with self._db.reading() as session:
+            return list(session.scalars(query))
+
+    def create(self, owner_id: int, *, label: str, maker: str | None, model: str | None) -> LensRow:
+        """Make a lens that only its owner can tell from others of its kind."""
+        with self._db.writing() as session:
+            row = _new_lens(
+                owner_id, f"label|{new_id()}", maker=maker, model=model, serial=None, source="user"
+            )
+            lens = LensRow(**{**row, "label": label, "serial_source": "user"})
+            session.add(lens)
+            session.flush()
+            return lens
+
+    def candidates(self, photo: PhotoRow, limit: int = 10) -> list[LensRow]:
+        """Return the owner's lenses that a photo without a serial may belong to."""
+        query = select(LensRow).where(LensRow.owner_id == photo.owner_id, LensRow.deleted_at.is_(None))
+        if photo.lens_model:
+            query = query.where(func.lower(LensRow.model) == photo.lens_model.lower())
+        with self._db.reading() as session:
+            return list(session.scalars(query.order_by(LensRow.public_id.desc()).limit(limit)))
+
+    def by_identity(self, photo: PhotoRow) -> LensRow | None:
+        """Return the lens whose identity an inspected photo carries, if there is one by now."""
+        if photo.lens_serial is None:
+            return None
+        key = identity_key(photo.lens_maker, photo.lens_model, photo.lens_serial)
+        with self._db.reading() as session:
+            return session.scalar(
+                select(LensRow).where(
+                    LensRow.owner_id == photo.owner_id,
+                    LensRow.identity_key == key,
+                    LensRow.deleted_at.is_(None),
+                )
+            )
+
+    def coverage_of(self, lens: Sequence[LensRow]) -> dict[int, tuple[list[float], list[float]]]:
+        """Return the apertures and focal lengths of the counted photos of lenses, by key."""
+        keys = [row.id for row in lens]
+        query = (
+            select(PhotoRow.lens_id, PhotoRow.aperture, PhotoRow.focal_mm)
+            .where(PhotoRow.lens_id.in_(keys), PhotoRow.state == "counted", PhotoRow.deleted_at.is_(None))
+            .distinct()
+        )
+        apertures: dict[int, set[float]] = {key: set() for key in keys}
+        focals: dict[int, set[float]] = {key: set() for key in keys}
+        with self._db.reading() as session:
+            for key, aperture, focal in session.execute(query):
+                assert key is not None
+                apertures[key] |= set() if aperture is None else {aperture}
+                focals[key] |= set() if focal is None else {focal}
+        return {key: (sorted(apertures[key]), sorted(focals[key])) for key in keys}
+
+    def lateral_of(self, lens: LensRow) -> list[dict[str, Any]]:
+        """Return the lateral colour of each counted photo of a lens that shows it."""
+        query = select(PhotoRow.lateral).where(
+            PhotoRow.lens_id == lens.id, PhotoRow.state == "counted", PhotoRow.deleted_at.is_(None)
+        )
+        with self._db.reading() as session:
+            return [lateral for lateral in session.scalars(query) if lateral]
+
+    def history(self, lens: LensRow, *, after: int = 0, limit: int = 1000) -> list[EventRow]:
+        """Return the events of a lens beyond version `after`, oldest first."""
+        query = (
+            select(EventRow)
+            .where(EventRow.lens_id == lens.id, EventRow.version > after)
+            .order_by(EventRow.version)
+            .limit(limit)
+        )
+        with self._db.reading() as session:
+            return list(session.scalars(query))
+
+    def record_metrics(self, lens_id: str, version: int, metrics: dict[str, Any]) -> None:
+        """Add what was measured of one version: held-out `error`, `coverage`, `bandwidth`."""
+        with self._db.writing() as session:
+            lens = find(session, LensRow, lens_id, None)
+            if lens is not None:
+                session.execute(
+                    update(EventRow)
+                    .where(EventRow.lens_id == lens.id, EventRow.version == version)
+                    .values(metrics=metrics)
+                )
+
+    def unmeasured(self, limit: int = 10) -> list[tuple[str, int]]:
+        """Return `(lens_id, version)` of the newest versions that were not measured yet."""
+        query = (
+            select(LensRow.public_id, LensRow.version)
+            .join(EventRow, (EventRow.lens_id == LensRow.id) & (EventRow.version == LensRow.version))
+            .where(EventRow.metrics.is_(None), LensRow.deleted_at.is_(None), LensRow.sample_count > 0)
+            .limit(limit)
+        )
+        with self._db.reading() as session:
+            return [(row[0], row[1]) for row in session.execute(query)]
+
+    def exclude(self, photo_id: str, owner: str) -> bool:
+        """Take a counted photo out of its lens's model; False if it is not counted."""
+        return self._switch(photo_id, owner, "counted", "excluded")
+
+    def include(self, photo_id: str, owner: str) -> bool:
+        """Let an excluded photo count again; False if it is not excluded."""
+        return self._switch(photo_id, owner, "excluded", "counted")
+
+    def _switch(self, photo_id: str, owner: str, before: str, after: str) -> bool:
+        with self._db.writing() as session:
+            photo = find(session, PhotoRow, photo_id, owner)
+            if photo is None or photo.state != before:
+                return False
+            photo.state, photo.stage_at = after, now()
+            session.flush()
+            if after == "excluded":
+                give_back(session, photo, "photo_excluded")
+            else:
+                bring_in(session, photo, "photo_included")
+            return True
+
+    def move(self, photo_id: str, owner: str, lens_id: str) -> bool:
+        """Give a finished photo to another lens; both get a new version if it counts."""
+        with self._db.writing() as session:
+            photo = find(session, PhotoRow, photo_id, owner)
+            lens = find(session, LensRow, lens_id, owner)
+            if photo is None or lens is None:
+                return False
+            if photo.lens_id == lens.id:
+                return True
+            counted = photo.state == "counted"
+            if counted:
+                give_back(session, photo, "photo_removed")
+            photo.lens_id = lens.id
+            photo.given = {**photo.given, "lens_id": lens_id}
+            session.flush()
+            if counted:
+                bring_in(session, photo, "photo_included")
+            return True
+
+    def change_settings(
+        self, photo_id: str, owner: str, given: dict[str, Any], columns: dict[str, Any]
+    ) -> bool:
+        """Correct the settings of a finished photo; a counted one renews its lens's model."""
+        with self._db.writing() as session:
+            photo = find(session, PhotoRow, photo_id, owner)
+            if photo is None:
+                return False
+            photo.given = {**photo.given, **given}
+            for column, value in columns.items():
+                setattr(photo, column, value)
+            session.flush()
+            if photo.state == "counted" and photo.lens_id is not None:
+                version = new_version(session, photo.lens_id, rebuild=True)
+                record_event(session, photo.lens_id, version, "photo_changed", photo, samples_added=0)
+            return True
+
+    def sample_count_of(self, photo: PhotoRow) -> int:
+        """Return how many samples a photo has, counted or not."""
+        with self._db.reading() as session:
+            return session.scalar(select(func.count()).where(SampleRow.photo_id == photo.id)) or 0

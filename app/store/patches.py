@@ -1,0 +1,209 @@
+"""Patches of a photo: planned once, each cell finished once."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from sqlalchemy import func, select, update
+from sqlalchemy.orm import Session
+
+from app.store.database import Database, insert_new
+from app.store.owners import now
+from app.tables import PatchRow, PhotoRow, SampleRow
+from lensmodel.types import Channel, Kernel
+
+DTYPE: Final = "<f4"
+FORMAT_VERSION: Final = 1
+
+
+@dataclass(frozen=True, slots=True)
+class NewPatch:
+    """A window that was chosen, or rejected with a reason."""
+
+    idx: int
+    row: int
+    col: int
+    size: int
+    r: float
+    phi: float
+    cell: int | None = None
+    score: float | None = None
+    rejected: str | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NewSample:
+    """One kernel that was estimated for one channel of the patch `idx`."""
+
+    idx: int
+    channel: Channel
+    kernel: Kernel
+    weight: float
+    estimator: str
+    predicted_error: float | None = None
+    statistics_key: str | None = None
+    diagnostics: Mapping[str, Any] = field(default_factory=dict)
+
+
+class PatchStore:
+    """Patches and the samples that come of them."""
+
+    def __init__(self, database: Database) -> None:
+        self._db = database
+
+    def add(self, photo_id: str, epoch: int, patches: Sequence[NewPatch]) -> int:
+        """Write the plan of a photo once; return how many patches are to be estimated.
+
+        A second call, by a worker that repeats the step, finds the rows there and adds nothing.
+        """
+        with self._db.writing() as session:
+            photo = _live(session, photo_id, epoch)
+            if photo is None:
+                return 0
+            rows = [
+                {
+                    "photo_id": photo.id,
+                    "epoch": epoch,
+                    "idx": patch.idx,
+                    "cell": patch.cell,
+                    "row": patch.row,
+                    "col": patch.col,
+                    "size": patch.size,
+                    "r": patch.r,
+                    "phi": patch.phi,
+                    "score": patch.score,
+                    "state": "pending" if patch.rejected is None else "rejected",
+                    "reason": patch.rejected,
+                    "attempts": 0,
+                    "finished_at": None if patch.rejected is None else now(),
+                }
+                for patch in patches
+            ]
+            insert_new(session, PatchRow, rows)
+            return _recount(session, photo)
+
+    def all_of(self, photo_id: str, epoch: int | None = None) -> list[PatchRow]:
+        """Return the patches of a photo in the order of their numbers."""
+        with self._db.reading() as session:
+            query = (
+                select(PatchRow)
+                .join(PhotoRow, PhotoRow.id == PatchRow.photo_id)
+                .where(PhotoRow.public_id == photo_id, PatchRow.epoch == (epoch or PhotoRow.epoch))
+                .order_by(PatchRow.idx)
+            )
+            return list(session.scalars(query))
+
+    def cells(self, photo_id: str, epoch: int) -> list[int]:
+        """Return the numbers of the cells that still have patches to estimate."""
+        open_cells = {
+            patch.cell
+            for patch in self.all_of(photo_id, epoch)
+            if patch.state in {"pending", "running"} and patch.cell is not None
+        }
+        return sorted(open_cells)
+
+    def of_cell(self, photo_id: str, epoch: int, cell: int) -> list[PatchRow]:
+        """Return the patches of one cell that are still to be estimated."""
+        return [
+            patch
+            for patch in self.all_of(photo_id, epoch)
+            if patch.cell == cell and patch.state in {"pending", "running"}
+        ]
+
+    def finish(self, photo_id: str, epoch: int, samples: Sequence[NewSample]) -> int:
+        """Store the samples of some patches and mark these done; return how many samples went in.
+
+        Nothing happens if the photo was cancelled, deleted or started anew meanwhile. A repeated
+        call stores nothing twice: patch and channel are a unique key.
+        """
+        with self._db.writing() as session:
+            photo = _live(session, photo_id, epoch)
+            if photo is None:
+                return 0
+            numbers = {sample.idx for sample in samples}
+            found = session.scalars(
+                select(PatchRow).where(
+                    PatchRow.photo_id == photo.id, PatchRow.epoch == epoch, PatchRow.idx.in_(numbers)
+                )
+            )
+            patches = {patch.idx: patch for patch in found}
+            rows = [_sample_row(photo, patches[s.idx], s) for s in samples if s.idx in patches]
+            stored = insert_new(session, SampleRow, rows)
+            for patch in patches.values():
+                patch.state, patch.finished_at = "done", patch.finished_at or now()
+            session.flush()
+            _recount(session, photo)
+            return stored
+
+    def fail(
+        self, photo_id: str, epoch: int, indices: Sequence[int], reason: str, *, rejected: bool = False
+    ) -> None:
+        """Mark patches as of no use: `rejected` for their quality, else failed."""
+        with self._db.writing() as session:
+            photo = _live(session, photo_id, epoch)
+            if photo is None:
+                return
+            session.execute(
+                update(PatchRow)
+                .where(
+                    PatchRow.photo_id == photo.id,
+                    PatchRow.epoch == epoch,
+                    PatchRow.idx.in_(indices),
+                    PatchRow.state != "done",
+                )
+                .values(state="rejected" if rejected else "failed", reason=reason[:60], finished_at=now())
+            )
+            _recount(session, photo)
+
+
+def _live(session: Session, photo_id: str, epoch: int) -> PhotoRow | None:
+    return session.scalar(
+        select(PhotoRow)
+        .where(
+            PhotoRow.public_id == photo_id,
+            PhotoRow.epoch == epoch,
+            PhotoRow.state.in_(("selecting", "estimating")),
+            PhotoRow.deleted_at.is_(None),
+        )
+        .with_for_update()  # PostgreSQL: a cancel waits until this transaction is through, and the other way
+    )
+
+
+def _recount(session: Session, photo: PhotoRow) -> int:
+    """Count the patches anew: recomputed, never incremented, so that a repeat cannot count twice."""
+    rows = session.execute(
+        select(PatchRow.state, func.count())
+        .where(PatchRow.photo_id == photo.id, PatchRow.epoch == photo.epoch)
+        .group_by(PatchRow.state)
+    )
+    counts = {row[0]: row[1] for row in rows}
+    photo.patches_rejected = counts.get("rejected", 0)
+    photo.patches_done = counts.get("done", 0) + counts.get("failed", 0)
+    photo.patches_total = sum(counts.values()) - photo.patches_rejected
+    return photo.patches_total
+
+
+def _sample_row(photo: PhotoRow, patch: PatchRow, sample: NewSample) -> dict[str, Any]:
+    blob = np.ascontiguousarray(sample.kernel, dtype=DTYPE).tobytes()
+    return {
+        "photo_id": photo.id,
+        "patch_id": patch.id,
+        "channel": sample.channel,
+        "r": patch.r,
+        "phi": patch.phi,
+        "weight": sample.weight,
+        "predicted_error": sample.predicted_error,
+        "size": sample.kernel.shape[0],
+        "dtype": DTYPE,
+        "format_version": FORMAT_VERSION,
+        "crc32": zlib.crc32(blob),
+        "psf": blob,
+        "statistics_key": sample.statistics_key,
+        "estimator": sample.estimator,
+        "diagnostics": dict(sample.diagnostics),
+        "created_at": now(),
+    }

@@ -1,0 +1,117 @@
+"""Samples as the model reads them: library values, in the order in which they joined."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+from sqlalchemy import Row, select
+
+from app.store.database import Database
+from app.store.patches import DTYPE
+from app.tables import LensRow, PhotoRow, SampleRow
+from lensmodel.errors import LensModelError
+from lensmodel.psf import PsfSample
+from lensmodel.types import Channel, FieldPosition, LensSettings
+
+
+class CorruptSampleError(LensModelError):
+    """A stored kernel is not what was written."""
+
+    code = "corrupt_sample"
+
+
+@dataclass(frozen=True, slots=True)
+class LensState:
+    """What tells whether a fitted model is up to date."""
+
+    version: int
+    rebuild_epoch: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredSample:
+    """A sample with the key by which later ones are told apart."""
+
+    id: int
+    version_added: int
+    sample: PsfSample
+
+
+class SampleStore:
+    """The samples that count."""
+
+    def __init__(self, database: Database) -> None:
+        self._db = database
+
+    def state_of(self, lens_id: str, owner: str | None = None) -> LensState | None:
+        """Return the version of a lens by one primary-key read; None if there is no such lens."""
+        del owner  # ids cannot be guessed; routes have asked for the lens by its owner before
+        query = select(LensRow.version, LensRow.rebuild_epoch).where(
+            LensRow.public_id == lens_id, LensRow.deleted_at.is_(None)
+        )
+        with self._db.reading() as session:
+            row = session.execute(query).one_or_none()
+            return None if row is None else LensState(row[0], row[1])
+
+    def of_lens(
+        self, lens_id: str, *, after_version: int = 0, up_to_version: int | None = None
+    ) -> tuple[LensState, list[StoredSample]]:
+        """Return the state of a lens and its samples that joined after a version.
+
+        Both are of one moment. Versions grow under the lens's row lock, so no sample of a
+        version that was seen can turn up later.
+        """
+        query = (
+            select(
+                SampleRow.id,
+                SampleRow.version_added,
+                SampleRow.channel,
+                SampleRow.r,
+                SampleRow.phi,
+                SampleRow.weight,
+                SampleRow.size,
+                SampleRow.crc32,
+                SampleRow.psf,
+                SampleRow.estimator,
+                PhotoRow.public_id.label("photo"),
+                PhotoRow.aperture,
+                PhotoRow.focal_mm,
+                PhotoRow.focus_m,
+                PhotoRow.pixel_pitch_um,
+            )
+            .join(PhotoRow, PhotoRow.id == SampleRow.photo_id)
+            .join(LensRow, LensRow.id == SampleRow.lens_id)
+            .where(LensRow.public_id == lens_id, SampleRow.version_added > after_version)
+            .order_by(SampleRow.version_added, SampleRow.id)
+        )
+        if up_to_version is not None:
+            query = query.where(SampleRow.version_added <= up_to_version)
+        with self._db.reading() as session:
+            state = session.execute(
+                select(LensRow.version, LensRow.rebuild_epoch).where(LensRow.public_id == lens_id)
+            ).one_or_none()
+            if state is None:
+                return LensState(0, 0), []
+            return LensState(state[0], state[1]), [_stored(row) for row in session.execute(query)]
+
+
+def _stored(row: Row[*tuple[Any, ...]]) -> StoredSample:
+    if zlib.crc32(row.psf) != row.crc32:
+        raise CorruptSampleError(f"sample {row.id} differs from what was written: restore the database")
+    kernel = np.frombuffer(row.psf, dtype=DTYPE).reshape(row.size, row.size)
+    return StoredSample(
+        row.id,
+        row.version_added,
+        PsfSample(
+            kernel=kernel.astype(np.float64),
+            position=FieldPosition(row.r, row.phi),
+            settings=LensSettings(row.aperture, row.focal_mm, row.focus_m, cast("Channel", row.channel)),
+            weight=row.weight,
+            photo=row.photo,
+            pixel_pitch_um=row.pixel_pitch_um,
+            estimator=row.estimator,
+        ),
+    )

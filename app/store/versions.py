@@ -1,0 +1,63 @@
+"""The version of a lens: grows with every change of its samples, under the lens's row lock."""
+
+from __future__ import annotations
+
+from sqlalchemy import func, select, update
+from sqlalchemy.orm import Session
+
+from app.tables import LensRow, PhotoRow, SampleRow
+
+
+def new_version(session: Session, lens_id: int, *, rebuild: bool = False) -> int:
+    """Raise the version by one and return it.
+
+    The UPDATE locks the lens's row until the transaction ends, so that versions and the samples
+    that belong to them become visible in the same order. `rebuild` says that samples went away
+    or changed: models in memory must be fitted anew instead of extended.
+    """
+    return session.execute(
+        update(LensRow)
+        .where(LensRow.id == lens_id)
+        .values(version=LensRow.version + 1, rebuild_epoch=LensRow.rebuild_epoch + (1 if rebuild else 0))
+        .returning(LensRow.version)
+    ).scalar_one()
+
+
+def take_samples(session: Session, photo: PhotoRow, version: int) -> int:
+    """Let the samples of a photo join its lens in `version`; return how many."""
+    joined = (
+        session.connection()
+        .execute(
+            update(SampleRow)
+            .where(SampleRow.photo_id == photo.id)
+            .values(lens_id=photo.lens_id, version_added=version)
+        )
+        .rowcount
+    )
+    assert photo.lens_id is not None
+    recount(session, photo.lens_id)
+    return joined
+
+
+def drop_samples(session: Session, photo: PhotoRow) -> int:
+    """Take the samples of a photo out of its lens, without deleting them; return how many."""
+    dropped = (
+        session.connection()
+        .execute(
+            update(SampleRow).where(SampleRow.photo_id == photo.id).values(lens_id=None, version_added=None)
+        )
+        .rowcount
+    )
+    assert photo.lens_id is not None
+    recount(session, photo.lens_id)
+    return dropped
+
+
+def recount(session: Session, lens_id: int) -> None:
+    """Count the samples and photos of a lens anew: recomputed, never incremented."""
+    samples, photos = session.execute(
+        select(func.count(), func.count(SampleRow.photo_id.distinct())).where(SampleRow.lens_id == lens_id)
+    ).one()
+    session.execute(
+        update(LensRow).where(LensRow.id == lens_id).values(sample_count=samples, photo_count=photos)
+    )

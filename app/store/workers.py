@@ -1,0 +1,90 @@
+"""Workers and their leases, and the blobs that wait to be deleted."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+
+from sqlalchemy import delete, select, update
+
+from app.store.database import Database
+from app.store.owners import now
+from app.tables import GarbageRow, WorkerRow
+
+
+class WorkerStore:
+    """Who works, and who was not heard of for too long."""
+
+    def __init__(self, database: Database) -> None:
+        self._db = database
+
+    def register(self, worker_id: str, *, host: str, pid: int, pid_started: float) -> None:
+        """Enter a new worker."""
+        with self._db.writing() as session:
+            session.add(
+                WorkerRow(
+                    id=worker_id,
+                    host=host,
+                    pid=pid,
+                    pid_started=pid_started,
+                    state="live",
+                    started_at=now(),
+                    heartbeat_at=now(),
+                )
+            )
+
+    def beat(self, worker_id: str) -> bool:
+        """Renew the lease; False if the worker was declared dead: it must then stop at once."""
+        with self._db.writing() as session:
+            statement = (
+                update(WorkerRow)
+                .where(WorkerRow.id == worker_id, WorkerRow.state == "live")
+                .values(heartbeat_at=now())
+            )
+            return session.connection().execute(statement).rowcount == 1
+
+    def live(self, lease_seconds: float) -> list[WorkerRow]:
+        """Return the workers that were heard of within the lease."""
+        query = select(WorkerRow).where(
+            WorkerRow.state == "live", WorkerRow.heartbeat_at > now() - timedelta(seconds=lease_seconds)
+        )
+        with self._db.reading() as session:
+            return list(session.scalars(query))
+
+    def all(self) -> list[WorkerRow]:
+        """Return every worker that is not forgotten."""
+        with self._db.reading() as session:
+            return list(session.scalars(select(WorkerRow)))
+
+    def bury_stale(self, lease_seconds: float) -> list[str]:
+        """Declare workers dead that missed their lease; return the ids of all dead ones."""
+        with self._db.writing() as session:
+            session.execute(
+                update(WorkerRow)
+                .where(
+                    WorkerRow.state == "live",
+                    WorkerRow.heartbeat_at < now() - timedelta(seconds=lease_seconds),
+                )
+                .values(state="dead")
+            )
+            return list(session.scalars(select(WorkerRow.id).where(WorkerRow.state == "dead")))
+
+    def bury(self, worker_id: str) -> None:
+        """Declare one worker dead: it said good-bye, or its process is known to be gone."""
+        with self._db.writing() as session:
+            session.execute(update(WorkerRow).where(WorkerRow.id == worker_id).values(state="dead"))
+
+    def forget(self, worker_id: str) -> None:
+        """Remove a dead worker, once others have taken over all it had begun."""
+        with self._db.writing() as session:
+            session.execute(delete(WorkerRow).where(WorkerRow.id == worker_id, WorkerRow.state == "dead"))
+
+    def garbage(self, limit: int = 100) -> list[str]:
+        """Return prefixes of blobs that are due for deletion."""
+        query = select(GarbageRow.prefix).where(GarbageRow.not_before <= now()).limit(limit)
+        with self._db.reading() as session:
+            return list(session.scalars(query))
+
+    def forget_garbage(self, prefix: str) -> None:
+        """Say that the blobs of a prefix are gone."""
+        with self._db.writing() as session:
+            session.execute(delete(GarbageRow).where(GarbageRow.prefix == prefix))

@@ -1,0 +1,1 @@
+"""Steps from each schema to the next; `app.store.migrate` runs them."""

@@ -317,15 +317,16 @@ class SimulatedLens:
         optics, n = self.at_focal(settings.focal_mm), self.f_number(settings)
         wavefront, aperture = _Wavefront.of(optics, h, n, defocus), _Pupil.of(optics, h, n)
         (col, row), spread = _ray_statistics(wavefront, aperture, WAVELENGTH_NM[settings.channel] / 1000.0, n)
-        return pupil.kernel(
+        response = pupil.pixel_otf(
             wavefront,
             aperture,
-            pupil.Sampling(size, pitch_um, n),
             spectrum(settings.channel),
+            size=size,
+            pitch_um=pitch_um,
+            f_number=n,
             spread_um=spread,
-            guess=(-row / pitch_um, col / pitch_um),
-            offset=offset,
         )
+        return response.centred(size, (-row / pitch_um, col / pitch_um), offset)
 
     def field(
         self, settings: LensSettings | None = None, *, pitch_um: float = DEFAULT_PITCH_UM, defocus: float = 0.0
@@ -337,8 +338,7 @@ class SimulatedLens:
         """Light that the cat's eye lets through at field vector `h`, over that of the full pupil."""
         optics, n = self.at_focal(settings.focal_mm), self.f_number(settings)
         step = 2.0 / 128
-        p = (np.arange(128, dtype=np.float32) + np.float32(0.5)) * np.float32(step) - np.float32(1.0)
-        px, py = p[None, :], -p[:, None]
+        px, py = pupil.coordinates(130, step)
         cut = _Pupil.of(optics, h, n)(px, py, step).sum(dtype=np.float64)
         return float(cut / pupil.disc(px, py, step).sum(dtype=np.float64))
 
@@ -353,10 +353,9 @@ def _ray_statistics(
     wavefront: _Wavefront, aperture: _Pupil, wavelength_um: float, f_number: float
 ) -> tuple[tuple[float, float], float]:
     """Centre of the ray spot (right, up) and its largest radius, in micrometres."""
-    samples = 48
-    p = (np.arange(samples, dtype=np.float32) + np.float32(0.5)) * np.float32(2.0 / samples) - np.float32(1)
-    px, py = p[None, :], -p[:, None]
-    light = aperture(px, py, 2.0 / samples).astype(np.float64) ** 2
+    step = 2.0 / 48
+    px, py = pupil.coordinates(48, step)
+    light = aperture(px, py, step).astype(np.float64) ** 2
     scale = 2.0 * pupil.REFERENCE_UM * f_number  # W counts reference waves
     gx, gy = wavefront.gradient(px, py, wavelength_um)
     total = light.sum()

@@ -1,6 +1,46 @@
 """Synthetic lenses, cameras and scenes whose truth is known."""
 
+from lensmodel.simulate.camera import SimulatedCamera, SimulatedPhoto, Truth, blurred, photograph
+from lensmodel.simulate.charts import Chart, ChartEdge, edge_area, edge_chart, slanted_edge_scene
 from lensmodel.simulate.draw import LENS_KINDS, draw_lens
 from lensmodel.simulate.lens import Aberrations, SimulatedField, SimulatedLens
+from lensmodel.simulate.scenes import (
+    DEMO_SCENES,
+    constant,
+    dead_leaves,
+    demo_data_path,
+    demo_scene,
+    disc_kernel,
+    load_scene,
+    out_of_focus,
+    point_lights,
+    srgb_to_linear,
+)
 
-__all__ = ["LENS_KINDS", "Aberrations", "SimulatedField", "SimulatedLens", "draw_lens"]
+__all__ = [
+    "DEMO_SCENES",
+    "LENS_KINDS",
+    "Aberrations",
+    "Chart",
+    "ChartEdge",
+    "SimulatedCamera",
+    "SimulatedField",
+    "SimulatedLens",
+    "SimulatedPhoto",
+    "Truth",
+    "blurred",
+    "constant",
+    "dead_leaves",
+    "demo_data_path",
+    "demo_scene",
+    "disc_kernel",
+    "draw_lens",
+    "edge_area",
+    "edge_chart",
+    "load_scene",
+    "out_of_focus",
+    "photograph",
+    "point_lights",
+    "slanted_edge_scene",
+    "srgb_to_linear",
+]

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from dataclasses import dataclass, field, fields
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,18 +75,20 @@ class Aberrations:
 
     def __post_init__(self) -> None:
         if not 0.7 <= self.f_number <= _SMALLEST_F:
-            raise InvalidInputError(f"open aperture must lie in f/0.7..f/{_SMALLEST_F:g}, got {self.f_number}")
+            raise InvalidInputError(
+                f"open aperture must lie in f/0.7..f/{_SMALLEST_F:g}, got {self.f_number}"
+            )
         for each in fields(self):
             if not np.isfinite(getattr(self, each.name)).all():
                 raise InvalidInputError(f"{each.name} must be finite, got {getattr(self, each.name)}")
 
     def mixed(self, other: Aberrations, share: float) -> Aberrations:
         """Optics between two focal lengths: every term linear in `share` of `other`."""
-        values = {}
+        values: dict[str, Any] = {}
         for each in fields(self):
             a, b = np.asarray(getattr(self, each.name)), np.asarray(getattr(other, each.name))
-            mixed = a + share * (b - a)
-            values[each.name] = tuple(mixed.tolist()) if mixed.ndim else float(mixed)
+            mixed = (a + share * (b - a)).tolist()
+            values[each.name] = tuple(mixed) if isinstance(mixed, list) else mixed
         return Aberrations(**values)
 
 
@@ -174,9 +176,7 @@ class _Pupil:
         x, y = h[0] - optics.decentring[0], h[1] - optics.decentring[1]
         return cls(radius / s, (shift * x / s, shift * y / s))
 
-    def __call__(
-        self, px: NDArray[np.float32], py: NDArray[np.float32], step: float
-    ) -> NDArray[np.float32]:
+    def __call__(self, px: NDArray[np.float32], py: NDArray[np.float32], step: float) -> NDArray[np.float32]:
         stop = pupil.disc(px, py, step)
         reach = 1.0 + math.hypot(*self.center) + step
         if self.radius <= 0.0 or self.radius >= reach:
@@ -329,7 +329,11 @@ class SimulatedLens:
         return response.centred(size, (-row / pitch_um, col / pitch_um), offset)
 
     def field(
-        self, settings: LensSettings | None = None, *, pitch_um: float = DEFAULT_PITCH_UM, defocus: float = 0.0
+        self,
+        settings: LensSettings | None = None,
+        *,
+        pitch_um: float = DEFAULT_PITCH_UM,
+        defocus: float = 0.0,
     ) -> SimulatedField:
         """The exact PSF of every place and channel at these settings, remembering what was asked."""
         return SimulatedField(self, settings or LensSettings(), pitch_um, defocus)

@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
 
 from app.jobs import child
+from lensmodel.types import ignore_step
 
 log = logging.getLogger(__name__)
 
@@ -205,7 +206,7 @@ class Sandbox:
         folder: Path,
         limits: Limits,
         wanted: Callable[[], bool] = lambda: True,
-        on_progress: child.Progress = _ignore,
+        on_progress: child.Progress = ignore_step,
     ) -> Outcome:
         """Run one task to its end.
 
@@ -338,10 +339,6 @@ def _result(path: Path) -> Outcome:
     if path.stat().st_size > MAX_RESULT:
         return Outcome("crashed", code="internal_error", detail="the task returned more than may be read")
     return Outcome("ok", value=json.loads(path.read_text(encoding="utf-8")))
-
-
-def _ignore(done: int, total: int) -> None:
-    """Take no notice of progress."""
 
 
 def _signal_name(number: int) -> str:

@@ -1,0 +1,180 @@
+"""What only a look at the window's own pixels tells: spectrum, periods, blocks, blobs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from lensmodel.patches.blocks import CLIP_SHARE
+from lensmodel.types import Plane
+
+SECTORS: Final = 8
+BAND_EDGES: Final = (0.03, 0.1, 0.2, 0.35)
+BANDS: Final = len(BAND_EDGES) - 1
+
+_JPEG_BLOCK = 8
+_MAIN_LOBE_PX = 8
+_ON_THE_WAY = 24
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Details:
+    """Second look at some windows; every array has one entry a window along axis 0.
+
+    Parameters
+    ----------
+    information : ndarray of float64, shape (n, BANDS, SECTORS)
+        Natural logarithm of power over noise by radial band and angular sector.
+    period : ndarray of float64, shape (n,)
+        Highest separate peak of the autocorrelation, 1 for a perfect period.
+    blockiness : ndarray of float64, shape (n,)
+        Steps on an 8 px grid over steps off it; 1 where there is none.
+    blob : ndarray of int64, shape (n,)
+        Pixels of the largest connected clipped area.
+    kurtosis : ndarray of float64, shape (n,)
+        Of the horizontal and vertical differences; 3 for a Gaussian, more for isolated edges.
+    """
+
+    information: NDArray[np.float64]
+    period: NDArray[np.float64]
+    blockiness: NDArray[np.float64]
+    blob: NDArray[np.int64]
+    kurtosis: NDArray[np.float64]
+
+    def take(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> Details:
+        """Return the entries that `index` picks."""
+        return Details(*(getattr(self, name)[index] for name in self.__slots__))
+
+
+def look_at(patch: Plane, sigma: float, clip: float, corner: tuple[int, int]) -> Details:
+    """Look at one window.
+
+    Parameters
+    ----------
+    patch : Plane, shape (P, P)
+        The window's pixels.
+    sigma : float
+        Standard deviation of the noise at the window's mean level.
+    clip : float
+        Level of saturation.
+    corner : tuple of int
+        Top-left pixel in the photo: the JPEG grid starts at the photo's corner.
+    """
+    values = np.asarray(patch, dtype=np.float64)
+    power = _power(values - values.mean())
+    return Details(
+        information=_information(power, sigma)[None],
+        period=np.array([_period(power, sigma)]),
+        blockiness=np.array([_blockiness(values, corner)]),
+        blob=np.array([_largest_blob(values >= CLIP_SHARE * clip)], dtype=np.int64),
+        kurtosis=np.array([_kurtosis(values)]),
+    )
+
+
+def joined(parts: list[Details]) -> Details:
+    """Put the entries of several together."""
+    return Details(*(np.concatenate([getattr(p, name) for p in parts]) for name in Details.__slots__))
+
+
+@lru_cache(maxsize=4)
+def _grids(size: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.intp]]:
+    """Hann window, |f|² and the band-sector number of each frequency (-1 outside)."""
+    hann = np.hanning(size + 2)[1:-1]
+    window = np.outer(hann, hann)
+    fr, fc = fft.fftfreq(size)[:, None], fft.rfftfreq(size)[None, :]
+    radius = np.hypot(fr, fc)
+    band = np.searchsorted(BAND_EDGES, radius, side="right") - 1
+    sector = np.floor(np.arctan2(fr, fc) * (SECTORS / np.pi) + 0.5).astype(np.intp) % SECTORS
+    number = np.where((band >= 0) & (band < BANDS), band * SECTORS + sector, -1)
+    return window, (2.0 * np.pi * radius) ** 2, number
+
+
+def _power(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Periodogram under a Hann window, scaled so that white noise gives its variance."""
+    window, _, _ = _grids(values.shape[0])
+    return np.square(np.abs(fft.rfft2(values * window))) / float(np.square(window).sum())
+
+
+def _information(power: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
+    """Mean log of power over noise: at which frequencies and directions the window carries signal.
+
+    If the scene were known, the covariance of a least-squares kernel would be the noise over
+    this power, frequency by frequency.
+    """
+    _, _, number = _grids(power.shape[0])
+    inside = number >= 0
+    total = np.bincount(number[inside], power[inside], BANDS * SECTORS)
+    count = np.bincount(number[inside], minlength=BANDS * SECTORS)
+    mean = total / np.maximum(count, 1)
+    return np.log(np.maximum(mean / max(sigma * sigma, 1e-12), 1e-3)).reshape(BANDS, SECTORS)
+
+
+def _period(power: NDArray[np.float64], sigma: float) -> float:
+    """Highest separate peak of the autocorrelation of the gradients.
+
+    A fence or a facade repeats itself, and a blind estimate then cannot tell one repetition
+    from the next. A long straight edge has a ridge through the origin, not a separate peak: on
+    the way from the origin the correlation must fall to half the peak's height.
+    """
+    size = power.shape[0]
+    window, square_frequency, _ = _grids(size)
+    signal = np.maximum(power - sigma * sigma, 0.0) * square_frequency * np.exp(-2.0 * square_frequency)
+    correlation = fft.fftshift(fft.irfft2(signal, s=(size, size)))
+    taper = fft.fftshift(fft.irfft2(np.square(np.abs(fft.rfft2(window))), s=(size, size)))
+    middle = size // 2
+    if correlation[middle, middle] <= 0.0:
+        return 0.0
+    # The window's own autocorrelation takes weight from long lags; give it back up to a third.
+    correlation = correlation / correlation[middle, middle]
+    reach = size // 3
+    part = slice(middle - reach, middle + reach + 1)
+    correlation = correlation[part, part] / (taper[part, part] / taper[middle, middle])
+    lag = np.hypot(*np.ogrid[-reach : reach + 1, -reach : reach + 1])
+    peaks = (correlation == ndimage.maximum_filter(correlation, 3)) & (lag >= _MAIN_LOBE_PX)
+    heights = np.where(peaks, correlation, 0.0)
+    highest = 0.0
+    for at in np.argsort(heights.ravel())[::-1][:6]:
+        row, col = np.unravel_index(at, heights.shape)
+        height = float(heights[row, col])
+        t = np.linspace(0.0, 1.0, _ON_THE_WAY)
+        way = correlation[
+            np.rint(reach + (row - reach) * t).astype(int), np.rint(reach + (col - reach) * t).astype(int)
+        ]
+        if height > highest and float(way.min()) < 0.5 * height:
+            highest = height
+    return min(highest, 1.0)
+
+
+def _blockiness(values: NDArray[np.float64], corner: tuple[int, int]) -> float:
+    """Mean step across the lines of an 8 px grid over the mean step elsewhere.
+
+    The step at a line is the difference minus what its neighbours on either side predict.
+    """
+    ratios = []
+    for axis in (0, 1):
+        d = np.abs(np.diff(values, axis=axis))
+        d = d if axis == 0 else d.T
+        excess = np.abs(d[1:-1] - 0.5 * (d[:-2] + d[2:])).mean(axis=1)
+        # Entry i belongs to the line between pixels i + 1 and i + 2 of the window.
+        phase = (np.arange(excess.size) + 2 + corner[axis]) % _JPEG_BLOCK
+        by_phase = np.array([excess[phase == k].mean() for k in range(_JPEG_BLOCK)])
+        ratios.append(by_phase[0] / max(float(np.median(by_phase[1:])), 1e-12))
+    return float(np.mean(ratios))
+
+
+def _largest_blob(mask: NDArray[np.bool_]) -> int:
+    if not mask.any():
+        return 0
+    labels, _ = ndimage.label(mask)
+    return int(np.bincount(labels.ravel())[1:].max())
+
+
+def _kurtosis(values: NDArray[np.float64]) -> float:
+    d = np.concatenate([np.diff(values, axis=0).ravel(), np.diff(values, axis=1).ravel()])
+    square = float(np.mean(d**2))
+    return float(np.mean(d**4)) / max(square * square, 1e-30)

@@ -1,0 +1,330 @@
+from __future__ import annotations
+
+import math
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from lensmodel.errors import InvalidInputError, NoUsablePatchesError, UnknownMethodError
+from lensmodel.geometry import Frame
+from lensmodel.patches import REASONS, Patch, Selection, r_map, select, selectors
+from lensmodel.patches.defocus import isotonic
+from lensmodel.types import NoiseModel, Plane
+
+NOISE = NoiseModel.white(0.003)
+
+
+def dead_leaves(height: int, width: int, seed: int = 0) -> Plane:
+    """Discs of many sizes that hide each other: sharp edges in every direction."""
+    rng = np.random.default_rng(seed)
+    plane = np.full((height, width), 0.4, dtype=np.float32)
+    rows, cols = np.mgrid[:height, :width]
+    for _ in range(height * width // 600):
+        radius = 4.0 * (1.0 - rng.random()) ** -0.7
+        if radius > 120.0:
+            continue
+        row, col = rng.random(2) * (height, width)
+        r0, r1 = max(int(row - radius - 1), 0), int(row + radius + 2)
+        c0, c1 = max(int(col - radius - 1), 0), int(col + radius + 2)
+        inside = np.hypot(rows[r0:r1, c0:c1] - row, cols[r0:r1, c0:c1] - col) <= radius
+        plane[r0:r1, c0:c1][inside] = rng.uniform(0.08, 0.8)
+    return plane
+
+
+def photo_of(scene: Plane, seed: int = 1, blur_px: float = 0.8) -> Plane:
+    rng = np.random.default_rng(seed)
+    blurred = ndimage.gaussian_filter(scene, blur_px)
+    return (blurred + rng.normal(0.0, 0.003, scene.shape)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Plane:
+    return dead_leaves(1000, 1500)
+
+
+@pytest.fixture(scope="module")
+def photo(scene: Plane) -> Plane:
+    return photo_of(scene)
+
+
+@pytest.fixture(scope="module")
+def selection(photo: Plane) -> Selection:
+    return select(photo, NOISE, Frame(*photo.shape), count=36)
+
+
+def chosen(plane: Plane, **options: int) -> Selection:
+    return select(plane, NOISE, Frame(*plane.shape), **options)
+
+
+def overlap(patch: Patch, mask: np.ndarray) -> float:
+    return float(mask[patch.row : patch.row + patch.size, patch.col : patch.col + patch.size].mean())
+
+
+# ---- the r-map
+
+
+def test_r_is_high_at_a_step_and_low_on_stripes_narrower_than_the_window() -> None:
+    step, stripes = np.zeros((2, 101, 101), dtype=np.float32)
+    step[:, 50:] = 1.0
+    stripes[:, (np.arange(101) // 3) % 2 == 0] = 1.0
+
+    assert r_map(step)[50, 50] > 0.9
+    assert r_map(stripes)[50, 50] < 0.1
+
+
+def test_r_of_a_step_is_what_the_formula_says() -> None:
+    step = np.zeros((121, 121), dtype=np.float32)
+    step[:, 60:] = 1.0
+
+    # Within the window every row adds the whole step of 1, all in one direction.
+    assert r_map(step, 25)[60, 60] == pytest.approx(25.0 / (25.0 + 0.5), rel=1e-3)
+
+
+def test_r_of_a_flat_plane_is_zero() -> None:
+    assert r_map(np.full((60, 60), 0.5, dtype=np.float32)).max() < 1e-4
+
+
+@given(st.integers(1, 3))
+def test_r_map_turns_with_the_plane(turns: int) -> None:
+    plane = dead_leaves(90, 90, seed=7)
+
+    np.testing.assert_allclose(r_map(np.rot90(plane, turns).copy()), np.rot90(r_map(plane), turns), atol=2e-4)
+
+
+def test_r_map_refuses_an_even_window() -> None:
+    with pytest.raises(InvalidInputError, match="odd"):
+        r_map(np.zeros((50, 50), dtype=np.float32), 24)
+
+
+# ---- what is chosen
+
+
+def test_a_photo_of_1500_by_1000_gives_two_to_four_patches_a_cell(selection: Selection) -> None:
+    cells = Counter(patch.cell for patch in selection.patches)
+
+    assert len(selection.patches) == 36
+    assert {patch.size for patch in selection.patches} == {192}
+    assert set(cells.values()) <= {2, 3, 4}
+
+
+def test_cells_are_numbered_without_gaps(selection: Selection) -> None:
+    numbers = [patch.cell for patch in selection.patches]
+
+    assert numbers == sorted(numbers)
+    assert set(numbers) == set(range(max(numbers) + 1))
+
+
+def test_patches_of_a_cell_lie_together(selection: Selection) -> None:
+    for patch in selection.patches:
+        first = next(p for p in selection.patches if p.cell == patch.cell)
+        turn = (patch.position.phi - first.position.phi + math.pi) % (2 * math.pi) - math.pi
+        apart = max(abs(patch.row - first.row), abs(patch.col - first.col))
+        assert abs(patch.position.r - first.position.r) <= 0.12
+        assert apart < patch.size or abs(turn) <= math.radians(24.0)
+
+
+def test_patches_overlap_by_half_at_most(selection: Selection) -> None:
+    for i, a in enumerate(selection.patches):
+        for b in selection.patches[i + 1 :]:
+            assert max(abs(a.row - b.row), abs(a.col - b.col)) >= a.size / 2
+
+
+def test_every_corner_gets_its_share(selection: Selection) -> None:
+    outer = [p.position.phi for p in selection.patches if p.position.r > 0.55]
+    quadrants = Counter(int(phi // (math.pi / 2)) for phi in outer)
+
+    assert min(quadrants[q] for q in (-2, -1, 0, 1)) >= 2
+
+
+def test_position_is_that_of_the_centre_of_the_patch(selection: Selection) -> None:
+    patch = selection.patches[0]
+    expected = Frame(1000, 1500).position(patch.row + (patch.size - 1) / 2, patch.col + (patch.size - 1) / 2)
+
+    assert patch.position.r == pytest.approx(expected.r)
+    assert patch.position.phi == pytest.approx(expected.phi)
+
+
+def test_selection_is_the_same_each_time(photo: Plane, selection: Selection) -> None:
+    assert chosen(photo, count=36).patches == selection.patches
+
+
+def test_a_small_photo_gets_smaller_patches() -> None:
+    small = photo_of(dead_leaves(320, 400))
+    patches = chosen(small, count=12).patches
+
+    assert len(patches) >= 8
+    assert {p.size for p in patches} == {128}
+
+
+def test_a_memory_mapped_plane_gives_the_same(tmp_path: Path, photo: Plane, selection: Selection) -> None:
+    np.save(tmp_path / "plane.npy", photo)
+
+    assert chosen(np.load(tmp_path / "plane.npy", mmap_mode="r"), count=36).patches == selection.patches
+
+
+def test_scores_lie_in_zero_to_one_and_jpeg_counts_for_less(photo: Plane, selection: Selection) -> None:
+    jpeg = select(photo, NOISE, Frame(*photo.shape), count=36, jpeg=True)
+
+    assert all(0.0 < p.score <= 1.0 for p in selection.patches)
+    assert max(p.score for p in jpeg.patches) <= 0.3
+
+
+def test_a_window_with_edges_scores_above_one_with_faint_texture(scene: Plane) -> None:
+    faint = scene.copy()
+    faint[:, :750] = 0.4 + 0.15 * (faint[:, :750] - 0.4)
+    patches = chosen(photo_of(faint), count=24).patches
+    left = [p.score for p in patches if p.col + p.size <= 750]
+    right = [p.score for p in patches if p.col >= 750]
+
+    assert np.mean(right) > np.mean(left) + 0.1
+
+
+def test_progress_is_reported_to_the_end(photo: Plane) -> None:
+    steps: list[tuple[int, int]] = []
+    select(photo, NOISE, Frame(*photo.shape), on_step=lambda done, total: steps.append((done, total)))
+
+    assert steps[-1][0] == steps[-1][1]
+    assert [done for done, _ in steps] == sorted(done for done, _ in steps)
+
+
+# ---- what is rejected
+
+
+def test_every_window_is_chosen_or_has_a_reason(selection: Selection) -> None:
+    assert {r.reason for r in selection.rejected} <= set(REASONS)
+    assert sum(selection.counts.values()) == len(selection.rejected)
+    places = [(r.row, r.col) for r in selection.rejected] + [(p.row, p.col) for p in selection.patches]
+    assert len(places) == len(set(places)) == 17 * 28
+
+
+def test_clipped_flat_and_dark_parts_are_rejected_with_their_reason(scene: Plane) -> None:
+    spoilt = scene.copy()
+    spoilt[:300, :400] = np.where(spoilt[:300, :400] > 0.5, 1.2, spoilt[:300, :400])
+    spoilt[-300:, -400:] = 0.5
+    plane = photo_of(spoilt)
+    plane[:300, -400:] *= 0.01
+    result = chosen(np.minimum(plane, 1.0))
+    reason = {(r.row < 100, r.col < 100): r.reason for r in result.rejected if _in_a_corner(r.row, r.col)}
+
+    assert reason[True, True] == "clipped"
+    assert reason[False, False] == "flat"
+    assert reason[True, False] == "dark"
+
+
+def _in_a_corner(row: int, col: int) -> bool:
+    return (row < 100 or row > 700) and (col < 100 or col > 1200)
+
+
+def test_edges_of_one_direction_only_are_rejected() -> None:
+    stripes = np.repeat(np.cumsum(np.random.default_rng(3).normal(0, 1, 100)), 12)[None, :].repeat(600, 0)
+    plane = photo_of((0.5 + 0.3 * np.tanh(stripes / 3)).astype(np.float32))
+
+    with pytest.raises(NoUsablePatchesError, match="one-directional"):
+        chosen(plane)
+
+
+def test_a_grid_that_repeats_is_rejected_as_periodic() -> None:
+    rows, cols = np.mgrid[:600, :800]
+    tile = ((rows % 24 < 12) ^ (cols % 30 < 11)).astype(np.float32) * 0.5 + 0.2
+
+    with pytest.raises(NoUsablePatchesError, match="periodic"):
+        chosen(photo_of(tile))
+
+
+def test_steps_on_the_grid_of_jpeg_blocks_are_rejected(scene: Plane) -> None:
+    coarse = scene[:600, :800].reshape(75, 8, 100, 8).mean(axis=(1, 3)).repeat(8, 0).repeat(8, 1)
+
+    with pytest.raises(NoUsablePatchesError, match="jpeg-blocks"):
+        chosen((coarse + photo_of(scene)[:600, :800] * 0.05).astype(np.float32))
+
+
+def test_windows_with_missing_pixels_are_rejected_as_border(photo: Plane) -> None:
+    plane = photo.copy()
+    plane[:, :40] = np.nan
+    result = chosen(plane)
+
+    assert all(p.col >= 40 for p in result.patches)
+    assert {r.reason for r in result.rejected if r.col < 40} == {"border"}
+
+
+def test_a_defocused_part_is_left_out_and_the_rest_kept(scene: Plane, photo: Plane) -> None:
+    t = np.hypot(*np.ogrid[-4:5, -4:5])
+    disc = (np.clip(3.0 + 0.5 - t, 0.0, 1.0)).astype(np.float32)
+    out_of_focus = np.zeros(scene.shape, dtype=bool)
+    out_of_focus[:, 900:] = True
+    blurred = ndimage.convolve(scene, disc / disc.sum())
+    result = chosen(photo_of(np.where(out_of_focus, blurred, scene)))
+    sharp = chosen(photo)
+
+    defocused = [p for p in result.patches if overlap(p, out_of_focus) > 0.5]
+    in_focus = [p for p in sharp.patches if overlap(p, out_of_focus) == 0.0]
+    assert len(defocused) < 0.05 * len(result.patches)
+    assert len(result.patches) - len(defocused) > 0.5 * len(in_focus)
+
+
+def test_camera_shake_is_warned_of_and_blur_that_turns_with_the_field_is_not(
+    scene: Plane, selection: Selection
+) -> None:
+    shaken = ndimage.uniform_filter1d(scene, 9, axis=0)
+    rows, cols = np.mgrid[-500:500, -750:750]
+    frame_r = np.hypot(rows, cols) / 901
+    along = np.stack([cols, rows]) / np.maximum(np.hypot(rows, cols), 1)
+    radial = np.mean(
+        [
+            ndimage.map_coordinates(
+                scene, [rows + 500 + t * along[1] * frame_r, cols + 750 + t * along[0] * frame_r], order=1
+            )
+            for t in np.linspace(-4, 4, 9)
+        ],
+        axis=0,
+    )
+
+    (warning,) = chosen(photo_of(shaken)).warnings
+    assert warning.startswith("motion")
+    assert abs(int(warning.split("(")[1].split()[0])) > 80  # vertical
+    assert selection.warnings == ()
+    assert chosen(photo_of(radial.astype(np.float32))).warnings == ()
+
+
+def test_noise_alone_is_refused_with_a_remedy() -> None:
+    noise = np.random.default_rng(5).normal(0.4, 0.003, (400, 500)).astype(np.float32)
+
+    with pytest.raises(NoUsablePatchesError, match="more fine detail"):
+        chosen(noise)
+
+
+def test_a_tiny_photo_is_refused_with_its_size() -> None:
+    with pytest.raises(NoUsablePatchesError, match="50 x 40"):
+        chosen(np.zeros((40, 50), dtype=np.float32))
+
+
+def test_wrong_arguments_are_named(photo: Plane) -> None:
+    with pytest.raises(InvalidInputError, match="frame"):
+        select(photo, NOISE, Frame(10, 10))
+    with pytest.raises(InvalidInputError, match="count"):
+        chosen(photo, count=0)
+    with pytest.raises(InvalidInputError, match="64 px"):
+        chosen(photo, size=32)
+    with pytest.raises(UnknownMethodError, match="r-map"):
+        select(photo, NOISE, Frame(*photo.shape), selector="best")
+
+
+# ---- parts
+
+
+def test_isotonic_pools_adjacent_violators_by_weight() -> None:
+    result = isotonic(np.array([1.0, 3.0, 1.0, 5.0]), np.array([1.0, 1.0, 3.0, 1.0]))
+
+    np.testing.assert_allclose(result, [1.0, 1.5, 1.5, 5.0])
+
+
+def test_every_selector_scores_within_zero_and_one(photo: Plane) -> None:
+    for name in selectors:
+        patches = select(photo, NOISE, Frame(*photo.shape), count=12, selector=name).patches
+        assert len(patches) == 12
+        assert all(0.0 <= p.score <= 1.0 for p in patches)

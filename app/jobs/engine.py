@@ -1,0 +1,237 @@
+"""The durable queue behind a small protocol: what was asked for is run, after any crash too.
+
+The engine is DBOS Transact, a library that keeps its queue in SQLite or PostgreSQL. Nothing
+else of the program knows it. A job is a name and a few ids and numbers; the truth about what it
+did lies in our own tables, so that running a job twice is harmless and the engine can be
+replaced, or its database lost, without losing a photo.
+"""
+
+from __future__ import annotations
+
+import contextvars
+import json
+import logging
+import sqlite3
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Final, Literal, ParamSpec, Protocol, TypeAlias, TypeVar
+
+from dbos import DBOS, DBOSConfig, EnqueueOptions
+from dbos import Serializer as DBOSSerializer
+from sqlalchemy import make_url
+
+log = logging.getLogger(__name__)
+
+JOB_PROTOCOL: Final = 1
+"""Raised when jobs of an older program can no longer be finished by this one."""
+
+Kind: TypeAlias = Literal["photo", "cell", "correction", "measure"]
+Status: TypeAlias = Literal["unknown", "waiting", "done", "lost"]
+Handler: TypeAlias = Callable[..., None]
+P = ParamSpec("P")
+T = TypeVar("T")
+
+QUEUE_OF: Final[Mapping[Kind, str]] = {
+    "photo": "photos",
+    "cell": "patches",
+    "correction": "corrections",
+    "measure": "patches",
+}
+MAX_STARTS: Final[Mapping[Kind, int]] = {"photo": 50, "cell": 5, "correction": 5, "measure": 3}
+"""How often a job is started again after the death of a worker, before it is given up."""
+
+POLL_S: Final = 0.1
+_WAITING: Final = ("ENQUEUED", "PENDING", "DELAYED")
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Something to do: the kind, the ids and numbers that say what, and for whom.
+
+    The id is made of kind and arguments: asking twice is asking once.
+    """
+
+    kind: Kind
+    arguments: tuple[str | int, ...]
+    owner: str = "local"
+
+    @property
+    def id(self) -> str:
+        """The engine's id of this job."""
+        return "/".join([self.kind, *map(str, self.arguments)])
+
+
+class JobEngine(Protocol):
+    """A durable queue with its workers."""
+
+    def start(self, handlers: Mapping[Kind, Handler]) -> None:
+        """Begin to run jobs: `handlers[kind](*arguments)`."""
+
+    def enqueue(self, job: Job) -> None:
+        """Ask for a job; a second time does nothing, even after it ended."""
+
+    def status(self, job: Job) -> Status:
+        """Say whether a job waits or runs, ended, was given up, or was never asked for."""
+
+    def take_over(self, executor_id: str) -> int:
+        """Put the running jobs of a dead worker back into the queue; return how many it still holds."""
+
+    def forget(self, before: datetime) -> int:
+        """Remove what is known of jobs that ended before a time; return how many."""
+
+    def stop(self) -> None:
+        """Run no more jobs. Those that run already are not waited for."""
+
+
+class _Json(DBOSSerializer):
+    """Ids and numbers only: a changed row of the engine's tables must not run code here."""
+
+    def serialize(self, data: object) -> str:
+        return json.dumps(data, default=repr)
+
+    def deserialize(self, serialized_data: str) -> object:
+        return json.loads(serialized_data)
+
+    def name(self) -> str:
+        return "json"
+
+
+class DbosEngine:
+    """DBOS in this process; one at a time, since the library keeps one state per process.
+
+    Parameters
+    ----------
+    url : str
+        SQLAlchemy address of the engine's own tables.
+    executor_id : str
+        A fresh id for each process: two processes of one id would run the same jobs.
+    slots : int
+        Children at once; one more job is fetched ahead, so that none waits for the poll.
+    photos : int
+        Photos at once; they only wait for their cells.
+    """
+
+    def __init__(self, url: str, executor_id: str, *, slots: int, photos: int = 8) -> None:
+        self._url, self._executor_id = url, executor_id
+        self._concurrency = {"photos": photos, "patches": slots + 1, "corrections": 2}
+        self._asked: set[str] = set()
+        self._guard = threading.Lock()
+
+    def start(self, handlers: Mapping[Kind, Handler]) -> None:
+        """Open the tables, declare the queues, take up work. See `JobEngine`."""
+        _switch_on_wal(self._url)
+        config: DBOSConfig = {
+            "name": "lensmodel",
+            "system_database_url": self._url,
+            "application_version": str(JOB_PROTOCOL),
+            "executor_id": self._executor_id,
+            "serializer": _Json(),
+            "log_level": "WARNING",
+            "enable_otlp": False,
+        }
+        DBOS(config=config)
+        for kind, handler in handlers.items():
+            DBOS.workflow(name=kind, max_recovery_attempts=MAX_STARTS[kind])(_plain(handler))
+        DBOS.launch()
+        for queue, limit in self._concurrency.items():
+            DBOS.register_queue(
+                queue,
+                worker_concurrency=limit,
+                partition_worker_concurrency=limit,  # queues with partitions are fair between owners
+                polling_interval_sec=POLL_S,
+                on_conflict="always_update",
+            )
+
+    def enqueue(self, job: Job) -> None:
+        """Put a job into its queue. See `JobEngine`."""
+        with self._guard:
+            if job.id in self._asked:
+                return
+        options: EnqueueOptions = {
+            "workflow_name": job.kind,
+            "queue_name": QUEUE_OF[job.kind],
+            "workflow_id": job.id,
+            "app_version": str(JOB_PROTOCOL),
+            "queue_partition_key": job.owner,
+        }
+        _outside(DBOS.enqueue_workflow_with_options, options, *job.arguments)
+        with self._guard:
+            self._asked.add(job.id)
+
+    def status(self, job: Job) -> Status:
+        """Look a job up. See `JobEngine`."""
+        found = _outside(DBOS.get_workflow_status, job.id)
+        if found is None:
+            with self._guard:
+                self._asked.discard(job.id)
+            return "unknown"
+        if found.status in _WAITING:
+            return "waiting"
+        return "lost" if found.status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED" else "done"
+
+    def take_over(self, executor_id: str) -> int:
+        """Requeue what a dead worker ran. See `JobEngine`.
+
+        The library's call is private and swallows errors of single jobs; what still names the
+        dead worker afterwards is counted, so that the caller can try again.
+        """
+        DBOS._recover_pending_workflows([executor_id])  # noqa: SLF001 - contract-tested; no public way
+        held = _outside(
+            DBOS.list_workflows,
+            executor_id=executor_id,
+            status="PENDING",
+            app_version=str(JOB_PROTOCOL),
+            load_input=False,
+            load_output=False,
+        )
+        return len(held)
+
+    def forget(self, before: datetime) -> int:
+        """Delete old rows. See `JobEngine`."""
+        ended = _outside(
+            DBOS.list_workflows,
+            status=["SUCCESS", "ERROR", "CANCELLED", "MAX_RECOVERY_ATTEMPTS_EXCEEDED"],
+            completed_before=before.isoformat(),
+            limit=1000,
+            load_input=False,
+            load_output=False,
+        )
+        ids = [row.workflow_id for row in ended]
+        if ids:
+            _outside(DBOS.delete_workflows, ids)
+        with self._guard:
+            self._asked.difference_update(ids)
+        return len(ids)
+
+    def stop(self) -> None:
+        """Close the tables. See `JobEngine`."""
+        DBOS.destroy(destroy_registry=True)
+
+
+def _plain(handler: Handler) -> Handler:
+    """Wrap a bound method: the library registers functions."""
+
+    def run(*arguments: str | int) -> None:
+        handler(*arguments)
+
+    return run
+
+
+def _outside(call: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:
+    """Call the library as from outside of any job.
+
+    Inside a job it would record the call as one of the job's steps and replay it after a crash;
+    our jobs look at our tables instead.
+    """
+    return contextvars.Context().run(call, *arguments, **options)
+
+
+def _switch_on_wal(url: str) -> None:
+    """Let readers and one writer work at once; the library does not, and the file remembers it."""
+    parsed = make_url(url)
+    if parsed.get_backend_name() == "sqlite" and parsed.database:
+        with closing(sqlite3.connect(parsed.database, timeout=30)) as connection:
+            connection.execute("PRAGMA journal_mode=WAL")

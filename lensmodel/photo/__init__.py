@@ -1,0 +1,41 @@
+"""Photo files in and out: RAW, DNG, TIFF, PNG, JPEG; EXIF, ICC; which lens it was."""
+
+from lensmodel.photo.containers import HEAD_BYTES, sniff
+from lensmodel.photo.development import develop
+from lensmodel.photo.inspection import inspect
+from lensmodel.photo.metadata import is_placeholder, read_metadata
+from lensmodel.photo.model import (
+    ColorSpace,
+    Encoding,
+    FileKind,
+    LensIdentity,
+    Limits,
+    LinearPhoto,
+    OutputFormat,
+    PhotoInfo,
+    PhotoMetadata,
+)
+from lensmodel.photo.noise import estimate_noise
+from lensmodel.photo.raw import Demosaic
+from lensmodel.photo.writing import write_image
+
+__all__ = [
+    "HEAD_BYTES",
+    "ColorSpace",
+    "Demosaic",
+    "Encoding",
+    "FileKind",
+    "LensIdentity",
+    "Limits",
+    "LinearPhoto",
+    "OutputFormat",
+    "PhotoInfo",
+    "PhotoMetadata",
+    "develop",
+    "estimate_noise",
+    "inspect",
+    "is_placeholder",
+    "read_metadata",
+    "sniff",
+    "write_image",
+]

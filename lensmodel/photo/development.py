@@ -1,0 +1,118 @@
+"""From a photo file to linear light."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from lensmodel.errors import UnreadablePhotoError
+from lensmodel.geometry import Frame
+from lensmodel.photo.colour import curves_of, decode, icc_curves, icc_space
+from lensmodel.photo.containers import Header, opened_header
+from lensmodel.photo.inspection import info_of
+from lensmodel.photo.model import Encoding, Limits, LinearPhoto, PhotoInfo, Transfer
+from lensmodel.photo.noise import estimate_noise
+from lensmodel.photo.raster import Pixels, read_pixels
+from lensmodel.photo.raw import Demosaic, develop_raw
+from lensmodel.types import Planes
+
+
+def develop(path: Path | str, *, limits: Limits | None = None, demosaic: Demosaic = "default") -> LinearPhoto:
+    """Develop a photo: RAW through LibRaw, TIFF, PNG and JPEG through their transfer curve.
+
+    The planes are in sensor orientation, whatever the file says about turning them; RAW is in
+    camera colours before white balance, others in the primaries of their profile.
+
+    Parameters
+    ----------
+    path : Path or str
+        The file.
+    limits : Limits, optional
+        How large it may be; checked before decoding.
+    demosaic : {"default", "ahd", "dht", "linear", "half"}
+        Demosaicing of RAW; "half" makes one pixel of each 2 x 2 cell, without interpolation.
+
+    Raises
+    ------
+    UnreadablePhotoError
+        One of its kinds, if the file cannot be read or holds no picture.
+    ImageTooLargeError
+        If it is larger than the limits allow.
+    """
+    path, limits = Path(path), limits or Limits()
+    with opened_header(path, limits) as header:
+        info = info_of(path, header, limits)
+        if info.kind in {"raw", "dng"}:
+            return _develop_raw(path, info, demosaic)
+        return _develop_raster(path, header, info)
+
+
+def _develop_raw(path: Path, info: PhotoInfo, demosaic: Demosaic) -> LinearPhoto:
+    raw = develop_raw(path, demosaic)
+    _, height, width = raw.planes.shape
+    encoding = Encoding(
+        bit_depth=raw.bits,
+        metadata=info.metadata.without_serials(),
+        white_balance=raw.white_balance,
+        to_srgb=raw.to_srgb,
+        xyz_to_camera=raw.xyz_to_camera,
+    )
+    return LinearPhoto(
+        planes=raw.planes,
+        frame=Frame(height, width),
+        noise=raw.noise,
+        clip=(1.0, 1.0, 1.0),
+        info=replace(info, width=width, height=height),
+        encoding=encoding,
+        pipeline=raw.pipeline,
+        white_balance=raw.white_balance,
+    )
+
+
+def _develop_raster(path: Path, header: Header, info: PhotoInfo) -> LinearPhoto:
+    pixels = read_pixels(path, header)
+    height, width = pixels.shape[:2]
+    if (height, width) != (info.height, info.width):
+        raise UnreadablePhotoError(
+            f"the header says {info.width} x {info.height}, the decoder gave {width} x {height}; save it anew"
+        )
+    transfer, icc = _transfer_of(header, pixels)
+    planes = _linear(pixels, transfer, icc)
+    noise = [estimate_noise(plane) for plane in planes]
+    top = float(planes.max()) if pixels.dtype.kind == "f" else 1.0
+    return LinearPhoto(
+        planes=planes,
+        frame=Frame(height, width),
+        noise=(noise[0], noise[1], noise[2]),
+        clip=(max(1.0, top),) * 3,
+        info=info,
+        encoding=Encoding(
+            bit_depth=8 * pixels.dtype.itemsize,
+            transfer=transfer,
+            icc=icc,
+            metadata=info.metadata.without_serials(),
+        ),
+        pipeline=f"{info.kind}/{transfer}/1",
+    )
+
+
+def _transfer_of(header: Header, pixels: Pixels) -> tuple[Transfer, bytes | None]:
+    """Which curve the file's numbers follow, and the profile that goes back into the output."""
+    if header.icc is not None and icc_space(header.icc) in {"RGB", "GRAY"} and icc_curves(header.icc):
+        return "icc", header.icc
+    if header.linear or pixels.dtype.kind == "f":
+        return "linear", None
+    return "srgb", header.icc if header.icc is not None and icc_space(header.icc) == "RGB" else None
+
+
+def _linear(pixels: Pixels, transfer: Transfer, icc: bytes | None) -> Planes:
+    planes = np.empty((3, *pixels.shape[:2]), dtype=np.float32)
+    for k, curve in enumerate(curves_of(transfer, icc)):
+        planes[k] = (
+            pixels[:, :, k]
+            if pixels.dtype.kind == "f" and transfer == "linear"
+            else decode(pixels[:, :, k], curve)
+        )
+    return planes

@@ -1,0 +1,53 @@
+"""What can be told of a photo without decoding it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lensmodel.errors import NotAnImageError, UnsupportedFormatError
+from lensmodel.photo.containers import Header, check_size, opened_header
+from lensmodel.photo.metadata import metadata_of
+from lensmodel.photo.model import Limits, PhotoInfo
+from lensmodel.photo.raw import raw_size
+
+MIN_SIDE = 16
+"""Smaller pictures are icons, not photos."""
+
+
+def inspect(path: Path | str, limits: Limits | None = None) -> PhotoInfo:
+    """Read kind, size and metadata from the header, and refuse what cannot be developed.
+
+    Parameters
+    ----------
+    path : Path or str
+        The file; its name does not matter, its content decides.
+    limits : Limits, optional
+        How large it may be.
+
+    Raises
+    ------
+    NotAnImageError, UnsupportedFormatError
+        If it is no photo, or none that we read.
+    TruncatedImageError, RawDecodeError
+        If the header already shows that it ends early or is damaged.
+    ImageTooLargeError, DecompressionBombError
+        If it is larger than the limits allow, or claims to be out of all proportion.
+    """
+    path, limits = Path(path), limits or Limits()
+    with opened_header(path, limits) as header:
+        return info_of(path, header, limits)
+
+
+def info_of(path: Path, header: Header, limits: Limits) -> PhotoInfo:
+    """Put together what a parsed header says; see `inspect`."""
+    width, height = header.width, header.height
+    if header.kind in {"raw", "dng"}:
+        width, height = raw_size(path)
+        check_size(width, height, path.stat().st_size, limits)
+    if header.kind == "jpeg" and header.channels == 4:
+        raise UnsupportedFormatError("the JPEG is CMYK, made for print; convert it to RGB")
+    if min(width, height) < MIN_SIDE:
+        raise NotAnImageError(
+            f"{width} x {height} pixels are no photo; the smallest side allowed is {MIN_SIDE}"
+        )
+    return PhotoInfo(header.kind, width, height, metadata_of(header))

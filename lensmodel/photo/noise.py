@@ -1,0 +1,131 @@
+"""Noise of a photo, measured on the photo itself."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lensmodel.types import NoiseModel, Plane
+
+BLOCK: Final = 8
+"""Side of the blocks in pixels: flat places of this size exist in almost any photo."""
+
+_BINS: Final = 24
+_FLAT_SHARE: Final = 0.15
+"""Share of the blocks of one level, the least textured, that count."""
+
+_MIN_BLOCKS: Final = 12
+_MAD_TO_SIGMA: Final = 1.4826
+
+# The difference of two Laplacians: unit gain for white noise, blind to planes and to edges
+# along the axes. J. Immerkaer, "Fast noise variance estimation", CVIU 64, 1996, eq. 2.
+_HIGH_PASS: Final = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]) / 6.0
+
+
+def estimate_noise(plane: Plane, clip: float = 1.0) -> NoiseModel:
+    """Fit var(y) = shot * y + read to the flat places of a plane.
+
+    Blocks are sorted by level; of each level the blocks with the least texture count. Texture
+    is judged on the low-passed plane and noise on the high-passed one, so that the choice does
+    not favour blocks whose noise happens to be small. The variance of a level is that of the
+    median absolute deviation of all its high-passed pixels together.
+
+    Parameters
+    ----------
+    plane : ndarray of float32, shape (height, width)
+        Linear light.
+    clip : float
+        Level of saturation; blocks that come near it, or touch black, do not count.
+
+    Returns
+    -------
+    NoiseModel
+        Both terms not negative. Zero where nothing can be measured.
+
+    Notes
+    -----
+    The noise must be white. That of a demosaiced or scaled plane is not: see `develop`.
+
+    References
+    ----------
+    A. Foi, M. Trimeche, V. Katkovnik, K. Egiazarian, "Practical Poissonian-Gaussian noise
+    modeling and fitting for single-image raw-data", IEEE TIP 17, 2008.
+    """
+    levels, variances, counts = _levels(np.asarray(plane, dtype=np.float32), clip)
+    return _fit(levels, variances, counts)
+
+
+def _levels(
+    plane: Plane, clip: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Mean, variance and number of pixels of each level that was seen flat."""
+    nothing = np.zeros(0), np.zeros(0), np.zeros(0)
+    if min(plane.shape) < 3 * BLOCK:
+        return nothing
+    high = ndimage.convolve(plane, _HIGH_PASS.astype(np.float32), mode="nearest")
+    low = ndimage.uniform_filter(plane, 5, mode="nearest")
+    blocks = _blocks(plane)
+    mean = blocks.mean(axis=1, dtype=np.float64)
+    low_blocks = _blocks(low)
+    texture = low_blocks.std(axis=1, dtype=np.float64)
+    usable = (blocks.max(axis=1) < 0.98 * clip) & ((blocks <= 0).mean(axis=1) < 0.02)
+    high_blocks = _blocks(high)
+    # Areas without any change, painted or clipped by a program, tell nothing about the sensor.
+    usable &= np.ptp(high_blocks, axis=1) > 0
+    if usable.sum() < _MIN_BLOCKS:
+        return nothing
+    mean, texture, high_blocks = mean[usable], texture[usable], high_blocks[usable]
+    order = np.argsort(mean)
+    found = []
+    for part in np.array_split(order, max(1, min(_BINS, len(order) // (4 * _MIN_BLOCKS)))):
+        keep = max(_MIN_BLOCKS, int(_FLAT_SHARE * len(part)))
+        flat = part[np.argsort(texture[part])[:keep]]
+        values = high_blocks[flat]
+        sigma = _MAD_TO_SIGMA * float(np.median(np.abs(values)))
+        found.append((float(mean[flat].mean()), sigma * sigma, float(values.size)))
+    table = np.array(found)
+    return table[:, 0], table[:, 1], table[:, 2]
+
+
+def _blocks(plane: NDArray[np.float32]) -> NDArray[np.float32]:
+    rows, cols = (side // BLOCK for side in plane.shape)
+    cut = plane[: rows * BLOCK, : cols * BLOCK].reshape(rows, BLOCK, cols, BLOCK)
+    return np.ascontiguousarray(cut.swapaxes(1, 2)).reshape(rows * cols, BLOCK * BLOCK)
+
+
+def _fit(
+    levels: NDArray[np.float64], variances: NDArray[np.float64], counts: NDArray[np.float64]
+) -> NoiseModel:
+    """Weighted line through the levels, robust against those where no place is flat.
+
+    The error of a variance is proportional to the variance, so the weights are count / var^2;
+    texture only ever adds, so points above the line lose weight, those below do not.
+    """
+    if len(levels) == 0:
+        return NoiseModel(0.0, 0.0)
+    if len(levels) == 1:
+        return NoiseModel(0.0, float(variances[0]))
+    trust = np.ones_like(levels)
+    model = np.maximum(variances, 1e-16)
+    slope = offset = 0.0
+    for _ in range(12):
+        weight = np.sqrt(counts * trust) / np.maximum(model, 1e-16)
+        design = np.stack([levels * weight, weight], axis=1)
+        slope, offset = _non_negative(design, variances * weight)
+        model = np.maximum(slope * levels + offset, 1e-16)
+        excess = (variances - model) / model
+        trust = np.where(excess > 0.1, 0.1 / np.maximum(excess, 0.1), 1.0) ** 2
+    return NoiseModel(slope, offset)
+
+
+def _non_negative(design: NDArray[np.float64], target: NDArray[np.float64]) -> tuple[float, float]:
+    """Least squares with both coefficients not negative: the best of the three corners."""
+    slope, offset = np.linalg.lstsq(design, target, rcond=None)[0]
+    if slope >= 0 and offset >= 0:
+        return float(slope), float(offset)
+    only = [float(np.dot(c, target) / max(np.dot(c, c), 1e-300)) for c in design.T]
+    errors = [float(np.sum((target - c * max(k, 0.0)) ** 2)) for c, k in zip(design.T, only, strict=True)]
+    return (max(only[0], 0.0), 0.0) if errors[0] < errors[1] else (0.0, max(only[1], 0.0))

@@ -1,0 +1,105 @@
+"""XMP packets: the few properties that tell camera, lens and settings.
+
+The packet comes from strangers: a document type declaration, the door to entity expansion, is
+refused, and only flat properties are read.
+
+Source: ISO 16684-1:2019, section 7.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Final
+from xml.parsers import expat
+
+log = logging.getLogger(__name__)
+
+MAX_XMP_BYTES: Final = 1 << 20
+MAX_ELEMENTS: Final = 20_000
+
+_PREFIXES: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "http://ns.adobe.com/exif/1.0/aux/": "aux",
+        "http://ns.adobe.com/exif/1.0/": "exif",
+        "http://cipa.jp/exif/1.0/": "exifEX",
+        "http://ns.adobe.com/tiff/1.0/": "tiff",
+    }
+)
+
+
+class _RefusedPacketError(Exception):
+    """The packet has what no honest one has."""
+
+
+class _Collector:
+    """Gathers `prefix:name` -> text, from attributes and from elements without children."""
+
+    def __init__(self) -> None:
+        self.found: dict[str, str] = {}
+        self.elements = 0
+        self.name: str | None = None
+        self.text = ""
+
+    def start(self, name: str, attributes: dict[str, str]) -> None:
+        self.elements += 1
+        if self.elements > MAX_ELEMENTS:
+            raise _RefusedPacketError("too many elements")
+        for key, value in attributes.items():
+            self._keep(key, value)
+        # The items of a list belong to the property around it: <exif:ISO><Seq><li>100.
+        if not name.startswith("http://www.w3.org/1999/02/22-rdf-syntax-ns#"):
+            self.name = name
+        self.text = ""
+
+    def data(self, text: str) -> None:
+        if len(self.text) < 1024:
+            self.text += text
+
+    def end(self, _name: str) -> None:
+        if self.name is not None and self.text.strip():
+            self._keep(self.name, self.text)
+        self.text = ""
+
+    def _keep(self, qualified: str, value: str) -> None:
+        space, _, local = qualified.rpartition("|")
+        if space in _PREFIXES and value.strip():
+            self.found.setdefault(f"{_PREFIXES[space]}:{local}", value.strip()[:1024])
+
+    def refuse(self, *_: object) -> None:
+        raise _RefusedPacketError("a document type declaration")
+
+
+def read_xmp(packet: bytes | None) -> Mapping[str, str]:
+    """Read the `aux:`, `exif:`, `exifEX:` and `tiff:` properties of a packet.
+
+    A packet that is damaged gives what came before the damage, a refused one nothing:
+    metadata that cannot be read are unknown, and no reason to refuse the photo.
+
+    Parameters
+    ----------
+    packet : bytes or None
+        The XML text, up to `MAX_XMP_BYTES`.
+
+    Returns
+    -------
+    mapping of str to str
+        For example "aux:LensSerialNumber" to "0000129324".
+    """
+    if not packet or len(packet) > MAX_XMP_BYTES:
+        return {}
+    collector, parser = _Collector(), expat.ParserCreate(namespace_separator="|")
+    parser.StartElementHandler = collector.start
+    parser.EndElementHandler = collector.end
+    parser.CharacterDataHandler = collector.data
+    parser.StartDoctypeDeclHandler = collector.refuse
+    parser.EntityDeclHandler = collector.refuse
+    try:
+        parser.Parse(packet.strip(b"\0 \r\n"), True)  # noqa: FBT003  expat takes it by position only
+    except _RefusedPacketError as reason:
+        log.warning("an XMP packet was refused: %s", reason)
+        return {}
+    except (expat.ExpatError, ValueError) as damage:
+        log.info("an XMP packet is damaged: %s", damage)
+    return MappingProxyType(collector.found)

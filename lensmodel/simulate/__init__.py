@@ -3,6 +3,7 @@
 from lensmodel.simulate.camera import SimulatedCamera, SimulatedPhoto, Truth, blurred, photograph
 from lensmodel.simulate.charts import Chart, ChartEdge, edge_area, edge_chart, slanted_edge_scene
 from lensmodel.simulate.draw import LENS_KINDS, draw_lens
+from lensmodel.simulate.files import shot_info, write_photo
 from lensmodel.simulate.lens import Aberrations, SimulatedField, SimulatedLens
 from lensmodel.simulate.scenes import (
     DEMO_SCENES,
@@ -41,6 +42,8 @@ __all__ = [
     "out_of_focus",
     "photograph",
     "point_lights",
+    "shot_info",
     "slanted_edge_scene",
     "srgb_to_linear",
+    "write_photo",
 ]

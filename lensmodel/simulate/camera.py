@@ -18,6 +18,7 @@ from scipy import fft
 
 from lensmodel.errors import InvalidInputError
 from lensmodel.geometry import Frame
+from lensmodel.photo.dng import XYZ_TO_SRGB
 from lensmodel.simulate.lens import DEFAULT_SIZE, SimulatedLens
 from lensmodel.types import CHANNELS, LensSettings, NoiseModel, Planes, StepHook, ignore_step
 
@@ -103,6 +104,17 @@ class SimulatedCamera:
         return NoiseModel(
             shot=1.0 / self.full_well_electrons, read=read + 1.0 / (12.0 * (self.white - self.black) ** 2)
         )
+
+    @property
+    def as_shot_neutral(self) -> tuple[float, float, float]:
+        """What the sensor sees of a grey scene, as DNG wants it."""
+        r, g, b = self.white_balance
+        return 1.0 / r, 1.0 / g, 1.0 / b
+
+    @property
+    def color_matrix(self) -> NDArray[np.float64]:
+        """CIE XYZ (D65) to sensor colours: scenes are linear sRGB, the sensor sees them unbalanced."""
+        return np.asarray(XYZ_TO_SRGB) / np.asarray(self.white_balance)[:, None]
 
     def channel_map(self) -> NDArray[np.intp]:
         """Index into r, g, b of the colour filter over every pixel, `(height, width)`."""

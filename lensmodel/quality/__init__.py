@@ -1,0 +1,51 @@
+"""Sharpness and fidelity: slanted edges, MTF, PSNR, SSIM, noise gain."""
+
+from lensmodel.quality.charts import EdgeMeasurement, ZoneSharpness, by_zone, measure_edges
+from lensmodel.quality.edge import EdgeResponse, crossing, pixel_mtf, slanted_edge
+from lensmodel.quality.images import (
+    best_shift,
+    flat_noise,
+    noise_gain,
+    psnr,
+    shifted,
+    ssim,
+    to_srgb,
+    zone_masks,
+    zone_psnr,
+)
+from lensmodel.quality.kernels import (
+    encircled_energy,
+    encircled_radius,
+    lp_per_mm,
+    lp_per_ph,
+    mtf50_from_kernel,
+    mtf_from_kernel,
+    tangential_sagittal_mtf50,
+)
+
+__all__ = [
+    "EdgeMeasurement",
+    "EdgeResponse",
+    "ZoneSharpness",
+    "best_shift",
+    "by_zone",
+    "crossing",
+    "encircled_energy",
+    "encircled_radius",
+    "flat_noise",
+    "lp_per_mm",
+    "lp_per_ph",
+    "measure_edges",
+    "mtf50_from_kernel",
+    "mtf_from_kernel",
+    "noise_gain",
+    "pixel_mtf",
+    "psnr",
+    "shifted",
+    "slanted_edge",
+    "ssim",
+    "tangential_sagittal_mtf50",
+    "to_srgb",
+    "zone_masks",
+    "zone_psnr",
+]

@@ -1,0 +1,156 @@
+"""Sharpness of a photographed chart, edge by edge and zone by zone."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.geometry import Frame, zone_of
+from lensmodel.quality.edge import EdgeResponse, slanted_edge
+from lensmodel.types import ZONES, FieldPosition, Zone
+
+logger = logging.getLogger(__name__)
+
+Direction = Literal["tangential", "sagittal"]
+Box = tuple[int, int, int, int]
+"""(row, col, height, width) in pixels of the frame."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeMeasurement:
+    """One measured edge of a chart.
+
+    Parameters
+    ----------
+    box : tuple of int
+        (row, col, height, width).
+    position : FieldPosition
+        Of the middle of the box.
+    direction : {"tangential", "sagittal"}
+        Contrast along u or along v, whichever the edge's normal is nearer to.
+    response : EdgeResponse
+        What was measured.
+    """
+
+    box: Box
+    position: FieldPosition
+    direction: Direction
+    response: EdgeResponse
+
+    @property
+    def zone(self) -> Zone:
+        """Zone of the field."""
+        return zone_of(self.position.r)
+
+
+@dataclass(frozen=True, slots=True)
+class ZoneSharpness:
+    """Medians over the edges of one zone.
+
+    Parameters
+    ----------
+    zone : Zone
+    edges : int
+        How many were measured.
+    mtf50, tangential_mtf50, sagittal_mtf50 : float
+        Cycles/pixel; NaN where the zone has no edge of that direction.
+    mtf_max : float
+        Largest of the zone: above 1 means oversharpened.
+    overshoot : float
+        Largest of the zone, percent of the step.
+    """
+
+    zone: Zone
+    edges: int
+    mtf50: float
+    tangential_mtf50: float
+    sagittal_mtf50: float
+    mtf_max: float
+    overshoot: float
+
+
+def measure_edges(
+    plane: NDArray[np.floating], boxes: Sequence[Box], *, rendered: bool = False
+) -> tuple[EdgeMeasurement, ...]:
+    """Measure the slanted edges of a photo.
+
+    Parameters
+    ----------
+    plane : ndarray, shape (H, W)
+        The whole frame, linear light.
+    boxes : sequence of (row, col, height, width)
+        One edge each.
+    rendered : bool
+        The chart was rendered pixel by pixel, so take its pixel box out; see
+        `EdgeResponse.compensated`.
+
+    Returns
+    -------
+    tuple of EdgeMeasurement
+        In the order of `boxes`; edges that cannot be measured are left out, with a warning logged.
+
+    Raises
+    ------
+    InvalidInputError
+        If a box leaves the plane.
+    NotEnoughEvidenceError
+        If no edge can be measured.
+    """
+    frame = Frame(*plane.shape)
+    found = []
+    for box in boxes:
+        row, col, height, width = box
+        if row < 0 or col < 0 or row + height > frame.height or col + width > frame.width:
+            raise InvalidInputError(f"box {box} leaves the frame of {frame.height} x {frame.width} pixels")
+        try:
+            response = slanted_edge(plane[row : row + height, col : col + width])
+        except NotEnoughEvidenceError as error:
+            logger.warning("no edge measured in box %s: %s", box, error)
+            continue
+        position = frame.position(row + (height - 1) / 2.0, col + (width - 1) / 2.0)
+        along_u = abs(math.cos(response.normal - position.phi)) >= math.sqrt(0.5)
+        found.append(
+            EdgeMeasurement(
+                box=box,
+                position=position,
+                direction="tangential" if along_u else "sagittal",
+                response=response.compensated() if rendered else response,
+            )
+        )
+    if not found:
+        raise NotEnoughEvidenceError(f"none of the {len(boxes)} boxes holds a measurable edge")
+    return tuple(found)
+
+
+def by_zone(measurements: Sequence[EdgeMeasurement]) -> dict[Zone, ZoneSharpness]:
+    """Gather measured edges by zone; zones without an edge are missing."""
+    table = {}
+    for zone in ZONES:
+        here = [m for m in measurements if m.zone == zone]
+        if not here:
+            continue
+        directions = {
+            direction: [m.response.mtf50 for m in here if m.direction == direction]
+            for direction in ("tangential", "sagittal")
+        }
+        table[zone] = ZoneSharpness(
+            zone=zone,
+            edges=len(here),
+            mtf50=float(np.median([m.response.mtf50 for m in here])),
+            tangential_mtf50=_median(directions["tangential"]),
+            sagittal_mtf50=_median(directions["sagittal"]),
+            mtf_max=max(m.response.mtf_max for m in here),
+            overshoot=max(m.response.overshoot for m in here),
+        )
+    return table
+
+
+def _median(values: Sequence[float]) -> float:
+    return float(np.median(values)) if values else math.nan

@@ -1,0 +1,310 @@
+"""Slanted-edge spatial frequency response (ISO 12233 e-SFR).
+
+Steps, for an edge that crosses the rows; others are turned first:
+
+1. signed derivative of every row, Hamming window on the edge, centroid;
+2. straight line through the centroids, second pass with windows that follow the line;
+3. distance of every pixel to the edge along its normal, t = (x - c(row)) cos(theta);
+4. mean in bins of 1/4 pixel: the edge spread function, oversampled 4 times;
+5. central difference, Hamming window on its peak, |DFT|, 1 at zero frequency;
+6. division by the response of the difference, sin(2 pi f / 4) / (2 pi f / 4), and of the bins,
+   sin(pi f / 4) / (pi f / 4).
+
+The derivative keeps its sign: with |d| noise pulls every centroid to the middle of its window, the
+line is fitted wrong, and at 1 percent noise MTF50 falls from 0.324 to 0.228 for a sharp edge.
+
+Sources: ISO 12233:2017, annex D; P. D. Burns, "Slanted-edge MTF for digital camera and scanner
+analysis", IS&T PICS 2000.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lensmodel.errors import InvalidInputError, NotEnoughEvidenceError
+
+OVERSAMPLING: Final = 4
+"""Bins a pixel of the edge spread function."""
+
+_MIN_SIDE: Final = 16
+_MIN_ROWS: Final = 10
+_REACH: Final = 48.0  # pixels of edge spread on each side; more only adds noise
+_MAX_CORRECTION: Final = 10.0  # ISO 12233: limit of the division by the difference's response
+_MIN_STEP_OVER_NOISE: Final = 3.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeResponse:
+    """What one slanted edge says about the sharpness across it.
+
+    Parameters
+    ----------
+    frequencies : ndarray, shape (n,)
+        Cycles/pixel along the normal of the edge, 0 to 1.
+    mtf : ndarray, shape (n,)
+        Contrast, 1 at zero frequency.
+    mtf50, mtf50p : float
+        Lowest frequency in cycles/pixel where the contrast falls to half of that at zero, and to
+        half of its largest value (robust to oversharpening); 1.0 where it does not fall so far.
+    mtf_max : float
+        Largest contrast up to 0.5 cycles/pixel; above 1 means oversharpened.
+    mtf_nyquist : float
+        Contrast at 0.5 cycles/pixel.
+    overshoot, undershoot : float
+        How far the edge profile rises above its bright level and falls below its dark one, in
+        percent of the step.
+    normal : float
+        Angle of the normal from dark to bright, radians, counter-clockwise from the right.
+    step : float
+        Bright minus dark level.
+    esf_distance, esf : ndarray, shape (m,)
+        Edge profile: distance in pixels, dark to bright, and level.
+    """
+
+    frequencies: NDArray[np.float64]
+    mtf: NDArray[np.float64]
+    mtf50: float
+    mtf50p: float
+    mtf_max: float
+    mtf_nyquist: float
+    overshoot: float
+    undershoot: float
+    normal: float
+    step: float
+    esf_distance: NDArray[np.float64]
+    esf: NDArray[np.float64]
+
+    @property
+    def angle_deg(self) -> float:
+        """Slant: angle in degrees between the edge and the nearer of row and column axis, 0 to 45."""
+        folded = abs(math.degrees(self.normal)) % 90.0
+        return min(folded, 90.0 - folded)
+
+    def contrast(self, frequencies: ArrayLike) -> NDArray[np.float64]:
+        """Contrast at any frequencies in cycles/pixel, linearly interpolated."""
+        return np.interp(np.asarray(frequencies, dtype=np.float64), self.frequencies, self.mtf)
+
+    def compensated(self) -> EdgeResponse:
+        """Return the response without the pixel box of an area-sampled target.
+
+        A chart that is rendered pixel by pixel has been integrated over the pixel once already::
+
+            mtf / (|sinc(f cos)| |sinc(f sin)|)
+        """
+        return _response(
+            self.frequencies,
+            self.mtf / np.maximum(pixel_mtf(self.frequencies, self.normal), 1.0 / _MAX_CORRECTION),
+            self,
+        )
+
+
+def pixel_mtf(frequencies: ArrayLike, angle: float) -> NDArray[np.float64]:
+    """Contrast that a square pixel leaves of a wave whose normal has this angle."""
+    f = np.asarray(frequencies, dtype=np.float64)
+    return np.abs(np.sinc(f * math.cos(angle)) * np.sinc(f * math.sin(angle)))
+
+
+def crossing(frequencies: ArrayLike, contrast: ArrayLike, level: float) -> float:
+    """First frequency where `contrast` falls to `level`, linearly interpolated; the last if never."""
+    f, c = np.asarray(frequencies, dtype=np.float64), np.asarray(contrast, dtype=np.float64)
+    below = np.flatnonzero(c < level)
+    below = below[below > 0]
+    if below.size == 0:
+        return float(f[-1])
+    i = int(below[0])
+    share = (c[i - 1] - level) / (c[i - 1] - c[i])
+    return float(f[i - 1] + share * (f[i] - f[i - 1]))
+
+
+def slanted_edge(plane: NDArray[np.floating]) -> EdgeResponse:
+    """Measure one slanted edge, near-vertical or near-horizontal, either side bright.
+
+    Parameters
+    ----------
+    plane : ndarray, shape (H, W)
+        Linear light; one straight edge and flat ground on both sides. 80 x 60 pixels or more are
+        recommended; the edge should lean 2 to 10 degrees, or more as long as it stays clear of 45.
+
+    Returns
+    -------
+    EdgeResponse
+
+    Raises
+    ------
+    InvalidInputError
+        If the crop is too small, not finite, or not two-dimensional.
+    NotEnoughEvidenceError
+        If no edge stands out of the noise, or it leans so little that the profile has holes.
+    """
+    crop = np.asarray(plane, dtype=np.float64)
+    if crop.ndim != 2 or min(crop.shape) < _MIN_SIDE or not np.isfinite(crop).all():
+        raise InvalidInputError(
+            f"an edge needs a finite crop of {_MIN_SIDE} x {_MIN_SIDE} pixels or more, got {crop.shape}"
+        )
+    turned = _slope_energy(crop, axis=0) > _slope_energy(crop, axis=1)
+    upright = crop.T if turned else crop
+    intercept, slope, sign = _edge_line(upright)
+    cos = 1.0 / math.hypot(1.0, slope)
+    rows, cols = upright.shape
+    x = np.arange(cols)[None, :] - (intercept + slope * np.arange(rows)[:, None])
+    distance, esf = _profile(x * cos * sign, upright)
+    frequencies, mtf = _spectrum(esf)
+    # the normal in the upright crop: (1, -slope) in (column, row), towards the bright side
+    d_col, d_row = sign * 1.0, -sign * slope
+    if turned:
+        d_col, d_row = d_row, d_col
+    normal = math.atan2(-d_row, d_col)
+    dark, bright = _levels(distance, esf)
+    step = bright - dark
+    empty = EdgeResponse(
+        frequencies=frequencies,
+        mtf=mtf,
+        mtf50=0.0,
+        mtf50p=0.0,
+        mtf_max=0.0,
+        mtf_nyquist=0.0,
+        overshoot=max(float(esf.max()) - bright, 0.0) / step * 100.0,
+        undershoot=max(dark - float(esf.min()), 0.0) / step * 100.0,
+        normal=normal,
+        step=step,
+        esf_distance=distance,
+        esf=esf,
+    )
+    return _response(frequencies, mtf, empty)
+
+
+def _response(frequencies: NDArray[np.float64], mtf: NDArray[np.float64], like: EdgeResponse) -> EdgeResponse:
+    inside = frequencies <= 0.5 + 1e-9
+    peak = float(mtf[inside].max())
+    beyond_peak = int(np.argmax(np.where(inside, mtf, 0.0)))
+    return EdgeResponse(
+        frequencies=frequencies,
+        mtf=mtf,
+        mtf50=crossing(frequencies, mtf, 0.5),
+        mtf50p=crossing(frequencies[beyond_peak:], mtf[beyond_peak:], 0.5 * peak),
+        mtf_max=peak,
+        mtf_nyquist=float(np.interp(0.5, frequencies, mtf)),
+        overshoot=like.overshoot,
+        undershoot=like.undershoot,
+        normal=like.normal,
+        step=like.step,
+        esf_distance=like.esf_distance,
+        esf=like.esf,
+    )
+
+
+def _slope_energy(crop: NDArray[np.float64], axis: int) -> float:
+    """Energy of the derivative along `axis` of the smoothed crop, to tell which way the edge faces."""
+    smooth = crop
+    for along in (0, 1):
+        smooth = np.cumsum(np.insert(smooth, 0, 0.0, axis=along), axis=along)
+        ahead = np.take(smooth, range(5, smooth.shape[along]), axis=along)
+        smooth = ahead - np.take(smooth, range(smooth.shape[along] - 5), axis=along)
+    return float(np.square(np.diff(smooth, axis=axis)).mean())
+
+
+def _edge_line(crop: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Line c(row) = intercept + slope row of a near-vertical edge; and +1 if bright is on the right."""
+    rows, cols = crop.shape
+    derivative = (crop[:, 2:] - crop[:, :-2]) / 2.0
+    x = np.arange(1, cols - 1, dtype=np.float64)
+    y = np.arange(rows, dtype=np.float64)
+    quarter = max(cols // 4, 2)
+    sign = 1.0 if crop[:, -quarter:].mean() >= crop[:, :quarter].mean() else -1.0
+    # first windows: where the smoothed derivative of each row is largest, not blindly the middle,
+    # because a strongly leaning edge is far from it in the outer rows
+    smooth = np.apply_along_axis(np.convolve, 1, sign * derivative, np.ones(9) / 9.0, "same")
+    intercept, slope = _robust_line(y, x[smooth.argmax(axis=1)])
+    for half in (cols / 4.0, 12.0, 12.0):
+        reach = max(min(half, cols / 2.0 - 2.0), 4.0)
+        center = intercept + slope * y
+        used = (center - reach >= 0.0) & (center + reach <= cols - 1.0)
+        if used.sum() < _MIN_ROWS:
+            used = (center >= 4.0) & (center <= cols - 5.0)
+        if used.sum() < _MIN_ROWS:
+            raise NotEnoughEvidenceError(
+                "the edge leaves the crop after a few rows; crop it so that it runs through the middle"
+            )
+        offset = x[None, :] - center[:, None]
+        window = np.where(np.abs(offset) <= reach, 0.54 + 0.46 * np.cos(np.pi * offset / reach), 0.0)
+        weight = sign * derivative * window
+        total = weight.sum(axis=1)
+        good = used & (total > 0.2 * np.median(total[used]))
+        if good.sum() < _MIN_ROWS:
+            raise NotEnoughEvidenceError(
+                "no edge stands out of the noise; crop one straight high-contrast edge"
+            )
+        centroid = (weight * x).sum(axis=1)[good] / total[good]
+        slope, intercept = np.polyfit(y[good], centroid, 1)
+    return float(intercept), float(slope), sign
+
+
+def _robust_line(y: NDArray[np.float64], x: NDArray[np.float64]) -> tuple[float, float]:
+    """Line through points with outliers: median of the slopes of far pairs (Theil and Sen)."""
+    half = y.size // 2
+    slope = float(np.median((x[half:] - x[: x.size - half]) / (y[half:] - y[: y.size - half])))
+    return float(np.median(x - slope * y)), slope
+
+
+def _profile(
+    distance: NDArray[np.float64], crop: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean level in bins of a quarter pixel of the distance, as far as both sides are well filled."""
+    bins = np.floor(distance * OVERSAMPLING + 0.5).astype(np.intp)
+    limit = round(_REACH * OVERSAMPLING)
+    inside = np.abs(bins) <= limit
+    index = bins[inside] + limit
+    count = np.bincount(index, minlength=2 * limit + 1)
+    total = np.bincount(index, weights=crop[inside], minlength=2 * limit + 1)
+    per_side = np.minimum(count[limit:], count[limit::-1])
+    # where the crop ends, bins hold few pixels of few rows: leave them out
+    full = np.convolve(per_side, np.ones(OVERSAMPLING), "same") >= 0.25 * OVERSAMPLING * np.median(
+        per_side[: 4 * OVERSAMPLING]
+    )
+    reach = int(np.argmin(full)) if not full.all() else full.size
+    reach -= 2
+    if reach < 6 * OVERSAMPLING:
+        raise NotEnoughEvidenceError("fewer than six pixels of ground beside the edge; crop it wider")
+    keep = slice(limit - reach, limit + reach + 1)
+    count, total = count[keep], total[keep]
+    filled = count > 0
+    if filled.mean() < 0.7:
+        raise NotEnoughEvidenceError(
+            "the edge meets the pixel grid at too few phases; let it lean 2 to 10 degrees"
+        )
+    position = np.arange(-reach, reach + 1) / OVERSAMPLING
+    esf = np.interp(position, position[filled], total[filled] / count[filled])
+    dark, bright = _levels(position, esf)
+    tail = max(esf.size // 6, 4)
+    noise = math.sqrt((float(np.var(esf[:tail])) + float(np.var(esf[-tail:]))) / 2.0)
+    if not bright - dark > _MIN_STEP_OVER_NOISE * noise:
+        raise NotEnoughEvidenceError("no edge stands out of the noise; crop one straight high-contrast edge")
+    return position, esf
+
+
+def _levels(position: NDArray[np.float64], esf: NDArray[np.float64]) -> tuple[float, float]:
+    """Dark and bright level: mean over the outer third of each side."""
+    outer = np.abs(position) > 2.0 / 3.0 * position[-1]
+    return float(esf[outer & (position < 0)].mean()), float(esf[outer & (position > 0)].mean())
+
+
+def _spectrum(esf: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """MTF of an edge profile on frequencies from 0 to 1 cycles/pixel."""
+    lsf = (esf[2:] - esf[:-2]) / 2.0
+    t = np.arange(lsf.size, dtype=np.float64)
+    center = float(np.argmax(np.convolve(lsf, np.ones(OVERSAMPLING), "same")))
+    reach = max(center, lsf.size - 1 - center) + 1.0
+    lsf = lsf * (0.54 + 0.46 * np.cos(np.pi * (t - center) / reach))
+    length = 2048
+    spectrum = np.abs(np.fft.rfft(lsf, length))
+    frequencies = np.fft.rfftfreq(length, 1.0 / OVERSAMPLING)
+    inside = frequencies <= 1.0
+    frequencies = frequencies[inside]
+    known = np.sinc(2.0 * frequencies / OVERSAMPLING) * np.sinc(frequencies / OVERSAMPLING)
+    mtf = spectrum[inside] / spectrum[0] / np.maximum(known, 1.0 / _MAX_CORRECTION)
+    return np.asarray(frequencies, dtype=np.float64), np.asarray(mtf, dtype=np.float64)

@@ -1,0 +1,211 @@
+"""How close one picture is to another: PSNR and SSIM, also by zone and without a global shift."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+from skimage.metrics import structural_similarity
+
+from lensmodel.errors import InvalidInputError
+from lensmodel.geometry import CENTER_ZONE_R, CORNER_ZONE_R, Frame
+from lensmodel.types import ZONES, Zone
+
+_SSIM_WINDOW: Final = 11
+_SHIFT_STEPS: Final = 6
+_SHIFT_PAD: Final = 8
+
+
+def to_srgb(linear: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Linear light, clipped to 0..1, with the sRGB curve (IEC 61966-2-1): what an eye compares."""
+    v = np.clip(np.asarray(linear, dtype=np.float64), 0.0, 1.0)
+    return np.where(v <= 0.0031308, 12.92 * v, 1.055 * np.maximum(v, 0.0031308) ** (1.0 / 2.4) - 0.055)
+
+
+def psnr(
+    image: NDArray[np.floating],
+    reference: NDArray[np.floating],
+    *,
+    mask: NDArray[np.bool_] | None = None,
+    srgb: bool = False,
+) -> float:
+    """Peak signal-to-noise ratio in dB for a peak of 1; infinite for equal pictures.
+
+    Parameters
+    ----------
+    image, reference : ndarray, shape (..., H, W)
+        Linear light.
+    mask : ndarray of bool, shape (H, W), optional
+        Pixels that count.
+    srgb : bool
+        Compare after `to_srgb`, the usual figure for pictures.
+    """
+    error = _squared_error(image, reference, srgb=srgb)
+    if mask is not None:
+        if mask.shape != error.shape[-2:] or not mask.any():
+            raise InvalidInputError(
+                f"the mask must have the picture's size {error.shape[-2:]} and mark a pixel, got {mask.shape}"
+            )
+        error = error[..., mask]
+    mean = float(error.mean())
+    return math.inf if mean == 0.0 else -10.0 * math.log10(mean)
+
+
+def ssim(image: NDArray[np.floating], reference: NDArray[np.floating], *, srgb: bool = False) -> float:
+    """Structural similarity, mean over planes; Gaussian window of sigma 1.5, range 1.
+
+    Source: Z. Wang et al., "Image quality assessment: from error visibility to structural
+    similarity", IEEE TIP 13, 2004, with its constants.
+    """
+    _same_shape(image, reference)
+    if min(image.shape[-2:]) < _SSIM_WINDOW:
+        raise InvalidInputError(f"SSIM needs at least {_SSIM_WINDOW} pixels a side, got {image.shape}")
+    a = to_srgb(image) if srgb else np.asarray(image, dtype=np.float64)
+    b = to_srgb(reference) if srgb else np.asarray(reference, dtype=np.float64)
+    planes = zip(a.reshape(-1, *a.shape[-2:]), b.reshape(-1, *b.shape[-2:]), strict=True)
+    values = [
+        structural_similarity(  # type: ignore[no-untyped-call]  # scikit-image ships no types
+            x, y, data_range=1.0, gaussian_weights=True, use_sample_covariance=False
+        )
+        for x, y in planes
+    ]
+    return float(np.mean(values))
+
+
+def zone_masks(frame: Frame) -> dict[Zone, NDArray[np.bool_]]:
+    """Pixels of each zone, `(H, W)`: center r < 0.3, corner r > 0.75, mid between."""
+    r = frame.radius_map()
+    center, corner = r < CENTER_ZONE_R, r > CORNER_ZONE_R
+    return {"center": center, "mid": ~(center | corner), "corner": corner}
+
+
+def zone_psnr(
+    image: NDArray[np.floating],
+    reference: NDArray[np.floating],
+    frame: Frame,
+    *,
+    srgb: bool = False,
+    border: int = 0,
+) -> dict[Zone, float]:
+    """PSNR in dB of each zone, after the best global shift of the picture is removed.
+
+    Blind methods leave the position of the picture free; a shift of a tenth of a pixel would
+    otherwise count as blur. The shift is found to sub-pixel precision and the same for all planes
+    and zones.
+
+    Parameters
+    ----------
+    image, reference : ndarray, shape (..., H, W)
+        Linear light.
+    frame : Frame
+        (H, W).
+    srgb : bool
+        See `psnr`.
+    border : int
+        Pixels along the border that do not count.
+    """
+    _same_shape(image, reference)
+    if image.shape[-2:] != (frame.height, frame.width):
+        raise InvalidInputError(f"the pictures {image.shape} do not have the size of {frame}")
+    aligned = shifted(image, *best_shift(image, reference))
+    inside = np.zeros((frame.height, frame.width), dtype=bool)
+    edge = max(border, 2)  # the shift mirrors at the border
+    inside[edge : frame.height - edge, edge : frame.width - edge] = True
+    masks = zone_masks(frame)
+    return {
+        zone: psnr(aligned, reference, mask=masks[zone] & inside, srgb=srgb)
+        for zone in ZONES
+        if (masks[zone] & inside).any()
+    }
+
+
+def best_shift(image: NDArray[np.floating], reference: NDArray[np.floating]) -> tuple[float, float]:
+    """Shift (row, col) in pixels, up to 3, that brings `image` closest to `reference`.
+
+    Gauss-Newton on the sum of squared differences, s <- s - (G'G)^-1 G'(image(s) - reference), with
+    G the picture's gradient; sub-pixel shifts are Fourier shifts of mirrored pictures.
+    """
+    _same_shape(image, reference)
+    a = np.asarray(image, dtype=np.float64).reshape(-1, *image.shape[-2:])
+    b = np.asarray(reference, dtype=np.float64).reshape(-1, *image.shape[-2:])
+    shift = np.zeros(2)
+    core = (slice(None), slice(4, -4), slice(4, -4))
+    for _ in range(_SHIFT_STEPS):
+        moved = shifted(a, float(shift[0]), float(shift[1]))
+        # moving a picture by +s takes its values from -s: d moved / ds = -gradient
+        gradient = [-np.gradient(moved, axis=axis)[core].ravel() for axis in (-2, -1)]
+        residual = (moved - b)[core].ravel()
+        normal = np.array([[float(g @ h) for h in gradient] for g in gradient])
+        right = np.array([float(g @ residual) for g in gradient])
+        if np.linalg.det(normal) <= 1e-12 * max(float(np.trace(normal)), 1e-30) ** 2:
+            return 0.0, 0.0
+        step = np.clip(np.linalg.solve(normal, right), -1.0, 1.0)
+        shift = np.clip(shift - step, -3.0, 3.0)
+        if np.abs(step).max() < 1e-4:
+            break
+    return float(shift[0]), float(shift[1])
+
+
+def shifted(image: NDArray[np.floating], row: float, col: float) -> NDArray[np.float64]:
+    """Move a picture by a real-valued shift, mirrored at its borders; exact for what it resolves."""
+    picture = np.asarray(image, dtype=np.float64)
+    if row == 0.0 and col == 0.0:
+        return picture
+    height, width = picture.shape[-2:]
+    # mirrored into an even periodic picture there is no jump for the Fourier shift to ring at
+    grid = [int(fft.next_fast_len(n + 2 * _SHIFT_PAD, real=True)) for n in (height, width)]
+    pads = [(_SHIFT_PAD, n - m - _SHIFT_PAD) for n, m in zip(grid, (height, width), strict=True)]
+    inner = np.pad(picture, [(0, 0)] * (picture.ndim - 2) + pads, mode="symmetric")
+    even = np.concatenate([inner, inner[..., ::-1, :]], axis=-2)
+    even = np.concatenate([even, even[..., ::-1]], axis=-1)
+    f_row, f_col = fft.fftfreq(even.shape[-2])[:, None], fft.rfftfreq(even.shape[-1])[None, :]
+    phase = np.exp(-2j * np.pi * (f_row * row + f_col * col))
+    moved = fft.irfft2(fft.rfft2(even) * phase, s=even.shape[-2:])
+    return moved[..., _SHIFT_PAD : _SHIFT_PAD + height, _SHIFT_PAD : _SHIFT_PAD + width]
+
+
+def noise_gain(corrected: NDArray[np.floating], original: NDArray[np.floating]) -> float:
+    """Standard deviation of the noise in a flat part after a correction, over that before.
+
+    Shading does not count, see `flat_noise`.
+
+    Parameters
+    ----------
+    corrected, original : ndarray, shape (H, W)
+        The same flat part of both pictures.
+    """
+    _same_shape(corrected, original)
+    before, after = flat_noise(original), flat_noise(corrected)
+    if before == 0.0:
+        raise InvalidInputError("the original has no noise in this part; choose a flat part of a photo")
+    return after / before
+
+
+def flat_noise(plane: NDArray[np.floating]) -> float:
+    """Standard deviation over a flat part after its best fitting paraboloid is taken off."""
+    if plane.ndim != 2 or min(plane.shape) < 8:
+        raise InvalidInputError(f"a flat part has at least 8 x 8 pixels, got {plane.shape}")
+    rows, cols = (np.linspace(-1.0, 1.0, n) for n in plane.shape)
+    y, x = np.meshgrid(rows, cols, indexing="ij")
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1).reshape(-1, 6)
+    values = np.asarray(plane, dtype=np.float64).ravel()
+    fit, *_ = np.linalg.lstsq(terms, values, rcond=None)
+    residual = values - terms @ fit
+    return float(np.sqrt(np.square(residual).sum() / (values.size - 6)))
+
+
+def _same_shape(image: NDArray[np.floating], reference: NDArray[np.floating]) -> None:
+    if image.shape != reference.shape or image.ndim < 2:
+        raise InvalidInputError(f"pictures must have the same shape, got {image.shape} and {reference.shape}")
+
+
+def _squared_error(
+    image: NDArray[np.floating], reference: NDArray[np.floating], *, srgb: bool
+) -> NDArray[np.float64]:
+    _same_shape(image, reference)
+    a = to_srgb(image) if srgb else np.asarray(image, dtype=np.float64)
+    b = to_srgb(reference) if srgb else np.asarray(reference, dtype=np.float64)
+    return np.square(a - b)

@@ -183,7 +183,9 @@ class PhotoRow(Base):
     pixel_pitch_um: Mapped[float | None]
     iso: Mapped[float | None]
     exposure_s: Mapped[float | None]
-    taken_at: Mapped[datetime | None]
+    taken_at: Mapped[datetime | None] = mapped_column(DateTime())
+    """By the camera's clock, whose zone nobody knows."""
+
     lateral: Mapped[dict[str, Any] | None]
     """Lateral colour that this photo shows: radial polynomials of red and blue."""
 

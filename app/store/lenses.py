@@ -165,6 +165,18 @@ class LensStore:
             session.flush()
             return lens
 
+    def named(self, owner_id: int, maker: str | None, model: str | None, serial: str) -> LensRow:
+        """Find or make the lens of a maker, model and serial that its owner tells."""
+        key = identity_key(maker, model, serial)
+        fresh = _new_lens(owner_id, key, maker=maker, model=model, serial=serial, source="user")
+        with self._db.writing() as session:
+            insert_new(session, LensRow, [fresh])
+            return session.scalars(
+                select(LensRow).where(
+                    LensRow.owner_id == owner_id, LensRow.identity_key == key, LensRow.deleted_at.is_(None)
+                )
+            ).one()
+
     def candidates(self, photo: PhotoRow, limit: int = 10) -> list[LensRow]:
         """Return the owner's lenses that a photo without a serial may belong to."""
         query = select(LensRow).where(LensRow.owner_id == photo.owner_id, LensRow.deleted_at.is_(None))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from typing import Any, Protocol
 
 from sqlalchemy import delete, func, select, update
@@ -79,6 +79,12 @@ class PhotoStore:
     def __init__(self, database: Database) -> None:
         self._db = database
 
+    def expect(self, prefix: str) -> None:
+        """Say that blobs will come below `prefix`: garbage in an hour unless a photo claims them."""
+        with self._db.writing() as session:
+            due = now() + timedelta(hours=1)
+            insert_new(session, GarbageRow, [{"prefix": prefix, "not_before": due}])
+
     def receive(
         self,
         owner: str,
@@ -123,6 +129,8 @@ class PhotoStore:
                 **{column: given.get(field) for field, column in GIVEN_SETTINGS.items()},
             )
             session.add(photo)
+            prefix = f"{blob_key.rpartition('/')[0]}/"
+            session.execute(delete(GarbageRow).where(GarbageRow.prefix == prefix))
             session.flush()
             return Received(photo, fresh=True)
 

@@ -130,7 +130,7 @@ def upgrade() -> None:
         sa.Column("pixel_pitch_um", sa.Double(), nullable=True),
         sa.Column("iso", sa.Double(), nullable=True),
         sa.Column("exposure_s", sa.Double(), nullable=True),
-        sa.Column("taken_at", sa.DateTime(timezone=True), nullable=True),
+        sa.Column("taken_at", sa.DateTime(), nullable=True),
         sa.Column("lateral", sa.JSON(), nullable=True),
         sa.Column("epoch", sa.Integer(), nullable=False),
         sa.Column("attempt", sa.Integer(), nullable=False),

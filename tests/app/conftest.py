@@ -2,19 +2,99 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from starlette.testclient import TestClient
 
+from app.ids import new_id
 from app.settings import Settings
-from app.store import Store
+from app.store import LensName, NewPatch, NewSample, Store
 from app.store.migrate import upgrade
+from app.tables import PhotoRow
+from lensmodel.psf import gaussian
+
+PLACES = [(0.05, 0.0), (0.3, 0.6), (0.5, 2.2), (0.6, -2.2), (0.8, -0.6), (0.9, 0.59)]
+
+
+class Steps:
+    """Does to the tables what uploads and workers do, step by step."""
+
+    def __init__(self, store: Store, owner: str = "local") -> None:
+        self.store, self.owner = store, owner
+        self._numbers = itertools.count(1)
+
+    def receive(self, *, calibrate: bool = True, **given: Any) -> PhotoRow:
+        number, public_id = next(self._numbers), new_id()
+        return self.store.photos.receive(
+            self.owner,
+            public_id=public_id,
+            sha256=f"{number:064x}",
+            filename=f"p{number}.dng",
+            kind="dng",
+            byte_size=1000,
+            blob_key=f"photos/{public_id}/original",
+            calibrate=calibrate,
+            given=given,
+        ).photo
+
+    def inspect(self, photo: PhotoRow, *, serial: str | None = "123", aperture: float | None = 1.4) -> None:
+        self.store.photos.set_state(photo.public_id, ("received",), "inspecting")
+        self.store.photos.record_inspection(
+            photo.public_id,
+            width=6000,
+            height=4000,
+            identity=LensName("Canon", "EF24mm f/1.4L", serial, "exif" if serial else "none"),
+            aperture=aperture,
+            focal_mm=24.0,
+            focus_m=None,
+            pixel_pitch_um=6.0,
+        )
+        self.store.photos.assign_lens(photo.public_id)
+
+    def plan(self, photo: PhotoRow, count: int = 2) -> None:
+        self.store.photos.set_state(photo.public_id, ("inspecting",), "selecting")
+        patches = [
+            NewPatch(k, 100, 100 * k, 64, *PLACES[k % len(PLACES)], cell=k % 2, score=1.0)
+            for k in range(count)
+        ]
+        rejected = NewPatch(count, 0, 0, 64, 0, 0, rejected="flat")
+        self.store.patches.add(photo.public_id, photo.epoch, [*patches, rejected])
+        self.store.photos.set_state(photo.public_id, ("selecting",), "estimating")
+
+    def estimate(self, photo: PhotoRow, indices: tuple[int, ...] = (0, 1), *, width: float = 1.0) -> int:
+        kernel = gaussian(15, width * np.eye(2))
+        samples = [
+            NewSample(k, channel, kernel, 0.5, "default/1") for k in indices for channel in ("r", "g", "b")
+        ]
+        return self.store.patches.finish(photo.public_id, photo.epoch, samples)
+
+    def counted(self, *, patches: int = 2, width: float = 1.0, **options: Any) -> PhotoRow:
+        photo = self.receive()
+        self.inspect(photo, **options)
+        self.plan(photo, patches)
+        self.estimate(photo, tuple(range(patches)), width=width)
+        assert self.store.photos.finish(photo.public_id, photo.epoch) is not None
+        return self.fresh(photo)
+
+    def fresh(self, photo: PhotoRow) -> PhotoRow:
+        found = self.store.photos.get(photo.public_id)
+        assert found is not None
+        return found
+
+    def lens_id(self, photo: PhotoRow) -> str:
+        lens = self.store.photos.lens_of(self.fresh(photo))
+        assert lens is not None
+        return lens.public_id
 
 
 @pytest.fixture
 def settings(tmp_path: Path) -> Settings:
-    return Settings(data_dir=tmp_path / "data", long_poll_seconds=2.0, min_free_mb=0)
+    return Settings(data_dir=tmp_path / "data", long_poll_seconds=2.0, min_free_mb=0, max_upload_mb=1)
 
 
 @pytest.fixture
@@ -23,3 +103,17 @@ def store(settings: Settings) -> Iterator[Store]:
     upgrade(opened.database)
     yield opened
     opened.close()
+
+
+@pytest.fixture
+def steps(store: Store) -> Steps:
+    return Steps(store)
+
+
+@pytest.fixture
+def client(settings: Settings, store: Store) -> Iterator[TestClient]:
+    """Speak HTTP with the service; `store` and `steps` see the same database."""
+    from app.main import create_app  # noqa: PLC0415 - most tests of the store need no application
+
+    with TestClient(create_app(settings), raise_server_exceptions=False) as opened:
+        yield opened

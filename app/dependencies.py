@@ -1,0 +1,63 @@
+"""What routes need, handed to them: the parts of the application and who is asking."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from fastapi import Depends, Request, Response
+
+from app.models import ModelCache
+from app.settings import Settings
+from app.storage import Storage
+from app.store import Store
+from app.store.owners import LOCAL
+
+
+@dataclass(frozen=True, slots=True)
+class Services:
+    """Everything that one application is made of."""
+
+    settings: Settings
+    store: Store
+    storage: Storage
+    models: ModelCache
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """One request: what serves it, who asks, and the head of its answer."""
+
+    request: Request
+    response: Response
+    services: Services
+    owner: str
+
+    @property
+    def settings(self) -> Settings:
+        """What is configured."""
+        return self.services.settings
+
+    @property
+    def store(self) -> Store:
+        """The tables."""
+        return self.services.store
+
+    @property
+    def storage(self) -> Storage:
+        """The blobs."""
+        return self.services.storage
+
+    @property
+    def models(self) -> ModelCache:
+        """The fitted models."""
+        return self.services.models
+
+
+async def call_of(request: Request, response: Response) -> Call:
+    """Put together what a route needs. With `auth=none` everybody is the same owner."""
+    # async: a plain function would cost each request a trip to a thread
+    return Call(request, response, request.app.state.services, LOCAL)
+
+
+CallDep = Annotated[Call, Depends(call_of)]

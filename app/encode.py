@@ -1,0 +1,103 @@
+"""Kernels as JSON, PNG, NumPy and TIFF; the field as a picture."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from typing import Final, Literal
+
+import numpy as np
+import tifffile
+from lensmodel.regression import PsfAnswer
+from numpy.typing import NDArray
+from PIL import Image
+
+from app.models import Fitted
+from app.schemas import KernelOut, PsfOut, QueryOut, Support, Units
+from lensmodel.geometry import Frame
+from lensmodel.psf import PsfField
+from lensmodel.types import Channel, Kernel
+
+ASPECT: Final = (2, 3)
+"""Height to width of the field that a map shows."""
+
+DIGITS: Final = 10
+GAP_PX: Final = 2
+
+
+def describe(lens_id: str, fitted: Fitted, question: QueryOut, answer: PsfAnswer) -> PsfOut:
+    """Say what an answer rests on, with an empty kernel for formats that carry it themselves."""
+    size = answer.kernel.shape[0]
+    error = float(answer.predicted_error)
+    return PsfOut(
+        lens_id=lens_id,
+        version=fitted.state.version,
+        query=question,
+        psf=KernelOut(shape=(size, size), dtype="float32", data=[]),
+        support=Support(
+            effective_samples=float(answer.effective_samples),
+            photos=answer.photos,
+            extrapolated=answer.extrapolated,
+            predicted_error=error if np.isfinite(error) else None,
+        ),
+        bandwidth={name: float(value) for name, value in answer.bandwidth.items()},
+        units=Units(pixel_pitch_um=fitted.pixel_pitch_um),
+    )
+
+
+def psf(
+    form: Literal["json", "png", "npy", "tiff"], kernel: Kernel, described: PsfOut
+) -> tuple[bytes, Mapping[str, str]]:
+    """Encode a kernel; return the bytes and headers that explain them."""
+    if form == "json":
+        values = np.round(kernel, DIGITS).tolist()
+        full = described.model_copy(update={"psf": described.psf.model_copy(update={"data": values})})
+        return full.model_dump_json().encode(), {}
+    if form == "npy":
+        buffer = io.BytesIO()
+        np.save(buffer, kernel.astype("<f4"), allow_pickle=False)
+        return buffer.getvalue(), _named(described, "npy")
+    if form == "tiff":
+        buffer = io.BytesIO()
+        text = described.model_dump_json(exclude={"psf": {"data"}})
+        tifffile.imwrite(
+            buffer, kernel.astype(np.float32), photometric="minisblack", description=text, metadata=None
+        )
+        return buffer.getvalue(), _named(described, "tiff")
+    peak = float(kernel.max())
+    scaled = np.round(kernel / peak * 65535).astype(np.uint16)
+    headers = {"X-PSF-Scale": f"max={peak:.9g}; gamma=1"}
+    return _png(Image.fromarray(scaled)), headers | _named(described, "png")
+
+
+def field_map(
+    field: PsfField, channel: Channel, *, columns: int, rows: int, size: int, gamma: float
+) -> bytes:
+    """Draw kernels on a grid over the field as an 8-bit PNG, each scaled to its own peak."""
+    frame = Frame(ASPECT[0] * 1000, ASPECT[1] * 1000)
+    pitch = size + GAP_PX
+    sheet = np.full((rows * pitch + GAP_PX, columns * pitch + GAP_PX), 40, dtype=np.uint8)
+    for row in range(rows):
+        for column in range(columns):
+            place = frame.position((row + 0.5) / rows * frame.height, (column + 0.5) / columns * frame.width)
+            kernel = field.kernel_at(place, channel, size)
+            top, left = row * pitch + GAP_PX, column * pitch + GAP_PX
+            sheet[top : top + size, left : left + size] = _bright(kernel, gamma)
+    return _png(Image.fromarray(sheet))
+
+
+def _bright(kernel: Kernel, gamma: float) -> NDArray[np.uint8]:
+    return np.round((kernel / kernel.max()) ** gamma * 255).astype(np.uint8)
+
+
+def _png(image: Image.Image) -> bytes:
+    buffer = io.BytesIO()
+    image.save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def _named(described: PsfOut, suffix: str) -> dict[str, str]:
+    at = described.query
+    aperture = "" if at.aperture is None else f"-f{at.aperture:g}"
+    name = f"psf-v{described.version}-r{at.r:.3f}-phi{at.phi:.3f}{aperture}-{at.channel}.{suffix}"
+    return {"Content-Disposition": f'inline; filename="{name}"'}

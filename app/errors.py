@@ -1,0 +1,297 @@
+"""Exceptions to answers: one table, one shape (`application/problem+json`, RFC 9457).
+
+A route raises and contains no `try`. What is not in the table is our own fault: status 500,
+the cause goes to the log and not to the caller.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from http import HTTPStatus
+from typing import Any, ClassVar, Final
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import Response
+from pydantic import ValidationError
+from sqlalchemy.exc import OperationalError
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
+
+from app.schemas import FieldError, Problem
+from lensmodel import errors as library
+
+log = logging.getLogger(__name__)
+
+MEDIA_TYPE: Final = "application/problem+json"
+
+
+class ServiceError(library.LensModelError):
+    """Something that the service itself refuses.
+
+    Parameters
+    ----------
+    detail : str
+        The offending value and the remedy.
+    errors : sequence of FieldError
+        One entry for each offending field.
+    headers : mapping of str to str
+        For the answer.
+    """
+
+    status: ClassVar[int] = 400
+
+    def __init__(
+        self, detail: str, *, errors: Sequence[FieldError] = (), headers: Mapping[str, str] | None = None
+    ) -> None:
+        super().__init__(detail)
+        self.errors = tuple(errors)
+        self.headers = dict(headers or {})
+
+
+class MalformedUploadError(ServiceError):
+    """The body is not what an upload looks like."""
+
+    code = "malformed_upload"
+
+
+class InvalidParameterError(ServiceError):
+    """A value outside its range."""
+
+    status, code = 422, "invalid_parameter"
+
+
+class UnknownPhotoError(ServiceError):
+    """No photo of that id, or somebody else's."""
+
+    status, code = 404, "unknown_photo"
+
+
+class UnknownLensError(ServiceError):
+    """No lens of that id, or somebody else's."""
+
+    status, code = 404, "unknown_lens"
+
+
+class UnknownCorrectionError(ServiceError):
+    """No correction of that id, or somebody else's."""
+
+    status, code = 404, "unknown_correction"
+
+
+class UnknownJobError(ServiceError):
+    """No job of that id, or somebody else's."""
+
+    status, code = 404, "unknown_job"
+
+
+class NotReadyError(ServiceError):
+    """What was asked for is still being made."""
+
+    status, code = 409, "not_ready"
+
+
+class ConflictError(ServiceError):
+    """The state does not allow it."""
+
+    status, code = 409, "conflict"
+
+
+class NotAcceptableError(ServiceError):
+    """None of the formats that the caller accepts exists."""
+
+    status, code = 406, "not_acceptable"
+
+
+class TooLargeError(ServiceError):
+    """More bytes than an upload may have."""
+
+    status, code = 413, "image_too_large"
+
+
+class QuotaError(ServiceError):
+    """The owner has too much unfinished or stored already."""
+
+    status, code = 429, "quota_exceeded"
+
+
+class BusyError(ServiceError):
+    """The service cannot take more at the moment."""
+
+    status, code = 503, "busy"
+
+
+class StorageFullError(ServiceError):
+    """No room for another photo."""
+
+    status, code = 507, "quota_exceeded"
+
+
+class RangeError(ServiceError):
+    """A byte range beyond the end of the file."""
+
+    status, code = 416, "invalid_parameter"
+
+
+STATUS: Final[Mapping[type[Exception], int]] = {
+    library.InvalidInputError: 422,
+    library.UnreadablePhotoError: 415,
+    library.ImageTooLargeError: 413,
+    library.MetadataMissingError: 422,
+    library.OutsideSupportError: 422,
+    library.NotEnoughEvidenceError: 409,
+    library.CancelledError: 409,
+}
+"""Exceptions of the library by HTTP status; subclasses count as their nearest ancestor here."""
+
+STATUS_OF_CODE: Final[Mapping[str, int]] = {
+    "malformed_upload": 400,
+    "not_an_image": 415,
+    "truncated_image": 415,
+    "unsupported_format": 415,
+    "raw_decode_failed": 415,
+    "image_too_large": 413,
+    "decompression_bomb": 413,
+    "metadata_missing": 422,
+    "invalid_parameter": 422,
+    "no_usable_patches": 422,
+    "outside_support": 422,
+    "no_samples": 409,
+    "unknown_photo": 404,
+    "unknown_lens": 404,
+    "not_ready": 409,
+    "conflict": 409,
+    "cancelled": 409,
+    "quota_exceeded": 429,
+    "busy": 503,
+    "memory_limit": 422,
+    "time_limit": 422,
+    "crashed_repeatedly": 500,
+}
+"""Codes that a job can end with, by the status that the same error has as an answer."""
+
+CODE_OF_STATUS: Final[Mapping[int, str]] = {
+    404: "not_found",
+    405: "method_not_allowed",
+    413: "image_too_large",
+    422: "invalid_parameter",
+    503: "busy",
+}
+
+
+def status_of(error: Exception) -> int:
+    """Return the HTTP status of an exception: its own, or that of its nearest known ancestor."""
+    if isinstance(error, ServiceError):
+        return error.status
+    for kind in type(error).__mro__:
+        if kind in STATUS:
+            return STATUS[kind]
+    return 500
+
+
+def problem_of(code: str, detail: str | None, *, candidates: Sequence[str] = ()) -> Problem:
+    """Describe why a job ended, in the words of an answer."""
+    status = STATUS_OF_CODE.get(code, 500)
+    return Problem(
+        type=f"urn:lensmodel:{code}",
+        title=code.replace("_", " ").capitalize(),
+        status=status,
+        detail=detail or "",
+        code=code,
+        candidates=list(candidates) or None,
+    )
+
+
+def respond(
+    request: Request,
+    status: int,
+    code: str,
+    detail: str,
+    *,
+    errors: Sequence[FieldError] = (),
+    headers: Mapping[str, str] | None = None,
+) -> Response:
+    """Build the answer for a problem."""
+    problem = Problem(
+        type=f"urn:lensmodel:{code}",
+        title=HTTPStatus(status).phrase,
+        status=status,
+        detail=detail,
+        instance=request.url.path,
+        code=code,
+        errors=list(errors),
+        request_id=request.state.request_id if hasattr(request.state, "request_id") else None,
+    )
+    return Response(
+        problem.model_dump_json(exclude_none=True), status, media_type=MEDIA_TYPE, headers=dict(headers or {})
+    )
+
+
+def field_errors(found: Sequence[Any]) -> list[FieldError]:
+    """Turn pydantic's findings into ours: where, what was sent, what is allowed."""
+    return [
+        FieldError(
+            field=".".join(str(part) for part in error["loc"]) or "body",
+            value=_shortened(error.get("input")),
+            message=str(error["msg"]),
+        )
+        for error in found
+    ]
+
+
+def _shortened(value: object) -> str | None:
+    if value is None or isinstance(value, dict | list | bytes):
+        return None  # a whole document is no value to quote
+    text = str(value)
+    return text if len(text) <= 100 else f"{text[:100]}…"
+
+
+def _sentence(errors: Sequence[FieldError]) -> str:
+    said = (f"{e.field}: {e.message}" + (f", got {e.value!r}" if e.value is not None else "") for e in errors)
+    return "; ".join(said)
+
+
+def install(app: FastAPI) -> None:
+    """Add the handlers to an application."""
+
+    @app.exception_handler(library.LensModelError)
+    async def _known(request: Request, error: library.LensModelError) -> Response:
+        status = status_of(error)
+        if status >= HTTPStatus.INTERNAL_SERVER_ERROR and not isinstance(error, ServiceError):
+            log.error("unexpected %s", error.code, exc_info=error)
+        extra = error if isinstance(error, ServiceError) else ServiceError("")
+        return respond(request, status, error.code, str(error), errors=extra.errors, headers=extra.headers)
+
+    @app.exception_handler(RequestValidationError)
+    async def _invalid(request: Request, error: RequestValidationError) -> Response:
+        found = field_errors(error.errors())
+        return respond(request, 422, "invalid_parameter", _sentence(found), errors=found)
+
+    @app.exception_handler(ValidationError)
+    async def _invalid_form(request: Request, error: ValidationError) -> Response:
+        found = field_errors(error.errors())
+        return respond(request, 422, "invalid_parameter", _sentence(found), errors=found)
+
+    @app.exception_handler(HTTPException)
+    async def _framework(request: Request, error: HTTPException) -> Response:
+        code = CODE_OF_STATUS.get(error.status_code, "invalid_request")
+        detail = f"{request.method} {request.url.path}: {error.detail}; see /openapi.json for what there is"
+        return respond(request, error.status_code, code, detail, headers=error.headers)
+
+    @app.exception_handler(ClientDisconnect)
+    async def _gone(request: Request, error: ClientDisconnect) -> Response:
+        del error
+        return respond(request, 400, "malformed_upload", "the body ended early: send it again")
+
+    @app.exception_handler(OperationalError)
+    async def _database(request: Request, error: OperationalError) -> Response:
+        log.error("database: %s", error.orig)
+        detail = "the database does not answer; try again in a few seconds"
+        return respond(request, 503, "busy", detail, headers={"Retry-After": "5"})
+
+    @app.exception_handler(Exception)
+    async def _bug(request: Request, error: Exception) -> Response:
+        log.error("unexpected error", exc_info=error)
+        detail = "an error of ours; the log has it under this request_id"
+        return respond(request, 500, "internal_error", detail)

@@ -1,0 +1,50 @@
+"""The application: `create_app(settings)` and its lifespan."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from importlib.metadata import version
+
+from fastapi import FastAPI
+
+from app import errors
+from app.dependencies import Services
+from app.middleware import RequestLog
+from app.models import ModelCache
+from app.routes import corrections, health, jobs, lenses, photos, psf
+from app.settings import MIB, Settings
+from app.storage import Storage
+from app.store import Store
+
+
+def create_app(settings: Settings | None = None) -> FastAPI:
+    """Build the application; the database is opened when it starts and closed when it stops.
+
+    The schema is not changed here: the supervisor migrates before it starts the API, and until
+    then `/readyz` says what is missing.
+    """
+    chosen = Settings() if settings is None else settings
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        store = Store(chosen)
+        cache = ModelCache(store, chosen.model_cache_mb * MIB)
+        app.state.services = Services(chosen, store, Storage(chosen.storage), cache)
+        yield
+        store.close()
+
+    app = FastAPI(
+        title="lensmodel",
+        version=version("lensmodel"),
+        summary="Learns the blur of one copy of a lens from ordinary photos and removes it.",
+        lifespan=lifespan,
+        docs_url="/docs",
+        redoc_url=None,
+    )
+    app.add_middleware(RequestLog)
+    errors.install(app)
+    app.include_router(health.probes)
+    for router in (photos.router, jobs.router, lenses.router, psf.router, corrections.router, health.router):
+        app.include_router(router, prefix="/v1")
+    return app

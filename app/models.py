@@ -1,0 +1,157 @@
+"""Fitted lens models in memory: always current, fitted once, bounded.
+
+Each request compares the lens's version in the table (one primary-key read, microseconds) with
+that of the model in memory. So a new sample is seen by the very next request in every process,
+without messages between processes and without waiting for something to expire.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from lensmodel.regression import LensModel
+
+from app.errors import ConflictError, UnknownLensError
+from app.store import Store, StoredSample
+from app.store.samples import LensState
+from lensmodel.errors import NoSamplesError
+
+log = logging.getLogger(__name__)
+
+BYTES_FACTOR = 4
+"""A fitted model keeps its samples resampled and rotated: some copies of each."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fitted:
+    """A model and the state of the lens that it belongs to."""
+
+    lens_id: str
+    state: LensState
+    model: LensModel
+    pixel_pitch_um: float | None
+    size_bytes: int
+
+
+class ModelCache:
+    """Least recently used models of one process.
+
+    Parameters
+    ----------
+    store : Store
+        Where the samples are.
+    max_bytes : int
+        Bound of what is kept, by estimate; the model in use is kept in any case.
+    """
+
+    def __init__(self, store: Store, max_bytes: int) -> None:
+        self._store, self._max_bytes = store, max_bytes
+        self._models: OrderedDict[tuple[str, int | None], Fitted] = OrderedDict()
+        self._guard = threading.Lock()
+        self._building: dict[str, threading.Lock] = {}
+
+    def get(self, lens_id: str, version: int | None = None) -> Fitted:
+        """Return the model of a lens, current or of an earlier version.
+
+        Raises
+        ------
+        UnknownLensError
+            If there is no such lens.
+        NoSamplesError
+            If the lens has none (in that version).
+        ConflictError
+            If samples of that version were removed since.
+        """
+        state = self._store.samples.state_of(lens_id)
+        if state is None:
+            raise UnknownLensError(f"there is no lens {lens_id}: GET /v1/lenses lists those there are")
+        if version is not None and version != state.version:
+            return self._earlier(lens_id, version, state)
+        found = self._recall((lens_id, None))
+        if found is not None and found.state == state:
+            return found
+        with self._lock_of(lens_id):  # one thread fits, the others wait for its result
+            found = self._recall((lens_id, None))
+            if found is not None and found.state == self._store.samples.state_of(lens_id):
+                return found
+            return self._keep((lens_id, None), self._build(lens_id, found))
+
+    def _build(self, lens_id: str, old: Fitted | None) -> Fitted:
+        if old is not None:
+            state, samples = self._store.samples.of_lens(lens_id, after_version=old.state.version)
+            if state.rebuild_epoch == old.state.rebuild_epoch:
+                model = old.model.added([stored.sample for stored in samples]) if samples else old.model
+                size = old.size_bytes + _size(samples)
+                return Fitted(lens_id, state, model, old.pixel_pitch_um, size)
+        state, samples = self._store.samples.of_lens(lens_id)
+        return _fit(lens_id, state, samples)
+
+    def _earlier(self, lens_id: str, version: int, state: LensState) -> Fitted:
+        check_version(self._store, lens_id, version, state)
+        key = (lens_id, version)
+        with self._lock_of(lens_id):
+            found = self._recall(key)
+            if found is not None and found.state.rebuild_epoch == state.rebuild_epoch:
+                return found
+            _, samples = self._store.samples.of_lens(lens_id, up_to_version=version)
+            return self._keep(key, _fit(lens_id, LensState(version, state.rebuild_epoch), samples))
+
+    def _lock_of(self, lens_id: str) -> threading.Lock:
+        with self._guard:
+            return self._building.setdefault(lens_id, threading.Lock())
+
+    def _recall(self, key: tuple[str, int | None]) -> Fitted | None:
+        with self._guard:
+            if key in self._models:
+                self._models.move_to_end(key)
+            return self._models.get(key)
+
+    def _keep(self, key: tuple[str, int | None], fitted: Fitted) -> Fitted:
+        with self._guard:
+            self._models[key] = fitted
+            self._models.move_to_end(key)
+            while (
+                len(self._models) > 1 and sum(m.size_bytes for m in self._models.values()) > self._max_bytes
+            ):
+                dropped, _ = self._models.popitem(last=False)
+                log.info("model of lens %s dropped from memory", dropped[0])
+        return fitted
+
+
+def check_version(store: Store, lens_id: str, version: int, state: LensState) -> None:
+    """Make sure that an earlier version can still be had.
+
+    Raises
+    ------
+    ConflictError
+        If there is no such version, or samples were removed since.
+    """
+    lens = store.lenses.get(lens_id)
+    later = [] if lens is None else store.lenses.history(lens, after=version)
+    if version > state.version:
+        raise ConflictError(f"lens {lens_id} has no version {version} yet: the newest is {state.version}")
+    gone = [event.version for event in later if event.kind != "photo_added"]
+    if gone:
+        raise ConflictError(
+            f"version {version} of lens {lens_id} is gone: version {gone[0]} removed or changed photos; "
+            f"ask for version {state.version}, or leave the version out"
+        )
+
+
+def _fit(lens_id: str, state: LensState, samples: Sequence[StoredSample]) -> Fitted:
+    if not samples:
+        raise NoSamplesError(
+            f"lens {lens_id} has no samples yet (version {state.version}): "
+            "upload photos taken with it and wait until they are counted"
+        )
+    model = LensModel.fit([stored.sample for stored in samples])
+    pitch = next((s.sample.pixel_pitch_um for s in reversed(samples) if s.sample.pixel_pitch_um), None)
+    return Fitted(lens_id, state, model, pitch, _size(samples))
+
+
+def _size(samples: Sequence[StoredSample]) -> int:
+    return BYTES_FACTOR * sum(stored.sample.kernel.nbytes for stored in samples)

@@ -1,0 +1,50 @@
+"""What several routes share: pages, and which problems an endpoint may answer with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any, Protocol, TypeVar
+from urllib.parse import urlencode
+
+from fastapi import Query
+
+from app.dependencies import Call
+from app.errors import MEDIA_TYPE
+from app.schemas import Problem
+
+Limit = Annotated[int, Query(ge=1, le=200, description="items on a page")]
+Cursor = Annotated[str | None, Query(max_length=40, description="from `next` of the page before")]
+
+
+class HasPublicId(Protocol):
+    """A row that the outside knows."""
+
+    public_id: str
+
+
+Row = TypeVar("Row", bound=HasPublicId)
+
+
+def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Return the OpenAPI entries of the problems that an endpoint may answer with."""
+    schema = {"schema": {"$ref": "#/components/schemas/Problem"}}
+    return {
+        status: {"model": Problem, "description": "Problem", "content": {MEDIA_TYPE: schema}}
+        for status in (*statuses, 500, 503)
+    }
+
+
+def cut(rows: Sequence[Row], limit: int) -> tuple[list[Row], str | None]:
+    """Split one row more than a page into the page and the cursor of the next one."""
+    page = list(rows[:limit])
+    return page, page[-1].public_id if len(rows) > limit else None
+
+
+def next_link(call: Call, cursor: str | None) -> str | None:
+    """Return the address of the next page, and say it in the Link header too."""
+    if cursor is None:
+        return None
+    query = {**call.request.query_params, "cursor": cursor}
+    link = f"{call.request.url.path}?{urlencode(query)}"
+    call.response.headers["Link"] = f'<{link}>; rel="next"'
+    return link

@@ -1,0 +1,230 @@
+"""Corrections: ask for one, see how it fares, fetch the file."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Final
+from urllib.parse import quote
+
+from fastapi import APIRouter, Query, Response, status
+from starlette.responses import StreamingResponse
+
+from app import views
+from app.dependencies import Call, CallDep
+from app.errors import (
+    InvalidParameterError,
+    NotReadyError,
+    RangeError,
+    UnknownCorrectionError,
+    UnknownLensError,
+)
+from app.models import check_version
+from app.routes.common import Cursor, Limit, next_link, problems
+from app.routes.photos import find_photo
+from app.schemas import CorrectionIn, CorrectionOut, CorrectionPage
+from app.store.corrections import CorrectionPlan
+from app.store.samples import LensState
+from app.tables import LensRow, PhotoRow
+from lensmodel.deconv import deconvolvers
+from lensmodel.errors import MetadataMissingError, NoSamplesError, UnknownMethodError
+
+router = APIRouter(tags=["corrections"])
+_RANGE: Final = re.compile(r"bytes=(\d*)-(\d*)", re.ASCII)
+
+
+@router.post(
+    "/corrections",
+    operation_id="createCorrection",
+    status_code=status.HTTP_202_ACCEPTED,
+    response_model=CorrectionOut,
+    responses={200: {"model": CorrectionOut, "description": "The same correction is finished"}}
+    | problems(404, 409, 422),
+)
+def create_correction(wish: CorrectionIn, call: CallDep) -> CorrectionOut:
+    """Correct a photo with the model of its lens, or of another."""
+    photo = find_photo(call, wish.photo_id)
+    if wish.method not in deconvolvers.entries:
+        raise UnknownMethodError(
+            f"no method {wish.method!r}; known: {', '.join(sorted(deconvolvers.entries))}"
+        )
+    _check_region(photo, wish)
+    lens = _lens_for(call, photo, wish.lens_id)
+    version = _version_for(call, lens, wish.lens_version)
+    params = wish.model_dump(mode="json", include={"method", "strength", "output", "roi"})
+    row, made = call.store.corrections.create(photo, lens, version, params)
+    finished = not made and row.state == "succeeded"
+    call.response.status_code = status.HTTP_200_OK if finished else status.HTTP_202_ACCEPTED
+    call.response.headers["Location"] = f"{views.V1}/corrections/{row.public_id}"
+    return views.correction_out(CorrectionPlan(row, photo, lens))
+
+
+def _check_region(photo: PhotoRow, wish: CorrectionIn) -> None:
+    roi = wish.roi
+    if roi is None or photo.width is None or photo.height is None:
+        return
+    if roi.x + roi.width > photo.width or roi.y + roi.height > photo.height:
+        raise InvalidParameterError(
+            f"roi {roi.x},{roi.y} {roi.width}x{roi.height} reaches beyond the photo of "
+            f"{photo.width}x{photo.height} pixels: draw it in"
+        )
+
+
+def _lens_for(call: Call, photo: PhotoRow, lens_id: str | None) -> LensRow:
+    if lens_id is not None:
+        lens = call.store.lenses.get(lens_id, call.owner)
+        if lens is None:
+            raise UnknownLensError(f"lens_id {lens_id}: there is no such lens; GET /v1/lenses lists them")
+        return lens
+    lens = call.store.photos.lens_of(photo) or call.store.lenses.by_identity(photo)
+    if lens is not None:
+        return lens
+    if photo.width is None and photo.error_code is None:
+        raise NotReadyError(
+            f"photo {photo.public_id} is still being read ({photo.state}): wait for its job, or send lens_id",
+            headers={"Retry-After": "1"},
+        )
+    raise MetadataMissingError(
+        f"photo {photo.public_id} does not say which lens it was taken with: send lens_id"
+    )
+
+
+def _version_for(call: Call, lens: LensRow, wanted: int | None) -> int:
+    state = LensState(lens.version, lens.rebuild_epoch)
+    if wanted is not None and wanted != lens.version:
+        check_version(call.store, lens.public_id, wanted, state)
+        return wanted
+    if lens.sample_count == 0:
+        raise NoSamplesError(
+            f"lens {lens.public_id} has no samples yet: "
+            "upload photos taken with it and wait until they are counted"
+        )
+    return lens.version
+
+
+def find_plan(call: Call, correction_id: str) -> CorrectionPlan:
+    """Return a correction of the owner with its photo and lens."""
+    plan = call.store.corrections.plan(correction_id, call.owner)
+    if plan is None:
+        raise UnknownCorrectionError(f"there is no correction {correction_id[:60]}: it may be deleted")
+    return plan
+
+
+@router.get("/corrections", operation_id="listCorrections", responses=problems(404, 422))
+def list_corrections(
+    call: CallDep,
+    limit: Limit = 50,
+    cursor: Cursor = None,
+    photo_id: Annotated[str | None, Query(max_length=40)] = None,
+) -> CorrectionPage:
+    """List corrections, newest first, optionally of one photo."""
+    photo = None if photo_id is None else find_photo(call, photo_id)
+    plans = call.store.corrections.page(call.owner, before=cursor, limit=limit + 1, photo=photo)
+    following = plans[limit - 1].correction.public_id if len(plans) > limit else None
+    items = [views.correction_out(plan) for plan in plans[:limit]]
+    return CorrectionPage(items=items, next=next_link(call, following))
+
+
+@router.get("/corrections/{correction_id}", operation_id="getCorrection", responses=problems(404, 422))
+def read_correction(correction_id: str, call: CallDep) -> CorrectionOut:
+    """Return one correction."""
+    return views.correction_out(find_plan(call, correction_id))
+
+
+@router.delete(
+    "/corrections/{correction_id}",
+    operation_id="deleteCorrection",
+    status_code=status.HTTP_204_NO_CONTENT,
+    responses=problems(404, 422),
+)
+def delete_correction(correction_id: str, call: CallDep) -> None:
+    """Delete a correction with its file; a running one stops."""
+    prefix = call.store.corrections.delete(correction_id, call.owner)
+    if prefix is None:
+        raise UnknownCorrectionError(
+            f"there is no correction {correction_id[:60]}: it may be deleted already"
+        )
+    call.storage.delete(prefix)
+
+
+@router.get(
+    "/corrections/{correction_id}/result",
+    operation_id="getCorrectionResult",
+    response_class=Response,
+    responses={
+        200: {
+            "content": {"image/*": {"schema": {"type": "string", "format": "binary"}}},
+            "description": "The file",
+        },
+        206: {
+            "content": {"image/*": {"schema": {"type": "string", "format": "binary"}}},
+            "description": "A part",
+        },
+        304: {"description": "Not changed"},
+    }
+    | problems(404, 409, 416, 422),
+)
+def read_result(correction_id: str, call: CallDep) -> Response:
+    """Return the corrected photo, whole or in part."""
+    row = find_plan(call, correction_id).correction
+    if row.state != "succeeded":
+        raise NotReadyError(
+            f"correction {correction_id} is {row.state}: "
+            + ("wait for its job" if row.state in {"queued", "running"} else "ask for it again"),
+            headers={"Retry-After": "1"} if row.state in {"queued", "running"} else {},
+        )
+    assert row.result_key is not None
+    assert row.result_bytes is not None
+    tag = f'"{row.result_etag}"'
+    headers = {
+        "ETag": tag,
+        "Accept-Ranges": "bytes",
+        "Cache-Control": "private, no-cache",
+        "Content-Disposition": _disposition(row.result_name or "corrected"),
+        "X-Content-Type-Options": "nosniff",
+    }
+    if tag in {one.strip() for one in call.request.headers.get("if-none-match", "").split(",")}:
+        return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
+    part = call.request.headers.get("range")
+    if call.request.headers.get("if-range", tag) != tag:
+        part = None  # the file is another one than the caller has begun: all of it
+    start, end = byte_range(part, row.result_bytes)
+    headers["Content-Length"] = str(end - start)
+    code = status.HTTP_200_OK
+    if (start, end) != (0, row.result_bytes):
+        code = status.HTTP_206_PARTIAL_CONTENT
+        headers["Content-Range"] = f"bytes {start}-{end - 1}/{row.result_bytes}"
+    body = call.storage.stream(row.result_key, start, end)
+    return StreamingResponse(body, code, headers, row.result_media_type)
+
+
+def byte_range(header: str | None, size: int) -> tuple[int, int]:
+    """Return the part of a file that a Range header asks for, its end excluded.
+
+    Anything but one plain range asks for all of it, as RFC 9110 (14.2) allows.
+
+    Raises
+    ------
+    RangeError
+        If the range begins beyond the end.
+    """
+    match = _RANGE.fullmatch(header.strip()) if header else None
+    if match is None or match.group(0) == "bytes=-":
+        return 0, size
+    first, last = match.groups()
+    if not first:
+        start, end = max(size - int(last), 0), size
+    else:
+        start, end = int(first), min(int(last) + 1, size) if last else size
+    if last and first and int(last) < int(first):
+        return 0, size
+    if start >= size or start >= end:
+        raise RangeError(
+            f"range {header!r} lies beyond the {size} bytes of the file",
+            headers={"Content-Range": f"bytes */{size}"},
+        )
+    return start, end
+
+
+def _disposition(name: str) -> str:
+    plain = re.sub(r"[^A-Za-z0-9._-]", "_", name)
+    return f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(name, safe='')}"

@@ -1,0 +1,110 @@
+"""Whether the service lives, is ready, and what it can do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib.metadata import version
+
+from fastapi import APIRouter, status
+from lensmodel.blind import estimators
+
+from app.dependencies import Call, CallDep
+from app.routes.common import problems
+from app.routes.photos import GIB
+from app.routes.psf import MEDIA_TYPES
+from app.schemas import (
+    MAX_PSF_SIZE,
+    ColorSpace,
+    FormatsOut,
+    Health,
+    LimitsOut,
+    OutputFormat,
+    Readiness,
+    VersionOut,
+)
+from app.store import migrate
+from lensmodel.deconv import deconvolvers
+
+probes = APIRouter(tags=["service"])
+router = APIRouter(tags=["service"])
+
+
+@probes.get("/healthz", operation_id="getHealth")
+def healthz() -> Health:
+    """Say that the process lives."""
+    return Health()
+
+
+@probes.get(
+    "/readyz",
+    operation_id="getReadiness",
+    responses={503: {"model": Readiness, "description": "Something is missing"}},
+)
+def readyz(call: CallDep) -> Readiness:
+    """Say whether work can be taken: schema, storage and a worker are there."""
+    checks = {
+        "schema": _check(lambda: _schema(call)),
+        "storage": _check(call.storage.check_writable),
+        "worker": _check(lambda: _worker(call)),
+    }
+    ready = all(said == "ok" for said in checks.values())
+    if not ready:
+        call.response.status_code = status.HTTP_503_SERVICE_UNAVAILABLE
+    return Readiness(status="ready" if ready else "not ready", checks=checks)
+
+
+def _check(probe: Callable[[], None]) -> str:
+    try:
+        probe()
+    except Exception as error:  # noqa: BLE001 - whatever is wrong is what the probe has to tell
+        return f"{type(error).__name__}: {error}"[:300]
+    return "ok"
+
+
+def _schema(call: Call) -> None:
+    database, program = migrate.current(call.store.database), migrate.head()
+    if database != program:
+        raise RuntimeError(
+            f"the database is at {database}, this program needs {program}: run `lensmodel serve`"
+        )
+
+
+def _worker(call: Call) -> None:
+    if not call.store.workers.live(call.settings.lease_seconds):
+        raise RuntimeError(
+            f"no worker was heard of for {call.settings.lease_seconds:g} s: run `lensmodel worker`"
+        )
+
+
+@router.get("/version", operation_id="getVersion", responses=problems())
+def read_version(call: CallDep) -> VersionOut:
+    """Return what runs here."""
+    revision = migrate.current(call.store.database)
+    return VersionOut(name="lensmodel", version=version("lensmodel"), api="v1", schema_revision=revision)
+
+
+@router.get("/formats", operation_id="getFormats")
+def read_formats() -> FormatsOut:
+    """Return what can be read and written, and the methods by name."""
+    return FormatsOut(
+        read=["raw", "dng", "tiff", "png", "jpeg"],
+        write=list(OutputFormat.__args__),
+        color_spaces=list(ColorSpace.__args__),
+        psf=list(MEDIA_TYPES),
+        methods=sorted(deconvolvers.entries),
+        estimators=sorted(estimators.entries),
+    )
+
+
+@router.get("/limits", operation_id="getLimits")
+def read_limits(call: CallDep) -> LimitsOut:
+    """Return how much of everything."""
+    settings = call.settings
+    return LimitsOut(
+        max_upload_bytes=settings.max_upload_bytes,
+        max_megapixels=settings.max_megapixels,
+        max_queued_photos=settings.max_queued_photos,
+        max_stored_bytes=int(settings.max_stored_gb * GIB),
+        max_psf_size=MAX_PSF_SIZE,
+        long_poll_seconds=settings.long_poll_seconds,
+    )

@@ -1,0 +1,146 @@
+"""Jobs: how far the work on a photo or a correction is. A job has the id of what it makes."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import time
+from collections.abc import AsyncIterator
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Response, status
+from sse_starlette import EventSourceResponse, ServerSentEvent
+from starlette.concurrency import run_in_threadpool
+
+from app import views
+from app.dependencies import Call, CallDep
+from app.errors import ConflictError, UnknownJobError
+from app.routes.common import Cursor, Limit, next_link, problems
+from app.routes.photos import candidates
+from app.schemas import JobOut, JobPage
+
+router = APIRouter(tags=["jobs"])
+
+POLL_SECONDS = 0.1
+"""How often a waiting request looks at the row: a read of some 0.1 ms."""
+
+FINAL = {"succeeded", "failed", "cancelled"}
+
+
+def find_job(call: Call, job_id: str) -> JobOut:
+    """Return the job of a photo or of a correction."""
+    photo = call.store.photos.get(job_id, call.owner)
+    if photo is not None:
+        lens = call.store.photos.lens_of(photo)
+        return views.photo_job(photo, None if lens is None else lens.public_id, candidates(call, photo))
+    plan = call.store.corrections.plan(job_id, call.owner)
+    if plan is None:
+        raise UnknownJobError(f"there is no job {job_id[:60]}: its photo or correction may be deleted")
+    return views.correction_job(plan)
+
+
+def fingerprint(job: JobOut) -> str:
+    """Return what changes when something happens to a job: its estimate of time left does not count."""
+    return hashlib.sha256(job.model_dump_json(exclude={"eta_seconds"}).encode()).hexdigest()[:16]
+
+
+@router.get("/jobs", operation_id="listJobs", responses=problems(422))
+def list_jobs(
+    call: CallDep,
+    limit: Limit = 50,
+    cursor: Cursor = None,
+) -> JobPage:
+    """List jobs of photos and corrections, newest first."""
+    photos = call.store.photos.page(call.owner, before=cursor, limit=limit + 1)
+    plans = call.store.corrections.page(call.owner, before=cursor, limit=limit + 1)
+    lenses = call.store.photos.lens_ids(photos)
+    found: list[tuple[str, JobOut]] = [
+        *((row.public_id, views.photo_job(row, lenses.get(row.lens_id or 0))) for row in photos),
+        *((plan.correction.public_id, views.correction_job(plan)) for plan in plans),
+    ]
+    newest = sorted(found, key=lambda entry: entry[0], reverse=True)
+    page = [job for _, job in newest[:limit]]
+    following = page[-1].id if len(newest) > limit else None
+    return JobPage(items=page, next=next_link(call, following))
+
+
+@router.get(
+    "/jobs/{job_id}",
+    operation_id="getJob",
+    response_model=JobOut,
+    responses={304: {"description": "Not changed"}} | problems(404, 422),
+)
+async def read_job(
+    job_id: str,
+    call: CallDep,
+    wait: Annotated[float, Query(ge=0, le=20, allow_inf_nan=False, description="seconds")] = 0.0,
+) -> JobOut | Response:
+    """Return one job; with `wait`, as soon as it changes, at the latest after that time.
+
+    A finished job answers at once. With `If-None-Match` only a change from that state counts, so
+    that nothing is missed between two requests.
+    """
+    job = await run_in_threadpool(find_job, call, job_id)
+    seen = call.request.headers.get("if-none-match", "").strip('W/"')
+    before = seen or fingerprint(job)
+    deadline = time.monotonic() + min(wait, call.settings.long_poll_seconds)
+    while fingerprint(job) == before and job.state not in FINAL and time.monotonic() < deadline:
+        await asyncio.sleep(POLL_SECONDS)
+        job = await run_in_threadpool(find_job, call, job_id)
+    tag = fingerprint(job)
+    headers = {"ETag": f'W/"{tag}"', "Cache-Control": "no-cache"}
+    if job.state not in FINAL:
+        headers["Retry-After"] = "1"
+    if seen == tag:
+        return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
+    call.response.headers.update(headers)
+    return job
+
+
+@router.post(
+    "/jobs/{job_id}/cancel",
+    operation_id="cancelJob",
+    status_code=status.HTTP_202_ACCEPTED,
+    responses=problems(404, 409, 422),
+)
+def cancel_job(job_id: str, call: CallDep) -> JobOut:
+    """Cancel a job: running parts of it stop within a second, nothing of it counts."""
+    done = call.store.photos.cancel(job_id, call.owner) or call.store.corrections.cancel(job_id, call.owner)
+    job = find_job(call, job_id)
+    if not done:
+        raise ConflictError(f"job {job_id} is finished ({job.state}): there is nothing left to cancel")
+    return job
+
+
+@router.get(
+    "/jobs/{job_id}/events",
+    operation_id="watchJob",
+    response_class=EventSourceResponse,
+    responses={
+        200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}, "description": "Events"}
+    }
+    | problems(404, 422),
+)
+async def watch_job(job_id: str, call: CallDep) -> EventSourceResponse:
+    """Send the job as a server-sent event now and at each change, until it is finished.
+
+    Each event holds the whole job: whoever was cut off connects again and has missed nothing.
+    """
+    first = await run_in_threadpool(find_job, call, job_id)
+    return EventSourceResponse(_events(call, first), ping=15)
+
+
+async def _events(call: Call, job: JobOut) -> AsyncIterator[ServerSentEvent]:
+    sent = ""
+    while True:
+        tag = fingerprint(job)
+        if tag != sent:
+            yield ServerSentEvent(data=job.model_dump_json(), event="job", id=tag)
+            sent = tag
+        if job.state in FINAL:
+            return
+        await asyncio.sleep(2 * POLL_SECONDS)
+        try:
+            job = await run_in_threadpool(find_job, call, job.id)
+        except UnknownJobError:  # deleted while watched
+            return

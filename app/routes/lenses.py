@@ -1,0 +1,92 @@
+"""Lenses: what is known of each copy, and how it came to be known."""
+
+from __future__ import annotations
+
+from statistics import median
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query
+
+from app import views
+from app.dependencies import Call, CallDep
+from app.errors import UnknownLensError
+from app.routes.common import Cursor, Limit, cut, next_link, problems
+from app.schemas import CalibrationPage, LateralOut, LensOut, LensPage
+from app.tables import LensRow
+from lensmodel.errors import NoSamplesError
+
+router = APIRouter(tags=["lenses"])
+
+
+def find_lens(call: Call, lens_id: str) -> LensRow:
+    """Return a lens of the owner."""
+    lens = call.store.lenses.get(lens_id, call.owner)
+    if lens is None:
+        raise UnknownLensError(f"there is no lens {lens_id[:60]}: GET /v1/lenses lists those there are")
+    return lens
+
+
+@router.get("/lenses", operation_id="listLenses", responses=problems(422))
+def list_lenses(
+    call: CallDep,
+    limit: Limit = 50,
+    cursor: Cursor = None,
+    model: Annotated[str | None, Query(max_length=200)] = None,
+    serial: Annotated[str | None, Query(max_length=200)] = None,
+) -> LensPage:
+    """List lenses, newest first, optionally of one model or serial."""
+    rows = call.store.lenses.page(call.owner, before=cursor, limit=limit + 1, model=model, serial=serial)
+    page, following = cut(rows, limit)
+    seen = call.store.lenses.coverage_of(page)
+    items = [views.lens_out(row, *seen[row.id]) for row in page]
+    return LensPage(items=items, next=next_link(call, following))
+
+
+@router.get("/lenses/{lens_id}", operation_id="getLens", responses=problems(404, 422))
+def read_lens(lens_id: str, call: CallDep) -> LensOut:
+    """Return one lens."""
+    lens = find_lens(call, lens_id)
+    return views.lens_out(lens, *call.store.lenses.coverage_of([lens])[lens.id])
+
+
+@router.get("/lenses/{lens_id}/calibrations", operation_id="listCalibrations", responses=problems(404, 422))
+def list_calibrations(
+    lens_id: str,
+    call: CallDep,
+    limit: Limit = 200,
+    cursor: Annotated[int, Query(ge=0, description="from `next` of the page before")] = 0,
+) -> CalibrationPage:
+    """Return the history of a lens, oldest first: one item for each version."""
+    lens = find_lens(call, lens_id)
+    rows = call.store.lenses.history(lens, after=cursor, limit=limit + 1)
+    following = str(rows[limit - 1].version) if len(rows) > limit else None
+    items = [views.calibration_out(row) for row in rows[:limit]]
+    return CalibrationPage(items=items, next=next_link(call, following))
+
+
+@router.get(
+    "/lenses/{lens_id}/lateral-colour", operation_id="getLateralColour", responses=problems(404, 409, 422)
+)
+def read_lateral_colour(lens_id: str, call: CallDep) -> LateralOut:
+    """Return the lateral colour shift, which the kernels do not contain.
+
+    The median over the counted photos, coefficient by coefficient: one photo without edges near
+    the corners cannot spoil it.
+    """
+    lens = find_lens(call, lens_id)
+    seen = call.store.lenses.lateral_of(lens)
+    if not seen:
+        raise NoSamplesError(
+            f"lens {lens_id} has no photo whose lateral colour could be measured: upload one with colour data"
+        )
+    return LateralOut(
+        lens_id=lens.public_id,
+        version=lens.version,
+        photos=len(seen),
+        red=_middle(seen, "red"),
+        blue=_middle(seen, "blue"),
+    )
+
+
+def _middle(seen: list[dict[str, Any]], colour: str) -> list[float]:
+    return [median(values) for values in zip(*(entry[colour] for entry in seen), strict=True)]

@@ -1,0 +1,170 @@
+"""The PSF of a lens at a place of the field, and maps of the whole field."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Annotated, Final, Literal
+
+from fastapi import APIRouter, Query, Response, status
+
+from app import encode
+from app.dependencies import Call, CallDep
+from app.errors import InvalidParameterError, NotAcceptableError, UnknownLensError
+from app.models import Fitted
+from app.routes.common import problems
+from app.schemas import FieldQuery, PsfOut, PsfQuery, QueryOut
+from app.store.samples import LensState
+from lensmodel.errors import OutsideSupportError
+from lensmodel.types import FieldPosition, LensSettings
+
+router = APIRouter(tags=["psf"])
+
+Format = Literal["json", "png", "npy", "tiff"]
+MEDIA_TYPES: Final[dict[Format, str]] = {
+    "json": "application/json",
+    "png": "image/png",
+    "npy": "application/x-npy",
+    "tiff": "image/tiff",
+}
+MAX_GRID: Final = 25
+_CONTENT = {
+    name: {"schema": {"type": "string", "format": "binary"}}
+    for name in MEDIA_TYPES.values()
+    if "json" not in name
+}
+_ANSWERS = {
+    200: {"model": PsfOut, "content": _CONTENT, "description": "The PSF"},
+    304: {"description": "Not changed"},
+}
+
+
+@router.get(
+    "/lenses/{lens_id}/psf",
+    operation_id="getPsf",
+    response_class=Response,
+    responses=_ANSWERS | problems(404, 406, 409, 422),
+)
+def read_psf(lens_id: str, at: Annotated[PsfQuery, Query()], call: CallDep) -> Response:
+    """Return the PSF in the format that `Accept` asks for; JSON by default."""
+    return _answer(lens_id, at, accepted(call.request.headers.get("accept", "*/*")), call)
+
+
+@router.get(
+    "/lenses/{lens_id}/psf.{suffix}",
+    operation_id="getPsfAs",
+    response_class=Response,
+    responses=_ANSWERS | problems(404, 409, 422),
+)
+def read_psf_as(
+    lens_id: str,
+    suffix: Format,
+    at: Annotated[PsfQuery, Query()],
+    call: CallDep,
+) -> Response:
+    """Return the PSF in the format of the suffix."""
+    return _answer(lens_id, at, suffix, call)
+
+
+def accepted(header: str) -> Format:
+    """Choose the format that a caller likes best.
+
+    Raises
+    ------
+    NotAcceptableError
+        If he likes none that there is.
+    """
+    wishes: list[tuple[float, str]] = []
+    for entry in header.split(","):
+        media, *parameters = (part.strip().lower() for part in entry.split(";"))
+        quality = next((p.removeprefix("q=") for p in parameters if p.startswith("q=")), "1")
+        wishes.append((float(quality) if quality.replace(".", "", 1).isdecimal() else 0.0, media))
+    for quality, media in sorted(wishes, key=lambda wish: -wish[0]):
+        for name, kind in MEDIA_TYPES.items():
+            if quality > 0 and media in {"*/*", kind, f"{kind.partition('/')[0]}/*"}:
+                return name
+    raise NotAcceptableError(f"Accept: {header[:200]!r} names none of {', '.join(MEDIA_TYPES.values())}")
+
+
+def _answer(lens_id: str, at: PsfQuery, form: Format, call: Call) -> Response:
+    state = _state(call, lens_id, at.version)
+    tag = etag(lens_id, state, f"{at.model_dump_json()}{form}")
+    pinned = at.version is not None
+    headers = {
+        "ETag": tag,
+        "Cache-Control": "private, max-age=3600" if pinned else "private, no-cache",
+        "Vary": "Accept",
+    }
+    if _matches(call, tag):
+        return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
+    fitted = call.models.get(lens_id, at.version)
+    headers["ETag"] = etag(lens_id, fitted.state, f"{at.model_dump_json()}{form}")
+    position = FieldPosition(at.r, at.phi)
+    setting = LensSettings(at.aperture, at.focal_length_mm, at.focus_distance_m, at.channel)
+    answer = fitted.model.query(position, setting, size=at.size)
+    if at.strict and answer.extrapolated:
+        raise OutsideSupportError(
+            f"r={at.r}, phi={at.phi}, aperture={at.aperture} lies outside what the samples of lens {lens_id} "
+            "cover: upload photos that do, or ask without strict"
+        )
+    question = QueryOut(
+        r=position.r,
+        phi=position.phi,
+        aperture=at.aperture,
+        channel=at.channel,
+        size=at.size,
+        focal_length_mm=at.focal_length_mm,
+        focus_distance_m=at.focus_distance_m,
+    )
+    described = encode.describe(lens_id, fitted, question, answer)
+    body, more = encode.psf(form, answer.kernel, described)
+    return Response(body, media_type=MEDIA_TYPES[form], headers=headers | more)
+
+
+def _state(call: Call, lens_id: str, version: int | None) -> LensState:
+    state = call.store.samples.state_of(lens_id, call.owner)
+    if state is None:
+        raise UnknownLensError(f"there is no lens {lens_id[:60]}: GET /v1/lenses lists those there are")
+    return state if version is None else LensState(version, state.rebuild_epoch)
+
+
+def etag(lens_id: str, state: LensState, question: str) -> str:
+    """Return a strong tag: the same question to the same samples has the same answer."""
+    digest = hashlib.sha256(question.encode()).hexdigest()[:12]
+    return f'"{lens_id}-v{state.version}-e{state.rebuild_epoch}-{digest}"'
+
+
+def _matches(call: Call, tag: str) -> bool:
+    sent = call.request.headers.get("if-none-match", "")
+    return sent.strip() == "*" or tag in {one.strip().removeprefix("W/") for one in sent.split(",")}
+
+
+@router.get(
+    "/lenses/{lens_id}/field.png",
+    operation_id="getFieldMap",
+    response_class=Response,
+    responses={
+        200: {
+            "content": {"image/png": {"schema": {"type": "string", "format": "binary"}}},
+            "description": "Map",
+        },
+        304: {"description": "Not changed"},
+    }
+    | problems(404, 409, 422),
+)
+def read_field(lens_id: str, at: Annotated[FieldQuery, Query()], call: CallDep) -> Response:
+    """Return a picture of the kernels all over the field, each scaled to its own peak."""
+    columns, rows = (int(count) for count in at.grid.split("x"))
+    if not (1 <= columns <= MAX_GRID and 1 <= rows <= MAX_GRID):
+        raise InvalidParameterError(f"grid {at.grid}: columns and rows must lie in 1..{MAX_GRID}, as in 9x6")
+    state = _state(call, lens_id, None)
+    tag = etag(lens_id, state, at.model_dump_json())
+    headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
+    if _matches(call, tag):
+        return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
+    fitted: Fitted = call.models.get(lens_id)
+    headers["ETag"] = etag(lens_id, fitted.state, at.model_dump_json())
+    setting = LensSettings(at.aperture, at.focal_length_mm, at.focus_distance_m, at.channel)
+    picture = encode.field_map(
+        fitted.model.field(setting), at.channel, columns=columns, rows=rows, size=at.size, gamma=at.gamma
+    )
+    return Response(picture, media_type="image/png", headers=headers)

@@ -1,0 +1,492 @@
+"""What crosses HTTP: one model for each question and answer; units and bounds sit in the fields."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+
+from lensmodel.types import Channel
+
+MAX_PSF_SIZE = 255
+
+PhotoState = Literal[
+    "received",
+    "inspecting",
+    "developing",
+    "selecting",
+    "estimating",
+    "counted",
+    "stored",
+    "needs_lens",
+    "excluded",
+    "failed",
+    "cancelled",
+]
+JobState = Literal["queued", "running", "waiting", "succeeded", "failed", "cancelled"]
+CorrectionState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+OutputFormat = Literal["tiff16", "png16", "png8", "jpeg", "dng"]
+ColorSpace = Literal["same", "srgb", "camera-linear"]
+
+
+def _blank_is_none(value: object) -> object:
+    return None if isinstance(value, str) and not value.strip() else value
+
+
+def _printable(value: str) -> str:
+    if not value.isprintable():
+        raise ValueError("must not hold control characters")
+    return value.strip()
+
+
+def _odd(value: int) -> int:
+    if value % 2 == 0:
+        raise ValueError(f"must be odd, so that there is a middle pixel: {value - 1} or {value + 1}")
+    return value
+
+
+Name = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_printable)]
+OptionalName = Annotated[Name | None, BeforeValidator(_blank_is_none)]
+Id = Annotated[str, Field(min_length=1, max_length=40, pattern=r"^[A-Za-z0-9_-]+$")]
+OptionalId = Annotated[Id | None, BeforeValidator(_blank_is_none)]
+Aperture = Annotated[float, Field(ge=0.5, le=128, allow_inf_nan=False, description="f-number")]
+FocalLength = Annotated[float, Field(ge=0.1, le=20000, allow_inf_nan=False, description="mm")]
+FocusDistance = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False, description="m")]
+PixelPitch = Annotated[float, Field(gt=0.1, le=1000, allow_inf_nan=False, description="micrometres")]
+KernelSize = Annotated[
+    int, Field(ge=3, le=MAX_PSF_SIZE, description="odd side in pixels"), AfterValidator(_odd)
+]
+
+
+class Model(BaseModel):
+    """Common to what we send."""
+
+    model_config = ConfigDict(frozen=True, ser_json_inf_nan="null", protected_namespaces=())
+
+
+class Question(BaseModel):
+    """Common to what we are sent: a name that we do not know is an error, not a wish ignored."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", protected_namespaces=())
+
+
+class FieldError(Model):
+    """One offending field."""
+
+    field: str
+    message: str
+    value: str | None = None
+
+
+class Problem(Model):
+    """Why something did not work (RFC 9457)."""
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str
+    code: str = Field(description="Fixed word by which programs tell the cases apart.")
+    instance: str | None = None
+    errors: list[FieldError] = []
+    request_id: str | None = None
+    candidates: list[str] | None = Field(None, description="Lenses that the photo may belong to.")
+
+
+class UploadFields(Question):
+    """What an owner may say about a photo; it goes before what the file says."""
+
+    calibrate: bool = Field(default=True, description="false only stores the photo to correct it")
+    lens_id: OptionalId = None
+    lens_serial: OptionalName = None
+    lens_model: OptionalName = None
+    lens_maker: OptionalName = None
+    aperture: Annotated[Aperture | None, BeforeValidator(_blank_is_none)] = None
+    focal_length_mm: Annotated[FocalLength | None, BeforeValidator(_blank_is_none)] = None
+    focus_distance_m: Annotated[FocusDistance | None, BeforeValidator(_blank_is_none)] = None
+    pixel_pitch_um: Annotated[PixelPitch | None, BeforeValidator(_blank_is_none)] = None
+
+
+class NewLens(Question):
+    """A lens that only its owner can tell from others."""
+
+    label: Name
+
+
+class PhotoChange(Question):
+    """What to change about a photo; at least one field."""
+
+    lens_id: Id | None = None
+    lens_serial: Name | None = None
+    lens_model: Name | None = None
+    lens_maker: Name | None = None
+    new_lens: NewLens | None = None
+    aperture: Aperture | None = None
+    focal_length_mm: FocalLength | None = None
+    focus_distance_m: FocusDistance | None = None
+    pixel_pitch_um: PixelPitch | None = None
+    excluded: bool | None = None
+
+
+class PatchCounts(Model):
+    """How far the patches of a photo are."""
+
+    total: int
+    done: int
+    rejected: int
+
+
+class PhotoLinks(Model):
+    """Where to go from a photo."""
+
+    self: str
+    job: str
+    lens: str | None
+
+
+class PhotoOut(Model):
+    """A photo."""
+
+    id: str
+    filename: str
+    sha256: str
+    state: PhotoState
+    calibrate: bool
+    lens_id: str | None
+    aperture: float | None
+    focal_length_mm: float | None
+    focus_distance_m: float | None
+    pixel_pitch_um: float | None
+    camera: str | None
+    lens_model: str | None
+    width: int | None
+    height: int | None
+    patches: PatchCounts
+    error: Problem | None
+    created_at: datetime
+    links: PhotoLinks
+
+
+class PatchOut(Model):
+    """One window of a photo, used or rejected."""
+
+    index: int
+    row: int
+    col: int
+    size: int
+    r: float
+    phi: float
+    score: float | None
+    state: str
+    reason: str | None
+
+
+class Progress(Model):
+    """How far a job is."""
+
+    done: int
+    total: int
+    unit: str
+
+
+class JobLinks(Model):
+    """Where to go from a job."""
+
+    self: str
+    photo: str | None
+    lens: str | None
+    correction: str | None
+    result: str | None
+
+
+class JobOut(Model):
+    """Background work: of a photo or of a correction; its id is that of what it makes."""
+
+    id: str
+    kind: Literal["photo", "correction", "rebuild"]
+    state: JobState
+    stage: str | None
+    progress: Progress
+    eta_seconds: float | None
+    attempt: int
+    error: Problem | None
+    created_at: datetime
+    started_at: datetime | None
+    finished_at: datetime | None
+    links: JobLinks
+
+
+class LensLinks(Model):
+    """Where to go from a lens."""
+
+    self: str
+    psf: str
+    field: str
+    calibrations: str
+    lateral_colour: str
+    photos: str
+
+
+class LensOut(Model):
+    """One copy of a lens and what is known of it."""
+
+    id: str
+    maker: str | None
+    model: str | None
+    serial: str | None
+    serial_source: Literal["exif", "makernote", "xmp", "user", "none"]
+    label: str | None
+    version: int
+    photos: int
+    samples: int
+    apertures: list[float]
+    focal_lengths_mm: list[float]
+    created_at: datetime
+    links: LensLinks
+
+
+class PsfQuery(Question):
+    """Where and how to ask for a PSF."""
+
+    r: float = Field(ge=0, le=1, allow_inf_nan=False, description="half diagonals: 0 centre, 1 corner")
+    phi: float = Field(
+        0.0, ge=-100, le=100, allow_inf_nan=False, description="radians, counter-clockwise from the right"
+    )
+    aperture: Aperture | None = None
+    channel: Channel = "g"
+    size: KernelSize = 55
+    focal_length_mm: FocalLength | None = None
+    focus_distance_m: FocusDistance | None = None
+    version: int | None = Field(None, ge=1, description="an earlier version of the lens")
+    strict: bool = Field(default=False, description="refuse answers outside what the samples cover")
+
+
+class KernelOut(Model):
+    """A kernel: row 0 is the top, the sum is 1, the centre of mass on the middle pixel."""
+
+    shape: tuple[int, int]
+    dtype: Literal["float32"]
+    data: list[list[float]]
+
+
+class QueryOut(Model):
+    """The question as it was understood."""
+
+    r: float
+    phi: float
+    aperture: float | None
+    channel: Channel
+    size: int
+    focal_length_mm: float | None
+    focus_distance_m: float | None
+
+
+class Support(Model):
+    """What an answer rests on."""
+
+    effective_samples: float
+    photos: int
+    extrapolated: bool
+    predicted_error: float | None
+
+
+class Units(Model):
+    """Units of the answer."""
+
+    r: str = "half-diagonal"
+    phi: str = "radian"
+    pixel_pitch_um: float | None
+
+
+class PsfOut(Model):
+    """The PSF of a lens at one place and setting."""
+
+    lens_id: str
+    version: int
+    query: QueryOut
+    psf: KernelOut
+    support: Support
+    bandwidth: dict[str, float]
+    units: Units
+
+
+class FieldQuery(Question):
+    """What a field map shows."""
+
+    aperture: Aperture | None = None
+    channel: Channel = "g"
+    grid: str = Field("9x6", pattern=r"^\d{1,2}x\d{1,2}$", description="columns x rows, at most 25 x 25")
+    size: KernelSize = 55
+    gamma: float = Field(0.5, ge=0.1, le=2, allow_inf_nan=False, description="brightness ~ value^gamma")
+    focal_length_mm: FocalLength | None = None
+    focus_distance_m: FocusDistance | None = None
+
+
+class CalibrationOut(Model):
+    """One version of a lens: what changed, and how good the model was then."""
+
+    version: int
+    kind: str
+    photo_id: str | None
+    samples_added: int
+    samples: int
+    photos: int
+    error: dict[str, Any] | float | None = Field(description="held-out error; null until it is measured")
+    coverage: dict[str, Any] | None
+    created_at: datetime
+
+
+class LateralOut(Model):
+    """Lateral colour of a lens as radial polynomials relative to green.
+
+    A point that green shows at radius r (half diagonals) is shown by red or blue at the radius
+    that the polynomial with these coefficients, constant factor first, times r, gives.
+    """
+
+    lens_id: str
+    version: int
+    photos: int
+    red: list[float]
+    blue: list[float]
+
+
+class OutputOptions(Question):
+    """How a corrected photo is written."""
+
+    format: OutputFormat = "tiff16"
+    color_space: ColorSpace = "same"
+    quality: int = Field(95, ge=1, le=100, description="of JPEG")
+
+
+class Region(Question):
+    """A part of a photo in pixels of the sensor orientation."""
+
+    x: int = Field(ge=0)
+    y: int = Field(ge=0)
+    width: int = Field(ge=1)
+    height: int = Field(ge=1)
+
+
+class CorrectionIn(Question):
+    """What to correct, with what, into what."""
+
+    photo_id: Id
+    lens_id: Id | None = Field(None, description="default: the lens of the photo")
+    lens_version: int | None = Field(None, ge=1, description="default: the newest")
+    method: str = Field("standard", min_length=1, max_length=60)
+    strength: float = Field(1.0, ge=0, le=1, allow_inf_nan=False)
+    output: OutputOptions = OutputOptions()
+    roi: Region | None = None
+
+
+class CorrectionLinks(Model):
+    """Where to go from a correction."""
+
+    self: str
+    job: str
+    result: str | None
+
+
+class CorrectionOut(Model):
+    """A correction."""
+
+    id: str
+    photo_id: str
+    lens_id: str
+    lens_version: int
+    state: CorrectionState
+    method: str
+    strength: float
+    output: dict[str, Any]
+    roi: dict[str, Any] | None
+    report: dict[str, Any] | None
+    error: Problem | None
+    created_at: datetime
+    finished_at: datetime | None
+    links: CorrectionLinks
+
+
+class PhotoPage(Model):
+    """Some photos, newest first."""
+
+    items: list[PhotoOut]
+    next: str | None
+
+
+class PatchPage(Model):
+    """The patches of a photo."""
+
+    items: list[PatchOut]
+    next: str | None = None
+
+
+class JobPage(Model):
+    """Some jobs, newest first."""
+
+    items: list[JobOut]
+    next: str | None
+
+
+class LensPage(Model):
+    """Some lenses, newest first."""
+
+    items: list[LensOut]
+    next: str | None
+
+
+class CalibrationPage(Model):
+    """Some versions of a lens, oldest first."""
+
+    items: list[CalibrationOut]
+    next: str | None
+
+
+class CorrectionPage(Model):
+    """Some corrections, newest first."""
+
+    items: list[CorrectionOut]
+    next: str | None
+
+
+class Health(Model):
+    """The process lives."""
+
+    status: Literal["ok"] = "ok"
+
+
+class Readiness(Model):
+    """Whether work can be taken, and what is missing."""
+
+    status: Literal["ready", "not ready"]
+    checks: dict[str, str]
+
+
+class VersionOut(Model):
+    """What runs here."""
+
+    name: str
+    version: str
+    api: str
+    schema_revision: str | None
+
+
+class FormatsOut(Model):
+    """What can be read and written, and the methods by name."""
+
+    read: list[str]
+    write: list[str]
+    color_spaces: list[str]
+    psf: list[str]
+    methods: list[str]
+    estimators: list[str]
+
+
+class LimitsOut(Model):
+    """How much of everything."""
+
+    max_upload_bytes: int
+    max_megapixels: float
+    max_queued_photos: int
+    max_stored_bytes: int
+    max_psf_size: int
+    long_poll_seconds: float

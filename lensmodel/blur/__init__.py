@@ -1,0 +1,18 @@
+"""Forward models of lens blur with their adjoints."""
+
+from __future__ import annotations
+
+from lensmodel.blur.base import BlurOperator, crop_to_support, support_radius
+from lensmodel.blur.flow import EfficientFilterFlow
+from lensmodel.blur.uniform import UniformBlur
+from lensmodel.blur.windows import bartlett_hann, partition
+
+__all__ = [
+    "BlurOperator",
+    "EfficientFilterFlow",
+    "UniformBlur",
+    "bartlett_hann",
+    "crop_to_support",
+    "partition",
+    "support_radius",
+]

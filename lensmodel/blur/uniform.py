@@ -1,0 +1,89 @@
+"""One kernel for the whole plane."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from lensmodel.errors import InvalidInputError
+from lensmodel.psf import as_kernel, otf
+from lensmodel.types import Kernel, Plane
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UniformBlur:
+    """Blur by one kernel, y = k * x, no wrapping.
+
+    The latent plane is larger than the frame by the kernel's half side on each side.
+
+    Parameters
+    ----------
+    kernel : Kernel, shape (k, k)
+        The impulse response.
+    offset : tuple of float
+        Shift `(row, col)` in pixels of the image of a point, on top of the kernel: lateral colour.
+        It acts as a phase, so that it blurs nothing.
+    """
+
+    kernel: Kernel
+    offset: tuple[float, float] = (0.0, 0.0)
+    _spectra: dict[tuple[int, int], NDArray[np.complex64]] = field(
+        default_factory=dict, init=False, repr=False
+    )
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "kernel", as_kernel(self.kernel))
+
+    @property
+    def reach(self) -> int:
+        """By how many pixels the latent plane is wider than the frame on each side."""
+        return int(self.kernel.shape[0] // 2) + math.ceil(max(abs(self.offset[0]), abs(self.offset[1])))
+
+    def spectrum(self, shape: tuple[int, int]) -> NDArray[np.complex64]:
+        """Transfer function on the `rfft2` grid of `shape`, kept for the next call."""
+        if shape not in self._spectra:
+            self._spectra[shape] = (otf(self.kernel, shape) * _phase(self.offset, shape)).astype(np.complex64)
+        return self._spectra[shape]
+
+    def forward(self, latent: Plane) -> Plane:
+        """Return k * x where every pixel of the kernel meets data: `(h + k - 1, ...)` to `(h, ...)`."""
+        if min(latent.shape) <= 2 * self.reach:
+            raise InvalidInputError(
+                f"a latent plane of {latent.shape} leaves no frame inside a kernel that reaches {self.reach}"
+            )
+        shape = _fast(latent.shape)
+        spectrum = fft.rfft2(latent, shape) * self.spectrum(shape)
+        blurred = fft.irfft2(spectrum, shape)[: latent.shape[0], : latent.shape[1]]
+        return np.ascontiguousarray(self.frame(blurred), dtype=np.float32)
+
+    def adjoint(self, blurred: Plane) -> Plane:
+        """Return the correlation of y with k on the latent plane: `(h, ...)` to `(h + k - 1, ...)`."""
+        latent = np.pad(blurred, self.reach)
+        shape = _fast(latent.shape)
+        spectrum = fft.rfft2(latent, shape) * np.conj(self.spectrum(shape))
+        back = fft.irfft2(spectrum, shape)[: latent.shape[0], : latent.shape[1]]
+        return np.ascontiguousarray(back, dtype=np.float32)
+
+    def frame(self, latent: Plane) -> Plane:
+        """Return the part of the latent plane that the photo shows."""
+        cut = self.reach
+        return latent[cut : latent.shape[0] - cut, cut : latent.shape[1] - cut]
+
+
+def _phase(offset: tuple[float, float], shape: tuple[int, int]) -> NDArray[np.complex128]:
+    """Spectrum of a shift by `offset`; real on the Nyquist lines, as a real picture needs."""
+    rows = np.exp(-2j * np.pi * fft.fftfreq(shape[0]) * offset[0])
+    cols = np.exp(-2j * np.pi * fft.rfftfreq(shape[1]) * offset[1])
+    if shape[0] % 2 == 0:
+        rows[shape[0] // 2] = rows[shape[0] // 2].real
+    if shape[1] % 2 == 0:
+        cols[-1] = cols[-1].real
+    return np.asarray(rows[:, None] * cols[None, :])
+
+
+def _fast(shape: tuple[int, ...]) -> tuple[int, int]:
+    return int(fft.next_fast_len(shape[0], real=True)), int(fft.next_fast_len(shape[1], real=True))

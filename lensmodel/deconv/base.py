@@ -1,0 +1,109 @@
+"""What every non-blind deconvolver takes and gives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.blur import BlurOperator, UniformBlur
+from lensmodel.errors import InvalidInputError
+from lensmodel.types import NoiseModel, Plane, Planes, StepHook, ignore_step
+
+TINY = 1e-6
+"""Smallest light that a quotient may have below the bar."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sensor:
+    """What is known of one plane's sensor: its noise and where it clips.
+
+    Parameters
+    ----------
+    noise : NoiseModel
+        Variance against level.
+    clip : float
+        Level from which on a value is only a lower bound; infinity where nothing clips.
+    extra : ndarray or None
+        Further variance per pixel, of the plane's shape: what an uncertain kernel leaves behind.
+    """
+
+    noise: NoiseModel = field(default_factory=lambda: NoiseModel.white(0.005))
+    clip: float = float("inf")
+    extra: NDArray[np.float32] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.clip > 0.0:
+            raise InvalidInputError(f"clip must be a positive level, got {self.clip}")
+
+    def variance(self, plane: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Variance of the noise at each pixel."""
+        var = self.noise.variance(plane).astype(np.float32)
+        return var if self.extra is None else np.asarray(var + self.extra, dtype=np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Restored:
+    """Result of a deconvolution.
+
+    Parameters
+    ----------
+    plane : Plane
+        The latent plane inside the frame.
+    steps : int
+        Steps that were taken.
+    """
+
+    plane: Plane
+    steps: int
+
+
+class Deconvolver(Protocol):
+    """Non-blind deconvolution of one plane."""
+
+    def deconvolve(
+        self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step
+    ) -> Restored:
+        """Estimate the latent plane; call `on_step(done, total)` after each step."""
+
+
+@runtime_checkable
+class ColourDeconvolver(Protocol):
+    """A deconvolver that restores the three planes together, one from the other."""
+
+    def deconvolve_planes(
+        self, blurred: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor]
+    ) -> Planes:
+        """Estimate the latent planes inside the frame."""
+
+
+def restore_planes(
+    method: Deconvolver, blurred: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor]
+) -> Planes:
+    """Restore `(channel, row, col)` planes: together where the method can, else one by one."""
+    if isinstance(method, ColourDeconvolver):
+        return method.deconvolve_planes(blurred, blurs, sensors)
+    restored = [
+        method.deconvolve(plane, blur, sensor=sensor).plane
+        for plane, blur, sensor in zip(blurred, blurs, sensors, strict=True)
+    ]
+    return np.stack(restored)
+
+
+def uniform(blur: BlurOperator, method: str) -> UniformBlur:
+    """Return `blur` if it is one kernel, which methods that solve in the Fourier domain need.
+
+    Raises
+    ------
+    InvalidInputError
+        For any other operator.
+    """
+    if not isinstance(blur, UniformBlur):
+        raise InvalidInputError(
+            f"method {method!r} needs one kernel, got {type(blur).__name__}; "
+            "use correct_planes, which cuts the field into cells of one kernel"
+        )
+    return blur

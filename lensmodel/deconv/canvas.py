@@ -1,0 +1,67 @@
+"""The periodic canvas on which Fourier methods see a tile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+
+@dataclass(frozen=True, slots=True)
+class Canvas:
+    """A periodic grid that holds the data and a margin on which nothing was measured.
+
+    The margin is at least the kernel's side wide in total, so that light which wraps around
+    never meets data from the other end.
+
+    Parameters
+    ----------
+    rows, cols : int
+        Size of the data.
+    margin : int
+        Unmeasured pixels before the data; after them there are at least as many.
+    """
+
+    rows: int
+    cols: int
+    margin: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Size of the grid, quick to transform."""
+        return (
+            int(fft.next_fast_len(self.rows + 2 * self.margin, real=True)),
+            int(fft.next_fast_len(self.cols + 2 * self.margin, real=True)),
+        )
+
+    @property
+    def data(self) -> tuple[slice, slice]:
+        """Where the data lie on the grid."""
+        return slice(self.margin, self.margin + self.rows), slice(self.margin, self.margin + self.cols)
+
+    def fill(self, plane: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Place the data and cross-fade the margin from one end to the other, no step anywhere."""
+        height, width = self.shape
+        wide = _wrap(plane, self.margin, height)
+        return np.ascontiguousarray(_wrap(wide.T, self.margin, width).T)
+
+    def cut(self, canvas: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the part of a canvas that holds data."""
+        rows, cols = self.data
+        return canvas[rows, cols]
+
+
+def _wrap(plane: NDArray[np.float32], margin: int, length: int) -> NDArray[np.float32]:
+    """Extend the rows of `plane` to `length`; the margin mirrors both ends, faded into each other."""
+    rows = plane.shape[0]
+    gap = length - rows
+    if gap == 0:
+        return plane
+    t = np.arange(gap)
+    fade = ((t + 0.5) / gap).astype(np.float32)[:, None]
+    mirrored_end = plane[np.maximum(rows - 1 - t, 0)]
+    mirrored_start = plane[np.minimum(gap - 1 - t, rows - 1)]
+    bridge = mirrored_end * (1 - fade) + mirrored_start * fade
+    return np.roll(np.concatenate([plane, bridge.astype(np.float32)]), margin, axis=0)

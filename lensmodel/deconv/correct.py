@@ -1,0 +1,279 @@
+"""Correct a whole photo: cells of one PSF each, faded into each other."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lensmodel.blur import UniformBlur, crop_to_support
+from lensmodel.deconv.base import Deconvolver, Sensor, restore_planes
+from lensmodel.deconv.lattice import Cell, Roi, cells
+from lensmodel.deconv.methods import deconvolvers
+from lensmodel.deconv.report import CellForecast, ZoneReport, forecast, zone_reports
+from lensmodel.errors import InvalidInputError
+from lensmodel.geometry import Frame
+from lensmodel.psf import PsfField, as_kernel, delta
+from lensmodel.types import CHANNELS, Channel, FieldPosition, NoiseModel, Planes, StepHook, Zone, ignore_step
+
+PsfError = Callable[[FieldPosition, Channel], float] | float
+"""Relative L2 error that the PSF is expected to have, everywhere or by place and channel."""
+
+
+class LateralShift(Protocol):
+    """Lateral colour of a lens: how far red and blue images lie from the green one."""
+
+    def displacement(self, r: float, channel: Channel) -> float:
+        """Pixels outwards by which a channel's image of a point lies beyond the green one, at r."""
+
+
+KERNEL_SIZE = 55
+MIN_HALO = 24
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corrected:
+    """A corrected photo.
+
+    Parameters
+    ----------
+    planes : Planes
+        The photo, or the part of it that was asked for.
+    zones : Mapping[Zone, ZoneReport]
+        What the correction is expected to have gained in each zone of the field.
+    """
+
+    planes: Planes
+    zones: dict[Zone, ZoneReport]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Job:
+    """Everything that a cell needs; shared by the threads and never changed."""
+
+    planes: Planes
+    lens: PsfField
+    frame: Frame
+    method: Deconvolver
+    strength: float
+    noise: Sequence[NoiseModel]
+    clip: Sequence[float]
+    psf_error: PsfError
+    lateral: LateralShift | None
+
+    def uncertainty(self, position: FieldPosition, channel: Channel) -> float:
+        """Expected relative error of the PSF here."""
+        value = self.psf_error(position, channel) if callable(self.psf_error) else self.psf_error
+        if not (math.isfinite(value) and value >= 0.0):
+            raise InvalidInputError(f"psf_error must be finite and not negative, got {value} at {position}")
+        return float(value)
+
+    def blur(self, position: FieldPosition, channel: Channel, error: float) -> UniformBlur:
+        """Kernel of one channel here, its lateral shift included."""
+        kernel = crop_to_support(self.lens.kernel_at(position, channel, KERNEL_SIZE))
+        offset = (0.0, 0.0)
+        if self.lateral is not None and channel != "g":
+            out = self.lateral.displacement(position.r, channel)
+            offset = (-out * math.sin(position.phi), out * math.cos(position.phi))
+        return UniformBlur(_cautious(kernel, error), offset)
+
+
+def correct_planes(
+    planes: Planes,
+    field: PsfField,
+    frame: Frame,
+    *,
+    noise: Sequence[NoiseModel],
+    clip: Sequence[float] = (1.0, 1.0, 1.0),
+    method: str | Deconvolver = "standard",
+    strength: float = 1.0,
+    psf_error: PsfError = 0.0,
+    lateral: LateralShift | None = None,
+    roi: Roi | tuple[int, int, int, int] | None = None,
+    workers: int = 1,
+    pitch: int | None = None,
+    out: Planes | None = None,
+    on_step: StepHook = ignore_step,
+) -> Corrected:
+    """Remove the lens blur of a photo.
+
+    The frame is cut into cells that are fixed in the field. Each is restored with the PSF of its
+    centre and a halo of the PSF's own reach, and faded into its neighbours. Cells are added in a
+    fixed order, so the result does not depend on the number of workers to the last bit.
+
+    Parameters
+    ----------
+    planes : Planes, shape (3, height, width)
+        Linear light, saturation 1; may be memory-mapped.
+    field : PsfField
+        The lens.
+    frame : Frame
+        Size of the photo.
+    noise : sequence of NoiseModel
+        One per channel.
+    clip : sequence of float
+        Level per channel from which on a value is only a lower bound.
+    method : str or Deconvolver
+        A name in `deconvolvers`, or a method of your own.
+    strength : float
+        0 leaves the photo as it is, 1 applies what the noise allows.
+    psf_error : float or callable
+        Expected relative L2 error of the PSF; raises the noise where the picture has detail.
+    lateral : LateralShift or None
+        Lateral colour to remove in the same step: it becomes part of the red and blue PSFs, so
+        nothing is interpolated. Leave it out where the planes were resampled before.
+    roi : tuple of int or None
+        `(top, left, height, width)`: return only this part, with the same pixels as the whole.
+    workers : int
+        Threads.
+    pitch : int or None
+        Side of a cell in pixels; None chooses.
+    out : Planes or None
+        Where to write, for instance memory-mapped; zeroed first. None allocates.
+    on_step : StepHook
+        Called after each cell; may raise to stop.
+
+    Returns
+    -------
+    Corrected
+
+    Raises
+    ------
+    InvalidInputError
+        If shapes, strength, window or worker count make no sense.
+    UnknownMethodError
+        If `method` is in no registry.
+    """
+    if (
+        planes.ndim != 3
+        or planes.shape[0] != len(CHANNELS)
+        or planes.shape[1:] != (frame.height, frame.width)
+    ):
+        raise InvalidInputError(
+            f"planes must be (3, {frame.height}, {frame.width}) as the frame says, got {planes.shape}"
+        )
+    if not 0.0 <= strength <= 1.0:
+        raise InvalidInputError(f"strength must lie in 0..1, got {strength}")
+    if workers < 1:
+        raise InvalidInputError(f"workers must be at least 1, got {workers}")
+    if len(noise) != len(CHANNELS) or len(clip) != len(CHANNELS):
+        raise InvalidInputError(
+            f"noise and clip need one entry per channel, got {len(noise)} and {len(clip)}"
+        )
+    window = Roi.of(frame, roi)
+    shape = (len(CHANNELS), window.height, window.width)
+    if out is None:
+        out = np.zeros(shape, dtype=np.float32)
+    elif out.shape != shape or out.dtype != np.float32:
+        raise InvalidInputError(f"out must be float32 {shape}, got {out.dtype} {out.shape}")
+    else:
+        out[:] = 0.0
+    solver = deconvolvers.create(method) if isinstance(method, str) else method
+    job = _Job(planes, field, frame, solver, strength, tuple(noise), tuple(clip), psf_error, lateral)
+    wanted = [cell for cell in cells(frame, pitch) if cell.meets(window)]
+    forecasts = []
+    for done, (cell, restored, expected) in enumerate(_restored(job, wanted, workers), start=1):
+        _add(out, window, cell, restored)
+        forecasts.append(expected)
+        on_step(done, len(wanted))
+    return Corrected(out, zone_reports(forecasts))
+
+
+def _restored(job: _Job, wanted: Sequence[Cell], workers: int) -> Iterator[tuple[Cell, Planes, CellForecast]]:
+    """Restore cells in order, a few ahead of the one that is being added."""
+    if workers == 1:
+        for cell in wanted:
+            yield cell, *_restore(job, cell)
+        return
+    with ThreadPoolExecutor(workers) as pool:
+        ahead: deque[tuple[Cell, Future[tuple[Planes, CellForecast]]]] = deque()
+        queue = iter(wanted)
+        try:
+            for cell in queue:
+                ahead.append((cell, pool.submit(_restore, job, cell)))
+                if len(ahead) > 2 * workers:
+                    first, future = ahead.popleft()
+                    yield first, *future.result()
+            while ahead:
+                first, future = ahead.popleft()
+                yield first, *future.result()
+        finally:
+            for _, future in ahead:
+                future.cancel()
+
+
+def _restore(job: _Job, cell: Cell) -> tuple[Planes, CellForecast]:
+    """Restore one cell, halo cut off again."""
+    errors = [job.uncertainty(cell.position, channel) for channel in CHANNELS]
+    blurs = [job.blur(cell.position, channel, error) for channel, error in zip(CHANNELS, errors, strict=True)]
+    reach = max(blur.reach for blur in blurs)
+    halo = max(MIN_HALO, 2 * reach + 8)
+    top, left = max(cell.top - halo, 0), max(cell.left - halo, 0)
+    tile = np.asarray(job.planes[:, top : cell.bottom + halo, left : cell.right + halo], dtype=np.float32)
+    sensors = [
+        Sensor(noise, clip, _model_variance(plane, noise, blur, error))
+        for plane, noise, clip, blur, error in zip(tile, job.noise, job.clip, blurs, errors, strict=True)
+    ]
+    inner = (
+        slice(None),
+        slice(cell.top - top, cell.bottom - top),
+        slice(cell.left - left, cell.right - left),
+    )
+    expected = forecast(cell, tile, blurs, sensors, errors)
+    if job.strength == 0.0:
+        return tile[inner], expected
+    restored = restore_planes(job.method, tile, blurs, sensors)[inner]
+    if job.strength < 1.0:
+        restored = tile[inner] + np.float32(job.strength) * (restored - tile[inner])
+    return restored, expected
+
+
+def _model_variance(
+    plane: NDArray[np.float32], noise: NoiseModel, blur: UniformBlur, error: float
+) -> NDArray[np.float32] | None:
+    """Variance that a wrong kernel leaves in the residual.
+
+    With a relative error e the kernel is off by dk, |dk| = e |k|. Where the scene is rough on the
+    scale of the kernel, var(dk * x) = |dk|² var(x) and var(y) = |k|² var(x), so it is e² var(y),
+    taken over the kernel's support and without the noise's own share.
+    """
+    if error == 0.0:
+        return None
+    size = 2 * blur.reach + 3
+    mean = ndimage.uniform_filter(plane, size, mode="nearest")
+    local = ndimage.uniform_filter(plane * plane, size, mode="nearest") - mean * mean
+    signal = np.maximum(local - noise.variance(mean).astype(np.float32), 0.0)
+    return np.asarray(error * error * signal, dtype=np.float32)
+
+
+def _cautious(kernel: NDArray[np.float64], error: float) -> NDArray[np.float64]:
+    """Mix an uncertain kernel with a point, s k + (1 - s) delta, s = 1 / (1 + e²).
+
+    Too wide a kernel costs far more than too narrow a one.
+    """
+    if error == 0.0:
+        return kernel
+    share = 1.0 / (1.0 + error * error)
+    return as_kernel(share * kernel + (1.0 - share) * delta(kernel.shape[0]))
+
+
+def _add(out: Planes, window: Roi, cell: Cell, restored: Planes) -> None:
+    """Add a cell with its weights to the part of it that was asked for."""
+    top, left = max(cell.top, window.top), max(cell.left, window.left)
+    bottom = min(cell.bottom, window.top + window.height)
+    right = min(cell.right, window.left + window.width)
+    rows, cols = slice(top - cell.top, bottom - cell.top), slice(left - cell.left, right - cell.left)
+    weight = np.outer(cell.rise[rows], cell.run[cols])
+    target = (
+        slice(None),
+        slice(top - window.top, bottom - window.top),
+        slice(left - window.left, right - window.left),
+    )
+    out[target] += weight * restored[:, rows, cols]

@@ -1,0 +1,128 @@
+"""The lattice of cells, fixed in the field, that each have one PSF."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.errors import InvalidInputError
+from lensmodel.geometry import Frame
+from lensmodel.types import FieldPosition
+
+CELLS_PER_HALF_DIAGONAL = 18.0
+MIN_PITCH, MAX_PITCH = 96, 208
+"""Bounds of a cell's side in pixels: smaller ones are all halo, larger ones blur the PSF's change."""
+RAMP = 16
+"""Width in pixels over which neighbouring cells fade into each other."""
+
+
+@dataclass(frozen=True, slots=True)
+class Roi:
+    """A window of the photo in pixels."""
+
+    top: int
+    left: int
+    height: int
+    width: int
+
+    @classmethod
+    def of(cls, frame: Frame, roi: Roi | tuple[int, int, int, int] | None) -> Roi:
+        """Check a window `(top, left, height, width)` against the frame; None is all of it."""
+        if roi is None:
+            return cls(0, 0, frame.height, frame.width)
+        window = roi if isinstance(roi, Roi) else cls(*roi)
+        inside = (
+            window.top >= 0
+            and window.left >= 0
+            and window.height >= 1
+            and window.width >= 1
+            and window.top + window.height <= frame.height
+            and window.left + window.width <= frame.width
+        )
+        if not inside:
+            raise InvalidInputError(f"{window} does not lie in a photo of {frame.height} x {frame.width}")
+        return window
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cell:
+    """One cell: the part of the frame that it answers for, and its weight there.
+
+    Parameters
+    ----------
+    top, left : int
+        First pixel of the answer.
+    rise, run : ndarray
+        Weights along rows and columns; those of all cells sum to one.
+    position : FieldPosition
+        Centre of the cell: where its PSF is taken.
+    """
+
+    top: int
+    left: int
+    rise: NDArray[np.float32]
+    run: NDArray[np.float32]
+    position: FieldPosition
+
+    @property
+    def bottom(self) -> int:
+        """Row after the last one."""
+        return self.top + len(self.rise)
+
+    @property
+    def right(self) -> int:
+        """Column after the last one."""
+        return self.left + len(self.run)
+
+    def meets(self, roi: Roi) -> bool:
+        """Whether the cell has a pixel in `roi`."""
+        return (
+            self.top < roi.top + roi.height
+            and self.bottom > roi.top
+            and self.left < roi.left + roi.width
+            and self.right > roi.left
+        )
+
+
+def cells(frame: Frame, pitch: int | None = None) -> tuple[Cell, ...]:
+    """Cut a frame into cells, row by row.
+
+    The lattice depends on the frame only, never on the part asked for or on the memory given,
+    so a preview shows the same pixels as the whole picture.
+
+    Parameters
+    ----------
+    frame : Frame
+        Size of the photo.
+    pitch : int or None
+        Side of a cell; None takes a fixed share of the field within practical bounds.
+    """
+    if pitch is None:
+        pitch = int(np.clip(frame.half_diagonal / CELLS_PER_HALF_DIAGONAL, MIN_PITCH, MAX_PITCH))
+    down, across = _pieces(frame.height, pitch), _pieces(frame.width, pitch)
+    return tuple(
+        Cell(top, left, rise, run, frame.position(middle_row, middle_col))
+        for top, rise, middle_row in down
+        for left, run, middle_col in across
+    )
+
+
+def _pieces(extent: int, pitch: int) -> list[tuple[int, NDArray[np.float32], float]]:
+    count = max(1, round(extent / pitch))
+    edges = [round(i * extent / count) for i in range(count + 1)]
+    half = min(RAMP // 2, (edges[1] - edges[0]) // 2)
+    pieces = []
+    for low, high in itertools.pairwise(edges):
+        start = low if low == 0 else low - half
+        stop = high if high == extent else high + half
+        t = np.arange(start, stop, dtype=np.float64)
+        weight = np.ones(stop - start)
+        if low > 0:
+            weight = np.minimum(weight, np.clip((t - low + half + 0.5) / (2 * half), 0.0, 1.0))
+        if high < extent:
+            weight = np.minimum(weight, np.clip((high + half - t - 0.5) / (2 * half), 0.0, 1.0))
+        pieces.append((start, weight.astype(np.float32), (low + high - 1) / 2.0))
+    return pieces

@@ -1,0 +1,80 @@
+"""One-pass Wiener filter with the spectrum of natural images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from lensmodel.blur import BlurOperator, UniformBlur
+from lensmodel.deconv.base import Restored, Sensor, uniform
+from lensmodel.deconv.canvas import Canvas
+from lensmodel.types import Plane, StepHook, ignore_step
+
+SLOPE = 2.2
+"""Exponent of the power spectrum of natural images, S(f) = c |f|^-2.2."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wiener:
+    """Linear minimum-mean-square-error filter for a natural image in white noise.
+
+    In the Fourier domain::
+
+        X = conj(K) Y / ( |K|² + var / S(f) ),   S(f) = c |f|^-2.2
+
+    where c is fitted so that the blurred prior has the variance of the data.
+
+    Parameters
+    ----------
+    caution : float
+        Factor on the noise variance; above 1 the result is smoother.
+    """
+
+    caution: float = 1.0
+
+    def deconvolve(
+        self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step
+    ) -> Restored:
+        """Deconvolve one plane; see `Deconvolver`."""
+        kernel = uniform(blur, "wiener")
+        canvas = Canvas(blurred.shape[0], blurred.shape[1], kernel.reach)
+        noise = self.caution * float(sensor.variance(blurred).mean())
+        latent = wiener_canvas(canvas.fill(blurred), kernel, noise, float(blurred.var()))
+        on_step(1, 1)
+        return Restored(np.ascontiguousarray(canvas.cut(latent)), steps=1)
+
+
+def wiener_canvas(
+    data: NDArray[np.float32], blur: UniformBlur, noise: float, variance: float
+) -> NDArray[np.float32]:
+    """Wiener estimate on a periodic canvas, given noise variance and the variance of the data."""
+    shape = (data.shape[0], data.shape[1])
+    K = blur.spectrum(shape)
+    power = np.abs(K) ** 2
+    decay = frequency_squared(shape) ** np.float32(SLOPE / 2)
+    shown = float((_counts(shape) * power / decay).sum())
+    scale = max(variance - noise, 0.02 * variance + 1e-12) / shown
+    ratio = noise / (scale * data.size) * decay
+    ratio[0, 0] = 0.0  # the mean is kept
+    spectrum = fft.rfft2(data) * np.conj(K) / (power + ratio.astype(np.float32) + np.float32(1e-9))
+    return np.asarray(fft.irfft2(spectrum, shape), dtype=np.float32)
+
+
+def frequency_squared(shape: tuple[int, int]) -> NDArray[np.float32]:
+    """|f|² on the `rfft2` grid, in (cycles/pixel)²; the value at zero is a tenth of the next."""
+    squared = fft.fftfreq(shape[0])[:, None] ** 2 + fft.rfftfreq(shape[1])[None, :] ** 2
+    squared[0, 0] = 0.1 * min(squared[0, 1], squared[1, 0])
+    return squared.astype(np.float32)
+
+
+def _counts(shape: tuple[int, int]) -> NDArray[np.float32]:
+    """How often each column of the half spectrum stands in the whole; the mean stands nowhere."""
+    counts = np.full((shape[0], shape[1] // 2 + 1), 2.0, dtype=np.float32)
+    counts[:, 0] = 1.0
+    if shape[1] % 2 == 0:
+        counts[:, -1] = 1.0
+    counts[0, 0] = 0.0
+    return counts

@@ -1,0 +1,192 @@
+"""Contract of every deconvolution method, and what each one promises by itself."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+from skimage import restoration
+
+from lensmodel.blur import EfficientFilterFlow, UniformBlur
+from lensmodel.deconv import RichardsonLucy, SaturationAwareRichardsonLucy, Sensor, deconvolvers
+from lensmodel.deconv.shrinkage import Shrinkage
+from lensmodel.errors import InvalidInputError, UnknownMethodError
+from lensmodel.psf import delta, gaussian
+from lensmodel.types import NoiseModel
+
+CLEAN = Sensor(NoiseModel(1e-7, 1e-8))
+METHODS = list(deconvolvers)
+
+
+def scene(rows: int = 96, cols: int = 110, seed: int = 0) -> np.ndarray:
+    """Return overlapping squares of random light: edges of all sizes, as photographs have."""
+    rng = np.random.default_rng(seed)
+    plane = np.full((rows, cols), 0.3, dtype=np.float32)
+    for _ in range(150):
+        side = int(min(4 + rng.pareto(1.2) * 4, 40))
+        top, left = int(rng.integers(-side, rows)), int(rng.integers(-side, cols))
+        plane[max(top, 0) : max(top + side, 0), max(left, 0) : max(left + side, 0)] = rng.uniform(0.05, 0.8)
+    return plane
+
+
+def rmse(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.sqrt(np.mean((a - b) ** 2)))
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_method_keeps_a_constant(name: str) -> None:
+    flat = np.full((60, 64), 0.4, dtype=np.float32)
+
+    restored = deconvolvers.create(name).deconvolve(flat, UniformBlur(gaussian(9, np.eye(2))), sensor=CLEAN)
+
+    np.testing.assert_allclose(restored.plane, 0.4, atol=2e-3)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_method_changes_nothing_without_blur_and_noise(name: str) -> None:
+    plane = scene()
+
+    restored = deconvolvers.create(name).deconvolve(plane, UniformBlur(delta(5)), sensor=CLEAN)
+
+    assert rmse(restored.plane, plane) < 1e-3
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_method_brings_a_scene_blurred_without_noise_nearer_to_the_truth(name: str) -> None:
+    sharp, kernel = scene(), gaussian(11, np.eye(2) * 1.2)
+    blur = UniformBlur(kernel)
+    blurred = blur.forward(sharp)
+    truth = blur.frame(sharp)
+
+    restored = deconvolvers.create(name).deconvolve(blurred, blur, sensor=CLEAN)
+
+    slow = name in {"richardson-lucy", "paper", "whyte"}  # multiplicative steps creep, MAP solves
+    assert rmse(restored.plane, truth) < (0.9 if slow else 0.6) * rmse(blurred, truth)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_method_answers_float32_of_the_frame_and_counts_its_steps(name: str) -> None:
+    blurred, seen = scene(40, 50), []
+
+    restored = deconvolvers.create(name).deconvolve(
+        blurred,
+        UniformBlur(gaussian(7, np.eye(2))),
+        sensor=CLEAN,
+        on_step=lambda done, total: seen.append((done, total)),
+    )
+
+    assert restored.plane.shape == blurred.shape
+    assert restored.plane.dtype == np.float32
+    assert seen[-1] == (restored.steps, restored.steps)
+    assert len(seen) == restored.steps
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_method_is_repeatable_and_leaves_its_input_alone(name: str) -> None:
+    blurred = scene(40, 50)
+    before = blurred.copy()
+    blur = UniformBlur(gaussian(7, np.eye(2)))
+
+    first = deconvolvers.create(name).deconvolve(blurred, blur, sensor=CLEAN).plane
+    second = deconvolvers.create(name).deconvolve(blurred, blur, sensor=CLEAN).plane
+
+    np.testing.assert_array_equal(first, second)
+    np.testing.assert_array_equal(blurred, before)
+
+
+@pytest.mark.parametrize("name", ["standard", "fast", "wiener", "krishnan-fergus"])
+def test_method_of_one_kernel_says_what_to_use_for_a_field(name: str) -> None:
+    flow = EfficientFilterFlow(40, 40, ((delta(3),),))
+
+    with pytest.raises(InvalidInputError, match="correct_planes"):
+        deconvolvers.create(name).deconvolve(scene(40, 40), flow, sensor=CLEAN)
+
+
+def test_unknown_method_lists_the_known_ones() -> None:
+    with pytest.raises(UnknownMethodError, match="standard"):
+        deconvolvers.create("sharpen")
+
+
+@pytest.mark.parametrize("method", [RichardsonLucy, SaturationAwareRichardsonLucy])
+def test_richardson_lucy_refuses_a_step_count_out_of_range(method: type) -> None:
+    with pytest.raises(InvalidInputError, match="iterations"):
+        method(iterations=0)
+
+
+def test_richardson_lucy_raises_the_likelihood_with_every_step() -> None:
+    rng = np.random.default_rng(5)
+    blur = UniformBlur(gaussian(9, np.eye(2) * 2))
+    light = np.maximum(blur.forward(scene()), 0.01)
+    counts = (rng.poisson(light * 500) / 500).astype(np.float32)
+    sensor = Sensor(NoiseModel(1 / 500, 0.0))
+    scores = []
+    for steps in (1, 2, 4, 8, 16):
+        plane = RichardsonLucy(steps).deconvolve(counts, blur, sensor=sensor).plane
+        # The frame of the estimate is all that is returned; inside it the prediction is complete.
+        predicted = np.maximum(blur.forward(plane), 1e-6)
+        seen = blur.frame(counts)
+        scores.append(float((seen * np.log(predicted) - predicted).sum(dtype=np.float64)))
+
+    assert np.all(np.diff(scores) > 0)
+
+
+def test_richardson_lucy_equals_scikit_image_inside_at_equal_start() -> None:
+    sharp, kernel = scene(150, 150), gaussian(7, np.eye(2))
+    blur = UniformBlur(kernel)
+    blurred = np.maximum(blur.forward(sharp), 1e-3)
+    ours = RichardsonLucy(6).deconvolve(blurred, blur, sensor=Sensor(NoiseModel(1e-4, 0.0))).plane
+    # scikit-image starts from a constant; ours from one back-projection, which is its first step
+    # up to the constant: x1 = 0.5 k~ * (y / 0.5) = k~ * y.
+    theirs = restoration.richardson_lucy(blurred.astype(np.float64), kernel, num_iter=7, clip=False)
+
+    np.testing.assert_allclose(ours[30:-30, 30:-30], theirs[30:-30, 30:-30], atol=1e-4)
+
+
+def test_acceleration_is_worth_three_times_the_steps() -> None:
+    sharp, kernel = scene(128, 128), gaussian(15, np.eye(2) * 4)
+    blur = UniformBlur(kernel)
+    blurred = blur.forward(sharp)
+    truth = blur.frame(sharp)
+
+    fast = SaturationAwareRichardsonLucy(20).deconvolve(blurred, blur, sensor=CLEAN).plane
+    slow = SaturationAwareRichardsonLucy(60, accelerated=False).deconvolve(blurred, blur, sensor=CLEAN).plane
+
+    assert rmse(fast, truth) <= rmse(slow, truth)
+
+
+def test_clipped_lights_do_not_ring_into_their_neighbours() -> None:
+    rng = np.random.default_rng(8)
+    background = 0.2 + 0.05 * ndimage.gaussian_filter(rng.standard_normal((140, 140)), 1.5).astype(np.float32)
+    lights = background.copy()
+    rows, cols = np.mgrid[:140, :140]
+    for row, col, value in ((50, 60, 10.0), (95, 88, 20.0)):
+        lights[np.hypot(rows - row, cols - col) < 4] = value
+    kernel = gaussian(17, np.eye(2) * 4)
+    blur = UniformBlur(kernel)
+    noise = (rng.standard_normal((124, 124)) * 1e-3).astype(np.float32)
+    sensor = Sensor(NoiseModel(1e-6, 1e-6), clip=1.0)
+    photo = np.minimum(blur.forward(lights), 1.0) + noise
+    quiet = blur.forward(background) + noise
+    method = SaturationAwareRichardsonLucy(25)
+    truth = blur.frame(lights)
+    near = ndimage.binary_dilation(truth > 1.0, iterations=16)
+
+    with_lights = method.deconvolve(photo.astype(np.float32), blur, sensor=sensor).plane
+    without = method.deconvolve(quiet.astype(np.float32), blur, sensor=sensor).plane
+
+    far = ~near
+    assert rmse(with_lights[far], truth[far]) <= 1.1 * rmse(without[far], truth[far])
+
+
+@pytest.mark.parametrize("alpha", [0.5, 2 / 3, 0.8, 1.0])
+@pytest.mark.parametrize("threshold", [1e-4, 0.01, 1.0])
+def test_shrinkage_finds_the_minimum(alpha: float, threshold: float) -> None:
+    prox = Shrinkage.of(alpha)
+    v = np.linspace(-4.0, 4.0, 41).astype(np.float32)
+    grid = np.linspace(-4.2, 4.2, 20001)
+
+    found = prox(v, prox.scale(threshold))
+
+    def energy(w: np.ndarray) -> np.ndarray:
+        return threshold * np.abs(w) ** alpha + (w - v[:, None]) ** 2 / 2
+
+    best = energy(np.tile(grid, (v.size, 1))).min(axis=1)
+    assert np.all(energy(found[:, None].astype(np.float64))[:, 0] <= best + 2e-3 * threshold + 1e-5)

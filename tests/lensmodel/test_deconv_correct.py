@@ -1,0 +1,238 @@
+"""A whole photo: cells, borders, windows, workers, uncertainty."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from lensmodel.blur import EfficientFilterFlow
+from lensmodel.deconv import Corrected, Roi, correct_planes
+from lensmodel.deconv.lattice import cells
+from lensmodel.errors import CancelledError, InvalidInputError
+from lensmodel.geometry import Frame
+from lensmodel.psf import gaussian
+from lensmodel.types import CHANNELS, Channel, FieldPosition, Kernel, NoiseModel, Planes
+
+FRAME = Frame(200, 260)
+BASE = (NoiseModel(1 / 50_000, 1e-6),) * 3
+HIGH = (NoiseModel(1 / 2_500, 9e-6),) * 3
+DARK = (NoiseModel(1 / 40, 1e-3),) * 3
+
+
+@dataclass(frozen=True)
+class Soft:
+    """A lens whose blur grows from the centre to the corner."""
+
+    centre: float = 0.9
+    corner: float = 1.7
+
+    def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:  # noqa: ARG002 - the protocol names it
+        width = self.centre + (self.corner - self.centre) * position.r**2
+        return gaussian(size, np.eye(2) * width**2)
+
+
+def scene(seed: int = 0) -> Planes:
+    rng = np.random.default_rng(seed)
+    rows, cols = FRAME.height + 60, FRAME.width + 60
+    planes = np.full((3, rows, cols), 0.3, dtype=np.float32)
+    for _ in range(700):
+        side = int(min(4 + rng.pareto(1.2) * 4, 60))
+        top, left = int(rng.integers(-side, rows)), int(rng.integers(-side, cols))
+        colour = rng.uniform(0.03, 0.7) * rng.uniform(0.7, 1.0, 3)
+        planes[:, max(top, 0) : max(top + side, 0), max(left, 0) : max(left + side, 0)] = colour[
+            :, None, None
+        ]
+    return planes
+
+
+def photo(lens: Soft, noise: tuple[NoiseModel, ...], seed: int = 1) -> tuple[Planes, Planes]:
+    """Return what a camera sees and the sharp frame; light from outside the frame is in it."""
+    rng, sharp = np.random.default_rng(seed), scene()
+    seen = []
+    for plane, channel, model in zip(sharp, CHANNELS, noise, strict=True):
+        flow = EfficientFilterFlow.of_field(lens, FRAME, channel, pitch=64, size=17)
+        cut = 30 - flow.reach
+        light = flow.forward(np.ascontiguousarray(plane[cut:-cut, cut:-cut]))
+        seen.append(light + rng.standard_normal(light.shape) * np.sqrt(model.variance(light)))
+    return np.stack(seen).astype(np.float32), sharp[:, 30:-30, 30:-30]
+
+
+def rmse(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.sqrt(np.mean((a.astype(np.float64) - b) ** 2)))
+
+
+def test_cells_sum_to_one_at_every_pixel() -> None:
+    total = np.zeros((FRAME.height, FRAME.width))
+    for cell in cells(FRAME):
+        total[cell.top : cell.bottom, cell.left : cell.right] += np.outer(cell.rise, cell.run)
+
+    np.testing.assert_allclose(total, 1.0, atol=1e-6)
+
+
+def test_cells_of_a_large_frame_stay_within_their_bounds() -> None:
+    sides = [cell.bottom - cell.top for cell in cells(Frame(4000, 6000))]
+
+    assert max(sides) <= 240
+    assert min(sides) >= 150
+
+
+@pytest.mark.parametrize("method", ["standard", "fast"])
+@pytest.mark.parametrize("noise", [BASE, HIGH])
+def test_correction_brings_the_photo_nearer_to_the_scene(method: str, noise: tuple[NoiseModel, ...]) -> None:
+    seen, sharp = photo(Soft(), noise)
+
+    restored = correct_planes(seen, Soft(), FRAME, noise=noise, method=method).planes
+
+    share = {"standard": 0.75, "fast": 0.9}[method]  # one linear pass removes less
+    assert rmse(restored, sharp) < share * rmse(seen, sharp)
+
+
+@pytest.mark.parametrize("method", ["standard", "fast"])
+def test_correction_is_never_worse_than_the_photo_at_extreme_noise(method: str) -> None:
+    seen, sharp = photo(Soft(), DARK)
+
+    restored = correct_planes(seen, Soft(), FRAME, noise=DARK, method=method).planes
+
+    assert rmse(restored, sharp) < rmse(seen, sharp)
+
+
+def test_correction_is_the_same_for_any_number_of_workers() -> None:
+    seen, _ = photo(Soft(), BASE)
+
+    one = correct_planes(seen, Soft(), FRAME, noise=BASE, workers=1).planes
+    three = correct_planes(seen, Soft(), FRAME, noise=BASE, workers=3).planes
+
+    np.testing.assert_array_equal(one, three)
+
+
+def test_correction_of_a_window_shows_the_pixels_of_the_whole() -> None:
+    seen, _ = photo(Soft(), BASE)
+    roi = (37, 101, 64, 90)
+
+    whole = correct_planes(seen, Soft(), FRAME, noise=BASE).planes
+    part = correct_planes(seen, Soft(), FRAME, noise=BASE, roi=roi).planes
+
+    np.testing.assert_array_equal(part, whole[:, 37:101, 101:191])
+
+
+def test_correction_reads_and_writes_memory_mapped_planes(tmp_path: Path) -> None:
+    seen, _ = photo(Soft(), BASE)
+    np.save(tmp_path / "in.npy", seen)
+    mapped = np.load(tmp_path / "in.npy", mmap_mode="r")
+    out = np.lib.format.open_memmap(tmp_path / "out.npy", mode="w+", dtype=np.float32, shape=seen.shape)
+
+    correct_planes(mapped, Soft(), FRAME, noise=BASE, method="fast", out=out)
+    out.flush()
+
+    expected = correct_planes(seen, Soft(), FRAME, noise=BASE, method="fast").planes
+    np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), expected)
+
+
+def test_strength_zero_returns_the_photo() -> None:
+    seen, _ = photo(Soft(), BASE)
+
+    restored = correct_planes(seen, Soft(), FRAME, noise=BASE, strength=0.0).planes
+
+    np.testing.assert_allclose(restored, seen, atol=1e-6)
+
+
+def test_strength_half_lies_half_way() -> None:
+    seen, _ = photo(Soft(), BASE)
+
+    half = correct_planes(seen, Soft(), FRAME, noise=BASE, method="fast", strength=0.5).planes
+    full = correct_planes(seen, Soft(), FRAME, noise=BASE, method="fast").planes
+
+    np.testing.assert_allclose(half, (seen + full) / 2, atol=1e-5)
+
+
+def test_wrong_kernel_with_its_error_stated_does_less_harm() -> None:
+    seen, sharp = photo(Soft(0.7, 1.0), BASE)
+    wrong = Soft(1.3, 1.8)
+
+    trusting = correct_planes(seen, wrong, FRAME, noise=BASE).planes
+    careful = correct_planes(seen, wrong, FRAME, noise=BASE, psf_error=0.6).planes
+
+    assert rmse(careful, sharp) < rmse(trusting, sharp)
+
+
+def test_zone_report_expects_more_where_the_lens_is_softer() -> None:
+    seen, _ = photo(Soft(0.5, 1.5), BASE)
+
+    zones = correct_planes(
+        seen, Soft(0.5, 1.5), FRAME, noise=BASE, method="fast", psf_error=0.1, pitch=40
+    ).zones
+
+    assert set(zones) == {"center", "mid", "corner"}
+    assert zones["corner"].gain_db > zones["center"].gain_db > 0
+    assert zones["mid"].psf_error == pytest.approx(0.1)
+
+
+def test_steps_count_the_cells_and_can_cancel() -> None:
+    seen, _ = photo(Soft(), BASE)
+
+    def stop(done: int, total: int) -> None:
+        assert total == len(cells(FRAME))
+        if done == 2:
+            raise CancelledError("enough")
+
+    with pytest.raises(CancelledError):
+        correct_planes(seen, Soft(), FRAME, noise=BASE, method="fast", workers=2, on_step=stop)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"strength": 1.5}, "strength"),
+        ({"workers": 0}, "workers"),
+        ({"roi": (0, 0, 300, 10)}, "does not lie"),
+        ({"noise": BASE[:2]}, "one entry per channel"),
+        ({"psf_error": -0.1}, "psf_error"),
+        ({"out": np.zeros((3, 5, 5), dtype=np.float32)}, "out must be"),
+    ],
+)
+def test_correction_refuses_what_makes_no_sense(change: dict, text: str) -> None:
+    seen = np.full((3, FRAME.height, FRAME.width), 0.2, dtype=np.float32)
+
+    with pytest.raises(InvalidInputError, match=text):
+        correct_planes(seen, Soft(), FRAME, **({"noise": BASE} | change))
+
+
+def test_correction_refuses_planes_of_another_frame() -> None:
+    with pytest.raises(InvalidInputError, match="as the frame says"):
+        correct_planes(np.zeros((3, 10, 10), dtype=np.float32), Soft(), FRAME, noise=BASE)
+
+
+def test_lateral_colour_is_removed_in_the_same_step() -> None:
+    @dataclass(frozen=True)
+    class Shift:
+        def displacement(self, r: float, channel: Channel) -> float:
+            return {"r": 1.5, "g": 0.0, "b": -1.5}[channel] * r
+
+    lens, lateral = Soft(1.0, 1.0), Shift()
+    sharp = scene()
+    rows, cols = np.indices((FRAME.height, FRAME.width), dtype=np.float64)
+    row_c, col_c = FRAME.center
+    seen = []
+    for plane, channel in zip(sharp, CHANNELS, strict=True):
+        soft = ndimage.gaussian_filter(plane.astype(np.float64), 1.0)
+        pixels = lateral.displacement(1.0, channel) / FRAME.half_diagonal
+        # A point at p lands at p (1 + pixels): the pixel p shows what lies at p / (1 + pixels).
+        where = [
+            (rows - row_c) / (1 + pixels) + row_c + 30,
+            (cols - col_c) / (1 + pixels) + col_c + 30,
+        ]
+        seen.append(ndimage.map_coordinates(soft, where, order=3))
+    photo_planes = np.stack(seen).astype(np.float32)
+    truth = sharp[:, 30:-30, 30:-30]
+
+    plain = correct_planes(photo_planes, lens, FRAME, noise=BASE)
+    aligned = correct_planes(photo_planes, lens, FRAME, noise=BASE, lateral=lateral)
+
+    assert isinstance(aligned, Corrected)
+    assert rmse(aligned.planes, truth) < 0.7 * rmse(plain.planes, truth)
+
+
+def test_roi_accepts_its_own_kind() -> None:
+    assert Roi.of(FRAME, Roi(1, 2, 3, 4)) == Roi.of(FRAME, (1, 2, 3, 4))

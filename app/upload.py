@@ -21,7 +21,7 @@ from app.schemas import UploadFields
 from app.storage import AsyncBlobWriter, Storage
 from lensmodel import photo
 
-SNIFF_BYTES: Final = 4096
+SNIFF_BYTES: Final = photo.HEAD_BYTES
 MAX_FORM_BYTES: Final = 64 * 1024
 MAX_PARTS: Final = 32
 FILE_FIELD: Final = "file"

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Final
+from typing import Final
 from urllib.parse import quote
 
-from fastapi import APIRouter, Query, Response, status
+from fastapi import APIRouter, Response, status
 from starlette.responses import StreamingResponse
 
 from app import views
@@ -19,7 +19,7 @@ from app.errors import (
     UnknownLensError,
 )
 from app.models import check_version
-from app.routes.common import Cursor, Limit, next_link, problems
+from app.routes.common import Cursor, Limit, OnlyId, next_link, problems
 from app.routes.photos import find_photo
 from app.schemas import CorrectionIn, CorrectionOut, CorrectionPage
 from app.store.corrections import CorrectionPlan
@@ -114,7 +114,7 @@ def list_corrections(
     call: CallDep,
     limit: Limit = 50,
     cursor: Cursor = None,
-    photo_id: Annotated[str | None, Query(max_length=40)] = None,
+    photo_id: OnlyId = None,
 ) -> CorrectionPage:
     """List corrections, newest first, optionally of one photo."""
     photo = None if photo_id is None else find_photo(call, photo_id)

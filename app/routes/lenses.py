@@ -10,7 +10,7 @@ from fastapi import APIRouter, Query
 from app import views
 from app.dependencies import Call, CallDep
 from app.errors import UnknownLensError
-from app.routes.common import Cursor, Limit, cut, next_link, problems
+from app.routes.common import Cursor, Limit, OnlyName, cut, next_link, problems
 from app.schemas import CalibrationPage, LateralOut, LensOut, LensPage
 from app.tables import LensRow
 from lensmodel.errors import NoSamplesError
@@ -31,8 +31,8 @@ def list_lenses(
     call: CallDep,
     limit: Limit = 50,
     cursor: Cursor = None,
-    model: Annotated[str | None, Query(max_length=200)] = None,
-    serial: Annotated[str | None, Query(max_length=200)] = None,
+    model: OnlyName = None,
+    serial: OnlyName = None,
 ) -> LensPage:
     """List lenses, newest first, optionally of one model or serial."""
     rows = call.store.lenses.page(call.owner, before=cursor, limit=limit + 1, model=model, serial=serial)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import APIRouter, Query, status
+from fastapi import APIRouter, status
 from starlette.concurrency import run_in_threadpool
 
 from app import upload, views
@@ -18,7 +18,7 @@ from app.errors import (
     UnknownPhotoError,
 )
 from app.ids import new_id
-from app.routes.common import Cursor, Limit, cut, next_link, problems
+from app.routes.common import Cursor, Limit, OnlyId, cut, next_link, problems
 from app.schemas import PatchPage, PhotoChange, PhotoOut, PhotoPage, PhotoState
 from app.settings import MIB
 from app.store.photos import GIVEN_SETTINGS
@@ -149,7 +149,7 @@ def list_photos(
     call: CallDep,
     limit: Limit = 50,
     cursor: Cursor = None,
-    lens_id: Annotated[str | None, Query(max_length=40)] = None,
+    lens_id: OnlyId = None,
     state: PhotoState | None = None,
 ) -> PhotoPage:
     """List photos, newest first."""

@@ -49,4 +49,6 @@ def owned(table: type[Owned], owner: str | None) -> Select[Owned]:
 
 def find(session: Session, table: type[Owned], public_id: str, owner: str | None) -> Owned | None:
     """Return one row by its public id if it is this owner's."""
+    if not public_id.isalnum():  # no id of ours; PostgreSQL refuses some such texts with an error
+        return None
     return session.scalar(owned(table, owner).where(table.public_id == public_id))

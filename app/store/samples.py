@@ -11,7 +11,7 @@ from sqlalchemy import Row, select
 
 from app.store.database import Database
 from app.store.patches import DTYPE
-from app.tables import LensRow, PhotoRow, SampleRow
+from app.tables import LensRow, OwnerRow, PhotoRow, SampleRow
 from lensmodel.errors import LensModelError
 from lensmodel.psf import PsfSample
 from lensmodel.types import Channel, FieldPosition, LensSettings
@@ -47,11 +47,12 @@ class SampleStore:
         self._db = database
 
     def state_of(self, lens_id: str, owner: str | None = None) -> LensState | None:
-        """Return the version of a lens by one primary-key read; None if there is no such lens."""
-        del owner  # ids cannot be guessed; routes have asked for the lens by its owner before
+        """Return the version of a lens by one read through its key; None if there is no such lens."""
         query = select(LensRow.version, LensRow.rebuild_epoch).where(
             LensRow.public_id == lens_id, LensRow.deleted_at.is_(None)
         )
+        if owner is not None:
+            query = query.join(OwnerRow, OwnerRow.id == LensRow.owner_id).where(OwnerRow.name == owner)
         with self._db.reading() as session:
             row = session.execute(query).one_or_none()
             return None if row is None else LensState(row[0], row[1])

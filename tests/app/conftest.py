@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -97,10 +98,21 @@ def settings(tmp_path: Path) -> Settings:
     return Settings(data_dir=tmp_path / "data", long_poll_seconds=2.0, min_free_mb=0, max_upload_mb=1)
 
 
-@pytest.fixture
-def store(settings: Settings) -> Iterator[Store]:
-    opened = Store(settings)
+@pytest.fixture(scope="session")
+def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Migrate once: the tests copy the file."""
+    folder = tmp_path_factory.mktemp("empty")
+    opened = Store(Settings(data_dir=folder))
     upgrade(opened.database)
+    opened.close()
+    return folder / "app.db"
+
+
+@pytest.fixture
+def store(settings: Settings, empty_database: Path) -> Iterator[Store]:
+    settings.data_dir.mkdir(parents=True)
+    shutil.copy(empty_database, settings.data_dir / "app.db")
+    opened = Store(settings)
     yield opened
     opened.close()
 

@@ -79,6 +79,9 @@ class JobEngine(Protocol):
     def take_over(self, executor_id: str) -> int:
         """Put the running jobs of a dead worker back into the queue; return how many it still holds."""
 
+    def holders(self) -> set[str]:
+        """Return the workers that jobs are running on, as far as the engine knows."""
+
     def forget(self, before: datetime) -> int:
         """Remove what is known of jobs that ended before a time; return how many."""
 
@@ -179,15 +182,21 @@ class DbosEngine:
         dead worker afterwards is counted, so that the caller can try again.
         """
         DBOS._recover_pending_workflows([executor_id])  # noqa: SLF001 - contract-tested; no public way
-        held = _outside(
+        return sum(holder == executor_id for holder in self._running())
+
+    def holders(self) -> set[str]:
+        """Return who runs something. See `JobEngine`."""
+        return set(self._running())
+
+    def _running(self) -> list[str]:
+        rows = _outside(
             DBOS.list_workflows,
-            executor_id=executor_id,
             status="PENDING",
             app_version=str(JOB_PROTOCOL),
             load_input=False,
             load_output=False,
         )
-        return len(held)
+        return [row.executor_id for row in rows if row.executor_id is not None]
 
     def forget(self, before: datetime) -> int:
         """Delete old rows. See `JobEngine`."""

@@ -1,0 +1,151 @@
+"""Corrections, and the measuring of lens models."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import time
+from collections.abc import Callable
+from pathlib import Path, PurePath
+from typing import Any, Final
+
+from app.jobs.child import Progress
+from app.jobs.sandbox import Limits
+from app.jobs.tasks import SUFFIX
+from app.jobs.workbench import (
+    SPARE_MB,
+    JobFailedError,
+    NotWantedError,
+    Workbench,
+    settings_of,
+    write_samples,
+)
+from app.store.corrections import CorrectionPlan, Result
+
+log = logging.getLogger(__name__)
+
+MEDIA_TYPE: Final = {
+    ".tif": "image/tiff",
+    ".png": "image/png",
+    ".jpg": "image/jpeg",
+    ".dng": "image/x-adobe-dng",
+}
+TELL_S: Final = 0.5
+
+
+class CorrectionWork:
+    """Jobs of corrections and of lens versions."""
+
+    def __init__(self, bench: Workbench) -> None:
+        self._bench = bench
+        self._corrections = bench.store.corrections
+
+    def correction(self, correction_id: str) -> None:
+        """Make the corrected file."""
+
+        def wanted() -> bool:
+            return self._corrections.is_live(correction_id)
+
+        if not self._corrections.start(correction_id):
+            return
+        plan = self._corrections.plan(correction_id)
+        if plan is None:
+            return
+        try:
+            self._correct(plan, wanted)
+        except NotWantedError:
+            log.info("correction %s is not wanted any more", correction_id)
+        except JobFailedError as error:
+            self._corrections.fail(correction_id, error.code, error.detail)
+
+    def _correct(self, plan: CorrectionPlan, wanted: Callable[[], bool]) -> None:
+        key, photo, params = plan.correction.public_id, plan.photo, plan.correction.params
+        self._corrections.progress(key, 0, 0, "developing")
+        developed = self._bench.developed(photo, wanted)
+        self._corrections.progress(key, 0, 0, "correcting")
+        limits = self._bench.limits(photo, self._bench.settings.correct_seconds, 120)
+        arguments = {
+            "developed": str(developed),
+            "settings": settings_of(photo),
+            "lateral": photo.lateral,
+            "method": params["method"],
+            "strength": params["strength"],
+            "output": params["output"],
+            "roi": params.get("roi"),
+            "description": _description(plan),
+        }
+        with self._bench.sandbox.folder() as folder:
+            self._samples(plan.lens.public_id, plan.correction.lens_version, folder)
+            done = self._bench.attempt(
+                "correct",
+                arguments,
+                folder=folder,
+                limits=limits,
+                wanted=wanted,
+                on_progress=self._teller(key),
+            )
+            self._hand_in(plan, folder / Path(done["file"]).name, done["zones"])
+
+    def _samples(self, lens_id: str, version: int, folder: Path) -> None:
+        _, stored = self._bench.store.samples.of_lens(lens_id, up_to_version=version)
+        if not stored:
+            text = f"version {version} of lens {lens_id} has no samples any more; ask for the newest version"
+            raise JobFailedError("no_samples", text)
+        write_samples(folder, stored)
+
+    def _teller(self, correction_id: str) -> Progress:
+        last = 0.0
+
+        def tell(done: int, total: int) -> None:
+            nonlocal last
+            if time.monotonic() - last > TELL_S or done == total:
+                last = time.monotonic()
+                self._corrections.progress(correction_id, done, total)
+
+        return tell
+
+    def _hand_in(self, plan: CorrectionPlan, path: Path, zones: dict[str, Any]) -> None:
+        if path.suffix != SUFFIX[plan.correction.params["output"]["format"]] or not path.is_file():
+            raise JobFailedError("internal_error", "the correction wrote no file; retry, or report the photo")
+        with path.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        key = f"corrections/{plan.correction.public_id}/result{path.suffix}"
+        self._bench.storage.put_file(key, path)
+        stem = PurePath(plan.photo.filename).stem or "photo"
+        result = Result(
+            key=key,
+            etag=digest,
+            media_type=MEDIA_TYPE[path.suffix],
+            size=path.stat().st_size,
+            name=f"{stem}-corrected{path.suffix}",
+        )
+        self._corrections.finish(plan.correction.public_id, result, {"zones": zones})
+
+    def measure(self, lens_id: str, version: int) -> None:
+        """Measure how well one version of a lens predicts photos that it was not shown."""
+        lenses = self._bench.store.lenses
+
+        def wanted() -> bool:
+            lens = lenses.get(lens_id)
+            return lens is not None and lens.version == version
+
+        limits = Limits(memory_mb=2 * SPARE_MB, wall_s=self._bench.settings.patch_seconds)
+        try:
+            with self._bench.sandbox.folder() as folder:
+                self._samples(lens_id, version, folder)
+                metrics = self._bench.attempt("measure", {}, folder=folder, limits=limits, wanted=wanted)
+        except NotWantedError:
+            return
+        except JobFailedError as error:
+            log.warning("lens %s version %d could not be measured: %s", lens_id, version, error.detail)
+            metrics = {"error": None, "coverage": None, "problem": error.code}
+        lenses.record_metrics(lens_id, version, metrics)
+
+
+def _description(plan: CorrectionPlan) -> str:
+    params = plan.correction.params
+    lens = " ".join(word for word in (plan.lens.maker, plan.lens.model) if word) or "unknown lens"
+    return (
+        f"lens blur corrected by lensmodel: {lens}, version {plan.correction.lens_version}, "
+        f"method {params['method']}, strength {params['strength']:g}"
+    )

@@ -1,0 +1,333 @@
+"""The way of a photo: inspected, its lens known, developed, patches chosen, PSFs estimated, counted.
+
+Each step looks at the tables first and does only what is not done yet. So the whole may be
+begun again at any time, by any worker, and still every effect happens once.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from app.jobs import tasks
+from app.jobs.engine import Job, JobEngine
+from app.jobs.sandbox import Limits
+from app.jobs.workbench import SPARE_MB, JobFailedError, NotWantedError, Workbench, settings_of
+from app.store import LensName, NewPatch, NewSample
+from app.tables import PatchRow, PhotoRow
+from lensmodel.errors import InvalidKernelError
+from lensmodel.psf import as_kernel
+
+log = logging.getLogger(__name__)
+
+WAIT_S: Final = 0.2
+LOOK_AFTER_S: Final = 5.0
+OPEN: Final = ("pending", "running")
+
+
+class PhotoWork:
+    """Jobs of photos and of their cells."""
+
+    def __init__(self, bench: Workbench, engine: JobEngine) -> None:
+        self._bench, self._engine = bench, engine
+        self._store = bench.store
+
+    def photo(self, photo_id: str, epoch: int) -> None:
+        """Bring a photo as far as it can get."""
+
+        def wanted() -> bool:
+            return self._store.photos.is_live(photo_id, epoch)
+
+        if not wanted():
+            return
+        try:
+            photo = self._begin(photo_id, epoch)
+            photo = self._inspect(photo, wanted)
+            if not self._identify(photo):
+                return
+            self._move(photo, ("inspecting", "developing"), "developing")
+            developed = self._bench.developed(photo, wanted)
+            self._move(photo, ("developing", "selecting"), "selecting")
+            self._select(photo, developed, wanted)
+            self._move(photo, ("selecting", "estimating"), "estimating")
+            self._estimate(photo, wanted)
+            self._finish(photo)
+        except NotWantedError:
+            log.info("photo %s is not wanted any more", photo_id)
+        except JobFailedError as error:
+            self._store.photos.fail(photo_id, epoch, error.code, error.detail)
+
+    def _get(self, photo_id: str) -> PhotoRow:
+        photo = self._store.photos.get(photo_id)
+        if photo is None:
+            raise NotWantedError
+        return photo
+
+    def _begin(self, photo_id: str, epoch: int) -> PhotoRow:
+        photos = self._store.photos
+        again = ("inspecting", "developing", "selecting", "estimating")
+        started = {"started_at": datetime.now(UTC), "attempt": 1}
+        if not photos.set_state(photo_id, ("received",), "inspecting", epoch=epoch, **started):
+            state = self._get(photo_id).state
+            attempt = {"attempt": PhotoRow.attempt + 1}
+            if state not in again or not photos.set_state(photo_id, (state,), state, epoch=epoch, **attempt):
+                raise NotWantedError
+        return self._get(photo_id)
+
+    def _move(self, photo: PhotoRow, before: tuple[str, ...], to: str) -> None:
+        """Go on to the next state; a photo that is further already stays there."""
+        if not self._store.photos.set_state(photo.public_id, before, to, epoch=photo.epoch):
+            state = self._get(photo.public_id).state
+            if state not in {"developing", "selecting", "estimating"}:
+                raise NotWantedError
+
+    def _inspect(self, photo: PhotoRow, wanted: Callable[[], bool]) -> PhotoRow:
+        if photo.state != "inspecting":
+            return photo
+        limits = Limits(memory_mb=SPARE_MB, wall_s=self._bench.settings.inspect_seconds)
+        with self._bench.original(photo) as path, self._bench.sandbox.folder() as folder:
+            arguments = {"path": str(path), "max_megapixels": self._bench.settings.max_megapixels}
+            info = self._bench.attempt("inspect", arguments, folder=folder, limits=limits, wanted=wanted)
+        self._record(photo, info)
+        return self._get(photo.public_id)
+
+    def _record(self, photo: PhotoRow, info: dict[str, Any]) -> None:
+        seen, lens = info["metadata"], info["metadata"]["lens"]
+        taken = seen["taken_at"]
+        self._store.photos.record_inspection(
+            photo.public_id,
+            width=info["width"],
+            height=info["height"],
+            identity=LensName(lens["maker"], lens["model"], lens["serial"], lens["serial_source"]),
+            aperture=seen["aperture"],
+            focal_mm=seen["focal_mm"],
+            focus_m=seen["focus_m"],
+            pixel_pitch_um=seen["pixel_pitch_um"],
+            orientation=seen["orientation"],
+            camera_maker=seen["camera_maker"],
+            camera_model=seen["camera_model"],
+            iso=seen["iso"],
+            exposure_s=seen["exposure_s"],
+            # Cameras write local time without a zone; as UTC it at least sorts.
+            taken_at=None if taken is None else datetime.fromisoformat(taken).replace(tzinfo=UTC),
+        )
+
+    def _identify(self, photo: PhotoRow) -> bool:
+        """Find the lens; say whether to go on to calibrate it."""
+        if photo.state != "inspecting":
+            return True
+        photos, single = self._store.photos, self._bench.settings.assume_single_copy
+        lens = photos.assign_lens(photo.public_id, single_copy=single)
+        if not photo.calibrate:
+            photos.set_state(
+                photo.public_id, ("inspecting",), "stored", epoch=photo.epoch, finished_at=datetime.now(UTC)
+            )
+            return False
+        missing = _missing(photo, lens_known=lens is not None)
+        if missing:
+            photos.set_state(
+                photo.public_id,
+                ("inspecting",),
+                "needs_lens",
+                epoch=photo.epoch,
+                error_code="metadata_missing",
+                error_detail=missing,
+            )
+        return not missing
+
+    def _select(self, photo: PhotoRow, developed: Path, wanted: Callable[[], bool]) -> None:
+        if self._store.patches.all_of(photo.public_id, photo.epoch):
+            return
+        limits = self._bench.limits(photo, self._bench.settings.develop_seconds, 120)
+        arguments = {"developed": str(developed), "count": self._bench.settings.patches}
+        with self._bench.sandbox.folder() as folder:
+            found = self._bench.attempt("select", arguments, folder=folder, limits=limits, wanted=wanted)
+        if found["lateral"] is not None:
+            self._store.photos.record_lateral(photo.public_id, found["lateral"])
+        self._store.patches.add(photo.public_id, photo.epoch, _plan(found))
+
+    def _estimate(self, photo: PhotoRow, wanted: Callable[[], bool]) -> None:
+        """Hand out the cells and wait until each is done, rejected or given up."""
+        owner = self._store_owner(photo)
+        jobs = {
+            cell: Job("cell", (photo.public_id, photo.epoch, cell), owner)
+            for cell in self._store.patches.cells(photo.public_id, photo.epoch)
+        }
+        for job in jobs.values():
+            self._engine.enqueue(job)
+        looked = time.monotonic()
+        while wanted():
+            still_open = self._store.patches.cells(photo.public_id, photo.epoch)
+            if not still_open:
+                return
+            if time.monotonic() - looked > LOOK_AFTER_S:
+                looked = time.monotonic()
+                for cell in still_open:
+                    self._look_after(photo, cell, jobs.get(cell))
+            time.sleep(WAIT_S)
+        raise NotWantedError
+
+    def _store_owner(self, photo: PhotoRow) -> str:
+        return f"owner-{photo.owner_id}"
+
+    def _look_after(self, photo: PhotoRow, cell: int, job: Job | None) -> None:
+        """Deal with a cell whose job the engine lost, or gave up after it killed its workers."""
+        if job is None:
+            return
+        status = self._engine.status(job)
+        if status == "unknown":
+            self._engine.enqueue(job)
+        elif status in {"done", "lost"}:
+            rows = self._store.patches.of_cell(photo.public_id, photo.epoch, cell)
+            numbers = [row.idx for row in rows]
+            self._store.patches.fail(photo.public_id, photo.epoch, numbers, "crashed_repeatedly")
+
+    def _finish(self, photo: PhotoRow) -> None:
+        rows = self._store.patches.all_of(photo.public_id, photo.epoch)
+        tried = [row for row in rows if row.cell is not None]
+        good = sum(row.state == "done" for row in tried)
+        if good >= self._bench.settings.min_good_patches:
+            version = self._store.photos.finish(photo.public_id, photo.epoch)
+            if version is not None:
+                log.info("photo %s counted, lens version %d", photo.public_id, version)
+            return
+        raise JobFailedError(*_why_not(tried, good))
+
+    def cell(self, photo_id: str, epoch: int, cell: int) -> None:
+        """Estimate the PSF of one field cell of a photo."""
+        rows = self._bench.jobs.begin_cell(photo_id, epoch, cell)
+        if not rows:
+            return
+        numbers = [row.idx for row in rows]
+        try:
+            samples = self._samples(self._get(photo_id), rows)
+        except NotWantedError:
+            return
+        except JobFailedError as error:
+            log.info("cell %d of photo %s: %s: %s", cell, photo_id, error.code, error.detail)
+            rejected = error.code in {"no_samples", "no_usable_patches", "invalid_parameter"}
+            reason = "not-enough-evidence" if rejected else error.code
+            self._store.patches.fail(photo_id, epoch, numbers, reason, rejected=rejected)
+            return
+        self._store.patches.finish(photo_id, epoch, samples)
+        left = set(numbers) - {sample.idx for sample in samples}
+        if left:
+            self._store.patches.fail(photo_id, epoch, sorted(left), "not-enough-evidence", rejected=True)
+
+    def _samples(self, photo: PhotoRow, rows: list[PatchRow]) -> list[NewSample]:
+        def wanted() -> bool:
+            return self._store.photos.is_live(photo.public_id, photo.epoch)
+
+        settings = self._bench.settings
+        arguments = {
+            "developed": str(self._bench.developed(photo, wanted)),
+            "photo": photo.public_id,
+            "patches": [_patch(row) for row in rows],
+            "numbers": [row.idx for row in rows],
+            "settings": settings_of(photo),
+            "estimator": settings.estimator,
+            "size": settings.kernel_size,
+            "seed": rows[0].idx,
+        }
+        limits = self._bench.limits(photo, settings.patch_seconds, 24)
+        with self._bench.sandbox.folder() as folder:
+            listed = self._bench.attempt("estimate", arguments, folder=folder, limits=limits, wanted=wanted)
+            return [self._sample(photo, folder, number, entry) for number, entry in enumerate(listed)]
+
+    def _sample(self, photo: PhotoRow, folder: Path, number: int, entry: dict[str, Any]) -> NewSample:
+        """Check one result of a child as if a stranger had sent it, and keep its statistics."""
+        try:
+            kernels = np.load(folder / tasks.KERNELS, allow_pickle=False, mmap_mode="r")
+            kernel = as_kernel(kernels[number])
+            weight = float(np.clip(entry["weight"], 0.0, 1.0))
+        except (InvalidKernelError, ValueError, OSError, IndexError) as error:
+            raise JobFailedError("internal_error", f"the estimator gave no kernel: {error}") from error
+        key = None
+        if entry["evidence"] is not None:
+            base = photo.blob_key.rpartition("/")[0]
+            key = f"{base}/statistics/e{photo.epoch}/{entry['idx']}-{entry['channel']}.npz"
+            self._bench.storage.put_file(key, folder / Path(entry["evidence"]).name)
+        return NewSample(
+            idx=entry["idx"],
+            channel=entry["channel"],
+            kernel=kernel,
+            weight=weight,
+            estimator=entry["estimator"],
+            predicted_error=entry["predicted_error"],
+            statistics_key=key,
+            diagnostics=entry["diagnostics"],
+        )
+
+
+def _missing(photo: PhotoRow, *, lens_known: bool) -> str:
+    """Say what the owner must tell before the photo can count; empty if nothing."""
+    if not lens_known:
+        model = photo.lens_model or "unknown model"
+        return (
+            f"the photo names no lens serial ({model}): send lens_id, lens_serial with lens_model, or "
+            'new_lens {"label": ...} by PATCH'
+        )
+    if photo.aperture is None:
+        return 'the photo does not say its aperture: send {"aperture": f-number} by PATCH'
+    return ""
+
+
+def _plan(found: dict[str, Any]) -> list[NewPatch]:
+    chosen = [
+        NewPatch(
+            idx=number,
+            row=patch["row"],
+            col=patch["col"],
+            size=patch["size"],
+            r=patch["position"]["r"],
+            phi=patch["position"]["phi"],
+            cell=patch["cell"],
+            score=patch["score"],
+        )
+        for number, patch in enumerate(found["patches"])
+    ]
+    rejected = [
+        NewPatch(
+            idx=len(chosen) + number,
+            row=window["row"],
+            col=window["col"],
+            size=window["size"],
+            r=window["r"],
+            phi=window["phi"],
+            rejected=window["reason"],
+        )
+        for number, window in enumerate(found["rejected"])
+    ]
+    return chosen + rejected
+
+
+def _patch(row: PatchRow) -> dict[str, Any]:
+    place = {"r": row.r, "phi": row.phi}
+    score = row.score or 0.0
+    return {
+        "row": row.row,
+        "col": row.col,
+        "size": row.size,
+        "position": place,
+        "score": score,
+        "cell": row.cell,
+    }
+
+
+def _why_not(tried: list[PatchRow], good: int) -> tuple[str, str]:
+    failures = Counter(row.reason for row in tried if row.state == "failed")
+    if failures and good == 0:
+        reason, count = failures.most_common(1)[0]
+        text = f"{count} of {len(tried)} patches ended with {reason}; retry, or report the file"
+        return reason or "internal_error", text
+    return (
+        "no_usable_patches",
+        f"{good} of {len(tried)} patches gave a PSF: use a photo with more fine detail in focus",
+    )

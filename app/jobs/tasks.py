@@ -1,0 +1,215 @@
+"""What runs inside children: the library's functions, fed with JSON and files.
+
+A task takes JSON and its own empty folder, and returns JSON. Arrays go in and out as npy files
+in the folder. Nothing here knows of databases or of other photos.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from app.jobs.child import Progress, Task
+from lensmodel import codec, photo, pipeline
+from lensmodel.errors import LensModelError
+from lensmodel.patches import Patch
+from lensmodel.photo.lateral import LateralColour
+from lensmodel.psf import PsfSample
+from lensmodel.regression import LensModel
+from lensmodel.types import FieldPosition, LensSettings
+
+log = logging.getLogger(__name__)
+
+SUFFIX: Final[Mapping[str, str]] = {
+    "tiff16": ".tif",
+    "png16": ".png",
+    "png8": ".png",
+    "jpeg": ".jpg",
+    "dng": ".dng",
+}
+KERNELS: Final = "kernels.npy"
+SAMPLES: Final = "samples.json"
+INFINITY: Final = -1.0
+"""Stands for a focus distance of infinity where JSON and SQL have none."""
+
+
+def inspect(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+    """Read the header of `path`: size, kind, camera, lens, settings."""
+    del folder, progress
+    info = photo.inspect(Path(arguments["path"]), photo.Limits(max_megapixels=arguments["max_megapixels"]))
+    found: dict[str, Any] = codec.to_json(info)
+    found["metadata"]["focus_m"] = _finite(info.metadata.focus_m)
+    return found
+
+
+def develop(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+    """Develop `path` to linear planes in the folder."""
+    del progress
+    limits = photo.Limits(max_megapixels=arguments["max_megapixels"])
+    developed = photo.develop(Path(arguments["path"]), limits=limits)
+    pipeline.save_developed(developed, folder)
+    return {"height": developed.frame.height, "width": developed.frame.width, "pipeline": developed.pipeline}
+
+
+def select(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+    """Choose the patches of the photo developed in `developed`, and measure its lateral colour."""
+    del folder
+    developed = pipeline.load_developed(Path(arguments["developed"]))
+    found = pipeline.find_patches(developed, count=arguments["count"], on_step=progress)
+    rejected = []
+    for window in found.rejected:
+        centre = (window.row + (window.size - 1) / 2, window.col + (window.size - 1) / 2)
+        position = developed.frame.position(*centre)
+        place = {"row": window.row, "col": window.col, "size": window.size}
+        rejected.append({**place, "r": position.r, "phi": position.phi, "reason": window.reason})
+    try:
+        lateral = codec.to_json(pipeline.lateral_of(developed))
+    except LensModelError as error:
+        log.info("no lateral colour: %s", error)
+        lateral = None
+    return {"patches": codec.to_json(found.patches), "rejected": rejected, "lateral": lateral}
+
+
+def estimate(arguments: dict[str, Any], folder: Path, progress: Progress) -> list[dict[str, Any]]:
+    """Estimate the PSF of one field cell in each channel, from its patches."""
+    developed = pipeline.load_developed(Path(arguments["developed"]))
+    group = [codec.from_json(Patch, stored) for stored in arguments["patches"]]
+    numbers = {(patch.row, patch.col): idx for patch, idx in zip(group, arguments["numbers"], strict=True)}
+    results = pipeline.estimate_cell(
+        developed,
+        group,
+        settings=_settings(arguments["settings"]),
+        photo_id=arguments["photo"],
+        estimator=arguments["estimator"],
+        size=arguments["size"],
+        seed=arguments["seed"],
+        on_step=progress,
+    )
+    np.save(folder / KERNELS, np.stack([np.asarray(result.sample.kernel) for result in results]))
+    listed = []
+    for number, result in enumerate(results):
+        evidence = None
+        if result.evidence is not None:
+            evidence = f"evidence-{number}.npz"
+            (folder / evidence).write_bytes(result.evidence)
+        diagnostics = {name: _finite(value) for name, value in result.diagnostics.items()}
+        listed.append(
+            {
+                "idx": numbers[result.patch.row, result.patch.col],
+                "channel": result.channel,
+                "weight": result.sample.weight,
+                "estimator": result.sample.estimator,
+                "predicted_error": diagnostics.pop("predicted_error", None),
+                "diagnostics": diagnostics,
+                "evidence": evidence,
+            }
+        )
+    return listed
+
+
+def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+    """Correct the photo in `developed` with the samples in the folder; write the result there."""
+    developed = pipeline.load_developed(Path(arguments["developed"]))
+    stored = arguments["lateral"]
+    lateral = _lateral(developed) if stored is None else codec.from_json(LateralColour, stored)
+    output = arguments["output"]
+    roi = arguments["roi"]
+    corrected = pipeline.correct_photo(
+        developed,
+        _model(folder),
+        _settings(arguments["settings"]),
+        method=arguments["method"],
+        strength=arguments["strength"],
+        lateral=lateral,
+        roi=None if roi is None else (roi["y"], roi["x"], roi["height"], roi["width"]),
+        on_step=progress,
+    )
+    name = f"result{SUFFIX[output['format']]}"
+    photo.write_image(
+        folder / name,
+        corrected.planes,
+        developed.encoding,
+        format=output["format"],
+        color_space=output["color_space"],
+        quality=output["quality"],
+        description=arguments["description"],
+    )
+    return {"file": name, "zones": _numbers(codec.to_json(corrected.zones))}
+
+
+def measure(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+    """Say how well the model of the samples in the folder predicts photos that it was not shown."""
+    del arguments, progress
+    model = _model(folder)
+    error = codec.to_json(model.cross_validate())
+    return {"error": _numbers(error), "coverage": _numbers(codec.to_json(model.coverage()))}
+
+
+TASKS: Final[Mapping[str, Task]] = {
+    "inspect": inspect,
+    "develop": develop,
+    "select": select,
+    "estimate": estimate,
+    "correct": correct,
+    "measure": measure,
+}
+
+
+def _lateral(developed: photo.LinearPhoto) -> LateralColour | None:
+    try:
+        return pipeline.lateral_of(developed)
+    except LensModelError as error:
+        log.info("corrected without lateral colour: %s", error)
+        return None
+
+
+def _model(folder: Path) -> LensModel:
+    kernels = np.load(folder / KERNELS, allow_pickle=False, mmap_mode="r")
+    listed = json.loads((folder / SAMPLES).read_text(encoding="utf-8"))
+    samples = []
+    for kernel, entry in zip(kernels, listed, strict=True):
+        margin = (kernel.shape[0] - entry["size"]) // 2
+        inner = slice(margin, margin + entry["size"])
+        samples.append(
+            PsfSample(
+                kernel=np.asarray(kernel[inner, inner], dtype=np.float64),
+                position=FieldPosition(entry["r"], entry["phi"]),
+                settings=_settings(entry["settings"]),
+                weight=entry["weight"],
+                photo=entry["photo"],
+                pixel_pitch_um=entry["pixel_pitch_um"],
+                estimator=entry["estimator"],
+            )
+        )
+    return LensModel.fit(samples)
+
+
+def _settings(stored: Mapping[str, Any]) -> LensSettings:
+    focus = stored["focus_m"]
+    return LensSettings(
+        aperture=stored["aperture"],
+        focal_mm=stored["focal_mm"],
+        focus_m=math.inf if focus is not None and focus < 0 else focus,
+        channel=stored.get("channel", "g"),
+    )
+
+
+def _finite(value: float | None) -> float | None:
+    if value is None or math.isnan(value):
+        return None
+    return INFINITY if math.isinf(value) else float(value)
+
+
+def _numbers(value: Any) -> Any:  # noqa: ANN401 - JSON of any shape
+    """Replace numbers that JSON cannot write by null."""
+    if isinstance(value, dict):
+        return {key: _numbers(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_numbers(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

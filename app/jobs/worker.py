@@ -1,0 +1,263 @@
+"""A worker process: takes up what the tables ask for, and what dead workers left behind."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Final
+
+from sqlalchemy.exc import OperationalError
+
+from app.ids import new_id
+from app.jobs.correction_work import CorrectionWork
+from app.jobs.engine import DbosEngine, Handler, Job, JobEngine
+from app.jobs.lifeline import on_parents_end
+from app.jobs.photo_work import PhotoWork
+from app.jobs.processes import is_running, started_at
+from app.jobs.sandbox import Budget, Sandbox
+from app.jobs.workbench import Workbench
+from app.settings import Settings
+from app.storage import Storage
+from app.store import Store
+
+log = logging.getLogger(__name__)
+
+EXIT_FENCED: Final = 70
+"""Exit status of a worker that was declared dead, or whose database was replaced under it."""
+
+RECONCILE_S: Final = 10.0
+TIDY_S: Final = 60.0
+KEEP_JOBS: Final = timedelta(days=2)
+KEEP_DEVELOPED_BYTES: Final = 20 << 30
+
+
+class Worker:
+    """One worker: its lease, its sweeps, its engine."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.id = new_id()
+        self._settings = settings
+        self._store = Store(settings)
+        scratch = settings.data_dir.resolve() / "scratch"
+        self._scratch = scratch
+        self._sandbox = Sandbox(scratch / self.id, Budget(settings.worker_slots, settings.worker_memory_mb))
+        self._bench = Workbench(settings, self._store, Storage(settings.storage), self._sandbox)
+        self._engine: JobEngine = DbosEngine(settings.jobs, self.id, slots=settings.worker_slots)
+        self._stop = threading.Event()
+        self._last_beat = time.monotonic()
+        self._files: dict[Path, tuple[int, int]] = {}
+
+    def run(self) -> None:
+        """Work until told to stop."""
+        host = socket.gethostname()
+        self._store.workers.register(self.id, host=host, pid=os.getpid(), pid_started=started_at(os.getpid()))
+        photos, corrections = PhotoWork(self._bench, self._engine), CorrectionWork(self._bench)
+        self._engine.start(
+            {
+                "photo": self._safe(photos.photo, self._photo_broke),
+                "cell": self._safe(photos.cell, self._cell_broke),
+                "correction": self._safe(corrections.correction, self._correction_broke),
+                "measure": self._safe(corrections.measure, lambda *_: None),
+            }
+        )
+        self._files = {path: _identity(path) for path in self._database_files()}
+        self._bury_the_gone(host)
+        duties = (
+            (self._settings.sweep_seconds, self._sweep),
+            (min(self._settings.lease_seconds / 4, 5.0), self._keep_lease),
+            (RECONCILE_S, self._reconcile),
+            (TIDY_S, self._tidy),
+        )
+        due = [0.0, 0.0, time.monotonic() + RECONCILE_S, 0.0]
+        while not self._stop.is_set():
+            for number, (period, duty) in enumerate(duties):
+                if time.monotonic() >= due[number]:
+                    self._do(duty)
+                    due[number] = time.monotonic() + period
+            self._stop.wait(max(min(due) - time.monotonic(), 0.01))
+        self._leave()
+
+    def stop(self) -> None:
+        """Stop soon: what runs is left to the next worker."""
+        self._sandbox.stop()
+        self._stop.set()
+
+    def _leave(self) -> None:
+        self._sandbox.stop()
+        self._do(lambda: self._store.workers.bury(self.id))
+        shutil.rmtree(self._scratch / self.id, ignore_errors=True)
+        logging.shutdown()
+        os._exit(0)  # threads in the middle of a job must not go on to report it finished
+
+    def _do(self, duty: Callable[[], None]) -> None:
+        try:
+            duty()
+        except Exception:
+            log.exception("a duty of the worker failed; it is tried again")
+
+    # --- jobs ---------------------------------------------------------------------------------
+
+    def _safe(self, handler: Handler, broke: Handler) -> Handler:
+        """Wrap a job: what nobody foresaw is tried again, then ends the job with a reason."""
+
+        def run(*arguments: str | int) -> None:
+            for attempt in range(3):
+                try:
+                    handler(*arguments)
+                except Exception:
+                    log.exception("job %s%s, attempt %d", handler.__name__, arguments, attempt + 1)
+                    time.sleep(2.0**attempt)
+                else:
+                    return
+            broke(*arguments)
+
+        return run
+
+    def _photo_broke(self, photo_id: str, epoch: int) -> None:
+        self._store.photos.fail(photo_id, epoch, "internal_error", _OURS)
+
+    def _cell_broke(self, photo_id: str, epoch: int, cell: int) -> None:
+        rows = self._store.patches.of_cell(photo_id, epoch, cell)
+        self._store.patches.fail(photo_id, epoch, [row.idx for row in rows], "internal_error")
+
+    def _correction_broke(self, correction_id: str) -> None:
+        self._store.corrections.fail(correction_id, "internal_error", _OURS)
+
+    # --- duties -------------------------------------------------------------------------------
+
+    def _sweep(self) -> None:
+        """Put into the queue what the tables ask for; what is there already stays as it is."""
+        for photo_id, epoch, owner in self._store.photos.to_do():
+            self._engine.enqueue(Job("photo", (photo_id, epoch), owner))
+        for correction_id, _, owner in self._store.corrections.to_do():
+            self._engine.enqueue(Job("correction", (correction_id,), owner))
+        for lens_id, version in self._store.lenses.unmeasured():
+            self._engine.enqueue(Job("measure", (lens_id, version)))
+
+    def _keep_lease(self) -> None:
+        """Say that this worker lives; stop at once if others think otherwise."""
+        for path, identity in self._files.items():
+            if _identity(path) != identity:
+                self._die(f"{path} was replaced while this worker ran")
+        try:
+            alive = self._store.workers.beat(self.id)
+        except OperationalError:
+            if time.monotonic() - self._last_beat > self._settings.lease_seconds:
+                self._die("the database did not answer for a whole lease")
+            raise
+        if not alive:
+            self._die("this worker was silent for too long and others took over its work")
+        self._last_beat = time.monotonic()
+        for dead in self._store.workers.bury_stale(self._settings.lease_seconds):
+            self._take_over(dead)
+
+    def _take_over(self, dead: str) -> None:
+        if dead != self.id and self._engine.take_over(dead) == 0:
+            self._store.workers.forget(dead)
+            shutil.rmtree(self._scratch / dead, ignore_errors=True)
+            log.info("took over the work of worker %s", dead)
+
+    def _bury_the_gone(self, host: str) -> None:
+        """Take over at once from workers of this machine whose process is gone."""
+        for row in self._store.workers.all():
+            if row.id != self.id and row.host == host and not is_running(row.pid, row.pid_started):
+                self._store.workers.bury(row.id)
+                self._take_over(row.id)
+
+    def _reconcile(self) -> None:
+        """End what the engine lost or gave up: no job stays unfinished for ever."""
+        known = {row.id for row in self._store.workers.all()}
+        for holder in self._engine.holders() - known:
+            self._engine.take_over(holder)
+        photos, corrections = self._store.photos, self._store.corrections
+        for photo_id, epoch, owner in [*photos.to_do(), *photos.running()]:
+            ended = self._lost(Job("photo", (photo_id, epoch), owner))
+            if ended and photos.is_live(photo_id, epoch):
+                photos.fail(photo_id, epoch, *ended)
+        for correction_id, _, owner in [*corrections.to_do(), *corrections.running()]:
+            ended = self._lost(Job("correction", (correction_id,), owner))
+            if ended and corrections.is_live(correction_id):
+                corrections.fail(correction_id, *ended)
+
+    def _lost(self, job: Job) -> tuple[str, str] | None:
+        status = self._engine.status(job)
+        if status == "unknown":
+            self._engine.enqueue(job)
+        if status == "lost":
+            return "crashed_repeatedly", "the worker died each time that it tried; report the file"
+        return ("internal_error", _OURS) if status == "done" else None
+
+    def _tidy(self) -> None:
+        """Delete what nobody needs any more."""
+        for prefix in self._store.workers.garbage():
+            self._bench.storage.delete(prefix)
+            self._store.workers.forget_garbage(prefix)
+        self._engine.forget(datetime.now(UTC) - KEEP_JOBS)
+        self._drop_developed()
+
+    def _drop_developed(self) -> None:
+        """Bound the cache of developed photos; those of deleted photos go first."""
+        base = self._bench.developed_folder("x").parent
+        folders = [path for path in base.iterdir() if path.is_dir()] if base.is_dir() else []
+        existing = self._bench.jobs.existing_photos(path.name for path in folders)
+        used = sorted((_used(path), path) for path in folders)
+        free = shutil.disk_usage(base).free if folders else 0
+        room = min(KEEP_DEVELOPED_BYTES, free // 2) if free else 0
+        total = sum(_size(path) for path in folders)
+        for last, path in used:
+            idle = time.time() - last > self._settings.correct_seconds
+            if path.name not in existing or (total > room and idle):
+                total -= _size(path)
+                shutil.rmtree(path, ignore_errors=True)
+
+    def _database_files(self) -> list[Path]:
+        return [self._store.database.path] if self._store.database.is_sqlite else []
+
+    def _die(self, why: str) -> None:
+        log.error("%s: this worker stops", why)
+        logging.shutdown()
+        os._exit(EXIT_FENCED)
+
+
+_OURS: Final = "an error of ours; the log of the worker has it; retry later, or report the file"
+
+
+def _identity(path: Path) -> tuple[int, int]:
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return (0, 0)
+    return (found.st_dev, found.st_ino)
+
+
+def _size(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.glob("*"))
+
+
+def _used(folder: Path) -> float:
+    planes = folder / "planes.npy"
+    return planes.stat().st_mtime if planes.exists() else 0.0
+
+
+def main() -> None:
+    """Run a worker with the settings of the environment until SIGTERM or the supervisor's end."""
+    settings = Settings()
+    logging.basicConfig(
+        level=settings.log_level.upper(),
+        format="%(asctime)s %(levelname)s worker %(name)s: %(message)s",
+        stream=sys.stderr,
+    )
+    worker = Worker(settings)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: worker.stop())
+    on_parents_end(worker.stop)
+    worker.run()

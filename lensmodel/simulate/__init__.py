@@ -1,6 +1,7 @@
 """Synthetic lenses, cameras and scenes whose truth is known."""
 
-from lensmodel.simulate.camera import SimulatedCamera, SimulatedPhoto, Truth, blurred, photograph
+from lensmodel.simulate.blur import BlurOptions, blurred
+from lensmodel.simulate.camera import SimulatedCamera, SimulatedPhoto, Truth, photograph
 from lensmodel.simulate.charts import Chart, ChartEdge, edge_area, edge_chart, slanted_edge_scene
 from lensmodel.simulate.draw import LENS_KINDS, draw_lens
 from lensmodel.simulate.files import shot_info, write_photo
@@ -22,6 +23,7 @@ __all__ = [
     "DEMO_SCENES",
     "LENS_KINDS",
     "Aberrations",
+    "BlurOptions",
     "Chart",
     "ChartEdge",
     "SimulatedCamera",

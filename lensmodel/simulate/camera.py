@@ -1,31 +1,26 @@
-"""A sensor, and the photo that it takes through a simulated lens.
-
-The blur here is independent of `lensmodel.blur` and `lensmodel.deconv` on purpose: what those are
-tested against must not come from them.
-"""
+"""A sensor, and the photo that it takes through a simulated lens."""
 
 from __future__ import annotations
 
 import hashlib
 import logging
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from lensmodel.errors import InvalidInputError
 from lensmodel.geometry import Frame
 from lensmodel.photo.dng import XYZ_TO_SRGB
-from lensmodel.simulate.lens import DEFAULT_SIZE, SimulatedLens
+from lensmodel.simulate.blur import BlurOptions, blurred, with_margin
+from lensmodel.simulate.lens import SimulatedLens
 from lensmodel.types import CHANNELS, LensSettings, NoiseModel, Planes, StepHook, ignore_step
 
 logger = logging.getLogger(__name__)
 
 PATTERNS: Final = ("RGGB", "BGGR", "GRBG", "GBRG")
-DEFAULT_STEP: Final = 0.1
 
 _BITS: Final = (8, 16)
 
@@ -171,10 +166,8 @@ class Truth:
         Of the scene's float32 bytes.
     exposure : float
         Scene values were multiplied by it.
-    defocus : float
-        Focus error, waves at the open aperture.
-    vignetting, lateral : bool
-        Whether they were simulated.
+    options : BlurOptions
+        Focus error, which effects were simulated, and the grid of kernels.
     mirrored_px : int
         Width of the margin beyond the frame that had to be mirrored because the scene ended; 0 means
         that the borders are honest.
@@ -185,9 +178,7 @@ class Truth:
     settings: LensSettings
     scene_sha256: str
     exposure: float
-    defocus: float
-    vignetting: bool
-    lateral: bool
+    options: BlurOptions
     mirrored_px: int
 
 
@@ -215,132 +206,6 @@ class SimulatedPhoto:
     truth: Truth
 
 
-def blurred(
-    scene: Planes,
-    lens: SimulatedLens,
-    settings: LensSettings,
-    frame: Frame,
-    *,
-    pitch_um: float = 4.5,
-    size: int = DEFAULT_SIZE,
-    step: float = DEFAULT_STEP,
-    defocus: float = 0.0,
-    lateral: bool = True,
-    vignetting: bool = False,
-    on_step: StepHook = ignore_step,
-) -> Planes:
-    """Blur a scene as the lens does: every point becomes the kernel of its place.
-
-    Kernels k_i are exact on a grid of nodes; between them the scene x is divided by smooth windows
-    before the convolution, so that the image of a point is a weighted mean of its four neighbours'
-    kernels and light is neither lost nor made::
-
-        y = sum_i  k_i * (w_i x)          sum_i w_i = 1,  w_i a raised cosine in row and column
-
-    Parameters
-    ----------
-    scene : Planes, shape (3, H + 2 m, W + 2 m)
-        Linear light, the frame in its middle. Where the margin m is narrower than half a kernel,
-        the scene is mirrored.
-    lens, settings
-        The lens and how it is set; the channel of `settings` is ignored.
-    frame : Frame
-        The frame, (H, W).
-    pitch_um : float
-        Pixel pitch in micrometres.
-    size : int
-        Odd side of the kernels in pixels.
-    step : float
-        Distance of the nodes in half diagonals.
-    defocus : float
-        Focus error, waves at the open aperture.
-    lateral, vignetting : bool
-        Whether to simulate them.
-    on_step : StepHook
-        Called after each node.
-
-    Returns
-    -------
-    Planes, shape (3, H, W), float32
-
-    Notes
-    -----
-    With the default step the kernel between nodes differs from the exact one by a relative L2 of
-    0.5 to 3 percent, most in the corners of lenses with long comas. Cost: one kernel and one
-    convolution a node and channel, about 10 CPU seconds whatever the number of pixels.
-
-    Source: the windows before the convolution are those of M. Hirsch et al., "Efficient filter flow
-    for space-variant multiframe blind deconvolution", CVPR 2010, eq. 2.
-    """
-    half = size // 2
-    padded, _ = _with_margin(scene, frame, half)
-    spacing = max(round(step * frame.half_diagonal), 8)
-    rows, cols = _nodes(padded.shape[1], spacing), _nodes(padded.shape[2], spacing)
-    window = 0.5 + 0.5 * np.cos(np.pi * np.arange(-spacing + 1, spacing) / spacing)
-    window = window.astype(np.float32)
-    row_c, col_c = (padded.shape[1] - 1) / 2.0, (padded.shape[2] - 1) / 2.0
-    out = np.zeros_like(padded, shape=(3, padded.shape[1] + 2 * half, padded.shape[2] + 2 * half))
-    total, done = len(rows) * len(cols), 0
-    for row in rows:
-        for col in cols:
-            h = ((col - col_c) / frame.half_diagonal, (row_c - row) / frame.half_diagonal)
-            top, left = max(row - spacing + 1, 0), max(col - spacing + 1, 0)
-            tile = padded[:, top : row + spacing, left : col + spacing]
-            w_row = window[top - row + spacing - 1 :][: tile.shape[1]]
-            w_col = window[left - col + spacing - 1 :][: tile.shape[2]]
-            light = tile * (w_row[:, None] * w_col[None, :])
-            if vignetting:
-                light *= np.float32(lens.transmission(h, settings))
-            for index, channel in enumerate(CHANNELS):
-                offset = (0.0, 0.0)
-                r = math.hypot(*h)
-                if lateral and channel != "g" and r > 0:
-                    outwards = lens.lateral_shift(r, channel, settings.focal_mm) * frame.half_diagonal
-                    offset = (-outwards * h[1] / r, outwards * h[0] / r)
-                kernel = lens.kernel_at_field(
-                    h, settings.with_channel(channel), size, pitch_um=pitch_um, defocus=defocus, offset=offset
-                )
-                image = _convolved(light[index], kernel.astype(np.float32))
-                out[index, top : top + image.shape[0], left : left + image.shape[1]] += image
-            done += 1
-            on_step(done, total)
-    return np.ascontiguousarray(out[:, 2 * half : 2 * half + frame.height, 2 * half : 2 * half + frame.width])
-
-
-def _nodes(length: int, spacing: int) -> list[int]:
-    """Places of the nodes, symmetric about the middle, the outer ones on or beyond the edges."""
-    middle = (length - 1) // 2
-    before, after = -(-middle // spacing), -(-(length - 1 - middle) // spacing)
-    return [middle + k * spacing for k in range(-before, after + 1)]
-
-
-def _convolved(light: NDArray[np.float32], kernel: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Full convolution, larger than `light` by the side of the kernel less one."""
-    shape = (light.shape[0] + kernel.shape[0] - 1, light.shape[1] + kernel.shape[1] - 1)
-    grid = [int(fft.next_fast_len(n, real=True)) for n in shape]
-    product = fft.rfft2(light, s=grid) * fft.rfft2(kernel, s=grid)
-    return fft.irfft2(product, s=grid, overwrite_x=True)[: shape[0], : shape[1]]
-
-
-def _with_margin(scene: Planes, frame: Frame, margin: int) -> tuple[Planes, int]:
-    """Cut or mirror the scene to the frame plus `margin`; also how much had to be mirrored."""
-    if scene.ndim != 3 or scene.shape[0] != len(CHANNELS):
-        raise InvalidInputError(f"a scene has the shape (3, H, W), got {scene.shape}")
-    spare = (scene.shape[1] - frame.height, scene.shape[2] - frame.width)
-    if min(spare) < 0 or spare[0] % 2 or spare[1] % 2:
-        raise InvalidInputError(
-            f"the scene {scene.shape[1:]} must exceed the frame ({frame.height}, {frame.width}) by an even "
-            "number of rows and columns, or equal it; crop or enlarge it first"
-        )
-    if not np.isfinite(scene).all() or float(scene.min()) < 0.0:
-        raise InvalidInputError("scene values must be finite and not negative linear light")
-    cut = [max(s // 2 - margin, 0) for s in spare]
-    inner = scene[:, cut[0] : scene.shape[1] - cut[0], cut[1] : scene.shape[2] - cut[1]]
-    missing = [max(margin - s // 2, 0) for s in spare]
-    padded = np.pad(inner, ((0, 0), (missing[0],) * 2, (missing[1],) * 2), mode="symmetric")
-    return np.asarray(padded, dtype=np.float32), max(missing)
-
-
 def photograph(
     scene: Planes,
     lens: SimulatedLens,
@@ -349,11 +214,7 @@ def photograph(
     rng: np.random.Generator | None,
     *,
     exposure: float = 1.0,
-    size: int = DEFAULT_SIZE,
-    step: float = DEFAULT_STEP,
-    defocus: float = 0.0,
-    lateral: bool = True,
-    vignetting: bool = False,
+    options: BlurOptions | None = None,
     on_step: StepHook = ignore_step,
 ) -> SimulatedPhoto:
     """Take a photo: blur, exposure, colour response, noise, clipping, mosaic.
@@ -363,46 +224,40 @@ def photograph(
     scene : Planes, shape (3, H + 2 m, W + 2 m)
         White-balanced linear light; see `blurred` for the margin.
     lens, settings, camera
-        What it is taken with.
+        What it is taken with. The pixel pitch is the camera's.
     rng : numpy.random.Generator or None
         Source of the noise; None means no noise (quantisation and clipping remain).
     exposure : float
         Multiplies the scene.
-    size, step, defocus, lateral, vignetting, on_step
+    options : BlurOptions, optional
+        See `blurred`; its pitch is replaced by the camera's.
+    on_step : StepHook
         See `blurred`.
 
     Returns
     -------
     SimulatedPhoto
+
+    Raises
+    ------
+    InvalidInputError
+        If the scene does not fit the frame, or an argument is out of its range.
     """
     if not (math.isfinite(exposure) and exposure > 0):
         raise InvalidInputError(f"exposure must be positive, got {exposure}")
+    options = replace(options or BlurOptions(), pitch_um=camera.pitch_um)
     frame = camera.frame
-    clean = blurred(
-        scene,
-        lens,
-        settings,
-        frame,
-        pitch_um=camera.pitch_um,
-        size=size,
-        step=step,
-        defocus=defocus,
-        lateral=lateral,
-        vignetting=vignetting,
-        on_step=on_step,
-    )
-    clean = camera.balanced(np.maximum(clean, 0.0) * np.float32(exposure))
-    sharp, _ = _with_margin(scene, frame, 0)
-    _, mirrored = _with_margin(scene, frame, size // 2)
+    clean = blurred(scene, lens, settings, frame, options, on_step=on_step)
+    clean = camera.balanced(clean * np.float32(exposure))
+    sharp, _ = with_margin(scene, frame, 0)
+    _, mirrored = with_margin(scene, frame, options.size // 2)
     truth = Truth(
         lens=lens,
         camera=camera,
         settings=settings,
         scene_sha256=hashlib.sha256(np.ascontiguousarray(scene, dtype=np.float32).tobytes()).hexdigest(),
         exposure=exposure,
-        defocus=defocus,
-        vignetting=vignetting,
-        lateral=lateral,
+        options=options,
         mirrored_px=mirrored,
     )
     logger.info("simulated photo of %s at f/%s", lens.model, settings.aperture)

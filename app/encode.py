@@ -8,7 +8,6 @@ from typing import Final, Literal
 
 import numpy as np
 import tifffile
-from lensmodel.regression import PsfAnswer
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -16,6 +15,7 @@ from app.models import Fitted
 from app.schemas import KernelOut, PsfOut, QueryOut, Support, Units
 from lensmodel.geometry import Frame
 from lensmodel.psf import PsfField
+from lensmodel.regression import PsfAnswer
 from lensmodel.types import Channel, Kernel
 
 ASPECT: Final = (2, 3)
@@ -59,7 +59,7 @@ def psf(
         return buffer.getvalue(), _named(described, "npy")
     if form == "tiff":
         buffer = io.BytesIO()
-        text = described.model_dump_json(exclude={"psf": {"data"}})
+        text = described.model_dump_json(exclude={"psf"})  # tifffile takes a "shape" in it for its own
         tifffile.imwrite(
             buffer, kernel.astype(np.float32), photometric="minisblack", description=text, metadata=None
         )

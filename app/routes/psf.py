@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from typing import Annotated, Final, Literal
 
 from fastapi import APIRouter, Query, Response, status
@@ -108,7 +109,7 @@ def _answer(lens_id: str, at: PsfQuery, form: Format, call: Call) -> Response:
         )
     question = QueryOut(
         r=position.r,
-        phi=position.phi,
+        phi=at.phi if -math.pi < at.phi <= math.pi else position.phi,
         aperture=at.aperture,
         channel=at.channel,
         size=at.size,

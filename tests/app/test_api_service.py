@@ -1,0 +1,188 @@
+"""The service around the resources: probes, problems, request ids, and its own description."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import pytest
+from sqlalchemy.exc import OperationalError
+from starlette.testclient import TestClient
+
+from app.errors import CODE_OF_STATUS, STATUS_OF_CODE, status_of
+from app.main import create_app
+from app.settings import Settings
+from app.store import Store
+from lensmodel import errors
+
+
+def test_the_process_says_that_it_lives(client: TestClient) -> None:
+    assert client.get("/healthz").json() == {"status": "ok"}
+
+
+def test_ready_needs_schema_storage_and_a_live_worker(client: TestClient, store: Store) -> None:
+    before = client.get("/readyz")
+    assert before.status_code == 503
+    assert before.json()["checks"]["schema"] == before.json()["checks"]["storage"] == "ok"
+    assert "lensmodel worker" in before.json()["checks"]["worker"]
+
+    store.workers.register("w", host="h", pid=1, pid_started=0.0)
+
+    after = client.get("/readyz")
+    assert (after.status_code, after.json()["status"]) == (200, "ready")
+    store.workers.bury("w")
+    assert client.get("/readyz").status_code == 503
+
+
+def test_an_empty_database_is_not_ready_and_answers_with_a_problem(settings: Settings) -> None:
+    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
+        assert "schema" in client.get("/readyz").json()["checks"]
+        assert client.get("/readyz").json()["checks"]["schema"] != "ok"
+        answer = client.get("/v1/photos")
+
+    assert (answer.status_code, answer.json()["code"]) == (503, "busy")
+
+
+def test_formats_limits_and_version_are_told(client: TestClient, settings: Settings) -> None:
+    formats = client.get("/v1/formats").json()
+    assert {"fast", "standard", "paper"} <= set(formats["methods"])
+    assert "default" in formats["estimators"]
+    assert client.get("/v1/limits").json()["max_upload_bytes"] == settings.max_upload_bytes
+    assert client.get("/v1/version").json()["api"] == "v1"
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status", "code"),
+    [
+        ("GET", "/nothing", 404, "not_found"),
+        ("GET", "/v1/nothing", 404, "not_found"),
+        ("PUT", "/v1/photos", 405, "method_not_allowed"),
+        ("POST", "/v1/lenses", 405, "method_not_allowed"),
+        ("GET", "/v1/lenses/x/psf.exe?r=0", 422, "invalid_parameter"),
+    ],
+)
+def test_the_framework_speaks_problem_json_too(
+    client: TestClient, method: str, path: str, status: int, code: str
+) -> None:
+    answer = client.request(method, path)
+
+    assert (answer.status_code, answer.json()["code"]) == (status, code)
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert {"type", "title", "status", "detail", "code", "errors", "request_id"} <= set(answer.json())
+
+
+def test_our_own_fault_is_a_problem_without_its_cause(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    services = client.app.state.services  # type: ignore[attr-defined] # Starlette's own attribute
+
+    def broken(*args: object, **options: object) -> None:
+        raise RuntimeError("the secret cause")
+
+    monkeypatch.setattr(services.store.photos, "page", broken)
+    answer = client.get("/v1/photos", headers={"X-Request-ID": "abc-1"})
+
+    assert (answer.status_code, answer.json()["code"]) == (500, "internal_error")
+    assert "secret" not in answer.text
+    assert answer.json()["request_id"] == "abc-1"
+
+
+def test_a_locked_database_is_busy_and_not_broken(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    services = client.app.state.services  # type: ignore[attr-defined] # Starlette's own attribute
+
+    def locked(*args: object, **options: object) -> None:
+        raise OperationalError("SELECT", {}, Exception("database is locked"))
+
+    monkeypatch.setattr(services.store.photos, "page", locked)
+    answer = client.get("/v1/photos")
+
+    assert (answer.status_code, answer.json()["code"]) == (503, "busy")
+    assert answer.headers["retry-after"] == "5"
+
+
+@pytest.mark.parametrize("bad", ["", "a b", "x" * 65, "naïve", "a;b"])
+def test_a_request_id_is_echoed_if_it_is_a_plain_word(client: TestClient, bad: str) -> None:
+    good = client.get("/healthz", headers={"X-Request-ID": "my.id-7"})
+    assert good.headers["x-request-id"] == "my.id-7"
+
+    other = client.get("/healthz", headers={"X-Request-ID": bad.encode()})
+    assert other.headers["x-request-id"] not in {"", bad}
+
+
+def test_the_log_names_the_request_but_no_query(client: TestClient, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO, logger="app.access"):
+        client.get("/v1/lenses?serial=SECRET-77", headers={"X-Request-ID": "r-1"})
+
+    assert "GET /v1/lenses 200" in caplog.text
+    assert "r-1" in caplog.text
+    assert "SECRET-77" not in "".join(
+        record.getMessage() for record in caplog.records if record.name.startswith("app")
+    )
+
+
+def _all_kinds(kind: type[Exception]) -> list[type[Exception]]:
+    return [kind, *(deeper for child in kind.__subclasses__() for deeper in _all_kinds(child))]
+
+
+def test_every_error_of_the_library_has_a_status_and_its_code_the_same_one() -> None:
+    own = [kind for kind in _all_kinds(errors.LensModelError) if kind.__module__ == "lensmodel.errors"]
+
+    for kind in own:
+        if kind is errors.LensModelError:
+            continue
+        status = status_of(kind("x"))
+        assert 400 <= status < 500, kind
+        if kind is not errors.NoUsablePatchesError:  # as an answer "not yet", as the end of a job "never"
+            assert STATUS_OF_CODE[kind.code] == status, kind  # type: ignore[attr-defined] # all have one
+
+
+def schema_of(client: TestClient) -> dict[str, Any]:
+    return dict(client.get("/openapi.json").json())
+
+
+def test_every_operation_has_its_own_id_and_describes_its_problems(client: TestClient) -> None:
+    operations = [
+        (path, method, operation)
+        for path, methods in schema_of(client)["paths"].items()
+        for method, operation in methods.items()
+    ]
+
+    names = [operation["operationId"] for _, _, operation in operations]
+    assert len(set(names)) == len(names)
+    for path, method, operation in operations:
+        assert operation["summary"], path
+        assert operation.get("description"), path
+        for status, answer in operation["responses"].items():
+            if int(status) >= 400 and path != "/readyz":
+                assert "application/problem+json" in answer["content"], (path, method, status)
+                assert "HTTPValidationError" not in str(answer), (path, method)
+
+
+def test_the_description_names_all_endpoints_of_the_contract(client: TestClient) -> None:
+    paths = schema_of(client)["paths"]
+
+    assert set(paths) >= {
+        "/healthz",
+        "/readyz",
+        "/v1/photos",
+        "/v1/photos/{photo_id}",
+        "/v1/jobs/{job_id}",
+        "/v1/jobs/{job_id}/cancel",
+        "/v1/jobs/{job_id}/events",
+        "/v1/lenses",
+        "/v1/lenses/{lens_id}",
+        "/v1/lenses/{lens_id}/psf",
+        "/v1/lenses/{lens_id}/field.png",
+        "/v1/lenses/{lens_id}/calibrations",
+        "/v1/lenses/{lens_id}/lateral-colour",
+        "/v1/corrections",
+        "/v1/corrections/{correction_id}",
+        "/v1/corrections/{correction_id}/result",
+        "/v1/version",
+        "/v1/formats",
+        "/v1/limits",
+    }
+    assert set(paths["/v1/photos/{photo_id}"]) == {"get", "patch", "delete"}
+    assert CODE_OF_STATUS[404] == "not_found"

@@ -1,0 +1,1 @@
+"""Accuracy benchmarks that a user can run too."""

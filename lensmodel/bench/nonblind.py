@@ -1,0 +1,270 @@
+"""Two non-blind deconvolvers that judge kernels: the same solver and settings for every kernel.
+
+They are kept apart from `lensmodel.deconv` on purpose: a judge must not change when the product
+does.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from lensmodel.errors import InvalidInputError
+from lensmodel.registry import Registry
+from lensmodel.types import Kernel, Plane
+
+BORDER: Final = 28
+"""Pixels along the rim that do not count: light from outside the patch reaches so far."""
+
+_EPLL_PRIOR = Path(__file__).parent / "data" / "epll.npz"
+
+Spectrum = NDArray[np.complex128]
+
+
+class Judge(Protocol):
+    """Non-blind deconvolution of one patch by one kernel."""
+
+    def deconvolve(self, patch: Plane, kernel: Kernel, sigma: float, shift: tuple[float, float]) -> Plane:
+        """Return the sharp patch, same shape; `shift` (row, col) moves the kernel first, sub-pixel."""
+
+
+def shifted_otf(kernel: Kernel, shape: tuple[int, int], shift: tuple[float, float]) -> Spectrum:
+    """Transfer function of a kernel moved by `shift` pixels; exact, by phase.
+
+    As a kernel, a sub-pixel shift by phase would ring below zero. Deconvolution needs its
+    spectrum only, where the shift is just a phase.
+    """
+    size = kernel.shape[0]
+    if size > min(shape):
+        raise InvalidInputError(f"a kernel of side {size} does not fit a patch of {shape}")
+    grid = np.zeros(shape)
+    grid[:size, :size] = kernel / kernel.sum()
+    fr, fc = fft.fftfreq(shape[0])[:, None], fft.rfftfreq(shape[1])[None, :]
+    middle = size // 2
+    phase = fr * (shift[0] - middle) + fc * (shift[1] - middle)
+    return np.asarray(fft.rfft2(grid) * np.exp(-2j * np.pi * phase))
+
+
+def tapered(patch: Plane, margin: int) -> NDArray[np.float64]:
+    """Pad by mirror images that fade into each other around the edge of a torus.
+
+    The Fourier transform takes a patch for periodic; a jump at its edge would ring far inwards.
+    """
+    padded = np.pad(np.asarray(patch, dtype=np.float64), margin, mode="reflect")
+    for axis in (0, 1):
+        length = padded.shape[axis]
+        t = np.arange(length)
+        edge = np.minimum(t, length - 1 - t)
+        weight = 0.5 + 0.5 * np.clip((edge + 0.5) / margin, 0.0, 1.0)
+        shape = [1, 1]
+        shape[axis] = length
+        weight = weight.reshape(shape)
+        padded = weight * padded + (1.0 - weight) * np.flip(padded, axis=axis)
+    return padded
+
+
+@dataclass(frozen=True, slots=True)
+class HyperLaplacian:
+    """Deconvolution under a hyper-Laplacian prior on gradients, by half-quadratic splitting.
+
+    Minimises, over the latent x with auxiliary gradients w::
+
+        lambda/2 |k * x - y|² + sum |w|^(2/3) + beta/2 |grad x - w|²,   lambda = weight / sigma²
+
+    with beta growing from `first` to `last`.
+
+    References
+    ----------
+    .. [1] D. Krishnan and R. Fergus, "Fast image deconvolution using hyper-Laplacian priors",
+       NIPS 2009, eq. (3) to (5).
+    """
+
+    weight: float = 0.06
+    first: float = 1.0
+    last: float = 256.0
+    factor: float = 2.0 * math.sqrt(2.0)
+    exponent: float = 2.0 / 3.0
+    version: int = 1
+
+    def deconvolve(self, patch: Plane, kernel: Kernel, sigma: float, shift: tuple[float, float]) -> Plane:
+        """Return the sharp patch; see `Judge`."""
+        y = tapered(patch, BORDER)
+        otf = shifted_otf(kernel, (y.shape[0], y.shape[1]), shift)
+        fr, fc = fft.fftfreq(y.shape[0])[:, None], fft.rfftfreq(y.shape[1])[None, :]
+        # Forward differences on the torus.
+        dr, dc = np.exp(2j * np.pi * fr) - 1.0, np.exp(2j * np.pi * fc) - 1.0
+        lam = self.weight / (sigma * sigma)
+        data, power = lam * np.conj(otf) * fft.rfft2(y), lam * np.square(np.abs(otf))
+        laplacian = np.square(np.abs(dr)) + np.square(np.abs(dc))
+        x, beta = y, self.first
+        while beta <= self.last * 1.001:
+            spectrum = fft.rfft2(x)
+            target = np.zeros_like(spectrum)
+            for d in (dr, dc):
+                gradient = fft.irfft2(d * spectrum, s=y.shape)
+                target += np.conj(d) * fft.rfft2(_shrink(gradient, beta, self.exponent))
+            x = fft.irfft2((data + beta * target) / (power + beta * laplacian + 1e-12), s=y.shape)
+            beta *= self.factor
+        return _inner(x)
+
+
+_TABLE_REACH: Final = 1.5
+
+
+@lru_cache(maxsize=32)
+def _shrink_table(beta: float, exponent: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Minimiser of |w|^a + beta/2 (w - v)² on a grid of v >= 0, found on a grid and refined by Newton."""
+    v = np.linspace(0.0, _TABLE_REACH, 3001)
+    w = v.copy()
+    for _ in range(30):
+        w = np.maximum(w, 1e-9)
+        slope = exponent * w ** (exponent - 1.0) + beta * (w - v)
+        curvature = exponent * (exponent - 1.0) * w ** (exponent - 2.0) + beta
+        w = np.where(curvature > 0.0, w - slope / np.where(curvature > 0.0, curvature, 1.0), 0.0)
+    w = np.clip(w, 0.0, v)
+    cost = np.where(w > 1e-8, w, 0.0) ** exponent + 0.5 * beta * (w - v) ** 2
+    return v, np.where((w > 1e-8) & (cost < 0.5 * beta * v * v), w, 0.0)
+
+
+def _shrink(v: NDArray[np.float64], beta: float, exponent: float) -> NDArray[np.float64]:
+    grid, value = _shrink_table(beta, exponent)
+    size = np.abs(v)
+    # Beyond the table the power hardly moves the minimum.
+    beyond = size - exponent / beta * np.maximum(size, _TABLE_REACH) ** (exponent - 1.0)
+    return np.copysign(np.where(size > _TABLE_REACH, beyond, np.interp(size, grid, value)), v)
+
+
+def _inner(x: NDArray[np.float64]) -> Plane:
+    return x[BORDER:-BORDER, BORDER:-BORDER].astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatchMixture:
+    """Gaussian mixture over small zero-mean windows of sharp linear light.
+
+    Parameters
+    ----------
+    log_weights : ndarray of float32, shape (m,)
+    vectors : ndarray of float32, shape (m, d, d)
+        Eigenvectors in columns.
+    values : ndarray of float32, shape (m, d)
+        Eigenvalues.
+    """
+
+    log_weights: NDArray[np.float32]
+    vectors: NDArray[np.float32]
+    values: NDArray[np.float32]
+
+    @classmethod
+    def load(cls, path: Path = _EPLL_PRIOR) -> PatchMixture:
+        """Read weights and packed covariances, as `train_epll` wrote them."""
+        with np.load(path, allow_pickle=False) as stored:
+            weights, packed = stored["weights"].astype(np.float64), stored["covariances"].astype(np.float64)
+        side = (math.isqrt(8 * packed.shape[1] + 1) - 1) // 2
+        covariances = np.zeros((len(weights), side, side))
+        at = np.tril_indices(side)
+        covariances[:, at[0], at[1]] = packed
+        covariances[:, at[1], at[0]] = packed
+        values, vectors = np.linalg.eigh(covariances)
+        return cls(
+            np.log(weights / weights.sum()).astype(np.float32),
+            vectors.astype(np.float32),
+            np.maximum(values, 1e-9).astype(np.float32),
+        )
+
+    def denoised(self, windows: NDArray[np.float32], variance: float) -> NDArray[np.float32]:
+        """Most likely clean windows, `(n, d)`: the likeliest component's Wiener filter."""
+        mean = windows.mean(axis=1, keepdims=True)
+        flat = windows - mean
+        best = np.full(len(flat), -np.inf, dtype=np.float32)
+        which = np.zeros(len(flat), dtype=np.intp)
+        for j in range(len(self.log_weights)):
+            noisy = self.values[j] + np.float32(variance)
+            turned = flat @ (self.vectors[j] / np.sqrt(noisy))
+            score = (
+                self.log_weights[j]
+                - 0.5 * np.log(noisy).sum()
+                - np.float32(0.5) * np.einsum("nd,nd->n", turned, turned)
+            )
+            better = score > best
+            best[better], which[better] = score[better], j
+        out = np.empty_like(flat)
+        for j in np.unique(which):
+            own = which == j
+            gain = self.values[j] / (self.values[j] + np.float32(variance))
+            out[own] = (flat[own] @ (self.vectors[j] * gain)) @ self.vectors[j].T
+        return out + mean
+
+
+@lru_cache(maxsize=1)
+def _prior() -> PatchMixture:
+    return PatchMixture.load()
+
+
+@dataclass(frozen=True, slots=True)
+class Epll:
+    """Expected patch log likelihood under a Gaussian mixture, by half-quadratic splitting.
+
+    For growing beta: clean all windows under the mixture for noise of variance 1/beta, average
+    them to z, then solve ``(|K|²/sigma² + beta) X = conj(K) Y/sigma² + beta Z``. One window in
+    `step`² is used, on a grid moved each time.
+
+    References
+    ----------
+    .. [1] D. Zoran and Y. Weiss, "From learning models of natural image patches to whole image
+       restoration", ICCV 2011, eq. (4) to (6).
+    """
+
+    betas: tuple[float, ...] = (50.0, 100.0, 200.0, 400.0, 800.0, 1600.0, 3200.0)
+    step: int = 3
+    side: int = 8
+    version: int = 1
+
+    def deconvolve(self, patch: Plane, kernel: Kernel, sigma: float, shift: tuple[float, float]) -> Plane:
+        """Return the sharp patch; see `Judge`."""
+        y = tapered(patch, BORDER)
+        otf = shifted_otf(kernel, (y.shape[0], y.shape[1]), shift)
+        weight = 1.0 / (sigma * sigma)
+        data, power = weight * np.conj(otf) * fft.rfft2(y), weight * np.square(np.abs(otf))
+        prior = _prior()
+        x = y
+        for turn, beta in enumerate(self.betas):
+            z = self._cleaned(x.astype(np.float32), prior, 1.0 / beta, turn)
+            x = fft.irfft2((data + beta * fft.rfft2(z)) / (power + beta), s=y.shape)
+        return _inner(x)
+
+    def _cleaned(
+        self, x: NDArray[np.float32], prior: PatchMixture, variance: float, turn: int
+    ) -> NDArray[np.float64]:
+        side, step = self.side, self.step
+        starts = []
+        for axis in (0, 1):
+            last = x.shape[axis] - side
+            grid = np.arange((turn * (axis + 1)) % step, last, step)
+            starts.append(np.unique(np.concatenate([[0], grid, [last]])))
+        view = np.lib.stride_tricks.sliding_window_view(x, (side, side))
+        windows = view[np.ix_(*starts)].reshape(-1, side * side)
+        clean = prior.denoised(windows, variance).reshape(len(starts[0]), len(starts[1]), side, side)
+        total, count = np.zeros(x.shape), np.zeros(x.shape)
+        for i in range(side):
+            for j in range(side):
+                at = np.ix_(starts[0] + i, starts[1] + j)
+                total[at] += clean[:, :, i, j]
+                count[at] += 1.0
+        return total / count
+
+
+judges: Registry[Judge] = Registry("non-blind judge", {"hyper-laplacian": HyperLaplacian, "epll": Epll})
+
+
+def squared_error(a: Plane, b: Plane) -> float:
+    """Sum of squared differences, the rim of `BORDER` pixels left out."""
+    inner = (slice(BORDER, -BORDER), slice(BORDER, -BORDER))
+    return float(np.square(a[inner].astype(np.float64) - b[inner]).sum())

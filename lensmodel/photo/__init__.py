@@ -1,6 +1,5 @@
 """Photo files in and out: RAW, DNG, TIFF, PNG, JPEG; EXIF, ICC; which lens it was."""
 
-from lensmodel.photo.containers import HEAD_BYTES, sniff
 from lensmodel.photo.development import develop
 from lensmodel.photo.inspection import inspect
 from lensmodel.photo.metadata import is_placeholder, read_metadata
@@ -17,6 +16,7 @@ from lensmodel.photo.model import (
 )
 from lensmodel.photo.noise import estimate_noise
 from lensmodel.photo.raw import Demosaic
+from lensmodel.photo.sniffing import HEAD_BYTES, sniff
 from lensmodel.photo.writing import write_image
 
 __all__ = [

@@ -40,13 +40,6 @@ def srgb_to_linear(values: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.copysign(linear, values)
 
 
-def linear_to_srgb(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Encode linear light in 0..1 as sRGB, float32."""
-    linear = np.maximum(np.asarray(values, dtype=np.float32), np.float32(0.0))
-    upper = np.float32(1.055) * np.power(linear, np.float32(1 / 2.4)) - np.float32(0.055)
-    return np.where(linear <= np.float32(0.0031308), np.float32(12.92) * linear, upper)
-
-
 @lru_cache(maxsize=8)
 def curves_of(transfer: Transfer, icc: bytes | None = None) -> tuple[Curve, Curve, Curve]:
     """Curves of r, g and b. A profile without curves of its own is read as sRGB."""
@@ -70,14 +63,23 @@ def decode(codes: NDArray[np.generic], curve: Curve) -> NDArray[np.float32]:
     return np.where((values < 0) | (values > 1), values, inside)
 
 
-def encode(linear: NDArray[np.floating], curve: Curve, transfer: Transfer) -> NDArray[np.float32]:
-    """Turn linear light into file values in 0..1; the inverse of `decode`, clipped."""
-    clipped = np.clip(np.asarray(linear, dtype=np.float32), 0.0, 1.0)
-    if transfer == "linear":
-        return clipped
-    if transfer == "srgb":
-        return linear_to_srgb(clipped)
-    return np.interp(clipped, curve, np.linspace(0.0, 1.0, CODES)).astype(np.float32)
+def inverse(curve: Curve) -> NDArray[np.float32]:
+    """Table of file values at the linear light (k / (n - 1))^2, for `encode`.
+
+    The square root spreads the dark levels, where curves are steep; n is so large that the
+    rounding is below a quarter of a 16-bit code: what was decoded is encoded to the same code.
+    """
+    levels = np.linspace(0.0, 1.0, 4 * CODES) ** 2
+    return np.interp(levels, curve, np.linspace(0.0, 1.0, CODES)).astype(np.float32)
+
+
+def encode(linear: NDArray[np.float32], table: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Turn linear light into file values in 0..1 by a table of `inverse`; clipped."""
+    clipped = np.clip(linear, 0.0, 1.0)
+    np.sqrt(clipped, out=clipped)
+    clipped *= np.float32(len(table) - 1)
+    clipped += np.float32(0.5)
+    return table[clipped.astype(np.int32)]
 
 
 # --- ICC profiles ------------------------------------------------------------------------------
@@ -138,7 +140,8 @@ def _curve(tag: bytes) -> Curve | None:
 
 def _parametric(x: NDArray[np.float64], p: list[float]) -> NDArray[np.float64]:
     """Parametric curve of 1, 3, 4, 5 or 7 parameters: y = (a x + b)^g + c, or c x + f below d."""
-    g, a, b = p[0], *(p[1:3] if len(p) > 1 else (1.0, 0.0))
+    g = p[0]
+    a, b = (p[1], p[2]) if len(p) > 1 else (1.0, 0.0)
     upper = np.maximum(a * x + b, 0.0) ** g
     if len(p) == 1:
         return upper

@@ -9,8 +9,9 @@ import numpy as np
 
 from lensmodel.errors import UnreadablePhotoError
 from lensmodel.geometry import Frame
-from lensmodel.photo.colour import curves_of, decode, icc_curves, icc_space
-from lensmodel.photo.containers import Header, opened_header
+from lensmodel.photo.colour import CODES, curves_of, decode, icc_curves, icc_space
+from lensmodel.photo.containers import opened_header
+from lensmodel.photo.header import Header
 from lensmodel.photo.inspection import info_of
 from lensmodel.photo.model import Encoding, Limits, LinearPhoto, PhotoInfo, Transfer
 from lensmodel.photo.noise import estimate_noise
@@ -63,11 +64,12 @@ def _develop_raw(path: Path, info: PhotoInfo, demosaic: Demosaic) -> LinearPhoto
         planes=raw.planes,
         frame=Frame(height, width),
         noise=raw.noise,
-        clip=(1.0, 1.0, 1.0),
+        clip=raw.clip,
         info=replace(info, width=width, height=height),
         encoding=encoding,
         pipeline=raw.pipeline,
         white_balance=raw.white_balance,
+        sensor_noise=raw.sensor_noise,
     )
 
 
@@ -80,7 +82,9 @@ def _develop_raster(path: Path, header: Header, info: PhotoInfo) -> LinearPhoto:
         )
     transfer, icc = _transfer_of(header, pixels)
     planes = _linear(pixels, transfer, icc)
-    noise = [estimate_noise(plane) for plane in planes]
+    curve = curves_of(transfer, icc)[1]
+    code = {1: CODES // 255, 2: 1}.get(pixels.dtype.itemsize, 1)
+    noise = [estimate_noise(plane, step=float(curve[code] - curve[0])) for plane in planes]
     top = float(planes.max()) if pixels.dtype.kind == "f" else 1.0
     return LinearPhoto(
         planes=planes,

@@ -77,6 +77,10 @@ class Entry:
         value = self.number()
         return None if value is None else int(value)
 
+    def integers(self) -> tuple[int, ...]:
+        """Values where they are whole numbers by their type; others give none."""
+        return tuple(int(v) for v in self.numbers()) if _FORMATS[self.kind] in "BHIbhiQq" else ()
+
     def text(self) -> str:
         """Value as text up to the first NUL, stripped; bytes outside UTF-8 read as Latin-1."""
         raw = self.raw().split(b"\0", 1)[0]

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from lensmodel.errors import NotAnImageError, UnsupportedFormatError
-from lensmodel.photo.containers import Header, check_size, opened_header
+from lensmodel.photo.containers import opened_header
+from lensmodel.photo.header import Header, check_size
 from lensmodel.photo.metadata import metadata_of
 from lensmodel.photo.model import Limits, PhotoInfo
 from lensmodel.photo.raw import raw_size

@@ -17,7 +17,8 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Final
 
-from lensmodel.photo.containers import Header, opened_header
+from lensmodel.photo.containers import opened_header
+from lensmodel.photo.header import Header
 from lensmodel.photo.ifd import Directory, Entry
 from lensmodel.photo.makernote import MakerNote, read_maker_note
 from lensmodel.photo.model import LensIdentity, Limits, PhotoMetadata, SerialSource

@@ -15,6 +15,7 @@ SerialSource: TypeAlias = Literal["exif", "makernote", "xmp", "user", "none"]
 Transfer: TypeAlias = Literal["srgb", "linear", "icc"]
 OutputFormat: TypeAlias = Literal["tiff16", "png16", "png8", "jpeg", "dng"]
 ColorSpace: TypeAlias = Literal["same", "srgb", "camera-linear"]
+PlaneNoise: TypeAlias = tuple[NoiseModel, NoiseModel, NoiseModel]
 Matrix3: TypeAlias = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 
 
@@ -166,7 +167,7 @@ class LinearPhoto:
     frame : Frame
         Size of the planes.
     noise : tuple of NoiseModel
-        Noise of each plane.
+        Variance of the pixels of each plane.
     clip : tuple of float
         Level of each plane at which the sensor, or the file, clips.
     info : PhotoInfo
@@ -177,13 +178,17 @@ class LinearPhoto:
         How the planes were made; samples of different pipelines must not be mixed.
     white_balance : tuple of float
         Multipliers of the camera's own white balance, green 1.
+    sensor_noise : tuple of NoiseModel or None
+        Noise of the sensor itself, measured on the mosaic: white, unlike that of demosaiced
+        planes, whose pixels share their neighbours' noise. `None` where there is no mosaic.
     """
 
     planes: Planes
     frame: Frame
-    noise: tuple[NoiseModel, NoiseModel, NoiseModel]
+    noise: PlaneNoise
     clip: tuple[float, float, float]
     info: PhotoInfo
     encoding: Encoding
     pipeline: str
     white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    sensor_noise: PlaneNoise | None = None

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 import warnings
+from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, TypeAlias
 
 import imagecodecs
 import numpy as np
@@ -13,12 +13,17 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
-from lensmodel.errors import ImageTooLargeError, NotAnImageError, TruncatedImageError, UnsupportedFormatError
-from lensmodel.photo.containers import Header
+from lensmodel.errors import (
+    ImageTooLargeError,
+    LensModelError,
+    NotAnImageError,
+    TruncatedImageError,
+    UnsupportedFormatError,
+)
+from lensmodel.photo.header import Header
 
-log = logging.getLogger(__name__)
-
-Pixels = NDArray[np.generic]
+Pixels: TypeAlias = NDArray[Any]
+"""Numbers of a file, `(row, col)` or `(row, col, channel)`."""
 
 _PLAIN_MODES: Final = {"1", "L", "LA", "P", "PA", "RGB", "RGBA"}
 
@@ -72,10 +77,11 @@ def _read_with_pillow(path: Path, header: Header) -> Pixels:
         raise NotAnImageError(f"the {header.kind.upper()}'s pixel data are damaged ({error})") from error
 
 
-def _guarded(decoder: object, name: str) -> Pixels:
+def _guarded(decoder: Callable[[], Pixels], name: str) -> Pixels:
+    """Decoders meet hostile files with exceptions of any kind: all mean the same."""
     try:
-        return np.asarray(decoder())  # type: ignore[operator]
-    except MemoryError:
+        return np.asarray(decoder())
+    except (MemoryError, LensModelError):
         raise
     except Exception as error:
         raise NotAnImageError(f"the {name}'s pixel data are damaged ({error})") from error
@@ -84,7 +90,9 @@ def _guarded(decoder: object, name: str) -> Pixels:
 def _read_tiff(path: Path) -> Pixels:
     def decoded() -> Pixels:
         with tifffile.TiffFile(path) as file:
-            return _tiff_page(file.pages[0])
+            page = file.pages[0]
+            assert isinstance(page, tifffile.TiffPage)  # the first is always read in full
+            return _tiff_page(page)
 
     return _guarded(decoded, "TIFF")
 
@@ -104,7 +112,7 @@ def _tiff_page(page: tifffile.TiffPage) -> Pixels:
         pixels = _widened(pixels, page.bitspersample)
     if kind == 0:
         pixels = np.invert(pixels) if pixels.dtype.kind == "u" else 1 - pixels
-    if kind == 3:
+    if kind == 3 and page.colormap is not None:
         pixels = np.moveaxis(page.colormap, 0, -1)[pixels]
     return pixels
 

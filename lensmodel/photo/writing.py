@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Final, get_args
+from typing import Any, BinaryIO, Final, TypeAlias, get_args
 
 import imagecodecs
 import numpy as np
@@ -30,10 +30,13 @@ from lensmodel.photo.colour import (
     encode,
     icc_space,
     icc_to_xyz,
+    inverse,
     linear_profile,
+    matrix3,
 )
+from lensmodel.photo.dng import ShotInfo, write_linear_dng
 from lensmodel.photo.ifd import TiffReader
-from lensmodel.photo.model import ColorSpace, Encoding, OutputFormat, Transfer
+from lensmodel.photo.model import ColorSpace, Encoding, OutputFormat
 from lensmodel.types import Planes
 
 _ROWS: Final = 256
@@ -43,7 +46,8 @@ _PNG_LEVEL: Final = 4
 
 _PLACE_OF_POINTER: Final = exif_block.EXIF_POINTER - 1
 
-Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+Pixels: TypeAlias = NDArray[Any]
+"""Numbers of a file, `(row, col, channel)`, uint8 or uint16."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +56,6 @@ class _Target:
 
     gain: tuple[float, float, float]
     matrix: Matrix | None
-    transfer: Transfer
     curves: tuple[Curve, Curve, Curve]
     icc: bytes
 
@@ -86,7 +89,7 @@ def write_image(
     color_space : {"same", "srgb", "camera-linear"}
         "same": profile and curve of the input, and for RAW sRGB with the camera's white
         balance. "srgb": converted to sRGB. "camera-linear": the planes' own numbers and
-        primaries, with a profile that describes them.
+        primaries, with a profile that describes them. DNG is camera-linear by its nature.
     quality : int
         JPEG quality, 1 to 100; colour is never subsampled.
     description : str
@@ -106,10 +109,14 @@ def write_image(
         )
     if not 1 <= quality <= 100:
         raise InvalidInputError(f"JPEG quality must lie in 1..100, got {quality}")
+    if format == "dng":
+        _write_dng(Path(path), planes, encoding, description)
+        return
     target = _target(encoding, color_space)
     with _atomic(Path(path)) as file:
         if format == "jpeg":
-            _write_jpeg(file, _encoded(planes, target, 255), target.icc, encoding, description, quality)
+            pixels = _encoded(planes, target, 255)
+            _write_jpeg(file, pixels, target.icc, encoding, description, quality=quality)
         elif format == "tiff16":
             _write_tiff(file, _encoded(planes, target, 65535), target.icc, encoding, description)
         else:
@@ -145,13 +152,13 @@ def _target(encoding: Encoding, color_space: ColorSpace) -> _Target:
     rgb_icc = encoding.icc if encoding.icc is not None and icc_space(encoding.icc) == "RGB" else None
     if color_space == "camera-linear":
         profile = linear_profile(_to_xyz_d50(encoding, rgb_icc), "lensmodel linear")
-        return _Target((1.0, 1.0, 1.0), None, "linear", curves_of("linear"), profile)
+        return _Target((1.0, 1.0, 1.0), None, curves_of("linear"), profile)
     if encoding.to_srgb is None and rgb_icc is not None and color_space == "same":
         curves = curves_of(encoding.transfer, rgb_icc)
-        return _Target((1.0, 1.0, 1.0), None, encoding.transfer, curves, rgb_icc)
+        return _Target((1.0, 1.0, 1.0), None, curves, rgb_icc)
     # White must stay white: where all channels clip, no multiplier may be below 1.
     r, g, b = (float(w) / min(encoding.white_balance) for w in encoding.white_balance)
-    return _Target((r, g, b), _to_srgb(encoding, rgb_icc), "srgb", curves_of("srgb"), srgb_profile())
+    return _Target((r, g, b), _to_srgb(encoding, rgb_icc), curves_of("srgb"), srgb_profile())
 
 
 def _to_srgb(encoding: Encoding, rgb_icc: bytes | None) -> Matrix | None:
@@ -173,14 +180,14 @@ def _encoded(planes: Planes, target: _Target, top: int) -> Pixels:
     """File numbers `(row, col, channel)` of planes."""
     _, height, width = planes.shape
     out: Pixels = np.empty((height, width, 3), dtype=np.uint8 if top == 255 else np.uint16)
+    tables = [inverse(curve) for curve in target.curves]
     gain = np.asarray(target.gain, dtype=np.float32)[:, None, None]
     for row in range(0, height, _ROWS):
         part = np.clip(planes[:, row : row + _ROWS] * gain, 0.0, 1.0)
         if target.matrix is not None:
             part = np.tensordot(target.matrix.astype(np.float32), part, axes=1)
-        for k, curve in enumerate(target.curves):
-            values = encode(part[k], curve, target.transfer)
-            out[row : row + _ROWS, :, k] = np.rint(values * np.float32(top))
+        for k, table in enumerate(tables):
+            out[row : row + _ROWS, :, k] = np.rint(encode(part[k], table) * np.float32(top))
     return out
 
 
@@ -189,7 +196,9 @@ def _encoded(planes: Planes, target: _Target, top: int) -> Pixels:
 
 def _write_tiff(file: BinaryIO, pixels: Pixels, icc: bytes, encoding: Encoding, description: str) -> None:
     fields = exif_block.main_fields(encoding.metadata, encoding.orientation, description)
-    extra = [(f.tag, f.kind, f.count, f.data, True) for f in fields if f.tag != exif_block.SOFTWARE_TAG]
+    extra: list[tuple[int, int, int, bytes | int, bool]] = [
+        (f.tag, f.kind, f.count, f.data, True) for f in fields if f.tag != exif_block.SOFTWARE_TAG
+    ]
     extra.append((_PLACE_OF_POINTER, 4, 1, 0, True))
     tifffile.imwrite(
         file,
@@ -217,7 +226,7 @@ def _write_tiff(file: BinaryIO, pixels: Pixels, icc: bytes, encoding: Encoding, 
 
 
 def _write_jpeg(
-    file: BinaryIO, pixels: Pixels, icc: bytes, encoding: Encoding, description: str, quality: int
+    file: BinaryIO, pixels: Pixels, icc: bytes, encoding: Encoding, description: str, *, quality: int
 ) -> None:
     block = exif_block.exif_block(encoding.metadata, encoding.orientation, description)
     Image.fromarray(pixels).save(
@@ -237,6 +246,37 @@ def _write_png(file: BinaryIO, pixels: Pixels, icc: bytes, encoding: Encoding, d
     file.write(data[header_end:])
 
 
+def _write_dng(path: Path, planes: Planes, encoding: Encoding, description: str) -> None:
+    metadata = encoding.metadata
+    rgb_icc = encoding.icc if encoding.icc is not None and icc_space(encoding.icc) == "RGB" else None
+    to_camera = encoding.xyz_to_camera
+    if to_camera is None:
+        # To XYZ under D50, and back from D65, which is what the DNG tag means.
+        to_xyz = np.linalg.inv(D65_TO_D50) @ _to_xyz_d50(encoding, rgb_icc)
+        to_camera = matrix3(np.linalg.inv(to_xyz).astype(np.float64))
+    shot = ShotInfo(
+        camera_maker=metadata.camera_maker or "",
+        camera_model=metadata.camera_model or "",
+        lens_maker=metadata.lens.maker or "",
+        lens_model=metadata.lens.model or "",
+        aperture=metadata.aperture,
+        focal_mm=metadata.focal_mm,
+        focus_m=metadata.focus_m,
+        iso=None if metadata.iso is None else round(metadata.iso),
+        exposure_s=metadata.exposure_s,
+        taken_at=metadata.taken_at,
+        pixel_pitch_um=metadata.pixel_pitch_um,
+        orientation=encoding.orientation,
+        description=description,
+    )
+    r, g, b = encoding.white_balance
+    numbers = np.empty(planes.shape, dtype=np.uint16)
+    for row in range(0, planes.shape[1], _ROWS):
+        part = np.clip(planes[:, row : row + _ROWS], 0.0, 1.0)
+        numbers[:, row : row + _ROWS] = np.rint(part * np.float32(65535))
+    write_linear_dng(path, numbers, color_matrix=to_camera, as_shot_neutral=(1 / r, 1 / g, 1 / b), shot=shot)
+
+
 def _chunk(name: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
 
@@ -249,6 +289,6 @@ _UPRIGHT: Final[Mapping[int, Callable[[Pixels], Pixels]]] = {
     5: lambda a: a.swapaxes(0, 1),
     6: lambda a: np.rot90(a, -1),
     7: lambda a: a[::-1, ::-1].swapaxes(0, 1),
-    8: lambda a: np.rot90(a),
+    8: np.rot90,
 }
 """EXIF orientation -> how to turn the stored pixels upright."""

@@ -1,0 +1,152 @@
+"""The numbers of the sensor before demosaicing: where it clips, its noise, and whether they are a picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import rawpy
+from numpy.typing import NDArray
+
+from lensmodel.errors import RawDecodeError, TruncatedImageError
+from lensmodel.types import Plane
+
+_BAND: Final = 16
+"""Rows that are judged together by `Mosaic.check`."""
+
+_CLUSTER: Final = 0.005
+"""Width of the pile of saturated pixels, relative to the range: full wells differ a little."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mosaic:
+    """A colour filter array without its margins.
+
+    Parameters
+    ----------
+    values : ndarray of uint16, shape (height, width)
+        Raw numbers.
+    colours : ndarray of uint8, same shape
+        0 red, 1 green, 2 blue, 3 second green.
+    black : tuple of float
+        Black level of each of the four.
+    white : int
+        Level that the file states for saturation.
+    is_bayer : bool
+        The pattern repeats every 2 x 2 pixels; false for X-Trans.
+    """
+
+    values: NDArray[np.uint16]
+    colours: NDArray[np.uint8]
+    black: tuple[float, ...]
+    white: int
+    is_bayer: bool
+
+    @classmethod
+    def of(cls, raw: rawpy.RawPy) -> Mosaic | None:
+        """Take the mosaic of an opened file; `None` where each pixel has all colours already."""
+        if raw.raw_type != rawpy.RawType.Flat or raw.raw_pattern is None:
+            return None
+        black = tuple(float(level) for level in raw.black_level_per_channel)
+        return cls(
+            raw.raw_image_visible,
+            raw.raw_colors_visible,
+            black,
+            int(raw.white_level),
+            raw.raw_pattern.shape == (2, 2),
+        )
+
+    def check(self) -> None:
+        """Refuse numbers that no sensor gives, although the decoder was content.
+
+        Raises
+        ------
+        RawDecodeError
+            If all are equal, or a quarter of the rows are as random as a wrong decoding makes them.
+        TruncatedImageError
+            If rows are empty: the data were cut off and the decoder filled up.
+        """
+        low, high = self.values.min(axis=1), self.values.max(axis=1)
+        if low.min() == high.max():
+            raise RawDecodeError(f"every pixel of the RAW data is {int(low[0])}; the file holds no picture")
+        # A row in which all is saturated is a bright sky, and no damage.
+        dead = float(np.mean((low == high) & (low < 0.9 * self.white)))
+        if dead > 0.02:
+            raise TruncatedImageError(
+                f"{dead:.0%} of the rows of the RAW data are empty; the file was cut off"
+            )
+        random = self._random_share()
+        if random > 0.25:
+            raise RawDecodeError(
+                f"{random:.0%} of the RAW data are random numbers; the file is damaged or wrongly decoded"
+            )
+
+    def _random_share(self) -> float:
+        """Share of the bands of rows that have high contrast, but no likeness of neighbouring pixels.
+
+        Independent values differ by 2 / sqrt(pi) = 1.13 standard deviations on average; in
+        photographs of that contrast it is below 0.5.
+        """
+        starts = range(0, len(self.values), _BAND)
+        scale = max(self.white - min(self.black), 1.0)
+        random = 0
+        for row in starts:
+            band = self.values[row : row + _BAND].astype(np.float32)
+            deviation = float(band.std())
+            step = float(np.abs(band[:, 2:] - band[:, :-2]).mean())
+            random += deviation > 0.15 * scale and step > 0.9 * deviation
+        return random / len(starts)
+
+    def saturation(self) -> tuple[int, tuple[float, float, float]]:
+        """Level at which the sensor clips, and that of each colour relative to it.
+
+        The level that a file states is often too high, and the colours of some sensors clip at
+        different ones. Where a photo has clipped pixels they pile up, and the pile is the truth.
+
+        Returns
+        -------
+        white : int
+            Raw number that becomes 1.0; the stated one where nothing is clipped.
+        clip : tuple of float
+            For r, g, b the level of saturation on that scale, at most 1.
+        """
+        piles = {k: self._pile(k) for k in range(4) if self.is_bayer or k < 3}
+        top = int(self.values.max())
+        ends = [high for pile in piles.values() if pile is not None for high in pile[1:]]
+        white = top if ends and max(ends) == top < self.white else self.white
+        clip = [1.0, 1.0, 1.0]
+        for k, pile in piles.items():
+            if pile is not None:
+                channel = 1 if k == 3 else k
+                level = (pile[0] - self.black[k]) / max(white - self.black[k], 1.0)
+                clip[channel] = min(clip[channel], level)
+        return white, (clip[0], clip[1], clip[2])
+
+    def _pile(self, colour: int) -> tuple[int, int] | None:
+        """Lower and upper end of the pile of saturated pixels of one colour; `None` without one."""
+        counts = np.bincount(self.values[self.colours == colour])
+        if not counts.sum():
+            return None
+        top = len(counts) - 1
+        width = max(2, round(_CLUSTER * (self.white - self.black[colour])))
+        if top < self.black[colour] + 0.5 * (self.white - self.black[colour]) or top < 3 * width:
+            return None
+        pile, below = counts[top - width + 1 :], counts[top - 3 * width + 1 : top - width + 1]
+        if pile.sum() < max(50, 2e-5 * counts.sum()) or pile.sum() < 5 * below.sum():
+            return None
+        low = int(np.searchsorted(np.cumsum(pile), 0.02 * pile.sum()))
+        return top - width + 1 + low, top
+
+    def sites(self, white: int) -> list[Plane]:
+        """Red, green and blue at half the size, without interpolation; black 0, `white` 1."""
+        planes: dict[int, Plane] = {}
+        for row in (0, 1):
+            for col in (0, 1):
+                colour = int(self.colours[row, col])
+                values = self.values[row::2, col::2].astype(np.float32)
+                black = np.float32(self.black[colour])
+                planes.setdefault(
+                    1 if colour == 3 else colour, (values - black) / (np.float32(white) - black)
+                )
+        return [planes[k] for k in sorted(planes)]

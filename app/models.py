@@ -13,12 +13,11 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from lensmodel.regression import LensModel
-
 from app.errors import ConflictError, UnknownLensError
 from app.store import Store, StoredSample
 from app.store.samples import LensState
 from lensmodel.errors import NoSamplesError
+from lensmodel.regression import LensModel
 
 log = logging.getLogger(__name__)
 
@@ -54,8 +53,10 @@ class ModelCache:
         self._guard = threading.Lock()
         self._building: dict[str, threading.Lock] = {}
 
-    def get(self, lens_id: str, version: int | None = None) -> Fitted:
+    def get(self, lens_id: str, version: int | None = None, *, state: LensState | None = None) -> Fitted:
         """Return the model of a lens, current or of an earlier version.
+
+        `state` is what the caller has just read of the lens, if he did.
 
         Raises
         ------
@@ -66,7 +67,7 @@ class ModelCache:
         ConflictError
             If samples of that version were removed since.
         """
-        state = self._store.samples.state_of(lens_id)
+        state = self._store.samples.state_of(lens_id) if state is None else state
         if state is None:
             raise UnknownLensError(f"there is no lens {lens_id}: GET /v1/lenses lists those there are")
         if version is not None and version != state.version:

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from importlib.metadata import version
 
 from fastapi import APIRouter, status
-from lensmodel.blind import estimators
 
 from app.dependencies import Call, CallDep
 from app.routes.common import problems
@@ -23,6 +22,7 @@ from app.schemas import (
     VersionOut,
 )
 from app.store import migrate
+from lensmodel.blind import estimators
 from lensmodel.deconv import deconvolvers
 
 probes = APIRouter(tags=["service"])

@@ -11,7 +11,6 @@ from fastapi import APIRouter, Query, Response, status
 from app import encode
 from app.dependencies import Call, CallDep
 from app.errors import InvalidParameterError, NotAcceptableError, UnknownLensError
-from app.models import Fitted
 from app.routes.common import problems
 from app.schemas import FieldQuery, PsfOut, PsfQuery, QueryOut
 from app.store.samples import LensState
@@ -87,9 +86,10 @@ def accepted(header: str) -> Format:
 
 
 def _answer(lens_id: str, at: PsfQuery, form: Format, call: Call) -> Response:
-    state = _state(call, lens_id, at.version)
-    tag = etag(lens_id, state, f"{at.model_dump_json()}{form}")
+    state = _state(call, lens_id)
     pinned = at.version is not None
+    asked = LensState(at.version, state.rebuild_epoch) if at.version is not None else state
+    tag = etag(lens_id, asked, f"{at.model_dump_json()}{form}")
     headers = {
         "ETag": tag,
         "Cache-Control": "private, max-age=3600" if pinned else "private, no-cache",
@@ -97,7 +97,7 @@ def _answer(lens_id: str, at: PsfQuery, form: Format, call: Call) -> Response:
     }
     if _matches(call, tag):
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
-    fitted = call.models.get(lens_id, at.version)
+    fitted = call.models.get(lens_id, at.version, state=state)
     headers["ETag"] = etag(lens_id, fitted.state, f"{at.model_dump_json()}{form}")
     position = FieldPosition(at.r, at.phi)
     setting = LensSettings(at.aperture, at.focal_length_mm, at.focus_distance_m, at.channel)
@@ -121,11 +121,11 @@ def _answer(lens_id: str, at: PsfQuery, form: Format, call: Call) -> Response:
     return Response(body, media_type=MEDIA_TYPES[form], headers=headers | more)
 
 
-def _state(call: Call, lens_id: str, version: int | None) -> LensState:
+def _state(call: Call, lens_id: str) -> LensState:
     state = call.store.samples.state_of(lens_id, call.owner)
     if state is None:
         raise UnknownLensError(f"there is no lens {lens_id[:60]}: GET /v1/lenses lists those there are")
-    return state if version is None else LensState(version, state.rebuild_epoch)
+    return state
 
 
 def etag(lens_id: str, state: LensState, question: str) -> str:
@@ -157,12 +157,12 @@ def read_field(lens_id: str, at: Annotated[FieldQuery, Query()], call: CallDep) 
     columns, rows = (int(count) for count in at.grid.split("x"))
     if not (1 <= columns <= MAX_GRID and 1 <= rows <= MAX_GRID):
         raise InvalidParameterError(f"grid {at.grid}: columns and rows must lie in 1..{MAX_GRID}, as in 9x6")
-    state = _state(call, lens_id, None)
+    state = _state(call, lens_id)
     tag = etag(lens_id, state, at.model_dump_json())
     headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
     if _matches(call, tag):
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
-    fitted: Fitted = call.models.get(lens_id)
+    fitted = call.models.get(lens_id, state=state)
     headers["ETag"] = etag(lens_id, fitted.state, at.model_dump_json())
     setting = LensSettings(at.aperture, at.focal_length_mm, at.focus_distance_m, at.channel)
     picture = encode.field_map(

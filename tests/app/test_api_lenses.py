@@ -29,8 +29,8 @@ def lens(steps: Steps) -> str:
     return f"/v1/lenses/{steps.lens_id(steps.counted(patches=6))}"
 
 
-def ask(client: TestClient, lens: str, **query: object) -> dict[str, Any]:
-    answer = client.get(f"{lens}/psf", params={"r": 0.9, "phi": 0.59, "aperture": 1.4} | query)
+def ask(client: TestClient, lens: str, **query: float | str) -> dict[str, Any]:
+    answer = client.get(f"{lens}/psf", params={"r": 0.9, "phi": 0.59, "aperture": 1.4, **query})
     assert answer.status_code == 200, answer.text
     return dict(answer.json())
 
@@ -93,7 +93,7 @@ def test_all_formats_hold_the_same_kernel(client: TestClient, lens: str) -> None
     np.testing.assert_allclose(npy, data, atol=1e-7)
     with tifffile.TiffFile(io.BytesIO(tiff.content)) as file:
         np.testing.assert_array_equal(file.asarray(), npy)
-        assert '"version":1' in file.pages[0].tags["ImageDescription"].value
+        assert '"version":1' in file.pages.first.tags["ImageDescription"].value
     picture = np.asarray(Image.open(io.BytesIO(png.content)), dtype=np.float64)
     peak = float(png.headers["x-psf-scale"].partition(";")[0].removeprefix("max="))
     np.testing.assert_allclose(picture / 65535 * peak, data, atol=peak / 65535)

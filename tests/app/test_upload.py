@@ -272,7 +272,7 @@ def test_an_upload_cut_off_by_the_client_leaves_no_blob(client: TestClient, sett
     async def send(message: Any) -> None:
         sent.append(message)
 
-    scope = {
+    scope: dict[str, Any] = {
         "type": "http",
         "method": "POST",
         "path": "/v1/photos",

@@ -1,0 +1,317 @@
+"""Lateral colour: how far red and blue images lie from the green one, from the photo itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from lensmodel.errors import InvalidInputError
+from lensmodel.geometry import Frame
+from lensmodel.types import Channel, Plane, Planes
+
+Polynomial = tuple[float, float, float, float]
+IDENTITY: Polynomial = (0.0, 0.0, 0.0, 1.0)
+
+_CELLS = 10  # cells per side that each give a few points: corners must not be outvoted by the middle
+_POINTS = 5
+_WINDOW = 48
+_SEARCH = 8  # largest shift looked for, pixels
+_MIN_CORRELATION = 0.8
+_MIN_POINTS = 30
+_BAND = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class LateralColour:
+    """Radial displacement of red and blue against green, in the polynomial of tca_correct.
+
+    A point whose green image lies at radius r has its red (blue) image at::
+
+        r_src = r (v + c r + b r² + a r³)
+
+    Parameters
+    ----------
+    red, blue : tuple of float
+        (a, b, c, v), with r in half diagonals; (0, 0, 0, 1) is no displacement.
+    half_diagonal : float
+        Half diagonal of the frame in pixels.
+    red_points, blue_points : int
+        How many points of the photo the estimate rests on. With fewer than 30 nothing is claimed:
+        the polynomial is the identity.
+    """
+
+    red: Polynomial
+    blue: Polynomial
+    half_diagonal: float
+    red_points: int = 0
+    blue_points: int = 0
+
+    def __post_init__(self) -> None:
+        terms = (*self.red, *self.blue, self.half_diagonal)
+        if not all(math.isfinite(term) for term in terms) or self.half_diagonal <= 0.0:
+            raise InvalidInputError(f"lateral colour needs finite terms and a positive size, got {self}")
+        if max(abs(self.red[3] - 1.0), abs(self.blue[3] - 1.0)) > 0.1:
+            raise InvalidInputError(f"v must be near 1, got {self.red[3]} (red) and {self.blue[3]} (blue)")
+
+    def displacement(self, r: float, channel: Channel) -> float:
+        """Pixels outwards by which a channel's image lies beyond the green one at radius `r`."""
+        if channel == "g":
+            return 0.0
+        a, b, c, v = self.red if channel == "r" else self.blue
+        return float(r * ((v - 1.0) + c * r + b * r**2 + a * r**3) * self.half_diagonal)
+
+    def to_json(self) -> dict[str, object]:
+        """Return plain values for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, object]) -> LateralColour:
+        """Read what `to_json` wrote.
+
+        Raises
+        ------
+        InvalidInputError
+            If a value is missing or not a number.
+        """
+        try:
+            return cls(
+                _polynomial(values["red"]),
+                _polynomial(values["blue"]),
+                float(str(values["half_diagonal"])),
+                int(str(values.get("red_points", 0))),
+                int(str(values.get("blue_points", 0))),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise InvalidInputError(
+                f"not a lateral colour: {values!r}; expected what to_json writes"
+            ) from error
+
+    def to_hugin(self, frame: Frame) -> tuple[Polynomial, Polynomial]:
+        """Return red and blue (a, b, c, v) as tca_correct prints and fulla reads them.
+
+        There the radius is 1 at half the shorter side.
+        """
+        scale = min(frame.height, frame.width) / 2.0 / frame.half_diagonal
+        return _rescaled(self.red, scale), _rescaled(self.blue, scale)
+
+    @classmethod
+    def from_hugin(cls, red: Polynomial, blue: Polynomial, frame: Frame) -> LateralColour:
+        """Take over what tca_correct printed for photos of this frame."""
+        scale = frame.half_diagonal / (min(frame.height, frame.width) / 2.0)
+        return cls(_rescaled(red, scale), _rescaled(blue, scale), frame.half_diagonal)
+
+
+def estimate_lateral(planes: Planes, frame: Frame, *, clip: float = 1.0) -> LateralColour:
+    """Estimate lateral colour from corners and edges of the photo.
+
+    In each of 10 x 10 cells up to five points with structure in both directions are taken from
+    green. Around each, the shift of red and blue is where the normalised cross-correlation of
+    band-passed windows peaks, found to sub-pixels by Newton steps on the cross spectrum. The radial
+    part of the shifts is fitted by Huber-weighted least squares; the number of terms, none
+    included, is chosen by the Bayesian information criterion.
+
+    Parameters
+    ----------
+    planes : Planes, shape (3, height, width)
+        Linear light, not yet corrected for lateral colour.
+    frame : Frame
+        Size of the photo.
+    clip : float
+        Windows that reach this level are left out.
+
+    Returns
+    -------
+    LateralColour
+
+    Raises
+    ------
+    InvalidInputError
+        If the planes do not have the size of the frame.
+    """
+    if planes.shape != (3, frame.height, frame.width):
+        raise InvalidInputError(f"planes must be (3, {frame.height}, {frame.width}), got {planes.shape}")
+    radii: dict[int, list[float]] = {0: [], 2: []}
+    shifts: dict[int, list[float]] = {0: [], 2: []}
+    for row, col in _points(planes[1], frame):
+        window = _cut(planes, row, col)
+        if window is None or float(window.max()) >= 0.98 * clip:
+            continue
+        # Same geometry as FieldPosition: u points outwards from the centre.
+        position = frame.position(row, col)
+        out = (-math.sin(position.phi), math.cos(position.phi))
+        green = _banded(window[1])
+        for index in (0, 2):
+            shift = _shift(_banded(window[index]), green)
+            if shift is not None:
+                radii[index].append(position.r)
+                shifts[index].append(shift[0] * out[0] + shift[1] * out[1])
+    red, blue = (
+        _fit(np.array(radii[index]), np.array(shifts[index]), frame.half_diagonal) for index in (0, 2)
+    )
+    return LateralColour(red, blue, frame.half_diagonal, len(radii[0]), len(radii[2]))
+
+
+def resample(planes: Planes, frame: Frame, lateral: LateralColour) -> Planes:
+    """Move red and blue onto green by one interpolation with cubic B-splines.
+
+    Interpolation softens a little; `correct_planes(..., lateral=...)` needs none.
+    """
+    if planes.shape != (3, frame.height, frame.width):
+        raise InvalidInputError(f"planes must be (3, {frame.height}, {frame.width}), got {planes.shape}")
+    out = np.array(planes, dtype=np.float32)
+    row_c, col_c = frame.center
+    cols = np.arange(frame.width) - col_c
+    for index, (a, b, c, v) in ((0, lateral.red), (2, lateral.blue)):
+        if (a, b, c, v) == IDENTITY:
+            continue
+        spline = ndimage.spline_filter(planes[index], order=3, output=np.float32, mode="mirror")
+        for top in range(0, frame.height, _BAND):
+            rows = np.arange(top, min(top + _BAND, frame.height)) - row_c
+            r = np.hypot(rows[:, None], cols[None, :]) / frame.half_diagonal
+            ratio = v + r * (c + r * (b + r * a))
+            where = np.stack([rows[:, None] * ratio + row_c, cols[None, :] * ratio + col_c])
+            out[index, top : top + len(rows)] = ndimage.map_coordinates(
+                spline, where, order=3, prefilter=False, mode="mirror"
+            )
+    return out
+
+
+def _points(green: Plane, frame: Frame) -> Iterator[tuple[int, int]]:
+    """Pixels with structure in both directions, spread over the cells of the frame."""
+    # A corner is found as well on a coarser grid, at a fraction of the cost.
+    bin_by = max(1, min(frame.height, frame.width) // 1000)
+    rows, cols = frame.height // bin_by, frame.width // bin_by
+    coarse = green[: rows * bin_by, : cols * bin_by].reshape(rows, bin_by, cols, bin_by).mean(axis=(1, 3))
+    coarse = np.sqrt(np.maximum(coarse, 0.0))  # even noise and contrast in shadows and lights
+    slope_r = ndimage.gaussian_filter(coarse, 1.0, order=(1, 0))
+    slope_c = ndimage.gaussian_filter(coarse, 1.0, order=(0, 1))
+    rr, cc, rc = (
+        ndimage.gaussian_filter(product, 4.0)
+        for product in (slope_r * slope_r, slope_c * slope_c, slope_r * slope_c)
+    )
+    weaker = (rr + cc) / 2.0 - np.sqrt(((rr - cc) / 2.0) ** 2 + rc**2)
+    apart = max(_WINDOW // (2 * bin_by), 3)
+    peak = (weaker == ndimage.maximum_filter(weaker, size=2 * apart + 1)) & (weaker > 1e-7)
+    for i in range(_CELLS):
+        for j in range(_CELLS):
+            top, left = i * rows // _CELLS, j * cols // _CELLS
+            part = (slice(top, (i + 1) * rows // _CELLS), slice(left, (j + 1) * cols // _CELLS))
+            found = np.argwhere(peak[part])
+            strength = weaker[part][tuple(found.T)]
+            for row, col in found[np.argsort(-strength, kind="stable")[:_POINTS]]:
+                yield int((top + row) * bin_by), int((left + col) * bin_by)
+
+
+def _cut(planes: Planes, row: int, col: int) -> Planes | None:
+    """Window around a point, with a margin for the band-pass; None where it leaves the frame."""
+    half = _WINDOW // 2 + _SEARCH
+    if min(row, col) < half or row + half > planes.shape[1] or col + half > planes.shape[2]:
+        return None
+    return np.asarray(planes[:, row - half : row + half, col - half : col + half], dtype=np.float32)
+
+
+def _banded(window: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Difference of Gaussians: neither noise nor slow shading may pull the peak."""
+    wide = window.astype(np.float64)
+    return np.asarray(ndimage.gaussian_filter(wide, 1.0) - ndimage.gaussian_filter(wide, 4.0))
+
+
+def _shift(moved: NDArray[np.float64], reference: NDArray[np.float64]) -> tuple[float, float] | None:
+    """Shift `(row, col)` of `moved` against `reference`; None where they do not look alike.
+
+    The second window follows the whole-pixel shift, so that the taper cuts both the same.
+    """
+    taper = np.hanning(_WINDOW + 1)[:-1]
+    weight = taper[:, None] * taper[None, :]
+    inner = slice(_SEARCH, _SEARCH + _WINDOW)
+    still = reference[inner, inner] * weight
+    whole = (0, 0)
+    for _ in range(2):
+        rows, cols = (slice(_SEARCH + step, _SEARCH + step + _WINDOW) for step in whole)
+        cross = fft.rfft2(moved[rows, cols] * weight) * np.conj(fft.rfft2(still))
+        surface = fft.irfft2(cross, (_WINDOW, _WINDOW))
+        peak = np.unravel_index(int(surface.argmax()), surface.shape)
+        step = [(int(p) + _WINDOW // 2) % _WINDOW - _WINDOW // 2 for p in peak]
+        whole = (whole[0] + step[0], whole[1] + step[1])
+        if max(abs(whole[0]), abs(whole[1])) >= _SEARCH:
+            return None
+        if step == [0, 0]:
+            break
+    rows, cols = (slice(_SEARCH + step, _SEARCH + step + _WINDOW) for step in whole)
+    cut = moved[rows, cols] * weight
+    likeness = float((cut * still).sum() / math.sqrt((cut**2).sum() * (still**2).sum() + 1e-30))
+    if likeness < _MIN_CORRELATION:
+        return None
+    fraction = _refined(fft.fft2(cut) * np.conj(fft.fft2(still)))
+    if max(abs(fraction[0]), abs(fraction[1])) > 1.0:
+        return None
+    return whole[0] + fraction[0], whole[1] + fraction[1]
+
+
+def _refined(cross: NDArray[np.complex128]) -> tuple[float, float]:
+    """Peak of the correlation between pixels, by Newton steps on its Fourier series."""
+    freq = 2.0 * np.pi * fft.fftfreq(_WINDOW)
+    w = np.stack(np.broadcast_arrays(freq[:, None], freq[None, :]))
+    d = np.zeros(2)
+    for _ in range(6):
+        phased = cross * np.exp(1j * (w[0] * d[0] + w[1] * d[1]))
+        gradient = np.array([-(w[i] * phased.imag).sum() for i in range(2)])
+        hessian = -np.array([[(w[i] * w[j] * phased.real).sum() for j in range(2)] for i in range(2)])
+        if np.linalg.eigvalsh(hessian)[-1] >= 0.0:
+            break
+        step = np.clip(-np.linalg.solve(hessian, gradient), -0.5, 0.5)
+        d += step
+        if np.abs(step).max() < 1e-5:
+            break
+    return float(d[0]), float(d[1])
+
+
+def _fit(r: NDArray[np.float64], shift: NDArray[np.float64], half_diagonal: float) -> Polynomial:
+    """Fit shift = half_diagonal ((v - 1) r + c r² + b r³), as many terms as the points support."""
+    if r.size < _MIN_POINTS:
+        return IDENTITY
+    best, best_score = np.zeros(0), np.inf
+    for terms in range(4):
+        columns = half_diagonal * np.stack([r ** (i + 1) for i in range(terms)], axis=1) if terms else None
+        solution, cost = _huber(columns, shift)
+        score = r.size * math.log(cost) + (terms + 1) * math.log(r.size)
+        if score < best_score:
+            best, best_score = solution, score
+    v, c, b = (float(term) for term in np.pad(best, (0, 3 - best.size)))
+    return (0.0, b, c, 1.0 + v)
+
+
+def _huber(
+    columns: NDArray[np.float64] | None, shift: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float]:
+    """Iteratively reweighted least squares; returns the terms and the mean robust cost."""
+    solution: NDArray[np.float64] = np.zeros(0)
+    residual: NDArray[np.float64] = shift
+    for _ in range(20):
+        # The floor keeps perfect data from dividing by zero: shifts are not known below 0.002 px.
+        scale = max(1.4826 * float(np.median(np.abs(residual))), 2e-3)
+        weight = np.minimum(1.0, 1.345 * scale / np.maximum(np.abs(residual), 1e-12))
+        if columns is None:
+            break
+        root = np.sqrt(weight)
+        solution = np.linalg.lstsq(columns * root[:, None], shift * root, rcond=None)[0]
+        residual = shift - columns @ solution
+    size = np.minimum(np.abs(residual), 3.0 * scale)  # gross outliers count once, not squared
+    return solution, float(np.mean(size**2)) + 1e-8
+
+
+def _rescaled(terms: Polynomial, scale: float) -> Polynomial:
+    a, b, c, v = terms
+    return (a * scale**3, b * scale**2, c * scale, v)
+
+
+def _polynomial(value: object) -> Polynomial:
+    if not isinstance(value, list | tuple) or len(value) != 4:
+        raise ValueError(value)
+    a, b, c, v = (float(term) for term in value)
+    return (a, b, c, v)

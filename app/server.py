@@ -67,6 +67,7 @@ def main() -> None:
         format="%(asctime)s %(levelname)s api %(name)s: %(message)s",
         stream=sys.stderr,
     )
+    logging.getLogger("alembic").setLevel(logging.WARNING)  # it tells of every look at the schema
     number = os.environ.pop(SOCKET, None)
     listener = listen(settings.host, settings.port) if number is None else socket.socket(fileno=int(number))
     run(settings, listener)

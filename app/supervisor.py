@@ -36,6 +36,7 @@ from app.store.database import Database
 log = logging.getLogger(__name__)
 
 POLL_S: Final = 0.1
+READY_POLL_S: Final = 0.25
 STOP_S: Final = 15.0
 STEADY_S: Final = 20.0
 """A process that lived so long is restarted at once, and its earlier deaths are forgotten."""
@@ -216,7 +217,7 @@ class _Supervisor:
                     connection.request("GET", "/readyz")
                     if connection.getresponse().status == http.client.OK:
                         break
-            self._stopping.wait(POLL_S)
+            self._stopping.wait(READY_POLL_S)
         else:
             return
         print(f"lensmodel is ready: {self.url}  (data in {self.settings.data_dir.resolve()})", flush=True)  # noqa: T201

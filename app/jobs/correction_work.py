@@ -10,8 +10,8 @@ from pathlib import Path, PurePath
 from typing import Any, Final
 
 from app.jobs.child import Progress
+from app.jobs.handover import SUFFIX
 from app.jobs.sandbox import Limits
-from app.jobs.tasks import SUFFIX
 from app.jobs.workbench import (
     SPARE_MB,
     JobFailedError,

@@ -16,8 +16,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from app.jobs import tasks
 from app.jobs.engine import Job, JobEngine
+from app.jobs.handover import KERNELS
 from app.jobs.sandbox import Limits
 from app.jobs.workbench import SPARE_MB, JobFailedError, NotWantedError, Workbench, settings_of
 from app.store import LensName, NewPatch, NewSample
@@ -244,7 +244,7 @@ class PhotoWork:
     def _sample(self, photo: PhotoRow, folder: Path, number: int, entry: dict[str, Any]) -> NewSample:
         """Check one result of a child as if a stranger had sent it, and keep its statistics."""
         try:
-            kernels = np.load(folder / tasks.KERNELS, allow_pickle=False, mmap_mode="r")
+            kernels = np.load(folder / KERNELS, allow_pickle=False, mmap_mode="r")
             kernel = as_kernel(kernels[number])
             weight = float(np.clip(entry["weight"], 0.0, 1.0))
         except (InvalidKernelError, ValueError, OSError, IndexError) as error:

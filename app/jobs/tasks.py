@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from app.jobs.child import Progress, Task
+from app.jobs.handover import INFINITY, KERNELS, SAMPLES, SUFFIX
 from lensmodel import codec, photo, pipeline
 from lensmodel.errors import LensModelError
 from lensmodel.patches import Patch
@@ -25,18 +26,6 @@ from lensmodel.regression import LensModel
 from lensmodel.types import FieldPosition, LensSettings
 
 log = logging.getLogger(__name__)
-
-SUFFIX: Final[Mapping[str, str]] = {
-    "tiff16": ".tif",
-    "png16": ".png",
-    "png8": ".png",
-    "jpeg": ".jpg",
-    "dng": ".dng",
-}
-KERNELS: Final = "kernels.npy"
-SAMPLES: Final = "samples.json"
-INFINITY: Final = -1.0
-"""Stands for a focus distance of infinity where JSON and SQL have none."""
 
 
 def inspect(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:

@@ -17,8 +17,8 @@ from typing import Any, Final, NoReturn
 
 import numpy as np
 
-from app.jobs import tasks
 from app.jobs.child import Progress
+from app.jobs.handover import INFINITY, KERNELS, SAMPLES
 from app.jobs.sandbox import Limits, Outcome, Sandbox
 from app.settings import Settings
 from app.storage import Storage
@@ -192,10 +192,10 @@ def write_samples(folder: Path, stored: Sequence[StoredSample]) -> None:
                 "settings": {
                     "aperture": sample.settings.aperture,
                     "focal_mm": sample.settings.focal_mm,
-                    "focus_m": tasks.INFINITY if focus == float("inf") else focus,
+                    "focus_m": INFINITY if focus == float("inf") else focus,
                     "channel": sample.settings.channel,
                 },
             }
         )
-    np.save(folder / tasks.KERNELS, kernels)
-    (folder / tasks.SAMPLES).write_text(json.dumps(listed), encoding="utf-8")
+    np.save(folder / KERNELS, kernels)
+    (folder / SAMPLES).write_text(json.dumps(listed), encoding="utf-8")

@@ -256,6 +256,7 @@ def main() -> None:
         format="%(asctime)s %(levelname)s worker %(name)s: %(message)s",
         stream=sys.stderr,
     )
+    logging.getLogger("alembic").setLevel(logging.WARNING)  # it tells of every look at the schema
     worker = Worker(settings)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: worker.stop())

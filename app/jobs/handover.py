@@ -1,0 +1,24 @@
+"""How workers and their tasks hand things to each other: names of files, and numbers JSON lacks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+KERNELS: Final = "kernels.npy"
+"""Kernels, one a row: `(n, k, k)`."""
+
+SAMPLES: Final = "samples.json"
+"""What else belongs to each of the kernels."""
+
+SUFFIX: Final[Mapping[str, str]] = {
+    "tiff16": ".tif",
+    "png16": ".png",
+    "png8": ".png",
+    "jpeg": ".jpg",
+    "dng": ".dng",
+}
+"""Ending of a corrected file, by its format."""
+
+INFINITY: Final = -1.0
+"""Stands for a focus distance of infinity where JSON and SQL have none."""

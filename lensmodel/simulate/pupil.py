@@ -35,7 +35,7 @@ from lensmodel.types import Kernel
 REFERENCE_UM: Final = 0.54
 """Wavelength in micrometres in which wavefront errors are counted."""
 
-_MIN_SAMPLES: Final = 96  # across the pupil: its soft edge is then worth a thousandth of its area
+_MIN_SAMPLES: Final = 96  # across the pupil, to draw its edge well
 _MAX_SAMPLES: Final = 640
 _WRAP_MARGIN: Final = 1.2  # period of the discrete transform over the extent of the light
 _CENTRED_PX: Final = 5e-4
@@ -56,7 +56,11 @@ def disc(
     radius: float = 1.0,
     center: tuple[float, float] = (0.0, 0.0),
 ) -> NDArray[np.float32]:
-    """Disc with an edge one sample wide, so that its area does not jump with the sampling."""
+    """Disc with an edge one sample wide.
+
+    Its area does not jump with the sampling, and the diffraction wings of a hard edge, which would
+    wrap around, fade beyond one period of the discrete transform.
+    """
     dx, dy = px - np.float32(center[0]), py - np.float32(center[1])
     rho = np.sqrt(dx * dx + dy * dy)
     return np.clip((np.float32(radius) - rho) / np.float32(step) + np.float32(0.5), 0.0, 1.0)
@@ -75,8 +79,8 @@ class PixelOtf:
     Parameters
     ----------
     values : ndarray, shape (q, q // 2 + 1), complex64
-        On an `rfft2` grid; the value at zero frequency is the light through the pupil over that
-        through an open one.
+        On an `rfft2` grid; at zero frequency 1 less the light that diffraction throws beyond the
+        period.
     period : float
         Period in pixels of the image that it describes: frequencies are multiples of 1 / period.
     """
@@ -85,7 +89,7 @@ class PixelOtf:
     period: float
 
     def kernel(self, size: int, shift: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
-        """Light in `(size, size)` pixels when the image is moved by `shift` (row, col) pixels."""
+        """Share of the light in `(size, size)` pixels, the image moved by `shift` (row, col) pixels."""
         rows, half = self.values.shape
         x = np.arange(size) - size // 2
         row_f = fft.fftfreq(rows, 1.0 / rows) / self.period
@@ -169,10 +173,13 @@ def pixel_otf(
         np.multiply(transmitted, np.sin(angle), out=pupil.imag)
         # the rows beyond the pupil are empty: transform the others first
         field = fft.fft(fft.fft(pupil, n=grid, axis=1), n=grid, axis=0, overwrite_x=True)
-        open_pupil = math.pi / step**2
-        image += np.float32(weight / open_pupil) * (np.square(field.real) + np.square(field.imag))
+        # Parseval: sum |E|^2 = grid^2 sum A^2; and sum A, not sum A^2, is the area of the pupil
+        total = float(transmitted.sum(dtype=np.float64)) * grid**2
+        image += np.float32(weight / total) * (np.square(field.real) + np.square(field.imag))
     otf = fft.rfft2(image, overwrite_x=True)
-    otf /= np.float32(grid) * np.float32(grid)  # Parseval: sum |E|^2 = grid^2 sum |A|^2
+    if grid % 2 == 0:  # the highest frequency has no mirror image: shifted, it would break symmetry
+        otf[grid // 2, :] = 0.0
+        otf[:, grid // 2] = 0.0
     period = period_um / pitch_um
     row_f, col_f = fft.fftfreq(grid, 1.0 / grid) / period, np.arange(grid // 2 + 1) / period
     otf *= np.sinc(row_f).astype(np.float32)[:, None]

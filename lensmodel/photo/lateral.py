@@ -300,7 +300,7 @@ def _huber(
             break
         root = np.sqrt(weight)
         solution = np.linalg.lstsq(columns * root[:, None], shift * root, rcond=None)[0]
-        residual = shift - columns @ solution
+        residual = np.asarray(shift - columns @ solution, dtype=np.float64)
     size = np.minimum(np.abs(residual), 3.0 * scale)  # gross outliers count once, not squared
     return solution, float(np.mean(size**2)) + 1e-8
 

@@ -1,0 +1,167 @@
+"""A real service in processes of its own, and small photos to feed it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lensmodel.photo.dng import ShotInfo, write_bayer_dng
+
+PATIENCE_S = 120.0
+SETTINGS = {
+    "LENS_ESTIMATOR": "whittle",
+    "LENS_PATCHES": "6",
+    "LENS_KERNEL_SIZE": "15",
+    "LENS_SWEEP_SECONDS": "0.1",
+    "LENS_WORKER_SLOTS": "2",
+    "LENS_MIN_FREE_MB": "0",
+}
+SERVE = "from app import settings, supervisor; raise SystemExit(supervisor.serve(settings.Settings()))"
+FINAL = {"succeeded", "failed", "cancelled"}
+
+
+class Service:
+    """The whole service as `lensmodel serve` runs it, on a free port."""
+
+    def __init__(self, data: Path, **settings: str) -> None:
+        self.data = data
+        self.log = data.parent / f"{data.name}.log"
+        self._environment = {
+            **{name: value for name, value in os.environ.items() if not name.startswith("LENS_")},
+            **SETTINGS,
+            **settings,
+            "LENS_DATA_DIR": str(data),
+            "LENS_PORT": "0",
+        }
+        self.process: subprocess.Popen[str] | None = None
+        self.http = httpx2.Client(timeout=60.0)
+
+    def start(self) -> None:
+        """Start and wait until it says that it is ready."""
+        with self.log.open("a") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-c", SERVE],
+                env=self._environment,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+            )
+        assert self.process.stdout is not None
+        said = self.process.stdout.readline()
+        assert "ready" in said, self.log.read_text()[-4000:]
+        self.http.base_url = httpx2.URL(self.info()["url"])
+
+    def stop(self) -> int:
+        """Stop as Ctrl-C does; return the exit status."""
+        assert self.process is not None
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(30)
+
+    def close(self) -> None:
+        """Leave nothing behind."""
+        self.http.close()
+        if self.process is not None and self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+        if self.process is not None and self.process.stdout is not None:
+            self.process.stdout.close()
+
+    def info(self) -> dict[str, Any]:
+        """Return the address and the processes."""
+        found: dict[str, Any] = json.loads((self.data / "service.json").read_text())
+        return found
+
+    def get(self, path: str, status: int = 200, **options: Any) -> Any:
+        """Return the JSON of an address."""
+        answer = self.http.get(path, **options)
+        assert answer.status_code == status, answer.text
+        return answer.json()
+
+    def upload(self, path: Path, status: int = 202, **fields: str) -> dict[str, Any]:
+        """Send a photo; return its description."""
+        with path.open("rb") as file:
+            answer = self.http.post("/v1/photos", files={"file": (path.name, file)}, data=fields)
+        assert answer.status_code == status, answer.text
+        found: dict[str, Any] = answer.json()
+        return found
+
+    def job(self, job_id: str, until: Callable[[dict[str, Any]], object] | None = None) -> dict[str, Any]:
+        """Return a job once it ended, or once `until` holds."""
+        end = time.monotonic() + PATIENCE_S
+        while True:
+            job: dict[str, Any] = self.get(f"/v1/jobs/{job_id}")
+            if job["state"] in FINAL or (until is not None and until(job)):
+                return job
+            assert time.monotonic() < end, f"{job}\n{self.log.read_text()[-4000:]}"
+            time.sleep(0.1)
+
+    def calibrated(self, path: Path, **fields: str) -> dict[str, Any]:
+        """Send a photo and wait until it counts; return it."""
+        photo = self.upload(path, **fields)
+        job = self.job(photo["id"])
+        assert job["state"] == "succeeded", job
+        found: dict[str, Any] = self.get(f"/v1/photos/{photo['id']}")
+        return found
+
+
+@contextmanager
+def running(data: Path, **settings: str) -> Iterator[Service]:
+    """Give a service that runs, and end it afterwards."""
+    service = Service(data, **settings)
+    try:
+        service.start()
+        yield service
+        assert service.stop() == 0, service.log.read_text()[-4000:]
+    finally:
+        service.close()
+
+
+def scene(seed: int, height: int = 450, width: int = 600) -> NDArray[np.float64]:
+    """Rectangles of all sizes over each other: sharp edges of all directions and no period."""
+    rng = np.random.default_rng(seed)
+    rows, cols = np.mgrid[0:height, 0:width]
+    picture = np.full((height, width), 0.4)
+    for size in np.geomspace(150, 3, 1500):
+        angle, row, col = rng.uniform(0, np.pi), rng.uniform(0, height), rng.uniform(0, width)
+        reach = int(size) + 1
+        top, left = max(int(row) - reach, 0), max(int(col) - reach, 0)
+        part = (slice(top, int(row) + reach + 1), slice(left, int(col) + reach + 1))
+        y, x = rows[part] - row, cols[part] - col
+        u, v = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+        inside = (np.abs(u) < size / 2) & (np.abs(v) < size * rng.uniform(0.1, 0.4))
+        picture[part][inside] = rng.uniform(0.03, 0.85)
+    return picture
+
+
+def write_photo(
+    path: Path, seed: int, *, sigma: float = 1.3, serial: str = "L-42", aperture: float = 2.8
+) -> Path:
+    """Write a raw photo of such a scene, taken through a round Gaussian blur."""
+    rng = np.random.default_rng(seed)
+    light = ndimage.gaussian_filter(scene(seed), sigma)
+    electrons = rng.poisson(light * 20000.0)
+    mosaic = np.clip(512 + electrons / 20000.0 * 15000.0, 0, 16383).round().astype(np.uint16)
+    shot = ShotInfo(
+        camera_maker="Test",
+        camera_model="T-1",
+        lens_maker="Test Optics",
+        lens_model="Test 35mm f/1.8",
+        lens_serial=serial,
+        aperture=aperture,
+        focal_mm=35.0,
+    )
+    write_bayer_dng(path, mosaic, black=512, white=15512, shot=shot)
+    return path

@@ -1,0 +1,267 @@
+"""The whole service in real processes: what a user does, and what happens when processes die."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from lensmodel.psf import rms_width
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+from running import PATIENCE_S, SERVE, Service, running, write_photo  # noqa: E402 - beside this file
+
+sys.path.remove(str(HERE))
+
+SIGMA = 1.3
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Photos of one lens, one of them without its serial."""
+    folder = tmp_path_factory.mktemp("photos")
+    for seed, name in enumerate(("first", "second", "third", "fourth", "fifth", "sixth")):
+        write_photo(folder / f"{name}.dng", seed, sigma=SIGMA)
+    write_photo(folder / "nameless.dng", 10, sigma=SIGMA, serial="")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    with running(tmp_path_factory.mktemp("journey") / "data") as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def first(service: Service, photos: Path) -> dict[str, Any]:
+    return service.calibrated(photos / "first.dng")
+
+
+def lens_of(service: Service, photo: dict[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = service.get(f"/v1/lenses/{photo['lens_id']}")
+    return found
+
+
+def additions(service: Service, lens_id: str, photo_id: str) -> list[dict[str, Any]]:
+    history = service.get(f"/v1/lenses/{lens_id}/calibrations")["items"]
+    return [event for event in history if event["photo_id"] == photo_id]
+
+
+def test_a_photo_calibrates_the_lens_that_it_names(service: Service, first: dict[str, Any]) -> None:
+    lens = lens_of(service, first)
+
+    assert first["state"] == "counted"
+    assert (first["width"], first["height"], first["aperture"]) == (600, 450, 2.8)
+    assert first["patches"]["done"] == first["patches"]["total"] > 0
+    assert (lens["serial"], lens["serial_source"], lens["model"]) == ("L-42", "exif", "Test 35mm f/1.8")
+    assert lens["samples"] >= first["patches"]["total"]
+
+
+def test_the_psf_has_the_width_of_the_blur_and_the_same_numbers_in_each_format(
+    service: Service, first: dict[str, Any]
+) -> None:
+    place = {"r": 0.4, "phi": 0.3, "aperture": 2.8, "channel": "g", "size": 21}
+    base = f"/v1/lenses/{first['lens_id']}/psf"
+    answer = service.http.get(f"{base}.json", params=place)
+    kernel = np.array(answer.json()["psf"]["data"])
+    raw = np.load(io.BytesIO(service.http.get(f"{base}.npy", params=place).content))
+    tiff = tifffile.imread(io.BytesIO(service.http.get(f"{base}.tiff", params=place).content))
+    picture = Image.open(io.BytesIO(service.http.get(f"{base}.png", params=place).content))
+    again = service.http.get(f"{base}.json", params=place, headers={"If-None-Match": answer.headers["etag"]})
+
+    assert kernel.sum() == pytest.approx(1.0, abs=1e-4)
+    assert rms_width(kernel) == pytest.approx(SIGMA, rel=0.25)
+    np.testing.assert_allclose(raw, kernel, atol=1e-6)
+    np.testing.assert_allclose(tiff, kernel, atol=1e-6)
+    assert picture.size == (21, 21)
+    assert again.status_code == 304
+
+
+def test_the_same_bytes_again_are_the_same_photo(
+    service: Service, first: dict[str, Any], photos: Path
+) -> None:
+    again = service.upload(photos / "first.dng", status=200)
+
+    assert again["id"] == first["id"]
+    assert len(additions(service, first["lens_id"], first["id"])) == 1
+
+
+def test_a_photo_without_serial_waits_and_goes_on_once_its_lens_is_named(
+    service: Service, first: dict[str, Any], photos: Path
+) -> None:
+    photo = service.upload(photos / "nameless.dng")
+    job = service.job(photo["id"], until=lambda job: job["state"] == "waiting")
+    waiting = service.get(f"/v1/photos/{photo['id']}")
+
+    answer = service.http.patch(f"/v1/photos/{photo['id']}", json={"lens_id": first["lens_id"]})
+    done = service.job(photo["id"])
+
+    assert job["error"]["code"] == waiting["error"]["code"] == "metadata_missing"
+    assert first["lens_id"] in waiting["error"]["candidates"]
+    assert answer.status_code == 200
+    assert done["state"] == "succeeded"
+    assert service.get(f"/v1/photos/{photo['id']}")["lens_id"] == first["lens_id"]
+
+
+def test_each_version_of_the_lens_is_measured(service: Service, first: dict[str, Any]) -> None:
+    end = time.monotonic() + PATIENCE_S
+    newest: dict[str, Any] = {"coverage": None}
+    while newest["coverage"] is None:
+        assert time.monotonic() < end
+        time.sleep(0.1)
+        newest = service.get(f"/v1/lenses/{first['lens_id']}/calibrations")["items"][-1]
+
+    assert newest["version"] == lens_of(service, first)["version"]
+    assert sum(newest["coverage"].values()) > 0
+
+
+def test_events_tell_the_way_of_a_photo_to_its_end(service: Service, photos: Path) -> None:
+    photo = service.upload(photos / "second.dng")
+    with service.http.stream("GET", f"/v1/jobs/{photo['id']}/events", timeout=PATIENCE_S) as events:
+        assert events.headers["content-type"].startswith("text/event-stream")
+        seen = [json.loads(line[5:]) for line in events.iter_lines() if line.startswith("data:")]
+
+    done = [job["progress"]["done"] for job in seen]
+    assert seen[-1]["state"] == "succeeded"
+    assert done == sorted(done)
+    assert len(seen) > 2
+
+
+def test_a_stored_photo_is_corrected_and_the_result_is_sharper(
+    service: Service, first: dict[str, Any], photos: Path
+) -> None:
+    stored = service.upload(photos / "third.dng", calibrate="false")
+    service.job(stored["id"])
+    wish = {"photo_id": stored["id"], "output": {"format": "tiff16", "color_space": "camera-linear"}}
+    made = service.http.post("/v1/corrections", json=wish)
+    job = service.job(made.json()["id"])
+    again = service.http.post("/v1/corrections", json=wish)
+    correction = again.json()
+    plain = service.http.post("/v1/corrections", json=wish | {"strength": 0.0}).json()
+    service.job(plain["id"])
+    result = service.http.get(correction["links"]["result"])
+    sharp, soft = (
+        tifffile.imread(io.BytesIO(service.http.get(f"/v1/corrections/{key}/result").content))[..., 1]
+        for key in (correction["id"], plain["id"])
+    )
+
+    assert service.get(f"/v1/photos/{stored['id']}")["state"] == "stored"
+    assert made.status_code == 202, made.text
+    assert job["state"] == "succeeded", job
+    assert (again.status_code, correction["id"]) == (200, made.json()["id"])
+    assert set(correction["report"]["zones"]) == {"center", "mid", "corner"}
+    assert result.headers["content-type"] == "image/tiff"
+    assert "third-corrected.tif" in result.headers["content-disposition"]
+    assert sharp.shape == (450, 600)
+    assert np.abs(np.diff(sharp.astype(float))).mean() > 1.2 * np.abs(np.diff(soft.astype(float))).mean()
+
+
+def test_a_region_is_corrected_to_jpeg(service: Service, first: dict[str, Any]) -> None:
+    roi = {"x": 100, "y": 50, "width": 200, "height": 120}
+    wish = {"photo_id": first["id"], "output": {"format": "jpeg", "color_space": "srgb"}, "roi": roi}
+    made = service.http.post("/v1/corrections", json=wish).json()
+    job = service.job(made["id"])
+    picture = Image.open(io.BytesIO(service.http.get(f"/v1/corrections/{made['id']}/result").content))
+
+    assert job["state"] == "succeeded", job
+    assert (picture.format, picture.size) == ("JPEG", (200, 120))
+
+
+def test_a_cancelled_photo_never_counts(service: Service, first: dict[str, Any], photos: Path) -> None:
+    version = lens_of(service, first)["version"]
+    photo = service.upload(photos / "fourth.dng")
+    service.job(photo["id"], until=lambda job: job["stage"] == "estimating")
+    cancelled = service.http.post(f"/v1/jobs/{photo['id']}/cancel")
+    again = service.http.post(f"/v1/jobs/{photo['id']}/cancel")
+    time.sleep(1.0)
+
+    assert cancelled.status_code == 202
+    assert again.status_code == 409
+    assert service.get(f"/v1/photos/{photo['id']}")["state"] == "cancelled"
+    assert lens_of(service, first)["version"] == version
+
+
+def test_a_killed_worker_is_replaced_and_its_photo_counts_once(
+    service: Service, first: dict[str, Any], photos: Path
+) -> None:
+    photo = service.upload(photos / "fifth.dng")
+    service.job(photo["id"], until=lambda job: job["stage"] == "estimating")
+    worker = service.info()["worker_pid"]
+    os.kill(worker, signal.SIGKILL)
+
+    job = service.job(photo["id"])
+    events = additions(service, first["lens_id"], photo["id"])
+
+    assert job["state"] == "succeeded", job
+    assert service.info()["worker_pid"] != worker
+    assert len(events) == 1
+    assert events[0]["samples_added"] <= 3 * service.get(f"/v1/photos/{photo['id']}")["patches"]["done"]
+
+
+def test_a_killed_api_is_replaced_and_callers_wait_meanwhile(service: Service, first: dict[str, Any]) -> None:
+    api = service.info()["api_pid"]
+    os.kill(api, signal.SIGKILL)
+    time.sleep(0.3)
+
+    assert lens_of(service, first)["serial"] == "L-42"
+    assert service.info()["api_pid"] != api
+
+
+def test_work_that_a_stop_interrupted_goes_on_at_the_next_start(photos: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    with running(data) as before:
+        photo = before.upload(photos / "sixth.dng")
+        before.job(photo["id"], until=lambda job: job["stage"] == "estimating")
+        pids = [before.info()[name] for name in ("worker_pid", "api_pid")]
+    left = [pid for pid in pids if Path(f"/proc/{pid}").exists()]
+    file_left = (data / "service.json").exists()
+
+    with running(data) as after:
+        job = after.job(photo["id"])
+        lens_id = after.get(f"/v1/photos/{photo['id']}")["lens_id"]
+        events = additions(after, lens_id, photo["id"])
+
+    assert left == []
+    assert not file_left
+    assert job["state"] == "succeeded", job
+    assert len(events) == 1
+
+
+def test_a_second_service_on_the_same_data_is_refused(service: Service) -> None:
+    environment = {**os.environ, "LENS_DATA_DIR": str(service.data), "LENS_PORT": "0"}
+
+    second = subprocess.run(
+        [sys.executable, "-c", SERVE], env=environment, capture_output=True, text=True, check=False
+    )
+
+    assert second.returncode == 2
+    assert "another service already works on" in second.stderr
+
+
+def test_killing_the_supervisor_leaves_no_process(photos: Path, tmp_path: Path) -> None:
+    service = Service(tmp_path / "data")
+    try:
+        service.start()
+        info = service.info()
+        os.kill(info["pid"], signal.SIGKILL)
+        end = time.monotonic() + 20
+        pids = [info["worker_pid"], info["api_pid"]]
+        while any(Path(f"/proc/{pid}").exists() for pid in pids) and time.monotonic() < end:
+            time.sleep(0.1)
+
+        assert [pid for pid in pids if Path(f"/proc/{pid}").exists()] == []
+    finally:
+        service.close()

@@ -162,7 +162,6 @@ def write_linear_dng(
     path: str | Path,
     planes: NDArray[np.uint16],
     *,
-    black: int = 0,
     white: int = 65535,
     color_matrix: ArrayLike = XYZ_TO_SRGB,
     as_shot_neutral: Sequence[float] = (1.0, 1.0, 1.0),
@@ -175,8 +174,9 @@ def write_linear_dng(
     path : str or Path
         Where to; an existing file is replaced.
     planes : ndarray, shape (3, H, W), uint16
-        Camera colours, linear, not white balanced.
-    black, white, color_matrix, as_shot_neutral, shot
+        Camera colours, linear, not white balanced, black at 0: LibRaw 0.22 takes a black level of
+        linear images off the values but not off the white level.
+    white, color_matrix, as_shot_neutral, shot
         See `write_bayer_dng`.
 
     Raises
@@ -188,9 +188,7 @@ def write_linear_dng(
         raise InvalidInputError(f"planes are uint16 of shape (3, H, W), got {planes.dtype} {planes.shape}")
     shot = shot or ShotInfo()
     tags = _Directory(_common_tags(planes.shape[1], planes.shape[2], 3, _LINEAR_RAW, shot))
-    _colour_tags(
-        tags, 3, black=black, white=white, color_matrix=color_matrix, as_shot_neutral=as_shot_neutral
-    )
+    _colour_tags(tags, 3, black=0, white=white, color_matrix=color_matrix, as_shot_neutral=as_shot_neutral)
     _write(Path(path), tags, _exif(shot), planes.transpose(1, 2, 0))
 
 

@@ -63,13 +63,9 @@ def write_photo(
     camera = photo.truth.camera
     info = shot_info(photo, taken_at=taken_at, orientation=orientation)
     if demosaiced:
-        # keeping the camera's black level keeps the noise below black
-        numbers = np.rint(camera.black + photo.planes * np.float32(camera.white - camera.black))
         write_linear_dng(
             path,
-            np.clip(numbers, 0, camera.white).astype(np.uint16),
-            black=camera.black,
-            white=camera.white,
+            np.clip(np.rint(photo.planes * np.float32(65535.0)), 0, 65535).astype(np.uint16),
             color_matrix=camera.color_matrix,
             as_shot_neutral=camera.as_shot_neutral,
             shot=info,

@@ -1,9 +1,21 @@
 """Blind estimation: one PSF from the patches of one field position."""
 
-from lensmodel.blind.base import PsfEstimate, PsfEstimator
+from lensmodel.blind.base import NO_BLUR_PX2, PsfEstimate, PsfEstimator
+from lensmodel.blind.default import Guarded
+from lensmodel.blind.patch_recurrence import PatchRecurrence
 from lensmodel.blind.whittle import Whittle
 from lensmodel.registry import Registry
 
-estimators: Registry[PsfEstimator] = Registry("estimator", {"whittle": Whittle, "default": Whittle})
+estimators: Registry[PsfEstimator] = Registry(
+    "estimator", {"default": Guarded, "michaeli-irani": PatchRecurrence, "whittle": Whittle}
+)
 
-__all__ = ["PsfEstimate", "PsfEstimator", "Whittle", "estimators"]
+__all__ = [
+    "NO_BLUR_PX2",
+    "Guarded",
+    "PatchRecurrence",
+    "PsfEstimate",
+    "PsfEstimator",
+    "Whittle",
+    "estimators",
+]

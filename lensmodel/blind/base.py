@@ -1,20 +1,49 @@
-"""What every blind estimator takes and gives."""
+"""What every blind estimator takes and gives, and what it refuses."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.evidence import PatchEvidence
+from lensmodel.psf import second_moments
 from lensmodel.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
+
+NO_BLUR_PX2 = 0.3
+"""Below this mean second moment a kernel cannot be told from the pixel and the scene's own softness."""
+
+_MIN_SIDE = 64
+_CONTRAST_IN_NOISE = 3.0
+_CLIPPED_SHARE = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PsfEstimate:
-    """One estimated PSF and what speaks for it."""
+    """One estimated PSF and what speaks for it.
+
+    Parameters
+    ----------
+    kernel : Kernel, shape (size, size)
+    confidence : float
+        0..1; ranks estimates by their true error.
+    reliability : ndarray, shape (rings,)
+        Share of signal in the power of each ring of frequency, 0..1, low frequencies first.
+    predicted_error : float
+        Expected relative L2 distance to the true kernel.
+    diagnostics : mapping of str to float
+        What the estimator reports of itself.
+    seconds : float
+        CPU time.
+    evidence : tuple of PatchEvidence
+        One for each patch that took part, in order; empty where the method keeps none.
+    no_blur : bool
+        The kernel is too narrow to be told from none.
+    """
 
     kernel: Kernel
     confidence: float
@@ -22,7 +51,7 @@ class PsfEstimate:
     predicted_error: float
     diagnostics: Mapping[str, float]
     seconds: float
-    evidence: tuple[Any, ...] = ()
+    evidence: tuple[PatchEvidence, ...] = ()
     no_blur: bool = False
 
 
@@ -41,7 +70,28 @@ class PsfEstimator(Protocol):
         rng: np.random.Generator | None = None,
         on_step: StepHook = ignore_step,
     ) -> PsfEstimate:
-        """Estimate the kernel that all patches share."""
+        """Estimate the kernel that all patches share.
+
+        Parameters
+        ----------
+        patches : sequence of Plane
+            Windows of 64 to 512 px of one colour plane, linear light.
+        noise : sequence of NoiseModel
+            One for each patch.
+        size : int
+            Odd side of the kernel, up to 55.
+        rng : numpy.random.Generator, optional
+            Source of chance where the method uses any.
+        on_step : StepHook
+            Progress; raising `CancelledError` there stops the work.
+
+        Raises
+        ------
+        NotEnoughEvidenceError
+            If no patch determines a kernel: flat, clipped, or noise only.
+        InvalidInputError
+            For values that no photo has.
+        """
 
     def estimate_channel(
         self,
@@ -54,4 +104,70 @@ class PsfEstimator(Protocol):
         rng: np.random.Generator | None = None,
         on_step: StepHook = ignore_step,
     ) -> PsfEstimate:
-        """Estimate another channel of the same patches, given the result of the first."""
+        """Estimate another channel of the same patches, starting from the result of the first."""
+
+
+def usable(
+    patches: Sequence[Plane], noise: Sequence[NoiseModel], size: int
+) -> list[tuple[Plane, NoiseModel]]:
+    """Check patches at the door and keep those that carry signal.
+
+    Raises
+    ------
+    InvalidInputError
+        For an even size, a shape or values that no patch has.
+    NotEnoughEvidenceError
+        If none is left; the text says why.
+    """
+    if size % 2 == 0 or not 3 <= size <= 55:
+        raise InvalidInputError(f"kernel size must be odd and in 3..55, got {size}")
+    if len(patches) != len(noise) or not patches:
+        raise InvalidInputError(f"every patch needs a noise model, got {len(patches)} and {len(noise)}")
+    kept, reasons = [], []
+    for patch, model in zip(patches, noise, strict=True):
+        if patch.ndim != 2 or min(patch.shape) < _MIN_SIDE:
+            raise InvalidInputError(f"a patch must be a plane of at least {_MIN_SIDE} px, got {patch.shape}")
+        if not np.isfinite(patch).all():
+            raise InvalidInputError("a patch must be finite; mask or replace NaN and infinity first")
+        reason = _unfit(patch, model)
+        if reason is None:
+            kept.append((patch, model))
+        else:
+            reasons.append(reason)
+    if not kept:
+        raise NotEnoughEvidenceError(
+            f"no patch determines a kernel ({', '.join(sorted(set(reasons)))}); choose parts with fine detail"
+        )
+    return kept
+
+
+def _unfit(patch: Plane, model: NoiseModel) -> str | None:
+    sigma = model.sigma_at(float(patch.mean()))
+    if float(patch.std()) <= _CONTRAST_IN_NOISE * sigma or float(np.ptp(patch)) < 1e-6:
+        return "flat"
+    if float((patch >= 0.995).mean()) > _CLIPPED_SHARE:
+        return "clipped"
+    # White noise has as much power between neighbours as anywhere; a picture has far less.
+    steps = 0.5 * float(np.var(np.diff(patch, axis=0)) + np.var(np.diff(patch, axis=1)))
+    if steps > 1.4 * float(patch.var()):
+        return "noise"
+    centred = (patch - patch.mean()).astype(np.float64)
+    power = np.abs(np.fft.fft2(centred)) ** 2
+    acf = np.fft.ifft2(power).real
+    acf /= acf[0, 0]
+    far = np.ones(acf.shape, dtype=bool)
+    reach = min(acf.shape) // 3
+    rows = np.minimum(np.arange(acf.shape[0]), acf.shape[0] - np.arange(acf.shape[0]))
+    cols = np.minimum(np.arange(acf.shape[1]), acf.shape[1] - np.arange(acf.shape[1]))
+    gap = np.hypot(rows[:, None], cols[None, :])
+    valley = float(acf[(gap > 2) & (gap < reach)].min())
+    far &= (gap > 4) & (gap < reach)
+    ring = acf[far]
+    if valley < -0.4 and float(ring.max()) > 0.9:
+        return "periodic"
+    return None
+
+
+def is_no_blur(kernel: Kernel) -> bool:
+    """Whether a kernel is too narrow to be told from none."""
+    return float(np.trace(second_moments(kernel))) / 2.0 < NO_BLUR_PX2

@@ -36,6 +36,8 @@ class Header:
         Samples of a pixel; 0 unknown.
     bits : int
         Bits of a sample; 0 unknown.
+    compression : int
+        TIFF tag 259; 1 is none.
     tiff : tuple of TiffReader
         TIFF structures with EXIF in them.
     xmp, icc : bytes or None
@@ -49,6 +51,7 @@ class Header:
     height: int = 0
     channels: int = 0
     bits: int = 0
+    compression: int = 1
     tiff: tuple[TiffReader, ...] = ()
     xmp: bytes | None = None
     icc: bytes | None = None

@@ -73,6 +73,7 @@ def _sized(header: Header, directory: Directory) -> Header:
         height=_value(directory, 257, 0),
         channels=_value(directory, 277, 1),
         bits=_value(directory, 258, 1),
+        compression=_value(directory, 259, 1),
     )
 
 

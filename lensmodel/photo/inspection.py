@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
 
 from lensmodel.errors import NotAnImageError, UnsupportedFormatError
 from lensmodel.photo.containers import opened_header
@@ -13,6 +14,10 @@ from lensmodel.photo.raw import raw_size
 
 MIN_SIDE = 16
 """Smaller pictures are icons, not photos."""
+
+
+_UNDECODED: Final = {9: "VC-5 (GoPro GPR)", 52546: "JPEG XL"}
+"""Compressions of DNG that LibRaw, as built for Python, opens but cannot decode."""
 
 
 def inspect(path: Path | str, limits: Limits | None = None) -> PhotoInfo:
@@ -43,6 +48,10 @@ def info_of(path: Path, header: Header, limits: Limits) -> PhotoInfo:
     """Put together what a parsed header says; see `inspect`."""
     width, height = header.width, header.height
     if header.kind in {"raw", "dng"}:
+        if (packing := _UNDECODED.get(header.compression)) is not None:
+            raise UnsupportedFormatError(
+                f"RAW data packed as {packing} are not read; convert it to a plain DNG or TIFF"
+            )
         width, height = raw_size(path)
         check_size(width, height, path.stat().st_size, limits)
     if header.kind == "jpeg" and header.channels == 4:

@@ -133,7 +133,8 @@ class Mosaic:
         if top < self.black[colour] + 0.5 * (self.white - self.black[colour]) or top < 3 * width:
             return None
         pile, below = counts[top - width + 1 :], counts[top - 3 * width + 1 : top - width + 1]
-        if pile.sum() < max(50, 2e-5 * counts.sum()) or pile.sum() < 5 * below.sum():
+        # More than half of a colour in one pile is an even area of a drawing, not a clipped light.
+        if not max(50, 2e-5 * counts.sum()) < pile.sum() < 0.5 * counts.sum() or pile.sum() < 5 * below.sum():
             return None
         low = int(np.searchsorted(np.cumsum(pile), 0.02 * pile.sum()))
         return top - width + 1 + low, top

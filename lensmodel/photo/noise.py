@@ -17,7 +17,7 @@ _BINS: Final = 24
 _FLAT_SHARE: Final = 0.15
 """Share of the blocks of one level, the least textured, that count."""
 
-_MIN_BLOCKS: Final = 12
+_MIN_BLOCKS: Final = 24
 _ENOUGH_PIXELS: Final = 3_000_000
 _MAD_TO_SIGMA: Final = 1.4826
 
@@ -80,7 +80,7 @@ def _levels(
     if min(plane.shape) < 3 * BLOCK:
         return nothing
     high = ndimage.convolve(plane, _HIGH_PASS.astype(np.float32), mode="nearest")
-    low = ndimage.uniform_filter(plane, 5, mode="nearest")
+    low = ndimage.gaussian_filter(plane, 2.0, mode="nearest", truncate=3.0)
     blocks = _blocks(plane)
     mean = blocks.mean(axis=1, dtype=np.float64)
     low_blocks = _blocks(low)
@@ -124,6 +124,9 @@ def _fit(
     if len(levels) == 1:
         return NoiseModel(0.0, float(variances[0]))
     trust = np.ones_like(levels)
+    # Three standard errors of a variance from the median deviation of pixels, every second of
+    # which is independent after the high-pass.
+    chance = 3.0 * np.sqrt(2.7 * 2.0 * 2.0 / counts)
     model = np.maximum(variances, 1e-16)
     slope = offset = 0.0
     for _ in range(12):
@@ -132,7 +135,7 @@ def _fit(
         slope, offset = _non_negative(design, variances * weight)
         model = np.maximum(slope * levels + offset, 1e-16)
         excess = (variances - model) / model
-        trust = np.where(excess > 0.1, 0.1 / np.maximum(excess, 0.1), 1.0) ** 2
+        trust = np.minimum(1.0, chance / np.maximum(excess, chance)) ** 2
     return NoiseModel(slope, offset)
 
 

@@ -113,8 +113,14 @@ def _tiff_page(page: tifffile.TiffPage) -> Pixels:
     if kind == 0:
         pixels = np.invert(pixels) if pixels.dtype.kind == "u" else 1 - pixels
     if kind == 3 and page.colormap is not None:
-        pixels = np.moveaxis(page.colormap, 0, -1)[pixels]
+        pixels = _colours_of(page.colormap)[pixels]
     return pixels
+
+
+def _colours_of(table: NDArray[np.uint16]) -> Pixels:
+    """Palette as `(index, channel)`; many programs write 8-bit colours times 256, so that white is 65280."""
+    colours = np.moveaxis(table, 0, -1)
+    return colours if (colours & 255).any() else (colours >> 8).astype(np.uint8)
 
 
 def _widened(pixels: Pixels, bits: int) -> Pixels:

@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lensmodel import photo
+from lensmodel.photo.dng import write_bayer_dng
+from lensmodel.photo.noise import estimate_noise
+from lensmodel.types import NoiseModel
+
+BLACK, WHITE = 512, 15000
+
+
+def scene(height: int, width: int, seed: int, blur: float = 1.0) -> NDArray[np.float64]:
+    """Leaves of random grey one over the other, out to the pixel, then a lens of some blur."""
+    rng = np.random.default_rng(seed)
+    rows, cols = np.mgrid[:height, :width]
+    image = np.full((height, width), 0.3)
+    for radius in np.sort(rng.pareto(1.5, 400) * 6 + 3)[::-1]:
+        row, col = rng.uniform(0, height), rng.uniform(0, width)
+        image[(rows - row) ** 2 + (cols - col) ** 2 < radius**2] = rng.uniform(0.03, 0.8)
+    image += 0.03 * ndimage.gaussian_filter(rng.standard_normal((height, width)), 1.0)
+    return np.clip(ndimage.gaussian_filter(image, blur), 0.02, 0.9)
+
+
+def noisy(clean: NDArray[np.float64], model: NoiseModel, seed: int) -> NDArray[np.float32]:
+    rng = np.random.default_rng(seed)
+    return (clean + np.sqrt(model.variance(clean)) * rng.standard_normal(clean.shape)).astype(np.float32)
+
+
+@pytest.mark.parametrize(("shot", "read"), [(1e-3, 1e-6), (1e-4, 1e-6), (2e-4, 1e-5), (0.0, 1e-4)])
+def test_noise_is_recovered_to_15_percent_from_a_textured_scene(shot: float, read: float) -> None:
+    truth = NoiseModel(shot, read)
+    found = estimate_noise(noisy(scene(600, 800, seed=1), truth, seed=2))
+
+    levels = np.array([0.05, 0.2, 0.5])
+    assert found.variance(levels) == pytest.approx(truth.variance(levels), rel=0.15)
+
+
+def test_both_terms_are_recovered_from_a_smooth_ramp() -> None:
+    truth = NoiseModel(1e-3, 1e-4)
+    ramp = np.linspace(0.02, 0.9, 1200)[None].repeat(900, axis=0)
+    found = estimate_noise(noisy(ramp, truth, seed=4))
+
+    assert found.shot == pytest.approx(1e-3, rel=0.05)
+    assert found.read == pytest.approx(1e-4, rel=0.15)
+
+
+def test_saturated_areas_do_not_count() -> None:
+    truth = NoiseModel(1e-3, 1e-6)
+    plane = noisy(scene(600, 800, seed=1), truth, seed=2)
+    plane[:300] = 1.0
+    found = estimate_noise(plane)
+
+    assert found.variance(np.array([0.3])) == pytest.approx(truth.variance(np.array([0.3])), rel=0.15)
+
+
+def test_a_plane_without_noise_has_only_that_of_rounding() -> None:
+    assert estimate_noise(np.full((64, 64), 0.5, dtype=np.float32)) == NoiseModel(0.0, 0.0)
+    assert estimate_noise(np.full((64, 64), 0.5, dtype=np.float32), step=0.01).read == pytest.approx(
+        1e-4 / 12
+    )
+
+
+def test_a_plane_too_small_to_tell_gives_no_noise() -> None:
+    assert estimate_noise(np.zeros((5, 9), dtype=np.float32)) == NoiseModel(0.0, 0.0)
+
+
+def test_a_large_plane_gives_the_same_model_from_a_part_of_its_rows() -> None:
+    truth = NoiseModel(5e-4, 1e-6)
+    ramp = np.linspace(0.02, 0.9, 2500)[None].repeat(2600, axis=0)
+    found = estimate_noise(noisy(ramp, truth, seed=4))
+
+    assert found.shot == pytest.approx(5e-4, rel=0.05)
+
+
+def test_the_noise_of_the_sensor_is_found_on_the_mosaic(tmp_path: Path) -> None:
+    truth = NoiseModel(4e-4, 2e-6)
+    mosaic = noisy(scene(700, 900, seed=5), truth, seed=6) * (WHITE - BLACK) + BLACK
+    write_bayer_dng(tmp_path / "x.dng", np.rint(mosaic).astype(np.uint16), black=BLACK, white=WHITE)
+    developed = photo.develop(tmp_path / "x.dng")
+
+    levels = np.array([0.1, 0.3, 0.5])
+    assert developed.sensor_noise is not None
+    for found in developed.sensor_noise:
+        assert found.variance(levels) == pytest.approx(truth.variance(levels), rel=0.15)
+
+
+@pytest.mark.parametrize("demosaic", ["ahd", "dht", "linear", "half"])
+def test_the_noise_of_the_planes_is_the_variance_that_demosaicing_leaves(
+    tmp_path: Path, demosaic: photo.Demosaic
+) -> None:
+    flat = noisy(np.full((512, 512), 0.3), NoiseModel.white(0.01), seed=7) * (WHITE - BLACK) + BLACK
+    write_bayer_dng(tmp_path / "x.dng", np.rint(flat).astype(np.uint16), black=BLACK, white=WHITE)
+    developed = photo.develop(tmp_path / "x.dng", demosaic=demosaic)
+
+    inside = developed.planes[:, 16:-16, 16:-16].astype(np.float64)
+    for plane, model in zip(inside, developed.noise, strict=True):
+        assert model.variance(np.array(0.3)) == pytest.approx(plane.var(), rel=0.06)

@@ -55,7 +55,7 @@ class UniformBlur:
             raise InvalidInputError(
                 f"a latent plane of {latent.shape} leaves no frame inside a kernel that reaches {self.reach}"
             )
-        shape = _fast(latent.shape)
+        shape = fast_shape(latent.shape)
         spectrum = fft.rfft2(latent, shape) * self.spectrum(shape)
         blurred = fft.irfft2(spectrum, shape)[: latent.shape[0], : latent.shape[1]]
         return np.ascontiguousarray(self.frame(blurred), dtype=np.float32)
@@ -63,7 +63,7 @@ class UniformBlur:
     def adjoint(self, blurred: Plane) -> Plane:
         """Return the correlation of y with k on the latent plane: `(h, ...)` to `(h + k - 1, ...)`."""
         latent = np.pad(blurred, self.reach)
-        shape = _fast(latent.shape)
+        shape = fast_shape(latent.shape)
         spectrum = fft.rfft2(latent, shape) * np.conj(self.spectrum(shape))
         back = fft.irfft2(spectrum, shape)[: latent.shape[0], : latent.shape[1]]
         return np.ascontiguousarray(back, dtype=np.float32)
@@ -85,5 +85,6 @@ def _phase(offset: tuple[float, float], shape: tuple[int, int]) -> NDArray[np.co
     return np.asarray(rows[:, None] * cols[None, :])
 
 
-def _fast(shape: tuple[int, ...]) -> tuple[int, int]:
+def fast_shape(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Return the smallest size not below `shape` that transforms quickly."""
     return int(fft.next_fast_len(shape[0], real=True)), int(fft.next_fast_len(shape[1], real=True))

@@ -67,7 +67,10 @@ class Deconvolver(Protocol):
     def deconvolve(
         self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step
     ) -> Restored:
-        """Estimate the latent plane; call `on_step(done, total)` after each step."""
+        """Estimate the latent plane; call `on_step(done, total)` after each step.
+
+        Compiled loops run through and call it once, at the end.
+        """
 
 
 @runtime_checkable

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from lensmodel.blur import BlurOperator
+from lensmodel.blur import BlurOperator, UniformBlur
+from lensmodel.blur.uniform import fast_shape
 from lensmodel.deconv.base import TINY, Restored, Sensor
+from lensmodel.deconv.engine import Engine, compiled
 from lensmodel.errors import InvalidInputError
 from lensmodel.types import Plane, StepHook, ignore_step
 
@@ -87,6 +89,8 @@ class SaturationAwareRichardsonLucy:
         a, per clipping level.
     accelerated : bool
         Whether to extrapolate.
+    engine : {"auto", "numpy"}
+        "numpy" never uses compiled loops; the numbers are the same.
 
     References
     ----------
@@ -99,6 +103,7 @@ class SaturationAwareRichardsonLucy:
     iterations: int = 25
     sharpness: float = 50.0
     accelerated: bool = True
+    engine: Engine = "auto"
 
     def __post_init__(self) -> None:
         _check(self.iterations)
@@ -110,10 +115,28 @@ class SaturationAwareRichardsonLucy:
         base = background(sensor)
         data = np.maximum(blurred, 0.0) + base
         latent, reach = first_guess(blurred, blur)
-        previous = latent
+        steps = np.arange(1, self.iterations + 1)
+        alphas = np.minimum((steps - 1) / (steps + 2), ALPHA_MAX) * self.accelerated
         lights = bool(blurred.max() >= _LIGHT * sensor.clip)
-        for step in range(1, self.iterations + 1):
-            alpha = min((step - 1) / (step + 2), ALPHA_MAX) if self.accelerated else 0.0
+        loops = None if lights or not isinstance(blur, UniformBlur) else compiled(self.engine)
+        if loops is not None and isinstance(blur, UniformBlur):
+            shape = fast_shape(latent.shape)
+            latent = np.ascontiguousarray(latent)
+            loops.richardson_lucy(
+                latent,
+                np.ascontiguousarray(data, dtype=np.float32),
+                reach.astype(np.float32),
+                blur.spectrum(shape),
+                np.float32(base),
+                np.float32(sensor.clip),
+                np.float32(self.sharpness),
+                alphas.astype(np.float32),
+                shape[1],
+            )
+            on_step(self.iterations, self.iterations)
+            return Restored(np.ascontiguousarray(blur.frame(latent)), steps=self.iterations)
+        previous = latent
+        for step, alpha in enumerate(alphas.astype(np.float32), start=1):
             start = np.maximum(latent + alpha * (latent - previous), TINY)
             predicted = np.maximum(blur.forward(start), 0.0)
             seen, slope = response(predicted, sensor.clip, self.sharpness)

@@ -9,16 +9,20 @@ from numpy.typing import NDArray
 
 from lensmodel.errors import InvalidInputError
 
-_KNOTS = 2048
+DEGREE = 9
 _REACH = 24.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shrinkage:
-    """The minimiser of t |w|^alpha + (w - v)² / 2, by one table for all t.
+    """The minimiser of t |w|^alpha + (w - v)² / 2, by one polynomial for all t.
 
-    With s = t^(1 / (2 - alpha)) the substitution w = s u leaves t = 1, so that
-    ``prox_t(v) = s prox_1(v / s)``. Beyond the table |v| - alpha |v|^(alpha - 1) is exact enough.
+    With s = t^(1 / (2 - alpha)) the substitution w = s u leaves t = 1::
+
+        prox_t(v) = s prox_1(v / s),      prox_1(v) = v - p(1 / v)  beyond the jump, else 0
+
+    What is taken off v is smooth in 1 / v, so a short polynomial p serves: unlike a table it runs
+    in vector registers. Beyond 24 s the subtraction is held constant.
 
     Parameters
     ----------
@@ -26,17 +30,17 @@ class Shrinkage:
         Exponent of the hyper-Laplacian in (0, 1]; 1 is soft thresholding.
     jump : float
         |v| up to which the answer is 0, for t = 1.
-    table : ndarray
-        Answers for t = 1 on an even grid from the jump on.
+    terms : ndarray
+        Coefficients of p, highest power first.
     """
 
     alpha: float
     jump: float
-    table: NDArray[np.float32]
+    terms: NDArray[np.float32]
 
     @classmethod
     def of(cls, alpha: float) -> Shrinkage:
-        """Build the table by Newton steps from v, beyond the jump only.
+        """Fit the polynomial to the answers found by Newton steps.
 
         D. Krishnan, R. Fergus, "Fast image deconvolution using hyper-Laplacian priors", NIPS 2009.
         """
@@ -45,14 +49,17 @@ class Shrinkage:
         # Where the energies of w = 0 and of the other minimum are equal the answer jumps.
         jump_w = (2.0 * (1.0 - alpha)) ** (1.0 / (2.0 - alpha))
         jump = jump_w + alpha * jump_w ** (alpha - 1.0) if alpha < 1.0 else 1.0
-        v = np.linspace(jump, jump + _REACH, _KNOTS + 1)
+        low, high = 1.0 / _REACH, 1.0 / jump
+        nodes = np.cos(np.pi * (np.arange(400) + 0.5) / 400)
+        inverse = low + (high - low) * (nodes + 1.0) / 2.0
+        v = 1.0 / inverse
         w = v.copy()
         for _ in range(40):
-            safe = np.maximum(w, 1e-6)
-            slope = alpha * safe ** (alpha - 1.0) + w - v
-            bend = alpha * (alpha - 1.0) * safe ** (alpha - 2.0) + 1.0
-            w = np.clip(w - slope / np.where(np.abs(bend) < 1e-3, 1e-3, bend), jump_w, v)
-        return cls(alpha, float(jump), w.astype(np.float32))
+            slope = alpha * w ** (alpha - 1.0) + w - v
+            bend = alpha * (alpha - 1.0) * w ** (alpha - 2.0) + 1.0
+            w = np.clip(w - slope / np.where(np.abs(bend) < 1e-3, 1e-3, bend), max(jump_w, 1e-9), v)
+        terms = np.polynomial.Polynomial.fit(inverse, v - w, DEGREE).convert().coef[::-1]
+        return cls(alpha, float(jump), terms.astype(np.float32))
 
     def scale(self, threshold: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """S for a threshold t."""
@@ -60,13 +67,10 @@ class Shrinkage:
 
     def __call__(self, v: NDArray[np.float32], scale: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """Shrink `v`, any shape, with the scale s that broadcasts against it."""
-        ratio = np.abs(v) / np.maximum(scale, np.float32(1e-12))
-        past = ratio - np.float32(self.jump)
-        place = np.clip(past, 0.0, np.float32(_REACH)) * np.float32(_KNOTS / _REACH)
-        low = np.minimum(place.astype(np.int32), _KNOTS - 1)
-        share = place - low
-        near = self.table[low] * (1 - share) + self.table[low + 1] * share
-        tail = self.table[-1] - np.float32(_REACH)
-        shrunk = np.where(past < np.float32(_REACH), near, past + tail)
-        shrunk = np.where(past > 0.0, shrunk, np.float32(0.0))
-        return np.asarray(np.copysign(shrunk * scale, v), dtype=np.float32)
+        size = np.maximum(np.abs(v), np.float32(1e-20))
+        inverse = np.clip(scale / size, np.float32(1.0 / _REACH), np.float32(1.0 / self.jump))
+        taken = np.zeros_like(inverse)
+        for term in self.terms:
+            taken = taken * inverse + term
+        shrunk = np.where(size > scale * np.float32(self.jump), size - scale * taken, np.float32(0.0))
+        return np.asarray(np.copysign(shrunk, v), dtype=np.float32)

@@ -12,11 +12,13 @@ from scipy import fft, ndimage
 from lensmodel.blur import BlurOperator, UniformBlur
 from lensmodel.deconv.base import Restored, Sensor, uniform
 from lensmodel.deconv.canvas import Canvas
+from lensmodel.deconv.engine import Engine, compiled
 from lensmodel.deconv.shrinkage import Shrinkage
 from lensmodel.deconv.wiener import wiener_canvas
 from lensmodel.errors import InvalidInputError
-from lensmodel.types import Plane, Planes, StepHook, ignore_step
+from lensmodel.types import CHANNELS, Plane, Planes, StepHook, ignore_step
 
+# Luma, and two chroma directions, orthonormal.
 _OPPONENT = np.array(
     [
         [1 / np.sqrt(3)] * 3,
@@ -58,6 +60,8 @@ class SparseGradient:
         Half-quadratic steps.
     coupling, growth : float
         First b, in units of one over the squared light, and its factor per step.
+    engine : {"auto", "numpy"}
+        "numpy" never uses compiled loops; the numbers are the same.
 
     References
     ----------
@@ -65,12 +69,13 @@ class SparseGradient:
        NIPS 2009, eq. 3 to 5.
     """
 
-    weight: float = 3.0
-    chroma: float = 3.0
+    weight: float = 2.0
+    chroma: float = 2.0
     alpha: float = 0.67
-    steps: int = 7
-    coupling: float = 4.0
-    growth: float = 2.5
+    steps: int = 6
+    coupling: float = 1.5
+    growth: float = 3.0
+    engine: Engine = "auto"
 
     def __post_init__(self) -> None:
         if not (self.weight > 0.0 and self.chroma > 0.0 and self.coupling > 0.0 and self.growth >= 1.0):
@@ -96,55 +101,123 @@ class SparseGradient:
         sensors: Sequence[Sensor],
         on_step: StepHook,
     ) -> Planes:
-        channels = len(blurred)
+        light = np.maximum(blurred.mean(axis=(1, 2)), 1e-4).astype(np.float32)[:, None, None]
         canvas = Canvas(blurred.shape[1], blurred.shape[2], margin=max(blur.reach for blur in blurs))
-        shape = canvas.shape
-        light = np.maximum(blurred.mean(axis=(1, 2)), 1e-4).astype(np.float32)
-        planes = blurred / light[:, None, None]
-        var = np.stack([s.variance(_smooth(y)) for s, y in zip(sensors, blurred, strict=True)])
-        var = var / (light**2)[:, None, None]
+        problem = self._problem(blurred, blurs, sensors, light, canvas)
+        loops = compiled(self.engine) if len(blurred) == len(CHANNELS) else None
+        x = problem.start if loops is None else problem.start.copy()
+        if loops is None:
+            x = _half_quadratic(problem, on_step)
+        else:
+            loops.half_quadratic(
+                x,
+                problem.y,
+                problem.state,
+                problem.K,
+                problem.smooth,
+                problem.noise,
+                problem.scale,
+                problem.factors,
+                problem.couplings,
+                problem.refresh,
+                problem.rotation,
+                np.float32(problem.prox.jump),
+                problem.prox.terms,
+            )
+            on_step(self.steps, self.steps)
+        return np.ascontiguousarray(x[:, canvas.data[0], canvas.data[1]] * light)
+
+    def _problem(
+        self,
+        blurred: Planes,
+        blurs: Sequence[UniformBlur],
+        sensors: Sequence[Sensor],
+        light: NDArray[np.float32],
+        canvas: Canvas,
+    ) -> _Problem:
+        planes = blurred / light
+        var = np.stack([s.variance(_smooth(y)) for s, y in zip(sensors, blurred, strict=True)]) / light**2
         noise = np.maximum(var.mean(axis=(1, 2)), np.float32(1e-9))
         y = np.stack([canvas.fill(plane) for plane in planes])
-        level = np.maximum(canvas.fill(_smooth(planes.mean(axis=0))), np.float32(0.02))
+        level = np.maximum(canvas.fill(_smooth(planes.mean(axis=0))), _DARK)
         relative = canvas.fill((var / noise[:, None, None]).mean(axis=0))
-        weights = np.full(channels, self.weight * self.chroma, dtype=np.float32)
-        weights[0] = self.weight
-        rotation = _OPPONENT if channels == 3 else np.eye(channels, dtype=np.float32)
         prox = Shrinkage.of(self.alpha)
-        base = relative / level ** np.float32(self.alpha)
-        known = np.zeros(shape, dtype=bool)
-        known[canvas.data] = True
-        clip = np.array([s.clip for s in sensors], dtype=np.float32) / light
-        clipped = np.stack([known & (plane >= limit) for plane, limit in zip(y, clip, strict=True)])
-        K = np.stack([blur.spectrum(shape) for blur in blurs])
-        power = np.abs(K) ** 2
-        smooth = _gradient_power(shape)
-        x = np.stack(
+        scale = prox.scale((relative / level ** np.float32(self.alpha)).astype(np.float32))
+        couplings = self.coupling * self.growth ** np.arange(self.steps)
+        weights = np.full(len(y), self.weight * self.chroma)
+        weights[0] = self.weight
+        state = np.full(y.shape, _UNMEASURED, dtype=np.uint8)
+        inside = (slice(None), *canvas.data)
+        clip = np.array([s.clip for s in sensors], dtype=np.float32)[:, None, None]
+        state[inside] = np.where(blurred >= clip, _CLIPPED, _MEASURED)
+        start = np.stack(
             [
-                wiener_canvas(a, blur, float(n), float(p.var()))
-                for a, blur, n, p in zip(y, blurs, noise, planes, strict=True)
+                wiener_canvas(a, blur, float(n), float(plane.var()))
+                for a, blur, n, plane in zip(y, blurs, noise, planes, strict=True)
             ]
         )
-        X = fft.rfft2(x)
-        b = self.coupling
-        for step in range(1, self.steps + 1):
-            predicted = fft.irfft2(K * X, shape)
-            data = np.where(known, y, predicted)
-            data = np.where(clipped, np.maximum(y, predicted), data)
-            pull = np.zeros_like(x)
-            scales = [prox.scale((base * (w / b)).astype(np.float32)) for w in weights]
-            for axis in (1, 2):
-                slope = np.roll(x, -1, axis=axis) - x
-                mixed = np.einsum("ij,jrc->irc", rotation, slope)
-                kept = np.stack([prox(v, s) for v, s in zip(mixed, scales, strict=True)])
-                kept = np.einsum("ji,jrc->irc", rotation, kept)
-                pull += np.roll(kept, 1, axis=axis) - kept
-            strength = (b * noise)[:, None, None]
-            X = (np.conj(K) * fft.rfft2(data) + strength * fft.rfft2(pull)) / (power + strength * smooth)
-            x = fft.irfft2(X, shape).astype(np.float32)
-            b *= self.growth
-            on_step(step, self.steps)
-        return np.ascontiguousarray(x[:, canvas.data[0], canvas.data[1]] * light[:, None, None])
+        return _Problem(
+            start=start,
+            y=y,
+            state=state,
+            K=np.stack([blur.spectrum(canvas.shape) for blur in blurs]),
+            smooth=_gradient_power(canvas.shape),
+            noise=noise.astype(np.float32),
+            scale=scale,
+            factors=prox.scale((weights[None, :] / couplings[:, None]).astype(np.float32)),
+            couplings=couplings.astype(np.float32),
+            refresh=self.steps,
+            rotation=_OPPONENT if len(y) == len(CHANNELS) else np.eye(len(y), dtype=np.float32),
+            prox=prox,
+        )
+
+
+_MEASURED, _UNMEASURED, _CLIPPED = 0, 1, 2
+_DARK = np.float32(0.02)  # share of a tile's mean light below which the prior follows it no further
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Problem:
+    """Everything that the half-quadratic steps need, on the canvas; see `SparseGradient`."""
+
+    start: Planes
+    y: Planes
+    state: NDArray[np.uint8]
+    K: NDArray[np.complex64]
+    smooth: NDArray[np.float32]
+    noise: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    factors: NDArray[np.float32]
+    couplings: NDArray[np.float32]
+    refresh: int
+    rotation: NDArray[np.float32]
+    prox: Shrinkage
+
+
+def _half_quadratic(p: _Problem, on_step: StepHook) -> Planes:
+    """The steps in NumPy; `compiled.half_quadratic` is their twin."""
+    shape = (p.y.shape[1], p.y.shape[2])
+    power = np.abs(p.K) ** 2
+    x = p.start
+    X = fft.rfft2(x)
+    D = np.zeros_like(X)
+    for step, coupling in enumerate(p.couplings):
+        pull = np.zeros_like(x)
+        scales = p.factors[step][:, None, None] * p.scale
+        for axis in (1, 2):
+            slope = np.roll(x, -1, axis=axis) - x
+            kept = p.prox(np.einsum("ij,jrc->irc", p.rotation, slope), scales)
+            kept = np.einsum("ji,jrc->irc", p.rotation, kept)
+            pull += np.roll(kept, 1, axis=axis) - kept
+        if step < p.refresh:
+            predicted = fft.irfft2(p.K * X, shape)
+            measured = (p.state == _MEASURED) | ((p.state == _CLIPPED) & (predicted < p.y))
+            D = np.conj(p.K) * fft.rfft2(np.where(measured, p.y, predicted))
+        strength = (coupling * p.noise)[:, None, None]
+        X = (D + strength * fft.rfft2(pull)) / (power + strength * p.smooth)
+        x = fft.irfft2(X, shape).astype(np.float32)
+        on_step(step + 1, len(p.couplings))
+    return x
 
 
 def _smooth(plane: NDArray[np.float32]) -> NDArray[np.float32]:

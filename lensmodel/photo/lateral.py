@@ -299,7 +299,8 @@ def _huber(
         if columns is None:
             break
         root = np.sqrt(weight)
-        solution = np.linalg.lstsq(columns * root[:, None], shift * root, rcond=None)[0]
+        found = np.linalg.lstsq(columns * root[:, None], shift * root, rcond=None)[0]
+        solution = np.asarray(found, dtype=np.float64)
         residual = np.asarray(shift - columns @ solution, dtype=np.float64)
     size = np.minimum(np.abs(residual), 3.0 * scale)  # gross outliers count once, not squared
     return solution, float(np.mean(size**2)) + 1e-8

@@ -113,7 +113,7 @@ def test_lateral_colour_moves_red_and_blue_as_the_lens_says() -> None:
 def test_photo_of_a_constant_is_constant() -> None:
     # defocused, since the centre of mass of a kernel much sharper than a pixel jumps between
     # places by a tenth of a pixel, and that distortion is brightness
-    soft = SimulatedLens((Aberrations(f_number=2.8, astigmatism=3.0, coma=2.0, defocus=2.0),))
+    soft = SimulatedLens((Aberrations(f_number=2.8, astigmatism=1.0, coma=1.0, defocus=2.0),))
     options = BlurOptions(size=SIZE, step=0.25, lateral=False)
     image = blurred(constant(FRAME.height, FRAME.width, 0.5), soft, LensSettings(), FRAME, options)
 

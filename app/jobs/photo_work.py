@@ -148,7 +148,14 @@ class PhotoWork:
         limits = self._bench.limits(photo, self._bench.settings.develop_seconds, 120)
         arguments = {"developed": str(developed), "count": self._bench.settings.patches}
         with self._bench.sandbox.folder() as folder:
-            found = self._bench.attempt("select", arguments, folder=folder, limits=limits, wanted=wanted)
+            try:
+                found = self._bench.attempt("select", arguments, folder=folder, limits=limits, wanted=wanted)
+            except JobFailedError as error:
+                if error.code != "invalid_parameter":
+                    raise
+                size = f"{photo.width}x{photo.height}"
+                text = f"the photo of {size} pixels is too small to tell about its lens; send it in full size"
+                raise JobFailedError("no_usable_patches", text) from error
         if found["lateral"] is not None:
             self._store.photos.record_lateral(photo.public_id, found["lateral"])
         self._store.patches.add(photo.public_id, photo.epoch, _plan(found))

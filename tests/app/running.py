@@ -23,7 +23,7 @@ from lensmodel.photo.dng import ShotInfo, write_bayer_dng
 PATIENCE_S = 120.0
 SETTINGS = {
     "LENS_ESTIMATOR": "whittle",
-    "LENS_PATCHES": "6",
+    "LENS_PATCHES": "4",
     "LENS_KERNEL_SIZE": "15",
     "LENS_SWEEP_SECONDS": "0.1",
     "LENS_WORKER_SLOTS": "2",
@@ -129,7 +129,7 @@ def running(data: Path, **settings: str) -> Iterator[Service]:
         service.close()
 
 
-def scene(seed: int, height: int = 450, width: int = 600) -> NDArray[np.float64]:
+def scene(seed: int, height: int = 320, width: int = 448) -> NDArray[np.float64]:
     """Rectangles of all sizes over each other: sharp edges of all directions and no period."""
     rng = np.random.default_rng(seed)
     rows, cols = np.mgrid[0:height, 0:width]

@@ -64,7 +64,7 @@ def test_a_photo_calibrates_the_lens_that_it_names(service: Service, first: dict
     lens = lens_of(service, first)
 
     assert first["state"] == "counted"
-    assert (first["width"], first["height"], first["aperture"]) == (600, 450, 2.8)
+    assert (first["width"], first["height"], first["aperture"]) == (448, 320, 2.8)
     assert first["patches"]["done"] == first["patches"]["total"] > 0
     assert (lens["serial"], lens["serial_source"], lens["model"]) == ("L-42", "exif", "Test 35mm f/1.8")
     assert lens["samples"] >= first["patches"]["total"]
@@ -165,7 +165,7 @@ def test_a_stored_photo_is_corrected_and_the_result_is_sharper(
     assert set(correction["report"]["zones"]) == {"center", "mid", "corner"}
     assert result.headers["content-type"] == "image/tiff"
     assert "third-corrected.tif" in result.headers["content-disposition"]
-    assert sharp.shape == (450, 600)
+    assert sharp.shape == (320, 448)
     assert np.abs(np.diff(sharp.astype(float))).mean() > 1.2 * np.abs(np.diff(soft.astype(float))).mean()
 
 

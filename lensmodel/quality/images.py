@@ -17,6 +17,7 @@ from lensmodel.types import ZONES, Zone
 _SSIM_WINDOW: Final = 11
 _SHIFT_STEPS: Final = 6
 _SHIFT_PAD: Final = 8
+_SHIFT_WINDOW: Final = 1024
 
 
 def to_srgb(linear: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -129,8 +130,12 @@ def best_shift(image: NDArray[np.floating], reference: NDArray[np.floating]) -> 
     G the picture's gradient; sub-pixel shifts are Fourier shifts of mirrored pictures.
     """
     _same_shape(image, reference)
-    a = np.asarray(image, dtype=np.float64).reshape(-1, *image.shape[-2:])
-    b = np.asarray(reference, dtype=np.float64).reshape(-1, *image.shape[-2:])
+    middle = tuple(
+        slice(max((n - _SHIFT_WINDOW) // 2, 0), max((n - _SHIFT_WINDOW) // 2, 0) + _SHIFT_WINDOW)
+        for n in image.shape[-2:]
+    )
+    a, b = (np.asarray(picture, dtype=np.float64)[..., *middle] for picture in (image, reference))
+    a, b = (picture.reshape(-1, *picture.shape[-2:]) for picture in (a, b))
     shift = np.zeros(2)
     core = (slice(None), slice(4, -4), slice(4, -4))
     for _ in range(_SHIFT_STEPS):

@@ -231,7 +231,7 @@ def comatic() -> SimulatedLens:
                 coma=3.0,
                 astigmatism=1.5,
                 field_curvature=-0.5,
-                defocus=0.6,
+                defocus=1.2,
                 decentring=(0.1, 0.1),
             ),
         )

@@ -90,7 +90,7 @@ class Problem(Model):
     instance: str | None = None
     errors: list[FieldError] = []
     request_id: str | None = None
-    candidates: list[str] | None = Field(None, description="Lenses that the photo may belong to.")
+    candidates: list[str] | None = Field(default=None, description="Lenses that the photo may belong to.")
 
 
 class UploadFields(Question):
@@ -337,17 +337,17 @@ class CalibrationOut(Model):
 
 
 class LateralOut(Model):
-    """Lateral colour of a lens as radial polynomials relative to green.
+    """Lateral colour of a lens: what a point shown by green at r is shown at by red and blue.
 
-    A point that green shows at radius r (half diagonals) is shown by red or blue at the radius
-    that the polynomial with these coefficients, constant factor first, times r, gives.
+    The polynomials are (a, b, c, v) of r_src = r (v + c r + b r^2 + a r^3), with r in half
+    diagonals; (0, 0, 0, 1) is no shift.
     """
 
     lens_id: str
     version: int
     photos: int
-    red: list[float]
-    blue: list[float]
+    red: tuple[float, float, float, float]
+    blue: tuple[float, float, float, float]
 
 
 class OutputOptions(Question):

@@ -62,7 +62,8 @@ def _photo_problem(row: PhotoRow, candidates: Sequence[str]) -> s.Problem | None
     if row.state == "needs_lens":
         return problem_of(
             "metadata_missing",
-            f"the file does not say which copy of the lens it was (model {row.lens_model or 'unknown'}): "
+            row.error_detail
+            or f"the file does not say which copy of the lens it was (model {row.lens_model or 'unknown'}): "
             'PATCH the photo with {"lens_id"}, {"lens_serial"} or {"new_lens": {"label"}}',
             candidates=candidates,
         )

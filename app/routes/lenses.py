@@ -75,18 +75,21 @@ def read_lateral_colour(lens_id: str, call: CallDep) -> LateralOut:
     """
     lens = find_lens(call, lens_id)
     seen = call.store.lenses.lateral_of(lens)
-    if not seen:
+    red, blue = (_measured(seen, colour) for colour in ("red", "blue"))
+    if not red or not blue:
         raise NoSamplesError(
-            f"lens {lens_id} has no photo whose lateral colour could be measured: upload one with colour data"
+            f"lens {lens_id} has no photo whose lateral colour could be measured: "
+            "upload one in colour with detail near its corners"
         )
     return LateralOut(
         lens_id=lens.public_id,
         version=lens.version,
-        photos=len(seen),
-        red=_middle(seen, "red"),
-        blue=_middle(seen, "blue"),
+        photos=min(len(red), len(blue)),
+        red=[median(terms) for terms in zip(*red, strict=True)],
+        blue=[median(terms) for terms in zip(*blue, strict=True)],
     )
 
 
-def _middle(seen: list[dict[str, Any]], colour: str) -> list[float]:
-    return [median(values) for values in zip(*(entry[colour] for entry in seen), strict=True)]
+def _measured(seen: list[dict[str, Any]], colour: str) -> list[list[float]]:
+    """Return the polynomials of photos that could tell; the others say "no shift" without knowing."""
+    return [entry[colour] for entry in seen if entry[f"{colour}_points"] > 0]

@@ -131,7 +131,7 @@ def describe(call: Call, photo: PhotoRow) -> PhotoOut:
 
 def candidates(call: Call, photo: PhotoRow) -> list[str]:
     """Return the lenses that a waiting photo may belong to."""
-    if photo.state != "needs_lens":
+    if photo.state != "needs_lens" or photo.lens_id is not None:
         return []
     return [lens.public_id for lens in call.store.lenses.candidates(photo)]
 

@@ -297,13 +297,18 @@ def test_the_history_has_one_item_for_each_version(client: TestClient, steps: St
 def test_lateral_colour_is_the_middle_of_what_the_photos_show(
     client: TestClient, steps: Steps, store: Store
 ) -> None:
-    photos = [steps.counted() for _ in range(3)]
-    for photo, shift in zip(photos, (1e-4, 9e-4, 2e-4), strict=True):
-        store.photos.record_lateral(photo.public_id, {"red": [1.0, shift], "blue": [1.0, -shift]})
+    photos = [steps.counted() for _ in range(4)]
+    for photo, shift in zip(photos, (1e-4, 9e-4, 2e-4, 0.0), strict=True):
+        points = 50 if shift else 0  # the last could not tell
+        red, blue = [0.0, 0.0, shift, 1.0], [0.0, 0.0, -shift, 1.0]
+        lateral = {"red": red, "blue": blue, "red_points": points, "blue_points": points}
+        store.photos.record_lateral(photo.public_id, lateral)
 
     shown = client.get(f"/v1/lenses/{steps.lens_id(photos[0])}/lateral-colour").json()
 
-    assert (shown["red"], shown["blue"], shown["photos"]) == ([1.0, 2e-4], [1.0, -2e-4], 3)
+    assert shown["red"] == [0.0, 0.0, 2e-4, 1.0]
+    assert shown["blue"] == [0.0, 0.0, -2e-4, 1.0]
+    assert shown["photos"] == 3
 
 
 def test_a_warm_psf_costs_milliseconds(client: TestClient, lens: str) -> None:

@@ -130,11 +130,11 @@ def best_shift(image: NDArray[np.floating], reference: NDArray[np.floating]) -> 
     G the picture's gradient; sub-pixel shifts are Fourier shifts of mirrored pictures.
     """
     _same_shape(image, reference)
-    middle = tuple(
+    rows, cols = (
         slice(max((n - _SHIFT_WINDOW) // 2, 0), max((n - _SHIFT_WINDOW) // 2, 0) + _SHIFT_WINDOW)
         for n in image.shape[-2:]
     )
-    a, b = (np.asarray(picture, dtype=np.float64)[..., *middle] for picture in (image, reference))
+    a, b = (np.asarray(picture, dtype=np.float64)[..., rows, cols] for picture in (image, reference))
     a, b = (picture.reshape(-1, *picture.shape[-2:]) for picture in (a, b))
     shift = np.zeros(2)
     core = (slice(None), slice(4, -4), slice(4, -4))

@@ -120,6 +120,10 @@ def blurred(
     out = np.zeros((3, padded.shape[1] + 2 * half, padded.shape[2] + 2 * half), dtype=np.float32)
     total = len(CHANNELS) * (len(grid.exact_rows) + len(grid.rows))
     done = 0
+    shares = np.ones((len(grid.rows), len(grid.cols)), dtype=np.float32)
+    if options.vignetting:
+        fields = [[grid.field(row, col) for col in grid.cols] for row in grid.rows]
+        shares[:] = [[lens.transmission(h, settings) for h in line] for line in fields]
     for index, channel in enumerate(CHANNELS):
         kernels = []
         for row in grid.exact_rows:
@@ -134,10 +138,8 @@ def blurred(
         spread = grid.spread(np.asarray(kernels, dtype=np.float32))
         for i, row in enumerate(grid.rows):
             for j, col in enumerate(grid.cols):
-                share = lens.transmission(grid.field(row, col), settings) if options.vignetting else 1.0
-                kernel = spread[i, j] * np.float32(share)
                 for top, left, light in grid.windowed(padded[index], row, col):
-                    image = _convolved(light, kernel)
+                    image = _convolved(light, spread[i, j] * shares[i, j])
                     out[index, top : top + image.shape[0], left : left + image.shape[1]] += image
             done += 1
             on_step(done, total)

@@ -61,7 +61,7 @@ def lights(comatic: SimulatedLens) -> tuple[Planes, list[tuple[int, int]]]:
         for r, c in places
         if 2 * HALF <= r < FRAME.height and 2 * HALF <= c < FRAME.width
     ]
-    image = blurred(scene, comatic, LensSettings(), FRAME, BlurOptions(size=SIZE, lateral=False))
+    image = blurred(scene, comatic, LensSettings(), FRAME, BlurOptions(size=SIZE, step=0.12, lateral=False))
     return image, inside
 
 

@@ -11,6 +11,7 @@ run in as many processes as there are.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import logging
 import math
@@ -257,6 +258,12 @@ def settings_of(developed: LinearPhoto, override: LensSettings | None = None) ->
     )
 
 
+def photo_id(path: Path) -> str:
+    """Name a photo by its content: the first 16 hex digits of its SHA-256."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+
+
 def samples_of_photo(
     path: Path,
     *,
@@ -286,6 +293,7 @@ def samples_of_photo(
             f"{path.name} does not say its aperture; give it (for example --aperture 2.8)"
         )
     on_event(CalibrationEvent(path, "selecting"))
+    key = photo_id(path)
     groups = cells(find_patches(developed, count=count))
     total = sum(len(group) for group in groups)
     on_event(CalibrationEvent(path, "estimating", 0, total))
@@ -297,7 +305,7 @@ def samples_of_photo(
         workers = max(1, workers or os.cpu_count() or 1)
         with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
             jobs = {
-                pool.submit(_cell_from_folder, folder, group, chosen, path.name, estimator): index
+                pool.submit(_cell_from_folder, folder, group, chosen, key, estimator): index
                 for index, group in enumerate(groups)
             }
             for job in as_completed(jobs):
@@ -318,10 +326,10 @@ def samples_of_photo(
 
 
 def _cell_from_folder(
-    folder: str, group: tuple[Patch, ...], settings: LensSettings, photo_id: str, estimator: str
+    folder: str, group: tuple[Patch, ...], settings: LensSettings, key: str, estimator: str
 ) -> list[CellSample]:
     return estimate_cell(
-        load_developed(Path(folder)), group, settings=settings, photo_id=photo_id, estimator=estimator
+        load_developed(Path(folder)), group, settings=settings, photo_id=key, estimator=estimator
     )
 
 

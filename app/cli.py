@@ -1,0 +1,73 @@
+"""The command `lensmodel`."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from typing import Annotated
+
+import typer
+
+from app.commands import benchmarks, demonstration, display, photos, service
+from lensmodel.errors import LensModelError
+
+app = typer.Typer(
+    name="lensmodel",
+    help="Learn the blur of one copy of a lens from ordinary photos, and remove it.",
+    epilog="Start with: lensmodel calibrate PHOTO... --profile my-lens.lensprofile",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command()(photos.calibrate)
+app.command()(photos.correct)
+app.command()(photos.psf)
+app.command()(service.serve)
+app.command(hidden=True)(service.api)
+app.command(hidden=True)(service.worker)
+app.command()(service.config)
+app.command()(demonstration.demo)
+app.add_typer(benchmarks.bench, name="bench")
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version  # noqa: PLC0415 - costs 20 ms that no other call should pay
+
+        typer.echo(f"lensmodel {version('lensmodel')}")
+        raise typer.Exit
+
+
+@app.callback()
+def configure(
+    verbose: Annotated[
+        int, typer.Option("-v", "--verbose", count=True, help="More log lines; twice: all.")
+    ] = 0,
+    quiet: Annotated[bool, typer.Option("-q", "--quiet", help="No progress, only errors.")] = False,
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit."),
+    ] = False,
+) -> None:
+    """Learn the blur of one copy of a lens from ordinary photos, and remove it."""
+    del version
+    level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
+    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    display.quiet = quiet
+
+
+def main() -> None:
+    """Run the command; exit 0 done, 1 something failed, 2 wrong usage, 130 interrupted."""
+    try:
+        app()
+    except LensModelError as error:
+        typer.echo(f"lensmodel: {error}", err=True)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        typer.echo("lensmodel: interrupted; finished files are kept, nothing half-written is left", err=True)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The subcommands of `lensmodel`, one module for each group."""

@@ -1,0 +1,1 @@
+"""`lensmodel demo`: the whole way once, on a real RAW file and on a lens whose truth is known."""

@@ -1,0 +1,168 @@
+"""The demo from start to end, over HTTP as any other user of the service."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from app.client import Client
+from app.demo import camera, figures, measure
+from app.demo.report import Report
+from app.demo.service import own_service
+from app.schemas import CorrectionOut, JobOut, PhotoOut
+from lensmodel.photo import develop
+from lensmodel.simulate import demo_data_path
+
+Say = Callable[[str], None]
+
+REAL_RAW = "canon_kissx4_colorchart.dng"
+
+
+def run(output: Path, say: Say) -> bool:
+    """Run the demo; return whether the figures show an improvement.
+
+    Parameters
+    ----------
+    output : Path
+        Folder for what it leaves behind; files of an earlier demo there are replaced.
+    say : callable
+        Takes one line of progress at a time.
+    """
+    output.mkdir(parents=True, exist_ok=True)
+    began = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="lensmodel-demo-") as folder:
+        work = Path(folder)
+        say(f"Photographing 5 scenes through the simulated lens {camera.demo_lens().model} ...")
+        shots = camera.take_photos(
+            work / "photos",
+            workers=os.cpu_count() or 1,
+            on_photo=lambda name, done, total: say(f"  photo {done} of {total}: {name}"),
+        )
+        say("Starting the service ...")
+        with own_service(work / "data", output / "service.log") as client:
+            report = _simulated(client, shots, work, output, say)
+            _real(client, report, work, output, say)
+        say("The service has stopped.")
+    report.seconds = time.monotonic() - began
+    report.write(output)
+    say(f"Report: {output / 'report.md'}")
+    return report.improved
+
+
+def _simulated(client: Client, shots: dict[str, camera.Shot], work: Path, output: Path, say: Say) -> Report:
+    report = Report(lens=camera.demo_lens().model, aperture=camera.demo_settings().aperture or 0.0)
+    lens_id = ""
+    for number, name in enumerate(camera.LEARN_FROM, start=1):
+        say(f"Uploading {name}.dng, photo {number} of {len(camera.LEARN_FROM)} of this lens")
+        uploaded = client.upload(shots[name].path)
+        _follow(client, uploaded, say)
+        lens_id = client.photo(uploaded.id).lens_id or lens_id
+    lens = client.lens(lens_id)
+    say(f"Lens {lens.model}, version {lens.version}: {lens.photos} photos, {lens.samples} samples")
+    for version in range(1, lens.version + 1):
+        report.psf_error.append(measure.psf_error(client, lens_id, version))
+    for place in (0.0, 0.5, 0.9):
+        answer = client.psf(lens_id, r=place, phi=0.6, aperture=lens.apertures[0])
+        report.answers.append(
+            (place, answer.support.effective_samples, answer.support.photos, answer.support.predicted_error)
+        )
+
+    held_out = client.upload(shots[camera.HELD_OUT].path, calibrate=False)
+    chart = client.upload(shots[camera.CHART].path, calibrate=False)
+    for photo in (held_out, chart):
+        _follow(client, photo, say)
+    truth = shots[camera.HELD_OUT]
+    before = measure.developed(truth)
+    report.psnr_before = measure.psnr(before, truth)
+    after = before
+    for version in range(1, lens.version + 1):
+        say(f"Correcting {camera.HELD_OUT} with version {version} of the lens")
+        path = _corrected(client, held_out, work, say, lens_version=version, color_space="camera-linear")
+        after = measure.corrected(path)
+        report.psnr_after.append(measure.psnr(after, truth))
+    path = _corrected(client, chart, work, say, color_space="camera-linear")
+    report.chart_before = measure.sharpness(measure.developed(shots[camera.CHART]))
+    report.chart_after = measure.sharpness(measure.corrected(path))
+
+    shutil.copy(_corrected(client, held_out, work, say), output / "corrected.tif")
+    gain = camera.demo_camera().white_balance
+    rows = {
+        "as photographed": figures.as_shown(before, gain),
+        "corrected": figures.as_shown(after, gain),
+        "the scene itself": figures.as_shown(truth.sharp(), gain),
+    }
+    figures.mosaic(rows, output / "before-after.png")
+    (output / "psf-field.png").write_bytes(client.field_png(lens_id, aperture=lens.apertures[0]))
+    history = client.calibrations(lens_id)
+    (output / "calibration-history.json").write_text(
+        json.dumps([event.model_dump(mode="json") for event in history], indent=2), encoding="utf-8"
+    )
+    figures.curve(
+        output / "calibration-history.svg",
+        title="Error of the PSF after each photo",
+        x_label="photos of this lens",
+        series={zone: [row[zone] for row in report.psf_error] for zone in ("center", "mid", "corner")},
+        unit="(relative L2)",
+    )
+    return report
+
+
+def _real(client: Client, report: Report, work: Path, output: Path, say: Say) -> None:
+    say(f"Uploading {REAL_RAW}, a real RAW file; it does not say its lens, so the form does")
+    path = demo_data_path(REAL_RAW)
+    photo = client.upload(
+        path, lens_maker="Canon", lens_model="unknown lens of the Kiss X4", lens_serial="demo-1", aperture=5.6
+    )
+    job = _follow(client, photo, say)
+    photo = client.photo(photo.id)
+    correction = client.correct(photo.id)
+    _follow(client, correction, say)
+    result = client.download(correction.id, work / "real.tif")
+    shutil.copy(result, output / "corrected-real.tif")
+    found = client.correction(correction.id)
+    report.real = {
+        "patches": job.progress.total,
+        "zones": (found.report or {}).get("zones", {}),
+    }
+    original = develop(path)
+    gains = original.white_balance
+    linear = _corrected(client, photo, work, say, color_space="camera-linear")
+    rows: dict[str, figures.Picture] = {
+        "as photographed": figures.as_shown(original.planes, gains),
+        "corrected": figures.as_shown(measure.corrected(linear), gains),
+    }
+    figures.mosaic(rows, output / "before-after-real.png")
+
+
+def _corrected(
+    client: Client, photo: PhotoOut, work: Path, say: Say, *, lens_version: int | None = None, **output: str
+) -> Path:
+    wish: dict[str, Any] = {"output": {"format": "tiff16", **output}}
+    if lens_version is not None:
+        wish["lens_version"] = lens_version
+    correction = client.correct(photo.id, **wish)
+    _follow(client, correction, say)
+    return client.download(correction.id, work / f"{correction.id}.tif")
+
+
+def _follow(client: Client, work: PhotoOut | CorrectionOut, say: Say) -> JobOut:
+    last = ""
+
+    def show(job: JobOut) -> None:
+        nonlocal last
+        words = f"  {job.stage or job.state}"
+        if job.progress.total:
+            words += f" {job.progress.done} of {job.progress.total} {job.progress.unit}"
+        if job.eta_seconds:
+            words += f", about {job.eta_seconds:.0f} s left"
+        if words != last:
+            last = words
+            say(words)
+
+    return client.wait(work, timeout=900, on_change=show)

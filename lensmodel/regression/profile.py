@@ -1,0 +1,156 @@
+"""The portable lens profile: a zip of JSON and npy that opens anywhere and gives the same PSFs.
+
+Layout of a `.lensprofile`, format 1::
+
+    profile.json    format, lens, provenance, settings of the model, one entry for each sample
+    kernels.npy     (n, k, k) float32, sum 1, centred, in the order of the entries
+
+Nothing in it can run code: no pickle, sizes bounded before arrays are made.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import secrets
+import zipfile
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lensmodel.errors import InvalidInputError, LensModelError
+from lensmodel.psf import PsfSample, resized
+from lensmodel.regression.model import LensModel, ModelSettings
+from lensmodel.types import FieldPosition, LensSettings
+
+FORMAT = 1
+_MAX_BYTES = 1 << 30
+_MAX_SAMPLES = 200_000
+_INFINITY = "infinity"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LensProfile:
+    """A model with what is known of its lens and of the photos that it came from.
+
+    Parameters
+    ----------
+    model : LensModel
+    lens : dict
+        Texts: maker, model, serial, label; whatever is known.
+    photos : dict
+        File name of each photo by the id that samples carry.
+    """
+
+    model: LensModel
+    lens: dict[str, str] = field(default_factory=dict)
+    photos: dict[str, str] = field(default_factory=dict)
+
+
+def save_profile(path: Path | str, profile: LensProfile) -> None:
+    """Write a profile; the file appears complete or not at all."""
+    samples = profile.model.samples
+    side = max(sample.kernel.shape[0] for sample in samples)
+    stack = np.stack([resized(sample.kernel, side) for sample in samples]).astype(np.float32)
+    document = {
+        "format": FORMAT,
+        "units": {"r": "half-diagonal", "phi": "radian, counter-clockwise from the right", "kernel": "pixel"},
+        "lens": profile.lens,
+        "photos": profile.photos,
+        "model": asdict(profile.model.settings),
+        "samples": [_entry(sample) for sample in samples],
+    }
+    arrays = io.BytesIO()
+    np.save(arrays, stack, allow_pickle=False)
+    target = Path(path)
+    part = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
+    try:
+        with part.open("xb") as file:
+            with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+                archive.writestr("profile.json", json.dumps(document, allow_nan=False))
+                archive.writestr("kernels.npy", arrays.getvalue())
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(target)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def load_profile(path: Path | str) -> LensProfile:
+    """Open a profile.
+
+    Raises
+    ------
+    InvalidInputError
+        If the file is no profile, or one of a newer format; the text says which.
+    """
+    name = Path(path).name
+    try:
+        with zipfile.ZipFile(path) as archive:
+            sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
+            if sum(sizes.values()) > _MAX_BYTES:
+                raise InvalidInputError(
+                    f"{name} unpacks to more than {_MAX_BYTES >> 20} MiB; it is no lens profile"
+                )
+            document = json.loads(archive.read("profile.json"))
+            stack = np.load(io.BytesIO(archive.read("kernels.npy")), allow_pickle=False)
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise InvalidInputError(f"{name} is no lens profile; make one with `lensmodel calibrate`") from error
+    try:
+        if document["format"] != FORMAT:
+            raise InvalidInputError(
+                f"{name} has profile format {document['format']}, this program reads {FORMAT}; "
+                "update the program"
+            )
+        entries = document["samples"]
+        fits = stack.ndim == 3 and len(entries) == stack.shape[0] and 0 < len(entries) <= _MAX_SAMPLES
+        if not fits or stack.dtype != np.float32:
+            raise InvalidInputError(f"{name} holds {len(entries)} samples but kernels of shape {stack.shape}")
+        samples = [_sample(entry, kernel) for entry, kernel in zip(entries, stack, strict=True)]
+        model = LensModel.fit(samples, ModelSettings(**document["model"]))
+        return LensProfile(model, _texts(document["lens"]), _texts(document["photos"]))
+    except LensModelError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InvalidInputError(f"{name} is damaged: {error}") from error
+
+
+def _entry(sample: PsfSample) -> dict[str, Any]:
+    settings = asdict(sample.settings)
+    if settings["focus_m"] is not None and math.isinf(settings["focus_m"]):
+        settings["focus_m"] = _INFINITY
+    return {
+        "r": sample.position.r,
+        "phi": sample.position.phi,
+        "settings": settings,
+        "weight": sample.weight,
+        "photo": sample.photo,
+        "pixel_pitch_um": sample.pixel_pitch_um,
+        "estimator": sample.estimator,
+    }
+
+
+def _sample(entry: dict[str, Any], kernel: Any) -> PsfSample:  # noqa: ANN401 - one row of an array of any shape
+    settings = dict(entry["settings"])
+    if settings.get("focus_m") == _INFINITY:
+        settings["focus_m"] = math.inf
+    return PsfSample(
+        kernel=kernel,
+        position=FieldPosition(float(entry["r"]), float(entry["phi"])),
+        settings=LensSettings(**settings),
+        weight=float(entry["weight"]),
+        photo=str(entry["photo"]),
+        pixel_pitch_um=entry["pixel_pitch_um"],
+        estimator=str(entry["estimator"]),
+    )
+
+
+def _texts(values: dict[str, Any]) -> dict[str, str]:
+    return {str(key)[:200]: str(value)[:200] for key, value in values.items()}

@@ -65,6 +65,10 @@ class LensName:
     serial_source: str = "user"
 
 
+LATE = timedelta(minutes=10)
+"""Blobs of what is deleted are deleted again after this time: a worker may have written one more."""
+
+
 @dataclass(frozen=True, slots=True)
 class Received:
     """What an upload became: the photo, and whether there is work to do for it."""
@@ -105,34 +109,32 @@ class PhotoStore:
         """
         with self._db.writing(durable=True) as session:
             owner_key = ensure_owner(session, owner)
-            known = _known(session, owner_key, sha256)
-            if known is not None:
-                again = known.state in {"failed", "cancelled"} or (known.state == "stored" and calibrate)
-                if again:
-                    known.calibrate = calibrate
-                    known.given = {**known.given, **given}
-                    _restart(session, known)
-                return Received(known, fresh=again)
-            photo = PhotoRow(
-                public_id=public_id,
-                owner_id=owner_key,
-                sha256=sha256,
-                filename=filename,
-                kind=kind,
-                byte_size=byte_size,
-                blob_key=blob_key,
-                calibrate=calibrate,
-                given=dict(given),
-                state="received",
-                received_at=now(),
-                stage_at=now(),
+            fresh = {
+                "public_id": public_id,
+                "owner_id": owner_key,
+                "sha256": sha256,
+                "filename": filename,
+                "kind": kind,
+                "byte_size": byte_size,
+                "blob_key": blob_key,
+                "calibrate": calibrate,
+                "given": dict(given),
+                "state": "received",
+                "received_at": now(),
+                "stage_at": now(),
                 **{column: given.get(field) for field, column in GIVEN_SETTINGS.items()},
-            )
-            session.add(photo)
-            prefix = f"{blob_key.rpartition('/')[0]}/"
-            session.execute(delete(GarbageRow).where(GarbageRow.prefix == prefix))
-            session.flush()
-            return Received(photo, fresh=True)
+            }
+            if insert_new(session, PhotoRow, [fresh]):
+                prefix = f"{blob_key.rpartition('/')[0]}/"
+                session.execute(delete(GarbageRow).where(GarbageRow.prefix == prefix))
+                return Received(_known(session, owner_key, sha256), fresh=True)
+            known = _known(session, owner_key, sha256)
+            again = known.state in {"failed", "cancelled"} or (known.state == "stored" and calibrate)
+            if again:
+                known.calibrate = calibrate
+                known.given = {**known.given, **given}
+                _restart(session, known)
+            return Received(known, fresh=again)
 
     def known(self, owner: str, sha256: str) -> PhotoRow | None:
         """Return the owner's photo with these bytes."""
@@ -368,16 +370,16 @@ class PhotoStore:
             photo.state = "cancelled" if photo.state in UNFINISHED else photo.state
             photo.given, photo.lens_serial, photo.filename = {}, None, ""
             prefix = photo.blob_key.rpartition("/")[0]
-            insert_new(session, GarbageRow, [{"prefix": f"{prefix}/", "not_before": now()}])
+            insert_new(session, GarbageRow, [{"prefix": f"{prefix}/", "not_before": now() + LATE}])
             return f"{prefix}/"
 
 
-def _known(session: Session, owner_key: int, sha256: str) -> PhotoRow | None:
-    return session.scalar(
+def _known(session: Session, owner_key: int, sha256: str) -> PhotoRow:
+    return session.scalars(
         select(PhotoRow).where(
             PhotoRow.owner_id == owner_key, PhotoRow.sha256 == sha256, PhotoRow.deleted_at.is_(None)
         )
-    )
+    ).one()
 
 
 def _restart(session: Session, photo: PhotoRow) -> None:

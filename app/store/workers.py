@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import timedelta
+from datetime import datetime, timedelta
 
 from sqlalchemy import delete, select, update
 
@@ -78,9 +78,10 @@ class WorkerStore:
         with self._db.writing() as session:
             session.execute(delete(WorkerRow).where(WorkerRow.id == worker_id, WorkerRow.state == "dead"))
 
-    def garbage(self, limit: int = 100) -> list[str]:
-        """Return prefixes of blobs that are due for deletion."""
-        query = select(GarbageRow.prefix).where(GarbageRow.not_before <= now()).limit(limit)
+    def garbage(self, limit: int = 100, *, at: datetime | None = None) -> list[str]:
+        """Return prefixes of blobs that are due for deletion, now or at another time."""
+        due = now() if at is None else at
+        query = select(GarbageRow.prefix).where(GarbageRow.not_before <= due).limit(limit)
         with self._db.reading() as session:
             return list(session.scalars(query))
 

@@ -8,7 +8,7 @@ from importlib.metadata import version
 
 from fastapi import FastAPI
 
-from app import errors
+from app import errors, pages
 from app.dependencies import Services
 from app.middleware import RequestLog
 from app.models import ModelCache
@@ -44,6 +44,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.add_middleware(RequestLog)
     errors.install(app)
+    pages.install(app)
     app.include_router(health.probes)
     for router in (photos.router, jobs.router, lenses.router, psf.router, corrections.router, health.router):
         app.include_router(router, prefix="/v1")

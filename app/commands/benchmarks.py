@@ -24,7 +24,7 @@ def default(context: typer.Context) -> None:
 
 
 @bench.command()
-def blind(  # noqa: PLR0917 - options of a command, given by name
+def blind(
     photos: Annotated[Path | None, typer.Option(help="Folder of sharp photographs.")] = None,
     psfs: Annotated[Path | None, typer.Option(help="npz with the key psf, shape (n, k, k).")] = None,
     noise: Annotated[str, typer.Option(help="Standard deviations, comma separated.")] = "0.01,0.003",

@@ -17,7 +17,7 @@ from lensmodel.photo.model import (
 from lensmodel.photo.noise import estimate_noise
 from lensmodel.photo.raw import Demosaic
 from lensmodel.photo.sniffing import HEAD_BYTES, sniff
-from lensmodel.photo.writing import write_image
+from lensmodel.photo.writing import shown, write_image
 
 __all__ = [
     "HEAD_BYTES",
@@ -36,6 +36,7 @@ __all__ = [
     "inspect",
     "is_placeholder",
     "read_metadata",
+    "shown",
     "sniff",
     "write_image",
 ]

@@ -293,3 +293,8 @@ _UPRIGHT: Final[Mapping[int, Callable[[Pixels], Pixels]]] = {
     8: np.rot90,
 }
 """EXIF orientation -> how to turn the stored pixels upright."""
+
+
+def shown(planes: Planes, encoding: Encoding) -> NDArray[np.uint8]:
+    """Encode planes for a screen: 8-bit sRGB `(row, col, 3)`, white-balanced, in sensor orientation."""
+    return np.asarray(_encoded(planes, _target(encoding, "srgb"), 255), dtype=np.uint8)

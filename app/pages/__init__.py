@@ -1,0 +1,5 @@
+"""The web page: what a person sees of the service, rendered by the service itself."""
+
+from app.pages.routes import install
+
+__all__ = ["install"]

@@ -1,0 +1,220 @@
+"""Pages and their fragments and pictures; everything they do goes through the same API as others use."""
+
+from __future__ import annotations
+
+from collections import Counter
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+from fastapi import APIRouter, FastAPI, Query, Response
+from fastapi.responses import HTMLResponse
+from fastapi.staticfiles import StaticFiles
+from jinja2 import Environment, PackageLoader, select_autoescape
+
+from app import views
+from app.dependencies import Call, CallDep
+from app.pages import pictures, words
+from app.routes import corrections as correction_routes
+from app.routes import lenses as lens_routes
+from app.routes import photos as photo_routes
+from app.schemas import LensOut, PhotoOut
+
+HERE: Final = Path(__file__).parent
+SHOWN: Final = 60
+PLACES: Final = (
+    ("center", 0.5, 0.5),
+    ("upper left", 0.0, 0.0),
+    ("upper right", 0.0, 1.0),
+    ("lower left", 1.0, 0.0),
+    ("lower right", 1.0, 1.0),
+    ("top", 0.0, 0.5),
+    ("left", 0.5, 0.0),
+)
+HEADERS: Final = {
+    "Content-Security-Policy": (
+        "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; "
+        "frame-ancestors 'none'; base-uri 'none'; form-action 'self'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+}
+
+Share = Annotated[float, Query(ge=0, le=1, allow_inf_nan=False)]
+Side = Annotated[int, Query(ge=16, le=2000)]
+
+router = APIRouter(include_in_schema=False)
+templates = Environment(loader=PackageLoader("app.pages"), autoescape=select_autoescape(), trim_blocks=True)
+templates.filters.update(words.FILTERS)
+
+
+def install(app: FastAPI) -> None:
+    """Add the pages and their files to the application."""
+    app.include_router(router)
+    app.mount("/static", StaticFiles(directory=HERE / "static"), name="static")
+
+
+def _page(name: str, **values: Any) -> HTMLResponse:  # noqa: ANN401 - what the template shows
+    return HTMLResponse(templates.get_template(name).render(**values), headers=HEADERS)
+
+
+def _photos(call: Call, lens_id: str | None = None) -> tuple[list[PhotoOut], bool]:
+    page = photo_routes.list_photos(call, limit=SHOWN, lens_id=lens_id)
+    return page.items, page.next is not None
+
+
+def _lenses(call: Call) -> list[LensOut]:
+    return lens_routes.list_lenses(call, limit=SHOWN).items
+
+
+@router.get("/")
+def home(call: CallDep) -> HTMLResponse:
+    """Show where photos are given and what became of them."""
+    photos, more = _photos(call)
+    return _page("home.html", photos=photos, more=more, lenses=_lenses(call))
+
+
+@router.get("/ui/photos")
+def photos_fragment(call: CallDep) -> HTMLResponse:
+    """Show the list of photos again."""
+    photos, more = _photos(call)
+    return _page("_photos.html", photos=photos, more=more)
+
+
+@router.get("/ui/lenses")
+def lenses_fragment(call: CallDep) -> HTMLResponse:
+    """Show the list of lenses again."""
+    return _page("_lenses.html", lenses=_lenses(call))
+
+
+@router.get("/lenses/{lens_id}")
+def lens_page(lens_id: str, call: CallDep) -> HTMLResponse:
+    """Show a lens: its field of blur, its history, its photos."""
+    lens = lens_routes.read_lens(lens_id, call)
+    history = lens_routes.list_calibrations(lens_id, call, limit=200).items
+    photos, more = _photos(call, lens_id)
+    return _page("lens.html", lens=lens, history=history, photos=photos, more=more)
+
+
+@router.get("/photos/{photo_id}")
+def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
+    """Show a photo: what it taught, and how to correct it."""
+    row = photo_routes.find_photo(call, photo_id)
+    photo = photo_routes.describe(call, row)
+    turned = row.orientation or 1
+    patches = [views.patch_out(patch) for patch in call.store.patches.all_of(photo_id)]
+    if row.height and row.width:
+        patches = [pictures.upright_patch(patch, row.height, row.width, turned) for patch in patches]
+        if turned > 4:
+            photo = photo.model_copy(update={"width": row.height, "height": row.width})
+    left_out = Counter(patch.reason for patch in patches if patch.state in {"rejected", "failed"})
+    lenses = _lenses(call) if photo.state == "needs_lens" else []
+    mine = correction_routes.list_corrections(call, limit=50, photo_id=photo_id).items
+    return _page(
+        "photo.html",
+        photo=photo,
+        patches=patches,
+        used=sum(patch.state == "done" for patch in patches),
+        reasons=left_out.most_common(),
+        candidates=lenses,
+        corrections=mine,
+    )
+
+
+@router.get("/ui/photos/{photo_id}/state")
+def photo_state(photo_id: str, call: CallDep) -> HTMLResponse:
+    """Show where a photo stands."""
+    photo = photo_routes.describe(call, photo_routes.find_photo(call, photo_id))
+    return _page("_photo_state.html", photo=photo)
+
+
+@router.get("/corrections/{correction_id}")
+def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
+    """Show a corrected photo beside the original."""
+    plan = correction_routes.find_plan(call, correction_id)
+    correction = views.correction_out(plan)
+    zones = list(((correction.report or {}).get("zones") or {}).items())
+    columns = list(dict.fromkeys(name for _, values in zones for name in values))
+    return _page(
+        "correction.html",
+        correction=correction,
+        job=views.correction_job(plan),
+        photo=photo_routes.describe(call, plan.photo),
+        zones=zones,
+        columns=columns,
+        places=PLACES,
+    )
+
+
+@router.get("/ui/corrections/{correction_id}/state")
+def correction_state(correction_id: str, call: CallDep) -> HTMLResponse:
+    """Show where a correction stands."""
+    plan = correction_routes.find_plan(call, correction_id)
+    return _page(
+        "_correction_state.html", correction=views.correction_out(plan), job=views.correction_job(plan)
+    )
+
+
+# --- pictures ------------------------------------------------------------------------------------
+
+
+def _picture(data: bytes, media_type: str) -> Response:
+    return Response(data, media_type=media_type, headers={"Cache-Control": "private, max-age=3600"})
+
+
+@router.get("/ui/photos/{photo_id}/preview.jpg")
+def photo_preview(photo_id: str, call: CallDep, size: Side = 1200) -> Response:
+    """Show a photo in small."""
+    photo_routes.find_photo(call, photo_id)
+    developed = pictures.open_developed(call.settings.data_dir, photo_id)
+    return _picture(pictures.preview(developed, size), "image/jpeg")
+
+
+@router.get("/ui/photos/{photo_id}/r-map.png")
+def photo_r_map(photo_id: str, call: CallDep, size: Side = 1200) -> Response:
+    """Show where the edges of a photo tell about the blur."""
+    photo_routes.find_photo(call, photo_id)
+    developed = pictures.open_developed(call.settings.data_dir, photo_id)
+    return _picture(pictures.confidence_map(developed, size), "image/png")
+
+
+@router.get("/ui/photos/{photo_id}/crop.png")
+def photo_crop(
+    photo_id: str, call: CallDep, row: Share, col: Share, width: Side = 640, height: Side = 420
+) -> Response:
+    """Show a part of the photo as it was, 1:1."""
+    photo_routes.find_photo(call, photo_id)
+    developed = pictures.open_developed(call.settings.data_dir, photo_id)
+    return _picture(pictures.crop_of_photo(developed, row, col, height, width), "image/png")
+
+
+@router.get("/ui/corrections/{correction_id}/crop.png")
+def correction_crop(
+    correction_id: str, call: CallDep, row: Share, col: Share, width: Side = 640, height: Side = 420
+) -> Response:
+    """Show a part of the corrected photo, 1:1."""
+    plan = correction_routes.find_plan(call, correction_id)
+    done = plan.correction
+    if done.state != "succeeded" or done.result_key is None or done.result_media_type is None:
+        raise pictures.NotReadyError(f"correction {correction_id} is {done.state}: wait for its job")
+    read = partial(call.storage.get, done.result_key)
+    picture = pictures.decoded(
+        _Named(read, done.result_key), done.result_key, done.result_media_type, plan.photo.orientation or 1
+    )
+    return _picture(pictures.crop_of_result(picture, row, col, height, width), "image/png")
+
+
+class _Named:
+    """A reader that is equal to another of the same key, so that what it read can be cached."""
+
+    def __init__(self, read: partial[bytes], key: str) -> None:
+        self._read, self._key = read, key
+
+    def __call__(self) -> bytes:
+        return self._read()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Named) and other._key == self._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)

@@ -15,6 +15,7 @@ ENVELOPE_PERCENTILE: Final = 15.0
 ENVELOPE_RATIO: Final = 1.25
 CORNER_ALLOWANCE: Final = 0.2
 """The allowed ratio grows with r²: copies of a lens differ, and a decentred one is not out of focus."""
+GROWTH: Final = 4.0
 QUARTER_ALLOWANCE: Final = 1.2
 """A quarter of a window has fewer edges, its width a larger error."""
 SHARP_PX: Final = 0.6
@@ -29,8 +30,10 @@ def width_envelope(windows: Windows) -> NDArray[np.float64]:
     """Smallest consistent edge width at each window's r.
 
     Defocus can only widen, so that the lower envelope over a ring of the field is the width of
-    the lens in focus. The rings' 15th percentiles are made to grow outwards (weighted isotonic
-    regression): a ring that is out of focus as a whole is then judged by its neighbours.
+    the lens in focus. The rings' 15th percentiles become an envelope by two facts about lenses:
+    it does not fall outwards, so that a ring holds at most what every ring further out holds;
+    and it grows by no more than the factor 1 + 4 r², so that a background far out of focus does
+    not pass for a soft corner.
 
     Returns
     -------
@@ -44,22 +47,10 @@ def width_envelope(windows: Windows) -> NDArray[np.float64]:
     if not used:
         return np.full(len(windows), np.inf)
     low = np.array([np.percentile(members[k], ENVELOPE_PERCENTILE) for k in used])
-    level = isotonic(low, np.array([float(members[k].size) for k in used]))
+    level = np.maximum(np.minimum.accumulate(low[::-1])[::-1], SHARP_PX)
     centres = (np.array(used) + 0.5) / RINGS
-    return np.maximum(np.interp(windows.r, centres, level), SHARP_PX)
-
-
-def isotonic(values: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Closest non-decreasing sequence in the weighted least-squares sense (pool adjacent violators)."""
-    groups: list[tuple[float, float, int]] = []
-    for value, weight in zip(values.tolist(), weights.tolist(), strict=True):
-        current = (value, weight, 1)
-        while groups and groups[-1][0] > current[0]:
-            mean, mass, size = groups.pop()
-            both = mass + current[1]
-            current = ((mean * mass + current[0] * current[1]) / both, both, size + current[2])
-        groups.append(current)
-    return np.concatenate([np.full(size, mean) for mean, _, size in groups])
+    most = level[0] * (1.0 + GROWTH * windows.r**2)
+    return np.minimum(np.interp(windows.r, centres, level), most)
 
 
 def defocus_excess(windows: Windows) -> NDArray[np.float64]:

@@ -13,7 +13,6 @@ from scipy import ndimage
 from lensmodel.errors import InvalidInputError, NoUsablePatchesError, UnknownMethodError
 from lensmodel.geometry import Frame
 from lensmodel.patches import REASONS, Patch, Selection, r_map, select, selectors
-from lensmodel.patches.defocus import isotonic
 from lensmodel.types import NoiseModel, Plane
 
 NOISE = NoiseModel.white(0.003)
@@ -315,12 +314,6 @@ def test_wrong_arguments_are_named(photo: Plane) -> None:
 
 
 # ---- parts
-
-
-def test_isotonic_pools_adjacent_violators_by_weight() -> None:
-    result = isotonic(np.array([1.0, 3.0, 1.0, 5.0]), np.array([1.0, 1.0, 3.0, 1.0]))
-
-    np.testing.assert_allclose(result, [1.0, 1.5, 1.5, 5.0])
 
 
 def test_every_selector_scores_within_zero_and_one(photo: Plane) -> None:

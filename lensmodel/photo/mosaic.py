@@ -18,6 +18,9 @@ _BAND: Final = 16
 _CLUSTER: Final = 0.005
 """Width of the pile of saturated pixels, relative to the range: full wells differ a little."""
 
+_LOWEST_PILE: Final = 0.8
+"""Lowest level, relative to the stated one, at which sensors were seen to clip."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mosaic:
@@ -130,7 +133,7 @@ class Mosaic:
             return None
         top = len(counts) - 1
         width = max(2, round(_CLUSTER * (self.white - self.black[colour])))
-        if top < self.black[colour] + 0.5 * (self.white - self.black[colour]) or top < 3 * width:
+        if top < self.black[colour] + _LOWEST_PILE * (self.white - self.black[colour]):
             return None
         pile, below = counts[top - width + 1 :], counts[top - 3 * width + 1 : top - width + 1]
         # More than half of a colour in one pile is an even area of a drawing, not a clipped light.

@@ -59,7 +59,7 @@ def _read_with_pillow(path: Path, header: Header) -> Pixels:
         with warnings.catch_warnings():
             # Our own limit was checked on the header, before this.
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path, formats=("JPEG", "PNG", "MPO")) as image:
+            with Image.open(path, formats=("JPEG", "PNG")) as image:
                 if image.mode not in _PLAIN_MODES:
                     raise UnsupportedFormatError(
                         f"pictures of kind {image.mode} are not read; convert it to RGB"

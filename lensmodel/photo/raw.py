@@ -10,7 +10,6 @@ from typing import Final, Literal
 
 import numpy as np
 import rawpy
-from numpy.typing import NDArray
 
 from lensmodel.errors import (
     InvalidInputError,
@@ -33,20 +32,24 @@ _ALGORITHMS: Final = {
     "linear": rawpy.DemosaicAlgorithm.LINEAR,
     "half": rawpy.DemosaicAlgorithm.LINEAR,
 }
-_VARIANCE_GAIN: Final = {
-    "ahd": (1.06, 0.84, 1.06),
-    "dht": (0.97, 0.90, 0.97),
-    "linear": (0.5625, 0.625, 0.5625),
-    "half": (1.0, 0.5, 1.0),
+_NOISE_MIX: Final = {
+    "ahd": np.array([[0.53, 0.54, 0.0], [0.03, 0.77, 0.03], [0.0, 0.54, 0.53]]),
+    "dht": np.array([[0.48, 0.42, 0.06], [0.06, 0.77, 0.06], [0.06, 0.42, 0.48]]),
+    "linear": np.diag([0.5625, 0.625, 0.5625]),
+    "half": np.diag([1.0, 0.5, 1.0]),
 }
-"""Variance of demosaiced over that of raw pixels, for r, g, b, where noise is white and small.
+"""Share of the variance of each colour's pixels (column) in each demosaiced plane (row).
 
-For "linear" and "half" it is the sum of squared weights; for the others it was measured on
-flat fields, as the tests do again. The noise is no longer white: its power at low frequencies
-is about 3.7 times that of the sensor in red and blue and 1.9 times in green, whatever the method.
+For "linear" and "half" these are the sums of squared weights; for the others they were measured
+on flat fields, as the tests do again. The noise of the planes is not white: whatever the
+method, its power at low frequencies is about 3.7 times that of the sensor in red and blue and
+1.9 times in green, and at the highest it is about half.
 """
 
 _FULL: Final = 65535.0
+
+_LEAST_SHARE: Final = 0.25
+"""No channel is balanced by more than this relative to the strongest: it costs two of 16 bits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,12 +131,12 @@ def develop_raw(path: Path, demosaic: Demosaic = "default") -> DevelopedRaw:
             mosaic.check()
             white, clip = mosaic.saturation()
         sensor_noise = _sensor_noise(mosaic, white)
-        planes = _as_planes(_postprocess(raw, method, white))
         balance = _white_balance(raw)
+        planes = _developed(raw, method, white, balance)
         to_srgb, xyz_to_camera = _colour(raw, balance)
         return DevelopedRaw(
             planes=planes,
-            noise=_plane_noise(planes, sensor_noise, method),
+            noise=_plane_noise(planes, sensor_noise, method, balance),
             sensor_noise=sensor_noise,
             clip=clip,
             white_balance=balance,
@@ -150,7 +153,15 @@ def _pipeline_step(mosaic: Mosaic | None, method: str) -> str:
     return method if mosaic.is_bayer else "xtrans"  # for which LibRaw has one method only
 
 
-def _postprocess(raw: rawpy.RawPy, method: str, white: int) -> NDArray[np.uint16]:
+def _developed(raw: rawpy.RawPy, method: str, white: int, balance: tuple[float, float, float]) -> Planes:
+    """Demosaic with white balance, then take the balance off again.
+
+    Demosaicing fills in the fine detail of red and blue from green, as if their contrasts were
+    equal. That is roughly so after white balance only: without it the red of a camera whose
+    red is 0.4 of its green gets detail that is 2.5 times too strong.
+    """
+    share = np.asarray(balance) / max(balance)
+    share = np.maximum(share, _LEAST_SHARE)
     developed = raw.postprocess(
         demosaic_algorithm=_ALGORITHMS[method],
         half_size=method == "half",
@@ -158,23 +169,24 @@ def _postprocess(raw: rawpy.RawPy, method: str, white: int) -> NDArray[np.uint16
         no_auto_bright=True,
         output_bps=16,
         output_color=rawpy.ColorSpace.raw,
-        user_wb=[1.0, 1.0, 1.0, 1.0],
+        user_wb=[float(share[0]), float(share[1]), float(share[2]), float(share[1])],
         user_flip=0,
         # LibRaw applies this after it took the black level off, so it counts from black.
         user_sat=None if white == raw.white_level else white - min(raw.black_level_per_channel),
         adjust_maximum_thr=0.0,  # else LibRaw makes the brightest pixel of each photo the white
-        highlight_mode=rawpy.HighlightMode.Clip,
+        highlight_mode=rawpy.HighlightMode.Ignore,  # the strongest channel reaches 65535, none is cut
         median_filter_passes=0,
         fbdd_noise_reduction=rawpy.FBDDNoiseReductionMode.Off,
     )
-    return np.asarray(developed, dtype=np.uint16)
-
-
-def _as_planes(rgb: NDArray[np.uint16]) -> Planes:
+    rgb = np.asarray(developed)
     if rgb.ndim != 3 or rgb.shape[2] not in {1, 3}:
         raise UnsupportedFormatError("only RAW files of three colours, or none, are read")
-    planes = np.empty((3, *rgb.shape[:2]), dtype=np.float32)
-    np.multiply(np.moveaxis(rgb, -1, 0), np.float32(1 / _FULL), out=planes)
+    planes: Planes = np.empty((3, *rgb.shape[:2]), dtype=np.float32)
+    # LibRaw rounds down, and so do we: saturated pixels become 1.0 and not a little less.
+    saturated = np.floor(_FULL * share)
+    for k, plane in enumerate(planes):
+        np.multiply(rgb[:, :, min(k, rgb.shape[2] - 1)], np.float32(1 / saturated[k]), out=plane)
+        np.minimum(plane, np.float32(1.0), out=plane)
     if float(planes.max()) <= 0.0:
         raise RawDecodeError("the developed photo is black everywhere; the file holds no picture")
     return planes
@@ -188,15 +200,24 @@ def _sensor_noise(mosaic: Mosaic | None, white: int) -> PlaneNoise | None:
     return (sites[0], sites[1], sites[2]) if len(sites) == 3 else None
 
 
-def _plane_noise(planes: Planes, sensor: PlaneNoise | None, method: str) -> PlaneNoise:
-    """Variance of each plane's pixels, from that of the sensor where it is known."""
+def _plane_noise(
+    planes: Planes, sensor: PlaneNoise | None, method: str, balance: tuple[float, float, float]
+) -> PlaneNoise:
+    """Variance of each plane's pixels, from that of the sensor where it is known.
+
+    Demosaicing adds detail of colour s, noise included, to plane c after white balance w::
+
+        read_c = sum_s M_cs read_s (w_s / w_c)^2
+        shot_c = sum_s M_cs shot_s  w_s / w_c      (where the scene is grey)
+    """
     if sensor is None:
         r, g, b = (estimate_noise(plane, step=1 / _FULL) for plane in planes)
         return r, g, b
-    r, g, b = (
-        NoiseModel(model.shot * gain, model.read * gain)
-        for model, gain in zip(sensor, _VARIANCE_GAIN[method], strict=True)
-    )
+    weight = np.asarray(balance)[None, :] / np.asarray(balance)[:, None]
+    mix = _NOISE_MIX[method]
+    shot = (mix * weight) @ np.array([model.shot for model in sensor])
+    read = (mix * weight**2) @ np.array([model.read for model in sensor])
+    r, g, b = (NoiseModel(float(a), float(c)) for a, c in zip(shot, read, strict=True))
     return r, g, b
 
 

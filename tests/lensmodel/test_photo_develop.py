@@ -119,6 +119,21 @@ def test_raw_stays_in_sensor_orientation(tmp_path: Path, orientation: int) -> No
     assert developed.encoding.orientation == orientation
 
 
+@pytest.mark.parametrize("demosaic", ["ahd", "dht"])
+def test_detail_of_a_weak_red_is_no_stronger_than_it_was(tmp_path: Path, demosaic: photo.Demosaic) -> None:
+    neutral = np.array([0.4, 1.0, 0.6])
+    rows, cols = np.mgrid[:128, :128]
+    grey = 0.4 + 0.2 * np.sin(2 * np.pi * cols / 5.0) * np.cos(2 * np.pi * rows / 7.0)  # 0.24 cycles/pixel
+    mosaic = raw_numbers(grey * neutral[np.tile([[0, 1], [1, 2]], (64, 64))])
+    write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE, as_shot_neutral=neutral)
+    planes = photo.develop(tmp_path / "x.dng", demosaic=demosaic).planes
+
+    for plane, share in zip(planes[:, 16:-16, 16:-16], neutral, strict=True):
+        truth = (grey * share)[16:-16, 16:-16]
+        slope = np.polyfit(truth.ravel(), plane.ravel(), 1)[0]
+        assert slope == pytest.approx(1.0, abs=0.12)
+
+
 def test_half_size_makes_one_pixel_of_each_cell(tmp_path: Path) -> None:
     mosaic = raw_numbers(textured(64, 96))
     write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE)
@@ -284,6 +299,13 @@ def test_only_the_first_of_several_pages_is_the_photo(tmp_path: Path) -> None:
 
     truth = srgb_to_linear(np.moveaxis(pixels[0], -1, 0) / 255)
     assert photo.develop(path).planes == pytest.approx(truth, abs=1e-6)
+
+
+def test_only_the_first_picture_of_a_stereo_jpeg_is_the_photo(tmp_path: Path) -> None:
+    left, right = (Image.new("RGB", (64, 48), grey) for grey in ("white", "black"))
+    left.save(tmp_path / "x.jpg", "MPO", save_all=True, append_images=[right])
+
+    assert photo.develop(tmp_path / "x.jpg").planes.min() > 0.99
 
 
 def test_a_cmyk_tiff_is_refused(tmp_path: Path) -> None:

@@ -38,7 +38,8 @@ Ending: TypeAlias = Literal["ok", "error", "memory_limit", "time_limit", "crashe
 POLL_S: Final = 0.25
 MAX_MESSAGE: Final = 64 * 1024
 MAX_RESULT: Final = 16 * 1024 * 1024
-_PRELOAD: Final = ("numpy", "lensmodel.pipeline", "app.jobs.tasks")
+TASKS_MODULE = "app.jobs.tasks"
+"""Default module of the tasks; tests of the workers put in another."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,10 +158,10 @@ class Sandbox:
         Where the private folders of the tasks lie; of this process alone, emptied at start.
     budget : Budget
         What all children together may take.
-    module : str
+    module : str, optional
         Module whose `TASKS` maps names to functions; see `app.jobs.child.Task`.
-    preload : sequence of str
-        Modules that the fork server imports once, for all children.
+    preload : sequence of str, optional
+        Modules that the fork server imports once, for all children; by default that module.
     """
 
     def __init__(
@@ -168,13 +169,13 @@ class Sandbox:
         scratch: Path,
         budget: Budget,
         *,
-        module: str = "app.jobs.tasks",
-        preload: Sequence[str] = _PRELOAD,
+        module: str | None = None,
+        preload: Sequence[str] | None = None,
     ) -> None:
         self.scratch, self.budget = scratch, budget
-        self._module = module
+        self._module = module or TASKS_MODULE
         self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(list(preload))
+        self._context.set_forkserver_preload(["numpy", self._module] if preload is None else list(preload))
         self._alone = threading.Lock()  # the exit status of a child can be read only once
         self._stopping = threading.Event()
         shutil.rmtree(scratch, ignore_errors=True)

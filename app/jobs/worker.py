@@ -54,7 +54,7 @@ class Worker:
         self._engine: JobEngine = DbosEngine(settings.jobs, self.id, slots=settings.worker_slots)
         self._stop = threading.Event()
         self._last_beat = time.monotonic()
-        self._files: dict[Path, tuple[int, int]] = {}
+        self._files = {path: _identity(path) for path in self._database_files()}
 
     def run(self) -> None:
         """Work until told to stop."""
@@ -69,7 +69,6 @@ class Worker:
                 "measure": self._safe(corrections.measure, lambda *_: None),
             }
         )
-        self._files = {path: _identity(path) for path in self._database_files()}
         self._bury_the_gone(host)
         duties = (
             (self._settings.sweep_seconds, self._sweep),

@@ -1,0 +1,63 @@
+"""Tasks that take as long as they are told and need no photo: for tests of the workers."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from app.jobs.child import Progress
+from app.jobs.handover import KERNELS
+from lensmodel.psf import gaussian
+
+CELLS = 8
+SECONDS = 0.3
+LENS = {"maker": "Quick", "model": "Quick 50mm", "serial": "Q-1", "serial_source": "exif"}
+METADATA = {
+    "lens": LENS,
+    "aperture": 2.8,
+    "focal_mm": 50.0,
+    "orientation": 1,
+    **dict.fromkeys(
+        ("camera_maker", "camera_model", "focus_m", "iso", "exposure_s", "taken_at", "pixel_pitch_um")
+    ),
+}
+
+
+def inspect(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+    return {"kind": "dng", "width": 64, "height": 48, "metadata": METADATA}
+
+
+def develop(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+    np.save(folder / "planes.npy", np.zeros((3, 48, 64), np.float32))
+    return {}
+
+
+def select(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+    patches = [
+        {"row": 0, "col": k, "size": 8, "position": {"r": k / CELLS, "phi": 1.0}, "score": 1.0, "cell": k}
+        for k in range(CELLS)
+    ]
+    return {"patches": patches, "rejected": [], "lateral": None}
+
+
+def estimate(arguments: dict[str, Any], folder: Path, progress: Progress) -> list[dict[str, Any]]:
+    time.sleep(SECONDS)
+    np.save(folder / KERNELS, np.stack([gaussian(5, np.eye(2))] * 3))
+    common = {
+        "weight": 1.0,
+        "estimator": "quick/1",
+        "predicted_error": 0.1,
+        "diagnostics": {},
+        "evidence": None,
+    }
+    return [{"idx": arguments["numbers"][0], "channel": channel, **common} for channel in ("r", "g", "b")]
+
+
+def measure(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+    return {"error": {}, "coverage": {}}
+
+
+TASKS = {f.__name__: f for f in (inspect, develop, select, estimate, measure)}

@@ -1,0 +1,7 @@
+"""A worker process whose children run `quick_tasks`."""
+
+if __name__ == "__main__":
+    from app.jobs import sandbox, worker
+
+    sandbox.TASKS_MODULE = "quick_tasks"
+    worker.main()

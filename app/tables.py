@@ -186,7 +186,7 @@ class PhotoRow(Base):
     taken_at: Mapped[datetime | None] = mapped_column(DateTime())
     """By the camera's clock, whose zone nobody knows."""
 
-    lateral: Mapped[dict[str, Any] | None]
+    lateral: Mapped[dict[str, Any] | None] = mapped_column("lateral_colour")  # LATERAL is a word of SQL
     """Lateral colour that this photo shows: radial polynomials of red and blue."""
 
     epoch: Mapped[int] = mapped_column(default=1)

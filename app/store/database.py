@@ -44,7 +44,8 @@ class Database:
             self.durable = _sqlite(url, "BEGIN IMMEDIATE", "FULL")
             self.reader = _sqlite(url, "BEGIN", synchronous, read_only=True)
         else:
-            self.writer = self.durable = self.reader = create_engine(url, pool_pre_ping=True)
+            self.writer = self.durable = create_engine(url, pool_pre_ping=True)
+            self.reader = self.writer.execution_options(postgresql_readonly=True)
 
     @contextmanager
     def reading(self) -> Iterator[Session]:
@@ -98,8 +99,10 @@ def insert_new(session: Session, table: type[Base], rows: Sequence[dict[str, Any
         return 0
     dialect = session.get_bind().dialect.name
     insert = sqlite.insert if dialect == "sqlite" else postgresql.insert
+    key = table.__mapper__.primary_key[0]
     inserted = 0
     for row in rows:
-        statement = insert(table).values(**row).on_conflict_do_nothing()
-        inserted += max(session.connection().execute(statement).rowcount, 0)
+        # RETURNING tells what went in on both; the row count does not on PostgreSQL
+        statement = insert(table).values(**row).on_conflict_do_nothing().returning(key)
+        inserted += len(session.connection().execute(statement).all())
     return inserted

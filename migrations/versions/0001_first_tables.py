@@ -131,7 +131,7 @@ def upgrade() -> None:
         sa.Column("iso", sa.Double(), nullable=True),
         sa.Column("exposure_s", sa.Double(), nullable=True),
         sa.Column("taken_at", sa.DateTime(), nullable=True),
-        sa.Column("lateral", sa.JSON(), nullable=True),
+        sa.Column("lateral_colour", sa.JSON(), nullable=True),
         sa.Column("epoch", sa.Integer(), nullable=False),
         sa.Column("attempt", sa.Integer(), nullable=False),
         sa.Column("state", sa.String(length=20), nullable=False),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +16,8 @@ from starlette.testclient import TestClient
 from app.ids import new_id
 from app.settings import Settings
 from app.store import LensName, NewPatch, NewSample, Store
-from app.store.migrate import upgrade
+from app.store.database import Database
+from app.store.migrate import downgrade, upgrade
 from app.tables import PhotoRow
 from lensmodel.psf import gaussian
 
@@ -93,9 +95,20 @@ class Steps:
         return lens.public_id
 
 
+SERVER = os.environ.get("LENSMODEL_TEST_DATABASE", "")
+"""A PostgreSQL database to empty and to run the tests on, instead of SQLite files."""
+
+
 @pytest.fixture
 def settings(tmp_path: Path) -> Settings:
-    return Settings(data_dir=tmp_path / "data", long_poll_seconds=2.0, min_free_mb=0, max_upload_mb=1)
+    return Settings(
+        data_dir=tmp_path / "data",
+        database_url=SERVER,
+        shared_filesystem=True,
+        long_poll_seconds=2.0,
+        min_free_mb=0,
+        max_upload_mb=1,
+    )
 
 
 @pytest.fixture(scope="session")
@@ -111,7 +124,13 @@ def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def store(settings: Settings, empty_database: Path) -> Iterator[Store]:
     settings.data_dir.mkdir(parents=True)
-    shutil.copy(empty_database, settings.data_dir / "app.db")
+    if SERVER:
+        emptied = Database(SERVER)
+        downgrade(emptied, "base")
+        upgrade(emptied)
+        emptied.close()
+    else:
+        shutil.copy(empty_database, settings.data_dir / "app.db")
     opened = Store(settings)
     yield opened
     opened.close()

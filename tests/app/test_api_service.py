@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import logging
+import random
+import re
 from typing import Any
+from urllib.parse import quote
 
 import pytest
 from sqlalchemy.exc import OperationalError
@@ -186,3 +189,45 @@ def test_the_description_names_all_endpoints_of_the_contract(client: TestClient)
     }
     assert set(paths["/v1/photos/{photo_id}"]) == {"get", "patch", "delete"}
     assert CODE_OF_STATUS[404] == "not_found"
+
+
+HOSTILE = [
+    "",
+    "0",
+    "-1",
+    "1e999",
+    "nan",
+    "'; DROP TABLE lens;--",
+    "\u202e",
+    "%00",
+    "a" * 300,
+    "[]",
+    "{}",
+    "true",
+]
+
+
+def test_no_question_that_the_description_allows_for_brings_the_service_down(
+    client: TestClient, steps: Any
+) -> None:
+    rng = random.Random(7)
+    photo = steps.counted(patches=6)
+    known = [photo.public_id, steps.lens_id(photo)]
+
+    for path, methods in sorted(schema_of(client)["paths"].items()):
+        for method, operation in sorted(methods.items()):
+            if method not in {"get", "post", "patch"} or path.endswith("/events"):
+                continue
+            for _ in range(4):
+                filled = re.sub(r"\{\w+\}", lambda _: quote(rng.choice([*known, *HOSTILE]), safe=""), path)
+                names = [p["name"] for p in operation.get("parameters", []) if p["in"] == "query"]
+                query = {name: rng.choice(HOSTILE) for name in names if name != "wait" and rng.random() < 0.5}
+                body = (
+                    None
+                    if method == "get"
+                    else rng.choice([[], {}, {"photo_id": "\x00"}, {"aperture": []}, 7])
+                )
+                answer = client.request(method, filled, params=query, json=body)
+                assert answer.status_code < 500 or path == "/readyz", (method, filled, query, body)
+                if answer.status_code >= 400 and path != "/readyz":
+                    assert answer.headers["content-type"] == "application/problem+json"

@@ -10,7 +10,8 @@ from typing import Final
 import numpy as np
 
 from lensmodel.errors import UnknownMethodError
-from lensmodel.simulate.lens import DEFAULT_PITCH_UM, Aberrations, SimulatedLens
+from lensmodel.simulate.aberrations import Aberrations
+from lensmodel.simulate.lens import DEFAULT_PITCH_UM, SimulatedLens
 from lensmodel.simulate.pupil import REFERENCE_UM
 
 Draw = Callable[[np.random.Generator], "_Recipe"]

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from numpy.typing import NDArray
 from scipy import ndimage, optimize, special
 
@@ -171,6 +173,15 @@ def test_slanted_edge_refuses_what_holds_no_edge() -> None:
         slanted_edge(np.full((80, 80), np.nan))
     with pytest.raises(InvalidInputError, match="16 x 16"):
         slanted_edge(np.zeros((8, 80)))
+
+
+@pytest.mark.tools
+def test_published_edge_of_known_angle_and_width_is_measured_right(shared_data: Path) -> None:
+    edge = tifffile.imread(shared_data / "edges" / "simulated_edge_known_fwhm.tif")
+    measured = slanted_edge(edge.astype(np.float64))
+
+    assert measured.angle_deg == pytest.approx(16.776550, abs=5e-3)
+    assert 0.216 < measured.mtf50 < 0.226  # two independent tools say 0.218 and 0.224
 
 
 def test_crossing_interpolates_and_says_the_end_when_there_is_none() -> None:

@@ -51,9 +51,7 @@ def serve(settings: Settings, host: str | None = None, port: int | None = None) 
         chosen = _with_address(settings, host, port)
         chosen.data_dir.mkdir(parents=True, exist_ok=True)
         with _alone(chosen.data_dir), contextlib.closing(server.listen(chosen.host, chosen.port)) as listener:
-            database = Database(chosen.database)
-            migrate.upgrade(database)
-            database.close()
+            _migrate(chosen)
             return _Supervisor(chosen, listener).run()
     except (ValidationError, _TakenError) as error:
         print(f"lensmodel: {error}", file=sys.stderr)  # noqa: T201 - what a person at the terminal must know
@@ -66,6 +64,7 @@ def serve(settings: Settings, host: str | None = None, port: int | None = None) 
 def run_api(settings: Settings, host: str | None = None, port: int | None = None) -> None:
     """Run one API process in this process."""
     chosen = _with_address(settings, host, port)
+    _migrate(chosen)
     with contextlib.closing(server.listen(chosen.host, chosen.port)) as listener:
         server.run(chosen, listener)
 
@@ -76,8 +75,18 @@ def run_worker(settings: Settings) -> None:
     A new program rather than a call: children import the main module of their parent again, and
     that of a worker is small for this reason.
     """
+    _migrate(settings)
     os.environ.update(ONE_THREAD | environment(settings))
     os.execv(sys.executable, [sys.executable, "-m", "app.worker_main"])  # noqa: S606 - no shell is wanted
+
+
+def _migrate(settings: Settings) -> None:
+    """Bring the schema up to date; of several processes that try, one does it."""
+    database = Database(settings.database)
+    try:
+        migrate.upgrade(database)
+    finally:
+        database.close()
 
 
 def environment(settings: Settings) -> dict[str, str]:

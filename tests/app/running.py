@@ -29,7 +29,7 @@ SETTINGS = {
     "LENS_WORKER_SLOTS": "2",
     "LENS_MIN_FREE_MB": "0",
 }
-SERVE = "from app import settings, supervisor; raise SystemExit(supervisor.serve(settings.Settings()))"
+SERVE = [sys.executable, "-m", "app.cli", "serve", "--port", "0", "--data"]
 FINAL = {"succeeded", "failed", "cancelled"}
 
 
@@ -43,8 +43,6 @@ class Service:
             **{name: value for name, value in os.environ.items() if not name.startswith("LENS_")},
             **SETTINGS,
             **settings,
-            "LENS_DATA_DIR": str(data),
-            "LENS_PORT": "0",
         }
         self.process: subprocess.Popen[str] | None = None
         self.http = httpx2.Client(timeout=60.0)
@@ -53,7 +51,7 @@ class Service:
         """Start and wait until it says that it is ready."""
         with self.log.open("a") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-c", SERVE],
+                [*SERVE, str(self.data)],
                 env=self._environment,
                 stdout=subprocess.PIPE,
                 stderr=log,

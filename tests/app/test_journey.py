@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -13,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx2
 import numpy as np
 import pytest
 import tifffile
@@ -241,11 +244,7 @@ def test_work_that_a_stop_interrupted_goes_on_at_the_next_start(photos: Path, tm
 
 
 def test_a_second_service_on_the_same_data_is_refused(service: Service) -> None:
-    environment = {**os.environ, "LENS_DATA_DIR": str(service.data), "LENS_PORT": "0"}
-
-    second = subprocess.run(
-        [sys.executable, "-c", SERVE], env=environment, capture_output=True, text=True, check=False
-    )
+    second = subprocess.run([*SERVE, str(service.data)], capture_output=True, text=True, check=False)
 
     assert second.returncode == 2
     assert "another service already works on" in second.stderr
@@ -265,3 +264,33 @@ def test_killing_the_supervisor_leaves_no_process(photos: Path, tmp_path: Path) 
         assert [pid for pid in pids if Path(f"/proc/{pid}").exists()] == []
     finally:
         service.close()
+
+
+def test_the_parts_run_alone_for_installations_on_many_machines(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "app.cli"]
+    data = ["--data", str(tmp_path / "data")]
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    parts = [
+        subprocess.Popen([*command, "worker", *data], stderr=subprocess.DEVNULL),
+        subprocess.Popen([*command, "api", "--port", str(port), *data], stderr=subprocess.DEVNULL),
+    ]
+    try:
+        end = time.monotonic() + PATIENCE_S
+        ready = None
+        while ready is None or ready.status_code != 200:
+            assert time.monotonic() < end, ready
+            time.sleep(0.2)
+            with contextlib.suppress(httpx2.TransportError):
+                ready = httpx2.get(f"http://127.0.0.1:{port}/readyz")
+        for part in parts:
+            part.send_signal(signal.SIGTERM)
+        statuses = [part.wait(30) for part in parts]
+    finally:
+        for part in parts:
+            part.kill()
+            part.wait()
+
+    assert ready.json()["status"] == "ready"
+    assert statuses[0] == 0

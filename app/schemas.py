@@ -27,6 +27,7 @@ PhotoState = Literal[
 JobState = Literal["queued", "running", "waiting", "succeeded", "failed", "cancelled"]
 CorrectionState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 OutputFormat = Literal["tiff16", "png16", "png8", "jpeg", "dng"]
+SerialSource = Literal["exif", "makernote", "xmp", "user", "none"]
 ColorSpace = Literal["same", "srgb", "camera-linear"]
 
 
@@ -234,7 +235,7 @@ class LensOut(Model):
     maker: str | None
     model: str | None
     serial: str | None
-    serial_source: Literal["exif", "makernote", "xmp", "user", "none"]
+    serial_source: SerialSource
     label: str | None
     version: int
     photos: int
@@ -355,7 +356,7 @@ class OutputOptions(Question):
 
     format: OutputFormat = "tiff16"
     color_space: ColorSpace = "same"
-    quality: int = Field(95, ge=1, le=100, description="of JPEG")
+    quality: int = Field(default=95, ge=1, le=100, description="of JPEG")
 
 
 class Region(Question):

@@ -15,7 +15,7 @@ from typing import Protocol
 from urllib.parse import unquote, urlsplit
 
 import obstore
-from obstore.store import LocalStore, from_url
+from obstore.store import LocalStore, ObjectStore, from_url
 
 from app.ids import new_id
 
@@ -51,7 +51,7 @@ class Storage:
         if parts.scheme == "file":
             self.folder = Path(unquote(parts.path))
             self.folder.mkdir(parents=True, exist_ok=True)
-            self._store = LocalStore(prefix=self.folder)
+            self._store: ObjectStore = LocalStore(prefix=self.folder)
         else:
             self._store = from_url(url)
 

@@ -186,7 +186,7 @@ def lens_out(row: LensRow, apertures: list[float], focals: list[float]) -> s.Len
         maker=row.maker,
         model=row.model,
         serial=row.serial,
-        serial_source=row.serial_source,
+        serial_source=cast("s.SerialSource", row.serial_source),
         label=row.label,
         version=row.version,
         photos=row.photo_count,

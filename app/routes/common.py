@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Protocol, TypeVar
+from typing import Annotated, Any, Protocol, TypeAlias, TypeVar
 from urllib.parse import urlencode
 
 from fastapi import Query
@@ -29,13 +29,17 @@ class HasPublicId(Protocol):
 Row = TypeVar("Row", bound=HasPublicId)
 
 
-def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Return the OpenAPI entries of the problems that an endpoint may answer with."""
+Answers: TypeAlias = dict[int | str, dict[str, Any]]
+
+
+def problems(*statuses: int, also: Answers | None = None) -> Answers:
+    """Return the OpenAPI entries of the problems that an endpoint may answer with, and of `also`."""
     schema = {"schema": {"$ref": "#/components/schemas/Problem"}}
-    return {
+    found: Answers = {
         status: {"model": Problem, "description": "Problem", "content": {MEDIA_TYPE: schema}}
         for status in (*statuses, 500, 503)
     }
+    return found | (also or {})
 
 
 def cut(rows: Sequence[Row], limit: int) -> tuple[list[Row], str | None]:

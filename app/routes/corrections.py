@@ -37,8 +37,9 @@ _RANGE: Final = re.compile(r"bytes=(\d*)-(\d*)", re.ASCII)
     operation_id="createCorrection",
     status_code=status.HTTP_202_ACCEPTED,
     response_model=CorrectionOut,
-    responses={200: {"model": CorrectionOut, "description": "The same correction is finished"}}
-    | problems(404, 409, 422),
+    responses=problems(
+        404, 409, 422, also={200: {"model": CorrectionOut, "description": "The same correction is finished"}}
+    ),
 )
 def create_correction(wish: CorrectionIn, call: CallDep) -> CorrectionOut:
     """Correct a photo with the model of its lens, or of another."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib.metadata import version
+from typing import get_args
 
 from fastapi import APIRouter, status
 
@@ -88,8 +89,8 @@ def read_formats() -> FormatsOut:
     """Return what can be read and written, and the methods by name."""
     return FormatsOut(
         read=["raw", "dng", "tiff", "png", "jpeg"],
-        write=list(OutputFormat.__args__),
-        color_spaces=list(ColorSpace.__args__),
+        write=list(get_args(OutputFormat)),
+        color_spaces=list(get_args(ColorSpace)),
         psf=list(MEDIA_TYPES),
         methods=sorted(deconvolvers.entries),
         estimators=sorted(estimators.entries),

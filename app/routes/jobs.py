@@ -68,7 +68,7 @@ def list_jobs(
     "/jobs/{job_id}",
     operation_id="getJob",
     response_model=JobOut,
-    responses={304: {"description": "Not changed"}} | problems(404, 422),
+    responses=problems(404, 422, also={304: {"description": "Not changed"}}),
 )
 async def read_job(
     job_id: str,

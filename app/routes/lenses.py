@@ -85,11 +85,16 @@ def read_lateral_colour(lens_id: str, call: CallDep) -> LateralOut:
         lens_id=lens.public_id,
         version=lens.version,
         photos=min(len(red), len(blue)),
-        red=[median(terms) for terms in zip(*red, strict=True)],
-        blue=[median(terms) for terms in zip(*blue, strict=True)],
+        red=_middle(red),
+        blue=_middle(blue),
     )
 
 
 def _measured(seen: list[dict[str, Any]], colour: str) -> list[list[float]]:
     """Return the polynomials of photos that could tell; the others say "no shift" without knowing."""
     return [entry[colour] for entry in seen if entry[f"{colour}_points"] > 0]
+
+
+def _middle(polynomials: list[list[float]]) -> tuple[float, float, float, float]:
+    a, b, c, v = (median(terms) for terms in zip(*polynomials, strict=True))
+    return a, b, c, v

@@ -58,8 +58,16 @@ _UPLOAD_BODY = {
     operation_id="createPhoto",
     status_code=status.HTTP_202_ACCEPTED,
     response_model=PhotoOut,
-    responses={200: {"model": PhotoOut, "description": "The same bytes are known"}}
-    | problems(400, 404, 413, 415, 422, 429, 507),
+    responses=problems(
+        400,
+        404,
+        413,
+        415,
+        422,
+        429,
+        507,
+        also={200: {"model": PhotoOut, "description": "The same bytes are known"}},
+    ),
     openapi_extra={"requestBody": _UPLOAD_BODY},
 )
 async def create_photo(call: CallDep) -> PhotoOut:

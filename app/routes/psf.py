@@ -11,7 +11,7 @@ from fastapi import APIRouter, Query, Response, status
 from app import encode
 from app.dependencies import Call, CallDep
 from app.errors import InvalidParameterError, NotAcceptableError, UnknownLensError
-from app.routes.common import problems
+from app.routes.common import Answers, problems
 from app.schemas import FieldQuery, PsfOut, PsfQuery, QueryOut
 from app.store.samples import LensState
 from lensmodel.errors import OutsideSupportError
@@ -32,7 +32,7 @@ _CONTENT = {
     for name in MEDIA_TYPES.values()
     if "json" not in name
 }
-_ANSWERS = {
+_ANSWERS: Final[Answers] = {
     200: {"model": PsfOut, "content": _CONTENT, "description": "The PSF"},
     304: {"description": "Not changed"},
 }
@@ -42,7 +42,7 @@ _ANSWERS = {
     "/lenses/{lens_id}/psf",
     operation_id="getPsf",
     response_class=Response,
-    responses=_ANSWERS | problems(404, 406, 409, 422),
+    responses=problems(404, 406, 409, 422, also=_ANSWERS),
 )
 def read_psf(lens_id: str, at: Annotated[PsfQuery, Query()], call: CallDep) -> Response:
     """Return the PSF in the format that `Accept` asks for; JSON by default."""
@@ -53,7 +53,7 @@ def read_psf(lens_id: str, at: Annotated[PsfQuery, Query()], call: CallDep) -> R
     "/lenses/{lens_id}/psf.{suffix}",
     operation_id="getPsfAs",
     response_class=Response,
-    responses=_ANSWERS | problems(404, 409, 422),
+    responses=problems(404, 409, 422, also=_ANSWERS),
 )
 def read_psf_as(
     lens_id: str,
@@ -78,9 +78,9 @@ def accepted(header: str) -> Format:
         media, *parameters = (part.strip().lower() for part in entry.split(";"))
         quality = next((p.removeprefix("q=") for p in parameters if p.startswith("q=")), "1")
         wishes.append((float(quality) if quality.replace(".", "", 1).isdecimal() else 0.0, media))
-    for quality, media in sorted(wishes, key=lambda wish: -wish[0]):
+    for weight, media in sorted(wishes, key=lambda wish: -wish[0]):
         for name, kind in MEDIA_TYPES.items():
-            if quality > 0 and media in {"*/*", kind, f"{kind.partition('/')[0]}/*"}:
+            if weight > 0 and media in {"*/*", kind, f"{kind.partition('/')[0]}/*"}:
                 return name
     raise NotAcceptableError(f"Accept: {header[:200]!r} names none of {', '.join(MEDIA_TYPES.values())}")
 
@@ -118,7 +118,7 @@ def _answer(lens_id: str, at: PsfQuery, form: Format, call: Call) -> Response:
     )
     described = encode.describe(lens_id, fitted, question, answer)
     body, more = encode.psf(form, answer.kernel, described)
-    return Response(body, media_type=MEDIA_TYPES[form], headers=headers | more)
+    return Response(body, media_type=MEDIA_TYPES[form], headers={**headers, **more})
 
 
 def _state(call: Call, lens_id: str) -> LensState:

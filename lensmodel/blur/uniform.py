@@ -46,7 +46,10 @@ class UniformBlur:
     def spectrum(self, shape: tuple[int, int]) -> NDArray[np.complex64]:
         """Transfer function on the `rfft2` grid of `shape`, kept for the next call."""
         if shape not in self._spectra:
-            self._spectra[shape] = (otf(self.kernel, shape) * _phase(self.offset, shape)).astype(np.complex64)
+            spectrum = otf(self.kernel, shape)
+            if self.offset != (0.0, 0.0):
+                spectrum = spectrum * _phase(self.offset, shape)
+            self._spectra[shape] = spectrum.astype(np.complex64)
         return self._spectra[shape]
 
     def forward(self, latent: Plane) -> Plane:

@@ -118,7 +118,7 @@ class SaturationAwareRichardsonLucy:
         steps = np.arange(1, self.iterations + 1)
         alphas = np.minimum((steps - 1) / (steps + 2), ALPHA_MAX) * self.accelerated
         lights = bool(blurred.max() >= _LIGHT * sensor.clip)
-        loops = None if lights or not isinstance(blur, UniformBlur) else compiled(self.engine)
+        loops = compiled(self.engine) if isinstance(blur, UniformBlur) else None
         if loops is not None and isinstance(blur, UniformBlur):
             shape = fast_shape(latent.shape)
             latent = np.ascontiguousarray(latent)
@@ -132,6 +132,7 @@ class SaturationAwareRichardsonLucy:
                 np.float32(self.sharpness),
                 alphas.astype(np.float32),
                 shape[1],
+                lights,
             )
             on_step(self.iterations, self.iterations)
             return Restored(np.ascontiguousarray(blur.frame(latent)), steps=self.iterations)
@@ -201,7 +202,9 @@ def _split(
     touched = ndimage.maximum_filter(hard.astype(np.uint8), size=spread, mode="constant") > 0
     clean = blur.frame(np.asarray(~touched, dtype=np.float32))
     calm = 1.0 + blur.adjoint(error * clean) / reach
-    soft = np.minimum(ndimage.gaussian_filter(hard.astype(np.float32), 3.0, truncate=10 / 3), 1.0)
+    soft = np.minimum(
+        ndimage.gaussian_filter(hard.astype(np.float32), 3.0, mode="constant", truncate=10 / 3), 1.0
+    )
     return np.asarray(calm + (update - calm) * soft, dtype=np.float32)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,8 +39,9 @@ class Shrinkage:
     jump: float
     terms: NDArray[np.float32]
 
-    @classmethod
-    def of(cls, alpha: float) -> Shrinkage:
+    @staticmethod
+    @lru_cache(maxsize=16)  # one fit per exponent, not one per tile
+    def of(alpha: float) -> Shrinkage:
         """Fit the polynomial to the answers found by Newton steps.
 
         D. Krishnan, R. Fergus, "Fast image deconvolution using hyper-Laplacian priors", NIPS 2009.
@@ -59,7 +61,7 @@ class Shrinkage:
             bend = alpha * (alpha - 1.0) * w ** (alpha - 2.0) + 1.0
             w = np.clip(w - slope / np.where(np.abs(bend) < 1e-3, 1e-3, bend), max(jump_w, 1e-9), v)
         terms = np.polynomial.Polynomial.fit(inverse, v - w, DEGREE).convert().coef[::-1]
-        return cls(alpha, float(jump), terms.astype(np.float32))
+        return Shrinkage(alpha, float(jump), terms.astype(np.float32))
 
     def scale(self, threshold: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """S for a threshold t."""

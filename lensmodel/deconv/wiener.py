@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,13 +54,13 @@ def wiener_canvas(
     """Wiener estimate on a periodic canvas, given noise variance and the variance of the data."""
     shape = (data.shape[0], data.shape[1])
     K = blur.spectrum(shape)
-    power = np.abs(K) ** 2
-    decay = frequency_squared(shape) ** np.float32(SLOPE / 2)
-    shown = float((_counts(shape) * power / decay).sum())
+    power = K.real**2 + K.imag**2
+    decay, likely = _prior(shape)
+    shown = float(np.vdot(likely, power))
     scale = max(variance - noise, 0.02 * variance + 1e-12) / shown
-    ratio = noise / (scale * data.size) * decay
+    ratio = np.float32(noise / (scale * data.size)) * decay
     ratio[0, 0] = 0.0  # the mean is kept
-    spectrum = fft.rfft2(data) * np.conj(K) / (power + ratio.astype(np.float32) + np.float32(1e-9))
+    spectrum = fft.rfft2(data) * np.conj(K) / (power + ratio + np.float32(1e-9))
     return np.asarray(fft.irfft2(spectrum, shape), dtype=np.float32)
 
 
@@ -68,6 +69,15 @@ def frequency_squared(shape: tuple[int, int]) -> NDArray[np.float32]:
     squared = fft.fftfreq(shape[0])[:, None] ** 2 + fft.rfftfreq(shape[1])[None, :] ** 2
     squared[0, 0] = 0.1 * min(squared[0, 1], squared[1, 0])
     return squared.astype(np.float32)
+
+
+@lru_cache(maxsize=8)
+def _prior(shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """1 / S(f) for c = 1, and S(f) times how often each frequency of the half spectrum counts."""
+    decay = frequency_squared(shape) ** np.float32(SLOPE / 2)
+    likely = _counts(shape) / decay
+    decay.setflags(write=False)
+    return decay, np.ascontiguousarray(likely, dtype=np.float32)
 
 
 def _counts(shape: tuple[int, int]) -> NDArray[np.float32]:

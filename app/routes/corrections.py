@@ -151,18 +151,23 @@ def delete_correction(correction_id: str, call: CallDep) -> None:
     "/corrections/{correction_id}/result",
     operation_id="getCorrectionResult",
     response_class=Response,
-    responses={
-        200: {
-            "content": {"image/*": {"schema": {"type": "string", "format": "binary"}}},
-            "description": "The file",
+    responses=problems(
+        404,
+        409,
+        416,
+        422,
+        also={
+            200: {
+                "content": {"image/*": {"schema": {"type": "string", "format": "binary"}}},
+                "description": "The file",
+            },
+            206: {
+                "content": {"image/*": {"schema": {"type": "string", "format": "binary"}}},
+                "description": "A part",
+            },
+            304: {"description": "Not changed"},
         },
-        206: {
-            "content": {"image/*": {"schema": {"type": "string", "format": "binary"}}},
-            "description": "A part",
-        },
-        304: {"description": "Not changed"},
-    }
-    | problems(404, 409, 416, 422),
+    ),
 )
 def read_result(correction_id: str, call: CallDep) -> Response:
     """Return the corrected photo, whole or in part."""

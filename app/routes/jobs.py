@@ -116,10 +116,13 @@ def cancel_job(job_id: str, call: CallDep) -> JobOut:
     "/jobs/{job_id}/events",
     operation_id="watchJob",
     response_class=EventSourceResponse,
-    responses={
-        200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}, "description": "Events"}
-    }
-    | problems(404, 422),
+    responses=problems(
+        404,
+        422,
+        also={
+            200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}, "description": "Events"}
+        },
+    ),
 )
 async def watch_job(job_id: str, call: CallDep) -> EventSourceResponse:
     """Send the job as a server-sent event now and at each change, until it is finished.

@@ -143,14 +143,18 @@ def _matches(call: Call, tag: str) -> bool:
     "/lenses/{lens_id}/field.png",
     operation_id="getFieldMap",
     response_class=Response,
-    responses={
-        200: {
-            "content": {"image/png": {"schema": {"type": "string", "format": "binary"}}},
-            "description": "Map",
+    responses=problems(
+        404,
+        409,
+        422,
+        also={
+            200: {
+                "content": {"image/png": {"schema": {"type": "string", "format": "binary"}}},
+                "description": "Map",
+            },
+            304: {"description": "Not changed"},
         },
-        304: {"description": "Not changed"},
-    }
-    | problems(404, 409, 422),
+    ),
 )
 def read_field(lens_id: str, at: Annotated[FieldQuery, Query()], call: CallDep) -> Response:
     """Return a picture of the kernels all over the field, each scaled to its own peak."""

@@ -266,6 +266,21 @@ def test_a_defocused_part_is_left_out_and_the_rest_kept(scene: Plane, photo: Pla
     assert len(result.patches) - len(defocused) > 0.5 * len(in_focus)
 
 
+def test_the_soft_side_of_a_decentred_lens_is_not_taken_for_defocus(scene: Plane) -> None:
+    rows, cols = np.mgrid[-500:500, -750:750] / 901.0
+    sigma = 0.6 + 1.5 * (rows**2 + (cols + 0.25) ** 2)
+    steps = np.array([0.5, 0.8, 1.2, 1.7, 2.4])
+    blurred = np.stack([ndimage.gaussian_filter(scene, step) for step in steps])
+    at = np.clip(np.interp(sigma, steps, np.arange(5)), 0, 3.999)
+    low = at.astype(int)
+    r, c = np.indices(scene.shape)
+    soft = blurred[low, r, c] * (1 - (at - low)) + blurred[low + 1, r, c] * (at - low)
+    result = chosen(photo_of(soft.astype(np.float32), blur_px=0.01))
+
+    assert result.counts.get("defocus", 0) < 0.05 * 17 * 28
+    assert sum(p.position.r > 0.6 and abs(p.position.phi) < 0.8 for p in result.patches) >= 3
+
+
 def test_camera_shake_is_warned_of_and_blur_that_turns_with_the_field_is_not(
     scene: Plane, selection: Selection
 ) -> None:

@@ -41,7 +41,7 @@ def windows_of(photo: Path, count: int, rng: np.random.Generator) -> NDArray[np.
 
 
 def train_epll(
-    photos: Sequence[Path], out: Path, *, components: int = 60, windows: int = 120_000, seed: int = 0
+    photos: Sequence[Path], out: Path, *, components: int = 40, windows: int = 30_000, seed: int = 0
 ) -> None:
     """Fit the mixture by expectation maximisation and write it.
 
@@ -52,7 +52,7 @@ def train_epll(
     out : Path
         The .npz file: `weights` (m,) and `covariances` (m, 2080), lower triangles, float32.
     components : int
-        m; 60 make a file of about half a megabyte.
+        m; 40 make a file of a third of a megabyte.
     windows : int
         How many windows to fit.
     seed : int
@@ -76,8 +76,8 @@ def train_epll(
         means_init=np.zeros((components, SIDE * SIDE)),
         init_params="kmeans",
         reg_covar=1e-7,
-        tol=1e-2,
-        max_iter=40,
+        tol=2e-2,
+        max_iter=12,
         random_state=seed,
     ).fit(data.astype(np.float64))
     # The windows have no mean of their own and neither have the components: it goes into the spread.

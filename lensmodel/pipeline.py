@@ -425,7 +425,7 @@ def correct_photo(
         developed.frame,
         method=method,
         strength=strength,
-        noise=developed.sensor_noise,
+        noise=developed.sensor_noise or developed.noise,
         clip=developed.clip,
         psf_error=psf_error,
         lateral=lateral,

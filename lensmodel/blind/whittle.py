@@ -107,7 +107,7 @@ class Whittle:
             kernel=kernel,
             confidence=0.35,
             reliability=np.clip(share, 0.0, 1.0),
-            predicted_error=0.57,  # the median on simulated lenses; the likelihood does not rank its own errors
+            predicted_error=0.57,  # median on simulated lenses: the likelihood does not rank its errors
             diagnostics={
                 "width": float(np.sqrt(np.trace(covariance) / 2.0)),
                 "slope": float(np.mean(best.x[4::_PER_PATCH])),

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any, Final
 
@@ -31,6 +33,8 @@ MEDIA_TYPE: Final = {
     ".dng": "image/x-adobe-dng",
 }
 TELL_S: Final = 0.5
+THREAD_MB: Final = 136
+"""Address space that a thread reserves for its stack and its heap, most of it never touched."""
 
 
 class CorrectionWork:
@@ -63,7 +67,13 @@ class CorrectionWork:
         self._corrections.progress(key, 0, 0, "developing")
         developed = self._bench.developed(photo, wanted)
         self._corrections.progress(key, 0, 0, "correcting")
-        limits = self._bench.limits(photo, self._bench.settings.correct_seconds, 120)
+        settings = self._bench.settings
+        limits = self._bench.limits(photo, settings.correct_seconds, 120)
+        limits = replace(
+            limits,
+            memory_mb=limits.memory_mb + THREAD_MB * settings.worker_slots,
+            cpu_s=math.ceil(settings.correct_seconds) * settings.worker_slots,
+        )
         arguments = {
             "developed": str(developed),
             "settings": settings_of(photo),
@@ -72,6 +82,7 @@ class CorrectionWork:
             "strength": params["strength"],
             "output": params["output"],
             "roi": params.get("roi"),
+            "workers": settings.worker_slots,
             "description": _description(plan),
         }
         with self._bench.sandbox.folder() as folder:

@@ -117,6 +117,7 @@ def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
         strength=arguments["strength"],
         lateral=lateral,
         roi=None if roi is None else (roi["y"], roi["x"], roi["height"], roi["width"]),
+        workers=arguments["workers"],
         on_step=progress,
     )
     name = f"result{SUFFIX[output['format']]}"

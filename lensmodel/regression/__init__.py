@@ -1,6 +1,21 @@
 """The PSF as one continuous function of place and settings, learned from local samples."""
 
-from lensmodel.regression.model import LensModel, ModelSettings, PsfAnswer
+from lensmodel.regression.answer import ModelSettings, PsfAnswer
+from lensmodel.regression.model import LensModel, ModelField
 from lensmodel.regression.profile import LensProfile, load_profile, save_profile
+from lensmodel.regression.robust import Flag
+from lensmodel.regression.smoothers import Neighbours, Smoother, smoothers
 
-__all__ = ["LensModel", "LensProfile", "ModelSettings", "PsfAnswer", "load_profile", "save_profile"]
+__all__ = [
+    "Flag",
+    "LensModel",
+    "LensProfile",
+    "ModelField",
+    "ModelSettings",
+    "Neighbours",
+    "PsfAnswer",
+    "Smoother",
+    "load_profile",
+    "save_profile",
+    "smoothers",
+]

@@ -1,162 +1,280 @@
-"""Nadaraya-Watson regression of the PSF in rotated local frames (paper, section 6.2, eq. 4-8).
+"""The PSF of one lens as a continuous function of place and settings.
 
-The weight of a sample factorises into one of place and settings, common to all its pixels, and
-one of (u, v). So the sum over all pixels of all samples is one product of weights and kernels::
+Nadaraya-Watson regression in rotated local frames (paper, section 6.2, eq. 4-8). The weight of a
+sample factorises into one of place and settings, common to all its pixels, and one of (u, v). So
+the sum over all pixels of all samples is one product of weights and kernels::
 
     f(u, v) = sum_i W_i C_i(u, v) / sum_i W_i
 
-with C_i the sample's kernel in its own radial frame.
+with C_i the sample's kernel in its own radial frame. Departures from the paper: n in eq. (8) counts
+PSFs, not pixels; the smoothing over (u, v) is that of the spline, because a bandwidth of pixels
+would widen the PSF; kernels are scaled to the width of the place before averaging (`transport`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from lensmodel.errors import NoSamplesError
+from lensmodel.errors import InvalidInputError, NoSamplesError
 from lensmodel.geometry import zone_of
-from lensmodel.psf import PsfSample, distance
-from lensmodel.regression.canonical import from_canonical, to_canonical
-from lensmodel.types import WAVELENGTH_NM, ZONES, Channel, FieldPosition, Kernel, LensSettings, Zone
+from lensmodel.psf import PsfField, PsfSample, as_kernel
+from lensmodel.regression import robust
+from lensmodel.regression import variables as va
+from lensmodel.regression.answer import ModelSettings, PsfAnswer
+from lensmodel.regression.canonical import CanonicalGrid
+from lensmodel.regression.index import SampleIndex
+from lensmodel.regression.robust import Flag
+from lensmodel.regression.smoothers import Neighbours, Smoother, smoothers
+from lensmodel.regression.store import KernelStore
+from lensmodel.regression.transport import WidthField
+from lensmodel.regression.validation import Choice, Held, choose
+from lensmodel.types import ZONES, Channel, FieldPosition, Kernel, LensSettings, Zone
 
-_REACH = 4.0
-_CHANNEL_BANDWIDTH_NM = 20.0
-
-
-@dataclass(frozen=True, slots=True)
-class ModelSettings:
-    """Choices of the regression; None means automatic.
-
-    Parameters
-    ----------
-    r, phi, stops : float or None
-        Bandwidths in half-diagonals, chord of the unit circle, and stops.
-    """
-
-    r: float | None = None
-    phi: float | None = None
-    stops: float | None = None
+_CV_PHOTOS = 3
+_CV_SAMPLES = 300
+_JUDGED = 800
+_STRIDE = 3
+_ROTATIONAL = 10.0
+_INCREMENT = 0.05
+_DROPPED = 1e-3
+_FAR = 2.5
+_FEW = 8
+_UNKNOWN_ERROR = 0.5
+_TRANSPORT_ROOM = 1.35
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PsfAnswer:
-    """A PSF with how much stands behind it."""
+class _Judgement:
+    """What the samples say of each other: votes after robust weighting, held-out errors, flags."""
 
-    kernel: Kernel
-    effective_samples: float
-    photos: int
-    extrapolated: bool
-    predicted_error: float
-    bandwidth: Mapping[str, float]
+    votes: NDArray[np.float64]
+    errors: NDArray[np.float64]
+    choice: Choice
+    flags: tuple[Flag, ...] = ()
 
 
 class LensModel:
-    """PSF samples of one lens as a continuous function of place and settings."""
+    """PSF samples of one lens as a continuous function of place and settings.
 
-    def __init__(self, samples: Sequence[PsfSample], settings: ModelSettings) -> None:
-        if not samples:
-            raise NoSamplesError("the lens has no PSF samples yet; calibrate it with a photo first")
-        self.samples = tuple(samples)
+    Models are values: `added` and `without_photo` return new ones and leave this one as it was.
+    """
+
+    def __init__(
+        self,
+        samples: tuple[PsfSample, ...],
+        settings: ModelSettings,
+        widths: WidthField,
+        store: KernelStore,
+        judgement: _Judgement,
+        *,
+        index: SampleIndex | None = None,
+        prior: tuple[PsfField | LensModel, float] | None = None,
+    ) -> None:
+        self.samples = samples
         self.settings = settings
-        self._half = max(s.kernel.shape[0] for s in samples) // 2
-        self._stack = np.stack([to_canonical(s.kernel, s.position.phi, self._half) for s in samples])
-        self._weight = np.array([s.weight for s in samples])
-        self._photo = np.unique([s.photo for s in samples], return_inverse=True)[1]
-        self.bandwidth = self._bandwidths()
-        self._points = np.array([self._scaled(s.position, s.settings) for s in samples])
-        self._tree = cKDTree(self._points)
-        self._spread = self._spreads()
+        self.widths = widths
+        self.prior = prior
+        self._smoother: Smoother = smoothers.create(settings.method)
+        self._grid = _grid(samples, settings, self._smoother)
+        self._store, self._judgement = store, judgement
+        self._where = va.points(samples) if index is None else index.points
+        self._photos, self._photo = np.unique([s.photo for s in samples], return_inverse=True)
+        self._rule = va.bandwidths(self._where)
+        self.bandwidth = _bandwidth(self._rule, settings, judgement.choice)
+        self._scale = va.scales(self.bandwidth)
+        self._index = SampleIndex.of(self._where) if index is None else index
+
+    # --- building -------------------------------------------------------------------------------
 
     @classmethod
-    def fit(cls, samples: Sequence[PsfSample], settings: ModelSettings | None = None) -> LensModel:
-        """Build a model from samples."""
-        return cls(samples, settings or ModelSettings())
+    def fit(
+        cls,
+        samples: Sequence[PsfSample],
+        settings: ModelSettings | None = None,
+        *,
+        prior: tuple[PsfField | LensModel, float] | None = None,
+    ) -> LensModel:
+        """Build a model from samples.
+
+        Raises
+        ------
+        NoSamplesError
+            If there are none, or none may vote.
+        UnknownMethodError
+            If `settings.method` is in no registry.
+        """
+        settings = settings or ModelSettings()
+        kept = tuple(samples)
+        if not kept:
+            raise NoSamplesError("the lens has no PSF samples yet; calibrate it with a photo first")
+        voting = [s.weight > 0 and s.photo not in settings.excluded for s in kept]
+        if not any(voting):
+            raise NoSamplesError(f"none of the {len(kept)} samples may vote; include a photo again")
+        smoother = smoothers.create(settings.method)
+        grid = _grid(kept, settings, smoother)
+        base = np.array([s.weight if ok else 0.0 for s, ok in zip(kept, voting, strict=True)])
+        widths = WidthField.fit(_with_votes(kept, base)) if smoother.transport else WidthField()
+        store = KernelStore(grid.side**2).extended((_row(grid, widths, s) for s in kept), len(kept))
+        judgement = _judge(kept, settings, grid, store, base)
+        if smoother.transport and any(flag.sample is None for flag in judgement.flags):
+            # a spoilt photo has bent the widths too: fit them again without its voice
+            widths = WidthField.fit(_with_votes(kept, judgement.votes))
+            store = KernelStore(grid.side**2).extended((_row(grid, widths, s) for s in kept), len(kept))
+            judgement = _judge(kept, settings, grid, store, base)
+        return cls(kept, settings, widths, store, judgement, prior=prior)
 
     def added(self, samples: Sequence[PsfSample]) -> LensModel:
-        """Return the model with more samples."""
-        return LensModel((*self.samples, *samples), self.settings)
+        """Return the model with more samples.
+
+        A handful is put in place without touching the others: bandwidths follow eq. (8), widths and
+        cross-validated factors stay until the model has grown by a twentieth; then all is fitted anew.
+        """
+        new = tuple(samples)
+        if not new:
+            return self
+        largest = max(s.kernel.shape[0] for s in new)
+        if len(new) > _INCREMENT * len(self.samples) or largest > self._grid_source:
+            return self.refitted((*self.samples, *new))
+        store = self._store.extended((_row(self._grid, self.widths, s) for s in new), len(new))
+        old = self._judgement
+        votes = [0.0 if s.photo in self.settings.excluded else s.weight for s in new]
+        judgement = replace(
+            old,
+            votes=np.concatenate([old.votes, votes]),
+            errors=np.concatenate([old.errors, np.full(len(new), float(np.median(old.errors)))]),
+        )
+        index = self._index.extended(va.points(new))
+        return LensModel(
+            (*self.samples, *new), self.settings, self.widths, store, judgement, index=index, prior=self.prior
+        )
+
+    def refitted(self, samples: Sequence[PsfSample]) -> LensModel:
+        """Return a model of other samples with the settings and prior of this one."""
+        return LensModel.fit(samples, self.settings, prior=self.prior)
 
     def without_photo(self, photo: str) -> LensModel:
         """Return the model without the samples of one photo."""
-        return LensModel([s for s in self.samples if s.photo != photo], self.settings)
+        return self.refitted([s for s in self.samples if s.photo != photo])
 
-    def _bandwidths(self) -> dict[str, float]:
-        green = [s for s in self.samples if s.settings.channel == "g"] or list(self.samples)
-        n = max(len(green), 2)
-        rule = (4.0 / (4.0 * n)) ** (1.0 / 6.0)  # eq. 8 with d = 2: the place in the field
-        r = np.array([s.position.r for s in green])
-        return {
-            "r": self.settings.r or max(float(r.std()) * rule * 0.6, 0.04),
-            "phi": self.settings.phi or max(0.707 * rule, 0.25),
-            "aperture_stops": self.settings.stops or 0.6,
-        }
+    def excluding(self, *photos: str) -> LensModel:
+        """Return the model in which these photos stay listed but do not vote."""
+        names = tuple(sorted({*self.settings.excluded, *photos}))
+        return LensModel.fit(self.samples, replace(self.settings, excluded=names), prior=self.prior)
 
-    def _scaled(self, position: FieldPosition, settings: LensSettings) -> list[float]:
-        # near the centre all angles are neighbours: the chord shrinks with r
-        share = min(position.r / 0.25, 1.0)
-        stops = settings.stops
-        return [
-            position.r / self.bandwidth["r"],
-            share * math.cos(position.phi) / self.bandwidth["phi"],
-            share * math.sin(position.phi) / self.bandwidth["phi"],
-            0.0 if stops is None else stops / self.bandwidth["aperture_stops"],
-            WAVELENGTH_NM[settings.channel] / _CHANNEL_BANDWIDTH_NM,
-        ]
+    def including(self, *photos: str) -> LensModel:
+        """Return the model in which these photos vote again."""
+        names = tuple(name for name in self.settings.excluded if name not in photos)
+        return LensModel.fit(self.samples, replace(self.settings, excluded=names), prior=self.prior)
 
-    def _neighbours(
-        self, position: FieldPosition, settings: LensSettings
-    ) -> tuple[NDArray[np.intp], NDArray[np.float64], float]:
-        point = np.array(self._scaled(position, settings))
-        index = np.array(self._tree.query_ball_point(point, _REACH), dtype=np.intp)
-        nearest = float(self._tree.query(point)[0])
-        if index.size == 0:
-            index = np.atleast_1d(self._tree.query(point, k=min(8, len(self.samples)))[1])
-        gap = ((self._points[index] - point) ** 2).sum(axis=1)
-        weight = self._weight[index] * np.exp(-0.5 * (gap - gap.min()))
-        if weight.sum() <= 0:
-            weight = np.ones(index.size)
-        return index, weight, nearest
+    def with_prior(self, prior: PsfField | LensModel | None, strength: float = 2.0) -> LensModel:
+        """Return the model that leans on a prior where it has seen little; None switches it off.
 
-    def query(self, position: FieldPosition, settings: LensSettings, size: int = 55) -> PsfAnswer:
-        """Return the PSF at a place, with the evidence behind it."""
-        index, weight, nearest = self._neighbours(position, settings)
-        share = weight / weight.sum()
-        fine = np.tensordot(share, self._stack[index], axes=1)
-        photos = np.unique(self._photo[index])
-        per_photo = np.array([weight[self._photo[index] == p].sum() for p in photos])
-        effective = float(weight.sum() ** 2 / (weight**2).sum())
-        spread = float((share * self._spread[index]).sum())
-        groups = float(per_photo.sum() ** 2 / (per_photo**2).sum())
-        return PsfAnswer(
-            kernel=from_canonical(fine, position.phi, size),
-            effective_samples=effective,
-            photos=int(photos.size),
-            extrapolated=nearest > 2.0,
-            predicted_error=spread * math.sqrt(1.0 + 1.0 / max(groups, 1.0)) / math.sqrt(2.0),
-            bandwidth=dict(self.bandwidth),
+        Parameters
+        ----------
+        prior : LensModel or PsfField
+            Usually the model of other copies of the lens.
+        strength : float
+            Number of samples that the prior is worth.
+        """
+        if not (math.isfinite(strength) and strength > 0):
+            raise InvalidInputError(f"the strength of a prior must be positive, got {strength}")
+        return LensModel(
+            self.samples,
+            self.settings,
+            self.widths,
+            self._store,
+            self._judgement,
+            index=self._index,
+            prior=None if prior is None else (prior, strength),
         )
 
-    def field(self, settings: LensSettings) -> _Field:
-        """Return the PSF of every place and channel at these settings."""
-        return _Field(self, settings)
+    # --- asking ---------------------------------------------------------------------------------
 
-    def _spreads(self) -> NDArray[np.float64]:
-        spread = np.empty(len(self.samples))
-        for i, sample in enumerate(self.samples):
-            index, weight, _ = self._neighbours(sample.position, sample.settings)
-            other = index != i
-            if not other.any():
-                spread[i] = 0.5
-                continue
-            share = weight[other] / weight[other].sum()
-            mean = np.tensordot(share, self._stack[index[other]], axes=1)
-            spread[i] = np.linalg.norm(self._stack[i] - mean) / max(float(np.linalg.norm(mean)), 1e-12)
-        return np.minimum(spread, 1.0)
+    def query(
+        self, position: FieldPosition, settings: LensSettings, size: int = 55, *, std: bool = False
+    ) -> PsfAnswer:
+        """Return the PSF at a place, with the evidence behind it.
+
+        Parameters
+        ----------
+        position : FieldPosition
+        settings : LensSettings
+            Unknown settings take no part.
+        size : int
+            Odd side in pixels.
+        std : bool
+            Whether to return the standard error of each pixel as well.
+        """
+        if size < 1 or size % 2 == 0:
+            raise InvalidInputError(f"size must be odd and positive, got {size}")
+        rows, gaps, weight = self.weights(position, settings)
+        photos = self._photo[rows]
+        mean = weight @ self._store.rows[rows]
+        width = self.widths.at(position, settings)
+        kernel = self._grid.kernel(self._mirrored(mean), position.phi, width, size)
+        positive = np.maximum(weight, 0.0)
+        positive /= positive.sum()
+        per_photo = np.bincount(photos, positive)
+        independent = 1.0 / float((per_photo**2).sum())
+        nearest, beyond = self._support(position, settings, rows)
+        local = math.sqrt(float(positive @ self._judgement.errors[rows] ** 2))
+        error = local * math.sqrt(0.5 + 0.5 / independent) * (1.0 + 0.5 * max(nearest - 1.0, 0.0))
+        share = 0.0
+        if self.prior is not None:
+            kernel, share = self._blended(kernel, gaps, position, settings)
+        return PsfAnswer(
+            kernel=kernel,
+            effective_samples=1.0 / float((positive**2).sum()),
+            photos=int(np.count_nonzero(per_photo > _DROPPED)),
+            extrapolated=bool(beyond),
+            predicted_error=min(error, 1.0),
+            bandwidth=dict(self.bandwidth),
+            beyond=beyond,
+            nearest=nearest,
+            prior_share=share,
+            std=self._std(rows, positive, position, width, size) if std else None,
+        )
+
+    def weights(
+        self, position: FieldPosition, settings: LensSettings
+    ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
+        """Weights of sum 1 that a question gives to samples.
+
+        Returns
+        -------
+        rows : ndarray of int, shape (m,)
+            Samples that take part.
+        gaps : ndarray, shape (m, 7)
+            Their distances in bandwidths, by variable.
+        weights : ndarray, shape (m,)
+            Those that together weigh less than a thousandth are left out.
+        """
+        asked = va.point(position, settings)
+        rows = self._index.near(asked, self._smoother.reach, self._scale)
+        rows = rows[self._judgement.votes[rows] > 0]
+        if rows.size < _FEW:
+            squared = va.squared_distances(self._where, asked, self._scale)
+            squared[self._judgement.votes <= 0] = np.inf
+            rows = np.argsort(squared, kind="stable")[:_FEW]
+            rows = rows[np.isfinite(squared[rows])]
+        gaps = np.nan_to_num((self._where[rows] - asked) / self._scale, nan=0.0)
+        weight = self._smoother.weights(Neighbours(gaps, self._judgement.votes[rows]))
+        order = np.argsort(np.abs(weight), kind="stable")
+        kept = order[np.cumsum(np.abs(weight[order])) > _DROPPED]
+        return rows[kept], gaps[kept], weight[kept] / weight[kept].sum()
+
+    def field(self, settings: LensSettings) -> ModelField:
+        """Return the PSF of every place and channel at these settings."""
+        return ModelField(self, settings)
+
+    def flags(self) -> tuple[Flag, ...]:
+        """Photos and samples that count less than they claim, with reasons."""
+        return self._judgement.flags
 
     def coverage(self) -> dict[Zone, int]:
         """Number of green samples in each zone."""
@@ -164,25 +282,180 @@ class LensModel:
         return {zone: zones.count(zone) for zone in ZONES}
 
     def cross_validate(self) -> dict[Zone, float]:
-        """Median relative L2 of samples against a model of the other photos, by zone."""
-        found: dict[Zone, list[float]] = {zone: [] for zone in ZONES}
-        photos = sorted({s.photo for s in self.samples})
-        if len(photos) < 2:
+        """Median relative L2 of green samples against a model of the other photos, by zone.
+
+        Empty with fewer than two photos.
+        """
+        if len(self._photos) < 2:
             return {}
-        for photo in photos:
-            rest = self.without_photo(photo)
-            for sample in self.samples:
-                if sample.photo != photo or sample.settings.channel != "g":
-                    continue
-                answer = rest.query(sample.position, sample.settings, sample.kernel.shape[0])
-                found[zone_of(sample.position.r)].append(distance(answer.kernel, sample.kernel).rel_l2)
+        found: dict[Zone, list[float]] = {zone: [] for zone in ZONES}
+        for sample, error in zip(self.samples, self._judgement.errors, strict=True):
+            if sample.settings.channel == "g" and sample.photo not in self.settings.excluded:
+                found[zone_of(sample.position.r)].append(float(error))
         return {zone: float(np.median(values)) for zone, values in found.items() if values}
 
+    # --- inside ---------------------------------------------------------------------------------
 
-class _Field:
-    def __init__(self, model: LensModel, settings: LensSettings) -> None:
-        self._model, self._settings = model, settings
+    @property
+    def _grid_source(self) -> int:
+        return max(s.kernel.shape[0] for s in self.samples)
+
+    def _mirrored(self, mean: NDArray[np.float64]) -> NDArray[np.float64]:
+        share = self._judgement.choice.mirror
+        if share == 0.0:
+            return mean
+        square = mean.reshape(self._grid.side, self._grid.side)
+        return np.asarray((square + share * square[::-1]) / (1.0 + share)).ravel()
+
+    def _support(
+        self, position: FieldPosition, settings: LensSettings, rows: NDArray[np.intp]
+    ) -> tuple[float, tuple[str, ...]]:
+        asked = va.point(position, settings)
+        gaps = np.nan_to_num((self._where[rows] - asked) / va.scales(va.support(self._rule)), nan=0.0)
+        squared = gaps**2
+        nearest = int(squared.sum(axis=1).argmin())
+        beyond = {
+            name for name, value in zip(va.COLUMNS, np.abs(gaps).min(axis=0), strict=True) if value > _FAR
+        }
+        distance = math.sqrt(float(squared[nearest].sum()))
+        if not beyond and distance > _FAR:
+            beyond = {va.COLUMNS[int(squared[nearest].argmax())]}
+        return distance, tuple(sorted(beyond))
+
+    def _blended(
+        self, kernel: Kernel, gaps: NDArray[np.float64], position: FieldPosition, settings: LensSettings
+    ) -> tuple[Kernel, float]:
+        assert self.prior is not None
+        prior, strength = self.prior
+        near = float(np.exp(-0.5 * (gaps**2).sum(axis=1)).sum())
+        share = strength / (near + strength)
+        source = prior.field(settings) if isinstance(prior, LensModel) else prior
+        other = source.kernel_at(position, settings.channel, kernel.shape[0])
+        return as_kernel((1.0 - share) * kernel + share * other), share
+
+    def _std(
+        self,
+        rows: NDArray[np.intp],
+        weight: NDArray[np.float64],
+        position: FieldPosition,
+        width: tuple[float, float],
+        size: int,
+    ) -> NDArray[np.float64]:
+        """Standard error of each pixel, sqrt(sum w^2 sum w (C - f)^2 / (1 - sum w^2))."""
+        found = self._store.rows[rows]
+        mean = weight @ found
+        concentration = float((weight**2).sum())
+        if concentration > 1.0 - 1e-9:
+            return np.full((size, size), np.nan)  # a single sample says nothing of its own scatter
+        kernels = [self._grid.sampled(row - mean, position.phi, width, size) for row in found]
+        scatter = sum(w * k * k for w, k in zip(weight, kernels, strict=True))
+        return np.asarray(np.sqrt(scatter * concentration / (1.0 - concentration)), dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelField:
+    """The PSF field of a model at one setting."""
+
+    model: LensModel
+    settings: LensSettings
 
     def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
-        """Return the kernel at a field position, in the image frame."""
-        return self._model.query(position, self._settings.with_channel(channel), size).kernel
+        """Return the kernel of odd side `size` at a field position, in the image frame."""
+        return self.model.query(position, self.settings.with_channel(channel), size).kernel
+
+
+def _grid(samples: Sequence[PsfSample], settings: ModelSettings, smoother: Smoother) -> CanonicalGrid:
+    half = max(s.kernel.shape[0] for s in samples) // 2
+    room = _TRANSPORT_ROOM if smoother.transport else 1.0
+    return CanonicalGrid(math.ceil(half * room), settings.oversampling)
+
+
+def _row(grid: CanonicalGrid, widths: WidthField, sample: PsfSample) -> NDArray[np.float32]:
+    scale = widths.at(sample.position, sample.settings)
+    return grid.coefficients(sample.kernel, sample.position.phi, scale)
+
+
+def _with_votes(samples: Sequence[PsfSample], votes: NDArray[np.float64]) -> list[PsfSample]:
+    return [s.with_weight(float(v)) for s, v in zip(samples, votes, strict=True) if v > 0]
+
+
+def _bandwidth(rule: dict[str, float], settings: ModelSettings, choice: Choice) -> dict[str, float]:
+    found = dict(rule)
+    found["r"] = settings.r or rule["r"] * choice.r
+    phi = rule["phi"] * choice.phi
+    if settings.rotational is not None:
+        phi = rule["phi"] ** (1.0 - settings.rotational) * _ROTATIONAL**settings.rotational
+    found["phi"] = settings.phi or phi
+    found["aperture_stops"] = settings.stops or rule["aperture_stops"]
+    return found
+
+
+def _judge(
+    samples: tuple[PsfSample, ...],
+    settings: ModelSettings,
+    grid: CanonicalGrid,
+    store: KernelStore,
+    base: NDArray[np.float64],
+) -> _Judgement:
+    """Choose bandwidths by cross-validation, weigh robustly, note held-out errors."""
+    where = va.points(samples)
+    rule = va.bandwidths(where)
+    names, photo = np.unique([s.photo for s in samples], return_inverse=True)
+    voting = np.flatnonzero(base > 0)
+    several = len(np.unique(photo[voting])) >= 2
+    groups = photo if several else np.arange(len(samples))
+
+    def held(rows: NDArray[np.intp], votes: NDArray[np.float64]) -> Held:
+        side = len(range(0, grid.side, _STRIDE))
+        thin = store.rows[rows].reshape(len(rows), grid.side, grid.side)[:, ::_STRIDE, ::_STRIDE]
+        scale = va.scales(_bandwidth(rule, settings, Choice()))
+        return Held.of(thin.reshape(len(rows), -1), side, where[rows], scale, votes[rows], groups[rows])
+
+    green = voting[where[voting, 4] == where[voting[len(voting) // 2], 4]]
+    choice = Choice(mirror=settings.mirror or 0.0)
+    automatic = len(np.unique(photo[voting])) >= _CV_PHOTOS
+
+    def chosen(votes: NDArray[np.float64]) -> Choice:
+        if not automatic:
+            return choice
+        found = choose(
+            held(_thinned(green, _CV_SAMPLES), votes),
+            r=settings.r is None,
+            phi=settings.phi is None and settings.rotational is None,
+            mirror=settings.mirror is None,
+        )
+        return found if settings.mirror is None else replace(found, mirror=settings.mirror)
+
+    judged = _thinned(voting, _JUDGED)
+    votes, errors = base.copy(), np.full(len(samples), _UNKNOWN_ERROR)
+    if len(judged) < 2:
+        return _Judgement(votes, errors, choice)
+    choice = chosen(votes)
+    prepared = held(judged, base)
+    _, local = np.unique(photo[judged], return_inverse=True)
+    known = names[np.unique(photo[judged])]
+    by_sample, by_photo, found = robust.factors(
+        prepared, local, r=choice.r, phi=choice.phi, mirror=choice.mirror
+    )
+    flags: tuple[Flag, ...] = ()
+    if settings.robust and several:
+        own = {str(name): factor for name, factor in zip(known, by_photo, strict=True)}
+        votes = base * np.array([own.get(s.photo, 1.0) for s in samples])
+        votes[judged] *= by_sample
+        flags = robust.flags(
+            [samples[i] for i in judged], by_sample, by_photo, found, [str(n) for n in known]
+        )
+        flags = tuple(f if f.sample is None else replace(f, sample=int(judged[f.sample])) for f in flags)
+        if not (votes > 0).any():
+            votes, flags = base.copy(), ()
+        if flags:
+            choice = chosen(votes)
+    errors[:] = float(np.median(found))
+    errors[judged] = found
+    return _Judgement(votes, errors, choice, flags)
+
+
+def _thinned(rows: NDArray[np.intp], most: int) -> NDArray[np.intp]:
+    if len(rows) <= most:
+        return rows
+    return rows[np.linspace(0, len(rows) - 1, most).round().astype(np.intp)]

@@ -24,7 +24,8 @@ import numpy as np
 
 from lensmodel.errors import InvalidInputError, LensModelError
 from lensmodel.psf import PsfSample, resized
-from lensmodel.regression.model import LensModel, ModelSettings
+from lensmodel.regression.answer import ModelSettings
+from lensmodel.regression.model import LensModel
 from lensmodel.types import FieldPosition, LensSettings
 
 FORMAT = 1

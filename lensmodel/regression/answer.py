@@ -1,0 +1,107 @@
+"""What one asks a lens model for and what it answers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.errors import InvalidInputError
+from lensmodel.regression.canonical import DEFAULT_OVERSAMPLING
+from lensmodel.types import Kernel
+
+_MAX_OVERSAMPLING = 8
+
+
+@dataclass(frozen=True, slots=True)
+class ModelSettings:
+    """Choices of the regression; None means automatic.
+
+    Parameters
+    ----------
+    r, phi, stops : float or None
+        Bandwidths in half-diagonals, chord of the unit circle, and stops. Automatic: eq. (8), and
+        from three photos on the factors on it with the least leave-one-photo-out error.
+    method : str
+        Name in `smoothers`.
+    rotational : float or None
+        Strength of rotational symmetry: 0 none, 1 all angles count alike. None: by cross-validation.
+    mirror : float or None
+        Weight of each sample's mirror image about the meridional plane, 0..1. None: same.
+    robust : bool
+        Whether photos and samples that do not fit the others count less.
+    excluded : tuple of str
+        Photos whose samples do not vote; they stay listed.
+    oversampling : int
+        Samples per pixel of stored kernels.
+    """
+
+    r: float | None = None
+    phi: float | None = None
+    stops: float | None = None
+    method: str = "transport"
+    rotational: float | None = None
+    mirror: float | None = None
+    robust: bool = True
+    excluded: tuple[str, ...] = ()
+    oversampling: int = DEFAULT_OVERSAMPLING
+
+    def __post_init__(self) -> None:
+        for name in ("r", "phi", "stops"):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise InvalidInputError(
+                    f"bandwidth {name} must be positive, or None for automatic, got {value}"
+                )
+        for name in ("rotational", "mirror"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 <= value <= 1.0:
+                raise InvalidInputError(f"{name} symmetry must lie in 0..1, or None, got {value}")
+        if not 1 <= self.oversampling <= _MAX_OVERSAMPLING:
+            raise InvalidInputError(
+                f"oversampling must lie in 1..{_MAX_OVERSAMPLING}, got {self.oversampling}"
+            )
+        object.__setattr__(self, "excluded", tuple(str(name) for name in self.excluded))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PsfAnswer:
+    """A PSF with how much stands behind it.
+
+    Parameters
+    ----------
+    kernel : Kernel, shape (size, size)
+        In the image frame, centred, sum 1.
+    effective_samples : float
+        (sum w)^2 / sum w^2 of the weights; samples of one photo count together in `photos`.
+    photos : int
+        Photos among the samples that were used.
+    extrapolated : bool
+        True where no sample is near.
+    predicted_error : float
+        Expected relative L2, from the held-out errors of the neighbours; at most 1.
+    bandwidth : mapping of str to float
+        Bandwidths that were used.
+    beyond : tuple of str
+        Variables in which the question lies outside the samples.
+    nearest : float
+        Distance to the nearest sample, in bandwidths of eq. (8).
+    prior_share : float
+        Weight of the prior in the kernel, 0..1; 0 without a prior.
+    std : ndarray, shape (size, size), or None
+        Standard error of each pixel from the scatter of the samples; None unless asked for.
+    """
+
+    kernel: Kernel
+    effective_samples: float
+    photos: int
+    extrapolated: bool
+    predicted_error: float
+    bandwidth: Mapping[str, float]
+    beyond: tuple[str, ...] = ()
+    nearest: float = 0.0
+    prior_share: float = 0.0
+    std: NDArray[np.float64] | None = field(default=None)

@@ -90,7 +90,9 @@ def _grids(size: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray
     radius = np.hypot(fr, fc)
     band = np.searchsorted(BAND_EDGES, radius, side="right") - 1
     sector = np.floor(np.arctan2(fr, fc) * (SECTORS / np.pi) + 0.5).astype(np.intp) % SECTORS
-    number = np.where((band >= 0) & (band < BANDS), band * SECTORS + sector, -1)
+    # Of the column fc = 0 the half spectrum holds both halves: one of them must not count.
+    inside = (band >= 0) & (band < BANDS) & ((fc > 0.0) | (fr > 0.0))
+    number = np.where(inside, band * SECTORS + sector, -1)
     return window, (2.0 * np.pi * radius) ** 2, number
 
 

@@ -16,6 +16,7 @@ from lensmodel.patches import defocus, details, spread
 from lensmodel.patches.base import MAX_REJECTIONS, Patch, Reason, Rejection, Selection
 from lensmodel.patches.blocks import BLOCKS_A_SIDE, measure_blocks
 from lensmodel.patches.details import Details
+from lensmodel.patches.good_regions import GoodRegionsSelector
 from lensmodel.patches.windows import Windows, windows_of
 from lensmodel.registry import Registry
 from lensmodel.types import FieldPosition, NoiseModel, Plane, StepHook, ignore_step
@@ -80,7 +81,9 @@ class RMapSelector:
         return np.clip((edge_score(windows) + information) / self.full_marks, 0.0, 1.0)
 
 
-selectors: Registry[Selector] = Registry("patch selector", {"r-map": RMapSelector})
+selectors: Registry[Selector] = Registry(
+    "patch selector", {"r-map": RMapSelector, "good-regions": GoodRegionsSelector}
+)
 
 
 def edge_score(windows: Windows) -> NDArray[np.float64]:

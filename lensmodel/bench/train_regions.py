@@ -211,8 +211,12 @@ def _arrays(model: object) -> TreeEnsemble:
         count = tree.node_count
         leaf = tree.children_left < 0
         feature[i, :count] = np.where(leaf, -1, tree.feature)
-        # Rounded down: a value that went left in double precision must go left in single.
-        threshold[i, :count] = tree.threshold
+        # scikit-learn asks x <= t with x in single and t in double precision; with t rounded down
+        # to single precision the answer is the same.
+        single = tree.threshold.astype(np.float32)
+        threshold[i, :count] = np.where(
+            single > tree.threshold, np.nextafter(single, np.float32(-np.inf)), single
+        )
         left[i, :count] = np.where(leaf, np.arange(count), tree.children_left)
         right[i, :count] = np.where(leaf, np.arange(count), tree.children_right)
         value[i, :count] = model.learning_rate * tree.value[:, 0, 0]  # type: ignore[attr-defined]  # as above

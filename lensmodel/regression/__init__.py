@@ -1,6 +1,7 @@
 """The PSF as one continuous function of place and settings, learned from local samples."""
 
 from lensmodel.regression.answer import ModelSettings, PsfAnswer
+from lensmodel.regression.exact import PaperModel, all_pairs, factorised
 from lensmodel.regression.model import LensModel, ModelField
 from lensmodel.regression.profile import LensProfile, load_profile, save_profile
 from lensmodel.regression.robust import Flag
@@ -13,8 +14,11 @@ __all__ = [
     "ModelField",
     "ModelSettings",
     "Neighbours",
+    "PaperModel",
     "PsfAnswer",
     "Smoother",
+    "all_pairs",
+    "factorised",
     "load_profile",
     "save_profile",
     "smoothers",

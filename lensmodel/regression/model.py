@@ -214,7 +214,8 @@ class LensModel:
             raise InvalidInputError(f"size must be odd and positive, got {size}")
         rows, gaps, weight = self.weights(position, settings)
         photos = self._photo[rows]
-        mean = weight @ self._store.rows[rows]
+        found = self._store.rows[rows]
+        mean = weight.astype(np.float32) @ found
         width = self.widths.at(position, settings)
         kernel = self._grid.kernel(self._mirrored(mean), position.phi, width, size)
         positive = np.maximum(weight, 0.0)
@@ -222,8 +223,9 @@ class LensModel:
         per_photo = np.bincount(photos, positive)
         independent = 1.0 / float((per_photo**2).sum())
         nearest, beyond = self._support(position, settings, rows)
-        local = math.sqrt(float(positive @ self._judgement.errors[rows] ** 2))
-        error = local * math.sqrt(0.5 + 0.5 / independent) * (1.0 + 0.5 * max(nearest - 1.0, 0.0))
+        held_out = float(positive @ self._judgement.errors[rows] ** 2)
+        error = _field_error(held_out, found, mean, positive, independent)
+        error *= 1.0 + 0.5 * max(nearest - 1.0, 0.0)
         share = 0.0
         if self.prior is not None:
             kernel, share = self._blended(kernel, gaps, position, settings)
@@ -343,7 +345,7 @@ class LensModel:
     ) -> NDArray[np.float64]:
         """Standard error of each pixel, sqrt(sum w^2 sum w (C - f)^2 / (1 - sum w^2))."""
         found = self._store.rows[rows]
-        mean = weight @ found
+        mean = weight.astype(np.float32) @ found
         concentration = float((weight**2).sum())
         if concentration > 1.0 - 1e-9:
             return np.full((size, size), np.nan)  # a single sample says nothing of its own scatter
@@ -362,6 +364,30 @@ class ModelField:
     def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
         """Return the kernel of odd side `size` at a field position, in the image frame."""
         return self.model.query(position, self.settings.with_channel(channel), size).kernel
+
+
+def _field_error(
+    held_out: float,
+    rows: NDArray[np.float32],
+    mean: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    independent: float,
+) -> float:
+    """Expected relative L2 of the mean, from held-out errors that contain the samples' own noise.
+
+    With m independent photos, bias b and noise s of a sample::
+
+        held out:  e^2 = b^2 + s^2 (1 + 1/m)        field:  b^2 + s^2 / m
+
+    s is taken from the scatter of the neighbours, which also differ in place; so b is not
+    taken below a third of e.
+    """
+    norms = np.einsum("ij,ij->i", rows, rows, dtype=np.float64)
+    power = max(float(mean @ mean), 1e-30)
+    scatter = max(float(weight @ norms) / power - 1.0, 0.0)
+    noise = min(scatter / max(1.0 - float(weight @ weight), 0.1), held_out)
+    bias = max(held_out - noise * (1.0 + 1.0 / independent), held_out / 9.0)
+    return math.sqrt(bias + noise / independent)
 
 
 def _grid(samples: Sequence[PsfSample], settings: ModelSettings, smoother: Smoother) -> CanonicalGrid:

@@ -302,7 +302,7 @@ class LensModel:
     def _grid_source(self) -> int:
         return max(s.kernel.shape[0] for s in self.samples)
 
-    def _mirrored(self, mean: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _mirrored(self, mean: NDArray[np.floating]) -> NDArray[np.floating]:
         share = self._judgement.choice.mirror
         if share == 0.0:
             return mean
@@ -369,7 +369,7 @@ class ModelField:
 def _field_error(
     held_out: float,
     rows: NDArray[np.float32],
-    mean: NDArray[np.float64],
+    mean: NDArray[np.floating],
     weight: NDArray[np.float64],
     independent: float,
 ) -> float:
@@ -383,7 +383,7 @@ def _field_error(
     taken below a third of e.
     """
     norms = np.einsum("ij,ij->i", rows, rows, dtype=np.float64)
-    power = max(float(mean @ mean), 1e-30)
+    power = max(float(np.einsum("i,i->", mean, mean, dtype=np.float64)), 1e-30)
     scatter = max(float(weight @ norms) / power - 1.0, 0.0)
     noise = min(scatter / max(1.0 - float(weight @ weight), 0.1), held_out)
     bias = max(held_out - noise * (1.0 + 1.0 / independent), held_out / 9.0)

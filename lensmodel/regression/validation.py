@@ -50,7 +50,7 @@ class Held:
     @classmethod
     def of(
         cls,
-        rows: NDArray[np.float32],
+        rows: NDArray[np.floating],
         side: int,
         where: NDArray[np.float64],
         scale: NDArray[np.float64],
@@ -58,11 +58,12 @@ class Held:
         groups: NDArray[np.intp],
     ) -> Held:
         """Prepare kernels given as flat rows of a square grid, at points `where` (n, 7)."""
+        rows = np.asarray(rows, dtype=np.float64)  # errors are small differences of these products
         flipped = rows.reshape(-1, side, side)[:, ::-1].reshape(len(rows), -1)
         gap = np.nan_to_num((where[:, None, :] - where[None, :, :]) / scale, nan=0.0) ** 2
         return cls(
-            gram=np.asarray(rows @ rows.T, dtype=np.float64),
-            mirrored=np.asarray(rows @ flipped.T, dtype=np.float64),
+            gram=rows @ rows.T,
+            mirrored=rows @ flipped.T,
             place=gap[..., 0],
             turn=gap[..., 1] + gap[..., 2],
             others=gap[..., 3:].sum(axis=-1),

@@ -16,6 +16,7 @@ import math
 import os
 import secrets
 import zipfile
+import zlib
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,19 @@ from lensmodel.types import FieldPosition, LensSettings
 FORMAT = 1
 _MAX_BYTES = 1 << 30
 _MAX_SAMPLES = 200_000
+_MAX_SIDE = 255
 _INFINITY = "infinity"
+_UNREADABLE = (
+    OSError,
+    ValueError,
+    KeyError,
+    EOFError,
+    MemoryError,  # an array header may claim any size
+    RecursionError,  # lists in lists in lists
+    RuntimeError,  # encrypted, or packed by a method that zipfile does not know
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,7 +115,7 @@ def load_profile(path: Path | str) -> LensProfile:
             stack = np.load(io.BytesIO(archive.read("kernels.npy")), allow_pickle=False)
     except FileNotFoundError:
         raise
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except _UNREADABLE as error:
         raise InvalidInputError(f"{name} is no lens profile; make one with `lensmodel calibrate`") from error
     try:
         if document["format"] != FORMAT:
@@ -111,15 +124,23 @@ def load_profile(path: Path | str) -> LensProfile:
                 "update the program"
             )
         entries = document["samples"]
-        fits = stack.ndim == 3 and len(entries) == stack.shape[0] and 0 < len(entries) <= _MAX_SAMPLES
+        fits = (
+            stack.ndim == 3
+            and stack.shape[1] <= _MAX_SIDE
+            and len(entries) == stack.shape[0]
+            and 0 < len(entries) <= _MAX_SAMPLES
+        )
         if not fits or stack.dtype != np.float32:
-            raise InvalidInputError(f"{name} holds {len(entries)} samples but kernels of shape {stack.shape}")
+            raise InvalidInputError(
+                f"{name} holds {len(entries)} samples but kernels of shape {stack.shape}; "
+                f"one is needed for each, of side {_MAX_SIDE} at most"
+            )
         samples = [_sample(entry, kernel) for entry, kernel in zip(entries, stack, strict=True)]
         model = LensModel.fit(samples, ModelSettings(**document["model"]))
         return LensProfile(model, _texts(document["lens"]), _texts(document["photos"]))
     except LensModelError:
         raise
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
         raise InvalidInputError(f"{name} is damaged: {error}") from error
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import zipfile
@@ -283,3 +284,17 @@ class TestProfile:
 
         with pytest.raises(InvalidInputError):
             load_profile(path)
+
+    def test_every_truncation_and_flipped_byte_is_refused_or_harmless(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.lensprofile"
+        save_profile(path, LensProfile(LensModel.fit(photo("a", 0, count=3))))
+        whole, rng = path.read_bytes(), np.random.default_rng(0)
+        damaged = [whole[: int(n)] for n in rng.integers(0, len(whole), 10)]
+        for at in rng.integers(0, len(whole), 30):
+            changed = bytearray(whole)
+            changed[at] ^= 0xFF
+            damaged.append(bytes(changed))
+        for data in damaged:
+            path.write_bytes(data)
+            with contextlib.suppress(InvalidInputError):  # anything else fails the test
+                assert len(load_profile(path).model.samples) == 3

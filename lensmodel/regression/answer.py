@@ -42,7 +42,7 @@ class ModelSettings:
     r: float | None = None
     phi: float | None = None
     stops: float | None = None
-    method: str = "transport"
+    method: str = "blended"
     rotational: float | None = None
     mirror: float | None = None
     robust: bool = True
@@ -91,6 +91,8 @@ class PsfAnswer:
         Distance to the nearest sample, in bandwidths of eq. (8).
     prior_share : float
         Weight of the prior in the kernel, 0..1; 0 without a prior.
+    image_frame_share : float
+        Weight of the regression in the image frame, 0..1, by held-out errors near the place.
     std : ndarray, shape (size, size), or None
         Standard error of each pixel from the scatter of the samples; None unless asked for.
     """
@@ -104,4 +106,5 @@ class PsfAnswer:
     beyond: tuple[str, ...] = ()
     nearest: float = 0.0
     prior_share: float = 0.0
+    image_frame_share: float = 0.0
     std: NDArray[np.float64] | None = field(default=None)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from lensmodel.errors import InvalidInputError, NoSamplesError
 from lensmodel.geometry import zone_of
 from lensmodel.psf import PsfField, PsfSample, as_kernel
-from lensmodel.regression import robust
+from lensmodel.regression import kriging, robust
 from lensmodel.regression import variables as va
 from lensmodel.regression.answer import ModelSettings, PsfAnswer
 from lensmodel.regression.canonical import CanonicalGrid
@@ -56,6 +56,8 @@ class _Judgement:
     errors: NDArray[np.float64]
     choice: Choice
     flags: tuple[Flag, ...] = ()
+    nugget: float = 1.0  # of the image frame
+    image_errors: NDArray[np.float64] | None = None  # held out, of the image frame
 
 
 class LensModel:
@@ -74,6 +76,7 @@ class LensModel:
         *,
         index: SampleIndex | None = None,
         prior: tuple[PsfField | LensModel, float] | None = None,
+        pixels: KernelStore | None = None,
     ) -> None:
         self.samples = samples
         self.settings = settings
@@ -81,7 +84,8 @@ class LensModel:
         self.prior = prior
         self._smoother: Smoother = smoothers.create(settings.method)
         self._grid = _grid(samples, settings, self._smoother)
-        self._store, self._judgement = store, judgement
+        self._store, self._judgement, self._pixels = store, judgement, pixels
+        self._vectors = np.array([kriging.field_vector(s.position) for s in samples])
         self._where = va.points(samples) if index is None else index.points
         self._photos, self._photo = np.unique([s.photo for s in samples], return_inverse=True)
         self._rule = va.bandwidths(self._where)
@@ -120,13 +124,14 @@ class LensModel:
         base = np.array([s.weight if ok else 0.0 for s, ok in zip(kept, voting, strict=True)])
         widths = WidthField.fit(_with_votes(kept, base)) if smoother.transport else WidthField()
         store = KernelStore(grid.side**2).extended((_row(grid, widths, s) for s in kept), len(kept))
-        judgement = _judge(kept, settings, grid, store, base)
+        pixels = _pixel_store(kept) if smoother.blend else None
+        judgement = _judge(kept, settings, grid, store, base, pixels)
         if smoother.transport and any(flag.sample is None for flag in judgement.flags):
             # a spoilt photo has bent the widths too: fit them again without its voice
             widths = WidthField.fit(_with_votes(kept, judgement.votes))
             store = KernelStore(grid.side**2).extended((_row(grid, widths, s) for s in kept), len(kept))
-            judgement = _judge(kept, settings, grid, store, base)
-        return cls(kept, settings, widths, store, judgement, prior=prior)
+            judgement = _judge(kept, settings, grid, store, base, pixels)
+        return cls(kept, settings, widths, store, judgement, prior=prior, pixels=pixels)
 
     def added(self, samples: Sequence[PsfSample]) -> LensModel:
         """Return the model with more samples.
@@ -148,9 +153,22 @@ class LensModel:
             votes=np.concatenate([old.votes, votes]),
             errors=np.concatenate([old.errors, np.full(len(new), float(np.median(old.errors)))]),
         )
+        if old.image_errors is not None:
+            usual = np.full(len(new), float(np.median(old.image_errors)))
+            judgement = replace(judgement, image_errors=np.concatenate([old.image_errors, usual]))
+        pixels = self._pixels
+        if pixels is not None:
+            pixels = pixels.extended(kriging.pixel_rows(new, self._grid_source), len(new))
         index = self._index.extended(va.points(new))
         return LensModel(
-            (*self.samples, *new), self.settings, self.widths, store, judgement, index=index, prior=self.prior
+            (*self.samples, *new),
+            self.settings,
+            self.widths,
+            store,
+            judgement,
+            index=index,
+            prior=self.prior,
+            pixels=pixels,
         )
 
     def refitted(self, samples: Sequence[PsfSample]) -> LensModel:
@@ -191,6 +209,7 @@ class LensModel:
             self._judgement,
             index=self._index,
             prior=None if prior is None else (prior, strength),
+            pixels=self._pixels,
         )
 
     # --- asking ---------------------------------------------------------------------------------
@@ -224,6 +243,14 @@ class LensModel:
         independent = 1.0 / float((per_photo**2).sum())
         nearest, beyond = self._support(position, settings, rows)
         held_out = float(positive @ self._judgement.errors[rows] ** 2)
+        in_image = 0.0
+        if self._pixels is not None and self._judgement.image_errors is not None:
+            other = float(positive @ self._judgement.image_errors[rows] ** 2)
+            in_image = held_out**2 / max(held_out**2 + other**2, 1e-30)
+            kernel = as_kernel(
+                (1.0 - in_image) * kernel + in_image * self._of_image_frame(position, settings, size)
+            )
+            held_out = (1.0 - in_image) * held_out + in_image * other
         error = _field_error(held_out, found, mean, positive, independent)
         error *= 1.0 + 0.5 * max(nearest - 1.0, 0.0)
         share = 0.0
@@ -239,6 +266,7 @@ class LensModel:
             beyond=beyond,
             nearest=nearest,
             prior_share=share,
+            image_frame_share=in_image,
             std=self._std(rows, positive, position, width, size) if std else None,
         )
 
@@ -308,6 +336,20 @@ class LensModel:
             return mean
         square = mean.reshape(self._grid.side, self._grid.side)
         return np.asarray((square + share * square[::-1]) / (1.0 + share)).ravel()
+
+    def _of_image_frame(self, position: FieldPosition, settings: LensSettings, size: int) -> Kernel:
+        assert self._pixels is not None
+        row = kriging.predict(
+            self._pixels.rows,
+            self._vectors,
+            self._where,
+            self._judgement.votes,
+            kriging.field_vector(position),
+            va.point(position, settings),
+            self._scale,
+            self._judgement.nugget,
+        )
+        return kriging.as_pixels(row, size)
 
     def _support(
         self, position: FieldPosition, settings: LensSettings, rows: NDArray[np.intp]
@@ -396,6 +438,11 @@ def _grid(samples: Sequence[PsfSample], settings: ModelSettings, smoother: Smoot
     return CanonicalGrid(math.ceil(half * room), settings.oversampling)
 
 
+def _pixel_store(samples: Sequence[PsfSample]) -> KernelStore:
+    side = max(s.kernel.shape[0] for s in samples)
+    return KernelStore(side * side).extended(kriging.pixel_rows(samples, side), len(samples))
+
+
 def _row(grid: CanonicalGrid, widths: WidthField, sample: PsfSample) -> NDArray[np.float32]:
     scale = widths.at(sample.position, sample.settings)
     return grid.coefficients(sample.kernel, sample.position.phi, scale)
@@ -422,6 +469,7 @@ def _judge(
     grid: CanonicalGrid,
     store: KernelStore,
     base: NDArray[np.float64],
+    pixels: KernelStore | None,
 ) -> _Judgement:
     """Choose bandwidths by cross-validation, weigh robustly, note held-out errors."""
     where = va.points(samples)
@@ -478,7 +526,21 @@ def _judge(
             choice = chosen(votes)
     errors[:] = float(np.median(found))
     errors[judged] = found
-    return _Judgement(votes, errors, choice, flags)
+    if pixels is None:
+        return _Judgement(votes, errors, choice, flags)
+    trusted = judged[votes[judged] > 0]
+    vectors = np.array([kriging.field_vector(samples[i].position) for i in trusted])
+    nugget, seen = kriging.held_out_errors(
+        pixels.rows[trusted],
+        vectors,
+        where[trusted],
+        votes[trusted],
+        va.scales(_bandwidth(rule, settings, choice)),
+        groups[trusted],
+    )
+    image_errors = np.full(len(samples), float(np.median(seen)))
+    image_errors[trusted] = seen
+    return _Judgement(votes, errors, choice, flags, nugget, image_errors)
 
 
 def _thinned(rows: NDArray[np.intp], most: int) -> NDArray[np.intp]:

@@ -48,6 +48,10 @@ class Smoother(Protocol):
     def reach(self) -> float:
         """Distance in bandwidths beyond which samples are left out."""
 
+    @property
+    def blend(self) -> bool:
+        """Whether the answer is mixed with that of the image frame, by their held-out errors."""
+
     def weights(self, near: Neighbours) -> NDArray[np.float64]:
         """Weights of sum 1, shape (m,)."""
 
@@ -68,6 +72,7 @@ class NadarayaWatson:
 
     transport: bool = False
     reach: float = 4.0
+    blend: bool = False
 
     def weights(self, near: Neighbours) -> NDArray[np.float64]:
         """Weights of sum 1."""
@@ -85,6 +90,7 @@ class NearestNeighbours:
     at: float = 1.0
     transport: bool = False
     reach: float = 8.0
+    blend: bool = False
 
     def weights(self, near: Neighbours) -> NDArray[np.float64]:
         """Weights of sum 1."""
@@ -104,6 +110,7 @@ class Abramson:
 
     transport: bool = False
     reach: float = 5.0
+    blend: bool = False
 
     def weights(self, near: Neighbours) -> NDArray[np.float64]:
         """Weights of sum 1."""
@@ -129,6 +136,7 @@ class LocalLinear:
     least: float = 5.0
     transport: bool = False
     reach: float = 4.0
+    blend: bool = False
 
     def weights(self, near: Neighbours) -> NDArray[np.float64]:
         """Weights of sum 1; some may be negative."""
@@ -165,6 +173,7 @@ class GaussianProcess:
     most: int = 128
     transport: bool = False
     reach: float = 12.0
+    blend: bool = False
 
     def weights(self, near: Neighbours) -> NDArray[np.float64]:
         """Weights of sum 1; some may be negative."""
@@ -187,6 +196,8 @@ class GaussianProcess:
 smoothers: Registry[Smoother] = Registry(
     "regression",
     {
+        "blended": lambda **params: NadarayaWatson(transport=True, blend=True, **params),
+        "blended-gaussian-process": lambda **params: GaussianProcess(transport=True, blend=True, **params),
         "nadaraya-watson": NadarayaWatson,
         "nearest": NearestNeighbours,
         "abramson": Abramson,

@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from typing import Annotated
+
+# Before NumPy is imported: the work is parallel over processes, and linear algebra libraries that
+# start threads of their own in each of them only get in one another's way.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
 
 import typer
 

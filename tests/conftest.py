@@ -1,6 +1,11 @@
 from __future__ import annotations
 
 import os
+
+# Before NumPy is imported: tests run in parallel processes, threads inside each only slow them down.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
 from pathlib import Path
 
 import pytest

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from lensmodel.photo.dng import ShotInfo, write_bayer_dng
 from lensmodel.simulate import (
     ChartEdge,
     SimulatedCamera,
@@ -19,6 +18,7 @@ from lensmodel.simulate import (
     draw_lens,
     edge_chart,
     photograph,
+    write_photo,
 )
 from lensmodel.types import LensSettings, Planes
 
@@ -101,27 +101,7 @@ def _take(name: str, number: int, folder: Path) -> Shot:
     photo = photograph(scene, lens, settings, camera, np.random.default_rng(number))
     shot = Shot(name, folder / f"{name}.dng", folder / f"{name}-sharp.npy")
     np.save(shot.truth, photo.sharp, allow_pickle=False)
-    write_bayer_dng(
-        shot.path,
-        photo.mosaic,
-        black=camera.black,
-        white=camera.white,
-        pattern=camera.pattern,
-        as_shot_neutral=[1.0 / gain for gain in camera.white_balance],
-        shot=ShotInfo(
-            camera_maker=camera.maker,
-            camera_model=camera.model,
-            body_serial=camera.serial,
-            lens_maker=lens.maker,
-            lens_model=lens.model,
-            lens_serial=lens.serial,
-            aperture=settings.aperture,
-            focal_mm=settings.focal_mm,
-            iso=100,
-            exposure_s=1 / 250,
-            pixel_pitch_um=camera.pitch_um,
-        ),
-    )
+    write_photo(shot.path, photo)
     return shot
 
 

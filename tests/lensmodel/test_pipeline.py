@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lensmodel import codec, photo, pipeline, quality
+from lensmodel.errors import InvalidInputError, MetadataMissingError, NotEnoughEvidenceError
+from lensmodel.geometry import Frame
+from lensmodel.patches import Patch, Selection
+from lensmodel.photo import LinearPhoto
+from lensmodel.simulate import SimulatedCamera, SimulatedPhoto, demo_scene, draw_lens, photograph, write_photo
+from lensmodel.types import FieldPosition, LensSettings
+
+LENS = draw_lens(5, "astigmatism")
+CAMERA = SimulatedCamera(height=384, width=576, pitch_um=9.0)
+SETTINGS = LensSettings(aperture=LENS.at_focal().f_number)
+
+
+def taken(name: str, folder: Path, seed: int) -> tuple[Path, SimulatedPhoto]:
+    scene = demo_scene(name)[:, 200 : 200 + CAMERA.height + 32, 400 : 400 + CAMERA.width + 32]
+    shot = photograph(
+        np.ascontiguousarray(scene), LENS, SETTINGS, CAMERA, np.random.default_rng(seed)
+    )
+    path = folder / f"{name}.dng"
+    write_photo(path, shot)
+    return path, shot
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, SimulatedPhoto]]:
+    folder = tmp_path_factory.mktemp("photos")
+    return {name: taken(name, folder, seed) for seed, name in enumerate(("city", "lake"))}
+
+
+def test_developed_photo_comes_back_from_disk_as_it_was(
+    photos: dict[str, tuple[Path, SimulatedPhoto]], tmp_path: Path
+) -> None:
+    developed = photo.develop(photos["city"][0])
+
+    pipeline.save_developed(developed, tmp_path)
+    back = pipeline.load_developed(tmp_path)
+
+    assert np.array_equal(back.planes, developed.planes)
+    assert back.planes.flags.writeable is False
+    assert (back.frame, back.noise, back.clip) == (developed.frame, developed.noise, developed.clip)
+    assert (back.info, back.encoding) == (developed.info, developed.encoding)
+
+
+def test_half_written_folder_is_no_developed_photo(tmp_path: Path) -> None:
+    (tmp_path / "photo.json").write_text("{}", encoding="utf-8")
+
+    with pytest.raises(InvalidInputError, match="develop it again"):
+        pipeline.load_developed(tmp_path)
+
+
+def test_cells_hold_every_patch_once_largest_first() -> None:
+    place = FieldPosition(0.1, 0.0)
+    patches = tuple(Patch(i, i, 64, place, 1.0, cell) for i, cell in enumerate((2, 1, 2, 0, 2, 1)))
+
+    groups = pipeline.cells(Selection(patches, ()))
+
+    assert [len(group) for group in groups] == [3, 2, 1]
+    assert sorted(p.row for group in groups for p in group) == list(range(6))
+
+
+def test_calibrated_lens_makes_another_photo_sharper(
+    photos: dict[str, tuple[Path, SimulatedPhoto]], tmp_path: Path
+) -> None:
+    events: list[pipeline.CalibrationEvent] = []
+    model = pipeline.calibrate([photos["city"][0]], count=12, workers=1, on_event=events.append)
+    path, shot = photos["lake"]
+    output = tmp_path / "corrected.tif"
+
+    corrected = pipeline.correct(path, model, output)
+
+    before = quality.zone_psnr(photo.develop(path).planes, shot.sharp, CAMERA.frame, border=8)
+    after = quality.zone_psnr(corrected.planes, shot.sharp, CAMERA.frame, border=8)
+    assert after["corner"] > before["corner"] + 0.5
+    assert after["center"] > before["center"]
+    assert output.stat().st_size > CAMERA.height * CAMERA.width * 6
+    stages = [event.stage for event in events]
+    assert stages[0] == "developing"
+    assert stages[-1] == "counted"
+
+
+def test_photos_that_cannot_help_are_skipped_with_the_reason(tmp_path: Path) -> None:
+    text = tmp_path / "notes.jpg"
+    text.write_text("not a photo", encoding="utf-8")
+    events: list[pipeline.CalibrationEvent] = []
+
+    with pytest.raises(NotEnoughEvidenceError, match=r"notes\.jpg"):
+        pipeline.calibrate([text], on_event=events.append)
+
+    assert [event.stage for event in events] == ["skipped" if e.stage == "skipped" else e.stage for e in events]
+    assert events[-1].stage == "skipped"
+
+
+def test_photo_without_aperture_asks_for_it(tmp_path: Path) -> None:
+    from PIL import Image  # noqa: PLC0415 - one test needs it
+
+    path = tmp_path / "scan.png"
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (300, 400, 3), dtype=np.uint8)).save(path)
+
+    with pytest.raises(MetadataMissingError, match="--aperture"):
+        pipeline.samples_of_photo(path)
+
+
+def test_settings_given_by_hand_go_before_the_file() -> None:
+    developed = LinearPhoto(
+        planes=np.zeros((3, 4, 4), dtype=np.float32),
+        frame=Frame(4, 4),
+        noise=(pipeline.NoiseModel.white(0.01),) * 3,
+        clip=(1.0, 1.0, 1.0),
+        info=photo.PhotoInfo("dng", 4, 4, photo.PhotoMetadata(aperture=2.8, focal_mm=35.0)),
+        encoding=photo.Encoding(),
+        pipeline="test",
+    )
+
+    chosen = pipeline.settings_of(developed, LensSettings(aperture=4.0))
+
+    assert (chosen.aperture, chosen.focal_mm) == (4.0, 35.0)
+
+
+def test_json_refuses_what_it_could_not_read_back() -> None:
+    with pytest.raises(InvalidInputError, match="object"):
+        codec.to_json({"x": object()})

@@ -14,6 +14,7 @@ from jinja2 import Environment, PackageLoader, select_autoescape
 
 from app import views
 from app.dependencies import Call, CallDep
+from app.errors import NotReadyError
 from app.pages import pictures, words
 from app.routes import corrections as correction_routes
 from app.routes import lenses as lens_routes
@@ -196,7 +197,7 @@ def correction_crop(
     plan = correction_routes.find_plan(call, correction_id)
     done = plan.correction
     if done.state != "succeeded" or done.result_key is None or done.result_media_type is None:
-        raise pictures.NotReadyError(f"correction {correction_id} is {done.state}: wait for its job")
+        raise NotReadyError(f"correction {correction_id} is {done.state}: wait for its job")
     read = partial(call.storage.get, done.result_key)
     picture = pictures.decoded(
         _Named(read, done.result_key), done.result_key, done.result_media_type, plan.photo.orientation or 1

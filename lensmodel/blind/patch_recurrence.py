@@ -125,17 +125,14 @@ class PatchRecurrence:
         widest = self.support or min(size, 31)
         while levels > 1 and min(level_shape(scaled[0].y.shape, levels - 1)) < 40:
             levels -= 1
-        kernel, images = start, [None] * len(scaled)
-        latent: list[Image | None] = list(images)
+        kernel, latent = start, [view.y for view in (s.at(levels - 1) for s in scaled)]
         total, done = levels * self.iterations, 0
         state: _Equations | None = None
         for level in reversed(range(levels)):
             side = max(5, _odd(widest / ALPHA**level))
             views = [s.at(level) for s in scaled]
             kernel = _start(kernel, side) if level == levels - 1 else _upscaled(kernel, side)
-            latent = [
-                v.y if x is None else resample(x, v.y.shape) for x, v in zip(latent, views, strict=True)
-            ]
+            latent = [resample(x, v.y.shape) for x, v in zip(latent, views, strict=True)]
             for _ in range(self.iterations):
                 state = self._step(views, latent, kernel, side)
                 kernel = state.kernel

@@ -31,6 +31,8 @@ Image = NDArray[np.float64]
 
 def resample(image: Image, shape: tuple[int, int]) -> Image:
     """Resize by cubic splines, anti-aliased when it shrinks (Gaussian of sigma (ratio - 1) / 2)."""
+    if image.shape == shape:
+        return image
     ratios = [have / want for have, want in zip(image.shape, shape, strict=True)]
     sigma = [max(ratio - 1.0, 0.0) / 2.0 for ratio in ratios]
     smooth = ndimage.gaussian_filter(image, sigma, mode="mirror") if max(sigma) > 0 else image
@@ -121,7 +123,8 @@ def blend(y: Image, kernel: NDArray[np.float64], z: Image, beta: float) -> tuple
         Impulse response of conj(K) / (|K|² + beta), by which the noise of y enters x; origin at [0, 0].
     """
     pad = kernel.shape[0]
-    shape = tuple(int(fft.next_fast_len(n + 2 * pad, real=True)) for n in y.shape)
+    rows, cols = (int(fft.next_fast_len(n + 2 * pad, real=True)) for n in y.shape)
+    shape = (rows, cols)
     after = [(pad, n - m - pad) for n, m in zip(shape, y.shape, strict=True)]
     transfer = otf(kernel, shape)
     power = np.abs(transfer) ** 2 + beta

@@ -11,7 +11,9 @@ what one patch leaves open, another decides. Two kinds are kept:
 from __future__ import annotations
 
 import io
+import math
 import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -101,6 +103,8 @@ class PatchEvidence:
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
                 if sum(entry.file_size for entry in archive.infolist()) > _MAX_BYTES:
                     raise InvalidInputError(f"evidence unpacks to more than {_MAX_BYTES} bytes")
+                for entry in archive.infolist():
+                    _refuse_large(archive, entry)
             with np.load(io.BytesIO(data), allow_pickle=False) as stored:
                 pixels, noise, floor = (float(v) for v in stored["scalars"])
                 return cls(
@@ -111,8 +115,27 @@ class PatchEvidence:
                     stored["spectrum"].astype(np.float32),
                     floor,
                 )
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile, EOFError) as error:
+        # RuntimeError: an encrypted member, or one packed by a method that zipfile does not know.
+        except (
+            OSError,
+            ValueError,
+            KeyError,
+            EOFError,
+            OverflowError,
+            RuntimeError,
+            zipfile.BadZipFile,
+            zlib.error,
+        ) as error:
             raise InvalidInputError("these bytes are no patch evidence") from error
+
+
+def _refuse_large(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:
+    """Refuse a member whose header promises more than its bytes: NumPy allocates by the header."""
+    with archive.open(entry) as member:
+        np.lib.format.read_magic(member)
+        shape, _, dtype = np.lib.format.read_array_header_1_0(member)
+    if math.prod(shape) * dtype.itemsize > entry.file_size:
+        raise InvalidInputError(f"evidence claims an array of shape {shape} in {entry.file_size} bytes")
 
 
 def binned_spectrum(patch: Plane, noise: NoiseModel) -> tuple[NDArray[np.float32], float]:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import zipfile
 
 import numpy as np
 import pytest
@@ -112,3 +113,14 @@ def test_least_squares_respects_the_sign_constraint() -> None:
     k = nonnegative_least_squares(a, np.array([2.0, -3.0, 0.5]), np.ones(3))
 
     assert np.allclose(k, [1.0, 0.0, 0.5], atol=1e-6)
+
+
+def test_a_header_that_promises_more_than_its_bytes_is_refused() -> None:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        member = io.BytesIO()
+        header = {"descr": "<f4", "fortran_order": False, "shape": (1 << 20, 1 << 20)}
+        np.lib.format.write_array_header_1_0(member, header)
+        archive.writestr("scalars.npy", member.getvalue())
+    with pytest.raises(InvalidInputError, match="claims an array"):
+        PatchEvidence.from_bytes(buffer.getvalue())

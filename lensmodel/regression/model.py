@@ -424,9 +424,10 @@ def _field_error(
     s is taken from the scatter of the neighbours, which also differ in place; so b is not
     taken below a third of e.
     """
-    norms = np.einsum("ij,ij->i", rows, rows)
+    apart = rows - mean
+    norms = np.einsum("ij,ij->i", apart, apart)
     power = max(float(mean @ mean), 1e-30)
-    scatter = max(float(weight @ norms) / power - 1.0, 0.0)
+    scatter = float(weight @ norms) / power
     noise = min(scatter / max(1.0 - float(weight @ weight), 0.1), held_out)
     bias = max(held_out - noise * (1.0 + 1.0 / independent), held_out / 9.0)
     return math.sqrt(bias + noise / independent)

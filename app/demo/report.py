@@ -70,7 +70,7 @@ class Report:
                 before, after = self.chart_before[zone], self.chart_after[zone]
                 lines.append(
                     f"| {zone} | {before.mtf50:.3f} | {after.mtf50:.3f} | {after.mtf_max:.2f} "
-                    f"| {100 * after.overshoot:.1f} % |"
+                    f"| {after.overshoot:.1f} % |"
                 )
         lines += [
             "",

@@ -12,7 +12,7 @@ import numpy as np
 from lensmodel.blind.base import PsfEstimate, is_no_blur
 from lensmodel.blind.patch_recurrence import PatchRecurrence
 from lensmodel.blind.whittle import Whittle
-from lensmodel.psf import distance, rms_width
+from lensmodel.psf import as_kernel, distance, rms_width
 from lensmodel.types import NoiseModel, Plane, StepHook, ignore_step
 
 _PIXEL_SIGMA = 0.29
@@ -23,17 +23,18 @@ class Guarded:
     """Patch recurrence, unless a Whittle Gaussian says that it ran too wide.
 
     A kernel that is too wide ruins a photo, one too narrow only helps less. A Whittle Gaussian
-    follows the core of a lens PSF and has half to two thirds of its width; patch recurrence that is
-    more than `width_limit` times as wide has taken the scene's own softness for blur.
+    follows the core of a lens PSF and has about half of its width; patch recurrence that is more than
+    `width_limit` times as wide has taken the scene's own softness for blur, at least in part. Then
+    the mean of both is given: their core and half of the skirt.
 
     Their disagreement, the root mean square distance of their MTFs, is also the best predictor of
     the true error.
     """
 
-    width_limit: float = 2.0
+    width_limit: float = 2.7
 
     name = "default"
-    version = 1
+    version = 2
 
     def estimate(
         self,
@@ -76,7 +77,7 @@ class Guarded:
         disagreement = distance(found.kernel, gaussian.kernel).mtf_rmse
         wide = rms_width(found.kernel) > self.width_limit * max(rms_width(gaussian.kernel), _PIXEL_SIGMA)
         error = predicted_error(disagreement, len(found.evidence), guarded=wide)
-        kernel = gaussian.kernel if wide else found.kernel
+        kernel = as_kernel(0.5 * (gaussian.kernel + found.kernel)) if wide else found.kernel
         diagnostics: Mapping[str, float] = {
             **found.diagnostics,
             "gaussian_width": gaussian.diagnostics["width"],

@@ -65,9 +65,9 @@ def corrected(path: Path) -> Planes:
 
 
 def psnr(planes: Planes, shot: camera.Shot) -> dict[Zone, float]:
-    """PSNR in dB of the sRGB-encoded, white-balanced picture in each zone."""
+    """PSNR in dB of the sRGB-encoded, white-balanced picture in each zone, registered block by block."""
     gains = np.asarray(camera.demo_camera().white_balance, dtype=np.float32)[:, None, None]
-    return quality.zone_psnr(
+    return quality.registered_zone_psnr(
         planes * gains, shot.sharp() * gains, camera.demo_camera().frame, srgb=True, border=_BORDER
     )
 

@@ -17,6 +17,7 @@ from lensmodel.types import ZONES, Zone
 _SSIM_WINDOW: Final = 11
 _SHIFT_STEPS: Final = 6
 _SHIFT_PAD: Final = 8
+_LARGEST_SHIFT = 3.0
 _SHIFT_WINDOW: Final = 1024
 
 
@@ -121,6 +122,70 @@ def zone_psnr(
         for zone in ZONES
         if (masks[zone] & inside).any()
     }
+
+
+def registered_zone_psnr(
+    image: NDArray[np.floating],
+    reference: NDArray[np.floating],
+    frame: Frame,
+    *,
+    srgb: bool = False,
+    border: int = 8,
+    block: int = 128,
+) -> dict[Zone, float]:
+    """PSNR in dB of each zone after the best shift of every block of the picture is removed.
+
+    A PSF is centred on its centre of mass, and where it has long faint wings on one side that lies
+    a pixel or two beside its core. Neither a blind method nor an eye can tell: it is a smooth
+    distortion of the picture, not blur. `zone_psnr` would count it, block by block it is taken out.
+
+    Parameters
+    ----------
+    image, reference : ndarray, shape (..., H, W)
+        Linear light.
+    frame : Frame
+        (H, W), no side shorter than a block and two borders.
+    srgb : bool
+        See `psnr`.
+    border : int
+        Pixels along the frame, and along each block, that do not count.
+    block : int
+        Side of a block; blocks overlap by two borders, so that all pixels inside count.
+    """
+    _same_shape(image, reference)
+    if image.shape[-2:] != (frame.height, frame.width):
+        raise InvalidInputError(f"the pictures {image.shape} do not have the size of {frame}")
+    if min(frame.height, frame.width) < block or block <= 2 * border:
+        raise InvalidInputError(f"{frame} is too small for blocks of {block} with a border of {border}")
+    radius = frame.radius_map()
+    wanted, found = (to_srgb(reference), to_srgb(image)) if srgb else (reference, image)
+    total = dict.fromkeys(ZONES, 0.0)
+    count = dict.fromkeys(ZONES, 0)
+    core = (..., slice(border, -border), slice(border, -border))
+    step = block - 2 * border
+    for row in _starts(frame.height, block, step):
+        for col in _starts(frame.width, block, step):
+            window = (..., slice(row, row + block), slice(col, col + block))
+            shift = best_shift(found[window], wanted[window])
+            if max(map(abs, shift)) > _LARGEST_SHIFT:
+                shift = (0.0, 0.0)  # nothing in the block says where it lies
+            error = np.square(shifted(found[window], *shift) - wanted[window])[core]
+            zones = radius[window][core]
+            for zone in ZONES:
+                inside = np.broadcast_to(_in_zone(zones, zone), error.shape)
+                total[zone] += float(error[inside].sum())
+                count[zone] += int(inside.sum())
+    return {zone: -10.0 * math.log10(max(total[zone] / count[zone], 1e-30)) for zone in ZONES if count[zone]}
+
+
+def _starts(length: int, block: int, step: int) -> list[int]:
+    return [*range(0, length - block, step), length - block]
+
+
+def _in_zone(r: NDArray[np.floating], zone: Zone) -> NDArray[np.bool_]:
+    if zone == "center":
+        return r < CENTER_ZONE_R
+    return r > CORNER_ZONE_R if zone == "corner" else (r >= CENTER_ZONE_R) & (r <= CORNER_ZONE_R)
 
 
 def best_shift(image: NDArray[np.floating], reference: NDArray[np.floating]) -> tuple[float, float]:

@@ -29,6 +29,7 @@ from lensmodel.quality import (
     noise_gain,
     pixel_mtf,
     psnr,
+    registered_zone_psnr,
     shifted,
     slanted_edge,
     ssim,
@@ -394,3 +395,19 @@ def test_delta_kernel_passes_everything() -> None:
 
     np.testing.assert_allclose(mtf_from_kernel(kernel, 0.3, [0.0, 0.2, 0.5]), 1.0)
     assert mtf50_from_kernel(kernel, 0.3) == 1.0
+
+
+def test_registered_psnr_forgives_a_smooth_distortion_but_no_blur() -> None:
+    rng = np.random.default_rng(0)
+    sharp = ndimage.gaussian_filter(rng.random((256, 384)), 1.0)
+    rows, cols = np.mgrid[0:256, 0:384].astype(float)
+    bent = ndimage.map_coordinates(sharp, [rows + 0.004 * (cols - 192), cols], order=3, mode="mirror")
+    soft = ndimage.gaussian_filter(sharp, 1.0)
+    frame = Frame(256, 384)
+
+    plain = zone_psnr(bent, sharp, frame)["corner"]
+    registered = registered_zone_psnr(bent, sharp, frame)["corner"]
+    blurred = registered_zone_psnr(soft, sharp, frame)["corner"]
+
+    assert registered > plain + 6.0
+    assert blurred < registered - 3.0

@@ -6,12 +6,14 @@ import glob
 import json
 import sys
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 from PIL import Image
+from rich.progress import Progress, TaskID
 
 from app.commands import display
 from lensmodel import pipeline, quality
@@ -206,7 +208,7 @@ def correct(
                     strength=strength,
                     file_format=file_format,  # type: ignore[arg-type]  # checked above
                     workers=workers,
-                    on_step=lambda done, total, task=task: bars.update(task, completed=done, total=total),
+                    on_step=partial(_advance, bars, task),
                 )
                 result |= {"state": "corrected", "zones": to_json(corrected.zones)}
                 if not json_output:
@@ -219,6 +221,10 @@ def correct(
         typer.echo(json.dumps({"results": results}, indent=2))
     if any(result["state"] == "failed" for result in results):
         raise typer.Exit(1)
+
+
+def _advance(bars: Progress, task: TaskID, done: int, total: int) -> None:
+    bars.update(task, completed=done, total=total)
 
 
 def psf(
@@ -244,7 +250,7 @@ def psf(
     """
     if channel not in CHANNELS:
         raise InvalidInputError(f"channel must be r, g or b, got {channel!r}")
-    named: Channel = channel  # type: ignore[assignment]  # checked above
+    named: Channel = channel
     place = FieldPosition(r, phi)
     model = load_profile(profile).model
     answer = model.query(place, LensSettings(aperture=aperture, channel=named), size)

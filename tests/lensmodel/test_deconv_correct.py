@@ -28,7 +28,7 @@ class Soft:
     centre: float = 0.9
     corner: float = 1.7
 
-    def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:  # noqa: ARG002 - the protocol names it
+    def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
         width = self.centre + (self.corner - self.centre) * position.r**2
         return gaussian(size, np.eye(2) * width**2)
 

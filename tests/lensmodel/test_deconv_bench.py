@@ -1,0 +1,30 @@
+import numpy as np
+import pytest
+
+from lensmodel.bench.correct import SoftCorners, run_correct_benchmark
+from lensmodel.errors import InvalidInputError
+from lensmodel.psf import rms_width
+from lensmodel.types import FieldPosition
+
+
+def test_benchmark_times_each_method_and_prints_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    photo = np.full((3, 210, 220), 0.3, dtype=np.float32)
+
+    report = run_correct_benchmark(photo, methods=("fast",))
+
+    assert report["methods"]["fast"]["cpu_s"] > 0
+    assert report["kernel"]["ours"] > 0
+    assert capsys.readouterr().out == ""
+
+
+def test_lens_for_timing_is_softer_in_the_corner() -> None:
+    lens = SoftCorners()
+
+    widths = [rms_width(lens.kernel_at(FieldPosition(r, 0.5), "g", 21)) for r in (0.0, 1.0)]
+
+    assert widths[0] < 1.0 < widths[1]
+
+
+def test_benchmark_refuses_a_single_plane() -> None:
+    with pytest.raises(InvalidInputError, match="photo must be"):
+        run_correct_benchmark(np.zeros((10, 10), dtype=np.float32))

@@ -13,7 +13,7 @@ from lensmodel.photo import LinearPhoto
 from lensmodel.simulate import SimulatedCamera, SimulatedPhoto, demo_scene, draw_lens, photograph, write_photo
 from lensmodel.types import FieldPosition, LensSettings
 
-LENS = draw_lens(5, "astigmatism")
+LENS = draw_lens(5, "soft-fast")  # blurred in the center too: there is something to gain everywhere
 CAMERA = SimulatedCamera(height=384, width=576, pitch_um=9.0)
 SETTINGS = LensSettings(aperture=LENS.at_focal().f_number)
 
@@ -73,8 +73,8 @@ def test_calibrated_lens_makes_another_photo_sharper(
 
     corrected = pipeline.correct(path, model, output)
 
-    before = quality.zone_psnr(photo.develop(path).planes, shot.sharp, CAMERA.frame, border=8)
-    after = quality.zone_psnr(corrected.planes, shot.sharp, CAMERA.frame, border=8)
+    before = quality.registered_zone_psnr(photo.develop(path).planes, shot.sharp, CAMERA.frame)
+    after = quality.registered_zone_psnr(corrected.planes, shot.sharp, CAMERA.frame)
     assert after["corner"] > before["corner"] + 0.5
     assert after["center"] > before["center"]
     assert output.stat().st_size > CAMERA.height * CAMERA.width * 6

@@ -36,7 +36,7 @@ from lensmodel.errors import (
 )
 from lensmodel.patches import Patch, Selection
 from lensmodel.photo import LinearPhoto
-from lensmodel.photo.lateral import LateralColour, estimate_lateral
+from lensmodel.photo.lateral import LateralColour, estimate_lateral, resample
 from lensmodel.psf import PsfSample
 from lensmodel.regression import LensModel, ModelSettings
 from lensmodel.types import (
@@ -419,8 +419,13 @@ def correct_photo(
         answer = model.query(position, settings.with_channel(channel), size=15)
         return answer.predicted_error if math.isfinite(answer.predicted_error) else 1.0
 
+    planes = developed.planes
+    if method == "paper" and lateral is not None:
+        # As the paper did (section 8): the channels are warped first. All other methods carry the
+        # shift in their PSFs and spare the picture that resampling.
+        planes, lateral = resample(planes, developed.frame, lateral), None
     return deconv.correct_planes(
-        developed.planes,
+        planes,
         model.field(settings),
         developed.frame,
         method=method,

@@ -123,3 +123,31 @@ def test_settings_given_by_hand_go_before_the_file() -> None:
 def test_json_refuses_what_it_could_not_read_back() -> None:
     with pytest.raises(InvalidInputError, match="object"):
         codec.to_json({"x": object()})
+
+
+def test_paper_method_warps_the_channels_before_it_corrects(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: dict[str, object] = {}
+
+    def record(planes: np.ndarray, *args: object, lateral: object, **rest: object) -> None:
+        seen.update(planes=planes, lateral=lateral)
+
+    monkeypatch.setattr(pipeline.deconv, "correct_planes", record)
+    monkeypatch.setattr(pipeline, "resample", lambda planes, *_: planes + 1)
+    developed = LinearPhoto(
+        planes=np.zeros((3, 4, 4), dtype=np.float32),
+        frame=Frame(4, 4),
+        noise=(pipeline.NoiseModel.white(0.01),) * 3,
+        clip=(1.0, 1.0, 1.0),
+        info=photo.PhotoInfo("dng", 4, 4),
+        encoding=photo.Encoding(),
+        pipeline="test",
+    )
+    kernel = np.zeros((5, 5))
+    kernel[2, 2] = 1.0
+    model = pipeline.LensModel.fit([pipeline.PsfSample(kernel, FieldPosition(0.1, 0.0))])
+
+    for method, warped in (("paper", True), ("standard", False)):
+        pipeline.correct_photo(developed, model, LensSettings(), method=method, lateral="shift")  # type: ignore[arg-type]
+
+        assert bool(np.asarray(seen["planes"]).any()) is warped
+        assert seen["lateral"] == (None if warped else "shift")

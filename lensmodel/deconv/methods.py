@@ -10,6 +10,11 @@ from lensmodel.deconv.wiener import Wiener
 from lensmodel.registry import Registry
 
 
+def _fast() -> SparseGradient:
+    """Half the steps of "standard", each a larger one: nearly its quality, for previews."""
+    return SparseGradient(steps=4, coupling=4.0, growth=6.0)
+
+
 def _paper() -> SaturationAwareRichardsonLucy:
     return SaturationAwareRichardsonLucy(iterations=25)
 
@@ -23,7 +28,7 @@ deconvolvers: Registry[Deconvolver] = Registry(
     {
         "standard": SparseGradient,
         "paper": _paper,
-        "fast": Wiener,
+        "fast": _fast,
         "richardson-lucy": RichardsonLucy,
         "whyte": _whyte,
         "krishnan-fergus": KrishnanFergus,

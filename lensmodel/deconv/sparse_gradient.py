@@ -8,12 +8,14 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage
+from scipy import fft
 
 from lensmodel.blur import BlurOperator, UniformBlur
 from lensmodel.deconv.base import Restored, Sensor, uniform
 from lensmodel.deconv.canvas import Canvas
+from lensmodel.deconv.clipping import faded_to, spoilt
 from lensmodel.deconv.engine import Engine, compiled
+from lensmodel.deconv.local import signal_variance, smoothed
 from lensmodel.deconv.shrinkage import Shrinkage
 from lensmodel.deconv.wiener import wiener_canvas
 from lensmodel.errors import InvalidInputError
@@ -44,10 +46,11 @@ class SparseGradient:
         X_c = ( conj(K) Y~ + b var sum_j conj(F_j) W_j ) / ( |K|² + b var sum_j |F_j|² )
 
     Three departures from [1]_: the threshold follows the noise variance pixel by pixel, and the
-    local light (gradients of a scene scale with its illumination); chroma is shrunk harder than luma,
+    local light and contrast (gradients of a scene scale with both); chroma is shrunk harder than luma,
     because edges of all colours coincide; and unmeasured or clipped pixels take the model's own
     prediction as data, Y~ = F x (clipped ones only where it is above the clip), which maximises
-    the likelihood of what was measured.
+    the likelihood of what was measured. That guess converges slowly for lights far above the clip:
+    pixels that got most of their blur count as unmeasured, and the correction fades out there.
 
     Parameters
     ----------
@@ -73,7 +76,7 @@ class SparseGradient:
     weight: float = 2.0
     chroma: float = 2.5
     alpha: float = 0.67
-    steps: int = 6
+    steps: int = 8
     coupling: float = 1.5
     growth: float = 3.0
     engine: Engine = "auto"
@@ -126,7 +129,8 @@ class SparseGradient:
                 problem.prox.terms,
             )
             on_step(self.steps, self.steps)
-        return np.ascontiguousarray(x[:, canvas.data[0], canvas.data[1]] * light)
+        restored = np.ascontiguousarray(x[:, canvas.data[0], canvas.data[1]] * light)
+        return faded_to(blurred, restored, blurred >= _clips(sensors), blurs)
 
     def _problem(
         self,
@@ -137,20 +141,22 @@ class SparseGradient:
         canvas: Canvas,
     ) -> _Problem:
         planes = blurred / light
-        var = np.stack([s.variance(_smooth(y)) for s, y in zip(sensors, blurred, strict=True)]) / light**2
+        var = np.stack([s.variance(smoothed(y)) for s, y in zip(sensors, blurred, strict=True)]) / light**2
         noise = np.maximum(var.mean(axis=(1, 2)), np.float32(1e-9))
         y = np.stack([canvas.fill(plane) for plane in planes])
-        level = np.maximum(canvas.fill(_smooth(planes.mean(axis=0))), _DARK)
+        luma = planes.mean(axis=0)
+        level = np.maximum(canvas.fill(smoothed(luma)), _DARK)
         relative = canvas.fill((var / noise[:, None, None]).mean(axis=0))
         prox = Shrinkage.of(self.alpha)
-        scale = prox.scale((relative / level ** np.float32(self.alpha)).astype(np.float32))
+        calm = canvas.fill(_calm(luma, var.mean(axis=0) / len(planes), self.alpha))
+        scale = prox.scale((relative * calm / level ** np.float32(self.alpha)).astype(np.float32))
         couplings = self.coupling * self.growth ** np.arange(self.steps)
         weights = np.full(len(y), self.weight * self.chroma)
         weights[0] = self.weight
         state = np.full(y.shape, _UNMEASURED, dtype=np.uint8)
         inside = (slice(None), *canvas.data)
-        clip = np.array([s.clip for s in sensors], dtype=np.float32)[:, None, None]
-        state[inside] = np.where(blurred >= clip, _CLIPPED, _MEASURED)
+        clipped = blurred >= _clips(sensors)
+        state[inside] = np.where(clipped, _CLIPPED, np.where(spoilt(clipped, blurs), _UNMEASURED, _MEASURED))
         start = np.stack(
             [
                 wiener_canvas(a, blur, float(n), float(plane.var()))
@@ -174,6 +180,8 @@ class SparseGradient:
 
 
 _MEASURED, _UNMEASURED, _CLIPPED = 0, 1, 2
+_TYPICAL_CONTRAST = np.float32(0.02)  # variance over squared light of a scene for which kappa is `weight`
+_BUSIEST, _CALMEST = 0.7, 50.0
 _DARK = np.float32(0.02)  # share of a tile's mean light below which the prior follows it no further
 
 
@@ -193,6 +201,10 @@ class _Problem:
     refresh: int
     rotation: NDArray[np.float32]
     prox: Shrinkage
+
+
+def _clips(sensors: Sequence[Sensor]) -> NDArray[np.float32]:
+    return np.array([s.clip for s in sensors], dtype=np.float32)[:, None, None]
 
 
 def _half_quadratic(p: _Problem, on_step: StepHook) -> Planes:
@@ -221,10 +233,17 @@ def _half_quadratic(p: _Problem, on_step: StepHook) -> Planes:
     return x
 
 
-def _smooth(plane: NDArray[np.float32]) -> NDArray[np.float32]:
-    # Two running means cost the same at any width, unlike a Gaussian.
-    once = ndimage.uniform_filter(plane, 7, mode="nearest")
-    return ndimage.uniform_filter(once, 7, mode="nearest")
+def _calm(luma: NDArray[np.float32], noise: NDArray[np.float32], alpha: float) -> NDArray[np.float32]:
+    """How much smoother than an average scene it is here: the factor on kappa.
+
+    The maximum-likelihood kappa of a hyper-Laplacian is proportional to E|g|^-alpha; gradients
+    scale with the local contrast, so it is (typical over local variance of the signal)^(alpha / 2).
+    Without it the flat parts of a picture keep the noise that the inverse of a wide kernel amplifies.
+    """
+    signal = signal_variance(luma, noise)
+    level = np.maximum(smoothed(luma), _DARK)
+    calm = (_TYPICAL_CONTRAST * level**2 / signal) ** np.float32(alpha / 2)
+    return np.asarray(np.clip(calm, _BUSIEST, _CALMEST), dtype=np.float32)
 
 
 @lru_cache(maxsize=8)

@@ -57,7 +57,7 @@ def wiener_canvas(
     power = K.real**2 + K.imag**2
     decay, likely = _prior(shape)
     shown = float(np.vdot(likely, power))
-    scale = max(variance - noise, 0.02 * variance + 1e-12) / shown
+    scale = max(variance - noise, 0.005 * variance + 1e-12) / shown
     ratio = np.float32(noise / (scale * data.size)) * decay
     ratio[0, 0] = 0.0  # the mean is kept
     spectrum = fft.rfft2(data) * np.conj(K) / (power + ratio + np.float32(1e-9))

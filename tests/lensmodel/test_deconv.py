@@ -203,6 +203,29 @@ def test_clipped_lights_do_not_ring_into_their_neighbours() -> None:
     assert rmse(with_lights[far], truth[far]) <= 1.1 * rmse(without[far], truth[far])
 
 
+@pytest.mark.parametrize("light", [1.5, 4.0, 20.0])
+def test_standard_method_does_not_ring_around_clipped_lights(light: float) -> None:
+    rng = np.random.default_rng(8)
+    sharp = scene(140, 140) * 0.5
+    rows, cols = np.mgrid[:140, :140]
+    for row, col in ((50, 60), (95, 88)):
+        sharp[np.hypot(rows - row, cols - col) < 5] = light
+    blur = UniformBlur(gaussian(17, np.eye(2) * 4))
+    truth = blur.frame(sharp)
+    photo = np.minimum(blur.forward(sharp), 1.0) + 1e-3 * rng.standard_normal((124, 124))
+    photo = photo.astype(np.float32)
+    dark = ~ndimage.binary_dilation(truth > 1.0, iterations=3)
+    far = ~ndimage.binary_dilation(photo > 0.98, iterations=8)
+    noise = NoiseModel(1e-5, 1e-6)
+
+    told = SparseGradient().deconvolve(photo, blur, sensor=Sensor(noise, clip=0.98)).plane
+    untold = SparseGradient().deconvolve(photo, blur, sensor=Sensor(noise)).plane
+
+    assert rmse(told[dark], truth[dark]) < rmse(photo[dark], truth[dark])
+    assert rmse(told[far], truth[far]) < 0.85 * rmse(photo[far], truth[far])
+    assert rmse(told[dark], truth[dark]) < rmse(untold[dark], truth[dark])
+
+
 @pytest.mark.parametrize("alpha", [0.5, 2 / 3, 0.8, 1.0])
 @pytest.mark.parametrize("threshold", [1e-4, 0.01, 1.0])
 def test_shrinkage_finds_the_minimum(alpha: float, threshold: float) -> None:

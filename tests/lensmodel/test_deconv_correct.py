@@ -130,6 +130,52 @@ def test_correction_reads_and_writes_memory_mapped_planes(tmp_path: Path) -> Non
     np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), expected)
 
 
+def test_border_is_restored_like_the_inside_from_the_fourth_pixel_on() -> None:
+    lens = Soft(1.2, 1.2)
+    seen, sharp = photo(lens, BASE)
+
+    restored = correct_planes(seen, lens, FRAME, noise=BASE).planes
+
+    depth = np.minimum.outer(
+        np.minimum(np.arange(FRAME.height), np.arange(FRAME.height)[::-1]),
+        np.minimum(np.arange(FRAME.width), np.arange(FRAME.width)[::-1]),
+    )
+    # The outermost pixels share their light with a scene that nobody saw; they still must gain.
+    left = {
+        name: rmse(restored[:, where], sharp[:, where]) / rmse(seen[:, where], sharp[:, where])
+        for name, where in {
+            "edge": depth < 3,
+            "rim": (depth >= 4) & (depth < 14),
+            "inside": depth >= 14,
+        }.items()
+    }
+    assert left["edge"] < 0.85
+    assert left["rim"] < 1.25 * left["inside"]
+
+
+def test_result_hardly_depends_on_the_size_of_the_cells() -> None:
+    lens = Soft(1.0, 1.0)
+    seen, _ = photo(lens, BASE)
+
+    small = correct_planes(seen, lens, FRAME, noise=BASE, method="paper", pitch=90).planes
+    large = correct_planes(seen, lens, FRAME, noise=BASE, method="paper", pitch=200).planes
+
+    assert np.abs(small - large)[:, 8:-8, 8:-8].max() < 1e-3
+
+
+@pytest.mark.parametrize("noise", [BASE, HIGH])
+def test_smooth_scene_under_a_wide_blur_does_not_gain_noise(noise: tuple[NoiseModel, ...]) -> None:
+    rows, cols = np.indices((FRAME.height, FRAME.width))
+    sharp = np.stack([0.3 + 0.2 * np.sin(rows / 60.0 + c) * np.cos(cols / 70.0) for c in range(3)])
+    rng = np.random.default_rng(3)
+    seen = sharp + rng.standard_normal(sharp.shape) * np.sqrt(noise[0].variance(sharp))
+    seen = seen.astype(np.float32)
+
+    restored = correct_planes(seen, Soft(3.0, 3.0), FRAME, noise=noise).planes
+
+    assert rmse(restored, sharp) < rmse(seen, sharp)
+
+
 def test_strength_zero_returns_the_photo() -> None:
     seen, _ = photo(Soft(), BASE)
 

@@ -419,11 +419,11 @@ def correct_photo(
         answer = model.query(position, settings.with_channel(channel), size=15)
         return answer.predicted_error if math.isfinite(answer.predicted_error) else 1.0
 
-    planes = developed.planes
+    planes, cfa = developed.planes, developed.cfa
     if method == "paper" and lateral is not None:
         # As the paper did (section 8): the channels are warped first. All other methods carry the
         # shift in their PSFs and spare the picture that resampling.
-        planes, lateral = resample(planes, developed.frame, lateral), None
+        planes, lateral, cfa = resample(planes, developed.frame, lateral), None, None
     return deconv.correct_planes(
         planes,
         model.field(settings),
@@ -434,6 +434,7 @@ def correct_photo(
         clip=developed.clip,
         psf_error=psf_error,
         lateral=lateral,
+        cfa=cfa,
         roi=roi,
         workers=workers,
         on_step=on_step,

@@ -29,6 +29,9 @@ WAVELENGTH_NM: Final[dict[Channel, float]] = {"r": 610.0, "g": 540.0, "b": 465.0
 Zone: TypeAlias = Literal["center", "mid", "corner"]
 ZONES: Final[tuple[Zone, ...]] = get_args(Zone)
 
+BayerPattern: TypeAlias = tuple[tuple[int, int], tuple[int, int]]
+"""Channel (0 r, 1 g, 2 b) that each pixel of the top left 2 x 2 measured; it repeats over the frame."""
+
 StepHook: TypeAlias = Callable[[int, int], None]
 """Called as `on_step(done, total)`; it may raise `CancelledError` to stop the work."""
 

@@ -29,11 +29,14 @@ class Sensor:
         Level from which on a value is only a lower bound; infinity where nothing clips.
     extra : ndarray or None
         Further variance per pixel, of the plane's shape: what an uncertain kernel leaves behind.
+    measured : ndarray of bool or None
+        Where the sensor measured this plane; demosaicing filled in the rest. `None` for everywhere.
     """
 
     noise: NoiseModel = field(default_factory=lambda: NoiseModel.white(0.005))
     clip: float = float("inf")
     extra: NDArray[np.float32] | None = None
+    measured: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         if not self.clip > 0.0:

@@ -21,7 +21,17 @@ from lensmodel.deconv.report import CellForecast, ZoneReport, forecast, zone_rep
 from lensmodel.errors import InvalidInputError
 from lensmodel.geometry import Frame
 from lensmodel.psf import PsfField, as_kernel, delta
-from lensmodel.types import CHANNELS, Channel, FieldPosition, NoiseModel, Planes, StepHook, Zone, ignore_step
+from lensmodel.types import (
+    CHANNELS,
+    BayerPattern,
+    Channel,
+    FieldPosition,
+    NoiseModel,
+    Planes,
+    StepHook,
+    Zone,
+    ignore_step,
+)
 
 PsfError = Callable[[FieldPosition, Channel], float] | float
 """Relative L2 error that the PSF is expected to have, everywhere or by place and channel."""
@@ -67,6 +77,15 @@ class _Job:
     clip: Sequence[float]
     psf_error: PsfError
     lateral: LateralShift | None
+    cfa: BayerPattern | None
+
+    def measured(self, channel: int, top: int, left: int, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
+        """Where the sensor measured a channel, on the part of the frame that begins at (top, left)."""
+        if self.cfa is None:
+            return None
+        rows = (np.arange(shape[0]) + top) % 2
+        cols = (np.arange(shape[1]) + left) % 2
+        return np.asarray(np.asarray(self.cfa)[rows[:, None], cols[None, :]] == channel)
 
     def uncertainty(self, position: FieldPosition, channel: Channel) -> float:
         """Expected relative error of the PSF here."""
@@ -96,6 +115,7 @@ def correct_planes(
     strength: float = 1.0,
     psf_error: PsfError = 0.0,
     lateral: LateralShift | None = None,
+    cfa: BayerPattern | None = None,
     roi: Roi | tuple[int, int, int, int] | None = None,
     workers: int = 1,
     pitch: int | None = None,
@@ -125,10 +145,14 @@ def correct_planes(
     strength : float
         0 leaves the photo as it is, 1 applies what the noise allows.
     psf_error : float or callable
-        Expected relative L2 error of the PSF; raises the noise where the picture has detail.
+        Expected relative L2 error of the PSF: it is mixed with a point, and, where the planes are no
+        mosaic, raises the noise where the picture has detail.
     lateral : LateralShift or None
         Lateral colour to remove in the same step: it becomes part of the red and blue PSFs, so
         nothing is interpolated. Leave it out where the planes were resampled before.
+    cfa : BayerPattern or None
+        The mosaic on which the planes were measured; what demosaicing filled in is then no datum, and
+        "standard" and "fast" demosaic and deblur in one. `noise` is that of the sensor then.
     roi : tuple of int or None
         `(top, left, height, width)`: return only this part, with the same pixels as the whole.
     workers : int
@@ -176,7 +200,7 @@ def correct_planes(
     else:
         out[:] = 0.0
     solver = deconvolvers.create(method) if isinstance(method, str) else method
-    job = _Job(planes, field, frame, solver, strength, tuple(noise), tuple(clip), psf_error, lateral)
+    job = _Job(planes, field, frame, solver, strength, tuple(noise), tuple(clip), psf_error, lateral, cfa)
     wanted = [cell for cell in cells(frame, pitch) if cell.meets(window)]
     forecasts = []
     for done, (cell, restored, expected) in enumerate(_restored(job, wanted, workers), start=1):
@@ -218,8 +242,14 @@ def _restore(job: _Job, cell: Cell) -> tuple[Planes, CellForecast]:
     top, left = max(cell.top - halo, 0), max(cell.left - halo, 0)
     tile = np.asarray(job.planes[:, top : cell.bottom + halo, left : cell.right + halo], dtype=np.float32)
     sensors = [
-        Sensor(noise, clip, _model_variance(plane, noise, blur, error))
-        for plane, noise, clip, blur, error in zip(tile, job.noise, job.clip, blurs, errors, strict=True)
+        Sensor(
+            job.noise[c],
+            job.clip[c],
+            # With one colour of three measured, variance that no noise made would leave all to the prior.
+            None if job.cfa else _model_variance(plane, job.noise[c], blurs[c], errors[c]),
+            job.measured(c, top, left, plane.shape),
+        )
+        for c, plane in enumerate(tile)
     ]
     inner = (
         slice(None),

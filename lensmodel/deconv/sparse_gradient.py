@@ -56,6 +56,8 @@ class SparseGradient:
     ----------
     weight : float
         kappa of luma; the strength relative to the noise found in the data.
+    mosaic_weight : float
+        The same where a mosaic was measured: the prior has to fill in two colours of three as well.
     chroma : float
         kappa of chroma over that of luma.
     alpha : float
@@ -74,6 +76,7 @@ class SparseGradient:
     """
 
     weight: float = 2.0
+    mosaic_weight: float = 4.0
     chroma: float = 2.5
     alpha: float = 0.67
     steps: int = 8
@@ -151,12 +154,16 @@ class SparseGradient:
         calm = canvas.fill(_calm(luma, var.mean(axis=0) / len(planes), self.alpha))
         scale = prox.scale((relative * calm / level ** np.float32(self.alpha)).astype(np.float32))
         couplings = self.coupling * self.growth ** np.arange(self.steps)
-        weights = np.full(len(y), self.weight * self.chroma)
-        weights[0] = self.weight
+        mosaic = any(sensor.measured is not None for sensor in sensors)
+        weights = np.full(len(y), self.mosaic_weight if mosaic else self.weight)
+        weights[1:] *= self.chroma
         state = np.full(y.shape, _UNMEASURED, dtype=np.uint8)
         inside = (slice(None), *canvas.data)
         clipped = blurred >= _clips(sensors)
         state[inside] = np.where(clipped, _CLIPPED, np.where(spoilt(clipped, blurs), _UNMEASURED, _MEASURED))
+        for plane, sensor in zip(state, sensors, strict=True):
+            if sensor.measured is not None:
+                plane[canvas.data][~sensor.measured] = _UNMEASURED
         start = np.stack(
             [
                 wiener_canvas(a, blur, float(n), float(plane.var()))

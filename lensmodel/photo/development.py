@@ -70,6 +70,7 @@ def _develop_raw(path: Path, info: PhotoInfo, demosaic: Demosaic) -> LinearPhoto
         pipeline=raw.pipeline,
         white_balance=raw.white_balance,
         sensor_noise=raw.sensor_noise,
+        cfa=raw.cfa,
     )
 
 

@@ -8,7 +8,7 @@ from typing import Literal, TypeAlias
 
 from lensmodel.errors import InvalidInputError
 from lensmodel.geometry import Frame
-from lensmodel.types import NoiseModel, Planes
+from lensmodel.types import BayerPattern, NoiseModel, Planes
 
 FileKind: TypeAlias = Literal["raw", "dng", "tiff", "png", "jpeg"]
 SerialSource: TypeAlias = Literal["exif", "makernote", "xmp", "user", "none"]
@@ -181,6 +181,9 @@ class LinearPhoto:
     sensor_noise : tuple of NoiseModel or None
         Noise of the sensor itself, measured on the mosaic: white, unlike that of demosaiced
         planes, whose pixels share their neighbours' noise. `None` where there is no mosaic.
+    cfa : BayerPattern or None
+        Which pixels of each plane were measured, and not filled in by demosaicing. `None` where
+        the planes are no longer on the sensor's grid, or there was no Bayer mosaic.
     """
 
     planes: Planes
@@ -192,3 +195,4 @@ class LinearPhoto:
     pipeline: str
     white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
     sensor_noise: PlaneNoise | None = None
+    cfa: BayerPattern | None = None

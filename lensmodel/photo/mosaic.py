@@ -10,7 +10,7 @@ import rawpy
 from numpy.typing import NDArray
 
 from lensmodel.errors import RawDecodeError, TruncatedImageError
-from lensmodel.types import Plane
+from lensmodel.types import BayerPattern, Plane
 
 _BAND: Final = 16
 """Rows that are judged together by `Mosaic.check`."""
@@ -141,6 +141,15 @@ class Mosaic:
             return None
         low = int(np.searchsorted(np.cumsum(pile), 0.02 * pile.sum()))
         return top - width + 1 + low, top
+
+    def bayer_pattern(self) -> BayerPattern | None:
+        """Channel of each pixel of the top left 2 x 2; `None` for X-Trans."""
+        if not self.is_bayer or min(self.colours.shape) < 2:
+            return None
+        (a, b), (c, d) = (
+            [1 if colour == 3 else int(colour) for colour in row] for row in self.colours[:2, :2]
+        )
+        return ((a, b), (c, d))
 
     def sites(self, white: int) -> list[Plane]:
         """Red, green and blue at half the size, without interpolation; black 0, `white` 1."""

@@ -22,7 +22,7 @@ from lensmodel.photo.colour import SRGB_TO_XYZ_D65, Matrix, camera_to_srgb, matr
 from lensmodel.photo.model import Matrix3, PlaneNoise
 from lensmodel.photo.mosaic import Mosaic
 from lensmodel.photo.noise import estimate_noise
-from lensmodel.types import NoiseModel, Planes
+from lensmodel.types import BayerPattern, NoiseModel, Planes
 
 Demosaic = Literal["default", "ahd", "dht", "linear", "half"]
 
@@ -65,6 +65,7 @@ class DevelopedRaw:
     xyz_to_camera: Matrix3 | None
     bits: int
     pipeline: str
+    cfa: BayerPattern | None
 
 
 @contextmanager
@@ -144,6 +145,7 @@ def develop_raw(path: Path, demosaic: Demosaic = "default") -> DevelopedRaw:
             xyz_to_camera=None if xyz_to_camera is None else matrix3(xyz_to_camera),
             bits=max(1, white.bit_length()),
             pipeline=f"raw/{_pipeline_step(mosaic, method)}/1",
+            cfa=None if mosaic is None or method == "half" else mosaic.bayer_pattern(),
         )
 
 

@@ -4,10 +4,17 @@ from lensmodel.blind.base import NO_BLUR_PX2, PsfEstimate, PsfEstimator
 from lensmodel.blind.default import Guarded
 from lensmodel.blind.patch_recurrence import PatchRecurrence
 from lensmodel.blind.whittle import Whittle
+from lensmodel.blind.zhang import Zhang
 from lensmodel.registry import Registry
 
 estimators: Registry[PsfEstimator] = Registry(
-    "estimator", {"default": Guarded, "michaeli-irani": PatchRecurrence, "whittle": Whittle}
+    "estimator",
+    {
+        "default": Guarded,
+        "michaeli-irani": PatchRecurrence,
+        "whittle": Whittle,
+        "zhang": Zhang,
+    },
 )
 
 __all__ = [
@@ -17,5 +24,6 @@ __all__ = [
     "PsfEstimate",
     "PsfEstimator",
     "Whittle",
+    "Zhang",
     "estimators",
 ]

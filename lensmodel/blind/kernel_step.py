@@ -1,0 +1,172 @@
+"""The kernel step: least squares over valid convolutions, k >= 0, pooled over any number of images.
+
+Valid means that only pixels count where every pixel of the kernel meets data; nothing wraps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+Floats = NDArray[np.float32]
+Spectrum = NDArray[np.complex64]
+Kernelish = NDArray[np.float64]
+
+_TINY = 1e-12
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Shapes of one valid convolution y = k * x, and its products by FFT.
+
+    Parameters
+    ----------
+    frame : tuple of int
+        Shape of y.
+    side : int
+        Odd side of k; x is wider than y by `side - 1`.
+    """
+
+    frame: tuple[int, int]
+    side: int
+
+    @property
+    def latent(self) -> tuple[int, int]:
+        """Shape of x."""
+        return self.frame[0] + self.side - 1, self.frame[1] + self.side - 1
+
+    @property
+    def fast(self) -> tuple[int, int]:
+        """Shape of the transforms: nothing of the valid part wraps."""
+        rows, cols = self.latent
+        return int(fft.next_fast_len(rows, real=True)), int(fft.next_fast_len(cols, real=True))
+
+    def spectrum(self, values: NDArray[np.floating]) -> Spectrum:
+        """Transform of an array whose first pixel lies at the origin."""
+        return fft.rfft2(values.astype(np.float32), self.fast)
+
+    def frame_spectrum(self, residual: Floats) -> Spectrum:
+        """Transform of an array on the frame, at its place behind the first `side - 1` pixels."""
+        reach = self.side - 1
+        return fft.rfft2(np.pad(residual, ((reach, 0), (reach, 0))), self.fast)
+
+    def valid(self, product: Spectrum) -> Floats:
+        """Valid part of a convolution given by the product of two spectra."""
+        reach = self.side - 1
+        full = fft.irfft2(product, self.fast)
+        return full[reach : reach + self.frame[0], reach : reach + self.frame[1]]
+
+    def blurred(self, kernel: Kernelish, x: Floats) -> Floats:
+        """Return k * x on the frame."""
+        return self.valid(self.spectrum(kernel) * self.spectrum(x))
+
+    def back(self, kernel_spectrum: Spectrum, residual: Floats) -> Floats:
+        """Adjoint in x: from the frame to the latent plane."""
+        rows, cols = self.latent
+        return fft.irfft2(self.frame_spectrum(residual) * np.conj(kernel_spectrum), self.fast)[:rows, :cols]
+
+    def onto_kernel(self, x_spectrum: Spectrum, residual: Floats) -> Kernelish:
+        """Adjoint in k: sum_p e(p) x(p - u) for every kernel pixel u."""
+        product = self.frame_spectrum(residual) * np.conj(x_spectrum)
+        return fft.irfft2(product, self.fast)[: self.side, : self.side].astype(np.float64)
+
+    def reach_of(self, kernel: Kernelish) -> Floats:
+        """w_i = sum_j k_j² over the kernel pixels by which latent pixel i reaches the frame."""
+        ones = np.ones(self.frame, dtype=np.float32)
+        return np.maximum(self.back(self.spectrum(kernel**2), ones), _TINY)
+
+    def sums_of(self, variance: Floats) -> Kernelish:
+        """sum_i c_i for every kernel pixel j, over the latent pixels that j carries into the frame."""
+        total = np.zeros((self.latent[0] + 1, self.latent[1] + 1))
+        total[1:, 1:] = variance.astype(np.float64).cumsum(axis=0).cumsum(axis=1)
+        high, wide = self.frame
+        boxes = total[high:, wide:] - total[:-high, wide:] - total[high:, :-wide] + total[:-high, :-wide]
+        return boxes[::-1, ::-1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Term:
+    """One summand w (|y - k * x|² + sum_j q_j k_j²) of the kernel step.
+
+    Parameters
+    ----------
+    grid : Grid
+    y : ndarray of float32, shape grid.frame
+    x : ndarray of float32, shape grid.latent
+    weight : float
+        w.
+    quadratic : ndarray of float64, shape (side, side), or float
+        q.
+    """
+
+    grid: Grid
+    y: Floats
+    x: Floats
+    weight: float
+    quadratic: Kernelish | float = 0.0
+
+
+def least_squares_kernel(
+    terms: Sequence[Term], kernel: Kernelish, *, turns: int = 2, steps: int = 80
+) -> Kernelish:
+    """Minimise the sum of terms over k >= 0, from `kernel` on.
+
+    The normal matrix of the valid convolution is nearly Toeplitz. Each turn takes the exact gradient
+    at k and the nearest Toeplitz matrix, by which accelerated projected gradients run on a small
+    FFT; a few turns come to the exact minimum, where the matrix no longer matters.
+
+    Returns
+    -------
+    ndarray of float64, shape (side, side)
+        Not normalised.
+    """
+    side = kernel.shape[0]
+    n = int(fft.next_fast_len(2 * side, real=True))
+    correlation, diagonal = np.zeros((n, n)), np.zeros((side, side))
+    spectra = []
+    for term in terms:
+        spectra.append(term.grid.spectrum(term.x))
+        correlation += term.weight * _mean_correlation(term, n)
+        diagonal += term.weight * term.quadratic
+    # Cutting the correlation at the kernel's side can leave negative power.
+    toeplitz = np.maximum(fft.rfft2(correlation).real, 0.0)
+    step = 1.0 / (float(toeplitz.max()) + float(diagonal.max()) + _TINY)
+
+    def applied(k: Kernelish) -> Kernelish:
+        return fft.irfft2(toeplitz * fft.rfft2(k, (n, n)), (n, n))[:side, :side] + diagonal * k
+
+    k = np.array(kernel)
+    for _ in range(turns):
+        target = applied(k) - diagonal * k
+        for term, spectrum in zip(terms, spectra, strict=True):
+            grid = term.grid
+            residual = term.y - grid.valid(grid.spectrum(k) * spectrum)
+            target += term.weight * grid.onto_kernel(spectrum, residual)
+        momentum, t = k, 1.0
+        for _ in range(steps):
+            after = np.maximum(momentum - step * (applied(momentum) - target), 0.0)
+            t_next = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * t * t))
+            momentum = after + (t - 1.0) / t_next * (after - k)
+            k, t = after, t_next
+    return k
+
+
+def _mean_correlation(term: Term, n: int) -> Kernelish:
+    """Mean over u of sum_p x(p - u) x(p - u - d) with p on the frame, for |d| < side, wrapped to n x n.
+
+    A latent pixel counts by the share of shifts u that carry it into the frame; the root of the
+    share goes to either factor, which keeps the result a correlation.
+    """
+    grid = term.grid
+    rows, cols = (np.convolve(np.ones(length), np.full(grid.side, 1.0 / grid.side)) for length in grid.frame)
+    weighted = np.sqrt(np.outer(rows, cols)) * term.x
+    high, wide = (int(fft.next_fast_len(length + grid.side, real=True)) for length in grid.latent)
+    full = fft.irfft2(np.abs(fft.rfft2(weighted, (high, wide))) ** 2, (high, wide))
+    lags = np.arange(-(grid.side - 1), grid.side)
+    wrapped = np.zeros((n, n))
+    wrapped[np.ix_(lags % n, lags % n)] = full[np.ix_(lags % high, lags % wide)]
+    return wrapped

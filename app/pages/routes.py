@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
+from collections.abc import Awaitable, Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, TypeAlias
 
-from fastapi import APIRouter, FastAPI, Query, Response
+from fastapi import APIRouter, FastAPI, Query, Request, Response
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse
 from fastapi.staticfiles import StaticFiles
 from jinja2 import Environment, PackageLoader, select_autoescape
+from starlette.exceptions import HTTPException
 
 from app import views
 from app.dependencies import Call, CallDep
@@ -20,18 +24,19 @@ from app.routes import corrections as correction_routes
 from app.routes import lenses as lens_routes
 from app.routes import photos as photo_routes
 from app.schemas import LensOut, PhotoOut
+from lensmodel.errors import LensModelError
 
 HERE: Final = Path(__file__).parent
 SHOWN: Final = 60
-PLACES: Final = (
-    ("center", 0.5, 0.5),
-    ("upper left", 0.0, 0.0),
-    ("upper right", 0.0, 1.0),
-    ("lower left", 1.0, 0.0),
-    ("lower right", 1.0, 1.0),
-    ("top", 0.0, 0.5),
-    ("left", 0.5, 0.0),
+ROWS: Final = (("upper", 0.0), ("", 0.5), ("lower", 1.0))
+COLUMNS: Final = (("left", 0.0), ("middle", 0.5), ("right", 1.0))
+PLACES: Final = tuple(
+    (f"{above} {beside}".strip() if (above or beside != "middle") else "center", row, col)
+    for above, row in ROWS
+    for beside, col in COLUMNS
 )
+"""Nine places of a picture with their shares of its height and width."""
+
 HEADERS: Final = {
     "Content-Security-Policy": (
         "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; "
@@ -53,10 +58,36 @@ def install(app: FastAPI) -> None:
     """Add the pages and their files to the application."""
     app.include_router(router)
     app.mount("/static", StaticFiles(directory=HERE / "static"), name="static")
+    for kind in (LensModelError, HTTPException, RequestValidationError, Exception):
+        app.add_exception_handler(kind, _for_people(app.exception_handlers[kind]))
 
 
-def _page(name: str, **values: Any) -> HTMLResponse:  # noqa: ANN401 - what the template shows
-    return HTMLResponse(templates.get_template(name).render(**values), headers=HEADERS)
+Handler: TypeAlias = Callable[[Request, Any], Any]
+
+
+def _for_people(answer: Handler) -> Handler:
+    """Show what an exception handler answers as a page, where a person asked for one."""
+
+    async def handle(request: Request, error: Exception) -> Response:
+        waited = answer(request, error)
+        plain: Response = await waited if isinstance(waited, Awaitable) else waited
+        if plain.status_code < 400 or not _asked_for_page(request):
+            return plain
+        title, detail = words.refusal(plain.status_code, str(error))
+        return _page("missing.html", plain.status_code, title=title, detail=detail)
+
+    return handle
+
+
+def _asked_for_page(request: Request) -> bool:
+    wanted = "text/html" in request.headers.get("accept", "")
+    return (
+        request.method == "GET" and wanted and not request.url.path.startswith(("/v1/", "/ui/", "/static/"))
+    )
+
+
+def _page(name: str, status: int = 200, **values: Any) -> HTMLResponse:  # noqa: ANN401 - what the template shows
+    return HTMLResponse(templates.get_template(name).render(**values), status, headers=HEADERS)
 
 
 def _photos(call: Call, lens_id: str | None = None) -> tuple[list[PhotoOut], bool]:
@@ -94,7 +125,28 @@ def lens_page(lens_id: str, call: CallDep) -> HTMLResponse:
     lens = lens_routes.read_lens(lens_id, call)
     history = lens_routes.list_calibrations(lens_id, call, limit=200).items
     photos, more = _photos(call, lens_id)
-    return _page("lens.html", lens=lens, history=history, photos=photos, more=more)
+    newest = next((event.coverage for event in reversed(history) if event.coverage), None)
+    return _page(
+        "lens.html",
+        lens=lens,
+        history=history,
+        coverage=words.coverage_bars(newest),
+        spots=_spots(call, photos),
+        photos=photos,
+        more=more,
+    )
+
+
+def _spots(call: Call, photos: list[PhotoOut]) -> list[tuple[float, float]]:
+    """Return where the patches of photos lie in a field of 3:2 from (-1.5, -1) to (1.5, 1), y downwards."""
+    corner = math.hypot(1.5, 1.0)
+    return [
+        (corner * patch.r * math.cos(patch.phi), -corner * patch.r * math.sin(patch.phi))
+        for photo in photos
+        if photo.state == "counted"
+        for patch in call.store.patches.all_of(photo.id)
+        if patch.state == "done"
+    ]
 
 
 @router.get("/photos/{photo_id}")
@@ -109,7 +161,9 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
         if turned > 4:
             photo = photo.model_copy(update={"width": row.height, "height": row.width})
     left_out = Counter(patch.reason for patch in patches if patch.state in {"rejected", "failed"})
-    lenses = _lenses(call) if photo.state == "needs_lens" else []
+    candidates = []
+    if photo.lens_id is None:
+        candidates = [lens for lens in _lenses(call) if lens.samples or photo.state == "needs_lens"]
     mine = correction_routes.list_corrections(call, limit=50, photo_id=photo_id).items
     return _page(
         "photo.html",
@@ -117,7 +171,8 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
         patches=patches,
         used=sum(patch.state == "done" for patch in patches),
         reasons=left_out.most_common(),
-        candidates=lenses,
+        candidates=candidates,
+        lens=None if photo.lens_id is None else lens_routes.read_lens(photo.lens_id, call),
         corrections=mine,
     )
 
@@ -134,15 +189,12 @@ def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
     """Show a corrected photo beside the original."""
     plan = correction_routes.find_plan(call, correction_id)
     correction = views.correction_out(plan)
-    zones = list(((correction.report or {}).get("zones") or {}).items())
-    columns = list(dict.fromkeys(name for _, values in zones for name in values))
     return _page(
         "correction.html",
         correction=correction,
         job=views.correction_job(plan),
         photo=photo_routes.describe(call, plan.photo),
-        zones=zones,
-        columns=columns,
+        zones=words.gain_bars((correction.report or {}).get("zones") or {}),
         places=PLACES,
     )
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 from app.schemas import CorrectionOut, LensOut, PatchOut, PhotoOut
@@ -12,12 +13,14 @@ PHOTO_STATES: Final[Mapping[str, str]] = {
     "inspecting": "Reading what the file says",
     "developing": "Developing to linear light",
     "selecting": "Looking for parts that tell about the blur",
-    "needs_lens": "Which lens was it? The file does not say: open it and choose",
+    "needs_lens": "Waiting for you: which lens was it?",
     "counted": "Learned from",
     "stored": "Kept, to be corrected",
     "excluded": "Left out of the lens by you",
     "cancelled": "Cancelled",
 }
+ZONES: Final[Mapping[str, str]] = {"center": "Center", "mid": "Middle", "corner": "Corners"}
+ENOUGH_PLACES: Final = 20
 ACTIVE: Final = frozenset({"received", "inspecting", "developing", "selecting", "estimating"})
 UNDEVELOPED: Final = frozenset({"received", "inspecting", "developing", "needs_lens", "failed", "cancelled"})
 REASONS: Final[Mapping[str, str]] = {
@@ -45,7 +48,7 @@ def serial_words(lens: LensOut) -> str:
     """Say how sure it is that all photos are of one copy; the serial is shown shortened."""
     if not lens.serial:
         return "The photos do not say a serial number: all of them must be of one copy."
-    return f"Serial ending in {lens.serial[-4:]}."
+    return f"This copy: serial number ending in {lens.serial[-4:]}."
 
 
 def f_stop(number: float) -> str:
@@ -58,11 +61,28 @@ def photo_state(photo: PhotoOut) -> str:
     if photo.state == "failed":
         return f"Not used: {photo.error.detail if photo.error else 'unknown reason'}"
     if photo.state == "estimating":
-        return f"Measuring blur: {photo.patches.done} of {photo.patches.total} patches"
+        return f"Measuring blur: {photo.patches.done} of {photo.patches.total} places"
     words = PHOTO_STATES.get(photo.state, photo.state)
     if photo.state == "counted":
-        return f"{words}: {photo.patches.done} patches used, {photo.patches.rejected} left out"
+        return f"{words}, at {counted(photo.patches.done, 'place')}"
     return words
+
+
+def state_class(photo: PhotoOut) -> str:
+    """Name the look of a state."""
+    return "busy" if photo.state in ACTIVE else photo.state
+
+
+def counted(number: int, what: str) -> str:
+    """Write a number of things."""
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
+def duration(seconds: float) -> str:
+    """Write how long something still takes, no more exactly than it is known."""
+    if seconds < 10:
+        return "a few seconds"
+    return f"about {round(seconds, -1):.0f} seconds" if seconds < 90 else f"about {seconds / 60:.0f} minutes"
 
 
 def correction_state(correction: CorrectionOut) -> str:
@@ -70,10 +90,22 @@ def correction_state(correction: CorrectionOut) -> str:
     return {
         "queued": "Waiting its turn",
         "running": "Removing the blur",
-        "succeeded": f"Done, with version {correction.lens_version} of the lens, method {correction.method}",
-        "failed": "It did not work",
+        "succeeded": f"Done, with version {correction.lens_version} of the lens",
+        "failed": "This did not work",
         "cancelled": "Cancelled",
     }.get(correction.state, correction.state)
+
+
+def refusal(status: int, detail: str) -> tuple[str, str]:
+    """Write title and text of a page that stands for one that cannot be shown."""
+    if status == 404:
+        return (
+            "Not here",
+            "There is nothing at this address. It may have been deleted, or the address was cut.",
+        )
+    if status < 500:
+        return "Not like this", detail
+    return "That was our fault", "Something went wrong here; the log says what. Try again in a moment."
 
 
 def reason_words(reason: str | None) -> str:
@@ -85,24 +117,65 @@ def patch_words(patch: PatchOut) -> str:
     """Describe one window of the overlay."""
     place = f"{round(100 * patch.r)} % of the way to the corner"
     if patch.state in {"rejected", "failed"}:
-        return f"left out: {reason_words(patch.reason)} ({place})"
-    return f"used ({place})" if patch.state == "done" else f"{patch.state} ({place})"
+        return f"Left out: {reason_words(patch.reason)} ({place})"
+    return f"Used ({place})" if patch.state == "done" else f"Still to be measured ({place})"
 
 
 def error_words(error: dict[str, Any] | float | None) -> str:
     """Write a held-out error, one figure a zone."""
-    if error is None:
-        return "not yet known"
     if isinstance(error, Mapping):
-        return ", ".join(f"{zone} {figure(value)}" for zone, value in error.items()) or "not yet known"
-    return figure(error)
+        return ", ".join(figure(error.get(zone)) or "?" for zone in ZONES) if error else "not yet known"
+    return figure(error) or "not yet known"
 
 
-def coverage_words(coverage: dict[str, Any] | None) -> str:
-    """Write the samples of each zone."""
+def coverage_words(coverage: Mapping[str, Any] | None) -> str:
+    """Write the places seen in each zone."""
+    return ", ".join(str(coverage.get(zone, 0)) for zone in ZONES) if coverage else ""
+
+
+@dataclass(frozen=True, slots=True)
+class ZoneBar:
+    """One zone of the picture in a bar chart; `share` is the length of the bar in percent."""
+
+    name: str
+    words: str
+    share: int
+    count: int = 0
+    gain: str = ""
+
+
+def coverage_bars(coverage: Mapping[str, Any] | None) -> list[ZoneBar]:
+    """Compare how many places were seen in each zone."""
     if not coverage:
-        return ""
-    return ", ".join(str(coverage.get(zone, 0)) for zone in ("center", "mid", "corner"))
+        return []
+    counts = {zone: int(coverage.get(zone, 0)) for zone in ZONES}
+    most = max(1, *counts.values())
+    return [ZoneBar(zone, ZONES[zone], round(100 * count / most), count) for zone, count in counts.items()]
+
+
+def coverage_advice(bars: Sequence[ZoneBar]) -> str:
+    """Say which photo would teach most."""
+    if not bars:
+        return "Being counted: look again in a moment."
+    few = [bar.words.lower() for bar in bars if bar.count < ENOUGH_PLACES]
+    if not few:
+        return "Every part of the picture has been seen well."
+    return f"Little seen yet of: {', '.join(few)}. A photo with fine detail there, in focus, helps most."
+
+
+def gain_bars(zones: Mapping[str, Mapping[str, Any]]) -> list[ZoneBar]:
+    """Compare the expected gains of the zones."""
+    gains = {zone: zones[zone].get("gain_db") or 0.0 for zone in ZONES if zones.get(zone, {}).get("cells")}
+    most = max([1.0, *gains.values()])
+    return [
+        ZoneBar(
+            zone,
+            ZONES[zone],
+            round(100 * gain / most),
+            gain=f"+{gain:.1f} dB" if gain >= 0.05 else "no change",
+        )
+        for zone, gain in gains.items()
+    ]
 
 
 def figure(value: object) -> str:
@@ -120,6 +193,11 @@ def developed(photo: PhotoOut) -> bool:
     return photo.state not in UNDEVELOPED
 
 
+def correctable(photo: PhotoOut) -> bool:
+    """Whether it can be corrected now."""
+    return photo.state in {"counted", "stored", "excluded"}
+
+
 FILTERS: Final[Mapping[str, Callable[..., object]]] = {
     f.__name__: f
     for f in (
@@ -127,13 +205,17 @@ FILTERS: Final[Mapping[str, Callable[..., object]]] = {
         serial_words,
         f_stop,
         photo_state,
+        state_class,
+        counted,
+        duration,
         correction_state,
         reason_words,
         patch_words,
         error_words,
         coverage_words,
-        figure,
+        coverage_advice,
         active,
         developed,
+        correctable,
     )
 }

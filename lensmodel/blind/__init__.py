@@ -2,6 +2,7 @@
 
 from lensmodel.blind.base import NO_BLUR_PX2, PsfEstimate, PsfEstimator
 from lensmodel.blind.default import Guarded
+from lensmodel.blind.edges import Edges
 from lensmodel.blind.patch_recurrence import PatchRecurrence
 from lensmodel.blind.whittle import Whittle
 from lensmodel.blind.zhang import Zhang
@@ -11,6 +12,7 @@ estimators: Registry[PsfEstimator] = Registry(
     "estimator",
     {
         "default": Guarded,
+        "edges": Edges,
         "michaeli-irani": PatchRecurrence,
         "whittle": Whittle,
         "zhang": Zhang,
@@ -19,6 +21,7 @@ estimators: Registry[PsfEstimator] = Registry(
 
 __all__ = [
     "NO_BLUR_PX2",
+    "Edges",
     "Guarded",
     "PatchRecurrence",
     "PsfEstimate",

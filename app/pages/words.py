@@ -41,7 +41,10 @@ def lens_name(lens: LensOut) -> str:
     """Name a lens as its owner would."""
     if lens.label:
         return lens.label
-    return " ".join(part for part in (lens.maker, lens.model) if part) or "Unnamed lens"
+    maker, model = lens.maker or "", lens.model or ""
+    if model.lower().startswith(maker.lower()):
+        maker = ""  # "Canon Canon EF 24mm"
+    return f"{maker} {model}".strip() or "Unnamed lens"
 
 
 def serial_words(lens: LensOut) -> str:

@@ -5,6 +5,21 @@ import { byId } from "./common.js";
 const SHAPE = 420 / 640;
 const WIDEST = 1200;
 
+// A corner full of sky shows nothing: begin where there is most to see.
+async function mostDetailed(tiles) {
+  await Promise.allSettled(tiles.map((tile) => tile.decode()));
+  const detail = tiles.map((tile) => {
+    const canvas = new OffscreenCanvas(85, 56);
+    const context = canvas.getContext("2d");
+    context.drawImage(tile, 0, 0, 85, 56);
+    const { data } = context.getImageData(0, 0, 85, 56);
+    let sum = 0;
+    for (let i = 4; i < data.length; i += 4) sum += Math.abs(data[i + 1] - data[i - 3]);
+    return sum;
+  });
+  return detail.indexOf(Math.max(...detail));
+}
+
 export function setUpCompare() {
   const holder = byId("compare");
   if (!holder) return;
@@ -57,6 +72,5 @@ export function setUpCompare() {
   });
   for (const tile of tiles) new Image().src = tile.dataset.before;
   holdBefore(false);
-  const chosen = places.find((place) => place.getAttribute("aria-pressed") === "true") ?? places[0];
-  if (chosen) show(chosen);
+  mostDetailed(tiles).then((index) => show(places[index]));
 }

@@ -125,19 +125,19 @@ function plot(holder, events) {
   const colour = (name) => ((probe.style.color = `var(--${name})`), getComputedStyle(probe).color);
   const font = `14px ${style.fontFamily}`;
   const axis = { stroke: colour("soft"), grid: { stroke: colour("line"), width: 1 }, ticks: { show: false }, font, labelFont: font };
-  const percent = (value) => (value === null || value === undefined ? "" : value.toFixed(2));
   const of = (event, zone) => (typeof event.error === "object" ? (event.error?.[zone] ?? null) : event.error);
   const options = {
     width: holder.clientWidth - 16,
     height: 280,
+    legend: { live: false },
     scales: { x: { time: false }, y: { range: (_, __, most) => [0, Math.max(0.1, most * 1.1)] } },
     axes: [
-      { ...axis, label: "version of the lens", incrs: [1, 2, 5, 10, 20, 50] },
+      { ...axis, label: "version of the lens", size: 34, labelSize: 26, incrs: [1, 2, 5, 10, 20, 50] },
       { ...axis, label: "relative error", size: 60 },
     ],
     series: [
       { label: "Version" },
-      ...ZONES.map(([zone, label, dash]) => ({ label, stroke: colour(zone), width: 2.5, dash, points: { show: true, size: 7, fill: colour(zone) }, value: (_, v) => percent(v) })),
+      ...ZONES.map(([zone, label, dash]) => ({ label, stroke: colour(zone), width: 2.5, dash, points: { show: true, size: 7, fill: colour(zone) } })),
     ],
   };
   const data = [events.map((event) => event.version), ...ZONES.map(([zone]) => events.map((event) => of(event, zone)))];

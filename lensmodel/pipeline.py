@@ -55,7 +55,11 @@ log = logging.getLogger(__name__)
 DEFAULT_PATCHES = 24
 """Patches asked for in one photo: enough for every ring and octant of the field to get one."""
 
+BLIND_BIAS = 0.25
+"""Relative L2 error that blind estimates share, so that their scatter in the model does not show it."""
+
 DEFAULT_PATCH_SIZE = 192
+SMALLEST_PATCH = 64
 DEFAULT_KERNEL_SIZE = 31
 
 
@@ -135,7 +139,8 @@ def find_patches(
     NoUsablePatchesError
         If no part of the photo does.
     """
-    size = min(DEFAULT_PATCH_SIZE, (min(developed.frame.height, developed.frame.width) // 3) // 2 * 2)
+    third = (min(developed.frame.height, developed.frame.width) // 3) // 2 * 2
+    size = min(DEFAULT_PATCH_SIZE, max(third, SMALLEST_PATCH))
     return patches.select(
         developed.planes[1],
         developed.noise[1],
@@ -417,7 +422,8 @@ def correct_photo(
 
     def psf_error(position: FieldPosition, channel: Channel) -> float:
         answer = model.query(position, settings.with_channel(channel), size=15)
-        return answer.predicted_error if math.isfinite(answer.predicted_error) else 1.0
+        error = answer.predicted_error if math.isfinite(answer.predicted_error) else 1.0
+        return math.hypot(error, BLIND_BIAS)
 
     planes, cfa = developed.planes, developed.cfa
     if method == "paper" and lateral is not None:

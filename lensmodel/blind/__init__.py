@@ -1,7 +1,7 @@
 """Blind estimation: one PSF from the patches of one field position."""
 
 from lensmodel.blind.base import NO_BLUR_PX2, PsfEstimate, PsfEstimator
-from lensmodel.blind.default import Guarded
+from lensmodel.blind.default import Cautious
 from lensmodel.blind.edges import Edges
 from lensmodel.blind.patch_recurrence import PatchRecurrence
 from lensmodel.blind.whittle import Whittle
@@ -11,7 +11,7 @@ from lensmodel.registry import Registry
 estimators: Registry[PsfEstimator] = Registry(
     "estimator",
     {
-        "default": Guarded,
+        "default": Cautious,
         "edges": Edges,
         "michaeli-irani": PatchRecurrence,
         "whittle": Whittle,
@@ -21,8 +21,8 @@ estimators: Registry[PsfEstimator] = Registry(
 
 __all__ = [
     "NO_BLUR_PX2",
+    "Cautious",
     "Edges",
-    "Guarded",
     "PatchRecurrence",
     "PsfEstimate",
     "PsfEstimator",

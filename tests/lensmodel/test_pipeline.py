@@ -10,7 +10,15 @@ from lensmodel.errors import InvalidInputError, MetadataMissingError, NotEnoughE
 from lensmodel.geometry import Frame
 from lensmodel.patches import Patch, Selection
 from lensmodel.photo import LinearPhoto
-from lensmodel.simulate import SimulatedCamera, SimulatedPhoto, demo_scene, draw_lens, photograph, write_photo
+from lensmodel.simulate import (
+    BlurOptions,
+    SimulatedCamera,
+    SimulatedPhoto,
+    demo_scene,
+    draw_lens,
+    photograph,
+    write_photo,
+)
 from lensmodel.types import FieldPosition, LensSettings
 
 LENS = draw_lens(5, "soft-fast")  # blurred in the center too: there is something to gain everywhere
@@ -20,7 +28,9 @@ SETTINGS = LensSettings(aperture=LENS.at_focal().f_number)
 
 def taken(name: str, folder: Path, seed: int) -> tuple[Path, SimulatedPhoto]:
     scene = demo_scene(name)[:, 200 : 200 + CAMERA.height + 32, 400 : 400 + CAMERA.width + 32]
-    shot = photograph(np.ascontiguousarray(scene), LENS, SETTINGS, CAMERA, np.random.default_rng(seed))
+    options = BlurOptions(pitch_um=CAMERA.pitch_um, step=0.3, size=41)  # coarse nodes: seconds, not minutes
+    rng = np.random.default_rng(seed)
+    shot = photograph(np.ascontiguousarray(scene), LENS, SETTINGS, CAMERA, rng, options=options)
     path = folder / f"{name}.dng"
     write_photo(path, shot)
     return path, shot

@@ -4,6 +4,7 @@ from lensmodel.blind.base import NO_BLUR_PX2, PsfEstimate, PsfEstimator
 from lensmodel.blind.default import Cautious
 from lensmodel.blind.edges import Edges
 from lensmodel.blind.patch_recurrence import PatchRecurrence
+from lensmodel.blind.sun import Sun
 from lensmodel.blind.whittle import Whittle
 from lensmodel.blind.zhang import Zhang
 from lensmodel.registry import Registry
@@ -14,6 +15,7 @@ estimators: Registry[PsfEstimator] = Registry(
         "default": Cautious,
         "edges": Edges,
         "michaeli-irani": PatchRecurrence,
+        "sun": Sun,
         "whittle": Whittle,
         "zhang": Zhang,
     },
@@ -26,6 +28,7 @@ __all__ = [
     "PatchRecurrence",
     "PsfEstimate",
     "PsfEstimator",
+    "Sun",
     "Whittle",
     "Zhang",
     "estimators",

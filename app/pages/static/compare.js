@@ -33,6 +33,7 @@ export function setUpCompare() {
   // the crop is as wide as its frame, so that a pixel of the photo is a pixel of the page
   const show = (place) => {
     for (const other of places) other.setAttribute("aria-pressed", String(other === place));
+    holder.style.maxWidth = "";
     const width = Math.min(WIDEST, Math.floor(holder.clientWidth));
     const height = Math.min(560, Math.max(240, Math.round(width * SHAPE)));
     const { row, col } = place.dataset;
@@ -43,6 +44,10 @@ export function setUpCompare() {
     after.src = `/ui/corrections/${holder.dataset.id}/crop.png?${query}`;
     slider.setAttribute("aria-valuetext", `${place.textContent.trim()}: half before, half after`);
   };
+  // a photo smaller than the frame is not blown up
+  before.addEventListener("load", () => {
+    holder.style.maxWidth = `${before.naturalWidth}px`;
+  });
   const holdBefore = (on) => {
     hold.hidden = !on;
     tag.hidden = on;

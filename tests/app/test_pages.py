@@ -1,0 +1,374 @@
+"""The pages in a real browser: what a photographer does, with pointer, touch and keyboard."""
+
+from __future__ import annotations
+
+import base64
+import os
+import re
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, ConsoleMessage, Locator, Page, Request, expect, sync_playwright
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+from running import Service, running, write_photo  # noqa: E402 - beside this file
+
+sys.path.remove(str(HERE))
+
+PATIENCE_MS = 60_000.0
+FLAGS = [
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+WIDTHS = (360, 768, 1280)
+RULES = {"runOnly": {"type": "tag", "values": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"]}}
+DROP = """([name, data]) => {
+  const bytes = Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0));
+  const carried = new DataTransfer();
+  carried.items.add(new File([bytes], name));
+  for (const kind of ["dragenter", "dragover", "drop"]) {
+    const event = new DragEvent(kind, { bubbles: true, cancelable: true, dataTransfer: carried });
+    document.querySelector("main").dispatchEvent(event);
+  }
+}"""
+RECORD = """() => {
+  window.states = new Set();
+  const note = () => document.querySelectorAll("#photos .state").forEach((e) => states.add(e.textContent));
+  new MutationObserver(note).observe(
+    document.querySelector("#photos"), { childList: true, subtree: true, characterData: true });
+}"""
+STOP = """() => {
+  const at = document.activeElement;
+  const style = getComputedStyle(at.type === "file" ? at.labels[0] : at);
+  window.stops ??= new Map();
+  if (!stops.has(at)) stops.set(at, stops.size);
+  const width = style.outlineStyle === "none" ? 0 : parseFloat(style.outlineWidth);
+  return [`${stops.get(at)} ${at.outerHTML.slice(0, 80)}`, width];
+}"""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        reason = "there is no `chromium` on this machine to open the pages with"
+        if os.environ.get("LENSMODEL_REQUIRE_BROWSER"):
+            pytest.fail(reason)
+        pytest.skip(reason)
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture(scope="module")
+def service(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    with running(tmp_path_factory.mktemp("pages") / "data") as made:
+        yield made
+
+
+class Visitor:
+    """A page that notes each complaint of the browser and each request to another host."""
+
+    def __init__(self, page: Page, home: str) -> None:
+        self.page, self.host = page, urlsplit(home).netloc
+        self.complaints: list[str] = []
+        self.strangers: list[str] = []
+        page.on("console", self._listen)
+        page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        page.on("request", self._watch)
+
+    def _listen(self, message: ConsoleMessage) -> None:
+        if message.type in {"error", "warning"}:
+            self.complaints.append(f"{message.text} ({message.location.get('url')})")
+
+    def _watch(self, request: Request) -> None:
+        parts = urlsplit(request.url)
+        if parts.scheme not in {"data", "blob"} and parts.netloc != self.host:
+            self.strangers.append(request.url)
+
+
+@pytest.fixture
+def visitor(browser: Browser, service: Service) -> Iterator[Visitor]:
+    context = browser.new_context(
+        base_url=service.info()["url"], viewport={"width": 1280, "height": 900}, has_touch=True
+    )
+    context.set_default_timeout(PATIENCE_MS)
+    made = Visitor(context.new_page(), service.info()["url"])
+    yield made
+    context.close()
+    assert made.strangers == []
+    assert made.complaints == []
+
+
+@pytest.fixture
+def page(visitor: Visitor) -> Page:
+    return visitor.page
+
+
+@pytest.fixture(scope="module")
+def learned(service: Service, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """A photo of a lens that has learned from two, at two apertures."""
+    folder = tmp_path_factory.mktemp("photos")
+    sent = [
+        service.upload(write_photo(folder / f"wall-{k}.dng", 20 + k, serial="P-77", aperture=aperture))
+        for k, aperture in enumerate((2.8, 5.6))
+    ]
+    for photo in sent:
+        assert service.job(photo["id"])["state"] == "succeeded"
+    found: dict[str, Any] = service.get(f"/v1/photos/{sent[0]['id']}")
+    return found
+
+
+@pytest.fixture(scope="module")
+def correction(service: Service, learned: dict[str, Any]) -> dict[str, Any]:
+    wish = {"photo_id": learned["id"], "method": "fast", "output": {"format": "png16"}}
+    made: dict[str, Any] = service.http.post("/v1/corrections", json=wish).json()
+    assert service.job(made["id"])["state"] == "succeeded"
+    return made
+
+
+def address_of(kind: str, learned: dict[str, Any], correction: dict[str, Any]) -> str:
+    return {
+        "home": "/",
+        "lens": f"/lenses/{learned['lens_id']}",
+        "photo": f"/photos/{learned['id']}",
+        "correction": f"/corrections/{correction['id']}",
+    }[kind]
+
+
+def faults(page: Page) -> list[str]:
+    found = Axe().run(page, options=RULES).response["violations"]
+    return [f"{fault['id']}: {node['html'][:160]}" for fault in found for node in fault["nodes"]]
+
+
+def overhang(page: Page) -> int:
+    found: int = page.evaluate("document.documentElement.scrollWidth - innerWidth")
+    return found
+
+
+def test_an_empty_service_says_how_to_begin(page: Page) -> None:
+    page.goto("/")
+
+    expect(page.locator("#photos .empty")).to_contain_text("No photo yet")
+    expect(page.locator("#lenses .empty")).to_contain_text("No lens yet")
+    expect(page.locator(".steps li")).to_have_count(3)
+    assert faults(page) == []
+
+
+def test_photos_chosen_and_dropped_are_learned_from_while_the_page_watches(
+    visitor: Visitor, page: Page, tmp_path: Path
+) -> None:
+    chosen = write_photo(tmp_path / "chosen.dng", 1, serial="C-1")
+    dropped = write_photo(tmp_path / "dropped.dng", 2, serial="C-1")
+    page.goto("/")
+    page.evaluate(RECORD)
+
+    page.set_input_files("#files", chosen)
+    page.evaluate(DROP, [dropped.name, base64.b64encode(dropped.read_bytes()).decode()])
+    for name in ("chosen.dng", "dropped.dng"):
+        row = page.locator(".row", has_text=name)
+        expect(row.locator(".state")).to_contain_text("Learned from", timeout=PATIENCE_MS)
+        expect(row.locator("img")).to_have_js_property("complete", value=True)
+    expect(page.locator("#lenses .card")).to_have_count(1)
+
+    states = page.evaluate("[...window.states]")  # gone if the page had been loaded again
+    assert len(states) > 1
+    assert not visitor.complaints
+
+
+def test_a_file_that_is_no_photo_is_refused_in_a_plain_sentence(visitor: Visitor, page: Page) -> None:
+    page.goto("/")
+
+    page.evaluate(DROP, ["holiday.nef", base64.b64encode(b"not a photo" * 50).decode()])
+    refusal = page.locator("#uploads li")
+    expect(refusal.locator(".error")).to_contain_text("belong to no photo format")
+    expect(page.locator("#announce")).to_have_text("0 of 1 photos sent, 1 refused.")
+    refusal.get_by_role("button", name="Dismiss").click()
+    expect(refusal).to_have_count(0)
+
+    assert all("415" in complaint for complaint in visitor.complaints)
+    visitor.complaints.clear()
+
+
+def test_a_photo_that_waits_for_a_lens_gets_one(
+    page: Page, service: Service, learned: dict[str, Any], tmp_path: Path
+) -> None:
+    photo = service.upload(write_photo(tmp_path / "nameless.dng", 31, serial=""))
+    service.job(photo["id"], until=lambda job: job["state"] == "waiting")
+    page.goto(f"/photos/{photo['id']}")
+
+    page.get_by_role("button", name="Go on with this lens").click()
+    expect(page.locator("#name-lens .alert")).to_have_text("Choose a lens, or give a new one a name.")
+    page.get_by_label("A lens you already have").select_option(learned["lens_id"])
+    page.get_by_role("button", name="Go on with this lens").click()
+
+    expect(page.locator("#photo-state")).to_contain_text("Learned from", timeout=PATIENCE_MS)
+    expect(page.locator(".overlay rect.done").first).to_be_attached()
+    expect(page.locator(".facts a")).to_have_attribute("href", f"/lenses/{learned['lens_id']}")
+
+
+def test_a_lens_shows_its_blur_at_any_place_aperture_and_colour(page: Page, learned: dict[str, Any]) -> None:
+    page.goto(f"/lenses/{learned['lens_id']}")
+    field, words, drawn = page.locator("#field"), page.locator("#psf-words"), page.locator("#psf")
+    picture = "canvas => canvas.toDataURL()"
+    expect(words).to_contain_text("of the way to the corner")
+    expect(page.locator("#field img")).not_to_have_js_property("naturalWidth", 0)
+    begun = drawn.evaluate(picture)
+
+    box = field.bounding_box()
+    assert box is not None
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    expect(words).to_contain_text("In the center")
+    assert drawn.evaluate(picture) != begun
+    field.press("ArrowRight")
+    expect(words).to_contain_text("9 % of the way to the corner")
+    with page.expect_response(lambda answer: "aperture=5.6" in answer.url and "psf.json" in answer.url):
+        page.get_by_label("Aperture").select_option("5.6")
+    with page.expect_response(lambda answer: "channel=b" in answer.url and "field.png" in answer.url) as told:
+        page.get_by_label("Colour").select_option("b")
+
+    assert told.value.ok
+    expect(page.locator("#psf-numbers")).to_contain_text("pixels wide")
+    expect(page.locator("#psf-npy")).to_have_attribute("href", re.compile("channel=b"))
+
+
+def test_a_lens_shows_what_it_has_seen_and_how_it_learned(page: Page, learned: dict[str, Any]) -> None:
+    page.goto(f"/lenses/{learned['lens_id']}")
+
+    page.get_by_label("Show where photos told").check()
+    expect(page.locator("#coverage")).to_be_visible()
+    assert page.locator("#coverage circle").count() >= learned["patches"]["done"]
+    expect(page.locator("#history canvas")).to_be_visible()
+    expect(page.locator("#history .u-legend")).to_contain_text("Corners")
+    page.get_by_text("All figures").click()
+    expect(page.locator(".figures tbody tr").first).to_be_visible()
+    expect(page.locator("section[aria-labelledby=coverage-title] .zones li")).to_have_count(3)
+
+
+def test_a_photo_shows_where_it_learned_and_why_not_elsewhere(page: Page, learned: dict[str, Any]) -> None:
+    page.goto(f"/photos/{learned['id']}")
+    used, left = page.locator(".overlay rect.done"), page.locator(".overlay rect.rejected")
+    expect(used).to_have_count(learned["patches"]["done"])
+    assert left.count() == learned["patches"]["rejected"] > 0
+    expect(page.locator(".overlay > img").first).to_have_js_property("complete", value=True)
+
+    used.last.dispatch_event("click")
+    expect(page.locator("#told")).to_contain_text("Used (")
+    reason = page.locator(".reasons button").first
+    reason.click()
+    lit = page.locator(".overlay rect.lit")
+    expect(lit).to_have_count(int(reason.locator("b").inner_text()))
+    page.get_by_label("Show where edges are sharp enough to tell").check()
+    expect(page.locator("#rmap")).not_to_have_js_property("naturalWidth", 0)
+    expect(page.locator("#rmap")).to_be_visible()
+
+
+def test_a_photo_is_corrected_and_compared(page: Page, learned: dict[str, Any], tmp_path: Path) -> None:
+    page.goto(f"/photos/{learned['id']}")
+    page.get_by_label("File").select_option("jpeg")
+    page.get_by_role("button", name="Correct this photo").click()
+    page.wait_for_url("**/corrections/*")
+    expect(page.locator("#correction-state")).to_contain_text("Done", timeout=PATIENCE_MS)
+
+    slider, hold = page.locator("img-comparison-slider"), page.locator("#hold")
+    expect(page.locator("#compare img[slot=second]")).not_to_have_js_property("naturalWidth", 0)
+    before, after = (slider.locator(f"img[slot={slot}]") for slot in ("first", "second"))
+    assert pixels(before) == pixels(after)
+    assert before.evaluate("image => image.naturalWidth === image.clientWidth")
+    slider.focus()
+    page.keyboard.down("ArrowRight")
+    expect(slider).not_to_have_attribute("aria-valuenow", "50")
+    page.keyboard.up("ArrowRight")
+
+    page.keyboard.down("b")
+    expect(hold).to_be_visible()
+    page.keyboard.up("b")
+    expect(hold).to_be_hidden()
+    button = page.get_by_role("button", name="Hold to see before")
+    button.hover()
+    page.mouse.down()
+    expect(hold).to_be_visible()
+    assert "/ui/photos/" in str(page.locator(".mosaic img").first.get_attribute("src"))
+    page.mouse.up()
+    expect(hold).to_be_hidden()
+
+    expect(page.locator(".mosaic button")).to_have_count(9)
+    with page.expect_response(lambda answer: "row=1.0&col=1.0" in answer.url and answer.ok):
+        page.get_by_role("button", name="lower right").click()
+    expect(page.get_by_role("button", name="lower right")).to_have_attribute("aria-pressed", "true")
+    expect(page.locator("section[aria-labelledby=gain] .zones")).to_contain_text("Corners")
+    with page.expect_download() as got:
+        page.get_by_role("link", name="Download the corrected photo").click()
+    got.value.save_as(tmp_path / "saved")
+    assert got.value.suggested_filename == "wall-0-corrected.jpg"
+    assert (tmp_path / "saved").read_bytes()[:2] == b"\xff\xd8"
+
+
+def pixels(picture: Locator) -> list[int]:
+    found: list[int] = picture.evaluate("image => [image.naturalWidth, image.naturalHeight]")
+    return found
+
+
+def test_an_address_without_anything_is_a_page_for_people_and_json_for_programs(
+    visitor: Visitor, page: Page, service: Service
+) -> None:
+    for address in ("/photos/gone", "/lenses/gone", "/corrections/gone", "/nowhere"):
+        answer = page.goto(address)
+        assert answer is not None
+        assert answer.status == 404
+        expect(page.locator("h1")).to_have_text("Not here")
+    assert service.http.get("/photos/gone").json()["code"] == "unknown_photo"
+    assert service.http.get("/v1/photos/gone", headers={"Accept": "text/html"}).json()["status"] == 404
+
+    assert faults(page) == []
+    visitor.complaints.clear()  # the browser notes each 404
+
+
+@pytest.mark.parametrize("kind", ["home", "lens", "photo", "correction"])
+def test_a_page_is_accessible_and_fits_each_screen(
+    page: Page, learned: dict[str, Any], correction: dict[str, Any], kind: str
+) -> None:
+    page.goto(address_of(kind, learned, correction))
+    page.wait_for_load_state("load")
+    for scheme in ("light", "dark"):
+        page.emulate_media(color_scheme=scheme, reduced_motion="reduce")  # type: ignore[arg-type]
+        assert faults(page) == [], scheme
+    for width in WIDTHS:
+        page.set_viewport_size({"width": width, "height": 800})
+        assert overhang(page) <= 0, width
+
+
+@pytest.mark.parametrize("kind", ["home", "lens", "photo", "correction"])
+def test_each_stop_of_the_keyboard_is_seen(
+    page: Page, learned: dict[str, Any], correction: dict[str, Any], kind: str
+) -> None:
+    page.goto(address_of(kind, learned, correction))
+    wanted = page.evaluate(
+        "[...document.querySelectorAll('a[href], button:not(:disabled), input, select, summary, "
+        '[tabindex="0"]\')].filter((e) => e.checkVisibility() && e.tabIndex >= 0).length'
+    )
+    seen = set()
+    page.keyboard.press("Tab")
+    expect(page.locator(".skip")).to_be_focused()
+    expect(page.locator(".skip")).to_be_in_viewport()
+    for _ in range(wanted):
+        name, outline = page.evaluate(STOP)
+        assert outline >= 2, name
+        seen.add(name)
+        page.keyboard.press("Tab")
+
+    assert len(seen) == wanted

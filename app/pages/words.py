@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from app.schemas import CorrectionOut, LensOut, PatchOut, PhotoOut
+from app.schemas import CorrectionOut, LensOut, PatchOut, PhotoOut, Problem
 
 PHOTO_STATES: Final[Mapping[str, str]] = {
     "received": "Waiting its turn",
@@ -18,6 +18,15 @@ PHOTO_STATES: Final[Mapping[str, str]] = {
     "stored": "Kept, to be corrected",
     "excluded": "Left out of the lens by you",
     "cancelled": "Cancelled",
+}
+FAILURES: Final[Mapping[str, str]] = {
+    "no_usable_patches": "nothing in it tells about the blur. A photo with fine detail in focus would",
+    "truncated_image": "the file ends too early. Copy it again from the camera or card",
+    "raw_decode_failed": "the RAW data cannot be read. It may be damaged, or the camera too new",
+    "decompression_bomb": "it would unpack to far more than a photo holds",
+    "memory_limit": "it needs more memory than the service may use",
+    "time_limit": "it took longer than the service allows",
+    "crashed_repeatedly": "reading it failed again and again. The file is probably damaged",
 }
 ZONES: Final[Mapping[str, str]] = {"center": "Center", "mid": "Middle", "corner": "Corners"}
 ENOUGH_PLACES: Final = 20
@@ -62,13 +71,20 @@ def f_stop(number: float) -> str:
 def photo_state(photo: PhotoOut) -> str:
     """Say where a photo stands."""
     if photo.state == "failed":
-        return f"Not used: {photo.error.detail if photo.error else 'unknown reason'}"
+        return f"Not used: {failure(photo.error)}"
     if photo.state == "estimating":
         return f"Measuring blur: {photo.patches.done} of {photo.patches.total} places"
     words = PHOTO_STATES.get(photo.state, photo.state)
     if photo.state == "counted":
         return f"{words}, at {counted(photo.patches.done, 'place')}"
     return words
+
+
+def failure(error: Problem | None) -> str:
+    """Say why something failed: in our own words where we have some, else in those of the error."""
+    if error is None:
+        return "the reason was not noted"
+    return FAILURES.get(error.code, error.detail)
 
 
 def state_class(photo: PhotoOut) -> str:

@@ -12,6 +12,24 @@ export async function problemText(response) {
   }
 }
 
+const PLAIN = {
+  not_an_image: "This is not a photo that can be read. Give RAW, DNG, TIFF, PNG or JPEG.",
+  unsupported_format: "This kind of file cannot be read. Give RAW, DNG, TIFF, PNG or JPEG.",
+  truncated_image: "The file ends too early. Copy it again from the camera or card.",
+  image_too_large: "This photo is larger than the service takes.",
+  decompression_bomb: "This file would unpack to far more than a photo holds.",
+};
+
+// The answer to a refused upload as a sentence for people; the service's own words where we have none.
+export function refusalText(answered, status) {
+  try {
+    const { code, detail } = JSON.parse(answered);
+    return PLAIN[code] ?? detail[0].toUpperCase() + detail.slice(1);
+  } catch {
+    return `The service answered ${status}. Try again in a moment.`;
+  }
+}
+
 export async function send(method, url, body) {
   const response = await fetch(url, {
     method,

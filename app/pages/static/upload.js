@@ -1,6 +1,6 @@
 // Photos chosen or dropped are sent one after the other; what became of them is in the list below.
 
-import { byId } from "./common.js";
+import { byId, refusalText } from "./common.js";
 
 function uploadOne(file, calibrate, list) {
   const item = document.createElement("li");
@@ -40,11 +40,7 @@ function uploadOne(file, calibrate, list) {
           resolve(true);
           return;
         }
-        try {
-          fail(JSON.parse(request.responseText).detail);
-        } catch {
-          fail(`The service answered ${request.status}.`);
-        }
+        fail(refusalText(request.responseText, request.status));
       };
       request.send(file);
     });

@@ -54,6 +54,28 @@ def test_raw_numbers_become_linear_light_with_saturation_at_one(tmp_path: Path, 
     assert (developed.planes[:, 32, 32] == 1.0).all()
 
 
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG"])
+def test_developed_planes_say_which_pixels_the_sensor_measured(tmp_path: Path, pattern: str) -> None:
+    mosaic = raw_numbers(textured(64, 96))
+    write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE, pattern=pattern)
+
+    developed = photo.develop(tmp_path / "x.dng")
+
+    assert developed.cfa is not None
+    assert "".join("RGB"[c] for row in developed.cfa for c in row) == pattern
+    rows, cols = np.indices(mosaic.shape)
+    channel = np.asarray(developed.cfa)[rows % 2, cols % 2]
+    at_sites = np.take_along_axis(developed.planes, channel[None], axis=0)[0]
+    inside = (slice(8, -8), slice(8, -8))
+    np.testing.assert_allclose(at_sites[inside], ((mosaic - BLACK) / (WHITE - BLACK))[inside], atol=2e-4)
+
+
+def test_half_size_planes_have_no_mosaic_any_more(tmp_path: Path) -> None:
+    write_bayer_dng(tmp_path / "x.dng", raw_numbers(textured(64, 96)), black=BLACK, white=WHITE)
+
+    assert photo.develop(tmp_path / "x.dng", demosaic="half").cfa is None
+
+
 def test_the_brightest_pixel_does_not_become_the_white(tmp_path: Path) -> None:
     write_bayer_dng(tmp_path / "x.dng", raw_numbers(textured(64, 96)), black=BLACK, white=WHITE)
 

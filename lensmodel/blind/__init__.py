@@ -6,6 +6,7 @@ from lensmodel.blind.default import Cautious
 from lensmodel.blind.edges import Edges
 from lensmodel.blind.l0 import L0
 from lensmodel.blind.patch_recurrence import PatchRecurrence
+from lensmodel.blind.polyblur import Polyblur
 from lensmodel.blind.sun import Sun
 from lensmodel.blind.whittle import Whittle
 from lensmodel.blind.xu_jia import XuJia
@@ -20,6 +21,7 @@ estimators: Registry[PsfEstimator] = Registry(
         "edges": Edges,
         "l0": L0,
         "michaeli-irani": PatchRecurrence,
+        "polyblur": Polyblur,
         "sun": Sun,
         "whittle": Whittle,
         "xu-jia": XuJia,
@@ -34,6 +36,7 @@ __all__ = [
     "ChoLee",
     "Edges",
     "PatchRecurrence",
+    "Polyblur",
     "PsfEstimate",
     "PsfEstimator",
     "Sun",

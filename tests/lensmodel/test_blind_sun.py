@@ -133,7 +133,7 @@ def test_the_kernel_turns_with_the_patch() -> None:
 
 
 def test_patches_of_one_position_share_one_kernel() -> None:
-    method, noise = Sun(iterations=3), NoiseModel.white(SIGMA)
+    method, noise = Sun(iterations=2), NoiseModel.white(SIGMA)
     patches = [shot(stroke(), side=80, seed=seed) for seed in (0, 1, 2)]
 
     single = [distance(method.estimate([y], [noise], size=13).kernel, stroke()).rel_l2 for y in patches]

@@ -33,7 +33,7 @@ def bent(size: int = 13) -> Kernel:
     return as_kernel(signal.convolve(kernel, gaussian(3, 0.3 * np.eye(2)), mode="same"))
 
 
-def explained(y: NDArray[np.floating], kernel: Kernel, sweeps: int = 15) -> float:
+def explained(y: NDArray[np.floating], kernel: Kernel, sweeps: int = 10) -> float:
     """Free energy when everything but the kernel is fitted."""
     found = Scene.of(y.astype(np.float64), kernel.shape[0], kernel, FLOOR)
     for _ in range(sweeps):
@@ -127,7 +127,7 @@ def test_sharp_patches_give_a_kernel_like_a_point() -> None:
 
 def test_the_kernel_turns_and_stays_as_the_patch_turns_and_shifts() -> None:
     y = shot(gaussian(13, [[2.0, 0.8], [0.8, 1.2]]), side=100)
-    method, noise = Zhang(iterations=6), [NoiseModel.white(SIGMA)]
+    method, noise = Zhang(iterations=3), [NoiseModel.white(SIGMA)]
 
     straight = method.estimate([y[:97, :97]], noise, size=13).kernel
     turned = method.estimate([np.ascontiguousarray(np.rot90(y[:97, :97]))], noise, size=13).kernel
@@ -138,7 +138,7 @@ def test_the_kernel_turns_and_stays_as_the_patch_turns_and_shifts() -> None:
 
 
 def test_patches_of_one_position_share_a_better_kernel() -> None:
-    method, noise = Zhang(iterations=10), NoiseModel.white(SIGMA)
+    method, noise = Zhang(iterations=6), NoiseModel.white(SIGMA)
     patches = [shot(bent(), side=80, seed=seed) for seed in (0, 1)]
 
     single = [distance(method.estimate([y], [noise], size=13).kernel, bent()).rel_l2 for y in patches]

@@ -88,6 +88,7 @@ class Cautious:
         diagnostics: Mapping[str, float] = {
             **found.diagnostics,
             "gaussian_width": gaussian.diagnostics["width"],
+            "slope": gaussian.diagnostics["slope"],
             "disagreement": disagreement,
             "narrow": float(narrow),
         }

@@ -6,6 +6,7 @@ from lensmodel.regression.model import LensModel, ModelField
 from lensmodel.regression.profile import LensProfile, load_profile, save_profile
 from lensmodel.regression.robust import Flag
 from lensmodel.regression.smoothers import Neighbours, Smoother, smoothers
+from lensmodel.regression.wavefront import Wavefront, fit_wavefront
 
 __all__ = [
     "Flag",
@@ -17,8 +18,10 @@ __all__ = [
     "PaperModel",
     "PsfAnswer",
     "Smoother",
+    "Wavefront",
     "all_pairs",
     "factorised",
+    "fit_wavefront",
     "load_profile",
     "save_profile",
     "smoothers",

@@ -1,0 +1,138 @@
+"""Kernels from a wavefront, with their derivatives, fast enough to be fitted.
+
+With the pupil p (right, up; |p| <= 1), q = wavelength x f-number / pixel pitch, and W in waves::
+
+    E(x) = sum_p A(p) exp(2 pi i W(p)) exp(-i pi p . x / q),     x in pixels
+    k(pixel) = integral over the pixel of |E(x)|^2
+
+The wavefront is written in blur: W = sum_k g_k B_k(p) / (2 q), so that a ray through p lands at
+sum_k g_k grad B_k(p) pixels whatever the wavelength. The terms B_k are those that third-order
+theory has at one place of the field::
+
+    |p|^4,  px |p|^2,  py |p|^2,  |p|^2,  px^2 - py^2,  2 px py,  px,  py
+
+The transform is a product of matrices (R. Soummer et al., "Fast computation of Lyot-style
+coronagraph propagation", Optics Express 15, 2007, eq. 1): only the pixels that matter are computed,
+and the derivatives dE = sum 2 pi i B A exp(2 pi i W) ... share its matrices.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+TERMS = 8
+"""Number of wavefront terms; the last two are the tilts, which move the kernel."""
+
+_MIN_ACROSS, _MAX_ACROSS = 40, 176
+_PERIOD = 1.25  # of the discrete pupil over the side of the kernel
+_SAMPLING = 0.9  # light is band limited to 1 / q cycles/pixel; its last tenth may alias, the pixel kills it
+_MIN_FINE, _MAX_FINE = 3, 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PupilGrid:
+    """What is common to all kernels of one q and side.
+
+    Parameters
+    ----------
+    q : float
+        Wavelength x f-number / pixel pitch.
+    size : int
+        Odd side of the kernels.
+    """
+
+    q: float
+    size: int
+    px: NDArray[np.float32]
+    py: NDArray[np.float32]
+    step: float
+    terms: NDArray[np.float32]  # (TERMS, m, m)
+    rows: NDArray[np.complex64]  # (fine * size, m)
+    cols: NDArray[np.complex64]  # (m, fine * size)
+    fine: int
+
+    @classmethod
+    def of(cls, q: float, size: int) -> PupilGrid:
+        """Lay out the pupil and the transform."""
+        m = min(max(math.ceil(_PERIOD * size / q), _MIN_ACROSS), _MAX_ACROSS)
+        fine = min(max(math.ceil(_SAMPLING / q), _MIN_FINE), _MAX_FINE)
+        step = 2.0 / m
+        p = ((np.arange(m) - (m - 1) / 2.0) * step).astype(np.float32)
+        px, py = np.meshgrid(p, -p)
+        rho2 = px * px + py * py
+        terms = np.stack(
+            [rho2 * rho2, px * rho2, py * rho2, rho2, px * px - py * py, 2.0 * px * py, px, py]
+        ).astype(np.float32)
+        t = (np.arange(fine * size) - (fine * size - 1) / 2.0) / fine
+        # rows of the image grow downwards, py grows upwards
+        rows = np.exp(-1j * np.pi / q * np.outer(-t, -p)).astype(np.complex64)
+        cols = np.exp(-1j * np.pi / q * np.outer(p, t)).astype(np.complex64)
+        return cls(q, size, px, py, step, terms, rows, cols, fine)
+
+    def amplitude(self, radius: float, shift: tuple[float, float]) -> NDArray[np.float32]:
+        """Stop of radius 1 cut by a second circle (cat's eye), edges one sample wide."""
+        stop = np.clip((1.0 - np.sqrt(self.px**2 + self.py**2)) / self.step + 0.5, 0.0, 1.0)
+        if radius >= 1.0 + math.hypot(*shift) + self.step:
+            return stop.astype(np.float32)
+        apart = np.sqrt((self.px - shift[0]) ** 2 + (self.py - shift[1]) ** 2)
+        return (stop * np.clip((radius - apart) / self.step + 0.5, 0.0, 1.0)).astype(np.float32)
+
+    def light(self, g: NDArray[np.float64], amplitude: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Light in each pixel, shape (size, size); its sum is not 1."""
+        field = self._field(self._wave(g, amplitude))
+        return self._binned(field.real**2 + field.imag**2)
+
+    def with_derivatives(
+        self,
+        g: NDArray[np.float64],
+        amplitude: NDArray[np.float32],
+        others: tuple[NDArray[np.float32], ...] = (),
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Light, and its derivatives by g and by changes `others` of the amplitude.
+
+        Returns
+        -------
+        light : ndarray, shape (size, size)
+        derivatives : ndarray, shape (TERMS + len(others), size, size)
+        """
+        unit = self._wave(g, np.ones_like(amplitude))
+        wave = unit * amplitude
+        field = self._field(wave)
+        factor = np.complex64(1j * math.pi / self.q)
+        found = []
+        for term in self.terms:
+            change = self._field(wave * term) * factor
+            found.append(self._binned(2.0 * (field.real * change.real + field.imag * change.imag)))
+        for other in others:
+            change = self._field(unit * other)
+            found.append(self._binned(2.0 * (field.real * change.real + field.imag * change.imag)))
+        return self._binned(field.real**2 + field.imag**2), np.stack(found)
+
+    def centre(self, g: NDArray[np.float64], amplitude: NDArray[np.float32]) -> tuple[float, float]:
+        """Where the rays' centre of mass lies, (right, up) pixels, tilts left out."""
+        weight = (amplitude * amplitude).astype(np.float64)
+        px, py, total = self.px, self.py, weight.sum()
+        rho2 = px * px + py * py
+        gx = 4 * g[0] * rho2 * px + g[1] * (rho2 + 2 * px * px) + 2 * g[2] * px * py
+        gx = gx + 2 * (g[3] + g[4]) * px + 2 * g[5] * py
+        gy = 4 * g[0] * rho2 * py + g[2] * (rho2 + 2 * py * py) + 2 * g[1] * px * py
+        gy = gy + 2 * (g[3] - g[4]) * py + 2 * g[5] * px
+        return float((weight * gx).sum() / total), float((weight * gy).sum() / total)
+
+    def _wave(self, g: NDArray[np.float64], amplitude: NDArray[np.float32]) -> NDArray[np.complex64]:
+        angle = np.tensordot((g * (math.pi / self.q)).astype(np.float32), self.terms, axes=1)
+        wave = np.empty(angle.shape, dtype=np.complex64)
+        np.multiply(amplitude, np.cos(angle), out=wave.real)
+        np.multiply(amplitude, np.sin(angle), out=wave.imag)
+        return wave
+
+    def _field(self, wave: NDArray[np.complex64]) -> NDArray[np.complex64]:
+        return np.asarray(self.rows @ wave @ self.cols)
+
+    def _binned(self, light: NDArray[np.float32]) -> NDArray[np.float64]:
+        side = self.size
+        return np.asarray(light.reshape(side, self.fine, side, self.fine).sum(axis=(1, 3)), dtype=np.float64)

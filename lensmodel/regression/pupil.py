@@ -133,6 +133,6 @@ class PupilGrid:
     def _field(self, wave: NDArray[np.complex64]) -> NDArray[np.complex64]:
         return np.asarray(self.rows @ wave @ self.cols)
 
-    def _binned(self, light: NDArray[np.float32]) -> NDArray[np.float64]:
+    def _binned(self, light: NDArray[np.floating]) -> NDArray[np.float64]:
         side = self.size
         return np.asarray(light.reshape(side, self.fine, side, self.fine).sum(axis=(1, 3)), dtype=np.float64)

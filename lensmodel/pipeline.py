@@ -55,7 +55,7 @@ log = logging.getLogger(__name__)
 DEFAULT_PATCHES = 24
 """Patches asked for in one photo: enough for every ring and octant of the field to get one."""
 
-BLIND_BIAS = 0.25
+BLIND_BIAS = 0.4
 """Relative L2 error that blind estimates share, so that their scatter in the model does not show it."""
 
 DEFAULT_PATCH_SIZE = 192

@@ -7,35 +7,11 @@ from pathlib import Path
 from xml.sax.saxutils import escape
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from lensmodel.types import Planes
-
-Picture = NDArray[np.uint8]
-"""`(row, col, 3)` sRGB, as shown."""
+from lensmodel.bench.pictures import Picture, crop_boxes
 
 _GAP, _LABEL = 6, 18
-
-
-def as_shown(planes: Planes, gain: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Picture:
-    """Encode linear planes `(3, row, col)` to 8-bit sRGB, each channel times its gain."""
-    linear = np.clip(planes * np.asarray(gain, dtype=np.float32)[:, None, None], 0.0, 1.0)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return np.ascontiguousarray(np.moveaxis(np.rint(encoded * 255), 0, -1).astype(np.uint8))
-
-
-def crop_boxes(height: int, width: int, side: int) -> dict[str, tuple[int, int]]:
-    """Top-left pixels of five crops: the center and the four corners, clear of the border."""
-    edge = 4
-    bottom, right = height - side - edge, width - side - edge
-    return {
-        "center": ((height - side) // 2, (width - side) // 2),
-        "upper left": (edge, edge),
-        "upper right": (edge, right),
-        "lower left": (bottom, edge),
-        "lower right": (bottom, right),
-    }
 
 
 def mosaic(rows: Mapping[str, Picture], path: Path, *, side: int = 220) -> None:

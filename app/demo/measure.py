@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-import tifffile
 
 from app.client import Client
 from app.demo import camera
@@ -56,12 +54,6 @@ def psf_error(client: Client, lens_id: str, version: int) -> dict[Zone, float]:
 def developed(shot: camera.Shot) -> Planes:
     """Return the photo as it was, developed in the same way as the service does."""
     return develop(shot.path).planes
-
-
-def corrected(path: Path) -> Planes:
-    """Return the planes of a corrected 16-bit TIFF in the camera's linear colours."""
-    pixels = tifffile.imread(path)
-    return np.ascontiguousarray(np.moveaxis(pixels, -1, 0), dtype=np.float32) / np.float32(65535.0)
 
 
 def psnr(planes: Planes, shot: camera.Shot) -> dict[Zone, float]:

@@ -7,19 +7,16 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from app.client import Client
 from app.demo import camera, figures, measure
 from app.demo.report import Report
-from app.demo.service import own_service
-from app.schemas import CorrectionOut, JobOut, PhotoOut
+from app.errands import Say, corrected, follow, planes_of
+from app.own_service import own_service
+from lensmodel.bench.pictures import Picture, as_shown
 from lensmodel.photo import develop
 from lensmodel.simulate import demo_data_path
-
-Say = Callable[[str], None]
 
 REAL_RAW = "canon_kissx4_colorchart.dng"
 
@@ -61,7 +58,7 @@ def _simulated(client: Client, shots: dict[str, camera.Shot], work: Path, output
     for number, name in enumerate(camera.LEARN_FROM, start=1):
         say(f"Uploading {name}.dng, photo {number} of {len(camera.LEARN_FROM)} of this lens")
         uploaded = client.upload(shots[name].path)
-        _follow(client, uploaded, say)
+        follow(client, uploaded, say)
         lens_id = client.photo(uploaded.id).lens_id or lens_id
     lens = client.lens(lens_id)
     say(f"Lens {lens.model}, version {lens.version}: {lens.photos} photos, {lens.samples} samples")
@@ -76,26 +73,28 @@ def _simulated(client: Client, shots: dict[str, camera.Shot], work: Path, output
     held_out = client.upload(shots[camera.HELD_OUT].path, calibrate=False)
     chart = client.upload(shots[camera.CHART].path, calibrate=False)
     for photo in (held_out, chart):
-        _follow(client, photo, say)
+        follow(client, photo, say)
     truth = shots[camera.HELD_OUT]
     before = measure.developed(truth)
     report.psnr_before = measure.psnr(before, truth)
     after = before
     for version in range(1, lens.version + 1):
         say(f"Correcting {camera.HELD_OUT} with version {version} of the lens")
-        path = _corrected(client, held_out, work, say, lens_version=version, color_space="camera-linear")
-        after = measure.corrected(path)
+        path = corrected(
+            client, held_out, work, say, lens_version=version, output={"color_space": "camera-linear"}
+        )
+        after = planes_of(path)
         report.psnr_after.append(measure.psnr(after, truth))
-    path = _corrected(client, chart, work, say, color_space="camera-linear")
+    path = corrected(client, chart, work, say, output={"color_space": "camera-linear"})
     report.chart_before = measure.sharpness(measure.developed(shots[camera.CHART]))
-    report.chart_after = measure.sharpness(measure.corrected(path))
+    report.chart_after = measure.sharpness(planes_of(path))
 
-    shutil.copy(_corrected(client, held_out, work, say), output / "corrected.tif")
+    shutil.copy(corrected(client, held_out, work, say), output / "corrected.tif")
     gain = camera.demo_camera().white_balance
     rows = {
-        "as photographed": figures.as_shown(before, gain),
-        "corrected": figures.as_shown(after, gain),
-        "the scene itself": figures.as_shown(truth.sharp(), gain),
+        "as photographed": as_shown(before, gain),
+        "corrected": as_shown(after, gain),
+        "the scene itself": as_shown(truth.sharp(), gain),
     }
     figures.mosaic(rows, output / "before-after.png")
     (output / "psf-field.png").write_bytes(client.field_png(lens_id, aperture=lens.apertures[0]))
@@ -119,10 +118,10 @@ def _real(client: Client, report: Report, work: Path, output: Path, say: Say) ->
     photo = client.upload(
         path, lens_maker="Canon", lens_model="unknown lens of the Kiss X4", lens_serial="demo-1", aperture=5.6
     )
-    job = _follow(client, photo, say)
+    job = follow(client, photo, say)
     photo = client.photo(photo.id)
     correction = client.correct(photo.id)
-    _follow(client, correction, say)
+    follow(client, correction, say)
     result = client.download(correction.id, work / "real.tif")
     shutil.copy(result, output / "corrected-real.tif")
     found = client.correction(correction.id)
@@ -132,37 +131,9 @@ def _real(client: Client, report: Report, work: Path, output: Path, say: Say) ->
     }
     original = develop(path)
     gains = original.white_balance
-    linear = _corrected(client, photo, work, say, color_space="camera-linear")
-    rows: dict[str, figures.Picture] = {
-        "as photographed": figures.as_shown(original.planes, gains),
-        "corrected": figures.as_shown(measure.corrected(linear), gains),
+    linear = corrected(client, photo, work, say, output={"color_space": "camera-linear"})
+    rows: dict[str, Picture] = {
+        "as photographed": as_shown(original.planes, gains),
+        "corrected": as_shown(planes_of(linear), gains),
     }
     figures.mosaic(rows, output / "before-after-real.png")
-
-
-def _corrected(
-    client: Client, photo: PhotoOut, work: Path, say: Say, *, lens_version: int | None = None, **output: str
-) -> Path:
-    wish: dict[str, Any] = {"output": {"format": "tiff16", **output}}
-    if lens_version is not None:
-        wish["lens_version"] = lens_version
-    correction = client.correct(photo.id, **wish)
-    _follow(client, correction, say)
-    return client.download(correction.id, work / f"{correction.id}.tif")
-
-
-def _follow(client: Client, work: PhotoOut | CorrectionOut, say: Say) -> JobOut:
-    last = ""
-
-    def show(job: JobOut) -> None:
-        nonlocal last
-        words = f"  {job.stage or job.state}"
-        if job.progress.total:
-            words += f" {job.progress.done} of {job.progress.total} {job.progress.unit}"
-        if job.eta_seconds:
-            words += f", about {job.eta_seconds:.0f} s left"
-        if words != last:
-            last = words
-            say(words)
-
-    return client.wait(work, timeout=900, on_change=show)

@@ -1,4 +1,4 @@
-"""A service of one's own for as long as the demo lasts."""
+"""A service of one's own for as long as a program needs it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -25,9 +25,20 @@ class ServiceDidNotStartError(Exception):
 
 
 @contextmanager
-def own_service(data: Path, log_file: Path) -> Iterator[Client]:
-    """Start the real service on a free loopback port, wait until it is ready, and stop it at the end."""
+def own_service(data: Path, log_file: Path, settings: Mapping[str, str] | None = None) -> Iterator[Client]:
+    """Start the real service on a free loopback port, wait until it is ready, and stop it at the end.
+
+    Parameters
+    ----------
+    data : Path
+        Folder of everything that it keeps.
+    log_file : Path
+        Where its log goes; what an earlier one wrote there is replaced.
+    settings : mapping of str to str, optional
+        Values of the environment, such as `LENS_ESTIMATOR`; nothing else of that prefix is passed on.
+    """
     environment = {name: value for name, value in os.environ.items() if not name.startswith("LENS_")}
+    environment |= settings or {}
     data.mkdir(parents=True, exist_ok=True)
     with log_file.open("wb") as log:
         process = subprocess.Popen(  # noqa: S603 - our own program, with arguments of our own

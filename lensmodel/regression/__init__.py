@@ -6,7 +6,8 @@ from lensmodel.regression.model import LensModel, ModelField
 from lensmodel.regression.profile import LensProfile, load_profile, save_profile
 from lensmodel.regression.robust import Flag
 from lensmodel.regression.smoothers import Neighbours, Smoother, smoothers
-from lensmodel.regression.wavefront import Wavefront, fit_wavefront
+from lensmodel.regression.wavefront import Wavefront
+from lensmodel.regression.wavefront_fit import fit_wavefront
 
 __all__ = [
     "Flag",

@@ -9,7 +9,7 @@ import pytest
 
 from lensmodel.psf import PsfSample, distance
 from lensmodel.regression.pupil import TERMS, PupilGrid
-from lensmodel.regression.wavefront import fit_wavefront
+from lensmodel.regression.wavefront_fit import fit_wavefront
 from lensmodel.simulate import draw_lens
 from lensmodel.types import FieldPosition, LensSettings
 

@@ -1,0 +1,117 @@
+"""Fitting the wavefront of a lens: from the moments of its samples to a fit of their kernels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from lensmodel.psf import PsfSample
+from lensmodel.regression.starts import starts
+from lensmodel.regression.wavefront import NAMES, Wavefront, design, stopped
+from lensmodel.regression.wavefront_problem import PRIOR_PX, USUAL_EYE, Problem
+from lensmodel.types import WAVELENGTH_NM, Kernel
+
+_USUAL_F, _USUAL_PITCH_UM = 2.8, 4.5
+_LARGEST = 35
+_COARSE, _FINE = 12, 36
+_COARSE_ROUNDS, _FINE_ROUNDS = 8, 12
+_STARTS, _REFINED = 4, 2
+_BLUR_PX = 1.0
+_GUESSED = 0.1
+_LEAST_HALF, _HELD_LIGHT = 5, 0.98
+_MIN_SAMPLES = 12
+
+
+def fit_wavefront(samples: Sequence[PsfSample], start: Wavefront | None = None) -> Wavefront | None:
+    """Fit the wavefront of a lens to samples of one focal length.
+
+    Parameters
+    ----------
+    samples : sequence of PsfSample
+        Weights count.
+    start : Wavefront, optional
+        An earlier fit to begin with instead of searching.
+
+    Returns
+    -------
+    Wavefront or None
+        None with fewer than twelve samples.
+
+    Notes
+    -----
+    At most 36 samples spread over field and settings take part: the unknowns are few.
+    """
+    kept = [s for s in samples if s.weight > 0]
+    if len(kept) < _MIN_SAMPLES:
+        return None
+    apertures = [s.settings.aperture for s in kept if s.settings.aperture is not None]
+    widest = min(apertures) if apertures else _USUAL_F
+    pitches = [s.pixel_pitch_um for s in kept if s.pixel_pitch_um is not None]
+    pitch = float(np.median(pitches)) if pitches else _USUAL_PITCH_UM
+    kept.sort(key=_order)
+    log_q = math.log(WAVELENGTH_NM["g"] / 1000.0 * widest / pitch)
+    vague = 0.03 if apertures and pitches else (0.3 if apertures else 0.5)
+    few, many = spread(kept, _COARSE), spread(kept, _FINE)
+    size = max(_side_of_light(s.kernel) for s in many)
+    begins = [start] if start is not None else []
+    if start is None:
+        usual = Wavefront(np.zeros(len(NAMES)), log_q, USUAL_EYE, widest, size)
+        designs = np.stack([stopped(design(s.position, s.settings), usual.stop(s.settings)) for s in many])
+        coarse = Problem(tuple(few), size, log_q, vague, _BLUR_PX)
+        tried = [
+            coarse.solve(replace(usual, terms=terms), _COARSE_ROUNDS)
+            for terms in starts(many, designs, PRIOR_PX, math.exp(log_q), _STARTS)
+        ]
+        # the best fit of few blurred samples need not lead to the best of all sharp ones
+        begins = [front for front, _, _ in sorted(tried, key=lambda found: found[1])[:_REFINED]]
+    fine = Problem(tuple(many), size, log_q, vague, 0.0)
+    fitted = [fine.solve(replace(begin, size=size, f_number=widest), _FINE_ROUNDS) for begin in begins]
+    found, cost, errors = min(fitted, key=lambda one: one[1])
+    if vague > _GUESSED:
+        # the width of diffraction was a guess: blur alone leads to minima at either side of it
+        for guess in (log_q - 0.5, log_q + 0.5):
+            other, other_cost, other_errors = fine.solve(replace(found, log_q=guess), _FINE_ROUNDS)
+            if other_cost < cost:
+                found, cost, errors = other, other_cost, other_errors
+    return replace(found, error=float(np.median(errors)))
+
+
+def _order(sample: PsfSample) -> tuple[float, float, float, str, str]:
+    place = sample.position
+    return place.r, place.phi, sample.settings.aperture or 0.0, sample.settings.channel, sample.photo
+
+
+def _side_of_light(kernel: Kernel) -> int:
+    """Odd side of the middle square that holds nearly all light."""
+    middle = kernel.shape[0] // 2
+    for half in range(min(_LEAST_HALF, middle), min(middle, _LARGEST // 2)):
+        if kernel[middle - half : middle + half + 1, middle - half : middle + half + 1].sum() > _HELD_LIGHT:
+            return 2 * half + 1
+    return 2 * min(middle, _LARGEST // 2) + 1
+
+
+def spread(samples: Sequence[PsfSample], count: int) -> list[PsfSample]:
+    """Choose samples far from each other in place, colour and stops; the first is the best one."""
+    if len(samples) <= count:
+        return list(samples)
+    where = np.array(
+        [
+            (
+                s.position.r * math.cos(s.position.phi),
+                s.position.r * math.sin(s.position.phi),
+                0.004 * WAVELENGTH_NM[s.settings.channel],
+                0.2 * (s.settings.stops or 0.0),
+            )
+            for s in samples
+        ]
+    )
+    vote = np.array([s.weight for s in samples])
+    chosen = [int(vote.argmax())]
+    distance = ((where - where[chosen[0]]) ** 2).sum(axis=1)
+    while len(chosen) < count:
+        chosen.append(int((distance * vote).argmax()))
+        distance = np.minimum(distance, ((where - where[chosen[-1]]) ** 2).sum(axis=1))
+    return [samples[i] for i in chosen]

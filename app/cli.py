@@ -14,7 +14,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 import typer
 
-from app.commands import benchmarks, demonstration, display, photos, service
+from app.commands import benchmarks, demonstration, display, photos, reproduce, service
 from lensmodel.errors import LensModelError
 
 app = typer.Typer(
@@ -34,6 +34,7 @@ app.command(hidden=True)(service.api)
 app.command(hidden=True)(service.worker)
 app.command()(service.config)
 app.command()(demonstration.demo)
+app.command()(reproduce.reproduce)
 app.add_typer(benchmarks.bench, name="bench")
 
 

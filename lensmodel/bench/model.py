@@ -131,6 +131,17 @@ def run_model_benchmark(
     return {"seeds": list(seeds), "rows": [_plain(row) for row in rows]}
 
 
+def predictor(method: str, samples: Sequence[PsfSample]) -> Predictor:
+    """Fit one of the methods of `run_model_benchmark` to samples; all of the same settings.
+
+    Raises
+    ------
+    InvalidInputError
+        If there is no method of that name.
+    """
+    return _fits([method])[method](samples)
+
+
 def load_field(path: Path) -> list[PsfSample]:
     """Read measured PSFs from an npz; negative pixels are noise and become zero.
 

@@ -1,0 +1,103 @@
+"""`lensmodel reproduce` through the service: uploaded, calibrated and corrected as by any other user."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from app.client import Client, JobEndedError
+from app.errands import corrected, follow, planes_of
+from app.own_service import own_service
+from lensmodel.bench.reproduce import Answer, Case, Place
+from lensmodel.errors import NoSamplesError
+from lensmodel.psf import as_kernel
+from lensmodel.types import LensSettings, Planes
+
+log = logging.getLogger(__name__)
+
+_PATIENCE = 4 * 3600.0
+
+CODE = (Path(__file__).parent / "jobs",)
+"""Code of the service on which the figures depend."""
+
+
+class ServiceRoute:
+    """One lens in a running service.
+
+    Parameters
+    ----------
+    client : Client
+    work : Path
+        Folder for downloads; each is removed as soon as it has been read.
+    """
+
+    def __init__(self, client: Client, work: Path) -> None:
+        self._client, self._work = client, work
+        self._lens_id: str | None = None
+
+    def learn(self, photo: Path) -> str:
+        """Upload a photo and wait until the lens has learned from it; see `Route`."""
+        uploaded = self._client.upload(photo)
+        try:
+            follow(self._client, uploaded, log.info, patience=_PATIENCE)
+        except JobEndedError as error:
+            return str(error)
+        self._lens_id = self._client.photo(uploaded.id).lens_id
+        return ""
+
+    def answers(self, places: Sequence[Place], settings: LensSettings, size: int) -> list[Answer]:
+        """Ask for the PSFs at some places; see `Route`."""
+        lens_id, found = self._lens(), []
+        for place, channel in places:
+            psf = self._client.psf(
+                lens_id, r=place.r, phi=place.phi, aperture=settings.aperture, channel=channel, size=size
+            )
+            error = psf.support.predicted_error
+            found.append(Answer(as_kernel(psf.psf.data), np.nan if error is None else error))
+        return found
+
+    def corrected(self, photo: Path, method: str) -> Planes:
+        """Have a photo corrected that the lens does not learn from; see `Route`."""
+        uploaded = self._client.upload(photo, calibrate=False)
+        follow(self._client, uploaded, log.info)
+        path = corrected(
+            self._client,
+            uploaded,
+            self._work,
+            log.info,
+            output={"color_space": "camera-linear"},
+            method=method,
+            lens_id=self._lens(),
+        )
+        planes = planes_of(path)
+        path.unlink()
+        return planes
+
+    def _lens(self) -> str:
+        if self._lens_id is None:
+            raise NoSamplesError("no photo has counted yet: learn from one with fine detail in focus")
+        return self._lens_id
+
+
+class ServiceRoutes:
+    """Opens a service of its own for each case, so that no lens knows of another.
+
+    Its data stay in the case's folder: a run that was stopped goes on with the photos that are
+    there already.
+    """
+
+    def __init__(self, estimator: str) -> None:
+        self._settings = {"LENS_ESTIMATOR": estimator}
+
+    @contextmanager
+    def __call__(self, case: Case, folder: Path) -> Iterator[ServiceRoute]:
+        """Open the route of one case; see `OpenRoute`."""
+        log.info("starting a service for %s", case.title)
+        downloads = folder / "downloads"
+        downloads.mkdir(parents=True, exist_ok=True)
+        with own_service(folder / "service", folder / "service.log", self._settings) as client:
+            yield ServiceRoute(client, downloads)

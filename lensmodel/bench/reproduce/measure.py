@@ -1,0 +1,92 @@
+"""What is measured of a route, all against a truth that it never saw."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any, Final
+
+import numpy as np
+
+from lensmodel import quality
+from lensmodel.bench.model import asked_places
+from lensmodel.bench.reproduce.cases import Case
+from lensmodel.bench.reproduce.routes import Answer, Place
+from lensmodel.bench.reproduce.shots import Shots, guard_of
+from lensmodel.geometry import zone_of
+from lensmodel.psf import distance
+from lensmodel.simulate import edge_chart
+from lensmodel.types import CHANNELS, ZONES, Planes
+
+PSF_SIZE: Final = 55
+BORDER: Final = 8
+NEAR: Final = 1.5
+"""A predicted error within this factor of the true one counts as right."""
+
+
+def places() -> list[Place]:
+    """Where PSFs are asked for, in every channel: not where patches lie."""
+    return [(place, channel) for channel in CHANNELS for place in asked_places()]
+
+
+def psf_errors(answers: Sequence[Answer], case: Case) -> dict[str, Any]:
+    """Compare the answers at `places()` with the truth, after sub-pixel alignment.
+
+    Returns
+    -------
+    dict
+        `rel_l2`: median by channel and zone; `mtf_rmse` alike; `predicted_right`: share of places
+        where the model's own prediction of the relative L2 lies within a factor of 1.5.
+    """
+    truth = case.truth()
+    rel_l2: dict[str, dict[str, list[float]]] = {c: {z: [] for z in ZONES} for c in CHANNELS}
+    mtf: dict[str, dict[str, list[float]]] = {c: {z: [] for z in ZONES} for c in CHANNELS}
+    right = []
+    for (place, channel), answer in zip(places(), answers, strict=True):
+        found = distance(answer.kernel, truth.kernel_at(place, channel, PSF_SIZE))
+        rel_l2[channel][zone_of(place.r)].append(found.rel_l2)
+        mtf[channel][zone_of(place.r)].append(found.mtf_rmse)
+        ratio = answer.predicted_error / max(found.rel_l2, 1e-9)
+        right.append(1.0 / NEAR <= ratio <= NEAR)
+    return {
+        "rel_l2": _medians(rel_l2),
+        "mtf_rmse": _medians(mtf),
+        "predicted_right": float(np.mean(right)),
+    }
+
+
+def _medians(values: Mapping[str, Mapping[str, Sequence[float]]]) -> dict[str, dict[str, float]]:
+    return {c: {z: float(np.median(v)) for z, v in zones.items()} for c, zones in values.items()}
+
+
+def edges(chart: Planes, case: Case) -> dict[str, Any]:
+    """Measure the green slanted edges of the chart by zone; MTF50 in LP/PH.
+
+    The chart keeps the pixel box that it was rendered with, so that perfect means the MTF of one
+    pixel, not a constant 1, whose MTF50 would lie at infinity.
+    """
+    boxes = [edge.box for edge in edge_chart(case.camera.frame, guard=guard_of(case)).edges]
+    found = quality.by_zone(quality.measure_edges(chart[1], boxes))
+    return {zone: _in_lp_per_ph(asdict(row), case.height) for zone, row in found.items()}
+
+
+def _in_lp_per_ph(row: dict[str, Any], height: int) -> dict[str, Any]:
+    del row["zone"]
+    for name in ("mtf50", "tangential_mtf50", "sagittal_mtf50"):
+        row[name] = None if math.isnan(row[name]) else quality.lp_per_ph(row[name], height)
+    return row
+
+
+def psnr(photo: Planes, shots: Shots, case: Case) -> dict[str, float]:
+    """PSNR in dB of the sRGB-encoded, white-balanced picture by zone, each block at its best shift."""
+    gains = np.asarray(case.camera.white_balance, dtype=np.float32)[:, None, None]
+    found = quality.registered_zone_psnr(
+        photo * gains, shots.truth() * gains, case.camera.frame, srgb=True, border=BORDER
+    )
+    return {str(zone): value for zone, value in found.items()}
+
+
+def state(chart: Planes, photo: Planes, shots: Shots, case: Case) -> dict[str, Any]:
+    """Everything about one version of the chart and of the held-out photo."""
+    return {"edges": edges(chart, case), "psnr": psnr(photo, shots, case)}

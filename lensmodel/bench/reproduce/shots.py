@@ -1,0 +1,98 @@
+"""The photos of a case: DNG files of a Bayer sensor with noise, clipping and lateral colour."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+from lensmodel.bench.reproduce.cases import Case
+from lensmodel.bench.reproduce.scenes import centred_cut, frame_scene
+from lensmodel.simulate import edge_chart, photograph, write_photo
+from lensmodel.types import Planes, StepHook, ignore_step
+
+
+@dataclass(frozen=True, slots=True)
+class Shots:
+    """Files of the photos of one case.
+
+    Parameters
+    ----------
+    learn : tuple of Path
+        In the order in which the lens learns from them.
+    held_out, chart : Path
+        Never used for calibration.
+    sharp : Path
+        npy, the light that a perfect lens would have put on the sensor for `held_out`.
+    """
+
+    learn: tuple[Path, ...]
+    held_out: Path
+    chart: Path
+    sharp: Path
+
+    @classmethod
+    def of(cls, case: Case, folder: Path) -> Shots:
+        """Name the files of a case in a folder."""
+        return cls(
+            tuple(folder / f"photo-{i:02d}.dng" for i in range(case.photos[-1])),
+            folder / "held-out.dng",
+            folder / "chart.dng",
+            folder / "held-out-sharp.npy",
+        )
+
+    def truth(self) -> Planes:
+        """Load the truth behind `held_out`: camera colours, not white-balanced."""
+        planes: Planes = np.load(self.sharp, allow_pickle=False)
+        return planes
+
+
+def take(
+    case: Case, files: Sequence[Path], folder: Path, *, workers: int = 1, on_step: StepHook = ignore_step
+) -> Shots:
+    """Take the photos of a case that are not there yet."""
+    folder.mkdir(parents=True, exist_ok=True)
+    shots = Shots.of(case, folder)
+    targets = (*shots.learn, shots.held_out, shots.chart)
+    missing = [number for number, path in enumerate(targets) if not path.exists()]
+    if not missing:
+        return shots
+    if workers <= 1 or len(missing) == 1:
+        for done, number in enumerate(missing, start=1):
+            _take(case, tuple(files), folder, number)
+            on_step(done, len(missing))
+        return shots
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        jobs = [pool.submit(_take, case, tuple(files), folder, number) for number in missing]
+        for done, job in enumerate(as_completed(jobs), start=1):
+            job.result()
+            on_step(done, len(missing))
+    return shots
+
+
+def _take(case: Case, files: tuple[Path, ...], folder: Path, number: int) -> None:
+    shots, camera = Shots.of(case, folder), case.camera
+    frames = len(shots.learn) + 1  # the held-out photo is the last of them
+    if number < frames:
+        order = case.order(len(files) * case.layout.pieces)
+        scene = centred_cut(frame_scene(files, case.layout, order, number), case.height, case.width)
+    else:
+        scene = edge_chart(camera.frame, guard=guard_of(case)).scene
+    rng = np.random.default_rng([case.seed, number])
+    photo = photograph(scene, case.lens, case.settings, camera, rng)
+    if number == frames - 1:
+        part = shots.sharp.with_suffix(".part.npy")
+        np.save(part, photo.sharp, allow_pickle=False)
+        part.replace(shots.sharp)
+    # last, and whole or not at all: a photo that is there is complete
+    write_photo((*shots.learn, shots.held_out, shots.chart)[number], photo)
+
+
+def guard_of(case: Case) -> int:
+    """Pixels between an edge and the border of its tile of the chart: half a kernel if it fits."""
+    tile = min(case.height // 6, case.width // 8)
+    return min(27, (tile - 32) // 2)

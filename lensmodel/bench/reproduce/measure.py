@@ -15,7 +15,7 @@ from lensmodel.bench.reproduce.cases import Case
 from lensmodel.bench.reproduce.routes import Answer, Place
 from lensmodel.bench.reproduce.shots import Shots, guard_of
 from lensmodel.geometry import zone_of
-from lensmodel.psf import distance
+from lensmodel.psf import PsfField, distance
 from lensmodel.simulate import edge_chart
 from lensmodel.types import CHANNELS, ZONES, Planes
 
@@ -30,7 +30,7 @@ def places() -> list[Place]:
     return [(place, channel) for channel in CHANNELS for place in asked_places()]
 
 
-def psf_errors(answers: Sequence[Answer], case: Case) -> dict[str, Any]:
+def psf_errors(answers: Sequence[Answer], truth: PsfField) -> dict[str, Any]:
     """Compare the answers at `places()` with the truth, after sub-pixel alignment.
 
     Returns
@@ -39,7 +39,6 @@ def psf_errors(answers: Sequence[Answer], case: Case) -> dict[str, Any]:
         `rel_l2`: median by channel and zone; `mtf_rmse` alike; `predicted_right`: share of places
         where the model's own prediction of the relative L2 lies within a factor of 1.5.
     """
-    truth = case.truth()
     rel_l2: dict[str, dict[str, list[float]]] = {c: {z: [] for z in ZONES} for c in CHANNELS}
     mtf: dict[str, dict[str, list[float]]] = {c: {z: [] for z in ZONES} for c in CHANNELS}
     right = []

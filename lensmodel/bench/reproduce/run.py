@@ -31,6 +31,7 @@ from lensmodel.bench.reproduce.routes import OpenRoute, PointField, Route, corre
 from lensmodel.bench.reproduce.shots import Shots, take
 from lensmodel.errors import InvalidInputError
 from lensmodel.photo import develop
+from lensmodel.psf import PsfField
 from lensmodel.types import Planes
 
 log = logging.getLogger(__name__)
@@ -104,7 +105,9 @@ def run_reproduction(
     progress = _Progress(on_work, weights + (_FIGURES if with_figures else 0.0))
     results = []
     for case, key in zip(plan.cases, keys, strict=True):
-        job = _Job(case, plan, open_route, cache / key, shown, progress, workers or os.cpu_count() or 1)
+        job = _Job(
+            case, case.truth(), plan, open_route, cache / key, shown, progress, workers or os.cpu_count() or 1
+        )
         results.append(job.run())
     drawn: Unit = {}
     if with_figures:
@@ -157,9 +160,10 @@ def _weight(case: Case, plan: Reproduction) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Job:
-    """One case."""
+    """One case; `truth` keeps the kernels that were asked for, which are slow to make."""
 
     case: Case
+    truth: PsfField
     plan: Reproduction
     open_route: OpenRoute
     folder: Path
@@ -210,7 +214,7 @@ class _Job:
     def _measured_truth(self, shots: Shots) -> Unit:
         case = self.case
         chart, photo = develop(shots.chart), develop(shots.held_out)
-        field, point = case.truth(), PointField()
+        point = PointField()
         unit: Unit = {
             "before": measure.state(chart.planes, photo.planes, shots, case),
             "true": {},
@@ -220,8 +224,10 @@ class _Job:
             },
         }
         for method in self.plan.methods:
-            after = corrected_with(photo, field, method)
-            unit["true"][method] = measure.state(corrected_with(chart, field, method), after, shots, case)
+            after = corrected_with(photo, self.truth, method)
+            unit["true"][method] = measure.state(
+                corrected_with(chart, self.truth, method), after, shots, case
+            )
             unit["pictures"][f"true-{method}"] = self._picture(f"true-{method}", after)
         unit["control"] = measure.state(
             corrected_with(chart, point, CONTROL), corrected_with(photo, point, CONTROL), shots, case
@@ -256,9 +262,8 @@ class _Job:
             # no model: a user gets no correction, so the photos stay as they are
             before = _read(self.folder / "truth.json")["before"]
             return {**unit, "psf": None, "methods": dict.fromkeys(self.plan.methods, before)}
-        unit["psf"] = measure.psf_errors(
-            route.answers(measure.places(), case.settings, measure.PSF_SIZE), case
-        )
+        answers = route.answers(measure.places(), case.settings, measure.PSF_SIZE)
+        unit["psf"] = measure.psf_errors(answers, self.truth)
         unit["methods"] = {}
         for method in self.plan.methods:
             after = route.corrected(shots.held_out, method)

@@ -1,0 +1,400 @@
+"""`lensmodel.bench.reproduce`: planning, keys, tables, pages and resuming; one real run, slow."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from lensmodel.bench.pictures import as_shown, strip
+from lensmodel.bench.reproduce import (
+    Answer,
+    Case,
+    DirectRoute,
+    Place,
+    Reproduction,
+    measure,
+    planned,
+    run,
+    run_reproduction,
+    write_json,
+    write_page,
+)
+from lensmodel.bench.reproduce.cases import FIRST_SEED, fingerprint, key_of
+from lensmodel.bench.reproduce.scenes import centred_cut, frame_scene, layout_for, scene_files
+from lensmodel.bench.reproduce.shots import Shots
+from lensmodel.bench.reproduce.tables import kept, shares, summary
+from lensmodel.errors import InvalidInputError
+from lensmodel.simulate import LENS_KINDS
+from lensmodel.types import CHANNELS, ZONES, FieldPosition, LensSettings, Planes
+
+
+def case(**changes: Any) -> Case:
+    return replace(planned("quick").cases[0], height=480, width=640, **changes)
+
+
+def plan(*cases: Case) -> Reproduction:
+    return Reproduction(cases or (case(),), estimator="whittle", size="quick")
+
+
+def photographs(folder: Path, count: int) -> tuple[Path, ...]:
+    """Photographs of one colour each; every third stands upright."""
+    paths = []
+    for i in range(count):
+        size = (90, 150) if i % 3 == 0 else (150, 90)
+        path = folder / f"photo{i}.png"
+        Image.new("RGB", size, (10 * i + 5, 0, 0)).save(path)
+        paths.append(path)
+    return tuple(paths)
+
+
+# --- planning ----------------------------------------------------------------------------------
+
+
+def test_default_size_has_eight_kinds_of_lenses_on_reported_seeds() -> None:
+    cases = planned("default").cases
+    assert len({one.lens.model.split()[1] for one in cases}) == len(LENS_KINDS) == 8
+    assert min(one.seed for one in cases) >= FIRST_SEED
+
+
+def test_full_size_takes_every_lens_at_two_apertures() -> None:
+    cases = planned("full").cases
+    for seed in {one.seed for one in cases}:
+        apertures = {one.aperture for one in cases if one.seed == seed}
+        assert max(apertures) == pytest.approx(2 * min(apertures))
+    assert any(len({c.focal_mm for c in cases if c.seed == seed}) == 2 for seed in {c.seed for c in cases})
+
+
+def test_names_of_cases_are_unique() -> None:
+    names = [one.name for one in planned("full").cases]
+    assert len(set(names)) == len(names)
+
+
+def test_case_refuses_numbers_of_photos_that_do_not_ascend() -> None:
+    with pytest.raises(InvalidInputError, match="ascend"):
+        case(photos=(2, 1))
+
+
+# --- scenes ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("files", "frames"), [(3, 3), (6, 3), (13, 3), (3, 5)])
+def test_no_part_of_a_photograph_serves_twice(tmp_path: Path, files: int, frames: int) -> None:
+    paths = photographs(tmp_path, files)
+    layout = layout_for(paths, frames)
+    order = np.random.default_rng(0).permutation(files * layout.pieces).tolist()
+    seen = [frame_scene(paths, layout, order, i) for i in range(frames)]
+    rows, cols = layout.tile
+    assert all(scene.shape == (3, layout.rows * rows, layout.cols * cols) for scene in seen)
+    area = {level: sum(int((scene[0] == level).sum()) for scene in seen) for level in np.unique(seen)}
+    del area[0.0]  # green and blue
+    assert max(area.values()) <= rows * cols * layout.pieces
+
+
+def test_too_few_photographs_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match="need at least 4"):
+        layout_for(photographs(tmp_path, 3), 7)
+
+
+def test_only_the_test_half_of_a_folder_is_used(tmp_path: Path) -> None:
+    for name in ("s01_city_sunset", "s03_lake_mountains"):
+        Image.new("RGB", (64, 48)).save(tmp_path / f"{name}.png")
+    assert [path.stem for path in scene_files(tmp_path)] == ["s01_city_sunset"]
+
+
+def test_cut_leaves_an_even_margin_of_half_a_kernel_at_most() -> None:
+    scene = np.zeros((3, 161, 140), dtype=np.float32)
+    assert centred_cut(scene, 100, 100).shape == (3, 156, 140)
+    with pytest.raises(InvalidInputError, match="cover"):
+        centred_cut(scene, 100, 200)
+
+
+# --- keys --------------------------------------------------------------------------------------
+
+
+def test_key_changes_with_settings_route_and_code() -> None:
+    one = case()
+    keys = {
+        key_of(one, plan(), "a", "1"),
+        key_of(one, plan(), "a", "2"),
+        key_of(one, plan(), "b", "1"),
+        key_of(replace(one, aperture=2.8), plan(), "a", "1"),
+        key_of(one, replace(plan(), estimator="default"), "a", "1"),
+    }
+    assert len(keys) == 5
+    assert key_of(case(), plan(), "a", "1") in keys
+
+
+def test_fingerprint_follows_the_code_given_to_it(tmp_path: Path) -> None:
+    code = tmp_path / "code.py"
+    code.write_text("one = 1")
+    before = fingerprint([tmp_path])
+    assert fingerprint([tmp_path]) == before
+    code.write_text("one = 2")
+    assert fingerprint([tmp_path]) != before
+
+
+# --- tables and page, from made-up results -----------------------------------------------------
+
+
+def state(mtf50: float, psnr: float) -> dict[str, Any]:
+    edge = {
+        "edges": 2,
+        "mtf50": mtf50,
+        "tangential_mtf50": mtf50,
+        "sagittal_mtf50": None,
+        "mtf_max": 1.02,
+        "overshoot": 2.0,
+    }
+    return {"edges": {zone: dict(edge) for zone in ZONES}, "psnr": dict.fromkeys(ZONES, psnr)}
+
+
+def result(*lenses: tuple[float, float]) -> dict[str, Any]:
+    """Lenses given by MTF50 and PSNR after n = 1; 100 and 30 before, 200 and 34 with the true PSF."""
+    cases = [
+        {
+            "name": f"lens{i}",
+            "title": f"Lens <{i}>",
+            "kind": "coma",
+            "settings": {"seed": 1000 + i, "height": 480, "width": 640},
+            "frames": "each frame is a photograph",
+            "truth": {
+                "before": state(100, 30.0),
+                "true": {"paper": state(200, 34.0)},
+                "control": state(101, 30.5),
+                "pictures": {"before": "before.png", "scene": "scene.png", "true-paper": "true.png"},
+            },
+            "learned": {
+                "1": {
+                    "photos": 1,
+                    "counted": 1,
+                    "refused": [],
+                    "pictures": {"n1-paper": "after.png"},
+                    "psf": {
+                        "rel_l2": {c: dict.fromkeys(ZONES, 0.2) for c in "rgb"},
+                        "predicted_right": 0.75,
+                    },
+                    "methods": {"paper": state(mtf50, psnr)},
+                }
+            },
+        }
+        for i, (mtf50, psnr) in enumerate(lenses)
+    ]
+    return {
+        "route": "by the service",
+        "code": "abc",
+        "plan": {"size": "quick", "estimator": "whittle", "methods": ["paper"], "own_scenes": True},
+        "scenes": ["city"],
+        "cases": cases,
+        "figures": {},
+    }
+
+
+def test_share_is_of_the_gain_of_the_true_psf() -> None:
+    assert shares(result((160, 32.0))["cases"][0], 1, "paper") == dict.fromkeys(ZONES, pytest.approx(0.6))
+    assert kept(result((160, 33.0))["cases"][0], 1, "paper") == dict.fromkeys(ZONES, pytest.approx(0.75))
+
+
+def test_share_of_a_small_gain_is_left_out() -> None:
+    made = result((160, 32.0))
+    made["cases"][0]["truth"]["true"]["paper"] = state(104, 30.1)
+    assert shares(made["cases"][0], 1, "paper") == dict.fromkeys(ZONES)
+    assert kept(made["cases"][0], 1, "paper") == dict.fromkeys(ZONES)
+
+
+def test_summary_takes_the_mean_over_lenses_and_counts_zones_that_fell() -> None:
+    found = summary(result((160, 32.0), (120, 29.98), (120, 29.0)))
+    rows = {row["state"]: row for row in found["mtf"]["paper"]}
+    assert list(rows) == ["without correction", "n = 1", "true PSF"]
+    assert rows["n = 1"]["corner"]["mtf50"] == pytest.approx(400 / 3)
+    assert rows["n = 1"]["corner"]["sagittal_mtf50"] is None
+    assert found["worse"]["paper"]["1"] == {"zones": 9, "worse": 6, "clearly_worse": 3}
+    assert found["share"]["paper"]["1"]["mid"] == pytest.approx(1 / 3)
+    assert found["psnr_control"]["center"] == pytest.approx(0.5)
+
+
+def test_page_needs_nothing_from_outside_and_escapes_names(tmp_path: Path) -> None:
+    markdown, html = write_page(result((160, 32.0)), tmp_path)
+    text = html.read_text(encoding="utf-8")
+    assert not re.search(r"https?:|//[a-z]|<script|<link|@import", text)
+    sources = re.findall(r'src="([^"]+)"', text)
+    assert sources
+    assert all(source.startswith("pictures/") for source in sources)
+    assert "Lens &lt;0&gt;" in text
+    assert "| n = 1 | 160 |" in markdown.read_text(encoding="utf-8")
+
+
+def test_json_holds_results_and_summary(tmp_path: Path) -> None:
+    path = write_json(result((160, 32.0)), tmp_path / "all.json")
+    stored = json.loads(path.read_text(encoding="utf-8"))
+    assert stored["summary"]["share"]["paper"]["1"]["corner"] == pytest.approx(0.6)
+    assert stored["cases"][0]["learned"]["1"]["methods"]["paper"]["psnr"]["mid"] == 32.0
+
+
+def test_page_says_when_photos_did_not_count(tmp_path: Path) -> None:
+    made = result((100, 30.0))
+    unit = made["cases"][0]["learned"]["1"]
+    unit["refused"], unit["counted"], unit["psf"] = ["photo-00: flat"], 0, None
+    markdown, _ = write_page(made, tmp_path)
+    assert "photo-00: flat" in markdown.read_text(encoding="utf-8")
+
+
+# --- measuring ---------------------------------------------------------------------------------
+
+
+def test_true_kernels_have_no_error_and_a_cautious_prediction_is_wrong(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    few = [(FieldPosition(r, 0.5), c) for r in (0.1, 0.5, 0.9) for c in CHANNELS]
+    monkeypatch.setattr(measure, "places", lambda: few)
+    field = case().truth()
+    exact = [Answer(field.kernel_at(p, c, measure.PSF_SIZE), 0.1) for p, c in measure.places()]
+    found = measure.psf_errors(exact, field)
+    assert max(v for zones in found["rel_l2"].values() for v in zones.values()) < 1e-3
+    assert found["predicted_right"] == 0.0  # it expected an error of 0.1 where there was none
+
+
+def test_strip_shows_the_corners_of_a_picture() -> None:
+    planes = np.zeros((3, 80, 120), dtype=np.float32)
+    planes[0, :30, :30] = 1.0  # upper left
+    crops = strip(as_shown(planes), 20, gap=2)
+    assert crops.shape == (20, 108, 3)
+    assert (crops[:, 22:42, 0] == 255).all()
+    assert (crops[:, 44:64, 0] == 0).all()
+
+
+# --- running -----------------------------------------------------------------------------------
+
+
+class Nothing:
+    """A route that never learns anything; counts what it is asked."""
+
+    def __init__(self) -> None:
+        self.learned: list[str] = []
+
+    def learn(self, photo: Path) -> str:
+        self.learned.append(photo.stem)
+        return "too dark"
+
+    def answers(self, places: Sequence[Place], settings: LensSettings, size: int) -> list[Answer]:
+        raise AssertionError((places, settings, size))
+
+    def corrected(self, photo: Path, method: str) -> Planes:
+        raise AssertionError((photo, method))
+
+
+@pytest.fixture
+def quick_photos(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Photos and truth are made up, so that only the order of work is under test."""
+    taken: list[str] = []
+
+    def take(one: Case, files: Sequence[Path], folder: Path, **_: object) -> Shots:
+        taken.append(one.name)
+        folder.mkdir(parents=True, exist_ok=True)
+        return Shots.of(one, folder)
+
+    def truth(self: Any, shots: Shots) -> dict[str, Any]:
+        made: dict[str, Any] = result((160, 32.0))["cases"][0]["truth"]
+        return made
+
+    monkeypatch.setattr(run, "take", take)
+    monkeypatch.setattr(run._Job, "_measured_truth", truth)
+    return taken
+
+
+def reproduced(folder: Path, route: Nothing, chosen: Reproduction) -> dict[str, Any]:
+    told: list[tuple[float, float]] = []
+
+    @contextmanager
+    def opened(one: Case, work: Path) -> Iterator[Nothing]:
+        del one
+        work.mkdir(parents=True, exist_ok=True)
+        yield route
+
+    def on_work(words: str, done: float, total: float, *, fresh: bool) -> None:
+        del words, fresh
+        told.append((done, total))
+
+    made = run_reproduction(
+        chosen, opened, folder, route="test", workers=1, with_figures=False, on_work=on_work
+    )
+    assert told[-1][0] == pytest.approx(told[-1][1])  # all the work that was announced is over
+    return made
+
+
+def test_second_run_computes_nothing(tmp_path: Path, quick_photos: list[str]) -> None:
+    chosen = plan(case(photos=(1, 2)))
+    first = reproduced(tmp_path, Nothing(), chosen)
+    again = Nothing()
+    assert reproduced(tmp_path, again, chosen) == first
+    assert again.learned == []
+    assert len(quick_photos) == 1
+    assert not list(tmp_path.rglob("work"))
+
+
+def test_stopped_run_goes_on_where_it_was(tmp_path: Path, quick_photos: list[str]) -> None:
+    del quick_photos
+    chosen = plan(case(photos=(1, 2)))
+    first = reproduced(tmp_path, Nothing(), chosen)
+    path = next(tmp_path.rglob("learned-2.json"))
+    path.unlink()
+    assert reproduced(tmp_path, Nothing(), chosen) == first
+    assert path.exists()
+    assert not list(tmp_path.rglob("*.part"))
+
+
+def test_other_settings_are_computed_anew(tmp_path: Path, quick_photos: list[str]) -> None:
+    reproduced(tmp_path, Nothing(), plan(case(photos=(1,))))
+    reproduced(tmp_path, Nothing(), plan(case(photos=(1,), aperture=4.0)))
+    assert len(quick_photos) == 2
+
+
+def test_lens_that_learned_nothing_leaves_photos_as_they_are(tmp_path: Path, quick_photos: list[str]) -> None:
+    del quick_photos
+    made = reproduced(tmp_path, Nothing(), plan(case(photos=(1,))))
+    unit = made["cases"][0]["learned"]["1"]
+    assert unit["counted"] == 0
+    assert unit["methods"]["paper"] == made["cases"][0]["truth"]["before"]
+    assert unit["refused"] == ["photo-00: too dark"]
+
+
+def test_damaged_result_is_reported(tmp_path: Path, quick_photos: list[str]) -> None:
+    del quick_photos
+    chosen = plan(case(photos=(1,)))
+    reproduced(tmp_path, Nothing(), chosen)
+    next(tmp_path.rglob("learned-1.json")).write_text("{")
+    with pytest.raises(InvalidInputError, match="delete it"):
+        reproduced(tmp_path, Nothing(), chosen)
+
+
+def unheard(words: str, done: float, total: float, *, fresh: bool) -> None:
+    del words, done, total, fresh
+
+
+@pytest.mark.slow
+def test_lens_is_learned_and_corrected_from_end_to_end(tmp_path: Path) -> None:
+    one = case(photos=(1,))
+
+    @contextmanager
+    def opened(of: Case, folder: Path) -> Iterator[DirectRoute]:
+        del of
+        yield DirectRoute(folder / "models", "whittle", workers=1)
+
+    made = run_reproduction(plan(one), opened, tmp_path, route="in the library", workers=1, on_work=unheard)
+    truth, learned = made["cases"][0]["truth"], made["cases"][0]["learned"]["1"]
+    for zone in ("center", "corner"):
+        before, true = truth["before"], truth["true"]["standard"]
+        assert true["psnr"][zone] > before["psnr"][zone]
+        assert true["edges"][zone]["mtf50"] > before["edges"][zone]["mtf50"]
+        assert learned["methods"]["standard"]["edges"][zone]["mtf50"] > before["edges"][zone]["mtf50"]
+    _, html = write_page(made, tmp_path)
+    for source in re.findall(r'src="([^"]+)"', html.read_text(encoding="utf-8")):
+        assert (tmp_path / source).stat().st_size > 0

@@ -65,17 +65,17 @@ def predict(
     nugget : float
         Variance of a sample of vote 1.
     """
-    apart = _settings_gap(where, asked, scale)
+    apart = settings_gap(where, asked, scale)
     nearness = ((vectors - vector) ** 2).sum(axis=1) + apart
     nearness[votes <= 0] = np.inf
     few = min(_MOST, int((votes > 0).sum()))
     chosen = np.argpartition(nearness, few - 1)[:few]
     places, settings = vectors[chosen], where[chosen]
     between = np.sqrt(((places[:, None] - places[None]) ** 2).sum(axis=-1))
-    gaps = _settings_gap(settings[:, None, :], settings[None, :, :], scale)
-    covariance = _matern(between) * np.exp(-0.5 * gaps)
+    gaps = settings_gap(settings[:, None, :], settings[None, :, :], scale)
+    covariance = matern(between) * np.exp(-0.5 * gaps)
     covariance[np.diag_indices_from(covariance)] += nugget / np.maximum(votes[chosen], 1e-3)
-    towards = _matern(np.sqrt(((places - vector) ** 2).sum(axis=1))) * np.exp(-0.5 * apart[chosen])
+    towards = matern(np.sqrt(((places - vector) ** 2).sum(axis=1))) * np.exp(-0.5 * apart[chosen])
     solved = np.linalg.solve(covariance, np.stack([towards, np.ones(few)], axis=1))
     # far from every sample `towards` vanishes, and what is left is the mean
     weights = solved[:, 0] + solved[:, 1] * (1.0 - solved[:, 0].sum()) / solved[:, 1].sum()
@@ -98,8 +98,8 @@ def held_out_errors(
     values = np.asarray(rows, dtype=np.float64)
     norms = np.sqrt((values**2).sum(axis=1))
     between = np.sqrt(((vectors[:, None] - vectors[None]) ** 2).sum(axis=-1))
-    gaps = _settings_gap(where[:, None, :], where[None, :, :], scale)
-    covariance = _matern(between) * np.exp(-0.5 * gaps)
+    gaps = settings_gap(where[:, None, :], where[None, :, :], scale)
+    covariance = matern(between) * np.exp(-0.5 * gaps)
     best: tuple[float, float, NDArray[np.float64]] | None = None
     for nugget in NUGGETS:
         inverse = np.linalg.inv(covariance + np.diag(nugget / np.maximum(votes, 1e-3)))
@@ -125,14 +125,16 @@ def as_pixels(row: NDArray[np.float64], size: int) -> Kernel:
     return resized(np.maximum(row.reshape(side, side), 0.0), size)
 
 
-def _matern(distance: NDArray[np.float64]) -> NDArray[np.float64]:
+def matern(distance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Matern-3/2 covariance of a distance in half-diagonals."""
     scaled = np.sqrt(3.0) * distance
     return np.asarray((1.0 + scaled) * np.exp(-scaled))
 
 
-def _settings_gap(
+def settings_gap(
     where: NDArray[np.float64], asked: NDArray[np.float64], scale: NDArray[np.float64]
 ) -> NDArray[np.float64]:
+    """Squared distance of settings in bandwidths; unknown ones drop out."""
     total = np.zeros(np.broadcast_shapes(where.shape[:-1], asked.shape[:-1]))
     for column in _SETTINGS:
         values = where[..., column]

@@ -23,41 +23,29 @@ from numpy.typing import NDArray
 from lensmodel.errors import InvalidInputError, NoSamplesError
 from lensmodel.geometry import zone_of
 from lensmodel.psf import PsfField, PsfSample, as_kernel
-from lensmodel.regression import kriging, robust
+from lensmodel.regression import kriging
 from lensmodel.regression import variables as va
 from lensmodel.regression.answer import ModelSettings, PsfAnswer
-from lensmodel.regression.canonical import CanonicalGrid
 from lensmodel.regression.index import SampleIndex
+from lensmodel.regression.judgement import (
+    Judgement,
+    bandwidth,
+    grid_of,
+    judge,
+    pixel_store,
+    row_of,
+    with_votes,
+)
 from lensmodel.regression.robust import Flag
 from lensmodel.regression.smoothers import Neighbours, Smoother, smoothers
 from lensmodel.regression.store import KernelStore
+from lensmodel.regression.support import field_error, standard_error, support
 from lensmodel.regression.transport import WidthField
-from lensmodel.regression.validation import Choice, Held, choose
 from lensmodel.types import ZONES, Channel, FieldPosition, Kernel, LensSettings, Zone
 
-_CV_PHOTOS = 3
-_CV_SAMPLES = 300
-_JUDGED = 800
-_STRIDE = 3
-_ROTATIONAL = 10.0
 _INCREMENT = 0.05
 _DROPPED = 1e-3
-_FAR = 2.5
 _FEW = 8
-_UNKNOWN_ERROR = 0.5
-_TRANSPORT_ROOM = 1.35
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Judgement:
-    """What the samples say of each other: votes after robust weighting, held-out errors, flags."""
-
-    votes: NDArray[np.float64]
-    errors: NDArray[np.float64]
-    choice: Choice
-    flags: tuple[Flag, ...] = ()
-    nugget: float = 1.0  # of the image frame
-    image_errors: NDArray[np.float64] | None = None  # held out, of the image frame
 
 
 class LensModel:
@@ -72,7 +60,7 @@ class LensModel:
         settings: ModelSettings,
         widths: WidthField,
         store: KernelStore,
-        judgement: _Judgement,
+        judgement: Judgement,
         *,
         index: SampleIndex | None = None,
         prior: tuple[PsfField | LensModel, float] | None = None,
@@ -83,13 +71,13 @@ class LensModel:
         self.widths = widths
         self.prior = prior
         self._smoother: Smoother = smoothers.create(settings.method)
-        self._grid = _grid(samples, settings, self._smoother)
+        self._grid = grid_of(samples, settings, self._smoother)
         self._store, self._judgement, self._pixels = store, judgement, pixels
         self._vectors = np.array([kriging.field_vector(s.position) for s in samples])
         self._where = va.points(samples) if index is None else index.points
         self._photos, self._photo = np.unique([s.photo for s in samples], return_inverse=True)
         self._rule = va.bandwidths(self._where)
-        self.bandwidth = _bandwidth(self._rule, settings, judgement.choice)
+        self.bandwidth = bandwidth(self._rule, settings, judgement.choice)
         self._scale = va.scales(self.bandwidth)
         self._index = SampleIndex.of(self._where) if index is None else index
 
@@ -120,17 +108,17 @@ class LensModel:
         if not any(voting):
             raise NoSamplesError(f"none of the {len(kept)} samples may vote; include a photo again")
         smoother = smoothers.create(settings.method)
-        grid = _grid(kept, settings, smoother)
+        grid = grid_of(kept, settings, smoother)
         base = np.array([s.weight if ok else 0.0 for s, ok in zip(kept, voting, strict=True)])
-        widths = WidthField.fit(_with_votes(kept, base)) if smoother.transport else WidthField()
-        store = KernelStore(grid.side**2).extended((_row(grid, widths, s) for s in kept), len(kept))
-        pixels = _pixel_store(kept) if smoother.blend else None
-        judgement = _judge(kept, settings, grid, store, base, pixels)
+        widths = WidthField.fit(with_votes(kept, base)) if smoother.transport else WidthField()
+        store = KernelStore(grid.side**2).extended((row_of(grid, widths, s) for s in kept), len(kept))
+        pixels = pixel_store(kept) if smoother.blend else None
+        judgement = judge(kept, settings, grid, store, base, pixels)
         if smoother.transport and any(flag.sample is None for flag in judgement.flags):
             # a spoilt photo has bent the widths too: fit them again without its voice
-            widths = WidthField.fit(_with_votes(kept, judgement.votes))
-            store = KernelStore(grid.side**2).extended((_row(grid, widths, s) for s in kept), len(kept))
-            judgement = _judge(kept, settings, grid, store, base, pixels)
+            widths = WidthField.fit(with_votes(kept, judgement.votes))
+            store = KernelStore(grid.side**2).extended((row_of(grid, widths, s) for s in kept), len(kept))
+            judgement = judge(kept, settings, grid, store, base, pixels)
         return cls(kept, settings, widths, store, judgement, prior=prior, pixels=pixels)
 
     def added(self, samples: Sequence[PsfSample]) -> LensModel:
@@ -145,7 +133,7 @@ class LensModel:
         largest = max(s.kernel.shape[0] for s in new)
         if len(new) > _INCREMENT * len(self.samples) or largest > self._grid_source:
             return self.refitted((*self.samples, *new))
-        store = self._store.extended((_row(self._grid, self.widths, s) for s in new), len(new))
+        store = self._store.extended((row_of(self._grid, self.widths, s) for s in new), len(new))
         old = self._judgement
         votes = [0.0 if s.photo in self.settings.excluded else s.weight for s in new]
         judgement = replace(
@@ -241,7 +229,7 @@ class LensModel:
         positive /= positive.sum()
         per_photo = np.bincount(photos, positive)
         independent = 1.0 / float((per_photo**2).sum())
-        nearest, beyond = self._support(position, settings, rows)
+        nearest, beyond = support(self._where[rows], va.point(position, settings), self._rule)
         held_out = float(positive @ self._judgement.errors[rows] ** 2)
         in_image = 0.0
         if self._pixels is not None and self._judgement.image_errors is not None:
@@ -251,7 +239,7 @@ class LensModel:
                 (1.0 - in_image) * kernel + in_image * self._of_image_frame(position, settings, size)
             )
             held_out = (1.0 - in_image) * held_out + in_image * other
-        error = _field_error(held_out, found, mean, positive, independent)
+        error = field_error(held_out, found, mean, positive, independent)
         error *= 1.0 + 0.5 * max(nearest - 1.0, 0.0)
         share = 0.0
         if self.prior is not None:
@@ -267,7 +255,7 @@ class LensModel:
             nearest=nearest,
             prior_share=share,
             image_frame_share=in_image,
-            std=self._std(rows, positive, position, width, size) if std else None,
+            std=standard_error(self._grid, found, positive, position.phi, width, size) if std else None,
         )
 
     def weights(
@@ -351,21 +339,6 @@ class LensModel:
         )
         return kriging.as_pixels(row, size)
 
-    def _support(
-        self, position: FieldPosition, settings: LensSettings, rows: NDArray[np.intp]
-    ) -> tuple[float, tuple[str, ...]]:
-        asked = va.point(position, settings)
-        gaps = np.nan_to_num((self._where[rows] - asked) / va.scales(va.support(self._rule)), nan=0.0)
-        squared = gaps**2
-        nearest = int(squared.sum(axis=1).argmin())
-        beyond = {
-            name for name, value in zip(va.COLUMNS, np.abs(gaps).min(axis=0), strict=True) if value > _FAR
-        }
-        distance = math.sqrt(float(squared[nearest].sum()))
-        if not beyond and distance > _FAR:
-            beyond = {va.COLUMNS[int(squared[nearest].argmax())]}
-        return distance, tuple(sorted(beyond))
-
     def _blended(
         self, kernel: Kernel, gaps: NDArray[np.float64], position: FieldPosition, settings: LensSettings
     ) -> tuple[Kernel, float]:
@@ -376,24 +349,6 @@ class LensModel:
         source = prior.field(settings) if isinstance(prior, LensModel) else prior
         other = source.kernel_at(position, settings.channel, kernel.shape[0])
         return as_kernel((1.0 - share) * kernel + share * other), share
-
-    def _std(
-        self,
-        rows: NDArray[np.intp],
-        weight: NDArray[np.float64],
-        position: FieldPosition,
-        width: tuple[float, float],
-        size: int,
-    ) -> NDArray[np.float64]:
-        """Standard error of each pixel, sqrt(sum w^2 sum w (C - f)^2 / (1 - sum w^2))."""
-        found = self._store.rows[rows]
-        mean = weight.astype(np.float32) @ found
-        concentration = float((weight**2).sum())
-        if concentration > 1.0 - 1e-9:
-            return np.full((size, size), np.nan)  # a single sample says nothing of its own scatter
-        kernels = [self._grid.sampled(row - mean, position.phi, width, size) for row in found]
-        scatter = sum(w * k * k for w, k in zip(weight, kernels, strict=True))
-        return np.asarray(np.sqrt(scatter * concentration / (1.0 - concentration)), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -406,145 +361,3 @@ class ModelField:
     def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
         """Return the kernel of odd side `size` at a field position, in the image frame."""
         return self.model.query(position, self.settings.with_channel(channel), size).kernel
-
-
-def _field_error(
-    held_out: float,
-    rows: NDArray[np.float32],
-    mean: NDArray[np.floating],
-    weight: NDArray[np.float64],
-    independent: float,
-) -> float:
-    """Expected relative L2 of the mean, from held-out errors that contain the samples' own noise.
-
-    With m independent photos, bias b and noise s of a sample::
-
-        held out:  e^2 = b^2 + s^2 (1 + 1/m)        field:  b^2 + s^2 / m
-
-    s is taken from the scatter of the neighbours, which also differ in place; so b is not
-    taken below a third of e.
-    """
-    apart = rows - mean
-    norms = np.einsum("ij,ij->i", apart, apart)
-    power = max(float(mean @ mean), 1e-30)
-    scatter = float(weight @ norms) / power
-    noise = min(scatter / max(1.0 - float(weight @ weight), 0.1), held_out)
-    bias = max(held_out - noise * (1.0 + 1.0 / independent), held_out / 9.0)
-    return math.sqrt(bias + noise / independent)
-
-
-def _grid(samples: Sequence[PsfSample], settings: ModelSettings, smoother: Smoother) -> CanonicalGrid:
-    half = max(s.kernel.shape[0] for s in samples) // 2
-    room = _TRANSPORT_ROOM if smoother.transport else 1.0
-    return CanonicalGrid(math.ceil(half * room), settings.oversampling)
-
-
-def _pixel_store(samples: Sequence[PsfSample]) -> KernelStore:
-    side = max(s.kernel.shape[0] for s in samples)
-    return KernelStore(side * side).extended(kriging.pixel_rows(samples, side), len(samples))
-
-
-def _row(grid: CanonicalGrid, widths: WidthField, sample: PsfSample) -> NDArray[np.float32]:
-    scale = widths.at(sample.position, sample.settings)
-    return grid.coefficients(sample.kernel, sample.position.phi, scale)
-
-
-def _with_votes(samples: Sequence[PsfSample], votes: NDArray[np.float64]) -> list[PsfSample]:
-    return [s.with_weight(float(v)) for s, v in zip(samples, votes, strict=True) if v > 0]
-
-
-def _bandwidth(rule: dict[str, float], settings: ModelSettings, choice: Choice) -> dict[str, float]:
-    found = dict(rule)
-    found["r"] = settings.r or rule["r"] * choice.r
-    phi = rule["phi"] * choice.phi
-    if settings.rotational is not None:
-        phi = rule["phi"] ** (1.0 - settings.rotational) * _ROTATIONAL**settings.rotational
-    found["phi"] = settings.phi or phi
-    found["aperture_stops"] = settings.stops or rule["aperture_stops"]
-    return found
-
-
-def _judge(
-    samples: tuple[PsfSample, ...],
-    settings: ModelSettings,
-    grid: CanonicalGrid,
-    store: KernelStore,
-    base: NDArray[np.float64],
-    pixels: KernelStore | None,
-) -> _Judgement:
-    """Choose bandwidths by cross-validation, weigh robustly, note held-out errors."""
-    where = va.points(samples)
-    rule = va.bandwidths(where)
-    names, photo = np.unique([s.photo for s in samples], return_inverse=True)
-    voting = np.flatnonzero(base > 0)
-    several = len(np.unique(photo[voting])) >= 2
-    groups = photo if several else np.arange(len(samples))
-
-    def held(rows: NDArray[np.intp], votes: NDArray[np.float64]) -> Held:
-        side = len(range(0, grid.side, _STRIDE))
-        thin = store.rows[rows].reshape(len(rows), grid.side, grid.side)[:, ::_STRIDE, ::_STRIDE]
-        scale = va.scales(_bandwidth(rule, settings, Choice()))
-        return Held.of(thin.reshape(len(rows), -1), side, where[rows], scale, votes[rows], groups[rows])
-
-    green = voting[where[voting, 4] == where[voting[len(voting) // 2], 4]]
-    choice = Choice(mirror=settings.mirror or 0.0)
-    automatic = len(np.unique(photo[voting])) >= _CV_PHOTOS
-
-    def chosen(votes: NDArray[np.float64]) -> Choice:
-        if not automatic:
-            return choice
-        found = choose(
-            held(_thinned(green, _CV_SAMPLES), votes),
-            r=settings.r is None,
-            phi=settings.phi is None and settings.rotational is None,
-            mirror=settings.mirror is None,
-        )
-        return found if settings.mirror is None else replace(found, mirror=settings.mirror)
-
-    judged = _thinned(voting, _JUDGED)
-    votes, errors = base.copy(), np.full(len(samples), _UNKNOWN_ERROR)
-    if len(judged) < 2:
-        return _Judgement(votes, errors, choice)
-    choice = chosen(votes)
-    prepared = held(judged, base)
-    _, local = np.unique(photo[judged], return_inverse=True)
-    known = names[np.unique(photo[judged])]
-    by_sample, by_photo, found = robust.factors(
-        prepared, local, r=choice.r, phi=choice.phi, mirror=choice.mirror
-    )
-    flags: tuple[Flag, ...] = ()
-    if settings.robust and several:
-        own = {str(name): factor for name, factor in zip(known, by_photo, strict=True)}
-        votes = base * np.array([own.get(s.photo, 1.0) for s in samples])
-        votes[judged] *= by_sample
-        flags = robust.flags(
-            [samples[i] for i in judged], by_sample, by_photo, found, [str(n) for n in known]
-        )
-        flags = tuple(f if f.sample is None else replace(f, sample=int(judged[f.sample])) for f in flags)
-        if not (votes > 0).any():
-            votes, flags = base.copy(), ()
-        if flags:
-            choice = chosen(votes)
-    errors[:] = float(np.median(found))
-    errors[judged] = found
-    if pixels is None:
-        return _Judgement(votes, errors, choice, flags)
-    trusted = judged[votes[judged] > 0]
-    vectors = np.array([kriging.field_vector(samples[i].position) for i in trusted])
-    nugget, seen = kriging.held_out_errors(
-        pixels.rows[trusted],
-        vectors,
-        where[trusted],
-        votes[trusted],
-        va.scales(_bandwidth(rule, settings, choice)),
-        groups[trusted],
-    )
-    image_errors = np.full(len(samples), float(np.median(seen)))
-    image_errors[trusted] = seen
-    return _Judgement(votes, errors, choice, flags, nugget, image_errors)
-
-
-def _thinned(rows: NDArray[np.intp], most: int) -> NDArray[np.intp]:
-    if len(rows) <= most:
-        return rows
-    return rows[np.linspace(0, len(rows) - 1, most).round().astype(np.intp)]

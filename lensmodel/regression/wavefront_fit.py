@@ -22,7 +22,8 @@ _STARTS, _REFINED = 4, 2
 _BLUR_PX = 1.0
 _GUESSED = 0.1
 _LEAST_HALF, _HELD_LIGHT = 5, 0.98
-_MIN_SAMPLES = 12
+MIN_SAMPLES = 12
+"""Fewer samples make no wavefront."""
 
 
 def fit_wavefront(samples: Sequence[PsfSample], start: Wavefront | None = None) -> Wavefront | None:
@@ -45,7 +46,7 @@ def fit_wavefront(samples: Sequence[PsfSample], start: Wavefront | None = None) 
     At most 36 samples spread over field and settings take part: the unknowns are few.
     """
     kept = [s for s in samples if s.weight > 0]
-    if len(kept) < _MIN_SAMPLES:
+    if len(kept) < MIN_SAMPLES:
         return None
     apertures = [s.settings.aperture for s in kept if s.settings.aperture is not None]
     widest = min(apertures) if apertures else _USUAL_F

@@ -1,6 +1,32 @@
 """What a lens model says in words, numbers and pictures, and how to take it elsewhere."""
 
 from lensmodel.report.advice import Advice, Wish, advice
+from lensmodel.report.decentring import Asymmetry, Decentring, decentring
+from lensmodel.report.lens_report import (
+    ApertureRow,
+    Curve,
+    FieldShape,
+    LensReport,
+    MapPoint,
+    ReportSettings,
+    lens_report,
+)
 from lensmodel.report.places import direction_in_words, place_in_words
 
-__all__ = ["Advice", "Wish", "advice", "direction_in_words", "place_in_words"]
+__all__ = [
+    "Advice",
+    "ApertureRow",
+    "Asymmetry",
+    "Curve",
+    "Decentring",
+    "FieldShape",
+    "LensReport",
+    "MapPoint",
+    "ReportSettings",
+    "Wish",
+    "advice",
+    "decentring",
+    "direction_in_words",
+    "lens_report",
+    "place_in_words",
+]

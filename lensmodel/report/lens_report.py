@@ -1,0 +1,382 @@
+"""The report on one copy of a lens: sharpness over the field, best aperture, centring.
+
+Everything follows from the model and its samples. Frequencies are cycles/pixel; where the samples
+know their pixel pitch, the curves are drawn at 10 and 30 line pairs per millimetre, as lens tests are.
+Tangential is the contrast along u (of lines across the radius), sagittal along v.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.errors import InvalidInputError
+from lensmodel.psf import second_moments
+from lensmodel.quality import mtf_from_kernel, tangential_sagittal_mtf50
+from lensmodel.regression import LensModel
+from lensmodel.report.decentring import Decentring, decentring
+from lensmodel.report.places import DEFAULT_ASPECT, grid, ring
+from lensmodel.types import ZONES, FieldPosition, Kernel, LensSettings, Zone
+
+LINE_PAIRS_MM: Final = (10.0, 30.0)
+FALLBACK_FREQUENCIES: Final = (0.05, 0.15)
+"""Cycles/pixel of the curves where no pixel pitch is known: 10 and 30 lp/mm at 5 micrometres."""
+
+_RADII: Final = tuple(float(r) for r in np.linspace(0.0, 0.95, 11).round(4))
+_RING: Final = 3
+_MOST_APERTURES: Final = 12
+_ZONE_RADIUS: Final[dict[Zone, float]] = {"center": 0.15, "mid": 0.5, "corner": 0.88}
+_EVEN_PX: Final = 0.1  # widths along u and v that differ by less count as alike
+
+
+@dataclass(frozen=True, slots=True)
+class ReportSettings:
+    """What a report looks at.
+
+    Parameters
+    ----------
+    rows, cols : int
+        Cells of the map.
+    aspect : float
+        Width over height of the picture.
+    size : int
+        Odd side of the kernels, pixels.
+    frequencies : tuple of float
+        Of the curves, cycles/pixel; empty: 10 and 30 lp/mm by the samples' pixel pitch, or 0.05 and 0.15.
+    """
+
+    rows: int = 7
+    cols: int = 11
+    aspect: float = DEFAULT_ASPECT
+    size: int = 31
+    frequencies: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not 3 <= self.size <= 255 or self.size % 2 == 0:
+            raise InvalidInputError(f"size must be odd and lie in 3..255, got {self.size}")
+        if any(not 0.0 < f <= 0.5 for f in self.frequencies):
+            raise InvalidInputError(f"frequencies must lie in 0..0.5 cycles/pixel, got {self.frequencies}")
+
+
+@dataclass(frozen=True, slots=True)
+class MapPoint:
+    """Sharpness at one place; MTF50 in cycles/pixel."""
+
+    position: FieldPosition
+    tangential: float
+    sagittal: float
+    predicted_error: float
+    effective_samples: float
+    extrapolated: bool
+
+    @property
+    def mean(self) -> float:
+        """Mean of both MTF50."""
+        return (self.tangential + self.sagittal) / 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """Contrast at one frequency over the radius.
+
+    Parameters
+    ----------
+    frequency : float
+        Cycles/pixel.
+    lp_mm : float or None
+        The same in line pairs per millimetre, where the pixel pitch is known.
+    tangential, sagittal : tuple of float
+        Mean over the angles that lie on the picture, one value for each radius of the report.
+    tangential_spread, sagittal_spread : tuple of float
+        Standard deviation over the angles: zero in a centred lens.
+    """
+
+    frequency: float
+    lp_mm: float | None
+    tangential: tuple[float, ...]
+    sagittal: tuple[float, ...]
+    tangential_spread: tuple[float, ...]
+    sagittal_spread: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class FieldShape:
+    """How blur along u and along v part over the radius, the mark of astigmatism and curved fields.
+
+    Parameters
+    ----------
+    along_u, along_v : tuple of float
+        Root mean square widths in pixels, one for each radius of the report, mean over angles.
+    difference : tuple of float
+        along_u - along_v: positive where points are drawn out radially.
+    text : str
+        The same as one sentence.
+
+    Notes
+    -----
+    Two foci that part with the field (Welford, "Aberrations of Optical Systems", 1986, sec. 8.3) show
+    as widths that part. How far each focal surface lies from the sensor cannot be told from photos
+    of one focus; a curved but stigmatic field shows as both widths growing alike.
+    """
+
+    along_u: tuple[float, ...]
+    along_v: tuple[float, ...]
+    difference: tuple[float, ...]
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class ApertureRow:
+    """MTF50 in cycles/pixel by zone at one aperture; `whole` weighs the zones by their area."""
+
+    aperture: float
+    center: float
+    mid: float
+    corner: float
+    whole: float
+
+
+@dataclass(frozen=True, slots=True)
+class LensReport:
+    """What a model says of its lens, at some settings.
+
+    Parameters
+    ----------
+    settings : LensSettings
+    photos, samples : int
+        Behind the model, of all settings.
+    pixel_pitch_um : float or None
+        Of the samples, where they agree.
+    aspect : float
+        Width over height of the map.
+    rows, cols : int
+    field : tuple of MapPoint
+        rows x cols places, row by row from the top left.
+    radii : tuple of float
+        Of the curves and the field's shape.
+    curves : tuple of Curve
+    shape : FieldShape
+    apertures : tuple of ApertureRow
+        One for each aperture that a photo had; empty where none is known.
+    best_aperture : mapping of str to float
+        f-number of the largest MTF50 for "center", "mid", "corner" and "whole"; empty with fewer
+        than two apertures.
+    decentring : Decentring
+    extrapolated_share : float
+        Share of the map for which no sample is near, 0..1.
+    summary : tuple of str
+        The report in sentences.
+    """
+
+    settings: LensSettings
+    photos: int
+    samples: int
+    pixel_pitch_um: float | None
+    aspect: float
+    rows: int
+    cols: int
+    field: tuple[MapPoint, ...]
+    radii: tuple[float, ...]
+    curves: tuple[Curve, ...]
+    shape: FieldShape
+    apertures: tuple[ApertureRow, ...]
+    best_aperture: dict[str, float]
+    decentring: Decentring
+    extrapolated_share: float
+    summary: tuple[str, ...]
+
+
+def lens_report(
+    model: LensModel, settings: LensSettings | None = None, options: ReportSettings | None = None
+) -> LensReport:
+    """Report on a lens at some settings.
+
+    Parameters
+    ----------
+    model : LensModel
+    settings : LensSettings, optional
+        Default: the widest aperture that a photo had, where faults show most; green.
+    options : ReportSettings, optional
+
+    Notes
+    -----
+    About 400 questions to the model and as many again for each eight apertures: a second or two.
+    """
+    settings = widest(model) if settings is None else settings
+    options = options or ReportSettings()
+    field = tuple(
+        map_point(model, place, settings, options.size)
+        for place in grid(options.rows, options.cols, options.aspect)
+    )
+    pitch = _pitch(model)
+    rings = [
+        [(p, model.query(p, settings, options.size).kernel) for p in ring(r, _RING, options.aspect)]
+        for r in _RADII
+    ]
+    shape = _shape(rings)
+    rows = tuple(_aperture_row(model, settings, n, options) for n in apertures(model))
+    best = {} if len(rows) < 2 else {zone: _best(rows, zone) for zone in (*ZONES, "whole")}
+    centring = decentring(model, settings)
+    unseen = sum(point.extrapolated for point in field) / len(field)
+    return LensReport(
+        settings=settings,
+        photos=len({s.photo for s in model.samples}),
+        samples=len(model.samples),
+        pixel_pitch_um=pitch,
+        aspect=options.aspect,
+        rows=options.rows,
+        cols=options.cols,
+        field=field,
+        radii=_RADII,
+        curves=tuple(_curve(rings, f, lp) for f, lp in _frequencies(options, pitch)),
+        shape=shape,
+        apertures=rows,
+        best_aperture=best,
+        decentring=centring,
+        extrapolated_share=unseen,
+        summary=_summary(field, shape, best, centring, unseen),
+    )
+
+
+def apertures(model: LensModel) -> tuple[float, ...]:
+    """The f-numbers that photos had, ascending; the twelve with most samples."""
+    found = [s.settings.aperture for s in model.samples if s.settings.aperture is not None]
+    ranked = sorted(set(found), key=lambda n: (-found.count(n), n))
+    return tuple(sorted(ranked[:_MOST_APERTURES]))
+
+
+def widest(model: LensModel) -> LensSettings:
+    """The widest aperture that a photo had, green; focal length and distance as unknown."""
+    known = apertures(model)
+    return LensSettings(aperture=known[0] if known else None)
+
+
+def map_point(model: LensModel, place: FieldPosition, settings: LensSettings, size: int) -> MapPoint:
+    """Sharpness at one place, with the evidence behind it."""
+    answer = model.query(place, settings, size)
+    tangential, sagittal = tangential_sagittal_mtf50(answer.kernel, place.phi)
+    return MapPoint(
+        place, tangential, sagittal, answer.predicted_error, answer.effective_samples, answer.extrapolated
+    )
+
+
+def widths_along(kernel: Kernel, phi: float) -> tuple[float, float]:
+    """Root mean square widths along u and along v of a kernel at field angle `phi`, pixels.
+
+    The variance along a unit vector a is a' M a, with M the second moments and u = (-sin, cos) as
+    (row, col).
+    """
+    moments = second_moments(kernel)
+    u = np.array([-math.sin(phi), math.cos(phi)])
+    v = np.array([-math.cos(phi), -math.sin(phi)])
+    return math.sqrt(max(float(u @ moments @ u), 0.0)), math.sqrt(max(float(v @ moments @ v), 0.0))
+
+
+def _pitch(model: LensModel) -> float | None:
+    known = {s.pixel_pitch_um for s in model.samples}
+    return next(iter(known)) if len(known) == 1 else None
+
+
+def _frequencies(options: ReportSettings, pitch_um: float | None) -> list[tuple[float, float | None]]:
+    """Cycles/pixel and lp/mm of the curves, only those below the Nyquist frequency of the sensor."""
+    if options.frequencies or pitch_um is None:
+        chosen = options.frequencies or FALLBACK_FREQUENCIES
+        return [(f, None if pitch_um is None else f * 1000.0 / pitch_um) for f in chosen]
+    pairs = [(lp * pitch_um / 1000.0, lp) for lp in LINE_PAIRS_MM]
+    return [(f, lp) for f, lp in pairs if f <= 0.5]
+
+
+_Ring = list[tuple[FieldPosition, Kernel]]
+
+
+def _curve(rings: list[_Ring], frequency: float, lp_mm: float | None) -> Curve:
+    def contrast(turn: float) -> list[NDArray[np.float64]]:
+        return [
+            np.array([mtf_from_kernel(k, p.phi + turn, [frequency])[0] for p, k in places])
+            for places in rings
+        ]
+
+    tangential, sagittal = contrast(0.0), contrast(math.pi / 2.0)
+    if len(rings[0]) == 1:
+        # u has no direction at the centre: both are the mean over all, as they are just beside it
+        both = np.concatenate([tangential[0], sagittal[0]])
+        tangential[0] = sagittal[0] = np.array([both.mean()])
+    return Curve(
+        frequency,
+        lp_mm,
+        tuple(float(c.mean()) for c in tangential),
+        tuple(float(c.mean()) for c in sagittal),
+        tuple(float(c.std()) for c in tangential),
+        tuple(float(c.std()) for c in sagittal),
+    )
+
+
+def _shape(rings: list[_Ring]) -> FieldShape:
+    along_u, along_v = [], []
+    for places in rings:
+        squared = np.mean([np.square(widths_along(k, p.phi)) for p, k in places], axis=0)
+        if len(places) == 1:
+            squared[:] = squared.mean()  # u has no direction at the centre
+        along_u.append(float(math.sqrt(squared[0])))
+        along_v.append(float(math.sqrt(squared[1])))
+    apart = tuple(u - v for u, v in zip(along_u, along_v, strict=True))
+    largest = max(range(len(apart)), key=lambda i: abs(apart[i]))
+    grown = (along_u[-1] + along_v[-1]) / (along_u[0] + along_v[0])
+    growth = f"the blur grows to {grown:.1f} times its width at the center towards the corners"
+    if abs(apart[largest]) < _EVEN_PX:
+        text = f"points stay round over the field; {growth}"
+    else:
+        way = "radially" if apart[largest] > 0 else "around the center"
+        text = (
+            f"points are drawn out {way}, most at r = {_RADII[largest]:.2f} by "
+            f"{abs(apart[largest]):.2f} px; {growth}"
+        )
+    return FieldShape(tuple(along_u), tuple(along_v), apart, text)
+
+
+def _aperture_row(
+    model: LensModel, settings: LensSettings, aperture: float, options: ReportSettings
+) -> ApertureRow:
+    asked = replace(settings, aperture=aperture)
+
+    def sharpness(r: float) -> float:
+        return float(
+            np.mean([map_point(model, p, asked, options.size).mean for p in ring(r, 1, options.aspect)])
+        )
+
+    found = {zone: sharpness(r) for zone, r in _ZONE_RADIUS.items()}
+    # shares of a 3:2 picture's area: r < 0.3, between, r > 0.75
+    whole = 0.15 * found["center"] + 0.65 * found["mid"] + 0.2 * found["corner"]
+    return ApertureRow(aperture, found["center"], found["mid"], found["corner"], whole)
+
+
+def _best(rows: tuple[ApertureRow, ...], zone: str) -> float:
+    return max(rows, key=lambda row: (getattr(row, zone), -row.aperture)).aperture
+
+
+def _summary(
+    field: tuple[MapPoint, ...],
+    shape: FieldShape,
+    best: dict[str, float],
+    centring: Decentring,
+    unseen: float,
+) -> tuple[str, ...]:
+    sharpest = max(field, key=lambda point: point.mean)
+    softest = min(field, key=lambda point: point.mean)
+    lines = [
+        f"MTF50 lies between {softest.mean:.3f} and {sharpest.mean:.3f} cycles/px over the picture",
+        shape.text,
+        centring.text,
+    ]
+    if best:
+        lines.append(
+            f"sharpest at f/{best['center']:g} in the center, at f/{best['corner']:g} in the corners, "
+            f"at f/{best['whole']:g} over the whole picture"
+        )
+    if unseen > 0:
+        lines.append(f"no photo shows {100.0 * unseen:.0f} % of the picture at these settings: guessed there")
+    return tuple(lines)

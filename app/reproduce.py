@@ -54,7 +54,13 @@ class ServiceRoute:
         lens_id, found = self._lens(), []
         for place, channel in places:
             psf = self._client.psf(
-                lens_id, r=place.r, phi=place.phi, aperture=settings.aperture, channel=channel, size=size
+                lens_id,
+                r=place.r,
+                phi=place.phi,
+                aperture=settings.aperture,
+                focal_length_mm=settings.focal_mm,
+                channel=channel,
+                size=size,
             )
             error = psf.support.predicted_error
             found.append(Answer(as_kernel(psf.psf.data), np.nan if error is None else error))

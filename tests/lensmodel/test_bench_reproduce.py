@@ -192,7 +192,8 @@ def result(*lenses: tuple[float, float]) -> dict[str, Any]:
         "route": "by the service",
         "code": "abc",
         "plan": {"size": "quick", "estimator": "whittle", "methods": ["paper"], "own_scenes": True},
-        "scenes": ["city"],
+        "scenes": ["city", "lake"],
+        "developed_on": ["lake"],
         "cases": cases,
         "figures": {},
     }
@@ -229,6 +230,7 @@ def test_page_needs_nothing_from_outside_and_escapes_names(tmp_path: Path) -> No
     assert sources
     assert all(source.startswith("pictures/") for source in sources)
     assert "Lens &lt;0&gt;" in text
+    assert "developed on 1 of them" in text
     assert "| n = 1 | 160 |" in markdown.read_text(encoding="utf-8")
 
 

@@ -102,22 +102,24 @@ def _conditions(result: Mapping[str, Any]) -> str:
     seeds = sorted({case["settings"]["seed"] for case in cases})
     frames = sorted({(c["settings"]["width"], c["settings"]["height"]) for c in cases})
     sizes = ", ".join(f"{w} x {h} ({w * h / 1e6:.1f} MP)" for w, h in frames)
-    scenes = (
-        "The scenes are the library's own five photographs, two of which belong to the half on which "
-        "methods were developed"
-        if plan["own_scenes"]
-        else f"The scenes are {len(result['scenes'])} photographs on which nothing was developed"
-    )
+    whose = "the library's own" if plan["own_scenes"] else "given from outside"
+    seen = result["developed_on"]
+    unseen = f"methods were developed on {len(seen)} of them" if seen else "nothing was developed on them"
+    scenes = f"The scenes are {len(result['scenes'])} photographs, {whose}; {unseen}"
     made = "; ".join(sorted({c["frames"] for c in cases}))
     return (
-        f"Size {plan['size']}: {len(cases)} simulated lenses at one setting each, seeds {seeds[0]} to "
-        f"{seeds[-1]}; no parameter was chosen on seeds from 1000 on. {scenes}; {made}; no part of any "
+        f"Size {plan['size']}: {len(cases)} simulated lenses, each at one setting, seeds "
+        f"{_listed(seeds)}; no parameter was chosen on seeds from 1000 on. {scenes}; {made}; no part of any "
         f"photograph serves twice for one lens. Frames of {sizes}. The photos are Bayer DNG files of a "
         "14-bit sensor at base ISO with shot and read noise, clipping and lateral colour. "
         f"Calibrated and corrected {result['route']}, estimator {plan['estimator']}; "
         "the true PSF and the control go through the same correction in the library. "
         f"Code {result['code']}."
     )
+
+
+def _listed(seeds: Sequence[int]) -> str:
+    return ", ".join(str(seed) for seed in seeds)
 
 
 def _table1(page: _Page, found: Mapping[str, Any]) -> None:

@@ -25,6 +25,7 @@ from typing import Any, Protocol
 from PIL import Image
 
 from lensmodel.bench import pictures
+from lensmodel.bench.cases import photo_half
 from lensmodel.bench.reproduce import figures, measure
 from lensmodel.bench.reproduce.cases import Case, Reproduction, fingerprint, key_of
 from lensmodel.bench.reproduce.routes import OpenRoute, PointField, Route, corrected_with
@@ -125,6 +126,7 @@ def run_reproduction(
             "own_scenes": plan.scenes is None,
         },
         "scenes": [path.stem for path in files],
+        "developed_on": [path.stem for path in files if photo_half(path.stem) == "dev"],
         "cases": results,
         "figures": drawn,
     }

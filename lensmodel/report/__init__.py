@@ -2,6 +2,7 @@
 
 from lensmodel.report.advice import Advice, Wish, advice
 from lensmodel.report.decentring import Asymmetry, Decentring, decentring
+from lensmodel.report.exporters import Exporter, PsfGrid, export, exporters, psf_grid
 from lensmodel.report.lens_report import (
     ApertureRow,
     Curve,
@@ -19,14 +20,19 @@ __all__ = [
     "Asymmetry",
     "Curve",
     "Decentring",
+    "Exporter",
     "FieldShape",
     "LensReport",
     "MapPoint",
+    "PsfGrid",
     "ReportSettings",
     "Wish",
     "advice",
     "decentring",
     "direction_in_words",
+    "export",
+    "exporters",
     "lens_report",
     "place_in_words",
+    "psf_grid",
 ]

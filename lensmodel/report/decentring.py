@@ -145,7 +145,7 @@ def decentring(model: LensModel, settings: LensSettings) -> Decentring:
         third = np.array([_third_moment(samples[i]) for i in inner])
         coma = _asymmetry(_constant(h[inner], third, weight[inner]), groups[inner], 1.0)
     beyond = {zone: found.amount for zone, found in zones.items() if found.significant}
-    part = max(beyond, key=lambda zone: beyond[zone]) if beyond else None
+    part = max(beyond.items(), key=lambda item: item[1])[0] if beyond else None
     verdict, text = _verdict(softer, coma, photos)
     if verdict == "centred":
         part = None

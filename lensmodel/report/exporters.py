@@ -1,0 +1,341 @@
+"""PSFs and MTF in the formats of other programs.
+
+All kernels are the image of a point in sensor orientation, row 0 at the top, sum 1, centre of mass on
+the middle pixel: what a program convolves with to blur, and is to be given to undo it.
+"""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import io
+import json
+import math
+import secrets
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final, Protocol
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image
+
+from lensmodel.errors import InvalidInputError
+from lensmodel.quality import mtf_from_kernel, tangential_sagittal_mtf50
+from lensmodel.registry import Registry
+from lensmodel.regression import LensModel
+from lensmodel.report.places import DEFAULT_ASPECT, grid
+from lensmodel.types import FieldPosition, LensSettings
+
+FREQUENCIES: Final = tuple(round(0.05 * i, 2) for i in range(1, 11))
+"""Cycles/pixel of the MTF table, up to the Nyquist frequency."""
+
+_MOST_BYTES: Final = 1 << 29
+_GAP: Final = 2
+_ABOUT: Final = "point spread functions by lensmodel; row 0 at the top, each sums to 1"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PsfGrid:
+    """Kernels at a grid of places, or at a single one.
+
+    Parameters
+    ----------
+    kernels : ndarray of float32, shape (rows * cols, k, k)
+        Row by row from the top left.
+    positions : tuple of FieldPosition
+    rows, cols : int
+    settings : LensSettings
+    predicted_error : tuple of float
+        Expected relative L2 of each kernel.
+    """
+
+    kernels: NDArray[np.float32]
+    positions: tuple[FieldPosition, ...]
+    rows: int
+    cols: int
+    settings: LensSettings
+    predicted_error: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        n = len(self.positions)
+        if self.kernels.ndim != 3 or not self.kernels.shape[0] == n == self.rows * self.cols:
+            raise InvalidInputError(
+                f"{self.rows} x {self.cols} places need as many kernels, got shape {self.kernels.shape}"
+            )
+        if len(self.predicted_error) != n:
+            raise InvalidInputError(f"{n} kernels need as many errors, got {len(self.predicted_error)}")
+
+
+def psf_grid(
+    model: LensModel,
+    settings: LensSettings,
+    *,
+    rows: int = 5,
+    cols: int = 7,
+    size: int = 31,
+    aspect: float = DEFAULT_ASPECT,
+    at: FieldPosition | None = None,
+) -> PsfGrid:
+    """Ask a model for the kernels of a grid of places.
+
+    Parameters
+    ----------
+    model : LensModel
+    settings : LensSettings
+    rows, cols : int
+        Cells of the picture; a kernel is that of its cell's centre.
+    size : int
+        Odd side in pixels.
+    aspect : float
+        Width over height of the picture.
+    at : FieldPosition, optional
+        A single place instead of the grid.
+
+    Raises
+    ------
+    InvalidInputError
+        If that would take more than 512 MiB.
+    """
+    places = grid(rows, cols, aspect) if at is None else (at,)
+    if at is not None:
+        rows = cols = 1
+    if size < 1 or 4 * len(places) * size * size > _MOST_BYTES:
+        raise InvalidInputError(
+            f"{rows} x {cols} kernels of side {size} are out of range; "
+            f"ask for at most {_MOST_BYTES >> 20} MiB"
+        )
+    answers = [model.query(place, settings, size) for place in places]
+    kernels = np.stack([answer.kernel for answer in answers]).astype(np.float32)
+    return PsfGrid(kernels, places, rows, cols, settings, tuple(a.predicted_error for a in answers))
+
+
+class Exporter(Protocol):
+    """One format."""
+
+    @property
+    def suffix(self) -> str:
+        """How names of such files end, with the dot."""
+
+    def encode(self, psfs: PsfGrid) -> bytes:
+        """Return the content of the file."""
+
+
+@dataclass(frozen=True, slots=True)
+class TiffStack:
+    """32-bit float TIFF, a page for each place, as ImageJ opens it; a single place is a plain image."""
+
+    suffix: str = ".tif"
+
+    def encode(self, psfs: PsfGrid) -> bytes:
+        """Return the content of the file; the description of the first page is JSON."""
+        out = io.BytesIO()
+        with tifffile.TiffWriter(out) as writer:
+            for i, kernel in enumerate(psfs.kernels):
+                about = {"about": _ABOUT, **document(psfs, kernels=False)} if i == 0 else None
+                writer.write(
+                    kernel,
+                    photometric="minisblack",
+                    description=None if about is None else json.dumps(about),
+                    metadata=None,
+                    contiguous=False,
+                )
+        return out.getvalue()
+
+
+@dataclass(frozen=True, slots=True)
+class Fits:
+    """FITS, 32-bit float: a cube (place, row, col), or an image for a single place, as Siril loads it.
+
+    Notes
+    -----
+    Rows are stored from the bottom, as is the custom of the format, and ROWORDER says so. The
+    extension POSITIONS lists r, phi (radians, counter-clockwise from the right) and the expected error.
+    Source: "Definition of the Flexible Image Transport System", version 4.0, 2018, sec. 3.3 and 7.3.
+    """
+
+    suffix: str = ".fits"
+
+    def encode(self, psfs: PsfGrid) -> bytes:
+        """Return the content of the file.
+
+        Raises
+        ------
+        InvalidInputError
+            If astropy is not installed.
+        """
+        fits = _astropy_fits()
+        cube = psfs.kernels[:, ::-1, :]
+        primary = fits.PrimaryHDU(np.ascontiguousarray(cube[0] if len(cube) == 1 else cube))
+        header = primary.header
+        header["ROWORDER"] = ("BOTTOM-UP", "first row stored is the bottom one")
+        header["GRIDROWS"], header["GRIDCOLS"] = psfs.rows, psfs.cols
+        header["FILTER"] = (psfs.settings.channel, "colour channel")
+        if psfs.settings.aperture is not None:
+            header["FNUMBER"] = (psfs.settings.aperture, "aperture, f-number")
+        if psfs.settings.focal_mm is not None:
+            header["FOCALLEN"] = (psfs.settings.focal_mm, "focal length, mm")
+        header["COMMENT"] = "point spread functions by lensmodel, sum 1"
+        table = fits.BinTableHDU.from_columns(
+            [
+                fits.Column("R", "D", unit="half-diagonal", array=[p.r for p in psfs.positions]),
+                fits.Column("PHI", "D", unit="rad", array=[p.phi for p in psfs.positions]),
+                fits.Column("ERROR", "D", array=list(psfs.predicted_error)),
+            ],
+            name="POSITIONS",
+        )
+        out = io.BytesIO()
+        fits.HDUList([primary, table]).writeto(out)
+        return out.getvalue()
+
+
+@dataclass(frozen=True, slots=True)
+class Npz:
+    """NumPy archive with `psf` (n, k, k), `r`, `phi`, `error`, `shape` (rows, cols) and `aperture`."""
+
+    suffix: str = ".npz"
+
+    def encode(self, psfs: PsfGrid) -> bytes:
+        """Return the content of the file; an unknown aperture is NaN."""
+        out = io.BytesIO()
+        aperture = math.nan if psfs.settings.aperture is None else psfs.settings.aperture
+        np.savez_compressed(
+            out,
+            psf=psfs.kernels,
+            r=np.array([p.r for p in psfs.positions]),
+            phi=np.array([p.phi for p in psfs.positions]),
+            error=np.array(psfs.predicted_error),
+            shape=np.array([psfs.rows, psfs.cols]),
+            aperture=np.full(len(psfs.positions), aperture),
+            channel=np.array(psfs.settings.channel),
+        )
+        return out.getvalue()
+
+
+@dataclass(frozen=True, slots=True)
+class JsonMatrix:
+    """JSON: a bare matrix, a list of rows, for a single place, as ART loads it; else an object."""
+
+    suffix: str = ".json"
+
+    def encode(self, psfs: PsfGrid) -> bytes:
+        """Return the content of the file; nine digits hold any float32."""
+        if len(psfs.positions) == 1:
+            content: Any = _matrix(psfs.kernels[0])
+        else:
+            content = document(psfs, kernels=True)
+        return json.dumps(content, allow_nan=False).encode()
+
+
+@dataclass(frozen=True, slots=True)
+class MtfTable:
+    """CSV of MTF50 and of contrast along u (tangential) and v (sagittal), a line for each place."""
+
+    suffix: str = ".csv"
+
+    def encode(self, psfs: PsfGrid) -> bytes:
+        """Return the content of the file; frequencies are cycles/pixel."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        heads = [f"{way}_{f:.2f}" for way in ("tangential", "sagittal") for f in FREQUENCIES]
+        writer.writerow(["row", "col", "r", "phi", "error", "mtf50_tangential", "mtf50_sagittal", *heads])
+        for i, (place, kernel) in enumerate(zip(psfs.positions, psfs.kernels, strict=True)):
+            exact = kernel.astype(np.float64)
+            fifty = tangential_sagittal_mtf50(exact, place.phi)
+            contrast = [mtf_from_kernel(exact, place.phi + turn, FREQUENCIES) for turn in (0, math.pi / 2)]
+            values = [place.r, place.phi, psfs.predicted_error[i], *fifty, *np.concatenate(contrast)]
+            writer.writerow([*divmod(i, psfs.cols), *(f"{v:.6f}" for v in values)])
+        return out.getvalue().encode()
+
+
+@dataclass(frozen=True, slots=True)
+class ContactSheet:
+    """16-bit grey PNG: every kernel at its place of the picture, its peak white; one place is plain."""
+
+    suffix: str = ".png"
+
+    def encode(self, psfs: PsfGrid) -> bytes:
+        """Return the content of the file; values are linear, kernels part by two dark pixels."""
+        side = psfs.kernels.shape[1]
+        step = side + _GAP
+        sheet = np.zeros((psfs.rows * step - _GAP, psfs.cols * step - _GAP), dtype=np.uint16)
+        for i, kernel in enumerate(psfs.kernels):
+            row, col = (step * k for k in divmod(i, psfs.cols))
+            sheet[row : row + side, col : col + side] = np.rint(65535.0 * (kernel / kernel.max()))
+        out = io.BytesIO()
+        Image.fromarray(sheet).save(out, "PNG")
+        return out.getvalue()
+
+
+exporters: Registry[Exporter] = Registry(
+    "export format",
+    {
+        "csv": MtfTable,
+        "fits": Fits,
+        "json": JsonMatrix,
+        "npz": Npz,
+        "png": ContactSheet,
+        "tiff": TiffStack,
+    },
+)
+
+
+def export(path: Path | str, psfs: PsfGrid, file_format: str) -> None:
+    """Write a grid in a format; the file appears complete or not at all.
+
+    Raises
+    ------
+    UnknownMethodError
+        If there is no such format.
+    InvalidInputError
+        If the format needs a library that is not installed.
+    """
+    write_atomically(Path(path), exporters.create(file_format).encode(psfs))
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write beside the target, then rename: nobody sees half a file."""
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        part.write_bytes(content)
+        part.replace(path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def document(psfs: PsfGrid, *, kernels: bool) -> dict[str, Any]:
+    """A grid as what `json` can write, with its units; kernels as lists of rows on request."""
+    entries = []
+    for place, error, kernel in zip(psfs.positions, psfs.predicted_error, psfs.kernels, strict=True):
+        entry: dict[str, Any] = {"r": place.r, "phi": place.phi, "predicted_error": error}
+        if kernels:
+            entry["kernel"] = _matrix(kernel)
+        entries.append(entry)
+    settings = psfs.settings
+    return {
+        "units": {"r": "half-diagonal", "phi": "radian, counter-clockwise from the right", "kernel": "pixel"},
+        "aperture": settings.aperture,
+        "focal_mm": settings.focal_mm,
+        "channel": settings.channel,
+        "rows": psfs.rows,
+        "cols": psfs.cols,
+        "psfs": entries,
+    }
+
+
+def _matrix(kernel: NDArray[np.float32]) -> list[list[float]]:
+    return [[float(f"{value:.9g}") for value in row] for row in kernel]
+
+
+def _astropy_fits() -> ModuleType:
+    # imported when it is wanted: most people never write FITS, and it takes half a second
+    try:
+        return importlib.import_module("astropy.io.fits")
+    except ImportError as error:
+        raise InvalidInputError(
+            "writing FITS needs astropy; install it with `pip install 'lensmodel[fits]'`, "
+            "or export tiff instead"
+        ) from error

@@ -104,6 +104,14 @@ def test_too_few_photographs_are_refused(tmp_path: Path) -> None:
         layout_for(photographs(tmp_path, 3), 7)
 
 
+def test_smallest_grid_that_covers_a_wanted_frame_is_taken(tmp_path: Path) -> None:
+    paths = photographs(tmp_path, 12)
+    assert layout_for(paths, 3).frame > layout_for(paths, 6).frame
+    assert (layout_for(paths, 3, (80, 140)).rows, layout_for(paths, 3, (80, 140)).cols) == (1, 1)
+    with pytest.raises(InvalidInputError, match="give larger ones"):
+        layout_for(paths, 3, (200, 300))
+
+
 def test_only_the_test_half_of_a_folder_is_used(tmp_path: Path) -> None:
     for name in ("s01_city_sunset", "s03_lake_mountains"):
         Image.new("RGB", (64, 48)).save(tmp_path / f"{name}.png")

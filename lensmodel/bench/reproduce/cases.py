@@ -211,7 +211,7 @@ def _case(
     stopped: float = 1.0,
 ) -> Case:
     lens = draw_lens(seed)
-    layout = layout_for(files, photos[-1] + 1)
+    layout = layout_for(files, photos[-1] + 1, frame)
     height, width = frame or layout.frame
     mm = lens.focal_mm[focal]
     return Case(seed, mm, lens.at_focal(mm).f_number * stopped, photos, height, width, layout)

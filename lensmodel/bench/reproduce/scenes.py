@@ -71,13 +71,22 @@ def scene_files(folder: Path | None) -> tuple[Path, ...]:
     return tested
 
 
-def layout_for(files: Sequence[Path], frames: int) -> Layout:
-    """Largest frames of which `frames` can be made without using anything twice.
+def layout_for(files: Sequence[Path], frames: int, wanted: tuple[int, int] | None = None) -> Layout:
+    """Decide how to make `frames` frames without using anything twice.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        The photographs.
+    frames : int
+        How many frames.
+    wanted : tuple of int, optional
+        (height, width) that each has to cover: the smallest grid that does. None: the largest grid.
 
     Raises
     ------
     InvalidInputError
-        If there are too few photographs.
+        If there are too few photographs, or they are too small.
     """
     share = len(files) // frames
     if share == 0 and 2 * len(files) < frames:
@@ -86,8 +95,20 @@ def layout_for(files: Sequence[Path], frames: int) -> Layout:
             "ask for fewer photos a lens or give a folder with more photographs"
         )
     pieces = 1 if share else 2
-    rows, cols = _GRIDS[max(n for n in _GRIDS if n <= max(share, 1))]
-    sizes = np.array([_turned_size(path, pieces, upright=cols == 2 and rows == 1) for path in files])
+    layouts = [_layout(files, pieces, _GRIDS[n]) for n in _GRIDS if n <= max(share, 1)]
+    if wanted is None:
+        return layouts[-1]
+    for layout in layouts:
+        if layout.rows * layout.tile[0] >= wanted[0] and layout.cols * layout.tile[1] >= wanted[1]:
+            return layout
+    raise InvalidInputError(
+        f"the photographs do not cover {frames} frames of {wanted[0]} x {wanted[1]}: give larger ones"
+    )
+
+
+def _layout(files: Sequence[Path], pieces: int, grid: tuple[int, int]) -> Layout:
+    rows, cols = grid
+    sizes = np.array([_turned_size(path, pieces, upright=cols > rows) for path in files])
     height, width = (int(n) // 2 * 2 for n in sizes.min(axis=0))
     return Layout(rows, cols, pieces, (height, width))
 

@@ -1,33 +1,48 @@
-# Two stages: wheels are built where compilers may be, and only they reach the image that runs.
-ARG BASE=python:3.12-slim-bookworm
+# Two stages: what only the build needs stays in the first, and only the finished program reaches the second.
+# Both need Python 3.11 or newer with venv. Any Debian-like base will do: --build-arg BASE=...
+ARG BASE=docker.io/library/python:3.12-slim-bookworm
 
 FROM ${BASE} AS build
+ENV PIP_NO_CACHE_DIR=1 \
+    PIP_DISABLE_PIP_VERSION_CHECK=1
 WORKDIR /src
-COPY requirements/lock.txt requirements/lock.txt
+COPY requirements/run.txt requirements/build.txt requirements/
 RUN python3 -m venv /opt/lensmodel \
- && /opt/lensmodel/bin/pip install --no-cache-dir --disable-pip-version-check --require-hashes --requirement requirements/lock.txt
+ && /opt/lensmodel/bin/pip install --require-hashes --requirement requirements/run.txt \
+ && python3 -m venv /opt/build \
+ && /opt/build/bin/pip install --require-hashes --requirement requirements/build.txt
 COPY pyproject.toml README.md LICENSE ./
+COPY migrations migrations
 COPY lensmodel lensmodel
 COPY app app
-COPY migrations migrations
-RUN /opt/lensmodel/bin/pip install --no-cache-dir --disable-pip-version-check --no-deps --no-build-isolation .
+RUN /opt/build/bin/python -m hatchling build --target wheel --directory /wheels \
+ && /opt/lensmodel/bin/pip install --no-deps --no-index /wheels/*.whl
 
 FROM ${BASE}
-RUN groupadd --gid 10001 lens && useradd --uid 10001 --gid lens --no-create-home --home-dir /data lens \
- && mkdir /data && chown lens:lens /data
+RUN groupadd --gid 10001 lens \
+ && useradd --uid 10001 --gid lens --no-create-home --home-dir /data --shell /usr/sbin/nologin lens \
+ && install --directory --owner=lens --group=lens --mode=0750 /data
 COPY --from=build /opt/lensmodel /opt/lensmodel
+# Listening on every address of a container reaches nobody: publishing its port does, and that is
+# the host's decision (compose.yaml publishes it on loopback). Hence LENS_PUBLIC.
 ENV PATH=/opt/lensmodel/bin:$PATH \
+    HOME=/data \
     LENS_DATA_DIR=/data \
+    LENS_HOST=0.0.0.0 \
+    LENS_PUBLIC=true \
+    NUMBA_CACHE_DIR=/data/cache \
     OMP_NUM_THREADS=1 \
     OPENBLAS_NUM_THREADS=1 \
-    NUMBA_CACHE_DIR=/data/cache \
     PYTHONDONTWRITEBYTECODE=1 \
+    PYTHONUNBUFFERED=1 \
     TMPDIR=/data/tmp
-USER lens
+USER 10001:10001
+# The root file system may be read-only: everything that is written lies under /data.
 VOLUME /data
+WORKDIR /data
 EXPOSE 8000
 STOPSIGNAL SIGTERM
-# The root file system may be read-only: everything that is written lies under /data.
 HEALTHCHECK --interval=30s --timeout=5s --start-period=60s --retries=3 \
   CMD ["python3", "-c", "import urllib.request as u; u.urlopen('http://127.0.0.1:8000/readyz', timeout=4)"]
-CMD ["sh", "-c", "mkdir -p /data/tmp && exec lensmodel serve --host 0.0.0.0 --port 8000"]
+ENTRYPOINT ["/bin/sh", "-c", "mkdir -p /data/tmp && exec lensmodel \"$@\"", "lensmodel"]
+CMD ["serve", "--port", "8000"]

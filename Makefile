@@ -9,7 +9,7 @@ STAMP := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo test test-all serve check format bench lock clean
+.PHONY: help install demo test test-all serve check format bench lock container-check clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -48,8 +48,14 @@ format: install ## let the formatter and the linter mend what they can
 bench: install ## quality and speed benchmarks, tables on standard output
 	@$(BIN)/lensmodel bench
 
-lock: ## renew requirements/lock.txt from pyproject.toml (needs uv)
-	uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --no-annotate --extra dev --output-file requirements/lock.txt pyproject.toml
+LOCK := uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --no-annotate
+lock: ## renew the files of requirements/ from pyproject.toml (needs uv)
+	$(LOCK) --extra dev --output-file requirements/lock.txt pyproject.toml
+	$(LOCK) --extra fast --output-file requirements/run.txt pyproject.toml
+	echo hatchling | $(LOCK) --output-file requirements/build.txt -
+
+container-check: ## build the image without an engine, start it and use it (root; Debian's buildah and debootstrap)
+	tools/container_check.sh
 
 clean: ## remove what the targets made
 	rm -rf $(VENV) demo-output bench-output .mypy_cache .ruff_cache .pytest_cache .hypothesis

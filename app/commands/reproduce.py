@@ -43,6 +43,9 @@ def reproduce(
             f"${DATA_VARIABLE} where that is set, else the library's five."
         ),
     ] = None,
+    benchmark: Annotated[
+        Path, typer.Option(help="Output of `lensmodel bench blind`: Fig. 1 where it is there.")
+    ] = Path("bench-output"),
     estimator: Annotated[str, typer.Option(help="Blind estimator of the calibration.")] = "default",
 ) -> None:
     """Make the paper's figures and its Table 1 on simulated lenses that nothing was tuned on.
@@ -59,6 +62,7 @@ def reproduce(
     """
     from app.reproduce import CODE, ServiceRoutes  # noqa: PLC0415 - only this command needs them
     from lensmodel.bench.reproduce import (  # noqa: PLC0415 - as above: the simulation is slow to import
+        collected,
         planned,
         run_reproduction,
         write_json,
@@ -77,6 +81,7 @@ def reproduce(
         code=() if direct else CODE,
         on_work=Progress(),
     )
+    result["figures"]["fig1"] = collected(benchmark, output / "pictures")
     written = [*write_page(result, output)]
     if json_output is not None:
         written.append(write_json(result, json_output))

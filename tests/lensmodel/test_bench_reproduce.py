@@ -21,6 +21,7 @@ from lensmodel.bench.reproduce import (
     DirectRoute,
     Place,
     Reproduction,
+    collected,
     measure,
     planned,
     run,
@@ -255,6 +256,28 @@ def test_page_says_when_photos_did_not_count(tmp_path: Path) -> None:
     unit["refused"], unit["counted"], unit["psf"] = ["photo-00: flat"], 0, None
     markdown, _ = write_page(made, tmp_path)
     assert "photo-00: flat" in markdown.read_text(encoding="utf-8")
+
+
+def test_fig1_comes_from_a_stored_benchmark(tmp_path: Path) -> None:
+    bench = tmp_path / "bench"
+    bench.mkdir()
+    assert collected(bench, tmp_path) is None
+    row = {"method": "whittle", "noise": 0.01, "cases": 4, "improved": 0.5, "er_lt_3": 0.25}
+    settings = {"noise": [0.01], "half": "test", "patch": 128, "variant": "bayer", "judge": "epll", "seed": 0}
+    stored = {"settings": settings, "summary": [{**row, "er_median": 3.0, "rel_l2": 0.4}]}
+    (bench / "blind.json").write_text(json.dumps(stored))
+    Image.new("L", (4, 4)).save(bench / "blind-er-1percent.png")
+    made = result((160, 32.0))
+    made["figures"]["fig1"] = collected(bench, tmp_path / "pictures")
+    markdown, _ = write_page(made, tmp_path)
+    assert "| whittle | 1 % | 4 | 50 | 25 | 3.00 | 0.40 |" in markdown.read_text(encoding="utf-8")
+    assert (tmp_path / "pictures" / "fig1-blind-er-1percent.png").exists()
+
+
+def test_fig1_of_a_damaged_benchmark_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "blind.json").write_text("{}")
+    with pytest.raises(InvalidInputError, match="no benchmark"):
+        collected(tmp_path, tmp_path)
 
 
 # --- measuring ---------------------------------------------------------------------------------

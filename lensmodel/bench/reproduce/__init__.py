@@ -1,5 +1,6 @@
 """The paper's figures and its Table 1, with our software, on lenses whose truth is known."""
 
+from lensmodel.bench.reproduce.benchmark import collected
 from lensmodel.bench.reproduce.cases import Case, Reproduction, Size, planned
 from lensmodel.bench.reproduce.page import write_json, write_page
 from lensmodel.bench.reproduce.routes import Answer, DirectRoute, OpenRoute, Place, Route
@@ -14,6 +15,7 @@ __all__ = [
     "Reproduction",
     "Route",
     "Size",
+    "collected",
     "planned",
     "run_reproduction",
     "write_json",

@@ -86,6 +86,7 @@ def write_page(result: Mapping[str, Any], folder: Path) -> tuple[Path, Path]:
     _table1(page, found)
     _fidelity(page, found)
     _lenses(page, result)
+    _fig1(page, result["figures"].get("fig1"))
     _fig2(page, result["figures"].get("fig2"))
     _fig4(page, result["figures"].get("fig4"))
     _before_after(page, result)
@@ -225,6 +226,33 @@ def _lens_cells(state: Mapping[str, Any], psf: Mapping[str, float] | None) -> li
 
 def _count_rows(rows: Mapping[str, Mapping[str, float | None]], digits: int) -> list[list[str]]:
     return [[f"n = {n}", *(number(row[zone], digits) for zone in ZONES)] for n, row in rows.items()]
+
+
+def _fig1(page: _Page, fig: Mapping[str, Any] | None) -> None:
+    if not fig:
+        return
+    page.title("Fig. 1: blind estimators on single patches")
+    page.text(
+        "Share of cases whose error ratio stays below a bound, higher is better; from "
+        f"`lensmodel bench blind`, half {fig['settings']['half']}, "
+        f"patches of {fig['settings']['patch']} pixels, "
+        f"camera {fig['settings']['variant']}, judged by {fig['settings']['judge']}."
+    )
+    rows = [
+        [
+            row["method"],
+            f"{100 * row['noise']:g} %",
+            str(row["cases"]),
+            number(100 * row["improved"]),
+            number(100 * row["er_lt_3"]),
+            number(row["er_median"], 2),
+            number(row["rel_l2"], 2),
+        ]
+        for row in fig["rows"]
+    ]
+    page.table(["", "noise", "cases", "improved %", "ER < 3 %", "median ER", "PSF error"], rows)
+    for name in fig["pictures"]:
+        page.picture(name, "Cumulative error ratio")
 
 
 def _fig2(page: _Page, fig: Mapping[str, Any] | None) -> None:

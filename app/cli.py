@@ -14,7 +14,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 import typer
 
-from app.commands import benchmarks, demonstration, display, photos, reproduce, service
+from app.commands import benchmarks, demonstration, display, photos, report, reproduce, service
 from lensmodel.errors import LensModelError
 
 app = typer.Typer(
@@ -29,6 +29,8 @@ app = typer.Typer(
 app.command()(photos.calibrate)
 app.command()(photos.correct)
 app.command()(photos.psf)
+app.command()(report.report)
+app.command(name="export")(report.export_psfs)
 app.command()(service.serve)
 app.command(hidden=True)(service.api)
 app.command(hidden=True)(service.worker)

@@ -12,6 +12,7 @@ from lensmodel.report.lens_report import (
     ReportSettings,
     lens_report,
 )
+from lensmodel.report.pictures import apertures_svg, curves_svg, mtf_map_svg
 from lensmodel.report.places import direction_in_words, place_in_words
 
 __all__ = [
@@ -28,11 +29,14 @@ __all__ = [
     "ReportSettings",
     "Wish",
     "advice",
+    "apertures_svg",
+    "curves_svg",
     "decentring",
     "direction_in_words",
     "export",
     "exporters",
     "lens_report",
+    "mtf_map_svg",
     "place_in_words",
     "psf_grid",
 ]

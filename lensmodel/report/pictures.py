@@ -1,0 +1,91 @@
+"""The lens report in pictures: map of sharpness, contrast over the radius, sharpness by aperture."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from lensmodel.report.drawing import COLOURS, GREY, INK, Axes, Box, Label, Part, svg
+from lensmodel.report.lens_report import LensReport
+
+WIDTH: Final = 640
+HEIGHT: Final = 400
+_LEFT, _RIGHT, _TOP, _BOTTOM = 56, 170, 40, 52
+_MARGIN: Final = 20
+_SOFT: Final = (127, 29, 29)
+_MIDDLE: Final = (253, 246, 227)
+_SHARP: Final = (11, 110, 153)
+_TICKS: Final = tuple((i / 5, f"{i / 5:.1f}") for i in range(6))
+
+
+def mtf_map_svg(report: LensReport) -> str:
+    """Draw the mean MTF50 of each cell of the picture, upright, as SVG; a question mark is a guess."""
+    title = f"MTF50 in cycles/pixel{_at(report)}"
+    across = WIDTH - 2 * _MARGIN
+    high = across / report.aspect
+    cell = (across / report.cols, high / report.rows)
+    values = [point.mean for point in report.field]
+    low, top = min(values), max(values)
+    parts: list[Part] = [Label(_MARGIN, 24, title)]
+    for i, point in enumerate(report.field):
+        row, col = divmod(i, report.cols)
+        x, y = _MARGIN + col * cell[0], _TOP + row * cell[1]
+        share = 0.5 if top <= low else (point.mean - low) / (top - low)
+        parts.append(Box(x, y, cell[0] - 1, cell[1] - 1, _colour(share)))
+        ink = "#ffffff" if share < 0.25 or share > 0.8 else INK
+        doubt = "?" if point.extrapolated else ""
+        middle = x + cell[0] / 2
+        parts.append(Label(middle, y + cell[1] / 2 + 4, f"{point.mean:.3f}"[1:] + doubt, ink, "middle"))
+    note = f"from {low:.3f} (red) to {top:.3f} (blue)"
+    if any(point.extrapolated for point in report.field):
+        note += "; ? no photo shows this place, guessed"
+    parts.append(Label(_MARGIN, _TOP + high + 20, note, GREY))
+    parts.append(Label(_MARGIN, _TOP + high + 38, report.decentring.text, GREY))
+    return svg(title, WIDTH, round(_TOP + high + 50), parts)
+
+
+def curves_svg(report: LensReport) -> str:
+    """Draw contrast over the radius, sagittal solid and tangential dashed, as SVG."""
+    title = f"Contrast over the picture{_at(report)}"
+    axes = Axes(_LEFT, _TOP, WIDTH - _RIGHT, HEIGHT - _BOTTOM, (0.0, 1.0), (0.0, 1.0))
+    parts: list[Part] = [Label(_LEFT, 24, title)]
+    parts += axes.grid(_TICKS, _TICKS, "r: 0 center, 1 corner")
+    for i, curve in enumerate(report.curves):
+        colour = COLOURS[i % len(COLOURS)]
+        name = f"{curve.frequency:.3g} c/px" if curve.lp_mm is None else f"{curve.lp_mm:.3g} lp/mm"
+        parts.append(axes.curve(report.radii, curve.sagittal, colour))
+        parts.append(axes.curve(report.radii, curve.tangential, colour, dashed=True))
+        parts += axes.key(2 * i, f"{name} sagittal", colour)
+        parts += axes.key(2 * i + 1, f"{name} tangential", colour, dashed=True)
+    return svg(title, WIDTH, HEIGHT, parts)
+
+
+def apertures_svg(report: LensReport) -> str:
+    """Draw MTF50 of center, mid and corner over the apertures that photos had, as SVG."""
+    title = "MTF50 in cycles/pixel by aperture"
+    zones = ("center", "mid", "corner")
+    rows = report.apertures
+    values = [getattr(row, zone) for row in rows for zone in zones]
+    top = max(0.1, *values) * 1.1 if values else 0.5
+    axes = Axes(
+        _LEFT, _TOP, WIDTH - _RIGHT, HEIGHT - _BOTTOM, (-0.3, max(len(rows) - 1, 1) + 0.3), (0.0, top)
+    )
+    ticks = [(top * i / 5, f"{top * i / 5:.2f}") for i in range(6)]
+    parts: list[Part] = [Label(_LEFT, 24, title)]
+    parts += axes.grid([(i, f"f/{row.aperture:g}") for i, row in enumerate(rows)], ticks, "aperture")
+    for number, zone in enumerate(zones):
+        parts.append(axes.curve(range(len(rows)), [getattr(row, zone) for row in rows], COLOURS[number]))
+        parts += axes.key(number, zone, COLOURS[number])
+    return svg(title, WIDTH, HEIGHT, parts)
+
+
+def _at(report: LensReport) -> str:
+    aperture = report.settings.aperture
+    return "" if aperture is None else f" at f/{aperture:g}"
+
+
+def _colour(share: float) -> str:
+    """Dark red for 0 through pale to blue for 1: it also tells apart by lightness and to the colour-blind."""
+    ends = (_SOFT, _MIDDLE) if share < 0.5 else (_MIDDLE, _SHARP)
+    t = 2.0 * share - (share >= 0.5)
+    mixed = (round(a + (b - a) * t) for a, b in zip(*ends, strict=True))
+    return "#" + "".join(f"{value:02x}" for value in mixed)

@@ -93,6 +93,8 @@ class PsfAnswer:
         Weight of the prior in the kernel, 0..1; 0 without a prior.
     image_frame_share : float
         Weight of the regression in the image frame, 0..1, by held-out errors near the place.
+    wavefront_share : float
+        Weight of the fitted wavefront with the rest of the samples, 0..1, likewise.
     std : ndarray, shape (size, size), or None
         Standard error of each pixel from the scatter of the samples; None unless asked for.
     """
@@ -107,4 +109,5 @@ class PsfAnswer:
     nearest: float = 0.0
     prior_share: float = 0.0
     image_frame_share: float = 0.0
+    wavefront_share: float = 0.0
     std: NDArray[np.float64] | None = field(default=None)

@@ -36,6 +36,7 @@ from lensmodel.regression.judgement import (
     row_of,
     with_votes,
 )
+from lensmodel.regression.physical import PhysicalMean
 from lensmodel.regression.robust import Flag
 from lensmodel.regression.smoothers import Neighbours, Smoother, smoothers
 from lensmodel.regression.store import KernelStore
@@ -46,6 +47,7 @@ from lensmodel.types import ZONES, Channel, FieldPosition, Kernel, LensSettings,
 _INCREMENT = 0.05
 _DROPPED = 1e-3
 _FEW = 8
+_SILENT = 1e-3
 
 
 class LensModel:
@@ -65,6 +67,7 @@ class LensModel:
         index: SampleIndex | None = None,
         prior: tuple[PsfField | LensModel, float] | None = None,
         pixels: KernelStore | None = None,
+        physical: PhysicalMean | None = None,
     ) -> None:
         self.samples = samples
         self.settings = settings
@@ -80,6 +83,11 @@ class LensModel:
         self.bandwidth = bandwidth(self._rule, settings, judgement.choice)
         self._scale = va.scales(self.bandwidth)
         self._index = SampleIndex.of(self._where) if index is None else index
+        self._physical = physical
+        if physical is None and self._smoother.physical:
+            several = len(self._photos) >= 2
+            groups = self._photo if several else np.arange(len(samples))
+            self._physical = PhysicalMean(samples, judgement.votes, groups, self._scale)
 
     # --- building -------------------------------------------------------------------------------
 
@@ -157,6 +165,7 @@ class LensModel:
             index=index,
             prior=self.prior,
             pixels=pixels,
+            physical=self._physical,
         )
 
     def refitted(self, samples: Sequence[PsfSample]) -> LensModel:
@@ -198,6 +207,7 @@ class LensModel:
             index=self._index,
             prior=None if prior is None else (prior, strength),
             pixels=self._pixels,
+            physical=self._physical,
         )
 
     # --- asking ---------------------------------------------------------------------------------
@@ -231,14 +241,7 @@ class LensModel:
         independent = 1.0 / float((per_photo**2).sum())
         nearest, beyond = support(self._where[rows], va.point(position, settings), self._rule)
         held_out = float(positive @ self._judgement.errors[rows] ** 2)
-        in_image = 0.0
-        if self._pixels is not None and self._judgement.image_errors is not None:
-            other = float(positive @ self._judgement.image_errors[rows] ** 2)
-            in_image = held_out**2 / max(held_out**2 + other**2, 1e-30)
-            kernel = as_kernel(
-                (1.0 - in_image) * kernel + in_image * self._of_image_frame(position, settings, size)
-            )
-            held_out = (1.0 - in_image) * held_out + in_image * other
+        kernel, held_out, shares = self._mixed(kernel, held_out, rows, positive, position, settings)
         error = field_error(held_out, found, mean, positive, independent)
         error *= 1.0 + 0.5 * max(nearest - 1.0, 0.0)
         share = 0.0
@@ -254,7 +257,8 @@ class LensModel:
             beyond=beyond,
             nearest=nearest,
             prior_share=share,
-            image_frame_share=in_image,
+            image_frame_share=shares[0],
+            wavefront_share=shares[1],
             std=standard_error(self._grid, found, positive, position.phi, width, size) if std else None,
         )
 
@@ -324,6 +328,41 @@ class LensModel:
             return mean
         square = mean.reshape(self._grid.side, self._grid.side)
         return np.asarray((square + share * square[::-1]) / (1.0 + share)).ravel()
+
+    def _mixed(
+        self,
+        kernel: Kernel,
+        held_out: float,
+        rows: NDArray[np.intp],
+        weight: NDArray[np.float64],
+        position: FieldPosition,
+        settings: LensSettings,
+    ) -> tuple[Kernel, float, tuple[float, float]]:
+        """Mix experts by their held-out errors e near the place, shares ~ e^-4: a bad one loses its own.
+
+        Returns the kernel, the squared error of the mixture, and the shares of the image frame and of
+        the wavefront.
+        """
+        squared = [held_out, math.inf, math.inf]
+        if self._pixels is not None and self._judgement.image_errors is not None:
+            squared[1] = float(weight @ self._judgement.image_errors[rows] ** 2)
+        if self._physical is not None:
+            errors = self._physical.extended_errors(len(self.samples))
+            squared[2] = math.inf if errors is None else float(weight @ errors[rows] ** 2)
+        parts = np.maximum(squared, 1e-15) ** -2.0
+        shares = parts / parts.sum()
+        shares = np.where(shares < _SILENT, 0.0, shares)
+        shares /= shares.sum()
+        if shares[0] == 1.0:
+            return kernel, held_out, (0.0, 0.0)
+        size = kernel.shape[0]
+        mixed = shares[0] * kernel
+        if shares[1] > 0:
+            mixed = mixed + shares[1] * self._of_image_frame(position, settings, size)
+        if shares[2] > 0 and self._physical is not None:
+            mixed = mixed + shares[2] * kriging.as_pixels(self._physical.row(position, settings), size)
+        error = sum(float(s) * e for s, e in zip(shares, squared, strict=True) if s > 0)
+        return as_kernel(mixed), error, (float(shares[1]), float(shares[2]))
 
     def _of_image_frame(self, position: FieldPosition, settings: LensSettings, size: int) -> Kernel:
         assert self._pixels is not None

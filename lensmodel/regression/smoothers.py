@@ -52,6 +52,10 @@ class Smoother(Protocol):
     def blend(self) -> bool:
         """Whether the answer is mixed with that of the image frame, by their held-out errors."""
 
+    @property
+    def physical(self) -> bool:
+        """Whether a fitted wavefront with the kriged rest takes part in that mixture."""
+
     def weights(self, near: Neighbours) -> NDArray[np.float64]:
         """Weights of sum 1, shape (m,)."""
 
@@ -73,6 +77,7 @@ class NadarayaWatson:
     transport: bool = False
     reach: float = 4.0
     blend: bool = False
+    physical: bool = False
 
     def weights(self, near: Neighbours) -> NDArray[np.float64]:
         """Weights of sum 1."""
@@ -91,6 +96,7 @@ class NearestNeighbours:
     transport: bool = False
     reach: float = 8.0
     blend: bool = False
+    physical: bool = False
 
     def weights(self, near: Neighbours) -> NDArray[np.float64]:
         """Weights of sum 1."""
@@ -111,6 +117,7 @@ class Abramson:
     transport: bool = False
     reach: float = 5.0
     blend: bool = False
+    physical: bool = False
 
     def weights(self, near: Neighbours) -> NDArray[np.float64]:
         """Weights of sum 1."""
@@ -137,6 +144,7 @@ class LocalLinear:
     transport: bool = False
     reach: float = 4.0
     blend: bool = False
+    physical: bool = False
 
     def weights(self, near: Neighbours) -> NDArray[np.float64]:
         """Weights of sum 1; some may be negative."""
@@ -174,6 +182,7 @@ class GaussianProcess:
     transport: bool = False
     reach: float = 12.0
     blend: bool = False
+    physical: bool = False
 
     def weights(self, near: Neighbours) -> NDArray[np.float64]:
         """Weights of sum 1; some may be negative."""
@@ -197,6 +206,7 @@ smoothers: Registry[Smoother] = Registry(
     "regression",
     {
         "blended": lambda **params: NadarayaWatson(transport=True, blend=True, **params),
+        "combined": lambda **params: NadarayaWatson(transport=True, blend=True, physical=True, **params),
         "blended-gaussian-process": lambda **params: GaussianProcess(transport=True, blend=True, **params),
         "nadaraya-watson": NadarayaWatson,
         "nearest": NearestNeighbours,

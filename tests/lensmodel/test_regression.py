@@ -49,7 +49,12 @@ def difference(a: Kernel, b: Kernel) -> float:
     return float(np.linalg.norm(a - b) / np.linalg.norm(b))
 
 
-@pytest.mark.parametrize("method", sorted(smoothers))
+METHODS = [
+    pytest.param(name, marks=pytest.mark.slow) if name == "combined" else name for name in sorted(smoothers)
+]
+
+
+@pytest.mark.parametrize("method", METHODS)
 class TestEveryMethod:
     def test_answers_a_centred_kernel_of_sum_one(self, method: str) -> None:
         model = LensModel.fit(photos(1), ModelSettings(method=method))

@@ -7,11 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from lensmodel.psf import PsfSample, distance
+from lensmodel.psf import PsfSample, as_kernel, distance
+from lensmodel.regression import LensModel, ModelSettings
 from lensmodel.regression.pupil import TERMS, PupilGrid
 from lensmodel.regression.wavefront_fit import fit_wavefront
 from lensmodel.simulate import draw_lens
-from lensmodel.types import FieldPosition, LensSettings
+from lensmodel.types import FieldPosition, Kernel, LensSettings
 
 
 def test_derivatives_of_the_light_are_its_differences() -> None:
@@ -56,3 +57,52 @@ def test_too_few_samples_make_no_wavefront(count: int) -> None:
     kernel = draw_lens(4).kernel(FieldPosition(0.2, 0.0), None, 11)
 
     assert fit_wavefront([PsfSample(kernel, FieldPosition(0.2, 0.0))] * count) is None
+
+
+def of_lens(seed: int, photos: int) -> list[PsfSample]:
+    lens, rng = draw_lens(seed), np.random.default_rng(seed)
+    places = [
+        FieldPosition(float(r), float(a))
+        for r, a in zip(*rng.uniform((0, -3), (0.9, 3), (14 * photos, 2)).T, strict=True)
+    ]
+    return [PsfSample(lens.kernel(p, None, 21), p, photo=f"p{i % photos}") for i, p in enumerate(places)]
+
+
+class TestCombined:
+    def test_leans_on_the_wavefront_in_a_corner_without_samples(self) -> None:
+        samples, corner = of_lens(4, 1), FieldPosition(0.97, 0.58)
+        truth = draw_lens(4).kernel(corner, None, 21)
+        plain = LensModel.fit(samples).query(corner, LensSettings(), 21)
+        combined = LensModel.fit(samples, ModelSettings(method="combined")).query(corner, LensSettings(), 21)
+
+        assert plain.wavefront_share == 0.0
+        assert combined.wavefront_share > 0.5
+        assert distance(combined.kernel, truth).rel_l2 < 0.6 * distance(plain.kernel, truth).rel_l2
+
+    def test_is_no_worse_than_without_where_no_wavefront_fits(self) -> None:
+        # three separate spots in a row, apart by the field: no pupil makes them
+        def spots(place: FieldPosition) -> Kernel:
+            t, apart = np.arange(-10, 11), 3.0 + 2.0 * place.r
+            along = np.exp(-0.8 * t**2) + np.exp(-0.8 * (t - apart) ** 2) + np.exp(-0.8 * (t + apart) ** 2)
+            return as_kernel(np.outer(np.exp(-0.8 * t**2), along))
+
+        samples = [PsfSample(spots(s.position), s.position, photo=s.photo) for s in of_lens(4, 2)]
+        asked = [FieldPosition(r, a) for r in (0.2, 0.5, 0.8) for a in (-2.0, 0.3, 2.2)]
+
+        def error(method: str) -> float:
+            model = LensModel.fit(samples, ModelSettings(method=method))
+            kernels = [(model.query(p, LensSettings(), 21).kernel, spots(p)) for p in asked]
+            return float(np.mean([distance(k, t).rel_l2 for k, t in kernels]))
+
+        assert error("combined") < 1.1 * error("blended")
+
+    def test_several_focal_lengths_have_no_common_wavefront(self) -> None:
+        samples = [
+            PsfSample(s.kernel, s.position, LensSettings(focal_mm=24.0 if i % 2 else 70.0), photo=s.photo)
+            for i, s in enumerate(of_lens(4, 2))
+        ]
+        answer = LensModel.fit(samples, ModelSettings(method="combined")).query(
+            FieldPosition(0.3, 0.2), LensSettings(focal_mm=24.0), 21
+        )
+
+        assert answer.wavefront_share == 0.0

@@ -270,10 +270,10 @@ def _verdict(softer: Asymmetry, coma: Asymmetry | None, photos: int) -> tuple[Ve
     told = "one photo" if photos == 1 else f"{photos} photos"
     signs = []
     if softer.significant and softer.amount > _SOFTER:
-        low, high = (100.0 * math.expm1(v) for v in (softer.amount, softer.amount + softer.error))
+        ratio, more = math.exp(softer.amount), math.exp(softer.amount + softer.error)
         signs.append(
             f"the {direction_in_words(softer.direction)} is softer than the opposite side, "
-            f"its blur {low:.0f} % wider, give or take {high - low:.0f} %"
+            f"its blur {ratio:.2f} times as wide, give or take {more - ratio:.2f}"
         )
     if coma is not None and coma.significant and coma.amount > _COMATIC:
         signs.append(
@@ -291,7 +291,7 @@ def _verdict(softer: Asymmetry, coma: Asymmetry | None, photos: int) -> tuple[Ve
             f"well centred within what {told} can tell: the blur of opposite sides differs by "
             f"{sides:.0f} %, give or take {spread:.0f} %"
         )
-    text = f"decentred: {' and '.join(signs)}"
+    text = f"decentred: {'; '.join(signs)}"
     if photos == 1:
         text += "; one photo cannot tell this from a subject at a slant, another photo can"
     return "decentred", text

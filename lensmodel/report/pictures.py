@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import textwrap
 from typing import Final
 
 from lensmodel.report.drawing import COLOURS, GREY, INK, Axes, Box, Label, Part, svg
@@ -11,6 +13,7 @@ WIDTH: Final = 640
 HEIGHT: Final = 400
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 170, 40, 52
 _MARGIN: Final = 20
+_LINE_CHARACTERS: Final = 100
 _SOFT: Final = (127, 29, 29)
 _MIDDLE: Final = (253, 246, 227)
 _SHARP: Final = (11, 110, 153)
@@ -30,17 +33,19 @@ def mtf_map_svg(report: LensReport) -> str:
         row, col = divmod(i, report.cols)
         x, y = _MARGIN + col * cell[0], _TOP + row * cell[1]
         share = 0.5 if top <= low else (point.mean - low) / (top - low)
-        parts.append(Box(x, y, cell[0] - 1, cell[1] - 1, _colour(share)))
-        ink = "#ffffff" if share < 0.25 or share > 0.8 else INK
+        fill = _colour(share)
+        parts.append(Box(x, y, cell[0] - 1, cell[1] - 1, _hex(fill)))
         doubt = "?" if point.extrapolated else ""
         middle = x + cell[0] / 2
-        parts.append(Label(middle, y + cell[1] / 2 + 4, f"{point.mean:.3f}"[1:] + doubt, ink, "middle"))
-    note = f"from {low:.3f} (red) to {top:.3f} (blue)"
+        text = f"{point.mean:.3f}".removeprefix("0") + doubt
+        parts.append(Label(middle, y + cell[1] / 2 + 4, text, _ink(fill), "middle"))
+    notes = [f"from {low:.3f} (red) to {top:.3f} (blue)"]
     if any(point.extrapolated for point in report.field):
-        note += "; ? no photo shows this place, guessed"
-    parts.append(Label(_MARGIN, _TOP + high + 20, note, GREY))
-    parts.append(Label(_MARGIN, _TOP + high + 38, report.decentring.text, GREY))
-    return svg(title, WIDTH, round(_TOP + high + 50), parts)
+        notes[0] += "; ? no photo shows this place, guessed"
+    notes += textwrap.wrap(report.decentring.text, _LINE_CHARACTERS)
+    for number, note in enumerate(notes):
+        parts.append(Label(_MARGIN, _TOP + high + 20 + 18 * number, note, GREY))
+    return svg(title, WIDTH, round(_TOP + high + 32 + 18 * len(notes)), parts)
 
 
 def curves_svg(report: LensReport) -> str:
@@ -69,9 +74,8 @@ def apertures_svg(report: LensReport) -> str:
     axes = Axes(
         _LEFT, _TOP, WIDTH - _RIGHT, HEIGHT - _BOTTOM, (-0.3, max(len(rows) - 1, 1) + 0.3), (0.0, top)
     )
-    ticks = [(top * i / 5, f"{top * i / 5:.2f}") for i in range(6)]
     parts: list[Part] = [Label(_LEFT, 24, title)]
-    parts += axes.grid([(i, f"f/{row.aperture:g}") for i, row in enumerate(rows)], ticks, "aperture")
+    parts += axes.grid([(i, f"f/{row.aperture:g}") for i, row in enumerate(rows)], _steps(top), "aperture")
     for number, zone in enumerate(zones):
         parts.append(axes.curve(range(len(rows)), [getattr(row, zone) for row in rows], COLOURS[number]))
         parts += axes.key(number, zone, COLOURS[number])
@@ -83,9 +87,27 @@ def _at(report: LensReport) -> str:
     return "" if aperture is None else f" at f/{aperture:g}"
 
 
-def _colour(share: float) -> str:
+def _steps(top: float) -> list[tuple[float, str]]:
+    """Round ticks from 0 to `top`, four to nine of them."""
+    power = 10.0 ** math.floor(math.log10(top))
+    step = next(power * m for m in (1.0, 0.5, 0.2, 0.1) if top / (power * m) >= 4.0)
+    return [(step * i, f"{step * i:.2f}") for i in range(int(top / step + 1e-9) + 1)]
+
+
+def _colour(share: float) -> tuple[int, int, int]:
     """Dark red for 0 through pale to blue for 1: it also tells apart by lightness and to the colour-blind."""
     ends = (_SOFT, _MIDDLE) if share < 0.5 else (_MIDDLE, _SHARP)
     t = 2.0 * share - (share >= 0.5)
-    mixed = (round(a + (b - a) * t) for a, b in zip(*ends, strict=True))
-    return "#" + "".join(f"{value:02x}" for value in mixed)
+    red, green, blue = (round(a + (b - a) * t) for a, b in zip(*ends, strict=True))
+    return red, green, blue
+
+
+def _hex(colour: tuple[int, int, int]) -> str:
+    return "#" + "".join(f"{value:02x}" for value in colour)
+
+
+def _ink(colour: tuple[int, int, int]) -> str:
+    """Black or white, whichever has more contrast (WCAG 2.2, relative luminance)."""
+    linear = [(v / 255.0 + 0.055) ** 2.4 / 1.055**2.4 if v > 10 else v / 3294.6 for v in colour]
+    luminance = 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+    return "#ffffff" if luminance < 0.18 else INK

@@ -6,51 +6,27 @@ import csv
 import io
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Final
-from xml.sax.saxutils import escape
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from lensmodel.bench.blind import UNTOUCHED, BlindReport, CaseResult
+from lensmodel.report.drawing import COLOURS, GREY, PALE, Label, Line, svg
 
 WIDTH: Final = 640
 HEIGHT: Final = 400
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 170, 34, 48
 LOWEST: Final = 1.0
 HIGHEST: Final = 10.0
-_COLOURS = ("#0b6e99", "#c2410c", "#15803d", "#7e22ce", "#a16207", "#be185d", "#334155")
-_GREY = "#6b7280"
 _HEADS = (
     *("noise", "method", "cases", "better than blurry", "ER < 3", "ER < 2", "ER median (p90)"),
     *("NCC", "rel. L2", "MTF error", "width", "seconds"),
 )
-_FONT = 'font-family="system-ui, sans-serif" font-size="12"'
 _PNG_SCALE = 2
-
-
-@dataclass(frozen=True, slots=True)
-class _Line:
-    """One polyline in picture coordinates."""
-
-    points: tuple[tuple[float, float], ...]
-    colour: str
-    width: float = 1.0
-    dashed: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class _Label:
-    """One text; `anchor` is start, middle or end."""
-
-    x: float
-    y: float
-    text: str
-    colour: str = "#111827"
-    anchor: str = "start"
 
 
 def markdown_table(report: BlindReport) -> str:
@@ -85,20 +61,7 @@ def cumulative(ratios: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[
 def curve_svg(report: BlindReport, noise: float) -> str:
     """Draw the percent of cases with an error ratio below t, for t in 1..10, as SVG."""
     lines, labels = _drawing(report, noise)
-    parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" {_FONT}>',
-        f"<title>{escape(_title(noise))}</title>",
-        f'<rect width="{WIDTH}" height="{HEIGHT}" fill="#ffffff"/>',
-    ]
-    for line in lines:
-        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in line.points)
-        dash = ' stroke-dasharray="6 4"' if line.dashed else ""
-        stroke = f'stroke="{line.colour}" stroke-width="{line.width:g}"{dash}'
-        parts.append(f'<polyline points="{points}" fill="none" {stroke}/>')
-    for label in labels:
-        place = f'x="{label.x:.1f}" y="{label.y:.1f}" text-anchor="{label.anchor}"'
-        parts.append(f'<text {place} fill="{label.colour}">{escape(label.text)}</text>')
-    return "\n".join([*parts, "</svg>"]) + "\n"
+    return svg(_title(noise), WIDTH, HEIGHT, [*lines, *labels])
 
 
 def curve_png(report: BlindReport, noise: float) -> Image.Image:
@@ -146,7 +109,7 @@ def _title(noise: float) -> str:
     return f"Cases with an error ratio below t, {100 * noise:g} % noise"
 
 
-def _drawing(report: BlindReport, noise: float) -> tuple[list[_Line], list[_Label]]:
+def _drawing(report: BlindReport, noise: float) -> tuple[list[Line], list[Label]]:
     across, down = WIDTH - _LEFT - _RIGHT, HEIGHT - _TOP - _BOTTOM
 
     def x_of(t: float) -> float:
@@ -155,14 +118,14 @@ def _drawing(report: BlindReport, noise: float) -> tuple[list[_Line], list[_Labe
     def y_of(percent: float) -> float:
         return _TOP + down * (1.0 - percent / 100.0)
 
-    lines, labels = [], [_Label(_LEFT, 20, _title(noise))]
+    lines, labels = [], [Label(_LEFT, 20, _title(noise))]
     for percent in range(0, 101, 20):
         y = y_of(percent)
-        lines.append(_Line(((_LEFT, y), (_LEFT + across, y)), "#e5e7eb"))
-        labels.append(_Label(_LEFT - 8, y + 4, f"{percent} %", _GREY, "end"))
+        lines.append(Line(((_LEFT, y), (_LEFT + across, y)), PALE))
+        labels.append(Label(_LEFT - 8, y + 4, f"{percent} %", GREY, "end"))
     ticks = range(int(LOWEST), int(HIGHEST) + 1)
-    labels.extend(_Label(x_of(t), _TOP + down + 18, str(t), _GREY, "middle") for t in ticks)
-    labels.append(_Label(_LEFT + across / 2, HEIGHT - 10, "error ratio t", _GREY, "middle"))
+    labels.extend(Label(x_of(t), _TOP + down + 18, str(t), GREY, "middle") for t in ticks)
+    labels.append(Label(_LEFT + across / 2, HEIGHT - 10, "error ratio t", GREY, "middle"))
     grid = np.linspace(LOWEST, HIGHEST, 181)
     methods = [row.method for row in report.summary if row.noise == noise]
     coloured = [m for m in methods if m != UNTOUCHED]
@@ -170,13 +133,13 @@ def _drawing(report: BlindReport, noise: float) -> tuple[list[_Line], list[_Labe
         ratios = np.array([r.error_ratio for r in report.results if r.method == method and r.noise == noise])
         percents = cumulative(ratios, grid)
         untouched = method == UNTOUCHED
-        colour = _GREY if untouched else _COLOURS[coloured.index(method) % len(_COLOURS)]
+        colour = GREY if untouched else COLOURS[coloured.index(method) % len(COLOURS)]
         points = tuple((x_of(float(t)), y_of(float(p))) for t, p in zip(grid, percents, strict=True))
-        lines.append(_Line(points, colour, 2.0, untouched))
+        lines.append(Line(points, colour, 2.0, untouched))
         y = _TOP + 12 + 20 * place
         x = _LEFT + across + 14
-        lines.append(_Line(((x, y - 4), (x + 22, y - 4)), colour, 2.0, untouched))
-        labels.append(_Label(x + 28, y, "no correction" if untouched else method))
+        lines.append(Line(((x, y - 4), (x + 22, y - 4)), colour, 2.0, untouched))
+        labels.append(Label(x + 28, y, "no correction" if untouched else method))
     return lines, labels
 
 

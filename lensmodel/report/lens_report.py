@@ -204,7 +204,7 @@ def lens_report(
 
     Notes
     -----
-    About 400 questions to the model and as many again for each eight apertures: a second or two.
+    About 200 questions to the model, and 12 more for each aperture: a second or two.
     """
     settings = widest(model) if settings is None else settings
     options = options or ReportSettings()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -242,6 +243,7 @@ def _spline(known: int, wanted: int) -> NDArray[np.float32]:
     return np.asarray(basis(np.linspace(0.0, known - 1.0, wanted)), dtype=np.float32)
 
 
+@lru_cache(maxsize=2048)  # photos of one lens and frame share all their kernels, 50 MB at most
 def _kernel(
     lens: SimulatedLens, settings: LensSettings, h: tuple[float, float], frame: Frame, options: BlurOptions
 ) -> NDArray[np.float64]:

@@ -26,6 +26,7 @@ from lensmodel.psf import PsfField, PsfSample, as_kernel
 from lensmodel.regression import kriging
 from lensmodel.regression import variables as va
 from lensmodel.regression.answer import ModelSettings, PsfAnswer
+from lensmodel.regression.experts import Experts
 from lensmodel.regression.index import SampleIndex
 from lensmodel.regression.judgement import (
     Judgement,
@@ -47,7 +48,6 @@ from lensmodel.types import ZONES, Channel, FieldPosition, Kernel, LensSettings,
 _INCREMENT = 0.05
 _DROPPED = 1e-3
 _FEW = 8
-_SILENT = 1e-3
 
 
 class LensModel:
@@ -76,18 +76,18 @@ class LensModel:
         self._smoother: Smoother = smoothers.create(settings.method)
         self._grid = grid_of(samples, settings, self._smoother)
         self._store, self._judgement, self._pixels = store, judgement, pixels
-        self._vectors = np.array([kriging.field_vector(s.position) for s in samples])
         self._where = va.points(samples) if index is None else index.points
         self._photos, self._photo = np.unique([s.photo for s in samples], return_inverse=True)
         self._rule = va.bandwidths(self._where)
         self.bandwidth = bandwidth(self._rule, settings, judgement.choice)
         self._scale = va.scales(self.bandwidth)
         self._index = SampleIndex.of(self._where) if index is None else index
-        self._physical = physical
         if physical is None and self._smoother.physical:
             several = len(self._photos) >= 2
             groups = self._photo if several else np.arange(len(samples))
-            self._physical = PhysicalMean(samples, judgement.votes, groups, self._scale)
+            physical = PhysicalMean(samples, judgement.votes, groups, self._scale)
+        self._physical = physical
+        self._experts = Experts(self._where, judgement, self._scale, pixels, physical)
 
     # --- building -------------------------------------------------------------------------------
 
@@ -241,7 +241,7 @@ class LensModel:
         independent = 1.0 / float((per_photo**2).sum())
         nearest, beyond = support(self._where[rows], va.point(position, settings), self._rule)
         held_out = float(positive @ self._judgement.errors[rows] ** 2)
-        kernel, held_out, shares = self._mixed(kernel, held_out, rows, positive, position, settings)
+        kernel, held_out, shares = self._experts.mixed(kernel, held_out, rows, positive, position, settings)
         error = field_error(held_out, found, mean, positive, independent)
         error *= 1.0 + 0.5 * max(nearest - 1.0, 0.0)
         share = 0.0
@@ -257,8 +257,8 @@ class LensModel:
             beyond=beyond,
             nearest=nearest,
             prior_share=share,
-            image_frame_share=shares[0],
-            wavefront_share=shares[1],
+            image_frame_share=shares.image_frame,
+            wavefront_share=shares.wavefront,
             std=standard_error(self._grid, found, positive, position.phi, width, size) if std else None,
         )
 
@@ -316,6 +316,12 @@ class LensModel:
                 found[zone_of(sample.position.r)].append(float(error))
         return {zone: float(np.median(values)) for zone, values in found.items() if values}
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of stored kernels, those of the samples included."""
+        stored = self._store.rows.nbytes + (0 if self._pixels is None else self._pixels.rows.nbytes)
+        return stored + sum(s.kernel.nbytes for s in self.samples)
+
     # --- inside ---------------------------------------------------------------------------------
 
     @property
@@ -328,55 +334,6 @@ class LensModel:
             return mean
         square = mean.reshape(self._grid.side, self._grid.side)
         return np.asarray((square + share * square[::-1]) / (1.0 + share)).ravel()
-
-    def _mixed(
-        self,
-        kernel: Kernel,
-        held_out: float,
-        rows: NDArray[np.intp],
-        weight: NDArray[np.float64],
-        position: FieldPosition,
-        settings: LensSettings,
-    ) -> tuple[Kernel, float, tuple[float, float]]:
-        """Mix experts by their held-out errors e near the place, shares ~ e^-4: a bad one loses its own.
-
-        Returns the kernel, the squared error of the mixture, and the shares of the image frame and of
-        the wavefront.
-        """
-        squared = [held_out, math.inf, math.inf]
-        if self._pixels is not None and self._judgement.image_errors is not None:
-            squared[1] = float(weight @ self._judgement.image_errors[rows] ** 2)
-        if self._physical is not None:
-            errors = self._physical.extended_errors(len(self.samples))
-            squared[2] = math.inf if errors is None else float(weight @ errors[rows] ** 2)
-        parts = np.maximum(squared, 1e-15) ** -2.0
-        shares = parts / parts.sum()
-        shares = np.where(shares < _SILENT, 0.0, shares)
-        shares /= shares.sum()
-        if shares[0] == 1.0:
-            return kernel, held_out, (0.0, 0.0)
-        size = kernel.shape[0]
-        mixed = shares[0] * kernel
-        if shares[1] > 0:
-            mixed = mixed + shares[1] * self._of_image_frame(position, settings, size)
-        if shares[2] > 0 and self._physical is not None:
-            mixed = mixed + shares[2] * kriging.as_pixels(self._physical.row(position, settings), size)
-        error = sum(float(s) * e for s, e in zip(shares, squared, strict=True) if s > 0)
-        return as_kernel(mixed), error, (float(shares[1]), float(shares[2]))
-
-    def _of_image_frame(self, position: FieldPosition, settings: LensSettings, size: int) -> Kernel:
-        assert self._pixels is not None
-        row = kriging.predict(
-            self._pixels.rows,
-            self._vectors,
-            self._where,
-            self._judgement.votes,
-            kriging.field_vector(position),
-            va.point(position, settings),
-            self._scale,
-            self._judgement.nugget,
-        )
-        return kriging.as_pixels(row, size)
 
     def _blended(
         self, kernel: Kernel, gaps: NDArray[np.float64], position: FieldPosition, settings: LensSettings

@@ -57,6 +57,12 @@ def points(samples: Sequence[PsfSample]) -> NDArray[np.float64]:
     return np.array([point(s.position, s.settings) for s in samples]).reshape(len(samples), len(COLUMNS))
 
 
+def vectors(where: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(x, y) to the right and up, in half-diagonals, of points `(n, 7)`, shape (n, 2)."""
+    r = where[:, :1]
+    return np.asarray(where[:, 1:3] * (r / np.minimum(np.maximum(r, 1e-30) / _CENTER_R, 1.0)))
+
+
 def rule_of_thumb(sigma: float, dimensions: int, count: int) -> float:
     """Bandwidth by the normal reference rule, h = sigma (4 / ((d + 2) n))^(1 / (d + 4)), eq. (8)."""
     return sigma * (4.0 / ((dimensions + 2) * max(count, 1))) ** (1.0 / (dimensions + 4))

@@ -1,0 +1,125 @@
+"""Speed and size of the lens model as ratios of one run; prints the table of docs/lens-model.md.
+
+    python benchmarks/model_speed.py [--samples 1000] [--many 4000] [--methods blended nadaraya-watson]
+
+Peer: scipy's cKDTree over the flat cloud of (u, v, r, cos phi, sin phi) points of the same samples, 200
+nearest for every pixel of the answer, as the paper describes. CPU seconds of the process, medians.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import statistics
+import time
+from collections.abc import Callable
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from lensmodel.geometry import pixel_to_local
+from lensmodel.psf import PsfSample, gaussian
+from lensmodel.regression import LensModel, ModelSettings
+from lensmodel.types import CHANNELS, FieldPosition, LensSettings
+
+SIDE, NEAREST = 31, 200
+GRID = (20, 30)
+SETTINGS = LensSettings(aperture=2.8, channel="g")
+
+
+def lens(count: int) -> list[PsfSample]:
+    """Make samples of a family of kernels that are wide along v and grow outwards, 24 to a photo."""
+    rng = np.random.default_rng(0)
+    found = []
+    for i in range(count):
+        r = math.sqrt(rng.uniform(0.0, 0.95))
+        along, across = 0.8 + 1.2 * r * r, 1.0 + 2.0 * r * r
+        phi = float(rng.uniform(-math.pi, math.pi))
+        c, s = math.cos(phi), math.sin(phi)
+        u, v = np.array([-s, c]), np.array([-c, -s])
+        kernel = gaussian(SIDE, along**2 * np.outer(u, u) + across**2 * np.outer(v, v))
+        settings = SETTINGS.with_channel(CHANNELS[i % 3])
+        found.append(PsfSample(kernel, FieldPosition(r, phi), settings, photo=f"p{i // 24}"))
+    return found
+
+
+def cpu(work: Callable[[], object], times: int) -> float:
+    """Median CPU seconds."""
+    found = []
+    for _ in range(times):
+        start = time.process_time()
+        work()
+        found.append(time.process_time() - start)
+    return statistics.median(found)
+
+
+def growth(model: LensModel, samples: list[PsfSample]) -> float:
+    """Median CPU seconds of adding one sample after another."""
+    found = []
+    for sample in samples:
+        start = time.process_time()
+        model = model.added([sample])
+        found.append(time.process_time() - start)
+    return statistics.median(found)
+
+
+def points(samples: list[PsfSample], scale: np.ndarray) -> np.ndarray:
+    """Place every pixel of every sample in units of bandwidths, shape (n * SIDE^2, 5)."""
+    t = np.arange(SIDE) - SIDE // 2
+    clouds = []
+    for s in samples:
+        u, v = pixel_to_local(t[:, None], t[None, :], s.position.phi)
+        place = [s.position.r, math.cos(s.position.phi), math.sin(s.position.phi)]
+        clouds.append(np.column_stack([u.ravel(), v.ravel(), np.tile(place, (SIDE * SIDE, 1))]))
+    return np.concatenate(clouds) / scale
+
+
+def asked(count: int) -> list[FieldPosition]:
+    """Draw places."""
+    rng = np.random.default_rng(1)
+    return [FieldPosition(float(r), float(p)) for r, p in rng.uniform((0, -3), (0.95, 3), (count, 2))]
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--samples", type=int, default=1000)
+    parser.add_argument("--many", type=int, default=4000)
+    parser.add_argument("--methods", nargs="+", default=["combined", "blended", "nadaraya-watson"])
+    wanted = parser.parse_args()
+    samples = lens(max(wanted.samples, wanted.many))
+    few, places = samples[: wanted.samples], asked(15)
+
+    scale = np.array([0.6, 0.6, 0.09, 0.3, 0.3])
+    tree = cKDTree(points(few, scale))
+    questions = [PsfSample(gaussian(SIDE, np.eye(2)), p, SETTINGS) for p in places[:5]]
+    clouds = iter([points([q], scale) for q in questions])
+    peer = cpu(lambda: tree.query(next(clouds), k=NEAREST), 5)
+    print(f"flat cKDTree, {NEAREST} nearest, {len(few)} samples: {1e3 * peer:.1f} ms a PSF")
+    print("| method | samples | fit s | first s | PSF ms | of the tree | 30 x 20 x 3 s | add one ms | MiB |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for method in wanted.methods:
+        for chosen in (few, samples[: wanted.many]):
+            start = time.process_time()
+            model = LensModel.fit(chosen, ModelSettings(method=method))
+            fit = time.process_time() - start
+            start = time.process_time()
+            model.query(places[0], SETTINGS, SIDE)
+            first = time.process_time() - start
+            turns = iter(places)
+            one = cpu(lambda m=model, t=turns: m.query(next(t), SETTINGS, SIDE), len(places))
+            start = time.process_time()
+            for place in asked(GRID[0] * GRID[1] // 4):  # a quarter of the grid, times four
+                for channel in CHANNELS:
+                    model.query(place, SETTINGS.with_channel(channel), SIDE)
+            grid = 4 * (time.process_time() - start)
+            size, add = model.nbytes, growth(model, chosen[:12])
+            print(
+                f"| {method} | {len(chosen)} | {fit:.2f} | {first:.2f} | {1e3 * one:.2f} | {one / peer:.3f} "
+                f"| {grid:.2f} | {1e3 * add:.1f} | {size / 2**20:.0f} |",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

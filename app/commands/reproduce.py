@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import time
 from collections.abc import Iterator
@@ -11,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.commands import display
 from lensmodel.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def reproduce(
         output,
         route="in the library" if direct else "by the service",
         code=() if direct else CODE,
-        on_work=Progress(),
+        on_work=Progress(quiet=not logging.getLogger().isEnabledFor(logging.WARNING)),
     )
     result["figures"]["fig1"] = collected(benchmark, output / "pictures")
     written = [*write_page(result, output)]
@@ -91,7 +91,8 @@ def reproduce(
 class Progress:
     """One line on standard error after each piece of work, with the time left."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, quiet: bool = False) -> None:
+        self._quiet = quiet
         self._began = time.monotonic()
         self._stored = 0.0
         self._last = 0.0
@@ -101,7 +102,7 @@ class Progress:
         if not fresh:
             self._stored += done - self._last
         self._last = done
-        if display.quiet:
+        if self._quiet:
             return
         spent, computed = time.monotonic() - self._began, done - self._stored
         left = ""

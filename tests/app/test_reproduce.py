@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 
 from app.cli import app
 from app.client import JobEndedError
-from app.commands import display
 from app.commands.reproduce import Progress
 from app.reproduce import CODE, ServiceRoute, ServiceRoutes
 from app.schemas import JobOut
@@ -72,7 +71,6 @@ def test_route_says_why_a_photo_did_not_count(tmp_path: Path) -> None:
 def test_progress_tells_the_share_done_and_leaves_stored_work_out_of_the_estimate(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(display, "quiet", False)
     now = iter([0.0, 0.0, 10.0, 20.0])  # begun, then once a line
     monkeypatch.setattr("app.commands.reproduce.time", SimpleNamespace(monotonic=lambda: next(now)))
     tell = Progress()

@@ -32,7 +32,7 @@ from lensmodel.bench.reproduce import (
 from lensmodel.bench.reproduce.cases import FIRST_SEED, fingerprint, key_of
 from lensmodel.bench.reproduce.scenes import centred_cut, frame_scene, layout_for, scene_files
 from lensmodel.bench.reproduce.shots import Shots
-from lensmodel.bench.reproduce.tables import kept, shares, summary
+from lensmodel.bench.reproduce.tables import groups, kept, shares, summary
 from lensmodel.errors import InvalidInputError
 from lensmodel.simulate import LENS_KINDS
 from lensmodel.types import CHANNELS, ZONES, FieldPosition, LensSettings, Planes
@@ -71,6 +71,7 @@ def test_full_size_takes_every_lens_at_two_apertures() -> None:
     for seed in {one.seed for one in cases}:
         apertures = {one.aperture for one in cases if one.seed == seed}
         assert max(apertures) == pytest.approx(2 * min(apertures))
+    assert {round(one.stops) for one in cases} == {0, 2}
     assert any(len({c.focal_mm for c in cases if c.seed == seed}) == 2 for seed in {c.seed for c in cases})
 
 
@@ -174,6 +175,7 @@ def result(*lenses: tuple[float, float]) -> dict[str, Any]:
             "title": f"Lens <{i}>",
             "kind": "coma",
             "settings": {"seed": 1000 + i, "height": 480, "width": 640},
+            "stops": 0.0,
             "frames": "each frame is a photograph",
             "truth": {
                 "before": state(100, 30.0),
@@ -246,8 +248,19 @@ def test_page_needs_nothing_from_outside_and_escapes_names(tmp_path: Path) -> No
 def test_json_holds_results_and_summary(tmp_path: Path) -> None:
     path = write_json(result((160, 32.0)), tmp_path / "all.json")
     stored = json.loads(path.read_text(encoding="utf-8"))
-    assert stored["summary"]["share"]["paper"]["1"]["corner"] == pytest.approx(0.6)
+    assert stored["summary"]["wide open, frames of 640 x 480"]["share"]["paper"]["1"][
+        "corner"
+    ] == pytest.approx(0.6)
     assert stored["cases"][0]["learned"]["1"]["methods"]["paper"]["psnr"]["mid"] == 32.0
+
+
+def test_lenses_at_other_apertures_get_tables_of_their_own(tmp_path: Path) -> None:
+    made = result((160, 32.0), (120, 31.0))
+    made["cases"][1]["stops"] = 2.0
+    found = {label: summary(group) for label, group in groups(made).items()}
+    assert [one["lenses"] for one in found.values()] == [1, 1]
+    markdown, _ = write_page(made, tmp_path)
+    assert "2 stops down, frames of 640 x 480" in markdown.read_text(encoding="utf-8")
 
 
 def test_page_says_when_photos_did_not_count(tmp_path: Path) -> None:

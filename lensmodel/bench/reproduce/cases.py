@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,6 +75,11 @@ class Case:
     def title(self) -> str:
         """For people."""
         return f"{self.lens.model.removeprefix('Simulated ')} at {self.focal_mm:g} mm f/{self.aperture:g}"
+
+    @property
+    def stops(self) -> float:
+        """How many stops it is closed from wide open."""
+        return 2.0 * math.log2(self.aperture / self.lens.at_focal(self.focal_mm).f_number)
 
     @property
     def settings(self) -> LensSettings:

@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from lensmodel.bench.reproduce.tables import number, states, summary, table
+from lensmodel.bench.reproduce.tables import groups, number, states, summary, table
 from lensmodel.types import ZONES
 
 _PAPER = [
@@ -80,11 +80,13 @@ def write_page(result: Mapping[str, Any], folder: Path) -> tuple[Path, Path]:
     tuple of Path
     """
     folder.mkdir(parents=True, exist_ok=True)
-    page, found = _Page(), summary(result)
+    page = _Page()
     page.title("The paper's figures with this software", 1)
     page.text(_conditions(result))
-    _table1(page, found)
-    _fidelity(page, found)
+    for label, group in groups(result).items():
+        found = summary(group)
+        _table1(page, found, label)
+        _fidelity(page, found, label)
     _lenses(page, result)
     _fig1(page, result["figures"].get("fig1"))
     _fig2(page, result["figures"].get("fig2"))
@@ -94,8 +96,9 @@ def write_page(result: Mapping[str, Any], folder: Path) -> tuple[Path, Path]:
 
 
 def write_json(result: Mapping[str, Any], path: Path) -> Path:
-    """Write every figure and the summary."""
-    return _whole(path, json.dumps({**result, "summary": summary(result)}, indent=1) + "\n")
+    """Write every figure, and the summary of each group of lenses."""
+    found = {label: summary(group) for label, group in groups(result).items()}
+    return _whole(path, json.dumps({**result, "summary": found}, indent=1) + "\n")
 
 
 def _conditions(result: Mapping[str, Any]) -> str:
@@ -123,12 +126,13 @@ def _listed(seeds: Sequence[int]) -> str:
     return ", ".join(str(seed) for seed in seeds)
 
 
-def _table1(page: _Page, found: Mapping[str, Any]) -> None:
-    page.title("Table 1: MTF50 in line pairs per picture height")
+def _table1(page: _Page, found: Mapping[str, Any], label: str) -> None:
+    page.title(f"Table 1: MTF50 in line pairs per picture height, {label}")
     page.text(
-        "Mean over the lenses; in each zone the median over its slanted edges. MTF50 alone proves nothing, "
-        "because a PSF that is too wide scores above the truth: read it with the highest MTF (1.00 is "
-        "right) and the overshoot of the edge in percent of the step, both the largest of the zone."
+        f"Mean over {found['lenses']} lenses; in each zone the median over its slanted edges. MTF50 "
+        "alone proves nothing, because a PSF that is too wide scores above the truth: read it with the "
+        "highest MTF (1.00 is right) and the overshoot of the edge in percent of the step, "
+        "both the largest of the zone."
     )
     for method, rows in found["mtf"].items():
         page.title(f"Method {method}", 3)
@@ -153,8 +157,8 @@ def _edge_cells(row: Mapping[str, Any]) -> list[str]:
     return cells
 
 
-def _fidelity(page: _Page, found: Mapping[str, Any]) -> None:
-    page.title("Error of the PSF")
+def _fidelity(page: _Page, found: Mapping[str, Any], label: str) -> None:
+    page.title(f"Error of the PSF, {label}")
     page.text(
         "Relative L2 against the truth after sub-pixel alignment, green; median of the zone, mean over "
         "lenses."
@@ -167,7 +171,7 @@ def _fidelity(page: _Page, found: Mapping[str, Any]) -> None:
         "Share of places where the model's own prediction of this error is right within a factor of 1.5: "
         f"{right}."
     )
-    page.title("A photo never used for calibration")
+    page.title(f"A photo never used for calibration, {label}")
     page.text(
         "PSNR in dB of the sRGB-encoded picture against the sharp scene, each block of 128 pixels at "
         "its best shift, before and after alike. The control denoises and demosaics without deblurring: "

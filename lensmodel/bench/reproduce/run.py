@@ -189,6 +189,7 @@ class _Job:
             "title": case.title,
             "kind": case.lens.model.split()[1].lower(),
             "settings": {key: value for key, value in asdict(case).items() if key != "layout"},
+            "stops": case.stops,
             "frames": case.layout.words(),
             "truth": _read(truth),
             "learned": {str(n): _read(path) for n, path in learned.items()},

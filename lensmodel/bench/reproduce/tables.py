@@ -17,6 +17,17 @@ SMALL_GAIN: Final = 0.05
 TOLERATED_DB: Final = 0.05
 
 
+def groups(result: Result) -> dict[str, Result]:
+    """Split the lenses by aperture and frame: means over different ones would compare nothing."""
+    found: dict[str, list[Result]] = {}
+    for case in result["cases"]:
+        settings = case["settings"]
+        stops = "wide open" if case["stops"] < 0.1 else f"{case['stops']:.0f} stops down"
+        label = f"{stops}, frames of {settings['width']} x {settings['height']}"
+        found.setdefault(label, []).append(case)
+    return {label: {**result, "cases": cases} for label, cases in found.items()}
+
+
 def counts(result: Result) -> list[int]:
     """Numbers of photos that occur, ascending."""
     return sorted({int(n) for case in result["cases"] for n in case["learned"]})

@@ -47,6 +47,7 @@ _NEAR_STOPS: Final = 0.7
 _FEWEST: Final = 12
 _SOFTER: Final = 0.10  # less is not seen between two sides of a print
 _COMATIC: Final = 0.15  # third moment over width cubed, at the middle of the picture
+_UNSURE_PERCENT: Final = 40.0  # sides that may differ by more are not called alike
 _CHANCE: Final = 0.01
 _WING: Final = 0.01
 
@@ -282,7 +283,7 @@ def _verdict(softer: Asymmetry, coma: Asymmetry | None, photos: int) -> tuple[Ve
     if not signs:
         spread = 100.0 * math.expm1(2.0 * softer.error)
         sides = 100.0 * math.expm1(softer.amount)
-        if max(spread, sides) > 60.0:
+        if max(spread, sides) > _UNSURE_PERCENT:
             return "unknown", (
                 f"{told} cannot tell whether the lens is centred: opposite sides differ by "
                 f"{sides:.0f} %, give or take {spread:.0f} %"
@@ -291,7 +292,9 @@ def _verdict(softer: Asymmetry, coma: Asymmetry | None, photos: int) -> tuple[Ve
             f"well centred within what {told} can tell: the blur of opposite sides differs by "
             f"{sides:.0f} %, give or take {spread:.0f} %"
         )
-    text = f"decentred: {'; '.join(signs)}"
+    found = "; ".join(signs)
     if photos == 1:
-        text += "; one photo cannot tell this from a subject at a slant, another photo can"
-    return "decentred", text
+        return "unknown", (
+            f"perhaps decentred: {found}; one photo cannot tell this from a subject at a slant, another can"
+        )
+    return "decentred", f"decentred: {found}"

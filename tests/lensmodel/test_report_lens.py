@@ -50,7 +50,9 @@ def true_samples(
 
 def quick(samples: list[PsfSample]) -> LensModel:
     """A model that is made fast: the centring is judged by the samples, whatever smooths them."""
-    return LensModel.fit(samples, ModelSettings(method="nadaraya-watson", robust=False))
+    return LensModel.fit(
+        samples, ModelSettings(r=0.2, phi=0.5, mirror=0.0, method="nadaraya-watson", robust=False)
+    )
 
 
 def aligned(kind: str, seed: int = 1000, decentred: tuple[float, float] = (0.0, 0.0)) -> SimulatedLens:
@@ -109,11 +111,11 @@ class TestDecentring:
 def test_drawn_faults_are_found_on_the_side_where_the_truth_is_softer(kind: str, seed: int) -> None:
     lens = draw_lens(seed, kind)
     settings = wide_open(lens)
-    angles = np.arange(24) * math.pi / 12
+    angles = np.arange(12) * math.pi / 6
     width = [np.sum(widths_along(lens.kernel(FieldPosition(0.7, a), settings, 31), a)) for a in angles]
     softer = float(np.angle((np.log(width) * np.exp(1j * angles)).sum()))
 
-    found = decentring(LensModel.fit(true_samples(lens, 3)), settings)
+    found = decentring(quick(true_samples(lens, 3)), settings)
 
     assert found.verdict == "decentred"
     assert found.softer is not None
@@ -178,7 +180,7 @@ def noisy(seed: int, photos: int, tilt: float) -> LensModel:
 
 
 def test_errors_are_as_large_as_the_scatter_of_centred_lenses() -> None:
-    found = [decentring(noisy(seed, 5, 0.0), LensSettings(aperture=2.0)) for seed in range(12)]
+    found = [decentring(noisy(seed, 5, 0.0), LensSettings(aperture=2.0)) for seed in range(8)]
 
     softer = [f.softer for f in found if f.softer is not None]
     scatter = math.sqrt(np.mean([s.amount**2 / 2.0 for s in softer]))
@@ -186,7 +188,7 @@ def test_errors_are_as_large_as_the_scatter_of_centred_lenses() -> None:
     assert 0.6 < scatter / np.mean([s.error for s in softer]) < 1.5
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_tilt_is_found_through_the_scatter(seed: int) -> None:
     found = decentring(noisy(seed, 5, 0.35), LensSettings(aperture=2.0))
 
@@ -227,7 +229,7 @@ def test_a_report_survives_json() -> None:
 def test_the_map_tells_the_sharpness_of_the_true_kernels() -> None:
     lens = draw_lens(1000, "coma")
     settings = wide_open(lens)
-    report = lens_report(LensModel.fit(true_samples(lens, 4)), settings, SMALL)
+    report = lens_report(LensModel.fit(true_samples(lens, 3)), settings, SMALL)
 
     for point in report.field:
         truth = lens.kernel(point.position, settings, SIZE)

@@ -6,7 +6,7 @@ import csv
 import io
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -37,6 +37,8 @@ ChannelName = Annotated[str, typer.Option("--channel", help="r, g or b.")]
 Aspect = Annotated[float, typer.Option(help="Width over height of the picture.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace files that are there already.")]
 
+_FILES: Final = ("report.json", "mtf.csv", "mtf-map.svg", "mtf-curves.svg", "apertures.svg")
+
 
 def report(
     profile: Profile,
@@ -59,6 +61,9 @@ def report(
 
         lensmodel report my-24mm.lensprofile --json
     """
+    if output is not None:
+        for name in _FILES:
+            _refuse_existing(output / name, force=force)
     model = load_profile(profile).model
     found = lens_report(model, _settings(model, aperture, channel), ReportSettings(aspect=aspect))
     wish = advice(model)
@@ -73,8 +78,6 @@ def report(
         if len(found.apertures) > 1:
             files["apertures.svg"] = apertures_svg(found)
         output.mkdir(parents=True, exist_ok=True)
-        for name in files:
-            _refuse_existing(output / name, force=force)
         for name, text in files.items():
             write_atomically(output / name, text.encode())
     typer.echo(document if json_output else _words(found, wish, output))

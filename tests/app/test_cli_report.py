@@ -95,13 +95,18 @@ def test_the_report_folder_holds_numbers_and_pictures_that_agree(folder: Path) -
 
 
 def test_files_that_are_there_are_kept_without_force(folder: Path) -> None:
-    run("report", NAME, "-o", "out")
-    run("export", NAME, "-o", "psf.tif")
+    (folder / "out").mkdir()
+    for name in ("out/report.json", "psf.tif"):
+        (folder / name).write_text("mine", encoding="utf-8")
 
     for words in (("report", NAME, "-o", "out"), ("export", NAME, "-o", "psf.tif")):
         with pytest.raises(InvalidInputError, match="--force replaces it"):
             run(*words)
-        run(*words, "--force")
+    assert {p.name for p in (folder / "out").iterdir()} == {"report.json"}
+    assert (folder / "psf.tif").read_text(encoding="utf-8") == "mine"
+
+    run("export", NAME, "-o", "psf.tif", "--force")
+    assert tifffile.imread(folder / "psf.tif").shape == (35, 31, 31)
 
 
 def test_an_exported_stack_holds_the_answers_of_the_profile(folder: Path) -> None:

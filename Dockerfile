@@ -29,6 +29,7 @@ ENV PATH=/opt/lensmodel/bin:$PATH \
     HOME=/data \
     LENS_DATA_DIR=/data \
     LENS_HOST=0.0.0.0 \
+    LENS_PORT=8000 \
     LENS_PUBLIC=true \
     NUMBA_CACHE_DIR=/data/cache \
     OMP_NUM_THREADS=1 \
@@ -43,6 +44,6 @@ WORKDIR /data
 EXPOSE 8000
 STOPSIGNAL SIGTERM
 HEALTHCHECK --interval=30s --timeout=5s --start-period=60s --retries=3 \
-  CMD ["python3", "-c", "import urllib.request as u; u.urlopen('http://127.0.0.1:8000/readyz', timeout=4)"]
+  CMD ["python3", "-c", "import os, urllib.request as u; u.urlopen('http://127.0.0.1:' + os.environ['LENS_PORT'] + '/readyz', timeout=4)"]
 ENTRYPOINT ["/bin/sh", "-c", "mkdir -p /data/tmp && exec lensmodel \"$@\"", "lensmodel"]
-CMD ["serve", "--port", "8000"]
+CMD ["serve"]

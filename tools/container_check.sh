@@ -86,7 +86,7 @@ for path in $(grep -oE '(file://)?/[^ ]+' "$folder/pip.conf" | sed 's#^file://##
 done
 
 say "building the image ..."
-engine bud --isolation chroot --pull-never --layers --build-arg BASE=localhost/lensmodel-base \
+engine bud --format docker --isolation chroot --pull-never --layers --build-arg BASE=localhost/lensmodel-base \
   "${lent[@]}" --tag lensmodel --file "$here/Dockerfile" "$here" >"$folder/build.log" 2>&1 \
   || { tail -n 30 "$folder/build.log" >&2; fail "the image does not build"; }
 

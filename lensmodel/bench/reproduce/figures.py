@@ -85,7 +85,7 @@ def _sheet(rows: Sequence[Sequence[NDArray[np.uint8]]], gap: int = 4) -> NDArray
 def _fig4(plan: Reproduction, case: Case, folder: Path, workers: int | None) -> dict[str, Any]:
     """Confidence map with the patches, the PSF of each patch, and the regressed field."""
     with TemporaryDirectory(prefix="lensmodel-figure-") as work:
-        shots = take(case, plan.files(), Path(work), workers=workers or 1)
+        shots = take(case, plan.files(), Path(work), first=1)
         developed = develop(shots.learn[0])
         chosen = pipeline.find_patches(developed)
         try:

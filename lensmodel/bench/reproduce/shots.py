@@ -52,13 +52,19 @@ class Shots:
 
 
 def take(
-    case: Case, files: Sequence[Path], folder: Path, *, workers: int = 1, on_step: StepHook = ignore_step
+    case: Case,
+    files: Sequence[Path],
+    folder: Path,
+    *,
+    first: int | None = None,
+    workers: int = 1,
+    on_step: StepHook = ignore_step,
 ) -> Shots:
-    """Take the photos of a case that are not there yet."""
+    """Take the photos of a case that are not there yet; only the `first` so many if that is given."""
     folder.mkdir(parents=True, exist_ok=True)
     shots = Shots.of(case, folder)
     targets = (*shots.learn, shots.held_out, shots.chart)
-    missing = [number for number, path in enumerate(targets) if not path.exists()]
+    missing = [number for number, path in enumerate(targets[:first]) if not path.exists()]
     if not missing:
         return shots
     if workers <= 1 or len(missing) == 1:

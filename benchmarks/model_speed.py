@@ -65,7 +65,7 @@ def growth(model: LensModel, samples: list[PsfSample]) -> float:
 
 def points(samples: list[PsfSample], scale: np.ndarray) -> np.ndarray:
     """Place every pixel of every sample in units of bandwidths, shape (n * SIDE^2, 5)."""
-    t = np.arange(SIDE) - SIDE // 2
+    t = np.arange(SIDE, dtype=np.float64) - SIDE // 2
     clouds = []
     for s in samples:
         u, v = pixel_to_local(t[:, None], t[None, :], s.position.phi)

@@ -16,6 +16,7 @@ from lensmodel.blind.whittle import Whittle
 from lensmodel.psf import as_kernel, centred, distance, rms_width
 from lensmodel.types import NoiseModel, Plane, StepHook, ignore_step
 
+_PIXEL_SIGMA = 0.29
 _AT_TYPICAL = -1.08
 """Logarithm of the error where both estimates agree on a Gaussian of 1 px and a usual scene."""
 
@@ -27,17 +28,18 @@ class Cautious:
     A kernel that is too wide ruins a photo, one too narrow only helps less. Both methods take the
     softness of a scene for blur, each in its own way:
 
-    * narrower than `trusted_px`, the Gaussian alone is given: patch recurrence is often twice too
-      wide there;
-    * wider, the mean of both, its radial MTF raised to the higher one of the two.
+    * a Gaussian narrower than `trusted_px`: the mean of both, unless patch recurrence ran more than
+      `apart` times as wide; then the Gaussian alone;
+    * a wider one: the mean, its radial MTF raised to the higher one of the two.
 
     The root mean square distance of their MTFs is also the best predictor of the true error.
     """
 
     trusted_px: float = 0.95
+    apart: float = 2.2
 
     name = "default"
-    version = 3
+    version = 4
 
     def estimate(
         self,
@@ -79,9 +81,10 @@ class Cautious:
     def _chosen(self, gaussian: PsfEstimate, found: PsfEstimate, began: float, size: int) -> PsfEstimate:
         disagreement = distance(found.kernel, gaussian.kernel).mtf_rmse
         narrow = rms_width(gaussian.kernel) <= self.trusted_px
-        kernel = gaussian.kernel
-        if not narrow:
-            mean = as_kernel(0.5 * (gaussian.kernel + found.kernel))
+        kernel = mean = as_kernel(0.5 * (gaussian.kernel + found.kernel))
+        if narrow and rms_width(found.kernel) > self.apart * max(rms_width(gaussian.kernel), _PIXEL_SIGMA):
+            kernel = gaussian.kernel
+        elif not narrow:
             milder = np.maximum(radial_mtf(gaussian.kernel), radial_mtf(found.kernel))
             kernel = centred(with_radial_mtf(mean, milder))
         error = predicted_error(disagreement, rms_width(gaussian.kernel), gaussian.diagnostics["slope"])

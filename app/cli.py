@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 import os
+import signal
 import sys
 from typing import Annotated
 
@@ -14,8 +14,11 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 import typer
 
-from app.commands import benchmarks, demonstration, display, photos, report, reproduce, service
+from app.commands import benchmarks, demonstration, display, interrupt, photos, report, reproduce, service
+from app.commands.failure import InterruptedByUser, UsageError
 from lensmodel.errors import LensModelError
+
+interrupt.workers_ignore_it()
 
 app = typer.Typer(
     name="lensmodel",
@@ -50,6 +53,7 @@ def _show_version(wanted: bool) -> None:
 
 @app.callback()
 def configure(
+    context: typer.Context,
     verbose: Annotated[
         int, typer.Option("-v", "--verbose", count=True, help="More log lines; twice: all.")
     ] = 0,
@@ -61,21 +65,32 @@ def configure(
 ) -> None:
     """Learn the blur of one copy of a lens from ordinary photos, and remove it."""
     del version
-    level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
-    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    shown = display.Display(quiet, verbose)
+    shown.configure()
+    context.obj = shown
     display.quiet = quiet
 
 
 def main() -> None:
-    """Run the command; exit 0 done, 1 something failed, 2 wrong usage, 130 interrupted."""
+    """Run the command; exit 0 done, 1 something failed, 2 wrong usage, 128 + signal interrupted."""
+    interrupt.install()
     try:
         app()
     except LensModelError as error:
         typer.echo(f"lensmodel: {error}", err=True)
+        sys.exit(2 if isinstance(error, UsageError) else 1)
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        typer.echo(
+            f"lensmodel: {where}{error.strerror or error}; check the path, its rights and the disk", err=True
+        )
         sys.exit(1)
-    except KeyboardInterrupt:
-        typer.echo("lensmodel: interrupted; finished files are kept, nothing half-written is left", err=True)
-        sys.exit(130)
+    except InterruptedByUser as stopped:
+        name = signal.Signals(stopped.number).name
+        typer.echo(
+            f"lensmodel: stopped by {name}; finished files are kept, nothing is half-written", err=True
+        )
+        sys.exit(128 + stopped.number)
 
 
 if __name__ == "__main__":

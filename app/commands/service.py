@@ -1,64 +1,93 @@
-"""`lensmodel serve` and its two parts."""
+"""`lensmodel serve`, its two parts, and what they are set to."""
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.settings import Settings
+from app.commands.failure import UsageError
+
+if TYPE_CHECKING:
+    from app.settings import Settings
 
 Data = Annotated[
-    Path | None, typer.Option("--data", help="Folder for the database and the photos.", show_default="./data")
+    Path | None,
+    typer.Option("--data", help="Folder of the database and the photos.", show_default="lensmodel-data"),
 ]
+Port = Annotated[
+    int | None,
+    typer.Option("--port", "-p", min=0, max=65535, help="0 takes any free port.", show_default="8000"),
+]
+Host = Annotated[str | None, typer.Option("--host", help="Address to listen on.", show_default="127.0.0.1")]
 
 
-def _settings(data: Path | None) -> Settings:
-    if data is not None:
-        os.environ["LENS_DATA_DIR"] = str(data.resolve())
-    return Settings()
+def _settings(data: Path | None, host: str | None = None, port: int | None = None) -> Settings:
+    """Read the settings; what the command line says goes before the environment."""
+    from pydantic import ValidationError  # noqa: PLC0415 - only these commands need the service
+
+    from app.settings import Settings  # noqa: PLC0415 - same
+
+    given = {"data_dir": data, "host": host, "port": port}
+    try:
+        return Settings(**{name: value for name, value in given.items() if value is not None})  # type: ignore[arg-type]  # checked by pydantic
+    except ValidationError as error:
+        said = [str(found["msg"]).removeprefix("Value error, ") for found in error.errors()]
+        places = [".".join(str(part) for part in found["loc"]) for found in error.errors()]
+        raise UsageError(
+            "; ".join(
+                f"LENS_{place.upper()}: {text}" if place else text
+                for place, text in zip(places, said, strict=True)
+            )
+        ) from error
 
 
-def serve(
-    port: Annotated[
-        int, typer.Option("--port", "-p", min=0, max=65535, help="0 takes any free port.")
-    ] = 8000,
-    host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",
-    data: Data = None,
-) -> None:
+def serve(port: Port = None, host: Host = None, data: Data = None) -> None:
     """Run the whole service: the API, a worker, and a guard that restarts them.
 
     Open the printed address in a browser. Stop with Ctrl-C: running work resumes at the next start.
+    Each LENS_ setting of `lensmodel config` can be given in the environment.
 
-    Examples
-    --------
+    Examples:
+
         lensmodel serve
 
         lensmodel serve --port 9000 --data ~/lenses
     """
+    settings = _settings(data, host, port)
     from app import supervisor  # noqa: PLC0415 - only this command needs the service
 
-    raise typer.Exit(supervisor.serve(_settings(data), host=host, port=port))
+    raise typer.Exit(supervisor.serve(settings, host=settings.host, port=settings.port))
 
 
-def api(port: int = 8000, host: str = "127.0.0.1", data: Data = None) -> None:
+def api(port: Port = None, host: Host = None, data: Data = None) -> None:
     """Run only the API process, for installations on many machines."""
-    from app import supervisor  # noqa: PLC0415
+    settings = _settings(data, host, port)
+    from app import supervisor  # noqa: PLC0415 - only this command needs the service
 
-    supervisor.run_api(_settings(data), host=host, port=port)
+    supervisor.run_api(settings)
 
 
 def worker(data: Data = None) -> None:
     """Run only a worker process, for installations on many machines."""
-    from app import supervisor  # noqa: PLC0415
+    settings = _settings(data)
+    from app import supervisor  # noqa: PLC0415 - only this command needs the service
 
-    supervisor.run_worker(_settings(data))
+    supervisor.run_worker(settings)
 
 
 def config(data: Data = None) -> None:
-    """Print the effective settings; secrets are masked."""
+    """Print the effective settings as the environment that would give them; secrets are masked.
+
+    Example:
+
+        lensmodel config
+    """
+    from urllib.parse import urlsplit  # noqa: PLC0415 - only this command needs it
+
     for name, value in sorted(_settings(data).model_dump(mode="json").items()):
-        shown = "********" if "secret" in name or "password" in name else value
+        shown = value
+        if name.endswith("_url") and (password := urlsplit(str(value)).password):
+            shown = str(value).replace(f":{password}@", ":********@")
         typer.echo(f"LENS_{name.upper()}={shown}")

@@ -1,0 +1,107 @@
+"""`lensmodel psf`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import tifffile
+from PIL import Image
+
+from app.commands import files
+from app.commands.display import Display, atomic
+from app.commands.failure import UsageError
+from lensmodel import quality
+from lensmodel.codec import to_json
+from lensmodel.geometry import zone_of
+from lensmodel.psf import rms_width
+from lensmodel.regression import PsfAnswer
+from lensmodel.types import Channel, FieldPosition, LensSettings
+
+WRITTEN: Final = (".npy", ".json", ".tif", ".png")
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """Which PSF is asked for."""
+
+    r: float
+    phi: float
+    aperture: float | None
+    channel: Channel
+    size: int
+
+
+def run(
+    source: Path, asked: Question, output: Path | None, display: Display, *, force: bool, as_json: bool
+) -> None:
+    """Answer in words, as JSON, or into a file.
+
+    Raises
+    ------
+    UsageError
+        If the question or the file is refused.
+    """
+    with files.as_usage():
+        place = FieldPosition(asked.r, asked.phi)
+        settings = LensSettings(aperture=asked.aperture, channel=asked.channel)
+    if asked.size % 2 == 0:
+        raise UsageError(f"--size must be odd, got {asked.size}; a PSF has one middle pixel")
+    if output is not None and output.suffix.lower() not in WRITTEN:
+        raise UsageError(f"no format for {output.name}; give a name that ends in {', '.join(WRITTEN)}")
+    if output is not None and output.exists() and not force:
+        raise UsageError(f"{output} is there already; --force replaces it")
+    answer = files.profile_at(source).model.query(place, settings, asked.size)
+    tangential, sagittal = quality.tangential_sagittal_mtf50(answer.kernel, place.phi)
+    document = {
+        "query": {
+            "r": place.r,
+            "phi": place.phi,
+            "aperture": asked.aperture,
+            "channel": asked.channel,
+            "size": asked.size,
+        },
+        "support": {
+            "effective_samples": answer.effective_samples,
+            "photos": answer.photos,
+            "extrapolated": answer.extrapolated,
+            "predicted_error": answer.predicted_error,
+        },
+        "rms_width_px": rms_width(answer.kernel),
+        "mtf50": {"tangential": tangential, "sagittal": sagittal},
+        "psf": {"shape": list(answer.kernel.shape), "dtype": "float32", "data": answer.kernel.tolist()},
+    }
+    if output is not None:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        with atomic(output) as part:
+            _write(part, answer, document)
+    if as_json:
+        display.document(document)
+    else:
+        display.result(_words(place, answer, tangential, sagittal))
+
+
+def _words(place: FieldPosition, answer: PsfAnswer, tangential: float, sagittal: float) -> str:
+    beyond = " (beyond what the photos cover)" if answer.extrapolated else ""
+    return (
+        f"{zone_of(place.r)}, r {place.r:g}: rms width {rms_width(answer.kernel):.2f} px, MTF50 tangential "
+        f"{tangential:.3f}, sagittal {sagittal:.3f} cycles/px; {answer.photos} photos, "
+        f"{answer.effective_samples:.1f} effective samples, expected error "
+        f"{answer.predicted_error:.2f}{beyond}"
+    )
+
+
+def _write(path: Path, answer: PsfAnswer, document: dict[str, Any]) -> None:
+    kernel = answer.kernel.astype(np.float32)
+    match path.suffix.lower():
+        case ".npy":
+            np.save(path, kernel, allow_pickle=False)
+        case ".json":
+            path.write_text(json.dumps(to_json(document)), encoding="utf-8")
+        case ".tif":
+            tifffile.imwrite(path, kernel)
+        case _:
+            Image.fromarray(np.rint(65535.0 * kernel / kernel.max()).astype(np.uint16)).save(path)

@@ -1,0 +1,133 @@
+"""`lensmodel calibrate`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.progress import Progress, TaskID
+
+from app.commands import files
+from app.commands.display import Display
+from app.commands.failure import UsageError
+from lensmodel import blind, pipeline
+from lensmodel.errors import InvalidInputError, LensModelError
+from lensmodel.regression import LensModel, LensProfile, save_profile
+from lensmodel.types import LensSettings
+
+
+@dataclass(frozen=True, slots=True)
+class Wishes:
+    """What the options said."""
+
+    aperture: float | None
+    estimator: str
+    workers: int | None
+    any_lens: bool
+    force: bool
+
+
+def run(names: Sequence[str], target: Path, wishes: Wishes, display: Display, *, as_json: bool) -> None:
+    """Add photos to a profile, one after the other, and save it after each.
+
+    Raises
+    ------
+    UsageError
+        If something is wrong that can be seen before any work.
+    typer.Exit
+        With 1 if a photo could not be used.
+    """
+    paths = files.photos(names)
+    with files.as_usage():
+        blind.estimators.create(wishes.estimator)
+        settings = LensSettings(aperture=wishes.aperture)
+    calibration = _Calibration(target, _known(target, force=wishes.force), wishes, settings)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    results: list[dict[str, Any]] = []
+    with display.progress() as bars:
+        task = bars.add_task("", total=len(paths))
+        for number, path in enumerate(paths):
+            try:
+                result = calibration.add(path, partial(_show, bars, task, number))
+            except (LensModelError, OSError) as error:
+                code = error.code if isinstance(error, LensModelError) else "unreadable"
+                result = {"state": "failed", "code": code, "reason": files.reason(error)}
+                display.error(f"{path}: {result['reason']}")
+            if result["state"] == "known":
+                display.note(f"{path}: the profile has it already")
+            results.append({"photo": str(path), **result})
+            bars.update(task, completed=number + 1)
+    profile = calibration.profile
+    summary = {
+        "profile": str(target) if profile else None,
+        "photos": len(profile.photos) if profile else 0,
+        "samples": len(profile.model.samples) if profile else 0,
+        "coverage": profile.model.coverage() if profile else {},
+        "results": results,
+    }
+    if as_json:
+        display.document(summary)
+    elif profile is not None and any(result["state"] != "failed" for result in results):
+        cover = ", ".join(f"{zone} {count}" for zone, count in profile.model.coverage().items())
+        display.result(f"{target}: photos {summary['photos']}, samples {summary['samples']} ({cover})")
+    if profile is None:
+        display.error("no photo could be used, so there is no profile; use photos with fine detail in focus")
+    if any(result["state"] == "failed" for result in results):
+        raise typer.Exit(1)
+
+
+def _known(target: Path, *, force: bool) -> LensProfile | None:
+    if target.is_dir():
+        raise UsageError(f"{target} is a folder; give the file of a lens profile")
+    if force or not target.exists():
+        return None
+    try:
+        return files.profile_at(target)
+    except InvalidInputError as error:
+        raise InvalidInputError(f"{error}; --force replaces the file") from error
+
+
+def _show(bars: Progress, task: TaskID, number: int, event: pipeline.CalibrationEvent) -> None:
+    share = event.done / event.total if event.total else 0.0
+    bars.update(task, description=f"{event.photo.name}: {event.stage}", completed=number + share)
+
+
+class _Calibration:
+    """A profile that grows, and the file that keeps up with it."""
+
+    def __init__(
+        self, target: Path, profile: LensProfile | None, wishes: Wishes, settings: LensSettings
+    ) -> None:
+        self.profile = profile
+        self._target, self._wishes, self._settings = target, wishes, settings
+
+    def add(self, path: Path, on_event: pipeline.EventHook) -> dict[str, Any]:
+        """Learn from one photo; say what became of it."""
+        if path.stem.endswith(files.CORRECTED):
+            raise InvalidInputError(
+                "it was corrected already and tells nothing of the lens; give the original"
+            )
+        key = pipeline.photo_id(path)
+        names = dict(self.profile.photos) if self.profile else {}
+        if key in names:
+            return {"state": "known"}
+        lens = dict(self.profile.lens) if self.profile else {}
+        seen = files.identity(path)
+        if not self._wishes.any_lens:
+            files.refuse_other_lens(lens, seen, "give it a profile of its own, or add --any-lens")
+        samples = pipeline.samples_of_photo(
+            path,
+            settings=self._settings,
+            estimator=self._wishes.estimator,
+            workers=self._wishes.workers,
+            on_event=on_event,
+        )
+        model = self.profile.model.added(samples) if self.profile else LensModel.fit(samples)
+        grown = LensProfile(model, seen | lens, {**names, key: path.name})
+        save_profile(self._target, grown)
+        self.profile = grown
+        return {"state": "counted", "samples": len(samples)}

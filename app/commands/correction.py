@@ -1,0 +1,132 @@
+"""`lensmodel correct`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import typer
+from rich.progress import Progress, TaskID
+
+from app.commands import files
+from app.commands.display import Display
+from app.commands.failure import UsageError
+from lensmodel import deconv, pipeline
+from lensmodel.errors import InvalidInputError, LensModelError
+from lensmodel.photo import OutputFormat
+from lensmodel.regression import LensProfile
+from lensmodel.types import LensSettings
+
+EXTENSION: Final[dict[OutputFormat, str]] = {
+    "tiff16": ".tif",
+    "png16": ".png",
+    "png8": ".png",
+    "jpeg": ".jpg",
+    "dng": ".dng",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Wishes:
+    """What the options said."""
+
+    aperture: float | None
+    method: str
+    strength: float
+    file_format: OutputFormat
+    workers: int | None
+    any_lens: bool
+    force: bool
+
+
+def run(
+    names: Sequence[str], source: Path, output: Path, wishes: Wishes, display: Display, *, as_json: bool
+) -> None:
+    """Correct photos into a folder, one after the other.
+
+    Raises
+    ------
+    UsageError
+        If something is wrong that can be seen before any work.
+    typer.Exit
+        With 1 if a photo could not be corrected.
+    """
+    targets = _targets(files.photos(names), output, EXTENSION[wishes.file_format])
+    with files.as_usage():
+        deconv.deconvolvers.create(wishes.method)
+        settings = LensSettings(aperture=wishes.aperture)
+    profile = files.profile_at(source)
+    if output.exists() and not output.is_dir():
+        raise UsageError(f"{output} is a file; give a folder to -o")
+    output.mkdir(parents=True, exist_ok=True)
+    results: list[dict[str, Any]] = []
+    with display.progress() as bars:
+        task = bars.add_task("", total=len(targets))
+        for number, (target, path) in enumerate(targets.items()):
+            bars.update(task, description=path.name)
+            try:
+                result = _one(path, target, profile, settings, wishes, partial(_show, bars, task, number))
+            except (LensModelError, OSError) as error:
+                code = error.code if isinstance(error, LensModelError) else "unreadable"
+                result = {"state": "failed", "code": code, "reason": files.reason(error)}
+                display.error(f"{path}: {result['reason']}")
+            if result["state"] == "kept":
+                display.note(f"{target} is there already and was left alone; --force replaces it")
+            elif result["state"] == "corrected" and not as_json:
+                display.result(str(target))
+            results.append({"photo": str(path), "output": str(target), **result})
+            bars.update(task, completed=number + 1)
+    if as_json:
+        display.document({"profile": str(source), "results": results})
+    if any(result["state"] == "failed" for result in results):
+        raise typer.Exit(1)
+
+
+def _targets(paths: Sequence[Path], output: Path, extension: str) -> dict[Path, Path]:
+    """Name the file that each photo becomes; no two may become the same."""
+    found: dict[Path, Path] = {}
+    for path in paths:
+        target = output / f"{path.stem}{files.CORRECTED}{extension}"
+        if target in found:
+            raise UsageError(
+                f"{found[target]} and {path} would both become {target}; correct them into different folders"
+            )
+        found[target] = path
+    return found
+
+
+def _one(
+    path: Path,
+    target: Path,
+    profile: LensProfile,
+    settings: LensSettings,
+    wishes: Wishes,
+    on_step: Any,  # noqa: ANN401 - a partial of `_show`
+) -> dict[str, Any]:
+    if path.stem.endswith(files.CORRECTED):
+        raise InvalidInputError("it was corrected already; give the original")
+    if target.exists() and not wishes.force:
+        return {"state": "kept"}
+    if not wishes.any_lens:
+        remedy = "use the profile of its own lens, or add --any-lens"
+        files.refuse_other_lens(profile.lens, files.identity(path), remedy)
+    corrected = pipeline.correct(
+        path,
+        profile.model,
+        target,
+        settings=settings,
+        method=wishes.method,
+        strength=wishes.strength,
+        file_format=wishes.file_format,
+        workers=wishes.workers or os.cpu_count() or 1,
+        on_step=on_step,
+    )
+    return {"state": "corrected", "zones": corrected.zones}
+
+
+def _show(bars: Progress, task: TaskID, number: int, done: int, total: int) -> None:
+    bars.update(task, completed=number + done / max(total, 1))

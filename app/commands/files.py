@@ -1,0 +1,147 @@
+"""From the words of a command line to photos and profiles."""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from app.commands.failure import UsageError
+from lensmodel.errors import InvalidInputError
+from lensmodel.photo import inspect
+from lensmodel.regression import LensProfile, load_profile
+
+RAW: Final = frozenset(
+    [
+        ".dng",
+        ".nef",
+        ".nrw",
+        ".cr2",
+        ".cr3",
+        ".crw",
+        ".arw",
+        ".sr2",
+        ".srf",
+        ".raf",
+        ".orf",
+        ".rw2",
+        ".pef",
+        ".srw",
+        ".x3f",
+        ".mrw",
+        ".rwl",
+        ".iiq",
+        ".3fr",
+        ".erf",
+        ".kdc",
+        ".dcr",
+        ".mef",
+        ".mos",
+    ]
+)
+JPEG: Final = frozenset({".jpg", ".jpeg"})
+SUFFIXES: Final = RAW | JPEG | {".tif", ".tiff", ".png"}
+CORRECTED: Final = "-corrected"
+"""Ends the names of what `lensmodel correct` wrote."""
+
+
+def photos(names: Iterable[str]) -> list[Path]:
+    """Turn files, folders and patterns into a list of photos without repeats.
+
+    Of folders and patterns, corrected photos are left out, and JPEG files beside a RAW file of the
+    same name, which show the same exposure again.
+
+    Raises
+    ------
+    UsageError
+        If a name matches nothing.
+    """
+    found: dict[Path, None] = {}
+    for name in names:
+        path = Path(name).expanduser()
+        if path.is_dir():
+            inside = (
+                p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")
+            )
+            matches = _sources(p for p in inside if p.is_file())
+            if not matches:
+                raise UsageError(
+                    f"no photo in the folder {name}; give one that holds RAW, TIFF, PNG or JPEG files"
+                )
+        elif path.is_file():
+            matches = [path]
+        else:
+            every = (Path(p) for p in glob.glob(str(path), recursive=True))  # noqa: PTH207 - absolute patterns too
+            matches = _sources(p for p in every if p.is_file())
+            if not matches:
+                raise UsageError(f"no photo called {name}; check the name and the folder")
+        found.update(dict.fromkeys(matches))
+    return list(found)
+
+
+def _sources(found: Iterable[Path]) -> list[Path]:
+    given = sorted(p for p in found if not p.stem.endswith(CORRECTED))
+    raw = {p.with_suffix("") for p in given if p.suffix.lower() in RAW}
+    return [p for p in given if p.suffix.lower() not in JPEG or p.with_suffix("") not in raw]
+
+
+def profile_at(path: Path) -> LensProfile:
+    """Open a profile.
+
+    Raises
+    ------
+    UsageError
+        If there is none.
+    InvalidInputError
+        If the file is no profile, or a damaged one.
+    """
+    if path.is_dir():
+        raise UsageError(f"{path} is a folder; give the file of a lens profile")
+    if not path.exists():
+        raise UsageError(
+            f"no lens profile at {path}; make it with `lensmodel calibrate PHOTO... --profile {path}`"
+        )
+    return load_profile(path)
+
+
+def identity(path: Path) -> dict[str, str]:
+    """Return what a photo says of its lens: maker, model, serial, as far as it does."""
+    seen = inspect(path).metadata.lens
+    named = {"maker": seen.maker, "model": seen.model, "serial": seen.serial}
+    return {name: value for name, value in named.items() if value}
+
+
+def refuse_other_lens(known: dict[str, str], seen: dict[str, str], remedy: str) -> None:
+    """Compare two lenses as far as both are named.
+
+    Raises
+    ------
+    InvalidInputError
+        If they differ.
+    """
+    for name, value in seen.items():
+        if known.get(name, value) != value:
+            raise InvalidInputError(
+                f"it was taken with another lens, {name} {value}, "
+                f"and the profile is of {name} {known[name]}; {remedy}"
+            )
+
+
+@contextmanager
+def as_usage() -> Iterator[None]:
+    """Turn a refused value into wrong usage: nothing was begun."""
+    try:
+        yield
+    except InvalidInputError as error:
+        raise UsageError(str(error)) from error
+
+
+def reason(error: Exception) -> str:
+    """Say why a file could not be used; the system's errors in words."""
+    if isinstance(error, OSError) and error.strerror:
+        return (
+            f"{error.strerror[:1].lower()}{error.strerror[1:]}; check the file, its folder and their rights"
+        )
+    return str(error)

@@ -1,0 +1,393 @@
+"""The command line as a person types it: real processes, real files."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import pty
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rawpy
+from PIL import Image
+from typer.testing import CliRunner
+
+from app.cli import app, main
+from lensmodel.psf import PsfSample, gaussian
+from lensmodel.regression import LensModel, LensProfile, load_profile, save_profile
+from lensmodel.types import FieldPosition, LensSettings
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+from running import write_photo  # noqa: E402 - beside this file
+
+sys.path.remove(str(HERE))
+
+PROFILE = "my-24mm.lensprofile"
+PATIENCE_S = 60.0
+ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith("LENS_")}
+
+
+def command(*words: str | Path) -> list[str]:
+    return [sys.executable, "-m", "app.cli", *map(str, words)]
+
+
+def lensmodel(*words: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    found = {**ENVIRONMENT, "PYTHONPATH": str(HERE.parents[1])}
+    return subprocess.run(
+        command(*words), cwd=cwd, env=found, capture_output=True, text=True, check=False, timeout=PATIENCE_S
+    )
+
+
+Here = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture
+def here(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Iterator[Here]:
+    """Run `main` in this process, in that folder: saves two seconds of imports where nothing is lost."""
+    root = logging.getLogger()
+    handlers, level = list(root.handlers), root.level
+    signals = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    monkeypatch.chdir(folder)
+
+    def run(*words: str | Path) -> subprocess.CompletedProcess[str]:
+        capsys.readouterr()
+        monkeypatch.setattr(sys, "argv", ["lensmodel", *map(str, words)])
+        try:
+            main()
+            status = 0
+        except SystemExit as end:
+            status = int(end.code or 0)
+        said = capsys.readouterr()
+        return subprocess.CompletedProcess(words, status, said.out, said.err)
+
+    yield run
+    root.handlers[:], root.level = handlers, level
+    for number, handler in signals.items():
+        signal.signal(number, handler)
+
+
+def start(*words: str | Path, cwd: Path) -> subprocess.Popen[str]:
+    """Start a command as a terminal does, in a process group of its own."""
+    return subprocess.Popen(
+        command(*words),
+        cwd=cwd,
+        env={**ENVIRONMENT, "PYTHONPATH": str(HERE.parents[1])},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def wait_for(fact: Callable[[], object]) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not fact():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def one_sentence(text: str) -> str:
+    """Check that standard error is one plain line, and return it."""
+    lines = text.strip().splitlines()
+    assert len(lines) == 1, text
+    assert "Traceback" not in text
+    assert lines[0].startswith("lensmodel: ")
+    return lines[0]
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A profile of a known blur, and photos of that lens and of another."""
+    folder = tmp_path_factory.mktemp("made")
+    write_photo(folder / "a.dng", 1)
+    write_photo(folder / "b.dng", 2)
+    write_photo(folder / "other.dng", 3, serial="L-43")
+    samples = [
+        PsfSample(gaussian(15, np.eye(2) * 1.7), FieldPosition(r, phi), LensSettings(2.8, 35.0), photo="x")
+        for r in (0.1, 0.5, 0.9)
+        for phi in (-2.0, 0.5, 2.5)
+    ]
+    lens = {"maker": "Test Optics", "model": "Test 35mm f/1.8", "serial": "L-42"}
+    save_profile(folder / PROFILE, LensProfile(LensModel.fit(samples), lens, {"0123456789abcdef": "x.dng"}))
+    return folder
+
+
+@pytest.fixture
+def folder(made: Path, tmp_path: Path) -> Iterator[Path]:
+    """A working folder with a profile and one photo, and nothing left behind in it."""
+    shutil.copy(made / PROFILE, tmp_path)
+    shutil.copy(made / "a.dng", tmp_path / "one.dng")
+    yield tmp_path
+    assert not [path for path in tmp_path.rglob("*") if ".part" in path.name]
+
+
+# --- help --------------------------------------------------------------------------------------
+
+
+def examples(*name: str) -> list[list[str]]:
+    text = CliRunner().invoke(app, [*name, "--help"], env={"COLUMNS": "200"}).output
+    return [shlex.split(line) for line in re.findall(r"^ *lensmodel (.+?) *$", text, re.MULTILINE)]
+
+
+RUN_HERE = [
+    *[pytest.param(words, id=" ".join(words)) for words in examples("correct") + examples("psf")],
+    *[pytest.param(words, id=" ".join(words)) for words in examples("calibrate") + examples("config")],
+]
+
+
+def test_every_command_teaches_by_example() -> None:
+    for name in ("calibrate", "correct", "psf", "serve", "config", "demo"):
+        assert examples(name), name
+    for name in ("blind", "model", "correct"):
+        assert examples("bench", name), name
+
+
+@pytest.mark.parametrize("words", RUN_HERE)
+def test_example_runs(words: list[str], folder: Path, made: Path, here: Here) -> None:
+    (folder / "holiday").mkdir()
+    shutil.copy(made / "b.dng", folder / "holiday")
+    shutil.copy(made / "b.dng", folder / "one-more.dng")
+    Image.fromarray(_picture()).save(folder / "scan.tif")
+    if words[0] == "calibrate":  # the estimators have tests of their own
+        words = [*words, "--estimator", "whittle"]
+    done = lensmodel(*words, cwd=folder) if words[0] == "calibrate" else here(*words)
+
+    assert done.returncode == 0, done.stderr
+    assert done.stdout
+
+
+def _picture() -> np.ndarray[Any, np.dtype[np.uint8]]:
+    rng = np.random.default_rng(0)
+    blocks = np.kron(rng.integers(20, 200, (80, 100, 3)), np.ones((4, 4, 1)))
+    smooth = (blocks + np.roll(blocks, 1, 0) + np.roll(blocks, 1, 1) + np.roll(blocks, (1, 1), (0, 1))) / 4
+    return np.clip(smooth + rng.normal(0, 2, smooth.shape), 0, 255).astype(np.uint8)
+
+
+# --- results -----------------------------------------------------------------------------------
+
+
+def test_calibrate_learns_once_from_each_photo_and_says_so_in_json(folder: Path) -> None:
+    words = ("calibrate", "one.dng", "--profile", "new/lens.lensprofile", "--estimator", "whittle", "--json")
+    first = lensmodel(*words, cwd=folder)
+    again = lensmodel(*words, cwd=folder)
+
+    said, then = json.loads(first.stdout), json.loads(again.stdout)
+    assert first.returncode == again.returncode == 0
+    assert [result["state"] for result in said["results"]] == ["counted"]
+    assert [result["state"] for result in then["results"]] == ["known"]
+    assert said["samples"] == then["samples"] > 0
+    assert load_profile(folder / "new/lens.lensprofile").lens["serial"] == "L-42"
+
+
+@pytest.mark.slow
+def test_calibrate_force_begins_anew(folder: Path) -> None:
+    done = lensmodel("calibrate", "one.dng", "-p", PROFILE, "--estimator", "whittle", "--force", cwd=folder)
+
+    assert done.returncode == 0, done.stderr
+    assert list(load_profile(folder / PROFILE).photos.values()) == ["one.dng"]
+
+
+def test_correct_leaves_what_is_there_alone_unless_forced(folder: Path, here: Here) -> None:
+    (folder / "out").mkdir()
+    target = folder / "out" / "one-corrected.tif"
+    target.write_bytes(b"mine")
+    words = ("correct", "one.dng", "--profile", PROFILE, "-o", "out", "--method", "fast")
+    kept = here(*words)
+    was = target.read_bytes()
+    forced = here(*words, "--force", "-q")
+
+    assert kept.returncode == forced.returncode == 0
+    assert was == b"mine"
+    assert "--force" in one_sentence(kept.stderr)
+    assert target.stat().st_size > 10000
+    assert forced.stdout == forced.stderr == ""
+
+
+def test_corrected_dng_opens_as_raw(folder: Path, here: Here) -> None:
+    done = here("correct", "one.dng", "-p", PROFILE, "-o", "out", "--format", "dng", "--method", "fast")
+
+    assert done.stdout.splitlines() == [str(Path("out/one-corrected.dng"))]
+    with rawpy.imread(str(folder / "out/one-corrected.dng")) as raw:
+        assert raw.sizes.width > 400
+
+
+def test_folders_pass_over_corrected_photos_and_the_jpeg_beside_a_raw_file(folder: Path, here: Here) -> None:
+    Image.fromarray(_picture()).save(folder / "one.jpg")
+    Image.fromarray(_picture()).save(folder / "one-corrected.tif")
+    done = here("correct", ".", "-p", PROFILE, "-o", "out", "--method", "fast", "--json")
+
+    assert [result["photo"] for result in json.loads(done.stdout)["results"]] == ["one.dng"]
+
+
+def test_one_bad_photo_does_not_stop_the_others(folder: Path, here: Here) -> None:
+    (folder / "a-note.dng").write_text("this is text")
+    done = here("correct", ".", "-p", PROFILE, "-o", "out", "--method", "fast", "--json")
+
+    assert done.returncode == 1
+    states = [result["state"] for result in json.loads(done.stdout)["results"]]
+    assert states == ["failed", "corrected"]
+    assert "give RAW, DNG, TIFF, PNG or JPEG" in one_sentence(done.stderr)
+
+
+@pytest.mark.parametrize("suffix", ["npy", "json", "tif", "png"])
+def test_psf_writes_files_that_open(folder: Path, suffix: str) -> None:
+    target = folder / f"corner.{suffix}"
+    result = CliRunner().invoke(app, ["psf", str(folder / PROFILE), "--size", "15", "-o", str(target)])
+
+    assert result.exit_code == 0, result.output
+    match suffix:
+        case "npy":
+            shape = np.load(target).shape
+        case "json":
+            shape = tuple(json.loads(target.read_text())["psf"]["shape"])
+        case _:
+            with Image.open(target) as picture:
+                shape = picture.size
+    assert shape == (15, 15)
+
+
+# --- refusals ----------------------------------------------------------------------------------
+
+REFUSED = {
+    "missing photo": (["calibrate", "gone.dng", "-p", "new"], 2, "no photo called gone.dng"),
+    "empty folder": (["calibrate", "empty", "-p", "new"], 2, "no photo in the folder empty"),
+    "no image": (["correct", "text.dng", "-p", PROFILE, "-o", "out"], 1, "belong to no photo format"),
+    "other lens": (["correct", "other.dng", "-p", PROFILE, "-o", "out"], 1, "serial L-43.*L-42.*--any-lens"),
+    "add other lens": (["calibrate", "other.dng", "-p", PROFILE], 1, "serial L-43.*profile of its own"),
+    "no profile": (["correct", "one.dng", "-p", "gone", "-o", "out"], 2, "no lens profile at gone; make it"),
+    "bad profile": (["correct", "one.dng", "-p", "bad", "-o", "out"], 1, "bad is no lens profile"),
+    "bad profile to add to": (["calibrate", "one.dng", "-p", "bad"], 1, "bad is no lens profile.*--force"),
+    "profile is a folder": (["calibrate", "one.dng", "-p", "empty"], 2, "empty is a folder"),
+    "output is a file": (["correct", "one.dng", "-p", PROFILE, "-o", "bad"], 2, "bad is a file"),
+    "unknown method": (["correct", "one.dng", "-p", PROFILE, "-o", "o", "--method", "x"], 2, "known: .*fast"),
+    "unknown estimator": (["calibrate", "one.dng", "-p", "new", "--estimator", "x"], 2, "known: .*whittle"),
+    "aperture": (["calibrate", "one.dng", "-p", "new", "--aperture", "-2"], 2, "-2"),
+    "same name twice": (["correct", "one.dng", "sub/one.dng", "-p", PROFILE, "-o", "o"], 2, "would both"),
+    "even size": (["psf", PROFILE, "--size", "20"], 2, "must be odd, got 20"),
+    "psf file there": (["psf", PROFILE, "-o", "there.npy"], 2, "there.npy is there already; --force"),
+    "psf format": (["psf", PROFILE, "-o", "psf.xyz"], 2, "psf.xyz"),
+    "bench json there": (["bench", "model", "--json", "there.npy"], 2, "there.npy is there already; --force"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refusal_is_one_sentence_with_the_value_and_a_remedy(
+    case: str, folder: Path, made: Path, here: Here
+) -> None:
+    words, status, expected = REFUSED[case]
+    (folder / "empty").mkdir()
+    (folder / "sub").mkdir()
+    shutil.copy(made / "other.dng", folder)
+    shutil.copy(made / "other.dng", folder / "sub" / "one.dng")
+    (folder / "text.dng").write_text("no picture at all")
+    (folder / "bad").write_bytes((folder / PROFILE).read_bytes()[:-200])
+    (folder / "there.npy").write_bytes(b"mine")
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+    done = here(*words)
+
+    assert done.returncode == status, done.stderr
+    assert re.search(expected, one_sentence(done.stderr)), done.stderr
+    assert done.stdout == ""
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_unknown_options_and_settings_are_wrong_usage(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    option = lensmodel("calibrate", "one.dng", "--profil", "x", cwd=folder)
+    monkeypatch.setitem(ENVIRONMENT, "LENS_PROT", "9000")
+    setting = lensmodel("serve", cwd=folder)
+
+    assert option.returncode == setting.returncode == 2
+    assert "did you mean LENS_PORT" in one_sentence(setting.stderr)
+
+
+# --- interrupting ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)], ids=str
+)
+def test_stopped_calibration_keeps_finished_photos_and_goes_on(
+    number: signal.Signals, folder: Path, made: Path
+) -> None:
+    shutil.copy(made / "b.dng", folder / "two.dng")
+    profile = folder / "new.lensprofile"
+    words = ("calibrate", "one.dng", "two.dng", "-p", "new.lensprofile", "--estimator", "whittle", "--json")
+    process = start(*words, cwd=folder)
+    wait_for(profile.exists)
+    os.killpg(process.pid, number)  # the whole group, as a terminal does
+    said, errors = process.communicate(timeout=20)
+
+    assert process.returncode == 128 + number
+    assert said == ""
+    assert "finished files are kept" in one_sentence(errors)
+    assert list(load_profile(profile).photos.values()) == ["one.dng"]
+    again = json.loads(lensmodel(*words, cwd=folder).stdout)
+    assert [result["state"] for result in again["results"]] == ["known", "counted"]
+
+
+def test_stopped_correction_leaves_whole_files_only_and_goes_on(folder: Path, made: Path) -> None:
+    shutil.copy(made / "b.dng", folder / "two.dng")
+    words = ("correct", "one.dng", "two.dng", "-p", PROFILE, "-o", "out", "--method", "paper")
+    process = start(*words, cwd=folder)
+    first = folder / "out" / "one-corrected.tif"
+    wait_for(first.exists)
+    os.killpg(process.pid, signal.SIGINT)
+    process.communicate(timeout=20)
+    stamp = first.stat().st_mtime_ns
+
+    assert process.returncode == 130
+    assert [path.name for path in (folder / "out").iterdir()] == ["one-corrected.tif"]
+    again = lensmodel(*words, cwd=folder)
+    assert again.stdout.splitlines() == [str(Path("out/two-corrected.tif"))]
+    assert first.stat().st_mtime_ns == stamp
+
+
+# --- progress ----------------------------------------------------------------------------------
+
+
+def test_progress_with_time_left_is_on_a_terminal_and_results_are_in_the_pipe(folder: Path) -> None:
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(
+        command("correct", "one.dng", "-p", PROFILE, "-o", "out", "--method", "fast"),
+        cwd=folder,
+        env={**ENVIRONMENT, "PYTHONPATH": str(HERE.parents[1]), "TERM": "xterm", "COLUMNS": "120"},
+        stdout=subprocess.PIPE,
+        stderr=theirs,
+        text=True,
+    )
+    os.close(theirs)
+    seen = b""
+    while chunk := _read(ours):
+        seen += chunk
+    os.close(ours)
+    said, _ = process.communicate(timeout=PATIENCE_S)
+
+    assert said.splitlines() == [str(Path("out/one-corrected.tif"))]
+    assert b"ETA" in seen
+    assert b"one.dng" in seen
+
+
+def _read(terminal: int) -> bytes:
+    try:
+        return os.read(terminal, 4096)
+    except OSError:  # Linux says so when the other side is closed
+        return b""
+
+
+def test_without_a_terminal_standard_error_stays_empty(folder: Path) -> None:
+    done = lensmodel("correct", "one.dng", "-p", PROFILE, "-o", "out", "--method", "fast", cwd=folder)
+
+    assert done.stderr == ""

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lensmodel.errors import InvalidInputError
+from lensmodel.geometry import pixel_to_local
 from lensmodel.psf import as_kernel, centred, resized
-from lensmodel.regression.canonical import CanonicalGrid
 from lensmodel.types import Channel, FieldPosition, Kernel
 
 STORED: Final = Path(__file__).parent.parent / "data" / "rival_basis.npz"
@@ -53,15 +53,11 @@ class RadialBasis:
         share = min(max((position.r - low) / (high - low), 0.0), 1.0)
         every = np.concatenate([self.mean[None], self.parts])
         local = (1.0 - share) * every[:, upper - 1] + share * every[:, upper]
-        grid = CanonicalGrid(self.side // 2, 1)
-        return np.stack(
-            [
-                grid.sampled(
-                    ndimage.spline_filter(one, mode="grid-constant"), position.phi, (1.0, 1.0), self.side
-                )
-                for one in local
-            ]
-        )
+        half = self.side // 2
+        t = np.arange(-half, half + 1, dtype=np.float64)
+        u, v = pixel_to_local(t[:, None], t[None, :], position.phi)
+        points = np.stack(np.broadcast_arrays(half - v, half + u))
+        return np.stack([ndimage.map_coordinates(one, points, order=3, mode="grid-constant") for one in local])
 
 
 def principal(fields: NDArray[np.floating], radii: Sequence[float], count: int) -> RadialBasis:

@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from scipy import ndimage
 
+from lensmodel import quality
 from lensmodel.bench.pictures import as_shown, strip
 from lensmodel.bench.reproduce import (
     Answer,
@@ -22,18 +24,23 @@ from lensmodel.bench.reproduce import (
     Place,
     Reproduction,
     collected,
+    job,
     measure,
     planned,
-    run,
     run_reproduction,
     write_json,
     write_page,
 )
-from lensmodel.bench.reproduce.cases import FIRST_SEED, fingerprint, key_of
+from lensmodel.bench.reproduce.bars import bars, held
+from lensmodel.bench.reproduce.cases import FIRST_SEED, Size, fingerprint, key_of
+from lensmodel.bench.reproduce.conditions import BASE, CONDITIONS, PATHS, SCENES_THAT_HURT
+from lensmodel.bench.reproduce.fidelity import EVERY, blocks, fidelity
 from lensmodel.bench.reproduce.scenes import centred_cut, frame_scene, layout_for, scene_files
-from lensmodel.bench.reproduce.shots import Shots
-from lensmodel.bench.reproduce.tables import groups, kept, shares, summary
+from lensmodel.bench.reproduce.shots import Shots, take
+from lensmodel.bench.reproduce.tables import groups, hard_rows, kept, shares, summary
 from lensmodel.errors import InvalidInputError
+from lensmodel.geometry import Frame, zone_of
+from lensmodel.photo import develop
 from lensmodel.simulate import LENS_KINDS
 from lensmodel.types import CHANNELS, ZONES, FieldPosition, LensSettings, Planes
 
@@ -43,7 +50,7 @@ def case(**changes: Any) -> Case:
 
 
 def plan(*cases: Case) -> Reproduction:
-    return Reproduction(cases or (case(),), estimator="whittle", size="quick")
+    return Reproduction(cases or (case(),), estimator="whittle", rivals=(), size="quick")
 
 
 def photographs(folder: Path, count: int) -> tuple[Path, ...]:
@@ -61,18 +68,37 @@ def photographs(folder: Path, count: int) -> tuple[Path, ...]:
 
 
 def test_default_size_has_eight_kinds_of_lenses_on_reported_seeds() -> None:
-    cases = planned("default").cases
+    cases = [one for one in planned("default").cases if one.condition == BASE]
     assert len({one.lens.model.split()[1] for one in cases}) == len(LENS_KINDS) == 8
     assert min(one.seed for one in cases) >= FIRST_SEED
 
 
 def test_full_size_takes_every_lens_at_two_apertures() -> None:
-    cases = planned("full").cases
+    cases = [one for one in planned("full").cases if one.condition == BASE]
     for seed in {one.seed for one in cases}:
         apertures = {one.aperture for one in cases if one.seed == seed}
         assert max(apertures) == pytest.approx(2 * min(apertures))
     assert {round(one.stops) for one in cases} == {0, 2}
     assert any(len({c.focal_mm for c in cases if c.seed == seed}) == 2 for seed in {c.seed for c in cases})
+
+
+def test_default_size_takes_high_iso_tiff_and_jpeg_with_two_lenses_each() -> None:
+    taken = [one for one in planned("default").cases if one.condition != BASE]
+    assert {one.condition for one in taken} == set(PATHS)
+    for name in PATHS:
+        assert len({one.seed for one in taken if one.condition == name}) == 2
+    assert min(one.seed for one in taken) >= FIRST_SEED
+
+
+@pytest.mark.parametrize(("size", "hard"), [("full", False), ("default", True), ("quick", True)])
+def test_scenes_that_hurt_are_taken_when_asked_for_and_in_full(size: Size, hard: bool) -> None:
+    cases = planned(size, hard=hard).cases
+    assert {one.condition for one in cases} == {BASE, *PATHS, *SCENES_THAT_HURT}
+
+
+def test_unknown_condition_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match="known: base, high-iso"):
+        case(condition="fog")
 
 
 def test_names_of_cases_are_unique() -> None:
@@ -137,9 +163,10 @@ def test_key_changes_with_settings_route_and_code() -> None:
         key_of(one, plan(), "a", "2"),
         key_of(one, plan(), "b", "1"),
         key_of(replace(one, aperture=2.8), plan(), "a", "1"),
+        key_of(replace(one, condition="jpeg"), plan(), "a", "1"),
         key_of(one, replace(plan(), estimator="default"), "a", "1"),
     }
-    assert len(keys) == 5
+    assert len(keys) == 6
     assert key_of(case(), plan(), "a", "1") in keys
 
 
@@ -164,7 +191,11 @@ def state(mtf50: float, psnr: float) -> dict[str, Any]:
         "mtf_max": 1.02,
         "overshoot": 2.0,
     }
-    return {"edges": {zone: dict(edge) for zone in ZONES}, "psnr": dict.fromkeys(ZONES, psnr)}
+    return {
+        "edges": {zone: dict(edge) for zone in ZONES},
+        "psnr": dict.fromkeys(ZONES, psnr),
+        "ssim": dict.fromkeys(ZONES, psnr / 40.0),
+    }
 
 
 def result(*lenses: tuple[float, float]) -> dict[str, Any]:
@@ -174,6 +205,8 @@ def result(*lenses: tuple[float, float]) -> dict[str, Any]:
             "name": f"lens{i}",
             "title": f"Lens <{i}>",
             "kind": "coma",
+            "condition": "base",
+            "condition_title": "raw",
             "settings": {"seed": 1000 + i, "height": 480, "width": 640},
             "stops": 0.0,
             "frames": "each frame is a photograph",
@@ -196,18 +229,39 @@ def result(*lenses: tuple[float, float]) -> dict[str, Any]:
                     "methods": {"paper": state(mtf50, psnr)},
                 }
             },
+            "rivals": {
+                "kee": {
+                    "pictures": {"kee-paper": "kee.png"},
+                    "psf": {"rel_l2": {c: dict.fromkeys(ZONES, 0.5) for c in "rgb"}, "predicted_right": 0.0},
+                    "methods": {"paper": state(130, 31.0)},
+                }
+            },
         }
         for i, (mtf50, psnr) in enumerate(lenses)
     ]
     return {
         "route": "by the service",
         "code": "abc",
-        "plan": {"size": "quick", "estimator": "whittle", "methods": ["paper"], "own_scenes": True},
+        "plan": {
+            "size": "quick",
+            "estimator": "whittle",
+            "methods": ["paper"],
+            "rivals": {"kee": "Kee et al. 2011"},
+            "own_scenes": True,
+        },
         "scenes": ["city", "lake"],
         "developed_on": ["lake"],
         "cases": cases,
+        "hard": [],
         "figures": {},
     }
+
+
+def hurt(made: dict[str, Any], psnr: float) -> dict[str, Any]:
+    """Add a lens whose photos were taken at night, and corrected to this PSNR from 30."""
+    (one,) = result((100, psnr))["cases"]
+    made["hard"].append({**one, "condition": "night", "condition_title": "night: lamps", "rivals": {}})
+    return made
 
 
 def test_share_is_of_the_gain_of_the_true_psf() -> None:
@@ -225,12 +279,66 @@ def test_share_of_a_small_gain_is_left_out() -> None:
 def test_summary_takes_the_mean_over_lenses_and_counts_zones_that_fell() -> None:
     found = summary(result((160, 32.0), (120, 29.98), (120, 29.0)))
     rows = {row["state"]: row for row in found["mtf"]["paper"]}
-    assert list(rows) == ["without correction", "n = 1", "true PSF"]
+    assert list(rows) == ["without correction", "denoised only", "kee, n = 1", "n = 1", "true PSF"]
     assert rows["n = 1"]["corner"]["mtf50"] == pytest.approx(400 / 3)
     assert rows["n = 1"]["corner"]["sagittal_mtf50"] is None
-    assert found["worse"]["paper"]["1"] == {"zones": 9, "worse": 6, "clearly_worse": 3}
+    assert found["worse"]["paper"]["1"] == {
+        "zones": 9,
+        "worse": 6,
+        "clearly_worse": 3,
+        "ssim_worse": 6,
+        "unimproved": 6,
+    }
+    assert found["ssim_kept"]["paper"]["1"]["mid"] == pytest.approx((0.5 - 0.005 - 0.25) / 3)
+    assert found["halo"]["paper"]["1"]["mid"] == pytest.approx(0.0)
+    assert found["psf_rivals"]["kee"]["corner"] == pytest.approx(0.5)
     assert found["share"]["paper"]["1"]["mid"] == pytest.approx(1 / 3)
     assert found["psnr_control"]["center"] == pytest.approx(0.5)
+
+
+def test_gain_that_the_lens_does_not_allow_is_not_missed() -> None:
+    made = result((100, 30.0))
+    made["cases"][0]["truth"]["true"]["paper"] = state(104, 30.1)
+    assert summary(made)["worse"]["paper"]["1"]["unimproved"] == 0
+
+
+def test_bars_are_two_sided() -> None:
+    name = "share of the true-PSF gain in MTF50, method paper, n = 1"
+    for mtf50, met in ((180, False), (190, True), (210, False)):
+        found = {(bar.name, bar.place): bar for bar in bars(result((mtf50, 33.0)))}
+        assert found[name, "corner"].met is met
+        assert found[name.replace("n = 1", "n = 5"), "corner"].met is None  # this run has no n = 5
+
+
+def test_bars_compare_with_rivals_only_at_no_more_overshoot() -> None:
+    made = result((120, 30.5))
+    place = "MTF50 ahead of kee, n = 1 at no more overshoot, LP/PH, method paper, n = 1", "center"
+    assert {(b.name, b.place): b for b in bars(made)}[place].met is False
+    for zone in ZONES:
+        made["cases"][0]["rivals"]["kee"]["methods"]["paper"]["edges"][zone]["overshoot"] = 9.0
+    found = {(b.name, b.place): b for b in bars(made)}
+    assert found[place].met is None
+    assert found["PSNR ahead of kee, n = 1, dB, method paper, n = 1", "mid"].met is False
+
+
+def test_bars_count_what_holds() -> None:
+    every = bars(result((190, 33.0)))
+    count = held(every)
+    assert sum(count.values()) == len(every)
+    assert count["held"] == sum(bar.met is True for bar in every) > 0
+
+
+def test_what_hurts_is_counted_apart(tmp_path: Path) -> None:
+    made = hurt(hurt(result((190, 33.0)), 30.5), 29.9)
+    (row,) = hard_rows(made)
+    assert (row["condition"], row["lenses"]) == ("night", 2)
+    assert row["gain"]["corner"] == pytest.approx(0.2)
+    assert row["counts"] == {"zones": 6, "worse": 3, "clearly_worse": 3, "ssim_worse": 3, "unimproved": 3}
+    assert summary(made)["lenses"] == 1
+    missed = [bar for bar in bars(made) if bar.name.startswith("night")]
+    assert [bar.met for bar in missed] == [False]
+    markdown, _ = write_page(made, tmp_path)
+    assert "| night: lamps | 2 | 0 | 0.20 / 0.20 / 0.20 |" in markdown.read_text(encoding="utf-8")
 
 
 def test_page_needs_nothing_from_outside_and_escapes_names(tmp_path: Path) -> None:
@@ -242,7 +350,10 @@ def test_page_needs_nothing_from_outside_and_escapes_names(tmp_path: Path) -> No
     assert all(source.startswith("pictures/") for source in sources)
     assert "Lens &lt;0&gt;" in text
     assert "developed on 1 of them" in text
-    assert "| n = 1 | 160 |" in markdown.read_text(encoding="utf-8")
+    text = markdown.read_text(encoding="utf-8")
+    assert "| n = 1 | 160 |" in text
+    assert "| kee, n = 1 | 130 |" in text
+    assert "MISSED" in text
 
 
 def test_json_holds_results_and_summary(tmp_path: Path) -> None:
@@ -252,6 +363,9 @@ def test_json_holds_results_and_summary(tmp_path: Path) -> None:
         "corner"
     ] == pytest.approx(0.6)
     assert stored["cases"][0]["learned"]["1"]["methods"]["paper"]["psnr"]["mid"] == 32.0
+    assert stored["bars_held"] == held(bars(result((160, 32.0))))
+    assert {"name", "place", "value", "low", "high", "met"} <= stored["bars"][0].keys()
+    assert stored["hard_summary"] == []
 
 
 def test_lenses_at_other_apertures_get_tables_of_their_own(tmp_path: Path) -> None:
@@ -308,6 +422,65 @@ def test_true_kernels_have_no_error_and_a_cautious_prediction_is_wrong(
     assert found["predicted_right"] == 0.0  # it expected an error of 0.1 where there was none
 
 
+def test_fidelity_is_the_registered_psnr_where_all_blocks_count() -> None:
+    frame, rng = Frame(300, 420), np.random.default_rng(0)
+    reference = ndimage.gaussian_filter(rng.random((3, 300, 420)), (0, 2, 2)).astype(np.float32)
+    image = reference + rng.normal(0.0, 0.01, reference.shape).astype(np.float32)
+    found = fidelity(image, reference, frame)
+    assert len(blocks(frame)) <= EVERY
+    wanted = quality.registered_zone_psnr(image, reference, frame, srgb=True)
+    assert found["psnr"] == pytest.approx(wanted)
+    assert all(0.0 < value < 1.0 for value in found["ssim"].values())
+    assert fidelity(reference, reference, frame)["ssim"] == pytest.approx(dict.fromkeys(ZONES, 1.0))
+
+
+def test_every_second_block_of_a_large_frame_still_meets_every_zone() -> None:
+    frame = Frame(1500, 2200)
+    found = blocks(frame)
+    whole = len(range(0, 1500 - 128, 112)) + 1, len(range(0, 2200 - 128, 112)) + 1
+    assert len(found) == -(-whole[0] * whole[1] // 2)
+    assert {zone_of(frame.position(row + 64.0, col + 64.0).r) for row, col in found} == set(ZONES)
+
+
+@pytest.mark.parametrize("name", SCENES_THAT_HURT)
+def test_scenery_is_light_of_the_same_frame_and_not_the_scene_itself(name: str) -> None:
+    scene = np.random.default_rng(1).random((3, 160, 240), dtype=np.float32)
+    change = CONDITIONS[name].scenery
+    assert change is not None
+    made = change(scene, np.random.default_rng(2))
+    assert made.shape == scene.shape
+    assert made.dtype == np.float32
+    assert made.min() >= 0.0
+    assert np.abs(made - scene).mean() > 0.01
+    assert np.array_equal(made, change(scene, np.random.default_rng(2)))
+
+
+def test_night_clips_at_lamps_and_snow_at_its_brightest() -> None:
+    scene = np.random.default_rng(1).random((3, 160, 240), dtype=np.float32)
+    dark = CONDITIONS["night"].scenery(scene, np.random.default_rng(2))  # type: ignore[misc]
+    assert float((dark > 1.0).any(axis=0).mean()) < 0.02
+    assert float(np.median(dark)) < 0.05
+    assert dark.max() > 2.0
+    bright = CONDITIONS["snow"].scenery(scene, np.random.default_rng(2))  # type: ignore[misc]
+    assert bright.min() > 0.8
+    assert bright.max() > 1.0
+
+
+@pytest.mark.parametrize("name", ["tiff", "jpeg"])
+def test_photo_of_another_path_shows_what_the_raw_one_does(tmp_path: Path, name: str) -> None:
+    files = photographs(tmp_path, 4)
+    one = Case(1006, 24.0, 4.0, (1,), 32, 64, layout_for(files, 2, (32, 64)), condition=name)
+    one = replace(one, focal_mm=one.lens.focal_mm[0], aperture=one.lens.f_number(LensSettings()))
+    shots = take(one, files, tmp_path / "photos", first=2)
+    assert not list((tmp_path / "photos").glob("*.dng"))
+    seen = develop(shots.held_out)
+    assert seen.info.kind == name
+    assert seen.info.metadata.aperture == pytest.approx(one.aperture, abs=0.01)
+    gains = np.asarray(one.camera.white_balance, dtype=np.float32)[:, None, None]
+    red = (shots.truth() * gains)[0]
+    assert float(np.median(seen.planes[0])) == pytest.approx(float(np.median(red)), abs=0.02)
+
+
 def test_strip_shows_the_corners_of_a_picture() -> None:
     planes = np.zeros((3, 80, 120), dtype=np.float32)
     planes[0, :30, :30] = 1.0  # upper left
@@ -342,7 +515,7 @@ def quick_photos(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Photos and truth are made up, so that only the order of work is under test."""
     taken: list[str] = []
 
-    def take(one: Case, files: Sequence[Path], folder: Path, **_: object) -> Shots:
+    def made_up(one: Case, files: Sequence[Path], folder: Path, **_: object) -> Shots:
         taken.append(one.name)
         folder.mkdir(parents=True, exist_ok=True)
         return Shots.of(one, folder)
@@ -351,8 +524,8 @@ def quick_photos(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         made: dict[str, Any] = result((160, 32.0))["cases"][0]["truth"]
         return made
 
-    monkeypatch.setattr(run, "take", take)
-    monkeypatch.setattr(run._Job, "_measured_truth", truth)
+    monkeypatch.setattr(job, "take", made_up)
+    monkeypatch.setattr(job.Job, "_measured_truth", truth)
     return taken
 
 

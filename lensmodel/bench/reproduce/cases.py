@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
 import numpy as np
 
 import lensmodel
+from lensmodel.bench.reproduce.conditions import BASE, PATHS, SCENES_THAT_HURT, Condition, condition
 from lensmodel.bench.reproduce.scenes import Layout, content_of, layout_for, scene_files
 from lensmodel.errors import InvalidInputError
 from lensmodel.simulate import SimulatedCamera, SimulatedField, SimulatedLens, draw_lens
@@ -19,7 +20,7 @@ from lensmodel.types import LensSettings
 
 Size: TypeAlias = Literal["quick", "default", "full"]
 
-PROTOCOL: Final = 1
+PROTOCOL: Final = 2
 """Part of every key of a stored result; raised when what is measured changes."""
 
 FIRST_SEED: Final = 1000
@@ -27,7 +28,13 @@ FIRST_SEED: Final = 1000
 
 METHODS: Final = ("paper", "standard")
 
+HARD_METHODS: Final = ("standard",)
+"""Of the correction of scenes and paths that hurt: what a user gets who chooses nothing."""
+
+RIVALS: Final = ("schuler", "kee")
+
 _QUICK_FRAME = (640, 960)
+_HARD_FRAME = (840, 1260)
 _STOPPED_DOWN = 2.0  # two stops
 
 
@@ -47,6 +54,8 @@ class Case:
         Of the camera, pixels.
     layout : Layout
         How frames are made of photographs.
+    condition : str
+        Name of a `Condition`: what is photographed, at which ISO, into which kind of file.
     """
 
     seed: int
@@ -56,10 +65,17 @@ class Case:
     height: int
     width: int
     layout: Layout
+    condition: str = BASE
 
     def __post_init__(self) -> None:
         if not self.photos or self.photos[0] < 1 or list(self.photos) != sorted(set(self.photos)):
             raise InvalidInputError(f"numbers of photos must ascend from 1 or more, got {self.photos}")
+        condition(self.condition)
+
+    @property
+    def conditions(self) -> Condition:
+        """What is different from a raw photo of a photograph at base ISO."""
+        return condition(self.condition)
 
     @property
     def lens(self) -> SimulatedLens:
@@ -69,7 +85,8 @@ class Case:
     @property
     def name(self) -> str:
         """Short and unique within a run."""
-        return f"{self.seed}-{self.focal_mm:g}mm-f{self.aperture:g}-n{self.photos[-1]}"
+        name = f"{self.seed}-{self.focal_mm:g}mm-f{self.aperture:g}-n{self.photos[-1]}"
+        return name if self.condition == BASE else f"{name}-{self.condition}"
 
     @property
     def title(self) -> str:
@@ -88,8 +105,13 @@ class Case:
 
     @property
     def camera(self) -> SimulatedCamera:
-        """Base ISO."""
-        return SimulatedCamera(height=self.height, width=self.width)
+        """The sensor at the ISO of the photos."""
+        return SimulatedCamera(
+            height=self.height,
+            width=self.width,
+            full_well_electrons=self.conditions.full_well_electrons,
+            read_noise=self.conditions.read_noise,
+        )
 
     def truth(self) -> SimulatedField:
         """Return the true PSF field."""
@@ -113,6 +135,8 @@ class Reproduction:
         Blind estimator of the calibration.
     methods : tuple of str
         Non-blind methods of the correction.
+    rivals : tuple of str
+        Blind methods of others, names in `lensmodel.bench.rivals`; each sees one photo.
     size : {"quick", "default", "full"}
         How it was planned, for the page.
     """
@@ -121,6 +145,7 @@ class Reproduction:
     scenes: Path | None = None
     estimator: str = "default"
     methods: tuple[str, ...] = METHODS
+    rivals: tuple[str, ...] = RIVALS
     size: Size = "default"
 
     def files(self) -> tuple[Path, ...]:
@@ -128,7 +153,9 @@ class Reproduction:
         return scene_files(self.scenes)
 
 
-def planned(size: Size, *, scenes: Path | None = None, estimator: str = "default") -> Reproduction:
+def planned(
+    size: Size, *, scenes: Path | None = None, estimator: str = "default", hard: bool = False
+) -> Reproduction:
     """Plan a run of one of three sizes.
 
     Parameters
@@ -136,28 +163,39 @@ def planned(size: Size, *, scenes: Path | None = None, estimator: str = "default
     size : {"quick", "default", "full"}
         Two lenses, small photos, n = 1, 2; eight lenses of different kind, wide open, n = 1, 2, 5;
         the same stopped down too, the zoom also at its long end, and n = 10, 20 on smaller frames.
+        The default size takes the other paths (high ISO, TIFF, JPEG) with two lenses each, the full
+        size takes them and the scenes that hurt with four.
     scenes : Path or None
         See `Reproduction`.
     estimator : str
         See `Reproduction`.
+    hard : bool
+        Take the scenes that hurt too, each with two lenses.
 
     Notes
     -----
     With few photographs the largest n shrinks to what they allow without using one twice.
     """
     files = scene_files(scenes)
+    seeds = range(FIRST_SEED, FIRST_SEED + 8)
     if size == "quick":
         cases = tuple(_case(seed, (1, 2), files, _QUICK_FRAME) for seed in (FIRST_SEED, FIRST_SEED + 4))
-        return Reproduction(cases, scenes, estimator, size=size)
-    seeds = range(FIRST_SEED, FIRST_SEED + 8)
-    few = _allowed((1, 2, 5), len(files))
-    cases = tuple(_case(seed, few, files) for seed in seeds)
+    else:
+        few = _allowed((1, 2, 5), len(files))
+        cases = tuple(_case(seed, few, files) for seed in seeds)
     if size == "full":
         zooms = [seed for seed in seeds if len(draw_lens(seed).focal_mm) > 1]
         cases += tuple(_case(seed, few, files, focal=-1) for seed in zooms)
         cases += tuple(_case(seed, few, files, stopped=_STOPPED_DOWN) for seed in seeds)
         many = _allowed((10, 20), 2 * len(files))
         cases += tuple(_case(seed, many, files) for seed in seeds if many != few)
+    names = (PATHS if size != "quick" or hard else ()) + (SCENES_THAT_HURT if hard or size == "full" else ())
+    lenses = {"quick": 1, "default": 2, "full": 4}[size]
+    for number, name in enumerate(names):
+        # other lenses for each, in turn: the first of each pair is soft, the second four kinds further
+        chosen = [seeds[(number + 8 * i // lenses) % len(seeds)] for i in range(lenses)]
+        frame = _QUICK_FRAME if size == "quick" else _HARD_FRAME
+        cases += tuple(replace(_case(seed, (1,), files, frame), condition=name) for seed in chosen)
     return Reproduction(cases, scenes, estimator, size=size)
 
 
@@ -173,7 +211,8 @@ def fingerprint(extra: Sequence[Path] = ()) -> str:
     root = Path(lensmodel.__file__).parent
     code = [path for path in root.rglob("*.py") if root / "bench" not in path.parents]
     code += [
-        own / name for name in ("cases.py", "measure.py", "routes.py", "run.py", "scenes.py", "shots.py")
+        own / f"{name}.py"
+        for name in ("cases", "conditions", "fidelity", "job", "measure", "routes", "scenes", "shots")
     ]
     code += [p for path in extra for p in ([path] if path.is_file() else path.rglob("*.py"))]
     total = hashlib.sha256()
@@ -192,6 +231,7 @@ def key_of(case: Case, plan: Reproduction, route: str, code: str) -> str:
         PROTOCOL,
         code,
         (case.seed, case.focal_mm, case.aperture, case.height, case.width, case.photos[-1]),
+        case.condition,
         case.layout,
         plan.estimator,
         plan.methods,

@@ -12,6 +12,7 @@ import numpy as np
 from lensmodel import quality
 from lensmodel.bench.model import asked_places
 from lensmodel.bench.reproduce.cases import Case
+from lensmodel.bench.reproduce.fidelity import fidelity
 from lensmodel.bench.reproduce.routes import Answer, Place
 from lensmodel.bench.reproduce.shots import Shots, guard_of
 from lensmodel.geometry import zone_of
@@ -20,7 +21,6 @@ from lensmodel.simulate import edge_chart
 from lensmodel.types import CHANNELS, ZONES, Planes
 
 PSF_SIZE: Final = 55
-BORDER: Final = 8
 NEAR: Final = 1.5
 """A predicted error within this factor of the true one counts as right."""
 
@@ -77,15 +77,16 @@ def _in_lp_per_ph(row: dict[str, Any], height: int) -> dict[str, Any]:
     return row
 
 
-def psnr(photo: Planes, shots: Shots, case: Case) -> dict[str, float]:
-    """PSNR in dB of the sRGB-encoded, white-balanced picture by zone, each block at its best shift."""
+def pictures(photo: Planes, shots: Shots, case: Case) -> dict[str, dict[str, float]]:
+    """PSNR and SSIM of the held-out photo against the sharp scene; see `fidelity`.
+
+    Photos of the raw path are white-balanced for it; others are already.
+    """
     gains = np.asarray(case.camera.white_balance, dtype=np.float32)[:, None, None]
-    found = quality.registered_zone_psnr(
-        photo * gains, shots.truth() * gains, case.camera.frame, srgb=True, border=BORDER
-    )
-    return {str(zone): value for zone, value in found.items()}
+    seen = photo * gains if case.conditions.container == "dng" else photo
+    return fidelity(seen, shots.truth() * gains, case.camera.frame)
 
 
-def state(chart: Planes, photo: Planes, shots: Shots, case: Case) -> dict[str, Any]:
-    """Everything about one version of the chart and of the held-out photo."""
-    return {"edges": edges(chart, case), "psnr": psnr(photo, shots, case)}
+def state(chart: Planes | None, photo: Planes, shots: Shots, case: Case) -> dict[str, Any]:
+    """Everything about one version of the chart, if there is one, and of the held-out photo."""
+    return {"edges": {} if chart is None else edges(chart, case), **pictures(photo, shots, case)}

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from dataclasses import field as dataclass_field
 from pathlib import Path
 from typing import Protocol, TypeAlias
 
@@ -127,12 +129,28 @@ class DirectRoute:
             pipeline.settings_of(developed),
             method=method,
             lateral=pipeline.lateral_of(developed),
+            workers=self._workers or os.cpu_count() or 1,
         ).planes
 
     def _known(self) -> LensModel:
         if self._model is None:
             raise NoSamplesError("no photo has counted yet: learn from one with fine detail in focus")
         return self._model
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Remembered:
+    """A PSF field whose kernels are made once: several photos are corrected with it."""
+
+    field: PsfField
+    _known: dict[tuple[float, float, Channel, int], Kernel] = dataclass_field(default_factory=dict)
+
+    def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
+        """Return the kernel of a place; see `PsfField`."""
+        key = (position.r, position.phi, channel, size)
+        if key not in self._known:
+            self._known[key] = self.field.kernel_at(position, channel, size)
+        return self._known[key]
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,8 +163,8 @@ class PointField:
         return psf.delta(size)
 
 
-def corrected_with(developed: LinearPhoto, field: PsfField, method: str) -> Planes:
-    """Correct a photo with a PSF field that is known to be right, as the routes do with theirs."""
+def corrected_with(developed: LinearPhoto, field: PsfField, method: str, *, workers: int = 1) -> Planes:
+    """Correct a photo with a PSF field taken as right, as the routes do with theirs."""
     planes, cfa = developed.planes, developed.cfa
     lateral: LateralColour | None = pipeline.lateral_of(developed)
     if method == "paper" and lateral is not None:
@@ -161,4 +179,5 @@ def corrected_with(developed: LinearPhoto, field: PsfField, method: str) -> Plan
         clip=developed.clip,
         lateral=lateral,
         cfa=cfa,
+        workers=workers,
     ).planes

@@ -1,4 +1,7 @@
-"""The photos of a case: DNG files of a Bayer sensor with noise, clipping and lateral colour."""
+"""The photos of a case: DNG files of a Bayer sensor with noise, clipping and lateral colour.
+
+Where a case's path is not raw, the files are what our own development makes of these DNG files.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +10,17 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
 from lensmodel.bench.reproduce.cases import Case
 from lensmodel.bench.reproduce.scenes import centred_cut, frame_scene
-from lensmodel.simulate import edge_chart, photograph, write_photo
+from lensmodel.photo import develop, write_image
+from lensmodel.simulate import SimulatedPhoto, edge_chart, photograph, write_photo
 from lensmodel.types import Planes, StepHook, ignore_step
+
+JPEG_QUALITY: Final = 92
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,25 +32,31 @@ class Shots:
     learn : tuple of Path
         In the order in which the lens learns from them.
     held_out, chart : Path
-        Never used for calibration.
+        Never used for calibration; the chart is None where the case has none.
     sharp : Path
         npy, the light that a perfect lens would have put on the sensor for `held_out`.
     """
 
     learn: tuple[Path, ...]
     held_out: Path
-    chart: Path
+    chart: Path | None
     sharp: Path
 
     @classmethod
     def of(cls, case: Case, folder: Path) -> Shots:
         """Name the files of a case in a folder."""
+        suffix = case.conditions.suffix
         return cls(
-            tuple(folder / f"photo-{i:02d}.dng" for i in range(case.photos[-1])),
-            folder / "held-out.dng",
-            folder / "chart.dng",
+            tuple(folder / f"photo-{i:02d}{suffix}" for i in range(case.photos[-1])),
+            folder / f"held-out{suffix}",
+            folder / f"chart{suffix}" if case.conditions.with_chart else None,
             folder / "held-out-sharp.npy",
         )
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All photos, in the order in which they are taken."""
+        return (*self.learn, self.held_out, *(() if self.chart is None else (self.chart,)))
 
     def truth(self) -> Planes:
         """Load the truth behind `held_out`: camera colours, not white-balanced."""
@@ -63,8 +76,7 @@ def take(
     """Take the photos of a case that are not there yet; only the `first` so many if that is given."""
     folder.mkdir(parents=True, exist_ok=True)
     shots = Shots.of(case, folder)
-    targets = (*shots.learn, shots.held_out, shots.chart)
-    missing = [number for number, path in enumerate(targets[:first]) if not path.exists()]
+    missing = [number for number, path in enumerate(shots.files[:first]) if not path.exists()]
     if not missing:
         return shots
     if workers <= 1 or len(missing) == 1:
@@ -89,13 +101,34 @@ def _take(case: Case, files: tuple[Path, ...], folder: Path, number: int) -> Non
     else:
         scene = edge_chart(camera.frame, guard=guard_of(case)).scene
     rng = np.random.default_rng([case.seed, number])
+    if number < frames and case.conditions.scenery is not None:
+        scene = case.conditions.scenery(scene, np.random.default_rng([case.seed, number, 1]))
     photo = photograph(scene, case.lens, case.settings, camera, rng)
     if number == frames - 1:
         part = shots.sharp.with_suffix(".part.npy")
         np.save(part, photo.sharp, allow_pickle=False)
         part.replace(shots.sharp)
     # last, and whole or not at all: a photo that is there is complete
-    write_photo((*shots.learn, shots.held_out, shots.chart)[number], photo)
+    _write(shots.files[number], photo, case)
+
+
+def _write(path: Path, photo: SimulatedPhoto, case: Case) -> None:
+    container = case.conditions.container
+    if container == "dng":
+        write_photo(path, photo)
+        return
+    raw = path.with_suffix(".raw.dng")
+    write_photo(raw, photo)
+    developed = develop(raw)
+    write_image(
+        path,
+        developed.planes,
+        developed.encoding,
+        format="jpeg" if container == "jpeg" else "tiff16",
+        color_space="srgb",
+        quality=JPEG_QUALITY,
+    )
+    raw.unlink()
 
 
 def guard_of(case: Case) -> int:

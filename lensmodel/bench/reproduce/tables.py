@@ -16,6 +16,13 @@ SMALL_GAIN: Final = 0.05
 
 TOLERATED_DB: Final = 0.05
 
+MEASURABLE: Final = {"psnr": 0.2, "ssim": 0.002}
+"""Gains of the true PSF below these say nothing of a lens."""
+
+BEFORE: Final = "without correction"
+DENOISED: Final = "denoised only"
+TRUE: Final = "true PSF"
+
 
 def groups(result: Result) -> dict[str, Result]:
     """Split the lenses by aperture and frame: means over different ones would compare nothing."""
@@ -45,20 +52,39 @@ def summary(result: Result) -> dict[str, Any]:
     Returns
     -------
     dict
-        `rows`: state (before, n, true PSF) by method, with the mean over the lenses that have it;
-        `share`: share of the true-PSF gain in MTF50; `psf`; `psnr_worse`.
+        `mtf`, `psnr`, `ssim`: rows of states by method, with the mean over the lenses that have it;
+        `share`: share of the true-PSF gain in MTF50; `halo`: overshoot beyond that of the true PSF;
+        `psnr_kept`, `ssim_kept`: share of its gain; `psnr_control`: gain by denoising alone;
+        `worse`: zones that fell; `psf`, `psf_all_channels`, `psf_rivals`; `predicted_right`.
     """
     methods = result["plan"]["methods"]
     return {
         "lenses": len(result["cases"]),
         "mtf": {method: _mtf(result, method) for method in methods},
         "share": {method: _by_count(result, partial(shares, method=method)) for method in methods},
-        "psnr": {method: _psnr(result, method) for method in methods},
-        "psnr_control": _zones(
-            lambda z: mean(_psnr_gain(c, c["truth"]["control"], z) for c in result["cases"])
-        ),
+        "share_tangential": {
+            method: _by_count(result, partial(shares, method=method, edge="tangential_mtf50"))
+            for method in methods
+        },
+        "share_sagittal": {
+            method: _by_count(result, partial(shares, method=method, edge="sagittal_mtf50"))
+            for method in methods
+        },
+        "halo": {method: _by_count(result, partial(halo, method=method)) for method in methods},
+        "psnr": {method: _fidelity(result, method, "psnr") for method in methods},
+        "ssim": {method: _fidelity(result, method, "ssim") for method in methods},
+        "psnr_control": _zones(lambda z: mean(gain(c, c["truth"]["control"], z) for c in result["cases"])),
         "psnr_kept": {method: _by_count(result, partial(kept, method=method)) for method in methods},
+        "ssim_kept": {
+            method: _by_count(result, partial(kept, method=method, of="ssim")) for method in methods
+        },
         "worse": {method: worse(result, method) for method in methods},
+        "psf_rivals": {
+            name: _zones(
+                partial(_column_mean, [_rel_l2(c["rivals"][name]["psf"], "g") for c in _with(result, name)])
+            )
+            for name in result["plan"].get("rivals", {})
+        },
         "psf": _by_count(result, partial(_psf, channel="g")),
         "psf_all_channels": _by_count(result, _psf_mean),
         "predicted_right": {
@@ -68,13 +94,13 @@ def summary(result: Result) -> dict[str, Any]:
     }
 
 
-def shares(case: Result, n: int, method: str) -> dict[str, float | None]:
+def shares(case: Result, n: int, method: str, edge: str = "mtf50") -> dict[str, float | None]:
     """Share of the gain of the true PSF in MTF50 that one lens reaches; None where that gain is small."""
     found: dict[str, float | None] = {}
     for zone in ZONES:
-        before = _mtf50(case["truth"]["before"], zone)
-        true = _mtf50(case["truth"]["true"][method], zone)
-        after = _mtf50(case["learned"][str(n)]["methods"][method], zone)
+        before = _edge(case["truth"]["before"], zone, edge)
+        true = _edge(case["truth"]["true"][method], zone, edge)
+        after = _edge(case["learned"][str(n)]["methods"][method], zone, edge)
         if before is None or true is None or after is None or true - before < SMALL_GAIN * before:
             found[zone] = None
         else:
@@ -82,32 +108,98 @@ def shares(case: Result, n: int, method: str) -> dict[str, float | None]:
     return found
 
 
-def kept(case: Result, n: int, method: str) -> dict[str, float | None]:
-    """Share of the PSNR gain of the true PSF; None where that is below 0.2 dB."""
+def halo(case: Result, n: int, method: str) -> dict[str, float | None]:
+    """Overshoot of edges beyond that of the correction with the true PSF, percent of the step."""
     found: dict[str, float | None] = {}
     for zone in ZONES:
-        true = _psnr_gain(case, case["truth"]["true"][method], zone)
-        after = _psnr_gain(case, case["learned"][str(n)]["methods"][method], zone)
-        found[zone] = None if true is None or after is None or true < 0.2 else after / true
+        true = _edge(case["truth"]["true"][method], zone, "overshoot")
+        after = _edge(case["learned"][str(n)]["methods"][method], zone, "overshoot")
+        found[zone] = None if true is None or after is None else after - true
+    return found
+
+
+def kept(case: Result, n: int, method: str, of: str = "psnr") -> dict[str, float | None]:
+    """Share of the gain of the true PSF in PSNR or SSIM; None where that gain is small."""
+    found: dict[str, float | None] = {}
+    for zone in ZONES:
+        true = gain(case, case["truth"]["true"][method], zone, of)
+        after = gain(case, case["learned"][str(n)]["methods"][method], zone, of)
+        found[zone] = None if true is None or after is None or true < MEASURABLE[of] else after / true
     return found
 
 
 def worse(result: Result, method: str) -> dict[str, dict[str, int]]:
-    """Count zones of lenses whose PSNR fell, at all and by more than is tolerated."""
-    table = {}
-    for n in counts(result):
-        gains = [
-            gain
-            for case in _having(result, n)
-            for zone in ZONES
-            if (gain := _psnr_gain(case, case["learned"][str(n)]["methods"][method], zone)) is not None
-        ]
-        table[str(n)] = {
-            "zones": len(gains),
-            "worse": sum(gain < 0.0 for gain in gains),
-            "clearly_worse": sum(gain < -TOLERATED_DB for gain in gains),
-        }
-    return table
+    """Count zones of lenses whose PSNR or SSIM fell.
+
+    Returns
+    -------
+    dict
+        By number of photos: `zones`; `worse` and `clearly_worse`, PSNR at all and by more than is
+        tolerated; `ssim_worse`; `unimproved`, PSNR or SSIM did not rise although the true PSF raises
+        PSNR measurably.
+    """
+    return {
+        str(n): counted(
+            [
+                (case, zone, case["learned"][str(n)]["methods"][method], case["truth"]["true"][method])
+                for case in _having(result, n)
+                for zone in ZONES
+            ]
+        )
+        for n in counts(result)
+    }
+
+
+def counted(rows: Iterable[tuple[Result, str, Result, Result]]) -> dict[str, int]:
+    """Count zones that fell, of rows `(case, zone, corrected, with the true PSF)`; see `worse`."""
+    found = dict.fromkeys(("zones", "worse", "clearly_worse", "ssim_worse", "unimproved"), 0)
+    for case, zone, after, true in rows:
+        psnr, ssim = gain(case, after, zone), gain(case, after, zone, "ssim")
+        possible = gain(case, true, zone)
+        if psnr is None or ssim is None or possible is None:
+            continue
+        found["zones"] += 1
+        found["worse"] += psnr < 0.0
+        found["clearly_worse"] += psnr < -TOLERATED_DB
+        found["ssim_worse"] += ssim < 0.0
+        found["unimproved"] += possible >= MEASURABLE["psnr"] and (psnr <= 0.0 or ssim <= 0.0)
+    return found
+
+
+def hard_rows(result: Result) -> list[dict[str, Any]]:
+    """One row a scene or path that hurts: gains in PSNR by zone, and zones that fell.
+
+    Returns
+    -------
+    list of dict
+        `condition`, `title`, `lenses`, `refused` (photos that were not learned from); `gain`,
+        `control`, `true`: mean gain in dB by zone of the correction learned from such a photo, of
+        denoising alone, and of the true PSF; `ssim`: mean gain in SSIM; `kept`; `counts` of `counted`.
+    """
+    every: dict[str, list[Result]] = {}
+    for case in result.get("hard", ()):
+        every.setdefault(case["condition"], []).append(case)
+    return [_hard_row(name, cases) for name, cases in every.items()]
+
+
+def _hard_row(name: str, cases: Sequence[Result]) -> dict[str, Any]:
+    after = [(case, *case["learned"].values()) for case in cases]
+    method = next(iter(after[0][1]["methods"]))
+    done = [(case, unit["methods"][method]) for case, unit in after]
+    rows = [(c, z, state, c["truth"]["true"][method]) for c, state in done for z in ZONES]
+    return {
+        "condition": name,
+        "title": cases[0]["condition_title"],
+        "lenses": len(cases),
+        "refused": sum(len(unit["refused"]) for _, unit in after),
+        "gain": _zones(lambda z: mean(gain(c, state, z) for c, state in done)),
+        "ssim": _zones(lambda z: mean(gain(c, state, z, "ssim") for c, state in done)),
+        "control": _zones(lambda z: mean(gain(c, c["truth"]["control"], z) for c in cases)),
+        "true": _zones(lambda z: mean(gain(c, c["truth"]["true"][method], z) for c in cases)),
+        "kept": _zones(partial(_column_mean, [kept(c, 1, method) for c in cases])),
+        "psf": _zones(partial(_column_mean, [_rel_l2(unit["psf"], "g") for _, unit in after])),
+        "counts": counted(rows),
+    }
 
 
 def states(case: Result, method: str) -> dict[str, Mapping[str, Any]]:
@@ -116,10 +208,13 @@ def states(case: Result, method: str) -> dict[str, Mapping[str, Any]]:
         f"n = {n}": unit["methods"][method]
         for n, unit in sorted(case["learned"].items(), key=lambda item: int(item[0]))
     }
+    rival = {f"{name}, n = 1": unit["methods"][method] for name, unit in case["rivals"].items()}
     return {
-        "without correction": case["truth"]["before"],
+        BEFORE: case["truth"]["before"],
+        DENOISED: case["truth"]["control"],
+        **rival,
         **learned,
-        "true PSF": case["truth"]["true"][method],
+        TRUE: case["truth"]["true"][method],
     }
 
 
@@ -134,13 +229,23 @@ def number(value: float | None, digits: int = 0) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
+def _names(every: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Names of all states: untouched, denoised, rivals, numbers of photos ascending, the true PSF."""
+    found = dict.fromkeys(name for one in every for name in one)
+
+    def place(name: str) -> tuple[int, int]:
+        fixed = {BEFORE: 0, DENOISED: 1, TRUE: 4}
+        if name in fixed:
+            return fixed[name], 0
+        return (3, int(name[4:])) if name.startswith("n = ") else (2, 0)
+
+    return sorted(found, key=place)
+
+
 def _mtf(result: Result, method: str) -> list[dict[str, Any]]:
     every = [states(case, method) for case in result["cases"]]
-    names = list(dict.fromkeys(name for one in every for name in one))
-    # the true PSF last, numbers ascending before it
-    names.sort(key=lambda name: (name == "true PSF", int(name[4:]) if name.startswith("n = ") else 0))
     rows = []
-    for name in names:
+    for name in _names(every):
         row: dict[str, Any] = {"state": name}
         for zone in ZONES:
             here = [one[name]["edges"].get(zone, {}) for one in every if name in one]
@@ -152,15 +257,14 @@ def _mtf(result: Result, method: str) -> list[dict[str, Any]]:
     return rows
 
 
-def _psnr(result: Result, method: str) -> list[dict[str, Any]]:
+def _fidelity(result: Result, method: str, of: str) -> list[dict[str, Any]]:
     every = [states(case, method) for case in result["cases"]]
-    names = [row["state"] for row in _mtf(result, method)]
     return [
         {
             "state": name,
-            **{zone: mean(_get(one[name]["psnr"], zone) for one in every if name in one) for zone in ZONES},
+            **{zone: mean(_get(one[name][of], zone) for one in every if name in one) for zone in ZONES},
         }
-        for name in names
+        for name in _names(every)
     ]
 
 
@@ -186,8 +290,15 @@ def _having(result: Result, n: int) -> list[Result]:
     return [case for case in result["cases"] if str(n) in case["learned"]]
 
 
+def _with(result: Result, rival: str) -> list[Result]:
+    return [case for case in result["cases"] if rival in case["rivals"]]
+
+
 def _psf(case: Result, n: int, channel: str) -> dict[str, float | None]:
-    found = case["learned"][str(n)]["psf"]
+    return _rel_l2(case["learned"][str(n)]["psf"], channel)
+
+
+def _rel_l2(found: Result | None, channel: str) -> dict[str, float | None]:
     return {zone: None if found is None else found["rel_l2"][channel].get(zone) for zone in ZONES}
 
 
@@ -196,13 +307,14 @@ def _psf_mean(case: Result, n: int) -> dict[str, float | None]:
     return {zone: mean(one[zone] for one in every) for zone in ZONES}
 
 
-def _mtf50(state: Result, zone: str) -> float | None:
-    value: float | None = _get(state["edges"].get(zone, {}), "mtf50")
+def _edge(state: Result, zone: str, name: str) -> float | None:
+    value: float | None = _get(state["edges"].get(zone, {}), name)
     return value
 
 
-def _psnr_gain(case: Result, state: Result, zone: str) -> float | None:
-    before, after = _get(case["truth"]["before"]["psnr"], zone), _get(state["psnr"], zone)
+def gain(case: Result, state: Result, zone: str, of: str = "psnr") -> float | None:
+    """Gain in PSNR (dB) or SSIM over the photo as it was; None where the zone is not there."""
+    before, after = _get(case["truth"]["before"][of], zone), _get(state[of], zone)
     return None if before is None or after is None else after - before
 
 

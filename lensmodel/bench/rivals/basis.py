@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Final
 
@@ -57,7 +57,8 @@ class RadialBasis:
         t = np.arange(-half, half + 1, dtype=np.float64)
         u, v = pixel_to_local(t[:, None], t[None, :], position.phi)
         points = np.stack(np.broadcast_arrays(half - v, half + u))
-        return np.stack([ndimage.map_coordinates(one, points, order=3, mode="grid-constant") for one in local])
+        turn = partial(ndimage.map_coordinates, coordinates=points, order=3, mode="grid-constant")
+        return np.stack([turn(one) for one in local])
 
 
 def principal(fields: NDArray[np.floating], radii: Sequence[float], count: int) -> RadialBasis:

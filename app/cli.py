@@ -23,7 +23,9 @@ interrupt.workers_ignore_it()
 app = typer.Typer(
     name="lensmodel",
     help="Learn the blur of one copy of a lens from ordinary photos, and remove it.",
-    epilog="Start with: lensmodel calibrate PHOTO... --profile my-lens.lensprofile",
+    epilog="""Start with: lensmodel calibrate PHOTO... --profile my-lens.lensprofile
+
+Exit status: 0 done, 1 something failed, 2 called wrongly, 130 stopped by Ctrl-C, 143 by SIGTERM.""",
     no_args_is_help=True,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
@@ -68,7 +70,6 @@ def configure(
     shown = display.Display(quiet, verbose)
     shown.configure()
     context.obj = shown
-    display.quiet = quiet
 
 
 def main() -> None:

@@ -52,8 +52,7 @@ def run(
         raise UsageError(f"--size must be odd, got {asked.size}; a PSF has one middle pixel")
     if output is not None and output.suffix.lower() not in WRITTEN:
         raise UsageError(f"no format for {output.name}; give a name that ends in {', '.join(WRITTEN)}")
-    if output is not None and output.exists() and not force:
-        raise UsageError(f"{output} is there already; --force replaces it")
+    files.refuse_existing(output, force=force)
     answer = files.profile_at(source).model.query(place, settings, asked.size)
     tangential, sagittal = quality.tangential_sagittal_mtf50(answer.kernel, place.phi)
     document = {
@@ -86,9 +85,10 @@ def run(
 
 def _words(place: FieldPosition, answer: PsfAnswer, tangential: float, sagittal: float) -> str:
     beyond = " (beyond what the photos cover)" if answer.extrapolated else ""
+    photos = "1 photo" if answer.photos == 1 else f"{answer.photos} photos"
     return (
         f"{zone_of(place.r)}, r {place.r:g}: rms width {rms_width(answer.kernel):.2f} px, MTF50 tangential "
-        f"{tangential:.3f}, sagittal {sagittal:.3f} cycles/px; {answer.photos} photos, "
+        f"{tangential:.3f}, sagittal {sagittal:.3f} cycles/px; {photos}, "
         f"{answer.effective_samples:.1f} effective samples, expected error "
         f"{answer.predicted_error:.2f}{beyond}"
     )

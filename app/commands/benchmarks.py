@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 
 from app.commands import display
+from app.commands.display import Display
 from app.commands.failure import UsageError
-from app.commands.options import Force
-from lensmodel.bench.blind import BlindBenchmark, run_blind_benchmark
+from app.commands.files import as_usage, refuse_existing
+from app.commands.options import Force, Quiet, Verbose
+from lensmodel.bench.blind import BlindBenchmark, BlindReport, run_blind_benchmark
 from lensmodel.bench.correct import run_correct_benchmark
 from lensmodel.bench.model import run_model_benchmark, table
 from lensmodel.bench.report import markdown_table, write_report
@@ -19,26 +21,66 @@ from lensmodel.codec import to_json
 from lensmodel.photo import develop
 from lensmodel.simulate import demo_data_path
 
-bench = typer.Typer(help="Measure quality and speed.", invoke_without_command=True)
+NOISE: Final = "0.01,0.003"
+ESTIMATORS: Final = "default,michaeli-irani,whittle"
+BLIND_OUTPUT: Final = Path("bench-output")
+STANDARD_OUTPUT: Final = Path("-")
+FINISHED: Final = ("blind.json", "blind.csv", "blind.md")
+"""What a finished report of `bench blind` consists of, beside its curves."""
+
+JsonFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--json",
+        metavar="FILE",
+        help="Also write the figures to this file; - prints them instead of the table.",
+    ),
+]
+
+bench = typer.Typer(
+    help="""Measure quality and speed.
+
+    Without a name, three quick runs, whose tables go to standard output:
+
+    - bench blind --cases 12
+
+    - bench model --seeds 1000:1002
+
+    - bench correct --methods fast,standard
+
+    They take some minutes, and write nothing but finished cases, in bench-output/cache.
+
+    Examples:
+
+        lensmodel bench
+
+        lensmodel bench blind --help
+
+    Exit status: 0 measured, 1 something failed, 2 called wrongly.
+    """,
+    invoke_without_command=True,
+)
 
 
 @bench.callback()
-def default(context: typer.Context) -> None:
-    """Measure quality and speed; without a name, a short run of each."""
+def default(context: typer.Context, quiet: Quiet = False, verbose: Verbose = 0) -> None:
+    """Run the three quick ones unless one is named."""
+    shown = display.of(context, quiet=quiet, verbose=verbose)
+    context.obj = shown
     if context.invoked_subcommand is None:
-        blind(cases=12, output=Path("bench-output"))
-        model(seeds="1000:1002")
-        correct(methods="fast,standard")
+        settings = BlindBenchmark(noise=_levels(NOISE), methods=_names(ESTIMATORS), cases=12)
+        shown.result("Blind estimators\n\n" + markdown_table(_blind(settings, 2, BLIND_OUTPUT, shown)))
+        shown.result("Lens model\n\n" + table(run_model_benchmark(seeds=range(1000, 1002), photos=[1, 5])))
+        shown.result("Correction\n\n" + _speeds(_correct(None, "fast,standard", 1, shown)))
 
 
 @bench.command()
 def blind(
+    context: typer.Context,
     photos: Annotated[Path | None, typer.Option(help="Folder of sharp photographs.")] = None,
     psfs: Annotated[Path | None, typer.Option(help="npz with the key psf, shape (n, k, k).")] = None,
-    noise: Annotated[str, typer.Option(help="Standard deviations, comma separated.")] = "0.01,0.003",
-    methods: Annotated[
-        str, typer.Option(help="Estimators, comma separated.")
-    ] = "default,michaeli-irani,whittle",
+    noise: Annotated[str, typer.Option(help="Standard deviations, comma separated.")] = NOISE,
+    methods: Annotated[str, typer.Option(help="Estimators, comma separated.")] = ESTIMATORS,
     patch: Annotated[int, typer.Option(help="Side of a patch.")] = 256,
     cases: Annotated[int | None, typer.Option(help="At most so many.")] = None,
     pool: Annotated[int, typer.Option(help="Patches that share one kernel.")] = 1,
@@ -47,58 +89,63 @@ def blind(
     judge: Annotated[str, typer.Option(help="hyper-laplacian or epll.")] = "hyper-laplacian",
     seed: int = 0,
     workers: Annotated[int, typer.Option(min=1)] = 2,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for tables and curves.")] = Path(
-        "bench-output"
-    ),
-    json_output: Annotated[
-        Path | None, typer.Option("--json", help="Also write the figures to this file.")
-    ] = None,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for tables and curves.")
+    ] = BLIND_OUTPUT,
+    json_output: JsonFile = None,
     force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = 0,
 ) -> None:
     """Blind PSF estimators on blurred patches with known truth (paper, section 5.1).
 
-    Finished cases are kept; a run that was stopped goes on.
+    Finished cases are kept; a run that was stopped goes on. A finished report is replaced only
+    with --force.
 
     Examples:
 
         lensmodel bench blind --cases 12
 
-        lensmodel bench blind --photos sharp/ --psfs mine.npz --noise 0.01 --methods default
+        lensmodel bench blind --photos sharp --psfs mine.npz --noise 0.01 --methods default -o mine
+
+    Exit status: 0 measured, 1 something failed, 2 called wrongly.
     """
-    _refuse_existing(json_output, force=force)
-    try:
-        levels = tuple(float(part) for part in noise.split(","))
-    except ValueError as error:
-        raise UsageError(f"noise must be numbers such as 0.01,0.003, got {noise!r}") from error
-    settings = BlindBenchmark(
-        photos=photos,
-        psfs=psfs,
-        noise=levels,
-        methods=tuple(part.strip() for part in methods.split(",")),
-        half=half,  # type: ignore[arg-type]  # checked by the benchmark
-        cases=cases,
-        patch=patch,
-        pool=pool,
-        variant=variant,  # type: ignore[arg-type]  # checked by the benchmark
-        judge=judge,
-        seed=seed,
-    )
-    with display.progress() as bars:
+    shown = display.of(context, quiet=quiet, verbose=verbose)
+    refuse_existing(_file(json_output), *(output / name for name in FINISHED), force=force)
+    with as_usage():
+        settings = BlindBenchmark(
+            photos=photos,
+            psfs=psfs,
+            noise=_levels(noise),
+            methods=_names(methods),
+            half=half,  # type: ignore[arg-type]  # checked by the benchmark
+            cases=cases,
+            patch=patch,
+            pool=pool,
+            variant=variant,  # type: ignore[arg-type]  # checked by the benchmark
+            judge=judge,
+            seed=seed,
+        )
+    report = _blind(settings, workers, output, shown)
+    written = write_report(report, output)
+    _tell(shown, json_output, report.to_json(), markdown_table(report))
+    shown.note("written: " + ", ".join(str(path) for path in written))
+
+
+def _blind(settings: BlindBenchmark, workers: int, output: Path, shown: Display) -> BlindReport:
+    with shown.progress() as bars:
         task = bars.add_task("cases", total=None)
-        report = run_blind_benchmark(
+        return run_blind_benchmark(
             settings,
             workers=workers,
             cache=output / "cache",
             on_step=lambda done, total: bars.update(task, completed=done, total=total),
         )
-    written = write_report(report, output)
-    _write_json(json_output, report.to_json())
-    typer.echo(markdown_table(report))
-    typer.echo("Written: " + ", ".join(str(path) for path in written))
 
 
 @bench.command()
 def model(
+    context: typer.Context,
     seeds: Annotated[
         str, typer.Option(metavar="FIRST:LAST", help="Simulated lenses, the last excluded.")
     ] = "1000:1004",
@@ -107,10 +154,10 @@ def model(
     psf_field: Annotated[
         Path | None, typer.Option(metavar="FILE", help="npz of measured PSFs instead of simulated lenses.")
     ] = None,
-    json_output: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Also write the figures to this file.")
-    ] = None,
+    json_output: JsonFile = None,
     force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = 0,
 ) -> None:
     """Predictions of the lens model where no sample was, against other regressions.
 
@@ -119,8 +166,11 @@ def model(
         lensmodel bench model --seeds 1000:1001 --photos 1 --methods eff-linear
 
         lensmodel bench model --psf-field mine.npz --json model.json
+
+    Exit status: 0 measured, 1 something failed, 2 called wrongly.
     """
-    _refuse_existing(json_output, force=force)
+    shown = display.of(context, quiet=quiet, verbose=verbose)
+    refuse_existing(_file(json_output), force=force)
     try:
         first, last = (int(part) for part in seeds.split(":"))
         counts = [int(part) for part in photos.split(",")]
@@ -131,24 +181,24 @@ def model(
     result = run_model_benchmark(
         seeds=range(first, last),
         photos=counts,
-        methods=None if methods is None else [part.strip() for part in methods.split(",")],
+        methods=None if methods is None else _names(methods),
         psf_field=psf_field,
     )
-    typer.echo(table(result))
-    _write_json(json_output, result)
+    _tell(shown, json_output, result, table(result))
 
 
 @bench.command()
 def correct(
+    context: typer.Context,
     photo: Annotated[
         Path | None, typer.Option(metavar="FILE", help="A photo of yours; default: one of the library's.")
     ] = None,
     methods: Annotated[str, typer.Option(help="Names, comma separated.")] = "fast,standard,paper",
     workers: Annotated[int, typer.Option(min=1, metavar="N", help="Threads.")] = 1,
-    json_output: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Also write the figures to this file.")
-    ] = None,
+    json_output: JsonFile = None,
     force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = 0,
 ) -> None:
     """Time and memory of correcting a photo, and of the Richardson-Lucy step against its peers.
 
@@ -157,19 +207,25 @@ def correct(
         lensmodel bench correct --methods fast
 
         lensmodel bench correct --photo mine.dng --methods fast,standard --workers 2 --json correct.json
+
+    Exit status: 0 measured, 1 something failed, 2 called wrongly.
     """
-    _refuse_existing(json_output, force=force)
+    shown = display.of(context, quiet=quiet, verbose=verbose)
+    refuse_existing(_file(json_output), force=force)
+    result = _correct(photo, methods, workers, shown)
+    _tell(shown, json_output, result, _speeds(result))
+
+
+def _correct(photo: Path | None, methods: str, workers: int, shown: Display) -> dict[str, Any]:
     planes = develop(photo or demo_data_path("lake.jpg")).planes
-    with display.progress() as bars:
+    with shown.progress() as bars:
         task = bars.add_task("methods", total=None)
-        result = run_correct_benchmark(
+        return run_correct_benchmark(
             planes,
-            methods=[part.strip() for part in methods.split(",")],
+            methods=_names(methods),
             workers=workers,
             on_step=lambda done, total: bars.update(task, completed=done, total=total),
         )
-    typer.echo(_speeds(result))
-    _write_json(json_output, result)
 
 
 def _speeds(result: dict[str, Any]) -> str:
@@ -186,13 +242,28 @@ def _speeds(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _refuse_existing(path: Path | None, *, force: bool) -> None:
-    if path is not None and path.exists() and not force:
-        raise UsageError(f"{path} is there already; --force replaces it")
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in text.split(","))
 
 
-def _write_json(path: Path | None, result: object) -> None:
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with display.atomic(path) as part:
+def _levels(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError as error:
+        raise UsageError(f"--noise must be numbers such as 0.01,0.003, got {text!r}") from error
+
+
+def _file(json_output: Path | None) -> Path | None:
+    return None if json_output == STANDARD_OUTPUT else json_output
+
+
+def _tell(shown: Display, json_output: Path | None, result: object, words: str) -> None:
+    """Print the table, or the figures where they were asked for; write them where a file was named."""
+    if json_output == STANDARD_OUTPUT:
+        shown.document(result)
+        return
+    shown.result(words)
+    if json_output is not None:
+        json_output.parent.mkdir(parents=True, exist_ok=True)
+        with display.atomic(json_output) as part:
             part.write_text(json.dumps(to_json(result), indent=1), encoding="utf-8")

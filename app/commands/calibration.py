@@ -75,7 +75,9 @@ def run(names: Sequence[str], target: Path, wishes: Wishes, display: Display, *,
         cover = ", ".join(f"{zone} {count}" for zone, count in profile.model.coverage().items())
         display.result(f"{target}: photos {summary['photos']}, samples {summary['samples']} ({cover})")
     if profile is None:
-        display.error("no photo could be used, so there is no profile; use photos with fine detail in focus")
+        display.error(
+            "no photo could be used, so there is no profile; the lines above say what each photo needs"
+        )
     if any(result["state"] == "failed" for result in results):
         raise typer.Exit(1)
 
@@ -121,7 +123,7 @@ class _Calibration:
             files.refuse_other_lens(lens, seen, "give it a profile of its own, or add --any-lens")
         samples = pipeline.samples_of_photo(
             path,
-            settings=self._settings,
+            settings=None if files.says_aperture(path) else self._settings,
             estimator=self._wishes.estimator,
             workers=self._wishes.workers,
             on_event=on_event,

@@ -69,7 +69,9 @@ def run(
         for number, (target, path) in enumerate(targets.items()):
             bars.update(task, description=path.name)
             try:
-                result = _one(path, target, profile, settings, wishes, partial(_show, bars, task, number))
+                result = _one(
+                    path, target, profile, settings, wishes, display, partial(_show, bars, task, number)
+                )
             except (LensModelError, OSError) as error:
                 code = error.code if isinstance(error, LensModelError) else "unreadable"
                 result = {"state": "failed", "code": code, "reason": files.reason(error)}
@@ -105,20 +107,27 @@ def _one(
     profile: LensProfile,
     settings: LensSettings,
     wishes: Wishes,
+    display: Display,
     on_step: Any,  # noqa: ANN401 - a partial of `_show`
 ) -> dict[str, Any]:
     if path.stem.endswith(files.CORRECTED):
         raise InvalidInputError("it was corrected already; give the original")
     if target.exists() and not wishes.force:
         return {"state": "kept"}
+    seen = files.identity(path)
+    if not seen:
+        display.note(f"{path} does not name its lens; it is taken for a photo of the profile's lens")
+    needs_help = not files.says_aperture(path)
+    if needs_help and settings.aperture is None:
+        display.note(f"{path} does not say its aperture; all apertures of the profile are taken together")
     if not wishes.any_lens:
         remedy = "use the profile of its own lens, or add --any-lens"
-        files.refuse_other_lens(profile.lens, files.identity(path), remedy)
+        files.refuse_other_lens(profile.lens, seen, remedy)
     corrected = pipeline.correct(
         path,
         profile.model,
         target,
-        settings=settings,
+        settings=settings if needs_help else LensSettings(),
         method=wishes.method,
         strength=wishes.strength,
         file_format=wishes.file_format,

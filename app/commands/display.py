@@ -6,7 +6,7 @@ import json
 import logging
 import sys
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,9 +23,6 @@ from rich.progress import (
 )
 
 from lensmodel.codec import to_json
-
-quiet = False
-"""Set once by the command line's own `--quiet`."""
 
 LONG_S = 3600.0
 """Speed is taken over so many seconds: one step may take minutes, and the default forgets in 30 s."""
@@ -76,6 +73,11 @@ class Display:
         if not self.quiet:
             self.error(text)
 
+    def progress_line(self, text: str, seconds: float) -> None:
+        """Tell a step of long work, with the time since its start, on standard error."""
+        if not self.quiet:
+            typer.echo(f"[{int(seconds // 60):2d}:{int(seconds % 60):02d}] {text}", err=True)
+
     def error(self, text: str) -> None:
         """Tell what went wrong."""
         typer.echo(f"lensmodel: {text}", err=True)
@@ -104,11 +106,6 @@ def of(context: typer.Context, *, quiet: bool = False, verbose: int = 0) -> Disp
     """Return the display of a subcommand."""
     base = context.find_object(Display) or Display()
     return base.more(quiet=quiet, verbose=verbose)
-
-
-def progress() -> AbstractContextManager[Progress]:
-    """Bars for commands that have no display of their own."""
-    return Display(quiet).progress()
 
 
 @contextmanager

@@ -113,6 +113,11 @@ def identity(path: Path) -> dict[str, str]:
     return {name: value for name, value in named.items() if value}
 
 
+def says_aperture(path: Path) -> bool:
+    """Tell whether a photo says its own aperture; what the command line says is then not needed."""
+    return inspect(path).metadata.aperture is not None
+
+
 def refuse_other_lens(known: dict[str, str], seen: dict[str, str], remedy: str) -> None:
     """Compare two lenses as far as both are named.
 
@@ -127,6 +132,19 @@ def refuse_other_lens(known: dict[str, str], seen: dict[str, str], remedy: str) 
                 f"it was taken with another lens, {name} {value}, "
                 f"and the profile is of {name} {known[name]}; {remedy}"
             )
+
+
+def refuse_existing(*paths: Path | None, force: bool) -> None:
+    """Make sure, before any work, that nothing is replaced that the user did not give up.
+
+    Raises
+    ------
+    UsageError
+        If one of the files is there.
+    """
+    for path in paths:
+        if path is not None and not force and path.exists():
+            raise UsageError(f"{path} is there already; --force replaces it")
 
 
 @contextmanager

@@ -145,6 +145,8 @@ def psf(
         lensmodel psf my-24mm.lensprofile --r 0.9 --channel b --output corner.npy
 
         lensmodel psf my-24mm.lensprofile --json
+
+    Exit status: 0 answered, 1 the profile cannot be used, 2 called wrongly.
     """
     shown = display.of(context, quiet=quiet, verbose=verbose)
     answer.run(

@@ -10,9 +10,11 @@ from typing import Annotated, Final
 
 import typer
 
+from app.commands import display, files
+from app.commands.failure import UsageError
+from app.commands.options import Quiet, Verbose
 from lensmodel.codec import to_json
-from lensmodel.errors import InvalidInputError
-from lensmodel.regression import LensModel, load_profile
+from lensmodel.regression import LensModel
 from lensmodel.report import (
     Advice,
     LensReport,
@@ -21,6 +23,7 @@ from lensmodel.report import (
     apertures_svg,
     curves_svg,
     export,
+    exporters,
     lens_report,
     mtf_map_svg,
     psf_grid,
@@ -41,6 +44,7 @@ _FILES: Final = ("report.json", "mtf.csv", "mtf-map.svg", "mtf-curves.svg", "ape
 
 
 def report(
+    context: typer.Context,
     profile: Profile,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Folder for report.json, mtf.csv and pictures.")
@@ -50,6 +54,8 @@ def report(
     aspect: Aspect = 1.5,
     json_output: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
     force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = 0,
 ) -> None:
     """Tell how sharp a lens is, whether it is centred, and which photo would help most.
 
@@ -60,30 +66,36 @@ def report(
         lensmodel report my-24mm.lensprofile --aperture 2 -o my-24mm-report
 
         lensmodel report my-24mm.lensprofile --json
+
+    Exit status: 0 told, 1 the profile cannot be used, 2 called wrongly.
     """
+    shown = display.of(context, quiet=quiet, verbose=verbose)
     if output is not None:
-        for name in _FILES:
-            _refuse_existing(output / name, force=force)
-    model = load_profile(profile).model
+        files.refuse_existing(*(output / name for name in _FILES), force=force)
+    model = files.profile_at(profile).model
     found = lens_report(model, _settings(model, aperture, channel), ReportSettings(aspect=aspect))
     wish = advice(model)
     document = json.dumps({"report": to_json(found), "advice": to_json(wish)}, indent=2)
     if output is not None:
-        files = {
+        texts = {
             "report.json": document + "\n",
             "mtf.csv": _map_csv(found),
             "mtf-map.svg": mtf_map_svg(found),
             "mtf-curves.svg": curves_svg(found),
         }
         if len(found.apertures) > 1:
-            files["apertures.svg"] = apertures_svg(found)
+            texts["apertures.svg"] = apertures_svg(found)
         output.mkdir(parents=True, exist_ok=True)
-        for name, text in files.items():
+        for name, text in texts.items():
             write_atomically(output / name, text.encode())
-    typer.echo(document if json_output else _words(found, wish, output))
+    if json_output:
+        typer.echo(document)
+    else:
+        shown.result(_words(found, wish, output))
 
 
 def export_psfs(
+    context: typer.Context,
     profile: Profile,
     output: Annotated[Path, typer.Option("--output", "-o", help="The file to write.")],
     file_format: Annotated[str, typer.Option("--format", help="csv, fits, json, npz, png, tiff.")] = "tiff",
@@ -99,7 +111,10 @@ def export_psfs(
     ] = 0.0,
     size: Annotated[int, typer.Option(min=3, max=255, help="Odd side in pixels.")] = 31,
     aspect: Aspect = 1.5,
+    json_output: Annotated[bool, typer.Option("--json", help="Say what was written as JSON.")] = False,
     force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = 0,
 ) -> None:
     """Write PSFs for other programs: a grid over the picture, or a single place with --r and --phi.
 
@@ -110,28 +125,31 @@ def export_psfs(
         lensmodel export my-24mm.lensprofile --format json --r 0.9 --phi 0.6 -o corner-for-art.json
 
         lensmodel export my-24mm.lensprofile --format csv --aperture 2 -o mtf.csv
+
+    Exit status: 0 written, 1 the profile cannot be used, 2 called wrongly.
     """
-    _refuse_existing(output, force=force)
-    model = load_profile(profile).model
+    shown = display.of(context, quiet=quiet, verbose=verbose)
+    files.refuse_existing(output, force=force)
+    with files.as_usage():
+        exporters.create(file_format)
+    model = files.profile_at(profile).model
     place = None if r is None else FieldPosition(r, phi)
     psfs = psf_grid(
         model, _settings(model, aperture, channel), rows=rows, cols=cols, size=size, aspect=aspect, at=place
     )
     export(output, psfs, file_format)
-    typer.echo(str(output))
+    if json_output:
+        shown.document({"output": str(output), "format": file_format, "psfs": len(psfs.positions)})
+    else:
+        shown.result(str(output))
 
 
 def _settings(model: LensModel, aperture: float | None, channel: str) -> LensSettings:
     if channel not in CHANNELS:
-        raise InvalidInputError(f"channel must be r, g or b, got {channel!r}")
+        raise UsageError(f"channel must be r, g or b, got {channel!r}")
     named: Channel = channel
     chosen = widest(model) if aperture is None else LensSettings(aperture=aperture)
     return chosen.with_channel(named)
-
-
-def _refuse_existing(path: Path, *, force: bool) -> None:
-    if path.exists() and not force:
-        raise InvalidInputError(f"{path} is there already; --force replaces it")
 
 
 def _words(found: LensReport, wish: Advice, output: Path | None) -> str:

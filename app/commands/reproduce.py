@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import time
 from collections.abc import Iterator
@@ -12,15 +11,21 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lensmodel.errors import InvalidInputError
+from app.commands import display
+from app.commands.failure import UsageError
+from app.commands.files import refuse_existing
+from app.commands.options import Force, Quiet, Verbose
 
 if TYPE_CHECKING:
     from lensmodel.bench.reproduce import Case, DirectRoute, OpenRoute, Size
 
 DATA_VARIABLE = "LENSMODEL_TEST_DATA"
+PAGE = ("reproduction.md", "reproduction.html")
+"""What is in the folder of a finished reproduction, beside pictures and stored results."""
 
 
 def reproduce(
+    context: typer.Context,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for the page, its pictures and stored results.")
     ] = Path("reproduction"),
@@ -47,19 +52,29 @@ def reproduce(
         Path, typer.Option(help="Output of `lensmodel bench blind`: Fig. 1 where it is there.")
     ] = Path("bench-output"),
     estimator: Annotated[str, typer.Option(help="Blind estimator of the calibration.")] = "default",
+    force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = 0,
 ) -> None:
     """Make the paper's figures and its Table 1 on simulated lenses that nothing was tuned on.
 
     Each lens learns from Bayer DNG files uploaded to a service started for it; what the service
     answers and corrects is measured against the truth. Finished results are kept: a run that was
-    stopped goes on, and a change of code or settings computes anew.
+    stopped goes on, and a change of code or settings computes anew. A finished page is replaced
+    only with --force.
 
     Examples:
 
         lensmodel reproduce --quick -o reproduction
 
         lensmodel reproduce --json reproduction.json
+
+    Exit status: 0 the page is written, 1 something failed, 2 called wrongly.
     """
+    shown = display.of(context, quiet=quiet, verbose=verbose)
+    if quick and full:
+        raise UsageError("--quick and --full exclude each other; give one of them")
+    refuse_existing(json_output, *(output / name for name in PAGE), force=force)
     from app.reproduce import CODE, ServiceRoutes  # noqa: PLC0415 - only this command needs them
     from lensmodel.bench.reproduce import (  # noqa: PLC0415 - as above: the simulation is slow to import
         collected,
@@ -69,8 +84,6 @@ def reproduce(
         write_page,
     )
 
-    if quick and full:
-        raise InvalidInputError("--quick and --full exclude each other; give one of them")
     size: Size = "quick" if quick else "full" if full else "default"
     plan = planned(size, scenes=scenes or _external(), estimator=estimator)
     result = run_reproduction(
@@ -79,13 +92,13 @@ def reproduce(
         output,
         route="in the library" if direct else "by the service",
         code=() if direct else CODE,
-        on_work=Progress(quiet=not logging.getLogger().isEnabledFor(logging.WARNING)),
+        on_work=Progress(quiet=shown.quiet),
     )
     result["figures"]["fig1"] = collected(benchmark, output / "pictures")
     written = [*write_page(result, output)]
     if json_output is not None:
         written.append(write_json(result, json_output))
-    typer.echo("Written: " + ", ".join(str(path) for path in written))
+    shown.result("Written: " + ", ".join(str(path) for path in written))
 
 
 class Progress:

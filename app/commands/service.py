@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -54,6 +55,8 @@ def serve(port: Port = None, host: Host = None, data: Data = None) -> None:
         lensmodel serve
 
         lensmodel serve --port 9000 --data ~/lenses
+
+    Exit status: 0 stopped as told by Ctrl-C or SIGTERM, 1 it could not run, 2 called wrongly.
     """
     settings = _settings(data, host, port)
     from app import supervisor  # noqa: PLC0415 - only this command needs the service
@@ -77,17 +80,28 @@ def worker(data: Data = None) -> None:
     supervisor.run_worker(settings)
 
 
-def config(data: Data = None) -> None:
+def config(
+    data: Data = None,
+    json_output: Annotated[bool, typer.Option("--json", help="Print the settings as JSON.")] = False,
+) -> None:
     """Print the effective settings as the environment that would give them; secrets are masked.
 
-    Example:
+    Examples:
 
         lensmodel config
+
+        lensmodel config --json
+
+    Exit status: 0 printed, 2 a setting is wrong.
     """
     from urllib.parse import urlsplit  # noqa: PLC0415 - only this command needs it
 
-    for name, value in sorted(_settings(data).model_dump(mode="json").items()):
-        shown = value
-        if name.endswith("_url") and (password := urlsplit(str(value)).password):
-            shown = str(value).replace(f":{password}@", ":********@")
-        typer.echo(f"LENS_{name.upper()}={shown}")
+    shown = {f"LENS_{n.upper()}": v for n, v in sorted(_settings(data).model_dump(mode="json").items())}
+    for name, value in shown.items():
+        if name.endswith("_URL") and (password := urlsplit(str(value)).password):
+            shown[name] = str(value).replace(f":{password}@", ":********@")
+    if json_output:
+        typer.echo(json.dumps(shown, indent=2))
+        return
+    for name, value in shown.items():
+        typer.echo(f"{name}={value}")

@@ -7,7 +7,6 @@ import logging
 import os
 import pty
 import re
-import shlex
 import shutil
 import signal
 import subprocess
@@ -133,41 +132,6 @@ def folder(made: Path, tmp_path: Path) -> Iterator[Path]:
     assert not [path for path in tmp_path.rglob("*") if ".part" in path.name]
 
 
-# --- help --------------------------------------------------------------------------------------
-
-
-def examples(*name: str) -> list[list[str]]:
-    text = CliRunner().invoke(app, [*name, "--help"], env={"COLUMNS": "200"}).output
-    return [shlex.split(line) for line in re.findall(r"^ *lensmodel (.+?) *$", text, re.MULTILINE)]
-
-
-RUN_HERE = [
-    *[pytest.param(words, id=" ".join(words)) for words in examples("correct") + examples("psf")],
-    *[pytest.param(words, id=" ".join(words)) for words in examples("calibrate") + examples("config")],
-]
-
-
-def test_every_command_teaches_by_example() -> None:
-    for name in ("calibrate", "correct", "psf", "serve", "config", "demo"):
-        assert examples(name), name
-    for name in ("blind", "model", "correct"):
-        assert examples("bench", name), name
-
-
-@pytest.mark.parametrize("words", RUN_HERE)
-def test_example_runs(words: list[str], folder: Path, made: Path, here: Here) -> None:
-    (folder / "holiday").mkdir()
-    shutil.copy(made / "b.dng", folder / "holiday")
-    shutil.copy(made / "b.dng", folder / "one-more.dng")
-    Image.fromarray(_picture()).save(folder / "scan.tif")
-    if words[0] == "calibrate":  # the estimators have tests of their own
-        words = [*words, "--estimator", "whittle"]
-    done = lensmodel(*words, cwd=folder) if words[0] == "calibrate" else here(*words)
-
-    assert done.returncode == 0, done.stderr
-    assert done.stdout
-
-
 def _picture() -> np.ndarray[Any, np.dtype[np.uint8]]:
     rng = np.random.default_rng(0)
     blocks = np.kron(rng.integers(20, 200, (80, 100, 3)), np.ones((4, 4, 1)))
@@ -278,6 +242,13 @@ REFUSED = {
     "even size": (["psf", PROFILE, "--size", "20"], 2, "must be odd, got 20"),
     "psf file there": (["psf", PROFILE, "-o", "there.npy"], 2, "there.npy is there already; --force"),
     "psf format": (["psf", PROFILE, "-o", "psf.xyz"], 2, "psf.xyz"),
+    "quick and full": (["reproduce", "--quick", "--full"], 2, "exclude each other"),
+    "noise in words": (["bench", "blind", "--noise", "much"], 2, "numbers such as 0.01,0.003, got 'much'"),
+    "unknown half": (["bench", "blind", "--half", "x"], 2, "half must be one of .*got 'x'"),
+    "report there": (["report", PROFILE, "-o", "reported"], 2, "mtf.csv is there already; --force"),
+    "export format": (["export", PROFILE, "-o", "new.bmp", "--format", "bmp"], 2, "known: csv, fits, json"),
+    "report of nothing": (["report", "gone"], 2, "no lens profile at gone; make it"),
+    "demo into a file": (["demo", "-o", "bad"], 2, "bad is a file"),
     "bench json there": (["bench", "model", "--json", "there.npy"], 2, "there.npy is there already; --force"),
 }
 
@@ -294,6 +265,8 @@ def test_refusal_is_one_sentence_with_the_value_and_a_remedy(
     (folder / "text.dng").write_text("no picture at all")
     (folder / "bad").write_bytes((folder / PROFILE).read_bytes()[:-200])
     (folder / "there.npy").write_bytes(b"mine")
+    (folder / "reported").mkdir()
+    (folder / "reported" / "mtf.csv").write_bytes(b"mine")
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
     done = here(*words)
@@ -304,6 +277,13 @@ def test_refusal_is_one_sentence_with_the_value_and_a_remedy(
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
+def test_help_tells_what_each_exit_status_means(here: Here) -> None:
+    said = here("--help").stdout
+
+    assert re.search(r"0\s+done,\s+1\s+something failed,\s+2\s+called\s+wrongly", said)
+    assert re.search(r"130\s+stopped\s+by\s+Ctrl-C,\s+143\s+by\s+SIGTERM", said)
+
+
 def test_unknown_options_and_settings_are_wrong_usage(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     option = lensmodel("calibrate", "one.dng", "--profil", "x", cwd=folder)
     monkeypatch.setitem(ENVIRONMENT, "LENS_PROT", "9000")
@@ -311,6 +291,109 @@ def test_unknown_options_and_settings_are_wrong_usage(folder: Path, monkeypatch:
 
     assert option.returncode == setting.returncode == 2
     assert "did you mean LENS_PORT" in one_sentence(setting.stderr)
+
+
+# --- what is there already ---------------------------------------------------------------------
+
+
+@pytest.fixture
+def shown_off(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Put a demo in place of the real one that writes two files at once, and counts its runs."""
+    runs: list[int] = []
+
+    def run(output: Path, say: Callable[[str], None]) -> bool:
+        runs.append(len(runs))
+        say("working")
+        output.mkdir(parents=True, exist_ok=True)
+        for name in ("report.md", "report.json"):
+            (output / name).write_text(f'{{"run": {len(runs)}}}', encoding="utf-8")
+        return True
+
+    monkeypatch.setattr("app.demo.run.run", run)
+    return runs
+
+
+def test_demo_renews_what_an_earlier_demo_left(folder: Path, here: Here, shown_off: list[int]) -> None:
+    first, second = here("demo", "-o", "out"), here("demo", "-o", "out", "--json")
+
+    assert first.returncode == second.returncode == 0
+    assert json.loads(second.stdout) == {"run": 2}
+    assert "working" in first.stderr
+    assert len(shown_off) == 2
+
+
+@pytest.mark.parametrize("touched", ["report.md", "mine.txt"])
+def test_demo_replaces_nothing_that_is_not_its_own_unless_forced(
+    touched: str, folder: Path, here: Here, shown_off: list[int]
+) -> None:
+    if touched == "report.md":
+        here("demo", "-o", "out")
+    (folder / "out").mkdir(exist_ok=True)
+    (folder / "out" / touched).write_text("my notes", encoding="utf-8")
+    begun = len(shown_off)
+
+    refused = here("demo", "-o", "out")
+    runs, kept = len(shown_off), (folder / "out" / touched).read_text(encoding="utf-8")
+    forced = here("demo", "-o", "out", "--force")
+
+    assert refused.returncode == 2
+    assert re.search(f"{touched} is not as a demo left it; .*--force", one_sentence(refused.stderr))
+    assert (runs, kept) == (begun, "my notes")
+    assert forced.returncode == 0
+    assert "my notes" in kept
+    assert (folder / "out" / "mine.txt").exists() == (touched == "mine.txt")
+
+
+def test_a_file_of_mine_stays_mine_after_a_forced_demo(
+    folder: Path, here: Here, shown_off: list[int]
+) -> None:
+    (folder / "out").mkdir()
+    (folder / "out" / "mine.txt").write_text("my notes", encoding="utf-8")
+    here("demo", "-o", "out", "--force")
+
+    assert here("demo", "-o", "out").returncode == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "finished"),
+    [
+        (("bench", "blind", "-o", "out"), "out/blind.md"),
+        (("reproduce", "--quick", "-o", "out"), "out/reproduction.md"),
+        (("reproduce", "--json", "out/figures.json"), "out/figures.json"),
+    ],
+)
+def test_a_finished_report_is_refused_before_any_work(
+    words: tuple[str, ...], finished: str, folder: Path, here: Here
+) -> None:
+    (folder / "out").mkdir()
+    (folder / finished).write_text("finished", encoding="utf-8")
+
+    done = here(*words)
+
+    assert done.returncode == 2
+    assert f"{finished} is there already; --force replaces it" in one_sentence(done.stderr)
+    assert [path.name for path in (folder / "out").iterdir()] == [Path(finished).name]
+
+
+@pytest.mark.slow
+def test_aperture_of_the_command_line_is_for_photos_that_do_not_say_their_own(
+    folder: Path, here: Here
+) -> None:
+    Image.fromarray(_picture()).save(folder / "scan.tif")
+    words = ("calibrate", "one.dng", "scan.tif", "-p", "new", "--any-lens", "--estimator", "whittle")
+    done = here(*words, "--aperture", "8", "--workers", "1")
+
+    assert done.returncode == 0, done.stderr
+    seen = {sample.settings.aperture for sample in load_profile(folder / "new").model.samples}
+    assert seen == {2.8, 8.0}
+
+
+def test_a_photo_that_says_little_is_corrected_with_a_word_of_warning(folder: Path, here: Here) -> None:
+    Image.fromarray(_picture()).save(folder / "scan.tif")
+    done = here("correct", "scan.tif", "-p", PROFILE, "-o", "out", "--method", "fast")
+
+    assert done.returncode == 0
+    assert re.search("does not name its lens.*\n.*does not say its aperture", done.stderr)
 
 
 # --- interrupting ------------------------------------------------------------------------------

@@ -313,14 +313,18 @@ def samples_of_photo(
                 pool.submit(_cell_from_folder, folder, group, chosen, key, estimator): index
                 for index, group in enumerate(groups)
             }
-            for job in as_completed(jobs):
-                index = jobs[job]
-                try:
-                    found[index] = job.result()
-                except NotEnoughEvidenceError as error:
-                    log.info("a cell of %s was dropped: %s", path.name, error)
-                done += len(groups[index])
-                on_event(CalibrationEvent(path, "estimating", done, total))
+            try:
+                for job in as_completed(jobs):
+                    index = jobs[job]
+                    try:
+                        found[index] = job.result()
+                    except NotEnoughEvidenceError as error:
+                        log.info("a cell of %s was dropped: %s", path.name, error)
+                    done += len(groups[index])
+                    on_event(CalibrationEvent(path, "estimating", done, total))
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)  # leaving `with` waits only for what runs
+                raise
     samples = [cell.sample for index in sorted(found) for cell in found[index]]
     if not samples:
         raise NoUsablePatchesError(

@@ -27,6 +27,7 @@ from lensmodel.bench.reproduce import (
     job,
     measure,
     planned,
+    run,
     run_reproduction,
     write_json,
     write_page,
@@ -568,6 +569,59 @@ def test_stopped_run_goes_on_where_it_was(tmp_path: Path, quick_photos: list[str
     assert reproduced(tmp_path, Nothing(), chosen) == first
     assert path.exists()
     assert not list(tmp_path.rglob("*.part"))
+
+
+class Killed(Nothing):
+    """A route that is killed while it learns from the second photo."""
+
+    def learn(self, photo: Path) -> str:
+        if photo.stem == "photo-01":
+            raise KeyboardInterrupt
+        return super().learn(photo)
+
+
+def test_run_that_was_killed_keeps_what_it_has_and_ends_as_if_it_had_not_been(
+    tmp_path: Path, quick_photos: list[str]
+) -> None:
+    second = replace(planned("quick").cases[1], height=480, width=640, photos=(1, 2))
+    chosen = plan(case(photos=(1, 2)), second)
+    with pytest.raises(KeyboardInterrupt):
+        reproduced(tmp_path / "killed", Killed(), chosen)
+    (kept_result,) = (tmp_path / "killed").rglob("learned-1.json")
+    written = kept_result.stat().st_mtime_ns
+    assert len(quick_photos) == 1
+    again = Nothing()
+    made = reproduced(tmp_path / "killed", again, chosen)
+    assert kept_result.stat().st_mtime_ns == written
+    assert not list((tmp_path / "killed").rglob("work"))
+
+    def timeless(found: dict[str, Any]) -> list[Any]:
+        units = [unit for one in found["cases"] for unit in one["learned"].values()]
+        return [{**unit, "learning_seconds": 0} for unit in units]
+
+    assert timeless(made) == timeless(reproduced(tmp_path / "whole", Nothing(), chosen))
+
+
+def test_new_version_of_the_rivals_computes_them_alone(
+    tmp_path: Path, quick_photos: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    del quick_photos
+    asked: list[str] = []
+
+    def measured(self: job.Job, name: str, shots: Shots) -> dict[str, Any]:
+        del shots
+        asked.append(name)
+        return {"refused": "", "psf": None, "pictures": {}, "methods": {}}
+
+    monkeypatch.setattr(job.Job, "_measured_rival", measured)
+    chosen = replace(plan(case(photos=(1,))), rivals=("kee",))
+    reproduced(tmp_path, Nothing(), chosen)
+    monkeypatch.setattr(run, "rivals_version", lambda: "other")
+    again = Nothing()
+    made = reproduced(tmp_path, again, chosen)
+    assert asked == ["kee", "kee"]
+    assert again.learned == []
+    assert set(made["cases"][0]["rivals"]) == {"kee"}
 
 
 def test_other_settings_are_computed_anew(tmp_path: Path, quick_photos: list[str]) -> None:

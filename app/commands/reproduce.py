@@ -38,6 +38,10 @@ def reproduce(
     full: Annotated[
         bool, typer.Option("--full", help="Two apertures a lens, n up to 20: over night.")
     ] = False,
+    hard: Annotated[
+        bool,
+        typer.Option("--hard", help="Add scenes that hurt: depth, motion, night, sky, snow, text, foliage."),
+    ] = False,
     direct: Annotated[
         bool, typer.Option("--direct", help="Use the library in this process, not a service.")
     ] = False,
@@ -85,7 +89,7 @@ def reproduce(
     )
 
     size: Size = "quick" if quick else "full" if full else "default"
-    plan = planned(size, scenes=scenes or _external(), estimator=estimator)
+    plan = planned(size, scenes=scenes or _external(), estimator=estimator, hard=hard)
     result = run_reproduction(
         plan,
         _direct(estimator) if direct else ServiceRoutes(estimator),

@@ -116,3 +116,18 @@ def test_lens_is_learned_and_corrected_by_a_real_service(tmp_path: Path) -> None
     assert unit["psf"]["rel_l2"]["g"]["center"] < 1.0
     assert any(re.search("learned from photo-00", words) for words in told)
     assert not list(tmp_path.rglob("service"))
+
+
+def test_scenes_that_hurt_are_taken_when_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    planned_for: list[Reproduction] = []
+
+    def run(plan: Reproduction, *_: object, **__: object) -> None:
+        planned_for.append(plan)
+        raise NoSamplesError("that is enough")
+
+    monkeypatch.setattr("lensmodel.bench.reproduce.run_reproduction", run)
+    for asked in ([], ["--hard"]):
+        CliRunner().invoke(app, ["reproduce", "--quick", "--direct", "-o", str(tmp_path), *asked])
+    without, hard = ({case.condition for case in plan.cases} for plan in planned_for)
+    assert without == {"base"}
+    assert {"base", "high-iso", "tiff", "jpeg", "depth", "motion", "night", "text", "foliage"} < hard

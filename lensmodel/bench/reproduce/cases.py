@@ -192,7 +192,7 @@ def planned(
     names = (PATHS if size != "quick" or hard else ()) + (SCENES_THAT_HURT if hard or size == "full" else ())
     lenses = {"quick": 1, "default": 2, "full": 4}[size]
     for number, name in enumerate(names):
-        # other lenses for each, in turn: the first of each pair is soft, the second four kinds further
+        # other lenses for each, in turn, as unlike each other as they come
         chosen = [seeds[(number + 8 * i // lenses) % len(seeds)] for i in range(lenses)]
         frame = _QUICK_FRAME if size == "quick" else _HARD_FRAME
         cases += tuple(replace(_case(seed, (1,), files, frame), condition=name) for seed in chosen)

@@ -10,10 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.errors import InvalidInputError
-from lensmodel.regression.canonical import DEFAULT_OVERSAMPLING
 from lensmodel.types import Kernel
-
-_MAX_OVERSAMPLING = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +32,6 @@ class ModelSettings:
         Whether photos and samples that do not fit the others count less.
     excluded : tuple of str
         Photos whose samples do not vote; they stay listed.
-    oversampling : int
-        Samples per pixel of stored kernels.
     """
 
     r: float | None = None
@@ -47,7 +42,6 @@ class ModelSettings:
     mirror: float | None = None
     robust: bool = True
     excluded: tuple[str, ...] = ()
-    oversampling: int = DEFAULT_OVERSAMPLING
 
     def __post_init__(self) -> None:
         for name in ("r", "phi", "stops"):
@@ -60,10 +54,6 @@ class ModelSettings:
             value = getattr(self, name)
             if value is not None and not 0.0 <= value <= 1.0:
                 raise InvalidInputError(f"{name} symmetry must lie in 0..1, or None, got {value}")
-        if not 1 <= self.oversampling <= _MAX_OVERSAMPLING:
-            raise InvalidInputError(
-                f"oversampling must lie in 1..{_MAX_OVERSAMPLING}, got {self.oversampling}"
-            )
         object.__setattr__(self, "excluded", tuple(str(name) for name in self.excluded))
 
 

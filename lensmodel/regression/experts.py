@@ -7,109 +7,99 @@ its share is proportional to e^-4: where one is much worse than the others it lo
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.psf import as_kernel
-from lensmodel.regression import kriging
 from lensmodel.regression import variables as va
 from lensmodel.regression.judgement import Judgement
+from lensmodel.regression.kriging import as_kernels, field_vector
+from lensmodel.regression.local import Answers
 from lensmodel.regression.physical import PhysicalMean
-from lensmodel.regression.store import KernelStore
-from lensmodel.types import FieldPosition, Kernel, LensSettings
+from lensmodel.types import FieldPosition, LensSettings
 
 _SILENT = 1e-3
 
 
-@dataclass(frozen=True, slots=True)
-class Shares:
-    """Weights of the image frame and of the wavefront; the local frame has what is left."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Mixture:
+    """Mixed answers to several questions.
 
-    image_frame: float = 0.0
-    wavefront: float = 0.0
+    Parameters
+    ----------
+    kernels : ndarray, shape (q, size, size)
+    squared : ndarray, shape (q,)
+        Squared held-out errors near the places.
+    usual : float
+        The same of the best expert, all over the field.
+    shares : ndarray, shape (q, 3)
+        Weights of the local frame, the image frame and the wavefront.
+    """
+
+    kernels: NDArray[np.float64]
+    squared: NDArray[np.float64]
+    usual: float
+    shares: NDArray[np.float64]
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Experts:
     """Experts besides the regression in the local frame.
 
     Parameters
     ----------
-    where : ndarray, shape (n, 7)
-        Points of the samples.
     judgement : Judgement
+        With the image frame, if that takes part.
     scale : ndarray, shape (7,)
         Bandwidths.
-    pixels : KernelStore or None
-        Kernels of the image frame, for kriging; None if it takes no part.
     physical : PhysicalMean or None
-        Likewise.
+        The wavefront; None if it takes no part.
     """
 
-    where: NDArray[np.float64]
     judgement: Judgement
     scale: NDArray[np.float64]
-    pixels: KernelStore | None
     physical: PhysicalMean | None
-    vectors: NDArray[np.float64] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.vectors = va.vectors(self.where)
 
     def mixed(
         self,
-        kernel: Kernel,
-        held_out: float,
-        rows: NDArray[np.intp],
-        weight: NDArray[np.float64],
-        position: FieldPosition,
+        kernels: NDArray[np.float64],
+        near: Answers,
+        positions: Sequence[FieldPosition],
         settings: LensSettings,
-    ) -> tuple[Kernel, float, Shares]:
-        """Mix an answer of the local frame with those of the others.
+    ) -> Mixture:
+        """Mix answers of the local frame with those of the others.
 
         Parameters
         ----------
-        kernel, held_out
-            Answer of the local frame and its squared error near the place.
-        rows, weight : ndarray, shape (m,)
-            Samples near the place, and weights of sum 1 that say how near.
-
-        Returns
-        -------
-        kernel, squared error of the mixture, shares
+        kernels : ndarray, shape (q, size, size)
+            Answers of the local frame.
+        near : Answers
+            Samples near the places, and weights that say how near.
         """
-        squared = [held_out, math.inf, math.inf]
-        if self.pixels is not None and self.judgement.image_errors is not None:
-            squared[1] = float(weight @ self.judgement.image_errors[rows] ** 2)
+        judgement, size = self.judgement, kernels.shape[1]
+        squared, usual = np.full((len(positions), 3), math.inf), np.full(3, math.inf)
+        told_of = [judgement.errors, judgement.image_errors, None]
         if self.physical is not None:
-            errors = self.physical.extended_errors(len(self.where))
-            squared[2] = math.inf if errors is None else float(weight @ errors[rows] ** 2)
+            told_of[2] = self.physical.extended_errors(len(judgement.votes))
+        for expert, errors in enumerate(told_of):
+            if errors is not None:
+                squared[:, expert] = near.mean(errors**2)
+                usual[expert] = float(errors @ errors) / len(errors)
         parts = np.maximum(squared, 1e-15) ** -2.0
-        shares = parts / parts.sum()
-        shares = np.where(shares < _SILENT, 0.0, shares)
-        shares /= shares.sum()
-        size = kernel.shape[0]
-        light = shares[0] * kernel
-        if shares[1] > 0 and self.pixels is not None:
-            light = light + shares[1] * self._of_image_frame(self.pixels, position, settings, size)
-        if shares[2] > 0 and self.physical is not None:
-            light = light + shares[2] * kriging.as_pixels(self.physical.row(position, settings), size)
-        error = sum(float(s) * e for s, e in zip(shares, squared, strict=True) if s > 0)
-        return as_kernel(light), error, Shares(float(shares[1]), float(shares[2]))
-
-    def _of_image_frame(
-        self, pixels: KernelStore, position: FieldPosition, settings: LensSettings, size: int
-    ) -> Kernel:
-        row = kriging.predict(
-            pixels.rows,
-            self.vectors,
-            self.where,
-            self.judgement.votes,
-            kriging.field_vector(position),
-            va.point(position, settings),
-            self.scale,
-            self.judgement.nugget,
-        )
-        return kriging.as_pixels(row, size)
+        shares = parts / parts.sum(axis=1, keepdims=True)
+        shares[shares < _SILENT] = 0.0
+        shares /= shares.sum(axis=1, keepdims=True)
+        light = shares[:, 0, None, None] * kernels
+        told = np.flatnonzero(shares[:, 1])
+        if judgement.image is not None and told.size:
+            vectors = np.array([field_vector(positions[int(i)]) for i in told])
+            rows = judgement.image.rows(vectors, va.point(positions[0], settings), self.scale)
+            light[told] += shares[told, 1, None, None] * as_kernels(rows, size)
+        told = np.flatnonzero(shares[:, 2])
+        if self.physical is not None and told.size:
+            rows = self.physical.rows([positions[int(i)] for i in told], settings)
+            light[told] += shares[told, 2, None, None] * as_kernels(rows, size)
+        error = np.where(shares > 0, shares * np.where(shares > 0, squared, 0.0), 0.0).sum(axis=1)
+        return Mixture(light / light.sum(axis=(1, 2), keepdims=True), error, float(usual.min()), shares)

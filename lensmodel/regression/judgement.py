@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -10,59 +9,59 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.psf import PsfSample
-from lensmodel.regression import kriging, robust
+from lensmodel.regression import robust
 from lensmodel.regression import variables as va
 from lensmodel.regression.answer import ModelSettings
-from lensmodel.regression.canonical import CanonicalGrid
+from lensmodel.regression.kriging import ImageFrame
+from lensmodel.regression.local import LocalKernels
 from lensmodel.regression.robust import Flag
-from lensmodel.regression.smoothers import Smoother
-from lensmodel.regression.store import KernelStore
-from lensmodel.regression.transport import WidthField
 from lensmodel.regression.validation import Choice, Held, choose
 
 _CV_PHOTOS = 3
 _CV_SAMPLES = 300
 _JUDGED = 800
-_STRIDE = 3
 _ROTATIONAL = 10.0
 _UNKNOWN_ERROR = 0.5
-_TRANSPORT_ROOM = 1.35
+_FEWEST = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judgement:
-    """What the samples say of each other: votes after robust weighting, held-out errors, flags."""
+    """What the samples say of each other.
+
+    Parameters
+    ----------
+    votes, errors, noise : ndarray, shape (n,)
+        Votes after robust weighting; held-out relative L2; the part of its square that is the samples'
+        own scatter.
+    choice : Choice
+    flags : tuple of Flag
+    image : ImageFrame or None
+        The regression of the image frame, if it takes part, and its held-out errors, shape (n,).
+    image_errors : ndarray or None
+    """
 
     votes: NDArray[np.float64]
     errors: NDArray[np.float64]
+    noise: NDArray[np.float64]
     choice: Choice
     flags: tuple[Flag, ...] = ()
-    nugget: float = 1.0  # of the image frame
-    image_errors: NDArray[np.float64] | None = None  # held out, of the image frame
+    image: ImageFrame | None = None
+    image_errors: NDArray[np.float64] | None = None
 
+    def extended(self, votes: NDArray[np.float64]) -> Judgement:
+        """Return it with samples that were not judged: the usual errors, the votes that they claim."""
 
-def grid_of(samples: Sequence[PsfSample], settings: ModelSettings, smoother: Smoother) -> CanonicalGrid:
-    """Grid that holds the largest kernel, with room for scaling."""
-    half = max(s.kernel.shape[0] for s in samples) // 2
-    room = _TRANSPORT_ROOM if smoother.transport else 1.0
-    return CanonicalGrid(math.ceil(half * room), settings.oversampling)
+        def longer(values: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.concatenate([values, np.full(len(votes), float(np.median(values)))])
 
-
-def pixel_store(samples: Sequence[PsfSample]) -> KernelStore:
-    """Kernels of the image frame, for `kriging`."""
-    side = max(s.kernel.shape[0] for s in samples)
-    return KernelStore(side * side).extended(kriging.pixel_rows(samples, side), len(samples))
-
-
-def row_of(grid: CanonicalGrid, widths: WidthField, sample: PsfSample) -> NDArray[np.float32]:
-    """Spline coefficients of a sample scaled to unit widths."""
-    scale = widths.at(sample.position, sample.settings)
-    return grid.coefficients(sample.kernel, sample.position.phi, scale)
-
-
-def with_votes(samples: Sequence[PsfSample], votes: NDArray[np.float64]) -> list[PsfSample]:
-    """Samples that vote, with their votes as weights."""
-    return [s.with_weight(float(v)) for s, v in zip(samples, votes, strict=True) if v > 0]
+        return replace(
+            self,
+            votes=np.concatenate([self.votes, votes]),
+            errors=longer(self.errors),
+            noise=longer(self.noise),
+            image_errors=None if self.image_errors is None else longer(self.image_errors),
+        )
 
 
 def bandwidth(rule: dict[str, float], settings: ModelSettings, choice: Choice) -> dict[str, float]:
@@ -78,15 +77,29 @@ def bandwidth(rule: dict[str, float], settings: ModelSettings, choice: Choice) -
 
 
 def judge(
-    samples: tuple[PsfSample, ...],
+    samples: Sequence[PsfSample],
     settings: ModelSettings,
-    grid: CanonicalGrid,
-    store: KernelStore,
+    local: LocalKernels,
+    where: NDArray[np.float64],
     base: NDArray[np.float64],
-    pixels: KernelStore | None,
+    *,
+    blend: bool,
 ) -> Judgement:
-    """Choose bandwidths by cross-validation, weigh robustly, note held-out errors."""
-    where = va.points(samples)
+    """Choose bandwidths by cross-validation, weigh robustly, note held-out errors.
+
+    Parameters
+    ----------
+    samples : sequence of PsfSample
+    settings : ModelSettings
+    local : LocalKernels
+        Their kernels.
+    where : ndarray, shape (n, 7)
+        Their points.
+    base : ndarray, shape (n,)
+        Votes that they claim; those of 0 take no part.
+    blend : bool
+        Whether the image frame takes part.
+    """
     rule = va.bandwidths(where)
     names, photo = np.unique([s.photo for s in samples], return_inverse=True)
     voting = np.flatnonzero(base > 0)
@@ -94,10 +107,10 @@ def judge(
     groups = photo if several else np.arange(len(samples))
 
     def held(rows: NDArray[np.intp], votes: NDArray[np.float64]) -> Held:
-        side = len(range(0, grid.side, _STRIDE))
-        thin = store.rows[rows].reshape(len(rows), grid.side, grid.side)[:, ::_STRIDE, ::_STRIDE]
+        kernels = local.upright(rows)
         scale = va.scales(bandwidth(rule, settings, Choice()))
-        return Held.of(thin.reshape(len(rows), -1), side, where[rows], scale, votes[rows], groups[rows])
+        flat = kernels.reshape(len(rows), -1)
+        return Held.of(flat, kernels.shape[1], where[rows], scale, votes[rows], groups[rows])
 
     green = voting[where[voting, 4] == where[voting[len(voting) // 2], 4]]
     choice = Choice(mirror=settings.mirror or 0.0)
@@ -116,14 +129,15 @@ def judge(
 
     judged = _thinned(voting, _JUDGED)
     votes, errors = base.copy(), np.full(len(samples), _UNKNOWN_ERROR)
-    if len(judged) < 2:
-        return Judgement(votes, errors, choice)
+    noise = np.zeros(len(samples))
+    if len(judged) < _FEWEST:
+        return Judgement(votes, errors, noise, choice)
     choice = chosen(votes)
     prepared = held(judged, base)
-    _, local = np.unique(photo[judged], return_inverse=True)
+    _, own_photo = np.unique(photo[judged], return_inverse=True)
     known = names[np.unique(photo[judged])]
     by_sample, by_photo, found = robust.factors(
-        prepared, local, r=choice.r, phi=choice.phi, mirror=choice.mirror
+        prepared, own_photo, r=choice.r, phi=choice.phi, mirror=choice.mirror
     )
     flags: tuple[Flag, ...] = ()
     if settings.robust and several:
@@ -138,23 +152,19 @@ def judge(
             votes, flags = base.copy(), ()
         if flags:
             choice = chosen(votes)
-    errors[:] = float(np.median(found))
-    errors[judged] = found
-    if pixels is None:
-        return Judgement(votes, errors, choice, flags)
+    scatter = np.minimum(prepared.noise(prepared.weights(choice.r, choice.phi)), found**2)
+    errors[:], noise[:] = float(np.median(found)), float(np.median(scatter))
+    errors[judged], noise[judged] = found, scatter
+    if not blend:
+        return Judgement(votes, errors, noise, choice, flags)
     trusted = judged[votes[judged] > 0]
-    vectors = np.array([kriging.field_vector(samples[i].position) for i in trusted])
-    nugget, seen = kriging.held_out_errors(
-        pixels.rows[trusted],
-        vectors,
-        where[trusted],
-        votes[trusted],
-        va.scales(bandwidth(rule, settings, choice)),
-        groups[trusted],
+    scale = va.scales(bandwidth(rule, settings, choice))
+    image, seen = ImageFrame.fit(
+        [samples[i] for i in trusted], where[trusted], votes[trusted], scale, groups[trusted]
     )
     image_errors = np.full(len(samples), float(np.median(seen)))
     image_errors[trusted] = seen
-    return Judgement(votes, errors, choice, flags, nugget, image_errors)
+    return Judgement(votes, errors, noise, choice, flags, image, image_errors)
 
 
 def _thinned(rows: NDArray[np.intp], most: int) -> NDArray[np.intp]:

@@ -16,23 +16,21 @@ N. Cressie, "Statistics for Spatial Data", 1993, section 3.2.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.psf import PsfSample, resized
-from lensmodel.types import FieldPosition, Kernel
+from lensmodel.regression import variables as va
+from lensmodel.types import FieldPosition
 
 NUGGETS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 """Variances of a sample of vote 1, over that of the field, that cross-validation chooses from."""
 
-_MOST = 64
 _SETTINGS = (3, 4, 5, 6)
-
-
-def pixel_rows(samples: Sequence[PsfSample], side: int) -> list[NDArray[np.float32]]:
-    """Kernels of the image frame as flat rows of `side` squared pixels."""
-    return [resized(s.kernel, side).astype(np.float32).ravel() for s in samples]
+_CAP = 1.5
+_ALIKE = 1e-7
 
 
 def field_vector(position: FieldPosition) -> NDArray[np.float64]:
@@ -40,89 +38,118 @@ def field_vector(position: FieldPosition) -> NDArray[np.float64]:
     return position.r * np.array([np.cos(position.phi), np.sin(position.phi)])
 
 
-def predict(
-    rows: NDArray[np.float32],
-    vectors: NDArray[np.float64],
-    where: NDArray[np.float64],
-    votes: NDArray[np.float64],
-    vector: NDArray[np.float64],
-    asked: NDArray[np.float64],
-    scale: NDArray[np.float64],
-    nugget: float,
-) -> NDArray[np.float64]:
-    """Kriged row of pixels at a place, from the nearest samples.
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageFrame:
+    """A field kriged once for all: with B of `fit`, the rest B C and the mean, l C = c' (B C) + mean.
 
     Parameters
     ----------
-    rows : ndarray, shape (n, k^2)
-        Kernels of the image frame.
-    vectors, vector : ndarray, shape (n, 2), (2,)
-        Places of samples and question, from `field_vector`.
-    where, asked, scale : ndarray, shape (n, 7), (7,), (7,)
-        Points and bandwidths, of which the settings count.
-    votes : ndarray, shape (n,)
-        Those of 0 take no part.
+    vectors, where : ndarray, shape (m, 2), (m, 7)
+        Places and points of the samples that it was made from.
+    rest : ndarray, shape (m, side^2)
+        In double precision: with a small nugget its rows are large and nearly cancel.
+    mean : ndarray, shape (side^2,)
     nugget : float
-        Variance of a sample of vote 1.
+        Variance of a sample of vote 1 over that of the field.
     """
-    apart = settings_gap(where, asked, scale)
-    nearness = ((vectors - vector) ** 2).sum(axis=1) + apart
-    nearness[votes <= 0] = np.inf
-    few = min(_MOST, int((votes > 0).sum()))
-    chosen = np.argpartition(nearness, few - 1)[:few]
-    places, settings = vectors[chosen], where[chosen]
-    between = np.sqrt(((places[:, None] - places[None]) ** 2).sum(axis=-1))
-    gaps = settings_gap(settings[:, None, :], settings[None, :, :], scale)
-    covariance = matern(between) * np.exp(-0.5 * gaps)
-    covariance[np.diag_indices_from(covariance)] += nugget / np.maximum(votes[chosen], 1e-3)
-    towards = matern(np.sqrt(((places - vector) ** 2).sum(axis=1))) * np.exp(-0.5 * apart[chosen])
-    solved = np.linalg.solve(covariance, np.stack([towards, np.ones(few)], axis=1))
-    # far from every sample `towards` vanishes, and what is left is the mean
-    weights = solved[:, 0] + solved[:, 1] * (1.0 - solved[:, 0].sum()) / solved[:, 1].sum()
-    return np.asarray(weights @ rows[chosen], dtype=np.float64)
+
+    vectors: NDArray[np.float64]
+    where: NDArray[np.float64]
+    rest: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    nugget: float
+
+    @classmethod
+    def fit(
+        cls,
+        samples: Sequence[PsfSample],
+        where: NDArray[np.float64],
+        votes: NDArray[np.float64],
+        scale: NDArray[np.float64],
+        groups: NDArray[np.intp],
+    ) -> tuple[ImageFrame, NDArray[np.float64]]:
+        """Choose the nugget by leaving groups out; return it with the held-out errors of the samples.
+
+        With B = K^-1 - K^-1 1 1'K^-1 / (1'K^-1 1), the residuals of a group p that was left out are
+        (B_pp)^-1 (B C)_p: one inverse serves all groups and, after that, all questions.
+
+        Parameters
+        ----------
+        samples : sequence of PsfSample
+            Those that vote.
+        where, scale : ndarray, shape (m, 7), (7,)
+            Points and bandwidths, of which the settings count.
+        votes : ndarray, shape (m,)
+        groups : ndarray of int, shape (m,)
+            Samples that are held out together.
+        """
+        order = np.lexsort(where[:, _SETTINGS].T)  # those of one setting together, see `rows`
+        back = np.argsort(order)
+        samples, where = [samples[i] for i in order], where[order]
+        votes, groups = votes[order], groups[order]
+        side = max(s.kernel.shape[0] for s in samples)
+        values = np.stack([resized(s.kernel, side).ravel() for s in samples])
+        vectors = va.vectors(where)
+        norms = np.sqrt((values**2).sum(axis=1))
+        covariance = matern(np.sqrt(squared_gaps(vectors, vectors)))
+        covariance *= np.exp(-0.5 * settings_gap(where[:, None, :], where[None, :, :], scale))
+        own = [np.flatnonzero(groups == group) for group in np.unique(groups)]
+        best: tuple[float, ImageFrame, NDArray[np.float64]] | None = None
+        for nugget in NUGGETS:
+            inverse = np.linalg.inv(covariance + np.diag(nugget / np.maximum(votes, 1e-3)))
+            ones = inverse.sum(axis=1)
+            mean = ones @ values / ones.sum()
+            answered = inverse @ (values - mean)  # equal to B C
+            projected = inverse - np.outer(ones, ones) / ones.sum()
+            errors = np.ones(len(values))
+            for held in own:
+                if len(held) < len(values):
+                    left = np.linalg.solve(projected[np.ix_(held, held)], answered[held])
+                    errors[held] = np.sqrt((left**2).sum(axis=1)) / np.maximum(norms[held], 1e-30)
+            score = float(np.average(np.minimum(errors, _CAP), weights=np.maximum(votes, 1e-9)))
+            if best is None or score < best[0]:
+                best = (score, cls(vectors, where, answered, mean, nugget), errors)
+        assert best is not None
+        return best[1], best[2][back]
+
+    def rows(
+        self, vectors: NDArray[np.float64], asked: NDArray[np.float64], scale: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Kriged rows of pixels at places `vectors` (q, 2) and one setting, shape (q, side^2).
+
+        Parameters
+        ----------
+        asked, scale : ndarray, shape (7,)
+            Point of the question, of which the settings count, and bandwidths.
+        """
+        gap = settings_gap(self.where, asked, scale)
+        alike = np.exp(-0.5 * (gap - gap.min()))  # far from all settings the nearest still speak
+        near = np.flatnonzero(alike > _ALIKE)
+        towards = matern(np.sqrt(squared_gaps(vectors, self.vectors[near]))) * alike[near]
+        # far from every sample `towards` vanishes, and what is left is the mean
+        rest = self.rest[near[0] : near[-1] + 1] if _run(near) else self.rest[near]
+        return np.asarray(towards @ rest + self.mean)
 
 
-def held_out_errors(
-    rows: NDArray[np.float32],
-    vectors: NDArray[np.float64],
-    where: NDArray[np.float64],
-    votes: NDArray[np.float64],
-    scale: NDArray[np.float64],
-    groups: NDArray[np.intp],
-) -> tuple[float, NDArray[np.float64]]:
-    """Choose the nugget by leaving groups out; return it with the relative L2 of every sample.
-
-    With B = K^-1 - K^-1 1 1'K^-1 / (1'K^-1 1), the residuals of a group p that was left out are
-    (B_pp)^-1 (B C)_p: one inverse serves all groups.
-    """
-    values = np.asarray(rows, dtype=np.float64)
-    norms = np.sqrt((values**2).sum(axis=1))
-    between = np.sqrt(((vectors[:, None] - vectors[None]) ** 2).sum(axis=-1))
-    gaps = settings_gap(where[:, None, :], where[None, :, :], scale)
-    covariance = matern(between) * np.exp(-0.5 * gaps)
-    best: tuple[float, float, NDArray[np.float64]] | None = None
-    for nugget in NUGGETS:
-        inverse = np.linalg.inv(covariance + np.diag(nugget / np.maximum(votes, 1e-3)))
-        ones = inverse.sum(axis=1)
-        projected = inverse - np.outer(ones, ones) / ones.sum()
-        answered = projected @ values
-        errors = np.ones(len(values))
-        for group in np.unique(groups):
-            held = np.flatnonzero(groups == group)
-            if len(held) < len(values):
-                left = np.linalg.solve(projected[np.ix_(held, held)], answered[held])
-                errors[held] = np.sqrt((left**2).sum(axis=1)) / np.maximum(norms[held], 1e-30)
-        score = float(np.average(np.minimum(errors, 1.5), weights=np.maximum(votes, 1e-9)))
-        if best is None or score < best[0]:
-            best = (score, nugget, errors)
-    assert best is not None
-    return best[1], best[2]
+def _run(rows: NDArray[np.intp]) -> bool:
+    """Whether rows follow each other: a slice of them is no copy."""
+    return int(rows[-1] - rows[0]) == len(rows) - 1
 
 
-def as_pixels(row: NDArray[np.float64], size: int) -> Kernel:
-    """Row of pixels as a kernel of odd side `size`; negative pixels become zero."""
-    side = round(row.size**0.5)
-    return resized(np.maximum(row.reshape(side, side), 0.0), size)
+def as_kernels(rows: NDArray[np.float64], size: int) -> NDArray[np.float64]:
+    """Rows of pixels as kernels of odd side `size`, shape (q, size, size); negative pixels become zero."""
+    side = round(rows.shape[1] ** 0.5)
+    found = np.maximum(rows.reshape(-1, side, side), 0.0)
+    cut, pad = max((side - size) // 2, 0), max((size - side) // 2, 0)
+    found = found[:, cut : side - cut, cut : side - cut]
+    found = found / np.maximum(found.sum(axis=(1, 2), keepdims=True), 1e-30)
+    return np.pad(found, ((0, 0), (pad, pad), (pad, pad))) if pad else found
+
+
+def squared_gaps(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Squared distances of places `a` (m, 2) from places `b` (n, 2), shape (m, n)."""
+    x, y = np.subtract.outer(a[:, 0], b[:, 0]), np.subtract.outer(a[:, 1], b[:, 1])
+    return np.asarray(x * x + y * y)
 
 
 def matern(distance: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,7 +2,7 @@
 
 Nadaraya-Watson regression in rotated local frames (paper, section 6.2, eq. 4-8). The weight of a
 sample factorises into one of place and settings, common to all its pixels, and one of (u, v). So
-the sum over all pixels of all samples is one product of weights and kernels::
+the sum over all pixels of all samples is one of kernels::
 
     f(u, v) = sum_i W_i C_i(u, v) / sum_i W_i
 
@@ -20,34 +20,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.errors import InvalidInputError, NoSamplesError
+from lensmodel.errors import InvalidInputError
 from lensmodel.geometry import zone_of
-from lensmodel.psf import PsfField, PsfSample, as_kernel
-from lensmodel.regression import kriging
+from lensmodel.psf import PsfField, PsfSample
+from lensmodel.regression import pitch as pitches
 from lensmodel.regression import variables as va
 from lensmodel.regression.answer import ModelSettings, PsfAnswer
-from lensmodel.regression.experts import Experts
-from lensmodel.regression.index import SampleIndex
-from lensmodel.regression.judgement import (
-    Judgement,
-    bandwidth,
-    grid_of,
-    judge,
-    pixel_store,
-    row_of,
-    with_votes,
-)
-from lensmodel.regression.physical import PhysicalMean
+from lensmodel.regression.experts import Experts, Mixture
+from lensmodel.regression.fitting import Fit
+from lensmodel.regression.neighbourhood import Near, Neighbourhood
 from lensmodel.regression.robust import Flag
-from lensmodel.regression.smoothers import Neighbours, Smoother, smoothers
-from lensmodel.regression.store import KernelStore
+from lensmodel.regression.smoothers import smoothers
 from lensmodel.regression.support import field_error, standard_error, support
-from lensmodel.regression.transport import WidthField
 from lensmodel.types import ZONES, Channel, FieldPosition, Kernel, LensSettings, Zone
 
-_INCREMENT = 0.05
-_DROPPED = 1e-3
-_FEW = 8
+_LISTED = 1e-3
+_WIDEST = 255
 
 
 class LensModel:
@@ -60,34 +48,19 @@ class LensModel:
         self,
         samples: tuple[PsfSample, ...],
         settings: ModelSettings,
-        widths: WidthField,
-        store: KernelStore,
-        judgement: Judgement,
+        fit: Fit,
         *,
-        index: SampleIndex | None = None,
         prior: tuple[PsfField | LensModel, float] | None = None,
-        pixels: KernelStore | None = None,
-        physical: PhysicalMean | None = None,
     ) -> None:
         self.samples = samples
         self.settings = settings
-        self.widths = widths
         self.prior = prior
-        self._smoother: Smoother = smoothers.create(settings.method)
-        self._grid = grid_of(samples, settings, self._smoother)
-        self._store, self._judgement, self._pixels = store, judgement, pixels
-        self._where = va.points(samples) if index is None else index.points
-        self._photos, self._photo = np.unique([s.photo for s in samples], return_inverse=True)
-        self._rule = va.bandwidths(self._where)
-        self.bandwidth = bandwidth(self._rule, settings, judgement.choice)
-        self._scale = va.scales(self.bandwidth)
-        self._index = SampleIndex.of(self._where) if index is None else index
-        if physical is None and self._smoother.physical:
-            several = len(self._photos) >= 2
-            groups = self._photo if several else np.arange(len(samples))
-            physical = PhysicalMean(samples, judgement.votes, groups, self._scale)
-        self._physical = physical
-        self._experts = Experts(self._where, judgement, self._scale, pixels, physical)
+        self._fit = fit
+        scale = va.scales(fit.bandwidth)
+        self._neighbourhood = Neighbourhood(
+            fit.index, fit.judgement.votes, scale, smoothers.create(settings.method)
+        )
+        self._experts = Experts(fit.judgement, scale, fit.physical)
 
     # --- building -------------------------------------------------------------------------------
 
@@ -108,65 +81,22 @@ class LensModel:
         UnknownMethodError
             If `settings.method` is in no registry.
         """
-        settings = settings or ModelSettings()
-        kept = tuple(samples)
-        if not kept:
-            raise NoSamplesError("the lens has no PSF samples yet; calibrate it with a photo first")
-        voting = [s.weight > 0 and s.photo not in settings.excluded for s in kept]
-        if not any(voting):
-            raise NoSamplesError(f"none of the {len(kept)} samples may vote; include a photo again")
-        smoother = smoothers.create(settings.method)
-        grid = grid_of(kept, settings, smoother)
-        base = np.array([s.weight if ok else 0.0 for s, ok in zip(kept, voting, strict=True)])
-        widths = WidthField.fit(with_votes(kept, base)) if smoother.transport else WidthField()
-        store = KernelStore(grid.side**2).extended((row_of(grid, widths, s) for s in kept), len(kept))
-        pixels = pixel_store(kept) if smoother.blend else None
-        judgement = judge(kept, settings, grid, store, base, pixels)
-        if smoother.transport and any(flag.sample is None for flag in judgement.flags):
-            # a spoilt photo has bent the widths too: fit them again without its voice
-            widths = WidthField.fit(with_votes(kept, judgement.votes))
-            store = KernelStore(grid.side**2).extended((row_of(grid, widths, s) for s in kept), len(kept))
-            judgement = judge(kept, settings, grid, store, base, pixels)
-        return cls(kept, settings, widths, store, judgement, prior=prior, pixels=pixels)
+        settings, kept = settings or ModelSettings(), tuple(samples)
+        return cls(kept, settings, Fit.of(kept, settings), prior=prior)
 
     def added(self, samples: Sequence[PsfSample]) -> LensModel:
         """Return the model with more samples.
 
-        A handful is put in place without touching the others: bandwidths follow eq. (8), widths and
-        cross-validated factors stay until the model has grown by a twentieth; then all is fitted anew.
+        A handful is put in place without touching the others: bandwidths, widths and cross-validated
+        factors stay until the model has grown by a twentieth; then all is fitted anew.
         """
         new = tuple(samples)
         if not new:
             return self
-        largest = max(s.kernel.shape[0] for s in new)
-        if len(new) > _INCREMENT * len(self.samples) or largest > self._grid_source:
+        if not self._fit.takes(new):
             return self.refitted((*self.samples, *new))
-        store = self._store.extended((row_of(self._grid, self.widths, s) for s in new), len(new))
-        old = self._judgement
-        votes = [0.0 if s.photo in self.settings.excluded else s.weight for s in new]
-        judgement = replace(
-            old,
-            votes=np.concatenate([old.votes, votes]),
-            errors=np.concatenate([old.errors, np.full(len(new), float(np.median(old.errors)))]),
-        )
-        if old.image_errors is not None:
-            usual = np.full(len(new), float(np.median(old.image_errors)))
-            judgement = replace(judgement, image_errors=np.concatenate([old.image_errors, usual]))
-        pixels = self._pixels
-        if pixels is not None:
-            pixels = pixels.extended(kriging.pixel_rows(new, self._grid_source), len(new))
-        index = self._index.extended(va.points(new))
-        return LensModel(
-            (*self.samples, *new),
-            self.settings,
-            self.widths,
-            store,
-            judgement,
-            index=index,
-            prior=self.prior,
-            pixels=pixels,
-            physical=self._physical,
-        )
+        fit = self._fit.extended(new, self.settings)
+        return LensModel((*self.samples, *new), self.settings, fit, prior=self.prior)
 
     def refitted(self, samples: Sequence[PsfSample]) -> LensModel:
         """Return a model of other samples with the settings and prior of this one."""
@@ -199,21 +129,19 @@ class LensModel:
         if not (math.isfinite(strength) and strength > 0):
             raise InvalidInputError(f"the strength of a prior must be positive, got {strength}")
         return LensModel(
-            self.samples,
-            self.settings,
-            self.widths,
-            self._store,
-            self._judgement,
-            index=self._index,
-            prior=None if prior is None else (prior, strength),
-            pixels=self._pixels,
-            physical=self._physical,
+            self.samples, self.settings, self._fit, prior=None if prior is None else (prior, strength)
         )
 
     # --- asking ---------------------------------------------------------------------------------
 
     def query(
-        self, position: FieldPosition, settings: LensSettings, size: int = 55, *, std: bool = False
+        self,
+        position: FieldPosition,
+        settings: LensSettings,
+        size: int = 55,
+        *,
+        std: bool = False,
+        pitch_um: float | None = None,
     ) -> PsfAnswer:
         """Return the PSF at a place, with the evidence behind it.
 
@@ -226,41 +154,56 @@ class LensModel:
             Odd side in pixels.
         std : bool
             Whether to return the standard error of each pixel as well.
+        pitch_um : float, optional
+            Size of a pixel of the body that asks, in micrometres; that of the samples if unknown.
         """
-        if size < 1 or size % 2 == 0:
-            raise InvalidInputError(f"size must be odd and positive, got {size}")
-        rows, gaps, weight = self.weights(position, settings)
-        photos = self._photo[rows]
-        found = self._store.rows[rows]
-        mean = weight.astype(np.float32) @ found
-        width = self.widths.at(position, settings)
-        kernel = self._grid.kernel(self._mirrored(mean), position.phi, width, size)
-        positive = np.maximum(weight, 0.0)
-        positive /= positive.sum()
-        per_photo = np.bincount(photos, positive)
+        inside = self._inner_size(size, pitch_um)
+        near, mixture, prior_shares = self._asked([position], settings, inside)
+        fit, answers = self._fit, near.answers
+        rows, weight = answers.rows, np.maximum(answers.weights, 0.0)
+        weight /= weight.sum()
+        per_photo = np.bincount(fit.roster.photo[rows], weight)
         independent = 1.0 / float((per_photo**2).sum())
-        nearest, beyond = support(self._where[rows], va.point(position, settings), self._rule)
-        held_out = float(positive @ self._judgement.errors[rows] ** 2)
-        kernel, held_out, shares = self._experts.mixed(kernel, held_out, rows, positive, position, settings)
-        error = field_error(held_out, found, mean, positive, independent)
+        nearest, beyond = support(fit.index.points[rows], va.point(position, settings), fit.rule)
+        # how well the nearest samples agree says nothing of a place without samples
+        held_out = float(mixture.usual if beyond else mixture.squared[0])
+        error = field_error(held_out, float(weight @ fit.judgement.noise[rows]), independent)
         error *= 1.0 + 0.5 * max(nearest - 1.0, 0.0)
-        share = 0.0
-        if self.prior is not None:
-            kernel, share = self._blended(kernel, gaps, position, settings)
+        scatter = None
+        if std:
+            apart = fit.local.apart(rows, position.phi, np.array(fit.widths.at(position, settings)), inside)
+            scatter = standard_error(apart, weight)
         return PsfAnswer(
-            kernel=kernel,
-            effective_samples=1.0 / float((positive**2).sum()),
-            photos=int(np.count_nonzero(per_photo > _DROPPED)),
+            kernel=self._at_pitch(mixture.kernels, size, pitch_um)[0],
+            effective_samples=1.0 / float((weight**2).sum()),
+            photos=int(np.count_nonzero(per_photo > _LISTED)),
             extrapolated=bool(beyond),
             predicted_error=min(error, 1.0),
-            bandwidth=dict(self.bandwidth),
+            bandwidth=dict(fit.bandwidth),
             beyond=beyond,
             nearest=nearest,
-            prior_share=share,
-            image_frame_share=shares.image_frame,
-            wavefront_share=shares.wavefront,
-            std=standard_error(self._grid, found, positive, position.phi, width, size) if std else None,
+            prior_share=float(prior_shares[0]),
+            image_frame_share=float(mixture.shares[0, 1]),
+            wavefront_share=float(mixture.shares[0, 2]),
+            std=scatter,
         )
+
+    def kernels(
+        self,
+        positions: Sequence[FieldPosition],
+        settings: LensSettings,
+        size: int = 55,
+        *,
+        pitch_um: float | None = None,
+    ) -> NDArray[np.float64]:
+        """Return the PSFs of many places at one setting, shape (n, size, size).
+
+        The same numbers as of `query`, several times faster: for grids and maps.
+        """
+        if not positions:
+            return np.empty((0, size, size))
+        _, mixture, _ = self._asked(positions, settings, self._inner_size(size, pitch_um))
+        return self._at_pitch(mixture.kernels, size, pitch_um)
 
     def weights(
         self, position: FieldPosition, settings: LensSettings
@@ -274,29 +217,30 @@ class LensModel:
         gaps : ndarray, shape (m, 7)
             Their distances in bandwidths, by variable.
         weights : ndarray, shape (m,)
-            Those that together weigh less than a thousandth are left out.
+            Those that hardly weigh anything are left out.
         """
-        asked = va.point(position, settings)
-        rows = self._index.near(asked, self._smoother.reach, self._scale)
-        rows = rows[self._judgement.votes[rows] > 0]
-        if rows.size < _FEW:
-            squared = va.squared_distances(self._where, asked, self._scale)
-            squared[self._judgement.votes <= 0] = np.inf
-            rows = np.argsort(squared, kind="stable")[:_FEW]
-            rows = rows[np.isfinite(squared[rows])]
-        gaps = np.nan_to_num((self._where[rows] - asked) / self._scale, nan=0.0)
-        weight = self._smoother.weights(Neighbours(gaps, self._judgement.votes[rows]))
-        order = np.argsort(np.abs(weight), kind="stable")
-        kept = order[np.cumsum(np.abs(weight[order])) > _DROPPED]
-        return rows[kept], gaps[kept], weight[kept] / weight[kept].sum()
+        near = self._neighbourhood.near([position], settings)
+        return near.answers.rows, near.gaps[0], near.answers.weights
 
-    def field(self, settings: LensSettings) -> ModelField:
-        """Return the PSF of every place and channel at these settings."""
-        return ModelField(self, settings)
+    def field(self, settings: LensSettings, *, pitch_um: float | None = None) -> ModelField:
+        """Return the PSF of every place and channel at these settings, for pixels of some size."""
+        return ModelField(self, settings, pitch_um)
+
+    # --- what it is made of ---------------------------------------------------------------------
+
+    @property
+    def bandwidth(self) -> dict[str, float]:
+        """Bandwidths in use, by variable."""
+        return self._fit.bandwidth
+
+    @property
+    def pitch_um(self) -> float | None:
+        """Pixel pitch that answers are for unless another is asked for; None where no sample knows."""
+        return self._fit.pitch_um
 
     def flags(self) -> tuple[Flag, ...]:
         """Photos and samples that count less than they claim, with reasons."""
-        return self._judgement.flags
+        return self._fit.judgement.flags
 
     def coverage(self) -> dict[Zone, int]:
         """Number of green samples in each zone."""
@@ -308,10 +252,10 @@ class LensModel:
 
         Empty with fewer than two photos.
         """
-        if len(self._photos) < 2:
+        if len(self._fit.roster.numbers) < 2:
             return {}
         found: dict[Zone, list[float]] = {zone: [] for zone in ZONES}
-        for sample, error in zip(self.samples, self._judgement.errors, strict=True):
+        for sample, error in zip(self.samples, self._fit.judgement.errors, strict=True):
             if sample.settings.channel == "g" and sample.photo not in self.settings.excluded:
                 found[zone_of(sample.position.r)].append(float(error))
         return {zone: float(np.median(values)) for zone, values in found.items() if values}
@@ -319,32 +263,49 @@ class LensModel:
     @property
     def nbytes(self) -> int:
         """Bytes of stored kernels, those of the samples included."""
-        stored = self._store.rows.nbytes + (0 if self._pixels is None else self._pixels.rows.nbytes)
-        return stored + sum(s.kernel.nbytes for s in self.samples)
+        return self._fit.nbytes + sum(s.kernel.nbytes for s in self.samples)
 
     # --- inside ---------------------------------------------------------------------------------
 
-    @property
-    def _grid_source(self) -> int:
-        return max(s.kernel.shape[0] for s in self.samples)
+    def _asked(
+        self, positions: Sequence[FieldPosition], settings: LensSettings, size: int
+    ) -> tuple[Near, Mixture, NDArray[np.float64]]:
+        """Answers at the pitch of the samples, and the shares of the prior in them."""
+        fit = self._fit
+        near = self._neighbourhood.near(positions, settings)
+        widths = fit.widths.over(np.array([va.point(p, settings) for p in positions]))
+        angles = np.array([p.phi for p in positions])
+        light = fit.local.kernels(near.answers, angles, widths, size, fit.judgement.choice.mirror)
+        mixture = self._experts.mixed(light, near.answers, positions, settings)
+        shares = np.zeros(len(positions))
+        if self.prior is not None:
+            prior, strength = self.prior
+            seen = np.array([np.exp(-0.5 * (gaps**2).sum(axis=1)).sum() for gaps in near.gaps])
+            shares = strength / (seen + strength)
+            source = prior.field(settings, pitch_um=fit.pitch_um) if isinstance(prior, LensModel) else prior
+            other = np.stack([source.kernel_at(p, settings.channel, size) for p in positions])
+            part = shares[:, None, None]
+            mixture = replace(mixture, kernels=(1.0 - part) * mixture.kernels + part * other)
+        return near, mixture, shares
 
-    def _mirrored(self, mean: NDArray[np.floating]) -> NDArray[np.floating]:
-        share = self._judgement.choice.mirror
-        if share == 0.0:
-            return mean
-        square = mean.reshape(self._grid.side, self._grid.side)
-        return np.asarray((square + share * square[::-1]) / (1.0 + share)).ravel()
+    def _inner_size(self, size: int, pitch_um: float | None) -> int:
+        """Side at the pitch of the samples that holds an answer of side `size`."""
+        if size < 1 or size % 2 == 0:
+            raise InvalidInputError(f"size must be odd and positive, got {size}")
+        if pitch_um is not None and not (math.isfinite(pitch_um) and pitch_um > 0):
+            raise InvalidInputError(f"the pixel pitch must be positive micrometres, got {pitch_um}")
+        own = self._fit.pitch_um
+        if own is None or pitch_um is None or pitches.alike(own, pitch_um):
+            return size
+        return min(2 * math.ceil(size / 2 * pitch_um / own) + 1, max(_WIDEST, size))
 
-    def _blended(
-        self, kernel: Kernel, gaps: NDArray[np.float64], position: FieldPosition, settings: LensSettings
-    ) -> tuple[Kernel, float]:
-        assert self.prior is not None
-        prior, strength = self.prior
-        near = float(np.exp(-0.5 * (gaps**2).sum(axis=1)).sum())
-        share = strength / (near + strength)
-        source = prior.field(settings) if isinstance(prior, LensModel) else prior
-        other = source.kernel_at(position, settings.channel, kernel.shape[0])
-        return as_kernel((1.0 - share) * kernel + share * other), share
+    def _at_pitch(
+        self, kernels: NDArray[np.float64], size: int, pitch_um: float | None
+    ) -> NDArray[np.float64]:
+        own = self._fit.pitch_um
+        if own is None or pitch_um is None or pitches.alike(own, pitch_um):
+            return kernels
+        return np.stack([pitches.rescaled(kernel, own, pitch_um, size) for kernel in kernels])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -353,7 +314,16 @@ class ModelField:
 
     model: LensModel
     settings: LensSettings
+    pitch_um: float | None = None
 
     def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
         """Return the kernel of odd side `size` at a field position, in the image frame."""
-        return self.model.query(position, self.settings.with_channel(channel), size).kernel
+        settings = self.settings.with_channel(channel)
+        return np.asarray(self.model.kernels([position], settings, size, pitch_um=self.pitch_um)[0])
+
+    def kernels_at(
+        self, positions: Sequence[FieldPosition], channel: Channel, size: int
+    ) -> NDArray[np.float64]:
+        """Return the kernels of many places, shape (n, size, size), faster than one by one."""
+        settings = self.settings.with_channel(channel)
+        return self.model.kernels(positions, settings, size, pitch_um=self.pitch_um)

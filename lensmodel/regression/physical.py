@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from lensmodel.errors import NotEnoughEvidenceError
 from lensmodel.psf import PsfSample, resized
 from lensmodel.regression import variables as va
-from lensmodel.regression.kriging import NUGGETS, field_vector, matern, settings_gap
+from lensmodel.regression.kriging import NUGGETS, field_vector, matern, settings_gap, squared_gaps
 from lensmodel.regression.wavefront import Wavefront
 from lensmodel.regression.wavefront_fit import MIN_SAMPLES, fit_wavefront, spread
 from lensmodel.types import FieldPosition, LensSettings
@@ -32,6 +32,7 @@ _AROUND = 6  # pixels beyond the side that was fitted, for corners wider than ev
 _OCTAVES = 0.25
 _NOTHING_LEFT = 1e3
 _WORST = 1.5
+_ALIKE = 1e-7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,8 +94,8 @@ class PhysicalMean:
                 self._known, self._asked = self._fit(), True
             return self._known
 
-    def row(self, position: FieldPosition, settings: LensSettings) -> NDArray[np.float64]:
-        """Kernel of the image frame as a flat row.
+    def rows(self, positions: Sequence[FieldPosition], settings: LensSettings) -> NDArray[np.float64]:
+        """Kernels of the image frame as flat rows, shape (q, side^2).
 
         Raises
         ------
@@ -106,13 +107,15 @@ class PhysicalMean:
             raise NotEnoughEvidenceError(
                 f"{len(self._samples)} samples make no wavefront: it takes {MIN_SAMPLES} of one focal length"
             )
-        vector = field_vector(position)
-        apart = np.sqrt(((physics.vectors - vector) ** 2).sum(axis=1))
-        gap = settings_gap(physics.where, va.point(position, settings), self._scale)
-        towards = matern(apart) * np.exp(-0.5 * gap)
-        return np.asarray(
-            self._rendered(physics.front, position, settings) + towards @ physics.rest, dtype=np.float64
-        )
+        vectors = np.array([field_vector(position) for position in positions])
+        gap = settings_gap(physics.where, va.point(positions[0], settings), self._scale)
+        alike = np.exp(-0.5 * gap)
+        near = np.flatnonzero(alike > _ALIKE)
+        found = np.stack([self._rendered(physics.front, position, settings) for position in positions])
+        if near.size:
+            towards = matern(np.sqrt(squared_gaps(vectors, physics.vectors[near]))) * alike[near]
+            found += towards.astype(np.float32) @ physics.rest[near]
+        return found
 
     def extended_errors(self, count: int) -> NDArray[np.float64] | None:
         """Held-out errors of the first `count` samples; the usual one of those added later."""
@@ -142,9 +145,8 @@ class PhysicalMean:
         wanted = np.stack([resized(s.kernel, self._side).ravel() for s in samples])
         left = wanted - [self._rendered(front, s.position, s.settings) for s in samples]
         where, vectors = va.points(samples), np.array([field_vector(s.position) for s in samples])
-        between = np.sqrt(((vectors[:, None] - vectors[None]) ** 2).sum(axis=-1))
         gaps = settings_gap(where[:, None, :], where[None, :, :], self._scale)
-        covariance = matern(between) * np.exp(-0.5 * gaps)
+        covariance = matern(np.sqrt(squared_gaps(vectors, vectors))) * np.exp(-0.5 * gaps)
         votes = np.maximum(self._votes[chosen], 1e-3)
         rest, held = _kriged(covariance, votes, self._groups[chosen], left)
         seen = held / np.maximum(np.sqrt((wanted**2).sum(axis=1)), 1e-30)

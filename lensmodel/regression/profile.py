@@ -136,7 +136,7 @@ def load_profile(path: Path | str) -> LensProfile:
                 f"one is needed for each, of side {_MAX_SIDE} at most"
             )
         samples = [_sample(entry, kernel) for entry, kernel in zip(entries, stack, strict=True)]
-        model = LensModel.fit(samples, ModelSettings(**document["model"]))
+        model = LensModel.fit(samples, _settings(document["model"]))
         return LensProfile(model, _texts(document["lens"]), _texts(document["photos"]))
     except LensModelError:
         raise
@@ -172,6 +172,11 @@ def _sample(entry: dict[str, Any], kernel: Any) -> PsfSample:  # noqa: ANN401 - 
         pixel_pitch_um=entry["pixel_pitch_um"],
         estimator=str(entry["estimator"]),
     )
+
+
+def _settings(values: dict[str, Any]) -> ModelSettings:
+    # written until 0.2; it changed how finely kernels were kept, and no answer
+    return ModelSettings(**{key: value for key, value in values.items() if key != "oversampling"})
 
 
 def _texts(values: dict[str, Any]) -> dict[str, str]:

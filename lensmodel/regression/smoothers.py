@@ -75,7 +75,7 @@ class NadarayaWatson:
     """Gaussian weights of fixed bandwidth, w_i ~ q_i exp(-d_i^2 / 2) (paper, eq. 4 and 7)."""
 
     transport: bool = False
-    reach: float = 4.0
+    reach: float = 5.0
     blend: bool = False
     physical: bool = False
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _GROWTH = 1.5
+_ROOM = 0.06  # a model grows by a twentieth before it is fitted anew
 
 
 class _Buffer:
@@ -48,7 +49,7 @@ class KernelStore:
             if fits:
                 buffer.used = total
         if not fits:
-            spare = int(self._count * (_GROWTH - 1.0))
+            spare = max(int(self._count * (_GROWTH - 1.0)), int(total * _ROOM))
             buffer = _Buffer(total + spare, self._buffer.rows.shape[1])
             buffer.rows[: self._count] = self.rows
             buffer.used = total

@@ -9,32 +9,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.regression import variables as va
-from lensmodel.regression.canonical import CanonicalGrid
 
 _FAR = 2.5
 
 
-def field_error(
-    held_out: float,
-    rows: NDArray[np.float32],
-    mean: NDArray[np.floating],
-    weight: NDArray[np.float64],
-    independent: float,
-) -> float:
-    """Expected relative L2 of the mean, from held-out errors that contain the samples' own noise.
+def field_error(held_out: float, noise: float, independent: float) -> float:
+    """Expected relative L2 of an answer, from held-out errors that contain the samples' own noise.
 
     With m independent photos, bias b and noise s of a sample::
 
         held out:  e^2 = b^2 + s^2 (1 + 1/m)        field:  b^2 + s^2 / m
 
-    s is taken from the scatter of the neighbours, which also differ in place; so b is not
-    taken below a third of e.
+    s^2 is the scatter of neighbours, which also differ in place; so b is not taken below a third of e.
+
+    Parameters
+    ----------
+    held_out, noise : float
+        e^2 and s^2 near the place.
+    independent : float
+        m.
     """
-    apart = rows - mean
-    norms = np.einsum("ij,ij->i", apart, apart)
-    power = max(float(mean @ mean), 1e-30)
-    scatter = float(weight @ norms) / power
-    noise = min(scatter / max(1.0 - float(weight @ weight), 0.1), held_out)
+    noise = min(noise, held_out)
     bias = max(held_out - noise * (1.0 + 1.0 / independent), held_out / 9.0)
     return math.sqrt(bias + noise / independent)
 
@@ -56,19 +51,18 @@ def support(
     return distance, tuple(sorted(beyond))
 
 
-def standard_error(
-    grid: CanonicalGrid,
-    rows: NDArray[np.float32],
-    weight: NDArray[np.float64],
-    phi: float,
-    width: tuple[float, float],
-    size: int,
-) -> NDArray[np.float64]:
-    """Standard error of each pixel, sqrt(sum w^2 sum w (C - f)^2 / (1 - sum w^2))."""
-    mean = weight.astype(np.float32) @ rows
+def standard_error(apart: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Standard error of each pixel, sqrt(sum w^2 sum w (C - f)^2 / (1 - sum w^2)).
+
+    Parameters
+    ----------
+    apart : ndarray, shape (m, size, size)
+        Kernels of the samples as seen from the place.
+    weight : ndarray, shape (m,)
+        Of sum 1.
+    """
     concentration = float((weight**2).sum())
     if concentration > 1.0 - 1e-9:
-        return np.full((size, size), np.nan)  # a single sample says nothing of its own scatter
-    kernels = [grid.sampled(row - mean, phi, width, size) for row in rows]
-    scatter = sum(w * k * k for w, k in zip(weight, kernels, strict=True))
+        return np.full(apart.shape[1:], np.nan)  # a single sample says nothing of its own scatter
+    scatter = np.tensordot(weight, (apart - np.tensordot(weight, apart, axes=1)) ** 2, axes=1)
     return np.asarray(np.sqrt(scatter * concentration / (1.0 - concentration)), dtype=np.float64)

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.psf import PsfSample, second_moments
+from lensmodel.regression import variables as va
 from lensmodel.types import WAVELENGTH_NM, FieldPosition, LensSettings
 
 _PLACE_RIDGE = np.array([1e-6, 1e-3, 1e-2, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05])
@@ -27,6 +28,7 @@ _SETTING_RIDGE = 0.05
 _RANGE = (0.45, 2.5)
 _HUBER = 0.15
 _MIN_SAMPLES = 6
+_MOST = 3000
 _ROUNDS = 4
 
 Scale = tuple[float, float]
@@ -54,38 +56,55 @@ class WidthField:
 
     def at(self, position: FieldPosition, settings: LensSettings) -> Scale:
         """Widths along u and v at a place, over the reference width; kept within 0.45 and 2.5."""
-        if self.slopes is None:
-            return 1.0, 1.0
-        widths = np.exp(self._features(position, settings) @ self.slopes - self.reference)
-        u, v = np.clip(widths, *_RANGE)
+        u, v = self.over(va.point(position, settings)[None])[0]
         return float(u), float(v)
 
-    def _features(self, position: FieldPosition, settings: LensSettings) -> NDArray[np.float64]:
-        r2 = position.r * position.r
-        x, y = position.r * np.cos(position.phi), position.r * np.sin(position.phi)
-        stops = 0.0 if settings.stops is None else settings.stops - self.stops
-        focal = 0.0 if settings.focal_mm is None else float(np.log2(settings.focal_mm)) - self.focal
-        wave = (WAVELENGTH_NM[settings.channel] - self.wavelength) / 100.0
-        place = [1.0, r2, r2 * r2, x, y, x * r2, y * r2, x * x - y * y, x * y]
-        return np.array([*place, stops, stops * stops, stops * r2, focal, focal * r2, wave, wave * wave])
+    def over(self, where: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Widths of `at` for points `(n, 7)` of `variables`, shape (n, 2)."""
+        if self.slopes is None:
+            return np.ones((len(where), 2))
+        return np.clip(np.exp(self._features(where) @ self.slopes - self.reference), *_RANGE)
+
+    def _features(self, where: NDArray[np.float64]) -> NDArray[np.float64]:
+        r2 = where[:, 0] ** 2
+        x, y = va.vectors(where).T
+        stops = np.nan_to_num(where[:, 3] - self.stops)
+        focal = np.nan_to_num(where[:, 5] - self.focal)
+        wave = (where[:, 4] - self.wavelength) / 100.0
+        place = [np.ones_like(r2), r2, r2 * r2, x, y, x * r2, y * r2, x * x - y * y, x * y]
+        return np.stack(
+            [*place, stops, stops * stops, stops * r2, focal, focal * r2, wave, wave * wave], axis=1
+        )
 
     @classmethod
-    def fit(cls, samples: Sequence[PsfSample]) -> WidthField:
+    def fit(cls, samples: Sequence[PsfSample], votes: NDArray[np.float64] | None = None) -> WidthField:
         """Fit the widths of samples robustly; one width everywhere below six samples.
 
         Huber's weights by iteration: a width that is wrong by a factor counts less, not nothing.
+
+        Parameters
+        ----------
+        samples : sequence of PsfSample
+            At most some thousands of them, evenly spread, take part.
+        votes : ndarray, shape (n,), optional
+            Instead of their weights; those of 0 take no part.
         """
-        if len(samples) < _MIN_SAMPLES:
+        votes = np.array([s.weight for s in samples]) if votes is None else votes
+        rows = np.flatnonzero(votes > 0)
+        if len(rows) < _MIN_SAMPLES:
             return cls()
-        stops = [s.settings.stops for s in samples if s.settings.stops is not None]
-        focal = [np.log2(s.settings.focal_mm) for s in samples if s.settings.focal_mm is not None]
+        if len(rows) > _MOST:
+            rows = rows[np.linspace(0, len(rows) - 1, _MOST).round().astype(np.intp)]
+        samples = [samples[int(i)] for i in rows]
+        where = va.points(samples)
+        stops, focal = (column[~np.isnan(column)] for column in (where[:, 3], where[:, 5]))
         origin = cls(
-            stops=float(np.median(stops)) if stops else 0.0,
-            focal=float(np.median(focal)) if focal else 0.0,
+            stops=float(np.median(stops)) if stops.size else 0.0,
+            focal=float(np.median(focal)) if focal.size else 0.0,
         )
-        design = np.array([origin._features(s.position, s.settings) for s in samples])
+        design = origin._features(where)
         target = np.array([_log_widths(s) for s in samples])
-        vote = np.array([max(s.weight, 1e-3) for s in samples])
+        vote = np.maximum(votes[rows], 1e-3)
         extra = design.shape[1] - len(_PLACE_RIDGE)
         ridge = np.diag(np.concatenate([_PLACE_RIDGE, np.full(extra, _SETTING_RIDGE)])) * vote.mean()
         trust = np.ones(len(samples))

@@ -22,6 +22,7 @@ MULTIPLES = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
 PHI_MULTIPLES = (0.5, 0.7, 1.0, 1.4, 2.0, 4.0, 20.0)
 MIRRORS = (0.0, 0.3, 1.0)
 _CAP = 1.5
+_AS_GOOD, _NEGLIGIBLE = 1.01, 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,6 +104,16 @@ class Held:
         relative = np.sqrt(np.maximum(found, 0.0) / np.maximum(own, 1e-30))
         return np.where(weight.sum(axis=1) > 0, relative, 1.0)
 
+    def noise(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Squared relative scatter of each sample's others about their weighted mean.
+
+        From the weights of `weights`: sum_j w_j |C_j - f|^2 / (1 - sum_j w_j^2), over the sample's |C_i|^2.
+        """
+        own = np.diag(self.gram)
+        spread = weight @ own - np.einsum("ij,ij->i", weight @ self.gram, weight)
+        free = np.maximum(1.0 - (weight**2).sum(axis=1), 0.1)
+        return np.asarray(np.maximum(spread, 0.0) / free / np.maximum(own, 1e-30))
+
     def score(self, errors: NDArray[np.float64]) -> float:
         """Mean error by vote; gross errors count at most 1.5."""
         return float(np.average(np.minimum(errors, _CAP), weights=np.maximum(self.votes, 1e-9)))
@@ -122,8 +133,10 @@ def choose(held: Held, *, r: bool = True, phi: bool = True, mirror: bool = True)
     """Search the factors, each only where it is free, for the least held-out error."""
 
     def best(options: tuple[float, ...], make: Callable[[float], Choice]) -> Choice:
+        # the least reach among those that are as good: far neighbours cost time and trust in a symmetry
         tried = [make(option) for option in options]
-        return min(tried, key=lambda choice: choice.error)
+        least = min(choice.error for choice in tried)
+        return next(choice for choice in tried if choice.error <= least * _AS_GOOD + _NEGLIGIBLE)
 
     def at(r_: float, phi_: float, mirror_: float) -> Choice:
         return Choice(r_, phi_, mirror_, held.score(held.errors(r_, phi_, mirror_)))

@@ -32,6 +32,7 @@ FALLBACK: Final[Mapping[str, float]] = {
 
 _CENTER_R = 0.25
 _FLOOR_R, _FLOOR_PHI = 0.02, 0.12
+_SAME = 1e-6  # equal values have a spread of rounding errors, not of zero
 _PLACE_SHARE = 0.45  # of eq. 8: the rule is for densities, a smooth regression wants less
 
 
@@ -82,7 +83,7 @@ def bandwidths(where: NDArray[np.float64]) -> dict[str, float]:
     _, counts = np.unique(where[:, 4], return_counts=True)
     varying = [3, 5, 6]
     spread = {column: float(np.nanstd(_known(where[:, column]))) for column in varying}
-    d = 2 + sum(value > 0 for value in spread.values())
+    d = 2 + sum(value > _SAME for value in spread.values())
     n = int(counts.max())
     found = {
         "r": max(_PLACE_SHARE * rule_of_thumb(float(where[:, 0].std()), d, n), _FLOOR_R),
@@ -91,7 +92,7 @@ def bandwidths(where: NDArray[np.float64]) -> dict[str, float]:
     }
     for column, sigma in spread.items():
         name = COLUMNS[column]
-        if sigma > 0:
+        if sigma > _SAME:
             found[name] = min(FALLBACK[name], rule_of_thumb(sigma, d, n))
     return found
 

@@ -31,7 +31,7 @@ def photo(
     name: str, aperture: float | None = 2.0, *, without: float | None = None, seed: int = 0
 ) -> list[PsfSample]:
     """Samples of a photo, in all channels; nothing within 60 degrees of `without` and far out."""
-    kept = [p for p in places(seed) if without is None or p.r < 0.35 or math.cos(p.phi - without) < 0.5]
+    kept = [p for p in places(seed) if without is None or p.r < 0.6 or math.cos(p.phi - without) < 0.5]
     return [
         PsfSample(gaussian(13, np.eye(2) * (1.0 + p.r)), p, LensSettings(aperture, channel=c), photo=name)
         for p in kept

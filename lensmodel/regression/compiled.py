@@ -1,0 +1,110 @@
+"""The inner loop of `splines.sums`, compiled; imported only where Numba is installed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+_ONE, _HALF = np.float32(1.0), np.float32(0.5)
+_SIXTH, _TWO_THIRDS = np.float32(1.0 / 6.0), np.float32(2.0 / 3.0)
+
+
+def _jit(function: F) -> F:
+    """Compile without the interpreter's lock, keep the machine code on disk."""
+    return cast(
+        "F",
+        numba.njit(
+            cache=True, nogil=True, fastmath={"nsz", "contract", "reassoc", "arcp"}, error_model="numpy"
+        )(function),
+    )
+
+
+@_jit
+def _inside(a: float, b: float, c: float, size: int) -> tuple[int, int]:
+    """Integers j in 0..size with a j^2 + 2 b j + c <= 0, as first and last + 1."""
+    root = b * b - a * c
+    if root < 0.0:
+        return 0, 0
+    root = math.sqrt(root)
+    first, last = math.ceil((-b - root) / a), math.floor((-b + root) / a)
+    return max(first, 0), min(last + 1, size)
+
+
+@_jit
+def _weights(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """Weights of the four coefficients round a point that lies `t` beyond the second."""
+    rest = _ONE - t
+    first, last = rest * rest * rest * _SIXTH, t * t * t * _SIXTH
+    second = _TWO_THIRDS - t * t * (_ONE - _HALF * t)
+    return first, second, _ONE - first - second - last, last
+
+
+@_jit
+def _inner(spline: NDArray[np.float32], side: int, y: float, x: float) -> np.float32:
+    """Value of a spline at (y, x), at least two steps inside its grid."""
+    row, col = int(y), int(x)
+    v0, v1, v2, v3 = _weights(np.float32(y - row))
+    h0, h1, h2, h3 = _weights(np.float32(x - col))
+    p = (row - 1) * side + col - 1
+    q, r, o = p + side, p + 2 * side, p + 3 * side
+    return (
+        v0 * (h0 * spline[p] + h1 * spline[p + 1] + h2 * spline[p + 2] + h3 * spline[p + 3])
+        + v1 * (h0 * spline[q] + h1 * spline[q + 1] + h2 * spline[q + 2] + h3 * spline[q + 3])
+        + v2 * (h0 * spline[r] + h1 * spline[r + 1] + h2 * spline[r + 2] + h3 * spline[r + 3])
+        + v3 * (h0 * spline[o] + h1 * spline[o + 1] + h2 * spline[o + 2] + h3 * spline[o + 3])
+    )
+
+
+@_jit
+def _anywhere(spline: NDArray[np.float32], side: int, y: float, x: float) -> np.float32:
+    """Value of a spline at (y, x), zero coefficients around its grid."""
+    row, col = math.floor(y), math.floor(x)
+    total = np.float32(0.0)
+    for i, v in enumerate(_weights(np.float32(y - row))):
+        for j, h in enumerate(_weights(np.float32(x - col))):
+            line, place = row - 1 + i, col - 1 + j
+            if 0 <= line < side and 0 <= place < side:
+                total += v * h * spline[line * side + place]
+    return total
+
+
+@_jit
+def sums(
+    rows: NDArray[np.float32],
+    radii: NDArray[np.float64],
+    chosen: NDArray[np.intp],
+    weights: NDArray[np.float64],
+    maps: NDArray[np.float64],
+    starts: NDArray[np.intp],
+    shifts: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
+    """Add to `out`; see `splines.sums`."""
+    side, size = round(math.sqrt(rows.shape[1])), out.shape[1]
+    half, middle = side // 2, size // 2
+    for answer in range(out.shape[0]):
+        left = -middle - shifts[answer, 1]
+        for k in range(starts[answer], starts[answer + 1]):
+            row, weight = chosen[k], weights[k]
+            spline, reach = rows[row], radii[row]
+            inner = reach < half - 2.0
+            dy, dx = maps[k, 0, 1], maps[k, 1, 1]
+            for i in range(size):
+                down = i - middle - shifts[answer, 0]
+                y = maps[k, 0, 0] * down + dy * left
+                x = maps[k, 1, 0] * down + dx * left
+                first, last = _inside(dy * dy + dx * dx, y * dy + x * dx, y * y + x * x - reach * reach, size)
+                y, x = y + half, x + half
+                if inner:
+                    for j in range(first, last):
+                        out[answer, i, j] += weight * _inner(spline, side, y + j * dy, x + j * dx)
+                else:
+                    for j in range(first, last):
+                        out[answer, i, j] += weight * _anywhere(spline, side, y + j * dy, x + j * dx)

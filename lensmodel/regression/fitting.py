@@ -1,0 +1,140 @@
+"""What is made of samples before the first question: kernels, widths, bandwidths, votes, experts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.errors import NoSamplesError
+from lensmodel.psf import PsfSample
+from lensmodel.regression import pitch as pitches
+from lensmodel.regression import variables as va
+from lensmodel.regression.answer import ModelSettings
+from lensmodel.regression.index import SampleIndex
+from lensmodel.regression.judgement import Judgement, bandwidth, judge
+from lensmodel.regression.local import LocalKernels
+from lensmodel.regression.physical import PhysicalMean
+from lensmodel.regression.smoothers import smoothers
+from lensmodel.regression.transport import WidthField
+
+_INCREMENT = 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Roster:
+    """Numbers of photos by name, and the photo of each sample, shape (n,)."""
+
+    numbers: dict[str, int]
+    photo: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, samples: Sequence[PsfSample]) -> Roster:
+        """Number the photos in the order of their first samples."""
+        return cls({}, np.empty(0, dtype=np.intp)).extended(samples)
+
+    def extended(self, samples: Sequence[PsfSample]) -> Roster:
+        """Return it with more samples."""
+        numbers = dict(self.numbers)
+        own = [numbers.setdefault(s.photo, len(numbers)) for s in samples]
+        return Roster(numbers, np.concatenate([self.photo, np.array(own, dtype=np.intp)]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """A model's samples, prepared for questions.
+
+    Parameters
+    ----------
+    pitch_um : float or None
+        Pitch that all kernels are brought to; None where none is known.
+    size : int
+        How many samples it was fitted to; those added since keep what was fitted.
+    widths : WidthField
+    local : LocalKernels
+    index : SampleIndex
+        Points of the samples.
+    roster : Roster
+    judgement : Judgement
+    rule, bandwidth : dict
+        Bandwidths of eq. (8), and those in use.
+    physical : PhysicalMean or None
+    """
+
+    pitch_um: float | None
+    size: int
+    widths: WidthField
+    local: LocalKernels
+    index: SampleIndex
+    roster: Roster
+    judgement: Judgement
+    rule: dict[str, float]
+    bandwidth: dict[str, float]
+    physical: PhysicalMean | None
+
+    @classmethod
+    def of(cls, samples: Sequence[PsfSample], settings: ModelSettings) -> Fit:
+        """Fit everything but the wavefront, which waits for the first question or for `warm`.
+
+        Raises
+        ------
+        NoSamplesError
+            If there are none, or none may vote.
+        UnknownMethodError
+            If `settings.method` is in no registry.
+        """
+        if not samples:
+            raise NoSamplesError("the lens has no PSF samples yet; calibrate it with a photo first")
+        base = _claimed(samples, settings)
+        if not (base > 0).any():
+            raise NoSamplesError(f"none of the {len(samples)} samples may vote; include a photo again")
+        smoother = smoothers.create(settings.method)
+        pitch = pitches.usual_pitch(samples)
+        common = pitches.at_pitch(samples, pitch)
+        index, roster = SampleIndex.of(va.points(common)), Roster.of(common)
+        where = index.points
+        widths = WidthField.fit(common, base) if smoother.transport else WidthField()
+        local = LocalKernels.of(common, where, widths)
+        judgement = judge(common, settings, local, where, base, blend=smoother.blend)
+        if smoother.transport and any(flag.sample is None for flag in judgement.flags):
+            # a spoilt photo has bent the widths too: fit them again without its voice
+            widths = WidthField.fit(common, judgement.votes)
+            local = local.rescaled(where, widths)
+            judgement = judge(common, settings, local, where, base, blend=smoother.blend)
+        rule = va.bandwidths(where)
+        used = bandwidth(rule, settings, judgement.choice)
+        physical = None
+        if smoother.physical:
+            groups = roster.photo if len(roster.numbers) >= 2 else np.arange(len(samples))
+            physical = PhysicalMean(common, judgement.votes, groups, va.scales(used))
+        return cls(pitch, len(samples), widths, local, index, roster, judgement, rule, used, physical)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of stored kernels."""
+        image = self.judgement.image
+        return self.local.nbytes + (0 if image is None else image.rest.nbytes)
+
+    def takes(self, samples: Sequence[PsfSample]) -> bool:
+        """Whether so few samples can join without fitting everything anew."""
+        total = len(self.roster.photo) + len(samples)
+        sides = [pitches.side_at(s, self.pitch_um) for s in samples]
+        return total <= (1.0 + _INCREMENT) * self.size and max(sides) <= self.local.side
+
+    def extended(self, samples: Sequence[PsfSample], settings: ModelSettings) -> Fit:
+        """Return it with more samples; widths, bandwidths and the other experts stay as they were fitted."""
+        common = pitches.at_pitch(samples, self.pitch_um)
+        where = va.points(common)
+        return replace(
+            self,
+            local=self.local.extended(common, where, self.widths),
+            index=self.index.extended(where),
+            roster=self.roster.extended(common),
+            judgement=self.judgement.extended(_claimed(samples, settings)),
+        )
+
+
+def _claimed(samples: Sequence[PsfSample], settings: ModelSettings) -> NDArray[np.float64]:
+    return np.array([0.0 if s.photo in settings.excluded else s.weight for s in samples])

@@ -13,7 +13,7 @@ as large as the kernel.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -105,12 +105,20 @@ class LocalKernels:
         self, samples: Sequence[PsfSample], where: NDArray[np.float64], field: WidthField
     ) -> LocalKernels:
         """Return these with more, none larger than `side`."""
-        found = [splines.coefficients(resized(s.kernel, self.side), self.finer) for s in samples]
+        radii = np.empty(len(samples))
+
+        def rows() -> Iterator[NDArray[np.float32]]:  # one after the other: there may be very many
+            for i, sample in enumerate(samples):
+                found = splines.coefficients(resized(sample.kernel, self.side), self.finer)
+                radii[i] = splines.light_radius(found)
+                yield found.astype(np.float32).ravel()
+
+        kept = self.splines.extended(rows(), len(samples))
         return replace(
             self,
-            splines=self.splines.extended((f.astype(np.float32).ravel() for f in found), len(samples)),
+            splines=kept,
             angles=np.concatenate([self.angles, [s.position.phi for s in samples]]),
-            radii=np.concatenate([self.radii, [splines.light_radius(f) for f in found]]),
+            radii=np.concatenate([self.radii, radii]),
             widths=np.concatenate([self.widths, field.over(where)]),
         )
 

@@ -30,6 +30,12 @@ FAILURES: Final[Mapping[str, str]] = {
 }
 ZONES: Final[Mapping[str, str]] = {"center": "Center", "mid": "Middle", "corner": "Corners"}
 ENOUGH_PLACES: Final = 20
+FULL_STOPS: Final = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0, 22.0)
+STOP: Final = 1.45
+"""One stop as a factor of the f-number, with room for their rounding."""
+
+NEAR: Final = 0.06
+"""Apertures closer than this share are written alike."""
 ACTIVE: Final = frozenset({"received", "inspecting", "developing", "selecting", "estimating"})
 UNDEVELOPED: Final = frozenset({"received", "inspecting", "developing", "needs_lens", "failed", "cancelled"})
 REASONS: Final[Mapping[str, str]] = {
@@ -66,6 +72,19 @@ def serial_words(lens: LensOut) -> str:
 def f_stop(number: float) -> str:
     """Write an aperture as photographers do."""
     return f"f/{number:.3g}"
+
+
+def f_stops(seen: Sequence[float]) -> list[tuple[float, bool]]:
+    """List the apertures to ask a lens for: those of its photos, and full stops within one stop of them.
+
+    Each comes with whether a photo was taken at it: the model answers in between too, and says how
+    far it trusts that.
+    """
+    if not seen:
+        return []
+    low, high = min(seen) / STOP, max(seen) * STOP
+    between = [n for n in FULL_STOPS if low <= n <= high and all(abs(n / a - 1.0) > NEAR for a in seen)]
+    return sorted([*((a, True) for a in seen), *((n, False) for n in between)])
 
 
 def photo_state(photo: PhotoOut) -> str:
@@ -223,6 +242,7 @@ FILTERS: Final[Mapping[str, Callable[..., object]]] = {
         lens_name,
         serial_words,
         f_stop,
+        f_stops,
         photo_state,
         state_class,
         counted,

@@ -239,6 +239,11 @@ def test_a_lens_shows_its_blur_at_any_place_aperture_and_colour(page: Page, lear
     expect(words).to_contain_text("9 % of the way to the corner")
     with page.expect_response(lambda answer: "aperture=5.6" in answer.url and "psf.json" in answer.url):
         page.get_by_label("Aperture").select_option("5.6")
+    with page.expect_response(
+        lambda answer: "aperture=4" in answer.url and "psf.json" in answer.url
+    ) as between:
+        page.get_by_label("Aperture").select_option(label="f/4 (no photo)")
+    assert between.value.ok
     with page.expect_response(lambda answer: "channel=b" in answer.url and "field.png" in answer.url) as told:
         page.get_by_label("Colour").select_option("b")
 

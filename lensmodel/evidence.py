@@ -19,16 +19,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from lensmodel.errors import InvalidInputError
 from lensmodel.psf import centred, resized
-from lensmodel.types import Kernel, NoiseModel, Plane
+from lensmodel.spectrum import RINGS, SECTORS
+from lensmodel.types import Kernel
 
-RINGS = 14
-SECTORS = 12
-RING_LIMITS = (0.03, 0.5)
-_TILE = 64
 _MAX_BYTES = 4 << 20
 _MAX_SIDE = 255
 
@@ -136,43 +132,6 @@ def _refuse_large(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:
         shape, _, dtype = np.lib.format.read_array_header_1_0(member)
     if math.prod(shape) * dtype.itemsize > entry.file_size:
         raise InvalidInputError(f"evidence claims an array of shape {shape} in {entry.file_size} bytes")
-
-
-def binned_spectrum(patch: Plane, noise: NoiseModel) -> tuple[NDArray[np.float32], float]:
-    """Mean periodogram of Hann-windowed 64 px tiles at half overlap, in rings and sectors.
-
-    Returns
-    -------
-    spectrum : ndarray of float32, shape (RINGS, SECTORS)
-        Power per pixel of the window, noise included; frequencies 0.03 to 0.5 cycles/pixel.
-    floor : float
-        Power of the noise alone.
-    """
-    side = min(_TILE, *patch.shape)
-    hann = 0.5 - 0.5 * np.cos(2 * np.pi * (np.arange(side) + 0.5) / side)
-    window = hann[:, None] * hann[None, :]
-    energy = float((window**2).sum())
-    total = np.zeros((side, side // 2 + 1))
-    count = 0
-    for row in range(0, patch.shape[0] - side + 1, side // 2):
-        for col in range(0, patch.shape[1] - side + 1, side // 2):
-            tile = patch[row : row + side, col : col + side].astype(np.float64)
-            total += np.abs(fft.rfft2((tile - tile.mean()) * window)) ** 2
-            count += 1
-    power = total / (count * energy)
-    f_row, f_col = np.meshgrid(fft.fftfreq(side), fft.rfftfreq(side), indexing="ij")
-    frequency, angle = np.hypot(f_row, f_col), np.mod(np.arctan2(f_row, f_col), np.pi)
-    edges = np.geomspace(*RING_LIMITS, RINGS + 1)
-    ring = np.searchsorted(edges, frequency, side="right") - 1
-    sector = np.minimum((angle / np.pi * SECTORS).astype(int), SECTORS - 1)
-    spectrum = np.zeros((RINGS, SECTORS), dtype=np.float32)
-    for i in range(RINGS):
-        in_ring = ring == i
-        mean = float(power[in_ring].mean()) if in_ring.any() else 0.0
-        for j in range(SECTORS):
-            bin_ = in_ring & (sector == j)
-            spectrum[i, j] = float(power[bin_].mean()) if bin_.any() else mean
-    return spectrum, float(noise.sigma_at(float(patch.mean())) ** 2)
 
 
 def nonnegative_least_squares(

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from scipy import fft, ndimage
 
 from lensmodel.errors import InvalidInputError, InvalidKernelError
+from lensmodel.spectrum import PatchSpectrum
 from lensmodel.types import Channel, FieldPosition, Kernel, LensSettings
 
 WING_LEVEL = 0.01
@@ -233,6 +234,8 @@ class PsfSample:
         Size of a sensor pixel in micrometres; None where unknown.
     estimator : str
         Name and version of the method that made it.
+    spectrum : PatchSpectrum or None
+        What the patch says without a kernel, so that all patches of a lens can be solved together.
     """
 
     kernel: Kernel
@@ -242,6 +245,7 @@ class PsfSample:
     photo: str = ""
     pixel_pitch_um: float | None = None
     estimator: str = ""
+    spectrum: PatchSpectrum | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kernel", as_kernel(self.kernel))

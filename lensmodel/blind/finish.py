@@ -12,8 +12,8 @@ from scipy import ndimage
 
 from lensmodel.blind.base import PsfEstimate, is_no_blur
 from lensmodel.errors import NotEnoughEvidenceError
-from lensmodel.evidence import binned_spectrum
 from lensmodel.psf import as_kernel, centred, resized, rms_width
+from lensmodel.spectrum import binned_spectrum
 from lensmodel.types import Kernel, NoiseModel, Plane
 
 _EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=np.int_)

@@ -20,8 +20,9 @@ from scipy import fft
 from lensmodel.blind.base import PsfEstimate, is_no_blur, usable
 from lensmodel.blind.recurrence import ALPHA, Image, blend, level_shape, noise_gain, recur, resample
 from lensmodel.errors import NotEnoughEvidenceError
-from lensmodel.evidence import RINGS, PatchEvidence, binned_spectrum, nonnegative_least_squares
+from lensmodel.evidence import PatchEvidence, nonnegative_least_squares
 from lensmodel.psf import as_kernel, centred, resized, rms_width
+from lensmodel.spectrum import RINGS, binned_spectrum
 from lensmodel.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
 
 log = logging.getLogger(__name__)

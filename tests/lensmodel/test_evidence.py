@@ -9,14 +9,12 @@ from scipy import signal
 
 from lensmodel.errors import InvalidInputError
 from lensmodel.evidence import (
-    RINGS,
-    SECTORS,
     PatchEvidence,
-    binned_spectrum,
     nonnegative_least_squares,
     solve_kernel,
 )
 from lensmodel.psf import distance, gaussian
+from lensmodel.spectrum import RINGS, SECTORS, binned_spectrum
 from lensmodel.types import NoiseModel
 
 K = 9

@@ -1,0 +1,194 @@
+"""The kernels of all samples of a lens, solved together from their spectra.
+
+A wavefront is fitted to the spectra of all patches (`fit`), beginning with fits to the samples' own kernels
+and to their moments; the side of the tails is decided by the patches' vote (`PatchSpectrum.tail`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.psf import PsfSample, distance, rms_width
+from lensmodel.regression.pooled.fit import PatchView, PooledFit, fit_spectra
+from lensmodel.regression.pooled.scene import SceneView
+from lensmodel.regression.starts import starts
+from lensmodel.regression.wavefront import Wavefront, design, stopped
+from lensmodel.regression.wavefront_fit import fit_wavefront, spread
+from lensmodel.regression.wavefront_problem import PRIOR_PX, USUAL_EYE
+from lensmodel.types import Channel, FieldPosition, Kernel, StepHook, ignore_step
+
+MIN_PLACES: Final = 12
+"""Fewer patches with a spectrum are not solved together."""
+
+_COMA = slice(2, 6)  # the terms that a turn by 180 degrees negates
+_COARSE_PLACES, _FINE_PLACES = 16, 48
+_COARSE_ROUNDS, _FINE_ROUNDS = 8, 15
+_STARTS, _REFINED = 4, 2
+_SAME_COST = 1.0
+_TAIL_SIDE = 31
+_DRAWS, _SEED = 6, 0
+_OVERCONFIDENCE = 1.5
+"""Bins of a spectrum and patches of a photo are not as independent as the cost takes them to be."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pooled:
+    """A lens that all patches agree on.
+
+    Parameters
+    ----------
+    fit : PooledFit
+    tails : float
+        Vote of the patches for the side of the tails, in standard deviations; its sign was obeyed.
+    trust : dict
+        Median weight of each photo's patches; near 0 where something other than the lens blurred.
+    """
+
+    fit: PooledFit
+    tails: float
+    trust: dict[str, float]
+
+    @property
+    def front(self) -> Wavefront:
+        """The wavefront."""
+        return self.fit.front
+
+    def kernel(self, sample: PsfSample, size: int) -> Kernel:
+        """Kernel at the place and settings of a sample."""
+        return self.front.kernel(sample.position, sample.settings, size)
+
+    def errors(self, samples: Sequence[PsfSample]) -> NDArray[np.float64]:
+        """Expected relative L2 of the kernels at samples, by draws from the fit's covariance."""
+        few = spread(samples, _COARSE_PLACES)
+        rng = np.random.default_rng(_SEED)
+        lens = np.concatenate([self.front.terms, self.front.eye])
+        values, vectors = np.linalg.eigh(self.fit.covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0.0)) * _OVERCONFIDENCE
+        found = np.zeros(len(few))
+        right = [self.front.kernel(s.position, s.settings, _TAIL_SIDE) for s in few]
+        for _ in range(_DRAWS):
+            drawn = lens + root @ rng.standard_normal(len(lens))
+            other = replace(self.front, terms=drawn[:-2], eye=(max(drawn[-2], 0.5), float(drawn[-1])))
+            found += [
+                distance(other.kernel(s.position, s.settings, _TAIL_SIDE), k).rel_l2 ** 2
+                for s, k in zip(few, right, strict=True)
+            ]
+        found = np.sqrt(found / _DRAWS)
+        here = np.array([_vector(s) for s in samples])
+        there = np.array([_vector(s) for s in few])
+        apart = ((here[:, None] - there[None]) ** 2).sum(axis=-1)
+        weight = np.exp(-0.5 * apart / 0.15**2) + 1e-9
+        return np.asarray(weight @ found / weight.sum(axis=1), dtype=np.float64)
+
+
+def pool(
+    samples: Sequence[PsfSample], begin: Wavefront | None = None, on_step: StepHook = ignore_step
+) -> Pooled | None:
+    """Solve all samples of one focal length together.
+
+    Parameters
+    ----------
+    samples : sequence of PsfSample
+        Those without a spectrum only help to begin.
+    begin : Wavefront, optional
+        An earlier fit of this lens.
+
+    Returns
+    -------
+    Pooled or None
+        None with fewer than `MIN_PLACES` patches that have a spectrum.
+    """
+    seen = [s for s in samples if s.spectrum is not None and s.weight > 0]
+    places = _places(seen)
+    if len(places) < MIN_PLACES:
+        return None
+    heads = [group.get("g", next(iter(group.values()))) for group in places]
+    first = fit_wavefront(list(samples), begin)
+    if first is None:
+        return None
+    begins = [first]
+    if begin is None:
+        designs = np.stack([stopped(design(s.position, s.settings), first.stop(s.settings)) for s in heads])
+        begins += [
+            replace(first, terms=terms, eye=USUAL_EYE)
+            for terms in starts(heads, designs, PRIOR_PX, math.exp(first.log_q), _STARTS)
+        ]
+    at = {id(head): group for head, group in zip(heads, places, strict=True)}
+    chosen = [at[id(s)] for s in spread(heads, _FINE_PLACES)]
+    fine = [_view(group) for group in chosen]
+    total = len(begins) * _COARSE_ROUNDS + _REFINED * _FINE_ROUNDS
+    fits: list[PooledFit] = []
+    if len(begins) > 1:
+        coarse = [_view({"g": group["g"]}) for group in chosen[:_COARSE_PLACES] if "g" in group]
+        for start in begins:
+            fits.append(fit_spectra(coarse, start, rounds=_COARSE_ROUNDS))
+            on_step(len(fits) * _COARSE_ROUNDS, total)
+        fits.sort(key=lambda f: f.cost)
+        begins = [f.front for f in _different(fits)[:_REFINED]]
+    refined = [fit_spectra(fine, start, rounds=_FINE_ROUNDS) for start in begins]
+    on_step(total, total)
+    best = min(refined, key=lambda f: f.cost)
+    tails = _tail_vote(best.front, heads)
+    if tails < 0:
+        turned = best.front.terms.copy()
+        turned[_COMA] *= -1.0
+        best = replace(best, front=replace(best.front, terms=turned))
+    trust: dict[str, list[float]] = {}
+    for view, value in zip(fine, best.trust, strict=True):
+        trust.setdefault(view.photo, []).append(float(value))
+    return Pooled(best, tails, {photo: float(np.median(values)) for photo, values in trust.items()})
+
+
+def _different(fits: Sequence[PooledFit]) -> list[PooledFit]:
+    """Fits that ended in different minima."""
+    kept: list[PooledFit] = []
+    for fit in fits:
+        if all(abs(fit.cost - other.cost) > _SAME_COST for other in kept):
+            kept.append(fit)
+    return kept
+
+
+def _places(samples: Sequence[PsfSample]) -> list[dict[Channel, PsfSample]]:
+    """Samples of one patch in its channels."""
+    found: dict[tuple[str, float, float], dict[Channel, PsfSample]] = {}
+    for sample in samples:
+        key = (sample.photo, sample.position.r, sample.position.phi)
+        found.setdefault(key, {})[sample.settings.channel] = sample
+    return list(found.values())
+
+
+def _view(group: dict[Channel, PsfSample]) -> PatchView:
+    head = next(iter(group.values()))
+    spectra = {c: group[c].spectrum for c in ("g", "r", "b") if c in group}
+    scene = SceneView.of({c: s for c, s in spectra.items() if s is not None})
+    return PatchView(head.position, head.settings, head.photo, scene)
+
+
+def _tail_vote(front: Wavefront, samples: Sequence[PsfSample]) -> float:
+    """How much the patches' tails agree with those of a wavefront, in standard deviations."""
+    votes = []
+    for sample in samples:
+        if sample.spectrum is not None:
+            x, y = _third_moment(front.kernel(sample.position, sample.settings, _TAIL_SIDE))
+            votes.append(x * sample.spectrum.tail[0] + y * sample.spectrum.tail[1])
+    total, scatter = float(np.sum(votes)), float(np.sqrt(np.sum(np.square(votes))))
+    return total / scatter if scatter > 0 else 0.0
+
+
+def _third_moment(kernel: Kernel) -> tuple[float, float]:
+    """Vector sum k x |x|^2 over the cube of the width, (right, up)."""
+    middle = kernel.shape[0] // 2
+    row, col = np.mgrid[-middle : middle + 1, -middle : middle + 1]
+    weight = kernel * (row**2 + col**2) / max(rms_width(kernel), 0.1) ** 3
+    return float((weight * col).sum()), float(-(weight * row).sum())
+
+
+def _vector(sample: PsfSample) -> tuple[float, float]:
+    place: FieldPosition = sample.position
+    return place.r * math.cos(place.phi), place.r * math.sin(place.phi)

@@ -1,0 +1,134 @@
+"""What is known of a scene's own spectrum, so that the rest of a photographed one is the lens's.
+
+In the bins of a patch, with L = ln(f / 0.1) and the angle t of the frequency, a scene's log power is
+
+    s(f, t) = a + z1 L + z2 L^2 + z3 cos 2t + z4 sin 2t + z5 cos 4t + z6 sin 4t + z7 L cos 2t + z8 L sin 2t
+
+with normal priors on z: natural images fall off with about the square of the frequency (D. J. Field,
+JOSA A 4, 1987), buildings prefer two directions. Red and blue differ a little from green; all
+patches of one photo share a part of their slope and curvature, since one motif and one focus are theirs.
+What is seen is ln(exp(s) |OTF|^2 + n) with the power n of the noise, and a roughness that the
+polynomial does not follow, which is the same in all channels.
+
+The numbers were measured on simulated photographs of the development half (lens seeds 0..7, Bayer DNG
+files): `benchmarks/scene_spectra.py` prints them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.regression.pooled.transfer import BINS, FIRST_RING, bin_frequencies
+from lensmodel.spectrum import SECTORS, PatchSpectrum
+from lensmodel.types import Channel
+
+Floats = NDArray[np.float64]
+
+_MODULUS, _ANGLE = bin_frequencies()
+_L = np.log(_MODULUS / 0.1)
+
+SHAPES: Final = np.stack(
+    [
+        *(np.ones(BINS), _L, _L**2, np.cos(2 * _ANGLE), np.sin(2 * _ANGLE)),
+        *(np.cos(4 * _ANGLE), np.sin(4 * _ANGLE), _L * np.cos(2 * _ANGLE), _L * np.sin(2 * _ANGLE)),
+    ],
+    axis=1,
+)
+"""Values of the polynomial's terms in the bins, shape (BINS, 9)."""
+
+_USUAL = (0.0, -2.08, 0.0, -0.2, 0.0, 0.08, 0.02, 0.0, 0.0)
+_SPREAD = (1e-3, 0.42, 0.27, 0.5, 0.35, 0.2, 0.16, 0.27, 0.18)
+_AMPLITUDE = (-4.0, 6.0)  # of each channel: usual, spread
+_CHANNEL_SPREAD = (0.13, 0.13)  # of its slope and curvature about those of the patch
+PHOTO_SPREAD: Final = np.array([0.35, 0.16])
+"""Standard deviations of what all patches of a photo share: slope and curvature."""
+
+_BIAS = (0.12, -0.07, -0.09, -0.04, 0.0, 0.02, 0.05, 0.05, 0.01, -0.1, -0.2)
+_ROUGHNESS = (0.42, 0.36, 0.31, 0.30, 0.27, 0.25, 0.24, 0.24, 0.24, 0.28, 0.4)
+_OWN, _NOISY = 0.13, 0.35
+# Demosaicing borrows the finest detail of red and blue from green, and smooths their noise.
+_BORROWED = (0.0, 0.0, 0.0, 0.0, 0.05, 0.1, 0.2, 0.5, 3.0, 3.0, 3.0)
+_NOISE_GREEN = (1.0,) * 9 + (0.81, 0.68)
+_NOISE_OTHER = (1.0,) * 8 + (0.95, 0.68, 0.46)
+_SMALLEST = 1e-15
+
+
+def _rings(values: tuple[float, ...]) -> Floats:
+    return np.repeat(np.asarray(values, dtype=np.float64), SECTORS)
+
+
+BIAS: Final = _rings(_BIAS)
+"""Mean of the log power about the polynomial, shape (BINS,)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneView:
+    """The spectra of one patch in its channels, ready to be fitted.
+
+    Parameters
+    ----------
+    channels : tuple of Channel
+    log_power : ndarray, shape (BINS, c)
+        Of what was seen, noise included.
+    noise : ndarray, shape (BINS, c)
+        Power of the noise.
+    precision : ndarray, shape (BINS, c, c)
+        Inverse covariance of the log powers of a bin about the model.
+    shapes : ndarray, shape (BINS, c, z)
+        Derivatives of the scene's log power by the patch's own unknowns.
+    usual, vote : ndarray, shape (z,)
+        Their prior means and inverse variances.
+    """
+
+    channels: tuple[Channel, ...]
+    log_power: Floats
+    noise: Floats
+    precision: Floats
+    shapes: Floats
+    usual: Floats
+    vote: Floats
+
+    @classmethod
+    def of(cls, spectra: dict[Channel, PatchSpectrum]) -> SceneView:
+        """Take the spectra of a patch."""
+        channels = tuple(spectra)
+        count = len(channels)
+        power = np.stack([s.power[FIRST_RING:].astype(np.float64).ravel() for s in spectra.values()], 1)
+        power = np.maximum(power, _SMALLEST)
+        noise = np.stack(
+            [s.noise * _rings(_NOISE_GREEN if c == "g" else _NOISE_OTHER) for c, s in spectra.items()],
+            axis=1,
+        )
+        seen = np.clip(1.0 - _of_ring(noise) / _of_ring(power), 0.0, 1.0)
+        covariance = (_rings(_ROUGHNESS) ** 2)[:, None, None] * seen[:, :, None] * seen[:, None, :]
+        for k, channel in enumerate(channels):
+            covariance[:, k, k] += _OWN**2 + (_NOISY * (1.0 - seen[:, k])) ** 2
+            if channel != "g":
+                covariance[:, k, k] += _rings(_BORROWED) ** 2
+        own = SHAPES[:, :3]
+        shapes = np.zeros((BINS, count, SHAPES.shape[1] + 3 * count))
+        shapes[:, :, : SHAPES.shape[1]] = SHAPES[:, None, :]
+        for k in range(count):
+            at = SHAPES.shape[1] + 3 * k
+            shapes[:, k, at : at + 3] = own
+        usual = np.concatenate([_USUAL, np.tile([_AMPLITUDE[0], 0.0, 0.0], count)])
+        spread = np.concatenate([_SPREAD, np.tile([_AMPLITUDE[1], *_CHANNEL_SPREAD], count)])
+        return cls(
+            channels,
+            np.log(power),
+            noise,
+            np.asarray(np.linalg.inv(covariance), dtype=np.float64),
+            shapes,
+            usual,
+            1.0 / spread**2,
+        )
+
+
+def _of_ring(values: Floats) -> Floats:
+    """Mean of each ring in all its bins."""
+    rings = values.reshape(-1, SECTORS, values.shape[1]).mean(axis=1)
+    return np.repeat(rings, SECTORS, axis=0)

@@ -1,0 +1,188 @@
+"""How much power of a scene a wavefront lets through, in the bins of a patch's spectrum.
+
+The transfer function is the autocorrelation of the pupil P = A exp(2 pi i W)::
+
+    OTF(f) = sum_p P(p + q f) P*(p - q f) / sum_p |P(p)|^2,      q = wavelength x f-number / pixel pitch
+
+With the wavefront in blur (see `pupil`), 2 pi W = (pi / q) sum_k g_k B_k, the phase of a term is
+sum_k g_k (pi / q) (B_k(p + q f) - B_k(p - q f)): smooth in p however small q is, so that a coarse
+pupil does. The square of its modulus, times that of the pixel, is averaged over each bin, since the
+zeros of an OTF are lines.
+
+Source: J. W. Goodman, "Introduction to Fourier Optics", 3rd ed., 2005, eq. 6-27.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.spectrum import RING_LIMITS, RINGS, SECTORS
+
+FIRST_RING: Final = 3
+"""Rings below hold too few frequencies of a 64 px tile to be told apart by angle."""
+
+BINS: Final = (RINGS - FIRST_RING) * SECTORS
+"""Number of bins that count."""
+
+_ACROSS = 26  # samples across the pupil
+_EDGE = np.geomspace(*RING_LIMITS, RINGS + 1)
+_RATIO = float(_EDGE[1] / _EDGE[0])
+_INSIDE = (-0.3, 0.3)  # where a bin is sampled, in parts of its width
+_LEAST = 1e-7
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+
+
+def bin_frequencies() -> tuple[Floats, Floats]:
+    """Modulus (cycles/pixel) and angle of the middle of each bin, shape (BINS,) each.
+
+    The angle is that of `spectrum.binned_spectrum`: from the columns' axis towards the rows'.
+    """
+    middle = np.sqrt(_EDGE[1:] * _EDGE[:-1])[FIRST_RING:]
+    angle = (np.arange(SECTORS) + 0.5) * math.pi / SECTORS
+    modulus, turned = np.meshgrid(middle, angle, indexing="ij")
+    return modulus.ravel(), turned.ravel()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Transfer:
+    """The pupil laid out for one q.
+
+    Parameters
+    ----------
+    ahead, behind : tuple of ndarray, shape (F, P)
+        Coordinates (right, up) of p + q f and p - q f; F frequencies, `len(_INSIDE)^2` to a bin.
+    phases : ndarray, shape (6, F, P)
+        Phase per pixel of blur of each term of `pupil` but the tilts.
+    stop : ndarray, shape (F, P)
+        Transmission of the two shifted stops.
+    points : tuple of ndarray, shape (P,)
+        The pupil p itself.
+    pixel : ndarray, shape (F,)
+        Square of the pixel's transfer function.
+    """
+
+    ahead: tuple[Singles, Singles]
+    behind: tuple[Singles, Singles]
+    phases: Singles
+    stop: Singles
+    points: tuple[Singles, Singles]
+    pixel: Floats
+
+    @classmethod
+    def of(cls, q: float) -> Transfer:
+        """Lay out the pupil; layouts are remembered."""
+        return _laid_out(round(q, 4))
+
+    def log_power(
+        self, blur: Floats, radius: float, shift: tuple[float, float]
+    ) -> tuple[Floats, Floats, Floats]:
+        """Logarithm of the mean square of the transfer function in each bin, and its derivatives.
+
+        Parameters
+        ----------
+        blur : ndarray, shape (6,)
+            Coefficients of the first six terms of `pupil`, pixels.
+        radius : float
+            Of the second circle of the pupil (cat's eye), in units of the stop.
+        shift : tuple of float
+            Its middle, (right, up).
+
+        Returns
+        -------
+        value : ndarray, shape (BINS,)
+        by_blur : ndarray, shape (BINS, 6)
+        by_eye : ndarray, shape (BINS, 3)
+            By `radius` and `shift`.
+        """
+        ahead, ahead_by = _circle(*self.ahead, radius, shift)
+        behind, behind_by = _circle(*self.behind, radius, shift)
+        alone, alone_by = _circle(*self.points, radius, shift)
+        open_ = _circle(*self.points, 1.0, (0.0, 0.0))[0]
+        area = float((open_ * alone * open_ * alone).sum())
+        angle = np.tensordot(blur.astype(np.float32), self.phases, axes=1)
+        cosine, sine = np.cos(angle), np.sin(angle)
+        both = self.stop * ahead * behind
+        real_parts, imaginary_parts = both * cosine, both * sine
+        real, imaginary = (
+            real_parts.sum(axis=1, dtype=np.float64),
+            imaginary_parts.sum(axis=1, dtype=np.float64),
+        )
+        scale = self.pixel / area**2
+        power = _binned((real * real + imaginary * imaginary) * scale)
+        found = []
+        for phase in self.phases:
+            by_real = -np.einsum("fp,fp->f", phase, imaginary_parts)
+            by_imaginary = np.einsum("fp,fp->f", phase, real_parts)
+            found.append(_binned(2.0 * scale * (real * by_real + imaginary * by_imaginary)))
+        eye = []
+        for one, other, own in zip(ahead_by, behind_by, alone_by, strict=True):
+            change = self.stop * (one * behind + ahead * other)
+            towards = real * np.einsum("fp,fp->f", change, cosine)
+            towards += imaginary * np.einsum("fp,fp->f", change, sine)
+            loss = 4.0 * float((open_ * open_ * alone * own).sum()) / area
+            eye.append(_binned(2.0 * scale * towards) - power * loss)
+        safe = np.maximum(power, _LEAST)
+        return np.log(safe), np.stack(found, axis=1) / safe[:, None], np.stack(eye, axis=1) / safe[:, None]
+
+
+@lru_cache(maxsize=16)
+def _laid_out(q: float) -> Transfer:
+    modulus, angle = bin_frequencies()
+    right, up = [], []
+    for along in _INSIDE:
+        for across in _INSIDE:
+            f, t = modulus * _RATIO**along, angle + across * math.pi / SECTORS
+            right.append(f * np.cos(t))
+            up.append(-f * np.sin(t))  # rows grow downwards
+    fx, fy = np.concatenate(right), np.concatenate(up)
+    side = ((np.arange(_ACROSS) - (_ACROSS - 1) / 2.0) * 2.0 / _ACROSS).astype(np.float64)
+    px, py = (a.ravel() for a in np.meshgrid(side, side))
+    inside = np.hypot(px, py) <= 1.0 + 1.0 / _ACROSS
+    px, py = px[inside], py[inside]
+    ahead = (px + q * fx[:, None], py + q * fy[:, None])
+    behind = (px - q * fx[:, None], py - q * fy[:, None])
+    stop = _circle(*ahead, 1.0, (0.0, 0.0))[0] * _circle(*behind, 1.0, (0.0, 0.0))[0]
+    phases = (_terms(*ahead) - _terms(*behind)) * (math.pi / q)
+    return Transfer(
+        (ahead[0].astype(np.float32), ahead[1].astype(np.float32)),
+        (behind[0].astype(np.float32), behind[1].astype(np.float32)),
+        phases.astype(np.float32),
+        stop.astype(np.float32),
+        (px.astype(np.float32), py.astype(np.float32)),
+        np.sinc(fx) ** 2 * np.sinc(fy) ** 2,
+    )
+
+
+def _terms(px: Floats, py: Floats) -> Floats:
+    """Return the first six terms of `pupil`."""
+    rho2 = px * px + py * py
+    return np.stack([rho2 * rho2, px * rho2, py * rho2, rho2, px * px - py * py, 2.0 * px * py])
+
+
+def _circle(
+    px: NDArray[np.floating], py: NDArray[np.floating], radius: float, shift: tuple[float, float]
+) -> tuple[NDArray[np.floating], tuple[NDArray[np.floating], ...]]:
+    """Transmission of a disc whose edge is one sample wide; derivatives by radius and shift.
+
+    Squares spare the root: (radius^2 - r^2) / (2 radius) is the distance to the edge near it.
+    """
+    dtype = px.dtype.type
+    dx, dy = px - dtype(shift[0]), py - dtype(shift[1])
+    steep = dtype(_ACROSS / 2.0)
+    edge = (dtype(radius * radius) - dx * dx - dy * dy) * (steep / dtype(2.0 * radius)) + dtype(0.5)
+    inside = np.clip(edge, 0.0, 1.0)
+    soft = ((edge > 0.0) & (edge < 1.0)) * steep
+    over = dtype(1.0 / radius)
+    return inside, (soft, soft * dx * over, soft * dy * over)
+
+
+def _binned(values: Floats) -> Floats:
+    return np.asarray(values.reshape(len(_INSIDE) ** 2, BINS).mean(axis=0))

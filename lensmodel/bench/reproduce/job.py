@@ -152,7 +152,8 @@ class Job:
         edges = None if chart is None else corrected_with(chart, field, method, workers=self.workers)
         after = corrected_with(photo, field, method, workers=self.workers)
         name = {} if label is None else {f"{label}-{method}": self._picture(f"{label}-{method}", after)}
-        return measure.state(edges, after, shots, self.case), name
+        before = None if chart is None else chart.planes
+        return measure.state(edges, after, shots, self.case, before=before), name
 
     def _as_photo(self, planes: Planes) -> Planes:
         """Planes of the sensor as the photo's file has them: white-balanced where it is not raw."""
@@ -222,10 +223,11 @@ class Job:
         answers = route.answers(measure.places(), case.settings, measure.PSF_SIZE)
         unit["psf"] = measure.psf_errors(answers, self.truth)
         unit["methods"] = {}
+        chart = None if shots.chart is None else develop(shots.chart).planes
         for method in self.methods:
             after = route.corrected(shots.held_out, method)
             edges = None if shots.chart is None else route.corrected(shots.chart, method)
-            unit["methods"][method] = measure.state(edges, after, shots, case)
+            unit["methods"][method] = measure.state(edges, after, shots, case, before=chart)
             unit["pictures"][f"n{n}-{method}"] = self._picture(f"n{n}-{method}", after)
         return unit
 

@@ -24,6 +24,11 @@ PSF_SIZE: Final = 55
 NEAR: Final = 1.5
 """A predicted error within this factor of the true one counts as right."""
 
+FAIR_OVERSHOOT: Final = 5.0
+"""Percent of the step: corrections are compared at no more than that."""
+
+_MIXES = 10
+
 
 def places() -> list[Place]:
     """Where PSFs are asked for, in every channel: not where patches lie."""
@@ -59,14 +64,14 @@ def _medians(values: Mapping[str, Mapping[str, Sequence[float]]]) -> dict[str, d
     return {c: {z: float(np.median(v)) for z, v in zones.items()} for c, zones in values.items()}
 
 
-def edges(chart: Planes, case: Case) -> dict[str, Any]:
+def edges(chart: Planes, case: Case, *, channel: int = 1) -> dict[str, Any]:
     """Measure the green slanted edges of the chart by zone; MTF50 in LP/PH.
 
     The chart keeps the pixel box that it was rendered with, so that perfect means the MTF of one
     pixel, not a constant 1, whose MTF50 would lie at infinity.
     """
     boxes = [edge.box for edge in edge_chart(case.camera.frame, guard=guard_of(case)).edges]
-    found = quality.by_zone(quality.measure_edges(chart[1], boxes))
+    found = quality.by_zone(quality.measure_edges(chart[channel], boxes))
     return {zone: _in_lp_per_ph(asdict(row), case.height) for zone, row in found.items()}
 
 
@@ -87,6 +92,33 @@ def pictures(photo: Planes, shots: Shots, case: Case) -> dict[str, dict[str, flo
     return fidelity(seen, shots.truth() * gains, case.camera.frame)
 
 
-def state(chart: Planes | None, photo: Planes, shots: Shots, case: Case) -> dict[str, Any]:
-    """Everything about one version of the chart, if there is one, and of the held-out photo."""
-    return {"edges": {} if chart is None else edges(chart, case), **pictures(photo, shots, case)}
+def state(
+    chart: Planes | None, photo: Planes, shots: Shots, case: Case, *, before: Planes | None = None
+) -> dict[str, Any]:
+    """Everything about one version of the chart, if there is one, and of the held-out photo.
+
+    With the chart as it was (`before`) each zone also has `mtf50_fair`, see `fair_mtf50`.
+    """
+    found = {} if chart is None else edges(chart, case)
+    if chart is not None and before is not None:
+        for zone, value in fair_mtf50(chart, before, case).items():
+            found[zone]["mtf50_fair"] = value
+    return {"edges": found, **pictures(photo, shots, case)}
+
+
+def fair_mtf50(chart: Planes, before: Planes, case: Case) -> dict[str, float | None]:
+    """MTF50 in LP/PH at equal overshoot, by zone.
+
+    Overshoot buys MTF50. A correction that overshoots more than 5 percent is mixed with the photo as it
+    was, in steps of a tenth, until it no longer does: that is what its strength slider would do.
+    """
+    found: dict[str, float | None] = {}
+    for step in range(_MIXES, -1, -1):
+        share = np.float32(step / _MIXES)
+        mixed = edges(before[1:2] + share * (chart[1:2] - before[1:2]), case, channel=0)
+        for zone, row in mixed.items():
+            if zone not in found and (row["overshoot"] <= FAIR_OVERSHOOT or step == 0):
+                found[zone] = row["mtf50"]
+        if len(found) == len(mixed):
+            break
+    return found

@@ -7,6 +7,7 @@ from typing import Any
 
 from lensmodel.bench.reproduce.bars import Bar, held
 from lensmodel.bench.reproduce.cases import HARD_METHODS
+from lensmodel.bench.reproduce.measure import FAIR_OVERSHOOT
 from lensmodel.bench.reproduce.sheet import Page
 from lensmodel.bench.reproduce.tables import DENOISED, hard_rows, number, states
 from lensmodel.types import ZONES
@@ -29,11 +30,15 @@ def table1(page: Page, found: Mapping[str, Any], label: str) -> None:
         f"Mean over {found['lenses']} lenses; in each zone the median over its slanted edges. MTF50 "
         "alone proves nothing, because a PSF that is too wide scores above the truth: read it with the "
         "highest MTF (1.00 is right) and the overshoot of the edge in percent of the step, "
-        "both the largest of the zone."
+        "both the largest of the zone. Fair is MTF50 at equal overshoot: a correction that overshoots more "
+        f"than {FAIR_OVERSHOOT:g} percent is mixed with the photo as it was until it does not."
     )
     for method, rows in found["mtf"].items():
         page.title(f"Method {method}", 3)
-        head = ["", *(f"{zone} {what}" for zone in ZONES for what in ("MTF50", "tan / sag", "max", "over"))]
+        head = [
+            "",
+            *(f"{zone} {what}" for zone in ZONES for what in ("MTF50", "tan / sag", "max", "over", "fair")),
+        ]
         page.table(head, [[row["state"], *_edge_cells(row)] for row in rows])
         page.text("Share of the gain of the true PSF, mean over lenses where that gain is 5 percent or more:")
         page.table(
@@ -69,6 +74,7 @@ def _edge_cells(row: Mapping[str, Any]) -> list[str]:
             f"{number(edge['tangential_mtf50'])} / {number(edge['sagittal_mtf50'])}",
             number(edge["mtf_max"], 2),
             number(edge["overshoot"], 1),
+            number(edge["mtf50_fair"]),
         ]
     return cells
 
@@ -184,6 +190,7 @@ def hard_table(page: Page, result: Mapping[str, Any]) -> None:
             "denoised only",
             "true PSF",
             "gain in SSIM",
+            "MTF50 share",
             "PSF error",
             "worse zones",
             "by more than 0.05 dB",
@@ -197,6 +204,7 @@ def hard_table(page: Page, result: Mapping[str, Any]) -> None:
                 _slashed(row["control"], 2),
                 _slashed(row["true"], 2),
                 _slashed(row["ssim"], 3),
+                _slashed(row["share"], 2),
                 _slashed(row["psf"], 2),
                 f"{row['counts']['worse']} of {row['counts']['zones']}",
                 str(row["counts"]["clearly_worse"]),

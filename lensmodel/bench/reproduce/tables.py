@@ -14,6 +14,15 @@ Result = Mapping[str, Any]
 SMALL_GAIN: Final = 0.05
 """Where the true PSF raises MTF50 by a smaller share, the share of its gain says nothing."""
 
+EDGE_FIGURES: Final = (
+    "mtf50",
+    "tangential_mtf50",
+    "sagittal_mtf50",
+    "mtf_max",
+    "overshoot",
+    "mtf50_fair",
+)
+
 TOLERATED_DB: Final = 0.05
 
 MEASURABLE: Final = {"psnr": 0.2, "ssim": 0.002}
@@ -174,7 +183,8 @@ def hard_rows(result: Result) -> list[dict[str, Any]]:
     list of dict
         `condition`, `title`, `lenses`, `refused` (photos that were not learned from); `gain`,
         `control`, `true`: mean gain in dB by zone of the correction learned from such a photo, of
-        denoising alone, and of the true PSF; `ssim`: mean gain in SSIM; `kept`; `counts` of `counted`.
+        denoising alone, and of the true PSF; `ssim`: mean gain in SSIM; `kept`; `share` of the true-PSF
+        gain in MTF50 where there was a chart; `psf`; `counts` of `counted`.
     """
     every: dict[str, list[Result]] = {}
     for case in result.get("hard", ()):
@@ -197,6 +207,7 @@ def _hard_row(name: str, cases: Sequence[Result]) -> dict[str, Any]:
         "control": _zones(lambda z: mean(gain(c, c["truth"]["control"], z) for c in cases)),
         "true": _zones(lambda z: mean(gain(c, c["truth"]["true"][method], z) for c in cases)),
         "kept": _zones(partial(_column_mean, [kept(c, 1, method) for c in cases])),
+        "share": _zones(partial(_column_mean, [shares(c, 1, method) for c in cases])),
         "psf": _zones(partial(_column_mean, [_rel_l2(unit["psf"], "g") for _, unit in after])),
         "counts": counted(rows),
     }
@@ -249,10 +260,7 @@ def _mtf(result: Result, method: str) -> list[dict[str, Any]]:
         row: dict[str, Any] = {"state": name}
         for zone in ZONES:
             here = [one[name]["edges"].get(zone, {}) for one in every if name in one]
-            row[zone] = {
-                field: mean(_get(edge, field) for edge in here)
-                for field in ("mtf50", "tangential_mtf50", "sagittal_mtf50", "mtf_max", "overshoot")
-            }
+            row[zone] = {field: mean(_get(edge, field) for edge in here) for field in EDGE_FIGURES}
         rows.append(row)
     return rows
 

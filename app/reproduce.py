@@ -12,9 +12,11 @@ import numpy as np
 from app.client import Client, JobEndedError
 from app.errands import corrected, follow, planes_of
 from app.own_service import own_service
+from app.schemas import PhotoOut
 from lensmodel.bench.reproduce import Answer, Case, Place
 from lensmodel.errors import NoSamplesError
 from lensmodel.psf import as_kernel
+from lensmodel.simulate import SimulatedLens
 from lensmodel.types import LensSettings, Planes
 
 log = logging.getLogger(__name__)
@@ -33,15 +35,17 @@ class ServiceRoute:
     client : Client
     work : Path
         Folder for downloads; each is removed as soon as it has been read.
+    lens : SimulatedLens or None
+        Which lens it is, said with photos that do not say it themselves.
     """
 
-    def __init__(self, client: Client, work: Path) -> None:
-        self._client, self._work = client, work
+    def __init__(self, client: Client, work: Path, lens: SimulatedLens | None = None) -> None:
+        self._client, self._work, self._lens = client, work, lens
         self._lens_id: str | None = None
 
     def learn(self, photo: Path) -> str:
         """Upload a photo and wait until the lens has learned from it; see `Route`."""
-        uploaded = self._client.upload(photo)
+        uploaded = self._upload(photo, calibrate=True)
         try:
             follow(self._client, uploaded, log.info, patience=_PATIENCE)
         except JobEndedError as error:
@@ -51,7 +55,7 @@ class ServiceRoute:
 
     def answers(self, places: Sequence[Place], settings: LensSettings, size: int) -> list[Answer]:
         """Ask for the PSFs at some places; see `Route`."""
-        lens_id, found = self._lens(), []
+        lens_id, found = self._known(), []
         for place, channel in places:
             psf = self._client.psf(
                 lens_id,
@@ -68,7 +72,7 @@ class ServiceRoute:
 
     def corrected(self, photo: Path, method: str) -> Planes:
         """Have a photo corrected that the lens does not learn from; see `Route`."""
-        uploaded = self._client.upload(photo, calibrate=False)
+        uploaded = self._upload(photo, calibrate=False)
         follow(self._client, uploaded, log.info)
         path = corrected(
             self._client,
@@ -77,13 +81,24 @@ class ServiceRoute:
             log.info,
             output={"color_space": "camera-linear"},
             method=method,
-            lens_id=self._lens(),
+            lens_id=self._known(),
         )
         planes = planes_of(path)
         path.unlink()
         return planes
 
-    def _lens(self) -> str:
+    def _upload(self, photo: Path, *, calibrate: bool) -> PhotoOut:
+        """Send a photo; a TIFF or JPEG has no lens serial, so its lens is named as its owner would."""
+        lens = None if photo.suffix == ".dng" else self._lens
+        return self._client.upload(
+            photo,
+            calibrate=calibrate,
+            lens_maker=None if lens is None else lens.maker,
+            lens_model=None if lens is None else lens.model,
+            lens_serial=None if lens is None else lens.serial,
+        )
+
+    def _known(self) -> str:
         if self._lens_id is None:
             raise NoSamplesError("no photo has counted yet: learn from one with fine detail in focus")
         return self._lens_id
@@ -106,4 +121,4 @@ class ServiceRoutes:
         downloads = folder / "downloads"
         downloads.mkdir(parents=True, exist_ok=True)
         with own_service(folder / "service", folder / "service.log", self._settings) as client:
-            yield ServiceRoute(client, downloads)
+            yield ServiceRoute(client, downloads, case.lens)

@@ -20,6 +20,7 @@ from app.schemas import JobOut
 from lensmodel.bench.reproduce import Reproduction, planned, run_reproduction
 from lensmodel.errors import NoSamplesError
 from lensmodel.psf import gaussian
+from lensmodel.simulate import draw_lens
 from lensmodel.types import FieldPosition, LensSettings
 
 
@@ -29,8 +30,10 @@ class FakeClient:
     def __init__(self, *, refuses: bool = False) -> None:
         self.refuses = refuses
         self.asked: list[dict[str, Any]] = []
+        self.said: dict[str, dict[str, str | None]] = {}
 
-    def upload(self, path: Path, *, calibrate: bool = True) -> SimpleNamespace:
+    def upload(self, path: Path, *, calibrate: bool = True, **said: str | None) -> SimpleNamespace:
+        self.said[path.suffix] = said
         return SimpleNamespace(id=path.stem, calibrate=calibrate)
 
     def wait(self, work: SimpleNamespace, **_: object) -> None:
@@ -59,6 +62,15 @@ def test_route_asks_the_service_for_the_lens_of_the_photos(tmp_path: Path) -> No
     (asked,) = client.asked
     assert asked["lens_id"] == "lens-1"
     assert (asked["aperture"], asked["focal_length_mm"], asked["channel"]) == (2.0, 24.0, "r")
+
+
+def test_route_names_the_lens_of_photos_that_do_not(tmp_path: Path) -> None:
+    client, lens = FakeClient(), draw_lens(1003)
+    route = ServiceRoute(client, tmp_path, lens)  # type: ignore[arg-type]  # as above
+    route.learn(tmp_path / "raw.dng")
+    route.learn(tmp_path / "developed.tif")
+    assert client.said[".dng"]["lens_serial"] is None
+    assert client.said[".tif"]["lens_serial"] == lens.serial
 
 
 def test_route_says_why_a_photo_did_not_count(tmp_path: Path) -> None:

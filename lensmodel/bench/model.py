@@ -214,7 +214,7 @@ def _fits(methods: Sequence[str] | None) -> dict[str, Fit]:
 
 def _regression(method: str) -> Fit:
     def fit(samples: Sequence[PsfSample]) -> Predictor:
-        model = LensModel.fit(samples, ModelSettings(method=method))
+        model = LensModel.fit(samples, ModelSettings(method=method)).warmed()
         settings, size = samples[0].settings, samples[0].kernel.shape[0]
         return lambda place: model.query(place, settings, size).kernel
 

@@ -37,7 +37,7 @@ class ModelSettings:
     r: float | None = None
     phi: float | None = None
     stops: float | None = None
-    method: str = "blended"
+    method: str = "combined"
     rotational: float | None = None
     mirror: float | None = None
     robust: bool = True

@@ -17,7 +17,7 @@ from lensmodel.regression import variables as va
 from lensmodel.regression.judgement import Judgement
 from lensmodel.regression.kriging import as_kernels, field_vector
 from lensmodel.regression.local import Answers
-from lensmodel.regression.physical import PhysicalMean
+from lensmodel.regression.physical import Physics
 from lensmodel.types import FieldPosition, LensSettings
 
 _SILENT = 1e-3
@@ -54,13 +54,13 @@ class Experts:
         With the image frame, if that takes part.
     scale : ndarray, shape (7,)
         Bandwidths.
-    physical : PhysicalMean or None
+    physical : Physics or None
         The wavefront; None if it takes no part.
     """
 
     judgement: Judgement
     scale: NDArray[np.float64]
-    physical: PhysicalMean | None
+    physical: Physics | None
 
     def mixed(
         self,

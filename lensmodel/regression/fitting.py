@@ -16,9 +16,10 @@ from lensmodel.regression.answer import ModelSettings
 from lensmodel.regression.index import SampleIndex
 from lensmodel.regression.judgement import Judgement, bandwidth, judge
 from lensmodel.regression.local import LocalKernels
-from lensmodel.regression.physical import PhysicalMean
+from lensmodel.regression.physical import Physics
 from lensmodel.regression.smoothers import smoothers
 from lensmodel.regression.transport import WidthField
+from lensmodel.types import StepHook, ignore_step
 
 _INCREMENT = 0.05
 
@@ -60,7 +61,8 @@ class Fit:
     judgement : Judgement
     rule, bandwidth : dict
         Bandwidths of eq. (8), and those in use.
-    physical : PhysicalMean or None
+    physical : Physics or None
+        None until `warmed`, or if it takes no part.
     """
 
     pitch_um: float | None
@@ -72,11 +74,11 @@ class Fit:
     judgement: Judgement
     rule: dict[str, float]
     bandwidth: dict[str, float]
-    physical: PhysicalMean | None
+    physical: Physics | None = None
 
     @classmethod
     def of(cls, samples: Sequence[PsfSample], settings: ModelSettings) -> Fit:
-        """Fit everything but the wavefront, which waits for the first question or for `warm`.
+        """Fit everything but the wavefront, which `warmed` adds.
 
         Raises
         ------
@@ -105,11 +107,13 @@ class Fit:
             judgement = judge(common, settings, local, where, base, blend=smoother.blend)
         rule = va.bandwidths(where)
         used = bandwidth(rule, settings, judgement.choice)
-        physical = None
-        if smoother.physical:
-            groups = roster.photo if len(roster.numbers) >= 2 else np.arange(len(samples))
-            physical = PhysicalMean(common, judgement.votes, groups, va.scales(used))
-        return cls(pitch, len(samples), widths, local, index, roster, judgement, rule, used, physical)
+        return cls(pitch, len(samples), widths, local, index, roster, judgement, rule, used)
+
+    def warmed(self, samples: Sequence[PsfSample], on_step: StepHook = ignore_step) -> Fit:
+        """Return it with the wavefront of its samples."""
+        groups = self.roster.photo if len(self.roster.numbers) >= 2 else np.arange(len(samples))
+        common, scale = pitches.at_pitch(samples, self.pitch_um), va.scales(self.bandwidth)
+        return replace(self, physical=Physics.fit(common, self.judgement.votes, groups, scale, on_step))
 
     @property
     def nbytes(self) -> int:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from lensmodel.errors import InvalidInputError
 from lensmodel.geometry import zone_of
 from lensmodel.psf import PsfField, PsfSample
+from lensmodel.regression import learned as memory
 from lensmodel.regression import pitch as pitches
 from lensmodel.regression import variables as va
 from lensmodel.regression.answer import ModelSettings, PsfAnswer
@@ -32,7 +33,16 @@ from lensmodel.regression.neighbourhood import Near, Neighbourhood
 from lensmodel.regression.robust import Flag
 from lensmodel.regression.smoothers import smoothers
 from lensmodel.regression.support import field_error, standard_error, support
-from lensmodel.types import ZONES, Channel, FieldPosition, Kernel, LensSettings, Zone
+from lensmodel.types import (
+    ZONES,
+    Channel,
+    FieldPosition,
+    Kernel,
+    LensSettings,
+    StepHook,
+    Zone,
+    ignore_step,
+)
 
 _LISTED = 1e-3
 _WIDEST = 255
@@ -88,7 +98,8 @@ class LensModel:
         """Return the model with more samples.
 
         A handful is put in place without touching the others: bandwidths, widths and cross-validated
-        factors stay until the model has grown by a twentieth; then all is fitted anew.
+        factors stay until the model has grown by a twentieth; then all is fitted anew, and wants to be
+        `warmed` again.
         """
         new = tuple(samples)
         if not new:
@@ -101,6 +112,46 @@ class LensModel:
     def refitted(self, samples: Sequence[PsfSample]) -> LensModel:
         """Return a model of other samples with the settings and prior of this one."""
         return LensModel.fit(samples, self.settings, prior=self.prior)
+
+    @classmethod
+    def restored(
+        cls,
+        samples: Sequence[PsfSample],
+        learned: bytes,
+        settings: ModelSettings | None = None,
+        *,
+        prior: tuple[PsfField | LensModel, float] | None = None,
+    ) -> LensModel:
+        """Build the model that `learned` was taken from, without fitting anything.
+
+        Raises
+        ------
+        InvalidInputError
+            If `learned` is damaged, or belongs to other samples, settings or another version.
+        """
+        settings, kept = settings or ModelSettings(), tuple(samples)
+        return cls(kept, settings, memory.load(learned, kept, settings), prior=prior)
+
+    def learned(self) -> bytes:
+        """What was learned from the samples, the wavefront included if `warm`; see `restored`."""
+        return memory.dump(self._fit, self.samples, self.settings)
+
+    @property
+    def warm(self) -> bool:
+        """Whether nothing is left for `warmed` to do."""
+        return self._fit.physical is not None or not self._neighbourhood.smoother.physical
+
+    def warmed(self, on_step: StepHook = ignore_step) -> LensModel:
+        """Return the model with the wavefront fitted to its samples, if its method has one.
+
+        That takes some seconds of CPU, and the answers are good without it, so it is not done behind
+        anybody's back: call it once when the samples are complete. The same samples give the same model.
+        """
+        if self.warm:
+            return self
+        return LensModel(
+            self.samples, self.settings, self._fit.warmed(self.samples, on_step), prior=self.prior
+        )
 
     def without_photo(self, photo: str) -> LensModel:
         """Return the model without the samples of one photo."""

@@ -4,6 +4,7 @@ Layout of a `.lensprofile`, format 1::
 
     profile.json    format, lens, provenance, settings of the model, one entry for each sample
     kernels.npy     (n, k, k) float32, sum 1, centred, in the order of the entries
+    learned.npz     optional: what the model has learned from them, see `learned`
 
 Nothing in it can run code: no pickle, sizes bounded before arrays are made.
 """
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import math
 import os
 import secrets
@@ -34,6 +36,9 @@ _MAX_BYTES = 1 << 30
 _MAX_SAMPLES = 200_000
 _MAX_SIDE = 255
 _INFINITY = "infinity"
+_LEARNED = "learned.npz"
+
+log = logging.getLogger(__name__)
 _UNREADABLE = (
     OSError,
     ValueError,
@@ -87,6 +92,7 @@ def save_profile(path: Path | str, profile: LensProfile) -> None:
             with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
                 archive.writestr("profile.json", json.dumps(document, allow_nan=False))
                 archive.writestr("kernels.npy", arrays.getvalue())
+                archive.writestr(_LEARNED, profile.model.learned(), zipfile.ZIP_STORED)
             file.flush()
             os.fsync(file.fileno())
         part.replace(target)
@@ -113,6 +119,7 @@ def load_profile(path: Path | str) -> LensProfile:
                 )
             document = json.loads(archive.read("profile.json"))
             stack = np.load(io.BytesIO(archive.read("kernels.npy")), allow_pickle=False)
+            learned = archive.read(_LEARNED) if _LEARNED in sizes else None
     except FileNotFoundError:
         raise
     except _UNREADABLE as error:
@@ -136,7 +143,7 @@ def load_profile(path: Path | str) -> LensProfile:
                 f"one is needed for each, of side {_MAX_SIDE} at most"
             )
         samples = [_sample(entry, kernel) for entry, kernel in zip(entries, stack, strict=True)]
-        model = LensModel.fit(samples, _settings(document["model"]))
+        model = _model(samples, _settings(document["model"]), learned)
         return LensProfile(model, _texts(document["lens"]), _texts(document["photos"]))
     except LensModelError:
         raise
@@ -172,6 +179,15 @@ def _sample(entry: dict[str, Any], kernel: Any) -> PsfSample:  # noqa: ANN401 - 
         pixel_pitch_um=entry["pixel_pitch_um"],
         estimator=str(entry["estimator"]),
     )
+
+
+def _model(samples: list[PsfSample], settings: ModelSettings, learned: bytes | None) -> LensModel:
+    if learned is not None:
+        try:
+            return LensModel.restored(samples, learned, settings)
+        except InvalidInputError as error:
+            log.info("the profile's model is fitted anew: %s", error)
+    return LensModel.fit(samples, settings)
 
 
 def _settings(values: dict[str, Any]) -> ModelSettings:

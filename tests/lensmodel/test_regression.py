@@ -50,9 +50,7 @@ def difference(a: Kernel, b: Kernel) -> float:
     return float(np.linalg.norm(a - b) / np.linalg.norm(b))
 
 
-METHODS = [
-    pytest.param(name, marks=pytest.mark.slow) if name == "combined" else name for name in sorted(smoothers)
-]
+METHODS = sorted(smoothers)
 
 
 @pytest.mark.parametrize("method", METHODS)

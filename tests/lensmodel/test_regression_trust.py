@@ -298,3 +298,57 @@ class TestProfile:
             path.write_bytes(data)
             with contextlib.suppress(InvalidInputError):  # anything else fails the test
                 assert len(load_profile(path).model.samples) == 3
+
+    def test_opens_without_what_was_learned(self, tmp_path: Path) -> None:
+        path, where = tmp_path / "a.lensprofile", FieldPosition(0.5, 0.5)
+        save_profile(path, self.profile())
+        known = load_profile(path).model.query(where, GREEN, SIZE)
+        with zipfile.ZipFile(path) as archive:
+            parts = {name: archive.read(name) for name in ("profile.json", "kernels.npy")}
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, data in parts.items():
+                archive.writestr(name, data)
+
+        again = load_profile(path).model.query(where, GREEN, SIZE)
+
+        assert np.abs(again.kernel - known.kernel).max() <= 1e-6
+
+
+class TestLearned:
+    def test_gives_the_same_answers_without_a_fit(self, good: list[list[PsfSample]]) -> None:
+        model = LensModel.fit(merged(good[:3])).added(good[3][:2])
+        again = LensModel.restored(model.samples, model.learned())
+
+        for where in places(4, 2):
+            a, b = model.query(where, GREEN, SIZE), again.query(where, GREEN, SIZE)
+            assert np.array_equal(a.kernel, b.kernel)
+            assert a.predicted_error == b.predicted_error
+        assert again.flags() == model.flags()
+        assert again.added(good[4]).samples == model.added(good[4]).samples
+
+    def test_keeps_the_wavefront(self, good: list[list[PsfSample]]) -> None:
+        model, where = LensModel.fit(good[0]).warmed(), FieldPosition(0.9, 0.5)
+        again = LensModel.restored(model.samples, model.learned())
+
+        assert again.warm
+        assert np.array_equal(again.query(where, GREEN, SIZE).kernel, model.query(where, GREEN, SIZE).kernel)
+
+    def test_of_other_samples_is_refused(self, good: list[list[PsfSample]]) -> None:
+        learned = LensModel.fit(good[0]).learned()
+
+        with pytest.raises(InvalidInputError, match="other samples"):
+            LensModel.restored(good[1], learned)
+        with pytest.raises(InvalidInputError, match="other samples"):
+            LensModel.restored(good[0], learned, ModelSettings(method="blended"))
+
+    def test_damaged_is_refused_or_harmless(self, good: list[list[PsfSample]]) -> None:
+        samples = good[0][:4]
+        whole, rng = LensModel.fit(samples).learned(), np.random.default_rng(0)
+        damaged = [whole[: int(n)] for n in rng.integers(0, len(whole), 10)]
+        for at in rng.integers(0, len(whole), 30):
+            changed = bytearray(whole)
+            changed[at] ^= 0xFF
+            damaged.append(bytes(changed))
+        for data in damaged:
+            with contextlib.suppress(InvalidInputError):  # anything else fails the test
+                assert len(LensModel.restored(samples, data).samples) == 4

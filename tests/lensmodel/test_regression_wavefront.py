@@ -73,7 +73,11 @@ class TestCombined:
         samples, corner = of_lens(4, 1), FieldPosition(0.97, 0.58)
         truth = draw_lens(4).kernel(corner, None, 21)
         plain = LensModel.fit(samples).query(corner, LensSettings(), 21)
-        combined = LensModel.fit(samples, ModelSettings(method="combined")).query(corner, LensSettings(), 21)
+        combined = (
+            LensModel.fit(samples, ModelSettings(method="combined"))
+            .warmed()
+            .query(corner, LensSettings(), 21)
+        )
 
         assert plain.wavefront_share == 0.0
         assert combined.wavefront_share > 0.5
@@ -90,7 +94,7 @@ class TestCombined:
         asked = [FieldPosition(r, a) for r in (0.2, 0.5, 0.8) for a in (-2.0, 0.3, 2.2)]
 
         def error(method: str) -> float:
-            model = LensModel.fit(samples, ModelSettings(method=method))
+            model = LensModel.fit(samples, ModelSettings(method=method)).warmed()
             kernels = [(model.query(p, LensSettings(), 21).kernel, spots(p)) for p in asked]
             return float(np.mean([distance(k, t).rel_l2 for k, t in kernels]))
 
@@ -101,8 +105,28 @@ class TestCombined:
             PsfSample(s.kernel, s.position, LensSettings(focal_mm=24.0 if i % 2 else 70.0), photo=s.photo)
             for i, s in enumerate(of_lens(4, 2))
         ]
-        answer = LensModel.fit(samples, ModelSettings(method="combined")).query(
-            FieldPosition(0.3, 0.2), LensSettings(focal_mm=24.0), 21
+        answer = (
+            LensModel.fit(samples, ModelSettings(method="combined"))
+            .warmed()
+            .query(FieldPosition(0.3, 0.2), LensSettings(focal_mm=24.0), 21)
         )
 
         assert answer.wavefront_share == 0.0
+
+    def test_waits_for_the_wavefront_until_it_is_asked_to_be_warm(self) -> None:
+        model = LensModel.fit(of_lens(4, 2))
+        steps: list[tuple[int, int]] = []
+        warm = model.warmed(lambda done, total: steps.append((done, total)))
+
+        assert not model.warm
+        assert model.query(FieldPosition(0.5, 0.2), LensSettings(), 21).wavefront_share == 0.0
+        assert warm.warm
+        assert warm.warmed() is warm
+        assert warm.query(FieldPosition(0.5, 0.2), LensSettings(), 21).wavefront_share > 0.0
+        assert steps[-1][0] == steps[-1][1]
+
+    def test_same_samples_give_the_same_wavefront(self) -> None:
+        samples, corner = of_lens(2, 1), FieldPosition(0.97, 0.58)
+        one, two = (LensModel.fit(samples).warmed().query(corner, LensSettings(), 21) for _ in range(2))
+
+        assert np.array_equal(one.kernel, two.kernel)

@@ -1,0 +1,198 @@
+"""What a model has learned from its samples, as bytes: so that nobody has to fit it twice.
+
+An npz archive without pickle: a JSON document and arrays. It belongs to certain samples in a certain
+order and to the settings they were fitted with; both are checked when it is opened.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.errors import InvalidInputError
+from lensmodel.psf import PsfSample
+from lensmodel.regression import pitch as pitches
+from lensmodel.regression import variables as va
+from lensmodel.regression.answer import ModelSettings
+from lensmodel.regression.fitting import Fit, Roster
+from lensmodel.regression.index import SampleIndex
+from lensmodel.regression.judgement import Judgement
+from lensmodel.regression.kriging import ImageFrame
+from lensmodel.regression.local import LocalKernels
+from lensmodel.regression.physical import Physics
+from lensmodel.regression.robust import Flag
+from lensmodel.regression.transport import WidthField
+from lensmodel.regression.validation import Choice
+from lensmodel.regression.wavefront import NAMES, Wavefront
+
+VERSION: Final = 1
+"""Raised whenever the same samples would be fitted otherwise."""
+
+_MOST_BYTES = 1 << 27
+_MOST_NODES = 4096
+_DAMAGED = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    IndexError,
+    EOFError,
+    MemoryError,
+    RecursionError,
+    RuntimeError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+Arrays = dict[str, NDArray[np.float64]]
+
+
+def dump(fit: Fit, samples: Sequence[PsfSample], settings: ModelSettings) -> bytes:
+    """Write what was learned from samples with settings."""
+    judgement, image, physical = fit.judgement, fit.judgement.image, fit.physical
+    arrays: Arrays = {
+        "votes": judgement.votes,
+        "errors": judgement.errors,
+        "noise": judgement.noise,
+    }
+    document: dict[str, Any] = {
+        "version": VERSION,
+        "belongs": _belongs(samples, settings),
+        "size": fit.size,
+        "rule": fit.rule,
+        "bandwidth": fit.bandwidth,
+        "choice": asdict(judgement.choice),
+        "flags": [asdict(flag) for flag in judgement.flags],
+        "widths": {k: v for k, v in _scalars(fit.widths).items() if k != "slopes"},
+    }
+    if fit.widths.slopes is not None:
+        arrays["widths.slopes"] = fit.widths.slopes
+    if image is not None and judgement.image_errors is not None:
+        arrays |= {"image_errors": judgement.image_errors, **_arrays("image", image)}
+        document["image"] = _scalars(image)
+    if physical is not None:
+        arrays |= _arrays("physical", physical)
+        arrays["front.terms"] = physical.front.terms
+        document |= {"physical": _scalars(physical), "front": _scalars(physical.front)}
+    text = np.frombuffer(json.dumps(document, allow_nan=True).encode(), dtype=np.uint8)
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, document=text, **arrays)
+    return buffer.getvalue()
+
+
+def load(data: bytes, samples: Sequence[PsfSample], settings: ModelSettings) -> Fit:
+    """Open what `dump` wrote.
+
+    Raises
+    ------
+    InvalidInputError
+        If it is damaged, of another version, or belongs to other samples or settings.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
+                raise InvalidInputError("what was learned unpacks to too much; fit the model again")
+        with np.load(io.BytesIO(data), allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        document = json.loads(arrays.pop("document").tobytes())
+        if document["version"] != VERSION or document["belongs"] != _belongs(samples, settings):
+            raise InvalidInputError("what was learned belongs to other samples or another version; fit again")
+        return _fit(document, _checked(arrays, len(samples)), samples)
+    except _DAMAGED as error:
+        raise InvalidInputError(f"what was learned is damaged ({error}); fit the model again") from error
+
+
+def _belongs(samples: Sequence[PsfSample], settings: ModelSettings) -> str:
+    """Checksum of settings and of what names the samples: their pixels are rounded when they are stored."""
+    found = zlib.crc32(json.dumps(asdict(settings), sort_keys=True).encode())
+    for s in samples:
+        named = (s.photo, s.estimator, round(s.weight, 6), s.pixel_pitch_um, s.kernel.shape[0], s.settings)
+        found = zlib.crc32(f"{named} {s.position.r:.6f} {s.position.phi:.6f}".encode(), found)
+    return f"{len(samples)}-{found:08x}"
+
+
+def _scalars(value: Any) -> dict[str, Any]:  # noqa: ANN401 - any of the frozen values here
+    named = {name: getattr(value, name) for name in value.__dataclass_fields__}
+    return {
+        k: list(v) if isinstance(v, tuple) else v
+        for k, v in named.items()
+        if not isinstance(v, (np.ndarray, Wavefront))
+    }
+
+
+def _arrays(prefix: str, value: Any) -> Arrays:  # noqa: ANN401 - likewise
+    named = {name: getattr(value, name) for name in value.__dataclass_fields__}
+    return {f"{prefix}.{k}": v for k, v in named.items() if isinstance(v, np.ndarray)}
+
+
+def _checked(arrays: Mapping[str, NDArray[Any]], count: int) -> Arrays:
+    found: Arrays = {}
+    for name, values in arrays.items():
+        numbers = np.asarray(values, dtype=np.float64)
+        # an unknown setting is NaN, and only points have settings
+        if not name.endswith("where") and not np.isfinite(numbers).all():
+            raise ValueError(f"{name} is not finite")
+        if name in {"votes", "errors", "noise", "image_errors", "physical.errors"} and len(numbers) != count:
+            raise ValueError(f"{name} has {len(numbers)} entries for {count} samples")
+        if numbers.ndim and len(numbers) > max(count, _MOST_NODES):
+            raise ValueError(f"{name} has {len(numbers)} entries")
+        found[name] = numbers
+    return found
+
+
+def _of(arrays: Arrays, prefix: str) -> dict[str, Any]:
+    return {name.partition(".")[2]: v for name, v in arrays.items() if name.startswith(f"{prefix}.")}
+
+
+def _fit(document: Mapping[str, Any], arrays: Arrays, samples: Sequence[PsfSample]) -> Fit:
+    pitch = pitches.usual_pitch(samples)
+    common = pitches.at_pitch(samples, pitch)
+    where = va.points(common)
+    widths = WidthField(slopes=arrays.get("widths.slopes"), **document["widths"])
+    local = LocalKernels.of(common, where, widths)
+    image, physical = None, None
+    if "image" in document:
+        image = ImageFrame(**document["image"], **_of(arrays, "image"))
+        if image.rest.shape != (len(image.vectors), image.mean.size):
+            raise ValueError("the image frame does not fit together")
+    if "physical" in document:
+        values = dict(document["front"])
+        front = Wavefront(arrays["front.terms"], **{**values, "eye": tuple(values["eye"])})
+        physical = Physics(front=front, **document["physical"], **_of(arrays, "physical"))
+        if front.terms.shape != (len(NAMES),) or physical.rest.shape != (
+            len(physical.vectors),
+            physical.side**2,
+        ):
+            raise ValueError("the wavefront does not fit together")
+    judgement = Judgement(
+        votes=arrays["votes"],
+        errors=arrays["errors"],
+        noise=arrays["noise"],
+        choice=Choice(**document["choice"]),
+        flags=tuple(Flag(**flag) for flag in document["flags"]),
+        image=image,
+        image_errors=arrays.get("image_errors"),
+    )
+    rule = {str(k): float(v) for k, v in document["rule"].items()}
+    used = {str(k): float(v) for k, v in document["bandwidth"].items()}
+    va.scales(rule), va.scales(used)
+    return Fit(
+        pitch_um=pitch,
+        size=int(document["size"]),
+        widths=widths,
+        local=local,
+        index=SampleIndex.of(where),
+        roster=Roster.of(common),
+        judgement=judgement,
+        rule=rule,
+        bandwidth=used,
+        physical=physical,
+    )

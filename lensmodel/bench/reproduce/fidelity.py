@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -21,16 +23,16 @@ EVERY: Final = 120
 _LARGEST_SHIFT = 3.0
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class _Sum:
+    """Squared errors and SSIM of the pixels of a zone, summed."""
+
     error: float = 0.0
     likeness: float = 0.0
     count: int = 0
 
-
-@dataclass(slots=True)
-class _Sums:
-    zones: dict[Zone, _Sum] = field(default_factory=lambda: {zone: _Sum() for zone in ZONES})
+    def plus(self, other: _Sum) -> _Sum:
+        return _Sum(self.error + other.error, self.likeness + other.likeness, self.count + other.count)
 
 
 def fidelity(image: Planes, reference: Planes, frame: Frame) -> dict[str, dict[str, float]]:
@@ -53,11 +55,17 @@ def fidelity(image: Planes, reference: Planes, frame: Frame) -> dict[str, dict[s
     """
     wanted, found = quality.to_srgb(reference), quality.to_srgb(image)
     radius = frame.radius_map()
-    sums = _Sums()
-    for row, col in blocks(frame):
-        window = (..., slice(row, row + BLOCK), slice(col, col + BLOCK))
-        _add(sums, found[window], wanted[window], radius[window])
-    seen = {zone: s for zone, s in sums.zones.items() if s.count}
+
+    def compared(corner: tuple[int, int]) -> dict[Zone, _Sum]:
+        rows, cols = (slice(start, start + BLOCK) for start in corner)
+        return _compared(found[:, rows, cols], wanted[:, rows, cols], radius[rows, cols])
+
+    sums = dict.fromkeys(ZONES, _Sum())
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        # in the order of the blocks: the same sum for any number of threads
+        for part in pool.map(compared, blocks(frame)):
+            sums = {zone: total.plus(part[zone]) for zone, total in sums.items()}
+    seen = {zone: s for zone, s in sums.items() if s.count}
     return {
         "psnr": {z: float(-10.0 * np.log10(max(s.error / s.count, 1e-30))) for z, s in seen.items()},
         "ssim": {z: s.likeness / s.count for z, s in seen.items()},
@@ -76,9 +84,10 @@ def _starts(length: int) -> list[int]:
     return [*range(0, length - BLOCK, BLOCK - 2 * BORDER), length - BLOCK]
 
 
-def _add(
-    sums: _Sums, found: NDArray[np.float64], wanted: NDArray[np.float64], radius: NDArray[np.floating]
-) -> None:
+def _compared(
+    found: NDArray[np.float64], wanted: NDArray[np.float64], radius: NDArray[np.floating]
+) -> dict[Zone, _Sum]:
+    """Compare one block at its best shift."""
     shift = quality.best_shift(found, wanted)
     if max(map(abs, shift)) > _LARGEST_SHIFT:
         shift = (0.0, 0.0)  # nothing in the block says where it lies
@@ -95,8 +104,7 @@ def _add(
     r = radius[core]
     masks: dict[Zone, NDArray[np.bool_]] = {"center": r < CENTER_ZONE_R, "corner": r > CORNER_ZONE_R}
     masks["mid"] = ~(masks["center"] | masks["corner"])
-    for zone, mask in masks.items():
-        total = sums.zones[zone]
-        total.error += float(error[mask].sum())
-        total.likeness += float(likeness[mask].sum())
-        total.count += int(mask.sum())
+    return {
+        zone: _Sum(float(error[mask].sum()), float(likeness[mask].sum()), int(mask.sum()))
+        for zone, mask in masks.items()
+    }

@@ -29,8 +29,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         store = Store(chosen)
-        cache = ModelCache(store, chosen.model_cache_mb * MIB)
-        app.state.services = Services(chosen, store, Storage(chosen.storage), cache)
+        storage = Storage(chosen.storage)
+        cache = ModelCache(store, chosen.model_cache_mb * MIB, storage)
+        app.state.services = Services(chosen, store, storage, cache)
         yield
         store.close()
 

@@ -8,32 +8,45 @@ without messages between processes and without waiting for something to expire.
 from __future__ import annotations
 
 import logging
+import math
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from app.errors import ConflictError, UnknownLensError
+from app.storage import Storage
 from app.store import Store, StoredSample
 from app.store.samples import LensState
-from lensmodel.errors import NoSamplesError
+from app.store.versions import learned_key
+from lensmodel.errors import InvalidInputError, NoSamplesError
+from lensmodel.psf import PsfSample
 from lensmodel.regression import LensModel
 
 log = logging.getLogger(__name__)
 
+LOOK_S = 1.0
+"""How often to look whether a worker has learned more."""
+
 BYTES_FACTOR = 4
-"""A fitted model keeps its samples resampled and rotated: some copies of each."""
+"""A fitted model keeps its samples as splines besides: some copies of each."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
-    """A model and the state of the lens that it belongs to."""
+    """A model and the state of the lens that it belongs to.
+
+    `learned` says that a worker has fitted it wholly. Until then requests are answered by a model
+    without the wavefront of the lens, which takes seconds to fit.
+    """
 
     lens_id: str
     state: LensState
     model: LensModel
     pixel_pitch_um: float | None
     size_bytes: int
+    learned: bool
 
 
 class ModelCache:
@@ -45,10 +58,13 @@ class ModelCache:
         Where the samples are.
     max_bytes : int
         Bound of what is kept, by estimate; the model in use is kept in any case.
+    storage : Storage, optional
+        Where workers keep what they have learned from samples.
     """
 
-    def __init__(self, store: Store, max_bytes: int) -> None:
-        self._store, self._max_bytes = store, max_bytes
+    def __init__(self, store: Store, max_bytes: int, storage: Storage | None = None) -> None:
+        self._store, self._max_bytes, self._storage = store, max_bytes, storage
+        self._asked: dict[str, float] = {}
         self._models: OrderedDict[tuple[str, int | None], Fitted] = OrderedDict()
         self._guard = threading.Lock()
         self._building: dict[str, threading.Lock] = {}
@@ -73,13 +89,32 @@ class ModelCache:
         if version is not None and version != state.version:
             return self._earlier(lens_id, version, state)
         found = self._recall((lens_id, None))
-        if found is not None and found.state == state:
+        if found is not None and found.state == state and not self._outdone(found):
             return found
         with self._lock_of(lens_id):  # one thread fits, the others wait for its result
             found = self._recall((lens_id, None))
-            if found is not None and found.state == self._store.samples.state_of(lens_id):
+            same = found is not None and found.state == self._store.samples.state_of(lens_id)
+            if found is not None and same and not self._outdone(found):
                 return found
-            return self._keep((lens_id, None), self._build(lens_id, found))
+            return self._keep((lens_id, None), self._build(lens_id, None if same else found))
+
+    def _outdone(self, fitted: Fitted) -> bool:
+        """Whether a worker has learned more of these samples; looked up now and then."""
+        if fitted.learned or self._storage is None:
+            return False
+        key = learned_key(fitted.lens_id, fitted.state.version, fitted.state.rebuild_epoch)
+        now = time.monotonic()
+        with self._guard:
+            if now - self._asked.get(key, -math.inf) < LOOK_S:
+                return False
+            self._asked = {key: now, **{k: t for k, t in self._asked.items() if now - t < LOOK_S}}
+        try:
+            self._storage.info(key)
+        except FileNotFoundError:
+            return False
+        with self._guard:
+            self._asked.pop(key, None)
+        return True
 
     def _build(self, lens_id: str, old: Fitted | None) -> Fitted:
         if old is not None:
@@ -87,9 +122,9 @@ class ModelCache:
             if state.rebuild_epoch == old.state.rebuild_epoch:
                 model = old.model.added([stored.sample for stored in samples]) if samples else old.model
                 size = old.size_bytes + _size(samples)
-                return Fitted(lens_id, state, model, old.pixel_pitch_um, size)
+                return Fitted(lens_id, state, model, old.pixel_pitch_um, size, learned=False)
         state, samples = self._store.samples.of_lens(lens_id)
-        return _fit(lens_id, state, samples)
+        return self._fit(lens_id, state, samples)
 
     def _earlier(self, lens_id: str, version: int, state: LensState) -> Fitted:
         check_version(self._store, lens_id, version, state)
@@ -99,7 +134,31 @@ class ModelCache:
             if found is not None and found.state.rebuild_epoch == state.rebuild_epoch:
                 return found
             _, samples = self._store.samples.of_lens(lens_id, up_to_version=version)
-            return self._keep(key, _fit(lens_id, LensState(version, state.rebuild_epoch), samples))
+            return self._keep(key, self._fit(lens_id, LensState(version, state.rebuild_epoch), samples))
+
+    def _fit(self, lens_id: str, state: LensState, samples: Sequence[StoredSample]) -> Fitted:
+        if not samples:
+            raise NoSamplesError(
+                f"lens {lens_id} has no samples yet (version {state.version}): "
+                "upload photos taken with it and wait until they are counted"
+            )
+        values = [stored.sample for stored in samples]
+        model = self._restored(lens_id, state, values)
+        learned = model is not None
+        pitch = next((s.pixel_pitch_um for s in reversed(values) if s.pixel_pitch_um), None)
+        return Fitted(lens_id, state, model or LensModel.fit(values), pitch, _size(samples), learned)
+
+    def _restored(self, lens_id: str, state: LensState, samples: Sequence[PsfSample]) -> LensModel | None:
+        if self._storage is None:
+            return None
+        try:
+            stored = self._storage.get(learned_key(lens_id, state.version, state.rebuild_epoch))
+            return LensModel.restored(samples, stored)
+        except FileNotFoundError:
+            return None
+        except InvalidInputError as error:
+            log.info("model of lens %s is fitted here: %s", lens_id, error)
+            return None
 
     def _lock_of(self, lens_id: str) -> threading.Lock:
         with self._guard:
@@ -141,17 +200,6 @@ def check_version(store: Store, lens_id: str, version: int, state: LensState) ->
             f"version {version} of lens {lens_id} is gone: version {gone[0]} removed or changed photos; "
             f"ask for version {state.version}, or leave the version out"
         )
-
-
-def _fit(lens_id: str, state: LensState, samples: Sequence[StoredSample]) -> Fitted:
-    if not samples:
-        raise NoSamplesError(
-            f"lens {lens_id} has no samples yet (version {state.version}): "
-            "upload photos taken with it and wait until they are counted"
-        )
-    model = LensModel.fit([stored.sample for stored in samples])
-    pitch = next((s.sample.pixel_pitch_um for s in reversed(samples) if s.sample.pixel_pitch_um), None)
-    return Fitted(lens_id, state, model, pitch, _size(samples))
 
 
 def _size(samples: Sequence[StoredSample]) -> int:

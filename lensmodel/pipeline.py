@@ -423,9 +423,10 @@ def correct_photo(
     roi : tuple of int, optional
         `(row, col, height, width)` in sensor orientation; only that part is corrected.
     """
+    model, pitch_um = model.warmed(), developed.info.metadata.pixel_pitch_um
 
     def psf_error(position: FieldPosition, channel: Channel) -> float:
-        answer = model.query(position, settings.with_channel(channel), size=15)
+        answer = model.query(position, settings.with_channel(channel), size=15, pitch_um=pitch_um)
         error = answer.predicted_error if math.isfinite(answer.predicted_error) else 1.0
         return math.hypot(error, BLIND_BIAS)
 
@@ -436,7 +437,7 @@ def correct_photo(
         planes, lateral, cfa = resample(planes, developed.frame, lateral), None, None
     return deconv.correct_planes(
         planes,
-        model.field(settings),
+        model.field(settings, pitch_um=pitch_um),
         developed.frame,
         method=method,
         strength=strength,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -61,6 +61,7 @@ def run(names: Sequence[str], target: Path, wishes: Wishes, display: Display, *,
                 display.note(f"{path}: the profile has it already")
             results.append({"photo": str(path), **result})
             bars.update(task, completed=number + 1)
+    calibration.finish()
     profile = calibration.profile
     summary = {
         "profile": str(target) if profile else None,
@@ -106,6 +107,13 @@ class _Calibration:
     ) -> None:
         self.profile = profile
         self._target, self._wishes, self._settings = target, wishes, settings
+        self._grown = False
+
+    def finish(self) -> None:
+        """Fit what takes long and need be done only once, when all photos are in."""
+        if self.profile is not None and self._grown:
+            self.profile = replace(self.profile, model=self.profile.model.warmed())
+            save_profile(self._target, self.profile)
 
     def add(self, path: Path, on_event: pipeline.EventHook) -> dict[str, Any]:
         """Learn from one photo; say what became of it."""
@@ -131,5 +139,5 @@ class _Calibration:
         model = self.profile.model.added(samples) if self.profile else LensModel.fit(samples)
         grown = LensProfile(model, seen | lens, {**names, key: path.name})
         save_profile(self._target, grown)
-        self.profile = grown
+        self.profile, self._grown = grown, True
         return {"state": "counted", "samples": len(samples)}

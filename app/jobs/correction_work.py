@@ -7,12 +7,13 @@ import logging
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any, Final
 
 from app.jobs.child import Progress
-from app.jobs.handover import SUFFIX
+from app.jobs.handover import LEARNED, SUFFIX
 from app.jobs.sandbox import Limits
 from app.jobs.workbench import (
     SPARE_MB,
@@ -23,6 +24,8 @@ from app.jobs.workbench import (
     write_samples,
 )
 from app.store.corrections import CorrectionPlan, Result
+from app.store.samples import LensState
+from app.store.versions import learned_key
 
 log = logging.getLogger(__name__)
 
@@ -97,12 +100,16 @@ class CorrectionWork:
             )
             self._hand_in(plan, folder / Path(done["file"]).name, done["zones"])
 
-    def _samples(self, lens_id: str, version: int, folder: Path) -> None:
-        _, stored = self._bench.store.samples.of_lens(lens_id, up_to_version=version)
+    def _samples(self, lens_id: str, version: int, folder: Path) -> LensState:
+        state, stored = self._bench.store.samples.of_lens(lens_id, up_to_version=version)
         if not stored:
             text = f"version {version} of lens {lens_id} has no samples any more; ask for the newest version"
             raise JobFailedError("no_samples", text)
         write_samples(folder, stored)
+        key = learned_key(lens_id, version, state.rebuild_epoch)
+        with suppress(FileNotFoundError):  # not learned yet: the task does it
+            (folder / LEARNED).write_bytes(self._bench.storage.get(key))
+        return state
 
     def _teller(self, correction_id: str) -> Progress:
         last = 0.0
@@ -143,14 +150,21 @@ class CorrectionWork:
         limits = Limits(memory_mb=2 * SPARE_MB, wall_s=self._bench.settings.patch_seconds)
         try:
             with self._bench.sandbox.folder() as folder:
-                self._samples(lens_id, version, folder)
+                state = self._samples(lens_id, version, folder)
                 metrics = self._bench.attempt("measure", {}, folder=folder, limits=limits, wanted=wanted)
+                self._keep_learned(lens_id, version, state, folder / LEARNED)
         except NotWantedError:
             return
         except JobFailedError as error:
             log.warning("lens %s version %d could not be measured: %s", lens_id, version, error.detail)
             metrics = {"error": None, "coverage": None, "problem": error.code}
         lenses.record_metrics(lens_id, version, metrics)
+
+    def _keep_learned(self, lens_id: str, version: int, state: LensState, path: Path) -> None:
+        """Keep what was learned of the newest version for every process that answers questions."""
+        if path.is_file():
+            key = learned_key(lens_id, version, state.rebuild_epoch)
+            self._bench.storage.put_file(key, path)
 
 
 def _description(plan: CorrectionPlan) -> str:

@@ -11,6 +11,9 @@ KERNELS: Final = "kernels.npy"
 SAMPLES: Final = "samples.json"
 """What else belongs to each of the kernels."""
 
+LEARNED: Final = "learned.npz"
+"""What a model has learned from the samples."""
+
 SUFFIX: Final[Mapping[str, str]] = {
     "tiff16": ".tif",
     "png16": ".png",

@@ -16,9 +16,9 @@ from typing import Any, Final
 import numpy as np
 
 from app.jobs.child import Progress, Task
-from app.jobs.handover import INFINITY, KERNELS, SAMPLES, SUFFIX
+from app.jobs.handover import INFINITY, KERNELS, LEARNED, SAMPLES, SUFFIX
 from lensmodel import codec, photo, pipeline
-from lensmodel.errors import LensModelError
+from lensmodel.errors import InvalidInputError, LensModelError
 from lensmodel.patches import Patch
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.psf import PsfSample
@@ -134,9 +134,13 @@ def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
 
 
 def measure(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
-    """Say how well the model of the samples in the folder predicts photos that it was not shown."""
-    del arguments, progress
-    model = _model(folder)
+    """Say how well the model of the samples in the folder predicts photos that it was not shown.
+
+    What the model has learned, the wavefront of the lens included, is written to the folder.
+    """
+    del arguments
+    model = _model(folder).warmed(progress)
+    (folder / LEARNED).write_bytes(model.learned())
     error = codec.to_json(model.cross_validate())
     return {"error": _numbers(error), "coverage": _numbers(codec.to_json(model.coverage()))}
 
@@ -177,6 +181,12 @@ def _model(folder: Path) -> LensModel:
                 estimator=entry["estimator"],
             )
         )
+    learned = folder / LEARNED
+    if learned.is_file():
+        try:
+            return LensModel.restored(samples, learned.read_bytes())
+        except InvalidInputError as error:
+            log.info("the model is fitted anew: %s", error)
     return LensModel.fit(samples)
 
 

@@ -11,6 +11,7 @@ from fastapi import APIRouter, Query, Response, status
 from app import encode
 from app.dependencies import Call, CallDep
 from app.errors import InvalidParameterError, NotAcceptableError, UnknownLensError
+from app.models import Fitted
 from app.routes.common import Answers, problems
 from app.schemas import FieldQuery, PsfOut, PsfQuery, QueryOut
 from app.store.samples import LensState
@@ -86,10 +87,9 @@ def accepted(header: str) -> Format:
 
 
 def _answer(lens_id: str, at: PsfQuery, form: Format, call: Call) -> Response:
-    state = _state(call, lens_id)
-    pinned = at.version is not None
-    asked = LensState(at.version, state.rebuild_epoch) if at.version is not None else state
-    tag = etag(lens_id, asked, f"{at.model_dump_json()}{form}")
+    fitted = call.models.get(lens_id, at.version, state=_state(call, lens_id))
+    pinned = at.version is not None and fitted.learned
+    tag = etag(fitted, f"{at.model_dump_json()}{form}")
     headers = {
         "ETag": tag,
         "Cache-Control": "private, max-age=3600" if pinned else "private, no-cache",
@@ -97,8 +97,6 @@ def _answer(lens_id: str, at: PsfQuery, form: Format, call: Call) -> Response:
     }
     if _matches(call, tag):
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
-    fitted = call.models.get(lens_id, at.version, state=state)
-    headers["ETag"] = etag(lens_id, fitted.state, f"{at.model_dump_json()}{form}")
     position = FieldPosition(at.r, at.phi)
     setting = LensSettings(at.aperture, at.focal_length_mm, at.focus_distance_m, at.channel)
     answer = fitted.model.query(position, setting, size=at.size)
@@ -128,10 +126,11 @@ def _state(call: Call, lens_id: str) -> LensState:
     return state
 
 
-def etag(lens_id: str, state: LensState, question: str) -> str:
-    """Return a strong tag: the same question to the same samples has the same answer."""
+def etag(fitted: Fitted, question: str) -> str:
+    """Return a strong tag: the same question to the same model of the same samples has the same answer."""
     digest = hashlib.sha256(question.encode()).hexdigest()[:12]
-    return f'"{lens_id}-v{state.version}-e{state.rebuild_epoch}-{digest}"'
+    state, sort = fitted.state, "l" if fitted.learned else "p"
+    return f'"{fitted.lens_id}-v{state.version}-e{state.rebuild_epoch}-{sort}-{digest}"'
 
 
 def _matches(call: Call, tag: str) -> bool:
@@ -161,13 +160,11 @@ def read_field(lens_id: str, at: Annotated[FieldQuery, Query()], call: CallDep) 
     columns, rows = (int(count) for count in at.grid.split("x"))
     if not (1 <= columns <= MAX_GRID and 1 <= rows <= MAX_GRID):
         raise InvalidParameterError(f"grid {at.grid}: columns and rows must lie in 1..{MAX_GRID}, as in 9x6")
-    state = _state(call, lens_id)
-    tag = etag(lens_id, state, at.model_dump_json())
+    fitted = call.models.get(lens_id, state=_state(call, lens_id))
+    tag = etag(fitted, at.model_dump_json())
     headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
     if _matches(call, tag):
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
-    fitted = call.models.get(lens_id, state=state)
-    headers["ETag"] = etag(lens_id, fitted.state, at.model_dump_json())
     setting = LensSettings(at.aperture, at.focal_length_mm, at.focus_distance_m, at.channel)
     picture = encode.field_map(
         fitted.model.field(setting), at.channel, columns=columns, rows=rows, size=at.size, gamma=at.gamma

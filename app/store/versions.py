@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from datetime import timedelta
+from typing import Final
+
 from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
-from app.tables import LensRow, PhotoRow, SampleRow
+from app.store.database import insert_new
+from app.store.owners import now
+from app.tables import GarbageRow, LensRow, PhotoRow, SampleRow
+
+STILL_WRITTEN: Final = timedelta(minutes=30)
+"""A worker may be learning from the version before while the next one comes."""
 
 
 def new_version(session: Session, lens_id: int, *, rebuild: bool = False) -> int:
@@ -15,12 +23,27 @@ def new_version(session: Session, lens_id: int, *, rebuild: bool = False) -> int
     that belong to them become visible in the same order. `rebuild` says that samples went away
     or changed: models in memory must be fitted anew instead of extended.
     """
-    return session.execute(
+    raised = 1 if rebuild else 0
+    version, epoch, public_id = session.execute(
         update(LensRow)
         .where(LensRow.id == lens_id)
-        .values(version=LensRow.version + 1, rebuild_epoch=LensRow.rebuild_epoch + (1 if rebuild else 0))
-        .returning(LensRow.version)
-    ).scalar_one()
+        .values(version=LensRow.version + 1, rebuild_epoch=LensRow.rebuild_epoch + raised)
+        .returning(LensRow.version, LensRow.rebuild_epoch, LensRow.public_id)
+    ).one()
+    if version > 1:  # before the first there was nothing to learn from
+        outdated = learned_prefix(public_id, version - 1, epoch - raised)
+        insert_new(session, GarbageRow, [{"prefix": outdated, "not_before": now() + STILL_WRITTEN}])
+    return int(version)
+
+
+def learned_prefix(lens_id: str, version: int, epoch: int) -> str:
+    """Where workers keep what they have learned from the samples of one version of a lens."""
+    return f"models/{lens_id}/{version}-{epoch}/"
+
+
+def learned_key(lens_id: str, version: int, epoch: int) -> str:
+    """Key of the blob in `learned_prefix`."""
+    return f"{learned_prefix(lens_id, version, epoch)}learned.npz"
 
 
 def take_samples(session: Session, photo: PhotoRow, version: int) -> int:

@@ -17,7 +17,9 @@ from starlette.testclient import TestClient
 from app.models import ModelCache
 from app.routes.psf import accepted
 from app.store import Store
+from app.store.versions import learned_key
 from lensmodel.psf import centroid
+from lensmodel.regression import LensModel
 from lensmodel.types import FieldPosition, LensSettings
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
@@ -322,3 +324,25 @@ def test_a_warm_psf_costs_milliseconds(client: TestClient, lens: str) -> None:
         seconds.append(time.process_time() - began)
 
     assert statistics.median(seconds) < 0.005  # processor time: other work on the machine does not count
+
+
+def test_what_a_worker_learned_of_a_version_is_served_from_the_next_request_on(
+    client: TestClient, store: Store, lens: str
+) -> None:
+    services = client.app.state.services  # type: ignore[attr-defined] # Starlette's own attribute
+    lens_id = lens.rpartition("/")[2]
+    first = client.get(f"{lens}/psf", params={"r": 0.9, "phi": 0.6, "aperture": 1.4})
+    state, samples = store.samples.of_lens(lens_id)
+    model = LensModel.fit([stored.sample for stored in samples]).warmed()
+    key = learned_key(lens_id, state.version, state.rebuild_epoch)
+    services.storage.put(key, model.learned())
+
+    second = client.get(f"{lens}/psf", params={"r": 0.9, "phi": 0.6, "aperture": 1.4})
+
+    assert "-p-" in first.headers["etag"]
+    assert "-l-" in second.headers["etag"]
+    assert ModelCache(store, 1, services.storage).get(lens_id).learned
+    services.storage.put(key, b"torn")
+    torn = ModelCache(store, 1, services.storage).get(lens_id)
+    assert not torn.learned
+    assert torn.model.query(FieldPosition(0.9, 0.6), LensSettings(1.4), 21).kernel.sum() == pytest.approx(1.0)

@@ -680,13 +680,28 @@ def test_lens_is_learned_and_corrected_from_end_to_end(tmp_path: Path) -> None:
         del of
         yield DirectRoute(folder / "models", "whittle", workers=1)
 
-    made = run_reproduction(plan(one), opened, tmp_path, route="in the library", workers=1, on_work=unheard)
+    made = run_reproduction(
+        replace(plan(one, replace(one, condition="high-iso")), rivals=("schuler",)),
+        opened,
+        tmp_path,
+        route="in the library",
+        workers=1,
+        on_work=unheard,
+    )
     truth, learned = made["cases"][0]["truth"], made["cases"][0]["learned"]["1"]
     for zone in ("center", "corner"):
         before, true = truth["before"], truth["true"]["standard"]
         assert true["psnr"][zone] > before["psnr"][zone]
         assert true["edges"][zone]["mtf50"] > before["edges"][zone]["mtf50"]
         assert learned["methods"]["standard"]["edges"][zone]["mtf50"] > before["edges"][zone]["mtf50"]
+    rival = made["cases"][0]["rivals"]["schuler"]
+    assert rival["psf"]["rel_l2"]["g"]["center"] < 1.0
+    assert (
+        rival["methods"]["standard"]["edges"]["center"]["mtf50"] > truth["before"]["edges"]["center"]["mtf50"]
+    )
+    (noisy,) = made["hard"]
+    assert noisy["truth"]["before"]["psnr"]["center"] < truth["before"]["psnr"]["center"]
+    assert noisy["truth"]["true"]["standard"]["psnr"]["center"] > noisy["truth"]["before"]["psnr"]["center"]
     _, html = write_page(made, tmp_path)
     for source in re.findall(r'src="([^"]+)"', html.read_text(encoding="utf-8")):
         assert (tmp_path / source).stat().st_size > 0

@@ -216,6 +216,7 @@ def estimate_cell(
                 photo=photo_id,
                 pixel_pitch_um=developed.info.metadata.pixel_pitch_um,
                 estimator=f"{method.name}/{method.version}",
+                error=estimate.predicted_error if math.isfinite(estimate.predicted_error) else None,
             )
             stored = None if evidence is None else evidence.to_bytes()
             diagnostics = {**estimate.diagnostics, "predicted_error": estimate.predicted_error}
@@ -428,7 +429,8 @@ def correct_photo(
     def psf_error(position: FieldPosition, channel: Channel) -> float:
         answer = model.query(position, settings.with_channel(channel), size=15, pitch_um=pitch_um)
         error = answer.predicted_error if math.isfinite(answer.predicted_error) else 1.0
-        return math.hypot(error, BLIND_BIAS)
+        # samples whose estimator said nothing of itself share the error that is usual
+        return math.hypot(error, 0.0 if answer.shared_error > 0 else BLIND_BIAS)
 
     planes, cfa = developed.planes, developed.cfa
     if method == "paper" and lateral is not None:

@@ -236,6 +236,8 @@ class PsfSample:
         Name and version of the method that made it.
     spectrum : PatchSpectrum or None
         What the patch says without a kernel, so that all patches of a lens can be solved together.
+    error : float or None
+        Relative L2 distance to the truth that the method expects of it; None where it says nothing.
     """
 
     kernel: Kernel
@@ -246,11 +248,14 @@ class PsfSample:
     pixel_pitch_um: float | None = None
     estimator: str = ""
     spectrum: PatchSpectrum | None = None
+    error: float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kernel", as_kernel(self.kernel))
         if not 0.0 <= self.weight <= 1.0:
             raise InvalidInputError(f"weight must lie in 0..1, got {self.weight}")
+        if self.error is not None and not (math.isfinite(self.error) and self.error >= 0.0):
+            raise InvalidInputError(f"the expected error must be finite and not negative, got {self.error}")
 
     def with_weight(self, weight: float) -> PsfSample:
         """Return the same sample with another vote."""

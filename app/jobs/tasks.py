@@ -179,6 +179,7 @@ def _model(folder: Path) -> LensModel:
                 photo=entry["photo"],
                 pixel_pitch_um=entry["pixel_pitch_um"],
                 estimator=entry["estimator"],
+                error=entry["error"],
             )
         )
     learned = folder / LEARNED

@@ -189,6 +189,7 @@ def write_samples(folder: Path, stored: Sequence[StoredSample]) -> None:
                 "photo": sample.photo,
                 "pixel_pitch_um": sample.pixel_pitch_um,
                 "estimator": sample.estimator,
+                "error": sample.error,
                 "settings": {
                     "aperture": sample.settings.aperture,
                     "focal_mm": sample.settings.focal_mm,

@@ -80,6 +80,7 @@ class SampleStore:
                 SampleRow.crc32,
                 SampleRow.psf,
                 SampleRow.estimator,
+                SampleRow.predicted_error,
                 PhotoRow.public_id.label("photo"),
                 PhotoRow.aperture,
                 PhotoRow.focal_mm,
@@ -117,5 +118,6 @@ def _stored(row: Row[*tuple[Any, ...]]) -> StoredSample:
             photo=row.photo,
             pixel_pitch_um=row.pixel_pitch_um,
             estimator=row.estimator,
+            error=row.predicted_error,
         ),
     )

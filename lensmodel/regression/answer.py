@@ -72,7 +72,10 @@ class PsfAnswer:
     extrapolated : bool
         True where no sample is near.
     predicted_error : float
-        Expected relative L2, from the held-out errors of the neighbours; at most 1.
+        Expected relative L2, from the held-out errors of the neighbours and `shared_error`; at most 1.
+    shared_error : float
+        The part of it that all samples share, which no number of them makes smaller: what their estimators
+        expect beyond what their scatter shows. 0 where they expect nothing.
     bandwidth : mapping of str to float
         Bandwidths that were used.
     beyond : tuple of str
@@ -95,6 +98,7 @@ class PsfAnswer:
     extrapolated: bool
     predicted_error: float
     bandwidth: Mapping[str, float]
+    shared_error: float = 0.0
     beyond: tuple[str, ...] = ()
     nearest: float = 0.0
     prior_share: float = 0.0

@@ -59,6 +59,8 @@ class Fit:
         Points of the samples.
     roster : Roster
     judgement : Judgement
+    told : ndarray, shape (n,)
+        Squared errors that the estimators expect of their samples; 0 where they expect nothing.
     rule, bandwidth : dict
         Bandwidths of eq. (8), and those in use.
     physical : Physics or None
@@ -72,6 +74,7 @@ class Fit:
     index: SampleIndex
     roster: Roster
     judgement: Judgement
+    told: NDArray[np.float64]
     rule: dict[str, float]
     bandwidth: dict[str, float]
     physical: Physics | None = None
@@ -107,7 +110,9 @@ class Fit:
             judgement = judge(common, settings, local, where, base, blend=smoother.blend)
         rule = va.bandwidths(where)
         used = bandwidth(rule, settings, judgement.choice)
-        return cls(pitch, len(samples), widths, local, index, roster, judgement, rule, used)
+        return cls(
+            pitch, len(samples), widths, local, index, roster, judgement, told_errors(samples), rule, used
+        )
 
     def warmed(self, samples: Sequence[PsfSample], on_step: StepHook = ignore_step) -> Fit:
         """Return it with the wavefront of its samples."""
@@ -137,7 +142,13 @@ class Fit:
             index=self.index.extended(where),
             roster=self.roster.extended(common),
             judgement=self.judgement.extended(_claimed(samples, settings)),
+            told=np.concatenate([self.told, told_errors(samples)]),
         )
+
+
+def told_errors(samples: Sequence[PsfSample]) -> NDArray[np.float64]:
+    """Squared errors that the estimators expect, shape (n,)."""
+    return np.array([0.0 if s.error is None else min(s.error, 1.0) ** 2 for s in samples])
 
 
 def _claimed(samples: Sequence[PsfSample], settings: ModelSettings) -> NDArray[np.float64]:

@@ -22,7 +22,7 @@ from lensmodel.psf import PsfSample
 from lensmodel.regression import pitch as pitches
 from lensmodel.regression import variables as va
 from lensmodel.regression.answer import ModelSettings
-from lensmodel.regression.fitting import Fit, Roster
+from lensmodel.regression.fitting import Fit, Roster, told_errors
 from lensmodel.regression.index import SampleIndex
 from lensmodel.regression.judgement import Judgement
 from lensmodel.regression.kriging import ImageFrame
@@ -192,6 +192,7 @@ def _fit(document: Mapping[str, Any], arrays: Arrays, samples: Sequence[PsfSampl
         index=SampleIndex.of(where),
         roster=Roster.of(common),
         judgement=judgement,
+        told=told_errors(samples),
         rule=rule,
         bandwidth=used,
         physical=physical,

@@ -32,7 +32,7 @@ from lensmodel.regression.fitting import Fit
 from lensmodel.regression.neighbourhood import Near, Neighbourhood
 from lensmodel.regression.robust import Flag
 from lensmodel.regression.smoothers import smoothers
-from lensmodel.regression.support import field_error, standard_error, support
+from lensmodel.regression.support import field_error, shared_error, standard_error, support
 from lensmodel.types import (
     ZONES,
     Channel,
@@ -218,8 +218,10 @@ class LensModel:
         nearest, beyond = support(fit.index.points[rows], va.point(position, settings), fit.rule)
         # how well the nearest samples agree says nothing of a place without samples
         held_out = float(mixture.usual if beyond else mixture.squared[0])
-        error = field_error(held_out, float(weight @ fit.judgement.noise[rows]), independent)
-        error *= 1.0 + 0.5 * max(nearest - 1.0, 0.0)
+        noise = float(weight @ fit.judgement.noise[rows])
+        error = field_error(held_out, noise, independent) * (1.0 + 0.5 * max(nearest - 1.0, 0.0))
+        shared = shared_error(float(weight @ fit.told[rows]), noise)
+        error = math.hypot(error, shared)
         scatter = None
         if std:
             apart = fit.local.apart(rows, position.phi, np.array(fit.widths.at(position, settings)), inside)
@@ -231,6 +233,7 @@ class LensModel:
             extrapolated=bool(beyond),
             predicted_error=min(error, 1.0),
             bandwidth=dict(fit.bandwidth),
+            shared_error=shared,
             beyond=beyond,
             nearest=nearest,
             prior_share=float(prior_shares[0]),

@@ -163,6 +163,7 @@ def _entry(sample: PsfSample) -> dict[str, Any]:
         "photo": sample.photo,
         "pixel_pitch_um": sample.pixel_pitch_um,
         "estimator": sample.estimator,
+        "error": sample.error,
     }
 
 
@@ -178,6 +179,7 @@ def _sample(entry: dict[str, Any], kernel: Any) -> PsfSample:  # noqa: ANN401 - 
         photo=str(entry["photo"]),
         pixel_pitch_um=entry["pixel_pitch_um"],
         estimator=str(entry["estimator"]),
+        error=entry.get("error"),
     )
 
 

@@ -34,6 +34,23 @@ def field_error(held_out: float, noise: float, independent: float) -> float:
     return math.sqrt(bias + noise / independent)
 
 
+def shared_error(told: float, noise: float) -> float:
+    """Error that all samples share, from what their estimators expect of them.
+
+    They expect bias and noise together, t^2 = b^2 + s^2, and s^2 is the scatter that neighbours show::
+
+        b^2 = max(t^2 - s^2, t^2 / 4)
+
+    Estimators that err alike do not scatter: at least half of what they expect is taken for shared.
+
+    Parameters
+    ----------
+    told, noise : float
+        t^2 and s^2 near the place.
+    """
+    return math.sqrt(max(told - noise, told / 4.0))
+
+
 def support(
     where: NDArray[np.float64], asked: NDArray[np.float64], rule: Mapping[str, float]
 ) -> tuple[float, tuple[str, ...]]:

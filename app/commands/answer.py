@@ -68,6 +68,8 @@ def run(
             "photos": answer.photos,
             "extrapolated": answer.extrapolated,
             "predicted_error": answer.predicted_error,
+            "prior": answer.prior,
+            "prior_share": answer.prior_share,
         },
         "rms_width_px": rms_width(answer.kernel),
         "mtf50": {"tangential": tangential, "sagittal": sagittal},
@@ -85,12 +87,13 @@ def run(
 
 def _words(place: FieldPosition, answer: PsfAnswer, tangential: float, sagittal: float) -> str:
     beyond = " (beyond what the photos cover)" if answer.extrapolated else ""
+    prior = f", {100 * answer.prior_share:.0f} % from {answer.prior}" if answer.prior else ""
     photos = "1 photo" if answer.photos == 1 else f"{answer.photos} photos"
     return (
         f"{zone_of(place.r)}, r {place.r:g}: rms width {rms_width(answer.kernel):.2f} px, MTF50 tangential "
         f"{tangential:.3f}, sagittal {sagittal:.3f} cycles/px; {photos}, "
         f"{answer.effective_samples:.1f} effective samples, expected error "
-        f"{answer.predicted_error:.2f}{beyond}"
+        f"{answer.predicted_error:.2f}{beyond}{prior}"
     )
 
 

@@ -29,6 +29,8 @@ class Wishes:
     workers: int | None
     any_lens: bool
     force: bool
+    family: Path | None
+    no_family: bool
 
 
 def run(names: Sequence[str], target: Path, wishes: Wishes, display: Display, *, as_json: bool) -> None:
@@ -45,7 +47,11 @@ def run(names: Sequence[str], target: Path, wishes: Wishes, display: Display, *,
     with files.as_usage():
         blind.estimators.create(wishes.estimator)
         settings = LensSettings(aperture=wishes.aperture)
+    with files.as_usage():
+        family = None if wishes.family is None else files.profile_at(wishes.family)
     calibration = _Calibration(target, _known(target, force=wishes.force), wishes, settings)
+    if family is not None or wishes.no_family:
+        calibration.lean_on(family)
     target.parent.mkdir(parents=True, exist_ok=True)
     results: list[dict[str, Any]] = []
     with display.progress() as bars:
@@ -108,6 +114,21 @@ class _Calibration:
         self.profile = profile
         self._target, self._wishes, self._settings = target, wishes, settings
         self._grown = False
+        self._family: LensProfile | None = None
+
+    def lean_on(self, family: LensProfile | None) -> None:
+        """Start from the profile of another copy where this one has seen little; None no longer does."""
+        self._family = family
+        if self.profile is not None:
+            self.profile = replace(self.profile, model=self._leaning(self.profile.model))
+            self._grown = True
+
+    def _leaning(self, model: LensModel) -> LensModel:
+        if self._family is None:
+            return model.with_prior(None)
+        lens = self._family.lens
+        name = " ".join(lens[key] for key in ("maker", "model", "serial") if lens.get(key))
+        return model.with_prior(self._family.model, name=name or "another copy")
 
     def finish(self) -> None:
         """Fit what takes long and need be done only once, when all photos are in."""
@@ -136,7 +157,10 @@ class _Calibration:
             workers=self._wishes.workers,
             on_event=on_event,
         )
-        model = self.profile.model.added(samples) if self.profile else LensModel.fit(samples)
+        if self.profile is not None:
+            model = self.profile.model.added(samples)
+        else:
+            model = self._leaning(LensModel.fit(samples))
         grown = LensProfile(model, seen | lens, {**names, key: path.name})
         save_profile(self._target, grown)
         self.profile, self._grown = grown, True

@@ -35,6 +35,11 @@ def calibrate(
     workers: Workers = None,
     any_lens: AnyLens = False,
     force: Annotated[bool, typer.Option("--force", help="Forget what the profile knew; begin anew.")] = False,
+    family: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Profile of another copy: leaned on where photos are missing."),
+    ] = None,
+    no_family: Annotated[bool, typer.Option("--no-family", help="Lean on no other copy any more.")] = False,
     json_output: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = 0,
@@ -53,13 +58,23 @@ def calibrate(
 
         lensmodel calibrate scan.tif --aperture 2.8 --profile old-lens.lensprofile
 
+        lensmodel calibrate first.dng --profile second-copy.lensprofile --family my-24mm.lensprofile
+
     Exit status: 0 all photos counted, 1 some did not, 2 called wrongly.
     """
     shown = display.of(context, quiet=quiet, verbose=verbose)
     calibration.run(
         photos,
         profile,
-        calibration.Wishes(aperture, estimator, workers, any_lens=any_lens, force=force),
+        calibration.Wishes(
+            aperture,
+            estimator,
+            workers,
+            any_lens=any_lens,
+            force=force,
+            family=family,
+            no_family=no_family,
+        ),
         shown,
         as_json=json_output,
     )

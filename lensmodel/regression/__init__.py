@@ -2,7 +2,7 @@
 
 from lensmodel.regression.answer import ModelSettings, PsfAnswer
 from lensmodel.regression.exact import PaperModel, all_pairs, factorised
-from lensmodel.regression.model import LensModel, ModelField
+from lensmodel.regression.model import LensModel, ModelField, Prior
 from lensmodel.regression.profile import LensProfile, load_profile, save_profile
 from lensmodel.regression.robust import Flag
 from lensmodel.regression.smoothers import Neighbours, Smoother, smoothers
@@ -17,6 +17,7 @@ __all__ = [
     "ModelSettings",
     "Neighbours",
     "PaperModel",
+    "Prior",
     "PsfAnswer",
     "Smoother",
     "Wavefront",

@@ -82,6 +82,8 @@ class PsfAnswer:
         Variables in which the question lies outside the samples.
     nearest : float
         Distance to the nearest sample, in bandwidths of eq. (8).
+    prior : str
+        Name of the prior that the model leans on where it has seen little; empty without one.
     prior_share : float
         Weight of the prior in the kernel, 0..1; 0 without a prior.
     image_frame_share : float
@@ -101,6 +103,7 @@ class PsfAnswer:
     shared_error: float = 0.0
     beyond: tuple[str, ...] = ()
     nearest: float = 0.0
+    prior: str = ""
     prior_share: float = 0.0
     image_frame_share: float = 0.0
     wavefront_share: float = 0.0

@@ -46,6 +46,47 @@ from lensmodel.types import (
 
 _LISTED = 1e-3
 _WIDEST = 255
+_SMALL = 15
+_AROUND = {**va.FALLBACK, "r": 0.15, "phi": 0.5}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """What is thought of a lens before its own photos speak: a cold start.
+
+    Parameters
+    ----------
+    source : LensModel or PsfField
+        Usually the model of other copies of the lens, or a published profile.
+    strength : float
+        Number of samples near the place that it is worth.
+    name : str
+        What answers call it.
+    """
+
+    source: PsfField | LensModel
+    strength: float = 2.0
+    name: str = "other copies"
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.strength) and self.strength > 0):
+            raise InvalidInputError(f"the strength of a prior must be positive, got {self.strength}")
+        if isinstance(self.source, LensModel) and self.source.prior is not None:
+            object.__setattr__(self, "source", self.source.with_prior(None))
+
+    def kernels(
+        self, positions: Sequence[FieldPosition], settings: LensSettings, size: int, pitch_um: float | None
+    ) -> NDArray[np.float64]:
+        """What it says of some places, shape (n, size, size)."""
+        if isinstance(self.source, LensModel):
+            return self.source.kernels(positions, settings, size, pitch_um=pitch_um)
+        return np.stack([self.source.kernel_at(p, settings.channel, size) for p in positions])
+
+    def error(self, position: FieldPosition, settings: LensSettings) -> float:
+        """Relative L2 that it expects of itself; 1 where it cannot tell."""
+        if isinstance(self.source, LensModel):
+            return self.source.query(position, settings, _SMALL).predicted_error
+        return 1.0
 
 
 class LensModel:
@@ -60,7 +101,7 @@ class LensModel:
         settings: ModelSettings,
         fit: Fit,
         *,
-        prior: tuple[PsfField | LensModel, float] | None = None,
+        prior: Prior | None = None,
     ) -> None:
         self.samples = samples
         self.settings = settings
@@ -80,7 +121,7 @@ class LensModel:
         samples: Sequence[PsfSample],
         settings: ModelSettings | None = None,
         *,
-        prior: tuple[PsfField | LensModel, float] | None = None,
+        prior: Prior | None = None,
     ) -> LensModel:
         """Build a model from samples.
 
@@ -120,7 +161,7 @@ class LensModel:
         learned: bytes,
         settings: ModelSettings | None = None,
         *,
-        prior: tuple[PsfField | LensModel, float] | None = None,
+        prior: Prior | None = None,
     ) -> LensModel:
         """Build the model that `learned` was taken from, without fitting anything.
 
@@ -139,6 +180,8 @@ class LensModel:
     @property
     def warm(self) -> bool:
         """Whether nothing is left for `warmed` to do."""
+        if self.prior is not None and isinstance(self.prior.source, LensModel) and not self.prior.source.warm:
+            return False
         return self._fit.physical is not None or not self._neighbourhood.smoother.physical
 
     def warmed(self, on_step: StepHook = ignore_step) -> LensModel:
@@ -149,9 +192,10 @@ class LensModel:
         """
         if self.warm:
             return self
-        return LensModel(
-            self.samples, self.settings, self._fit.warmed(self.samples, on_step), prior=self.prior
-        )
+        prior = self.prior
+        if prior is not None and isinstance(prior.source, LensModel):
+            prior = replace(prior, source=prior.source.warmed())
+        return LensModel(self.samples, self.settings, self._fit.warmed(self.samples, on_step), prior=prior)
 
     def without_photo(self, photo: str) -> LensModel:
         """Return the model without the samples of one photo."""
@@ -167,21 +211,22 @@ class LensModel:
         names = tuple(name for name in self.settings.excluded if name not in photos)
         return LensModel.fit(self.samples, replace(self.settings, excluded=names), prior=self.prior)
 
-    def with_prior(self, prior: PsfField | LensModel | None, strength: float = 2.0) -> LensModel:
+    def with_prior(
+        self, source: PsfField | LensModel | None, strength: float = 2.0, name: str = "other copies"
+    ) -> LensModel:
         """Return the model that leans on a prior where it has seen little; None switches it off.
 
         Parameters
         ----------
-        prior : LensModel or PsfField
-            Usually the model of other copies of the lens.
+        source : LensModel or PsfField
+            Usually the model of other copies of the lens. A prior that it has itself does not count.
         strength : float
             Number of samples that the prior is worth.
+        name : str
+            What answers call it.
         """
-        if not (math.isfinite(strength) and strength > 0):
-            raise InvalidInputError(f"the strength of a prior must be positive, got {strength}")
-        return LensModel(
-            self.samples, self.settings, self._fit, prior=None if prior is None else (prior, strength)
-        )
+        prior = None if source is None else Prior(source, strength, name)
+        return LensModel(self.samples, self.settings, self._fit, prior=prior)
 
     # --- asking ---------------------------------------------------------------------------------
 
@@ -221,7 +266,9 @@ class LensModel:
         noise = float(weight @ fit.judgement.noise[rows])
         error = field_error(held_out, noise, independent) * (1.0 + 0.5 * max(nearest - 1.0, 0.0))
         shared = shared_error(float(weight @ fit.told[rows]), noise)
-        error = math.hypot(error, shared)
+        error, share = math.hypot(error, shared), float(prior_shares[0])
+        if self.prior is not None and share > _LISTED:
+            error = math.sqrt((1.0 - share) * error**2 + share * self.prior.error(position, settings) ** 2)
         scatter = None
         if std:
             apart = fit.local.apart(rows, position.phi, np.array(fit.widths.at(position, settings)), inside)
@@ -236,7 +283,8 @@ class LensModel:
             shared_error=shared,
             beyond=beyond,
             nearest=nearest,
-            prior_share=float(prior_shares[0]),
+            prior="" if self.prior is None else self.prior.name,
+            prior_share=share,
             image_frame_share=float(mixture.shares[0, 1]),
             wavefront_share=float(mixture.shares[0, 2]),
             std=scatter,
@@ -333,14 +381,17 @@ class LensModel:
         mixture = self._experts.mixed(light, near.answers, positions, settings)
         shares = np.zeros(len(positions))
         if self.prior is not None:
-            prior, strength = self.prior
-            seen = np.array([np.exp(-0.5 * (gaps**2).sum(axis=1)).sum() for gaps in near.gaps])
-            shares = strength / (seen + strength)
-            source = prior.field(settings, pitch_um=fit.pitch_um) if isinstance(prior, LensModel) else prior
-            other = np.stack([source.kernel_at(p, settings.channel, size) for p in positions])
+            shares = self.prior.strength / (self._seen(positions, settings) + self.prior.strength)
+            other = self.prior.kernels(positions, settings, size, fit.pitch_um)
             part = shares[:, None, None]
             mixture = replace(mixture, kernels=(1.0 - part) * mixture.kernels + part * other)
         return near, mixture, shares
+
+    def _seen(self, positions: Sequence[FieldPosition], settings: LensSettings) -> NDArray[np.float64]:
+        """How many samples speak of each place, by distances that do not shrink as samples come in."""
+        points, votes, scale = self._fit.index.points, self._fit.judgement.votes, va.scales(_AROUND)
+        gaps = [va.squared_distances(points, va.point(place, settings), scale) for place in positions]
+        return np.array([float(votes @ np.exp(-0.5 * gap)) for gap in gaps])
 
     def _inner_size(self, size: int, pitch_um: float | None) -> int:
         """Side at the pitch of the samples that holds an answer of side `size`."""

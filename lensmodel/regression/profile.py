@@ -5,6 +5,7 @@ Layout of a `.lensprofile`, format 1::
     profile.json    format, lens, provenance, settings of the model, one entry for each sample
     kernels.npy     (n, k, k) float32, sum 1, centred, in the order of the entries
     learned.npz     optional: what the model has learned from them, see `learned`
+    family.lensprofile  optional: the profile of other copies that the model leans on, without one of its own
 
 Nothing in it can run code: no pickle, sizes bounded before arrays are made.
 """
@@ -21,7 +22,7 @@ import zipfile
 import zlib
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -37,6 +38,7 @@ _MAX_SAMPLES = 200_000
 _MAX_SIDE = 255
 _INFINITY = "infinity"
 _LEARNED = "learned.npz"
+_FAMILY = "family.lensprofile"
 
 log = logging.getLogger(__name__)
 _UNREADABLE = (
@@ -72,7 +74,21 @@ class LensProfile:
 
 def save_profile(path: Path | str, profile: LensProfile) -> None:
     """Write a profile; the file appears complete or not at all."""
-    samples = profile.model.samples
+    target = Path(path)
+    part = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
+    try:
+        with part.open("xb") as file:
+            _write(file, profile)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(target)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def _write(file: IO[bytes], profile: LensProfile) -> None:
+    samples, prior = profile.model.samples, profile.model.prior
     side = max(sample.kernel.shape[0] for sample in samples)
     stack = np.stack([resized(sample.kernel, side) for sample in samples]).astype(np.float32)
     document = {
@@ -83,22 +99,18 @@ def save_profile(path: Path | str, profile: LensProfile) -> None:
         "model": asdict(profile.model.settings),
         "samples": [_entry(sample) for sample in samples],
     }
+    if prior is not None and isinstance(prior.source, LensModel):
+        document["family"] = {"name": prior.name, "strength": prior.strength}
     arrays = io.BytesIO()
     np.save(arrays, stack, allow_pickle=False)
-    target = Path(path)
-    part = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
-    try:
-        with part.open("xb") as file:
-            with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-                archive.writestr("profile.json", json.dumps(document, allow_nan=False))
-                archive.writestr("kernels.npy", arrays.getvalue())
-                archive.writestr(_LEARNED, profile.model.learned(), zipfile.ZIP_STORED)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(target)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("profile.json", json.dumps(document, allow_nan=False))
+        archive.writestr("kernels.npy", arrays.getvalue())
+        archive.writestr(_LEARNED, profile.model.learned(), zipfile.ZIP_STORED)
+        if prior is not None and isinstance(prior.source, LensModel):
+            family = io.BytesIO()
+            _write(family, LensProfile(prior.source))
+            archive.writestr(_FAMILY, family.getvalue(), zipfile.ZIP_STORED)
 
 
 def load_profile(path: Path | str) -> LensProfile:
@@ -109,9 +121,13 @@ def load_profile(path: Path | str) -> LensProfile:
     InvalidInputError
         If the file is no profile, or one of a newer format; the text says which.
     """
-    name = Path(path).name
+    return _read(path, Path(path).name)
+
+
+def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> LensProfile:
+    """Open a profile; `alone` passes over the family, which has none of its own."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(source) as archive:
             sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
             if sum(sizes.values()) > _MAX_BYTES:
                 raise InvalidInputError(
@@ -120,6 +136,7 @@ def load_profile(path: Path | str) -> LensProfile:
             document = json.loads(archive.read("profile.json"))
             stack = np.load(io.BytesIO(archive.read("kernels.npy")), allow_pickle=False)
             learned = archive.read(_LEARNED) if _LEARNED in sizes else None
+            family = archive.read(_FAMILY) if _FAMILY in sizes and not alone else None
     except FileNotFoundError:
         raise
     except _UNREADABLE as error:
@@ -144,6 +161,10 @@ def load_profile(path: Path | str) -> LensProfile:
             )
         samples = [_sample(entry, kernel) for entry, kernel in zip(entries, stack, strict=True)]
         model = _model(samples, _settings(document["model"]), learned)
+        if family is not None:
+            other = _read(io.BytesIO(family), f"the family in {name}", alone=True)
+            told = document["family"]
+            model = model.with_prior(other.model, float(told["strength"]), str(told["name"])[:200])
         return LensProfile(model, _texts(document["lens"]), _texts(document["photos"]))
     except LensModelError:
         raise

@@ -389,6 +389,20 @@ def test_aperture_of_the_command_line_is_for_photos_that_do_not_say_their_own(
     assert seen == {2.8, 8.0}
 
 
+@pytest.mark.slow
+def test_a_new_copy_starts_from_another_and_can_leave_it(folder: Path, here: Here) -> None:
+    words = ("calibrate", "one.dng", "-p", "new", "--estimator", "whittle", "--workers", "1")
+    done = here(*words, "--family", PROFILE)
+
+    assert done.returncode == 0, done.stderr
+    asked = json.loads(here("psf", "new", "--r", "0.95", "--phi", "1", "--json").stdout)
+    assert asked["support"]["prior"]
+    assert asked["support"]["prior_share"] > 0
+
+    assert here(*words, "--no-family").returncode == 0
+    assert load_profile(folder / "new").model.prior is None
+
+
 def test_a_photo_that_says_little_is_corrected_with_a_word_of_warning(folder: Path, here: Here) -> None:
     Image.fromarray(_picture()).save(folder / "scan.tif")
     done = here("correct", "scan.tif", "-p", PROFILE, "-o", "out", "--method", "fast")

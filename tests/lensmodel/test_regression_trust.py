@@ -20,6 +20,7 @@ from lensmodel.regression import (
     LensProfile,
     ModelSettings,
     PaperModel,
+    Prior,
     all_pairs,
     factorised,
     load_profile,
@@ -257,6 +258,36 @@ class TestPrior:
         assert distance(outside.kernel, truth(FieldPosition(0.95, 1.0))).rel_l2 < (
             distance(alone.kernel, truth(FieldPosition(0.95, 1.0))).rel_l2
         )
+
+    def test_prior_gives_way_as_photos_come_in(self) -> None:
+        others, where = LensModel.fit(merged([photo(f"o{i}", i) for i in range(3)])), FieldPosition(0.5, 0.4)
+        shares = []
+        for count in (1, 4, 12):
+            samples = merged([photo(f"a{i}", 20 + i) for i in range(count)])
+            answer = LensModel.fit(samples, prior=Prior(others, 2.0, "copy L-2")).query(where, GREEN, SIZE)
+            shares.append(answer.prior_share)
+            assert answer.prior == "copy L-2"
+
+        assert shares[0] > shares[1] > shares[2]
+
+    def test_prior_of_the_prior_does_not_count(self) -> None:
+        first, second, third = (LensModel.fit(photo(f"a{i}", i)) for i in range(3))
+        chain_ = first.with_prior(second.with_prior(third))
+
+        assert chain_.prior is not None
+        assert isinstance(chain_.prior.source, LensModel)
+        assert chain_.prior.source.prior is None
+
+    def test_prior_travels_with_the_profile(self, tmp_path: Path) -> None:
+        here = LensModel.fit(photo("a", 20)).with_prior(LensModel.fit(photo("o", 1)), 3.0, "copy L-2")
+        save_profile(tmp_path / "a.lensprofile", LensProfile(here))
+        where = FieldPosition(0.95, 1.0)
+
+        again = load_profile(tmp_path / "a.lensprofile").model.query(where, GREEN, SIZE)
+
+        assert again.prior == "copy L-2"
+        assert again.prior_share > 0
+        assert np.abs(again.kernel - here.query(where, GREEN, SIZE).kernel).max() <= 1e-6
 
     def test_strength_must_be_positive(self) -> None:
         model = LensModel.fit(photo("a", 0))

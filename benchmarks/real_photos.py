@@ -2,7 +2,7 @@
 
     LENSMODEL_TEST_DATA=... python benchmarks/real_photos.py [--out FOLDER] [PHOTO ...]
 
-For every photo, calibrated on its own green plane:
+For every photo, calibrated by itself; figures are of the green plane:
 
 * odd and even patches: relative L2 between the PSFs of two halves of the patches of each cell;
 * prediction: log likelihood of the spectra of patches under the PSFs of the model of *another* photo of
@@ -88,7 +88,7 @@ def look_at(path: Path, aperture: float | None, estimator: str, count: int) -> S
                 continue
             try:
                 found = pipeline.estimate_cell(
-                    photo, part, settings=settings, photo_id=path.stem, estimator=estimator, channels=("g",)
+                    photo, part, settings=settings, photo_id=path.stem, estimator=estimator
                 )
             except LensModelError as error:
                 print(f"  {path.stem}: a cell tells nothing: {error}")

@@ -152,7 +152,7 @@ def model(
     photos: Annotated[str, typer.Option(help="Numbers of photos, comma separated.")] = "1,5",
     methods: Annotated[str | None, typer.Option(help="Names, comma separated; default: all.")] = None,
     psf_field: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="npz of measured PSFs instead of simulated lenses.")
+        Path | None, typer.Option(metavar="FILE", help="Measured instead: npz of PSFs, or TIFF of stars.")
     ] = None,
     json_output: JsonFile = None,
     force: Force = False,

@@ -5,7 +5,7 @@ Two kinds of input:
 * lenses of `draw_lens` whose kernels are known: models are fed with true kernels at the patches of
   n photos and asked at places in between and beyond;
 * a file of measured PSFs (`--psf-field FILE.npz`, keys psf (n, k, k), r, phi, and optionally
-  aperture and group): groups are held out in turn.
+  aperture and group) or a TIFF of a star field: groups are held out in turn.
 
 Compared with two ways of the trade: linear interpolation between PSFs of the image plane, which is
 what efficient filter flow does, and a polynomial of the place for each pixel, as PSFEx fits.
@@ -29,6 +29,7 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.ndimage import gaussian_filter
 from scipy.signal import fftconvolve
 
+from lensmodel.bench.stars import stars_of
 from lensmodel.errors import InvalidInputError
 from lensmodel.geometry import Frame, zone_of
 from lensmodel.psf import PsfSample, as_kernel, centred, distance, gaussian
@@ -169,13 +170,15 @@ def predictor(method: str, samples: Sequence[PsfSample]) -> Predictor:
 
 
 def load_field(path: Path) -> list[PsfSample]:
-    """Read measured PSFs from an npz; negative pixels are noise and become zero.
+    """Read measured PSFs from an npz, or find stars in a TIFF; negative pixels are noise and become zero.
 
     Raises
     ------
     InvalidInputError
         If a key is missing or shapes differ.
     """
+    if path.suffix.lower() in {".tif", ".tiff"}:
+        return stars_of(path)
     try:
         with np.load(path, allow_pickle=False) as stored:
             psf, r, phi = stored["psf"], stored["r"], stored["phi"]
@@ -304,7 +307,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", default="1000:1004", help="first:last, the last excluded")
     parser.add_argument("--photos", default="1,5", help="numbers of photos, with commas")
     parser.add_argument("--methods", default=None, help="names with commas; all by default")
-    parser.add_argument("--psf-field", type=Path, default=None, help="npz of measured PSFs")
+    parser.add_argument("--psf-field", type=Path, default=None, help="npz of measured PSFs, or TIFF of stars")
     parser.add_argument("--spoiled", type=float, default=0.0, help="relative L2 of the kernels fed")
     parser.add_argument("--json", type=Path, default=None, help="also write the result there")
     given = parser.parse_args(arguments)

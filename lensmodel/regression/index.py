@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from lensmodel.regression import variables as va
+
 _BLOCK = 64
 _TIGHT, _LOOSE = 0.6, 1.6
 
@@ -86,8 +88,7 @@ class SampleIndex:
         found = [block.near(self.points, asked, reach, scale) for block in self.blocks]
         found.append(np.arange(done, len(self.points), dtype=np.intp))
         rows = np.sort(np.concatenate(found))
-        gap = np.nan_to_num((self.points[rows] - asked) / scale, nan=0.0)
-        return rows[(gap * gap).sum(axis=1) <= reach * reach]
+        return rows[va.squared_distances(self.points[rows], asked, scale) <= reach * reach]
 
 
 def _rank(block: _Block) -> int:

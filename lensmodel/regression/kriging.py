@@ -16,7 +16,7 @@ N. Cressie, "Statistics for Spatial Data", 1993, section 3.2.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,9 @@ NUGGETS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 _SETTINGS = (3, 4, 5, 6)
 _CAP = 1.5
 _ALIKE = 1e-7
+_KNOWN = 32  # settings that are remembered
+
+Alike = tuple[NDArray[np.float64], NDArray[np.float64], slice | NDArray[np.intp]]
 
 
 def field_vector(position: FieldPosition) -> NDArray[np.float64]:
@@ -51,6 +54,8 @@ class ImageFrame:
     mean : ndarray, shape (side^2,)
     nugget : float
         Variance of a sample of vote 1 over that of the field.
+    settings : dict
+        Which samples speak at settings that were asked for, how much, and where they lie.
     """
 
     vectors: NDArray[np.float64]
@@ -58,6 +63,7 @@ class ImageFrame:
     rest: NDArray[np.float64]
     mean: NDArray[np.float64]
     nugget: float
+    settings: dict[tuple[float, ...], Alike] = field(default_factory=dict, init=False)
 
     @classmethod
     def fit(
@@ -122,13 +128,21 @@ class ImageFrame:
         asked, scale : ndarray, shape (7,)
             Point of the question, of which the settings count, and bandwidths.
         """
-        gap = settings_gap(self.where, asked, scale)
-        alike = np.exp(-0.5 * (gap - gap.min()))  # far from all settings the nearest still speak
-        near = np.flatnonzero(alike > _ALIKE)
-        towards = matern(np.sqrt(squared_gaps(vectors, self.vectors[near]))) * alike[near]
+        key = (*asked[list(_SETTINGS)].tolist(), *scale.tolist())
+        known = self.settings.get(key)
+        if known is None:
+            gap = settings_gap(self.where, asked, scale)
+            alike = np.exp(-0.5 * (gap - gap.min()))  # far from all settings the nearest still speak
+            near = np.flatnonzero(alike > _ALIKE)
+            part = slice(int(near[0]), int(near[-1]) + 1) if _run(near) else near
+            known = alike[part], self.vectors[part], part
+            if len(self.settings) >= _KNOWN:
+                self.settings.clear()
+            self.settings[key] = known
+        alike, places, part = known
+        towards = matern(np.sqrt(squared_gaps(vectors, places))) * alike
         # far from every sample `towards` vanishes, and what is left is the mean
-        rest = self.rest[near[0] : near[-1] + 1] if _run(near) else self.rest[near]
-        return np.asarray(towards @ rest + self.mean)
+        return np.asarray(towards @ self.rest[part] + self.mean)
 
 
 def _run(rows: NDArray[np.intp]) -> bool:

@@ -33,7 +33,7 @@ from lensmodel.regression.transport import WidthField
 from lensmodel.regression.validation import Choice
 from lensmodel.regression.wavefront import NAMES, Wavefront
 
-VERSION: Final = 1
+VERSION: Final = 2
 """Raised whenever the same samples would be fitted otherwise."""
 
 _MOST_BYTES = 1 << 27
@@ -124,7 +124,7 @@ def _scalars(value: Any) -> dict[str, Any]:  # noqa: ANN401 - any of the frozen 
     return {
         k: list(v) if isinstance(v, tuple) else v
         for k, v in named.items()
-        if not isinstance(v, (np.ndarray, Wavefront))
+        if not isinstance(v, (np.ndarray, Wavefront, dict))
     }
 
 

@@ -18,6 +18,7 @@ DROPPED = 3e-5
 """Samples that together weigh less are left out; what they would change is a small part of that."""
 
 _FEW = 8
+_WIDER, _MANY = 3, 4096  # fewer samples are looked through faster than trees
 _PAIRS = 1 << 19
 
 
@@ -78,7 +79,7 @@ class Neighbourhood:
             rows = rows[self.votes[rows] > 0]
             if rows.size < _FEW:
                 rows = self._nearest(point)
-            gaps = np.nan_to_num((self.index.points[rows] - point) / self.scale, nan=0.0)
+            gaps = va.gaps(self.index.points[rows], point, self.scale)
             found.append(self._weighed(rows, gaps))
         return found
 
@@ -86,7 +87,7 @@ class Neighbourhood:
         self, asked: NDArray[np.float64]
     ) -> list[tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]]:
         """Many places of one setting: distances in settings are computed once, those of place in a table."""
-        apart = np.nan_to_num((self.index.points - asked[0]) / self.scale, nan=0.0)
+        apart = va.gaps(self.index.points, asked[0], self.scale)
         apart[:, :3] = 0.0
         settings, limit = (apart * apart).sum(axis=1), self.smoother.reach**2
         rows = np.flatnonzero((settings <= limit) & (self.votes > 0))
@@ -101,7 +102,7 @@ class Neighbourhood:
                 near = np.flatnonzero(distance <= limit)
                 if near.size < _FEW:
                     nearest = self._nearest(point)
-                    gaps = np.nan_to_num((self.index.points[nearest] - point) / self.scale, nan=0.0)
+                    gaps = va.gaps(self.index.points[nearest], point, self.scale)
                     found.append(self._weighed(nearest, gaps))
                     continue
                 gaps = apart[rows[near]]
@@ -110,10 +111,18 @@ class Neighbourhood:
         return found
 
     def _nearest(self, point: NDArray[np.float64]) -> NDArray[np.intp]:
-        squared = va.squared_distances(self.index.points, point, self.scale)
-        squared[self.votes <= 0] = np.inf
-        rows = np.argsort(squared, kind="stable")[:_FEW]
-        return rows[np.isfinite(squared[rows])]
+        """The nearest few that vote, however far."""
+        rows, reach = np.arange(len(self.index.points)), self.smoother.reach
+        for _ in range(_WIDER if len(rows) > _MANY else 0):
+            reach *= 2.0
+            found = self.index.near(point, reach, self.scale)
+            if np.count_nonzero(self.votes[found] > 0) >= _FEW:
+                rows = found
+                break
+        squared = va.squared_distances(self.index.points[rows], point, self.scale)
+        squared[self.votes[rows] <= 0] = np.inf
+        order = np.argsort(squared, kind="stable")[:_FEW]
+        return rows[order[np.isfinite(squared[order])]]
 
     def _weighed(
         self, rows: NDArray[np.intp], gaps: NDArray[np.float64]

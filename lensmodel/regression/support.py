@@ -58,7 +58,7 @@ def support(
 
     Distances count in bandwidths of eq. (8), `rule` from `variables.bandwidths`.
     """
-    gaps = np.nan_to_num((where - asked) / va.scales(va.support(rule)), nan=0.0)
+    gaps = va.gaps(where, asked, va.scales(va.support(rule)))
     squared = gaps**2
     nearest = int(squared.sum(axis=1).argmin())
     beyond = {name for name, value in zip(va.COLUMNS, np.abs(gaps).min(axis=0), strict=True) if value > _FAR}

@@ -107,11 +107,20 @@ def scales(widths: Mapping[str, float]) -> NDArray[np.float64]:
     return np.array([widths[name] for name in COLUMNS])
 
 
+def gaps(
+    where: NDArray[np.float64], asked: NDArray[np.float64], scale: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Differences of points `(n, d)` from one point `(d,)` in bandwidths; 0 where either is unknown."""
+    found = (where - asked) / scale
+    found[np.isnan(found)] = 0.0
+    return np.asarray(found)
+
+
 def squared_distances(
     where: NDArray[np.float64], asked: NDArray[np.float64], scale: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Squared distances in bandwidths of points `(n, 7)` from one point `(7,)`; unknowns drop out."""
-    gap = np.nan_to_num((where - asked) / scale, nan=0.0)
+    gap = gaps(where, asked, scale)
     return np.asarray((gap * gap).sum(axis=-1))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from lensmodel.deconv.base import Deconvolver
+from lensmodel.deconv.epll import Epll
 from lensmodel.deconv.krishnan_fergus import KrishnanFergus
 from lensmodel.deconv.richardson_lucy import RichardsonLucy, SaturationAwareRichardsonLucy
 from lensmodel.deconv.sparse_gradient import SparseGradient
@@ -33,5 +34,6 @@ deconvolvers: Registry[Deconvolver] = Registry(
         "whyte": _whyte,
         "krishnan-fergus": KrishnanFergus,
         "wiener": Wiener,
+        "epll": Epll,
     },
 )

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from lensmodel.blur.base import BlurOperator, crop_to_support, support_radius
 from lensmodel.blur.flow import EfficientFilterFlow
-from lensmodel.blur.uniform import UniformBlur
+from lensmodel.blur.uniform import Drift, UniformBlur
 from lensmodel.blur.windows import bartlett_hann, partition
 
 __all__ = [
     "BlurOperator",
+    "Drift",
     "EfficientFilterFlow",
     "UniformBlur",
     "bartlett_hann",

@@ -15,6 +15,46 @@ from lensmodel.types import Kernel, Plane
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Drift:
+    """Linear change of a kernel over a tile, h(. ; q) = k + (q_row - row) k_down + (q_col - col) k_across.
+
+    A point at q of the sharp plane is spread by h(. ; q), so that k_down and k_across act on the
+    latent plane times its distance from the origin.
+
+    Parameters
+    ----------
+    down, across : tuple of (UniformBlur, UniformBlur, float)
+        Two blurs before and after, and the pixels between the places they were taken at.
+    origin : tuple of float
+        Pixel `(row, col)` of the tile where the kernel is k.
+    """
+
+    down: tuple[UniformBlur, UniformBlur, float]
+    across: tuple[UniformBlur, UniformBlur, float]
+    origin: tuple[float, float]
+
+    def spectra(self, shape: tuple[int, int]) -> NDArray[np.complex64]:
+        """Transfer functions of k_down and k_across on the `rfft2` grid of `shape`, `(2, rows, cols)`."""
+        rates = [
+            _change(before, after, shape) / np.float32(max(pixels, 1.0))
+            for before, after, pixels in (self.down, self.across)
+        ]
+        return np.stack(rates).astype(np.complex64)
+
+
+def _change(before: UniformBlur, after: UniformBlur, shape: tuple[int, int]) -> NDArray[np.complexfloating]:
+    """Difference of two transfer functions; one transform where no shift is in the way."""
+    if before.offset != (0.0, 0.0) or after.offset != (0.0, 0.0):
+        return np.asarray(after.transfer(shape) - before.transfer(shape))
+    side = max(before.kernel.shape[0], after.kernel.shape[0])
+    grid = np.zeros(shape, dtype=np.float32)
+    for blur, sign in ((before, -1.0), (after, 1.0)):
+        low = (side - blur.kernel.shape[0]) // 2
+        grid[low : side - low, low : side - low] += (sign * blur.kernel).astype(np.float32)
+    return np.asarray(fft.rfft2(np.roll(grid, (-(side // 2), -(side // 2)), axis=(0, 1))))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class UniformBlur:
     """Blur by one kernel, y = k * x, no wrapping.
 
@@ -27,10 +67,14 @@ class UniformBlur:
     offset : tuple of float
         Shift `(row, col)` in pixels of the image of a point, on top of the kernel: lateral colour.
         It acts as a phase, so that it blurs nothing.
+    drift : Drift or None
+        How the kernel changes around the place that it was taken at. The operator itself is uniform;
+        a method may use it to model what a uniform operator leaves out.
     """
 
     kernel: Kernel
     offset: tuple[float, float] = (0.0, 0.0)
+    drift: Drift | None = None
     _spectra: dict[tuple[int, int], NDArray[np.complex64]] = field(
         default_factory=dict, init=False, repr=False
     )
@@ -46,11 +90,13 @@ class UniformBlur:
     def spectrum(self, shape: tuple[int, int]) -> NDArray[np.complex64]:
         """Transfer function on the `rfft2` grid of `shape`, kept for the next call."""
         if shape not in self._spectra:
-            spectrum = otf(self.kernel, shape)
-            if self.offset != (0.0, 0.0):
-                spectrum = spectrum * _phase(self.offset, shape)
-            self._spectra[shape] = spectrum.astype(np.complex64)
+            self._spectra[shape] = self.transfer(shape).astype(np.complex64)
         return self._spectra[shape]
+
+    def transfer(self, shape: tuple[int, int]) -> NDArray[np.complex128]:
+        """Transfer function on the `rfft2` grid of `shape`, kept nowhere."""
+        spectrum = otf(self.kernel, shape)
+        return spectrum * _phase(self.offset, shape) if self.offset != (0.0, 0.0) else spectrum
 
     def forward(self, latent: Plane) -> Plane:
         """Return k * x where every pixel of the kernel meets data: `(h + k - 1, ...)` to `(h, ...)`."""

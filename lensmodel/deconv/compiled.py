@@ -117,21 +117,25 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
     scale: Real,
     factors: Real,
     couplings: Real,
-    refresh: int,
+    drift: Complex,
+    down: Real,
+    across: Real,
     rotation: Real,
     jump: float,
     terms: Real,
 ) -> None:
     """Half-quadratic steps of `SparseGradient` on a canvas; `x` is the start and the result.
 
-    `state` is 0 where the pixel was measured, 1 where nothing was, 2 where it was clipped.
+    `state` is 0 where the pixel was measured, 1 where nothing was, 2 where it was clipped. `drift`
+    is how K changes per pixel down and across, and empty where it does not; `down` and `across` are
+    the distances from where it is K.
     """
     channels, height, width = x.shape
     half = width // 2 + 1
     axes = np.array([0, 1])
     norm = 1.0 / (height * width)
     X = np.empty((channels, height, half), np.complex64)
-    D = np.empty((channels, height, half), np.complex64)
+    D = np.empty((height, half), np.complex64)
     P = np.empty((height, half), np.complex64)
     pull = np.empty_like(x)
     work = np.empty((height, width), np.float32)
@@ -140,27 +144,32 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
     for step in range(couplings.shape[0]):
         pull_of(x, scale, factors[step], rotation, jump, terms, pull)
         for c in range(channels):
-            if step < refresh:
-                for i in range(height):
-                    for j in range(half):
-                        P[i, j] = K[c, i, j] * X[c, i, j]
-                rocket_fft.c2r(P, work, axes, _BACK, norm, 1)
-                for i in range(height):
-                    for j in range(width):
-                        seen, kind = y[c, i, j], state[c, i, j]
-                        if kind == 0 or (kind == 2 and work[i, j] < seen):
-                            work[i, j] = seen
-                rocket_fft.r2c(work, P, axes, _FORWARD, 1.0, 1)
-                for i in range(height):
-                    for j in range(half):
-                        D[c, i, j] = np.conj(K[c, i, j]) * P[i, j]
+            for i in range(height):
+                for j in range(half):
+                    P[i, j] = K[c, i, j] * X[c, i, j]
+            if drift.shape[0] > 0:
+                for way in range(2):
+                    for i in range(height):
+                        for j in range(width):
+                            work[i, j] = x[c, i, j] * (down[i] if way == 0 else across[j])
+                    rocket_fft.r2c(work, D, axes, _FORWARD, 1.0, 1)
+                    for i in range(height):
+                        for j in range(half):
+                            P[i, j] += drift[c, way, i, j] * D[i, j]
+            rocket_fft.c2r(P, work, axes, _BACK, norm, 1)
+            for i in range(height):
+                for j in range(width):
+                    kind, left = state[c, i, j], y[c, i, j] - work[i, j]
+                    work[i, j] = left if kind == 0 or (kind == 2 and left > _ZERO) else _ZERO
+            rocket_fft.r2c(work, D, axes, _FORWARD, 1.0, 1)
             rocket_fft.r2c(pull[c], P, axes, _FORWARD, 1.0, 1)
             weight = couplings[step] * noise[c]
             for i in range(height):
                 for j in range(half):
                     k = K[c, i, j]
                     power = k.real * k.real + k.imag * k.imag
-                    X[c, i, j] = (D[c, i, j] + weight * P[i, j]) * (_ONE / (power + weight * smooth[i, j]))
+                    found = power * X[c, i, j] + np.conj(k) * D[i, j]
+                    X[c, i, j] = (found + weight * P[i, j]) * (_ONE / (power + weight * smooth[i, j]))
             P[:] = X[c]
             rocket_fft.c2r(P, x[c], axes, _BACK, norm, 1)
 

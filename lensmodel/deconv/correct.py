@@ -7,13 +7,14 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lensmodel.blur import UniformBlur, crop_to_support
+from lensmodel.blur import Drift, UniformBlur, crop_to_support
 from lensmodel.deconv.base import Deconvolver, Sensor, restore_planes
 from lensmodel.deconv.lattice import Cell, Roi, cells
 from lensmodel.deconv.methods import deconvolvers
@@ -26,6 +27,7 @@ from lensmodel.types import (
     BayerPattern,
     Channel,
     FieldPosition,
+    Kernel,
     NoiseModel,
     Planes,
     StepHook,
@@ -69,7 +71,7 @@ class _Job:
     """Everything that a cell needs; shared by the threads and never changed."""
 
     planes: Planes
-    lens: PsfField
+    kernels: Callable[[FieldPosition, Channel], Kernel]
     frame: Frame
     method: Deconvolver
     strength: float
@@ -94,9 +96,23 @@ class _Job:
             raise InvalidInputError(f"psf_error must be finite and not negative, got {value} at {position}")
         return float(value)
 
-    def blur(self, position: FieldPosition, channel: Channel, error: float) -> UniformBlur:
-        """Kernel of one channel here, its lateral shift included."""
-        kernel = crop_to_support(self.lens.kernel_at(position, channel, KERNEL_SIZE))
+    def blur(self, cell: Cell, channel: Channel, error: float, corner: tuple[int, int]) -> UniformBlur:
+        """Kernel of one channel in a cell, and how it changes there, on a tile that begins at `corner`."""
+        middle = self._at(cell.position, channel, error)
+        down, across = (
+            (self._at(before, channel, error), self._at(after, channel, error), pixels)
+            for before, after, pixels in cell.beside
+        )
+        origin = (cell.middle[0] - corner[0], cell.middle[1] - corner[1])
+        return UniformBlur(middle.kernel, middle.offset, Drift(down, across, origin))
+
+    def reach(self, position: FieldPosition, channel: Channel, error: float) -> int:
+        """How far the blur of a place reaches, in pixels."""
+        return self._at(position, channel, error).reach
+
+    def _at(self, position: FieldPosition, channel: Channel, error: float) -> UniformBlur:
+        """Kernel of one channel at one place, its lateral shift included."""
+        kernel = self.kernels(position, channel)
         offset = (0.0, 0.0)
         if self.lateral is not None and channel != "g":
             out = self.lateral.displacement(position.r, channel)
@@ -200,7 +216,13 @@ def correct_planes(
     else:
         out[:] = 0.0
     solver = deconvolvers.create(method) if isinstance(method, str) else method
-    job = _Job(planes, field, frame, solver, strength, tuple(noise), tuple(clip), psf_error, lateral, cfa)
+
+    # Each kernel serves its own cell and as a neighbour; three rows of cells of 100 megapixels fit.
+    @lru_cache(maxsize=640)
+    def kernels(position: FieldPosition, channel: Channel) -> Kernel:
+        return crop_to_support(field.kernel_at(position, channel, KERNEL_SIZE))
+
+    job = _Job(planes, kernels, frame, solver, strength, tuple(noise), tuple(clip), psf_error, lateral, cfa)
     wanted = [cell for cell in cells(frame, pitch) if cell.meets(window)]
     forecasts = []
     for done, (cell, restored, expected) in enumerate(_restored(job, wanted, workers), start=1):
@@ -236,10 +258,14 @@ def _restored(job: _Job, wanted: Sequence[Cell], workers: int) -> Iterator[tuple
 def _restore(job: _Job, cell: Cell) -> tuple[Planes, CellForecast]:
     """Restore one cell, halo cut off again."""
     errors = [job.uncertainty(cell.position, channel) for channel in CHANNELS]
-    blurs = [job.blur(cell.position, channel, error) for channel, error in zip(CHANNELS, errors, strict=True)]
-    reach = max(blur.reach for blur in blurs)
+    reach = max(
+        job.reach(cell.position, channel, error) for channel, error in zip(CHANNELS, errors, strict=True)
+    )
     halo = max(MIN_HALO, 2 * reach + 8)
     top, left = max(cell.top - halo, 0), max(cell.left - halo, 0)
+    blurs = [
+        job.blur(cell, channel, error, (top, left)) for channel, error in zip(CHANNELS, errors, strict=True)
+    ]
     tile = np.asarray(job.planes[:, top : cell.bottom + halo, left : cell.right + halo], dtype=np.float32)
     sensors = [
         Sensor(

@@ -19,6 +19,9 @@ RAMP = 16
 """Width in pixels over which neighbouring cells fade into each other."""
 
 
+_Beside = tuple[FieldPosition, FieldPosition, float]
+
+
 @dataclass(frozen=True, slots=True)
 class Roi:
     """A window of the photo in pixels."""
@@ -59,6 +62,11 @@ class Cell:
         Weights along rows and columns; those of all cells sum to one.
     position : FieldPosition
         Centre of the cell: where its PSF is taken.
+    middle : tuple of float
+        The same as a pixel `(row, col)`.
+    beside : tuple of (FieldPosition, FieldPosition, float)
+        Centres of the cells above and below, and left and right, with the pixels between them; at the
+        border the cell itself stands in for the one that is not there.
     """
 
     top: int
@@ -66,6 +74,8 @@ class Cell:
     rise: NDArray[np.float32]
     run: NDArray[np.float32]
     position: FieldPosition
+    middle: tuple[float, float]
+    beside: tuple[_Beside, _Beside]
 
     @property
     def bottom(self) -> int:
@@ -103,11 +113,18 @@ def cells(frame: Frame, pitch: int | None = None) -> tuple[Cell, ...]:
     if pitch is None:
         pitch = int(np.clip(frame.half_diagonal / CELLS_PER_HALF_DIAGONAL, MIN_PITCH, MAX_PITCH))
     down, across = _pieces(frame.height, pitch), _pieces(frame.width, pitch)
-    return tuple(
-        Cell(top, left, rise, run, frame.position(middle_row, middle_col))
-        for top, rise, middle_row in down
-        for left, run, middle_col in across
-    )
+    rows, cols = [piece[2] for piece in down], [piece[2] for piece in across]
+    found = []
+    for i, (top, rise, row) in enumerate(down):
+        above, below = rows[max(i - 1, 0)], rows[min(i + 1, len(rows) - 1)]
+        for j, (left, run, col) in enumerate(across):
+            before, after = cols[max(j - 1, 0)], cols[min(j + 1, len(cols) - 1)]
+            beside = (
+                (frame.position(above, col), frame.position(below, col), below - above),
+                (frame.position(row, before), frame.position(row, after), after - before),
+            )
+            found.append(Cell(top, left, rise, run, frame.position(row, col), (row, col), beside))
+    return tuple(found)
 
 
 def _pieces(extent: int, pitch: int) -> list[tuple[int, NDArray[np.float32], float]]:

@@ -126,7 +126,9 @@ class SparseGradient:
                 problem.scale,
                 problem.factors,
                 problem.couplings,
-                problem.refresh,
+                problem.drift,
+                problem.down,
+                problem.across,
                 problem.rotation,
                 np.float32(problem.prox.jump),
                 problem.prox.terms,
@@ -155,7 +157,7 @@ class SparseGradient:
         scale = prox.scale((relative * calm / level ** np.float32(self.alpha)).astype(np.float32))
         couplings = self.coupling * self.growth ** np.arange(self.steps)
         mosaic = any(sensor.measured is not None for sensor in sensors)
-        weights = np.full(len(y), self.mosaic_weight if mosaic else self.weight)
+        weights = np.full(len(y), self.mosaic_weight if mosaic else self.weight, dtype=np.float64)
         weights[1:] *= self.chroma
         state = np.full(y.shape, _UNMEASURED, dtype=np.uint8)
         inside = (slice(None), *canvas.data)
@@ -170,6 +172,13 @@ class SparseGradient:
                 for a, blur, n, plane in zip(y, blurs, noise, planes, strict=True)
             ]
         )
+        drift = blurs[0].drift
+
+        def ramp(axis: int) -> NDArray[np.float32]:
+            """Pixels from where the kernel is K; held at the ends of the data, beyond which lies no datum."""
+            at = np.clip(np.arange(canvas.shape[axis]) - canvas.margin, 0, blurred.shape[1 + axis] - 1)
+            return (at - (drift.origin[axis] if drift else 0.0)).astype(np.float32)
+
         return _Problem(
             start=start,
             y=y,
@@ -180,7 +189,9 @@ class SparseGradient:
             scale=scale,
             factors=prox.scale((weights[None, :] / couplings[:, None]).astype(np.float32)),
             couplings=couplings.astype(np.float32),
-            refresh=self.steps,
+            drift=_drifts(blurs, canvas.shape, max(blurred.shape[1:]) / 2.0),
+            down=ramp(0),
+            across=ramp(1),
             rotation=_OPPONENT if len(y) == len(CHANNELS) else np.eye(len(y), dtype=np.float32),
             prox=prox,
         )
@@ -205,9 +216,28 @@ class _Problem:
     scale: NDArray[np.float32]
     factors: NDArray[np.float32]
     couplings: NDArray[np.float32]
-    refresh: int
+    drift: NDArray[np.complex64]
+    down: NDArray[np.float32]
+    across: NDArray[np.float32]
     rotation: NDArray[np.float32]
     prox: Shrinkage
+
+
+def _drifts(blurs: Sequence[UniformBlur], shape: tuple[int, int], reach: float) -> NDArray[np.complex64]:
+    """Change of the transfer functions per pixel, `(channel, 2, rows, cols)`; empty where one has none.
+
+    Each step inverts K alone and takes the change to the other side, as data. That converges only where
+    the change is smaller than K, so it is limited to half of K at `reach` pixels from the middle.
+    """
+    found = []
+    for blur in blurs:
+        if blur.drift is None:
+            return np.zeros((0, 2, 0, 0), dtype=np.complex64)
+        rates = blur.drift.spectra(shape)
+        change = np.float32(reach) * np.abs(rates).sum(axis=0)
+        allowed = np.float32(0.5) * np.abs(blur.spectrum(shape))
+        found.append(rates * np.minimum(allowed / np.maximum(change, np.float32(1e-9)), np.float32(1.0)))
+    return np.stack(found).astype(np.complex64)
 
 
 def _clips(sensors: Sequence[Sensor]) -> NDArray[np.float32]:
@@ -220,7 +250,6 @@ def _half_quadratic(p: _Problem, on_step: StepHook) -> Planes:
     power = np.abs(p.K) ** 2
     x = p.start
     X = fft.rfft2(x)
-    D = np.zeros_like(X)
     for step, coupling in enumerate(p.couplings):
         pull = np.zeros_like(x)
         scales = p.factors[step][:, None, None] * p.scale
@@ -229,12 +258,15 @@ def _half_quadratic(p: _Problem, on_step: StepHook) -> Planes:
             kept = p.prox(np.einsum("ij,jrc->irc", p.rotation, slope), scales)
             kept = np.einsum("ji,jrc->irc", p.rotation, kept)
             pull += np.roll(kept, 1, axis=axis) - kept
-        if step < p.refresh:
-            predicted = fft.irfft2(p.K * X, shape)
-            measured = (p.state == _MEASURED) | ((p.state == _CLIPPED) & (predicted < p.y))
-            D = np.conj(p.K) * fft.rfft2(np.where(measured, p.y, predicted))
+        predicted = p.K * X
+        if p.drift.size:
+            predicted += p.drift[:, 0] * fft.rfft2(x * p.down[:, None])
+            predicted += p.drift[:, 1] * fft.rfft2(x * p.across)
+        left = p.y - fft.irfft2(predicted, shape)
+        measured = (p.state == _MEASURED) | ((p.state == _CLIPPED) & (left > 0.0))
+        data = power * X + np.conj(p.K) * fft.rfft2(np.where(measured, left, np.float32(0.0)))
         strength = (coupling * p.noise)[:, None, None]
-        X = (D + strength * fft.rfft2(pull)) / (power + strength * p.smooth)
+        X = (data + strength * fft.rfft2(pull)) / (power + strength * p.smooth)
         x = fft.irfft2(X, shape).astype(np.float32)
         on_step(step + 1, len(p.couplings))
     return x

@@ -6,6 +6,7 @@ from hypothesis.extra import numpy as hnp
 from scipy import signal
 
 from lensmodel.blur import (
+    Drift,
     EfficientFilterFlow,
     UniformBlur,
     bartlett_hann,
@@ -169,3 +170,15 @@ def test_support_radius_holds_the_energy_asked_for() -> None:
 
     assert less < 0.999 <= held
     assert crop_to_support(kernel).shape == (2 * radius + 1, 2 * radius + 1)
+
+
+def test_drift_is_the_change_of_the_transfer_function_per_pixel() -> None:
+    narrow, wide = UniformBlur(gaussian(5, np.eye(2))), UniformBlur(gaussian(9, 2.0 * np.eye(2)))
+    shifted = UniformBlur(narrow.kernel, (0.5, -0.25))
+
+    down, across = Drift((narrow, wide, 40.0), (narrow, shifted, 20.0), (0.0, 0.0)).spectra((32, 30))
+
+    np.testing.assert_allclose(down, (wide.transfer((32, 30)) - narrow.transfer((32, 30))) / 40.0, atol=1e-7)
+    np.testing.assert_allclose(
+        across, (shifted.transfer((32, 30)) - narrow.transfer((32, 30))) / 20.0, atol=1e-7
+    )

@@ -5,7 +5,7 @@ import pytest
 from scipy import ndimage
 from skimage import restoration
 
-from lensmodel.blur import EfficientFilterFlow, UniformBlur
+from lensmodel.blur import Drift, EfficientFilterFlow, UniformBlur
 from lensmodel.deconv import (
     RichardsonLucy,
     SaturationAwareRichardsonLucy,
@@ -240,3 +240,21 @@ def test_shrinkage_finds_the_minimum(alpha: float, threshold: float) -> None:
 
     best = energy(np.tile(grid, (v.size, 1))).min(axis=1)
     assert np.all(energy(found[:, None].astype(np.float64))[:, 0] <= best + 2e-3 * threshold + 1e-5)
+
+
+def test_compiled_loops_give_the_numbers_of_numpy_where_the_kernel_drifts() -> None:
+    pytest.importorskip("numba")
+    pytest.importorskip("rocket_fft")
+    narrow, wide = (UniformBlur(gaussian(9, np.eye(2) * width)) for width in (0.8, 1.2))
+    blur = UniformBlur(
+        gaussian(9, np.eye(2)), drift=Drift((narrow, wide, 80.0), (wide, narrow, 90.0), (40.0, 45.0))
+    )
+    blurred = np.stack([blur.forward(scene(90, 101))[:80, :90]] * 3)
+    sensors = [Sensor(NoiseModel(1e-5, 1e-6))] * 3
+
+    slow = restore_planes(SparseGradient(engine="numpy"), blurred, [blur] * 3, sensors)
+    quick = restore_planes(SparseGradient(engine="auto"), blurred, [blur] * 3, sensors)
+    steady = restore_planes(SparseGradient(), blurred, [UniformBlur(blur.kernel)] * 3, sensors)
+
+    assert rmse(slow, quick) < 2e-5
+    assert rmse(slow, steady) > 1e-3

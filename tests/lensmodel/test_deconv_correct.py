@@ -317,3 +317,24 @@ def test_cells_of_a_mosaic_know_where_they_begin() -> None:
     part = correct_planes(seen, Soft(1.0, 1.0), FRAME, noise=BASE, cfa=((1, 0), (2, 1)), roi=roi).planes
 
     np.testing.assert_array_equal(part, whole[:, 31:91, 17:87])
+
+
+def test_cells_follow_a_kernel_that_changes_within_them() -> None:
+    lens = Soft(0.7, 2.2)
+    seen, sharp = photo(lens, BASE)
+
+    class Steps:
+        """The same lens, but with one kernel in each cell: those of its neighbours are its own."""
+
+        def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
+            nearest = min(places, key=lambda place: abs(place.r - position.r) + abs(place.phi - position.phi))
+            return lens.kernel_at(nearest, channel, size)
+
+    # A window in one cell, whose neighbours Steps hides by answering for that cell alone.
+    roi = (0, 0, 80, 100)
+    places = [cells(FRAME, 100)[0].position]
+    following = correct_planes(seen, lens, FRAME, noise=BASE, pitch=100, roi=roi).planes
+    fixed = correct_planes(seen, Steps(), FRAME, noise=BASE, pitch=100, roi=roi).planes
+
+    truth = sharp[:, :80, :100]
+    assert rmse(following, truth) < rmse(fixed, truth)

@@ -14,8 +14,9 @@ from app.commands.failure import UsageError
 from app.commands.files import as_usage, refuse_existing
 from app.commands.options import Force, Quiet, Verbose
 from lensmodel.bench.blind import BlindBenchmark, BlindReport, run_blind_benchmark
-from lensmodel.bench.correct import run_correct_benchmark
+from lensmodel.bench.correct import correct_table, run_correct_benchmark
 from lensmodel.bench.model import run_model_benchmark, table
+from lensmodel.bench.peers import PEERS
 from lensmodel.bench.report import markdown_table, write_report
 from lensmodel.codec import to_json
 from lensmodel.photo import develop
@@ -71,7 +72,7 @@ def default(context: typer.Context, quiet: Quiet = False, verbose: Verbose = 0) 
         settings = BlindBenchmark(noise=_levels(NOISE), methods=_names(ESTIMATORS), cases=12)
         shown.result("Blind estimators\n\n" + markdown_table(_blind(settings, 2, BLIND_OUTPUT, shown)))
         shown.result("Lens model\n\n" + table(run_model_benchmark(seeds=range(1000, 1002), photos=[1, 5])))
-        shown.result("Correction\n\n" + _speeds(_correct(None, "fast,standard", 1, shown)))
+        shown.result("Correction\n\n" + correct_table(_correct(None, "fast,standard", 1, shown)))
 
 
 @bench.command()
@@ -195,6 +196,10 @@ def correct(
     ] = None,
     methods: Annotated[str, typer.Option(help="Names, comma separated.")] = "fast,standard,paper",
     workers: Annotated[int, typer.Option(min=1, metavar="N", help="Threads.")] = 1,
+    repeats: Annotated[int, typer.Option(min=1, metavar="N", help="Runs; the median counts.")] = 1,
+    peers: Annotated[
+        bool, typer.Option("--peers", help="Time G'MIC, RawTherapee and darktable too, where installed.")
+    ] = False,
     json_output: JsonFile = None,
     force: Force = False,
     quiet: Quiet = False,
@@ -212,11 +217,13 @@ def correct(
     """
     shown = display.of(context, quiet=quiet, verbose=verbose)
     refuse_existing(_file(json_output), force=force)
-    result = _correct(photo, methods, workers, shown)
-    _tell(shown, json_output, result, _speeds(result))
+    result = _correct(photo, methods, workers, shown, repeats=repeats, peers=peers)
+    _tell(shown, json_output, result, correct_table(result))
 
 
-def _correct(photo: Path | None, methods: str, workers: int, shown: Display) -> dict[str, Any]:
+def _correct(
+    photo: Path | None, methods: str, workers: int, shown: Display, *, repeats: int = 1, peers: bool = False
+) -> dict[str, Any]:
     planes = develop(photo or demo_data_path("lake.jpg")).planes
     with shown.progress() as bars:
         task = bars.add_task("methods", total=None)
@@ -224,22 +231,10 @@ def _correct(photo: Path | None, methods: str, workers: int, shown: Display) -> 
             planes,
             methods=_names(methods),
             workers=workers,
+            repeats=repeats,
+            peers=PEERS if peers else (),
             on_step=lambda done, total: bars.update(task, completed=done, total=total),
         )
-
-
-def _speeds(result: dict[str, Any]) -> str:
-    lines = [
-        f"{result['megapixels']:.2f} megapixels, workers {result['workers']}; {result['machine']}",
-        "| method | wall s | CPU s | CPU s per megapixel and channel | memory so far MiB |",
-        "|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {name} | {row['wall_s']:.2f} | {row['cpu_s']:.2f} | {row['cpu_s_per_mp_channel']:.2f} "
-        f"| {row['peak_mib']:.0f} |"
-        for name, row in result["methods"].items()
-    ]
-    return "\n".join(lines)
 
 
 def _names(text: str) -> tuple[str, ...]:

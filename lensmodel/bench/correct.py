@@ -5,13 +5,17 @@ from __future__ import annotations
 import os
 import platform
 import resource
+import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from skimage import restoration
 
+from lensmodel.bench.peers import Peer
 from lensmodel.blur import UniformBlur
 from lensmodel.blur.uniform import fast_shape
 from lensmodel.deconv import SaturationAwareRichardsonLucy, Sensor, correct_planes
@@ -19,6 +23,7 @@ from lensmodel.deconv.engine import compiled
 from lensmodel.errors import InvalidInputError
 from lensmodel.geometry import Frame
 from lensmodel.psf import PsfField, gaussian
+from lensmodel.quality.images import to_srgb
 from lensmodel.types import Channel, FieldPosition, Kernel, NoiseModel, Planes, StepHook, ignore_step
 
 _TILE = 256
@@ -50,6 +55,8 @@ def run_correct_benchmark(
     field: PsfField | None = None,
     methods: Sequence[str] = ("fast", "standard", "paper"),
     workers: int = 1,
+    repeats: int = 1,
+    peers: Sequence[Peer] = (),
     out: Planes | None = None,
     on_step: StepHook = ignore_step,
 ) -> dict[str, object]:
@@ -65,6 +72,10 @@ def run_correct_benchmark(
         Names in `deconvolvers`.
     workers : int
         Threads.
+    repeats : int
+        Runs of each method and peer; the median counts.
+    peers : sequence of Peer
+        Programs to time on the same picture; those that are not installed are named as missing.
     out : Planes or None
         Where results are written; None allocates.
     on_step : StepHook
@@ -74,29 +85,35 @@ def run_correct_benchmark(
     -------
     dict
         `machine`, `megapixels`, `methods` (CPU and wall seconds, CPU seconds per megapixel and
-        channel, largest memory of the process so far in MiB) and `kernel` (CPU seconds per
-        megapixel and iteration of our tile kernel, of scikit-image and of the bare transforms).
+        channel, largest memory of the process so far in MiB), `kernel` (CPU seconds per
+        megapixel and iteration of our tile kernel, of scikit-image and of the bare transforms) and
+        `peers` (CPU seconds of each program's sharpening alone, or None where it is not installed).
 
     Raises
     ------
     InvalidInputError
-        If the photo is not three planes.
+        If the photo is not three planes, or there is no run.
     """
+    if repeats < 1:
+        raise InvalidInputError(f"repeats must be at least 1, got {repeats}")
     if photo.ndim != 3 or photo.shape[0] != 3:
         raise InvalidInputError(f"photo must be (3, height, width), got {photo.shape}")
     lens = field or SoftCorners()
     noise = [NoiseModel(1 / 50_000, 1e-6)] * 3
     frame = Frame(photo.shape[1], photo.shape[2])
     megapixels = frame.height * frame.width / 1e6
-    total = len(methods) + 1
+    total = len(methods) + 1 + len(peers)
     results: dict[str, dict[str, float]] = {}
     small = np.ascontiguousarray(photo[:, :200, :200])
     for done, method in enumerate(methods, start=1):
         # Compiling and first-use tables stay out of the figures.
         correct_planes(small, lens, Frame(small.shape[1], small.shape[2]), noise=noise, method=method)
-        wall, cpu = time.perf_counter(), time.process_time()
-        correct_planes(photo, lens, frame, noise=noise, method=method, workers=workers, out=out)
-        cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+        runs = []
+        for _ in range(repeats):
+            wall, cpu = time.perf_counter(), time.process_time()
+            correct_planes(photo, lens, frame, noise=noise, method=method, workers=workers, out=out)
+            runs.append((time.process_time() - cpu, time.perf_counter() - wall))
+        cpu, wall = (float(value) for value in np.median(runs, axis=0))
         results[method] = {
             "cpu_s": cpu,
             "wall_s": wall,
@@ -105,14 +122,56 @@ def run_correct_benchmark(
         }
         on_step(done, total)
     kernel = _kernel_times()
-    on_step(total, total)
+    on_step(len(methods) + 1, total)
+    others: dict[str, float | None] = {}
+    for done, peer in enumerate(peers, start=len(methods) + 2):
+        others[peer.name] = _peer_seconds(peer, photo, repeats) if peer.installed else None
+        on_step(done, total)
     return {
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",
         "megapixels": megapixels,
         "workers": workers,
         "methods": results,
         "kernel": kernel,
+        "peers": others,
     }
+
+
+def correct_table(report: Mapping[str, Any]) -> str:
+    """Tables of a report of `run_correct_benchmark`, in Markdown."""
+    lines = [
+        f"{report['megapixels']:.2f} megapixels, workers {report['workers']}; {report['machine']}",
+        "",
+        "| method | wall s | CPU s | CPU s per megapixel and channel | memory so far MiB |",
+        "|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {name} | {row['wall_s']:.2f} | {row['cpu_s']:.2f} | {row['cpu_s_per_mp_channel']:.3f} "
+        f"| {row['peak_mib']:.0f} |"
+        for name, row in report["methods"].items()
+    ]
+    lines += ["", "| Richardson-Lucy step | value |", "|---|---|"]
+    lines += [f"| {name.replace('_', ' ')} | {value:.4f} |" for name, value in report["kernel"].items()]
+    if report["peers"]:
+        names = list(report["methods"])
+        shares = "".join(f" {name} takes |" for name in names)
+        lines += ["", f"| program | CPU s, files left out |{shares}", "|---|---|" + "---|" * len(names)]
+    for peer, seconds in report["peers"].items():
+        if seconds is None:
+            lines.append(f"| {peer} | not installed |" + " |" * len(names))
+            continue
+        parts = [report["methods"][name]["cpu_s"] / max(seconds, 1e-3) for name in names]
+        lines.append(f"| {peer} | {seconds:.1f} |" + "".join(f" {part:.2f} of it |" for part in parts))
+    return "\n".join(lines)
+
+
+def _peer_seconds(peer: Peer, photo: Planes, repeats: int) -> float:
+    """Median CPU seconds of a program's sharpening on a photo."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        source = folder / ("in.dng" if peer.raw else "in.tif")
+        peer.write_input(np.moveaxis(to_srgb(photo), 0, -1).astype(np.float32), source)
+        return float(np.median([peer.net_seconds(source, folder) for _ in range(repeats)]))
 
 
 def _kernel_times() -> dict[str, float]:

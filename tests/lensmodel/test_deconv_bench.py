@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from lensmodel.bench.correct import SoftCorners, run_correct_benchmark
+from lensmodel.bench.correct import SoftCorners, correct_table, run_correct_benchmark
+from lensmodel.bench.peers import Peer
 from lensmodel.errors import InvalidInputError
 from lensmodel.psf import rms_width
 from lensmodel.types import FieldPosition
@@ -10,10 +11,14 @@ from lensmodel.types import FieldPosition
 def test_benchmark_times_each_method_and_prints_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     photo = np.full((3, 210, 220), 0.3, dtype=np.float32)
 
-    report = run_correct_benchmark(photo, methods=("fast",))
+    missing = Peer("nobody's", "no-such-program", lambda *_: [], (1.0,), 1.0)
+
+    report = run_correct_benchmark(photo, methods=("fast",), repeats=2, peers=[missing])
 
     assert report["methods"]["fast"]["cpu_s"] > 0
     assert report["kernel"]["ours"] > 0
+    assert report["peers"] == {"nobody's": None}
+    assert "| nobody's | not installed |" in correct_table(report)
     assert capsys.readouterr().out == ""
 
 

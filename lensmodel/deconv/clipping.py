@@ -12,6 +12,8 @@ from lensmodel.blur import UniformBlur
 from lensmodel.types import Kernel, Planes
 
 _FADE_PX = 4.0
+_RING_REACH = 4.0  # kernel radii about clipped light in which a dark ring is looked for
+_DARKEST = np.float32(0.6)  # share of the darkest pixel of the photo nearby that the result keeps there
 
 
 def light_radius(kernel: Kernel, share: float) -> float:
@@ -46,5 +48,10 @@ def faded_to(
     if not anywhere.any():
         return restored
     inner = max(light_radius(blur.kernel, 0.99) for blur in blurs) + 1.0
-    share = np.clip((ndimage.distance_transform_edt(~anywhere) - inner) / _FADE_PX, 0.0, 1.0)
+    distance = ndimage.distance_transform_edt(~anywhere)
+    share = np.clip((distance - inner) / _FADE_PX, 0.0, 1.0)
+    # What is left of a ring is a dark one: no scene is that much darker than its blur so near a light.
+    darkest = ndimage.minimum_filter(photo, (1, 5, 5), mode="nearest")
+    near = distance <= _RING_REACH * inner
+    restored = np.where(near, np.maximum(restored, _DARKEST * darkest), restored)
     return np.asarray(photo + share.astype(np.float32) * (restored - photo), dtype=np.float32)

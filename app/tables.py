@@ -263,6 +263,7 @@ class SampleRow(Base):
     format_version: Mapped[int]
     crc32: Mapped[int] = mapped_column(BigInteger)
     psf: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)
+    spectrum: Mapped[bytes | None] = mapped_column(LargeBinary)
     statistics_key: Mapped[str | None]
     estimator: Mapped[str]
     diagnostics: Mapped[dict[str, Any]]

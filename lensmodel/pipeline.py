@@ -37,8 +37,9 @@ from lensmodel.errors import (
 from lensmodel.patches import Patch, Selection
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.lateral import LateralColour, estimate_lateral, resample
-from lensmodel.psf import PsfSample
+from lensmodel.psf import PsfSample, rms_width
 from lensmodel.regression import LensModel, ModelSettings
+from lensmodel.spectrum import PatchSpectrum
 from lensmodel.types import (
     CHANNELS,
     Channel,
@@ -207,7 +208,9 @@ def estimate_cell(
             continue
         if channel == "g":
             green = estimate
-        for patch, evidence in zip(group, estimate.evidence or (None,) * len(group), strict=False):
+        width = rms_width(estimate.kernel)
+        proofs = estimate.evidence or (None,) * len(group)
+        for patch, evidence, plane, noise in zip(group, proofs, planes, noises, strict=False):
             sample = PsfSample(
                 kernel=estimate.kernel,
                 position=patch.position,
@@ -217,6 +220,7 @@ def estimate_cell(
                 pixel_pitch_um=developed.info.metadata.pixel_pitch_um,
                 estimator=f"{method.name}/{method.version}",
                 error=estimate.predicted_error if math.isfinite(estimate.predicted_error) else None,
+                spectrum=PatchSpectrum.of(plane, noise, width),
             )
             stored = None if evidence is None else evidence.to_bytes()
             diagnostics = {**estimate.diagnostics, "predicted_error": estimate.predicted_error}

@@ -22,8 +22,9 @@ from app.jobs.sandbox import Limits
 from app.jobs.workbench import SPARE_MB, JobFailedError, NotWantedError, Workbench, settings_of
 from app.store import LensName, NewPatch, NewSample
 from app.tables import PatchRow, PhotoRow
-from lensmodel.errors import InvalidKernelError
+from lensmodel.errors import InvalidInputError, InvalidKernelError
 from lensmodel.psf import as_kernel
+from lensmodel.spectrum import PatchSpectrum
 
 log = logging.getLogger(__name__)
 
@@ -254,7 +255,10 @@ class PhotoWork:
             kernels = np.load(folder / KERNELS, allow_pickle=False, mmap_mode="r")
             kernel = as_kernel(kernels[number])
             weight = float(np.clip(entry["weight"], 0.0, 1.0))
-        except (InvalidKernelError, ValueError, OSError, IndexError) as error:
+            spectrum = None if entry["spectrum"] is None else bytes.fromhex(entry["spectrum"])
+            if spectrum is not None:
+                PatchSpectrum.from_bytes(spectrum)
+        except (InvalidKernelError, InvalidInputError, ValueError, OSError, IndexError) as error:
             raise JobFailedError("internal_error", f"the estimator gave no kernel: {error}") from error
         key = None
         if entry["evidence"] is not None:
@@ -269,6 +273,7 @@ class PhotoWork:
             estimator=entry["estimator"],
             predicted_error=entry["predicted_error"],
             statistics_key=key,
+            spectrum=spectrum,
             diagnostics=entry["diagnostics"],
         )
 

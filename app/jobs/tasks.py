@@ -23,6 +23,7 @@ from lensmodel.patches import Patch
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.psf import PsfSample
 from lensmodel.regression import LensModel
+from lensmodel.spectrum import PatchSpectrum
 from lensmodel.types import FieldPosition, LensSettings
 
 log = logging.getLogger(__name__)
@@ -87,6 +88,7 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: Progress) -> lis
         if result.evidence is not None:
             evidence = f"evidence-{number}.npz"
             (folder / evidence).write_bytes(result.evidence)
+        spectrum = result.sample.spectrum
         diagnostics = {name: _finite(value) for name, value in result.diagnostics.items()}
         listed.append(
             {
@@ -97,6 +99,7 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: Progress) -> lis
                 "predicted_error": diagnostics.pop("predicted_error", None),
                 "diagnostics": diagnostics,
                 "evidence": evidence,
+                "spectrum": None if spectrum is None else spectrum.to_bytes().hex(),
             }
         )
     return listed
@@ -180,6 +183,7 @@ def _model(folder: Path) -> LensModel:
                 pixel_pitch_um=entry["pixel_pitch_um"],
                 estimator=entry["estimator"],
                 error=entry["error"],
+                spectrum=_spectrum(entry["spectrum"]),
             )
         )
     learned = folder / LEARNED
@@ -189,6 +193,10 @@ def _model(folder: Path) -> LensModel:
         except InvalidInputError as error:
             log.info("the model is fitted anew: %s", error)
     return LensModel.fit(samples)
+
+
+def _spectrum(stored: str | None) -> PatchSpectrum | None:
+    return None if stored is None else PatchSpectrum.from_bytes(bytes.fromhex(stored))
 
 
 def _settings(stored: Mapping[str, Any]) -> LensSettings:

@@ -190,6 +190,7 @@ def write_samples(folder: Path, stored: Sequence[StoredSample]) -> None:
                 "pixel_pitch_um": sample.pixel_pitch_um,
                 "estimator": sample.estimator,
                 "error": sample.error,
+                "spectrum": None if sample.spectrum is None else sample.spectrum.to_bytes().hex(),
                 "settings": {
                     "aperture": sample.settings.aperture,
                     "focal_mm": sample.settings.focal_mm,

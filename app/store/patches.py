@@ -46,6 +46,7 @@ class NewSample:
     estimator: str
     predicted_error: float | None = None
     statistics_key: str | None = None
+    spectrum: bytes | None = None
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -202,6 +203,7 @@ def _sample_row(photo: PhotoRow, patch: PatchRow, sample: NewSample) -> dict[str
         "format_version": FORMAT_VERSION,
         "crc32": zlib.crc32(blob),
         "psf": blob,
+        "spectrum": sample.spectrum,
         "statistics_key": sample.statistics_key,
         "estimator": sample.estimator,
         "diagnostics": dict(sample.diagnostics),

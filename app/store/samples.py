@@ -14,6 +14,7 @@ from app.store.patches import DTYPE
 from app.tables import LensRow, OwnerRow, PhotoRow, SampleRow
 from lensmodel.errors import LensModelError
 from lensmodel.psf import PsfSample
+from lensmodel.spectrum import PatchSpectrum
 from lensmodel.types import Channel, FieldPosition, LensSettings
 
 _STATE = select(LensRow.version, LensRow.rebuild_epoch).where(
@@ -79,6 +80,7 @@ class SampleStore:
                 SampleRow.size,
                 SampleRow.crc32,
                 SampleRow.psf,
+                SampleRow.spectrum,
                 SampleRow.estimator,
                 SampleRow.predicted_error,
                 PhotoRow.public_id.label("photo"),
@@ -119,5 +121,6 @@ def _stored(row: Row[*tuple[Any, ...]]) -> StoredSample:
             pixel_pitch_um=row.pixel_pitch_um,
             estimator=row.estimator,
             error=row.predicted_error,
+            spectrum=None if row.spectrum is None else PatchSpectrum.from_bytes(row.spectrum),
         ),
     )

@@ -267,6 +267,8 @@ class LensModel:
         error = field_error(held_out, noise, independent) * (1.0 + 0.5 * max(nearest - 1.0, 0.0))
         shared = shared_error(float(weight @ fit.told[rows]), noise)
         error, share = math.hypot(error, shared), float(prior_shares[0])
+        if fit.physical is not None and fit.physical.agreed:
+            error = shared = math.sqrt(float(mixture.squared[0])) * (1.0 + 0.5 * max(nearest - 1.0, 0.0))
         if self.prior is not None and share > _LISTED:
             error = math.sqrt((1.0 - share) * error**2 + share * self.prior.error(position, settings) ** 2)
         scatter = None

@@ -6,6 +6,9 @@ of the samples is kriged with mean zero, so that far from all samples the wavefr
 
     f(x, y) = N(x, y) + c'(x, y) K^-1 (C - N),    K = c + nugget / q
 
+Where the samples carry the spectra of their patches, the wavefront is fitted to those instead (`pooled`) and
+stands alone: all patches agree on it, while finished kernels carry each patch's own mistake.
+
 Cost: some seconds of CPU for the fit, one or two milliseconds at each question.
 """
 
@@ -21,6 +24,7 @@ from numpy.typing import NDArray
 from lensmodel.psf import PsfSample, resized
 from lensmodel.regression import variables as va
 from lensmodel.regression.kriging import NUGGETS, field_vector, matern, settings_gap, squared_gaps
+from lensmodel.regression.pooled import pool
 from lensmodel.regression.wavefront import Wavefront
 from lensmodel.regression.wavefront_fit import MIN_SAMPLES, fit_wavefront, spread
 from lensmodel.types import FieldPosition, LensSettings, StepHook, ignore_step
@@ -50,7 +54,10 @@ class Physics:
     rest : ndarray, shape (m, side^2)
         K^-1 (C - N): the rest at a place is the product of its covariances and this.
     errors : ndarray, shape (n,)
-        Relative L2 of every sample, of its own group's rest nothing known.
+        Relative L2 of every sample, of its own group's rest nothing known; expected errors of the
+        wavefront if `agreed`.
+    agreed : bool
+        Whether the wavefront was fitted to the spectra of all patches, and nothing is left to krige.
     """
 
     front: Wavefront
@@ -60,6 +67,7 @@ class Physics:
     scale: NDArray[np.float64]
     rest: NDArray[np.float64]
     errors: NDArray[np.float64]
+    agreed: bool = False
 
     @classmethod
     def fit(
@@ -86,8 +94,14 @@ class Physics:
         if len(voting) < MIN_SAMPLES or not _one_focal_length([samples[i] for i in voting]):
             return None
         on_step(0, _STEPS)
+        trusted = [samples[i].with_weight(float(votes[i])) for i in voting]
+        pooled = pool(trusted, on_step)
+        if pooled is not None:
+            side = max(s.kernel.shape[0] for s in samples)
+            empty = np.empty((0, 2)), np.empty((0, len(scale))), scale, np.empty((0, side**2))
+            return cls(pooled.front, side, *empty, pooled.errors(samples), agreed=True)
         known = {id(samples[i]): i for i in voting}
-        front = fit_wavefront([samples[i].with_weight(float(votes[i])) for i in voting])
+        front = fit_wavefront(trusted)
         if front is None:
             return None
         on_step(1, _STEPS)
@@ -111,6 +125,8 @@ class Physics:
     def rows(self, positions: Sequence[FieldPosition], settings: LensSettings) -> NDArray[np.float64]:
         """Kernels of the image frame as flat rows, shape (q, side^2)."""
         found = np.stack([_rendered(self.front, self.side, place, settings) for place in positions])
+        if self.agreed:
+            return found
         alike = np.exp(-0.5 * settings_gap(self.where, va.point(positions[0], settings), self.scale))
         near = np.flatnonzero(alike > _ALIKE)
         if near.size:

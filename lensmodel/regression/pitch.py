@@ -43,7 +43,11 @@ def at_pitch(samples: Sequence[PsfSample], pitch_um: float | None) -> tuple[PsfS
     return tuple(
         s
         if s.pixel_pitch_um is None or pitch_um is None or alike(s.pixel_pitch_um, pitch_um)
-        else replace(s, kernel=rescaled(s.kernel, s.pixel_pitch_um, pitch_um, side_at(s, pitch_um)))
+        else replace(
+            s,
+            kernel=rescaled(s.kernel, s.pixel_pitch_um, pitch_um, side_at(s, pitch_um)),
+            spectrum=None,  # its frequencies are those of the other pixels
+        )
         for s in samples
     )
 

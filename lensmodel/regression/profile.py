@@ -20,6 +20,7 @@ import os
 import secrets
 import zipfile
 import zlib
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -30,6 +31,7 @@ from lensmodel.errors import InvalidInputError, LensModelError
 from lensmodel.psf import PsfSample, resized
 from lensmodel.regression.answer import ModelSettings
 from lensmodel.regression.model import LensModel
+from lensmodel.spectrum import RINGS, SECTORS, PatchSpectrum
 from lensmodel.types import FieldPosition, LensSettings
 
 FORMAT = 1
@@ -38,6 +40,7 @@ _MAX_SAMPLES = 200_000
 _MAX_SIDE = 255
 _INFINITY = "infinity"
 _LEARNED = "learned.npz"
+_SPECTRA = "spectra.npy"
 _FAMILY = "family.lensprofile"
 
 log = logging.getLogger(__name__)
@@ -106,6 +109,8 @@ def _write(file: IO[bytes], profile: LensProfile) -> None:
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("profile.json", json.dumps(document, allow_nan=False))
         archive.writestr("kernels.npy", arrays.getvalue())
+        if any(sample.spectrum is not None for sample in samples):
+            archive.writestr(_SPECTRA, _spectra(samples))
         archive.writestr(_LEARNED, profile.model.learned(), zipfile.ZIP_STORED)
         if prior is not None and isinstance(prior.source, LensModel):
             family = io.BytesIO()
@@ -135,6 +140,7 @@ def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> 
                 )
             document = json.loads(archive.read("profile.json"))
             stack = np.load(io.BytesIO(archive.read("kernels.npy")), allow_pickle=False)
+            spectra = archive.read(_SPECTRA) if _SPECTRA in sizes else None
             learned = archive.read(_LEARNED) if _LEARNED in sizes else None
             family = archive.read(_FAMILY) if _FAMILY in sizes and not alone else None
     except FileNotFoundError:
@@ -159,7 +165,8 @@ def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> 
                 f"{name} holds {len(entries)} samples but kernels of shape {stack.shape}; "
                 f"one is needed for each, of side {_MAX_SIDE} at most"
             )
-        samples = [_sample(entry, kernel) for entry, kernel in zip(entries, stack, strict=True)]
+        seen = _opened(spectra, len(entries))
+        samples = [_sample(e, kernel, s) for e, kernel, s in zip(entries, stack, seen, strict=True)]
         model = _model(samples, _settings(document["model"]), learned)
         if family is not None:
             other = _read(io.BytesIO(family), f"the family in {name}", alone=True)
@@ -188,7 +195,29 @@ def _entry(sample: PsfSample) -> dict[str, Any]:
     }
 
 
-def _sample(entry: dict[str, Any], kernel: Any) -> PsfSample:  # noqa: ANN401 - one row of an array of any shape
+def _spectra(samples: Sequence[PsfSample]) -> bytes:
+    """One row for each sample, NaN where it has no spectrum."""
+    missing = np.full(RINGS * SECTORS + 3, np.nan, dtype="<f4").tobytes()
+    rows = b"".join(missing if s.spectrum is None else s.spectrum.to_bytes() for s in samples)
+    buffer = io.BytesIO()
+    np.save(buffer, np.frombuffer(rows, dtype="<f4").reshape(len(samples), -1), allow_pickle=False)
+    return buffer.getvalue()
+
+
+def _opened(data: bytes | None, count: int) -> list[PatchSpectrum | None]:
+    if data is None:
+        return [None] * count
+    rows = np.load(io.BytesIO(data), allow_pickle=False)
+    if rows.shape != (count, RINGS * SECTORS + 3) or rows.dtype != np.float32:
+        raise ValueError(f"spectra of shape {rows.shape} for {count} samples")
+    return [None if np.isnan(row).all() else PatchSpectrum.from_bytes(row.tobytes()) for row in rows]
+
+
+def _sample(
+    entry: dict[str, Any],
+    kernel: Any,  # noqa: ANN401 - one row of an array of any shape
+    spectrum: PatchSpectrum | None,
+) -> PsfSample:
     settings = dict(entry["settings"])
     if settings.get("focus_m") == _INFINITY:
         settings["focus_m"] = math.inf
@@ -198,6 +227,7 @@ def _sample(entry: dict[str, Any], kernel: Any) -> PsfSample:  # noqa: ANN401 - 
         settings=LensSettings(**settings),
         weight=float(entry["weight"]),
         photo=str(entry["photo"]),
+        spectrum=spectrum,
         pixel_pitch_um=entry["pixel_pitch_um"],
         estimator=str(entry["estimator"]),
         error=entry.get("error"),

@@ -28,9 +28,15 @@ TERMS = 8
 """Number of wavefront terms; the last two are the tilts, which move the kernel."""
 
 _MIN_ACROSS, _MAX_ACROSS = 40, 176
+_ALONE = 1.05  # period over the side of a kernel, at least
 _PERIOD = 1.25  # of the discrete pupil over the side of the kernel
 _SAMPLING = 0.9  # light is band limited to 1 / q cycles/pixel; its last tenth may alias, the pixel kills it
 _MIN_FINE, _MAX_FINE = 3, 8
+
+
+def largest_side(q: float) -> int:
+    """Odd side of the largest kernel that shows no copy of the light beside it: one period of the pupil."""
+    return 2 * int(_MAX_ACROSS * q / 2.0 / _ALONE) - 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,8 +26,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.psf import as_kernel, centroid
-from lensmodel.regression.pupil import PupilGrid
+from lensmodel.psf import as_kernel, centroid, resized
+from lensmodel.regression.pupil import PupilGrid, largest_side
 from lensmodel.types import WAVELENGTH_NM, FieldPosition, Kernel, LensSettings
 
 NAMES: Final = (
@@ -40,6 +40,7 @@ NAMES: Final = (
 """The linear unknowns, in pixels of blur at the widest aperture."""
 
 _STEPS = 4
+_BAND_NM = 35.0  # half the distance between the outer wavelengths of one channel
 _CENTRED_PX = 1e-3
 
 
@@ -87,12 +88,15 @@ class Wavefront:
 
     def kernel(self, position: FieldPosition, settings: LensSettings, size: int) -> Kernel:
         """Kernel of the image frame, centred, of odd side `size`; three wavelengths to a channel."""
-        light = np.zeros((size, size))
+        shortest = (WAVELENGTH_NM[settings.channel] - _BAND_NM) / WAVELENGTH_NM["g"]
+        q = math.exp(self.log_q) * shortest / self.stop(settings)
+        side = min(size, largest_side(q))
+        light = np.zeros((side, side))
         tilt = np.zeros(2)
-        for shift, weight in ((0.0, 0.5), (-35.0, 0.25), (35.0, 0.25)):
-            part, tilt = self._centred(position, settings, tilt, shift, size)
+        for shift, weight in ((0.0, 0.5), (-_BAND_NM, 0.25), (_BAND_NM, 0.25)):
+            part, tilt = self._centred(position, settings, tilt, shift, side)
             light += weight * part
-        return as_kernel(light)
+        return resized(as_kernel(light), size)
 
     def stop(self, settings: LensSettings) -> float:
         """N0 / N; an unknown aperture counts as the widest."""

@@ -52,6 +52,7 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: Progress) -> lis
         "predicted_error": 0.1,
         "diagnostics": {},
         "evidence": None,
+        "spectrum": None,
     }
     return [{"idx": arguments["numbers"][0], "channel": channel, **common} for channel in ("r", "g", "b")]
 

@@ -82,6 +82,7 @@ def estimate(arguments: dict[str, Any], folder: Path) -> Outcome:
             "predicted_error": 0.1,
             "diagnostics": {},
             "evidence": None,
+            "spectrum": None,
         }
         for number in arguments["numbers"]
         for channel in ("r", "g", "b")

@@ -18,22 +18,38 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.regression.pooled.scene import BIAS, PHOTO_SPREAD, SHAPES, SceneView
-from lensmodel.regression.pooled.transfer import BINS, Transfer
+from lensmodel.regression.pooled.transfer import BINS, BORROWED_RINGS, Transfer
 from lensmodel.regression.wavefront import NAMES, Wavefront, design, stopped
-from lensmodel.regression.wavefront_problem import PRIOR_PX, USUAL_EYE
+from lensmodel.regression.wavefront_problem import USUAL_EYE
+from lensmodel.spectrum import SECTORS
 from lensmodel.types import WAVELENGTH_NM, FieldPosition, LensSettings, StepHook, ignore_step
 
 Floats = NDArray[np.float64]
 
+_RINGS = BINS // SECTORS
 _LENS = len(NAMES) + 2  # and the cat's eye
 _EYE_SPREAD = (0.15, 0.3)
+SYMMETRIC: Final = np.array(
+    [name in {"spherical", "coma", "focus", "field curvature", "astigmatism"} for name in NAMES] + [False] * 2
+)
+"""Which unknowns a centred lens of third order has in one colour."""
+
+_HELD = 1e12
 _USUAL = np.concatenate([np.zeros(len(NAMES)), USUAL_EYE])
-_VOTE = 1.0 / np.concatenate([PRIOR_PX, _EYE_SPREAD]) ** 2
+# What third-order theory does not know is small; a copy's own faults are smaller than the design's.
+_SPREAD_PX = np.array(
+    [4.0, 0.25, 4.0, 0.5, 0.5, 0.25, 4.0, 0.7, 0.7, 4.0, 0.25, 1.0, 1.0, 4.0, 0.4, 0.4, 0.4, 0.4, 0.25]
+)
+_VOTE = 1.0 / np.concatenate([_SPREAD_PX, _EYE_SPREAD]) ** 2
+_TEMPER = 0.25
+"""Share of the likelihood that counts: neighbouring bins and patches of one motif err alike."""
+
 _FLOOR = 4e-3  # of |OTF|^2: below, zeros are smeared by more than the model knows
 _LARGEST_RESIDUAL = 3.0
 _TAILS = 6.0  # degrees of freedom of Student's t of a bin
@@ -41,7 +57,7 @@ _PATCH_TAILS = 3.0  # of a patch, in units of its bins
 _SCENE_ROUNDS, _SCENE_ROUNDS_AGAIN = 3, 2
 _TRIES = 5
 _STRIDE_PX = 1.5
-_ENOUGH = 0.05
+_ENOUGH = 0.2
 _SMALLEST_EYE = 0.5
 
 
@@ -86,7 +102,12 @@ class _State:
 
 
 def fit_spectra(
-    patches: Sequence[PatchView], begin: Wavefront, *, rounds: int = 15, on_step: StepHook = ignore_step
+    patches: Sequence[PatchView],
+    begin: Wavefront,
+    *,
+    rounds: int = 15,
+    symmetric: bool = False,
+    on_step: StepHook = ignore_step,
 ) -> PooledFit:
     """Fit a lens to patches, beginning with a wavefront.
 
@@ -97,17 +118,23 @@ def fit_spectra(
         `log_q`, `f_number` and `size` stay as they are here.
     rounds : int
         Steps at most.
+    symmetric : bool
+        Whether only the terms of a perfectly centred lens may change: few unknowns have few minima.
     """
     photos = sorted({patch.photo for patch in patches})
     problem = _Problem(tuple(patches), {name: i for i, name in enumerate(photos)}, begin)
     lens = np.concatenate([begin.terms, begin.eye])
     shared = np.zeros((len(photos), len(PHOTO_SPREAD)))
     state = problem.state(lens, shared, None)
+    held = np.zeros(_LENS + shared.size)
+    held[:_LENS] = np.where(SYMMETRIC, 0.0, _HELD) if symmetric else 0.0
     damping = 1e-2
     for done in range(rounds):
         better: tuple[Floats, Floats, _State] | None = None
         for _ in range(_TRIES):
-            step = np.linalg.solve(state.normal + damping * np.diag(np.diag(state.normal)), state.gradient)
+            step = np.linalg.solve(
+                state.normal + np.diag(damping * np.diag(state.normal) + held), state.gradient
+            )
             step = step * min(1.0, _STRIDE_PX / max(float(np.abs(step[: len(NAMES)]).max()), 1e-9))
             moved = lens + step[:_LENS]
             moved[-2] = max(moved[-2], _SMALLEST_EYE)
@@ -153,14 +180,15 @@ class _Problem:
             z = None if scenes is None else scenes[i]
             fitted = _Scene.fitted(patch.scene, offset, z)
             nu = _PATCH_TAILS * BINS * len(patch.scene.channels)
-            cost += nu * math.log1p(fitted.cost / nu)
-            weight = 1.0 / (1.0 + fitted.cost / nu)
+            cost += _TEMPER * nu * math.log1p(fitted.cost / nu)
+            trusted = 1.0 / (1.0 + fitted.cost / nu)
+            weight = _TEMPER * trusted
             own_normal, own_gradient, own_count = fitted.reduced(by_lens)
             places = [*range(_LENS), *range(at, at + own_count - _LENS)]
             normal[np.ix_(places, places)] += weight * own_normal
             gradient[places] += weight * own_gradient
             found.append(fitted.z)
-            trust.append(weight)
+            trust.append(trusted)
         vote = np.concatenate([_VOTE, np.tile(1.0 / PHOTO_SPREAD**2, len(self.photos))])
         off = np.concatenate([lens - _USUAL, shared.ravel()])
         cost += float(vote @ off**2)
@@ -177,9 +205,9 @@ class _Problem:
             q = math.exp(self.begin.log_q) * WAVELENGTH_NM[channel] / WAVELENGTH_NM["g"] / stop
             linear = stopped(design(patch.position, settings), stop)
             radius, move = lens[-2] / stop, lens[-1] / stop
-            value, by_blur, by_eye = Transfer.of(q).log_power(
-                linear @ lens[: len(NAMES)], radius, (move * x, move * y)
-            )
+            value, by_blur, by_eye = Transfer.of(
+                q, _RINGS if channel == "g" else _RINGS - BORROWED_RINGS
+            ).log_power(linear @ lens[: len(NAMES)], radius, (move * x, move * y))
             kept = np.exp(value) / (np.exp(value) + _FLOOR)
             values.append(np.log(np.exp(value) + _FLOOR))
             by_move = by_eye[:, 1] * x + by_eye[:, 2] * y

@@ -15,25 +15,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.psf import PsfSample, distance, rms_width
-from lensmodel.regression.pooled.fit import PatchView, PooledFit, fit_spectra
+from lensmodel.regression.pooled.fit import SYMMETRIC, PatchView, PooledFit, fit_spectra
 from lensmodel.regression.pooled.scene import SceneView
 from lensmodel.regression.starts import starts
 from lensmodel.regression.wavefront import Wavefront, design, stopped
 from lensmodel.regression.wavefront_fit import fit_wavefront, spread
 from lensmodel.regression.wavefront_problem import PRIOR_PX, USUAL_EYE
-from lensmodel.types import Channel, FieldPosition, Kernel, StepHook, ignore_step
+from lensmodel.types import WAVELENGTH_NM, Channel, FieldPosition, Kernel, StepHook, ignore_step
 
 MIN_PLACES: Final = 12
 """Fewer patches with a spectrum are not solved together."""
 
 _COMA = slice(2, 6)  # the terms that a turn by 180 degrees negates
-_COARSE_PLACES, _FINE_PLACES = 16, 48
+_COARSE_PLACES, _FINE_PLACES = 16, 40
 _COARSE_ROUNDS, _FINE_ROUNDS = 8, 15
-_STARTS, _REFINED = 4, 2
+_STARTS, _REFINED = 8, 3
 _SAME_COST = 1.0
 _TAIL_SIDE = 31
 _DRAWS, _SEED = 6, 0
-_OVERCONFIDENCE = 1.5
+_OVERCONFIDENCE = 3.0
 """Bins of a spectrum and patches of a photo are not as independent as the cost takes them to be."""
 
 
@@ -87,17 +87,13 @@ class Pooled:
         return np.asarray(weight @ found / weight.sum(axis=1), dtype=np.float64)
 
 
-def pool(
-    samples: Sequence[PsfSample], begin: Wavefront | None = None, on_step: StepHook = ignore_step
-) -> Pooled | None:
+def pool(samples: Sequence[PsfSample], on_step: StepHook = ignore_step) -> Pooled | None:
     """Solve all samples of one focal length together.
 
     Parameters
     ----------
     samples : sequence of PsfSample
         Those without a spectrum only help to begin.
-    begin : Wavefront, optional
-        An earlier fit of this lens.
 
     Returns
     -------
@@ -109,29 +105,31 @@ def pool(
     if len(places) < MIN_PLACES:
         return None
     heads = [group.get("g", next(iter(group.values()))) for group in places]
-    first = fit_wavefront(list(samples), begin)
+    first = fit_wavefront(list(samples))
     if first is None:
         return None
+    first = replace(first, log_q=_log_q(seen, first.log_q))
     begins = [first]
-    if begin is None:
-        designs = np.stack([stopped(design(s.position, s.settings), first.stop(s.settings)) for s in heads])
-        begins += [
-            replace(first, terms=terms, eye=USUAL_EYE)
-            for terms in starts(heads, designs, PRIOR_PX, math.exp(first.log_q), _STARTS)
-        ]
+    centred = np.where(SYMMETRIC[: len(PRIOR_PX)], PRIOR_PX, 0.0)
+    designs = np.stack([stopped(design(s.position, s.settings), first.stop(s.settings)) for s in heads])
+    begins += [
+        replace(first, terms=terms * (centred > 0), eye=USUAL_EYE)
+        for terms in starts(heads, designs, np.maximum(centred, 1e-3), math.exp(first.log_q), _STARTS)
+    ]
     at = {id(head): group for head, group in zip(heads, places, strict=True)}
     chosen = [at[id(s)] for s in spread(heads, _FINE_PLACES)]
-    fine = [_view(group) for group in chosen]
+    coarse = [_view({"g": group["g"]}) for group in chosen[:_COARSE_PLACES] if "g" in group]
     total = len(begins) * _COARSE_ROUNDS + _REFINED * _FINE_ROUNDS
     fits: list[PooledFit] = []
-    if len(begins) > 1:
-        coarse = [_view({"g": group["g"]}) for group in chosen[:_COARSE_PLACES] if "g" in group]
-        for start in begins:
-            fits.append(fit_spectra(coarse, start, rounds=_COARSE_ROUNDS))
-            on_step(len(fits) * _COARSE_ROUNDS, total)
-        fits.sort(key=lambda f: f.cost)
-        begins = [f.front for f in _different(fits)[:_REFINED]]
-    refined = [fit_spectra(fine, start, rounds=_FINE_ROUNDS) for start in begins]
+    for start in begins:
+        fits.append(fit_spectra(coarse, start, rounds=_COARSE_ROUNDS, symmetric=True))
+        on_step(len(fits) * _COARSE_ROUNDS, total)
+    fits.sort(key=lambda f: f.cost)
+    fine = [_view(group) for group in chosen]
+    refined = []
+    for fit in _different(fits)[:_REFINED]:
+        refined.append(fit_spectra(fine, fit.front, rounds=_FINE_ROUNDS))
+        on_step(len(begins) * _COARSE_ROUNDS + len(refined) * _FINE_ROUNDS, total)
     on_step(total, total)
     best = min(refined, key=lambda f: f.cost)
     tails = _tail_vote(best.front, heads)
@@ -143,6 +141,18 @@ def pool(
     for view, value in zip(fine, best.trust, strict=True):
         trust.setdefault(view.photo, []).append(float(value))
     return Pooled(best, tails, {photo: float(np.median(values)) for photo, values in trust.items()})
+
+
+def _log_q(samples: Sequence[PsfSample], fitted: float) -> float:
+    """Width of diffraction by the metadata; the fitted one where they are silent.
+
+    The pixels of a power spectrum follow it little, so that it stays fixed.
+    """
+    apertures = [s.settings.aperture for s in samples if s.settings.aperture is not None]
+    pitches = [s.pixel_pitch_um for s in samples if s.pixel_pitch_um is not None]
+    if not apertures or not pitches:
+        return fitted
+    return math.log(WAVELENGTH_NM["g"] / 1000.0 * min(apertures) / float(np.median(pitches)))
 
 
 def _different(fits: Sequence[PooledFit]) -> list[PooledFit]:

@@ -22,7 +22,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.regression.pooled.transfer import BINS, FIRST_RING, bin_frequencies
+from lensmodel.regression.pooled.transfer import BINS, BORROWED_RINGS, FIRST_RING, bin_frequencies
 from lensmodel.spectrum import SECTORS, PatchSpectrum
 from lensmodel.types import Channel
 
@@ -51,7 +51,7 @@ _BIAS = (0.12, -0.07, -0.09, -0.04, 0.0, 0.02, 0.05, 0.05, 0.01, -0.1, -0.2)
 _ROUGHNESS = (0.42, 0.36, 0.31, 0.30, 0.27, 0.25, 0.24, 0.24, 0.24, 0.28, 0.4)
 _OWN, _NOISY = 0.13, 0.35
 # Demosaicing borrows the finest detail of red and blue from green, and smooths their noise.
-_BORROWED = (0.0, 0.0, 0.0, 0.0, 0.05, 0.1, 0.2, 0.5, 3.0, 3.0, 3.0)
+_BORROWED = (0.0, 0.0, 0.0, 0.0, 0.05, 0.1, 0.2, 0.5) + (1e3,) * BORROWED_RINGS
 _NOISE_GREEN = (1.0,) * 9 + (0.81, 0.68)
 _NOISE_OTHER = (1.0,) * 8 + (0.95, 0.68, 0.46)
 _SMALLEST = 1e-15

@@ -7,7 +7,7 @@ The transfer function is the autocorrelation of the pupil P = A exp(2 pi i W)::
 With the wavefront in blur (see `pupil`), 2 pi W = (pi / q) sum_k g_k B_k, the phase of a term is
 sum_k g_k (pi / q) (B_k(p + q f) - B_k(p - q f)): smooth in p however small q is, so that a coarse
 pupil does. The square of its modulus, times that of the pixel, is averaged over each bin, since the
-zeros of an OTF are lines.
+zeros of an OTF are lines; where it is smooth, one frequency stands for the bin.
 
 Source: J. W. Goodman, "Introduction to Fourier Optics", 3rd ed., 2005, eq. 6-27.
 """
@@ -34,6 +34,9 @@ _ACROSS = 26  # samples across the pupil
 _EDGE = np.geomspace(*RING_LIMITS, RINGS + 1)
 _RATIO = float(_EDGE[1] / _EDGE[0])
 _INSIDE = (-0.3, 0.3)  # where a bin is sampled, in parts of its width
+_SMOOTH = 5  # rings in which one sample does: nothing has zeros at such low frequencies
+BORROWED_RINGS: Final = 3
+"""Outermost rings that say nothing of red and blue: demosaicing takes them from green."""
 _LEAST = 1e-7
 
 Floats = NDArray[np.float64]
@@ -58,7 +61,7 @@ class Transfer:
     Parameters
     ----------
     ahead, behind : tuple of ndarray, shape (F, P)
-        Coordinates (right, up) of p + q f and p - q f; F frequencies, `len(_INSIDE)^2` to a bin.
+        Coordinates (right, up) of p + q f and p - q f; F frequencies, one or four to a bin.
     phases : ndarray, shape (6, F, P)
         Phase per pixel of blur of each term of `pupil` but the tilts.
     stop : ndarray, shape (F, P)
@@ -66,7 +69,9 @@ class Transfer:
     points : tuple of ndarray, shape (P,)
         The pupil p itself.
     pixel : ndarray, shape (F,)
-        Square of the pixel's transfer function.
+        Square of the pixel's transfer function, over the number of frequencies of the bin.
+    bins : ndarray of int, shape (F,)
+        Which bin each frequency belongs to.
     """
 
     ahead: tuple[Singles, Singles]
@@ -75,11 +80,12 @@ class Transfer:
     stop: Singles
     points: tuple[Singles, Singles]
     pixel: Floats
+    bins: NDArray[np.intp]
 
     @classmethod
-    def of(cls, q: float) -> Transfer:
-        """Lay out the pupil; layouts are remembered."""
-        return _laid_out(round(q, 4))
+    def of(cls, q: float, rings: int = RINGS - FIRST_RING) -> Transfer:
+        """Lay out the pupil for the innermost `rings` that count; layouts are remembered."""
+        return _laid_out(round(q, 4), rings)
 
     def log_power(
         self, blur: Floats, radius: float, shift: tuple[float, float]
@@ -116,33 +122,37 @@ class Transfer:
             imaginary_parts.sum(axis=1, dtype=np.float64),
         )
         scale = self.pixel / area**2
-        power = _binned((real * real + imaginary * imaginary) * scale)
+        power = self._binned((real * real + imaginary * imaginary) * scale)
         found = []
         for phase in self.phases:
             by_real = -np.einsum("fp,fp->f", phase, imaginary_parts)
             by_imaginary = np.einsum("fp,fp->f", phase, real_parts)
-            found.append(_binned(2.0 * scale * (real * by_real + imaginary * by_imaginary)))
+            found.append(self._binned(2.0 * scale * (real * by_real + imaginary * by_imaginary)))
         eye = []
         for one, other, own in zip(ahead_by, behind_by, alone_by, strict=True):
             change = self.stop * (one * behind + ahead * other)
             towards = real * np.einsum("fp,fp->f", change, cosine)
             towards += imaginary * np.einsum("fp,fp->f", change, sine)
             loss = 4.0 * float((open_ * open_ * alone * own).sum()) / area
-            eye.append(_binned(2.0 * scale * towards) - power * loss)
+            eye.append(self._binned(2.0 * scale * towards) - power * loss)
         safe = np.maximum(power, _LEAST)
         return np.log(safe), np.stack(found, axis=1) / safe[:, None], np.stack(eye, axis=1) / safe[:, None]
 
+    def _binned(self, values: Floats) -> Floats:
+        return np.asarray(np.bincount(self.bins, values, BINS), dtype=np.float64)
+
 
 @lru_cache(maxsize=16)
-def _laid_out(q: float) -> Transfer:
+def _laid_out(q: float, rings: int) -> Transfer:
     modulus, angle = bin_frequencies()
-    right, up = [], []
-    for along in _INSIDE:
-        for across in _INSIDE:
-            f, t = modulus * _RATIO**along, angle + across * math.pi / SECTORS
-            right.append(f * np.cos(t))
-            up.append(-f * np.sin(t))  # rows grow downwards
-    fx, fy = np.concatenate(right), np.concatenate(up)
+    ring = np.arange(BINS) // SECTORS
+    smooth, rough = np.flatnonzero(ring < _SMOOTH), np.flatnonzero((ring >= _SMOOTH) & (ring < rings))
+    along, across = (a.ravel()[:, None] for a in np.meshgrid(_INSIDE, _INSIDE))
+    f = np.concatenate([modulus[smooth], (modulus[rough] * _RATIO**along).ravel()])
+    t = np.concatenate([angle[smooth], (angle[rough] + across * math.pi / SECTORS).ravel()])
+    bins = np.concatenate([smooth, np.tile(rough, len(_INSIDE) ** 2)])
+    share = np.where(bins < smooth.size, 1.0, 1.0 / len(_INSIDE) ** 2)
+    fx, fy = f * np.cos(t), -f * np.sin(t)  # rows grow downwards
     side = ((np.arange(_ACROSS) - (_ACROSS - 1) / 2.0) * 2.0 / _ACROSS).astype(np.float64)
     px, py = (a.ravel() for a in np.meshgrid(side, side))
     inside = np.hypot(px, py) <= 1.0 + 1.0 / _ACROSS
@@ -157,7 +167,8 @@ def _laid_out(q: float) -> Transfer:
         phases.astype(np.float32),
         stop.astype(np.float32),
         (px.astype(np.float32), py.astype(np.float32)),
-        np.sinc(fx) ** 2 * np.sinc(fy) ** 2,
+        np.sinc(fx) ** 2 * np.sinc(fy) ** 2 * share,
+        bins,
     )
 
 
@@ -182,7 +193,3 @@ def _circle(
     soft = ((edge > 0.0) & (edge < 1.0)) * steep
     over = dtype(1.0 / radius)
     return inside, (soft, soft * dx * over, soft * dy * over)
-
-
-def _binned(values: Floats) -> Floats:
-    return np.asarray(values.reshape(len(_INSIDE) ** 2, BINS).mean(axis=0))

@@ -157,6 +157,26 @@ def fit_spectra(
     return PooledFit(problem.front(lens), state.cost, covariance, state.trust)
 
 
+def fit_scene(view: SceneView, offset: Floats) -> tuple[Floats, Floats, Floats]:
+    """Fit the scene of one patch behind a lens that is known.
+
+    Parameters
+    ----------
+    view : SceneView
+    offset : ndarray, shape (BINS, c)
+        Logarithm of |OTF|^2, and what else is known of the log power.
+
+    Returns
+    -------
+    unknowns : ndarray, shape (z,)
+    residual, signal : ndarray, shape (BINS, c)
+        What is left of the log power, and the share of the scene in the power.
+    """
+    fitted = _Scene.fitted(view, offset, None)
+    scene = np.exp(np.clip(view.shapes @ fitted.z + offset, -60.0, 60.0))
+    return fitted.z, view.log_power - np.log(scene + view.noise), fitted.signal
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
     patches: tuple[PatchView, ...]

@@ -40,14 +40,14 @@ SHAPES: Final = np.stack(
 )
 """Values of the polynomial's terms in the bins, shape (BINS, 9)."""
 
-_USUAL = (0.0, -2.08, 0.0, -0.2, 0.0, 0.08, 0.02, 0.0, 0.0)
-_SPREAD = (1e-3, 0.42, 0.27, 0.5, 0.35, 0.2, 0.16, 0.27, 0.18)
+_USUAL = (0.0, -2.06, -0.08, -0.2, 0.0, 0.09, 0.02, 0.0, 0.0)
+_SPREAD = (1e-3, 0.5, 0.28, 0.45, 0.32, 0.16, 0.14, 0.25, 0.16)
 _AMPLITUDE = (-4.0, 6.0)  # of each channel: usual, spread
 _CHANNEL_SPREAD = (0.13, 0.13)  # of its slope and curvature about those of the patch
-PHOTO_SPREAD: Final = np.array([0.35, 0.16])
+PHOTO_SPREAD: Final = np.array([0.37, 0.2])
 """Standard deviations of what all patches of a photo share: slope and curvature."""
 
-_BIAS = (0.12, -0.07, -0.09, -0.04, 0.0, 0.02, 0.05, 0.05, 0.01, -0.1, -0.2)
+_BIAS = (0.17, -0.06, -0.11, -0.05, 0.0, 0.03, 0.07, 0.07, 0.02, -0.11, -0.26)
 _ROUGHNESS = (0.42, 0.36, 0.31, 0.30, 0.27, 0.25, 0.24, 0.24, 0.24, 0.28, 0.4)
 _OWN, _NOISY = 0.13, 0.35
 # Demosaicing borrows the finest detail of red and blue from green, and smooths their noise.

@@ -6,8 +6,10 @@ The transfer function is the autocorrelation of the pupil P = A exp(2 pi i W)::
 
 With the wavefront in blur (see `pupil`), 2 pi W = (pi / q) sum_k g_k B_k, the phase of a term is
 sum_k g_k (pi / q) (B_k(p + q f) - B_k(p - q f)): smooth in p however small q is, so that a coarse
-pupil does. The square of its modulus, times that of the pixel, is averaged over each bin, since the
-zeros of an OTF are lines; where it is smooth, one frequency stands for the bin.
+pupil does. The square of its modulus is averaged over each bin, since the
+zeros of an OTF are lines; where it is smooth, one frequency stands for the bin. A kernel is known on pixels
+only, so that its spectrum is a sum over aliases: sharp lenses lose no contrast to the pixel that the kernel,
+as we define it, could show.
 
 Source: J. W. Goodman, "Introduction to Fourier Optics", 3rd ed., 2005, eq. 6-27.
 """
@@ -68,8 +70,8 @@ class Transfer:
         Transmission of the two shifted stops.
     points : tuple of ndarray, shape (P,)
         The pupil p itself.
-    pixel : ndarray, shape (F,)
-        Square of the pixel's transfer function, over the number of frequencies of the bin.
+    share : ndarray, shape (F,)
+        One over the number of frequencies of the bin.
     bins : ndarray of int, shape (F,)
         Which bin each frequency belongs to.
     """
@@ -79,7 +81,7 @@ class Transfer:
     phases: Singles
     stop: Singles
     points: tuple[Singles, Singles]
-    pixel: Floats
+    share: Floats
     bins: NDArray[np.intp]
 
     @classmethod
@@ -108,6 +110,16 @@ class Transfer:
         by_eye : ndarray, shape (BINS, 3)
             By `radius` and `shift`.
         """
+        power, by_blur, by_eye = self._optical(blur, radius, shift)
+        safe = np.clip(power, _LEAST, 1.0)
+        value, slope = _on_pixels(safe)
+        scale = (slope / safe)[:, None]
+        return value, by_blur * scale, by_eye * scale
+
+    def _optical(
+        self, blur: Floats, radius: float, shift: tuple[float, float]
+    ) -> tuple[Floats, Floats, Floats]:
+        """Mean square of the transfer function of the lens alone in each bin, and its derivatives."""
         ahead, ahead_by = _circle(*self.ahead, radius, shift)
         behind, behind_by = _circle(*self.behind, radius, shift)
         alone, alone_by = _circle(*self.points, radius, shift)
@@ -121,7 +133,7 @@ class Transfer:
             real_parts.sum(axis=1, dtype=np.float64),
             imaginary_parts.sum(axis=1, dtype=np.float64),
         )
-        scale = self.pixel / area**2
+        scale = self.share / area**2
         power = self._binned((real * real + imaginary * imaginary) * scale)
         found = []
         for phase in self.phases:
@@ -135,8 +147,7 @@ class Transfer:
             towards += imaginary * np.einsum("fp,fp->f", change, sine)
             loss = 4.0 * float((open_ * open_ * alone * own).sum()) / area
             eye.append(self._binned(2.0 * scale * towards) - power * loss)
-        safe = np.maximum(power, _LEAST)
-        return np.log(safe), np.stack(found, axis=1) / safe[:, None], np.stack(eye, axis=1) / safe[:, None]
+        return power, np.stack(found, axis=1), np.stack(eye, axis=1)
 
     def _binned(self, values: Floats) -> Floats:
         return np.asarray(np.bincount(self.bins, values, BINS), dtype=np.float64)
@@ -167,7 +178,7 @@ def _laid_out(q: float, rings: int) -> Transfer:
         phases.astype(np.float32),
         stop.astype(np.float32),
         (px.astype(np.float32), py.astype(np.float32)),
-        np.sinc(fx) ** 2 * np.sinc(fy) ** 2 * share,
+        share,
         bins,
     )
 
@@ -193,3 +204,27 @@ def _circle(
     soft = ((edge > 0.0) & (edge < 1.0)) * steep
     over = dtype(1.0 / radius)
     return inside, (soft, soft * dx * over, soft * dy * over)
+
+
+def _on_pixels(power: Floats) -> tuple[Floats, Floats]:
+    """Ln |K|^2 of the kernel on pixels, and its derivative by the logarithm of the lens's `power`.
+
+    K(f) = sum_k sinc(f + k) OTF(f + k) over the nearest aliases, where the OTF follows that of the
+    Gaussian with the power at f: OTF(f + k) = OTF(f)^(|f + k|^2 / |f|^2).
+    """
+    terms = _PIXEL * power ** (_STEEP / 2.0)
+    kernel = np.maximum(terms.sum(axis=0), math.sqrt(_LEAST))
+    return 2.0 * np.log(kernel), (terms * _STEEP).sum(axis=0) / kernel
+
+
+def _aliases() -> tuple[Floats, Floats]:
+    """Sinc of the pixel and relative square of the frequency, shape (9, BINS)."""
+    modulus, angle = bin_frequencies()
+    fx, fy = modulus * np.cos(angle), modulus * np.sin(angle)
+    moves = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    pixel = np.stack([np.sinc(fx + i) * np.sinc(fy + j) for i, j in moves])
+    steep = np.stack([((fx + i) ** 2 + (fy + j) ** 2) / modulus**2 for i, j in moves])
+    return pixel, steep
+
+
+_PIXEL, _STEEP = _aliases()

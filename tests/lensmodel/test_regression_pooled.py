@@ -1,0 +1,230 @@
+"""All patches of a lens solved together."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lensmodel.psf import PsfSample, distance, gaussian, rms_width
+from lensmodel.regression import LensModel, LensProfile, load_profile, save_profile
+from lensmodel.regression.experts import agreed_share
+from lensmodel.regression.pooled import pool
+from lensmodel.regression.pooled.fit import PatchView, fit_spectra
+from lensmodel.regression.pooled.scene import BIAS, SceneView
+from lensmodel.regression.pooled.transfer import BINS, FIRST_RING, Transfer, bin_frequencies
+from lensmodel.regression.wavefront import Wavefront
+from lensmodel.simulate import SimulatedLens
+from lensmodel.simulate.aberrations import Aberrations
+from lensmodel.spectrum import RINGS, SECTORS, PatchSpectrum
+from lensmodel.types import CHANNELS, Channel, FieldPosition, LensSettings
+
+PITCH = 4.5
+SETTINGS = LensSettings(aperture=2.0)
+LENS = SimulatedLens(
+    (
+        Aberrations(
+            f_number=2.0,
+            spherical=2.5,
+            defocus=-2.7,
+            coma=4.0,
+            astigmatism=2.0,
+            field_curvature=-1.0,
+            uniform_coma=(0.2, -0.1),
+            vignetting=(1.15, 0.3),
+        ),
+    )
+)
+LOG_Q = math.log(0.54 * 2.0 / PITCH)
+
+
+def power_of(kernel: np.ndarray) -> np.ndarray:
+    """|OTF|^2 at the middles of the bins by a direct sum, shape (BINS,)."""
+    modulus, angle = bin_frequencies()
+    half = kernel.shape[0] // 2
+    row, col = np.mgrid[-half : half + 1, -half : half + 1]
+    phase = np.exp(
+        -2j
+        * np.pi
+        * (modulus[:, None] * (np.sin(angle)[:, None] * row.ravel() + np.cos(angle)[:, None] * col.ravel()))
+    )
+    return np.abs(phase @ kernel.ravel()) ** 2
+
+
+def seen_at(place: FieldPosition, rng: np.random.Generator, rough: float) -> dict[Channel, PatchSpectrum]:
+    """Spectra of a scene that falls off by a power law, behind the lens."""
+    modulus, angle = bin_frequencies()
+    slope, turned = rng.normal(2.1, 0.3), rng.uniform(0, math.pi)
+    scene = 1e-2 * (modulus / 0.1) ** -slope * np.exp(0.3 * np.cos(2 * (angle - turned)))
+    scene = scene * np.exp(BIAS + rough * rng.standard_normal(BINS))
+    found = {}
+    for channel in CHANNELS:
+        kernel = LENS.kernel(place, SETTINGS.with_channel(channel), 41)
+        noise = 1e-7
+        power = np.zeros((RINGS, SECTORS), np.float32)
+        power[FIRST_RING:] = (scene * power_of(kernel) + noise).reshape(-1, SECTORS)
+        found[channel] = PatchSpectrum(power, noise)
+    return found
+
+
+def places(count: int, seed: int = 5) -> list[FieldPosition]:
+    rng = np.random.default_rng(seed)
+    return [
+        FieldPosition(float(r), float(p))
+        for r, p in zip(np.sqrt(rng.random(count)) * 0.95, rng.uniform(-3, 3, count), strict=True)
+    ]
+
+
+def view(place: FieldPosition, spectra: dict[Channel, PatchSpectrum], photo: str = "a") -> PatchView:
+    return PatchView(place, SETTINGS, photo, SceneView.of({c: spectra[c] for c in ("g", "r", "b")}))
+
+
+def true_front() -> Wavefront:
+    optics, unit = LENS.at_focal(), 2 * math.exp(LOG_Q)
+    terms = np.zeros(19)
+    terms[0], terms[2], terms[3], terms[4] = optics.spherical, optics.coma, *optics.uniform_coma
+    terms[6], terms[9] = optics.defocus, optics.field_curvature + optics.astigmatism / 2
+    terms[13] = optics.astigmatism / 2
+    return Wavefront(terms * unit, LOG_Q, (1.15, 0.3), 2.0, 31)
+
+
+def errors_of(front: Wavefront) -> list[float]:
+    found = []
+    for r in (0.1, 0.5, 0.9):
+        place = FieldPosition(r, 0.7)
+        truth = LENS.kernel(place, SETTINGS, 41)
+        kernel = front.kernel(place, SETTINGS, 41)
+        found.append(min(distance(k, truth).rel_l2 for k in (kernel, kernel[::-1, ::-1])))
+    return found
+
+
+def test_power_is_that_of_the_simulated_lens() -> None:
+    front = true_front()
+    for place in (FieldPosition(0.1, 0.3), FieldPosition(0.6, -2.0), FieldPosition(0.9, 1.2)):
+        x, y = place.r * math.cos(place.phi), place.r * math.sin(place.phi)
+        found, _, _ = Transfer.of(math.exp(LOG_Q)).log_power(
+            front.blur(place, SETTINGS)[:6], front.eye[0], (front.eye[1] * x, front.eye[1] * y)
+        )
+        truth = power_of(LENS.kernel(place, SETTINGS, 41))
+        strong = truth > 0.05
+        assert strong.sum() > 60
+        assert np.abs(found - np.log(truth))[strong].max() < 0.3
+        assert np.abs(found - np.log(truth))[strong].mean() < 0.06
+
+
+def test_derivatives_of_the_power_are_those_of_its_values() -> None:
+    blur = np.array([0.6, 0.3, -0.2, -0.9, 0.4, 0.1])
+    transfer, step = Transfer.of(0.4), 1e-2
+    value, by_blur, by_eye = transfer.log_power(blur, 0.95, (0.1, -0.05))
+    strong = value > -3.0
+    for k in range(6):
+        change = np.zeros(6)
+        change[k] = step
+        after = transfer.log_power(blur + change, 0.95, (0.1, -0.05))[0]
+        before = transfer.log_power(blur - change, 0.95, (0.1, -0.05))[0]
+        assert by_blur[strong, k] == pytest.approx((after - before)[strong] / (2 * step), abs=2e-2, rel=2e-2)
+    # the edge of the second circle is one sample wide: its derivative is right on average
+    wider = transfer.log_power(blur, 0.97, (0.1, -0.05))[0]
+    narrower = transfer.log_power(blur, 0.93, (0.1, -0.05))[0]
+    assert np.corrcoef(by_eye[strong, 0], (wider - narrower)[strong] / 0.04)[0, 1] > 0.95
+
+
+def test_generating_lens_scores_best() -> None:
+    rng = np.random.default_rng(1)
+    patches = [view(place, seen_at(place, rng, 0.0)) for place in places(16)]
+    cost = fit_spectra(patches, true_front(), rounds=0).cost
+
+    for index in (0, 2, 6, 9, 13):
+        for change in (-0.25, 0.25):
+            terms = true_front().terms.copy()
+            terms[index] += change
+            assert fit_spectra(patches, replace(true_front(), terms=terms), rounds=0).cost > cost
+
+
+def test_fit_returns_to_the_lens_from_beside_it() -> None:
+    rng = np.random.default_rng(2)
+    patches = [view(place, seen_at(place, rng, 0.2)) for place in places(20)]
+    terms = true_front().terms * 0.8
+    terms[6] += 0.2
+
+    found = fit_spectra(patches, replace(true_front(), terms=terms), rounds=20)
+
+    assert max(errors_of(found.front)) < 0.25
+    assert max(errors_of(found.front)) < max(errors_of(replace(true_front(), terms=terms)))
+    assert found.trust.min() > 0.5
+
+
+def test_a_patch_blurred_by_something_else_loses_its_trust() -> None:
+    rng = np.random.default_rng(3)
+    spots = places(16)
+    spectra = [seen_at(place, rng, 0.1) for place in spots]
+    row = np.arange(RINGS)[:, None]
+    spoilt = {
+        c: replace(s, power=(s.power * (1.0 + 200.0 * (row == 8))).astype(np.float32))
+        for c, s in spectra[0].items()
+    }
+
+    found = fit_spectra(
+        [view(p, s) for p, s in zip(spots, [spoilt, *spectra[1:]], strict=True)], true_front(), rounds=4
+    )
+
+    assert found.trust[0] < 0.85 * found.trust[1:].min()
+
+
+def samples(count: int, photos: int = 1) -> list[PsfSample]:
+    rng, found = np.random.default_rng(4), []
+    for i, place in enumerate(places(count, 6)):
+        spectra = seen_at(place, rng, 0.15)
+        for channel in CHANNELS:
+            settings = SETTINGS.with_channel(channel)
+            width = rms_width(LENS.kernel(place, settings, 41))
+            found.append(
+                PsfSample(
+                    gaussian(31, width**2 * np.eye(2)),
+                    place,
+                    settings,
+                    0.5,
+                    f"photo-{i % photos}",
+                    PITCH,
+                    spectrum=spectra[channel],
+                )
+            )
+    return found
+
+
+def test_few_patches_are_not_pooled() -> None:
+    assert pool(samples(8)) is None
+    assert pool([replace(s, spectrum=None) for s in samples(20)]) is None
+
+
+@pytest.mark.slow
+def test_pooled_lens_is_nearer_to_the_truth_than_its_samples_and_kept_by_profiles(tmp_path: Path) -> None:
+    known = samples(24, photos=2)
+    model = LensModel.fit(known).warmed()
+    plain = LensModel.fit([replace(s, spectrum=None) for s in known]).warmed()
+
+    place = FieldPosition(0.85, 0.4)
+    truth = LENS.kernel(place, SETTINGS, 31)
+    assert (
+        distance(model.query(place, SETTINGS, 31).kernel, truth).rel_l2
+        < distance(plain.query(place, SETTINGS, 31).kernel, truth).rel_l2
+    )
+    assert model.query(place, SETTINGS, 31).wavefront_share > 0.3
+
+    save_profile(tmp_path / "a.lensprofile", LensProfile(model))
+    back = load_profile(tmp_path / "a.lensprofile").model
+    assert back.warm
+    assert np.allclose(
+        back.query(place, SETTINGS, 31).kernel, model.query(place, SETTINGS, 31).kernel, atol=1e-6
+    )
+    assert all(s.spectrum is not None for s in back.samples)
+
+
+def test_wide_blur_leaves_the_say_to_the_wavefront() -> None:
+    share = agreed_share(np.array([0.4, 0.9, 1.5, 3.0]))
+    assert share[0] < 0.05
+    assert 0.3 < share[1] < 0.5
+    assert 0.8 < share[2] < share[3] < 1.0

@@ -12,7 +12,6 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from lensmodel.blur import Drift, UniformBlur, crop_to_support
 from lensmodel.deconv.base import Deconvolver, Sensor, restore_planes
@@ -271,8 +270,9 @@ def _restore(job: _Job, cell: Cell) -> tuple[Planes, CellForecast]:
         Sensor(
             job.noise[c],
             job.clip[c],
-            # With one colour of three measured, variance that no noise made would leave all to the prior.
-            None if job.cfa else _model_variance(plane, job.noise[c], blurs[c], errors[c]),
+            # What a wrong kernel leaves is no noise: counted as such, it would hand strong edges to the
+            # prior, which paints their colour over what lies beside them. `_cautious` answers for it.
+            None,
             job.measured(c, top, left, plane.shape),
         )
         for c, plane in enumerate(tile)
@@ -289,24 +289,6 @@ def _restore(job: _Job, cell: Cell) -> tuple[Planes, CellForecast]:
     if job.strength < 1.0:
         restored = tile[inner] + np.float32(job.strength) * (restored - tile[inner])
     return restored, expected
-
-
-def _model_variance(
-    plane: NDArray[np.float32], noise: NoiseModel, blur: UniformBlur, error: float
-) -> NDArray[np.float32] | None:
-    """Variance that a wrong kernel leaves in the residual.
-
-    With a relative error e the kernel is off by dk, |dk| = e |k|. Where the scene is rough on the
-    scale of the kernel, var(dk * x) = |dk|² var(x) and var(y) = |k|² var(x), so it is e² var(y),
-    taken over the kernel's support and without the noise's own share.
-    """
-    if error == 0.0:
-        return None
-    size = 2 * blur.reach + 3
-    mean = ndimage.uniform_filter(plane, size, mode="nearest")
-    local = ndimage.uniform_filter(plane * plane, size, mode="nearest") - mean * mean
-    signal = np.maximum(local - noise.variance(mean).astype(np.float32), 0.0)
-    return np.asarray(error * error * signal, dtype=np.float32)
 
 
 def _cautious(kernel: NDArray[np.float64], error: float) -> NDArray[np.float64]:

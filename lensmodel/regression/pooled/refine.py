@@ -27,9 +27,9 @@ MIN_PLACES: Final = 12
 """Fewer patches with a spectrum are not solved together."""
 
 _COMA = slice(2, 6)  # the terms that a turn by 180 degrees negates
-_COARSE_PLACES, _FINE_PLACES = 16, 40
-_COARSE_ROUNDS, _FINE_ROUNDS = 8, 15
-_STARTS, _REFINED = 8, 3
+_COARSE_PLACES, _FINE_PLACES = 14, 32
+_COARSE_ROUNDS, _FINE_ROUNDS = 6, 12
+_STARTS, _REFINED = 5, 2
 _SAME_COST = 1.0
 _TAIL_SIDE = 31
 _DRAWS, _SEED = 6, 0

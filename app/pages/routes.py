@@ -129,12 +129,27 @@ def lens_page(lens_id: str, call: CallDep) -> HTMLResponse:
     return _page(
         "lens.html",
         lens=lens,
+        counting=_counting(call, lens_id),
         history=history,
         coverage=words.coverage_bars(newest),
         spots=_spots(call, photos),
         photos=photos,
         more=more,
     )
+
+
+@router.get("/ui/lenses/{lens_id}/state")
+def lens_state(lens_id: str, call: CallDep) -> HTMLResponse:
+    """Show whether the newest version of a lens is still being measured."""
+    lens = lens_routes.read_lens(lens_id, call)
+    return _page("_lens_state.html", lens=lens, counting=_counting(call, lens_id))
+
+
+def _counting(call: Call, lens_id: str) -> bool:
+    """Whether a worker has yet to measure the newest version of a lens."""
+    lens = lens_routes.find_lens(call, lens_id)
+    newest = call.store.lenses.history(lens, after=lens.version - 1)
+    return lens.sample_count > 0 and any(event.metrics is None for event in newest)
 
 
 def _spots(call: Call, photos: list[PhotoOut]) -> list[tuple[float, float]]:

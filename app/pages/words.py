@@ -194,7 +194,7 @@ def coverage_bars(coverage: Mapping[str, Any] | None) -> list[ZoneBar]:
 def coverage_advice(bars: Sequence[ZoneBar]) -> str:
     """Say which photo would teach most."""
     if not bars:
-        return "Being counted: look again in a moment."
+        return "Not counted yet."
     few = [bar.words.lower() for bar in bars if bar.count < ENOUGH_PLACES]
     if not few:
         return "Every part of the picture has been seen well."

@@ -224,6 +224,7 @@ def test_a_photo_that_waits_for_a_lens_gets_one(
 
 def test_a_lens_shows_its_blur_at_any_place_aperture_and_colour(page: Page, learned: dict[str, Any]) -> None:
     page.goto(f"/lenses/{learned['lens_id']}")
+    expect(page.locator("#lens-state")).to_have_attribute("data-settled", "")
     field, words, drawn = page.locator("#field"), page.locator("#psf-words"), page.locator("#psf")
     picture = "canvas => canvas.toDataURL()"
     expect(words).to_contain_text("of the way to the corner")
@@ -255,6 +256,7 @@ def test_a_lens_shows_its_blur_at_any_place_aperture_and_colour(page: Page, lear
 def test_a_lens_shows_what_it_has_seen_and_how_it_learned(page: Page, learned: dict[str, Any]) -> None:
     page.goto(f"/lenses/{learned['lens_id']}")
 
+    expect(page.locator("#lens-state")).to_have_attribute("data-settled", "")
     page.get_by_label("Show where photos had detail").check()
     expect(page.locator("#coverage")).to_be_visible()
     assert page.locator("#coverage circle").count() >= learned["patches"]["done"]

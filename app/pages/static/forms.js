@@ -83,7 +83,7 @@ export function setUpActions() {
 
 // A page whose work has come to its end shows the result.
 export function setUpSettling() {
-  for (const id of ["photo-state", "correction-state"]) {
+  for (const id of ["photo-state", "correction-state", "lens-state"]) {
     const first = byId(id);
     if (!first || "settled" in first.dataset) continue;
     document.addEventListener("htmx:after:swap", () => {

@@ -15,11 +15,19 @@ from lensmodel.types import Planes
 Say = Callable[[str], None]
 """Takes one line of progress."""
 
+OnJob = Callable[[str, JobOut], None]
+"""Takes the same line, and the job that it tells of."""
+
 PATIENCE_SECONDS = 900.0
 
 
 def follow(
-    client: Client, work: PhotoOut | CorrectionOut, say: Say, *, patience: float = PATIENCE_SECONDS
+    client: Client,
+    work: PhotoOut | CorrectionOut,
+    say: Say | None = None,
+    *,
+    on_job: OnJob | None = None,
+    patience: float = PATIENCE_SECONDS,
 ) -> JobOut:
     """Wait until a job is done; say each change of its progress once."""
     last = ""
@@ -33,7 +41,10 @@ def follow(
             words += f", about {job.eta_seconds:.0f} s left"
         if words != last:
             last = words
-            say(words)
+            if say is not None:
+                say(words)
+            if on_job is not None:
+                on_job(words, job)
 
     return client.wait(work, timeout=patience, on_change=show)
 
@@ -42,14 +53,15 @@ def corrected(
     client: Client,
     photo: PhotoOut,
     folder: Path,
-    say: Say,
+    say: Say | None = None,
     *,
+    on_job: OnJob | None = None,
     output: dict[str, str] | None = None,
     **wish: object,
 ) -> Path:
     """Have a photo corrected into a 16-bit TIFF and download it; `wish` is the rest of `CorrectionIn`."""
     correction = client.correct(photo.id, output={"format": "tiff16", **(output or {})}, **wish)
-    follow(client, correction, say)
+    follow(client, correction, say, on_job=on_job)
     return client.download(correction.id, folder / f"{correction.id}.tif")
 
 

@@ -53,7 +53,8 @@ def run(
     if output is not None and output.suffix.lower() not in WRITTEN:
         raise UsageError(f"no format for {output.name}; give a name that ends in {', '.join(WRITTEN)}")
     files.refuse_existing(output, force=force)
-    answer = files.profile_at(source).model.query(place, settings, asked.size)
+    with display.busy("asking the lens"):
+        answer = files.profile_at(source).model.query(place, settings, asked.size)
     tangential, sagittal = quality.tangential_sagittal_mtf50(answer.kernel, place.phi)
     document = {
         "query": {

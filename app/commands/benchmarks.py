@@ -1,10 +1,14 @@
-"""`lensmodel bench`: accuracy and speed, on the library's material or one's own."""
+"""`lensmodel bench`: accuracy and speed, on the library's material or one's own.
+
+The benchmarks are imported where they are run: they need half of SciPy, which no other command should
+wait for.
+"""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
@@ -13,14 +17,12 @@ from app.commands.display import Display
 from app.commands.failure import UsageError
 from app.commands.files import as_usage, refuse_existing
 from app.commands.options import Force, Quiet, Verbose
-from lensmodel.bench.blind import BlindBenchmark, BlindReport, run_blind_benchmark
-from lensmodel.bench.correct import correct_table, run_correct_benchmark
-from lensmodel.bench.model import run_model_benchmark, table
-from lensmodel.bench.peers import PEERS
-from lensmodel.bench.report import markdown_table, write_report
 from lensmodel.codec import to_json
-from lensmodel.photo import develop
-from lensmodel.simulate import demo_data_path
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from lensmodel.bench.blind import BlindBenchmark, BlindReport
 
 NOISE: Final = "0.01,0.003"
 ESTIMATORS: Final = "default,michaeli-irani,whittle"
@@ -69,9 +71,14 @@ def default(context: typer.Context, quiet: Quiet = False, verbose: Verbose = 0) 
     shown = display.of(context, quiet=quiet, verbose=verbose)
     context.obj = shown
     if context.invoked_subcommand is None:
+        from lensmodel.bench.blind import BlindBenchmark  # noqa: PLC0415 - see the top of the module
+        from lensmodel.bench.correct import correct_table  # noqa: PLC0415 - same
+        from lensmodel.bench.model import table  # noqa: PLC0415 - same
+        from lensmodel.bench.report import markdown_table  # noqa: PLC0415 - same
+
         settings = BlindBenchmark(noise=_levels(NOISE), methods=_names(ESTIMATORS), cases=12)
         shown.result("Blind estimators\n\n" + markdown_table(_blind(settings, 2, BLIND_OUTPUT, shown)))
-        shown.result("Lens model\n\n" + table(run_model_benchmark(seeds=range(1000, 1002), photos=[1, 5])))
+        shown.result("Lens model\n\n" + table(_model(shown, seeds=range(1000, 1002), photos=[1, 5])))
         shown.result("Correction\n\n" + correct_table(_correct(None, "fast,standard", 1, shown)))
 
 
@@ -111,6 +118,9 @@ def blind(
 
     Exit status: 0 measured, 1 something failed, 2 called wrongly.
     """
+    from lensmodel.bench.blind import BlindBenchmark  # noqa: PLC0415 - see the top of the module
+    from lensmodel.bench.report import markdown_table, write_report  # noqa: PLC0415 - same
+
     shown = display.of(context, quiet=quiet, verbose=verbose)
     refuse_existing(_file(json_output), *(output / name for name in FINISHED), force=force)
     with as_usage():
@@ -134,6 +144,8 @@ def blind(
 
 
 def _blind(settings: BlindBenchmark, workers: int, output: Path, shown: Display) -> BlindReport:
+    from lensmodel.bench.blind import run_blind_benchmark  # noqa: PLC0415 - see the top of the module
+
     with shown.progress() as bars:
         task = bars.add_task("cases", total=None)
         return run_blind_benchmark(
@@ -179,13 +191,37 @@ def model(
         raise UsageError(
             f"give --seeds like 1000:1004 and --photos like 1,5, got {seeds} and {photos}"
         ) from error
-    result = run_model_benchmark(
+    from lensmodel.bench.model import table  # noqa: PLC0415 - see the top of the module
+
+    result = _model(
+        shown,
         seeds=range(first, last),
         photos=counts,
         methods=None if methods is None else _names(methods),
         psf_field=psf_field,
     )
     _tell(shown, json_output, result, table(result))
+
+
+def _model(
+    shown: Display,
+    *,
+    seeds: Sequence[int],
+    photos: Sequence[int],
+    methods: Sequence[str] | None = None,
+    psf_field: Path | None = None,
+) -> dict[str, Any]:
+    from lensmodel.bench.model import run_model_benchmark  # noqa: PLC0415 - see the top of the module
+
+    with shown.progress() as bars:
+        task = bars.add_task("fits", total=None)
+        return run_model_benchmark(
+            seeds=seeds,
+            photos=photos,
+            methods=methods,
+            psf_field=psf_field,
+            on_step=lambda done, total: bars.update(task, completed=done, total=total),
+        )
 
 
 @bench.command()
@@ -215,6 +251,8 @@ def correct(
 
     Exit status: 0 measured, 1 something failed, 2 called wrongly.
     """
+    from lensmodel.bench.correct import correct_table  # noqa: PLC0415 - see the top of the module
+
     shown = display.of(context, quiet=quiet, verbose=verbose)
     refuse_existing(_file(json_output), force=force)
     result = _correct(photo, methods, workers, shown, repeats=repeats, peers=peers)
@@ -224,6 +262,11 @@ def correct(
 def _correct(
     photo: Path | None, methods: str, workers: int, shown: Display, *, repeats: int = 1, peers: bool = False
 ) -> dict[str, Any]:
+    from lensmodel.bench.correct import run_correct_benchmark  # noqa: PLC0415 - see the top of the module
+    from lensmodel.bench.peers import PEERS  # noqa: PLC0415 - same
+    from lensmodel.photo import develop  # noqa: PLC0415 - same
+    from lensmodel.simulate import demo_data_path  # noqa: PLC0415 - same
+
     planes = develop(photo or demo_data_path("lake.jpg")).planes
     with shown.progress() as bars:
         task = bars.add_task("methods", total=None)

@@ -17,7 +17,7 @@ from app.commands.failure import UsageError
 from lensmodel import blind, pipeline
 from lensmodel.errors import InvalidInputError, LensModelError
 from lensmodel.regression import LensModel, LensProfile, save_profile
-from lensmodel.types import LensSettings
+from lensmodel.types import LensSettings, StepHook
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,9 @@ def run(names: Sequence[str], target: Path, wishes: Wishes, display: Display, *,
                 display.note(f"{path}: the profile has it already")
             results.append({"photo": str(path), **result})
             bars.update(task, completed=number + 1)
-    calibration.finish()
+        bars.remove_task(task)
+        whole = bars.add_task("joining what all photos say", total=None)
+        calibration.finish(lambda done, total: bars.update(whole, completed=done, total=total))
     profile = calibration.profile
     summary = {
         "profile": str(target) if profile else None,
@@ -130,10 +132,10 @@ class _Calibration:
         name = " ".join(lens[key] for key in ("maker", "model", "serial") if lens.get(key))
         return model.with_prior(self._family.model, name=name or "another copy")
 
-    def finish(self) -> None:
+    def finish(self, on_step: StepHook) -> None:
         """Fit what takes long and need be done only once, when all photos are in."""
         if self.profile is not None and self._grown:
-            self.profile = replace(self.profile, model=self.profile.model.warmed())
+            self.profile = replace(self.profile, model=self.profile.model.warmed(on_step))
             save_profile(self._target, self.profile)
 
     def add(self, path: Path, on_event: pipeline.EventHook) -> dict[str, Any]:

@@ -47,7 +47,7 @@ def demo(
     before = _digests(output)
     began = time.monotonic()
     try:
-        improved = run(output, lambda text: shown.progress_line(text, time.monotonic() - began))
+        improved = run(output, lambda text, left: shown.progress_line(text, time.monotonic() - began, left))
     finally:
         _mark(output, before)
     if json_output:

@@ -17,6 +17,7 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    SpinnerColumn,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -73,10 +74,11 @@ class Display:
         if not self.quiet:
             self.error(text)
 
-    def progress_line(self, text: str, seconds: float) -> None:
-        """Tell a step of long work, with the time since its start, on standard error."""
+    def progress_line(self, text: str, seconds: float, left: float | None = None) -> None:
+        """Tell a step of long work, with the time since its start and the time left, on standard error."""
         if not self.quiet:
-            typer.echo(f"[{int(seconds // 60):2d}:{int(seconds % 60):02d}] {text}", err=True)
+            ahead = "" if left is None else f", ETA {_clock(left)}"
+            typer.echo(f"[{_clock(seconds):>5}{ahead}] {text}", err=True)
 
     def error(self, text: str) -> None:
         """Tell what went wrong."""
@@ -100,6 +102,26 @@ class Display:
         )
         with bars:
             yield bars
+
+    @contextmanager
+    def busy(self, text: str) -> Iterator[None]:
+        """Show that something goes on whose end cannot be foretold, with the time since its start."""
+        bars = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            TimeElapsedColumn(),
+            console=Console(file=sys.stderr),
+            disable=self.quiet or not sys.stderr.isatty(),
+            transient=True,
+            redirect_stdout=sys.stdout.isatty(),
+        )
+        with bars:
+            bars.add_task(text, total=None)
+            yield
+
+
+def _clock(seconds: float) -> str:
+    return f"{int(seconds // 60)}:{int(seconds % 60):02d}"
 
 
 def of(context: typer.Context, *, quiet: bool = False, verbose: int = 0) -> Display:

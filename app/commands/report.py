@@ -72,9 +72,10 @@ def report(
     shown = display.of(context, quiet=quiet, verbose=verbose)
     if output is not None:
         files.refuse_existing(*(output / name for name in _FILES), force=force)
-    model = files.profile_at(profile).model
-    found = lens_report(model, _settings(model, aperture, channel), ReportSettings(aspect=aspect))
-    wish = advice(model)
+    with shown.busy("asking the lens at 200 places"):
+        model = files.profile_at(profile).model
+        found = lens_report(model, _settings(model, aperture, channel), ReportSettings(aspect=aspect))
+        wish = advice(model)
     document = json.dumps({"report": to_json(found), "advice": to_json(wish)}, indent=2)
     if output is not None:
         texts = {
@@ -132,11 +133,18 @@ def export_psfs(
     files.refuse_existing(output, force=force)
     with files.as_usage():
         exporters.create(file_format)
-    model = files.profile_at(profile).model
     place = None if r is None else FieldPosition(r, phi)
-    psfs = psf_grid(
-        model, _settings(model, aperture, channel), rows=rows, cols=cols, size=size, aspect=aspect, at=place
-    )
+    with shown.busy("asking the lens"):
+        model = files.profile_at(profile).model
+        psfs = psf_grid(
+            model,
+            _settings(model, aperture, channel),
+            rows=rows,
+            cols=cols,
+            size=size,
+            aspect=aspect,
+            at=place,
+        )
     export(output, psfs, file_format)
     if json_output:
         shown.document({"output": str(output), "format": file_format, "psfs": len(psfs.positions)})

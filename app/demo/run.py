@@ -12,7 +12,8 @@ from pathlib import Path
 from app.client import Client
 from app.demo import camera, figures, measure
 from app.demo.report import Report
-from app.errands import Say, corrected, follow, planes_of
+from app.demo.stages import Stages, Tell
+from app.errands import corrected, follow, planes_of
 from app.own_service import own_service
 from lensmodel.bench.pictures import Picture, as_shown
 from lensmodel.photo import develop
@@ -21,47 +22,59 @@ from lensmodel.simulate import demo_data_path
 REAL_RAW = "canon_kissx4_colorchart.dng"
 
 
-def run(output: Path, say: Say) -> bool:
+def run(output: Path, tell: Tell) -> bool:
     """Run the demo; return whether the figures show an improvement.
 
     Parameters
     ----------
     output : Path
         Folder for what it leaves behind; files of an earlier demo there are replaced.
-    say : callable
-        Takes one line of progress at a time.
+    tell : callable
+        Takes one line of progress at a time, and the seconds that are left.
     """
     output.mkdir(parents=True, exist_ok=True)
+    stages = Stages(tell)
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="lensmodel-demo-") as folder:
         work = Path(folder)
-        say(f"Photographing 5 scenes through the simulated lens {camera.demo_lens().model} ...")
+        stages.begin(
+            "photograph", f"Photographing 5 scenes through the simulated lens {camera.demo_lens().model} ..."
+        )
         shots = camera.take_photos(
             work / "photos",
             workers=os.cpu_count() or 1,
-            on_photo=lambda name, done, total: say(f"  photo {done} of {total}: {name}"),
+            on_photo=lambda name, done, total: stages.part(
+                done / total, f"  photo {done} of {total}: {name}"
+            ),
         )
-        say("Starting the service ...")
+        stages.begin("start", "Starting the service ...")
         with own_service(work / "data", output / "service.log") as client:
-            report = _simulated(client, shots, work, output, say)
-            _real(client, report, work, output, say)
-        say("The service has stopped.")
+            report = _simulated(client, shots, work, output, stages)
+            _real(client, report, work, output, stages)
+            stages.finish("Stopping the service ...")
     report.seconds = time.monotonic() - began
     report.write(output)
-    say(f"Report: {output / 'report.md'}")
+    stages.finish(f"Report: {output / 'report.md'}")
     return report.improved
 
 
-def _simulated(client: Client, shots: dict[str, camera.Shot], work: Path, output: Path, say: Say) -> Report:
+def _simulated(
+    client: Client, shots: dict[str, camera.Shot], work: Path, output: Path, stages: Stages
+) -> Report:
     report = Report(lens=camera.demo_lens().model, aperture=camera.demo_settings().aperture or 0.0)
     lens_id = ""
     for number, name in enumerate(camera.LEARN_FROM, start=1):
-        say(f"Uploading {name}.dng, photo {number} of {len(camera.LEARN_FROM)} of this lens")
+        stages.begin(
+            f"learn {number}",
+            f"Uploading {name}.dng, photo {number} of {len(camera.LEARN_FROM)} of this lens",
+        )
         uploaded = client.upload(shots[name].path)
-        follow(client, uploaded, say)
+        follow(client, uploaded, on_job=stages.job)
         lens_id = client.photo(uploaded.id).lens_id or lens_id
     lens = client.lens(lens_id)
-    say(f"Lens {lens.model}, version {lens.version}: {lens.photos} photos, {lens.samples} samples")
+    stages.begin(
+        "compare", f"Lens {lens.model}, version {lens.version}: {lens.photos} photos, {lens.samples} samples"
+    )
     for version in range(1, lens.version + 1):
         report.psf_error.append(measure.psf_error(client, lens_id, version))
     for place in (0.0, 0.5, 0.9):
@@ -70,26 +83,34 @@ def _simulated(client: Client, shots: dict[str, camera.Shot], work: Path, output
             (place, answer.support.effective_samples, answer.support.photos, answer.support.predicted_error)
         )
 
+    stages.begin("develop", "Uploading the photos to be corrected, which the lens does not learn from")
     held_out = client.upload(shots[camera.HELD_OUT].path, calibrate=False)
     chart = client.upload(shots[camera.CHART].path, calibrate=False)
     for photo in (held_out, chart):
-        follow(client, photo, say)
+        follow(client, photo)
     truth = shots[camera.HELD_OUT]
     before = measure.developed(truth)
     report.psnr_before = measure.psnr(before, truth)
     after = before
     for version in range(1, lens.version + 1):
-        say(f"Correcting {camera.HELD_OUT} with version {version} of the lens")
+        stages.begin(f"correct {version}", f"Correcting {camera.HELD_OUT} with version {version} of the lens")
         path = corrected(
-            client, held_out, work, say, lens_version=version, output={"color_space": "camera-linear"}
+            client,
+            held_out,
+            work,
+            on_job=stages.job,
+            lens_version=version,
+            output={"color_space": "camera-linear"},
         )
         after = planes_of(path)
         report.psnr_after.append(measure.psnr(after, truth))
-    path = corrected(client, chart, work, say, output={"color_space": "camera-linear"})
+    stages.begin("correct chart", f"Correcting {camera.CHART}, which has edges to measure")
+    path = corrected(client, chart, work, on_job=stages.job, output={"color_space": "camera-linear"})
     report.chart_before = measure.sharpness(measure.developed(shots[camera.CHART]))
     report.chart_after = measure.sharpness(planes_of(path))
 
-    shutil.copy(corrected(client, held_out, work, say), output / "corrected.tif")
+    stages.begin("correct", f"Correcting {camera.HELD_OUT} as a picture to look at")
+    shutil.copy(corrected(client, held_out, work, on_job=stages.job), output / "corrected.tif")
     gain = camera.demo_camera().white_balance
     rows = {
         "as photographed": as_shown(before, gain),
@@ -112,16 +133,20 @@ def _simulated(client: Client, shots: dict[str, camera.Shot], work: Path, output
     return report
 
 
-def _real(client: Client, report: Report, work: Path, output: Path, say: Say) -> None:
-    say(f"Uploading {REAL_RAW}, a real RAW file; it does not say its lens, so the form does")
+def _real(client: Client, report: Report, work: Path, output: Path, stages: Stages) -> None:
+    stages.begin(
+        "learn from a real photo",
+        f"Uploading {REAL_RAW}, a real RAW file; it does not say its lens, so the form does",
+    )
     path = demo_data_path(REAL_RAW)
     photo = client.upload(
         path, lens_maker="Canon", lens_model="unknown lens of the Kiss X4", lens_serial="demo-1", aperture=5.6
     )
-    job = follow(client, photo, say)
+    job = follow(client, photo, on_job=stages.job)
     photo = client.photo(photo.id)
+    stages.begin("correct a real photo", f"Correcting {REAL_RAW}")
     correction = client.correct(photo.id)
-    follow(client, correction, say)
+    follow(client, correction, on_job=stages.job)
     result = client.download(correction.id, work / "real.tif")
     shutil.copy(result, output / "corrected-real.tif")
     found = client.correction(correction.id)
@@ -131,7 +156,8 @@ def _real(client: Client, report: Report, work: Path, output: Path, say: Say) ->
     }
     original = develop(path)
     gains = original.white_balance
-    linear = corrected(client, photo, work, say, output={"color_space": "camera-linear"})
+    stages.begin("correct a real photo again", f"Correcting {REAL_RAW} in linear light, for the comparison")
+    linear = corrected(client, photo, work, on_job=stages.job, output={"color_space": "camera-linear"})
     rows: dict[str, Picture] = {
         "as photographed": as_shown(original.planes, gains),
         "corrected": as_shown(planes_of(linear), gains),

@@ -35,7 +35,7 @@ from lensmodel.geometry import Frame, zone_of
 from lensmodel.psf import PsfSample, as_kernel, centred, distance, gaussian
 from lensmodel.regression import LensModel, ModelSettings, PaperModel, fit_wavefront, smoothers
 from lensmodel.simulate import draw_lens
-from lensmodel.types import ZONES, FieldPosition, Kernel, LensSettings, Zone
+from lensmodel.types import ZONES, FieldPosition, Kernel, LensSettings, StepHook, Zone, ignore_step
 
 FRAME = Frame(2832, 4256)
 PATCHES = (4, 6)
@@ -105,6 +105,7 @@ def run_model_benchmark(
     methods: Sequence[str] | None = None,
     psf_field: Path | None = None,
     spoiled: float = 0.0,
+    on_step: StepHook = ignore_step,
 ) -> dict[str, Any]:
     """Compare methods of regression by the error of their predictions.
 
@@ -121,6 +122,8 @@ def run_model_benchmark(
     spoiled : float
         Relative L2 of the kernels that models are fed with, see `like_estimated`; they are asked for
         the true ones in any case.
+    on_step : StepHook
+        Told after each fit of a method with its questions.
 
     Returns
     -------
@@ -130,10 +133,16 @@ def run_model_benchmark(
     fits = _fits(methods)
     if psf_field is not None:
         samples = load_field(psf_field)
-        rows = [_held_out(name, fit, samples) for name, fit in fits.items()]
+        rows: list[Row] = []
+        for name, fit in fits.items():
+            on_step(len(rows), len(fits))
+            rows.append(_held_out(name, fit, samples))
+        on_step(len(fits), len(fits))
         return {"psf_field": psf_field.name, "samples": len(samples), "rows": [_plain(r) for r in rows]}
     collected: dict[tuple[str, int], list[tuple[Zone, float]]] = {}
     seconds: dict[tuple[str, int], float] = {}
+    done, total = 0, len(seeds) * len(photos) * len(fits)
+    on_step(done, total)
     for seed in seeds:
         lens = draw_lens(seed)
         rng = np.random.default_rng(seed)
@@ -154,6 +163,8 @@ def run_model_benchmark(
                 found = [(zone_of(p.r), distance(predict(p), k).rel_l2) for p, k in truth]
                 seconds[name, count] = seconds.get((name, count), 0.0) + time.process_time() - start
                 collected.setdefault((name, count), []).extend(found)
+                done += 1
+                on_step(done, total)
     rows = [_row(name, count, errors, seconds[name, count]) for (name, count), errors in collected.items()]
     return {"seeds": list(seeds), "spoiled": spoiled, "rows": [_plain(row) for row in rows]}
 

@@ -302,9 +302,10 @@ def shown_off(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Put a demo in place of the real one that writes two files at once, and counts its runs."""
     runs: list[int] = []
 
-    def run(output: Path, say: Callable[[str], None]) -> bool:
+    def run(output: Path, tell: Callable[[str, float | None], None]) -> bool:
         runs.append(len(runs))
-        say("working")
+        tell("working", 83.4)
+        tell("done", None)
         output.mkdir(parents=True, exist_ok=True)
         for name in ("report.md", "report.json"):
             (output / name).write_text(f'{{"run": {len(runs)}}}', encoding="utf-8")
@@ -319,7 +320,7 @@ def test_demo_renews_what_an_earlier_demo_left(folder: Path, here: Here, shown_o
 
     assert first.returncode == second.returncode == 0
     assert json.loads(second.stdout) == {"run": 2}
-    assert "working" in first.stderr
+    assert first.stderr.splitlines() == ["[ 0:00, ETA 1:23] working", "[ 0:00] done"]
     assert len(shown_off) == 2
 
 
@@ -456,10 +457,11 @@ def test_stopped_correction_leaves_whole_files_only_and_goes_on(folder: Path, ma
 # --- progress ----------------------------------------------------------------------------------
 
 
-def test_progress_with_time_left_is_on_a_terminal_and_results_are_in_the_pipe(folder: Path) -> None:
+def on_a_terminal(folder: Path, *words: str) -> tuple[str, str]:
+    """Run a command whose standard error is a terminal; return what each of the two outputs got."""
     ours, theirs = pty.openpty()
     process = subprocess.Popen(
-        command("correct", "one.dng", "-p", PROFILE, "-o", "out", "--method", "fast"),
+        command(*words),
         cwd=folder,
         env={**ENVIRONMENT, "PYTHONPATH": str(HERE.parents[1]), "TERM": "xterm", "COLUMNS": "120"},
         stdout=subprocess.PIPE,
@@ -472,10 +474,32 @@ def test_progress_with_time_left_is_on_a_terminal_and_results_are_in_the_pipe(fo
         seen += chunk
     os.close(ours)
     said, _ = process.communicate(timeout=PATIENCE_S)
+    return said, seen.decode()
+
+
+def test_progress_with_time_left_is_on_a_terminal_and_results_are_in_the_pipe(folder: Path) -> None:
+    said, seen = on_a_terminal(folder, "correct", "one.dng", "-p", PROFILE, "-o", "out", "--method", "fast")
 
     assert said.splitlines() == [str(Path("out/one-corrected.tif"))]
-    assert b"ETA" in seen
-    assert b"one.dng" in seen
+    assert "ETA" in seen
+    assert "one.dng" in seen
+
+
+def test_a_benchmark_of_the_lens_model_says_how_far_it_is(folder: Path) -> None:
+    said, seen = on_a_terminal(
+        folder, "bench", "model", "--seeds", "1000:1003", "--photos", "1", "--methods", "eff-linear"
+    )
+
+    assert said.startswith("| method |")
+    assert "ETA" in seen
+    assert "3/3" in seen
+
+
+def test_a_question_to_the_lens_says_that_it_is_being_answered(folder: Path) -> None:
+    said, seen = on_a_terminal(folder, "psf", PROFILE)
+
+    assert said.startswith("center, r 0")
+    assert "asking the lens" in seen
 
 
 def _read(terminal: int) -> bytes:

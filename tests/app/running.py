@@ -108,7 +108,7 @@ class Service:
 
     def calibrated(self, path: Path, **fields: str) -> dict[str, Any]:
         """Send a photo and wait until it counts; return it."""
-        photo = self.upload(path, **fields)
+        photo = self.upload(path, 202, **fields)
         job = self.job(photo["id"])
         assert job["state"] == "succeeded", job
         found: dict[str, Any] = self.get(f"/v1/photos/{photo['id']}")

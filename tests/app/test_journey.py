@@ -76,7 +76,7 @@ def test_a_photo_calibrates_the_lens_that_it_names(service: Service, first: dict
 def test_the_psf_has_the_width_of_the_blur_and_the_same_numbers_in_each_format(
     service: Service, first: dict[str, Any]
 ) -> None:
-    place = {"r": 0.4, "phi": 0.3, "aperture": 2.8, "channel": "g", "size": 21}
+    place: dict[str, str | float] = {"r": 0.4, "phi": 0.3, "aperture": 2.8, "channel": "g", "size": 21}
     base = f"/v1/lenses/{first['lens_id']}/psf"
     answer = service.http.get(f"{base}.json", params=place)
     kernel = np.array(answer.json()["psf"]["data"])

@@ -13,7 +13,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from axe_playwright_python.sync_playwright import Axe
+from axe_playwright_python.sync_playwright import Axe  # type: ignore[import-untyped]  # has no types
 from playwright.sync_api import Browser, ConsoleMessage, Locator, Page, Request, expect, sync_playwright
 
 HERE = Path(__file__).parent
@@ -354,7 +354,7 @@ def test_a_page_is_accessible_fits_each_screen_and_shows_the_focus(
     page.goto(address_of(kind, learned, correction))
     page.wait_for_load_state("load")
     for scheme in ("light", "dark"):
-        page.emulate_media(color_scheme=scheme, reduced_motion="reduce")  # type: ignore[arg-type]
+        page.emulate_media(color_scheme=scheme, reduced_motion="reduce")
         assert faults(page) == [], scheme
     for width in WIDTHS:
         page.set_viewport_size({"width": width, "height": 800})

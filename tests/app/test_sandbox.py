@@ -176,7 +176,12 @@ def test_cancelling_kills_what_the_child_started_too(run: Run, tmp_path: Path) -
 
 def test_stopping_the_sandbox_ends_all_tasks(sandbox: Sandbox, run: Run, tmp_path: Path) -> None:
     pid_file = tmp_path / "pid"
-    threading.Thread(target=lambda: (read_pid(pid_file), sandbox.stop())).start()
+
+    def stop_once_it_runs() -> None:
+        read_pid(pid_file)
+        sandbox.stop()
+
+    threading.Thread(target=stop_once_it_runs).start()
 
     assert run("sleep", arguments={"pid_file": str(pid_file)}).ending == "cancelled"
     assert run("add", arguments={"a": 1, "b": 1}).ending == "cancelled"

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from app.schemas import CorrectionOut, LensOut, PatchOut, PhotoOut, Problem
+from app.schemas import CalibrationOut, CorrectionOut, LensOut, PatchOut, PhotoOut, Problem
 
 PHOTO_STATES: Final[Mapping[str, str]] = {
     "received": "Waiting its turn",
@@ -166,6 +166,19 @@ def error_words(error: dict[str, Any] | float | None) -> str:
     return figure(error) or "not yet known"
 
 
+def history_words(history: Sequence[CalibrationOut]) -> str:
+    """Say in words what a curve cannot show: fewer than two versions with an error."""
+    tested = [event for event in history if event.error]
+    if tested:
+        found = tested[-1].error
+        zones = found if isinstance(found, Mapping) else dict.fromkeys(ZONES, found)
+        said = ", ".join(f"{ZONES[zone].lower()} {figure(zones.get(zone)) or '?'}" for zone in ZONES)
+        return f"With {counted(tested[-1].photos, 'photo')}: {said}. The curve begins with the next one."
+    if history and history[-1].photos > 1:
+        return "The photos are being tested on one another."
+    return "One photo so far. It is tested on the others once there are some."
+
+
 def coverage_words(coverage: Mapping[str, Any] | None) -> str:
     """Write the places seen in each zone."""
     return ", ".join(str(coverage.get(zone, 0)) for zone in ZONES) if coverage else ""
@@ -251,6 +264,7 @@ FILTERS: Final[Mapping[str, Callable[..., object]]] = {
         reason_words,
         patch_words,
         error_words,
+        history_words,
         coverage_words,
         coverage_advice,
         active,

@@ -260,11 +260,20 @@ def test_a_lens_shows_what_it_has_seen_and_how_it_learned(page: Page, learned: d
     page.get_by_label("Show where photos had detail").check()
     expect(page.locator("#coverage")).to_be_visible()
     assert page.locator("#coverage circle").count() >= learned["patches"]["done"]
-    expect(page.locator("#history canvas")).to_be_visible()
-    expect(page.locator("#history .u-legend")).to_contain_text("Corners")
+    expect(page.locator("#history")).to_contain_text("photos")
     page.get_by_text("All figures").click()
     expect(page.locator(".figures tbody tr").first).to_be_visible()
     expect(page.locator("section[aria-labelledby=coverage-title] .zones li")).to_have_count(3)
+
+
+def test_two_measured_versions_make_a_curve(page: Page, learned: dict[str, Any]) -> None:
+    errors = [{}, {"center": 0.2, "mid": 0.3, "corner": 0.4}, {"center": 0.1, "mid": 0.2, "corner": 0.3}]
+    items = [{"version": k, "error": error} for k, error in enumerate(errors, start=1)]
+    page.route("**/calibrations", lambda route: route.fulfill(json={"items": items, "next": None}))
+    page.goto(f"/lenses/{learned['lens_id']}")
+
+    expect(page.locator("#history canvas")).to_be_visible()
+    expect(page.locator("#history .u-legend")).to_contain_text("Corners")
 
 
 def test_a_photo_shows_where_it_learned_and_why_not_elsewhere(page: Page, learned: dict[str, Any]) -> None:

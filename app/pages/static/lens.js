@@ -155,7 +155,7 @@ export async function setUpHistory() {
   if (!response.ok) return;
   const known = (event) => (typeof event.error === "object" ? Object.keys(event.error ?? {}).length : true);
   const events = (await response.json()).items.filter(known);
-  if (!events.length) return;
+  if (events.length < 2) return; // one point is no curve: the page says it in words
   const made = plot(holder, events);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
     made.destroy();

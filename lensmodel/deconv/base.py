@@ -31,12 +31,16 @@ class Sensor:
         Further variance per pixel, of the plane's shape: what an uncertain kernel leaves behind.
     measured : ndarray of bool or None
         Where the sensor measured this plane; demosaicing filled in the rest. `None` for everywhere.
+    surrounded : bool
+        Whether a rim as wide as the blur reaches will be cut off on all sides. What is beyond the plane
+        then need not be solved for.
     """
 
     noise: NoiseModel = field(default_factory=lambda: NoiseModel.white(0.005))
     clip: float = float("inf")
     extra: NDArray[np.float32] | None = None
     measured: NDArray[np.bool_] | None = None
+    surrounded: bool = False
 
     def __post_init__(self) -> None:
         if not self.clip > 0.0:

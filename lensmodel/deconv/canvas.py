@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,24 +45,26 @@ class Canvas:
     def fill(self, plane: NDArray[np.float32]) -> NDArray[np.float32]:
         """Place the data and cross-fade the margin from one end to the other, no step anywhere."""
         height, width = self.shape
-        wide = _wrap(plane, self.margin, height)
-        return np.ascontiguousarray(_wrap(wide.T, self.margin, width).T)
+        wide = self.wrap(plane, self.margin, height)
+        return np.ascontiguousarray(self.wrap(wide.T, self.margin, width).T)
 
     def cut(self, canvas: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the part of a canvas that holds data."""
         rows, cols = self.data
         return canvas[rows, cols]
 
+    @staticmethod
+    def wrap(plane: NDArray[np.float32], margin: int, length: int) -> NDArray[np.float32]:
+        """Extend the rows of `plane` to `length`; the margin mirrors both ends, faded into each other."""
+        rows = plane.shape[0]
+        first, second, fade = seam(rows, length)
+        bridge = plane[first] * (1 - fade)[:, None] + plane[second] * fade[:, None]
+        return np.roll(np.concatenate([plane, bridge.astype(np.float32)]), margin, axis=0)
 
-def _wrap(plane: NDArray[np.float32], margin: int, length: int) -> NDArray[np.float32]:
-    """Extend the rows of `plane` to `length`; the margin mirrors both ends, faded into each other."""
-    rows = plane.shape[0]
-    gap = length - rows
-    if gap == 0:
-        return plane
-    t = np.arange(gap)
-    fade = ((t + 0.5) / gap).astype(np.float32)[:, None]
-    mirrored_end = plane[np.maximum(rows - 1 - t, 0)]
-    mirrored_start = plane[np.minimum(gap - 1 - t, rows - 1)]
-    bridge = mirrored_end * (1 - fade) + mirrored_start * fade
-    return np.roll(np.concatenate([plane, bridge.astype(np.float32)]), margin, axis=0)
+
+@lru_cache(maxsize=64)
+def seam(rows: int, length: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
+    """Rows to fade from and to beyond `rows`, up to `length`, and the share of the latter."""
+    t = np.arange(length - rows)
+    fade = ((t + 0.5) / max(length - rows, 1)).astype(np.float32)
+    return np.maximum(rows - 1 - t, 0), np.minimum(length - rows - 1 - t, rows - 1), fade

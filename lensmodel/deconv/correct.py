@@ -266,6 +266,11 @@ def _restore(job: _Job, cell: Cell) -> tuple[Planes, CellForecast]:
         job.blur(cell, channel, error, (top, left)) for channel, error in zip(CHANNELS, errors, strict=True)
     ]
     tile = np.asarray(job.planes[:, top : cell.bottom + halo, left : cell.right + halo], dtype=np.float32)
+    surrounded = (
+        min(cell.top - halo, cell.left - halo) >= 0
+        and cell.bottom + halo <= job.frame.height
+        and cell.right + halo <= job.frame.width
+    )
     sensors = [
         Sensor(
             job.noise[c],
@@ -274,6 +279,7 @@ def _restore(job: _Job, cell: Cell) -> tuple[Planes, CellForecast]:
             # prior, which paints their colour over what lies beside them. `_cautious` answers for it.
             None,
             job.measured(c, top, left, plane.shape),
+            surrounded,
         )
         for c, plane in enumerate(tile)
     ]

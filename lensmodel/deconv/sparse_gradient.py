@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +13,13 @@ from scipy import fft
 
 from lensmodel.blur import BlurOperator, UniformBlur
 from lensmodel.deconv.base import Restored, Sensor, uniform
-from lensmodel.deconv.canvas import Canvas
+from lensmodel.deconv.canvas import Canvas, seam
 from lensmodel.deconv.clipping import faded_to, spoilt
 from lensmodel.deconv.engine import Engine, compiled
-from lensmodel.deconv.local import signal_variance, smoothed
+from lensmodel.deconv.local import coarse, signal_variance, smoothed, spread
 from lensmodel.deconv.shrinkage import Shrinkage
-from lensmodel.deconv.wiener import wiener_canvas
+from lensmodel.deconv.transfers import transfers
+from lensmodel.deconv.wiener import prior, wiener_spectrum
 from lensmodel.errors import InvalidInputError
 from lensmodel.types import CHANNELS, Plane, Planes, StepHook, ignore_step
 
@@ -66,6 +68,7 @@ class SparseGradient:
         Half-quadratic steps.
     coupling, growth : float
         First b, in units of one over the squared light, and its factor per step.
+        What a kernel's change within the tile adds is found anew in the first step and half way.
     engine : {"auto", "numpy"}
         "numpy" never uses compiled loops; the numbers are the same.
 
@@ -108,34 +111,17 @@ class SparseGradient:
         sensors: Sequence[Sensor],
         on_step: StepHook,
     ) -> Planes:
-        light = np.maximum(blurred.mean(axis=(1, 2)), 1e-4).astype(np.float32)[:, None, None]
+        light = np.maximum(blurred.mean(axis=(1, 2)), 1e-4).astype(np.float32)
         canvas = Canvas(blurred.shape[1], blurred.shape[2], margin=max(blur.reach for blur in blurs))
-        problem = self._problem(blurred, blurs, sensors, light, canvas)
         loops = compiled(self.engine) if len(blurred) == len(CHANNELS) else None
-        x = problem.start if loops is None else problem.start.copy()
+        problem = self._problem(blurred, blurs, sensors, light, canvas, loops)
         if loops is None:
             x = _half_quadratic(problem, on_step)
         else:
-            loops.half_quadratic(
-                x,
-                problem.y,
-                problem.state,
-                problem.K,
-                problem.smooth,
-                problem.noise,
-                problem.scale,
-                problem.factors,
-                problem.couplings,
-                problem.drift,
-                problem.down,
-                problem.across,
-                problem.rotation,
-                np.float32(problem.prox.jump),
-                problem.prox.terms,
-            )
+            x = _compiled(problem, loops)
             on_step(self.steps, self.steps)
-        restored = np.ascontiguousarray(x[:, canvas.data[0], canvas.data[1]] * light)
-        return faded_to(blurred, restored, blurred >= _clips(sensors), blurs)
+        restored = x[:, canvas.data[0], canvas.data[1]] * light[:, None, None]
+        return faded_to(blurred, restored, problem.clipped, blurs)
 
     def _problem(
         self,
@@ -144,35 +130,41 @@ class SparseGradient:
         sensors: Sequence[Sensor],
         light: NDArray[np.float32],
         canvas: Canvas,
+        loops: ModuleType | None,
     ) -> _Problem:
-        planes = blurred / light
-        var = np.stack([s.variance(smoothed(y)) for s, y in zip(sensors, blurred, strict=True)]) / light**2
+        bright = [coarse(plane) for plane in blurred]
+        var = np.stack([s.noise.variance(smoothed(b)) for s, b in zip(sensors, bright, strict=True)])
+        var = (var / light[:, None, None] ** 2).astype(np.float32)
         noise = np.maximum(var.mean(axis=(1, 2)), np.float32(1e-9))
-        y = np.stack([canvas.fill(plane) for plane in planes])
-        luma = planes.mean(axis=0)
-        level = np.maximum(canvas.fill(smoothed(luma)), _DARK)
-        relative = canvas.fill((var / noise[:, None, None]).mean(axis=0))
+        luma = np.tensordot((1.0 / (len(light) * light)).astype(np.float32), blurred, axes=1)
+        level = smoothed(coarse(luma))
+        relative = (var / noise[:, None, None]).mean(axis=0)
         prox = Shrinkage.of(self.alpha)
-        calm = canvas.fill(_calm(luma, var.mean(axis=0) / len(planes), self.alpha))
-        scale = prox.scale((relative * calm / level ** np.float32(self.alpha)).astype(np.float32))
+        calm = _calm(luma, level, var.mean(axis=0) / len(blurred), self.alpha)
+        threshold = relative * calm / np.maximum(level, _DARK) ** np.float32(self.alpha)
         couplings = self.coupling * self.growth ** np.arange(self.steps)
-        mosaic = any(sensor.measured is not None for sensor in sensors)
-        weights = np.full(len(y), self.mosaic_weight if mosaic else self.weight, dtype=np.float64)
-        weights[1:] *= self.chroma
-        state = np.full(y.shape, _UNMEASURED, dtype=np.uint8)
-        inside = (slice(None), *canvas.data)
-        clipped = blurred >= _clips(sensors)
-        state[inside] = np.where(clipped, _CLIPPED, np.where(spoilt(clipped, blurs), _UNMEASURED, _MEASURED))
-        for plane, sensor in zip(state, sensors, strict=True):
-            if sensor.measured is not None:
-                plane[canvas.data][~sensor.measured] = _UNMEASURED
-        start = np.stack(
-            [
-                wiener_canvas(a, blur, float(n), float(plane.var()))
-                for a, blur, n, plane in zip(y, blurs, noise, planes, strict=True)
-            ]
+        weights = np.full(
+            len(blurred),
+            self.weight if all(sensor.measured is None for sensor in sensors) else self.mosaic_weight,
         )
+        weights[1:] *= self.chroma
+        clipped = blurred >= np.array([s.clip for s in sensors], dtype=np.float32)[:, None, None]
+        state = _states(clipped, blurs, sensors, canvas)
         drift = blurs[0].drift
+        K, rates = transfers(blurs, canvas.shape, max(blurred.shape[1:]) / 2.0, loops)
+        y = np.empty((len(blurred), *canvas.shape), dtype=np.float32)
+        if loops is None:
+            for c, plane in enumerate(blurred):
+                y[c] = canvas.fill(plane / light[c])
+        else:
+            loops.fill(
+                blurred,
+                np.float32(1.0) / light,
+                canvas.margin,
+                seam(canvas.rows, canvas.shape[0]),
+                seam(canvas.cols, canvas.shape[1]),
+                y,
+            )
 
         def ramp(axis: int) -> NDArray[np.float32]:
             """Pixels from where the kernel is K; held at the ends of the data, beyond which lies no datum."""
@@ -180,16 +172,18 @@ class SparseGradient:
             return (at - (drift.origin[axis] if drift else 0.0)).astype(np.float32)
 
         return _Problem(
-            start=start,
             y=y,
+            variance=(blurred.reshape(len(blurred), -1).var(axis=1) / light**2).astype(np.float32),
+            clipped=clipped,
             state=state,
-            K=np.stack([blur.spectrum(canvas.shape) for blur in blurs]),
+            K=K,
             smooth=_gradient_power(canvas.shape),
             noise=noise.astype(np.float32),
-            scale=scale,
+            scale=spread(prox.scale(threshold), canvas),
             factors=prox.scale((weights[None, :] / couplings[:, None]).astype(np.float32)),
             couplings=couplings.astype(np.float32),
-            drift=_drifts(blurs, canvas.shape, max(blurred.shape[1:]) / 2.0),
+            turns=np.isin(np.arange(self.steps), (0, self.steps // 2)),
+            drift=rates,
             down=ramp(0),
             across=ramp(1),
             rotation=_OPPONENT if len(y) == len(CHANNELS) else np.eye(len(y), dtype=np.float32),
@@ -207,8 +201,9 @@ _DARK = np.float32(0.02)  # share of a tile's mean light below which the prior f
 class _Problem:
     """Everything that the half-quadratic steps need, on the canvas; see `SparseGradient`."""
 
-    start: Planes
     y: Planes
+    variance: NDArray[np.float32]
+    clipped: NDArray[np.bool_]
     state: NDArray[np.uint8]
     K: NDArray[np.complex64]
     smooth: NDArray[np.float32]
@@ -216,6 +211,7 @@ class _Problem:
     scale: NDArray[np.float32]
     factors: NDArray[np.float32]
     couplings: NDArray[np.float32]
+    turns: NDArray[np.bool_]
     drift: NDArray[np.complex64]
     down: NDArray[np.float32]
     across: NDArray[np.float32]
@@ -223,33 +219,40 @@ class _Problem:
     prox: Shrinkage
 
 
-def _drifts(blurs: Sequence[UniformBlur], shape: tuple[int, int], reach: float) -> NDArray[np.complex64]:
-    """Change of the transfer functions per pixel, `(channel, 2, rows, cols)`; empty where one has none.
+def _states(
+    clipped: NDArray[np.bool_], blurs: Sequence[UniformBlur], sensors: Sequence[Sensor], canvas: Canvas
+) -> NDArray[np.uint8]:
+    """What each pixel of the canvas is: measured, not, or clipped.
 
-    Each step inverts K alone and takes the change to the other side, as data. That converges only where
-    the change is smaller than K, so it is limited to half of K at `reach` pixels from the middle.
+    A margin of which nothing will be seen counts as measured: its faded data are as good as any guess,
+    and where all is measured, the steps need no prediction.
     """
-    found = []
-    for blur in blurs:
-        if blur.drift is None:
-            return np.zeros((0, 2, 0, 0), dtype=np.complex64)
-        rates = blur.drift.spectra(shape)
-        change = np.float32(reach) * np.abs(rates).sum(axis=0)
-        allowed = np.float32(0.5) * np.abs(blur.spectrum(shape))
-        found.append(rates * np.minimum(allowed / np.maximum(change, np.float32(1e-9)), np.float32(1.0)))
-    return np.stack(found).astype(np.complex64)
-
-
-def _clips(sensors: Sequence[Sensor]) -> NDArray[np.float32]:
-    return np.array([s.clip for s in sensors], dtype=np.float32)[:, None, None]
+    margin = _MEASURED if all(sensor.surrounded for sensor in sensors) else _UNMEASURED
+    state = np.full((len(sensors), *canvas.shape), margin, dtype=np.uint8)
+    if clipped.any():
+        state[:, canvas.data[0], canvas.data[1]] = np.where(
+            clipped, _CLIPPED, np.where(spoilt(clipped, blurs), _UNMEASURED, _MEASURED)
+        )
+    else:
+        state[:, canvas.data[0], canvas.data[1]] = _MEASURED
+    for plane, sensor in zip(state, sensors, strict=True):
+        if sensor.measured is not None:
+            plane[canvas.data][~sensor.measured] = _UNMEASURED
+    return state
 
 
 def _half_quadratic(p: _Problem, on_step: StepHook) -> Planes:
     """The steps in NumPy; `compiled.half_quadratic` is their twin."""
     shape = (p.y.shape[1], p.y.shape[2])
     power = np.abs(p.K) ** 2
-    x = p.start
-    X = fft.rfft2(x)
+    X = np.stack(
+        [
+            wiener_spectrum(y, K, float(n), float(v))
+            for y, K, n, v in zip(p.y, p.K, p.noise, p.variance, strict=True)
+        ]
+    )
+    x = fft.irfft2(X, shape).astype(np.float32)
+    drifted = np.zeros((0,), dtype=np.complex64)
     for step, coupling in enumerate(p.couplings):
         pull = np.zeros_like(x)
         scales = p.factors[step][:, None, None] * p.scale
@@ -258,10 +261,10 @@ def _half_quadratic(p: _Problem, on_step: StepHook) -> Planes:
             kept = p.prox(np.einsum("ij,jrc->irc", p.rotation, slope), scales)
             kept = np.einsum("ji,jrc->irc", p.rotation, kept)
             pull += np.roll(kept, 1, axis=axis) - kept
-        predicted = p.K * X
-        if p.drift.size:
-            predicted += p.drift[:, 0] * fft.rfft2(x * p.down[:, None])
-            predicted += p.drift[:, 1] * fft.rfft2(x * p.across)
+        if p.drift.size and p.turns[step]:
+            drifted = p.drift[:, 0] * fft.rfft2(x * p.down[:, None])
+            drifted += p.drift[:, 1] * fft.rfft2(x * p.across)
+        predicted = p.K * X + drifted if drifted.size else p.K * X
         left = p.y - fft.irfft2(predicted, shape)
         measured = (p.state == _MEASURED) | ((p.state == _CLIPPED) & (left > 0.0))
         data = power * X + np.conj(p.K) * fft.rfft2(np.where(measured, left, np.float32(0.0)))
@@ -272,7 +275,38 @@ def _half_quadratic(p: _Problem, on_step: StepHook) -> Planes:
     return x
 
 
-def _calm(luma: NDArray[np.float32], noise: NDArray[np.float32], alpha: float) -> NDArray[np.float32]:
+def _compiled(p: _Problem, loops: ModuleType) -> Planes:
+    """The same in compiled code."""
+    decay, likely = prior((p.y.shape[1], p.y.shape[2]))
+    x = np.empty_like(p.y)
+    loops.half_quadratic(
+        x,
+        p.y,
+        p.state,
+        not p.state.any(),
+        p.K,
+        p.smooth,
+        decay,
+        likely,
+        p.noise,
+        p.variance,
+        p.scale,
+        p.factors,
+        p.couplings,
+        p.turns,
+        p.drift,
+        p.down,
+        p.across,
+        p.rotation,
+        np.float32(p.prox.jump),
+        p.prox.terms,
+    )
+    return x
+
+
+def _calm(
+    luma: NDArray[np.float32], level: NDArray[np.float32], noise: NDArray[np.float32], alpha: float
+) -> NDArray[np.float32]:
     """How much smoother than an average scene it is here: the factor on kappa.
 
     The maximum-likelihood kappa of a hyper-Laplacian is proportional to E|g|^-alpha; gradients
@@ -280,8 +314,7 @@ def _calm(luma: NDArray[np.float32], noise: NDArray[np.float32], alpha: float) -
     Without it the flat parts of a picture keep the noise that the inverse of a wide kernel amplifies.
     """
     signal = signal_variance(luma, noise)
-    level = np.maximum(smoothed(luma), _DARK)
-    calm = (_TYPICAL_CONTRAST * level**2 / signal) ** np.float32(alpha / 2)
+    calm = (_TYPICAL_CONTRAST * np.maximum(level, _DARK) ** 2 / signal) ** np.float32(alpha / 2)
     return np.asarray(np.clip(calm, _BUSIEST, _CALMEST), dtype=np.float32)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from lensmodel.blur import BlurOperator, UniformBlur
+from lensmodel.blur import BlurOperator
 from lensmodel.deconv.base import Restored, Sensor, uniform
 from lensmodel.deconv.canvas import Canvas
 from lensmodel.types import Plane, StepHook, ignore_step
@@ -43,25 +43,24 @@ class Wiener:
         kernel = uniform(blur, "wiener")
         canvas = Canvas(blurred.shape[0], blurred.shape[1], kernel.reach)
         noise = self.caution * float(sensor.variance(blurred).mean())
-        latent = wiener_canvas(canvas.fill(blurred), kernel, noise, float(blurred.var()))
+        K = kernel.spectrum(canvas.shape)
+        spectrum = wiener_spectrum(canvas.fill(blurred), K, noise, float(blurred.var()))
+        latent = np.asarray(fft.irfft2(spectrum, canvas.shape), dtype=np.float32)
         on_step(1, 1)
         return Restored(np.ascontiguousarray(canvas.cut(latent)), steps=1)
 
 
-def wiener_canvas(
-    data: NDArray[np.float32], blur: UniformBlur, noise: float, variance: float
-) -> NDArray[np.float32]:
-    """Wiener estimate on a periodic canvas, given noise variance and the variance of the data."""
-    shape = (data.shape[0], data.shape[1])
-    K = blur.spectrum(shape)
+def wiener_spectrum(
+    data: NDArray[np.float32], K: NDArray[np.complex64], noise: float, variance: float
+) -> NDArray[np.complex64]:
+    """Spectrum of the Wiener estimate on a periodic canvas, given the variances of noise and data."""
     power = K.real**2 + K.imag**2
-    decay, likely = _prior(shape)
+    decay, likely = prior((data.shape[0], data.shape[1]))
     shown = float(np.vdot(likely, power))
     scale = max(variance - noise, 0.005 * variance + 1e-12) / shown
     ratio = np.float32(noise / (scale * data.size)) * decay
     ratio[0, 0] = 0.0  # the mean is kept
-    spectrum = fft.rfft2(data) * np.conj(K) / (power + ratio + np.float32(1e-9))
-    return np.asarray(fft.irfft2(spectrum, shape), dtype=np.float32)
+    return np.asarray(fft.rfft2(data) * np.conj(K) / (power + ratio + np.float32(1e-9)))
 
 
 def frequency_squared(shape: tuple[int, int]) -> NDArray[np.float32]:
@@ -72,7 +71,7 @@ def frequency_squared(shape: tuple[int, int]) -> NDArray[np.float32]:
 
 
 @lru_cache(maxsize=8)
-def _prior(shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def prior(shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """1 / S(f) for c = 1, and S(f) times how often each frequency of the half spectrum counts."""
     decay = frequency_squared(shape) ** np.float32(SLOPE / 2)
     likely = _counts(shape) / decay

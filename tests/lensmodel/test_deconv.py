@@ -242,7 +242,8 @@ def test_shrinkage_finds_the_minimum(alpha: float, threshold: float) -> None:
     assert np.all(energy(found[:, None].astype(np.float64))[:, 0] <= best + 2e-3 * threshold + 1e-5)
 
 
-def test_compiled_loops_give_the_numbers_of_numpy_where_the_kernel_drifts() -> None:
+@pytest.mark.parametrize("surrounded", [False, True])
+def test_compiled_loops_give_the_numbers_of_numpy_where_the_kernel_drifts(surrounded: bool) -> None:
     pytest.importorskip("numba")
     pytest.importorskip("rocket_fft")
     narrow, wide = (UniformBlur(gaussian(9, np.eye(2) * width)) for width in (0.8, 1.2))
@@ -250,7 +251,7 @@ def test_compiled_loops_give_the_numbers_of_numpy_where_the_kernel_drifts() -> N
         gaussian(9, np.eye(2)), drift=Drift((narrow, wide, 80.0), (wide, narrow, 90.0), (40.0, 45.0))
     )
     blurred = np.stack([blur.forward(scene(90, 101))[:80, :90]] * 3)
-    sensors = [Sensor(NoiseModel(1e-5, 1e-6))] * 3
+    sensors = [Sensor(NoiseModel(1e-5, 1e-6), surrounded=surrounded)] * 3
 
     slow = restore_planes(SparseGradient(engine="numpy"), blurred, [blur] * 3, sensors)
     quick = restore_planes(SparseGradient(engine="auto"), blurred, [blur] * 3, sensors)
@@ -258,3 +259,14 @@ def test_compiled_loops_give_the_numbers_of_numpy_where_the_kernel_drifts() -> N
 
     assert rmse(slow, quick) < 2e-5
     assert rmse(slow, steady) > 1e-3
+
+
+def test_data_with_their_surroundings_give_the_same_picture_inside() -> None:
+    blur = UniformBlur(gaussian(9, np.eye(2)))
+    blurred = np.stack([blur.forward(scene(110, 120))] * 3)
+    noise = NoiseModel(1e-5, 1e-6)
+
+    alone = restore_planes(SparseGradient(), blurred, [blur] * 3, [Sensor(noise)] * 3)
+    inside = restore_planes(SparseGradient(), blurred, [blur] * 3, [Sensor(noise, surrounded=True)] * 3)
+
+    assert rmse(alone[:, 16:-16, 16:-16], inside[:, 16:-16, 16:-16]) < 2e-3

@@ -1,0 +1,78 @@
+"""A tile made ready, compiled: data on the canvas, kernels as transfer functions."""
+
+from __future__ import annotations
+
+import numpy as np
+import rocket_fft
+from numpy.typing import NDArray
+
+from lensmodel.deconv.compiled_base import FORWARD, ONE, Complex, Real, jit
+
+Seam = tuple[NDArray[np.intp], NDArray[np.intp], Real]
+
+
+@jit
+def fill(planes: Real, gains: Real, margin: int, rows: Seam, cols: Seam, y: Real) -> None:
+    """Place planes times `gains` on a canvas; the margin fades from one end to the other (`Canvas.fill`)."""
+    channels, high, wide = planes.shape
+    height, width = y.shape[1], y.shape[2]
+    line = np.empty(wide, np.float32)
+    for c in range(channels):
+        for i in range(height):
+            if i < high:
+                for j in range(wide):
+                    line[j] = planes[c, i, j] * gains[c]
+            else:
+                a, b, t = rows[0][i - high], rows[1][i - high], rows[2][i - high]
+                for j in range(wide):
+                    line[j] = (planes[c, a, j] * (ONE - t) + planes[c, b, j] * t) * gains[c]
+            to = (i + margin) % height
+            y[c, to, margin : margin + wide] = line
+            for j in range(wide, width):
+                t = cols[2][j - wide]
+                value = line[cols[0][j - wide]] * (ONE - t) + line[cols[1][j - wide]] * t
+                y[c, to, (j + margin) % width] = value
+
+
+@jit
+def transfer(taps: Real, out: Complex, width: int) -> None:
+    """Spectrum of a small kernel around the first pixel: only its own rows go through the row transform."""
+    side = taps.shape[0]
+    height, half = out.shape
+    lines = np.zeros((side, width), np.float32)
+    spectra = np.empty((side, half), np.complex64)
+    for i in range(side):
+        for j in range(side):
+            lines[i, (j - side // 2) % width] = taps[i, j]
+    rocket_fft.r2c(lines, spectra, np.array([1]), FORWARD, 1.0, 1)
+    out[:] = 0
+    for i in range(side):
+        out[(i - side // 2) % height] = spectra[i]
+    rocket_fft.c2c(out, out, np.array([0]), FORWARD, 1.0, 1)
+
+
+@jit
+def _limit(K: Complex, rates: Complex, reach: float) -> None:
+    """Hold the change of a transfer function within half of it; see `drifts` of `kernels`."""
+    for i in range(K.shape[0]):
+        for j in range(K.shape[1]):
+            k, d, a = K[i, j], rates[0, i, j], rates[1, i, j]
+            change = reach * (
+                np.sqrt(d.real * d.real + d.imag * d.imag) + np.sqrt(a.real * a.real + a.imag * a.imag)
+            )
+            allowed = np.float32(0.5) * np.sqrt(k.real * k.real + k.imag * k.imag)
+            if change > allowed:
+                share = allowed / max(change, np.float32(1e-9))
+                rates[0, i, j] = d * share
+                rates[1, i, j] = a * share
+
+
+@jit
+def spectra_of(taps: Real, reach: float, width: int, K: Complex, rates: Complex) -> None:
+    """Transfer functions of kernels `(channel, 1 or 3, k, k)`, and how they change, limited."""
+    for c in range(taps.shape[0]):
+        transfer(taps[c, 0], K[c], width)
+        if taps.shape[1] > 1:
+            transfer(taps[c, 1], rates[c, 0], width)
+            transfer(taps[c, 2], rates[c, 1], width)
+            _limit(K[c], rates[c], reach)

@@ -178,7 +178,7 @@ def model(
 
         lensmodel bench model --seeds 1000:1001 --photos 1 --methods eff-linear
 
-        lensmodel bench model --psf-field mine.npz --json model.json
+        lensmodel bench model --psf-field stars.npz --json model.json
 
     Exit status: 0 measured, 1 something failed, 2 called wrongly.
     """

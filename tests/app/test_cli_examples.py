@@ -124,6 +124,11 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
         scan.save(folder / "scan.tif")
     kernels = np.stack([gaussian(31, np.eye(2) * (0.8 + 0.3 * k)) for k in range(4)])
     np.savez(folder / "mine.npz", psf=kernels)
+    places = [FieldPosition(r, phi) for r in (0.1, 0.3, 0.5, 0.7, 0.9) for phi in (-2.4, -0.8, 0.8, 2.4)]
+    stars = np.stack([gaussian(15, np.eye(2) * (1.0 + place.r)) for place in places])
+    np.savez(
+        folder / "stars.npz", psf=stars, r=[place.r for place in places], phi=[place.phi for place in places]
+    )
     samples = [
         PsfSample(gaussian(15, np.eye(2) * 1.7), FieldPosition(r, phi), LensSettings(2.8, 35.0), photo="x")
         for r in (0.1, 0.5, 0.9)

@@ -216,7 +216,7 @@ def scene_of(photo: Path) -> Planes:
 
 
 @lru_cache(maxsize=64)
-def _good_corners(photo: Path, patch: int, margin: int) -> tuple[tuple[int, int], ...]:
+def good_corners(photo: Path, patch: int, margin: int) -> tuple[tuple[int, int], ...]:
     """Corners of the windows with the better half of the edge scores, best first.
 
     The choice looks at the sharp scene only, so that it cannot favour a method.
@@ -243,7 +243,7 @@ def observe(case: Case, kernel: Kernel) -> Observation:
     sharp: Plane | None = None
     for turn, photo in enumerate(case.photos):
         rng = np.random.default_rng([case.seed, case.psf_number, turn, _number(photo.stem)])
-        corners = _good_corners(photo, size, margin)
+        corners = good_corners(photo, size, margin)
         row, col = corners[int(rng.integers(len(corners)))]
         scene = scene_of(photo)[:, row - margin : row + size + margin, col - margin : col + size + margin]
         if turn == 0:

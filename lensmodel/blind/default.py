@@ -1,4 +1,8 @@
-"""The default estimator: a Whittle Gaussian and patch recurrence, and of both the milder blur."""
+"""The default estimator: a Whittle Gaussian and patch recurrence, and of both the milder blur.
+
+From several patches of one position on, a wavefront is fitted to their spectra and to the result of patch
+recurrence, which then only has to tell the phase.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +13,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lensmodel.blind.base import PsfEstimate, is_no_blur
+from lensmodel.blind.aberrations import AberrationFit
+from lensmodel.blind.base import PsfEstimate, is_no_blur, usable
 from lensmodel.blind.patch_recurrence import PatchRecurrence
 from lensmodel.blind.radial import radial_mtf, with_radial_mtf
+from lensmodel.blind.scene_spectra import SceneSpectra
 from lensmodel.blind.whittle import Whittle
 from lensmodel.psf import as_kernel, centred, distance, rms_width
 from lensmodel.types import NoiseModel, Plane, StepHook, ignore_step
 
 _PIXEL_SIGMA = 0.29
+_POOLED_SUPPORT, _POOLED_ITERATIONS, _POOLED_SIDE = 21, 3, 160
+_POOLED_ERROR = 0.7
+"""Relative error of a wavefront agreed on by n patches, times the root of n."""
+
 _AT_TYPICAL = -1.08
 """Logarithm of the error where both estimates agree on a Gaussian of 1 px and a usual scene."""
 
@@ -33,13 +43,17 @@ class Cautious:
     * a wider one: the mean, its radial MTF raised to the higher one of the two.
 
     The root mean square distance of their MTFs is also the best predictor of the true error.
+
+    `pooled` patches and more are different enough for the scenes' slopes to average out: see
+    `aberrations`. The patches must be of different scenes.
     """
 
     trusted_px: float = 0.95
     apart: float = 2.2
+    pooled: int = 6
 
     name = "default"
-    version = 4
+    version = 5
 
     def estimate(
         self,
@@ -52,6 +66,9 @@ class Cautious:
     ) -> PsfEstimate:
         """Estimate the kernel that all patches share; see `PsfEstimator`."""
         began = time.process_time()
+        kept = usable(patches, noise, size)
+        if len(kept) >= self.pooled:
+            return self._agreed(kept, size, began, on_step)
         gaussian = Whittle().estimate(patches, noise, size=size)
         support = min(max(2 * round(3.0 * gaussian.diagnostics["width"] + 3.0) + 1, 15), 31, size)
         recurrence = PatchRecurrence(support=support)
@@ -77,6 +94,39 @@ class Cautious:
             patches, noise, reference, reference_patches, size=size, on_step=on_step
         )
         return self._chosen(gaussian, found, began, size)
+
+    def _agreed(
+        self, kept: Sequence[tuple[Plane, NoiseModel]], size: int, began: float, on_step: StepHook
+    ) -> PsfEstimate:
+        """Kernel of the wavefront that all patches agree on."""
+        inner = [_middle(patch, _POOLED_SIDE) for patch, _ in kept]
+        recurrence = PatchRecurrence(support=min(_POOLED_SUPPORT, size), iterations=_POOLED_ITERATIONS)
+        steps = recurrence.levels * recurrence.iterations
+        found = recurrence.estimate(
+            inner, [model for _, model in kept], size=size, on_step=lambda done, _: on_step(done, 2 * steps)
+        )
+        fitted = AberrationFit().fit(
+            SceneSpectra.of(kept),
+            found.kernel,
+            lambda done, total: on_step(steps + done * steps // total, 2 * steps),
+        )
+        kernel = fitted.kernel(size)
+        error = min(max(_POOLED_ERROR / math.sqrt(len(kept)), 0.05), 1.0)
+        diagnostics: Mapping[str, float] = {
+            **found.diagnostics,
+            "width": rms_width(kernel),
+            "disagreement": distance(found.kernel, kernel).mtf_rmse,
+            "cost": fitted.cost,
+        }
+        return replace(
+            found,
+            kernel=kernel,
+            confidence=1.0 / (1.0 + (error / 0.4) ** 2),
+            predicted_error=error,
+            diagnostics=diagnostics,
+            seconds=time.process_time() - began,
+            no_blur=is_no_blur(kernel),
+        )
 
     def _chosen(self, gaussian: PsfEstimate, found: PsfEstimate, began: float, size: int) -> PsfEstimate:
         disagreement = distance(found.kernel, gaussian.kernel).mtf_rmse
@@ -104,6 +154,12 @@ class Cautious:
             seconds=time.process_time() - began,
             no_blur=is_no_blur(kernel),
         )
+
+
+def _middle(patch: Plane, side: int) -> Plane:
+    """Cut the middle out: many patches together need not be large."""
+    top, left = (max(n - side, 0) // 2 for n in patch.shape)
+    return patch[top : top + side, left : left + side]
 
 
 def predicted_error(disagreement: float, width: float, slope: float) -> float:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from app.models import Fitted
-from app.schemas import KernelOut, PsfOut, QueryOut, Support, Units
+from app.schemas import FamilyOut, KernelOut, PsfOut, QueryOut, Support, Units
 from lensmodel.geometry import Frame
 from lensmodel.psf import PsfField
 from lensmodel.regression import PsfAnswer
@@ -39,6 +39,9 @@ def describe(lens_id: str, fitted: Fitted, question: QueryOut, answer: PsfAnswer
             photos=answer.photos,
             extrapolated=answer.extrapolated,
             predicted_error=error if np.isfinite(error) else None,
+            family=FamilyOut(lenses=len(fitted.family), weight=float(answer.prior_share))
+            if fitted.family
+            else None,
         ),
         bandwidth={name: float(value) for name, value in answer.bandwidth.items()},
         units=Units(pixel_pitch_um=fitted.pixel_pitch_um),

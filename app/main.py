@@ -30,7 +30,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         store = Store(chosen)
         storage = Storage(chosen.storage)
-        cache = ModelCache(store, chosen.model_cache_mb * MIB, storage)
+        cache = ModelCache(store, chosen.model_cache_mb * MIB, storage, family=chosen.family)
         app.state.services = Services(chosen, store, storage, cache)
         yield
         store.close()

@@ -13,16 +13,17 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Final, TypeAlias
 
 from app.errors import ConflictError, UnknownLensError
 from app.storage import Storage
 from app.store import Store, StoredSample
-from app.store.samples import LensState
+from app.store.samples import Family, LensState
 from app.store.versions import learned_key
 from lensmodel.errors import InvalidInputError, NoSamplesError
 from lensmodel.psf import PsfSample
-from lensmodel.regression import LensModel
+from lensmodel.regression import LensModel, Prior
 
 log = logging.getLogger(__name__)
 
@@ -33,12 +34,17 @@ BYTES_FACTOR = 4
 """A fitted model keeps its samples as splines besides: some copies of each."""
 
 
+_Key: TypeAlias = tuple[str, int | str | None]
+_LEANING: Final = "leaning"
+
+
 @dataclass(frozen=True, slots=True)
 class Fitted:
     """A model and the state of the lens that it belongs to.
 
     `learned` says that a worker has fitted it wholly. Until then requests are answered by a model
-    without the wavefront of the lens, which takes seconds to fit.
+    without the wavefront of the lens, which takes seconds to fit. `family` are the other copies that
+    `model` leans on; `own` is then the model without them.
     """
 
     lens_id: str
@@ -47,6 +53,8 @@ class Fitted:
     pixel_pitch_um: float | None
     size_bytes: int
     learned: bool
+    family: Family = ()
+    own: LensModel | None = None
 
 
 class ModelCache:
@@ -60,19 +68,33 @@ class ModelCache:
         Bound of what is kept, by estimate; the model in use is kept in any case.
     storage : Storage, optional
         Where workers keep what they have learned from samples.
+    family : bool
+        Whether lenses lean on other copies at all.
     """
 
-    def __init__(self, store: Store, max_bytes: int, storage: Storage | None = None) -> None:
+    def __init__(
+        self, store: Store, max_bytes: int, storage: Storage | None = None, *, family: bool = True
+    ) -> None:
         self._store, self._max_bytes, self._storage = store, max_bytes, storage
+        self._family = family
         self._asked: dict[str, float] = {}
-        self._models: OrderedDict[tuple[str, int | None], Fitted] = OrderedDict()
+        self._models: OrderedDict[_Key, Fitted] = OrderedDict()
         self._guard = threading.Lock()
         self._building: dict[str, threading.Lock] = {}
 
-    def get(self, lens_id: str, version: int | None = None, *, state: LensState | None = None) -> Fitted:
+    def get(
+        self,
+        lens_id: str,
+        version: int | None = None,
+        *,
+        state: LensState | None = None,
+        family: bool = True,
+    ) -> Fitted:
         """Return the model of a lens, current or of an earlier version.
 
-        `state` is what the caller has just read of the lens, if he did.
+        `state` is what the caller has just read of the lens, if he did. Where no version is named, the
+        model leans on the owner's other copies of the lens as they are now, unless `family` says no; a
+        named version is what the photos of that lens said, and stays so.
 
         Raises
         ------
@@ -83,6 +105,10 @@ class ModelCache:
         ConflictError
             If samples of that version were removed since.
         """
+        own = self._own(lens_id, version, state)
+        return self._leaning(own) if self._family and family and version is None else own
+
+    def _own(self, lens_id: str, version: int | None, state: LensState | None) -> Fitted:
         state = self._store.samples.state_of(lens_id) if state is None else state
         if state is None:
             raise UnknownLensError(f"there is no lens {lens_id}: GET /v1/lenses lists those there are")
@@ -97,6 +123,29 @@ class ModelCache:
             if found is not None and same and not self._outdone(found):
                 return found
             return self._keep((lens_id, None), self._build(lens_id, None if same else found))
+
+    def _leaning(self, own: Fitted) -> Fitted:
+        """Let a model lean on the other copies of its lens, if there are any."""
+        family = self._store.samples.family_of(own.lens_id)
+        if not family:
+            return own
+        key: _Key = (own.lens_id, _LEANING)
+        found = self._recall(key)
+        if found is not None and found.family == family and found.own is own.model:
+            return found
+        with self._lock_of(own.lens_id):
+            found = self._recall(key)
+            prior = None if found is None or found.family != family else found.model.prior
+            if prior is None:
+                others = [stored.sample for stored in self._store.samples.of_family(family)]
+                if not others:  # removed while we looked
+                    return own
+                prior = Prior(LensModel.fit(others), name=family_name(family))
+            leaning = own.model.with_prior(prior.source, name=prior.name)
+            size = own.size_bytes
+            if isinstance(prior.source, LensModel):
+                size += BYTES_FACTOR * sum(sample.kernel.nbytes for sample in prior.source.samples)
+            return self._keep(key, replace(own, model=leaning, size_bytes=size, family=family, own=own.model))
 
     def _outdone(self, fitted: Fitted) -> bool:
         """Whether a worker has learned more of these samples; looked up now and then."""
@@ -164,13 +213,13 @@ class ModelCache:
         with self._guard:
             return self._building.setdefault(lens_id, threading.Lock())
 
-    def _recall(self, key: tuple[str, int | None]) -> Fitted | None:
+    def _recall(self, key: _Key) -> Fitted | None:
         with self._guard:
             if key in self._models:
                 self._models.move_to_end(key)
             return self._models.get(key)
 
-    def _keep(self, key: tuple[str, int | None], fitted: Fitted) -> Fitted:
+    def _keep(self, key: _Key, fitted: Fitted) -> Fitted:
         with self._guard:
             self._models[key] = fitted
             self._models.move_to_end(key)
@@ -180,6 +229,11 @@ class ModelCache:
                 dropped, _ = self._models.popitem(last=False)
                 log.info("model of lens %s dropped from memory", dropped[0])
         return fitted
+
+
+def family_name(family: Family) -> str:
+    """Say what a model leans on."""
+    return "another copy" if len(family) == 1 else f"{len(family)} other copies"
 
 
 def check_version(store: Store, lens_id: str, version: int, state: LensState) -> None:

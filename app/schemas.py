@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
@@ -246,6 +246,12 @@ class LensOut(Model):
     links: LensLinks
 
 
+_FAMILY: Final = (
+    "lean on the owner's other copies of this lens model where this one has seen little; "
+    "a version that is named never does"
+)
+
+
 class PsfQuery(Question):
     """Where and how to ask for a PSF."""
 
@@ -260,6 +266,7 @@ class PsfQuery(Question):
     focus_distance_m: FocusDistance | None = None
     version: int | None = Field(None, ge=1, description="an earlier version of the lens")
     strict: bool = Field(default=False, description="refuse answers outside what the samples cover")
+    family: bool = Field(default=True, description=_FAMILY)
 
 
 class KernelOut(Model):
@@ -282,6 +289,13 @@ class QueryOut(Model):
     focus_distance_m: float | None
 
 
+class FamilyOut(Model):
+    """Other copies of the lens that an answer leans on: how many, and their weight in it, 0..1."""
+
+    lenses: int
+    weight: float
+
+
 class Support(Model):
     """What an answer rests on."""
 
@@ -289,6 +303,7 @@ class Support(Model):
     photos: int
     extrapolated: bool
     predicted_error: float | None
+    family: FamilyOut | None = None
 
 
 class Units(Model):
@@ -321,6 +336,7 @@ class FieldQuery(Question):
     gamma: float = Field(0.5, ge=0.1, le=2, allow_inf_nan=False, description="brightness ~ value^gamma")
     focal_length_mm: FocalLength | None = None
     focus_distance_m: FocusDistance | None = None
+    family: bool = Field(default=True, description=_FAMILY)
 
 
 class CalibrationOut(Model):
@@ -378,6 +394,7 @@ class CorrectionIn(Question):
     strength: float = Field(1.0, ge=0, le=1, allow_inf_nan=False)
     output: OutputOptions = OutputOptions()
     roi: Region | None = None
+    family: bool = Field(default=True, description=_FAMILY)
 
 
 class CorrectionLinks(Model):

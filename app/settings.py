@@ -88,6 +88,10 @@ class Settings(BaseSettings):
         default=False, description="Photos without a serial belong to the one lens of that model."
     )
 
+    family: bool = Field(
+        default=True,
+        description="A lens that has seen little leans on its owner's other copies of the same model.",
+    )
     model_cache_mb: int = Field(
         default=1024, ge=1, description="Memory for fitted lens models in one process, in MiB."
     )

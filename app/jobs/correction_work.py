@@ -13,7 +13,7 @@ from pathlib import Path, PurePath
 from typing import Any, Final
 
 from app.jobs.child import Progress
-from app.jobs.handover import LEARNED, SUFFIX
+from app.jobs.handover import FAMILY, LEARNED, SUFFIX
 from app.jobs.sandbox import Limits
 from app.jobs.workbench import (
     SPARE_MB,
@@ -24,7 +24,7 @@ from app.jobs.workbench import (
     write_samples,
 )
 from app.store.corrections import CorrectionPlan, Result
-from app.store.samples import LensState
+from app.store.samples import LensState, Relative
 from app.store.versions import learned_key
 
 log = logging.getLogger(__name__)
@@ -90,6 +90,7 @@ class CorrectionWork:
         }
         with self._bench.sandbox.folder() as folder:
             self._samples(plan.lens.public_id, plan.correction.lens_version, folder)
+            leaning = self._family(params.get("family", []), folder)
             done = self._bench.attempt(
                 "correct",
                 arguments,
@@ -98,7 +99,18 @@ class CorrectionWork:
                 wanted=wanted,
                 on_progress=self._teller(key),
             )
-            self._hand_in(plan, folder / Path(done["file"]).name, done["zones"])
+            report = {"zones": done["zones"]} | ({"family": {"lenses": leaning}} if leaning else {})
+            self._hand_in(plan, folder / Path(done["file"]).name, report)
+
+    def _family(self, listed: list[dict[str, Any]], folder: Path) -> int:
+        """Hand over what other copies of the lens say; return how many of them still say something."""
+        family = [Relative(one["lens_id"], LensState(**one["state"])) for one in listed]
+        stored = self._bench.store.samples.of_family(family)
+        if not stored:
+            return 0
+        (folder / FAMILY).mkdir()
+        write_samples(folder / FAMILY, stored)
+        return len(family)
 
     def _samples(self, lens_id: str, version: int, folder: Path) -> LensState:
         state, stored = self._bench.store.samples.of_lens(lens_id, up_to_version=version)
@@ -122,7 +134,7 @@ class CorrectionWork:
 
         return tell
 
-    def _hand_in(self, plan: CorrectionPlan, path: Path, zones: dict[str, Any]) -> None:
+    def _hand_in(self, plan: CorrectionPlan, path: Path, report: dict[str, Any]) -> None:
         if path.suffix != SUFFIX[plan.correction.params["output"]["format"]] or not path.is_file():
             raise JobFailedError("internal_error", "the correction wrote no file; retry, or report the photo")
         with path.open("rb") as file:
@@ -137,7 +149,7 @@ class CorrectionWork:
             size=path.stat().st_size,
             name=f"{stem}-corrected{path.suffix}",
         )
-        self._corrections.finish(plan.correction.public_id, result, {"zones": zones})
+        self._corrections.finish(plan.correction.public_id, result, report)
 
     def measure(self, lens_id: str, version: int) -> None:
         """Measure how well one version of a lens predicts photos that it was not shown."""

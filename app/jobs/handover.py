@@ -11,6 +11,9 @@ KERNELS: Final = "kernels.npy"
 SAMPLES: Final = "samples.json"
 """What else belongs to each of the kernels."""
 
+FAMILY: Final = "family"
+"""Folder of the samples of other copies that the model leans on; not there without any."""
+
 LEARNED: Final = "learned.npz"
 """What a model has learned from the samples."""
 

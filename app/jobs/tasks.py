@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from app.jobs.child import Progress, Task
-from app.jobs.handover import INFINITY, KERNELS, LEARNED, SAMPLES, SUFFIX
+from app.jobs.handover import FAMILY, INFINITY, KERNELS, LEARNED, SAMPLES, SUFFIX
 from lensmodel import codec, photo, pipeline
 from lensmodel.errors import InvalidInputError, LensModelError
 from lensmodel.patches import Patch
@@ -114,7 +114,7 @@ def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
     roi = arguments["roi"]
     corrected = pipeline.correct_photo(
         developed,
-        _model(folder),
+        _leaning(folder),
         _settings(arguments["settings"]),
         method=arguments["method"],
         strength=arguments["strength"],
@@ -167,6 +167,24 @@ def _lateral(developed: photo.LinearPhoto) -> LateralColour | None:
 
 
 def _model(folder: Path) -> LensModel:
+    """Build the model of the samples in a folder."""
+    samples = _samples(folder)
+    learned = folder / LEARNED
+    if learned.is_file():
+        try:
+            return LensModel.restored(samples, learned.read_bytes())
+        except InvalidInputError as error:
+            log.info("the model is fitted anew: %s", error)
+    return LensModel.fit(samples)
+
+
+def _leaning(folder: Path) -> LensModel:
+    """Build the model of the samples in a folder, which leans on other copies if they are handed over."""
+    model, family = _model(folder), folder / FAMILY
+    return model.with_prior(_model(family)) if family.is_dir() else model
+
+
+def _samples(folder: Path) -> list[PsfSample]:
     kernels = np.load(folder / KERNELS, allow_pickle=False, mmap_mode="r")
     listed = json.loads((folder / SAMPLES).read_text(encoding="utf-8"))
     samples = []
@@ -186,13 +204,7 @@ def _model(folder: Path) -> LensModel:
                 spectrum=_spectrum(entry["spectrum"]),
             )
         )
-    learned = folder / LEARNED
-    if learned.is_file():
-        try:
-            return LensModel.restored(samples, learned.read_bytes())
-        except InvalidInputError as error:
-            log.info("the model is fitted anew: %s", error)
-    return LensModel.fit(samples)
+    return samples
 
 
 def _spectrum(stored: str | None) -> PatchSpectrum | None:

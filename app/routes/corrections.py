@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from typing import Final
 from urllib.parse import quote
@@ -52,6 +53,10 @@ def create_correction(wish: CorrectionIn, call: CallDep) -> CorrectionOut:
     lens = _lens_for(call, photo, wish.lens_id)
     version = _version_for(call, lens, wish.lens_version)
     params = wish.model_dump(mode="json", include={"method", "strength", "output", "roi"})
+    if wish.family and wish.lens_version is None and call.settings.family:
+        # the copies and versions of this moment: the same wish after one of them learned is another one
+        leaning = call.store.samples.family_of(lens.public_id)
+        params |= {"family": [dataclasses.asdict(one) for one in leaning]} if leaning else {}
     row, made = call.store.corrections.create(photo, lens, version, params)
     finished = not made and row.state == "succeeded"
     call.response.status_code = status.HTTP_200_OK if finished else status.HTTP_202_ACCEPTED

@@ -87,7 +87,7 @@ def accepted(header: str) -> Format:
 
 
 def _answer(lens_id: str, at: PsfQuery, form: Format, call: Call) -> Response:
-    fitted = call.models.get(lens_id, at.version, state=_state(call, lens_id))
+    fitted = call.models.get(lens_id, at.version, state=_state(call, lens_id), family=at.family)
     pinned = at.version is not None and fitted.learned
     tag = etag(fitted, f"{at.model_dump_json()}{form}")
     headers = {
@@ -127,8 +127,12 @@ def _state(call: Call, lens_id: str) -> LensState:
 
 
 def etag(fitted: Fitted, question: str) -> str:
-    """Return a strong tag: the same question to the same model of the same samples has the same answer."""
-    digest = hashlib.sha256(question.encode()).hexdigest()[:12]
+    """Return a strong tag: the same question to the same model of the same samples has the same answer.
+
+    The samples are those of the lens and of the other copies that it leans on.
+    """
+    leaning = [(one.lens_id, one.state.version, one.state.rebuild_epoch) for one in fitted.family]
+    digest = hashlib.sha256(f"{question}{leaning}".encode()).hexdigest()[:12]
     state, sort = fitted.state, "l" if fitted.learned else "p"
     return f'"{fitted.lens_id}-v{state.version}-e{state.rebuild_epoch}-{sort}-{digest}"'
 
@@ -160,7 +164,7 @@ def read_field(lens_id: str, at: Annotated[FieldQuery, Query()], call: CallDep) 
     columns, rows = (int(count) for count in at.grid.split("x"))
     if not (1 <= columns <= MAX_GRID and 1 <= rows <= MAX_GRID):
         raise InvalidParameterError(f"grid {at.grid}: columns and rows must lie in 1..{MAX_GRID}, as in 9x6")
-    fitted = call.models.get(lens_id, state=_state(call, lens_id))
+    fitted = call.models.get(lens_id, state=_state(call, lens_id), family=at.family)
     tag = etag(fitted, at.model_dump_json())
     headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
     if _matches(call, tag):

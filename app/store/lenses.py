@@ -22,8 +22,12 @@ def identity_key(maker: str | None, model: str | None, serial: str | None) -> st
     Case, punctuation and blanks differ between programs that write the same name; the serial
     keeps its punctuation, since it may be all that tells two copies apart.
     """
-    words = [re.sub(r"[\W_]+", "", (text or "").casefold()) for text in (maker, model)]
-    return "|".join([*words, (serial or "").strip().casefold()])
+    return f"{kind_key(maker, model)}|{(serial or '').strip().casefold()}"
+
+
+def kind_key(maker: str | None, model: str | None) -> str:
+    """Return the key by which two lenses are known to be of one kind, see `identity_key`."""
+    return "|".join(re.sub(r"[\W_]+", "", (text or "").casefold()) for text in (maker, model))
 
 
 def lens_of_photo(session: Session, photo: PhotoRow, *, single_copy: bool) -> LensRow | None:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, Final, TypeAlias, cast
 
 import numpy as np
 from sqlalchemy import Row, bindparam, select
+from sqlalchemy.orm import aliased
 
 from app.store.database import Database
+from app.store.lenses import kind_key
 from app.store.patches import DTYPE
 from app.tables import LensRow, OwnerRow, PhotoRow, SampleRow
 from lensmodel.errors import LensModelError
@@ -24,6 +27,32 @@ _STATE_OF_OWNER = _STATE.join(OwnerRow, OwnerRow.id == LensRow.owner_id).where(
     OwnerRow.name == bindparam("owner")
 )
 
+_ME, _OTHER = aliased(LensRow), aliased(LensRow)
+_OTHERS = (
+    select(
+        _ME.maker,
+        _ME.model,
+        _OTHER.public_id,
+        _OTHER.version,
+        _OTHER.rebuild_epoch,
+        _OTHER.sample_count,
+        _OTHER.maker.label("other_maker"),
+        _OTHER.model.label("other_model"),
+    )
+    .join(_OTHER, _OTHER.owner_id == _ME.owner_id)
+    .where(
+        _ME.public_id == bindparam("lens"),
+        _ME.deleted_at.is_(None),
+        _ME.model.is_not(None),
+        _OTHER.id != _ME.id,
+        _OTHER.deleted_at.is_(None),
+        _OTHER.sample_count > 0,
+    )
+    .order_by(_OTHER.public_id.desc())
+)
+MOST_OF_FAMILY: Final = 2000
+"""So many samples of other copies are enough to lean on; more would only take time to fit."""
+
 
 class CorruptSampleError(LensModelError):
     """A stored kernel is not what was written."""
@@ -37,6 +66,17 @@ class LensState:
 
     version: int
     rebuild_epoch: int
+
+
+@dataclass(frozen=True, slots=True)
+class Relative:
+    """Another copy of a lens model, of the same owner, and what it knew at some moment."""
+
+    lens_id: str
+    state: LensState
+
+
+Family: TypeAlias = tuple[Relative, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,6 +100,29 @@ class SampleStore:
         with self._db.reader.connect() as connection:  # no session: this is half of a warm request
             row = connection.execute(query, {"lens": lens_id, "owner": owner}).one_or_none()
             return None if row is None else LensState(row[0], row[1])
+
+    def family_of(self, lens_id: str) -> Family:
+        """Return the other copies of a lens: same owner, maker and model, with samples that count.
+
+        The newest first, as many as it takes to have `MOST_OF_FAMILY` samples.
+        """
+        found: list[Relative] = []
+        samples = 0
+        with self._db.reader.connect() as connection:  # as above: part of a warm request
+            for row in connection.execute(_OTHERS, {"lens": lens_id}):
+                same = kind_key(row.maker, row.model) == kind_key(row.other_maker, row.other_model)
+                if same and samples < MOST_OF_FAMILY:
+                    found.append(Relative(row.public_id, LensState(row.version, row.rebuild_epoch)))
+                    samples += row.sample_count
+        return tuple(found)
+
+    def of_family(self, family: Iterable[Relative]) -> list[StoredSample]:
+        """Return the samples of other copies as of the versions named; what was removed since is gone."""
+        return [
+            stored
+            for one in family
+            for stored in self.of_lens(one.lens_id, up_to_version=one.state.version)[1]
+        ]
 
     def of_lens(
         self, lens_id: str, *, after_version: int = 0, up_to_version: int | None = None

@@ -89,6 +89,7 @@ export function setUpField() {
       ["Seen in", `${support.photos} photo${support.photos === 1 ? "" : "s"}`],
       ["Worth", `${support.effective_samples.toFixed(1)} samples`],
       ["Expected error", error],
+      ...(support.family ? [["Leans on your other copies", `${Math.round(support.family.weight * 100)} %`]] : []),
     ]);
   };
   const showField = () => {

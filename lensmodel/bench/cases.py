@@ -33,7 +33,7 @@ DATA: Final = Path(__file__).parent / "data"
 WHITE: Final = 0.9
 """Level of a scene's 99.5 percentile."""
 
-JPEG_QUALITY: Final = 92
+JPEG_QUALITY: Final = 90
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
 _CHOICE_SIGMA = 0.01
 

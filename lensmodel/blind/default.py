@@ -1,8 +1,4 @@
-"""The default estimator: a Whittle Gaussian and patch recurrence, and of both the milder blur.
-
-From several patches of one position on, a wavefront is fitted to their spectra and to the result of patch
-recurrence, which then only has to tell the phase.
-"""
+"""The default estimator: a Whittle Gaussian, patch recurrence, and a wavefront that pleases the spectra."""
 
 from __future__ import annotations
 
@@ -16,10 +12,9 @@ import numpy as np
 from lensmodel.blind.aberrations import AberrationFit
 from lensmodel.blind.base import PsfEstimate, is_no_blur, usable
 from lensmodel.blind.patch_recurrence import PatchRecurrence
-from lensmodel.blind.radial import radial_mtf, with_radial_mtf
 from lensmodel.blind.scene_spectra import SceneSpectra
 from lensmodel.blind.whittle import Whittle
-from lensmodel.psf import as_kernel, centred, distance, rms_width
+from lensmodel.psf import as_kernel, distance, rms_width
 from lensmodel.types import NoiseModel, Plane, StepHook, ignore_step
 
 _PIXEL_SIGMA = 0.29
@@ -33,27 +28,28 @@ _AT_TYPICAL = -1.08
 
 @dataclass(frozen=True, slots=True)
 class Cautious:
-    """What a Whittle Gaussian and patch recurrence agree on, and where they do not, the milder blur.
+    """What a Whittle Gaussian, patch recurrence and the spectra of the patches agree on.
 
-    A kernel that is too wide ruins a photo, one too narrow only helps less. Both methods take the
-    softness of a scene for blur, each in its own way:
+    A kernel that is too wide ruins a photo, one too narrow only helps less, and both of the first two
+    methods take the softness of a scene for blur, each in its own way. With few patches:
 
     * a Gaussian narrower than `trusted_px`: the mean of both, unless patch recurrence ran more than
       `apart` times as wide; then the Gaussian alone;
-    * a wider one: the mean, its radial MTF raised to the higher one of the two.
+    * a wider one: a wavefront fitted to the spectra and, with the weight `trust`, to the result of patch
+      recurrence (see `aberrations`).
 
-    The root mean square distance of their MTFs is also the best predictor of the true error.
-
-    `pooled` patches and more are different enough for the scenes' slopes to average out: see
-    `aberrations`. The patches must be of different scenes.
+    From `pooled` patches on the slopes of the scenes average out, the wavefront is all but given by the
+    spectra, and patch recurrence only has to tell the phase. The root mean square distance of the MTFs
+    of the Gaussian and patch recurrence is the best predictor of the true error of few patches.
     """
 
     trusted_px: float = 0.95
     apart: float = 2.2
     pooled: int = 6
+    trust: float = 75.0
 
     name = "default"
-    version = 5
+    version = 6
 
     def estimate(
         self,
@@ -68,12 +64,15 @@ class Cautious:
         began = time.process_time()
         kept = usable(patches, noise, size)
         if len(kept) >= self.pooled:
-            return self._agreed(kept, size, began, on_step)
+            inner, models = [_middle(patch) for patch, _ in kept], [model for _, model in kept]
+            recurrence = PatchRecurrence(support=min(_POOLED_SUPPORT, size), iterations=_POOLED_ITERATIONS)
+            found = recurrence.estimate(inner, models, size=size, on_step=_half(on_step, 0))
+            return self._agreed(kept, found, began, size, on_step)
         gaussian = Whittle().estimate(patches, noise, size=size)
         support = min(max(2 * round(3.0 * gaussian.diagnostics["width"] + 3.0) + 1, 15), 31, size)
         recurrence = PatchRecurrence(support=support)
-        found = recurrence.estimate(patches, noise, size=size, on_step=on_step)
-        return self._chosen(gaussian, found, began, size)
+        found = recurrence.estimate(patches, noise, size=size, on_step=_half(on_step, 0))
+        return self._chosen(kept, gaussian, found, began, size, on_step)
 
     def estimate_channel(
         self,
@@ -88,28 +87,29 @@ class Cautious:
     ) -> PsfEstimate:
         """Estimate another channel from the reference kernel on."""
         began = time.process_time()
-        gaussian = Whittle().estimate(patches, noise, size=size)
+        kept = usable(patches, noise, size)
         recurrence = PatchRecurrence(support=int(reference.diagnostics.get("support", 21.0)), iterations=3)
+        inner, models = [patch for patch, _ in kept], [model for _, model in kept]
+        if len(kept) >= self.pooled:
+            inner = [_middle(patch) for patch in inner]
         found = recurrence.estimate_channel(
-            patches, noise, reference, reference_patches, size=size, on_step=on_step
+            inner, models, reference, reference_patches, size=size, on_step=_half(on_step, 0)
         )
-        return self._chosen(gaussian, found, began, size)
+        if len(kept) >= self.pooled:
+            return self._agreed(kept, found, began, size, on_step)
+        gaussian = Whittle().estimate(patches, noise, size=size)
+        return self._chosen(kept, gaussian, found, began, size, on_step)
 
     def _agreed(
-        self, kept: Sequence[tuple[Plane, NoiseModel]], size: int, began: float, on_step: StepHook
+        self,
+        kept: Sequence[tuple[Plane, NoiseModel]],
+        found: PsfEstimate,
+        began: float,
+        size: int,
+        on_step: StepHook,
     ) -> PsfEstimate:
-        """Kernel of the wavefront that all patches agree on."""
-        inner = [_middle(patch, _POOLED_SIDE) for patch, _ in kept]
-        recurrence = PatchRecurrence(support=min(_POOLED_SUPPORT, size), iterations=_POOLED_ITERATIONS)
-        steps = recurrence.levels * recurrence.iterations
-        found = recurrence.estimate(
-            inner, [model for _, model in kept], size=size, on_step=lambda done, _: on_step(done, 2 * steps)
-        )
-        fitted = AberrationFit().fit(
-            SceneSpectra.of(kept),
-            found.kernel,
-            lambda done, total: on_step(steps + done * steps // total, 2 * steps),
-        )
+        """Kernel of the wavefront that many patches agree on."""
+        fitted = AberrationFit().fit(SceneSpectra.of(kept), found.kernel, _half(on_step, 1))
         kernel = fitted.kernel(size)
         error = min(max(_POOLED_ERROR / math.sqrt(len(kept)), 0.05), 1.0)
         diagnostics: Mapping[str, float] = {
@@ -128,15 +128,27 @@ class Cautious:
             no_blur=is_no_blur(kernel),
         )
 
-    def _chosen(self, gaussian: PsfEstimate, found: PsfEstimate, began: float, size: int) -> PsfEstimate:
+    def _chosen(
+        self,
+        kept: Sequence[tuple[Plane, NoiseModel]],
+        gaussian: PsfEstimate,
+        found: PsfEstimate,
+        began: float,
+        size: int,
+        on_step: StepHook,
+    ) -> PsfEstimate:
+        """Kernel of few patches, whose spectra alone do not tell a soft scene from a blur."""
         disagreement = distance(found.kernel, gaussian.kernel).mtf_rmse
         narrow = rms_width(gaussian.kernel) <= self.trusted_px
-        kernel = mean = as_kernel(0.5 * (gaussian.kernel + found.kernel))
-        if narrow and rms_width(found.kernel) > self.apart * max(rms_width(gaussian.kernel), _PIXEL_SIGMA):
+        if not narrow:
+            fit = AberrationFit(weight=self.trust)
+            fitted = fit.fit(SceneSpectra.of(kept), found.kernel, _half(on_step, 1))
+            kernel = fitted.kernel(size)
+        elif rms_width(found.kernel) > self.apart * max(rms_width(gaussian.kernel), _PIXEL_SIGMA):
             kernel = gaussian.kernel
-        elif not narrow:
-            milder = np.maximum(radial_mtf(gaussian.kernel), radial_mtf(found.kernel))
-            kernel = centred(with_radial_mtf(mean, milder))
+        else:
+            kernel = as_kernel(0.5 * (gaussian.kernel + found.kernel))
+        on_step(1, 1)
         error = predicted_error(disagreement, rms_width(gaussian.kernel), gaussian.diagnostics["slope"])
         diagnostics: Mapping[str, float] = {
             **found.diagnostics,
@@ -156,10 +168,15 @@ class Cautious:
         )
 
 
-def _middle(patch: Plane, side: int) -> Plane:
+def _middle(patch: Plane) -> Plane:
     """Cut the middle out: many patches together need not be large."""
-    top, left = (max(n - side, 0) // 2 for n in patch.shape)
-    return patch[top : top + side, left : left + side]
+    top, left = (max(n - _POOLED_SIDE, 0) // 2 for n in patch.shape)
+    return patch[top : top + _POOLED_SIDE, left : left + _POOLED_SIDE]
+
+
+def _half(on_step: StepHook, which: int) -> StepHook:
+    """Report progress as the first or the second half of the work."""
+    return lambda done, total: on_step(done + which * total, 2 * total)
 
 
 def predicted_error(disagreement: float, width: float, slope: float) -> float:

@@ -90,6 +90,19 @@ class ColourDeconvolver(Protocol):
         """Estimate the latent planes inside the frame."""
 
 
+@runtime_checkable
+class CoarseMethod(Protocol):
+    """A method for cells that are larger than usual, each of one kernel.
+
+    Attributes
+    ----------
+    cell_factor : int
+        Sides of its cells over the usual ones. Mosaics are cut as usual.
+    """
+
+    cell_factor: int
+
+
 def restore_planes(
     method: Deconvolver, blurred: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor]
 ) -> Planes:

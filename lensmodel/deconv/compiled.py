@@ -5,7 +5,17 @@ function has a NumPy twin that gives the same numbers.
 """
 
 from lensmodel.deconv.compiled_lucy import bare_transforms, richardson_lucy
+from lensmodel.deconv.compiled_pass import one_pass
 from lensmodel.deconv.compiled_steps import half_quadratic, pull_of
-from lensmodel.deconv.compiled_tile import fill, spectra_of
+from lensmodel.deconv.compiled_tile import block_means, fill, spectra_of
 
-__all__ = ["bare_transforms", "fill", "half_quadratic", "pull_of", "richardson_lucy", "spectra_of"]
+__all__ = [
+    "bare_transforms",
+    "block_means",
+    "fill",
+    "half_quadratic",
+    "one_pass",
+    "pull_of",
+    "richardson_lucy",
+    "spectra_of",
+]

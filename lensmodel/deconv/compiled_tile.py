@@ -6,7 +6,7 @@ import numpy as np
 import rocket_fft
 from numpy.typing import NDArray
 
-from lensmodel.deconv.compiled_base import FORWARD, ONE, Complex, Real, jit
+from lensmodel.deconv.compiled_base import FORWARD, ONE, ZERO, Complex, Real, jit
 
 Seam = tuple[NDArray[np.intp], NDArray[np.intp], Real]
 
@@ -76,3 +76,40 @@ def spectra_of(taps: Real, reach: float, width: int, K: Complex, rates: Complex)
             transfer(taps[c, 1], rates[c, 0], width)
             transfer(taps[c, 2], rates[c, 1], width)
             _limit(K[c], rates[c], reach)
+
+
+@jit
+def block_means(  # noqa: C901 - one pass over memory
+    tile: Real, gains: Real, planes: Real, luma: Real, square: Real
+) -> None:
+    """Means over blocks of 4 pixels of planes times `gains`, of their mean, and of its square."""
+    channels, height, width = tile.shape
+    share = ONE / np.float32(channels)
+    line = np.empty(width, np.float32)
+    sums = np.empty((channels + 2, width), np.float32)
+    for row in range(luma.shape[0]):
+        low, high = 4 * row, min(4 * row + 4, height)
+        sums[:] = ZERO
+        for i in range(low, high):
+            line[:] = ZERO
+            for c in range(channels):
+                for j in range(width):
+                    value = tile[c, i, j] * gains[c]
+                    sums[c, j] += value
+                    line[j] += value * share
+            for j in range(width):
+                sums[channels, j] += line[j]
+                sums[channels + 1, j] += line[j] * line[j]
+        for col in range(luma.shape[1]):
+            left, right = 4 * col, min(4 * col + 4, width)
+            size = np.float32((high - low) * (right - left))
+            for c in range(channels + 2):
+                total = ZERO
+                for j in range(left, right):
+                    total += sums[c, j]
+                if c < channels:
+                    planes[c, row, col] = total / size
+                elif c == channels:
+                    luma[row, col] = total / size
+                else:
+                    square[row, col] = total / size

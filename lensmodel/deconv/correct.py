@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.blur import Drift, UniformBlur, crop_to_support
-from lensmodel.deconv.base import Deconvolver, Sensor, restore_planes
-from lensmodel.deconv.lattice import Cell, Roi, cells
+from lensmodel.deconv.base import CoarseMethod, Deconvolver, Sensor, restore_planes
+from lensmodel.deconv.lattice import Cell, Roi, cells, usual_pitch
 from lensmodel.deconv.methods import deconvolvers
 from lensmodel.deconv.report import CellForecast, ZoneReport, forecast, zone_reports
 from lensmodel.errors import InvalidInputError
@@ -80,6 +80,11 @@ class _Job:
     lateral: LateralShift | None
     cfa: BayerPattern | None
 
+    @property
+    def cell_factor(self) -> int:
+        """How much larger cells are than usual; kernels do not change within larger ones."""
+        return self.method.cell_factor if isinstance(self.method, CoarseMethod) and self.cfa is None else 1
+
     def measured(self, channel: int, top: int, left: int, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
         """Where the sensor measured a channel, on the part of the frame that begins at (top, left)."""
         if self.cfa is None:
@@ -98,6 +103,8 @@ class _Job:
     def blur(self, cell: Cell, channel: Channel, error: float, corner: tuple[int, int]) -> UniformBlur:
         """Kernel of one channel in a cell, and how it changes there, on a tile that begins at `corner`."""
         middle = self._at(cell.position, channel, error)
+        if self.cell_factor > 1:
+            return middle
         down, across = (
             (self._at(before, channel, error), self._at(after, channel, error), pixels)
             for before, after, pixels in cell.beside
@@ -222,6 +229,8 @@ def correct_planes(
         return crop_to_support(field.kernel_at(position, channel, KERNEL_SIZE))
 
     job = _Job(planes, kernels, frame, solver, strength, tuple(noise), tuple(clip), psf_error, lateral, cfa)
+    if pitch is None:
+        pitch = usual_pitch(frame, job.cell_factor)
     wanted = [cell for cell in cells(frame, pitch) if cell.meets(window)]
     forecasts = []
     for done, (cell, restored, expected) in enumerate(_restored(job, wanted, workers), start=1):

@@ -97,6 +97,12 @@ class Cell:
         )
 
 
+def usual_pitch(frame: Frame, factor: int = 1) -> int:
+    """Side of a cell in pixels: a fixed share of the field, times `factor`, within practical bounds."""
+    share = factor * frame.half_diagonal / CELLS_PER_HALF_DIAGONAL
+    return int(np.clip(share, MIN_PITCH, factor * MAX_PITCH))
+
+
 def cells(frame: Frame, pitch: int | None = None) -> tuple[Cell, ...]:
     """Cut a frame into cells, row by row.
 
@@ -108,10 +114,9 @@ def cells(frame: Frame, pitch: int | None = None) -> tuple[Cell, ...]:
     frame : Frame
         Size of the photo.
     pitch : int or None
-        Side of a cell; None takes a fixed share of the field within practical bounds.
+        Side of a cell; None takes `usual_pitch`.
     """
-    if pitch is None:
-        pitch = int(np.clip(frame.half_diagonal / CELLS_PER_HALF_DIAGONAL, MIN_PITCH, MAX_PITCH))
+    pitch = usual_pitch(frame) if pitch is None else pitch
     down, across = _pieces(frame.height, pitch), _pieces(frame.width, pitch)
     rows, cols = [piece[2] for piece in down], [piece[2] for piece in across]
     found = []

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
 from lensmodel.deconv.canvas import Canvas
+from lensmodel.types import Planes
 
 BLOCK = 4
 _UNSURE = np.float32(0.1)  # share of the noise that a variance over so few pixels cannot tell from signal
@@ -34,18 +37,48 @@ def smoothed(blocks: NDArray[np.float32]) -> NDArray[np.float32]:
     return blocks
 
 
-def signal_variance(plane: NDArray[np.float32], noise: NDArray[np.float32] | float) -> NDArray[np.float32]:
-    """Local variance of a plane less that of its noise, coarse; never below a tenth of the noise.
+@dataclass(frozen=True, slots=True, eq=False)
+class Blocks:
+    """Means over blocks of a tile whose colours are scaled to equal light.
 
     Parameters
     ----------
-    plane : ndarray, shape (h, w)
-        Linear light.
+    planes : ndarray, shape (channels, rows, cols)
+        Of each colour.
+    luma, square : ndarray, shape (rows, cols)
+        Of the mean of the colours, and of its square.
+    """
+
+    planes: NDArray[np.float32]
+    luma: NDArray[np.float32]
+    square: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, tile: Planes, light: NDArray[np.float32], loops: ModuleType | None) -> Blocks:
+        """Take the means of a tile whose colours have the mean `light`."""
+        if loops is not None:
+            shape = tuple(-(-extent // BLOCK) for extent in tile.shape[1:])
+            planes = np.empty((len(tile), *shape), dtype=np.float32)
+            luma, square = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
+            loops.block_means(tile, np.float32(1.0) / light, planes, luma, square)
+            return cls(planes, luma, square)
+        scaled = tile / light[:, None, None]
+        luma = scaled.mean(axis=0)
+        return cls(np.stack([coarse(plane) for plane in scaled]), coarse(luma), coarse(luma * luma))
+
+
+def signal_variance(blocks: Blocks, noise: NDArray[np.float32] | float) -> NDArray[np.float32]:
+    """Local variance of luma less that of its noise, coarse; never below a tenth of the noise.
+
+    Parameters
+    ----------
+    blocks : Blocks
+        Of the tile.
     noise : ndarray or float
         Variance of its noise, coarse.
     """
-    mean = smoothed(coarse(plane))
-    local = smoothed(coarse(plane * plane)) - mean * mean
+    mean = smoothed(blocks.luma)
+    local = smoothed(blocks.square) - mean * mean
     return np.asarray(np.maximum(local - noise, 0.0) + _UNSURE * noise + np.float32(1e-12), dtype=np.float32)
 
 

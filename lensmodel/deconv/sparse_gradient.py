@@ -16,7 +16,7 @@ from lensmodel.deconv.base import Restored, Sensor, uniform
 from lensmodel.deconv.canvas import Canvas, seam
 from lensmodel.deconv.clipping import faded_to, spoilt
 from lensmodel.deconv.engine import Engine, compiled
-from lensmodel.deconv.local import coarse, signal_variance, smoothed, spread
+from lensmodel.deconv.local import Blocks, signal_variance, smoothed, spread
 from lensmodel.deconv.shrinkage import Shrinkage
 from lensmodel.deconv.transfers import transfers
 from lensmodel.deconv.wiener import prior, wiener_spectrum
@@ -132,15 +132,18 @@ class SparseGradient:
         canvas: Canvas,
         loops: ModuleType | None,
     ) -> _Problem:
-        bright = [coarse(plane) for plane in blurred]
-        var = np.stack([s.noise.variance(smoothed(b)) for s, b in zip(sensors, bright, strict=True)])
-        var = (var / light[:, None, None] ** 2).astype(np.float32)
+        blocks = Blocks.of(blurred, light, loops)
+        var = np.stack(
+            [
+                s.noise.variance(smoothed(b * bright)) / bright**2
+                for s, b, bright in zip(sensors, blocks.planes, light, strict=True)
+            ]
+        ).astype(np.float32)
         noise = np.maximum(var.mean(axis=(1, 2)), np.float32(1e-9))
-        luma = np.tensordot((1.0 / (len(light) * light)).astype(np.float32), blurred, axes=1)
-        level = smoothed(coarse(luma))
+        level = smoothed(blocks.luma)
         relative = (var / noise[:, None, None]).mean(axis=0)
         prox = Shrinkage.of(self.alpha)
-        calm = _calm(luma, level, var.mean(axis=0) / len(blurred), self.alpha)
+        calm = _calm(blocks, level, var.mean(axis=0) / len(blurred), self.alpha)
         threshold = relative * calm / np.maximum(level, _DARK) ** np.float32(self.alpha)
         couplings = self.coupling * self.growth ** np.arange(self.steps)
         weights = np.full(
@@ -305,7 +308,7 @@ def _compiled(p: _Problem, loops: ModuleType) -> Planes:
 
 
 def _calm(
-    luma: NDArray[np.float32], level: NDArray[np.float32], noise: NDArray[np.float32], alpha: float
+    blocks: Blocks, level: NDArray[np.float32], noise: NDArray[np.float32], alpha: float
 ) -> NDArray[np.float32]:
     """How much smoother than an average scene it is here: the factor on kappa.
 
@@ -313,7 +316,7 @@ def _calm(
     scale with the local contrast, so it is (typical over local variance of the signal)^(alpha / 2).
     Without it the flat parts of a picture keep the noise that the inverse of a wide kernel amplifies.
     """
-    signal = signal_variance(luma, noise)
+    signal = signal_variance(blocks, noise)
     calm = (_TYPICAL_CONTRAST * np.maximum(level, _DARK) ** 2 / signal) ** np.float32(alpha / 2)
     return np.asarray(np.clip(calm, _BUSIEST, _CALMEST), dtype=np.float32)
 

@@ -14,29 +14,35 @@ Transfers = tuple[NDArray[np.complex64], NDArray[np.complex64]]
 
 
 def transfers(
-    blurs: Sequence[UniformBlur], shape: tuple[int, int], reach: float, loops: ModuleType | None
+    blurs: Sequence[UniformBlur],
+    shape: tuple[int, int],
+    reach: float,
+    loops: ModuleType | None,
+    *,
+    drifting: bool = True,
 ) -> Transfers:
     """Return K, `(channel, rows, cols)`, and its change per pixel, `(channel, 2, rows, cols)`.
 
-    The latter is empty where one of the kernels has none. Each step of a solver inverts K alone and
-    takes the change to the other side, as data. That converges only where the change is smaller than
-    K, so it is limited to half of K at `reach` pixels from the middle.
+    The latter is empty where a kernel has none or `drifting` is false. Each step of a solver inverts K
+    alone and takes the change to the other side, as data. That converges only where the change is
+    smaller than K, so it is limited to half of K at `reach` pixels from the middle.
     """
     if loops is None or any(blur.offset != (0.0, 0.0) for blur in blurs):
-        return np.stack([blur.spectrum(shape) for blur in blurs]), _rates(blurs, shape, reach)
-    taps = _taps(blurs)
+        steady = np.zeros((0, 2, 0, 0), dtype=np.complex64)
+        spectra = np.stack([blur.spectrum(shape) for blur in blurs])
+        return spectra, _rates(blurs, shape, reach) if drifting else steady
+    taps = _taps(blurs, drifting=drifting)
     half = shape[1] // 2 + 1
-    drifting = len(taps) if taps.shape[1] > 1 else 0
     K = np.empty((len(taps), shape[0], half), dtype=np.complex64)
-    rates = np.empty((drifting, 2, shape[0], half), dtype=np.complex64)
+    rates = np.empty((len(taps) if taps.shape[1] > 1 else 0, 2, shape[0], half), dtype=np.complex64)
     loops.spectra_of(taps, np.float32(reach), shape[1], K, rates)
     return K, rates
 
 
-def _taps(blurs: Sequence[UniformBlur]) -> NDArray[np.float32]:
+def _taps(blurs: Sequence[UniformBlur], *, drifting: bool) -> NDArray[np.float32]:
     """Kernels and their changes per pixel down and across, `(channel, 1 or 3, k, k)`, centred alike."""
     ways = [(blur.drift.down, blur.drift.across) for blur in blurs if blur.drift is not None]
-    drifting = len(ways) == len(blurs)
+    drifting = drifting and len(ways) == len(blurs)
     used = [blur.kernel for blur in blurs]
     if drifting:
         used += [end.kernel for pair in ways for way in pair for end in way[:2]]

@@ -294,6 +294,14 @@ def test_a_photo_shows_where_it_learned_and_why_not_elsewhere(page: Page, learne
     expect(page.locator("#rmap")).to_be_visible()
 
 
+def test_a_button_waits_until_the_scripts_of_the_page_are_there(page: Page, learned: dict[str, Any]) -> None:
+    page.route("**/static/app.js*", lambda route: route.fulfill(body="", content_type="text/javascript"))
+    page.goto(f"/photos/{learned['id']}")
+
+    expect(page.get_by_role("button", name="Correct this photo")).to_be_disabled()
+    expect(page.get_by_role("button", name="Delete photo")).to_be_disabled()
+
+
 def test_a_photo_is_corrected_and_compared(page: Page, learned: dict[str, Any], tmp_path: Path) -> None:
     page.goto(f"/photos/{learned['id']}")
     page.get_by_label("File").select_option("jpeg")

@@ -6,6 +6,7 @@ function setUpForm(id, act) {
   const form = byId(id);
   if (!form) return;
   const error = form.querySelector(".alert");
+  form.querySelector("button").disabled = false; // until now a click would have gone nowhere
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
     error.hidden = true;
@@ -68,6 +69,7 @@ export function setUpActions() {
     },
   };
   for (const button of holder.querySelectorAll("button")) {
+    button.disabled = false;
     button.addEventListener("click", async () => {
       error.hidden = true;
       try {

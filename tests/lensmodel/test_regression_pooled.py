@@ -15,7 +15,14 @@ from lensmodel.regression.experts import agreed_share
 from lensmodel.regression.pooled import pool
 from lensmodel.regression.pooled.fit import PatchView, fit_spectra
 from lensmodel.regression.pooled.scene import BIAS, SceneView
-from lensmodel.regression.pooled.transfer import BINS, FIRST_RING, Transfer, bin_frequencies
+from lensmodel.regression.pooled.transfer import (
+    BINS,
+    COLUMNS,
+    FIRST_RING,
+    Transfer,
+    bin_frequencies,
+    sums,
+)
 from lensmodel.regression.wavefront import Wavefront
 from lensmodel.simulate import SimulatedLens
 from lensmodel.simulate.aberrations import Aberrations
@@ -130,6 +137,29 @@ def test_derivatives_of_the_power_are_those_of_its_values() -> None:
     wider = transfer.log_power(blur, 0.97, (0.1, -0.05))[0]
     narrower = transfer.log_power(blur, 0.93, (0.1, -0.05))[0]
     assert np.corrcoef(by_eye[strong, 0], (wider - narrower)[strong] / 0.04)[0, 1] > 0.95
+
+
+@pytest.mark.parametrize("coarse", [False, True])
+def test_compiled_sums_are_those_of_numpy(coarse: bool) -> None:
+    compiled = pytest.importorskip("lensmodel.regression.pooled.compiled", reason="Numba is not installed")
+    transfer = Transfer.of(0.4, coarse=coarse)
+    turns = np.array([0.9, 0.4, -0.3, -1.1, 0.5, 0.1], dtype=np.float32)
+    eye = np.array([0.95, 0.1, -0.05], dtype=np.float32)
+    found = [np.zeros((transfer.share.size, COLUMNS), dtype=np.float32) for _ in range(2)]
+    for loop, out in zip((sums, compiled.sums), found, strict=True):
+        loop(*transfer.points, *transfer.shifts, turns, eye, np.float32(transfer.steep), out)
+
+    assert np.abs(found[0] - found[1]).max() < 1e-4 * np.abs(found[0]).max()
+
+
+def test_negative_of_a_wavefront_turns_its_kernels_and_keeps_their_power() -> None:
+    front, place = true_front(), FieldPosition(0.9, 1.2)
+    turned = replace(front, terms=-front.terms)
+    here, there = front.kernel(place, SETTINGS, 31), turned.kernel(place, SETTINGS, 31)
+
+    assert distance(there[::-1, ::-1], here).rel_l2 < 0.02
+    assert distance(there, here).rel_l2 > 0.2
+    assert power_of(there) == pytest.approx(power_of(here), abs=2e-3)
 
 
 def test_generating_lens_scores_best() -> None:

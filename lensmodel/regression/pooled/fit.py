@@ -9,8 +9,8 @@ against outliers), so that photos add up::
     chi^2 = sum_bins t(r' V^-1 r),   r = ln S - ln(exp(s(z) + bias) |OTF(theta)|^2 + n)
 
 by Levenberg-Marquardt, the unknowns z of a patch eliminated from the normal equations (Schur). Power
-knows nothing of the phase: a lens and the same lens turned by 180 degrees have equal spectra, so a
-start has to come from kernels (`wavefront_fit`), and the sign is theirs.
+knows nothing of the phase: a wavefront and its negative, which turns the kernels by 180 degrees, have
+equal spectra. Which of the two it is has to come from elsewhere (`refine`).
 """
 
 from __future__ import annotations
@@ -107,6 +107,7 @@ def fit_spectra(
     *,
     rounds: int = 15,
     symmetric: bool = False,
+    coarse: bool = False,
     on_step: StepHook = ignore_step,
 ) -> PooledFit:
     """Fit a lens to patches, beginning with a wavefront.
@@ -120,9 +121,11 @@ def fit_spectra(
         Steps at most.
     symmetric : bool
         Whether only the terms of a perfectly centred lens may change: few unknowns have few minima.
+    coarse : bool
+        Whether a coarse pupil does; such costs compare only among each other.
     """
     photos = sorted({patch.photo for patch in patches})
-    problem = _Problem(tuple(patches), {name: i for i, name in enumerate(photos)}, begin)
+    problem = _Problem(tuple(patches), {name: i for i, name in enumerate(photos)}, begin, coarse)
     lens = np.concatenate([begin.terms, begin.eye])
     shared = np.zeros((len(photos), len(PHOTO_SPREAD)))
     state = problem.state(lens, shared, None)
@@ -182,6 +185,7 @@ class _Problem:
     patches: tuple[PatchView, ...]
     photos: dict[str, int]
     begin: Wavefront
+    coarse: bool
 
     def front(self, lens: Floats) -> Wavefront:
         """Wavefront of the unknowns."""
@@ -225,9 +229,12 @@ class _Problem:
             q = math.exp(self.begin.log_q) * WAVELENGTH_NM[channel] / WAVELENGTH_NM["g"] / stop
             linear = stopped(design(patch.position, settings), stop)
             radius, move = lens[-2] / stop, lens[-1] / stop
-            value, by_blur, by_eye = Transfer.of(
-                q, _RINGS if channel == "g" else _RINGS - BORROWED_RINGS
-            ).log_power(linear @ lens[: len(NAMES)], radius, (move * x, move * y))
+            transfer = Transfer.of(
+                q, _RINGS if channel == "g" else _RINGS - BORROWED_RINGS, coarse=self.coarse
+            )
+            value, by_blur, by_eye = transfer.log_power(
+                linear @ lens[: len(NAMES)], radius, (move * x, move * y)
+            )
             kept = np.exp(value) / (np.exp(value) + _FLOOR)
             values.append(np.log(np.exp(value) + _FLOOR))
             by_move = by_eye[:, 1] * x + by_eye[:, 2] * y

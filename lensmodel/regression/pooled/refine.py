@@ -26,10 +26,10 @@ from lensmodel.types import WAVELENGTH_NM, Channel, FieldPosition, Kernel, StepH
 MIN_PLACES: Final = 16
 """Fewer patches with a spectrum are not solved together."""
 
-_COMA = slice(2, 6)  # the terms that a turn by 180 degrees negates
-_COARSE_PLACES, _FINE_PLACES = 14, 32
-_COARSE_ROUNDS, _FINE_ROUNDS = 6, 12
-_STARTS, _REFINED = 5, 2
+_COMA = slice(2, 6)  # the odd terms
+_COARSE_PLACES, _MEDIUM_PLACES, _FINE_PLACES = 14, 24, 48
+_COARSE_ROUNDS, _MEDIUM_ROUNDS, _FINE_ROUNDS = 8, 6, 12
+_STARTS, _KEPT, _REFINED = 16, 4, 3
 _SAME_COST = 1.0
 _TAIL_SIDE = 31
 _DRAWS, _SEED = 6, 0
@@ -118,29 +118,56 @@ def pool(samples: Sequence[PsfSample], on_step: StepHook = ignore_step) -> Poole
     ]
     at = {id(head): group for head, group in zip(heads, places, strict=True)}
     chosen = [at[id(s)] for s in spread(heads, _FINE_PLACES)]
-    coarse = [_view({"g": group["g"]}) for group in chosen[:_COARSE_PLACES] if "g" in group]
-    total = len(begins) * _COARSE_ROUNDS + _REFINED * _FINE_ROUNDS
-    fits: list[PooledFit] = []
-    for start in begins:
-        fits.append(fit_spectra(coarse, start, rounds=_COARSE_ROUNDS, symmetric=True))
-        on_step(len(fits) * _COARSE_ROUNDS, total)
-    fits.sort(key=lambda f: f.cost)
-    fine = [_view(group) for group in chosen]
-    refined = []
-    for fit in _different(fits)[:_REFINED]:
-        refined.append(fit_spectra(fine, fit.front, rounds=_FINE_ROUNDS))
-        on_step(len(begins) * _COARSE_ROUNDS + len(refined) * _FINE_ROUNDS, total)
-    on_step(total, total)
-    best = min(refined, key=lambda f: f.cost)
+    best = _searched(chosen, begins, on_step)
     tails = _tail_vote(best.front, heads)
     if tails < 0:
-        turned = best.front.terms.copy()
-        turned[_COMA] *= -1.0
-        best = replace(best, front=replace(best.front, terms=turned))
+        best = replace(best, front=_negative(best.front))
     trust: dict[str, list[float]] = {}
-    for view, value in zip(fine, best.trust, strict=True):
-        trust.setdefault(view.photo, []).append(float(value))
+    for group, value in zip(chosen, best.trust, strict=True):
+        trust.setdefault(next(iter(group.values())).photo, []).append(float(value))
     return Pooled(best, tails, {photo: float(np.median(values)) for photo, values in trust.items()})
+
+
+def _searched(
+    chosen: Sequence[dict[Channel, PsfSample]], begins: Sequence[Wavefront], on_step: StepHook
+) -> PooledFit:
+    """Fit from many starts: all of them coarsely and centred, the best in green, the best of those in full.
+
+    Where the pupil is round, a wavefront whose coma is negated has the same spectra as before. Only the
+    cat's eye tells the two apart, so that both are tried.
+    """
+    green = [_view({"g": group["g"]}) for group in chosen if "g" in group]
+    total = len(begins) * _COARSE_ROUNDS + 2 * _KEPT * _MEDIUM_ROUNDS + _REFINED * _FINE_ROUNDS
+    done = 0
+    fits = []
+    for begin in begins:
+        fits.append(
+            fit_spectra(green[:_COARSE_PLACES], begin, rounds=_COARSE_ROUNDS, symmetric=True, coarse=True)
+        )
+        on_step(done := done + _COARSE_ROUNDS, total)
+    medium = []
+    for fit in _different(fits)[:_KEPT]:
+        for front in (fit.front, _mirrored(fit.front)):
+            medium.append(fit_spectra(green[:_MEDIUM_PLACES], front, rounds=_MEDIUM_ROUNDS))
+            on_step(done := done + _MEDIUM_ROUNDS, total)
+    fine, refined = [_view(group) for group in chosen], []
+    for fit in _different(medium)[:_REFINED]:
+        refined.append(fit_spectra(fine, fit.front, rounds=_FINE_ROUNDS))
+        on_step(done := done + _FINE_ROUNDS, total)
+    on_step(total, total)
+    return min(refined, key=_cost)
+
+
+def _negative(front: Wavefront) -> Wavefront:
+    """Return the wavefront of the kernels turned by 180 degrees."""
+    return replace(front, terms=-front.terms)
+
+
+def _mirrored(front: Wavefront) -> Wavefront:
+    """Negate the coma."""
+    terms = front.terms.copy()
+    terms[_COMA] *= -1.0
+    return replace(front, terms=terms)
 
 
 def _log_q(samples: Sequence[PsfSample], fitted: float) -> float:
@@ -155,10 +182,14 @@ def _log_q(samples: Sequence[PsfSample], fitted: float) -> float:
     return math.log(WAVELENGTH_NM["g"] / 1000.0 * min(apertures) / float(np.median(pitches)))
 
 
+def _cost(fit: PooledFit) -> float:
+    return fit.cost
+
+
 def _different(fits: Sequence[PooledFit]) -> list[PooledFit]:
-    """Fits that ended in different minima."""
+    """Fits that ended in different minima, the best first."""
     kept: list[PooledFit] = []
-    for fit in fits:
+    for fit in sorted(fits, key=_cost):
         if all(abs(fit.cost - other.cost) > _SAME_COST for other in kept):
             kept.append(fit)
     return kept

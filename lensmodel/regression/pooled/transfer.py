@@ -16,10 +16,13 @@ Source: J. W. Goodman, "Introduction to Fourier Optics", 3rd ed., 2005, eq. 6-27
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Final
+from functools import cache, lru_cache
+from typing import Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +35,11 @@ FIRST_RING: Final = 3
 BINS: Final = (RINGS - FIRST_RING) * SECTORS
 """Number of bins that count."""
 
-_ACROSS = 26  # samples across the pupil
+_ACROSS, _ACROSS_COARSE = 26, 16  # samples across the pupil
+
+COLUMNS: Final = 20
+"""Real and imaginary sum, the latter two by six terms, and by three numbers of the cat's eye."""
+
 _EDGE = np.geomspace(*RING_LIMITS, RINGS + 1)
 _RATIO = float(_EDGE[1] / _EDGE[0])
 _INSIDE = (-0.3, 0.3)  # where a bin is sampled, in parts of its width
@@ -62,32 +69,34 @@ class Transfer:
 
     Parameters
     ----------
-    ahead, behind : tuple of ndarray, shape (F, P)
-        Coordinates (right, up) of p + q f and p - q f; F frequencies, one or four to a bin.
-    phases : ndarray, shape (6, F, P)
-        Phase per pixel of blur of each term of `pupil` but the tilts.
-    stop : ndarray, shape (F, P)
-        Transmission of the two shifted stops.
-    points : tuple of ndarray, shape (P,)
-        The pupil p itself.
+    q : float
+        Wavelength x f-number / pixel pitch.
+    points : tuple of ndarray of float32, shape (P,)
+        The pupil p, (right, up).
+    shifts : tuple of ndarray of float32, shape (F,)
+        q f of F frequencies, one or four to a bin.
+    steep : float
+        Slope of the edge of a stop, which is one sample wide.
     share : ndarray, shape (F,)
         One over the number of frequencies of the bin.
     bins : ndarray of int, shape (F,)
         Which bin each frequency belongs to.
     """
 
-    ahead: tuple[Singles, Singles]
-    behind: tuple[Singles, Singles]
-    phases: Singles
-    stop: Singles
+    q: float
     points: tuple[Singles, Singles]
+    shifts: tuple[Singles, Singles]
+    steep: float
     share: Floats
     bins: NDArray[np.intp]
 
     @classmethod
-    def of(cls, q: float, rings: int = RINGS - FIRST_RING) -> Transfer:
-        """Lay out the pupil for the innermost `rings` that count; layouts are remembered."""
-        return _laid_out(round(q, 4), rings)
+    def of(cls, q: float, rings: int = RINGS - FIRST_RING, *, coarse: bool = False) -> Transfer:
+        """Lay out the pupil for the innermost `rings` that count; layouts are remembered.
+
+        `coarse` takes fewer samples and one frequency to a bin: an eighth of the work, for searching.
+        """
+        return _laid_out(round(q, 4), rings, coarse)
 
     def log_power(
         self, blur: Floats, radius: float, shift: tuple[float, float]
@@ -120,89 +129,113 @@ class Transfer:
         self, blur: Floats, radius: float, shift: tuple[float, float]
     ) -> tuple[Floats, Floats, Floats]:
         """Mean square of the transfer function of the lens alone in each bin, and its derivatives."""
-        ahead, ahead_by = _circle(*self.ahead, radius, shift)
-        behind, behind_by = _circle(*self.behind, radius, shift)
-        alone, alone_by = _circle(*self.points, radius, shift)
-        open_ = _circle(*self.points, 1.0, (0.0, 0.0))[0]
+        alone, alone_by = _circle(*self.points, radius, shift, self.steep)
+        open_ = _circle(*self.points, 1.0, (0.0, 0.0), self.steep)[0]
         area = float((open_ * alone * open_ * alone).sum())
-        angle = np.tensordot(blur.astype(np.float32), self.phases, axes=1)
-        cosine, sine = np.cos(angle), np.sin(angle)
-        both = self.stop * ahead * behind
-        real_parts, imaginary_parts = both * cosine, both * sine
-        real, imaginary = (
-            real_parts.sum(axis=1, dtype=np.float64),
-            imaginary_parts.sum(axis=1, dtype=np.float64),
-        )
-        scale = self.share / area**2
-        power = self._binned((real * real + imaginary * imaginary) * scale)
-        found = []
-        for phase in self.phases:
-            by_real = -np.einsum("fp,fp->f", phase, imaginary_parts)
-            by_imaginary = np.einsum("fp,fp->f", phase, real_parts)
-            found.append(self._binned(2.0 * scale * (real * by_real + imaginary * by_imaginary)))
-        eye = []
-        for one, other, own in zip(ahead_by, behind_by, alone_by, strict=True):
-            change = self.stop * (one * behind + ahead * other)
-            towards = real * np.einsum("fp,fp->f", change, cosine)
-            towards += imaginary * np.einsum("fp,fp->f", change, sine)
-            loss = 4.0 * float((open_ * open_ * alone * own).sum()) / area
-            eye.append(self._binned(2.0 * scale * towards) - power * loss)
-        return power, np.stack(found, axis=1), np.stack(eye, axis=1)
+        turns = (blur / (2.0 * self.q)).astype(np.float32)
+        eye = np.array([radius, *shift], dtype=np.float32)
+        out = np.zeros((self.share.size, COLUMNS), dtype=np.float32)
+        _engine()(*self.points, *self.shifts, turns, eye, np.float32(self.steep), out)
+        found = out.astype(np.float64)
+        real, imaginary = found[:, 0, None], found[:, 1, None]
+        scale = (self.share / area**2)[:, None]
+        power = self._binned((real**2 + imaginary**2) * scale)
+        to_phase = math.pi / self.q
+        by_blur = self._binned(2.0 * to_phase * scale * (real * found[:, 2:8] + imaginary * found[:, 8:14]))
+        towards = self._binned(2.0 * scale * (real * found[:, 14:17] + imaginary * found[:, 17:20]))
+        loss = [4.0 * float((open_ * open_ * alone * own).sum()) / area for own in alone_by]
+        return power[:, 0], by_blur, towards - power * np.array(loss)
 
     def _binned(self, values: Floats) -> Floats:
-        return np.asarray(np.bincount(self.bins, values, BINS), dtype=np.float64)
+        return np.stack([np.bincount(self.bins, column, BINS) for column in values.T], axis=1)
 
 
-@lru_cache(maxsize=16)
-def _laid_out(q: float, rings: int) -> Transfer:
+@lru_cache(maxsize=32)
+def _laid_out(q: float, rings: int, coarse: bool) -> Transfer:
     modulus, angle = bin_frequencies()
     ring = np.arange(BINS) // SECTORS
-    smooth, rough = np.flatnonzero(ring < _SMOOTH), np.flatnonzero((ring >= _SMOOTH) & (ring < rings))
+    alone = ring < (rings if coarse else _SMOOTH)
+    single, several = np.flatnonzero(alone), np.flatnonzero(~alone & (ring < rings))
     along, across = (a.ravel()[:, None] for a in np.meshgrid(_INSIDE, _INSIDE))
-    f = np.concatenate([modulus[smooth], (modulus[rough] * _RATIO**along).ravel()])
-    t = np.concatenate([angle[smooth], (angle[rough] + across * math.pi / SECTORS).ravel()])
-    bins = np.concatenate([smooth, np.tile(rough, len(_INSIDE) ** 2)])
-    share = np.where(bins < smooth.size, 1.0, 1.0 / len(_INSIDE) ** 2)
-    fx, fy = f * np.cos(t), -f * np.sin(t)  # rows grow downwards
-    side = ((np.arange(_ACROSS) - (_ACROSS - 1) / 2.0) * 2.0 / _ACROSS).astype(np.float64)
+    f = np.concatenate([modulus[single], (modulus[several] * _RATIO**along).ravel()])
+    t = np.concatenate([angle[single], (angle[several] + across * math.pi / SECTORS).ravel()])
+    bins = np.concatenate([single, np.tile(several, len(_INSIDE) ** 2)])
+    share = np.where(alone[bins], 1.0, 1.0 / len(_INSIDE) ** 2)
+    samples = _ACROSS_COARSE if coarse else _ACROSS
+    side = (np.arange(samples) - (samples - 1) / 2.0) * 2.0 / samples
     px, py = (a.ravel() for a in np.meshgrid(side, side))
-    inside = np.hypot(px, py) <= 1.0 + 1.0 / _ACROSS
-    px, py = px[inside], py[inside]
-    ahead = (px + q * fx[:, None], py + q * fy[:, None])
-    behind = (px - q * fx[:, None], py - q * fy[:, None])
-    stop = _circle(*ahead, 1.0, (0.0, 0.0))[0] * _circle(*behind, 1.0, (0.0, 0.0))[0]
-    phases = (_terms(*ahead) - _terms(*behind)) * (math.pi / q)
+    inside = np.hypot(px, py) <= 1.0 + 1.0 / samples
     return Transfer(
-        (ahead[0].astype(np.float32), ahead[1].astype(np.float32)),
-        (behind[0].astype(np.float32), behind[1].astype(np.float32)),
-        phases.astype(np.float32),
-        stop.astype(np.float32),
-        (px.astype(np.float32), py.astype(np.float32)),
+        q,
+        (px[inside].astype(np.float32), py[inside].astype(np.float32)),
+        (
+            (q * f * np.cos(t)).astype(np.float32),
+            (-q * f * np.sin(t)).astype(np.float32),
+        ),  # rows grow downwards
+        samples / 2.0,
         share,
         bins,
     )
 
 
-def _terms(px: Floats, py: Floats) -> Floats:
+@cache
+def _engine() -> Callable[..., None]:
+    """Return the compiled loop where Numba is installed."""
+    if importlib.util.find_spec("numba") is None:
+        return sums
+    return cast("Callable[..., None]", importlib.import_module("lensmodel.regression.pooled.compiled").sums)
+
+
+def sums(
+    px: Singles,
+    py: Singles,
+    fx: Singles,
+    fy: Singles,
+    turns: Singles,
+    eye: Singles,
+    steep: float,
+    out: Singles,
+) -> None:
+    """Sum over the pupil, without Numba: `compiled.sums`, where the columns of `out` are told."""
+    ax, ay = px + fx[:, None], py + fy[:, None]
+    bx, by = px - fx[:, None], py - fy[:, None]
+    stop = _circle(ax, ay, 1.0, (0.0, 0.0), steep)[0] * _circle(bx, by, 1.0, (0.0, 0.0), steep)[0]
+    radius, shift = float(eye[0]), (float(eye[1]), float(eye[2]))
+    ahead, ahead_by = _circle(ax, ay, radius, shift, steep)
+    behind, behind_by = _circle(bx, by, radius, shift, steep)
+    phases = _terms(ax, ay) - _terms(bx, by)
+    angle = np.tensordot(turns * np.float32(2.0 * math.pi), phases, axes=1)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    both = stop * ahead * behind
+    real, imaginary = both * cosine, both * sine
+    out[:, 0], out[:, 1] = real.sum(axis=1), imaginary.sum(axis=1)
+    out[:, 2:8] = -np.einsum("kfp,fp->fk", phases, imaginary)
+    out[:, 8:14] = np.einsum("kfp,fp->fk", phases, real)
+    for j, (one, other) in enumerate(zip(ahead_by, behind_by, strict=True)):
+        change = stop * (one * behind + ahead * other)
+        out[:, 14 + j] = np.einsum("fp,fp->f", change, cosine)
+        out[:, 17 + j] = np.einsum("fp,fp->f", change, sine)
+
+
+def _terms(px: Singles, py: Singles) -> Singles:
     """Return the first six terms of `pupil`."""
     rho2 = px * px + py * py
     return np.stack([rho2 * rho2, px * rho2, py * rho2, rho2, px * px - py * py, 2.0 * px * py])
 
 
 def _circle(
-    px: NDArray[np.floating], py: NDArray[np.floating], radius: float, shift: tuple[float, float]
-) -> tuple[NDArray[np.floating], tuple[NDArray[np.floating], ...]]:
-    """Transmission of a disc whose edge is one sample wide; derivatives by radius and shift.
+    px: Singles, py: Singles, radius: float, shift: tuple[float, float], steep: float
+) -> tuple[Singles, tuple[Singles, ...]]:
+    """Transmission of a disc with a soft edge; derivatives by radius and shift.
 
     Squares spare the root: (radius^2 - r^2) / (2 radius) is the distance to the edge near it.
     """
-    dtype = px.dtype.type
-    dx, dy = px - dtype(shift[0]), py - dtype(shift[1])
-    steep = dtype(_ACROSS / 2.0)
-    edge = (dtype(radius * radius) - dx * dx - dy * dy) * (steep / dtype(2.0 * radius)) + dtype(0.5)
+    single = np.float32
+    dx, dy = px - single(shift[0]), py - single(shift[1])
+    edge = (single(radius * radius) - dx * dx - dy * dy) * single(steep / (2.0 * radius)) + single(0.5)
     inside = np.clip(edge, 0.0, 1.0)
-    soft = ((edge > 0.0) & (edge < 1.0)) * steep
-    over = dtype(1.0 / radius)
+    soft = ((edge > 0.0) & (edge < 1.0)) * single(steep)
+    over = single(1.0 / radius)
     return inside, (soft, soft * dx * over, soft * dy * over)
 
 

@@ -59,6 +59,7 @@ def serve(port: Port = None, host: Host = None, data: Data = None) -> None:
     Exit status: 0 stopped as told by Ctrl-C or SIGTERM, 1 it could not run, 2 called wrongly.
     """
     settings = _settings(data, host, port)
+    typer.echo("lensmodel is starting ...", err=True)
     from app import supervisor  # noqa: PLC0415 - only this command needs the service
 
     raise typer.Exit(supervisor.serve(settings, host=settings.host, port=settings.port))

@@ -87,6 +87,13 @@ SHORTER = {
 }
 """What is added so that an example takes minutes at most; the estimators have tests of their own."""
 
+KEPT = {
+    "reproduce": Path("reproduction", "cache"),
+    "bench": Path("bench-output", "cache"),
+    "bench blind": Path("bench-output", "cache"),
+}
+"""Where a command keeps finished pieces of work, which its next example need not do again."""
+
 QUICK = {
     "correct one.dng --profile my-24mm.lensprofile -o linear --format dng --method fast --json",
     "calibrate scan.tif --aperture 2.8 --profile old-lens.lensprofile",
@@ -146,14 +153,23 @@ def folder(prepared: Path, tmp_path: Path) -> Path:
     return tmp_path / "work"
 
 
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder for what examples leave to one another, see `KEPT`."""
+    return tmp_path_factory.mktemp("finished")
+
+
 def environment(folder: Path) -> dict[str, str]:
     kept = {k: v for k, v in os.environ.items() if not k.startswith(("LENS_", "LENSMODEL_"))}
     return {**kept, "PYTHONPATH": str(HERE.parents[1]), "HOME": str(folder)}
 
 
 @pytest.mark.parametrize("line", marked(k for k in EXAMPLES if EXAMPLES[k] != "serve"))
-def test_example_runs(line: str, folder: Path) -> None:
+def test_example_runs(line: str, folder: Path, finished: Path) -> None:
     words = [*shlex.split(line), *SHORTER.get(EXAMPLES[line], [])]
+    kept = KEPT.get(EXAMPLES[line])
+    if kept is not None and (finished / kept).is_dir():
+        shutil.copytree(finished / kept, folder / kept)
     done = subprocess.run(
         [sys.executable, "-m", "app.cli", *words],
         cwd=folder,
@@ -166,6 +182,8 @@ def test_example_runs(line: str, folder: Path) -> None:
 
     assert done.returncode == 0, done.stderr
     assert done.stdout
+    if kept is not None and (folder / kept).is_dir():
+        shutil.copytree(folder / kept, finished / kept, dirs_exist_ok=True)
     for flag in ("-o", "--output", "--profile", "--json"):
         for at in (
             k for k, word in enumerate(words[:-1]) if word == flag and not words[k + 1].startswith("-")

@@ -160,7 +160,7 @@ class MethodSummary:
     """One method at one noise level; shares are of all cases, the rest are medians.
 
     `moment_bias` is the median of the difference of mean second moments, estimated minus true, in
-    px²; `width_ratio` the median of RMS width over the true one; `er_p90` the 90th percentile.
+    px²; `width_ratio` the median of RMS width over the true one, NaN for points; `er_p90` the 90th percentile.
     """
 
     method: str
@@ -302,7 +302,7 @@ def _summary(noise: float, method: str, rows: Sequence[CaseResult]) -> MethodSum
         rel_l2=median(lambda row: row.rel_l2),
         mtf_rmse=median(lambda row: row.mtf_rmse),
         moment_bias=median(lambda row: row.width_px**2 - row.true_width_px**2),
-        width_ratio=median(lambda row: row.width_px / row.true_width_px),
+        width_ratio=median(lambda row: row.width_px / row.true_width_px if row.true_width_px else math.nan),
         declined=sum(row.declined for row in rows),
         seconds=median(lambda row: row.seconds),
     )

@@ -160,7 +160,7 @@ class MethodSummary:
     """One method at one noise level; shares are of all cases, the rest are medians.
 
     `moment_bias` is the median of the difference of mean second moments, estimated minus true, in
-    px²; `width_ratio` the median of RMS width over the true one, NaN for points; `er_p90` the 90th percentile.
+    px²; `width_ratio` the median of RMS width over the true one, NaN for points; `er_p90` a percentile.
     """
 
     method: str

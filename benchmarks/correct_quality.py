@@ -1,6 +1,6 @@
 """Gain of every correction method, and of programs in use, on lenses and photographs nothing was tuned on.
 
-    LENSMODEL_TEST_DATA=... python benchmarks/correct_quality.py [--kinds coma] [--peers gmic] [--cache FOLDER]
+    LENSMODEL_TEST_DATA=... python benchmarks/correct_quality.py [--kinds coma] [--cache FOLDER]
 
 Prints the tables of docs/correction.md: gain in PSNR of the sRGB picture in center, mid and corner of a
 frame of 6 megapixels with the true PSF field, SSIM, edges, noise in flats, and light near clipped lamps.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from lensmodel.deconv.base import ColourDeconvolver, Deconvolver, Restored, Sensor, restore_planes
 from lensmodel.deconv.correct import Corrected, PsfError, correct_planes
+from lensmodel.deconv.direct import DirectFilter
 from lensmodel.deconv.epll import Epll
 from lensmodel.deconv.krishnan_fergus import KrishnanFergus
 from lensmodel.deconv.lattice import Roi
@@ -17,6 +18,7 @@ __all__ = [
     "ColourDeconvolver",
     "Corrected",
     "Deconvolver",
+    "DirectFilter",
     "Epll",
     "KrishnanFergus",
     "PsfError",

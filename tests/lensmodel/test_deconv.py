@@ -7,6 +7,7 @@ from skimage import restoration
 
 from lensmodel.blur import Drift, EfficientFilterFlow, UniformBlur
 from lensmodel.deconv import (
+    DirectFilter,
     RichardsonLucy,
     SaturationAwareRichardsonLucy,
     Sensor,
@@ -86,7 +87,7 @@ def test_method_answers_float32_of_the_frame_and_counts_its_steps(name: str) -> 
     assert seen == sorted(seen)
 
 
-@pytest.mark.parametrize("method", [SparseGradient, SaturationAwareRichardsonLucy])
+@pytest.mark.parametrize("method", [SparseGradient, SaturationAwareRichardsonLucy, DirectFilter])
 @pytest.mark.parametrize("clip", [np.inf, 0.75])
 def test_compiled_loops_give_the_numbers_of_numpy(method: type, clip: float) -> None:
     pytest.importorskip("numba")

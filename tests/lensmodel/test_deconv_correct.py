@@ -338,3 +338,25 @@ def test_cells_follow_a_kernel_that_changes_within_them() -> None:
 
     truth = sharp[:, :80, :100]
     assert rmse(following, truth) < rmse(fixed, truth)
+
+
+def test_one_pass_takes_larger_cells_but_not_on_a_mosaic() -> None:
+    frame = Frame(16, 6000)
+    seen = np.full((3, frame.height, frame.width), 0.3, dtype=np.float32)
+    roi = (0, 0, 16, 900)
+    counts = []
+    for cfa in (None, ((0, 1), (1, 2))):
+        steps: list[int] = []
+        correct_planes(
+            seen,
+            Soft(),
+            frame,
+            noise=BASE,
+            method="fast",
+            roi=roi,
+            cfa=cfa,
+            on_step=lambda _, total, steps=steps: steps.append(total),
+        )
+        counts.append(steps[-1])
+
+    assert counts == [3, 6]

@@ -19,6 +19,7 @@ def one_pass(  # noqa: C901 - one pass over memory per loop
     fine: Real,
     levels: NDArray[np.float64],
     busy: Real,
+    floor: float,
 ) -> None:
     """Filter three planes for two contrasts, `levels` of (luma, chroma), and mix by `busy` into `x`."""
     height, width = busy.shape
@@ -48,9 +49,9 @@ def one_pass(  # noqa: C901 - one pass over memory per loop
                 a, b, d = K[0, i, j], K[1, i, j], K[2, i, j]
                 s = decay[i, j] * chroma
                 g = decay[i, j] * ((luma - chroma) / np.float32(3.0))
-                u = ONE / ((a.real * a.real + a.imag * a.imag) * n0 + s)
-                v = ONE / ((b.real * b.real + b.imag * b.imag) * n1 + s)
-                w = ONE / ((d.real * d.real + d.imag * d.imag) * n2 + s)
+                u = ONE / ((a.real * a.real + a.imag * a.imag + floor) * n0 + s)
+                v = ONE / ((b.real * b.real + b.imag * b.imag + floor) * n1 + s)
+                w = ONE / ((d.real * d.real + d.imag * d.imag + floor) * n2 + s)
                 p = np.conj(a) * Y[0, i, j] * (n0 * u)
                 q = np.conj(b) * Y[1, i, j] * (n1 * v)
                 r = np.conj(d) * Y[2, i, j] * (n2 * w)

@@ -38,7 +38,7 @@ class DirectFilter:
     The scene is natural in luma and in chroma, S_l = l |f|^-2.2 and S_c = c |f|^-2.2, so that its colours
     tell of each other. With channels scaled to equal light, noise n_i and 1 a vector of ones::
 
-        M = diag( |K_i|² / n_i + 1 / S_c ) + g 1 1',    g = ( 1 / S_l - 1 / S_c ) / 3
+        M = diag( (|K_i|² + floor) / n_i + 1 / S_c ) + g 1 1',    g = ( 1 / S_l - 1 / S_c ) / 3
         X = M^-1 ( conj(K_i) Y_i / n_i )
 
     solved by the Sherman-Morrison formula. It is made for a busy scene and for a calm one, and each
@@ -49,12 +49,16 @@ class DirectFilter:
     ----------
     busy, calm : float
         The two contrasts: shares of the mean variance in windows of the tile.
+    floor : float
+        Added to |K_i|² in M: the square of what a transfer function is expected to be off by within a
+        cell. Without it strong frequencies of the scene come back as coloured ripples.
     engine : {"auto", "numpy"}
         "numpy" never uses compiled loops; the numbers are the same.
     """
 
-    busy: float = 0.12
+    busy: float = 0.25
     calm: float = 0.0015
+    floor: float = 1e-3
     engine: Engine = "auto"
     mosaic: Deconvolver = field(default_factory=_steps)
 
@@ -90,13 +94,23 @@ class DirectFilter:
         )
         if loops is None:
             y = np.stack([canvas.fill(plane / bright) for plane, bright in zip(blurred, light, strict=True)])
-            x = _filtered(y, K, noise, levels, busy)
+            x = _filtered(y, K, noise, levels, busy, self.floor)
         else:
             y = np.empty((len(blurred), *canvas.shape), dtype=np.float32)
             rows, cols = seam(canvas.rows, canvas.shape[0]), seam(canvas.cols, canvas.shape[1])
             loops.fill(blurred, np.float32(1.0) / light, canvas.margin, rows, cols, y)
             x = np.empty_like(y)
-            loops.one_pass(x, y, K, noise, prior(canvas.shape)[0], _fine(canvas.shape), levels, busy)
+            loops.one_pass(
+                x,
+                y,
+                K,
+                noise,
+                prior(canvas.shape)[0],
+                _fine(canvas.shape),
+                levels,
+                busy,
+                np.float32(self.floor),
+            )
         restored = x[:, canvas.data[0], canvas.data[1]] * light[:, None, None]
         clips = np.array([sensor.clip for sensor in sensors], dtype=np.float32)[:, None, None]
         return faded_to(blurred, restored, blurred >= clips, blurs)
@@ -134,6 +148,7 @@ def _filtered(
     noise: NDArray[np.float32],
     levels: NDArray[np.float64],
     busy: NDArray[np.float32],
+    floor: float,
 ) -> Planes:
     """The pass in NumPy; `compiled.one_pass` is its twin."""
     shape = (y.shape[1], y.shape[2])
@@ -144,7 +159,7 @@ def _filtered(
     data = np.conj(K) * Y / noise[:, None, None]
     found = []
     for luma, chroma in levels:
-        D = power / noise[:, None, None] + decay / np.float32(chroma)
+        D = (power + np.float32(floor)) / noise[:, None, None] + decay / np.float32(chroma)
         z = data / D
         g = decay * np.float32((1.0 / luma - 1.0 / chroma) / 3.0)
         X = z - (g * z.sum(axis=0) / (1.0 + g * (1.0 / D).sum(axis=0))) / D

@@ -11,6 +11,7 @@ import numpy as np
 
 from lensmodel.blind.aberrations import AberrationFit
 from lensmodel.blind.base import PsfEstimate, is_no_blur, usable
+from lensmodel.blind.finish import signal_share
 from lensmodel.blind.patch_recurrence import PatchRecurrence
 from lensmodel.blind.scene_spectra import SceneSpectra
 from lensmodel.blind.whittle import Whittle
@@ -19,6 +20,7 @@ from lensmodel.types import NoiseModel, Plane, StepHook, ignore_step
 
 _PIXEL_SIGMA = 0.29
 _POOLED_SUPPORT, _POOLED_ITERATIONS, _POOLED_SIDE = 21, 3, 160
+_STARTS, _STARTS_OF_CHANNEL = 12, 6
 _POOLED_ERROR = 0.7
 """Relative error of a wavefront agreed on by n patches, times the root of n."""
 
@@ -49,7 +51,7 @@ class Cautious:
     trust: float = 75.0
 
     name = "default"
-    version = 6
+    version = 7
 
     def estimate(
         self,
@@ -72,7 +74,7 @@ class Cautious:
         support = min(max(2 * round(3.0 * gaussian.diagnostics["width"] + 3.0) + 1, 15), 31, size)
         recurrence = PatchRecurrence(support=support)
         found = recurrence.estimate(patches, noise, size=size, on_step=_half(on_step, 0))
-        return self._chosen(kept, gaussian, found, began, size, on_step)
+        return self._chosen(kept, gaussian, found, began, size, on_step, _STARTS)
 
     def estimate_channel(
         self,
@@ -88,17 +90,15 @@ class Cautious:
         """Estimate another channel from the reference kernel on."""
         began = time.process_time()
         kept = usable(patches, noise, size)
+        if len(kept) >= self.pooled:
+            same_phase = replace(reference, evidence=(), reliability=signal_share(kept))
+            return self._agreed(kept, same_phase, began, size, on_step)
         recurrence = PatchRecurrence(support=int(reference.diagnostics.get("support", 21.0)), iterations=3)
-        inner, models = [patch for patch, _ in kept], [model for _, model in kept]
-        if len(kept) >= self.pooled:
-            inner = [_middle(patch) for patch in inner]
         found = recurrence.estimate_channel(
-            inner, models, reference, reference_patches, size=size, on_step=_half(on_step, 0)
+            patches, noise, reference, reference_patches, size=size, on_step=_half(on_step, 0)
         )
-        if len(kept) >= self.pooled:
-            return self._agreed(kept, found, began, size, on_step)
         gaussian = Whittle().estimate(patches, noise, size=size)
-        return self._chosen(kept, gaussian, found, began, size, on_step)
+        return self._chosen(kept, gaussian, found, began, size, on_step, _STARTS_OF_CHANNEL)
 
     def _agreed(
         self,
@@ -136,12 +136,13 @@ class Cautious:
         began: float,
         size: int,
         on_step: StepHook,
+        starts: int,
     ) -> PsfEstimate:
         """Kernel of few patches, whose spectra alone do not tell a soft scene from a blur."""
         disagreement = distance(found.kernel, gaussian.kernel).mtf_rmse
         narrow = rms_width(gaussian.kernel) <= self.trusted_px
         if not narrow:
-            fit = AberrationFit(weight=self.trust)
+            fit = AberrationFit(weight=self.trust, starts=starts, kept=max(starts // 4, 2))
             fitted = fit.fit(SceneSpectra.of(kept), found.kernel, _half(on_step, 1))
             kernel = fitted.kernel(size)
         elif rms_width(found.kernel) > self.apart * max(rms_width(gaussian.kernel), _PIXEL_SIGMA):

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import signal
@@ -148,3 +150,16 @@ def test_fitting_a_wavefront_can_be_cancelled() -> None:
     truth = kernel_of(LENS)
     with pytest.raises(LensModelError, match="stopped"):
         AberrationFit().fit(spectra_of(truth, 1), as_kernel(truth), stop)
+
+
+def test_another_channel_of_six_patches_follows_the_first() -> None:
+    truth, method = kernel_of(LENS), blind.estimators.create("default")
+    seen, noise = patches(truth, 6), [NoiseModel.white(0.01)] * 6
+    green = replace(
+        blind.estimators.create("whittle").estimate(seen, noise, size=21), kernel=as_kernel(truth)
+    )
+
+    found = method.estimate_channel(seen, noise, green, seen, size=21)
+
+    assert "cost" in found.diagnostics
+    assert distance(found.kernel, truth).ncc > 0.9

@@ -28,7 +28,7 @@ from lensmodel.regression.physical import Physics
 from lensmodel.types import FieldPosition, LensSettings
 
 _SILENT = 1e-3
-_AGREED_ERROR, _NARROW_PX = 0.35, 0.8
+_KERNEL_ERROR, _NARROW_PX = 0.35, 0.8
 
 
 def agreed_share(width: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -36,9 +36,9 @@ def agreed_share(width: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(width**4 / (width**4 + 1.0))
 
 
-def agreed_error(width: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Expected relative L2 of kernels and an agreed wavefront mixed, by width in pixels."""
-    return np.asarray(_AGREED_ERROR * np.minimum(width / _NARROW_PX, 1.0))
+def kernel_error(width: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Expected relative L2 of kernels that each patch gave alone, by width in pixels."""
+    return np.asarray(_KERNEL_ERROR * np.minimum(width / _NARROW_PX, 1.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,7 +131,7 @@ class Experts:
                 shares *= (1.0 - share)[:, None]
                 shares[:, 2] = share
                 light = light * (1.0 - share)[:, None, None]
-                squared[:] = agreed_error(width)[:, None] ** 2
+                squared[:, :2] = kernel_error(width)[:, None] ** 2
             light[told] += shares[told, 2, None, None] * rows
         error = np.where(shares > 0, shares * np.where(shares > 0, squared, 0.0), 0.0).sum(axis=1)
         return Mixture(light / light.sum(axis=(1, 2), keepdims=True), error, float(usual.min()), shares)

@@ -33,7 +33,7 @@ from lensmodel.regression.transport import WidthField
 from lensmodel.regression.validation import Choice
 from lensmodel.regression.wavefront import NAMES, Wavefront
 
-VERSION: Final = 2
+VERSION: Final = 3
 """Raised whenever the same samples would be fitted otherwise."""
 
 _MOST_BYTES = 1 << 27

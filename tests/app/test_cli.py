@@ -34,7 +34,7 @@ from running import write_photo  # noqa: E402 - beside this file
 sys.path.remove(str(HERE))
 
 PROFILE = "my-24mm.lensprofile"
-PATIENCE_S = 60.0
+PATIENCE_S = 240.0
 ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith("LENS_")}
 
 

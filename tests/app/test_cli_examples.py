@@ -32,7 +32,7 @@ from running import scene, write_photo  # noqa: E402 - beside this file
 
 sys.path.remove(str(HERE))
 
-PATIENCE_S = 60.0
+PATIENCE_S = 240.0
 LONG_S = 3600.0
 ROOT = typer.main.get_command(app)
 

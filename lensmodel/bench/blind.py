@@ -46,7 +46,7 @@ from lensmodel.types import Kernel, StepHook, ignore_step
 
 logger = logging.getLogger(__name__)
 
-PROTOCOL = 1
+PROTOCOL = 2
 """Part of every cache key; raised when cases or metrics change."""
 
 UNTOUCHED = "none"

@@ -33,9 +33,7 @@ def main() -> None:
     data = os.environ.get("LENSMODEL_TEST_DATA")
     methods = tuple(asked.methods.split(","))
     first: dict[str, float] = {}
-    print(
-        "| patches | method | cases | better than blurry | ER median | NCC | L2 | MTF error | L2 / L2(1) |"
-    )
+    print("| patches | method | cases | better than blurry | ER median | NCC | L2 | MTF error | L2 / L2(1) |")
     print("|---|---|---|---|---|---|---|---|---|")
     for pool in (int(text) for text in asked.pools.split(",")):
         settings = BlindBenchmark(

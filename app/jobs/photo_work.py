@@ -258,7 +258,10 @@ class PhotoWork:
             spectrum = None if entry["spectrum"] is None else bytes.fromhex(entry["spectrum"])
             if spectrum is not None:
                 PatchSpectrum.from_bytes(spectrum)
-        except (InvalidKernelError, InvalidInputError, ValueError, OSError, IndexError) as error:
+        except (
+            *(InvalidKernelError, InvalidInputError, OSError),
+            *(ValueError, TypeError, LookupError),  # not the JSON that was agreed on
+        ) as error:
             raise JobFailedError("internal_error", f"the estimator gave no kernel: {error}") from error
         key = None
         if entry["evidence"] is not None:

@@ -16,7 +16,7 @@ from lensmodel.blind.patch_recurrence import PatchRecurrence
 from lensmodel.blind.scene_spectra import SceneSpectra
 from lensmodel.blind.whittle import Whittle
 from lensmodel.psf import as_kernel, distance, rms_width
-from lensmodel.types import NoiseModel, Plane, StepHook, ignore_step
+from lensmodel.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
 
 _PIXEL_SIGMA = 0.29
 _POOLED_SUPPORT, _POOLED_ITERATIONS, _POOLED_SIDE = 21, 3, 160
@@ -112,21 +112,12 @@ class Cautious:
         fitted = AberrationFit().fit(SceneSpectra.of(kept), found.kernel, _half(on_step, 1))
         kernel = fitted.kernel(size)
         error = min(max(_POOLED_ERROR / math.sqrt(len(kept)), 0.05), 1.0)
-        diagnostics: Mapping[str, float] = {
-            **found.diagnostics,
+        more = {
             "width": rms_width(kernel),
             "disagreement": distance(found.kernel, kernel).mtf_rmse,
             "cost": fitted.cost,
         }
-        return replace(
-            found,
-            kernel=kernel,
-            confidence=1.0 / (1.0 + (error / 0.4) ** 2),
-            predicted_error=error,
-            diagnostics=diagnostics,
-            seconds=time.process_time() - began,
-            no_blur=is_no_blur(kernel),
-        )
+        return _told(found, kernel, error, more, began)
 
     def _chosen(
         self,
@@ -151,22 +142,28 @@ class Cautious:
             kernel = as_kernel(0.5 * (gaussian.kernel + found.kernel))
         on_step(1, 1)
         error = predicted_error(disagreement, rms_width(gaussian.kernel), gaussian.diagnostics["slope"])
-        diagnostics: Mapping[str, float] = {
-            **found.diagnostics,
+        more = {
             "gaussian_width": gaussian.diagnostics["width"],
             "slope": gaussian.diagnostics["slope"],
             "disagreement": disagreement,
             "narrow": float(narrow),
         }
-        return replace(
-            found,
-            kernel=kernel,
-            confidence=1.0 / (1.0 + (error / 0.4) ** 2),
-            predicted_error=error,
-            diagnostics=diagnostics,
-            seconds=time.process_time() - began,
-            no_blur=is_no_blur(kernel),
-        )
+        return _told(found, kernel, error, more, began)
+
+
+def _told(
+    found: PsfEstimate, kernel: Kernel, error: float, more: Mapping[str, float], began: float
+) -> PsfEstimate:
+    """Return the result of patch recurrence with another kernel, its expected error, and why."""
+    return replace(
+        found,
+        kernel=kernel,
+        confidence=1.0 / (1.0 + (error / 0.4) ** 2),
+        predicted_error=error,
+        diagnostics={**found.diagnostics, **more},
+        seconds=time.process_time() - began,
+        no_blur=is_no_blur(kernel),
+    )
 
 
 def _middle(patch: Plane) -> Plane:

@@ -16,7 +16,7 @@ _ONE, _HALF = np.float32(1.0), np.float32(0.5)
 _SIXTH, _TWO_THIRDS = np.float32(1.0 / 6.0), np.float32(2.0 / 3.0)
 
 
-def _jit(function: F) -> F:
+def jit(function: F) -> F:
     """Compile without the interpreter's lock, keep the machine code on disk."""
     return cast(
         "F",
@@ -26,7 +26,7 @@ def _jit(function: F) -> F:
     )
 
 
-@_jit
+@jit
 def _inside(a: float, b: float, c: float, size: int) -> tuple[int, int]:
     """Integers j in 0..size with a j^2 + 2 b j + c <= 0, as first and last + 1."""
     root = b * b - a * c
@@ -37,7 +37,7 @@ def _inside(a: float, b: float, c: float, size: int) -> tuple[int, int]:
     return max(first, 0), min(last + 1, size)
 
 
-@_jit
+@jit
 def _weights(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
     """Weights of the four coefficients round a point that lies `t` beyond the second."""
     rest = _ONE - t
@@ -46,7 +46,7 @@ def _weights(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.floa
     return first, second, _ONE - first - second - last, last
 
 
-@_jit
+@jit
 def _inner(spline: NDArray[np.float32], side: int, y: float, x: float) -> np.float32:
     """Value of a spline at (y, x), at least two steps inside its grid."""
     row, col = int(y), int(x)
@@ -62,7 +62,7 @@ def _inner(spline: NDArray[np.float32], side: int, y: float, x: float) -> np.flo
     )
 
 
-@_jit
+@jit
 def _anywhere(spline: NDArray[np.float32], side: int, y: float, x: float) -> np.float32:
     """Value of a spline at (y, x), zero coefficients around its grid."""
     row, col = math.floor(y), math.floor(x)
@@ -75,7 +75,7 @@ def _anywhere(spline: NDArray[np.float32], side: int, y: float, x: float) -> np.
     return total
 
 
-@_jit
+@jit
 def sums(
     rows: NDArray[np.float32],
     radii: NDArray[np.float64],

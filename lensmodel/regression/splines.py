@@ -17,12 +17,7 @@ Magazine 16, 1999.
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
-import logging
-import threading
-from functools import cache, lru_cache
-from types import ModuleType
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -30,11 +25,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.interpolate import make_interp_spline
 
+from lensmodel.regression.engine import compiled
+
 Engine = Literal["auto", "scipy"]
 
-logger = logging.getLogger(__name__)
-
-_loading = threading.Lock()
 _GAP = 4  # zeros between two kernels of one sheet: a spline reaches two beyond its last coefficient
 _LIGHT = 1e-6
 _REACH = 2.0 * 2.0**0.5  # of a coefficient, along the diagonal
@@ -126,7 +120,7 @@ def sums(
     -------
     ndarray, shape (answers, size, size)
     """
-    module = _compiled(engine)
+    module = None if engine == "scipy" else compiled("lensmodel.regression.compiled")
     if module is None:
         return _sums(rows, chosen, weights, maps, starts, shifts, size)
     out = np.zeros((len(starts) - 1, size, size))
@@ -171,18 +165,3 @@ def _sums(
             )
             out[answer] += (weights[part] @ found.reshape(count, -1)).reshape(size, size)
     return out
-
-
-def _compiled(engine: Engine) -> ModuleType | None:
-    if engine == "scipy":
-        return None
-    with _loading:  # threads that all start at once must not compile the same loop twice
-        return _load()
-
-
-@cache
-def _load() -> ModuleType | None:
-    if importlib.util.find_spec("numba") is None:
-        logger.info("numba is missing: lens models answer with SciPy, some times slower")
-        return None
-    return importlib.import_module("lensmodel.regression.compiled")

@@ -6,14 +6,11 @@ Nothing is loaded but the pupil's points: phases and transmissions are cheaper t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-F = TypeVar("F", bound=Callable[..., Any])
+from lensmodel.regression.compiled import jit
 
 _HALF, _ONE, _TWO = np.float32(0.5), np.float32(1.0), np.float32(2.0)
 # Of sin(pi x) and cos(pi x) for |x| <= 1/2, by least squares: within 2e-6.
@@ -22,20 +19,7 @@ _C0, _C2, _C4 = (np.float32(v) for v in (0.99999997, -4.93479493, 4.05845981))
 _C6, _C8 = np.float32(-1.33222587), np.float32(0.22046276)
 
 
-def _jit(function: F) -> F:
-    """Compile without the interpreter's lock, keep the machine code on disk."""
-    return cast(
-        "F",
-        numba.njit(
-            cache=True,
-            nogil=True,
-            fastmath={"nsz", "contract", "reassoc", "arcp", "nnan", "ninf"},
-            error_model="numpy",
-        )(function),
-    )
-
-
-@_jit
+@jit
 def sums(  # noqa: PLR0915 - one accumulator a column: arrays of them are not kept in registers
     px: NDArray[np.float32],
     py: NDArray[np.float32],

@@ -16,17 +16,16 @@ Source: J. W. Goodman, "Introduction to Fourier Optics", 3rd ed., 2005, eq. 6-27
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.regression.engine import compiled
 from lensmodel.spectrum import RING_LIMITS, RINGS, SECTORS
 
 FIRST_RING: Final = 3
@@ -94,7 +93,7 @@ class Transfer:
     def of(cls, q: float, rings: int = RINGS - FIRST_RING, *, coarse: bool = False) -> Transfer:
         """Lay out the pupil for the innermost `rings` that count; layouts are remembered.
 
-        `coarse` takes fewer samples and one frequency to a bin: an eighth of the work, for searching.
+        `coarse` takes fewer samples and one frequency to a bin: a seventh of the sums, for searching.
         """
         return _laid_out(round(q, 4), rings, coarse)
 
@@ -178,12 +177,10 @@ def _laid_out(q: float, rings: int, coarse: bool) -> Transfer:
     )
 
 
-@cache
 def _engine() -> Callable[..., None]:
     """Return the compiled loop where Numba is installed."""
-    if importlib.util.find_spec("numba") is None:
-        return sums
-    return cast("Callable[..., None]", importlib.import_module("lensmodel.regression.pooled.compiled").sums)
+    module = compiled("lensmodel.regression.pooled.compiled")
+    return sums if module is None else cast("Callable[..., None]", module.sums)
 
 
 def sums(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from app.client import Client, JobEndedError, JobPatienceError, ServiceProblemError
+from app.schemas import JobOut
 from app.settings import Settings
 from app.storage import Storage
 from app.store import Store
@@ -57,15 +57,17 @@ def test_waiting_ends_when_the_job_does(api: Client, steps: Steps, store: Store)
     steps.inspect(photo)
     steps.plan(photo)
     steps.estimate(photo)
-    timer = threading.Timer(0.3, store.photos.finish, (photo.public_id, 1))
-    timer.start()
     states: list[str] = []
 
-    job = api.wait(photo.public_id, timeout=20, on_change=lambda seen: states.append(seen.state))
+    def finish_when_seen(seen: JobOut) -> None:
+        states.append(seen.state)
+        if seen.state == "running":
+            store.photos.finish(photo.public_id, 1)
+
+    job = api.wait(photo.public_id, timeout=20, on_change=finish_when_seen)
 
     assert job.state == "succeeded"
     assert states == ["running", "succeeded"]
-    timer.join()
 
 
 def test_waiting_for_a_failed_or_stuck_job_raises_why(api: Client, steps: Steps, store: Store) -> None:

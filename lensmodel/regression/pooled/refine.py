@@ -23,7 +23,7 @@ from lensmodel.regression.wavefront_fit import fit_wavefront, spread
 from lensmodel.regression.wavefront_problem import PRIOR_PX, USUAL_EYE
 from lensmodel.types import WAVELENGTH_NM, Channel, FieldPosition, Kernel, StepHook, ignore_step
 
-MIN_PLACES: Final = 16
+MIN_PLACES: Final = 8
 """Fewer patches with a spectrum are not solved together."""
 
 _COMA = slice(2, 6)  # the odd terms

@@ -12,7 +12,7 @@ import pytest
 from lensmodel.psf import PsfSample, distance, gaussian, rms_width
 from lensmodel.regression import LensModel, LensProfile, load_profile, save_profile
 from lensmodel.regression.experts import agreed_share
-from lensmodel.regression.pooled import pool
+from lensmodel.regression.pooled import MIN_PLACES, pool
 from lensmodel.regression.pooled.fit import PatchView, fit_spectra
 from lensmodel.regression.pooled.scene import BIAS, SceneView
 from lensmodel.regression.pooled.transfer import (
@@ -226,7 +226,7 @@ def samples(count: int, photos: int = 1) -> list[PsfSample]:
 
 
 def test_few_patches_are_not_pooled() -> None:
-    assert pool(samples(8)) is None
+    assert pool(samples(MIN_PLACES - 1)) is None
     assert pool([replace(s, spectrum=None) for s in samples(20)]) is None
 
 

@@ -224,6 +224,7 @@ def estimate_cell(
                 estimator=f"{method.name}/{method.version}",
                 error=estimate.predicted_error if math.isfinite(estimate.predicted_error) else None,
                 spectrum=PatchSpectrum.of(plane, noise, width),
+                evidence=evidence,
             )
             stored = None if evidence is None else evidence.to_bytes()
             diagnostics = {**estimate.diagnostics, "predicted_error": estimate.predicted_error}

@@ -5,12 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.errors import InvalidInputError
+from lensmodel.errors import InvalidInputError, UnknownMethodError
 from lensmodel.types import Kernel
+
+MIXED: Final = "mixed"
+LIKELIEST: Final = "likeliest"
+MODES: Final = (MIXED, "kernels", "evidence", "wavefront", LIKELIEST)
+"""What can be made of the neighbours of a question; `modes` tells what they are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +38,8 @@ class ModelSettings:
         Whether photos and samples that do not fit the others count less.
     excluded : tuple of str
         Photos whose samples do not vote; they stay listed.
+    mode : str
+        What is made of the neighbours, one of `MODES`: see `modes`.
     """
 
     r: float | None = None
@@ -42,6 +50,7 @@ class ModelSettings:
     mirror: float | None = None
     robust: bool = True
     excluded: tuple[str, ...] = ()
+    mode: str = MIXED
 
     def __post_init__(self) -> None:
         for name in ("r", "phi", "stops"):
@@ -54,6 +63,8 @@ class ModelSettings:
             value = getattr(self, name)
             if value is not None and not 0.0 <= value <= 1.0:
                 raise InvalidInputError(f"{name} symmetry must lie in 0..1, or None, got {value}")
+        if self.mode not in MODES:
+            raise UnknownMethodError(f"no mode {self.mode!r} of the lens model; known: {', '.join(MODES)}")
         object.__setattr__(self, "excluded", tuple(str(name) for name in self.excluded))
 
 
@@ -92,6 +103,8 @@ class PsfAnswer:
         Weight of the fitted wavefront with the rest of the samples, 0..1, likewise.
     std : ndarray, shape (size, size), or None
         Standard error of each pixel from the scatter of the samples; None unless asked for.
+    mode : str
+        Which of `MODES` answered.
     """
 
     kernel: Kernel
@@ -108,3 +121,4 @@ class PsfAnswer:
     image_frame_share: float = 0.0
     wavefront_share: float = 0.0
     std: NDArray[np.float64] | None = field(default=None)
+    mode: str = MIXED

@@ -12,10 +12,11 @@ from lensmodel.errors import NoSamplesError
 from lensmodel.psf import PsfSample
 from lensmodel.regression import pitch as pitches
 from lensmodel.regression import variables as va
-from lensmodel.regression.answer import ModelSettings
+from lensmodel.regression.answer import LIKELIEST, MIXED, ModelSettings
 from lensmodel.regression.index import SampleIndex
 from lensmodel.regression.judgement import Judgement, bandwidth, judge
 from lensmodel.regression.local import LocalKernels
+from lensmodel.regression.normal_equations import NormalEquations
 from lensmodel.regression.physical import Physics
 from lensmodel.regression.smoothers import smoothers
 from lensmodel.regression.transport import WidthField
@@ -65,6 +66,10 @@ class Fit:
         Bandwidths of eq. (8), and those in use.
     physical : Physics or None
         None until `warmed`, or if it takes no part.
+    statistics : NormalEquations or None
+        Those of the patches, where the mode may need them.
+    mode : str
+        Which mode answers: that of the settings, or the one that was found likeliest.
     """
 
     pitch_um: float | None
@@ -78,6 +83,8 @@ class Fit:
     rule: dict[str, float]
     bandwidth: dict[str, float]
     physical: Physics | None = None
+    statistics: NormalEquations | None = None
+    mode: str = MIXED
 
     @classmethod
     def of(cls, samples: Sequence[PsfSample], settings: ModelSettings) -> Fit:
@@ -111,7 +118,9 @@ class Fit:
         rule = va.bandwidths(where)
         used = bandwidth(rule, settings, judgement.choice)
         return cls(
-            pitch, len(samples), widths, local, index, roster, judgement, told_errors(samples), rule, used
+            *(pitch, len(samples), widths, local, index, roster, judgement, told_errors(samples), rule, used),
+            statistics=statistics_of(common, settings),
+            mode=MIXED if settings.mode == LIKELIEST else settings.mode,
         )
 
     def warmed(self, samples: Sequence[PsfSample], on_step: StepHook = ignore_step) -> Fit:
@@ -143,7 +152,13 @@ class Fit:
             roster=self.roster.extended(common),
             judgement=self.judgement.extended(_claimed(samples, settings)),
             told=np.concatenate([self.told, told_errors(samples)]),
+            statistics=None if self.statistics is None else self.statistics.extended(common),
         )
+
+
+def statistics_of(samples: Sequence[PsfSample], settings: ModelSettings) -> NormalEquations | None:
+    """Normal equations of samples of one pitch, where the mode may ask for them."""
+    return NormalEquations.of(samples) if settings.mode in {"evidence", LIKELIEST} else None
 
 
 def told_errors(samples: Sequence[PsfSample]) -> NDArray[np.float64]:

@@ -21,8 +21,8 @@ from lensmodel.errors import InvalidInputError
 from lensmodel.psf import PsfSample
 from lensmodel.regression import pitch as pitches
 from lensmodel.regression import variables as va
-from lensmodel.regression.answer import ModelSettings
-from lensmodel.regression.fitting import Fit, Roster, told_errors
+from lensmodel.regression.answer import LIKELIEST, MODES, ModelSettings
+from lensmodel.regression.fitting import Fit, Roster, statistics_of, told_errors
 from lensmodel.regression.index import SampleIndex
 from lensmodel.regression.judgement import Judgement
 from lensmodel.regression.kriging import ImageFrame
@@ -67,6 +67,7 @@ def dump(fit: Fit, samples: Sequence[PsfSample], settings: ModelSettings) -> byt
         "version": VERSION,
         "belongs": _belongs(samples, settings),
         "size": fit.size,
+        "mode": fit.mode,
         "rule": fit.rule,
         "bandwidth": fit.bandwidth,
         "choice": asdict(judgement.choice),
@@ -105,7 +106,7 @@ def load(data: bytes, samples: Sequence[PsfSample], settings: ModelSettings) -> 
         document = json.loads(arrays.pop("document").tobytes())
         if document["version"] != VERSION or document["belongs"] != _belongs(samples, settings):
             raise InvalidInputError("what was learned belongs to other samples or another version; fit again")
-        return _fit(document, _checked(arrays, len(samples)), samples)
+        return _fit(document, _checked(arrays, len(samples)), samples, settings)
     except _DAMAGED as error:
         raise InvalidInputError(f"what was learned is damaged ({error}); fit the model again") from error
 
@@ -152,7 +153,9 @@ def _of(arrays: Arrays, prefix: str) -> dict[str, Any]:
     return {name.partition(".")[2]: v for name, v in arrays.items() if name.startswith(f"{prefix}.")}
 
 
-def _fit(document: Mapping[str, Any], arrays: Arrays, samples: Sequence[PsfSample]) -> Fit:
+def _fit(
+    document: Mapping[str, Any], arrays: Arrays, samples: Sequence[PsfSample], settings: ModelSettings
+) -> Fit:
     pitch = pitches.usual_pitch(samples)
     common = pitches.at_pitch(samples, pitch)
     where = va.points(common)
@@ -183,6 +186,9 @@ def _fit(document: Mapping[str, Any], arrays: Arrays, samples: Sequence[PsfSampl
     )
     rule = {str(k): float(v) for k, v in document["rule"].items()}
     used = {str(k): float(v) for k, v in document["bandwidth"].items()}
+    mode = str(document["mode"])
+    if mode not in MODES or mode == LIKELIEST:
+        raise ValueError(f"no mode {mode!r}")
     va.scales(rule), va.scales(used)
     return Fit(
         pitch_um=pitch,
@@ -196,4 +202,6 @@ def _fit(document: Mapping[str, Any], arrays: Arrays, samples: Sequence[PsfSampl
         rule=rule,
         bandwidth=used,
         physical=physical,
+        statistics=statistics_of(common, settings),
+        mode=mode,
     )

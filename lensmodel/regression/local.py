@@ -29,7 +29,8 @@ _CENTRED_PX = 1e-3
 _STEPS = 6
 _ROOM = 1.35
 _MOST_BYTES = 1 << 29  # beyond, kernels are kept no finer than their pixels
-_FLIP = np.array([1.0, -1.0])
+MIRRORED = np.array([1.0, -1.0])
+"""Factor on the scales that turns a map into that of the mirror image about the meridional plane."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -212,14 +213,14 @@ class LocalKernels:
         factor = answers.weights * scale[:, 0] * scale[:, 1]
         own, here = self.angles[rows], angles[asked]
         if mirror == 0.0:
-            return _maps(own, here, scale * self.finer), factor, rows, answers.starts
+            return affine_maps(own, here, scale * self.finer), factor, rows, answers.starts
         scale = scale * self.finer
-        both = np.stack([_maps(own, here, scale), _maps(own, here, scale * _FLIP)], axis=1)
+        both = np.stack([affine_maps(own, here, scale), affine_maps(own, here, scale * MIRRORED)], axis=1)
         shares = np.stack([factor, mirror * factor], axis=1) / (1.0 + mirror)
         return both.reshape(-1, 2, 2), shares.ravel(), np.repeat(rows, 2), answers.starts * 2
 
 
-def _maps(
+def affine_maps(
     own: NDArray[np.float64], here: NDArray[np.float64], scale: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """L_i' diag(scale) L for angles `own` of the samples and `here` of the questions, shape (m, 2, 2)."""

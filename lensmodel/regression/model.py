@@ -26,9 +26,11 @@ from lensmodel.psf import PsfField, PsfSample
 from lensmodel.regression import learned as memory
 from lensmodel.regression import pitch as pitches
 from lensmodel.regression import variables as va
-from lensmodel.regression.answer import ModelSettings, PsfAnswer
+from lensmodel.regression.answer import LIKELIEST, MIXED, MODES, ModelSettings, PsfAnswer
 from lensmodel.regression.experts import Experts, Mixture
 from lensmodel.regression.fitting import Fit
+from lensmodel.regression.likelihood import Predict, likeliest
+from lensmodel.regression.modes import NEEDING_WAVEFRONT, answered
 from lensmodel.regression.neighbourhood import Near, Neighbourhood
 from lensmodel.regression.robust import Flag
 from lensmodel.regression.smoothers import smoothers
@@ -182,20 +184,26 @@ class LensModel:
         """Whether nothing is left for `warmed` to do."""
         if self.prior is not None and isinstance(self.prior.source, LensModel) and not self.prior.source.warm:
             return False
-        return self._fit.physical is not None or not self._neighbourhood.smoother.physical
+        mixed = self.settings.mode == MIXED and self._neighbourhood.smoother.physical
+        return self._fit.physical is not None or not (mixed or self.settings.mode in NEEDING_WAVEFRONT)
 
     def warmed(self, on_step: StepHook = ignore_step) -> LensModel:
-        """Return the model with the wavefront fitted to its samples, if its method has one.
+        """Return the model with the wavefront fitted to its samples, if its method or mode has one.
 
         That takes some seconds of CPU, and the answers are good without it, so it is not done behind
         anybody's back: call it once when the samples are complete. The same samples give the same model.
+        The mode "likeliest" is chosen here too, which takes up to three such fits more.
         """
         if self.warm:
             return self
         prior = self.prior
         if prior is not None and isinstance(prior.source, LensModel):
             prior = replace(prior, source=prior.source.warmed())
-        return LensModel(self.samples, self.settings, self._fit.warmed(self.samples, on_step), prior=prior)
+        fit = self._fit.warmed(self.samples, on_step)
+        if self.settings.mode == LIKELIEST:
+            voting = [s for s, vote in zip(self.samples, fit.judgement.votes, strict=True) if vote > 0]
+            fit = replace(fit, mode=likeliest(voting, self._by_mode))
+        return LensModel(self.samples, self.settings, fit, prior=prior)
 
     def without_photo(self, photo: str) -> LensModel:
         """Return the model without the samples of one photo."""
@@ -256,6 +264,7 @@ class LensModel:
         inside = self._inner_size(size, pitch_um)
         near, mixture, prior_shares = self._asked([position], settings, inside)
         fit, answers = self._fit, near.answers
+        agreed = fit.mode in {MIXED, "wavefront"} and fit.physical is not None and fit.physical.agreed
         rows, weight = answers.rows, np.maximum(answers.weights, 0.0)
         weight /= weight.sum()
         per_photo = np.bincount(fit.roster.photo[rows], weight)
@@ -267,7 +276,7 @@ class LensModel:
         error = field_error(held_out, noise, independent) * (1.0 + 0.5 * max(nearest - 1.0, 0.0))
         shared = shared_error(float(weight @ fit.told[rows]), noise)
         error, share = math.hypot(error, shared), float(prior_shares[0])
-        if fit.physical is not None and fit.physical.agreed:
+        if agreed:
             error = shared = math.sqrt(float(mixture.squared[0])) * (1.0 + 0.5 * max(nearest - 1.0, 0.0))
         if self.prior is not None and share > _LISTED:
             error = math.sqrt((1.0 - share) * error**2 + share * self.prior.error(position, settings) ** 2)
@@ -290,6 +299,7 @@ class LensModel:
             image_frame_share=float(mixture.shares[0, 1]),
             wavefront_share=float(mixture.shares[0, 2]),
             std=scatter,
+            mode=fit.mode,
         )
 
     def kernels(
@@ -378,9 +388,17 @@ class LensModel:
         fit = self._fit
         near = self._neighbourhood.near(positions, settings)
         widths = fit.widths.over(np.array([va.point(p, settings) for p in positions]))
-        angles = np.array([p.phi for p in positions])
-        light = fit.local.kernels(near.answers, angles, widths, size, fit.judgement.choice.mirror)
-        mixture = self._experts.mixed(light, near.answers, positions, settings)
+        mixture = answered(
+            fit.mode,
+            self._experts,
+            fit.local,
+            fit.statistics,
+            near.answers,
+            positions,
+            settings,
+            widths,
+            size,
+        )
         shares = np.zeros(len(positions))
         if self.prior is not None:
             shares = self.prior.strength / (self._seen(positions, settings) + self.prior.strength)
@@ -388,6 +406,20 @@ class LensModel:
             part = shares[:, None, None]
             mixture = replace(mixture, kernels=(1.0 - part) * mixture.kernels + part * other)
         return near, mixture, shares
+
+    def _by_mode(self, samples: Sequence[PsfSample]) -> dict[str, Predict]:
+        """Predictors by mode, learned from some of the samples."""
+        seen = tuple(samples)
+        fit = Fit.of(seen, self.settings).warmed(seen)
+        open_ = {"evidence": fit.statistics is not None, "wavefront": fit.physical is not None}
+
+        def told_by(mode: str) -> Predict:
+            model = LensModel(seen, self.settings, replace(fit, mode=mode))
+            return lambda s: np.asarray(
+                model.kernels([s.position], s.settings, s.kernel.shape[0], pitch_um=s.pixel_pitch_um)[0]
+            )
+
+        return {mode: told_by(mode) for mode in MODES if mode != LIKELIEST and open_.get(mode, True)}
 
     def _seen(self, positions: Sequence[FieldPosition], settings: LensSettings) -> NDArray[np.float64]:
         """How many samples speak of each place, by distances that do not shrink as samples come in."""

@@ -47,6 +47,7 @@ def at_pitch(samples: Sequence[PsfSample], pitch_um: float | None) -> tuple[PsfS
             s,
             kernel=rescaled(s.kernel, s.pixel_pitch_um, pitch_um, side_at(s, pitch_um)),
             spectrum=None,  # its frequencies are those of the other pixels
+            evidence=None,
         )
         for s in samples
     )

@@ -4,6 +4,8 @@ Layout of a `.lensprofile`, format 1::
 
     profile.json    format, lens, provenance, settings of the model, one entry for each sample
     kernels.npy     (n, k, k) float32, sum 1, centred, in the order of the entries
+    spectra.npy     optional: what each patch says without a kernel, see `PatchSpectrum`
+    evidence/N.npz  optional: the normal equations of sample N, see `PatchEvidence`
     learned.npz     optional: what the model has learned from them, see `learned`
     family.lensprofile  optional: the profile of other copies that the model leans on, without one of its own
 
@@ -20,14 +22,16 @@ import os
 import secrets
 import zipfile
 import zlib
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lensmodel.errors import InvalidInputError, LensModelError
+from lensmodel.evidence import PatchEvidence
 from lensmodel.psf import PsfSample, resized
 from lensmodel.regression.answer import ModelSettings
 from lensmodel.regression.model import LensModel
@@ -41,6 +45,7 @@ _MAX_SIDE = 255
 _INFINITY = "infinity"
 _LEARNED = "learned.npz"
 _SPECTRA = "spectra.npy"
+_EVIDENCE = "evidence/"
 _FAMILY = "family.lensprofile"
 
 log = logging.getLogger(__name__)
@@ -111,6 +116,9 @@ def _write(file: IO[bytes], profile: LensProfile) -> None:
         archive.writestr("kernels.npy", arrays.getvalue())
         if any(sample.spectrum is not None for sample in samples):
             archive.writestr(_SPECTRA, _spectra(samples))
+        for i, sample in enumerate(samples):
+            if sample.evidence is not None:
+                archive.writestr(f"{_EVIDENCE}{i}.npz", sample.evidence.to_bytes())
         archive.writestr(_LEARNED, profile.model.learned(), zipfile.ZIP_STORED)
         if prior is not None and isinstance(prior.source, LensModel):
             family = io.BytesIO()
@@ -141,6 +149,7 @@ def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> 
             document = json.loads(archive.read("profile.json"))
             stack = np.load(io.BytesIO(archive.read("kernels.npy")), allow_pickle=False)
             spectra = archive.read(_SPECTRA) if _SPECTRA in sizes else None
+            evidence = {name: archive.read(name) for name in sizes if name.startswith(_EVIDENCE)}
             learned = archive.read(_LEARNED) if _LEARNED in sizes else None
             family = archive.read(_FAMILY) if _FAMILY in sizes and not alone else None
     except FileNotFoundError:
@@ -165,8 +174,7 @@ def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> 
                 f"{name} holds {len(entries)} samples but kernels of shape {stack.shape}; "
                 f"one is needed for each, of side {_MAX_SIDE} at most"
             )
-        seen = _opened(spectra, len(entries))
-        samples = [_sample(e, kernel, s) for e, kernel, s in zip(entries, stack, seen, strict=True)]
+        samples = _samples(entries, stack, spectra, evidence)
         model = _model(samples, _settings(document["model"]), learned)
         if family is not None:
             other = _read(io.BytesIO(family), f"the family in {name}", alone=True)
@@ -211,6 +219,20 @@ def _opened(data: bytes | None, count: int) -> list[PatchSpectrum | None]:
     if rows.shape != (count, RINGS * SECTORS + 3) or rows.dtype != np.float32:
         raise ValueError(f"spectra of shape {rows.shape} for {count} samples")
     return [None if np.isnan(row).all() else PatchSpectrum.from_bytes(row.tobytes()) for row in rows]
+
+
+def _samples(
+    entries: Sequence[dict[str, Any]],
+    stack: NDArray[np.float32],
+    spectra: bytes | None,
+    evidence: Mapping[str, bytes],
+) -> list[PsfSample]:
+    found = []
+    seen = _opened(spectra, len(entries))
+    for i, (entry, kernel, spectrum) in enumerate(zip(entries, stack, seen, strict=True)):
+        sample, data = _sample(entry, kernel, spectrum), evidence.get(f"{_EVIDENCE}{i}.npz")
+        found.append(sample if data is None else replace(sample, evidence=PatchEvidence.from_bytes(data)))
+    return found
 
 
 def _sample(

@@ -1,0 +1,81 @@
+"""Ways to answer from the same neighbours and weights.
+
+============  ===============================================================================
+mixed         the mixture of `experts`: kernels of both frames, and the wavefront (the default)
+kernels       the kernels of the neighbours averaged, as in the paper
+evidence      their normal equations summed with the same weights, solved once (`normal_equations`)
+wavefront     the wavefront of the lens alone, fitted to all samples (`physical`)
+likeliest     that of the four which makes patches likeliest that it was not fitted to (`likelihood`)
+============  ===============================================================================
+
+A mode that has nothing to go by at a place, no statistics or no wavefront, answers with averaged kernels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.regression.answer import LIKELIEST, MIXED
+from lensmodel.regression.experts import Experts, Mixture
+from lensmodel.regression.kriging import as_kernels
+from lensmodel.regression.local import Answers, LocalKernels
+from lensmodel.regression.normal_equations import NormalEquations
+from lensmodel.types import FieldPosition, LensSettings
+
+NEEDING_WAVEFRONT: Final = frozenset({"wavefront", LIKELIEST})
+
+
+def answered(
+    mode: str,
+    experts: Experts,
+    local: LocalKernels,
+    statistics: NormalEquations | None,
+    near: Answers,
+    positions: Sequence[FieldPosition],
+    settings: LensSettings,
+    widths: NDArray[np.float64],
+    size: int,
+) -> Mixture:
+    """Answer questions of one setting in one mode.
+
+    Parameters
+    ----------
+    mode : str
+        Of `answer.MODES`, but "likeliest".
+    near : Answers
+        Neighbours of the places and their weights.
+    widths : ndarray, shape (q, 2)
+        Scales of the places.
+
+    Notes
+    -----
+    The squared errors of "evidence" are those of its neighbours' kernels: what one step for all gains over
+    them is not told apart.
+    """
+    angles, mirror = np.array([p.phi for p in positions]), experts.judgement.choice.mirror
+    physical = experts.physical
+    if mode == "wavefront" and physical is not None:
+        kernels = as_kernels(physical.rows(positions, settings), size)
+        errors = physical.extended_errors(len(experts.judgement.votes))
+        return _alone(kernels, near, errors, 2)
+    kernels = local.kernels(near, angles, widths, size, mirror)
+    if mode == MIXED:
+        return experts.mixed(kernels, near, positions, settings)
+    if mode == "evidence" and statistics is not None:
+        for question in range(len(positions)):
+            found = statistics.kernel(
+                local, near, question, float(angles[question]), widths[question], size, mirror
+            )
+            if found is not None:
+                kernels[question] = found
+    return _alone(kernels, near, experts.judgement.errors, 0)
+
+
+def _alone(kernels: NDArray[np.float64], near: Answers, errors: NDArray[np.float64], expert: int) -> Mixture:
+    shares = np.zeros((len(kernels), 3))
+    shares[:, expert] = 1.0
+    return Mixture(kernels, near.mean(errors**2), float(errors @ errors) / len(errors), shares)

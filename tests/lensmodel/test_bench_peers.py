@@ -1,11 +1,13 @@
 """Programs that people use instead: called from outside, skipped where they are missing."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lensmodel.bench.peers import PEERS, Peer, read_picture, skimage_results
+from lensmodel.bench.reproduce import programs
 from lensmodel.errors import InvalidInputError
 
 
@@ -60,3 +62,52 @@ def test_scikit_image_gives_pictures_of_the_same_size() -> None:
         "scikit-image Wiener": 2,
     }
     assert all(p.shape == seen.shape for pictures in found.values() for p in pictures)
+
+
+GAINS = (2.0, 1.0, 1.5)
+SCALES = """
+import sys, numpy, tifffile
+seen = tifffile.imread(sys.argv[1]).astype(float)
+tifffile.imwrite(sys.argv[2], numpy.clip(seen * float(sys.argv[3]), 0, 65535).astype(numpy.uint16)[2:-2])
+"""
+
+
+def scaling() -> Peer:
+    """A program that scales what it is given, and cuts two rows off at either side."""
+
+    def command(source: Path, target: Path, folder: Path, setting: float) -> list[str]:
+        del folder
+        return [sys.executable, "-c", SCALES, str(source), str(target), str(setting)]
+
+    return Peer("scale", "sh", command, (0.8, 1.0, 1.1), 1.0)
+
+
+def test_program_gets_the_picture_as_shown_and_its_answer_is_light_again() -> None:
+    planes = np.moveaxis(picture(), -1, 0) / np.asarray(GAINS, np.float32)[:, None, None]
+
+    back = programs.corrected_by(scaling(), planes, 1.0, GAINS)
+
+    assert back.shape == planes.shape
+    np.testing.assert_allclose(back[:, 2:-2], planes[:, 2:-2], atol=2e-5)
+
+
+def test_program_is_compared_at_the_setting_that_is_nearest_to_the_truth() -> None:
+    planes = np.moveaxis(picture(), -1, 0) / np.asarray(GAINS, np.float32)[:, None, None]
+    brighter = programs.corrected_by(scaling(), planes, 1.1, GAINS)
+
+    setting, _ = programs.best_setting(scaling(), planes, brighter, GAINS)
+
+    assert setting == 1.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", programs.installed())
+def test_installed_program_sharpens_a_developed_photo_and_keeps_its_colours(name: str) -> None:
+    shown = np.tile(picture(), (4, 4, 1))  # readers of raw files refuse tiny ones
+    planes = np.moveaxis(shown, -1, 0) / np.asarray(GAINS, np.float32)[:, None, None]
+    peer = programs.named(name)
+
+    after = programs.corrected_by(peer, planes, peer.usual, GAINS)
+
+    np.testing.assert_allclose(np.median(after / planes, axis=(1, 2)), 1.0, rtol=0.03)
+    assert np.abs(after - planes).mean() > 1e-4

@@ -238,6 +238,13 @@ def result(*lenses: tuple[float, float]) -> dict[str, Any]:
                     "methods": {"paper": state(130, 31.0)},
                 }
             },
+            "programs": {
+                "G'MIC Richardson-Lucy": {
+                    "setting": 5.0,
+                    "state": state(120, 30.8),
+                    "pictures": {"gmic-richardson-lucy": "gmic.png"},
+                }
+            },
         }
         for i, (mtf50, psnr) in enumerate(lenses)
     ]
@@ -249,6 +256,7 @@ def result(*lenses: tuple[float, float]) -> dict[str, Any]:
             "estimator": "whittle",
             "methods": ["paper"],
             "rivals": {"kee": "Kee et al. 2011"},
+            "programs": ["G'MIC Richardson-Lucy"],
             "own_scenes": True,
         },
         "scenes": ["city", "lake"],
@@ -281,7 +289,8 @@ def test_share_of_a_small_gain_is_left_out() -> None:
 def test_summary_takes_the_mean_over_lenses_and_counts_zones_that_fell() -> None:
     found = summary(result((160, 32.0), (120, 29.98), (120, 29.0)))
     rows = {row["state"]: row for row in found["mtf"]["paper"]}
-    assert list(rows) == ["without correction", "denoised only", "kee, n = 1", "n = 1", "true PSF"]
+    others = ["G'MIC Richardson-Lucy", "kee, n = 1"]
+    assert list(rows) == ["without correction", "denoised only", *others, "n = 1", "true PSF"]
     assert rows["n = 1"]["corner"]["mtf50"] == pytest.approx(400 / 3)
     assert rows["n = 1"]["corner"]["sagittal_mtf50"] is None
     assert found["worse"]["paper"]["1"] == {
@@ -356,6 +365,8 @@ def test_page_needs_nothing_from_outside_and_escapes_names(tmp_path: Path) -> No
     text = markdown.read_text(encoding="utf-8")
     assert "| n = 1 | 160 |" in text
     assert "| kee, n = 1 | 130 |" in text
+    assert "| G'MIC Richardson-Lucy | 120 |" in text
+    assert "corrected by G'MIC Richardson-Lucy, its best setting 5" in text
     assert "MISSED" in text
 
 

@@ -12,6 +12,7 @@ from typing import Final, Literal, TypeAlias
 import numpy as np
 
 import lensmodel
+from lensmodel.bench.reproduce import programs
 from lensmodel.bench.reproduce.conditions import BASE, PATHS, SCENES_THAT_HURT, Condition, condition
 from lensmodel.bench.reproduce.scenes import Layout, content_of, layout_for, scene_files
 from lensmodel.errors import InvalidInputError
@@ -137,6 +138,8 @@ class Reproduction:
         Non-blind methods of the correction.
     rivals : tuple of str
         Blind methods of others, names in `lensmodel.bench.rivals`; each sees one photo.
+    programs : tuple of str
+        Programs of others that correct the same photos, names in `lensmodel.bench.peers`.
     size : {"quick", "default", "full"}
         How it was planned, for the page.
     """
@@ -146,6 +149,7 @@ class Reproduction:
     estimator: str = "default"
     methods: tuple[str, ...] = METHODS
     rivals: tuple[str, ...] = RIVALS
+    programs: tuple[str, ...] = ()
     size: Size = "default"
 
     def files(self) -> tuple[Path, ...]:
@@ -196,7 +200,7 @@ def planned(
         chosen = [seeds[(number + 8 * i // lenses) % len(seeds)] for i in range(lenses)]
         frame = _QUICK_FRAME if size == "quick" else _HARD_FRAME
         cases += tuple(replace(_case(seed, (1,), files, frame), condition=name) for seed in chosen)
-    return Reproduction(cases, scenes, estimator, size=size)
+    return Reproduction(cases, scenes, estimator, programs=programs.installed(), size=size)
 
 
 def fingerprint(extra: Sequence[Path] = ()) -> str:

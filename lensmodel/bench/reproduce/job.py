@@ -13,16 +13,18 @@ import numpy as np
 from PIL import Image
 
 from lensmodel.bench import pictures
-from lensmodel.bench.reproduce import measure
+from lensmodel.bench.reproduce import measure, programs
 from lensmodel.bench.reproduce.cases import Case, Reproduction
 from lensmodel.bench.reproduce.progress import (
     CORRECT,
     LEARN,
+    PROGRAM,
     RIVAL,
     SHOT,
     Progress,
     corrections,
     methods_of,
+    programs_of,
     rivals_of,
     weight_of,
 )
@@ -73,7 +75,12 @@ class Job:
         rival = {
             name: self.folder / f"rival-{name}-{self.rival_code}.json" for name in rivals_of(case, self.plan)
         }
-        if all(path.exists() for path in (truth, *learned.values(), *rival.values())):
+        version = programs.version()
+        program = {
+            name: self.folder / f"program-{programs.label_of(name)}-{version}.json"
+            for name in programs_of(case, self.plan)
+        }
+        if all(path.exists() for path in (truth, *learned.values(), *rival.values(), *program.values())):
             self.progress.tell(f"{case.title}: stored", weight_of(case, self.plan), fresh=False)
         else:
             shots = self._shots(work / "photos")
@@ -84,6 +91,7 @@ class Job:
                 with self.open_route(case, work) as route:
                     self._learned(route, shots, learned)
             self._beside(rival, shots)
+            self._programs(program, shots)
             shutil.rmtree(work)
         return {
             "name": case.name,
@@ -97,6 +105,7 @@ class Job:
             "truth": read(truth),
             "learned": {str(n): read(path) for n, path in learned.items()},
             "rivals": {name: read(path) for name, path in rival.items()},
+            "programs": {name: read(path) for name, path in program.items()},
         }
 
     def _learning(self) -> float:
@@ -191,6 +200,25 @@ class Job:
             unit["methods"][method], made = self._corrected(chart, photo, field, method, shots, name)
             unit["pictures"] |= made
         return unit
+
+    def _programs(self, targets: Mapping[str, Path], shots: Shots) -> None:
+        for name, path in targets.items():
+            _, fresh = stored(path, partial(self._measured_program, name, shots))
+            self.progress.tell(f"{self.case.title}: {name}", PROGRAM, fresh=fresh)
+
+    def _measured_program(self, name: str, shots: Shots) -> Unit:
+        """What a program of others makes of chart and photo, at its best setting."""
+        peer, gains = programs.named(name), self.case.camera.white_balance
+        photo = develop(shots.held_out).planes
+        setting, after = programs.best_setting(peer, photo, shots.truth(), gains)
+        chart = None if shots.chart is None else develop(shots.chart).planes
+        edges = None if chart is None else programs.corrected_by(peer, chart, setting, gains)
+        label = programs.label_of(name)
+        return {
+            "setting": setting,
+            "state": measure.state(edges, after, shots, self.case, before=chart),
+            "pictures": {label: self._picture(label, after)},
+        }
 
     def _learned(self, route: Route, shots: Shots, targets: Mapping[int, Path]) -> None:
         refused: list[str] = []

@@ -73,7 +73,7 @@ def _conditions(result: Mapping[str, Any]) -> str:
         f"{_listed(seeds)}; no parameter was chosen on seeds from 1000 on. {scenes}; {made}; no part of any "
         f"photograph serves twice for one lens. Frames of {sizes}. The photos are Bayer DNG files of a "
         "14-bit sensor at base ISO with shot and read noise, clipping and lateral colour. "
-        f"{_rivals(plan['rivals'])}"
+        f"{_rivals(plan['rivals'])}{_programs(plan.get('programs', ()))}"
         f"Calibrated and corrected {result['route']}, estimator {plan['estimator']}; "
         "the true PSF and the control go through the same correction in the library. "
         f"Code {result['code']}."
@@ -85,6 +85,15 @@ def _rivals(sources: Mapping[str, str]) -> str:
         return ""
     named = "; ".join(f"{name}: {source}" for name, source in sources.items())
     return f"Beside it, made anew by us, the blind rivals {named}. "
+
+
+def _programs(names: Sequence[str]) -> str:
+    if not names:
+        return "No program of others was installed to compare with. "
+    return (
+        f"Beside it the programs {', '.join(names)}, each at the best of its settings, chosen against the "
+        "truth. "
+    )
 
 
 def _listed(seeds: Sequence[int]) -> str:

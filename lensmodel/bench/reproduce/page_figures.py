@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from lensmodel.bench.reproduce import programs
 from lensmodel.bench.reproduce.sheet import Page
 from lensmodel.bench.reproduce.tables import number
 from lensmodel.types import ZONES
@@ -89,7 +90,8 @@ def before_after(page: Page, result: Mapping[str, Any]) -> None:
         page.title(case["title"], 3)
         seen = {**case["truth"]["pictures"]}
         n = max(int(n) for n in case["learned"])
-        for unit in (*case["learned"].values(), *case["rivals"].values()):
+        others = case.get("programs", {})
+        for unit in (*case["learned"].values(), *case["rivals"].values(), *others.values()):
             seen |= unit["pictures"]
         labels = {"before": "as photographed"}
         labels |= {f"n{n}-{m}": f"corrected blindly, n = {n}, method {m}" for m in result["plan"]["methods"]}
@@ -97,6 +99,10 @@ def before_after(page: Page, result: Mapping[str, Any]) -> None:
             f"{name}-{m}": f"corrected with the PSFs of {source}, method {m}"
             for name, source in result["plan"]["rivals"].items()
             for m in result["plan"]["methods"]
+        }
+        labels |= {
+            programs.label_of(name): f"corrected by {name}, its best setting {unit['setting']:g}"
+            for name, unit in others.items()
         }
         labels |= {f"true-{m}": f"corrected with the true PSF, method {m}" for m in result["plan"]["methods"]}
         labels["scene"] = "the scene itself"

@@ -34,6 +34,7 @@ SHOT: Final = 1.0
 LEARN: Final = 5.0
 CORRECT: Final = 1.0
 RIVAL: Final = 4.0
+PROGRAM: Final = 4.0
 FIGURES: Final = 12.0
 """Rough shares of the time."""
 
@@ -48,6 +49,11 @@ def rivals_of(case: Case, plan: Reproduction) -> tuple[str, ...]:
     return plan.rivals if case.condition == BASE and case.photos[0] <= 2 else ()
 
 
+def programs_of(case: Case, plan: Reproduction) -> tuple[str, ...]:
+    """Programs of others that correct what a case photographs; like the rivals, each lens once."""
+    return plan.programs if rivals_of(case, plan) else ()
+
+
 def corrections(case: Case, plan: Reproduction) -> float:
     """Weight of correcting and measuring chart and photo by every method."""
     return (2 if case.conditions.with_chart else 1) * len(methods_of(case, plan)) * CORRECT
@@ -57,5 +63,5 @@ def weight_of(case: Case, plan: Reproduction) -> float:
     """Weight of a whole case."""
     shots = (case.photos[-1] + 2) * SHOT
     each = corrections(case, plan)
-    rest = len(rivals_of(case, plan)) * (RIVAL + each)
+    rest = len(rivals_of(case, plan)) * (RIVAL + each) + len(programs_of(case, plan)) * PROGRAM
     return shots + each + 2 * CORRECT + case.photos[-1] * LEARN + len(case.photos) * each + rest

@@ -5,6 +5,7 @@ Stored for each case, one JSON file each, under a name that hashes all that it d
     <key>/truth.json                  as photographed, with the true PSF, denoised only
     <key>/learned-<n>.json            after n photos
     <key>/rival-<name>-<version>.json corrected with the PSFs of a rival, from the first photo
+    <key>/program-<name>-<version>.json  corrected by a program of others
 
 The folder `<key>/work` holds photos and models while a case is unfinished.
 """
@@ -101,6 +102,7 @@ def run_reproduction(
             "estimator": plan.estimator,
             "methods": list(plan.methods),
             "rivals": {name: rivals.create(name).source for name in plan.rivals},
+            "programs": list(plan.programs),
             "own_scenes": plan.scenes is None,
         },
         "scenes": [path.stem for path in files],

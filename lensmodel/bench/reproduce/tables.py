@@ -223,6 +223,7 @@ def states(case: Result, method: str) -> dict[str, Mapping[str, Any]]:
     return {
         BEFORE: case["truth"]["before"],
         DENOISED: case["truth"]["control"],
+        **{name: unit["state"] for name, unit in case.get("programs", {}).items()},
         **rival,
         **learned,
         TRUE: case["truth"]["true"][method],

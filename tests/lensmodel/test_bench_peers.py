@@ -9,6 +9,7 @@ import pytest
 from lensmodel.bench.peers import PEERS, Peer, read_picture, skimage_results
 from lensmodel.bench.reproduce import programs
 from lensmodel.errors import InvalidInputError
+from lensmodel.types import Planes
 
 
 def picture() -> np.ndarray:
@@ -72,6 +73,12 @@ tifffile.imwrite(sys.argv[2], numpy.clip(seen * float(sys.argv[3]), 0, 65535).as
 """
 
 
+def seen_by_the_sensor(shown: np.ndarray) -> Planes:
+    """Linear light before white balance."""
+    planes: Planes = np.moveaxis(shown, -1, 0) / np.asarray(GAINS, np.float32)[:, None, None]
+    return planes
+
+
 def scaling() -> Peer:
     """A program that scales what it is given, and cuts two rows off at either side."""
 
@@ -83,7 +90,7 @@ def scaling() -> Peer:
 
 
 def test_program_gets_the_picture_as_shown_and_its_answer_is_light_again() -> None:
-    planes = np.moveaxis(picture(), -1, 0) / np.asarray(GAINS, np.float32)[:, None, None]
+    planes = seen_by_the_sensor(picture())
 
     back = programs.corrected_by(scaling(), planes, 1.0, GAINS)
 
@@ -92,7 +99,7 @@ def test_program_gets_the_picture_as_shown_and_its_answer_is_light_again() -> No
 
 
 def test_program_is_compared_at_the_setting_that_is_nearest_to_the_truth() -> None:
-    planes = np.moveaxis(picture(), -1, 0) / np.asarray(GAINS, np.float32)[:, None, None]
+    planes = seen_by_the_sensor(picture())
     brighter = programs.corrected_by(scaling(), planes, 1.1, GAINS)
 
     setting, _ = programs.best_setting(scaling(), planes, brighter, GAINS)
@@ -104,7 +111,7 @@ def test_program_is_compared_at_the_setting_that_is_nearest_to_the_truth() -> No
 @pytest.mark.parametrize("name", programs.installed())
 def test_installed_program_sharpens_a_developed_photo_and_keeps_its_colours(name: str) -> None:
     shown = np.tile(picture(), (4, 4, 1))  # readers of raw files refuse tiny ones
-    planes = np.moveaxis(shown, -1, 0) / np.asarray(GAINS, np.float32)[:, None, None]
+    planes = seen_by_the_sensor(shown)
     peer = programs.named(name)
 
     after = programs.corrected_by(peer, planes, peer.usual, GAINS)

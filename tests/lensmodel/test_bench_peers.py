@@ -75,8 +75,7 @@ tifffile.imwrite(sys.argv[2], numpy.clip(seen * float(sys.argv[3]), 0, 65535).as
 
 def seen_by_the_sensor(shown: np.ndarray) -> Planes:
     """Linear light before white balance."""
-    planes: Planes = np.moveaxis(shown, -1, 0) / np.asarray(GAINS, np.float32)[:, None, None]
-    return planes
+    return (np.moveaxis(shown, -1, 0) / np.asarray(GAINS)[:, None, None]).astype(np.float32)
 
 
 def scaling() -> Peer:

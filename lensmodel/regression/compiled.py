@@ -1,4 +1,4 @@
-"""The inner loop of `splines.sums`, compiled; imported only where Numba is installed."""
+"""The inner loops of `splines.sums` and `neighbourhood`, compiled; imported only where Numba is installed."""
 
 from __future__ import annotations
 
@@ -108,3 +108,130 @@ def sums(
                 else:
                     for j in range(first, last):
                         out[answer, i, j] += weight * _anywhere(spline, side, y + j * dy, x + j * dx)
+
+
+@jit
+def without_negatives(values: NDArray[np.float64]) -> None:
+    """Replace each row of `values` (q, n) by the nearest one of its sum that is not negative.
+
+    Michelot's way: take the values above t for those that stay, until t = (their sum - total) / their number
+    no longer rises. Source: C. Michelot, "A finite algorithm for finding the projection of a point onto the
+    canonical simplex of R^n", Journal of Optimization Theory and Applications 50, 1986.
+    """
+    for q in range(len(values)):
+        row = values[q]
+        least, largest, total = math.inf, -math.inf, 0.0
+        for x in row:
+            least, largest, total = min(least, x), max(largest, x), total + x
+        if least >= 0.0 or largest <= 0.0:
+            continue
+        total = total if total > 0.0 else largest
+        # below this the one largest value would already hold more than all of the sum
+        t, count = largest - total, 0
+        while True:
+            above, number = 0.0, 0
+            for x in row:
+                if x > t:
+                    above += x
+                    number += 1
+            t = (above - total) / number
+            if number == count:
+                break
+            count = number
+        for i in range(len(row)):
+            row[i] = max(row[i] - t, 0.0)
+
+
+@jit
+def near(
+    points: NDArray[np.float64],
+    votes: NDArray[np.float64],
+    asked: NDArray[np.float64],
+    scale: NDArray[np.float64],
+    limit: float,
+    few: int,
+    dropped: float,
+) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.intp]]:
+    """Rows, Nadaraya-Watson weights and starts of many questions; see `neighbourhood`."""
+    starts = np.zeros(len(asked) + 1, dtype=np.intp)
+    rows, weights = np.empty(64, dtype=np.intp), np.empty(64)
+    squared, taken = np.empty(len(points)), np.empty(len(points), dtype=np.intp)
+    for question in range(len(asked)):
+        found = _within(points, votes, asked[question], 1.0 / scale, limit, squared, taken)
+        if found < few:
+            found = _fewest(squared, few, taken)
+        at = starts[question]
+        if at + found > len(rows):
+            rows = np.concatenate((rows, np.empty(len(rows) + found, dtype=np.intp)))
+            weights = np.concatenate((weights, np.empty(len(weights) + found)))
+        starts[question + 1] = at + _weigh(
+            squared, votes, taken[:found], dropped, rows[at : at + found], weights[at : at + found]
+        )
+    return rows[: starts[-1]], weights[: starts[-1]], starts
+
+
+@jit
+def _within(
+    points: NDArray[np.float64],
+    votes: NDArray[np.float64],
+    asked: NDArray[np.float64],
+    inverse: NDArray[np.float64],
+    limit: float,
+    squared: NDArray[np.float64],
+    taken: NDArray[np.intp],
+) -> int:
+    """Squared distances of all points, infinite without a vote, and those within the limit; how many."""
+    found = 0
+    for i in range(len(points)):
+        total = 0.0
+        for c in range(len(asked)):
+            gap = (points[i, c] - asked[c]) * inverse[c]
+            if not math.isnan(gap):  # an unknown setting takes no part
+                total += gap * gap
+        squared[i] = total if votes[i] > 0.0 else math.inf
+        if squared[i] <= limit:
+            taken[found] = i
+            found += 1
+    return found
+
+
+@jit
+def _weigh(
+    squared: NDArray[np.float64],
+    votes: NDArray[np.float64],
+    taken: NDArray[np.intp],
+    dropped: float,
+    rows: NDArray[np.intp],
+    weights: NDArray[np.float64],
+) -> int:
+    """Gaussian weights of sum 1, the least first, without those that hardly weigh anything; how many."""
+    nearest, total, below, kept = squared[taken].min(), 0.0, 0.0, 0.0
+    weight = np.empty(len(taken))
+    for k in range(len(taken)):
+        weight[k] = votes[taken[k]] * math.exp(-0.5 * (squared[taken[k]] - nearest))
+        total += weight[k]
+    count = 0
+    for k in np.argsort(weight, kind="mergesort"):
+        below += weight[k]
+        if below > dropped * total:
+            rows[count], weights[count] = taken[k], weight[k]
+            kept += weight[k]
+            count += 1
+    weights[:count] /= kept
+    return count
+
+
+@jit
+def _fewest(squared: NDArray[np.float64], few: int, taken: NDArray[np.intp]) -> int:
+    """The nearest few that vote, the nearest first; returns how many."""
+    found = 0
+    for i in range(len(squared)):
+        if squared[i] == math.inf or (found == few and squared[i] >= squared[taken[found - 1]]):
+            continue
+        k = found if found < few else few - 1
+        while k > 0 and squared[taken[k - 1]] > squared[i]:
+            taken[k] = taken[k - 1]
+            k -= 1
+        taken[k] = i
+        found = min(found + 1, few)
+    return found

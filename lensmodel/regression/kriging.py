@@ -63,7 +63,7 @@ class ImageFrame:
     rest: NDArray[np.float64]
     mean: NDArray[np.float64]
     nugget: float
-    settings: dict[tuple[float, ...], Alike] = field(default_factory=dict, init=False)
+    settings: dict[bytes, Alike] = field(default_factory=dict, init=False)
 
     @classmethod
     def fit(
@@ -128,7 +128,8 @@ class ImageFrame:
         asked, scale : ndarray, shape (7,)
             Point of the question, of which the settings count, and bandwidths.
         """
-        key = (*asked[list(_SETTINGS)].tolist(), *scale.tolist())
+        # bytes, since an unknown setting is NaN, which is not equal to itself
+        key = asked[list(_SETTINGS)].tobytes() + scale.tobytes()
         known = self.settings.get(key)
         if known is None:
             gap = settings_gap(self.where, asked, scale)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from lensmodel.psf import PsfSample, resized
 from lensmodel.regression import splines
+from lensmodel.regression.engine import compiled
 from lensmodel.regression.splines import FINER, Engine
 from lensmodel.regression.store import KernelStore
 from lensmodel.regression.transport import WidthField
@@ -163,7 +164,7 @@ class LocalKernels:
                 size,
                 engine=self.engine,
             )
-            found = _without_negatives(found)
+            found = _without_negatives(found, self.engine)
             light[open_] = found
             total = found.sum(axis=(1, 2))
             row, col = found.sum(axis=2) @ t / total, found.sum(axis=1) @ t / total
@@ -241,7 +242,7 @@ def _subset(starts: NDArray[np.intp], questions: NDArray[np.intp]) -> NDArray[np
     return np.concatenate([np.arange(starts[i], starts[i + 1]) for i in questions])
 
 
-def _without_negatives(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _without_negatives(values: NDArray[np.float64], engine: Engine) -> NDArray[np.float64]:
     """Nearest arrays, in L2, that are not negative and have the same sums, shape (q, k, k).
 
     max(x - t, 0) with t such that the sum stays: clipping alone would keep the crests of a spline's
@@ -249,6 +250,10 @@ def _without_negatives(values: NDArray[np.float64]) -> NDArray[np.float64]:
     "Projection onto the probability simplex", arXiv 1309.1541, 2013.
     """
     flat = values.reshape(len(values), -1)
+    module = compiled("lensmodel.regression.compiled") if engine == "auto" else None
+    if module is not None:
+        module.without_negatives(flat)  # a view: the values are those of `splines.sums`, ours alone
+        return values
     if flat.min() >= 0.0:
         return values
     total = flat.sum(axis=1, keepdims=True)

@@ -30,8 +30,9 @@ from lensmodel.regression.answer import LIKELIEST, MIXED, MODES, ModelSettings, 
 from lensmodel.regression.experts import Experts, Mixture
 from lensmodel.regression.fitting import Fit
 from lensmodel.regression.likelihood import Predict, likeliest
+from lensmodel.regression.local import Answers
 from lensmodel.regression.modes import NEEDING_WAVEFRONT, answered
-from lensmodel.regression.neighbourhood import Near, Neighbourhood
+from lensmodel.regression.neighbourhood import Neighbourhood
 from lensmodel.regression.robust import Flag
 from lensmodel.regression.smoothers import smoothers
 from lensmodel.regression.support import field_error, shared_error, standard_error, support
@@ -262,8 +263,8 @@ class LensModel:
             Size of a pixel of the body that asks, in micrometres; that of the samples if unknown.
         """
         inside = self._inner_size(size, pitch_um)
-        near, mixture, prior_shares = self._asked([position], settings, inside)
-        fit, answers = self._fit, near.answers
+        answers, mixture, prior_shares = self._asked([position], settings, inside)
+        fit = self._fit
         agreed = fit.mode in {MIXED, "wavefront"} and fit.physical is not None and fit.physical.agreed
         rows, weight = answers.rows, np.maximum(answers.weights, 0.0)
         weight /= weight.sum()
@@ -334,7 +335,8 @@ class LensModel:
             Those that hardly weigh anything are left out.
         """
         near = self._neighbourhood.near([position], settings)
-        return near.answers.rows, near.gaps[0], near.answers.weights
+        asked, scale = va.point(position, settings), va.scales(self._fit.bandwidth)
+        return near.rows, va.gaps(self._fit.index.points[near.rows], asked, scale), near.weights
 
     def field(self, settings: LensSettings, *, pitch_um: float | None = None) -> ModelField:
         """Return the PSF of every place and channel at these settings, for pixels of some size."""
@@ -383,7 +385,7 @@ class LensModel:
 
     def _asked(
         self, positions: Sequence[FieldPosition], settings: LensSettings, size: int
-    ) -> tuple[Near, Mixture, NDArray[np.float64]]:
+    ) -> tuple[Answers, Mixture, NDArray[np.float64]]:
         """Answers at the pitch of the samples, and the shares of the prior in them."""
         fit = self._fit
         near = self._neighbourhood.near(positions, settings)
@@ -393,7 +395,7 @@ class LensModel:
             self._experts,
             fit.local,
             fit.statistics,
-            near.answers,
+            near,
             positions,
             settings,
             widths,

@@ -9,33 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.regression import variables as va
+from lensmodel.regression.engine import compiled
 from lensmodel.regression.index import SampleIndex
 from lensmodel.regression.local import Answers
-from lensmodel.regression.smoothers import Neighbours, Smoother
+from lensmodel.regression.smoothers import NadarayaWatson, Neighbours, Smoother
+from lensmodel.regression.splines import Engine
 from lensmodel.types import FieldPosition, LensSettings
 
 DROPPED = 3e-5
 """Samples that together weigh less are left out; what they would change is a small part of that."""
 
 _FEW = 8
-_WIDER, _MANY = 3, 4096  # fewer samples are looked through faster than trees
+_WIDER, _MANY = 3, 4096  # fewer samples are looked through as fast as trees
 _PAIRS = 1 << 19
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Near:
-    """Samples near several places, at one setting.
-
-    Parameters
-    ----------
-    answers : Answers
-        Their rows and weights.
-    gaps : tuple of ndarray, shape (m, 7)
-        Of each place: distances in bandwidths, by variable.
-    """
-
-    answers: Answers
-    gaps: tuple[NDArray[np.float64], ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,28 +36,35 @@ class Neighbourhood:
     scale : ndarray, shape (7,)
         Bandwidths.
     smoother : Smoother
+    engine : {"auto", "scipy"}
+        Which code looks; the answers are the same.
     """
 
     index: SampleIndex
     votes: NDArray[np.float64]
     scale: NDArray[np.float64]
     smoother: Smoother
+    engine: Engine = "auto"
 
-    def near(self, positions: Sequence[FieldPosition], settings: LensSettings) -> Near:
+    def near(self, positions: Sequence[FieldPosition], settings: LensSettings) -> Answers:
         """Weigh the samples near each of some places."""
         asked = np.array([va.point(position, settings) for position in positions])
+        module = compiled("lensmodel.regression.compiled") if self.engine == "auto" else None
+        scanned = len(asked) > 1 or len(self.index.points) <= _MANY
+        if module is not None and scanned and isinstance(self.smoother, NadarayaWatson):
+            limit = self.smoother.reach**2
+            return Answers(
+                *module.near(self.index.points, self.votes, asked, self.scale, limit, _FEW, DROPPED)
+            )
         found = self._by_tree(asked) if len(asked) == 1 else self._by_table(asked)
-        counts = [len(weights) for _, _, weights in found]
-        answers = Answers(
-            np.concatenate([rows for rows, _, _ in found]),
-            np.concatenate([weights for _, _, weights in found]),
+        counts = [len(weights) for _, weights in found]
+        return Answers(
+            np.concatenate([rows for rows, _ in found]),
+            np.concatenate([weights for _, weights in found]),
             np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
         )
-        return Near(answers, tuple(gaps for _, gaps, _ in found))
 
-    def _by_tree(
-        self, asked: NDArray[np.float64]
-    ) -> list[tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]]:
+    def _by_tree(self, asked: NDArray[np.float64]) -> list[tuple[NDArray[np.intp], NDArray[np.float64]]]:
         """Cost of the neighbours, not of the samples."""
         found = []
         for point in asked:
@@ -83,9 +76,7 @@ class Neighbourhood:
             found.append(self._weighed(rows, gaps))
         return found
 
-    def _by_table(
-        self, asked: NDArray[np.float64]
-    ) -> list[tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]]:
+    def _by_table(self, asked: NDArray[np.float64]) -> list[tuple[NDArray[np.intp], NDArray[np.float64]]]:
         """Many places of one setting: distances in settings are computed once, those of place in a table."""
         apart = va.gaps(self.index.points, asked[0], self.scale)
         apart[:, :3] = 0.0
@@ -126,9 +117,9 @@ class Neighbourhood:
 
     def _weighed(
         self, rows: NDArray[np.intp], gaps: NDArray[np.float64]
-    ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
+    ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
         weight = self.smoother.weights(Neighbours(gaps, self.votes[rows]))
         size = np.abs(weight)
         order = np.argsort(size, kind="stable")
         kept = order[np.cumsum(size[order]) > DROPPED]
-        return rows[kept], gaps[kept], weight[kept] / weight[kept].sum()
+        return rows[kept], weight[kept] / weight[kept].sum()

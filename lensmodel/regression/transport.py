@@ -68,8 +68,8 @@ class WidthField:
     def _features(self, where: NDArray[np.float64]) -> NDArray[np.float64]:
         r2 = where[:, 0] ** 2
         x, y = va.vectors(where).T
-        stops = np.nan_to_num(where[:, 3] - self.stops)
-        focal = np.nan_to_num(where[:, 5] - self.focal)
+        stops, focal = where[:, 3] - self.stops, where[:, 5] - self.focal
+        stops[np.isnan(stops)] = focal[np.isnan(focal)] = 0.0
         wave = (where[:, 4] - self.wavelength) / 100.0
         place = [np.ones_like(r2), r2, r2 * r2, x, y, x * r2, y * r2, x * x - y * y, x * y]
         return np.stack(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import tracemalloc
 
@@ -9,8 +10,12 @@ import numpy as np
 import pytest
 
 from lensmodel.psf import PsfSample, gaussian
-from lensmodel.regression import LensModel, ModelSettings, splines
+from lensmodel.regression import LensModel, ModelSettings, local, splines
 from lensmodel.regression import variables as va
+from lensmodel.regression.index import SampleIndex
+from lensmodel.regression.local import Answers
+from lensmodel.regression.neighbourhood import Neighbourhood
+from lensmodel.regression.smoothers import NadarayaWatson
 from lensmodel.types import CHANNELS, FieldPosition, Kernel, LensSettings
 
 SIZE = 25
@@ -104,6 +109,47 @@ def test_compiled_and_plain_sums_are_the_same_numbers() -> None:
 
     assert np.abs(fast - plain).max() < 1e-6 * np.abs(plain).max()
     assert np.abs(plain).max() > 0
+
+
+@pytest.mark.parametrize("count", [1, 7])
+def test_compiled_and_plain_neighbours_are_the_same(count: int) -> None:
+    pytest.importorskip("numba")
+    rng = np.random.default_rng(6)
+    where = np.array(
+        [va.point(p, SETTINGS.with_channel(CHANNELS[i % 3])) for i, p in enumerate(places(300, 3))]
+    )
+    where[::5, 3] = np.nan  # some do not know their aperture
+    votes = np.where(rng.random(300) < 0.2, 0.0, rng.random(300))
+    scale = np.array([0.03, 0.2, 0.2, 0.5, 20.0, 0.25, 0.5])
+    asked = [FieldPosition(0.0, 0.0), *places(count, 4)][-count:]
+
+    def near(engine: splines.Engine) -> Answers:
+        index = SampleIndex.of(where)
+        return Neighbourhood(index, votes, scale, NadarayaWatson(), engine).near(asked, SETTINGS)
+
+    fast, plain = near("auto"), near("scipy")
+
+    assert np.array_equal(fast.starts, plain.starts)
+    assert min(plain.counts) > 1
+    for first, last in itertools.pairwise(plain.starts):
+        mine, other = np.argsort(fast.rows[first:last]), np.argsort(plain.rows[first:last])
+        assert np.array_equal(fast.rows[first:last][mine], plain.rows[first:last][other])
+        assert fast.weights[first:last][mine] == pytest.approx(plain.weights[first:last][other], rel=1e-9)
+
+
+def test_compiled_and_plain_removal_of_negatives_are_the_same() -> None:
+    pytest.importorskip("numba")
+    ripples = np.random.default_rng(9).normal(0.3, 1.0, (4, 9, 9))
+    ripples[1] = np.abs(ripples[1])
+    before = ripples.copy()
+
+    plain = local._without_negatives(ripples, "scipy")
+    fast = local._without_negatives(ripples.copy(), "auto")
+
+    assert np.abs(fast - plain).max() < 1e-12
+    assert plain.min() == 0.0
+    assert fast.sum(axis=(1, 2)) == pytest.approx(before.sum(axis=(1, 2)))
+    assert np.array_equal(fast[1], before[1])
 
 
 @pytest.mark.parametrize("finer", [1, 2])

@@ -125,7 +125,7 @@ def _drifted(x: Real, drift: Complex, down: Real, across: Real, work: Real, D: C
 def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
     x: Real,
     y: Real,
-    state: NDArray[np.uint8],
+    known: NDArray[np.bool_],
     whole: bool,
     K: Complex,
     smooth: Real,
@@ -146,8 +146,8 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
 ) -> None:
     """Wiener start and half-quadratic steps of `SparseGradient` on a canvas; the result goes into `x`.
 
-    `state` is 0 where the pixel was measured, 1 where nothing was, 2 where it was clipped; `whole`
-    says that all were measured, so that the data need no prediction. `drift` is how K changes per
+    `known` tells which pixels hold data; `whole` says that all do, so that none needs a prediction.
+    `drift` is how K changes per
     pixel down and across, and empty where it does not; `down` and `across` are the distances from
     where it is K. What it adds is found anew in the steps that `turns` names.
     """
@@ -182,8 +182,7 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
                 rocket_fft.c2r(P, work, axes, BACK, norm, 1)
                 for i in range(height):
                     for j in range(width):
-                        kind, left = state[c, i, j], y[c, i, j] - work[i, j]
-                        work[i, j] = left if kind == 0 or (kind == 2 and left > ZERO) else ZERO
+                        work[i, j] = y[c, i, j] - work[i, j] if known[c, i, j] else ZERO
                 rocket_fft.r2c(work, D, axes, FORWARD, 1.0, 1)
             rocket_fft.r2c(pull[c], P, axes, FORWARD, 1.0, 1)
             weight = couplings[step] * noise[c]

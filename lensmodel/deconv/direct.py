@@ -14,8 +14,8 @@ from scipy import fft
 from lensmodel.blur import BlurOperator, UniformBlur
 from lensmodel.deconv.base import Deconvolver, Restored, Sensor, restore_planes, uniform
 from lensmodel.deconv.canvas import Canvas, seam
-from lensmodel.deconv.clipping import faded_to
 from lensmodel.deconv.engine import Engine, compiled
+from lensmodel.deconv.lights import Lights
 from lensmodel.deconv.local import BLOCK, Blocks, signal_variance, smoothed, spread
 from lensmodel.deconv.sparse_gradient import SparseGradient
 from lensmodel.deconv.transfers import transfers
@@ -52,6 +52,8 @@ class DirectFilter:
     floor : float
         Added to |K_i|² in M: the square of what a transfer function is expected to be off by within a
         cell. Without it strong frequencies of the scene come back as coloured ripples.
+    light_steps : int
+        Steps by which the light of clipped pixels is found.
     engine : {"auto", "numpy"}
         "numpy" never uses compiled loops; the numbers are the same.
     """
@@ -59,6 +61,7 @@ class DirectFilter:
     busy: float = 0.25
     calm: float = 0.0015
     floor: float = 1e-3
+    light_steps: int = 15
     engine: Engine = "auto"
     mosaic: Deconvolver = field(default_factory=_steps)
 
@@ -80,6 +83,8 @@ class DirectFilter:
         """Restore the colours together; see `ColourDeconvolver`."""
         if any(sensor.measured is not None for sensor in sensors):
             return restore_planes(self.mosaic, blurred, blurs, sensors)
+        lights = Lights.of(blurred, blurs, sensors, self.light_steps, self.engine)
+        photo, blurred = blurred, blurred if lights is None else lights.rest
         light = np.maximum(blurred.mean(axis=(1, 2)), 1e-4).astype(np.float32)
         canvas = Canvas(blurred.shape[1], blurred.shape[2], margin=max(blur.reach for blur in blurs))
         loops = compiled(self.engine)
@@ -112,8 +117,7 @@ class DirectFilter:
                 np.float32(self.floor),
             )
         restored = x[:, canvas.data[0], canvas.data[1]] * light[:, None, None]
-        clips = np.array([sensor.clip for sensor in sensors], dtype=np.float32)[:, None, None]
-        return faded_to(blurred, restored, blurred >= clips, blurs)
+        return restored if lights is None else lights.put_back(photo, restored)
 
 
 def _contrasts(

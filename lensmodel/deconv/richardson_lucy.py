@@ -112,47 +112,92 @@ class SaturationAwareRichardsonLucy:
         self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step
     ) -> Restored:
         """Deconvolve one plane; see `Deconvolver`."""
-        base = background(sensor)
-        data = np.maximum(blurred, 0.0) + base
         latent, reach = first_guess(blurred, blur)
-        steps = np.arange(1, self.iterations + 1)
-        alphas = np.minimum((steps - 1) / (steps + 2), ALPHA_MAX) * self.accelerated
         lights = bool(blurred.max() >= _LIGHT * sensor.clip)
-        loops = compiled(self.engine) if isinstance(blur, UniformBlur) else None
-        if loops is not None and isinstance(blur, UniformBlur):
-            shape = fast_shape(latent.shape)
-            latent = np.ascontiguousarray(latent)
-            loops.richardson_lucy(
-                latent,
-                np.ascontiguousarray(data, dtype=np.float32),
-                reach.astype(np.float32),
-                blur.spectrum(shape),
-                np.float32(base),
-                np.float32(sensor.clip),
-                np.float32(self.sharpness),
-                alphas.astype(np.float32),
-                shape[1],
-                lights,
-            )
-            on_step(self.iterations, self.iterations)
-            return Restored(np.ascontiguousarray(blur.frame(latent)), steps=self.iterations)
-        previous = latent
-        for step, alpha in enumerate(alphas.astype(np.float32), start=1):
-            start = np.maximum(latent + alpha * (latent - previous), TINY)
-            predicted = np.maximum(blur.forward(start), 0.0)
-            seen, slope = response(predicted, sensor.clip, self.sharpness)
-            error = (data / np.maximum(seen + base, TINY) - 1.0) * slope
-            update = 1.0 + blur.adjoint(error) / reach
-            if lights:
-                update = _split(update, error, start, blur=blur, reach=reach, clip=sensor.clip)
-            previous, latent = latent, np.maximum(start * np.maximum(update, 0.0), TINY)
-            on_step(step, self.iterations)
+        latent = climbed(
+            latent,
+            blurred,
+            reach,
+            blur,
+            sensor,
+            steps=self.iterations,
+            sharpness=self.sharpness,
+            accelerated=self.accelerated,
+            lights=lights,
+            engine=self.engine,
+            on_step=on_step,
+        )
         return Restored(np.ascontiguousarray(blur.frame(latent)), steps=self.iterations)
 
 
 _REACH_FLOOR = 0.05
 _LIGHT = 0.9
 """Share of the clipping level above which a sharp pixel counts as a light."""
+
+
+def climbed(
+    latent: Plane,
+    blurred: Plane,
+    reach: Plane,
+    blur: BlurOperator,
+    sensor: Sensor,
+    *,
+    steps: int,
+    sharpness: float,
+    accelerated: bool = True,
+    lights: bool = False,
+    engine: Engine = "auto",
+    on_step: StepHook = ignore_step,
+) -> Plane:
+    """Take the steps of `SaturationAwareRichardsonLucy`.
+
+    Parameters
+    ----------
+    latent : Plane
+        Start, wider than the data by the reach of the blur.
+    blurred : Plane
+        What was seen.
+    reach : Plane
+        Normaliser of each pixel of the latent plane.
+    blur, sensor, steps, sharpness, accelerated, engine, on_step
+        As there.
+    lights : bool
+        Whether to keep what is poorly known about lights out of the update of everybody else.
+    """
+    base = background(sensor)
+    data: Plane = np.ascontiguousarray(np.maximum(blurred, 0.0) + base, dtype=np.float32)
+    count = np.arange(1, steps + 1)
+    alphas = (np.minimum((count - 1) / (count + 2), ALPHA_MAX) * accelerated).astype(np.float32)
+    loops = compiled(engine) if isinstance(blur, UniformBlur) else None
+    if loops is not None and isinstance(blur, UniformBlur):
+        shape = fast_shape(latent.shape)
+        latent = np.array(latent, dtype=np.float32, order="C")
+        loops.richardson_lucy(
+            latent,
+            data,
+            reach.astype(np.float32),
+            blur.spectrum(shape),
+            np.float32(base),
+            np.float32(sensor.clip),
+            np.float32(sharpness),
+            alphas,
+            shape[1],
+            lights,
+        )
+        on_step(steps, steps)
+        return latent
+    previous = latent
+    for step, alpha in enumerate(alphas, start=1):
+        start = np.maximum(latent + alpha * (latent - previous), TINY)
+        predicted = np.maximum(blur.forward(start), 0.0)
+        seen, slope = response(predicted, sensor.clip, sharpness)
+        error = (data / np.maximum(seen + base, TINY) - 1.0) * slope
+        update = 1.0 + blur.adjoint(error) / reach
+        if lights:
+            update = _split(update, error, start, blur=blur, reach=reach, clip=sensor.clip)
+        previous, latent = latent, np.maximum(start * np.maximum(update, 0.0), TINY)
+        on_step(step, steps)
+    return latent
 
 
 def background(sensor: Sensor) -> float:

@@ -14,8 +14,8 @@ from scipy import fft
 from lensmodel.blur import BlurOperator, UniformBlur
 from lensmodel.deconv.base import Restored, Sensor, uniform
 from lensmodel.deconv.canvas import Canvas, seam
-from lensmodel.deconv.clipping import faded_to, spoilt
 from lensmodel.deconv.engine import Engine, compiled
+from lensmodel.deconv.lights import Lights
 from lensmodel.deconv.local import Blocks, signal_variance, smoothed, spread
 from lensmodel.deconv.shrinkage import Shrinkage
 from lensmodel.deconv.transfers import transfers
@@ -49,10 +49,9 @@ class SparseGradient:
 
     Three departures from [1]_: the threshold follows the noise variance pixel by pixel, and the
     local light and contrast (gradients of a scene scale with both); chroma is shrunk harder than luma,
-    because edges of all colours coincide; and unmeasured or clipped pixels take the model's own
-    prediction as data, Y~ = F x (clipped ones only where it is above the clip), which maximises
-    the likelihood of what was measured. That guess converges slowly for lights far above the clip:
-    pixels that got most of their blur count as unmeasured, and the correction fades out there.
+    because edges of all colours coincide; and unmeasured pixels take the model's own prediction as
+    data, Y~ = F x, which maximises the likelihood of what was measured. Such a guess converges too
+    slowly for lights above the clipping level: see `Lights`, which takes them off before.
 
     Parameters
     ----------
@@ -69,6 +68,8 @@ class SparseGradient:
     coupling, growth : float
         First b, in units of one over the squared light, and its factor per step.
         What a kernel's change within the tile adds is found anew in the first step and half way.
+    light_steps : int
+        Steps by which the light of clipped pixels is found.
     engine : {"auto", "numpy"}
         "numpy" never uses compiled loops; the numbers are the same.
 
@@ -85,6 +86,7 @@ class SparseGradient:
     steps: int = 8
     coupling: float = 1.5
     growth: float = 3.0
+    light_steps: int = 20
     engine: Engine = "auto"
 
     def __post_init__(self) -> None:
@@ -111,17 +113,19 @@ class SparseGradient:
         sensors: Sequence[Sensor],
         on_step: StepHook,
     ) -> Planes:
-        light = np.maximum(blurred.mean(axis=(1, 2)), 1e-4).astype(np.float32)
+        lights = Lights.of(blurred, blurs, sensors, self.light_steps, self.engine)
+        rest, glow = (blurred, None) if lights is None else (lights.rest, lights.glow)
+        light = np.maximum(rest.mean(axis=(1, 2)), 1e-4).astype(np.float32)
         canvas = Canvas(blurred.shape[1], blurred.shape[2], margin=max(blur.reach for blur in blurs))
         loops = compiled(self.engine) if len(blurred) == len(CHANNELS) else None
-        problem = self._problem(blurred, blurs, sensors, light, canvas, loops)
+        problem = self._problem(rest, blurs, sensors, light, canvas, loops, glow)
         if loops is None:
             x = _half_quadratic(problem, on_step)
         else:
             x = _compiled(problem, loops)
             on_step(self.steps, self.steps)
         restored = x[:, canvas.data[0], canvas.data[1]] * light[:, None, None]
-        return faded_to(blurred, restored, problem.clipped, blurs)
+        return restored if lights is None else lights.put_back(blurred, restored)
 
     def _problem(
         self,
@@ -131,12 +135,14 @@ class SparseGradient:
         light: NDArray[np.float32],
         canvas: Canvas,
         loops: ModuleType | None,
+        glow: Planes | None,
     ) -> _Problem:
         blocks = Blocks.of(blurred, light, loops)
+        seen = blocks if glow is None else Blocks.of(blurred + glow, light, loops)
         var = np.stack(
             [
                 s.noise.variance(smoothed(b * bright)) / bright**2
-                for s, b, bright in zip(sensors, blocks.planes, light, strict=True)
+                for s, b, bright in zip(sensors, seen.planes, light, strict=True)
             ]
         ).astype(np.float32)
         noise = np.maximum(var.mean(axis=(1, 2)), np.float32(1e-9))
@@ -151,8 +157,7 @@ class SparseGradient:
             self.weight if all(sensor.measured is None for sensor in sensors) else self.mosaic_weight,
         )
         weights[1:] *= self.chroma
-        clipped = blurred >= np.array([s.clip for s in sensors], dtype=np.float32)[:, None, None]
-        state = _states(clipped, blurs, sensors, canvas)
+        known = _known(sensors, canvas)
         drift = blurs[0].drift
         K, rates = transfers(blurs, canvas.shape, max(blurred.shape[1:]) / 2.0, loops)
         y = np.empty((len(blurred), *canvas.shape), dtype=np.float32)
@@ -177,8 +182,7 @@ class SparseGradient:
         return _Problem(
             y=y,
             variance=(blurred.reshape(len(blurred), -1).var(axis=1) / light**2).astype(np.float32),
-            clipped=clipped,
-            state=state,
+            known=known,
             K=K,
             smooth=_gradient_power(canvas.shape),
             noise=noise.astype(np.float32),
@@ -194,7 +198,6 @@ class SparseGradient:
         )
 
 
-_MEASURED, _UNMEASURED, _CLIPPED = 0, 1, 2
 _TYPICAL_CONTRAST = np.float32(0.02)  # variance over squared light of a scene for which kappa is `weight`
 _BUSIEST, _CALMEST = 0.7, 50.0
 _DARK = np.float32(0.02)  # share of a tile's mean light below which the prior follows it no further
@@ -206,8 +209,7 @@ class _Problem:
 
     y: Planes
     variance: NDArray[np.float32]
-    clipped: NDArray[np.bool_]
-    state: NDArray[np.uint8]
+    known: NDArray[np.bool_]
     K: NDArray[np.complex64]
     smooth: NDArray[np.float32]
     noise: NDArray[np.float32]
@@ -222,26 +224,16 @@ class _Problem:
     prox: Shrinkage
 
 
-def _states(
-    clipped: NDArray[np.bool_], blurs: Sequence[UniformBlur], sensors: Sequence[Sensor], canvas: Canvas
-) -> NDArray[np.uint8]:
-    """What each pixel of the canvas is: measured, not, or clipped.
+def _known(sensors: Sequence[Sensor], canvas: Canvas) -> NDArray[np.bool_]:
+    """Where the canvas holds data.
 
-    A margin of which nothing will be seen counts as measured: its faded data are as good as any guess,
-    and where all is measured, the steps need no prediction.
+    A margin of which nothing will be seen counts as such: its faded data are as good as any guess,
+    and where all is known, the steps need no prediction.
     """
-    margin = _MEASURED if all(sensor.surrounded for sensor in sensors) else _UNMEASURED
-    state = np.full((len(sensors), *canvas.shape), margin, dtype=np.uint8)
-    if clipped.any():
-        state[:, canvas.data[0], canvas.data[1]] = np.where(
-            clipped, _CLIPPED, np.where(spoilt(clipped, blurs), _UNMEASURED, _MEASURED)
-        )
-    else:
-        state[:, canvas.data[0], canvas.data[1]] = _MEASURED
-    for plane, sensor in zip(state, sensors, strict=True):
-        if sensor.measured is not None:
-            plane[canvas.data][~sensor.measured] = _UNMEASURED
-    return state
+    known = np.full((len(sensors), *canvas.shape), all(s.surrounded for s in sensors), dtype=np.bool_)
+    for plane, sensor in zip(known, sensors, strict=True):
+        plane[canvas.data] = True if sensor.measured is None else sensor.measured
+    return known
 
 
 def _half_quadratic(p: _Problem, on_step: StepHook) -> Planes:
@@ -269,8 +261,7 @@ def _half_quadratic(p: _Problem, on_step: StepHook) -> Planes:
             drifted += p.drift[:, 1] * fft.rfft2(x * p.across)
         predicted = p.K * X + drifted if drifted.size else p.K * X
         left = p.y - fft.irfft2(predicted, shape)
-        measured = (p.state == _MEASURED) | ((p.state == _CLIPPED) & (left > 0.0))
-        data = power * X + np.conj(p.K) * fft.rfft2(np.where(measured, left, np.float32(0.0)))
+        data = power * X + np.conj(p.K) * fft.rfft2(np.where(p.known, left, np.float32(0.0)))
         strength = (coupling * p.noise)[:, None, None]
         X = (data + strength * fft.rfft2(pull)) / (power + strength * p.smooth)
         x = fft.irfft2(X, shape).astype(np.float32)
@@ -285,8 +276,8 @@ def _compiled(p: _Problem, loops: ModuleType) -> Planes:
     loops.half_quadratic(
         x,
         p.y,
-        p.state,
-        not p.state.any(),
+        p.known,
+        bool(p.known.all()),
         p.K,
         p.smooth,
         decay,

@@ -236,6 +236,12 @@ def correct(
     peers: Annotated[
         bool, typer.Option("--peers", help="Time G'MIC, RawTherapee and darktable too, where installed.")
     ] = False,
+    roi: Annotated[
+        str | None, typer.Option(metavar="T,L,H,W", help="Only this part, in the cells of the whole photo.")
+    ] = None,
+    beside: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Compare CPU time with that of N threads.")
+    ] = None,
     json_output: JsonFile = None,
     force: Force = False,
     quiet: Quiet = False,
@@ -255,12 +261,21 @@ def correct(
 
     shown = display.of(context, quiet=quiet, verbose=verbose)
     refuse_existing(_file(json_output), force=force)
-    result = _correct(photo, methods, workers, shown, repeats=repeats, peers=peers)
+    window = _window(roi)
+    result = _correct(photo, methods, workers, shown, repeats=repeats, peers=peers, roi=window, beside=beside)
     _tell(shown, json_output, result, correct_table(result))
 
 
 def _correct(
-    photo: Path | None, methods: str, workers: int, shown: Display, *, repeats: int = 1, peers: bool = False
+    photo: Path | None,
+    methods: str,
+    workers: int,
+    shown: Display,
+    *,
+    repeats: int = 1,
+    peers: bool = False,
+    roi: tuple[int, int, int, int] | None = None,
+    beside: int | None = None,
 ) -> dict[str, Any]:
     from lensmodel.bench.correct import run_correct_benchmark  # noqa: PLC0415 - see the top of the module
     from lensmodel.bench.peers import PEERS  # noqa: PLC0415 - same
@@ -276,8 +291,20 @@ def _correct(
             workers=workers,
             repeats=repeats,
             peers=PEERS if peers else (),
+            roi=roi,
+            beside=beside,
             on_step=lambda done, total: bars.update(task, completed=done, total=total),
         )
+
+
+def _window(text: str | None) -> tuple[int, int, int, int] | None:
+    if text is None:
+        return None
+    try:
+        top, left, height, width = (int(part) for part in text.split(","))
+    except ValueError as error:
+        raise UsageError(f"--roi must be four whole numbers T,L,H,W, got {text!r}") from error
+    return top, left, height, width
 
 
 def _names(text: str) -> tuple[str, ...]:

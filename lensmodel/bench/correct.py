@@ -18,7 +18,7 @@ from skimage import restoration
 from lensmodel.bench.peers import Peer
 from lensmodel.blur import UniformBlur
 from lensmodel.blur.uniform import fast_shape
-from lensmodel.deconv import SaturationAwareRichardsonLucy, Sensor, correct_planes
+from lensmodel.deconv import Roi, SaturationAwareRichardsonLucy, Sensor, correct_planes
 from lensmodel.deconv.engine import compiled
 from lensmodel.errors import InvalidInputError
 from lensmodel.geometry import Frame
@@ -57,6 +57,8 @@ def run_correct_benchmark(
     workers: int = 1,
     repeats: int = 1,
     peers: Sequence[Peer] = (),
+    roi: tuple[int, int, int, int] | None = None,
+    beside: int | None = None,
     out: Planes | None = None,
     on_step: StepHook = ignore_step,
 ) -> dict[str, object]:
@@ -76,6 +78,11 @@ def run_correct_benchmark(
         Runs of each method and peer; the median counts.
     peers : sequence of Peer
         Programs to time on the same picture; those that are not installed are named as missing.
+    roi : tuple of int or None
+        `(top, left, height, width)`: correct only this part, in the cells of the whole photo; peers are
+        given it alone.
+    beside : int or None
+        Threads of a second run of each method beside each of `workers`, so that their CPU times compare.
     out : Planes or None
         Where results are written; None allocates.
     on_step : StepHook
@@ -85,9 +92,10 @@ def run_correct_benchmark(
     -------
     dict
         `machine`, `megapixels`, `methods` (CPU and wall seconds, CPU seconds per megapixel and
-        channel, largest memory of the process so far in MiB), `kernel` (CPU seconds per
-        megapixel and iteration of our tile kernel, of scikit-image and of the bare transforms) and
-        `peers` (CPU seconds of each program's sharpening alone, or None where it is not installed).
+        channel, CPU time with the threads of `beside` over that with `workers`, largest memory of the
+        process so far in MiB), `kernel` (CPU seconds per megapixel and iteration of our tile kernel, of
+        scikit-image and of the bare transforms) and `peers` (CPU seconds of each program's sharpening
+        alone, or None where it is not installed).
 
     Raises
     ------
@@ -101,36 +109,44 @@ def run_correct_benchmark(
     lens = field or SoftCorners()
     noise = [NoiseModel(1 / 50_000, 1e-6)] * 3
     frame = Frame(photo.shape[1], photo.shape[2])
-    megapixels = frame.height * frame.width / 1e6
+    window = Roi.of(frame, roi)
+    part = photo[:, window.top : window.top + window.height, window.left : window.left + window.width]
+    megapixels = window.height * window.width / 1e6
     total = len(methods) + 1 + len(peers)
     results: dict[str, dict[str, float]] = {}
     small = np.ascontiguousarray(photo[:, :200, :200])
     for done, method in enumerate(methods, start=1):
         # Compiling and first-use tables stay out of the figures.
         correct_planes(small, lens, Frame(small.shape[1], small.shape[2]), noise=noise, method=method)
-        runs = []
-        for _ in range(repeats):
+        counts = [workers] if beside is None else [workers, beside]
+
+        def run(threads: int, name: str = method) -> tuple[float, float]:
             wall, cpu = time.perf_counter(), time.process_time()
-            correct_planes(photo, lens, frame, noise=noise, method=method, workers=workers, out=out)
-            runs.append((time.process_time() - cpu, time.perf_counter() - wall))
-        cpu, wall = (float(value) for value in np.median(runs, axis=0))
+            correct_planes(photo, lens, frame, noise=noise, method=name, workers=threads, roi=roi, out=out)
+            return time.process_time() - cpu, time.perf_counter() - wall
+
+        runs = np.array([[run(count) for count in counts] for _ in range(repeats)])
+        cpu, wall = (float(value) for value in np.median(runs[:, 0], axis=0))
         results[method] = {
             "cpu_s": cpu,
             "wall_s": wall,
             "cpu_s_per_mp_channel": cpu / megapixels / 3,
             "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         }
+        if beside is not None:
+            results[method]["cpu_beside_over"] = float(np.median(runs[:, 1, 0] / runs[:, 0, 0]))
         on_step(done, total)
     kernel = _kernel_times()
     on_step(len(methods) + 1, total)
     others: dict[str, float | None] = {}
     for done, peer in enumerate(peers, start=len(methods) + 2):
-        others[peer.name] = _peer_seconds(peer, photo, repeats) if peer.installed else None
+        others[peer.name] = _peer_seconds(peer, part, repeats) if peer.installed else None
         on_step(done, total)
     return {
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",
         "megapixels": megapixels,
         "workers": workers,
+        "beside": beside,
         "methods": results,
         "kernel": kernel,
         "peers": others,
@@ -149,6 +165,11 @@ def correct_table(report: Mapping[str, Any]) -> str:
         f"| {name} | {row['wall_s']:.2f} | {row['cpu_s']:.2f} | {row['cpu_s_per_mp_channel']:.3f} "
         f"| {row['peak_mib']:.0f} |"
         for name, row in report["methods"].items()
+    ]
+    lines += [
+        f"\n{name}: {report['beside']} threads take {row['cpu_beside_over']:.3f} of the CPU time of these."
+        for name, row in report["methods"].items()
+        if "cpu_beside_over" in row
     ]
     lines += ["", "| Richardson-Lucy step | value |", "|---|---|"]
     lines += [f"| {name.replace('_', ' ')} | {value:.4f} |" for name, value in report["kernel"].items()]

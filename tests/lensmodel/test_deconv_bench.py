@@ -13,13 +13,24 @@ def test_benchmark_times_each_method_and_prints_nothing(capsys: pytest.CaptureFi
 
     missing = Peer("nobody's", "no-such-program", lambda *_: [], (1.0,), 1.0)
 
-    report = run_correct_benchmark(photo, methods=("fast",), repeats=2, peers=[missing])
+    report = run_correct_benchmark(photo, methods=("fast",), repeats=2, peers=[missing], beside=2)
 
     assert report["methods"]["fast"]["cpu_s"] > 0
     assert report["kernel"]["ours"] > 0
     assert report["peers"] == {"nobody's": None}
     assert "| nobody's | not installed |" in correct_table(report)
+    assert "2 threads take" in correct_table(report)
     assert capsys.readouterr().out == ""
+
+
+def test_benchmark_of_a_window_counts_its_pixels_only() -> None:
+    photo = np.full((3, 210, 220), 0.3, dtype=np.float32)
+
+    report = run_correct_benchmark(photo, methods=("fast",), roi=(0, 0, 100, 110))
+
+    assert report["megapixels"] == pytest.approx(0.011)
+    with pytest.raises(InvalidInputError, match="does not lie"):
+        run_correct_benchmark(photo, methods=("fast",), roi=(150, 0, 100, 110))
 
 
 def test_lens_for_timing_is_softer_in_the_corner() -> None:

@@ -8,6 +8,7 @@ from lensmodel.deconv.direct import DirectFilter
 from lensmodel.deconv.epll import Epll
 from lensmodel.deconv.krishnan_fergus import KrishnanFergus
 from lensmodel.deconv.lattice import Roi
+from lensmodel.deconv.limits import Bounds
 from lensmodel.deconv.methods import deconvolvers
 from lensmodel.deconv.report import ZoneReport
 from lensmodel.deconv.richardson_lucy import RichardsonLucy, SaturationAwareRichardsonLucy
@@ -15,6 +16,7 @@ from lensmodel.deconv.sparse_gradient import SparseGradient
 from lensmodel.deconv.wiener import Wiener
 
 __all__ = [
+    "Bounds",
     "ColourDeconvolver",
     "Corrected",
     "Deconvolver",

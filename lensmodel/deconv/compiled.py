@@ -4,6 +4,7 @@ Imported only where Numba and rocket-fft are installed; `lensmodel.deconv.engine
 function has a NumPy twin that gives the same numbers.
 """
 
+from lensmodel.deconv.compiled_limits import hold
 from lensmodel.deconv.compiled_lucy import bare_transforms, richardson_lucy
 from lensmodel.deconv.compiled_pass import one_pass
 from lensmodel.deconv.compiled_steps import half_quadratic, pull_of
@@ -14,6 +15,7 @@ __all__ = [
     "block_means",
     "fill",
     "half_quadratic",
+    "hold",
     "one_pass",
     "pull_of",
     "richardson_lucy",

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from lensmodel.blur import Drift, UniformBlur, crop_to_support
 from lensmodel.deconv.base import CoarseMethod, Deconvolver, Sensor, restore_planes
 from lensmodel.deconv.lattice import Cell, Roi, cells, usual_pitch
+from lensmodel.deconv.limits import Bounds
 from lensmodel.deconv.methods import deconvolvers
 from lensmodel.deconv.report import CellForecast, ZoneReport, forecast, zone_reports
 from lensmodel.errors import InvalidInputError
@@ -79,6 +80,7 @@ class _Job:
     psf_error: PsfError
     lateral: LateralShift | None
     cfa: BayerPattern | None
+    bounds: Bounds
 
     @property
     def cell_factor(self) -> int:
@@ -138,6 +140,7 @@ def correct_planes(
     psf_error: PsfError = 0.0,
     lateral: LateralShift | None = None,
     cfa: BayerPattern | None = None,
+    bounds: Bounds | None = None,
     roi: Roi | tuple[int, int, int, int] | None = None,
     workers: int = 1,
     pitch: int | None = None,
@@ -175,6 +178,8 @@ def correct_planes(
     cfa : BayerPattern or None
         The mosaic on which the planes were measured; what demosaicing filled in is then no datum, and
         "standard" and "fast" demosaic and deblur in one. `noise` is that of the sensor then.
+    bounds : Bounds or None
+        What to allow beside edges and in flat areas; None lets `psf_error` decide.
     roi : tuple of int or None
         `(top, left, height, width)`: return only this part, with the same pixels as the whole.
     workers : int
@@ -228,7 +233,19 @@ def correct_planes(
     def kernels(position: FieldPosition, channel: Channel) -> Kernel:
         return crop_to_support(field.kernel_at(position, channel, KERNEL_SIZE))
 
-    job = _Job(planes, kernels, frame, solver, strength, tuple(noise), tuple(clip), psf_error, lateral, cfa)
+    job = _Job(
+        planes,
+        kernels,
+        frame,
+        solver,
+        strength,
+        tuple(noise),
+        tuple(clip),
+        psf_error,
+        lateral,
+        cfa,
+        bounds or Bounds(),
+    )
     if pitch is None:
         pitch = usual_pitch(frame, job.cell_factor)
     wanted = [cell for cell in cells(frame, pitch) if cell.meets(window)]
@@ -301,6 +318,7 @@ def _restore(job: _Job, cell: Cell) -> tuple[Planes, CellForecast]:
     if job.strength == 0.0:
         return tile[inner], expected
     restored = restore_planes(job.method, tile, blurs, sensors)[inner]
+    restored = job.bounds.hold(job.planes, (cell.top, cell.left), restored, errors, job.noise)
     if job.strength < 1.0:
         restored = tile[inner] + np.float32(job.strength) * (restored - tile[inner])
     return restored, expected

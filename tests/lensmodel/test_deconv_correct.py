@@ -8,8 +8,10 @@ import pytest
 from scipy import ndimage
 
 from lensmodel.blur import EfficientFilterFlow
-from lensmodel.deconv import Corrected, Roi, correct_planes
+from lensmodel.deconv import Bounds, Corrected, Roi, correct_planes
+from lensmodel.deconv.engine import compiled
 from lensmodel.deconv.lattice import cells
+from lensmodel.deconv.limits import allowance, flats_kept, limited
 from lensmodel.errors import CancelledError, InvalidInputError
 from lensmodel.geometry import Frame
 from lensmodel.psf import gaussian
@@ -203,6 +205,66 @@ def test_wrong_kernel_with_its_error_stated_does_less_harm() -> None:
     assert rmse(careful, sharp) < rmse(trusting, sharp)
 
 
+def test_result_stays_within_the_range_of_the_photo_where_no_halo_is_allowed() -> None:
+    seen, _ = photo(Soft(), BASE)
+    low, high = (f(seen, (1, 5, 5), mode="nearest") for f in (ndimage.minimum_filter, ndimage.maximum_filter))
+
+    held = correct_planes(seen, Soft(), FRAME, noise=BASE, bounds=Bounds(halo=0.0)).planes
+    free = correct_planes(seen, Soft(), FRAME, noise=BASE).planes
+
+    assert np.all(held >= low - 1e-6)
+    assert np.all(held <= high + 1e-6)
+    assert np.mean((free < low) | (free > high)) > 0.02
+
+
+def test_kernels_that_are_off_leave_no_dark_lines_beside_edges() -> None:
+    seen, sharp = photo(Soft(0.7, 1.0), BASE)
+    darkest = ndimage.minimum_filter(sharp, (1, 5, 5))
+
+    def line(bounds: Bounds) -> float:
+        made = correct_planes(seen, Soft(1.3, 1.8), FRAME, noise=BASE, psf_error=0.6, bounds=bounds).planes
+        return float(np.quantile(darkest - made, 0.999))
+
+    assert line(Bounds()) < 0.5 * line(Bounds(halo=np.inf))
+
+
+def test_range_is_wider_the_surer_the_kernel() -> None:
+    shares = [allowance(error) for error in (0.0, 0.15, 0.25, 0.5)]
+
+    assert shares[0] == np.inf
+    assert shares == sorted(shares, reverse=True)
+    assert shares[2] == pytest.approx(1.0)
+
+
+def test_compiled_limiter_gives_the_numbers_of_scipy() -> None:
+    pytest.importorskip("numba")
+    pytest.importorskip("rocket_fft")
+    rng = np.random.default_rng(0)
+    seen, made = rng.random((3, 44, 54), dtype=np.float32), rng.random((3, 40, 50), dtype=np.float32)
+    made = 3 * made - 1
+
+    quick = limited(seen, made, (0.1, 0.5, np.inf), compiled("auto"))
+
+    np.testing.assert_allclose(quick, limited(seen, made, (0.1, 0.5, np.inf)), atol=1e-6)
+    np.testing.assert_array_equal(quick[2], made[2])
+
+
+def test_flat_areas_keep_their_grain_where_asked_and_edges_their_sharpness() -> None:
+    rng, model = np.random.default_rng(1), NoiseModel(0.0, 1e-4)
+    seen = np.full((1, 64, 84), 0.3, dtype=np.float32)
+    seen[:, :, 42:] = 0.6
+    seen += 0.01 * rng.standard_normal(seen.shape).astype(np.float32)
+    made = np.full((1, 60, 80), 0.3, dtype=np.float32)
+    made[:, :, 40:] = 0.6
+
+    kept = flats_kept(seen, made, [model], 1.0)
+
+    inside = seen[:, 2:-2, 2:-2]
+    assert rmse(kept[:, :, :30], inside[:, :, :30]) < 0.3 * rmse(made[:, :, :30], inside[:, :, :30])
+    np.testing.assert_allclose(kept[:, :, 38:42], made[:, :, 38:42], atol=1e-6)
+    np.testing.assert_array_equal(flats_kept(seen, made, [model], 0.0), made)
+
+
 def test_zone_report_expects_less_gain_from_a_noisier_photo() -> None:
     seen, _ = photo(Soft(), BASE)
 
@@ -245,6 +307,12 @@ def test_correction_refuses_what_makes_no_sense(change: dict, text: str) -> None
 
     with pytest.raises(InvalidInputError, match=text):
         correct_planes(seen, Soft(), FRAME, **({"noise": BASE} | change))
+
+
+@pytest.mark.parametrize("change", [{"halo": -0.1}, {"keep_flats": 1.5}])
+def test_bounds_refuse_what_makes_no_sense(change: dict) -> None:
+    with pytest.raises(InvalidInputError, match="halo must not be negative"):
+        Bounds(**change)
 
 
 def test_correction_refuses_planes_of_another_frame() -> None:

@@ -1,0 +1,141 @@
+"""Bounds on what a correction may do: halos beside edges, grain in flat areas."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lensmodel.deconv.engine import compiled
+from lensmodel.errors import InvalidInputError
+from lensmodel.types import NoiseModel, Planes
+
+WINDOW: Final = 2
+"""Pixels around each one in which the photo is looked at."""
+_FREE: Final = (
+    0.25  # error of a kernel from which on a result may not leave the photo's range by more than it
+)
+_WIDEST: Final = 4.0  # share of the range beyond which a bound would cut nothing but noise
+_DARKEST, _DARKER = 0.5, 0.2  # of the darkest light nearby where no room is left, and per room
+_CALM, _BUSY = 1.5, 3.0  # standard deviation over the noise's, of a flat area and of one that is none
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """What a photographer lets a correction do.
+
+    Parameters
+    ----------
+    halo : float or None
+        By how much of the photo's range within 2 pixels the result may leave it: 0 not at all, infinity
+        without bound. None takes it from the expected error of the kernels.
+    keep_flats : float
+        0 to 1: how much of its own grain the photo keeps where it shows nothing else.
+    """
+
+    halo: float | None = None
+    keep_flats: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (self.halo is None or self.halo >= 0.0) or not 0.0 <= self.keep_flats <= 1.0:
+            raise InvalidInputError(f"halo must not be negative and keep_flats lie in 0..1, got {self}")
+
+    def hold(
+        self,
+        planes: Planes,
+        at: tuple[int, int],
+        restored: Planes,
+        errors: Sequence[float],
+        noise: Sequence[NoiseModel],
+    ) -> Planes:
+        """Hold what was made of the part of a photo that begins at `at` within these bounds."""
+        shares = [allowance(error) if self.halo is None else self.halo for error in errors]
+        if self.keep_flats == 0.0 and not np.isfinite(shares).any():
+            return restored
+        rows, cols = (
+            np.clip(np.arange(first - WINDOW, first + extent + WINDOW), 0, end - 1)
+            for first, extent, end in zip(at, restored.shape[1:], planes.shape[1:], strict=True)
+        )
+        photo = np.asarray(planes[:, rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1], dtype=np.float32)
+        photo = photo[:, (rows - rows[0])[:, None], (cols - cols[0])[None, :]]
+        restored = limited(photo, restored, shares, compiled("auto"))
+        return flats_kept(photo, restored, noise, self.keep_flats) if self.keep_flats > 0.0 else restored
+
+
+def allowance(error: float) -> float:
+    """By how much of the photo's local range a result may leave it, for a kernel with a relative error.
+
+    Beside an edge the picture is all kernel: what a wrong one makes there leaves the range of light
+    that the photo shows around, in one colour more than in the others. A right one does so as well, on
+    details narrower than itself, so the bound is wide where the kernel is sure: ( 0.25 / error )².
+    """
+    share = (_FREE / error) ** 2 if error > 0.0 else np.inf
+    return float(share) if share <= _WIDEST else float("inf")
+
+
+def limited(
+    photo: Planes, restored: Planes, allowances: Sequence[float], loops: ModuleType | None = None
+) -> Planes:
+    """Hold `restored` within the photo's range in windows of 5 pixels, widened by a share of it.
+
+    The less room, the less it may also fall below a share of the darkest light there.
+
+    Parameters
+    ----------
+    photo : Planes, shape (channels, rows + 4, cols + 4)
+        With the pixels around.
+    restored : Planes, shape (channels, rows, cols)
+        What was made of its middle.
+    allowances : sequence of float
+        Share of the range by colour; infinite for no bound.
+    loops : module or None
+        Compiled loops; None for SciPy, with the same numbers.
+    """
+    made = np.ascontiguousarray(restored).copy()
+    for c, share in enumerate(allowances):
+        if np.isfinite(share):
+            if loops is None:
+                size, inside = 2 * WINDOW + 1, slice(WINDOW, -WINDOW)
+                low = ndimage.minimum_filter(photo[c], size)[inside, inside]
+                high = ndimage.maximum_filter(photo[c], size)[inside, inside]
+                room = np.float32(share) * (high - low)
+                np.clip(made[c], np.maximum(low - room, _dark(share) * low), high + room, out=made[c])
+            else:
+                loops.hold(photo[c], np.float32(share), _dark(share), made[c])
+    return made
+
+
+def _dark(share: float) -> np.float32:
+    """Share of the darkest light nearby below which nothing falls: black lines are seen before all else."""
+    return np.float32(max(_DARKEST - _DARKER * share, 0.0))
+
+
+def flats_kept(photo: Planes, restored: Planes, noise: Sequence[NoiseModel], share: float) -> Planes:
+    """Give back the photo's own grain where it shows nothing but grain.
+
+    Parameters
+    ----------
+    photo : Planes, shape (channels, rows + 4, cols + 4)
+        With the pixels around.
+    restored : Planes, shape (channels, rows, cols)
+        What was made of its middle.
+    noise : sequence of NoiseModel
+        By colour.
+    share : float
+        0 changes nothing, 1 leaves flat areas as they were.
+    """
+    inside = slice(WINDOW, -WINDOW)
+    ratio = np.zeros(restored.shape[1:], dtype=np.float32)
+    for plane, model in zip(photo, noise, strict=True):
+        mean = ndimage.uniform_filter(plane, 2 * WINDOW + 1)
+        local = ndimage.uniform_filter(plane * plane, 2 * WINDOW + 1) - mean * mean
+        ratio = np.maximum(ratio, (local / model.variance(mean))[inside, inside])
+    contrast = np.sqrt(np.maximum(ratio, np.float32(0.0)))
+    t = np.clip((contrast - _CALM) / (_BUSY - _CALM), 0.0, 1.0)
+    keep: NDArray[np.float32] = (share * (1.0 - t * t * (3.0 - 2.0 * t))).astype(np.float32)
+    return np.asarray(restored + keep * (photo[:, inside, inside] - restored), dtype=np.float32)

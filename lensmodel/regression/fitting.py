@@ -14,7 +14,7 @@ from lensmodel.regression import pitch as pitches
 from lensmodel.regression import variables as va
 from lensmodel.regression.answer import LIKELIEST, MIXED, ModelSettings
 from lensmodel.regression.index import SampleIndex
-from lensmodel.regression.judgement import Judgement, bandwidth, judge
+from lensmodel.regression.judgement import Judgement, bandwidth, held_together, judge
 from lensmodel.regression.local import LocalKernels
 from lensmodel.regression.normal_equations import NormalEquations
 from lensmodel.regression.physical import Physics
@@ -125,7 +125,7 @@ class Fit:
 
     def warmed(self, samples: Sequence[PsfSample], on_step: StepHook = ignore_step) -> Fit:
         """Return it with the wavefront of its samples."""
-        groups = self.roster.photo if len(self.roster.numbers) >= 2 else np.arange(len(samples))
+        groups = held_together(samples, self.roster.photo)
         common, scale = pitches.at_pitch(samples, self.pitch_um), va.scales(self.bandwidth)
         return replace(self, physical=Physics.fit(common, self.judgement.votes, groups, scale, on_step))
 

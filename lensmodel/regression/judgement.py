@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -16,6 +17,7 @@ from lensmodel.regression.kriging import ImageFrame
 from lensmodel.regression.local import LocalKernels
 from lensmodel.regression.robust import Flag
 from lensmodel.regression.validation import Choice, Held, choose
+from lensmodel.regression.wavefront_fit import ONE_FOCAL_LENGTH
 
 _CV_PHOTOS = 3
 _CV_SAMPLES = 300
@@ -76,6 +78,25 @@ def bandwidth(rule: dict[str, float], settings: ModelSettings, choice: Choice) -
     return found
 
 
+def held_together(samples: Sequence[PsfSample], photo: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Group samples by photo; those of a photo that is alone at its focal length are held out one by one.
+
+    Without that photo nothing would be known of the focal length: that says how a lens changes when one
+    zooms, not how well its samples agree.
+    """
+    groups = np.array(photo)
+    octaves = np.array([math.log2(s.settings.focal_mm) if s.settings.focal_mm else math.nan for s in samples])
+    for number in np.unique(photo):
+        own = photo == number
+        apart = (
+            np.abs(octaves[~own] - np.nanmedian(octaves[own])) if (~np.isnan(octaves[own])).any() else None
+        )
+        alone = not (~own).any() if apart is None else bool((apart > ONE_FOCAL_LENGTH).all())
+        if alone:
+            groups[own] = len(samples) + np.flatnonzero(own)
+    return groups
+
+
 def judge(
     samples: Sequence[PsfSample],
     settings: ModelSettings,
@@ -104,7 +125,7 @@ def judge(
     names, photo = np.unique([s.photo for s in samples], return_inverse=True)
     voting = np.flatnonzero(base > 0)
     several = len(np.unique(photo[voting])) >= 2
-    groups = photo if several else np.arange(len(samples))
+    groups = held_together(samples, photo)
 
     def held(rows: NDArray[np.intp], votes: NDArray[np.float64]) -> Held:
         kernels = local.upright(rows)

@@ -82,6 +82,8 @@ def dump(fit: Fit, samples: Sequence[PsfSample], settings: ModelSettings) -> byt
     if physical is not None:
         arrays |= _arrays("physical", physical)
         arrays["front.terms"] = physical.front.terms
+        if physical.front.slopes is not None:
+            arrays["front.slopes"] = physical.front.slopes
         document |= {"physical": _scalars(physical), "front": _scalars(physical.front)}
     text = np.frombuffer(json.dumps(document, allow_nan=True).encode(), dtype=np.uint8)
     buffer = io.BytesIO()
@@ -168,9 +170,11 @@ def _fit(
             raise ValueError("the image frame does not fit together")
     if "physical" in document:
         values = dict(document["front"])
-        front = Wavefront(arrays["front.terms"], **{**values, "eye": tuple(values["eye"])})
+        values |= {"eye": tuple(values["eye"]), "slopes": arrays.get("front.slopes")}
+        front = Wavefront(arrays["front.terms"], **values)
         physical = Physics(front=front, **document["physical"], **_of(arrays, "physical"))
-        if front.terms.shape != (len(NAMES),) or physical.rest.shape != (
+        lines = [front.terms, front.terms if front.slopes is None else front.slopes]
+        if any(line.shape != (len(NAMES),) for line in lines) or physical.rest.shape != (
             len(physical.vectors),
             physical.side**2,
         ):

@@ -14,7 +14,6 @@ Cost: some seconds of CPU for the fit, one or two milliseconds at each question.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -26,12 +25,17 @@ from lensmodel.regression import variables as va
 from lensmodel.regression.kriging import NUGGETS, field_vector, matern, settings_gap, squared_gaps
 from lensmodel.regression.pooled import pool
 from lensmodel.regression.wavefront import Wavefront
-from lensmodel.regression.wavefront_fit import MIN_SAMPLES, fit_wavefront, spread
+from lensmodel.regression.wavefront_fit import (
+    MIN_SAMPLES,
+    ONE_FOCAL_LENGTH,
+    fit_wavefront,
+    focal_range,
+    spread,
+)
 from lensmodel.types import FieldPosition, LensSettings, StepHook, ignore_step
 
 _MOST = 240
 _AROUND = 6  # pixels beyond the side that was fitted, for corners wider than every sample
-_OCTAVES = 0.25
 _NOTHING_LEFT = 1e3
 _WORST = 1.5
 _ALIKE = 1e-7
@@ -78,7 +82,7 @@ class Physics:
         scale: NDArray[np.float64],
         on_step: StepHook = ignore_step,
     ) -> Physics | None:
-        """Fit to samples; None where there are too few of them or several focal lengths.
+        """Fit to samples; None where there are too few of them.
 
         Parameters
         ----------
@@ -91,11 +95,12 @@ class Physics:
             Bandwidths.
         """
         voting = [int(i) for i in np.flatnonzero(votes > 0)]
-        if len(voting) < MIN_SAMPLES or not _one_focal_length([samples[i] for i in voting]):
+        if len(voting) < MIN_SAMPLES:
             return None
         on_step(0, _STEPS)
         trusted = [samples[i].with_weight(float(votes[i])) for i in voting]
-        pooled = pool(trusted, on_step)
+        # spectra of one focal length alone are solved together
+        pooled = None if focal_range(trusted) > ONE_FOCAL_LENGTH else pool(trusted, on_step)
         if pooled is not None:
             side = max(s.kernel.shape[0] for s in samples)
             empty = np.empty((0, 2)), np.empty((0, len(scale))), scale, np.empty((0, side**2))
@@ -172,8 +177,3 @@ def _kriged(
             best = score, answered, held
     assert best is not None
     return best[1], best[2]
-
-
-def _one_focal_length(samples: Sequence[PsfSample]) -> bool:
-    focal = [math.log2(s.settings.focal_mm) for s in samples if s.settings.focal_mm is not None]
-    return not focal or max(focal) - min(focal) <= _OCTAVES

@@ -9,7 +9,8 @@ widest aperture N0 is linear in the unknowns::
     astigmatism  w h^2 + L h + K + w4 r^2 h^2  (complex)            two nodes, where the copy is decentred
 
 Stopping down to N scales the blur of a term of degree n by (N0 / N)^(n - 1). Besides: q0, the width of
-diffraction, and the cat's eye, a second circle that moves over the pupil with h.
+diffraction, and the cat's eye, a second circle that moves over the pupil with h. The unknowns of a zoom
+follow straight lines over the logarithm of the focal length.
 
 Sources: W. T. Welford, "Aberrations of Optical Systems", 1986, ch. 7 and 8; K. P. Thompson,
 "Description of the third-order optical aberrations of near-circular pupil optical systems without
@@ -61,7 +62,7 @@ def design(position: FieldPosition, settings: LensSettings) -> NDArray[np.float6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Wavefront:
-    """The aberrations of one copy of a lens at one focal length.
+    """The aberrations of one copy of a lens, at one focal length or at all of a zoom.
 
     Parameters
     ----------
@@ -77,6 +78,10 @@ class Wavefront:
         Odd side in pixels of the kernels that it was fitted to.
     error : float
         Median relative L2 of the samples against it.
+    slopes : ndarray, shape (19,), or None
+        Of a zoom: change of the terms by octave of focal length.
+    focal_octaves : float
+        Of a zoom: log2 of the focal length, in mm, that `terms` belong to.
     """
 
     terms: NDArray[np.float64]
@@ -85,6 +90,8 @@ class Wavefront:
     f_number: float
     size: int
     error: float = 1.0
+    slopes: NDArray[np.float64] | None = None
+    focal_octaves: float = 0.0
 
     def kernel(self, position: FieldPosition, settings: LensSettings, size: int) -> Kernel:
         """Kernel of the image frame, centred, of odd side `size`; three wavelengths to a channel."""
@@ -105,8 +112,15 @@ class Wavefront:
     def blur(self, position: FieldPosition, settings: LensSettings) -> NDArray[np.float64]:
         """Blur of the terms of `pupil` in pixels, tilts zero, shape (8,)."""
         found = np.zeros(8)
-        found[:6] = stopped(design(position, settings), self.stop(settings)) @ self.terms
+        terms = self.terms
+        if self.slopes is not None:
+            terms = terms + self.slopes * self.octaves(settings)
+        found[:6] = stopped(design(position, settings), self.stop(settings)) @ terms
         return found
+
+    def octaves(self, settings: LensSettings) -> float:
+        """Focal length from `focal_octaves` on; an unknown one counts as that."""
+        return 0.0 if settings.focal_mm is None else math.log2(settings.focal_mm) - self.focal_octaves
 
     def grid(self, settings: LensSettings, shift_nm: float = 0.0, size: int | None = None) -> PupilGrid:
         """Pupil and transform of a channel at an aperture."""

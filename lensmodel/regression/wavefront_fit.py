@@ -11,7 +11,7 @@ import numpy as np
 from lensmodel.psf import PsfSample
 from lensmodel.regression.starts import starts
 from lensmodel.regression.wavefront import NAMES, Wavefront, design, stopped
-from lensmodel.regression.wavefront_problem import PRIOR_PX, USUAL_EYE, Problem
+from lensmodel.regression.wavefront_problem import PRIOR_PX, SLOPE_PX, USUAL_EYE, Problem
 from lensmodel.types import WAVELENGTH_NM, Kernel
 
 _USUAL_F, _USUAL_PITCH_UM = 2.8, 4.5
@@ -25,9 +25,12 @@ _LEAST_HALF, _HELD_LIGHT = 5, 0.98
 MIN_SAMPLES = 12
 """Fewer samples make no wavefront."""
 
+ONE_FOCAL_LENGTH = 0.25
+"""Octaves within which focal lengths are one."""
+
 
 def fit_wavefront(samples: Sequence[PsfSample], start: Wavefront | None = None) -> Wavefront | None:
-    """Fit the wavefront of a lens to samples of one focal length.
+    """Fit the wavefront of a lens to samples, of several focal lengths if it is a zoom.
 
     Parameters
     ----------
@@ -43,7 +46,8 @@ def fit_wavefront(samples: Sequence[PsfSample], start: Wavefront | None = None) 
 
     Notes
     -----
-    At most 36 samples spread over field and settings take part: the unknowns are few.
+    At most 36 samples spread over field and settings take part, twice as many of a zoom: the unknowns are
+    few. Focal lengths within a quarter octave are one.
     """
     kept = [s for s in samples if s.weight > 0]
     if len(kept) < MIN_SAMPLES:
@@ -55,17 +59,17 @@ def fit_wavefront(samples: Sequence[PsfSample], start: Wavefront | None = None) 
     kept.sort(key=_order)
     log_q = math.log(WAVELENGTH_NM["g"] / 1000.0 * widest / pitch)
     vague = 0.03 if apertures and pitches else (0.3 if apertures else 0.5)
-    few, many = spread(kept, _COARSE), spread(kept, _FINE)
+    zoom = focal_range(kept) > ONE_FOCAL_LENGTH
+    few, many = spread(kept, _COARSE * (1 + zoom)), spread(kept, _FINE * (1 + zoom))
     size = max(_side_of_light(s.kernel) for s in many)
     begins = [start] if start is not None else []
     if start is None:
         usual = Wavefront(np.zeros(len(NAMES)), log_q, USUAL_EYE, widest, size)
-        designs = np.stack([stopped(design(s.position, s.settings), usual.stop(s.settings)) for s in many])
+        if zoom:
+            known = [math.log2(s.settings.focal_mm) for s in kept if s.settings.focal_mm is not None]
+            usual = replace(usual, slopes=np.zeros(len(NAMES)), focal_octaves=float(np.median(known)))
         coarse = Problem(tuple(few), size, log_q, vague, _BLUR_PX)
-        tried = [
-            coarse.solve(replace(usual, terms=terms), _COARSE_ROUNDS)
-            for terms in starts(many, designs, PRIOR_PX, math.exp(log_q), _STARTS)
-        ]
+        tried = [coarse.solve(front, _COARSE_ROUNDS) for front in _starts(many, usual)]
         # the best fit of few blurred samples need not lead to the best of all sharp ones
         begins = [front for front, _, _ in sorted(tried, key=lambda found: found[1])[:_REFINED]]
     fine = Problem(tuple(many), size, log_q, vague, 0.0)
@@ -77,7 +81,40 @@ def fit_wavefront(samples: Sequence[PsfSample], start: Wavefront | None = None) 
             other, other_cost, other_errors = fine.solve(replace(found, log_q=guess), _FINE_ROUNDS)
             if other_cost < cost:
                 found, cost, errors = other, other_cost, other_errors
+    if zoom:
+        # turned by 180 degrees at one end only, spots without coma stay as they are
+        other, other_cost, other_errors = fine.solve(_turned_at_one_end(found, kept), _FINE_ROUNDS)
+        if other_cost < cost:
+            found, errors = other, other_errors
     return replace(found, error=float(np.median(errors)))
+
+
+def focal_range(samples: Sequence[PsfSample]) -> float:
+    """Octaves between the shortest and the longest focal length that samples name."""
+    known = [s.settings.focal_mm for s in samples if s.settings.focal_mm is not None]
+    return math.log2(max(known) / min(known)) if known else 0.0
+
+
+def _starts(samples: Sequence[PsfSample], usual: Wavefront) -> list[Wavefront]:
+    """Wavefronts whose ray spots have the moments of samples."""
+    designs = np.stack([stopped(design(s.position, s.settings), usual.stop(s.settings)) for s in samples])
+    q, count = math.exp(usual.log_q), len(NAMES)
+    if usual.slopes is None:
+        return [replace(usual, terms=terms) for terms in starts(samples, designs, PRIOR_PX, q, _STARTS)]
+    octaves = np.array([usual.octaves(s.settings) for s in samples])
+    both = np.concatenate([designs, designs * octaves[:, None, None]], axis=2)
+    found = starts(samples, both, np.concatenate([PRIOR_PX, SLOPE_PX]), q, 2 * _STARTS)
+    return [replace(usual, terms=terms[:count], slopes=terms[count:]) for terms in found]
+
+
+def _turned_at_one_end(front: Wavefront, samples: Sequence[PsfSample]) -> Wavefront:
+    """Negate the terms at the longest focal length, those at the shortest stay."""
+    assert front.slopes is not None
+    octaves = [front.octaves(s.settings) for s in samples]
+    short, long = min(octaves), max(octaves)
+    first, last = front.terms + front.slopes * short, front.terms + front.slopes * long
+    slopes = (-last - first) / (long - short)
+    return replace(front, terms=first - slopes * short, slopes=slopes)
 
 
 def _order(sample: PsfSample) -> tuple[float, float, float, str, str]:
@@ -95,7 +132,7 @@ def _side_of_light(kernel: Kernel) -> int:
 
 
 def spread(samples: Sequence[PsfSample], count: int) -> list[PsfSample]:
-    """Choose samples far from each other in place, colour and stops; the first is the best one."""
+    """Choose samples far from each other in place and settings; the first is the best one."""
     if len(samples) <= count:
         return list(samples)
     where = np.array(
@@ -105,6 +142,7 @@ def spread(samples: Sequence[PsfSample], count: int) -> list[PsfSample]:
                 s.position.r * math.sin(s.position.phi),
                 0.004 * WAVELENGTH_NM[s.settings.channel],
                 0.2 * (s.settings.stops or 0.0),
+                0.4 * math.log2(s.settings.focal_mm or 1.0),
             )
             for s in samples
         ]

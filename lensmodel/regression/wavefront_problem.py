@@ -24,6 +24,9 @@ PRIOR_PX: Final = np.array(
 """Usual size of each linear unknown, in pixels."""
 
 USUAL_EYE: Final = (1.15, 0.25)
+SLOPE_PX: Final = 0.6 * PRIOR_PX
+"""Usual change of each linear unknown by octave of focal length."""
+
 _SHAPE_PRIOR: Final = np.array([0.15, 0.3])  # of the cat's eye: radius and shift per unit of field
 _NOISE = 0.1  # relative L2 that a good sample has against the best wavefront
 _HUBER = 0.35
@@ -102,9 +105,14 @@ class Problem:
         list[tuple[NDArray[np.float64], NDArray[np.float64]]],
     ]:
         """Cost, normal matrix, gradient, relative L2 of each sample, and how tilts follow a step."""
-        count = len(NAMES) + 3  # log q and the cat's eye
-        precision = np.concatenate([PRIOR_PX**-2.0, [self.vague**-2.0], _SHAPE_PRIOR**-2.0])
-        apart = np.concatenate([front.terms, [front.log_q - self.log_q], np.subtract(front.eye, USUAL_EYE)])
+        slopes = np.empty(0) if front.slopes is None else front.slopes
+        count = len(NAMES) + 3 + slopes.size  # log q and the cat's eye
+        precision = np.concatenate(
+            [PRIOR_PX**-2.0, [self.vague**-2.0], _SHAPE_PRIOR**-2.0, SLOPE_PX[: slopes.size] ** -2.0]
+        )
+        apart = np.concatenate(
+            [front.terms, [front.log_q - self.log_q], np.subtract(front.eye, USUAL_EYE), slopes]
+        )
         normal, gradient = np.diag(precision), precision * apart
         cost = float(precision @ apart**2)
         errors, locals_ = np.zeros(len(self.samples)), []
@@ -154,11 +162,15 @@ class Problem:
         kernel = flat[-1] / total
         normalised = flat[:-1] / total - np.outer(sums / total, kernel)
         terms = stopped(linear, front.stop(settings)).T @ normalised[:6]
-        return kernel, np.concatenate([terms, normalised[[10, 8, 9]]]), normalised[6:8]
+        columns = [terms, normalised[[10, 8, 9]]]
+        if front.slopes is not None:
+            columns.append(terms * front.octaves(settings))
+        return kernel, np.concatenate(columns), normalised[6:8]
 
 
 def _moved(front: Wavefront, step: NDArray[np.float64]) -> Wavefront:
     n = len(NAMES)
     q = float(np.clip(front.log_q + step[n], math.log(0.1), math.log(12.0)))
     eye = (max(front.eye[0] + float(step[n + 1]), 0.4), front.eye[1] + float(step[n + 2]))
-    return replace(front, terms=front.terms + step[:n], log_q=q, eye=eye)
+    slopes = None if front.slopes is None else front.slopes + step[n + 3 :]
+    return replace(front, terms=front.terms + step[:n], log_q=q, eye=eye, slopes=slopes)

@@ -100,19 +100,6 @@ class TestCombined:
 
         assert error("combined") < 1.1 * error("blended")
 
-    def test_several_focal_lengths_have_no_common_wavefront(self) -> None:
-        samples = [
-            PsfSample(s.kernel, s.position, LensSettings(focal_mm=24.0 if i % 2 else 70.0), photo=s.photo)
-            for i, s in enumerate(of_lens(4, 2))
-        ]
-        answer = (
-            LensModel.fit(samples, ModelSettings(method="combined"))
-            .warmed()
-            .query(FieldPosition(0.3, 0.2), LensSettings(focal_mm=24.0), 21)
-        )
-
-        assert answer.wavefront_share == 0.0
-
     def test_waits_for_the_wavefront_until_it_is_asked_to_be_warm(self) -> None:
         model = LensModel.fit(of_lens(4, 2))
         steps: list[tuple[int, int]] = []

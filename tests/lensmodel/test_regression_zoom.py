@@ -1,0 +1,111 @@
+"""One wavefront over the focal lengths of a zoom."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lensmodel.psf import PsfSample, distance, gaussian
+from lensmodel.regression import LensModel
+from lensmodel.regression.judgement import held_together
+from lensmodel.regression.wavefront import NAMES, Wavefront
+from lensmodel.regression.wavefront_fit import fit_wavefront
+from lensmodel.simulate import draw_lens
+from lensmodel.types import FieldPosition, Kernel, LensSettings
+
+SIZE = 31
+LENS = draw_lens(1001, "zoom")
+SHORT, LONG = LENS.focal_mm
+CORNER, MID = FieldPosition(0.85, 0.9), FieldPosition(0.5, -2.0)
+
+
+def at(focal_mm: float) -> LensSettings:
+    return LensSettings(aperture=LENS.at_focal().f_number, focal_mm=focal_mm)
+
+
+def taken(focal_mm: float, rings: tuple[float, ...], photo: str) -> list[PsfSample]:
+    """True kernels at four places of each ring."""
+    places = [FieldPosition(r, a + 3.0 * r - 3.0) for r in rings for a in np.arange(4) * math.pi / 3]
+    settings = at(focal_mm)
+    return [
+        PsfSample(LENS.kernel(p, settings, SIZE), p, settings, photo=photo, pixel_pitch_um=4.5)
+        for p in places
+    ]
+
+
+def error(kernel: Kernel, place: FieldPosition, focal_mm: float) -> float:
+    return distance(kernel, LENS.kernel(place, at(focal_mm), SIZE)).rel_l2
+
+
+@pytest.fixture(scope="module")
+def many() -> list[PsfSample]:
+    return taken(SHORT, (0.15, 0.4, 0.6, 0.75, 0.9), "short")
+
+
+@pytest.fixture(scope="module")
+def few() -> list[PsfSample]:
+    return taken(LONG, (0.3, 0.7), "long")[1:7]
+
+
+def test_terms_follow_a_straight_line_over_octaves() -> None:
+    rng = np.random.default_rng(0)
+    terms, slopes = rng.normal(0.0, 0.4, (2, len(NAMES)))
+    zoom = Wavefront(terms, math.log(0.3), (1.15, 0.3), 2.8, SIZE, slopes=slopes, focal_octaves=5.0)
+
+    twice = zoom.kernel(MID, LensSettings(2.8, 64.0), SIZE)
+    plain = replace(zoom, terms=terms + slopes, slopes=None).kernel(MID, LensSettings(2.8, 64.0), SIZE)
+    unknown = zoom.kernel(MID, LensSettings(2.8), SIZE)
+
+    assert np.allclose(twice, plain)
+    assert np.allclose(unknown, replace(zoom, slopes=None).kernel(MID, LensSettings(2.8), SIZE))
+    assert distance(twice, unknown).rel_l2 > 0.05
+
+
+def test_few_samples_at_one_end_of_a_zoom_lean_on_those_of_the_other(
+    many: list[PsfSample], few: list[PsfSample]
+) -> None:
+    alone = LensModel.fit(few).warmed()
+
+    front = fit_wavefront([*many, *few])
+
+    assert front is not None
+    for place in (CORNER, MID):
+        shared = error(front.kernel(place, at(LONG), SIZE), place, LONG)
+        assert shared < 0.6 * error(alone.query(place, at(LONG), SIZE).kernel, place, LONG)
+        assert error(front.kernel(place, at(SHORT), SIZE), place, SHORT) < 0.08
+
+
+@pytest.mark.slow
+def test_zoom_in_the_mixture_is_kept_by_what_was_learned_and_hardly_worse_at_the_other_end(
+    many: list[PsfSample], few: list[PsfSample]
+) -> None:
+    samples = [*many, *few]
+    model, alone = LensModel.fit(samples).warmed(), LensModel.fit(many).warmed()
+
+    again = LensModel.restored(samples, model.learned())
+
+    both = model.query(CORNER, at(LONG), SIZE), again.query(CORNER, at(LONG), SIZE)
+    assert both[0].wavefront_share > 0.2
+    assert np.abs(both[0].kernel - both[1].kernel).max() < 1e-5
+    for place in (CORNER, MID):
+        own = error(alone.query(place, at(SHORT), SIZE).kernel, place, SHORT)
+        assert error(model.query(place, at(SHORT), SIZE).kernel, place, SHORT) < own + 0.02
+
+
+@pytest.mark.parametrize(("last", "apart"), [(100.0, True), (None, False), (52.0, False)])
+def test_photo_alone_at_its_focal_length_is_held_out_sample_by_sample(
+    last: float | None, apart: bool
+) -> None:
+    kernel, photo = gaussian(5, np.eye(2)), np.array([0, 0, 1, 2, 2])
+    samples = [
+        PsfSample(kernel, MID, LensSettings(2.8, focal), photo=str(number))
+        for focal, number in zip((50.0, 50.0, 52.0, last, last), photo, strict=True)
+    ]
+
+    groups = held_together(samples, photo)
+
+    assert groups[0] == groups[1] != groups[2]
+    assert (groups[3] != groups[4]) == apart

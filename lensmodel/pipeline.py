@@ -225,6 +225,7 @@ def estimate_cell(
                 error=estimate.predicted_error if math.isfinite(estimate.predicted_error) else None,
                 spectrum=PatchSpectrum.of(plane, noise, width),
                 evidence=evidence,
+                half_diagonal_px=developed.frame.half_diagonal,
             )
             stored = None if evidence is None else evidence.to_bytes()
             diagnostics = {**estimate.diagnostics, "predicted_error": estimate.predicted_error}
@@ -456,7 +457,7 @@ def correct_photo(
         planes, lateral, cfa = resample(planes, developed.frame, lateral), None, None
     return deconv.correct_planes(
         planes,
-        model.field(settings, pitch_um=pitch_um),
+        model.field(settings, pitch_um=pitch_um, half_diagonal_px=developed.frame.half_diagonal),
         developed.frame,
         method=method,
         strength=strength,
@@ -501,10 +502,12 @@ def correct(
         workers=workers,
         on_step=on_step,
     )
+    encoding = developed.encoding
+    del developed  # its planes are as large as the result: at 100 megapixels, 1.1 GiB
     photo.write_image(
         output,
         corrected.planes,
-        developed.encoding,
+        encoding,
         format=file_format,
         color_space=color_space,
         quality=quality,

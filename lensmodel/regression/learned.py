@@ -33,7 +33,7 @@ from lensmodel.regression.transport import WidthField
 from lensmodel.regression.validation import Choice
 from lensmodel.regression.wavefront import NAMES, Wavefront
 
-VERSION: Final = 3
+VERSION: Final = 4
 """Raised whenever the same samples would be fitted otherwise."""
 
 _MOST_BYTES = 1 << 27
@@ -117,7 +117,14 @@ def _belongs(samples: Sequence[PsfSample], settings: ModelSettings) -> str:
     """Checksum of settings and of what names the samples: their pixels are rounded when they are stored."""
     found = zlib.crc32(json.dumps(asdict(settings), sort_keys=True).encode())
     for s in samples:
-        named = (s.photo, s.estimator, round(s.weight, 6), s.pixel_pitch_um, s.kernel.shape[0], s.settings)
+        named = (
+            s.photo,
+            s.estimator,
+            round(s.weight, 6),
+            pitches.pixel_of(s, settings.unit),
+            s.kernel.shape[0],
+            s.settings,
+        )
         found = zlib.crc32(f"{named} {s.position.r:.6f} {s.position.phi:.6f}".encode(), found)
     return f"{len(samples)}-{found:08x}"
 
@@ -158,8 +165,8 @@ def _of(arrays: Arrays, prefix: str) -> dict[str, Any]:
 def _fit(
     document: Mapping[str, Any], arrays: Arrays, samples: Sequence[PsfSample], settings: ModelSettings
 ) -> Fit:
-    pitch = pitches.usual_pitch(samples)
-    common = pitches.at_pitch(samples, pitch)
+    pixel = pitches.usual_pixel(samples, settings.unit)
+    common = pitches.at_pixel(samples, pixel, settings.unit)
     where = va.points(common)
     widths = WidthField(slopes=arrays.get("widths.slopes"), **document["widths"])
     local = LocalKernels.of(common, where, widths)
@@ -195,7 +202,7 @@ def _fit(
         raise ValueError(f"no mode {mode!r}")
     va.scales(rule), va.scales(used)
     return Fit(
-        pitch_um=pitch,
+        pixel=pixel,
         size=int(document["size"]),
         widths=widths,
         local=local,
@@ -208,4 +215,5 @@ def _fit(
         physical=physical,
         statistics=statistics_of(common, settings),
         mode=mode,
+        unit=settings.unit,
     )

@@ -18,7 +18,7 @@ from lensmodel.psf import PsfSample, distance, rms_width
 from lensmodel.regression.pooled.fit import SYMMETRIC, PatchView, PooledFit, fit_spectra
 from lensmodel.regression.pooled.scene import SceneView
 from lensmodel.regression.starts import starts
-from lensmodel.regression.wavefront import Wavefront, design, stopped
+from lensmodel.regression.wavefront import NAMES, Wavefront, design, stopped
 from lensmodel.regression.wavefront_fit import fit_wavefront, spread
 from lensmodel.regression.wavefront_problem import PRIOR_PX, USUAL_EYE
 from lensmodel.types import WAVELENGTH_NM, Channel, FieldPosition, Kernel, StepHook, ignore_step
@@ -28,9 +28,21 @@ MIN_PLACES: Final = 8
 
 _COMA = slice(2, 6)  # the odd terms
 _COARSE_PLACES, _MEDIUM_PLACES, _FINE_PLACES = 14, 24, 48
-_COARSE_ROUNDS, _MEDIUM_ROUNDS, _FINE_ROUNDS = 8, 6, 12
-_STARTS, _KEPT, _REFINED = 16, 4, 3
-_SAME_COST = 1.0
+_COARSE_ROUNDS, _MEDIUM_ROUNDS, _FINE_ROUNDS = 7, 6, 12
+_STARTS, _KEPT, _REFINED = 6, 6, 3
+_RANDOM = 24
+_SAME_PX = 0.4
+_USUAL_SHAPE: Final = {
+    "spherical": 1.2,
+    "coma": 1.5,
+    "field curvature": 1.3,
+    "astigmatism": 1.3,
+}
+"""Spread of the terms of a random wavefront, in widths of the samples' kernels."""
+
+_BALANCED, _FOCUS_SPREAD = -1.1, 0.5
+"""Who focuses balances spherical aberration: the spot is smallest between -1 and -4/3 of it."""
+
 _TAIL_SIDE = 31
 _DRAWS, _SEED = 6, 0
 _OVERCONFIDENCE = 2.0
@@ -123,10 +135,12 @@ def pool(samples: Sequence[PsfSample], on_step: StepHook = ignore_step) -> Poole
         replace(first, terms=terms * (centred > 0), eye=USUAL_EYE)
         for terms in starts(heads, designs, np.maximum(centred, 1e-3), math.exp(first.log_q), _STARTS)
     ]
+    begins += _random_fronts(first, float(np.median([rms_width(s.kernel) for s in heads])))
     at = {id(head): group for head, group in zip(heads, places, strict=True)}
     chosen = [at[id(s)] for s in spread(heads, _FINE_PLACES)]
-    best = _searched(chosen, begins, on_step)
-    tails = _tail_vote(best.front, heads)
+    votes = [(_tail_vote(fit.front, heads), fit) for fit in _searched(chosen, begins, on_step)]
+    # a vote of z standard deviations is a likelihood too: z^2 beside a cost of chi^2
+    tails, best = min(votes, key=lambda vote: vote[1].cost - vote[0] ** 2)
     if tails < 0:
         best = replace(best, front=_negative(best.front))
     trust: dict[str, list[float]] = {}
@@ -137,7 +151,7 @@ def pool(samples: Sequence[PsfSample], on_step: StepHook = ignore_step) -> Poole
 
 def _searched(
     chosen: Sequence[dict[Channel, PsfSample]], begins: Sequence[Wavefront], on_step: StepHook
-) -> PooledFit:
+) -> list[PooledFit]:
     """Fit from many starts: all of them coarsely and centred, the best in green, the best of those in full.
 
     Where the pupil is round, a wavefront whose coma is negated has the same spectra as before. Only the
@@ -162,7 +176,24 @@ def _searched(
         refined.append(fit_spectra(fine, fit.front, rounds=_FINE_ROUNDS))
         on_step(done := done + _FINE_ROUNDS, total)
     on_step(total, total)
-    return min(refined, key=_cost)
+    return refined
+
+
+def _random_fronts(first: Wavefront, width: float) -> list[Wavefront]:
+    """Draw centred lenses that blur about as much as the samples.
+
+    Kernels that were estimated one by one have the widths of the lens, not always its character: where
+    spherical aberration is balanced by focus, their moments lead elsewhere.
+    """
+    rng, found = np.random.default_rng(_SEED), []
+    for _ in range(_RANDOM):
+        terms = np.zeros(len(NAMES))
+        for name, usual in _USUAL_SHAPE.items():
+            terms[NAMES.index(name)] = rng.normal(0.0, usual)
+        balance = _BALANCED * terms[NAMES.index("spherical")]
+        terms[NAMES.index("focus")] = balance + rng.normal(0.0, _FOCUS_SPREAD)
+        found.append(replace(first, terms=width * terms, eye=USUAL_EYE))
+    return found
 
 
 def _negative(front: Wavefront) -> Wavefront:
@@ -194,12 +225,19 @@ def _cost(fit: PooledFit) -> float:
 
 
 def _different(fits: Sequence[PooledFit]) -> list[PooledFit]:
-    """Fits that ended in different minima, the best first."""
+    """Fits that ended in different minima, the best first; a wavefront and its negative count as one.
+
+    Their costs say nothing of that: unlike lenses can be about as likely.
+    """
     kept: list[PooledFit] = []
     for fit in sorted(fits, key=_cost):
-        if all(abs(fit.cost - other.cost) > _SAME_COST for other in kept):
+        if all(_apart(fit.front.terms, other.front.terms) > _SAME_PX for other in kept):
             kept.append(fit)
     return kept
+
+
+def _apart(terms: NDArray[np.float64], others: NDArray[np.float64]) -> float:
+    return float(min(np.abs(terms - others).max(), np.abs(terms + others).max()))
 
 
 def _places(samples: Sequence[PsfSample]) -> list[dict[Channel, PsfSample]]:

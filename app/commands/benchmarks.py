@@ -167,6 +167,10 @@ def model(
     psf_field: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Measured instead: npz of PSFs, or TIFF of stars.")
     ] = None,
+    photographs: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Sharp photographs: estimate patches of those blindly."),
+    ] = None,
     json_output: JsonFile = None,
     force: Force = False,
     quiet: Quiet = False,
@@ -199,6 +203,7 @@ def model(
         photos=counts,
         methods=None if methods is None else _names(methods),
         psf_field=psf_field,
+        photographs=photographs,
     )
     _tell(shown, json_output, result, table(result))
 
@@ -210,6 +215,7 @@ def _model(
     photos: Sequence[int],
     methods: Sequence[str] | None = None,
     psf_field: Path | None = None,
+    photographs: Path | None = None,
 ) -> dict[str, Any]:
     from lensmodel.bench.model import run_model_benchmark  # noqa: PLC0415 - see the top of the module
 
@@ -220,6 +226,7 @@ def _model(
             photos=photos,
             methods=methods,
             psf_field=psf_field,
+            photographs=photographs,
             on_step=lambda done, total: bars.update(task, completed=done, total=total),
         )
 

@@ -42,6 +42,12 @@ def reproduce(
         bool,
         typer.Option("--hard", help="Add scenes that hurt: depth, motion, night, sky, snow, text, foliage."),
     ] = False,
+    lenses: Annotated[
+        int | None,
+        typer.Option(
+            "--lenses", metavar="N", min=1, help="Only the first N lenses; a later run adds others."
+        ),
+    ] = None,
     direct: Annotated[
         bool, typer.Option("--direct", help="Use the library in this process, not a service.")
     ] = False,
@@ -89,7 +95,7 @@ def reproduce(
     )
 
     size: Size = "quick" if quick else "full" if full else "default"
-    plan = planned(size, scenes=scenes or _external(), estimator=estimator, hard=hard)
+    plan = planned(size, scenes=scenes or _external(), estimator=estimator, hard=hard, lenses=lenses)
     result = run_reproduction(
         plan,
         _direct(estimator) if direct else ServiceRoutes(estimator),

@@ -1,9 +1,11 @@
 """How well regressions predict the PSF where no sample was: simulated lenses, or measured fields.
 
-Two kinds of input:
+Three kinds of input:
 
 * lenses of `draw_lens` whose kernels are known: models are fed with true kernels at the patches of
   n photos and asked at places in between and beyond;
+* the same lenses behind photographs whose patches are estimated blindly (`--photographs FOLDER`): there the
+  ways to answer from kernels, from pooled evidence and from one wavefront can be compared;
 * a file of measured PSFs (`--psf-field FILE.npz`, keys psf (n, k, k), r, phi, and optionally
   aperture and group) or a TIFF of a star field: groups are held out in turn.
 
@@ -29,11 +31,14 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.ndimage import gaussian_filter
 from scipy.signal import fftconvolve
 
+from lensmodel.bench.cases import list_photos, photo_half
+from lensmodel.bench.estimated import estimated_samples
 from lensmodel.bench.stars import stars_of
 from lensmodel.errors import InvalidInputError
 from lensmodel.geometry import Frame, zone_of
 from lensmodel.psf import PsfSample, as_kernel, centred, distance, gaussian
 from lensmodel.regression import LensModel, ModelSettings, PaperModel, fit_wavefront, smoothers
+from lensmodel.regression.answer import MIXED, MODES
 from lensmodel.simulate import draw_lens
 from lensmodel.types import ZONES, FieldPosition, Kernel, LensSettings, StepHook, Zone, ignore_step
 
@@ -105,6 +110,7 @@ def run_model_benchmark(
     methods: Sequence[str] | None = None,
     psf_field: Path | None = None,
     spoiled: float = 0.0,
+    photographs: Path | None = None,
     on_step: StepHook = ignore_step,
 ) -> dict[str, Any]:
     """Compare methods of regression by the error of their predictions.
@@ -116,12 +122,16 @@ def run_model_benchmark(
     photos : sequence of int
         How many photos of 24 patches a model sees.
     methods : sequence of str, optional
-        Names in `smoothers`, "eff-linear", "polynomial", "wavefront" or "paper"; all by default.
+        Names in `smoothers`, "eff-linear", "polynomial", "wavefront", "paper", or the modes "mode-kernels",
+        "mode-evidence", "mode-wavefront", "mode-likeliest"; by default all, but modes only of `photographs`.
     psf_field : Path, optional
         Measured PSFs; then `seeds` and `photos` play no part.
     spoiled : float
         Relative L2 of the kernels that models are fed with, see `like_estimated`; they are asked for
         the true ones in any case.
+    photographs : Path, optional
+        Folder of sharp photographs; models are fed with blind estimates of patches of them, those of the
+        test half, in an order drawn for each lens.
     on_step : StepHook
         Told after each fit of a method with its questions.
 
@@ -130,7 +140,7 @@ def run_model_benchmark(
     dict
         `rows` of method, photos, errors by zone, seconds; and what was asked.
     """
-    fits = _fits(methods)
+    fits = _fits(methods, evidence=photographs is not None)
     if psf_field is not None:
         samples = load_field(psf_field)
         rows: list[Row] = []
@@ -146,17 +156,22 @@ def run_model_benchmark(
     for seed in seeds:
         lens = draw_lens(seed)
         rng = np.random.default_rng(seed)
-        samples = [
-            PsfSample(lens.kernel(place, None, SIZE), place, photo=f"photo{i}")
-            for i in range(max(photos))
-            for place in patch_places(rng)
-        ]
+        samples = (
+            [
+                PsfSample(lens.kernel(place, None, SIZE), place, photo=f"photo{i}")
+                for i in range(max(photos))
+                for place in patch_places(rng)
+            ]
+            if photographs is None
+            else estimated_samples(lens, _drawn(photographs, seed, max(photos)), seed)
+        )
         if spoiled > 0:
             spoil = np.random.default_rng([seed, 1])
             samples = [replace(s, kernel=like_estimated(s.kernel, spoil, spoiled)) for s in samples]
         truth = [(place, lens.kernel(place, None, SIZE)) for place in asked_places()]
         for count in photos:
-            seen = samples[: count * PATCHES[0] * PATCHES[1]]
+            names = {f"photo{i}" for i in range(count)}
+            seen = [s for s in samples if s.photo in names]
             for name, fit in fits.items():
                 start = time.process_time()
                 predict = fit(seen)
@@ -166,7 +181,8 @@ def run_model_benchmark(
                 done += 1
                 on_step(done, total)
     rows = [_row(name, count, errors, seconds[name, count]) for (name, count), errors in collected.items()]
-    return {"seeds": list(seeds), "spoiled": spoiled, "rows": [_plain(row) for row in rows]}
+    told = {"seeds": list(seeds), "spoiled": spoiled, "photographs": photographs is not None}
+    return {**told, "rows": [_plain(row) for row in rows]}
 
 
 def predictor(method: str, samples: Sequence[PsfSample]) -> Predictor:
@@ -212,23 +228,35 @@ def load_field(path: Path) -> list[PsfSample]:
     ]
 
 
-def _fits(methods: Sequence[str] | None) -> dict[str, Fit]:
+def _drawn(folder: Path, seed: int, count: int) -> list[Path]:
+    """Photographs of the test half that a lens is used for."""
+    files = [p for p in list_photos(folder) if photo_half(p.stem) == "test"]
+    if len(files) < count:
+        raise InvalidInputError(
+            f"{folder} holds {len(files)} photographs of the test half; {count} are needed"
+        )
+    return [files[i] for i in np.random.default_rng(seed).permutation(len(files))[:count]]
+
+
+def _fits(methods: Sequence[str] | None, *, evidence: bool = False) -> dict[str, Fit]:
     known: dict[str, Fit] = {
         "eff-linear": _linear,
         "polynomial": _polynomial,
         "paper": _paper,
         "wavefront": _wavefront,
-        **{name: _regression(name) for name in smoothers},
+        **{name: _regression(ModelSettings(method=name)) for name in smoothers},
+        **{f"mode-{mode}": _regression(ModelSettings(mode=mode)) for mode in MODES if mode != MIXED},
     }
     unknown = [name for name in methods or () if name not in known]
     if unknown:
         raise InvalidInputError(f"no method {unknown[0]!r}; known: {', '.join(sorted(known))}")
-    return {name: known[name] for name in methods or known}
+    usual = [name for name in known if evidence or not name.startswith("mode-")]
+    return {name: known[name] for name in methods or usual}
 
 
-def _regression(method: str) -> Fit:
+def _regression(chosen: ModelSettings) -> Fit:
     def fit(samples: Sequence[PsfSample]) -> Predictor:
-        model = LensModel.fit(samples, ModelSettings(method=method)).warmed()
+        model = LensModel.fit(samples, chosen).warmed()
         settings, size = samples[0].settings, samples[0].kernel.shape[0]
         return lambda place: model.query(place, settings, size).kernel
 
@@ -320,6 +348,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--methods", default=None, help="names with commas; all by default")
     parser.add_argument("--psf-field", type=Path, default=None, help="npz of measured PSFs, or TIFF of stars")
     parser.add_argument("--spoiled", type=float, default=0.0, help="relative L2 of the kernels fed")
+    parser.add_argument("--photographs", type=Path, default=None, help="folder; estimate patches of those")
     parser.add_argument("--json", type=Path, default=None, help="also write the result there")
     given = parser.parse_args(arguments)
     first, last = (int(part) for part in given.seeds.split(":"))
@@ -329,6 +358,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         methods=None if given.methods is None else given.methods.split(","),
         psf_field=given.psf_field,
         spoiled=given.spoiled,
+        photographs=given.photographs,
     )
     sys.stdout.write(table(result) + "\n")
     if given.json is not None:

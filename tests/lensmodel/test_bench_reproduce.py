@@ -97,6 +97,18 @@ def test_scenes_that_hurt_are_taken_when_asked_for_and_in_full(size: Size, hard:
     assert {one.condition for one in cases} == {BASE, *PATHS, *SCENES_THAT_HURT}
 
 
+def test_fewer_lenses_are_the_first_ones_and_their_results_serve_more() -> None:
+    some, every = planned("default", lenses=3), planned("default")
+    base = [one for one in some.cases if one.condition == BASE]
+
+    assert base == [one for one in every.cases if one.condition == BASE][:3]
+    assert {one.seed for one in some.cases} == {1000, 1001, 1002}
+    assert key_of(base[0], some, "direct", "abc") == key_of(every.cases[0], every, "direct", "abc")
+    assert len(planned("quick", lenses=1).cases) == 1
+    with pytest.raises(InvalidInputError, match="at least one lens"):
+        planned("quick", lenses=0)
+
+
 def test_unknown_condition_is_refused() -> None:
     with pytest.raises(InvalidInputError, match="known: base, high-iso"):
         case(condition="fog")

@@ -158,7 +158,12 @@ class Reproduction:
 
 
 def planned(
-    size: Size, *, scenes: Path | None = None, estimator: str = "default", hard: bool = False
+    size: Size,
+    *,
+    scenes: Path | None = None,
+    estimator: str = "default",
+    hard: bool = False,
+    lenses: int | None = None,
 ) -> Reproduction:
     """Plan a run of one of three sizes.
 
@@ -175,15 +180,25 @@ def planned(
         See `Reproduction`.
     hard : bool
         Take the scenes that hurt too, each with two lenses.
+    lenses : int or None
+        Only so many of the lenses, the first ones; results of a smaller run serve a larger one.
+
+    Raises
+    ------
+    InvalidInputError
+        If `lenses` is below one.
 
     Notes
     -----
     With few photographs the largest n shrinks to what they allow without using one twice.
     """
     files = scene_files(scenes)
-    seeds = range(FIRST_SEED, FIRST_SEED + 8)
+    if lenses is not None and lenses < 1:
+        raise InvalidInputError(f"a reproduction takes at least one lens, not {lenses}")
+    seeds = range(FIRST_SEED, FIRST_SEED + 8)[:lenses]
     if size == "quick":
-        cases = tuple(_case(seed, (1, 2), files, _QUICK_FRAME) for seed in (FIRST_SEED, FIRST_SEED + 4))
+        two = (FIRST_SEED, FIRST_SEED + 4)[:lenses]
+        cases = tuple(_case(seed, (1, 2), files, _QUICK_FRAME) for seed in two)
     else:
         few = _allowed((1, 2, 5), len(files))
         cases = tuple(_case(seed, few, files) for seed in seeds)
@@ -194,10 +209,10 @@ def planned(
         many = _allowed((10, 20), 2 * len(files))
         cases += tuple(_case(seed, many, files) for seed in seeds if many != few)
     names = (PATHS if size != "quick" or hard else ()) + (SCENES_THAT_HURT if hard or size == "full" else ())
-    lenses = {"quick": 1, "default": 2, "full": 4}[size]
+    each = min({"quick": 1, "default": 2, "full": 4}[size], len(seeds))
     for number, name in enumerate(names):
         # other lenses for each, in turn, as unlike each other as they come
-        chosen = [seeds[(number + 8 * i // lenses) % len(seeds)] for i in range(lenses)]
+        chosen = [seeds[(number + len(seeds) * i // each) % len(seeds)] for i in range(each)]
         frame = _QUICK_FRAME if size == "quick" else _HARD_FRAME
         cases += tuple(replace(_case(seed, (1,), files, frame), condition=name) for seed in chosen)
     return Reproduction(cases, scenes, estimator, programs=programs.installed(), size=size)

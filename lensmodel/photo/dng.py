@@ -276,7 +276,10 @@ def _common_tags(height: int, width: int, samples: int, photometric: int, shot: 
     tags.longs(_EXIF_IFD, 0)
     tags.raw(50706, _BYTE, bytes((1, 4, 0, 0)))  # DNGVersion
     tags.raw(50707, _BYTE, bytes((1, 1, 0, 0)))  # DNGBackwardVersion
-    tags.text(50708, f"{shot.camera_maker} {shot.camera_model}".strip() or "Unknown")  # UniqueCameraModel
+    # Most models carry their maker already; programs look cameras up by this name.
+    named = shot.camera_model.lower().startswith(shot.camera_maker.lower())
+    unique = shot.camera_model if named else f"{shot.camera_maker} {shot.camera_model}"
+    tags.text(50708, unique.strip() or "Unknown")  # UniqueCameraModel
     tags.text(50735, shot.body_serial)  # CameraSerialNumber
     return tags
 

@@ -211,3 +211,17 @@ def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError, match="aperture"):
         ShotInfo(aperture=0.0)
     assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    ("maker", "model", "unique"),
+    [("Maker", "Body 1", "Maker Body 1"), ("Maker", "Maker Body 1", "Maker Body 1"), ("", "Body", "Body")],
+)
+def test_camera_is_named_with_its_maker_once(tmp_path: Path, maker: str, model: str, unique: str) -> None:
+    path = tmp_path / "n.dng"
+    shot = ShotInfo(camera_maker=maker, camera_model=model)
+
+    write_bayer_dng(path, mosaic(), black=256, white=15872, shot=shot)
+
+    assert unique.encode() + b"\0" in path.read_bytes()
+    assert b"Maker Maker" not in path.read_bytes()

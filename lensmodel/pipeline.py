@@ -443,9 +443,11 @@ def correct_photo(
         `(row, col, height, width)` in sensor orientation; only that part is corrected.
     """
     model, pitch_um = model.warmed(), developed.info.metadata.pixel_pitch_um
+    half_px = developed.frame.half_diagonal
 
     def psf_error(position: FieldPosition, channel: Channel) -> float:
-        answer = model.query(position, settings.with_channel(channel), size=15, pitch_um=pitch_um)
+        asked = settings.with_channel(channel)
+        answer = model.query(position, asked, size=15, pitch_um=pitch_um, half_diagonal_px=half_px)
         error = answer.predicted_error if math.isfinite(answer.predicted_error) else 1.0
         # samples whose estimator said nothing of itself share the error that is usual
         return math.hypot(error, 0.0 if answer.shared_error > 0 else BLIND_BIAS)
@@ -457,7 +459,7 @@ def correct_photo(
         planes, lateral, cfa = resample(planes, developed.frame, lateral), None, None
     return deconv.correct_planes(
         planes,
-        model.field(settings, pitch_um=pitch_um, half_diagonal_px=developed.frame.half_diagonal),
+        model.field(settings, pitch_um=pitch_um, half_diagonal_px=half_px),
         developed.frame,
         method=method,
         strength=strength,

@@ -262,6 +262,8 @@ class PsfSample:
         Relative L2 distance to the truth that the method expects of it; None where it says nothing.
     evidence : PatchStatistics or None
         Normal equations of the patch, for models that solve those of many patches at once.
+    half_diagonal_px : float or None
+        Half the diagonal of the frame in pixels; None where unknown.
     """
 
     kernel: Kernel
@@ -274,11 +276,16 @@ class PsfSample:
     spectrum: PatchSpectrum | None = None
     error: float | None = None
     evidence: PatchStatistics | None = None
+    half_diagonal_px: float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kernel", as_kernel(self.kernel))
         if not 0.0 <= self.weight <= 1.0:
             raise InvalidInputError(f"weight must lie in 0..1, got {self.weight}")
+        if self.half_diagonal_px is not None and not (
+            math.isfinite(self.half_diagonal_px) and self.half_diagonal_px > 0
+        ):
+            raise InvalidInputError(f"the half diagonal must be positive pixels, got {self.half_diagonal_px}")
         if self.error is not None and not (math.isfinite(self.error) and self.error >= 0.0):
             raise InvalidInputError(f"the expected error must be finite and not negative, got {self.error}")
 

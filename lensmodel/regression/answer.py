@@ -18,6 +18,11 @@ LIKELIEST: Final = "likeliest"
 MODES: Final = (MIXED, "kernels", "evidence", "wavefront", LIKELIEST)
 """What can be made of the neighbours of a question; `modes` tells what they are."""
 
+MICROMETRE: Final = "micrometre"
+HALF_DIAGONAL: Final = "half-diagonal"
+UNITS: Final = (MICROMETRE, HALF_DIAGONAL)
+"""In what kernels of bodies with different pixels agree; see `pitch`."""
+
 
 @dataclass(frozen=True, slots=True)
 class ModelSettings:
@@ -40,6 +45,8 @@ class ModelSettings:
         Photos whose samples do not vote; they stay listed.
     mode : str
         What is made of the neighbours, one of `MODES`: see `modes`.
+    unit : str
+        In what (u, v) are the same for all bodies, one of `UNITS`. By default micrometres on the sensor.
     """
 
     r: float | None = None
@@ -51,6 +58,7 @@ class ModelSettings:
     robust: bool = True
     excluded: tuple[str, ...] = ()
     mode: str = MIXED
+    unit: str = MICROMETRE
 
     def __post_init__(self) -> None:
         for name in ("r", "phi", "stops"):
@@ -65,6 +73,8 @@ class ModelSettings:
                 raise InvalidInputError(f"{name} symmetry must lie in 0..1, or None, got {value}")
         if self.mode not in MODES:
             raise UnknownMethodError(f"no mode {self.mode!r} of the lens model; known: {', '.join(MODES)}")
+        if self.unit not in UNITS:
+            raise UnknownMethodError(f"no unit {self.unit!r} of the lens model; known: {', '.join(UNITS)}")
         object.__setattr__(self, "excluded", tuple(str(name) for name in self.excluded))
 
 

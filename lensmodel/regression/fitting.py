@@ -12,7 +12,7 @@ from lensmodel.errors import NoSamplesError
 from lensmodel.psf import PsfSample
 from lensmodel.regression import pitch as pitches
 from lensmodel.regression import variables as va
-from lensmodel.regression.answer import LIKELIEST, MIXED, ModelSettings
+from lensmodel.regression.answer import LIKELIEST, MICROMETRE, MIXED, ModelSettings
 from lensmodel.regression.index import SampleIndex
 from lensmodel.regression.judgement import Judgement, bandwidth, held_together, judge
 from lensmodel.regression.local import LocalKernels
@@ -50,8 +50,8 @@ class Fit:
 
     Parameters
     ----------
-    pitch_um : float or None
-        Pitch that all kernels are brought to; None where none is known.
+    pixel : float or None
+        Pixel, in the unit of the settings, that all kernels are brought to; None where none is known.
     size : int
         How many samples it was fitted to; those added since keep what was fitted.
     widths : WidthField
@@ -70,9 +70,11 @@ class Fit:
         Those of the patches, where the mode may need them.
     mode : str
         Which mode answers: that of the settings, or the one that was found likeliest.
+    unit : str
+        That of the settings.
     """
 
-    pitch_um: float | None
+    pixel: float | None
     size: int
     widths: WidthField
     local: LocalKernels
@@ -85,6 +87,7 @@ class Fit:
     physical: Physics | None = None
     statistics: NormalEquations | None = None
     mode: str = MIXED
+    unit: str = MICROMETRE
 
     @classmethod
     def of(cls, samples: Sequence[PsfSample], settings: ModelSettings) -> Fit:
@@ -103,8 +106,8 @@ class Fit:
         if not (base > 0).any():
             raise NoSamplesError(f"none of the {len(samples)} samples may vote; include a photo again")
         smoother = smoothers.create(settings.method)
-        pitch = pitches.usual_pitch(samples)
-        common = pitches.at_pitch(samples, pitch)
+        pixel = pitches.usual_pixel(samples, settings.unit)
+        common = pitches.at_pixel(samples, pixel, settings.unit)
         index, roster = SampleIndex.of(va.points(common)), Roster.of(common)
         where = index.points
         widths = WidthField.fit(common, base) if smoother.transport else WidthField()
@@ -118,15 +121,16 @@ class Fit:
         rule = va.bandwidths(where)
         used = bandwidth(rule, settings, judgement.choice)
         return cls(
-            *(pitch, len(samples), widths, local, index, roster, judgement, told_errors(samples), rule, used),
+            *(pixel, len(samples), widths, local, index, roster, judgement, told_errors(samples), rule, used),
             statistics=statistics_of(common, settings),
             mode=MIXED if settings.mode == LIKELIEST else settings.mode,
+            unit=settings.unit,
         )
 
     def warmed(self, samples: Sequence[PsfSample], on_step: StepHook = ignore_step) -> Fit:
         """Return it with the wavefront of its samples."""
         groups = held_together(samples, self.roster.photo)
-        common, scale = pitches.at_pitch(samples, self.pitch_um), va.scales(self.bandwidth)
+        common, scale = pitches.at_pixel(samples, self.pixel, self.unit), va.scales(self.bandwidth)
         return replace(self, physical=Physics.fit(common, self.judgement.votes, groups, scale, on_step))
 
     @property
@@ -138,12 +142,12 @@ class Fit:
     def takes(self, samples: Sequence[PsfSample]) -> bool:
         """Whether so few samples can join without fitting everything anew."""
         total = len(self.roster.photo) + len(samples)
-        sides = [pitches.side_at(s, self.pitch_um) for s in samples]
+        sides = [pitches.side_at(s, self.pixel, self.unit) for s in samples]
         return total <= (1.0 + _INCREMENT) * self.size and max(sides) <= self.local.side
 
     def extended(self, samples: Sequence[PsfSample], settings: ModelSettings) -> Fit:
         """Return it with more samples; widths, bandwidths and the other experts stay as they were fitted."""
-        common = pitches.at_pitch(samples, self.pitch_um)
+        common = pitches.at_pixel(samples, self.pixel, self.unit)
         where = va.points(common)
         return replace(
             self,

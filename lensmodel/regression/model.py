@@ -26,7 +26,7 @@ from lensmodel.psf import PsfField, PsfSample
 from lensmodel.regression import learned as memory
 from lensmodel.regression import pitch as pitches
 from lensmodel.regression import variables as va
-from lensmodel.regression.answer import LIKELIEST, MIXED, MODES, ModelSettings, PsfAnswer
+from lensmodel.regression.answer import LIKELIEST, MICROMETRE, MIXED, MODES, ModelSettings, PsfAnswer
 from lensmodel.regression.experts import Experts, Mixture
 from lensmodel.regression.fitting import Fit
 from lensmodel.regression.likelihood import Predict, likeliest
@@ -50,6 +50,7 @@ from lensmodel.types import (
 _LISTED = 1e-3
 _WIDEST = 255
 _SMALL = 15
+Pixels = dict[str, float | None]
 _AROUND = {**va.FALLBACK, "r": 0.15, "phi": 0.5}
 
 
@@ -78,11 +79,11 @@ class Prior:
             object.__setattr__(self, "source", self.source.with_prior(None))
 
     def kernels(
-        self, positions: Sequence[FieldPosition], settings: LensSettings, size: int, pitch_um: float | None
+        self, positions: Sequence[FieldPosition], settings: LensSettings, size: int, pixels: Pixels
     ) -> NDArray[np.float64]:
         """What it says of some places, shape (n, size, size)."""
         if isinstance(self.source, LensModel):
-            return self.source.kernels(positions, settings, size, pitch_um=pitch_um)
+            return self.source.kernels(positions, settings, size, **pixels)
         return np.stack([self.source.kernel_at(p, settings.channel, size) for p in positions])
 
     def error(self, position: FieldPosition, settings: LensSettings) -> float:
@@ -247,6 +248,7 @@ class LensModel:
         *,
         std: bool = False,
         pitch_um: float | None = None,
+        half_diagonal_px: float | None = None,
     ) -> PsfAnswer:
         """Return the PSF at a place, with the evidence behind it.
 
@@ -261,8 +263,11 @@ class LensModel:
             Whether to return the standard error of each pixel as well.
         pitch_um : float, optional
             Size of a pixel of the body that asks, in micrometres; that of the samples if unknown.
+        half_diagonal_px : float, optional
+            Half the diagonal of its frame in pixels, which counts where the unit is the half-diagonal.
         """
-        inside = self._inner_size(size, pitch_um)
+        pixel = self._pixel(pitch_um, half_diagonal_px)
+        inside = self._inner_size(size, pixel)
         answers, mixture, prior_shares = self._asked([position], settings, inside)
         fit = self._fit
         agreed = fit.mode in {MIXED, "wavefront"} and fit.physical is not None and fit.physical.agreed
@@ -286,7 +291,7 @@ class LensModel:
             apart = fit.local.apart(rows, position.phi, np.array(fit.widths.at(position, settings)), inside)
             scatter = standard_error(apart, weight)
         return PsfAnswer(
-            kernel=self._at_pitch(mixture.kernels, size, pitch_um)[0],
+            kernel=self._at_pixel(mixture.kernels, size, pixel)[0],
             effective_samples=1.0 / float((weight**2).sum()),
             photos=int(np.count_nonzero(per_photo > _LISTED)),
             extrapolated=bool(beyond),
@@ -310,6 +315,7 @@ class LensModel:
         size: int = 55,
         *,
         pitch_um: float | None = None,
+        half_diagonal_px: float | None = None,
     ) -> NDArray[np.float64]:
         """Return the PSFs of many places at one setting, shape (n, size, size).
 
@@ -317,8 +323,9 @@ class LensModel:
         """
         if not positions:
             return np.empty((0, size, size))
-        _, mixture, _ = self._asked(positions, settings, self._inner_size(size, pitch_um))
-        return self._at_pitch(mixture.kernels, size, pitch_um)
+        pixel = self._pixel(pitch_um, half_diagonal_px)
+        _, mixture, _ = self._asked(positions, settings, self._inner_size(size, pixel))
+        return self._at_pixel(mixture.kernels, size, pixel)
 
     def weights(
         self, position: FieldPosition, settings: LensSettings
@@ -338,9 +345,11 @@ class LensModel:
         asked, scale = va.point(position, settings), va.scales(self._fit.bandwidth)
         return near.rows, va.gaps(self._fit.index.points[near.rows], asked, scale), near.weights
 
-    def field(self, settings: LensSettings, *, pitch_um: float | None = None) -> ModelField:
+    def field(
+        self, settings: LensSettings, *, pitch_um: float | None = None, half_diagonal_px: float | None = None
+    ) -> ModelField:
         """Return the PSF of every place and channel at these settings, for pixels of some size."""
-        return ModelField(self, settings, pitch_um)
+        return ModelField(self, settings, pitch_um, half_diagonal_px)
 
     # --- what it is made of ---------------------------------------------------------------------
 
@@ -352,7 +361,8 @@ class LensModel:
     @property
     def pitch_um(self) -> float | None:
         """Pixel pitch that answers are for unless another is asked for; None where no sample knows."""
-        return self._fit.pitch_um
+        fit = self._fit
+        return fit.pixel if fit.unit == MICROMETRE else pitches.usual_pixel(self.samples, MICROMETRE)
 
     def flags(self) -> tuple[Flag, ...]:
         """Photos and samples that count less than they claim, with reasons."""
@@ -404,7 +414,7 @@ class LensModel:
         shares = np.zeros(len(positions))
         if self.prior is not None:
             shares = self.prior.strength / (self._seen(positions, settings) + self.prior.strength)
-            other = self.prior.kernels(positions, settings, size, fit.pitch_um)
+            other = self.prior.kernels(positions, settings, size, self._own_pixels())
             part = shares[:, None, None]
             mixture = replace(mixture, kernels=(1.0 - part) * mixture.kernels + part * other)
         return near, mixture, shares
@@ -418,7 +428,13 @@ class LensModel:
         def told_by(mode: str) -> Predict:
             model = LensModel(seen, self.settings, replace(fit, mode=mode))
             return lambda s: np.asarray(
-                model.kernels([s.position], s.settings, s.kernel.shape[0], pitch_um=s.pixel_pitch_um)[0]
+                model.kernels(
+                    [s.position],
+                    s.settings,
+                    s.kernel.shape[0],
+                    pitch_um=s.pixel_pitch_um,
+                    half_diagonal_px=s.half_diagonal_px,
+                )[0]
             )
 
         return {mode: told_by(mode) for mode in MODES if mode != LIKELIEST and open_.get(mode, True)}
@@ -429,24 +445,37 @@ class LensModel:
         gaps = [va.squared_distances(points, va.point(place, settings), scale) for place in positions]
         return np.array([float(votes @ np.exp(-0.5 * gap)) for gap in gaps])
 
-    def _inner_size(self, size: int, pitch_um: float | None) -> int:
-        """Side at the pitch of the samples that holds an answer of side `size`."""
+    def _pixel(self, pitch_um: float | None, half_diagonal_px: float | None) -> float | None:
+        """Pixel of who asks, in the unit of the model."""
+        for name, value in (("pixel pitch", pitch_um), ("half diagonal", half_diagonal_px)):
+            if value is not None and not (math.isfinite(value) and value > 0):
+                unit = "micrometres" if name == "pixel pitch" else "pixels"
+                raise InvalidInputError(f"the {name} must be positive {unit}, got {value}")
+        if self._fit.unit == MICROMETRE:
+            return pitch_um
+        return None if half_diagonal_px is None else 1.0 / half_diagonal_px
+
+    def _own_pixels(self) -> Pixels:
+        """How to ask another model for answers in the pixels of this one."""
+        own = self._fit.pixel
+        if self._fit.unit == MICROMETRE:
+            return {"pitch_um": own}
+        return {"half_diagonal_px": None if own is None else 1.0 / own}
+
+    def _inner_size(self, size: int, pixel: float | None) -> int:
+        """Side in the pixels of the samples that holds an answer of side `size`."""
         if size < 1 or size % 2 == 0:
             raise InvalidInputError(f"size must be odd and positive, got {size}")
-        if pitch_um is not None and not (math.isfinite(pitch_um) and pitch_um > 0):
-            raise InvalidInputError(f"the pixel pitch must be positive micrometres, got {pitch_um}")
-        own = self._fit.pitch_um
-        if own is None or pitch_um is None or pitches.alike(own, pitch_um):
+        own = self._fit.pixel
+        if own is None or pixel is None or pitches.alike(own, pixel):
             return size
-        return min(2 * math.ceil(size / 2 * pitch_um / own) + 1, max(_WIDEST, size))
+        return min(2 * math.ceil(size / 2 * pixel / own) + 1, max(_WIDEST, size))
 
-    def _at_pitch(
-        self, kernels: NDArray[np.float64], size: int, pitch_um: float | None
-    ) -> NDArray[np.float64]:
-        own = self._fit.pitch_um
-        if own is None or pitch_um is None or pitches.alike(own, pitch_um):
+    def _at_pixel(self, kernels: NDArray[np.float64], size: int, pixel: float | None) -> NDArray[np.float64]:
+        own = self._fit.pixel
+        if own is None or pixel is None or pitches.alike(own, pixel):
             return kernels
-        return np.stack([pitches.rescaled(kernel, own, pitch_um, size) for kernel in kernels])
+        return np.stack([pitches.rescaled(kernel, own, pixel, size) for kernel in kernels])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -456,15 +485,17 @@ class ModelField:
     model: LensModel
     settings: LensSettings
     pitch_um: float | None = None
+    half_diagonal_px: float | None = None
 
     def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
         """Return the kernel of odd side `size` at a field position, in the image frame."""
-        settings = self.settings.with_channel(channel)
-        return np.asarray(self.model.kernels([position], settings, size, pitch_um=self.pitch_um)[0])
+        return np.asarray(self.kernels_at([position], channel, size)[0])
 
     def kernels_at(
         self, positions: Sequence[FieldPosition], channel: Channel, size: int
     ) -> NDArray[np.float64]:
         """Return the kernels of many places, shape (n, size, size), faster than one by one."""
         settings = self.settings.with_channel(channel)
-        return self.model.kernels(positions, settings, size, pitch_um=self.pitch_um)
+        return self.model.kernels(
+            positions, settings, size, pitch_um=self.pitch_um, half_diagonal_px=self.half_diagonal_px
+        )

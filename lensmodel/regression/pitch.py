@@ -6,6 +6,9 @@ pitch p to q the spectrum is that of the kernel times the ratio of the two pixel
     K_q(f) = K_p(f) sinc(q f) / sinc(p f),     f in cycles / micrometre, on both axes
 
 and is read at the new pixels by its own Fourier series. Beyond its Nyquist frequency nothing is known.
+
+The unit of p may also be the half-diagonal of the frame: for pictures of one sensor in several sizes, and for
+bodies of one format whose pixel pitch no file names.
 """
 
 from __future__ import annotations
@@ -18,15 +21,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.psf import PsfSample, as_kernel
+from lensmodel.regression.answer import HALF_DIAGONAL
 from lensmodel.types import Kernel
 
 _SAME = 0.005
 _PADDED = 2
 
 
-def usual_pitch(samples: Sequence[PsfSample]) -> float | None:
-    """Pitch that most samples have, micrometres; None if no sample says."""
-    known = [s.pixel_pitch_um for s in samples if s.pixel_pitch_um is not None]
+def pixel_of(sample: PsfSample, unit: str) -> float | None:
+    """Size of a pixel in a unit of `answer.UNITS`; None if the sample does not say."""
+    if unit == HALF_DIAGONAL:
+        return None if sample.half_diagonal_px is None else 1.0 / sample.half_diagonal_px
+    return sample.pixel_pitch_um
+
+
+def usual_pixel(samples: Sequence[PsfSample], unit: str) -> float | None:
+    """Pixel that most samples have; None if no sample says."""
+    known = [pixel for pixel in (pixel_of(s, unit) for s in samples) if pixel is not None]
     if not known:
         return None
     values, counts = np.unique(known, return_counts=True)
@@ -34,45 +45,55 @@ def usual_pitch(samples: Sequence[PsfSample]) -> float | None:
 
 
 def alike(a: float | None, b: float | None) -> bool:
-    """Whether two pitches are one; an unknown one is the same as any other."""
+    """Whether two pixels are one; an unknown one is the same as any other."""
     return a is None or b is None or abs(a / b - 1.0) <= _SAME
 
 
-def at_pitch(samples: Sequence[PsfSample], pitch_um: float | None) -> tuple[PsfSample, ...]:
-    """Samples as a body of another pitch would have seen them; those of that pitch stay themselves."""
-    return tuple(
-        s
-        if s.pixel_pitch_um is None or pitch_um is None or alike(s.pixel_pitch_um, pitch_um)
-        else replace(
-            s,
-            kernel=rescaled(s.kernel, s.pixel_pitch_um, pitch_um, side_at(s, pitch_um)),
-            spectrum=None,  # its frequencies are those of the other pixels
-            evidence=None,
-        )
-        for s in samples
+def at_pixel(samples: Sequence[PsfSample], pixel: float | None, unit: str) -> tuple[PsfSample, ...]:
+    """Samples as a body of other pixels would have seen them; those of such pixels stay themselves."""
+    return tuple(_seen_with(s, pixel, pixel_of(s, unit)) for s in samples)
+
+
+def _seen_with(sample: PsfSample, pixel: float | None, own: float | None) -> PsfSample:
+    if own is None or pixel is None or alike(own, pixel):
+        return sample
+    ratio = pixel / own
+    pitch, half = sample.pixel_pitch_um, sample.half_diagonal_px
+    return replace(
+        sample,
+        kernel=rescaled(sample.kernel, own, pixel, _side(sample, ratio)),
+        spectrum=None,  # its frequencies are those of the other pixels
+        evidence=None,
+        pixel_pitch_um=None if pitch is None else pitch * ratio,
+        half_diagonal_px=None if half is None else half / ratio,
     )
 
 
-def side_at(sample: PsfSample, pitch_um: float | None) -> int:
-    """Odd side that a kernel needs at another pitch, at most twice its own."""
+def side_at(sample: PsfSample, pixel: float | None, unit: str) -> int:
+    """Odd side that a kernel needs with other pixels, at most twice its own."""
+    own = pixel_of(sample, unit)
+    if own is None or pixel is None or alike(own, pixel):
+        return sample.kernel.shape[0]
+    return _side(sample, pixel / own)
+
+
+def _side(sample: PsfSample, ratio: float) -> int:
     side = sample.kernel.shape[0]
-    if sample.pixel_pitch_um is None or pitch_um is None or alike(sample.pixel_pitch_um, pitch_um):
-        return side
-    return min(2 * math.ceil(side / 2 * sample.pixel_pitch_um / pitch_um) + 1, 2 * side + 1)
+    return min(2 * math.ceil(side / 2 / ratio) + 1, 2 * side + 1)
 
 
-def rescaled(kernel: Kernel, pitch_um: float, wanted_um: float, size: int) -> Kernel:
+def rescaled(kernel: Kernel, own: float, wanted: float, size: int) -> Kernel:
     """Kernel of a pixel pitch as one of another.
 
     Parameters
     ----------
     kernel : Kernel, shape (k, k)
-    pitch_um, wanted_um : float
-        Pitch that it was seen with, and the one that is asked for, micrometres.
+    own, wanted : float
+        Pixel that it was seen with, and the one that is asked for, in one unit.
     size : int
         Odd side of the result.
     """
-    ratio = wanted_um / pitch_um
+    ratio = wanted / own
     side = kernel.shape[0]
     reach = max(size * ratio, side)
     period = _PADDED * (2 * math.ceil(reach / 2) + 1)

@@ -198,6 +198,7 @@ def _entry(sample: PsfSample) -> dict[str, Any]:
         "weight": sample.weight,
         "photo": sample.photo,
         "pixel_pitch_um": sample.pixel_pitch_um,
+        "half_diagonal_px": sample.half_diagonal_px,
         "estimator": sample.estimator,
         "error": sample.error,
     }
@@ -253,6 +254,7 @@ def _sample(
         pixel_pitch_um=entry["pixel_pitch_um"],
         estimator=str(entry["estimator"]),
         error=entry.get("error"),
+        half_diagonal_px=entry.get("half_diagonal_px"),
     )
 
 

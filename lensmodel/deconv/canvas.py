@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from lensmodel.blur import UniformBlur
+from lensmodel.deconv.base import Sensor
+from lensmodel.types import Planes
+
+_JOINT: Final = 4  # pixels over which the ends of a tile fade into each other where its rim is cut off
+
 
 @dataclass(frozen=True, slots=True)
 class Canvas:
     """A periodic grid that holds the data and a margin on which nothing was measured.
-
-    The margin is at least the kernel's side wide in total, so that light which wraps around
-    never meets data from the other end.
 
     Parameters
     ----------
@@ -28,6 +33,18 @@ class Canvas:
     rows: int
     cols: int
     margin: int
+
+    @classmethod
+    def around(cls, tile: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor]) -> Canvas:
+        """Canvas for a tile `(channel, row, col)`.
+
+        The margin is at least the kernel's side wide in total, so that light which wraps around
+        never meets data from the other end. Where the tile's rim will be cut off, it need only join
+        the ends without a step.
+        """
+        wide = max(blur.reach for blur in blurs)
+        margin = min(_JOINT, wide) if all(sensor.surrounded for sensor in sensors) else wide
+        return cls(tile.shape[1], tile.shape[2], margin)
 
     @property
     def shape(self) -> tuple[int, int]:

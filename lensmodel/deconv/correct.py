@@ -47,7 +47,7 @@ class LateralShift(Protocol):
 
 
 KERNEL_SIZE = 55
-MIN_HALO = 24
+MIN_HALO = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -286,7 +286,7 @@ def _restore(job: _Job, cell: Cell) -> tuple[Planes, CellForecast]:
     reach = max(
         job.reach(cell.position, channel, error) for channel, error in zip(CHANNELS, errors, strict=True)
     )
-    halo = max(MIN_HALO, 2 * reach + 8)
+    halo = max(MIN_HALO, reach + 10)
     top, left = max(cell.top - halo, 0), max(cell.left - halo, 0)
     blurs = [
         job.blur(cell, channel, error, (top, left)) for channel, error in zip(CHANNELS, errors, strict=True)

@@ -86,7 +86,7 @@ class DirectFilter:
         lights = Lights.of(blurred, blurs, sensors, self.light_steps, self.engine)
         photo, blurred = blurred, blurred if lights is None else lights.rest
         light = np.maximum(blurred.mean(axis=(1, 2)), 1e-4).astype(np.float32)
-        canvas = Canvas(blurred.shape[1], blurred.shape[2], margin=max(blur.reach for blur in blurs))
+        canvas = Canvas.around(blurred, blurs, sensors)
         loops = compiled(self.engine)
         contrast, colour, noise = _contrasts(Blocks.of(blurred, light, loops), light, sensors)
         mean = float(contrast.mean())

@@ -116,7 +116,7 @@ class SparseGradient:
         lights = Lights.of(blurred, blurs, sensors, self.light_steps, self.engine)
         rest, glow = (blurred, None) if lights is None else (lights.rest, lights.glow)
         light = np.maximum(rest.mean(axis=(1, 2)), 1e-4).astype(np.float32)
-        canvas = Canvas(blurred.shape[1], blurred.shape[2], margin=max(blur.reach for blur in blurs))
+        canvas = Canvas.around(blurred, blurs, sensors)
         loops = compiled(self.engine) if len(blurred) == len(CHANNELS) else None
         problem = self._problem(rest, blurs, sensors, light, canvas, loops, glow)
         if loops is None:

@@ -327,6 +327,7 @@ def _plain(row: Row) -> dict[str, Any]:
         "method": row.method,
         "photos": row.photos,
         "errors": dict(row.errors),
+        "rel_l2": dict(row.errors),  # the same by the name of the measure
         "seconds": round(row.seconds, 2),
     }
 

@@ -6,7 +6,7 @@ its share is proportional to e^-4: where one is much worse than the others it lo
 A wavefront fitted to the spectra of all patches (`pooled`) makes other mistakes than kernels that were
 estimated one by one: those fail where blur is wide, it cannot tell blur below half a pixel from a soft scene,
 and between the mean of both is better than either. The rules below were chosen on simulated lenses of
-development seeds (0, 1, 2, 4, 5, 6 and 7, one photo each) with version 4 of the blind estimator `default`;
+development seeds (0, 1, 2, 4, 5, 6 and 7, one photo or two) with version 4 of the blind estimator `default`;
 `benchmarks/pooled_evidence.py` prints what they give.
 """
 
@@ -29,11 +29,12 @@ from lensmodel.types import FieldPosition, LensSettings
 
 _SILENT = 1e-3
 _KERNEL_ERROR, _NARROW_PX = 0.35, 0.8
+_EVEN_PX = 0.65
 
 
 def agreed_share(width: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Share of an agreed wavefront, by root mean square width in pixels: a half at 1 px, more above."""
-    return np.asarray(width**4 / (width**4 + 1.0))
+    """Share of an agreed wavefront, by root mean square width in pixels: a half at 0.65 px, more above."""
+    return np.asarray(width**4 / (width**4 + _EVEN_PX**4))
 
 
 def kernel_error(width: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -7,7 +7,8 @@ of the samples is kriged with mean zero, so that far from all samples the wavefr
     f(x, y) = N(x, y) + c'(x, y) K^-1 (C - N),    K = c + nugget / q
 
 Where the samples carry the spectra of their patches, the wavefront is fitted to those instead (`pooled`) and
-stands alone: all patches agree on it, while finished kernels carry each patch's own mistake.
+stands alone: all patches agree on it, while finished kernels carry each patch's own mistake. That is so as
+long as the patches are likelier behind it than behind their own kernels.
 
 Cost: some seconds of CPU for the fit, one or two milliseconds at each question.
 """
@@ -23,7 +24,8 @@ from numpy.typing import NDArray
 from lensmodel.psf import PsfSample, resized
 from lensmodel.regression import variables as va
 from lensmodel.regression.kriging import NUGGETS, field_vector, matern, settings_gap, squared_gaps
-from lensmodel.regression.pooled import pool
+from lensmodel.regression.likelihood import surprise
+from lensmodel.regression.pooled import Pooled, pool
 from lensmodel.regression.wavefront import Wavefront
 from lensmodel.regression.wavefront_fit import (
     MIN_SAMPLES,
@@ -101,7 +103,7 @@ class Physics:
         trusted = [samples[i].with_weight(float(votes[i])) for i in voting]
         # spectra of one focal length alone are solved together
         pooled = None if focal_range(trusted) > ONE_FOCAL_LENGTH else pool(trusted, on_step)
-        if pooled is not None:
+        if pooled is not None and _suits(pooled, trusted):
             side = max(s.kernel.shape[0] for s in samples)
             empty = np.empty((0, 2)), np.empty((0, len(scale))), scale, np.empty((0, side**2))
             return cls(pooled.front, side, *empty, pooled.errors(samples), agreed=True)
@@ -144,6 +146,17 @@ class Physics:
         """Held-out errors of the first `count` samples; the usual one of those added later."""
         usual = np.full(max(count - len(self.errors), 0), float(np.median(self.errors)))
         return np.concatenate([self.errors[:count], usual])
+
+
+def _suits(pooled: Pooled, samples: Sequence[PsfSample]) -> bool:
+    """Whether the patches are likelier behind the wavefront than behind the kernels each of them gave.
+
+    A blur that no wavefront of a few numbers makes, of a plain Gaussian for example, leaves them less likely.
+    """
+    seen = [s for s in samples if s.spectrum is not None and s.settings.channel == "g"]
+    seen = seen or [s for s in samples if s.spectrum is not None]
+    agreed = sum(surprise(s, pooled.kernel(s, s.kernel.shape[0])) for s in seen)
+    return agreed < sum(surprise(s, s.kernel) for s in seen)
 
 
 def _rendered(

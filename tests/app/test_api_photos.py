@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -313,13 +314,25 @@ def test_a_waiting_request_answers_at_the_change(
     assert time.monotonic() - began < 8.0  # it did not wait to the end
 
 
-def test_a_finished_job_does_not_make_anybody_wait(client: TestClient, steps: Steps) -> None:
+def test_a_finished_job_does_not_make_anybody_wait(
+    client: TestClient, steps: Steps, monkeypatch: pytest.MonkeyPatch
+) -> None:
     photo = steps.counted()
-    began = time.monotonic()
+    find, reads = jobs.find_job, list[str]()
+
+    def find_and_note(call: Call, job_id: str) -> JobOut:
+        reads.append(job_id)
+        return find(call, job_id)
+
+    async def nobody_sleeps(seconds: float) -> None:
+        pytest.fail(f"the request slept {seconds} s on a finished job")
+
+    monkeypatch.setattr(jobs, "find_job", find_and_note)
+    monkeypatch.setattr(jobs, "asyncio", SimpleNamespace(sleep=nobody_sleeps))
 
     assert get(client, f"/v1/jobs/{photo.public_id}?wait=20")["state"] == "succeeded"
 
-    assert time.monotonic() - began < 8.0
+    assert reads == [photo.public_id]
 
 
 def test_an_unchanged_job_is_not_sent_twice(client: TestClient, steps: Steps) -> None:

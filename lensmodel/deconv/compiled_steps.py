@@ -14,9 +14,10 @@ _REACH: Final = np.float32(1.0 / 24.0)
 
 
 @jit
-def _shrink(v: Any, scale: Any, jump: Any, terms: Real) -> Any:  # noqa: ANN401 - a float32 register
+def _shrink(v: Any, scale: Any, edge: Any, steepness: Any, terms: Real) -> Any:  # noqa: ANN401 - float32
     size = max(abs(v), np.float32(1e-20))
-    inverse = min(max(scale / size, _REACH), ONE / jump)
+    below = scale / size
+    inverse = min(max(below, _REACH), edge)
     taken = terms[0]
     taken = taken * inverse + terms[1]
     taken = taken * inverse + terms[2]
@@ -27,13 +28,20 @@ def _shrink(v: Any, scale: Any, jump: Any, terms: Real) -> Any:  # noqa: ANN401 
     taken = taken * inverse + terms[7]
     taken = taken * inverse + terms[8]
     taken = taken * inverse + terms[9]
-    kept = size - scale * taken if size > scale * jump else ZERO
+    kept = (size - scale * taken) * min(max((edge - below) * steepness, ZERO), ONE)
     return kept if v >= ZERO else -kept
 
 
 @jit
 def _shrink_row(
-    slopes: Real, scale: Real, factors: Real, rotation: Real, jump: float, terms: Real, kept: Real
+    slopes: Real,
+    scale: Real,
+    factors: Real,
+    rotation: Real,
+    edge: float,
+    steepness: float,
+    terms: Real,
+    kept: Real,
 ) -> None:
     """Rotate three gradients to luma and chroma, shrink each, rotate back."""
     t00, t01, t02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
@@ -42,9 +50,9 @@ def _shrink_row(
     f0, f1, f2 = factors[0], factors[1], factors[2]
     for j in range(scale.size):
         r, g, b, s = slopes[0, j], slopes[1, j], slopes[2, j], scale[j]
-        p = _shrink(t00 * r + t01 * g + t02 * b, s * f0, jump, terms)
-        q = _shrink(t10 * r + t11 * g + t12 * b, s * f1, jump, terms)
-        o = _shrink(t20 * r + t21 * g + t22 * b, s * f2, jump, terms)
+        p = _shrink(t00 * r + t01 * g + t02 * b, s * f0, edge, steepness, terms)
+        q = _shrink(t10 * r + t11 * g + t12 * b, s * f1, edge, steepness, terms)
+        o = _shrink(t20 * r + t21 * g + t22 * b, s * f2, edge, steepness, terms)
         kept[0, j] = t00 * p + t10 * q + t20 * o
         kept[1, j] = t01 * p + t11 * q + t21 * o
         kept[2, j] = t02 * p + t12 * q + t22 * o
@@ -52,7 +60,14 @@ def _shrink_row(
 
 @jit
 def pull_of(  # noqa: C901 - loops over rows and colours, one pass over memory
-    x: Real, scale: Real, factors: Real, rotation: Real, jump: float, terms: Real, pull: Real
+    x: Real,
+    scale: Real,
+    factors: Real,
+    rotation: Real,
+    edge: float,
+    steepness: float,
+    terms: Real,
+    pull: Real,
 ) -> None:
     """sum_j F_j^T prox(F_j x) of three planes, periodic forward differences, into `pull`."""
     channels, height, width = x.shape
@@ -64,7 +79,7 @@ def pull_of(  # noqa: C901 - loops over rows and colours, one pass over memory
         for c in range(channels):
             for j in range(width):
                 slopes[c, j] = x[c, below, j] - x[c, i, j]
-        _shrink_row(slopes, scale[i], factors, rotation, jump, terms, kept)
+        _shrink_row(slopes, scale[i], factors, rotation, edge, steepness, terms, kept)
         for c in range(channels):
             for j in range(width):
                 pull[c, below, j] += kept[c, j]
@@ -73,7 +88,7 @@ def pull_of(  # noqa: C901 - loops over rows and colours, one pass over memory
             for j in range(width - 1):
                 slopes[c, j] = x[c, i, j + 1] - x[c, i, j]
             slopes[c, width - 1] = x[c, i, 0] - x[c, i, width - 1]
-        _shrink_row(slopes, scale[i], factors, rotation, jump, terms, kept)
+        _shrink_row(slopes, scale[i], factors, rotation, edge, steepness, terms, kept)
         for c in range(channels):
             pull[c, i, 0] += kept[c, width - 1]
             for j in range(width):
@@ -141,7 +156,8 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
     down: Real,
     across: Real,
     rotation: Real,
-    jump: float,
+    edge: float,
+    steepness: float,
     terms: Real,
 ) -> None:
     """Wiener start and half-quadratic steps of `SparseGradient` on a canvas; the result goes into `x`.
@@ -169,7 +185,7 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
             X[c] = P
         rocket_fft.c2r(P, x[c], axes, BACK, norm, 1)
     for step in range(couplings.shape[0]):
-        pull_of(x, scale, factors[step], rotation, jump, terms, pull)
+        pull_of(x, scale, factors[step], rotation, edge, steepness, terms, pull)
         for c in range(channels):
             if drift.shape[0] > 0 and turns[step]:
                 _drifted(x[c], drift[c], down, across, work, D, E[c])

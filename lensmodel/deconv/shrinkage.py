@@ -12,6 +12,7 @@ from lensmodel.errors import InvalidInputError
 
 DEGREE = 9
 _REACH = 24.0
+_SHARP = 1e-6  # share of a jump that float32 resolves
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,15 +34,19 @@ class Shrinkage:
         |v| up to which the answer is 0, for t = 1.
     terms : ndarray
         Coefficients of p, highest power first.
+    ramp : float
+        Share of the jump over which the answer rises from 0 instead. A rounding error decides on which
+        side of a jump a gradient falls, and steps that follow make a visible pixel of it.
     """
 
     alpha: float
     jump: float
     terms: NDArray[np.float32]
+    ramp: float = 0.0
 
     @staticmethod
     @lru_cache(maxsize=16)  # one fit per exponent, not one per tile
-    def of(alpha: float) -> Shrinkage:
+    def of(alpha: float, ramp: float = 0.0) -> Shrinkage:
         """Fit the polynomial to the answers found by Newton steps.
 
         D. Krishnan, R. Fergus, "Fast image deconvolution using hyper-Laplacian priors", NIPS 2009.
@@ -61,7 +66,17 @@ class Shrinkage:
             bend = alpha * (alpha - 1.0) * w ** (alpha - 2.0) + 1.0
             w = np.clip(w - slope / np.where(np.abs(bend) < 1e-3, 1e-3, bend), max(jump_w, 1e-9), v)
         terms = np.polynomial.Polynomial.fit(inverse, v - w, DEGREE).convert().coef[::-1]
-        return Shrinkage(alpha, float(jump), terms.astype(np.float32))
+        return Shrinkage(alpha, float(jump), terms.astype(np.float32), ramp)
+
+    @property
+    def edge(self) -> float:
+        """1 / v for t = 1 where the answer begins to rise."""
+        return 1.0 / self.jump
+
+    @property
+    def steepness(self) -> float:
+        """How fast the share of the answer that is given rises from there, per 1 / v."""
+        return self.jump / max(1.0 - 1.0 / (1.0 + self.ramp), _SHARP)
 
     def scale(self, threshold: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """S for a threshold t."""
@@ -70,9 +85,11 @@ class Shrinkage:
     def __call__(self, v: NDArray[np.float32], scale: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """Shrink `v`, any shape, with the scale s that broadcasts against it."""
         size = np.maximum(np.abs(v), np.float32(1e-20))
-        inverse = np.clip(scale / size, np.float32(1.0 / _REACH), np.float32(1.0 / self.jump))
+        edge = np.float32(self.edge)
+        below = scale / size
+        inverse = np.clip(below, np.float32(1.0 / _REACH), edge)
         taken = np.zeros_like(inverse)
         for term in self.terms:
             taken = taken * inverse + term
-        shrunk = np.where(size > scale * np.float32(self.jump), size - scale * taken, np.float32(0.0))
-        return np.asarray(np.copysign(shrunk, v), dtype=np.float32)
+        share = np.clip((edge - below) * np.float32(self.steepness), np.float32(0.0), np.float32(1.0))
+        return np.asarray(np.copysign((size - scale * taken) * share, v), dtype=np.float32)

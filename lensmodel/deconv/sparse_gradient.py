@@ -148,7 +148,7 @@ class SparseGradient:
         noise = np.maximum(var.mean(axis=(1, 2)), np.float32(1e-9))
         level = smoothed(blocks.luma)
         relative = (var / noise[:, None, None]).mean(axis=0)
-        prox = Shrinkage.of(self.alpha)
+        prox = Shrinkage.of(self.alpha, _RAMP)
         calm = _calm(blocks, level, var.mean(axis=0) / len(blurred), self.alpha)
         threshold = relative * calm / np.maximum(level, _DARK) ** np.float32(self.alpha)
         couplings = self.coupling * self.growth ** np.arange(self.steps)
@@ -198,6 +198,7 @@ class SparseGradient:
         )
 
 
+_RAMP = 0.1  # of the jump of the shrinkage: see `Shrinkage`
 _TYPICAL_CONTRAST = np.float32(0.02)  # variance over squared light of a scene for which kappa is `weight`
 _BUSIEST, _CALMEST = 0.7, 50.0
 _DARK = np.float32(0.02)  # share of a tile's mean light below which the prior follows it no further
@@ -292,7 +293,8 @@ def _compiled(p: _Problem, loops: ModuleType) -> Planes:
         p.down,
         p.across,
         p.rotation,
-        np.float32(p.prox.jump),
+        np.float32(p.prox.edge),
+        np.float32(p.prox.steepness),
         p.prox.terms,
     )
     return x

@@ -17,6 +17,7 @@ from lensmodel.types import NoiseModel, Planes
 
 WINDOW: Final = 2
 """Pixels around each one in which the photo is looked at."""
+_SIDE: Final = 2 * WINDOW + 1
 _FREE: Final = (
     0.25  # error of a kernel from which on a result may not leave the photo's range by more than it
 )
@@ -100,14 +101,18 @@ def limited(
     for c, share in enumerate(allowances):
         if np.isfinite(share):
             if loops is None:
-                size, inside = 2 * WINDOW + 1, slice(WINDOW, -WINDOW)
-                low = ndimage.minimum_filter(photo[c], size)[inside, inside]
-                high = ndimage.maximum_filter(photo[c], size)[inside, inside]
+                low = _middle(ndimage.minimum_filter(photo[c], _SIDE))
+                high = _middle(ndimage.maximum_filter(photo[c], _SIDE))
                 room = np.float32(share) * (high - low)
                 np.clip(made[c], np.maximum(low - room, _dark(share) * low), high + room, out=made[c])
             else:
                 loops.hold(photo[c], np.float32(share), _dark(share), made[c])
     return made
+
+
+def _middle(wide: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Cut off the pixels around."""
+    return wide[..., WINDOW:-WINDOW, WINDOW:-WINDOW]
 
 
 def _dark(share: float) -> np.float32:
@@ -120,22 +125,19 @@ def flats_kept(photo: Planes, restored: Planes, noise: Sequence[NoiseModel], sha
 
     Parameters
     ----------
-    photo : Planes, shape (channels, rows + 4, cols + 4)
-        With the pixels around.
-    restored : Planes, shape (channels, rows, cols)
-        What was made of its middle.
+    photo, restored : Planes
+        As `limited` takes them.
     noise : sequence of NoiseModel
         By colour.
     share : float
         0 changes nothing, 1 leaves flat areas as they were.
     """
-    inside = slice(WINDOW, -WINDOW)
     ratio = np.zeros(restored.shape[1:], dtype=np.float32)
     for plane, model in zip(photo, noise, strict=True):
-        mean = ndimage.uniform_filter(plane, 2 * WINDOW + 1)
-        local = ndimage.uniform_filter(plane * plane, 2 * WINDOW + 1) - mean * mean
-        ratio = np.maximum(ratio, (local / model.variance(mean))[inside, inside])
+        mean = ndimage.uniform_filter(plane, _SIDE)
+        local = ndimage.uniform_filter(plane * plane, _SIDE) - mean * mean
+        ratio = np.maximum(ratio, _middle(local / model.variance(mean)))
     contrast = np.sqrt(np.maximum(ratio, np.float32(0.0)))
     t = np.clip((contrast - _CALM) / (_BUSY - _CALM), 0.0, 1.0)
     keep: NDArray[np.float32] = (share * (1.0 - t * t * (3.0 - 2.0 * t))).astype(np.float32)
-    return np.asarray(restored + keep * (photo[:, inside, inside] - restored), dtype=np.float32)
+    return np.asarray(restored + keep * (_middle(photo) - restored), dtype=np.float32)

@@ -95,6 +95,9 @@ def blind(
     half: Annotated[str, typer.Option(help="dev, test or all.")] = "test",
     variant: Annotated[str, typer.Option(help="gaussian, bayer or jpeg.")] = "gaussian",
     judge: Annotated[str, typer.Option(help="hyper-laplacian or epll.")] = "hyper-laplacian",
+    selection: Annotated[
+        str, typer.Option(help="Who chooses the patches: random, r-map or good-regions.")
+    ] = "random",
     seed: int = 0,
     workers: Annotated[int, typer.Option(min=1)] = 2,
     output: Annotated[
@@ -136,6 +139,7 @@ def blind(
             variant=variant,  # type: ignore[arg-type]  # checked by the benchmark
             judge=judge,
             seed=seed,
+            selection=selection,  # type: ignore[arg-type]  # checked by the benchmark
         )
     report = _blind(settings, workers, output, shown)
     written = write_report(report, output)

@@ -28,9 +28,11 @@ import numpy as np
 
 from lensmodel import psf
 from lensmodel.bench.cases import (
+    CHOICES,
     HALVES,
     VARIANTS,
     Case,
+    Choice,
     Half,
     Variant,
     list_photos,
@@ -81,6 +83,8 @@ class BlindBenchmark:
         Non-blind deconvolution: "hyper-laplacian" or "epll".
     seed : int
         For windows, noise and the choice of cases.
+    selection : {"random", "r-map", "good-regions"}
+        Who chooses the windows: chance among the better half, or a selector on the blurred photograph.
     """
 
     photos: Path | None = None
@@ -95,11 +99,15 @@ class BlindBenchmark:
     variant: Variant = "gaussian"
     judge: str = "hyper-laplacian"
     seed: int = 0
+    selection: Choice = "random"
 
     def __post_init__(self) -> None:
         checks = {
             f"half must be one of {', '.join(HALVES)}, got {self.half!r}": self.half in HALVES,
             f"variant must be one of {', '.join(VARIANTS)}, got {self.variant!r}": self.variant in VARIANTS,
+            f"selection must be one of {', '.join(CHOICES)}, got {self.selection!r}": (
+                self.selection in CHOICES
+            ),
             f"patch must be a multiple of 4 of at least 128, got {self.patch}": self.patch >= 128
             and self.patch % 4 == 0,
             f"kernel size must be odd and at least 5, got {self.kernel_size}": self.kernel_size >= 5
@@ -248,6 +256,7 @@ def run_blind_benchmark(
             pool=settings.pool,
             seed=settings.seed,
             limit=settings.cases,
+            choice=settings.selection,
         )
     ]
     store = _Store(cache, photos, settings, judge)
@@ -417,6 +426,7 @@ class _Store:
             (case.psf_number, case.noise, case.patch, case.variant, case.seed),
             (name, getattr(method, "version", 0), described, self._settings.kernel_size),
             repr(self._judge),
+            *(() if case.choice == "random" else (case.choice,)),
         )
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 

@@ -16,8 +16,9 @@ from PIL import Image
 from scipy import signal
 
 from lensmodel import psf
-from lensmodel.errors import InvalidInputError
+from lensmodel.errors import InvalidInputError, NoUsablePatchesError
 from lensmodel.geometry import Frame
+from lensmodel.patches import select
 from lensmodel.patches.blocks import BLOCKS_A_SIDE, measure_blocks
 from lensmodel.patches.select import edge_score, first_reasons
 from lensmodel.patches.windows import windows_of
@@ -26,8 +27,10 @@ from lensmodel.types import Kernel, NoiseModel, Plane, Planes, ignore_step
 
 Half: TypeAlias = Literal["dev", "test", "all"]
 Variant: TypeAlias = Literal["gaussian", "bayer", "jpeg"]
+Choice: TypeAlias = Literal["random", "r-map", "good-regions"]
 HALVES: Final = ("dev", "test", "all")
 VARIANTS: Final = ("gaussian", "bayer", "jpeg")
+CHOICES: Final = ("random", "r-map", "good-regions")
 
 DATA: Final = Path(__file__).parent / "data"
 WHITE: Final = 0.9
@@ -56,6 +59,9 @@ class Case:
         What the camera does: nothing but noise; a Bayer mosaic, interpolated; sRGB and JPEG.
     seed : int
         For the choice of windows and the noise.
+    choice : {"random", "r-map", "good-regions"}
+        Who chooses the windows: chance, from the better half of them by the sharp scene; or a selector of
+        `lensmodel.patches`, which sees the blurred and noisy photograph only.
     """
 
     photos: tuple[Path, ...]
@@ -64,6 +70,7 @@ class Case:
     patch: int
     variant: Variant
     seed: int
+    choice: Choice = "random"
 
     @property
     def name(self) -> str:
@@ -165,6 +172,7 @@ def make_cases(
     pool: int,
     seed: int,
     limit: int | None,
+    choice: Choice = "random",
 ) -> tuple[Case, ...]:
     """Every photo with every PSF of a half; at most `limit`, spread over both by a seeded shuffle.
 
@@ -186,7 +194,7 @@ def make_cases(
     order = np.random.default_rng(seed).permutation(len(pairs))
     chosen = order if limit is None else _spread(pairs, order, limit)
     return tuple(
-        Case(tuple(own[(i + k) % len(own)] for k in range(pool)), n, noise, patch, variant, seed)
+        Case(tuple(own[(i + k) % len(own)] for k in range(pool)), n, noise, patch, variant, seed, choice)
         for i, n in (pairs[int(at)] for at in np.sort(chosen))
     )
 
@@ -238,19 +246,57 @@ def good_corners(photo: Path, patch: int, margin: int) -> tuple[tuple[int, int],
 
 def observe(case: Case, kernel: Kernel) -> Observation:
     """Make what the camera sees: blur by valid convolution, then noise, then the variant's camera."""
-    size, margin = case.patch, kernel.shape[0] // 2
     patches = []
     sharp: Plane | None = None
     for turn, photo in enumerate(case.photos):
         rng = np.random.default_rng([case.seed, case.psf_number, turn, _number(photo.stem)])
-        corners = good_corners(photo, size, margin)
-        row, col = corners[int(rng.integers(len(corners)))]
-        scene = scene_of(photo)[:, row - margin : row + size + margin, col - margin : col + size + margin]
+        scene, patch = (_drawn if case.choice == "random" else _chosen)(photo, kernel, case, rng)
         if turn == 0:
-            sharp = np.ascontiguousarray(scene[1, margin : margin + size, margin : margin + size])
-        patches.append(_photographed(scene, kernel, case, rng))
+            sharp = np.ascontiguousarray(scene)
+        patches.append(patch)
     assert sharp is not None
     return Observation(tuple(patches), NoiseModel.white(case.noise), sharp, kernel)
+
+
+def _drawn(photo: Path, kernel: Kernel, case: Case, rng: np.random.Generator) -> tuple[Plane, Plane]:
+    """Sharp and photographed window, drawn by chance."""
+    size, margin = case.patch, kernel.shape[0] // 2
+    corners = good_corners(photo, size, margin)
+    row, col = corners[int(rng.integers(len(corners)))]
+    scene = scene_of(photo)[:, row - margin : row + size + margin, col - margin : col + size + margin]
+    return scene[1, margin : margin + size, margin : margin + size], _photographed(scene, kernel, case, rng)
+
+
+def _chosen(photo: Path, kernel: Kernel, case: Case, rng: np.random.Generator) -> tuple[Plane, Plane]:
+    """Sharp and photographed window, the best that a selector finds in the whole blurred photograph.
+
+    Selectors take smaller windows where the frame has not four of them on its shorter side; the window
+    then is larger than what was scored, about the same middle. Where nothing is usable the middle of the
+    frame is taken, lest a method profits from the refusal.
+    """
+    size, margin = case.patch, kernel.shape[0] // 2
+    scene = scene_of(photo)
+    plane = _photographed(scene, kernel, case, rng)
+    height, width = plane.shape
+    try:
+        found = select(
+            plane,
+            NoiseModel.white(case.noise),
+            Frame(height, width),
+            size=size,
+            selector=case.choice,
+            jpeg=case.variant == "jpeg",
+        )
+    except NoUsablePatchesError:
+        row, col = (height - size) // 2, (width - size) // 2
+    else:
+        best = max(found.patches, key=lambda patch: patch.score)
+        more = (size - best.size) // 2
+        row, col = (
+            min(max(at - more, 0), side - size) for at, side in ((best.row, height), (best.col, width))
+        )
+    sharp = scene[1, margin + row : margin + row + size, margin + col : margin + col + size]
+    return sharp, np.ascontiguousarray(plane[row : row + size, col : col + size])
 
 
 def _photographed(scene: Planes, kernel: Kernel, case: Case, rng: np.random.Generator) -> Plane:

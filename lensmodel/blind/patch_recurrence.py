@@ -13,11 +13,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy import fft
 
 from lensmodel.blind.base import PsfEstimate, is_no_blur, usable
+from lensmodel.blind.gram import window_products
 from lensmodel.blind.recurrence import ALPHA, Image, blend, level_shape, noise_gain, recur, resample
 from lensmodel.errors import NotEnoughEvidenceError
 from lensmodel.evidence import PatchEvidence, nonnegative_least_squares
@@ -212,15 +212,11 @@ def normal_equations(
     half = side // 2
     margin = _BORDER
     inner = x[margin : x.shape[0] - margin, margin : x.shape[1] - margin]
-    windows = sliding_window_view(inner, (side, side))
-    columns = windows.reshape(-1, side * side)[:, ::-1].astype(np.float32)
     reach = margin + half
-    target = y[reach : y.shape[0] - reach, reach : y.shape[1] - reach].reshape(-1).astype(np.float32)
-    columns = columns - columns.mean(axis=0)
-    target = target - target.mean()
+    target = y[reach : y.shape[0] - reach, reach : y.shape[1] - reach]
     n = target.size
-    a = (columns.T @ columns).astype(np.float64)
-    b = (columns.T @ target).astype(np.float64)
+    gram, cross = window_products(inner, target, side)
+    a, b = gram[::-1, ::-1].copy(), cross[::-1].copy()
     rows, cols = np.divmod(np.arange(side * side), side)
     spectrum = fft.rfft2(response)
     acf = fft.irfft2(np.abs(spectrum) ** 2, s=response.shape)

@@ -260,6 +260,18 @@ def test_observation_is_the_scene_through_the_psf() -> None:
     assert np.abs(again - seen.patches[0])[inner].max() < 1e-3
 
 
+def test_a_window_that_a_selector_chose_is_the_scene_through_the_psf() -> None:
+    kernel = load_psfs()[4]
+    options = {"half": "all", "noise": 1e-3, "patch": 128, "variant": "gaussian", "pool": 1, "seed": 3}
+    (case,) = make_cases(list_photos(), 12, limit=1, choice="r-map", **options)
+    seen = observe(case, kernel)
+    inner = (slice(27, -27), slice(27, -27))
+    again = ndimage.convolve(seen.sharp.astype(np.float64), kernel)
+
+    assert seen.sharp.shape == seen.patches[0].shape == (128, 128)
+    assert np.abs(again - seen.patches[0])[inner].std() < 1.1e-3
+
+
 @pytest.mark.parametrize("variant", ["bayer", "jpeg"])
 def test_camera_variants_stay_near_the_plain_one(variant: str) -> None:
     kernel = load_psfs()[7]
@@ -292,6 +304,8 @@ def test_bad_settings_are_named(tmp_path: Path) -> None:
         BlindBenchmark(kernel_size=30)
     with pytest.raises(InvalidInputError, match="noise"):
         BlindBenchmark(noise=(0.0,))
+    with pytest.raises(InvalidInputError, match="selection"):
+        BlindBenchmark(selection="best")
     with pytest.raises(UnknownMethodError, match="fake"):
         run_blind_benchmark(BlindBenchmark(methods=("best",)), methods=registry(fake=Fake()))
     with pytest.raises(InvalidInputError, match="no PNG"):

@@ -29,12 +29,12 @@ from lensmodel.types import FieldPosition, LensSettings
 
 _SILENT = 1e-3
 _KERNEL_ERROR, _NARROW_PX = 0.35, 0.8
-_EVEN_PX = 0.65
+_EVEN_PX = 0.75
 
 
 def agreed_share(width: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Share of an agreed wavefront, by root mean square width in pixels: a half at 0.65 px, more above."""
-    return np.asarray(width**4 / (width**4 + _EVEN_PX**4))
+    """Share of an agreed wavefront, by root mean square width in pixels: a half at 0.75 px, more above."""
+    return np.asarray(width**8 / (width**8 + _EVEN_PX**8))
 
 
 def kernel_error(width: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -6,10 +6,12 @@ The transfer function is the autocorrelation of the pupil P = A exp(2 pi i W)::
 
 With the wavefront in blur (see `pupil`), 2 pi W = (pi / q) sum_k g_k B_k, the phase of a term is
 sum_k g_k (pi / q) (B_k(p + q f) - B_k(p - q f)): smooth in p however small q is, so that a coarse
-pupil does. The square of its modulus is averaged over each bin, since the
-zeros of an OTF are lines; where it is smooth, one frequency stands for the bin. A kernel is known on pixels
-only, so that its spectrum is a sum over aliases: sharp lenses lose no contrast to the pixel that the kernel,
-as we define it, could show.
+pupil does. A kernel is known on pixels only, the centre of its light at the middle of one::
+
+    K(f) = sum_k sinc(f + k) OTF(f + k) exp(-2 pi i k . d),      d = centre of the light, k whole
+
+The square of its modulus is averaged over each bin, since the zeros of an OTF are lines; where it is
+smooth, one frequency stands for the bin.
 
 Source: J. W. Goodman, "Introduction to Fourier Optics", 3rd ed., 2005, eq. 6-27.
 """
@@ -45,10 +47,12 @@ _INSIDE = (-0.3, 0.3)  # where a bin is sampled, in parts of its width
 _SMOOTH = 5  # rings in which one sample does: nothing has zeros at such low frequencies
 BORROWED_RINGS: Final = 3
 """Outermost rings that say nothing of red and blue: demosaicing takes them from green."""
+_HIGHEST = 0.75  # cycles/pixel; beyond, lens and pixel pass too little to count
 _LEAST = 1e-7
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
+Waves = NDArray[np.complex128]
 
 
 def bin_frequencies() -> tuple[Floats, Floats]:
@@ -73,12 +77,18 @@ class Transfer:
     points : tuple of ndarray of float32, shape (P,)
         The pupil p, (right, up).
     shifts : tuple of ndarray of float32, shape (F,)
-        q f of F frequencies, one or four to a bin.
+        q (f + k) of the aliases of all frequencies, those of one frequency side by side.
     steep : float
         Slope of the edge of a stop, which is one sample wide.
-    share : ndarray, shape (F,)
-        One over the number of frequencies of the bin.
-    bins : ndarray of int, shape (F,)
+    pixel : ndarray, shape (F,)
+        sinc(f + k).
+    aliases : ndarray, shape (F, 2)
+        k, (right, up).
+    first : ndarray of int, shape (S,)
+        Where the aliases of each of S frequencies begin.
+    share : ndarray, shape (S,)
+        One over the number of frequencies of the bin, which are one or four.
+    bins : ndarray of int, shape (S,)
         Which bin each frequency belongs to.
     """
 
@@ -86,6 +96,9 @@ class Transfer:
     points: tuple[Singles, Singles]
     shifts: tuple[Singles, Singles]
     steep: float
+    pixel: Floats
+    aliases: Floats
+    first: NDArray[np.intp]
     share: Floats
     bins: NDArray[np.intp]
 
@@ -118,35 +131,59 @@ class Transfer:
         by_eye : ndarray, shape (BINS, 3)
             By `radius` and `shift`.
         """
-        power, by_blur, by_eye = self._optical(blur, radius, shift)
-        safe = np.clip(power, _LEAST, 1.0)
-        value, slope = _on_pixels(safe)
-        scale = (slope / safe)[:, None]
-        return value, by_blur * scale, by_eye * scale
+        otf, otf_by_blur, otf_by_eye = self._optical(blur, radius, shift)
+        centre, centre_by_blur, centre_by_eye = self._centre(blur, radius, shift)
+        turn = self.pixel * np.exp(-2j * math.pi * (self.aliases @ centre))
+        moved = -2j * math.pi * self.aliases * otf[:, None]
+        by = [otf[:, None], otf_by_blur + moved @ centre_by_blur, otf_by_eye + moved @ centre_by_eye]
+        columns = np.concatenate(by, axis=1) * turn[:, None]
+        kernel = np.add.reduceat(columns, self.first, axis=0)
+        # |K|^2 and its derivatives 2 Re K* dK
+        products = (kernel[:, :1].conj() * kernel).real * self.share[:, None]
+        products[:, 1:] *= 2.0
+        power = np.stack([np.bincount(self.bins, column, BINS) for column in products.T], axis=1)
+        safe = np.clip(power[:, 0], _LEAST, 1.0)
+        relative = power[:, 1:] / safe[:, None]
+        return np.log(safe), relative[:, :6], relative[:, 6:]
 
-    def _optical(
-        self, blur: Floats, radius: float, shift: tuple[float, float]
-    ) -> tuple[Floats, Floats, Floats]:
-        """Mean square of the transfer function of the lens alone in each bin, and its derivatives."""
-        alone, alone_by = _circle(*self.points, radius, shift, self.steep)
-        open_ = _circle(*self.points, 1.0, (0.0, 0.0), self.steep)[0]
+    def _optical(self, blur: Floats, radius: float, shift: tuple[float, float]) -> tuple[Waves, Waves, Waves]:
+        """OTF of the lens alone at f + k, shape (F,), and its derivatives (F, 6), (F, 3)."""
+        open_, alone, alone_by = self._stops(radius, shift)
         area = float((open_ * alone * open_ * alone).sum())
         turns = (blur / (2.0 * self.q)).astype(np.float32)
         eye = np.array([radius, *shift], dtype=np.float32)
-        out = np.zeros((self.share.size, COLUMNS), dtype=np.float32)
+        out = np.zeros((self.pixel.size, COLUMNS), dtype=np.float32)
         _engine()(*self.points, *self.shifts, turns, eye, np.float32(self.steep), out)
-        found = out.astype(np.float64)
-        real, imaginary = found[:, 0, None], found[:, 1, None]
-        scale = (self.share / area**2)[:, None]
-        power = self._binned((real**2 + imaginary**2) * scale)
-        to_phase = math.pi / self.q
-        by_blur = self._binned(2.0 * to_phase * scale * (real * found[:, 2:8] + imaginary * found[:, 8:14]))
-        towards = self._binned(2.0 * scale * (real * found[:, 14:17] + imaginary * found[:, 17:20]))
-        loss = [4.0 * float((open_ * open_ * alone * own).sum()) / area for own in alone_by]
-        return power[:, 0], by_blur, towards - power * np.array(loss)
+        found = out.astype(np.float64) / area
+        otf: Waves = found[:, 0] + 1j * found[:, 1]
+        by_blur: Waves = (found[:, 2:8] + 1j * found[:, 8:14]) * complex(math.pi / self.q)
+        loss = [2.0 * float((open_ * open_ * alone * own).sum()) / area for own in alone_by]
+        by_eye: Waves = found[:, 14:17] + 1j * found[:, 17:20] - otf[:, None] * np.array(loss)
+        return otf, by_blur, by_eye
 
-    def _binned(self, values: Floats) -> Floats:
-        return np.stack([np.bincount(self.bins, column, BINS) for column in values.T], axis=1)
+    def _centre(
+        self, blur: Floats, radius: float, shift: tuple[float, float]
+    ) -> tuple[Floats, Floats, Floats]:
+        """Centre of the light (right, up), pixels, and its derivatives (2, 6), (2, 3)."""
+        px, py = (point.astype(np.float64) for point in self.points)
+        open_, alone, alone_by = self._stops(radius, shift)
+        weight = (open_ * alone).astype(np.float64) ** 2
+        rho2 = px * px + py * py
+        right = [4 * rho2 * px, rho2 + 2 * px * px, 2 * px * py, 2 * px, 2 * px, 2 * py]
+        up = [4 * rho2 * py, 2 * px * py, rho2 + 2 * py * py, 2 * py, -2 * py, 2 * px]
+        rays = np.array([right, up])
+        by_blur = rays @ weight / weight.sum()
+        centre = by_blur @ blur
+        landed = np.einsum("akp,k->ap", rays, blur) - centre[:, None]
+        change = np.stack([2.0 * open_ * open_ * alone * own for own in alone_by])
+        return centre, by_blur, landed @ change.T / weight.sum()
+
+    def _stops(
+        self, radius: float, shift: tuple[float, float]
+    ) -> tuple[Singles, Singles, tuple[Singles, ...]]:
+        """Transmission of the stop, and of the second circle with its derivatives."""
+        open_ = _circle(*self.points, 1.0, (0.0, 0.0), self.steep)[0]
+        return open_, *_circle(*self.points, radius, shift, self.steep)
 
 
 @lru_cache(maxsize=32)
@@ -160,6 +197,9 @@ def _laid_out(q: float, rings: int, coarse: bool) -> Transfer:
     t = np.concatenate([angle[single], (angle[several] + across * math.pi / SECTORS).ravel()])
     bins = np.concatenate([single, np.tile(several, len(_INSIDE) ** 2)])
     share = np.where(alone[bins], 1.0, 1.0 / len(_INSIDE) ** 2)
+    pixel, aliases, first = _aliases(f * np.cos(t), -f * np.sin(t))  # rows grow downwards
+    number = np.repeat(np.arange(f.size), np.diff([*first, len(pixel)]))
+    fx, fy = (f * np.cos(t))[number] + aliases[:, 0], (-f * np.sin(t))[number] + aliases[:, 1]
     samples = _ACROSS_COARSE if coarse else _ACROSS
     side = (np.arange(samples) - (samples - 1) / 2.0) * 2.0 / samples
     px, py = (a.ravel() for a in np.meshgrid(side, side))
@@ -167,11 +207,11 @@ def _laid_out(q: float, rings: int, coarse: bool) -> Transfer:
     return Transfer(
         q,
         (px[inside].astype(np.float32), py[inside].astype(np.float32)),
-        (
-            (q * f * np.cos(t)).astype(np.float32),
-            (-q * f * np.sin(t)).astype(np.float32),
-        ),  # rows grow downwards
+        ((q * fx).astype(np.float32), (q * fy).astype(np.float32)),
         samples / 2.0,
+        pixel,
+        aliases,
+        first,
         share,
         bins,
     )
@@ -236,25 +276,10 @@ def _circle(
     return inside, (soft, soft * dx * over, soft * dy * over)
 
 
-def _on_pixels(power: Floats) -> tuple[Floats, Floats]:
-    """Ln |K|^2 of the kernel on pixels, and its derivative by the logarithm of the lens's `power`.
-
-    K(f) = sum_k sinc(f + k) OTF(f + k) over the nearest aliases, where the OTF follows that of the
-    Gaussian with the power at f: OTF(f + k) = OTF(f)^(|f + k|^2 / |f|^2).
-    """
-    terms = _PIXEL * power ** (_STEEP / 2.0)
-    kernel = np.maximum(terms.sum(axis=0), math.sqrt(_LEAST))
-    return 2.0 * np.log(kernel), (terms * _STEEP).sum(axis=0) / kernel
-
-
-def _aliases() -> tuple[Floats, Floats]:
-    """Sinc of the pixel and relative square of the frequency, shape (9, BINS)."""
-    modulus, angle = bin_frequencies()
-    fx, fy = modulus * np.cos(angle), modulus * np.sin(angle)
-    moves = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-    pixel = np.stack([np.sinc(fx + i) * np.sinc(fy + j) for i, j in moves])
-    steep = np.stack([((fx + i) ** 2 + (fy + j) ** 2) / modulus**2 for i, j in moves])
-    return pixel, steep
-
-
-_PIXEL, _STEEP = _aliases()
+def _aliases(fx: Floats, fy: Floats) -> tuple[Floats, Floats, NDArray[np.intp]]:
+    """Sinc and whole numbers k of the aliases that pass a lens, and where those of each f begin."""
+    moves = np.array([(i, j) for i in (0, -1, 1) for j in (0, -1, 1)], dtype=np.float64)
+    x, y = fx[:, None] + moves[:, 0], fy[:, None] + moves[:, 1]
+    kept = (np.hypot(x, y) < _HIGHEST) | (moves == 0.0).all(axis=1)
+    first = np.concatenate([[0], np.cumsum(kept.sum(axis=1))[:-1]])
+    return (np.sinc(x) * np.sinc(y))[kept], moves[np.nonzero(kept)[1]], first.astype(np.intp)

@@ -427,6 +427,7 @@ def correct_photo(
     *,
     method: str = "standard",
     strength: float = 1.0,
+    bounds: deconv.Bounds | None = None,
     lateral: LateralColour | None = None,
     roi: tuple[int, int, int, int] | None = None,
     workers: int = 1,
@@ -439,6 +440,8 @@ def correct_photo(
 
     Parameters
     ----------
+    bounds : Bounds, optional
+        What to allow beside edges and in flat areas.
     roi : tuple of int, optional
         `(row, col, height, width)` in sensor orientation; only that part is corrected.
     """
@@ -468,6 +471,7 @@ def correct_photo(
         psf_error=psf_error,
         lateral=lateral,
         cfa=cfa,
+        bounds=bounds,
         roi=roi,
         workers=workers,
         on_step=on_step,
@@ -482,15 +486,17 @@ def correct(
     settings: LensSettings | None = None,
     method: str = "standard",
     strength: float = 1.0,
+    bounds: deconv.Bounds | None = None,
     file_format: photo.OutputFormat = "tiff16",
     color_space: photo.ColorSpace = "same",
     quality: int = 95,
+    lens: str = "",
     workers: int = 1,
     on_step: StepHook = ignore_step,
 ) -> deconv.Corrected:
     """Correct one photo file and write the result, in the encoding of the input.
 
-    The file appears complete or not at all.
+    The file appears complete or not at all. It says in a tag what was done; `lens` goes into that.
     """
     developed = photo.develop(path)
     chosen = settings_of(developed, settings)
@@ -500,6 +506,7 @@ def correct(
         chosen,
         method=method,
         strength=strength,
+        bounds=bounds,
         lateral=lateral_of(developed),
         workers=workers,
         on_step=on_step,
@@ -513,6 +520,7 @@ def correct(
         format=file_format,
         color_space=color_space,
         quality=quality,
-        description=f"lens blur corrected by lensmodel: method {method}, strength {strength:g}",
+        description=f"lens blur corrected by lensmodel: {lens + ', ' if lens else ''}"
+        f"method {method}, strength {strength:g}{'' if bounds is None else bounds.described}",
     )
     return corrected

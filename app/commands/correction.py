@@ -37,6 +37,7 @@ class Wishes:
     aperture: float | None
     method: str
     strength: float
+    bounds: deconv.Bounds
     file_format: OutputFormat
     workers: int | None
     any_lens: bool
@@ -130,11 +131,20 @@ def _one(
         settings=settings if needs_help else LensSettings(),
         method=wishes.method,
         strength=wishes.strength,
+        bounds=wishes.bounds,
+        lens=_named(profile),
         file_format=wishes.file_format,
         workers=wishes.workers or os.cpu_count() or 1,
         on_step=on_step,
     )
     return {"state": "corrected", "zones": corrected.zones}
+
+
+def _named(profile: LensProfile) -> str:
+    """Which lens, and how many photos its profile has seen, for the tag of a corrected photo."""
+    words = [profile.lens[key] for key in ("maker", "model") if profile.lens.get(key)]
+    count = len(profile.photos)
+    return f"{' '.join(words) or 'unknown lens'}, profile of {count} photo{'' if count == 1 else 's'}"
 
 
 def _show(bars: Progress, task: TaskID, number: int, done: int, total: int) -> None:

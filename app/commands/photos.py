@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from app.commands import answer, calibration, correction, display
+from app.commands import answer, calibration, correction, display, files
 from app.commands.options import (
     AnyLens,
     Aperture,
@@ -22,6 +22,7 @@ from app.commands.options import (
     Verbose,
     Workers,
 )
+from lensmodel.deconv import Bounds
 
 
 def calibrate(
@@ -93,6 +94,18 @@ def correct(
     strength: Annotated[
         float, typer.Option(min=0.0, max=1.0, metavar="0..1", help="0 nothing, 1 all that the noise allows.")
     ] = 1.0,
+    halo: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SHARE",
+            help="How far beside edges to leave the light of the photo around, in shares of its range: "
+            "0 never. Default: the less sure the profile, the less.",
+        ),
+    ] = None,
+    keep_flats: Annotated[
+        float,
+        typer.Option(min=0.0, max=1.0, metavar="0..1", help="How much of its grain a flat area keeps."),
+    ] = 0.0,
     file_format: Annotated[
         Literal["tiff16", "png16", "png8", "jpeg", "dng"],
         typer.Option("--format", help="dng: linear, for a raw converter; only from RAW photos."),
@@ -117,16 +130,29 @@ def correct(
 
         lensmodel correct one.dng --profile my-24mm.lensprofile -o web --format jpeg --strength 0.7
 
+        lensmodel correct one.dng --profile my-24mm.lensprofile -o soft --halo 0.2 --keep-flats 0.5
+
         lensmodel correct one.dng --profile my-24mm.lensprofile -o linear --format dng --method fast --json
 
     Exit status: 0 all photos are corrected, 1 some are not, 2 called wrongly.
     """
     shown = display.of(context, quiet=quiet, verbose=verbose)
+    with files.as_usage():
+        bounds = Bounds(halo, keep_flats)
     correction.run(
         photos,
         profile,
         output,
-        correction.Wishes(aperture, method, strength, file_format, workers, any_lens=any_lens, force=force),
+        correction.Wishes(
+            aperture,
+            method,
+            strength,
+            bounds,
+            file_format,
+            workers,
+            any_lens=any_lens,
+            force=force,
+        ),
         shown,
         as_json=json_output,
     )

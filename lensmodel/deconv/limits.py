@@ -46,6 +46,12 @@ class Bounds:
         if not (self.halo is None or self.halo >= 0.0) or not 0.0 <= self.keep_flats <= 1.0:
             raise InvalidInputError(f"halo must not be negative and keep_flats lie in 0..1, got {self}")
 
+    @property
+    def described(self) -> str:
+        """What was asked for, for the tag of a corrected photo; nothing where nothing was."""
+        halo = "" if self.halo is None else f", halo {self.halo:g}"
+        return halo + (f", flats kept {self.keep_flats:g}" if self.keep_flats > 0.0 else "")
+
     def hold(
         self,
         planes: Planes,

@@ -19,7 +19,9 @@ from typing import Any
 import numpy as np
 import pytest
 import rawpy
+import tifffile
 from PIL import Image
+from scipy import ndimage
 from typer.testing import CliRunner
 
 from app.cli import app, main
@@ -179,6 +181,25 @@ def test_correct_leaves_what_is_there_alone_unless_forced(folder: Path, here: He
     assert forced.stdout == forced.stderr == ""
 
 
+def test_photographer_bounds_halos_and_keeps_the_grain_of_flats(folder: Path, here: Here) -> None:
+    words = ("correct", "one.dng", "-p", PROFILE, "--method", "fast")
+    here(*words, "-o", "plain", "--strength", "0")
+    here(*words, "-o", "free", "--halo", "inf")
+    done = here(*words, "-o", "bound", "--halo", "0", "--keep-flats", "1")
+
+    assert done.returncode == 0, done.stderr
+    with tifffile.TiffFile(folder / "bound/one-corrected.tif") as file:
+        assert "method fast, strength 1, halo 0, flats kept 1" in file.pages[0].description
+        assert "profile of 1 photo," in file.pages[0].description
+    plain, free, bound = (
+        tifffile.imread(folder / name / "one-corrected.tif").astype(float)
+        for name in ("plain", "free", "bound")
+    )
+    low, high = (f(plain, (5, 5, 1)) for f in (ndimage.minimum_filter, ndimage.maximum_filter))
+    assert np.mean((free < low - 50) | (free > high + 50)) > 0.01
+    assert np.mean((bound < low - 50) | (bound > high + 50)) < 0.001
+
+
 def test_corrected_dng_opens_as_raw(folder: Path, here: Here) -> None:
     done = here("correct", "one.dng", "-p", PROFILE, "-o", "out", "--format", "dng", "--method", "fast")
 
@@ -235,6 +256,12 @@ REFUSED = {
     "bad profile to add to": (["calibrate", "one.dng", "-p", "bad"], 1, "bad is no lens profile.*--force"),
     "profile is a folder": (["calibrate", "one.dng", "-p", "empty"], 2, "empty is a folder"),
     "output is a file": (["correct", "one.dng", "-p", PROFILE, "-o", "bad"], 2, "bad is a file"),
+    "negative halo": (["correct", "one.dng", "-p", PROFILE, "-o", "o", "--halo", "-1"], 2, "must not be neg"),
+    "halo that is none": (
+        ["correct", "one.dng", "-p", PROFILE, "-o", "o", "--halo", "nan"],
+        2,
+        "halo must not be negative.*nan",
+    ),
     "unknown method": (["correct", "one.dng", "-p", PROFILE, "-o", "o", "--method", "x"], 2, "known: .*fast"),
     "unknown estimator": (["calibrate", "one.dng", "-p", "new", "--estimator", "x"], 2, "known: .*whittle"),
     "aperture": (["calibrate", "one.dng", "-p", "new", "--aperture", "-2"], 2, "-2"),

@@ -18,6 +18,9 @@ LIKELIEST: Final = "likeliest"
 MODES: Final = (MIXED, "kernels", "evidence", "wavefront", LIKELIEST)
 """What can be made of the neighbours of a question; `modes` tells what they are."""
 
+NEEDING_EVIDENCE: Final = frozenset({"evidence", LIKELIEST})
+"""Modes that use the normal equations of patches."""
+
 MICROMETRE: Final = "micrometre"
 HALF_DIAGONAL: Final = "half-diagonal"
 UNITS: Final = (MICROMETRE, HALF_DIAGONAL)

@@ -12,7 +12,7 @@ from lensmodel.errors import NoSamplesError
 from lensmodel.psf import PsfSample
 from lensmodel.regression import pitch as pitches
 from lensmodel.regression import variables as va
-from lensmodel.regression.answer import LIKELIEST, MICROMETRE, MIXED, ModelSettings
+from lensmodel.regression.answer import LIKELIEST, MICROMETRE, MIXED, NEEDING_EVIDENCE, ModelSettings
 from lensmodel.regression.index import SampleIndex
 from lensmodel.regression.judgement import Judgement, bandwidth, held_together, judge
 from lensmodel.regression.local import LocalKernels
@@ -20,9 +20,11 @@ from lensmodel.regression.normal_equations import NormalEquations
 from lensmodel.regression.physical import Physics
 from lensmodel.regression.smoothers import smoothers
 from lensmodel.regression.transport import WidthField
-from lensmodel.types import StepHook, ignore_step
+from lensmodel.regression.zoom import End, ends_of, nearest
+from lensmodel.types import LensSettings, StepHook, ignore_step
 
 _INCREMENT = 0.05
+_MOSTLY = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,6 +68,8 @@ class Fit:
         Bandwidths of eq. (8), and those in use.
     physical : Physics or None
         None until `warmed`, or if it takes no part.
+    ends : tuple of End
+        Of a zoom: focal lengths that answer by a wavefront of their own.
     statistics : NormalEquations or None
         Those of the patches, where the mode may need them.
     mode : str
@@ -88,6 +92,7 @@ class Fit:
     statistics: NormalEquations | None = None
     mode: str = MIXED
     unit: str = MICROMETRE
+    ends: tuple[End, ...] = ()
 
     @classmethod
     def of(cls, samples: Sequence[PsfSample], settings: ModelSettings) -> Fit:
@@ -131,7 +136,15 @@ class Fit:
         """Return it with the wavefront of its samples."""
         groups = held_together(samples, self.roster.photo)
         common, scale = pitches.at_pixel(samples, self.pixel, self.unit), va.scales(self.bandwidth)
-        return replace(self, physical=Physics.fit(common, self.judgement.votes, groups, scale, on_step))
+        votes = self.judgement.votes
+        physical = Physics.fit(common, votes, groups, scale, on_step)
+        ends = () if physical is None else ends_of(common, votes, groups, scale, physical)
+        return replace(self, physical=physical, ends=ends)
+
+    def physical_at(self, settings: LensSettings) -> Physics | None:
+        """The wavefront that has the larger say at settings."""
+        end, share = nearest(self.ends, settings)
+        return self.physical if end is None or share < _MOSTLY else end.physical
 
     @property
     def nbytes(self) -> int:
@@ -162,7 +175,7 @@ class Fit:
 
 def statistics_of(samples: Sequence[PsfSample], settings: ModelSettings) -> NormalEquations | None:
     """Normal equations of samples of one pitch, where the mode may ask for them."""
-    return NormalEquations.of(samples) if settings.mode in {"evidence", LIKELIEST} else None
+    return NormalEquations.of(samples) if settings.mode in NEEDING_EVIDENCE else None
 
 
 def told_errors(samples: Sequence[PsfSample]) -> NDArray[np.float64]:

@@ -32,8 +32,9 @@ from lensmodel.regression.robust import Flag
 from lensmodel.regression.transport import WidthField
 from lensmodel.regression.validation import Choice
 from lensmodel.regression.wavefront import NAMES, Wavefront
+from lensmodel.regression.zoom import End
 
-VERSION: Final = 4
+VERSION: Final = 5
 """Raised whenever the same samples would be fitted otherwise."""
 
 _MOST_BYTES = 1 << 27
@@ -80,11 +81,12 @@ def dump(fit: Fit, samples: Sequence[PsfSample], settings: ModelSettings) -> byt
         arrays |= {"image_errors": judgement.image_errors, **_arrays("image", image)}
         document["image"] = _scalars(image)
     if physical is not None:
-        arrays |= _arrays("physical", physical)
-        arrays["front.terms"] = physical.front.terms
-        if physical.front.slopes is not None:
-            arrays["front.slopes"] = physical.front.slopes
-        document |= {"physical": _scalars(physical), "front": _scalars(physical.front)}
+        document["physical"] = []
+        for number, one in enumerate((physical, *(end.physical for end in fit.ends))):
+            arrays |= _arrays(f"physical{number}", one) | _arrays(f"front{number}", one.front)
+            front = {k: v for k, v in _scalars(one.front).items() if k != "slopes"}
+            document["physical"].append({"front": front, **_scalars(one)})
+        document["ends"] = [end.octaves for end in fit.ends]
     text = np.frombuffer(json.dumps(document, allow_nan=True).encode(), dtype=np.uint8)
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, document=text, **arrays)
@@ -150,7 +152,8 @@ def _checked(arrays: Mapping[str, NDArray[Any]], count: int) -> Arrays:
         # an unknown setting is NaN, and only points have settings
         if not name.endswith("where") and not np.isfinite(numbers).all():
             raise ValueError(f"{name} is not finite")
-        if name in {"votes", "errors", "noise", "image_errors", "physical.errors"} and len(numbers) != count:
+        told = name.startswith("physical") and name.endswith(".errors")
+        if (told or name in {"votes", "errors", "noise", "image_errors"}) and len(numbers) != count:
             raise ValueError(f"{name} has {len(numbers)} entries for {count} samples")
         if numbers.ndim and len(numbers) > max(count, _MOST_NODES):
             raise ValueError(f"{name} has {len(numbers)} entries")
@@ -162,6 +165,18 @@ def _of(arrays: Arrays, prefix: str) -> dict[str, Any]:
     return {name.partition(".")[2]: v for name, v in arrays.items() if name.startswith(f"{prefix}.")}
 
 
+def _physical(document: Mapping[str, Any], lines: dict[str, Any], arrays: dict[str, Any]) -> Physics:
+    if any(line.shape != (len(NAMES),) for line in lines.values()):
+        raise ValueError("the terms of a wavefront do not fit together")
+    scalars, front = dict(document), dict(document["front"])
+    del scalars["front"]
+    wavefront = Wavefront(**lines, **{**front, "eye": tuple(front["eye"])})
+    found = Physics(front=wavefront, **scalars, **arrays)
+    if found.rest.shape != (len(found.vectors), found.side**2):
+        raise ValueError("a wavefront and the rest of its samples do not fit together")
+    return found
+
+
 def _fit(
     document: Mapping[str, Any], arrays: Arrays, samples: Sequence[PsfSample], settings: ModelSettings
 ) -> Fit:
@@ -171,21 +186,19 @@ def _fit(
     widths = WidthField(slopes=arrays.get("widths.slopes"), **document["widths"])
     local = LocalKernels.of(common, where, widths)
     image, physical = None, None
+    ends: tuple[End, ...] = ()
     if "image" in document:
         image = ImageFrame(**document["image"], **_of(arrays, "image"))
         if image.rest.shape != (len(image.vectors), image.mean.size):
             raise ValueError("the image frame does not fit together")
     if "physical" in document:
-        values = dict(document["front"])
-        values |= {"eye": tuple(values["eye"]), "slopes": arrays.get("front.slopes")}
-        front = Wavefront(arrays["front.terms"], **values)
-        physical = Physics(front=front, **document["physical"], **_of(arrays, "physical"))
-        lines = [front.terms, front.terms if front.slopes is None else front.slopes]
-        if any(line.shape != (len(NAMES),) for line in lines) or physical.rest.shape != (
-            len(physical.vectors),
-            physical.side**2,
-        ):
-            raise ValueError("the wavefront does not fit together")
+        physical, *others = [
+            _physical(values, _of(arrays, f"front{number}"), _of(arrays, f"physical{number}"))
+            for number, values in enumerate(document["physical"])
+        ]
+        ends = tuple(
+            End(float(octaves), other) for octaves, other in zip(document["ends"], others, strict=True)
+        )
     judgement = Judgement(
         votes=arrays["votes"],
         errors=arrays["errors"],
@@ -216,4 +229,5 @@ def _fit(
         statistics=statistics_of(common, settings),
         mode=mode,
         unit=settings.unit,
+        ends=ends,
     )

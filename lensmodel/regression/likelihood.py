@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.psf import PsfSample, distance
+from lensmodel.regression.answer import MIXED
 from lensmodel.regression.pooled.fit import fit_scene
 from lensmodel.regression.pooled.scene import BIAS, SceneView
 from lensmodel.regression.pooled.transfer import BINS, bin_frequencies
@@ -24,7 +25,7 @@ from lensmodel.types import Kernel
 
 Predict = Callable[[PsfSample], Kernel]
 
-_FOLDS = 3
+_FOLDS, _FEWEST_GROUPS = 3, 2
 _MOST = 32  # patches of a fold that are asked
 _TAILS, _PATCH_TAILS = 6.0, 3.0  # degrees of freedom of a bin, and of a patch in units of its bins
 _FLOOR = 1e-5  # of |OTF|^2
@@ -37,7 +38,8 @@ def likeliest(
 ) -> str:
     """Choose the name under which patches are likeliest that `learn` was not shown.
 
-    Photos are held out in turn, three groups of them at most; of a single photo, groups of its patches.
+    Photos are held out in turn, three groups of them at most; of a single photo, groups of its patches. Where
+    all share one kernel, the usual mode is taken.
 
     Parameters
     ----------
@@ -46,6 +48,8 @@ def likeliest(
         Predictors by name, learned from some of the samples.
     """
     groups = _groups(samples)
+    if len(np.unique(groups)) < _FEWEST_GROUPS:
+        return MIXED  # nothing can be held out
     costs: dict[str, list[float]] = {}
     for group in range(int(groups.max()) + 1):
         held = [s for s, g in zip(samples, groups, strict=True) if g == group]

@@ -31,11 +31,12 @@ from lensmodel.regression.experts import Experts, Mixture
 from lensmodel.regression.fitting import Fit
 from lensmodel.regression.likelihood import Predict, likeliest
 from lensmodel.regression.local import Answers
-from lensmodel.regression.modes import NEEDING_WAVEFRONT, answered
+from lensmodel.regression.modes import NEEDING_WAVEFRONT, answered, between
 from lensmodel.regression.neighbourhood import Neighbourhood
 from lensmodel.regression.robust import Flag
 from lensmodel.regression.smoothers import smoothers
 from lensmodel.regression.support import field_error, shared_error, standard_error, support
+from lensmodel.regression.zoom import nearest
 from lensmodel.types import (
     ZONES,
     Channel,
@@ -270,7 +271,8 @@ class LensModel:
         inside = self._inner_size(size, pixel)
         answers, mixture, prior_shares = self._asked([position], settings, inside)
         fit = self._fit
-        agreed = fit.mode in {MIXED, "wavefront"} and fit.physical is not None and fit.physical.agreed
+        physical = fit.physical_at(settings)
+        agreed = fit.mode in {MIXED, "wavefront"} and physical is not None and physical.agreed
         rows, weight = answers.rows, np.maximum(answers.weights, 0.0)
         weight /= weight.sum()
         per_photo = np.bincount(fit.roster.photo[rows], weight)
@@ -400,17 +402,18 @@ class LensModel:
         fit = self._fit
         near = self._neighbourhood.near(positions, settings)
         widths = fit.widths.over(np.array([va.point(p, settings) for p in positions]))
-        mixture = answered(
-            fit.mode,
-            self._experts,
-            fit.local,
-            fit.statistics,
-            near,
-            positions,
-            settings,
-            widths,
-            size,
-        )
+        end, share = nearest(fit.ends, settings)
+
+        def told(experts: Experts) -> Mixture:
+            return answered(
+                fit.mode, experts, fit.local, fit.statistics, near, positions, settings, widths, size
+            )
+
+        mixture = told(self._experts) if end is None or share < 1.0 else None
+        if end is not None:
+            own = told(replace(self._experts, physical=end.physical))
+            mixture = own if mixture is None else between(own, mixture, share)
+        assert mixture is not None
         shares = np.zeros(len(positions))
         if self.prior is not None:
             shares = self.prior.strength / (self._seen(positions, settings) + self.prior.strength)

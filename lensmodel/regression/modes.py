@@ -79,3 +79,14 @@ def _alone(kernels: NDArray[np.float64], near: Answers, errors: NDArray[np.float
     shares = np.zeros((len(kernels), 3))
     shares[:, expert] = 1.0
     return Mixture(kernels, near.mean(errors**2), float(errors @ errors) / len(errors), shares)
+
+
+def between(one: Mixture, other: Mixture, share: float) -> Mixture:
+    """The mean of two mixtures of the same questions, with the share of the first."""
+    rest = 1.0 - share
+    return Mixture(
+        share * one.kernels + rest * other.kernels,
+        share * one.squared + rest * other.squared,
+        share * one.usual + rest * other.usual,
+        share * one.shares + rest * other.shares,
+    )

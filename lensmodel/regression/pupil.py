@@ -32,6 +32,7 @@ _ALONE = 1.05  # period over the side of a kernel, at least
 _PERIOD = 1.25  # of the discrete pupil over the side of the kernel
 _SAMPLING = 0.9  # light is band limited to 1 / q cycles/pixel; its last tenth may alias, the pixel kills it
 _MIN_FINE, _MAX_FINE = 3, 8
+_RIM = 4
 
 
 def largest_side(q: float) -> int:
@@ -60,6 +61,9 @@ class PupilGrid:
     rows: NDArray[np.complex64]  # (fine * size, m)
     cols: NDArray[np.complex64]  # (m, fine * size)
     fine: int
+    stop: NDArray[np.float32]  # (m, m): radius 1, edge one sample wide
+    powers: NDArray[np.float32]  # (m, 4): py^0 .. py^3 by row
+    sideways: NDArray[np.float32]  # (m, 4): px^0 .. px^3 by column
 
     @classmethod
     def of(cls, q: float, size: int) -> PupilGrid:
@@ -77,20 +81,30 @@ class PupilGrid:
         # rows of the image grow downwards, py grows upwards
         rows = np.exp(-1j * np.pi / q * np.outer(-t, -p)).astype(np.complex64)
         cols = np.exp(-1j * np.pi / q * np.outer(p, t)).astype(np.complex64)
-        return cls(q, size, px, py, step, terms, rows, cols, fine)
+        stop = np.clip((1.0 - np.sqrt(rho2)) / step + 0.5, 0.0, 1.0).astype(np.float32)
+        powers, sideways = np.vander(-p, 4, increasing=True), np.vander(p, 4, increasing=True)
+        return cls(q, size, px, py, step, terms, rows, cols, fine, stop, powers, sideways)
 
     def amplitude(self, radius: float, shift: tuple[float, float]) -> NDArray[np.float32]:
         """Stop of radius 1 cut by a second circle (cat's eye), edges one sample wide."""
-        stop = np.clip((1.0 - np.sqrt(self.px**2 + self.py**2)) / self.step + 0.5, 0.0, 1.0)
         if radius >= 1.0 + math.hypot(*shift) + self.step:
-            return stop.astype(np.float32)
+            return self.stop
         apart = np.sqrt((self.px - shift[0]) ** 2 + (self.py - shift[1]) ** 2)
-        return (stop * np.clip((radius - apart) / self.step + 0.5, 0.0, 1.0)).astype(np.float32)
+        return (self.stop * np.clip((radius - apart) / self.step + 0.5, 0.0, 1.0)).astype(np.float32)
+
+    def fine_light(self, g: NDArray[np.float64], amplitude: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Light on the finer grid, shape (fine * size, fine * size)."""
+        field = self._field(self._wave(g, amplitude))
+        return np.asarray(field.real**2 + field.imag**2)
+
+    def binned(self, light: NDArray[np.float32], size: int, away: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Light in the pixels of a square of odd side `size` whose middle is `away` (down, right)."""
+        down, right = (_pixels(self.fine, self.size, size, float(one)) for one in away)
+        return np.asarray(down @ light @ right.T, dtype=np.float64)
 
     def light(self, g: NDArray[np.float64], amplitude: NDArray[np.float32]) -> NDArray[np.float64]:
         """Light in each pixel, shape (size, size); its sum is not 1."""
-        field = self._field(self._wave(g, amplitude))
-        return self._binned(field.real**2 + field.imag**2)
+        return self._binned(self.fine_light(g, amplitude))
 
     def with_derivatives(
         self,
@@ -120,14 +134,15 @@ class PupilGrid:
 
     def centre(self, g: NDArray[np.float64], amplitude: NDArray[np.float32]) -> tuple[float, float]:
         """Where the rays' centre of mass lies, (right, up) pixels, tilts left out."""
-        weight = (amplitude * amplitude).astype(np.float64)
-        px, py, total = self.px, self.py, weight.sum()
-        rho2 = px * px + py * py
-        gx = 4 * g[0] * rho2 * px + g[1] * (rho2 + 2 * px * px) + 2 * g[2] * px * py
-        gx = gx + 2 * (g[3] + g[4]) * px + 2 * g[5] * py
-        gy = 4 * g[0] * rho2 * py + g[2] * (rho2 + 2 * py * py) + 2 * g[1] * px * py
-        gy = gy + 2 * (g[3] - g[4]) * py + 2 * g[5] * px
-        return float((weight * gx).sum() / total), float((weight * gy).sum() / total)
+        # m[i, j]: mean of py^i px^j over the light in the pupil
+        m = np.asarray(self.powers.T @ (amplitude * amplitude) @ self.sideways, dtype=np.float64)
+        m /= m[0, 0]
+        x3, y3 = m[0, 3] + m[2, 1], m[3, 0] + m[1, 2]
+        gx = 4 * g[0] * x3 + g[1] * (3 * m[0, 2] + m[2, 0]) + 2 * g[2] * m[1, 1]
+        gx = gx + 2 * (g[3] + g[4]) * m[0, 1] + 2 * g[5] * m[1, 0]
+        gy = 4 * g[0] * y3 + g[2] * (m[0, 2] + 3 * m[2, 0]) + 2 * g[1] * m[1, 1]
+        gy = gy + 2 * (g[3] - g[4]) * m[1, 0] + 2 * g[5] * m[0, 1]
+        return float(gx), float(gy)
 
     def _wave(self, g: NDArray[np.float64], amplitude: NDArray[np.float32]) -> NDArray[np.complex64]:
         angle = np.tensordot((g * (math.pi / self.q)).astype(np.float32), self.terms, axes=1)
@@ -142,3 +157,24 @@ class PupilGrid:
     def _binned(self, light: NDArray[np.floating]) -> NDArray[np.float64]:
         side = self.size
         return np.asarray(light.reshape(side, self.fine, side, self.fine).sum(axis=(1, 3)), dtype=np.float64)
+
+
+def _pixels(fine: int, across: int, size: int, away: float) -> NDArray[np.float32]:
+    """Weights by which samples of a finer grid make pixels, shape (size, fine * across).
+
+    Between samples light is a cubic through four of them. A square may reach beyond the grid by two samples.
+    """
+    whole = math.floor(away * fine)
+    t = away * fine - whole
+    cubic = (
+        -t * (t - 1.0) * (t - 2.0) / 6.0,
+        (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0,
+        -(t + 1.0) * t * (t - 2.0) / 2.0,
+        (t + 1.0) * t * (t - 1.0) / 6.0,
+    )
+    taps = np.convolve(cubic, np.ones(fine))
+    first = (across - size) // 2 * fine + whole - 1
+    found = np.zeros((size, fine * across + 2 * _RIM), dtype=np.float32)
+    cols = first + _RIM + fine * np.arange(size)[:, None] + np.arange(len(taps))
+    found[np.arange(size)[:, None], cols] = taps
+    return found[:, _RIM:-_RIM]

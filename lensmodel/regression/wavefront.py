@@ -43,6 +43,7 @@ NAMES: Final = (
 _STEPS = 4
 _BAND_NM = 35.0  # half the distance between the outer wavelengths of one channel
 _CENTRED_PX = 1e-3
+_SPARE = 1  # pixels around a kernel by which it may be moved without being rendered anew
 
 
 def design(position: FieldPosition, settings: LensSettings) -> NDArray[np.float64]:
@@ -143,24 +144,25 @@ class Wavefront:
         shift_nm: float,
         size: int,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        grid = self.grid(settings, shift_nm, size)
+        grid = self.grid(settings, shift_nm, size + 2 * _SPARE)
         amplitude = self.amplitude(grid, position, settings, self.eye)
-        g = self.blur(position, settings)
-        rounds = _STEPS
-        if not tilt.any():
-            tilt = -np.array(grid.centre(g, amplitude))
-        else:
-            rounds = 0  # the outer wavelengths stay where the middle one puts them
-        g[6:] = tilt
-        light = grid.light(g, amplitude)
-        for _ in range(rounds):
-            row, col = centroid(light)
-            if math.hypot(row, col) < _CENTRED_PX:
-                break
-            tilt = tilt + np.array([-col, row])
+        g, still = self.blur(position, settings), np.zeros(2)
+        if tilt.any():  # the outer wavelengths stay where the middle one puts them
             g[6:] = tilt
-            light = grid.light(g, amplitude)
-        return light / light.sum(), tilt
+            light = grid.binned(grid.fine_light(g, amplitude), size, still)
+            return light / light.sum(), tilt
+        g[6:] = -np.array(grid.centre(g, amplitude))
+        light = np.empty(0)
+        for _ in range(_STEPS):
+            fine, away, gap = grid.fine_light(g, amplitude), still, math.inf
+            while gap >= _CENTRED_PX and np.abs(away).max() <= _SPARE:
+                light = grid.binned(fine, size, away)
+                found = np.array(centroid(light))
+                gap, away = math.hypot(*found), away + found
+            g[6:] += -away[1], away[0]
+            if gap < _CENTRED_PX:
+                break
+        return light / light.sum(), g[6:].copy()
 
 
 @lru_cache(maxsize=24)

@@ -19,6 +19,7 @@ _LARGEST = 35
 _COARSE, _FINE = 12, 36
 _COARSE_ROUNDS, _FINE_ROUNDS = 8, 12
 _STARTS, _REFINED = 4, 2
+_REFINING_ROUNDS, _KNOWN = 6, 0.03
 _BLUR_PX = 1.0
 _GUESSED = 0.1
 _LEAST_HALF, _HELD_LIGHT = 5, 0.98
@@ -87,6 +88,13 @@ def fit_wavefront(samples: Sequence[PsfSample], start: Wavefront | None = None) 
         if other_cost < cost:
             found, errors = other, other_errors
     return replace(found, error=float(np.median(errors)))
+
+
+def refined(front: Wavefront, samples: Sequence[PsfSample]) -> Wavefront:
+    """A wavefront after some steps towards samples, of which there may be fewer than it was fitted to."""
+    many = spread(samples, _FINE * (1 + (front.slopes is not None)))
+    problem = Problem(tuple(many), front.size, front.log_q, _KNOWN, 0.0)
+    return problem.solve(front, _REFINING_ROUNDS)[0]
 
 
 def focal_range(samples: Sequence[PsfSample]) -> float:

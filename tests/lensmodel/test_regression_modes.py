@@ -204,6 +204,14 @@ def test_likeliest_predictor_wins_and_none_sees_what_it_is_judged_by() -> None:
     assert all(len(photos) < 4 for photos in shown)
 
 
+def test_patches_that_share_one_kernel_choose_no_mode(noisy: list[PsfSample]) -> None:
+    twins = [replace(s, photo="one", kernel=gaussian(SIZE, np.eye(2))) for s in noisy[:3]]
+
+    model = LensModel.fit(twins, wide("likeliest")).warmed()
+
+    assert model.query(FieldPosition(0.5, 1.0), SETTINGS, SIZE).mode == "mixed"
+
+
 def test_likeliest_mode_is_found_by_warming_and_kept_by_what_was_learned(noisy: list[PsfSample]) -> None:
     # spectra of so small patches tell little: kernels are what is judged by here
     samples = [replace(s, spectrum=None, kernel=truth(s.position)) for s in noisy[:10]]

@@ -25,7 +25,9 @@ DIGITS: Final = 10
 GAP_PX: Final = 2
 
 
-def describe(lens_id: str, fitted: Fitted, question: QueryOut, answer: PsfAnswer) -> PsfOut:
+def describe(
+    lens_id: str, fitted: Fitted, question: QueryOut, answer: PsfAnswer, pixel_pitch_um: float | None
+) -> PsfOut:
     """Say what an answer rests on, with an empty kernel for formats that carry it themselves."""
     size = answer.kernel.shape[0]
     error = float(answer.predicted_error)
@@ -39,12 +41,13 @@ def describe(lens_id: str, fitted: Fitted, question: QueryOut, answer: PsfAnswer
             photos=answer.photos,
             extrapolated=answer.extrapolated,
             predicted_error=error if np.isfinite(error) else None,
+            mode=answer.mode,
             family=FamilyOut(lenses=len(fitted.family), weight=float(answer.prior_share))
             if fitted.family
             else None,
         ),
         bandwidth={name: float(value) for name, value in answer.bandwidth.items()},
-        units=Units(pixel_pitch_um=fitted.pixel_pitch_um),
+        units=Units(pixel_pitch_um=pixel_pitch_um),
     )
 
 

@@ -16,6 +16,7 @@ from app.routes import corrections, health, jobs, lenses, photos, psf
 from app.settings import MIB, Settings
 from app.storage import Storage
 from app.store import Store
+from lensmodel.regression import ModelSettings
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
@@ -30,7 +31,13 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         store = Store(chosen)
         storage = Storage(chosen.storage)
-        cache = ModelCache(store, chosen.model_cache_mb * MIB, storage, family=chosen.family)
+        cache = ModelCache(
+            store,
+            chosen.model_cache_mb * MIB,
+            storage,
+            family=chosen.family,
+            settings=ModelSettings(mode=chosen.model_mode, unit=chosen.model_unit),
+        )
         app.state.services = Services(chosen, store, storage, cache)
         yield
         store.close()

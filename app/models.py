@@ -17,13 +17,14 @@ from dataclasses import dataclass, replace
 from typing import Final, TypeAlias
 
 from app.errors import ConflictError, UnknownLensError
+from app.evidence import with_evidence
 from app.storage import Storage
 from app.store import Store, StoredSample
 from app.store.samples import Family, LensState
 from app.store.versions import learned_key
 from lensmodel.errors import InvalidInputError, NoSamplesError
 from lensmodel.psf import PsfSample
-from lensmodel.regression import LensModel, Prior
+from lensmodel.regression import LensModel, ModelSettings, Prior
 
 log = logging.getLogger(__name__)
 
@@ -70,13 +71,21 @@ class ModelCache:
         Where workers keep what they have learned from samples.
     family : bool
         Whether lenses lean on other copies at all.
+    settings : ModelSettings, optional
+        Of all models; must be those of the workers, or what they learn is of no use here.
     """
 
     def __init__(
-        self, store: Store, max_bytes: int, storage: Storage | None = None, *, family: bool = True
+        self,
+        store: Store,
+        max_bytes: int,
+        storage: Storage | None = None,
+        *,
+        family: bool = True,
+        settings: ModelSettings | None = None,
     ) -> None:
         self._store, self._max_bytes, self._storage = store, max_bytes, storage
-        self._family = family
+        self._family, self._settings = family, settings or ModelSettings()
         self._asked: dict[str, float] = {}
         self._models: OrderedDict[_Key, Fitted] = OrderedDict()
         self._guard = threading.Lock()
@@ -137,10 +146,11 @@ class ModelCache:
             found = self._recall(key)
             prior = None if found is None or found.family != family else found.model.prior
             if prior is None:
-                others = [stored.sample for stored in self._store.samples.of_family(family)]
+                others = self._whole(self._store.samples.of_family(family))
                 if not others:  # removed while we looked
                     return own
-                prior = Prior(LensModel.fit(others), name=family_name(family))
+                source = LensModel.fit([stored.sample for stored in others], self._settings)
+                prior = Prior(source, name=family_name(family))
             leaning = own.model.with_prior(prior.source, name=prior.name)
             size = own.size_bytes
             if isinstance(prior.source, LensModel):
@@ -169,9 +179,10 @@ class ModelCache:
         if old is not None:
             state, samples = self._store.samples.of_lens(lens_id, after_version=old.state.version)
             if state.rebuild_epoch == old.state.rebuild_epoch:
+                samples = self._whole(samples)
                 model = old.model.added([stored.sample for stored in samples]) if samples else old.model
                 size = old.size_bytes + _size(samples)
-                return Fitted(lens_id, state, model, old.pixel_pitch_um, size, learned=False)
+                return Fitted(lens_id, state, model, model.pitch_um, size, learned=False)
         state, samples = self._store.samples.of_lens(lens_id)
         return self._fit(lens_id, state, samples)
 
@@ -191,18 +202,23 @@ class ModelCache:
                 f"lens {lens_id} has no samples yet (version {state.version}): "
                 "upload photos taken with it and wait until they are counted"
             )
+        samples = self._whole(samples)
         values = [stored.sample for stored in samples]
         model = self._restored(lens_id, state, values)
         learned = model is not None
-        pitch = next((s.pixel_pitch_um for s in reversed(values) if s.pixel_pitch_um), None)
-        return Fitted(lens_id, state, model or LensModel.fit(values), pitch, _size(samples), learned)
+        model = model or LensModel.fit(values, self._settings)
+        return Fitted(lens_id, state, model, model.pitch_um, _size(samples), learned)
+
+    def _whole(self, samples: Sequence[StoredSample]) -> list[StoredSample]:
+        """Samples with all that the mode of the models needs."""
+        return with_evidence(samples, self._storage, self._settings.mode)
 
     def _restored(self, lens_id: str, state: LensState, samples: Sequence[PsfSample]) -> LensModel | None:
         if self._storage is None:
             return None
         try:
             stored = self._storage.get(learned_key(lens_id, state.version, state.rebuild_epoch))
-            return LensModel.restored(samples, stored)
+            return LensModel.restored(samples, stored, self._settings)
         except FileNotFoundError:
             return None
         except InvalidInputError as error:
@@ -257,4 +273,8 @@ def check_version(store: Store, lens_id: str, version: int, state: LensState) ->
 
 
 def _size(samples: Sequence[StoredSample]) -> int:
-    return BYTES_FACTOR * sum(stored.sample.kernel.nbytes for stored in samples)
+    return BYTES_FACTOR * sum(
+        stored.sample.kernel.nbytes
+        + (0 if stored.sample.evidence is None else stored.sample.evidence.autocorrelation.nbytes)
+        for stored in samples
+    )

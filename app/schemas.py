@@ -264,6 +264,20 @@ class PsfQuery(Question):
     size: KernelSize = 55
     focal_length_mm: FocalLength | None = None
     focus_distance_m: FocusDistance | None = None
+    pixel_pitch_um: float | None = Field(
+        None,
+        gt=0,
+        le=100,
+        allow_inf_nan=False,
+        description="pixel of the answer; that of most photos by default",
+    )
+    half_diagonal_px: float | None = Field(
+        None,
+        gt=0,
+        le=1e6,
+        allow_inf_nan=False,
+        description="half the diagonal of the frame, if bodies agree in those",
+    )
     version: int | None = Field(None, ge=1, description="an earlier version of the lens")
     strict: bool = Field(default=False, description="refuse answers outside what the samples cover")
     family: bool = Field(default=True, description=_FAMILY)
@@ -303,6 +317,7 @@ class Support(Model):
     photos: int
     extrapolated: bool
     predicted_error: float | None
+    mode: str
     family: FamilyOut | None = None
 
 

@@ -92,6 +92,13 @@ class Settings(BaseSettings):
         default=True,
         description="A lens that has seen little leans on its owner's other copies of the same model.",
     )
+    model_mode: Literal["mixed", "kernels", "evidence", "wavefront", "likeliest"] = Field(
+        default="mixed",
+        description="What lens models make of their samples; likeliest chooses for each lens.",
+    )
+    model_unit: Literal["micrometre", "half-diagonal"] = Field(
+        default="micrometre", description="In what the kernels of bodies with different pixels agree."
+    )
     model_cache_mb: int = Field(
         default=1024, ge=1, description="Memory for fitted lens models in one process, in MiB."
     )
@@ -148,6 +155,11 @@ class Settings(BaseSettings):
     def storage(self) -> str:
         """Address of the blobs."""
         return self.storage_url or f"file://{self.data_dir.resolve() / 'blobs'}"
+
+    @property
+    def of_models(self) -> dict[str, str]:
+        """How all lens models of the service are made: arguments of `ModelSettings`."""
+        return {"mode": self.model_mode, "unit": self.model_unit}
 
     @property
     def max_upload_bytes(self) -> int:

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any, Final
 
+from app.evidence import with_evidence
 from app.jobs.child import Progress
 from app.jobs.handover import FAMILY, LEARNED, SUFFIX
 from app.jobs.sandbox import Limits
@@ -24,7 +25,7 @@ from app.jobs.workbench import (
     write_samples,
 )
 from app.store.corrections import CorrectionPlan, Result
-from app.store.samples import LensState, Relative
+from app.store.samples import LensState, Relative, StoredSample
 from app.store.versions import learned_key
 
 log = logging.getLogger(__name__)
@@ -80,6 +81,7 @@ class CorrectionWork:
         arguments = {
             "developed": str(developed),
             "settings": settings_of(photo),
+            "model": settings.of_models,
             "lateral": photo.lateral,
             "method": params["method"],
             "strength": params["strength"],
@@ -105,7 +107,7 @@ class CorrectionWork:
     def _family(self, listed: list[dict[str, Any]], folder: Path) -> int:
         """Hand over what other copies of the lens say; return how many of them still say something."""
         family = [Relative(one["lens_id"], LensState(**one["state"])) for one in listed]
-        stored = self._bench.store.samples.of_family(family)
+        stored = self._whole(self._bench.store.samples.of_family(family))
         if not stored:
             return 0
         (folder / FAMILY).mkdir()
@@ -117,11 +119,14 @@ class CorrectionWork:
         if not stored:
             text = f"version {version} of lens {lens_id} has no samples any more; ask for the newest version"
             raise JobFailedError("no_samples", text)
-        write_samples(folder, stored)
+        write_samples(folder, self._whole(stored))
         key = learned_key(lens_id, version, state.rebuild_epoch)
         with suppress(FileNotFoundError):  # not learned yet: the task does it
             (folder / LEARNED).write_bytes(self._bench.storage.get(key))
         return state
+
+    def _whole(self, stored: list[StoredSample]) -> list[StoredSample]:
+        return with_evidence(stored, self._bench.storage, self._bench.settings.model_mode)
 
     def _teller(self, correction_id: str) -> Progress:
         last = 0.0
@@ -163,7 +168,10 @@ class CorrectionWork:
         try:
             with self._bench.sandbox.folder() as folder:
                 state = self._samples(lens_id, version, folder)
-                metrics = self._bench.attempt("measure", {}, folder=folder, limits=limits, wanted=wanted)
+                model = self._bench.settings.of_models
+                metrics = self._bench.attempt(
+                    "measure", {"model": model}, folder=folder, limits=limits, wanted=wanted
+                )
                 self._keep_learned(lens_id, version, state, folder / LEARNED)
         except NotWantedError:
             return

@@ -16,13 +16,14 @@ from typing import Any, Final
 import numpy as np
 
 from app.jobs.child import Progress, Task
-from app.jobs.handover import FAMILY, INFINITY, KERNELS, LEARNED, SAMPLES, SUFFIX
+from app.jobs.handover import EVIDENCE, FAMILY, INFINITY, KERNELS, LEARNED, SAMPLES, SUFFIX
 from lensmodel import codec, photo, pipeline
 from lensmodel.errors import InvalidInputError, LensModelError
+from lensmodel.evidence import PatchEvidence
 from lensmodel.patches import Patch
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.psf import PsfSample
-from lensmodel.regression import LensModel
+from lensmodel.regression import LensModel, ModelSettings
 from lensmodel.spectrum import PatchSpectrum
 from lensmodel.types import FieldPosition, LensSettings
 
@@ -114,7 +115,7 @@ def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
     roi = arguments["roi"]
     corrected = pipeline.correct_photo(
         developed,
-        _leaning(folder),
+        _leaning(folder, ModelSettings(**arguments["model"])),
         _settings(arguments["settings"]),
         method=arguments["method"],
         strength=arguments["strength"],
@@ -141,8 +142,7 @@ def measure(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
 
     What the model has learned, the wavefront of the lens included, is written to the folder.
     """
-    del arguments
-    model = _model(folder).warmed(progress)
+    model = _model(folder, ModelSettings(**arguments["model"])).warmed(progress)
     (folder / LEARNED).write_bytes(model.learned())
     error = codec.to_json(model.cross_validate())
     return {"error": _numbers(error), "coverage": _numbers(codec.to_json(model.coverage()))}
@@ -166,29 +166,29 @@ def _lateral(developed: photo.LinearPhoto) -> LateralColour | None:
         return None
 
 
-def _model(folder: Path) -> LensModel:
+def _model(folder: Path, settings: ModelSettings) -> LensModel:
     """Build the model of the samples in a folder."""
     samples = _samples(folder)
     learned = folder / LEARNED
     if learned.is_file():
         try:
-            return LensModel.restored(samples, learned.read_bytes())
+            return LensModel.restored(samples, learned.read_bytes(), settings)
         except InvalidInputError as error:
             log.info("the model is fitted anew: %s", error)
-    return LensModel.fit(samples)
+    return LensModel.fit(samples, settings)
 
 
-def _leaning(folder: Path) -> LensModel:
+def _leaning(folder: Path, settings: ModelSettings) -> LensModel:
     """Build the model of the samples in a folder, which leans on other copies if they are handed over."""
-    model, family = _model(folder), folder / FAMILY
-    return model.with_prior(_model(family)) if family.is_dir() else model
+    model, family = _model(folder, settings), folder / FAMILY
+    return model.with_prior(_model(family, settings)) if family.is_dir() else model
 
 
 def _samples(folder: Path) -> list[PsfSample]:
     kernels = np.load(folder / KERNELS, allow_pickle=False, mmap_mode="r")
     listed = json.loads((folder / SAMPLES).read_text(encoding="utf-8"))
     samples = []
-    for kernel, entry in zip(kernels, listed, strict=True):
+    for number, (kernel, entry) in enumerate(zip(kernels, listed, strict=True)):
         margin = (kernel.shape[0] - entry["size"]) // 2
         inner = slice(margin, margin + entry["size"])
         samples.append(
@@ -202,6 +202,8 @@ def _samples(folder: Path) -> list[PsfSample]:
                 estimator=entry["estimator"],
                 error=entry["error"],
                 spectrum=_spectrum(entry["spectrum"]),
+                evidence=_evidence(folder / EVIDENCE.format(number)),
+                half_diagonal_px=entry["half_diagonal_px"],
             )
         )
     return samples
@@ -209,6 +211,10 @@ def _samples(folder: Path) -> list[PsfSample]:
 
 def _spectrum(stored: str | None) -> PatchSpectrum | None:
     return None if stored is None else PatchSpectrum.from_bytes(bytes.fromhex(stored))
+
+
+def _evidence(path: Path) -> PatchEvidence | None:
+    return PatchEvidence.from_bytes(path.read_bytes()) if path.is_file() else None
 
 
 def _settings(stored: Mapping[str, Any]) -> LensSettings:

@@ -18,13 +18,14 @@ from typing import Any, Final, NoReturn
 import numpy as np
 
 from app.jobs.child import Progress
-from app.jobs.handover import INFINITY, KERNELS, SAMPLES
+from app.jobs.handover import EVIDENCE, INFINITY, KERNELS, SAMPLES
 from app.jobs.sandbox import Limits, Outcome, Sandbox
 from app.settings import Settings
 from app.storage import Storage
 from app.store import Store, StoredSample
 from app.store.jobs import JobStore
 from app.tables import PhotoRow
+from lensmodel.evidence import PatchEvidence
 from lensmodel.types import ignore_step
 
 log = logging.getLogger(__name__)
@@ -180,6 +181,8 @@ def write_samples(folder: Path, stored: Sequence[StoredSample]) -> None:
         margin = (side - size) // 2
         kernels[number, margin : margin + size, margin : margin + size] = sample.kernel
         focus = sample.settings.focus_m
+        if isinstance(sample.evidence, PatchEvidence):
+            (folder / EVIDENCE.format(number)).write_bytes(sample.evidence.to_bytes())
         listed.append(
             {
                 "size": size,
@@ -191,6 +194,7 @@ def write_samples(folder: Path, stored: Sequence[StoredSample]) -> None:
                 "estimator": sample.estimator,
                 "error": sample.error,
                 "spectrum": None if sample.spectrum is None else sample.spectrum.to_bytes().hex(),
+                "half_diagonal_px": sample.half_diagonal_px,
                 "settings": {
                     "aperture": sample.settings.aperture,
                     "focal_mm": sample.settings.focal_mm,

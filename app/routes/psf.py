@@ -16,6 +16,7 @@ from app.routes.common import Answers, problems
 from app.schemas import FieldQuery, PsfOut, PsfQuery, QueryOut
 from app.store.samples import LensState
 from lensmodel.errors import OutsideSupportError
+from lensmodel.regression.answer import MICROMETRE
 from lensmodel.types import FieldPosition, LensSettings
 
 router = APIRouter(tags=["psf"])
@@ -99,7 +100,9 @@ def _answer(lens_id: str, at: PsfQuery, form: Format, call: Call) -> Response:
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
     position = FieldPosition(at.r, at.phi)
     setting = LensSettings(at.aperture, at.focal_length_mm, at.focus_distance_m, at.channel)
-    answer = fitted.model.query(position, setting, size=at.size)
+    answer = fitted.model.query(
+        position, setting, size=at.size, pitch_um=at.pixel_pitch_um, half_diagonal_px=at.half_diagonal_px
+    )
     if at.strict and answer.extrapolated:
         raise OutsideSupportError(
             f"r={at.r}, phi={at.phi}, aperture={at.aperture} lies outside what the samples of lens {lens_id} "
@@ -114,7 +117,9 @@ def _answer(lens_id: str, at: PsfQuery, form: Format, call: Call) -> Response:
         focal_length_mm=at.focal_length_mm,
         focus_distance_m=at.focus_distance_m,
     )
-    described = encode.describe(lens_id, fitted, question, answer)
+    in_micrometres = fitted.model.settings.unit == MICROMETRE
+    pitch = (at.pixel_pitch_um if in_micrometres else None) or fitted.pixel_pitch_um
+    described = encode.describe(lens_id, fitted, question, answer, pitch)
     body, more = encode.psf(form, answer.kernel, described)
     return Response(body, media_type=MEDIA_TYPES[form], headers={**headers, **more})
 

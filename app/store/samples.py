@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -86,6 +87,7 @@ class StoredSample:
     id: int
     version_added: int
     sample: PsfSample
+    statistics_key: str | None = None
 
 
 class SampleStore:
@@ -146,11 +148,14 @@ class SampleStore:
                 SampleRow.spectrum,
                 SampleRow.estimator,
                 SampleRow.predicted_error,
+                SampleRow.statistics_key,
                 PhotoRow.public_id.label("photo"),
                 PhotoRow.aperture,
                 PhotoRow.focal_mm,
                 PhotoRow.focus_m,
                 PhotoRow.pixel_pitch_um,
+                PhotoRow.width,
+                PhotoRow.height,
             )
             .join(PhotoRow, PhotoRow.id == SampleRow.photo_id)
             .join(LensRow, LensRow.id == SampleRow.lens_id)
@@ -185,5 +190,9 @@ def _stored(row: Row[*tuple[Any, ...]]) -> StoredSample:
             estimator=row.estimator,
             error=row.predicted_error,
             spectrum=None if row.spectrum is None else PatchSpectrum.from_bytes(row.spectrum),
+            half_diagonal_px=None
+            if not (row.width and row.height)
+            else math.hypot(row.width, row.height) / 2,
         ),
+        row.statistics_key,
     )

@@ -95,12 +95,17 @@ def asked_places() -> list[FieldPosition]:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Errors of one method: mean relative L2 by zone after sub-pixel alignment."""
+    """Errors of one method: mean relative L2 by zone after sub-pixel alignment.
+
+    `net` is what of the root of their mean square is left without the noise of the held-out PSFs, where those
+    say how noisy they are.
+    """
 
     method: str
     photos: int
     errors: Mapping[Zone, float]
     seconds: float
+    net: Mapping[Zone, float] | None = None
 
 
 def run_model_benchmark(
@@ -309,12 +314,17 @@ def _polynomial(samples: Sequence[PsfSample]) -> Predictor:
 
 def _held_out(name: str, fit: Fit, samples: Sequence[PsfSample]) -> Row:
     groups = sorted({s.photo for s in samples})
-    start, errors = time.process_time(), []
+    start, errors, noise = time.process_time(), [], list[float]()
     for group in groups:
         predict = fit([s for s in samples if s.photo != group])
         held = [s for s in samples if s.photo == group]
         errors += [(zone_of(s.position.r), distance(predict(s.position), s.kernel).rel_l2) for s in held]
-    return _row(name, len(groups) - 1, errors, time.process_time() - start)
+        noise += [0.0 if s.error is None else s.error for s in held]
+    row = _row(name, len(groups) - 1, errors, time.process_time() - start)
+    if not any(noise):
+        return row
+    beyond = _row("", 0, [(z, e**2 - n**2) for (z, e), n in zip(errors, noise, strict=True)], 0.0)
+    return replace(row, net={z: math.sqrt(max(e, 0.0)) for z, e in beyond.errors.items()})
 
 
 def _row(name: str, photos: int, errors: Sequence[tuple[Zone, float]], seconds: float) -> Row:
@@ -329,14 +339,19 @@ def _plain(row: Row) -> dict[str, Any]:
         "errors": dict(row.errors),
         "rel_l2": dict(row.errors),  # the same by the name of the measure
         "seconds": round(row.seconds, 2),
+        **({} if row.net is None else {"net": dict(row.net)}),
     }
 
 
 def table(result: Mapping[str, Any]) -> str:
     """Write the rows of a result as a Markdown table."""
-    lines = ["| method | photos | center | mid | corner | CPU s |", "|---|---|---|---|---|---|"]
+    net = any("net" in row for row in result["rows"])
+    more = [f"{zone}, net of noise" for zone in ZONES] if net else []
+    titles = ["method", "photos", *ZONES, *more, "CPU s"]
+    lines = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
     for row in sorted(result["rows"], key=lambda r: (r["photos"], r["errors"].get("corner", 0.0))):
-        cells = [f"{row['errors'][zone]:.3f}" if zone in row["errors"] else "-" for zone in ZONES]
+        kinds = [row["errors"], row["net"]] if net else [row["errors"]]
+        cells = [f"{kind[zone]:.3f}" if zone in kind else "-" for kind in kinds for zone in ZONES]
         lines.append(f"| {row['method']} | {row['photos']} | {' | '.join(cells)} | {row['seconds']:.1f} |")
     return "\n".join(lines)
 

@@ -12,7 +12,8 @@ from scipy import ndimage
 
 from lensmodel.errors import InvalidInputError
 from lensmodel.geometry import Frame
-from lensmodel.psf import PsfSample, centred
+from lensmodel.psf import PsfSample, centred, distance
+from lensmodel.types import Kernel
 
 SIZE = 11
 MOST = 160
@@ -21,6 +22,8 @@ _SIGMAS = 15.0  # of the sky's noise, that the peak of a usable star has
 _SATURATED = 0.9
 _NEIGHBOUR = 0.25  # of its peak, that another source beside a star may have
 _FEWEST = 20
+_REDRAWN = 8
+_HOT = 0.06  # of its peak: a pixel whose neighbours hold less in the mean is hot, no lens is so sharp
 
 
 def stars_of(path: Path) -> list[PsfSample]:
@@ -38,6 +41,17 @@ def stars_of(path: Path) -> list[PsfSample]:
     plane = picture[..., :3].mean(axis=-1) if picture.ndim == 3 and picture.shape[-1] in {3, 4} else picture
     if plane.ndim != 2 or min(plane.shape) < 4 * SIZE:
         raise InvalidInputError(f"{path.name} has shape {picture.shape}; give one picture of a star field")
+    samples = stars_in(plane)
+    if len(samples) < _FEWEST:
+        raise InvalidInputError(f"{path.name} shows {len(samples)} usable stars; {_FEWEST} are needed")
+    return samples
+
+
+def stars_in(plane: NDArray[np.float64]) -> list[PsfSample]:
+    """Find isolated, unsaturated stars in a picture, brightest first, in five groups to hold out.
+
+    `error` of each sample is what the noise of the sky makes of it: as much again changes it by that.
+    """
     plane = (
         plane
         - ndimage.median_filter(plane[::4, ::4], 15)
@@ -46,14 +60,25 @@ def stars_of(path: Path) -> list[PsfSample]:
     )
     noise = 1.4826 * float(np.median(np.abs(plane - np.median(plane)))) + 1e-12
     found = _isolated(plane, noise)
-    if len(found) < _FEWEST:
-        raise InvalidInputError(f"{path.name} shows {len(found)} usable stars; {_FEWEST} are needed")
     frame, half, samples = Frame(*plane.shape), SIZE // 2, []
+    rng = np.random.default_rng(0)
     for number, (row, col) in enumerate(found):
         window = plane[row - half : row + half + 1, col - half : col + half + 1]
-        kernel = np.maximum(window - 1.5 * noise, 0.0) * _round(SIZE)
-        samples.append(PsfSample(centred(kernel), frame.position(row, col), photo=f"group{number % _GROUPS}"))
+        kernel = _kernel(window, noise)
+        again = [_kernel(window + rng.normal(0.0, noise, window.shape), noise) for _ in range(_REDRAWN)]
+        samples.append(
+            PsfSample(
+                kernel,
+                frame.position(row, col),
+                photo=f"group{number % _GROUPS}",
+                error=float(np.mean([distance(other, kernel).rel_l2 for other in again])),
+            )
+        )
     return samples
+
+
+def _kernel(window: NDArray[np.float64], noise: float) -> Kernel:
+    return centred(np.maximum(window - 1.5 * noise, 0.0) * _round(SIZE))
 
 
 def _isolated(plane: NDArray[np.float64], noise: float) -> list[tuple[int, int]]:
@@ -69,6 +94,9 @@ def _isolated(plane: NDArray[np.float64], noise: float) -> list[tuple[int, int]]
     for row, col in zip(rows[order].tolist(), cols[order].tolist(), strict=True):
         inside = half <= row < plane.shape[0] - half and half <= col < plane.shape[1] - half
         if not inside or len(found) == MOST:
+            continue
+        around = (plane[row - 1 : row + 2, col - 1 : col + 2].sum() - plane[row, col]) / 8.0
+        if around < _HOT * plane[row, col]:
             continue
         window = smooth[row - half : row + half + 1, col - half : col + half + 1]
         if window[ring].max() < _NEIGHBOUR * window.max():

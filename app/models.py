@@ -98,12 +98,13 @@ class ModelCache:
         *,
         state: LensState | None = None,
         family: bool = True,
+        relatives: Family | None = None,
     ) -> Fitted:
         """Return the model of a lens, current or of an earlier version.
 
-        `state` is what the caller has just read of the lens, if he did. Where no version is named, the
-        model leans on the owner's other copies of the lens as they are now, unless `family` says no; a
-        named version is what the photos of that lens said, and stays so.
+        `state` and `relatives` are what the caller has just read of the lens, if he did. Where no version is
+        named, the model leans on the owner's other copies of the lens as they are now, unless `family` says
+        no; a named version is what the photos of that lens said, and stays so.
 
         Raises
         ------
@@ -115,7 +116,9 @@ class ModelCache:
             If samples of that version were removed since.
         """
         own = self._own(lens_id, version, state)
-        return self._leaning(own) if self._family and family and version is None else own
+        if not (self._family and family and version is None):
+            return own
+        return self._leaning(own, self._store.samples.family_of(lens_id) if relatives is None else relatives)
 
     def _own(self, lens_id: str, version: int | None, state: LensState | None) -> Fitted:
         state = self._store.samples.state_of(lens_id) if state is None else state
@@ -133,9 +136,8 @@ class ModelCache:
                 return found
             return self._keep((lens_id, None), self._build(lens_id, None if same else found))
 
-    def _leaning(self, own: Fitted) -> Fitted:
+    def _leaning(self, own: Fitted, family: Family) -> Fitted:
         """Let a model lean on the other copies of its lens, if there are any."""
-        family = self._store.samples.family_of(own.lens_id)
         if not family:
             return own
         key: _Key = (own.lens_id, _LEANING)

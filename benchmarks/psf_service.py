@@ -17,7 +17,6 @@ import contextlib
 import http.client
 import json
 import os
-import socket
 import statistics
 import subprocess
 import sys
@@ -54,8 +53,13 @@ class Member:
 
     def get(self, path: str) -> bytes:
         """Return a body; anything but 200 ends the benchmark."""
-        self.http.request("GET", path)
-        answer = self.http.getresponse()
+        try:
+            self.http.request("GET", path)
+            answer = self.http.getresponse()
+        except http.client.RemoteDisconnected:  # it has waited for too long: connect again
+            self.http.close()
+            self.http.request("GET", path)
+            answer = self.http.getresponse()
         body = answer.read()
         if answer.status != http.client.OK:
             raise SystemExit(f"{path}: {answer.status} {body[:300]!r}")
@@ -140,8 +144,6 @@ def serving(settings: Settings, processes: int) -> Iterator[list[Member]]:
             stack.callback(process.terminate)
             connection = http.client.HTTPConnection(*listener.getsockname()[:2], timeout=READY_S)
             stack.callback(connection.close)
-            connection.connect()
-            connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             members.append(Member(process, connection))
         for member in members:
             member.get("/healthz")

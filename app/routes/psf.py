@@ -14,7 +14,7 @@ from app.errors import InvalidParameterError, NotAcceptableError, UnknownLensErr
 from app.models import Fitted
 from app.routes.common import Answers, problems
 from app.schemas import FieldQuery, PsfOut, PsfQuery, QueryOut
-from app.store.samples import LensState
+from app.store.samples import Family, LensState
 from lensmodel.errors import OutsideSupportError
 from lensmodel.regression.answer import MICROMETRE
 from lensmodel.types import FieldPosition, LensSettings
@@ -88,7 +88,8 @@ def accepted(header: str) -> Format:
 
 
 def _answer(lens_id: str, at: PsfQuery, form: Format, call: Call) -> Response:
-    fitted = call.models.get(lens_id, at.version, state=_state(call, lens_id), family=at.family)
+    state, relatives = _known(call, lens_id)
+    fitted = call.models.get(lens_id, at.version, state=state, family=at.family, relatives=relatives)
     pinned = at.version is not None and fitted.learned
     tag = etag(fitted, f"{at.model_dump_json()}{form}")
     headers = {
@@ -124,11 +125,11 @@ def _answer(lens_id: str, at: PsfQuery, form: Format, call: Call) -> Response:
     return Response(body, media_type=MEDIA_TYPES[form], headers={**headers, **more})
 
 
-def _state(call: Call, lens_id: str) -> LensState:
-    state = call.store.samples.state_of(lens_id, call.owner)
-    if state is None:
+def _known(call: Call, lens_id: str) -> tuple[LensState, Family]:
+    known = call.store.samples.known_of(lens_id, call.owner)
+    if known is None:
         raise UnknownLensError(f"there is no lens {lens_id[:60]}: GET /v1/lenses lists those there are")
-    return state
+    return known
 
 
 def etag(fitted: Fitted, question: str) -> str:
@@ -169,7 +170,8 @@ def read_field(lens_id: str, at: Annotated[FieldQuery, Query()], call: CallDep) 
     columns, rows = (int(count) for count in at.grid.split("x"))
     if not (1 <= columns <= MAX_GRID and 1 <= rows <= MAX_GRID):
         raise InvalidParameterError(f"grid {at.grid}: columns and rows must lie in 1..{MAX_GRID}, as in 9x6")
-    fitted = call.models.get(lens_id, state=_state(call, lens_id), family=at.family)
+    state, relatives = _known(call, lens_id)
+    fitted = call.models.get(lens_id, state=state, family=at.family, relatives=relatives)
     tag = etag(fitted, at.model_dump_json())
     headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
     if _matches(call, tag):

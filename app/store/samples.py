@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Final, TypeAlias, cast
 
 import numpy as np
-from sqlalchemy import Row, bindparam, select
+from sqlalchemy import Row, and_, bindparam, select
 from sqlalchemy.orm import aliased
 
 from app.store.database import Database
@@ -24,10 +24,6 @@ from lensmodel.types import Channel, FieldPosition, LensSettings
 _STATE = select(LensRow.version, LensRow.rebuild_epoch).where(
     LensRow.public_id == bindparam("lens"), LensRow.deleted_at.is_(None)
 )
-_STATE_OF_OWNER = _STATE.join(OwnerRow, OwnerRow.id == LensRow.owner_id).where(
-    OwnerRow.name == bindparam("owner")
-)
-
 _ME, _OTHER = aliased(LensRow), aliased(LensRow)
 _OTHERS = (
     select(
@@ -49,6 +45,33 @@ _OTHERS = (
         _OTHER.deleted_at.is_(None),
         _OTHER.sample_count > 0,
     )
+    .order_by(_OTHER.public_id.desc())
+)
+_KNOWN = (
+    select(
+        _ME.version.label("my_version"),
+        _ME.rebuild_epoch.label("my_epoch"),
+        _ME.maker,
+        _ME.model,
+        _OTHER.public_id,
+        _OTHER.version,
+        _OTHER.rebuild_epoch,
+        _OTHER.sample_count,
+        _OTHER.maker.label("other_maker"),
+        _OTHER.model.label("other_model"),
+    )
+    .join(OwnerRow, OwnerRow.id == _ME.owner_id)
+    .outerjoin(
+        _OTHER,
+        and_(
+            _OTHER.owner_id == _ME.owner_id,
+            _OTHER.id != _ME.id,
+            _OTHER.deleted_at.is_(None),
+            _OTHER.sample_count > 0,
+            _ME.model.is_not(None),
+        ),
+    )
+    .where(_ME.public_id == bindparam("lens"), _ME.deleted_at.is_(None), OwnerRow.name == bindparam("owner"))
     .order_by(_OTHER.public_id.desc())
 )
 MOST_OF_FAMILY: Final = 2000
@@ -96,11 +119,10 @@ class SampleStore:
     def __init__(self, database: Database) -> None:
         self._db = database
 
-    def state_of(self, lens_id: str, owner: str | None = None) -> LensState | None:
+    def state_of(self, lens_id: str) -> LensState | None:
         """Return the version of a lens by one read through its key; None if there is no such lens."""
-        query = _STATE if owner is None else _STATE_OF_OWNER
-        with self._db.reader.connect() as connection:  # no session: this is half of a warm request
-            row = connection.execute(query, {"lens": lens_id, "owner": owner}).one_or_none()
+        with self._db.reader.connect() as connection:
+            row = connection.execute(_STATE, {"lens": lens_id}).one_or_none()
             return None if row is None else LensState(row[0], row[1])
 
     def family_of(self, lens_id: str) -> Family:
@@ -108,15 +130,17 @@ class SampleStore:
 
         The newest first, as many as it takes to have `MOST_OF_FAMILY` samples.
         """
-        found: list[Relative] = []
-        samples = 0
-        with self._db.reader.connect() as connection:  # as above: part of a warm request
-            for row in connection.execute(_OTHERS, {"lens": lens_id}):
-                same = kind_key(row.maker, row.model) == kind_key(row.other_maker, row.other_model)
-                if same and samples < MOST_OF_FAMILY:
-                    found.append(Relative(row.public_id, LensState(row.version, row.rebuild_epoch)))
-                    samples += row.sample_count
-        return tuple(found)
+        with self._db.reader.connect() as connection:
+            return _family(connection.execute(_OTHERS, {"lens": lens_id}).all())
+
+    def known_of(self, lens_id: str, owner: str) -> tuple[LensState, Family] | None:
+        """Return `state_of` and `family_of` by one read; None if the owner has no such lens."""
+        with self._db.reader.connect() as connection:  # no session: this is part of every warm request
+            rows = connection.execute(_KNOWN, {"lens": lens_id, "owner": owner}).all()
+        if not rows:
+            return None
+        state = LensState(rows[0].my_version, rows[0].my_epoch)
+        return state, _family([row for row in rows if row.public_id is not None])
 
     def of_family(self, family: Iterable[Relative]) -> list[StoredSample]:
         """Return the samples of other copies as of the versions named; what was removed since is gone."""
@@ -171,6 +195,18 @@ class SampleStore:
             if state is None:
                 return LensState(0, 0), []
             return LensState(state[0], state[1]), [_stored(row) for row in session.execute(query)]
+
+
+def _family(rows: Iterable[Row[*tuple[Any, ...]]]) -> Family:
+    """Those of the same maker and model, until they have enough samples."""
+    found: list[Relative] = []
+    samples = 0
+    for row in rows:
+        same = kind_key(row.maker, row.model) == kind_key(row.other_maker, row.other_model)
+        if same and samples < MOST_OF_FAMILY:
+            found.append(Relative(row.public_id, LensState(row.version, row.rebuild_epoch)))
+            samples += row.sample_count
+    return tuple(found)
 
 
 def _stored(row: Row[*tuple[Any, ...]]) -> StoredSample:

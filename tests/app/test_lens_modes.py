@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sqlalchemy import event
 from starlette.testclient import TestClient
 
 from app.evidence import MODES, with_evidence
@@ -234,3 +235,34 @@ def test_sizes_of_one_sensor_share_a_lens_in_half_diagonals(
 
     assert width(large) == pytest.approx(2.0, rel=0.05)
     assert width(small) == pytest.approx(1.2, rel=0.05)
+
+
+def test_warm_answers_cost_one_read_of_the_tables(client: TestClient, taken: Callable[..., str]) -> None:
+    lens = taken(6.0, (6000, 4000), 1.5)
+    services = client.app.state.services  # type: ignore[attr-defined] # Starlette's own attribute
+    psf(client, lens)
+    services.models.get(lens)
+    statements: list[str] = []
+
+    def note(*told: Any) -> None:
+        statements.append(str(told[2]))
+
+    event.listen(services.store.database.reader, "before_cursor_execute", note)
+    psf(client, lens, r=0.7)
+
+    assert len([text for text in statements if "SELECT" in text]) == 1
+
+
+def test_that_read_tells_what_two_others_do(store: Store, steps: Steps, taken: Callable[..., str]) -> None:
+    lens = taken(6.0, (6000, 4000), 1.5)
+    alone = store.samples.known_of(lens, "local")
+    steps.counted(serial="other copy", patches=6)
+
+    both = store.samples.known_of(lens, "local")
+
+    assert alone == (store.samples.state_of(lens), ())
+    assert both == (store.samples.state_of(lens), store.samples.family_of(lens))
+    assert both is not None
+    assert len(both[1]) == 1
+    assert store.samples.known_of(lens, "somebody else") is None
+    assert store.samples.known_of("none", "local") is None

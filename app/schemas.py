@@ -407,6 +407,15 @@ class CorrectionIn(Question):
     lens_version: int | None = Field(None, ge=1, description="default: the newest")
     method: str = Field("standard", min_length=1, max_length=60)
     strength: float = Field(1.0, ge=0, le=1, allow_inf_nan=False)
+    halo: float | None = Field(
+        None,
+        ge=0,
+        allow_inf_nan=False,
+        description="how far beside edges to leave the range of light around; default: by the model's error",
+    )
+    keep_flats: float = Field(
+        0.0, ge=0, le=1, allow_inf_nan=False, description="how much of its grain a flat area keeps"
+    )
     output: OutputOptions = OutputOptions()
     roi: Region | None = None
     family: bool = Field(default=True, description=_FAMILY)

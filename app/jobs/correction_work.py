@@ -27,6 +27,7 @@ from app.jobs.workbench import (
 from app.store.corrections import CorrectionPlan, Result
 from app.store.samples import LensState, Relative, StoredSample
 from app.store.versions import learned_key
+from lensmodel import deconv
 
 log = logging.getLogger(__name__)
 
@@ -85,6 +86,7 @@ class CorrectionWork:
             "lateral": photo.lateral,
             "method": params["method"],
             "strength": params["strength"],
+            "bounds": _bounds(params),
             "output": params["output"],
             "roi": params.get("roi"),
             "workers": settings.worker_slots,
@@ -187,10 +189,15 @@ class CorrectionWork:
             self._bench.storage.put_file(key, path)
 
 
+def _bounds(params: dict[str, Any]) -> dict[str, float]:
+    return {name: params[name] for name in ("halo", "keep_flats") if name in params}
+
+
 def _description(plan: CorrectionPlan) -> str:
     params = plan.correction.params
     lens = " ".join(word for word in (plan.lens.maker, plan.lens.model) if word) or "unknown lens"
     return (
         f"lens blur corrected by lensmodel: {lens}, version {plan.correction.lens_version}, "
         f"method {params['method']}, strength {params['strength']:g}"
+        f"{deconv.Bounds(**_bounds(params)).described}"
     )

@@ -17,7 +17,7 @@ import numpy as np
 
 from app.jobs.child import Progress, Task
 from app.jobs.handover import EVIDENCE, FAMILY, INFINITY, KERNELS, LEARNED, SAMPLES, SUFFIX
-from lensmodel import codec, photo, pipeline
+from lensmodel import codec, deconv, photo, pipeline
 from lensmodel.errors import InvalidInputError, LensModelError
 from lensmodel.evidence import PatchEvidence
 from lensmodel.patches import Patch
@@ -119,6 +119,7 @@ def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
         _settings(arguments["settings"]),
         method=arguments["method"],
         strength=arguments["strength"],
+        bounds=deconv.Bounds(**arguments["bounds"]),
         lateral=lateral,
         roi=None if roi is None else (roi["y"], roi["x"], roi["height"], roi["width"]),
         workers=arguments["workers"],

@@ -53,6 +53,8 @@ def create_correction(wish: CorrectionIn, call: CallDep) -> CorrectionOut:
     lens = _lens_for(call, photo, wish.lens_id)
     version = _version_for(call, lens, wish.lens_version)
     params = wish.model_dump(mode="json", include={"method", "strength", "output", "roi"})
+    # only where asked for: a wish of before there were bounds is still the same wish
+    params |= wish.model_dump(mode="json", include={"halo", "keep_flats"}, exclude_defaults=True)
     if wish.family and wish.lens_version is None and call.settings.family:
         # the copies and versions of this moment: the same wish after one of them learned is another one
         leaning = call.store.samples.family_of(lens.public_id)

@@ -498,6 +498,24 @@ def test_a_correction_ends_with_a_file(
     assert sandbox.files >= {KERNELS, SAMPLES}
 
 
+def test_a_photographers_bounds_reach_the_correction_and_its_tag(
+    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+) -> None:
+    told: list[dict[str, Any]] = []
+
+    def keep(arguments: dict[str, Any], folder: Path) -> Outcome:
+        told.append(arguments)
+        return write_result(arguments, folder)
+
+    sandbox.answers["correct"] = [keep, keep]
+    for bounds in ({}, {"halo": 0.2, "keep_flats": 0.5}):
+        CorrectionWork(bench).correction(ask(bench, counted, steps, **bounds))
+
+    assert [one["bounds"] for one in told] == [{}, {"halo": 0.2, "keep_flats": 0.5}]
+    assert told[0]["description"].endswith("strength 1")
+    assert told[1]["description"].endswith("strength 1, halo 0.2, flats kept 0.5")
+
+
 def test_a_correction_with_a_version_without_samples_fails(
     bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
 ) -> None:

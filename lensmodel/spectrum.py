@@ -29,6 +29,8 @@ _TAIL_POWER = 0.8  # of the gradients: photographs are about as sparse as that
 _TAIL_PHASE = 1.5  # radians at most: beyond, frequencies hold little but noise
 _TAIL_SOFT_PX = 0.3
 _TAIL_RIM = 16
+_CORE_PX = (2, 4)  # nearer than this neighbours are alike: for the valley, for the peak
+_REPEATS = (-0.4, 0.9)  # correlation at the valley and the peak of what repeats
 _BYTES = 4 * (RINGS * SECTORS + 3)
 
 
@@ -168,3 +170,21 @@ def _sparsity(image: NDArray[np.float64]) -> float:
     down, right = np.diff(inner, axis=0), np.diff(inner, axis=1)
     scale = float(np.sqrt((down**2).mean() + (right**2).mean())) + 1e-12
     return float((np.abs(down / scale) ** _TAIL_POWER).mean() + (np.abs(right / scale) ** _TAIL_POWER).mean())
+
+
+def repeats(patch: Plane) -> bool:
+    """Whether a patch repeats itself like a fence or an arcade, so that no blur can be told from it.
+
+    Its autocorrelation then falls far below zero and comes back nearly to one.
+    """
+    power = np.abs(fft.rfft2((patch - patch.mean()).astype(np.float64))) ** 2
+    correlation = fft.irfft2(power, s=patch.shape)
+    if not correlation[0, 0] > 0:
+        return False
+    correlation /= correlation[0, 0]
+    rows, cols = (np.minimum(np.arange(n), n - np.arange(n)) for n in patch.shape)
+    gap = np.hypot(rows[:, None], cols[None, :])
+    reach = gap < min(patch.shape) // 3
+    valley = float(correlation[(gap > _CORE_PX[0]) & reach].min())
+    peak = float(correlation[(gap > _CORE_PX[1]) & reach].max())
+    return valley < _REPEATS[0] and peak > _REPEATS[1]

@@ -97,7 +97,7 @@ def blind(
     judge: Annotated[str, typer.Option(help="hyper-laplacian or epll.")] = "hyper-laplacian",
     selection: Annotated[
         str, typer.Option(help="Who chooses the patches: random, r-map or good-regions.")
-    ] = "random",
+    ] = "r-map",
     seed: int = 0,
     workers: Annotated[int, typer.Option(min=1)] = 2,
     output: Annotated[

@@ -270,9 +270,8 @@ def _drawn(photo: Path, kernel: Kernel, case: Case, rng: np.random.Generator) ->
 def _chosen(photo: Path, kernel: Kernel, case: Case, rng: np.random.Generator) -> tuple[Plane, Plane]:
     """Sharp and photographed window, the best that a selector finds in the whole blurred photograph.
 
-    Selectors take smaller windows where the frame has not four of them on its shorter side; the window
-    then is larger than what was scored, about the same middle. Where nothing is usable the middle of the
-    frame is taken, lest a method profits from the refusal.
+    Selectors take smaller windows where the frame has not four of them on its shorter side. Where nothing is
+    usable the middle of the frame is taken, lest a method profits from the refusal.
     """
     size, margin = case.patch, kernel.shape[0] // 2
     scene = scene_of(photo)
@@ -291,10 +290,7 @@ def _chosen(photo: Path, kernel: Kernel, case: Case, rng: np.random.Generator) -
         row, col = (height - size) // 2, (width - size) // 2
     else:
         best = max(found.patches, key=lambda patch: patch.score)
-        more = (size - best.size) // 2
-        row, col = (
-            min(max(at - more, 0), side - size) for at, side in ((best.row, height), (best.col, width))
-        )
+        row, col, size = best.row, best.col, best.size
     sharp = scene[1, margin + row : margin + row + size, margin + col : margin + col + size]
     return sharp, np.ascontiguousarray(plane[row : row + size, col : col + size])
 

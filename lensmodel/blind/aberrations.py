@@ -162,6 +162,11 @@ class LocalWavefront:
     light: Floats
     cost: float
 
+    @property
+    def unusual(self) -> float:
+        """What speaks against a wavefront before anything is seen, |g / usual|²."""
+        return float(np.square(self.terms / _USUAL_PX).sum())
+
     def kernel(self, size: int) -> Kernel:
         """Kernel of odd side `size`, centred."""
         return resized(centred(as_kernel(self.light)), size)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lensmodel.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.evidence import PatchEvidence
 from lensmodel.psf import second_moments
+from lensmodel.spectrum import repeats
 from lensmodel.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
 
 NO_BLUR_PX2 = 0.3
@@ -151,19 +152,7 @@ def _unfit(patch: Plane, model: NoiseModel) -> str | None:
     steps = 0.5 * float(np.var(np.diff(patch, axis=0)) + np.var(np.diff(patch, axis=1)))
     if steps > 1.4 * float(patch.var()):
         return "noise"
-    centred = (patch - patch.mean()).astype(np.float64)
-    power = np.abs(np.fft.fft2(centred)) ** 2
-    acf = np.fft.ifft2(power).real
-    acf /= acf[0, 0]
-    far = np.ones(acf.shape, dtype=bool)
-    reach = min(acf.shape) // 3
-    rows = np.minimum(np.arange(acf.shape[0]), acf.shape[0] - np.arange(acf.shape[0]))
-    cols = np.minimum(np.arange(acf.shape[1]), acf.shape[1] - np.arange(acf.shape[1]))
-    gap = np.hypot(rows[:, None], cols[None, :])
-    valley = float(acf[(gap > 2) & (gap < reach)].min())
-    far &= (gap > 4) & (gap < reach)
-    ring = acf[far]
-    if valley < -0.4 and float(ring.max()) > 0.9:
+    if repeats(patch):
         return "periodic"
     return None
 

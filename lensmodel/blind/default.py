@@ -1,4 +1,4 @@
-"""The default estimator: a Whittle Gaussian, patch recurrence, and a wavefront that pleases the spectra."""
+"""The default estimator: a Whittle Gaussian, patch recurrence, a wavefront, and a judge among them."""
 
 from __future__ import annotations
 
@@ -12,15 +12,23 @@ import numpy as np
 from lensmodel.blind.aberrations import AberrationFit
 from lensmodel.blind.base import PsfEstimate, is_no_blur, usable
 from lensmodel.blind.finish import signal_share
+from lensmodel.blind.judgement import Judgement
 from lensmodel.blind.patch_recurrence import PatchRecurrence
+from lensmodel.blind.recurrence import QUICK
 from lensmodel.blind.scene_spectra import SceneSpectra
 from lensmodel.blind.whittle import Whittle
 from lensmodel.psf import as_kernel, distance, rms_width
 from lensmodel.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
 
-_PIXEL_SIGMA = 0.29
 _POOLED_SUPPORT, _POOLED_ITERATIONS, _POOLED_SIDE = 21, 3, 160
-_STARTS, _STARTS_OF_CHANNEL = 12, 6
+_STARTS, _STARTS_OF_CHANNEL = 10, 6
+_PIXEL_SIGMA = 0.29
+_PER_WIDTH = 40.0
+"""Cost of a kernel e times as wide: in doubt the narrower one, which does less harm."""
+
+_DOUBT = 30.0
+"""Difference of costs that hardly tells kernels from each other."""
+
 _POOLED_ERROR = 0.7
 """Relative error of a wavefront agreed on by n patches, times the root of n."""
 
@@ -33,25 +41,21 @@ class Cautious:
     """What a Whittle Gaussian, patch recurrence and the spectra of the patches agree on.
 
     A kernel that is too wide ruins a photo, one too narrow only helps less, and both of the first two
-    methods take the softness of a scene for blur, each in its own way. With few patches:
-
-    * a Gaussian narrower than `trusted_px`: the mean of both, unless patch recurrence ran more than
-      `apart` times as wide; then the Gaussian alone;
-    * a wider one: a wavefront fitted to the spectra and, with the weight `trust`, to the result of patch
-      recurrence (see `aberrations`).
+    methods take the softness of a scene for blur, each in its own way. With few patches there are four
+    kernels: the Gaussian, that of patch recurrence, the mean of both, and a wavefront fitted to the spectra
+    and, with the weight `trust`, to the result of patch recurrence (see `aberrations`). The likelihood of
+    the spectra of whole patches and of small tiles (see `judgement`) chooses among them.
 
     From `pooled` patches on the slopes of the scenes average out, the wavefront is all but given by the
     spectra, and patch recurrence only has to tell the phase. The root mean square distance of the MTFs
     of the Gaussian and patch recurrence is the best predictor of the true error of few patches.
     """
 
-    trusted_px: float = 0.95
-    apart: float = 2.2
     pooled: int = 6
-    trust: float = 75.0
+    trust: float = 20.0
 
     name = "default"
-    version = 7
+    version = 8
 
     def estimate(
         self,
@@ -72,7 +76,7 @@ class Cautious:
             return self._agreed(kept, found, began, size, on_step)
         gaussian = Whittle().estimate(patches, noise, size=size)
         support = min(max(2 * round(3.0 * gaussian.diagnostics["width"] + 3.0) + 1, 15), 31, size)
-        recurrence = PatchRecurrence(support=support)
+        recurrence = PatchRecurrence(support=support, search=QUICK)
         found = recurrence.estimate(patches, noise, size=size, on_step=_half(on_step, 0))
         return self._chosen(kept, gaussian, found, began, size, on_step, _STARTS)
 
@@ -93,7 +97,8 @@ class Cautious:
         if len(kept) >= self.pooled:
             same_phase = replace(reference, evidence=(), reliability=signal_share(kept))
             return self._agreed(kept, same_phase, began, size, on_step)
-        recurrence = PatchRecurrence(support=int(reference.diagnostics.get("support", 21.0)), iterations=3)
+        support = int(reference.diagnostics.get("support", 21.0))
+        recurrence = PatchRecurrence(support=support, iterations=3, search=QUICK)
         found = recurrence.estimate_channel(
             patches, noise, reference, reference_patches, size=size, on_step=_half(on_step, 0)
         )
@@ -129,24 +134,39 @@ class Cautious:
         on_step: StepHook,
         starts: int,
     ) -> PsfEstimate:
-        """Kernel of few patches, whose spectra alone do not tell a soft scene from a blur."""
+        """Kernel of few patches, the one that their spectra speak for."""
         disagreement = distance(found.kernel, gaussian.kernel).mtf_rmse
-        narrow = rms_width(gaussian.kernel) <= self.trusted_px
-        if not narrow:
-            fit = AberrationFit(weight=self.trust, starts=starts, kept=max(starts // 4, 2))
-            fitted = fit.fit(SceneSpectra.of(kept), found.kernel, _half(on_step, 1))
-            kernel = fitted.kernel(size)
-        elif rms_width(found.kernel) > self.apart * max(rms_width(gaussian.kernel), _PIXEL_SIGMA):
-            kernel = gaussian.kernel
-        else:
-            kernel = as_kernel(0.5 * (gaussian.kernel + found.kernel))
+        judgement = Judgement.of(kept)
+        fit = AberrationFit(
+            weight=self.trust, temper=judgement.temper, starts=starts, kept=max(starts // 5, 2)
+        )
+        fitted = fit.fit(judgement.whole, found.kernel, _half(on_step, 1))
+        options = {
+            "gaussian": gaussian.kernel,
+            "recurrence": found.kernel,
+            "mean": as_kernel(0.5 * (gaussian.kernel + found.kernel)),
+            "wavefront": fitted.kernel(size),
+        }
+        costs = {
+            name: judgement.cost(kernel) + _PER_WIDTH * math.log(max(rms_width(kernel), _PIXEL_SIGMA))
+            for name, kernel in options.items()
+        }
+        costs["wavefront"] += fitted.unusual
+        chosen = min(costs, key=lambda name: costs[name])
+        kernel = options[chosen]
+        votes = {name: math.exp((costs[chosen] - cost) / _DOUBT) for name, cost in costs.items()}
+        apart = {name: distance(other, kernel).mtf_rmse for name, other in options.items()}
+        doubt = sum(votes[name] * apart[name] for name in options) / sum(votes.values())
         on_step(1, 1)
         error = predicted_error(disagreement, rms_width(gaussian.kernel), gaussian.diagnostics["slope"])
         more = {
             "gaussian_width": gaussian.diagnostics["width"],
             "slope": gaussian.diagnostics["slope"],
             "disagreement": disagreement,
-            "narrow": float(narrow),
+            "doubt": doubt,
+            "from_gaussian": apart["gaussian"],
+            "from_recurrence": apart["recurrence"],
+            **{f"chose_{name}": float(name == chosen) for name in options},
         }
         return _told(found, kernel, error, more, began)
 

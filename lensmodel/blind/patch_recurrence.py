@@ -18,7 +18,17 @@ from scipy import fft
 
 from lensmodel.blind.base import PsfEstimate, is_no_blur, usable
 from lensmodel.blind.gram import window_products
-from lensmodel.blind.recurrence import ALPHA, Image, blend, level_shape, noise_gain, recur, resample
+from lensmodel.blind.recurrence import (
+    ALPHA,
+    THOROUGH,
+    Image,
+    Search,
+    blend,
+    level_shape,
+    noise_gain,
+    recur,
+    resample,
+)
 from lensmodel.errors import NotEnoughEvidenceError
 from lensmodel.evidence import PatchEvidence, nonnegative_least_squares
 from lensmodel.psf import as_kernel, centred, resized, rms_width
@@ -73,6 +83,8 @@ class PatchRecurrence:
         lambda2 over the mean diagonal of the normal matrix.
     support : int or None
         Odd side of the estimated kernel; None takes it from `size`, at most 31.
+    search : Search
+        How thoroughly matches are looked for.
     """
 
     levels: int = 6
@@ -81,6 +93,7 @@ class PatchRecurrence:
     bandwidth: float = 0.03
     ridge: float = 2.5e-2
     support: int | None = None
+    search: Search = THOROUGH
 
     name = "michaeli-irani"
     version = 1
@@ -161,7 +174,7 @@ class PatchRecurrence:
         a, b = np.zeros((side * side,) * 2), np.zeros(side * side)
         parts = []
         for i, view in enumerate(views):
-            z = recur(latent[i], view.noise, max(self.bandwidth, 2.0 * view.noise))
+            z = recur(latent[i], view.noise, max(self.bandwidth, 2.0 * view.noise), self.search)
             latent[i], response = blend(view.y, kernel, z, self.beta)
             part_a, part_b, pixels = normal_equations(latent[i], view.y, side, view.noise, response)
             vote = 1.0 / max(view.noise**2, 1e-6)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from lensmodel.patches.blocks import CLIP_SHARE
+from lensmodel.spectrum import repeats
 from lensmodel.types import Plane
 
 SECTORS: Final = 8
@@ -69,7 +70,7 @@ def look_at(patch: Plane, sigma: float, clip: float, corner: tuple[int, int]) ->
     power = _power(values - values.mean())
     return Details(
         information=_information(power, sigma)[None],
-        period=np.array([_period(power, sigma)]),
+        period=np.array([1.0 if repeats(patch) else _period(power, sigma)]),
         blockiness=np.array([_blockiness(values, corner)]),
         blob=np.array([_largest_blob(values >= CLIP_SHARE * clip)], dtype=np.int64),
         kurtosis=np.array([_kurtosis(values)]),

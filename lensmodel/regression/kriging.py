@@ -25,7 +25,7 @@ from lensmodel.psf import PsfSample, resized
 from lensmodel.regression import variables as va
 from lensmodel.types import FieldPosition
 
-NUGGETS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+NUGGETS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
 """Variances of a sample of vote 1, over that of the field, that cross-validation chooses from."""
 
 _SETTINGS = (3, 4, 5, 6)

@@ -217,6 +217,11 @@ class LensModel:
         names = tuple(sorted({*self.settings.excluded, *photos}))
         return LensModel.fit(self.samples, replace(self.settings, excluded=names), prior=self.prior)
 
+    def answering(self, *, mode: str | None = None, unit: str | None = None) -> LensModel:
+        """Return the model of the same samples in another mode or unit; None keeps what it has."""
+        chosen = replace(self.settings, mode=mode or self.settings.mode, unit=unit or self.settings.unit)
+        return self if chosen == self.settings else LensModel.fit(self.samples, chosen, prior=self.prior)
+
     def including(self, *photos: str) -> LensModel:
         """Return the model in which these photos vote again."""
         names = tuple(name for name in self.settings.excluded if name not in photos)
@@ -365,6 +370,11 @@ class LensModel:
         """Pixel pitch that answers are for unless another is asked for; None where no sample knows."""
         fit = self._fit
         return fit.pixel if fit.unit == MICROMETRE else pitches.usual_pixel(self.samples, MICROMETRE)
+
+    @property
+    def mode(self) -> str:
+        """Which of `MODES` answers: that of the settings, or the one that `warmed` found likeliest."""
+        return self._fit.mode
 
     def flags(self) -> tuple[Flag, ...]:
         """Photos and samples that count less than they claim, with reasons."""

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,7 +100,8 @@ class PupilGrid:
 
     def binned(self, light: NDArray[np.float32], size: int, away: NDArray[np.float64]) -> NDArray[np.float64]:
         """Light in the pixels of a square of odd side `size` whose middle is `away` (down, right)."""
-        down, right = (_pixels(self.fine, self.size, size, float(one)) for one in away)
+        grid = self.fine, self.size, size
+        down, right = (_pixels(*grid, float(one)) if one else _whole_pixels(*grid) for one in away)
         return np.asarray(down @ light @ right.T, dtype=np.float64)
 
     def light(self, g: NDArray[np.float64], amplitude: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -157,6 +159,12 @@ class PupilGrid:
     def _binned(self, light: NDArray[np.floating]) -> NDArray[np.float64]:
         side = self.size
         return np.asarray(light.reshape(side, self.fine, side, self.fine).sum(axis=(1, 3)), dtype=np.float64)
+
+
+@lru_cache(maxsize=8)
+def _whole_pixels(fine: int, across: int, size: int) -> NDArray[np.float32]:
+    """Those of a square that has not moved, as most have not."""
+    return _pixels(fine, across, size, 0.0)
 
 
 def _pixels(fine: int, across: int, size: int, away: float) -> NDArray[np.float32]:

@@ -26,14 +26,11 @@ _PIXEL_SIGMA = 0.29
 _PER_WIDTH = 40.0
 """Cost of a kernel e times as wide: in doubt the narrower one, which does less harm."""
 
-_DOUBT = 30.0
-"""Difference of costs that hardly tells kernels from each other."""
-
 _POOLED_ERROR = 0.7
 """Relative error of a wavefront agreed on by n patches, times the root of n."""
 
-_AT_TYPICAL = -1.08
-"""Logarithm of the error where both estimates agree on a Gaussian of 1 px and a usual scene."""
+_AT_ONE_PX = -2.09
+"""Logarithm of the error where the wavefront agrees with patch recurrence on a kernel of 1 px."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +44,8 @@ class Cautious:
     the spectra of whole patches and of small tiles (see `judgement`) chooses among them.
 
     From `pooled` patches on the slopes of the scenes average out, the wavefront is all but given by the
-    spectra, and patch recurrence only has to tell the phase. The root mean square distance of the MTFs
-    of the Gaussian and patch recurrence is the best predictor of the true error of few patches.
+    spectra, and patch recurrence only has to tell the phase. How far the wavefront lies from patch
+    recurrence is the best predictor found of the true error of few patches.
     """
 
     pooled: int = 6
@@ -154,18 +151,15 @@ class Cautious:
         costs["wavefront"] += fitted.unusual
         chosen = min(costs, key=lambda name: costs[name])
         kernel = options[chosen]
-        votes = {name: math.exp((costs[chosen] - cost) / _DOUBT) for name, cost in costs.items()}
-        apart = {name: distance(other, kernel).mtf_rmse for name, other in options.items()}
-        doubt = sum(votes[name] * apart[name] for name in options) / sum(votes.values())
         on_step(1, 1)
-        error = predicted_error(disagreement, rms_width(gaussian.kernel), gaussian.diagnostics["slope"])
+        unlike = distance(options["wavefront"], found.kernel).rel_l2
+        error = predicted_error(unlike, rms_width(kernel))
         more = {
             "gaussian_width": gaussian.diagnostics["width"],
             "slope": gaussian.diagnostics["slope"],
             "disagreement": disagreement,
-            "doubt": doubt,
-            "from_gaussian": apart["gaussian"],
-            "from_recurrence": apart["recurrence"],
+            "unlike": unlike,
+            "width": rms_width(kernel),
             **{f"chose_{name}": float(name == chosen) for name in options},
         }
         return _told(found, kernel, error, more, began)
@@ -197,17 +191,15 @@ def _half(on_step: StepHook, which: int) -> StepHook:
     return lambda done, total: on_step(done + which * total, 2 * total)
 
 
-def predicted_error(disagreement: float, width: float, slope: float) -> float:
-    """Expected relative L2 error of the kernel, a log-linear fit to simulated lenses.
+def predicted_error(apart: float, width: float) -> float:
+    """Expected relative L2 error of the kernel, log-linear in what the development half tells.
 
     Parameters
     ----------
-    disagreement : float
-        Root mean square distance of the MTFs of the two estimates.
+    apart : float
+        Relative L2 distance of the fitted wavefront from patch recurrence.
     width : float
-        RMS width of the Gaussian in pixels.
-    slope : float
-        Slope of the scene's power spectrum that went with it; a steep one hides blur or is it.
+        RMS width of the chosen kernel in pixels.
     """
-    logarithm = _AT_TYPICAL + 2.19 * disagreement + 0.66 * math.log(max(width, 0.2)) + 2.23 * (slope - 2.5)
+    logarithm = _AT_ONE_PX + 2.2 * apart + 0.28 * math.log(max(width, _PIXEL_SIGMA))
     return min(max(math.exp(logarithm), 0.05), 1.0)

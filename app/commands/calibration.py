@@ -16,7 +16,8 @@ from app.commands.display import Display
 from app.commands.failure import UsageError
 from lensmodel import blind, pipeline
 from lensmodel.errors import InvalidInputError, LensModelError
-from lensmodel.regression import LensModel, LensProfile, save_profile
+from lensmodel.regression import LensModel, LensProfile, ModelSettings, save_profile
+from lensmodel.regression.answer import MICROMETRE, MIXED
 from lensmodel.types import LensSettings, StepHook
 
 
@@ -31,6 +32,8 @@ class Wishes:
     force: bool
     family: Path | None
     no_family: bool
+    mode: str | None
+    unit: str | None
 
 
 def run(names: Sequence[str], target: Path, wishes: Wishes, display: Display, *, as_json: bool) -> None:
@@ -49,7 +52,8 @@ def run(names: Sequence[str], target: Path, wishes: Wishes, display: Display, *,
         settings = LensSettings(aperture=wishes.aperture)
     with files.as_usage():
         family = None if wishes.family is None else files.profile_at(wishes.family)
-    calibration = _Calibration(target, _known(target, force=wishes.force), wishes, settings)
+        chosen = ModelSettings(mode=wishes.mode or MIXED, unit=wishes.unit or MICROMETRE)
+    calibration = _Calibration(target, _known(target, force=wishes.force), wishes, settings, chosen)
     if family is not None or wishes.no_family:
         calibration.lean_on(family)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -76,6 +80,7 @@ def run(names: Sequence[str], target: Path, wishes: Wishes, display: Display, *,
         "photos": len(profile.photos) if profile else 0,
         "samples": len(profile.model.samples) if profile else 0,
         "coverage": profile.model.coverage() if profile else {},
+        "mode": profile.model.mode if profile else None,
         "results": results,
     }
     if as_json:
@@ -111,11 +116,19 @@ class _Calibration:
     """A profile that grows, and the file that keeps up with it."""
 
     def __init__(
-        self, target: Path, profile: LensProfile | None, wishes: Wishes, settings: LensSettings
+        self,
+        target: Path,
+        profile: LensProfile | None,
+        wishes: Wishes,
+        settings: LensSettings,
+        chosen: ModelSettings,
     ) -> None:
         self.profile = profile
-        self._target, self._wishes, self._settings = target, wishes, settings
+        self._target, self._wishes, self._settings, self._chosen = target, wishes, settings, chosen
         self._grown = False
+        if profile is not None:
+            model = profile.model.answering(mode=wishes.mode, unit=wishes.unit)
+            self.profile, self._grown = replace(profile, model=model), model is not profile.model
         self._family: LensProfile | None = None
 
     def lean_on(self, family: LensProfile | None) -> None:
@@ -162,7 +175,7 @@ class _Calibration:
         if self.profile is not None:
             model = self.profile.model.added(samples)
         else:
-            model = self._leaning(LensModel.fit(samples))
+            model = self._leaning(LensModel.fit(samples, self._chosen))
         grown = LensProfile(model, seen | lens, {**names, key: path.name})
         save_profile(self._target, grown)
         self.profile, self._grown = grown, True

@@ -41,6 +41,16 @@ def calibrate(
         typer.Option(metavar="FILE", help="Profile of another copy: leaned on where photos are missing."),
     ] = None,
     no_family: Annotated[bool, typer.Option("--no-family", help="Lean on no other copy any more.")] = False,
+    mode: Annotated[
+        Literal["mixed", "kernels", "evidence", "wavefront", "likeliest"] | None,
+        typer.Option(
+            help="What answers are made of; likeliest chooses by photos held out. Kept from then on."
+        ),
+    ] = None,
+    unit: Annotated[
+        Literal["micrometre", "half-diagonal"] | None,
+        typer.Option(help="In what bodies with other pixels agree. Kept from then on."),
+    ] = None,
     json_output: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = 0,
@@ -75,6 +85,8 @@ def calibrate(
             force=force,
             family=family,
             no_family=no_family,
+            mode=mode,
+            unit=unit,
         ),
         shown,
         as_json=json_output,

@@ -97,8 +97,9 @@ def asked_places() -> list[FieldPosition]:
 class Row:
     """Errors of one method: mean relative L2 by zone after sub-pixel alignment.
 
-    `net` is what of the root of their mean square is left without the noise of the held-out PSFs, where those
-    say how noisy they are.
+    `worst` are the means of the lens that is worst in each zone, where there were several. `net` is what of
+    the root of the mean square is left without the noise of the held-out PSFs, where those say how noisy they
+    are.
     """
 
     method: str
@@ -106,6 +107,7 @@ class Row:
     errors: Mapping[Zone, float]
     seconds: float
     net: Mapping[Zone, float] | None = None
+    worst: Mapping[Zone, float] | None = None
 
 
 def run_model_benchmark(
@@ -154,7 +156,7 @@ def run_model_benchmark(
             rows.append(_held_out(name, fit, samples))
         on_step(len(fits), len(fits))
         return {"psf_field": psf_field.name, "samples": len(samples), "rows": [_plain(r) for r in rows]}
-    collected: dict[tuple[str, int], list[tuple[Zone, float]]] = {}
+    collected: dict[tuple[str, int], list[list[tuple[Zone, float]]]] = {}
     seconds: dict[tuple[str, int], float] = {}
     done, total = 0, len(seeds) * len(photos) * len(fits)
     on_step(done, total)
@@ -182,10 +184,10 @@ def run_model_benchmark(
                 predict = fit(seen)
                 found = [(zone_of(p.r), distance(predict(p), k).rel_l2) for p, k in truth]
                 seconds[name, count] = seconds.get((name, count), 0.0) + time.process_time() - start
-                collected.setdefault((name, count), []).extend(found)
+                collected.setdefault((name, count), []).append(found)
                 done += 1
                 on_step(done, total)
-    rows = [_row(name, count, errors, seconds[name, count]) for (name, count), errors in collected.items()]
+    rows = [_over_lenses(*key, lenses, seconds[key]) for key, lenses in collected.items()]
     told = {"seeds": list(seeds), "spoiled": spoiled, "photographs": photographs is not None}
     return {**told, "rows": [_plain(row) for row in rows]}
 
@@ -327,6 +329,14 @@ def _held_out(name: str, fit: Fit, samples: Sequence[PsfSample]) -> Row:
     return replace(row, net={z: math.sqrt(max(e, 0.0)) for z, e in beyond.errors.items()})
 
 
+def _over_lenses(
+    name: str, photos: int, lenses: Sequence[Sequence[tuple[Zone, float]]], seconds: float
+) -> Row:
+    mean = _row(name, photos, [error for errors in lenses for error in errors], seconds)
+    alone = [_row(name, photos, errors, 0.0).errors for errors in lenses]
+    return replace(mean, worst={zone: max(one.get(zone, 0.0) for one in alone) for zone in mean.errors})
+
+
 def _row(name: str, photos: int, errors: Sequence[tuple[Zone, float]], seconds: float) -> Row:
     by_zone = {zone: [e for z, e in errors if z == zone] for zone in ZONES}
     return Row(name, photos, {z: float(np.mean(e)) for z, e in by_zone.items() if e}, seconds)
@@ -340,6 +350,7 @@ def _plain(row: Row) -> dict[str, Any]:
         "rel_l2": dict(row.errors),  # the same by the name of the measure
         "seconds": round(row.seconds, 2),
         **({} if row.net is None else {"net": dict(row.net)}),
+        **({} if row.worst is None else {"worst": dict(row.worst)}),
     }
 
 

@@ -431,6 +431,19 @@ def test_a_new_copy_starts_from_another_and_can_leave_it(folder: Path, here: Her
     assert load_profile(folder / "new").model.prior is None
 
 
+def test_a_profile_keeps_the_mode_and_the_unit_that_it_was_told(folder: Path, here: Here) -> None:
+    words = ("calibrate", "one.dng", "-p", PROFILE, "--estimator", "whittle", "--workers", "1", "--json")
+    told = json.loads(here(*words, "--any-lens", "--mode", "kernels", "--unit", "half-diagonal").stdout)
+
+    kept = load_profile(folder / PROFILE).model
+    assert (kept.settings.mode, kept.settings.unit) == ("kernels", "half-diagonal")
+    assert told["mode"] == kept.mode == "kernels"
+    again = json.loads(here(*words, "--any-lens").stdout)
+    assert again["results"][0]["state"] == "known"
+    assert again["mode"] == told["mode"]
+    assert here(*words, "--mode", "guess").returncode == 2
+
+
 def test_a_photo_that_says_little_is_corrected_with_a_word_of_warning(folder: Path, here: Here) -> None:
     Image.fromarray(_picture()).save(folder / "scan.tif")
     done = here("correct", "scan.tif", "-p", PROFILE, "-o", "out", "--method", "fast")

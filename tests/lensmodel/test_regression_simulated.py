@@ -28,7 +28,12 @@ def test_true_kernels_are_predicted_between_and_beyond_the_patches() -> None:
 def test_wavefront_in_the_mixture_tells_the_corners() -> None:
     result = run_model_benchmark(seeds=range(1000, 1004), photos=(1, 5), methods=["combined"])
     errors = {row["photos"]: row["errors"] for row in result["rows"]}
+    worst = {row["photos"]: row["worst"] for row in result["rows"]}
 
+    assert worst[1]["corner"] <= 0.25
+    assert worst[1]["center"] <= 0.15
+    assert worst[5]["corner"] <= 0.12
+    assert worst[5]["center"] <= 0.08
     assert errors[1]["corner"] <= 0.06
     assert errors[1]["center"] <= 0.04
     assert errors[5]["corner"] <= 0.06

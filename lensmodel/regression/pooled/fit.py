@@ -47,7 +47,7 @@ _SPREAD_PX = np.array(
     [4.0, 0.25, 4.0, 0.5, 0.5, 0.25, 4.0, 0.7, 0.7, 4.0, 0.25, 1.0, 1.0, 4.0, 0.4, 0.4, 0.4, 0.4, 0.25]
 )
 _VOTE = 1.0 / np.concatenate([_SPREAD_PX, _EYE_SPREAD]) ** 2
-_TEMPER = 0.25
+_TEMPER = 0.1
 """Share of the likelihood that counts: neighbouring bins and patches of one motif err alike."""
 
 _FLOOR = 4e-3  # of |OTF|^2: below, zeros are smeared by more than the model knows

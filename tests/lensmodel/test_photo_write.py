@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 from dataclasses import replace
@@ -20,6 +21,7 @@ from skimage import io
 from lensmodel import photo
 from lensmodel.errors import InvalidInputError
 from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, srgb_to_linear
+from lensmodel.photo.dng import write_bayer_dng
 
 METADATA = photo.PhotoMetadata(
     camera_maker="Canon",
@@ -181,6 +183,55 @@ def test_a_linear_dng_is_read_back_by_libraw_with_its_numbers(tmp_path: Path) ->
     with rawpy.imread(str(tmp_path / "x.dng")) as raw:
         shown = raw.postprocess(use_camera_wb=True, no_auto_bright=True)
     assert shown.shape == (48, 64, 3)
+
+
+OPENERS = {
+    "rawtherapee-cli": ["-Y", "-t", "-b16", "-o", "{to}", "-c", "{of}"],
+    # Tone curve and exposure of darktable's usual workflow depend on the kind of file, not on its numbers:
+    # filmic is left out where the pixels are no mosaic.
+    "darktable-cli": [
+        "{of}",
+        "{to}",
+        "--core",
+        "--configdir",
+        "{folder}/darktable",
+        "--library",
+        ":memory:",
+        "--conf",
+        "plugins/imageio/format/tiff/bpp=16",
+        "--conf",
+        "plugins/darkroom/workflow=none",
+        "--conf",
+        "plugins/darkroom/chromatic-adaptation=legacy",
+    ],
+}
+
+
+@pytest.mark.tools
+@pytest.mark.parametrize("program", OPENERS)
+def test_raw_converters_show_a_linear_dng_as_bright_as_the_mosaic_it_came_from(
+    tmp_path: Path, program: str
+) -> None:
+    if shutil.which(program) is None:
+        pytest.skip(f"the program {program} is not installed")
+    smooth = planes(240, 320) * np.array([0.45, 0.9, 0.55], dtype=np.float32)[:, None, None]
+    mosaic = np.rint(512 + 15360 * smooth[1]).astype(np.uint16)
+    mosaic[::2, ::2] = np.rint(512 + 15360 * smooth[0, ::2, ::2])
+    mosaic[1::2, 1::2] = np.rint(512 + 15360 * smooth[2, 1::2, 1::2])
+    neutral = (0.5, 1.0, 0.6)
+    write_bayer_dng(tmp_path / "mosaic.dng", mosaic, black=512, white=15872, as_shot_neutral=neutral)
+    developed = photo.develop(tmp_path / "mosaic.dng")
+    photo.write_image(tmp_path / "linear.dng", developed.planes, developed.encoding, format="dng")
+
+    def shown(name: str) -> NDArray[np.float64]:
+        target = tmp_path / f"{name}.tif"
+        fixed = {"of": str(tmp_path / f"{name}.dng"), "to": str(target), "folder": str(tmp_path)}
+        words = [program, *(word.format(**fixed) for word in OPENERS[program])]
+        subprocess.run(words, check=True, capture_output=True, env=os.environ | {"HOME": str(tmp_path)})
+        picture = tifffile.imread(target)[..., :3].astype(np.float64)
+        return srgb_to_linear(picture[20:-20, 20:-20].mean(axis=(0, 1)) / 65535)
+
+    assert shown("linear") == pytest.approx(shown("mosaic"), rel=0.01)
 
 
 @pytest.mark.parametrize("output", FORMATS)

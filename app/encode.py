@@ -40,6 +40,7 @@ def describe(
             effective_samples=float(answer.effective_samples),
             photos=answer.photos,
             extrapolated=answer.extrapolated,
+            beyond=list(answer.beyond),
             predicted_error=error if np.isfinite(error) else None,
             mode=answer.mode,
             family=FamilyOut(lenses=len(fitted.family), weight=float(answer.prior_share))

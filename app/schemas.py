@@ -280,6 +280,7 @@ class PsfQuery(Question):
     )
     version: int | None = Field(None, ge=1, description="an earlier version of the lens")
     strict: bool = Field(default=False, description="refuse answers outside what the samples cover")
+    std: bool = Field(default=False, description="JSON only: the standard error of each pixel as well")
     family: bool = Field(default=True, description=_FAMILY)
 
 
@@ -316,6 +317,9 @@ class Support(Model):
     effective_samples: float
     photos: int
     extrapolated: bool
+    beyond: list[str] = Field(
+        default_factory=list, description="in which variables it lies outside the samples"
+    )
     predicted_error: float | None
     mode: str
     family: FamilyOut | None = None
@@ -336,6 +340,7 @@ class PsfOut(Model):
     version: int
     query: QueryOut
     psf: KernelOut
+    std: list[list[float]] | None = None
     support: Support
     bandwidth: dict[str, float]
     units: Units

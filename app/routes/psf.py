@@ -6,6 +6,7 @@ import hashlib
 import math
 from typing import Annotated, Final, Literal
 
+import numpy as np
 from fastapi import APIRouter, Query, Response, status
 
 from app import encode
@@ -121,6 +122,8 @@ def _answer(lens_id: str, at: PsfQuery, form: Format, call: Call) -> Response:
     in_micrometres = fitted.model.settings.unit == MICROMETRE
     pitch = (at.pixel_pitch_um if in_micrometres else None) or fitted.pixel_pitch_um
     described = encode.describe(lens_id, fitted, question, answer, pitch)
+    if at.std and form == "json" and answer.std is not None:
+        described = described.model_copy(update={"std": np.round(answer.std, encode.DIGITS).tolist()})
     body, more = encode.psf(form, answer.kernel, described)
     return Response(body, media_type=MEDIA_TYPES[form], headers={**headers, **more})
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -114,10 +114,10 @@ class PsfAnswer:
         Weight of the regression in the image frame, 0..1, by held-out errors near the place.
     wavefront_share : float
         Weight of the fitted wavefront with the rest of the samples, 0..1, likewise.
-    std : ndarray, shape (size, size), or None
-        Standard error of each pixel from the scatter of the samples; None unless asked for.
     mode : str
         Which of `MODES` answered.
+    scatter : callable
+        Computes `std`.
     """
 
     kernel: Kernel
@@ -133,5 +133,14 @@ class PsfAnswer:
     prior_share: float = 0.0
     image_frame_share: float = 0.0
     wavefront_share: float = 0.0
-    std: NDArray[np.float64] | None = field(default=None)
     mode: str = MIXED
+    scatter: Callable[[], NDArray[np.float64]] | None = field(default=None, repr=False)
+
+    @property
+    def std(self) -> NDArray[np.float64] | None:
+        """Standard error of each pixel from the scatter of the samples, shape (size, size).
+
+        Computed when it is read: each neighbour is turned to the place alone. None where the model that made
+        the answer is not at hand.
+        """
+        return None if self.scatter is None else self.scatter()

@@ -252,7 +252,6 @@ class LensModel:
         settings: LensSettings,
         size: int = 55,
         *,
-        std: bool = False,
         pitch_um: float | None = None,
         half_diagonal_px: float | None = None,
     ) -> PsfAnswer:
@@ -265,8 +264,6 @@ class LensModel:
             Unknown settings take no part.
         size : int
             Odd side in pixels.
-        std : bool
-            Whether to return the standard error of each pixel as well.
         pitch_um : float, optional
             Size of a pixel of the body that asks, in micrometres; that of the samples if unknown.
         half_diagonal_px : float, optional
@@ -293,10 +290,11 @@ class LensModel:
             error = shared = math.sqrt(float(mixture.squared[0])) * (1.0 + 0.5 * max(nearest - 1.0, 0.0))
         if self.prior is not None and share > _LISTED:
             error = math.sqrt((1.0 - share) * error**2 + share * self.prior.error(position, settings) ** 2)
-        scatter = None
-        if std:
+
+        def scatter() -> NDArray[np.float64]:
             apart = fit.local.apart(rows, position.phi, np.array(fit.widths.at(position, settings)), inside)
-            scatter = standard_error(apart, weight)
+            return standard_error(self._at_pixel(apart, size, pixel), weight)
+
         return PsfAnswer(
             kernel=self._at_pixel(mixture.kernels, size, pixel)[0],
             effective_samples=1.0 / float((weight**2).sum()),
@@ -311,7 +309,7 @@ class LensModel:
             prior_share=share,
             image_frame_share=float(mixture.shares[0, 1]),
             wavefront_share=float(mixture.shares[0, 2]),
-            std=scatter,
+            scatter=scatter,
             mode=fit.mode,
         )
 

@@ -266,3 +266,19 @@ def test_that_read_tells_what_two_others_do(store: Store, steps: Steps, taken: C
     assert len(both[1]) == 1
     assert store.samples.known_of(lens, "somebody else") is None
     assert store.samples.known_of("none", "local") is None
+
+
+def test_every_pixel_of_an_answer_has_a_standard_error(client: TestClient, taken: Callable[..., str]) -> None:
+    lens = taken(6.0, (6000, 4000), 1.5)
+    taken(6.0, (6000, 4000), 1.9)
+
+    plain, more = psf(client, lens, r=0.98), psf(client, lens, r=0.98, std=True, pixel_pitch_um=4)
+
+    assert plain["std"] is None
+    error, kernel = np.array(more["std"]), np.array(more["psf"]["data"])
+    assert error.shape == kernel.shape == (15, 15)
+    assert 0.005 * kernel.max() < error.max() < 0.5 * kernel.max()
+    assert (error >= 0).all()
+    assert client.get(f"/v1/lenses/{lens}/psf", params={**ASKED, "aperture": 16}).json()["support"][
+        "beyond"
+    ] == ["aperture_stops"]

@@ -41,6 +41,7 @@ NAMES: Final = (
 """The linear unknowns, in pixels of blur at the widest aperture."""
 
 _STEPS = 4
+_MOVES = 8  # a centre of mass may go to and fro between two places
 _BAND_NM = 35.0  # half the distance between the outer wavelengths of one channel
 _CENTRED_PX = 1e-3
 _SPARE = 1  # pixels around a kernel by which it may be moved without being rendered anew
@@ -155,10 +156,12 @@ class Wavefront:
         light = np.empty(0)
         for _ in range(_STEPS):
             fine, away, gap = grid.fine_light(g, amplitude), still, math.inf
-            while gap >= _CENTRED_PX and np.abs(away).max() <= _SPARE:
+            for _ in range(_MOVES):
                 light = grid.binned(fine, size, away)
                 found = np.array(centroid(light))
                 gap, away = math.hypot(*found), away + found
+                if gap < _CENTRED_PX or np.abs(away).max() > _SPARE:
+                    break
             g[6:] += -away[1], away[0]
             if gap < _CENTRED_PX:
                 break

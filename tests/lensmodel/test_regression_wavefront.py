@@ -7,9 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from lensmodel.psf import PsfSample, as_kernel, distance
+from lensmodel.psf import PsfSample, as_kernel, centroid, distance
 from lensmodel.regression import LensModel, ModelSettings
 from lensmodel.regression.pupil import TERMS, PupilGrid
+from lensmodel.regression.wavefront import Wavefront
 from lensmodel.regression.wavefront_fit import fit_wavefront
 from lensmodel.simulate import draw_lens
 from lensmodel.types import FieldPosition, Kernel, LensSettings
@@ -117,3 +118,14 @@ class TestCombined:
         one, two = (LensModel.fit(samples).warmed().query(corner, LensSettings(), 21) for _ in range(2))
 
         assert np.array_equal(one.kernel, two.kernel)
+
+
+def test_a_kernel_whose_centre_goes_to_and_fro_is_rendered_all_the_same() -> None:
+    terms = [-0.389, -0.137, -0.445, 0.017, -0.369, -0.038, -0.193, 0.012, 0.068, 0.215]
+    terms += [-0.054, -0.56, 1.086, -0.005, 0.012, -0.054, -0.044, 0.006, -0.009]
+    front = Wavefront(np.array(terms), -1.53, (1.16, 0.2), 1.8, 13)
+
+    kernel = front.kernel(FieldPosition(0.71, 0.53), LensSettings(aperture=1.8, focal_mm=35.0), 31)
+
+    assert kernel.sum() == pytest.approx(1.0)
+    assert math.hypot(*centroid(kernel)) < 0.01

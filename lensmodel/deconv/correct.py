@@ -71,21 +71,16 @@ class _Job:
     """Everything that a cell needs; shared by the threads and never changed."""
 
     planes: Planes
-    kernels: Callable[[FieldPosition, Channel], Kernel]
+    blurs: Callable[[FieldPosition, Channel, float], UniformBlur]
     frame: Frame
     method: Deconvolver
     strength: float
     noise: Sequence[NoiseModel]
     clip: Sequence[float]
     psf_error: PsfError
-    lateral: LateralShift | None
     cfa: BayerPattern | None
     bounds: Bounds
-
-    @property
-    def cell_factor(self) -> int:
-        """How much larger cells are than usual; kernels do not change within larger ones."""
-        return self.method.cell_factor if isinstance(self.method, CoarseMethod) and self.cfa is None else 1
+    cell_factor: int
 
     def measured(self, channel: int, top: int, left: int, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
         """Where the sensor measured a channel, on the part of the frame that begins at (top, left)."""
@@ -104,11 +99,11 @@ class _Job:
 
     def blur(self, cell: Cell, channel: Channel, error: float, corner: tuple[int, int]) -> UniformBlur:
         """Kernel of one channel in a cell, and how it changes there, on a tile that begins at `corner`."""
-        middle = self._at(cell.position, channel, error)
+        middle = self.blurs(cell.position, channel, error)
         if self.cell_factor > 1:
-            return middle
+            return UniformBlur(middle.kernel, middle.offset)  # its spectra go with the cell
         down, across = (
-            (self._at(before, channel, error), self._at(after, channel, error), pixels)
+            (self.blurs(before, channel, error), self.blurs(after, channel, error), pixels)
             for before, after, pixels in cell.beside
         )
         origin = (cell.middle[0] - corner[0], cell.middle[1] - corner[1])
@@ -116,16 +111,7 @@ class _Job:
 
     def reach(self, position: FieldPosition, channel: Channel, error: float) -> int:
         """How far the blur of a place reaches, in pixels."""
-        return self._at(position, channel, error).reach
-
-    def _at(self, position: FieldPosition, channel: Channel, error: float) -> UniformBlur:
-        """Kernel of one channel at one place, its lateral shift included."""
-        kernel = self.kernels(position, channel)
-        offset = (0.0, 0.0)
-        if self.lateral is not None and channel != "g":
-            out = self.lateral.displacement(position.r, channel)
-            offset = (-out * math.sin(position.phi), out * math.cos(position.phi))
-        return UniformBlur(_cautious(kernel, error), offset)
+        return self.blurs(position, channel, error).reach
 
 
 def correct_planes(
@@ -228,23 +214,19 @@ def correct_planes(
         out[:] = 0.0
     solver = deconvolvers.create(method) if isinstance(method, str) else method
 
-    # Each kernel serves its own cell and as a neighbour; three rows of cells of 100 megapixels fit.
-    @lru_cache(maxsize=640)
-    def kernels(position: FieldPosition, channel: Channel) -> Kernel:
-        return crop_to_support(field.kernel_at(position, channel, KERNEL_SIZE))
-
     job = _Job(
         planes,
-        kernels,
+        _blurs_of(field, lateral),
         frame,
         solver,
         strength,
         tuple(noise),
         tuple(clip),
         psf_error,
-        lateral,
         cfa,
         bounds or Bounds(),
+        # Kernels do not change within cells that are larger than usual.
+        solver.cell_factor if isinstance(solver, CoarseMethod) and cfa is None else 1,
     )
     if pitch is None:
         pitch = usual_pitch(frame, job.cell_factor)
@@ -255,6 +237,29 @@ def correct_planes(
         forecasts.append(expected)
         on_step(done, len(wanted))
     return Corrected(out, zone_reports(forecasts))
+
+
+def _blurs_of(
+    field: PsfField, lateral: LateralShift | None
+) -> Callable[[FieldPosition, Channel, float], UniformBlur]:
+    """Blur of one channel at one place, its lateral shift included, for an expected error of its kernel.
+
+    Each serves its own cell and as a neighbour; three rows of cells of 100 megapixels fit.
+    """
+
+    @lru_cache(maxsize=640)
+    def kernels(position: FieldPosition, channel: Channel) -> Kernel:
+        return crop_to_support(field.kernel_at(position, channel, KERNEL_SIZE))
+
+    @lru_cache(maxsize=640)
+    def blurs(position: FieldPosition, channel: Channel, error: float) -> UniformBlur:
+        offset = (0.0, 0.0)
+        if lateral is not None and channel != "g":
+            out = lateral.displacement(position.r, channel)
+            offset = (-out * math.sin(position.phi), out * math.cos(position.phi))
+        return UniformBlur(_cautious(kernels(position, channel), error), offset)
+
+    return blurs
 
 
 def _restored(job: _Job, wanted: Sequence[Cell], workers: int) -> Iterator[tuple[Cell, Planes, CellForecast]]:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lensmodel.blur import UniformBlur
 from lensmodel.deconv.base import Sensor
@@ -62,17 +64,25 @@ def forecast(
     before = sum_f S |1 - K|² + n,     after = sum_f S n / (S |K|² + n),   S = c |f|^-2.2
     """
     before = after = 0.0
-    decay = frequency_squared(_GRID).astype(np.float64) ** (SLOPE / 2)
+    shape = _scene_power()
     for plane, blur, sensor in zip(tile[:, ::_EVERY, ::_EVERY], blurs, sensors, strict=True):
         noise = float(sensor.noise.variance(plane).mean())
-        K = blur.spectrum(_GRID) if blur.kernel.shape[0] <= min(_GRID) else np.ones(decay.shape)
-        shape = np.where(decay == decay[0, 0], 0.0, 1.0 / decay)
-        power = np.abs(K) ** 2
+        K = blur.spectrum(_GRID) if blur.kernel.shape[0] <= min(_GRID) else np.ones(shape.shape)
+        power = K.real**2 + K.imag**2
         scale = max(float(plane.var()) - noise, 0.0) / float((shape * power).sum())
         S, n = scale * shape, noise / shape.size
-        before += float((S * np.abs(1.0 - K) ** 2 + n).sum())
+        before += float((S * ((1.0 - K.real) ** 2 + K.imag**2) + n).sum())
         after += float((S * n / np.maximum(S * power + n, 1e-30)).sum())
     return CellForecast(zone_of(cell.position.r), before, after, float(np.mean(errors)))
+
+
+@lru_cache(maxsize=1)
+def _scene_power() -> NDArray[np.float64]:
+    """|f|^-2.2 on the grid of a forecast; nothing at zero."""
+    decay = frequency_squared(_GRID).astype(np.float64) ** (SLOPE / 2)
+    shape = np.where(decay == decay[0, 0], 0.0, 1.0 / decay)
+    shape.setflags(write=False)
+    return shape
 
 
 def zone_reports(forecasts: Sequence[CellForecast]) -> dict[Zone, ZoneReport]:

@@ -107,7 +107,12 @@ def rows(
             ]
             if name == "default":
                 d = answer.diagnostics
-                found["features"] = [d["unlike"], d["width"], answer.predicted_error]
+                found["features"] = [
+                    d["disagreement"],
+                    d["gaussian_width"],
+                    d["slope"],
+                    answer.predicted_error,
+                ]
         if "features" in found:
             yield found
         print(f"\r{turn + 1} of {count}", end="", file=sys.stderr)
@@ -143,9 +148,12 @@ def main() -> None:
             f"| {np.median(v[:, 3]):.2f} |"
         )
     features, error = np.array([f["features"] for f in found]), np.array([f["default"][1] for f in found])
-    rank = stats.spearmanr(features[:, 2], error).statistic
+    rank = stats.spearmanr(features[:, 3], error).statistic
     print(f"predicted against true error of the default: Spearman {rank:.2f}")
-    design = np.stack([np.ones(len(error)), features[:, 0], np.log(np.maximum(features[:, 1], 0.29))], 1)
+    design = np.stack(
+        [np.ones(len(error)), features[:, 0], np.log(np.maximum(features[:, 1], 0.2)), features[:, 2] - 2.5],
+        1,
+    )
     fit = np.linalg.lstsq(design, np.log(error), rcond=None)[0]
     print("constants of predicted_error fitted to these cases:", np.round(fit, 2))
 

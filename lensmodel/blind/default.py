@@ -29,8 +29,8 @@ _PER_WIDTH = 40.0
 _POOLED_ERROR = 0.7
 """Relative error of a wavefront agreed on by n patches, times the root of n."""
 
-_AT_ONE_PX = -2.09
-"""Logarithm of the error where the wavefront agrees with patch recurrence on a kernel of 1 px."""
+_AT_TYPICAL = -1.08
+"""Logarithm of the error where both estimates agree on a Gaussian of 1 px and a usual scene."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,18 +41,24 @@ class Cautious:
     methods take the softness of a scene for blur, each in its own way. With few patches there are four
     kernels: the Gaussian, that of patch recurrence, the mean of both, and a wavefront fitted to the spectra
     and, with the weight `trust`, to the result of patch recurrence (see `aberrations`). The likelihood of
-    the spectra of whole patches and of small tiles (see `judgement`) chooses among them.
+    the spectra of whole patches and of small tiles (see `judgement`) chooses among them. Where the Gaussian
+    is narrower than `trusted_px`, most lenses are as sharp as it says: then the mean, or the Gaussian if
+    patch recurrence ran more than `apart` times as wide, stays unless another is likelier by `sure`. A sharp
+    core with wide wings is.
 
     From `pooled` patches on the slopes of the scenes average out, the wavefront is all but given by the
-    spectra, and patch recurrence only has to tell the phase. How far the wavefront lies from patch
-    recurrence is the best predictor found of the true error of few patches.
+    spectra, and patch recurrence only has to tell the phase. The root mean square distance of the MTFs
+    of the Gaussian and patch recurrence is the best predictor of the true error of few patches.
     """
 
+    trusted_px: float = 0.95
+    apart: float = 2.2
+    sure: float = 60.0
     pooled: int = 6
     trust: float = 20.0
 
     name = "default"
-    version = 8
+    version = 9
 
     def estimate(
         self,
@@ -149,16 +155,17 @@ class Cautious:
             for name, kernel in options.items()
         }
         costs["wavefront"] += fitted.unusual
+        if rms_width(gaussian.kernel) <= self.trusted_px:
+            ran = rms_width(found.kernel) > self.apart * max(rms_width(gaussian.kernel), _PIXEL_SIGMA)
+            costs["gaussian" if ran else "mean"] -= self.sure
         chosen = min(costs, key=lambda name: costs[name])
         kernel = options[chosen]
         on_step(1, 1)
-        unlike = distance(options["wavefront"], found.kernel).rel_l2
-        error = predicted_error(unlike, rms_width(kernel))
+        error = predicted_error(disagreement, rms_width(gaussian.kernel), gaussian.diagnostics["slope"])
         more = {
             "gaussian_width": gaussian.diagnostics["width"],
             "slope": gaussian.diagnostics["slope"],
             "disagreement": disagreement,
-            "unlike": unlike,
             "width": rms_width(kernel),
             **{f"chose_{name}": float(name == chosen) for name in options},
         }
@@ -191,15 +198,17 @@ def _half(on_step: StepHook, which: int) -> StepHook:
     return lambda done, total: on_step(done + which * total, 2 * total)
 
 
-def predicted_error(apart: float, width: float) -> float:
-    """Expected relative L2 error of the kernel, log-linear in what the development half tells.
+def predicted_error(disagreement: float, width: float, slope: float) -> float:
+    """Expected relative L2 error of the kernel, a log-linear fit to simulated lenses.
 
     Parameters
     ----------
-    apart : float
-        Relative L2 distance of the fitted wavefront from patch recurrence.
+    disagreement : float
+        Root mean square distance of the MTFs of the Gaussian and patch recurrence.
     width : float
-        RMS width of the chosen kernel in pixels.
+        RMS width of the Gaussian in pixels.
+    slope : float
+        Slope of the scene's power spectrum that went with it; a steep one hides blur or is it.
     """
-    logarithm = _AT_ONE_PX + 2.2 * apart + 0.28 * math.log(max(width, _PIXEL_SIGMA))
+    logarithm = _AT_TYPICAL + 2.19 * disagreement + 0.66 * math.log(max(width, 0.2)) + 2.23 * (slope - 2.5)
     return min(max(math.exp(logarithm), 0.05), 1.0)

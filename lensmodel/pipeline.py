@@ -38,7 +38,7 @@ from lensmodel.patches import Patch, Selection
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.lateral import LateralColour, estimate_lateral, resample
 from lensmodel.psf import PsfSample, rms_width
-from lensmodel.regression import LensModel, ModelSettings
+from lensmodel.regression import Doubt, LensModel, ModelSettings
 from lensmodel.spectrum import PatchSpectrum
 from lensmodel.types import (
     CHANNELS,
@@ -436,7 +436,8 @@ def correct_photo(
     """Remove the blur of the lens from a developed photo.
 
     The model's own predicted error of each PSF goes into the noise model of the correction:
-    where the PSF is uncertain, the correction is gentler.
+    where the PSF is uncertain, the correction is gentler, less so where the patches exclude that it
+    is too wide (`Doubt`).
 
     Parameters
     ----------
@@ -446,14 +447,15 @@ def correct_photo(
         `(row, col, height, width)` in sensor orientation; only that part is corrected.
     """
     model, pitch_um = model.warmed(), developed.info.metadata.pixel_pitch_um
-    half_px = developed.frame.half_diagonal
+    half_px, doubt = developed.frame.half_diagonal, Doubt(model)
 
     def psf_error(position: FieldPosition, channel: Channel) -> float:
         asked = settings.with_channel(channel)
         answer = model.query(position, asked, size=15, pitch_um=pitch_um, half_diagonal_px=half_px)
         error = answer.predicted_error if math.isfinite(answer.predicted_error) else 1.0
         # samples whose estimator said nothing of itself share the error that is usual
-        return math.hypot(error, 0.0 if answer.shared_error > 0 else BLIND_BIAS)
+        error = math.hypot(error, 0.0 if answer.shared_error > 0 else BLIND_BIAS)
+        return error if answer.extrapolated else error * doubt.share(position, settings)
 
     planes, cfa = developed.planes, developed.cfa
     if method == "paper" and lateral is not None:

@@ -1,6 +1,7 @@
 """The PSF as one continuous function of place and settings, learned from local samples."""
 
 from lensmodel.regression.answer import ModelSettings, PsfAnswer
+from lensmodel.regression.doubt import Doubt
 from lensmodel.regression.exact import PaperModel, all_pairs, factorised
 from lensmodel.regression.model import LensModel, ModelField, Prior
 from lensmodel.regression.profile import LensProfile, load_profile, save_profile
@@ -10,6 +11,7 @@ from lensmodel.regression.wavefront import Wavefront
 from lensmodel.regression.wavefront_fit import fit_wavefront
 
 __all__ = [
+    "Doubt",
     "Flag",
     "LensModel",
     "LensProfile",

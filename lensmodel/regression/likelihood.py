@@ -62,13 +62,16 @@ def likeliest(
     return min(complete, key=lambda name: complete[name])
 
 
-def surprise(sample: PsfSample, kernel: Kernel) -> float:
-    """Negative logarithm of the likelihood of a patch behind a kernel, up to a constant."""
+def surprise(sample: PsfSample, kernel: Kernel, share: float = 1.0) -> float:
+    """Negative logarithm of the likelihood of a patch behind a kernel, up to a constant.
+
+    Where the patch has a spectrum, `share` narrows the kernel to that part of its width.
+    """
     if sample.spectrum is None:
         error = max(distance(kernel, sample.kernel).rel_l2, _LEAST_ERROR)
         return BINS * math.log(error)
     view = SceneView.of({sample.settings.channel: sample.spectrum})
-    offset = np.log(_power(kernel) + _FLOOR) + BIAS
+    offset = np.log(_power(kernel, share) + _FLOOR) + BIAS
     unknowns, residual, _ = fit_scene(view, offset[:, None])
     squared = np.einsum("bi,bij,bj->b", residual, view.precision, residual)
     cost = float((_TAILS + 1.0) * np.log1p(squared / _TAILS).sum() + view.vote @ (unknowns - view.usual) ** 2)
@@ -94,15 +97,15 @@ def _asked(held: Sequence[PsfSample]) -> list[PsfSample]:
     return [told[i] for i in np.linspace(0, len(told) - 1, _MOST).round().astype(int)]
 
 
-def _power(kernel: Kernel) -> NDArray[np.float64]:
-    """Mean of |OTF|^2 in each bin, shape (BINS,)."""
-    rows, cols = _waves(kernel.shape[0])
+def _power(kernel: Kernel, share: float) -> NDArray[np.float64]:
+    """Mean of |OTF|^2 in each bin, shape (BINS,), of a kernel narrowed to a share of its width."""
+    rows, cols = _waves(kernel.shape[0], share)
     found = np.abs(((rows @ kernel) * cols).sum(axis=1)) ** 2
     return np.asarray(found.reshape(-1, BINS).mean(axis=0))
 
 
-@lru_cache(maxsize=4)
-def _waves(side: int) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+@lru_cache(maxsize=8)
+def _waves(side: int, share: float) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
     """Waves of nine frequencies in each bin along rows and columns, shape (9 BINS, side)."""
     middle, angle = bin_frequencies()
     wide = float(np.unique(middle)[1] / np.unique(middle)[0])
@@ -110,7 +113,7 @@ def _waves(side: int) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
     rows, cols = [], []
     for out in _INSIDE:
         for along in _INSIDE:
-            modulus, turned = middle * wide**out, angle + along * math.pi / SECTORS
+            modulus, turned = share * middle * wide**out, angle + along * math.pi / SECTORS
             rows.append(np.exp(-2j * np.pi * np.outer(modulus * np.sin(turned), t)))
             cols.append(np.exp(-2j * np.pi * np.outer(modulus * np.cos(turned), t)))
     return np.concatenate(rows), np.concatenate(cols)

@@ -41,6 +41,7 @@ _AROUND = 6  # pixels beyond the side that was fitted, for corners wider than ev
 _NOTHING_LEFT = 1e3
 _WORST = 1.5
 _ALIKE = 1e-7
+_CHOSEN = 3.0  # numbers by which the kernel of a patch follows its own scene
 _STEPS = 2
 
 
@@ -152,11 +153,12 @@ def _suits(pooled: Pooled, samples: Sequence[PsfSample]) -> bool:
     """Whether the patches are likelier behind the wavefront than behind the kernels each of them gave.
 
     A blur that no wavefront of a few numbers makes, of a plain Gaussian for example, leaves them less likely.
+    Kernels that were chosen for a patch follow its own scene as well, by about one for each of their numbers.
     """
     seen = [s for s in samples if s.spectrum is not None and s.settings.channel == "g"]
     seen = seen or [s for s in samples if s.spectrum is not None]
     agreed = sum(surprise(s, pooled.kernel(s, s.kernel.shape[0])) for s in seen)
-    return agreed < sum(surprise(s, s.kernel) for s in seen)
+    return agreed < sum(surprise(s, s.kernel) + _CHOSEN for s in seen)
 
 
 def _rendered(

@@ -8,20 +8,22 @@ of the samples is kriged with mean zero, so that far from all samples the wavefr
 
 Where the samples carry the spectra of their patches, the wavefront is fitted to those instead (`pooled`) and
 stands alone: all patches agree on it, while finished kernels carry each patch's own mistake. That is so as
-long as the patches are likelier behind it than behind their own kernels.
+long as the patches are likelier behind it than behind the kernels of their neighbours.
 
 Cost: some seconds of CPU for the fit, one or two milliseconds at each question.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from lensmodel.psf import PsfSample, resized
+from lensmodel.psf import PsfSample, as_kernel, resized
 from lensmodel.regression import variables as va
 from lensmodel.regression.kriging import NUGGETS, field_vector, matern, settings_gap, squared_gaps
 from lensmodel.regression.likelihood import surprise
@@ -34,14 +36,13 @@ from lensmodel.regression.wavefront_fit import (
     focal_range,
     spread,
 )
-from lensmodel.types import FieldPosition, LensSettings, StepHook, ignore_step
+from lensmodel.types import FieldPosition, Kernel, LensSettings, StepHook, ignore_step
 
 _MOST = 240
 _AROUND = 6  # pixels beyond the side that was fitted, for corners wider than every sample
 _NOTHING_LEFT = 1e3
 _WORST = 1.5
 _ALIKE = 1e-7
-_CHOSEN = 3.0  # numbers by which the kernel of a patch follows its own scene
 _STEPS = 2
 
 
@@ -150,15 +151,27 @@ class Physics:
 
 
 def _suits(pooled: Pooled, samples: Sequence[PsfSample]) -> bool:
-    """Whether the patches are likelier behind the wavefront than behind the kernels each of them gave.
+    """Whether the patches are likelier behind the wavefront than behind the kernels of their neighbours.
 
     A blur that no wavefront of a few numbers makes, of a plain Gaussian for example, leaves them less likely.
-    Kernels that were chosen for a patch follow its own scene as well, by about one for each of their numbers.
+    The kernel that a patch gave itself follows its own scene as well, so that it is no judge.
     """
     seen = [s for s in samples if s.spectrum is not None and s.settings.channel == "g"]
     seen = seen or [s for s in samples if s.spectrum is not None]
     agreed = sum(surprise(s, pooled.kernel(s, s.kernel.shape[0])) for s in seen)
-    return agreed < sum(surprise(s, s.kernel) + _CHOSEN for s in seen)
+    return agreed < sum(surprise(s, _neighbour(s, seen)) for s in seen)
+
+
+def _neighbour(sample: PsfSample, others: Sequence[PsfSample]) -> Kernel:
+    """Kernel of the nearest patch that was estimated apart from this one, turned to its place."""
+    apart = [other for other in others if not np.array_equal(other.kernel, sample.kernel)]
+    if not apart:
+        return sample.kernel
+    here = field_vector(sample.position)
+    nearest = min(apart, key=lambda other: float(((field_vector(other.position) - here) ** 2).sum()))
+    angle = math.degrees(sample.position.phi - nearest.position.phi)
+    turned = ndimage.rotate(nearest.kernel, angle, reshape=False, order=3)
+    return as_kernel(np.maximum(turned, 0.0))
 
 
 def _rendered(

@@ -2,10 +2,9 @@
 
 A kernel that is too wide ruins a photo, one too narrow only helps less. Where a patch would be hardly less
 likely behind a narrower kernel, its scene may be soft by itself and the lens sharper than it seems; where it
-would be far less likely, nothing but the blur makes its spectrum fall as it does. Judged by the widths of
-patches' own kernels of simulated lenses of development seeds (0, 1, 2, 5 and 7, one photo each): those that
-were too wide by more than half rose by less than 3, those that rose by 15 and more were at most a fifth too
-wide.
+would be far less likely, nothing but the blur makes its spectrum fall as it does. The bounds were chosen by
+the widths of patches' own kernels behind simulated lenses of development seeds (0, 1, 2, 5 and 7, one photo
+each).
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from lensmodel.regression.likelihood import surprise
 from lensmodel.regression.model import LensModel
 from lensmodel.types import FieldPosition, LensSettings
 
-_NARROWER: Final = 0.7
+_NARROWER: Final = 0.7  # of the width
 _OPEN, _SURE = 5.0, 20.0  # rise of a patch's negative log likelihood behind the narrower kernel
 _LEAST: Final = 0.5
 _NEIGHBOURS: Final = 8
@@ -33,16 +32,18 @@ class Doubt:
     ----------
     model : LensModel
     rises : dict
-        What was found of its samples so far, by their numbers.
+        By the number of a sample: how much its patch's negative log likelihood rises behind narrower
+        kernels; kept since many places ask for the same samples.
     """
 
     model: LensModel
     rises: dict[int, float] = field(default_factory=dict)
 
     def share(self, position: FieldPosition, settings: LensSettings) -> float:
-        """Return 1 where kernels may be too wide, down to a half where the patches nearby exclude it.
+        """Share of the expected relative L2 of a kernel that counts, for its place and settings.
 
-        1 where no patch nearby has a spectrum.
+        1 where kernels may be too wide or no patch nearby has a spectrum, down to a half where the patches
+        nearby exclude it.
         """
         rows, _, weights = self.model.weights(position, settings.with_channel("g"))
         green = [

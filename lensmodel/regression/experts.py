@@ -6,8 +6,8 @@ its share is proportional to e^-4: where one is much worse than the others it lo
 A wavefront fitted to the spectra of all patches (`pooled`) makes other mistakes than kernels that were
 estimated one by one: those fail where blur is wide, it cannot tell blur below half a pixel from a soft scene,
 and between the mean of both is better than either. The rules below were chosen on simulated lenses of
-development seeds (0, 1, 2, 4, 5, 6 and 7, one photo or two) with version 4 of the blind estimator `default`;
-`benchmarks/pooled_evidence.py` prints what they give.
+development seeds (0, 1, 2, 4, 5, 6 and 7, one photo or two) with versions 4 and 7 of the blind estimator
+`default`; `benchmarks/pooled_evidence.py` prints what they give.
 """
 
 from __future__ import annotations

@@ -170,7 +170,8 @@ def _whole_pixels(fine: int, across: int, size: int) -> NDArray[np.float32]:
 def _pixels(fine: int, across: int, size: int, away: float) -> NDArray[np.float32]:
     """Weights by which samples of a finer grid make pixels, shape (size, fine * across).
 
-    Between samples light is a cubic through four of them. A square may reach beyond the grid by two samples.
+    Between samples light is Lagrange's cubic through four of them. A square may reach beyond the grid by two
+    samples.
     """
     whole = math.floor(away * fine)
     t = away * fine - whole

@@ -25,53 +25,30 @@ _STATE = select(LensRow.version, LensRow.rebuild_epoch).where(
     LensRow.public_id == bindparam("lens"), LensRow.deleted_at.is_(None)
 )
 _ME, _OTHER = aliased(LensRow), aliased(LensRow)
-_OTHERS = (
-    select(
-        _ME.maker,
-        _ME.model,
-        _OTHER.public_id,
-        _OTHER.version,
-        _OTHER.rebuild_epoch,
-        _OTHER.sample_count,
-        _OTHER.maker.label("other_maker"),
-        _OTHER.model.label("other_model"),
-    )
-    .join(_OTHER, _OTHER.owner_id == _ME.owner_id)
-    .where(
-        _ME.public_id == bindparam("lens"),
-        _ME.deleted_at.is_(None),
-        _ME.model.is_not(None),
-        _OTHER.id != _ME.id,
-        _OTHER.deleted_at.is_(None),
-        _OTHER.sample_count > 0,
-    )
-    .order_by(_OTHER.public_id.desc())
+_RELATIVES = (
+    _ME.maker,
+    _ME.model,
+    _OTHER.public_id,
+    _OTHER.version,
+    _OTHER.rebuild_epoch,
+    _OTHER.sample_count,
+    _OTHER.maker.label("other_maker"),
+    _OTHER.model.label("other_model"),
 )
+_MAY_BE_RELATED = and_(
+    _OTHER.owner_id == _ME.owner_id,
+    _OTHER.id != _ME.id,
+    _OTHER.deleted_at.is_(None),
+    _OTHER.sample_count > 0,
+    _ME.model.is_not(None),
+)
+_THIS = and_(_ME.public_id == bindparam("lens"), _ME.deleted_at.is_(None))
+_OTHERS = select(*_RELATIVES).join(_OTHER, _MAY_BE_RELATED).where(_THIS).order_by(_OTHER.public_id.desc())
 _KNOWN = (
-    select(
-        _ME.version.label("my_version"),
-        _ME.rebuild_epoch.label("my_epoch"),
-        _ME.maker,
-        _ME.model,
-        _OTHER.public_id,
-        _OTHER.version,
-        _OTHER.rebuild_epoch,
-        _OTHER.sample_count,
-        _OTHER.maker.label("other_maker"),
-        _OTHER.model.label("other_model"),
-    )
+    select(_ME.version.label("my_version"), _ME.rebuild_epoch.label("my_epoch"), *_RELATIVES)
     .join(OwnerRow, OwnerRow.id == _ME.owner_id)
-    .outerjoin(
-        _OTHER,
-        and_(
-            _OTHER.owner_id == _ME.owner_id,
-            _OTHER.id != _ME.id,
-            _OTHER.deleted_at.is_(None),
-            _OTHER.sample_count > 0,
-            _ME.model.is_not(None),
-        ),
-    )
-    .where(_ME.public_id == bindparam("lens"), _ME.deleted_at.is_(None), OwnerRow.name == bindparam("owner"))
+    .outerjoin(_OTHER, _MAY_BE_RELATED)
+    .where(_THIS, OwnerRow.name == bindparam("owner"))
     .order_by(_OTHER.public_id.desc())
 )
 MOST_OF_FAMILY: Final = 2000

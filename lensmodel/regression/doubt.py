@@ -61,16 +61,9 @@ class Doubt:
     def _rise(self, row: int) -> float:
         if row not in self.rises:
             sample = self.model.samples[row]
-            answer = self.model.kernels(
-                [sample.position],
-                sample.settings,
-                sample.kernel.shape[0],
-                pitch_um=sample.pixel_pitch_um,
-                half_diagonal_px=sample.half_diagonal_px,
-            )[0]
             # a wavefront of the wrong shape may fit one patch so well that any other width fits worse
             self.rises[row] = min(
                 surprise(sample, kernel, _NARROWER) - surprise(sample, kernel)
-                for kernel in (answer, sample.kernel)
+                for kernel in (self.model.kernel_of(sample), sample.kernel)
             )
         return self.rises[row]

@@ -332,6 +332,17 @@ class LensModel:
         _, mixture, _ = self._asked(positions, settings, self._inner_size(size, pixel))
         return self._at_pixel(mixture.kernels, size, pixel)
 
+    def kernel_of(self, sample: PsfSample) -> Kernel:
+        """Return the PSF at the place and settings of a sample, in its pixels and of its size."""
+        found = self.kernels(
+            [sample.position],
+            sample.settings,
+            sample.kernel.shape[0],
+            pitch_um=sample.pixel_pitch_um,
+            half_diagonal_px=sample.half_diagonal_px,
+        )
+        return np.asarray(found[0])
+
     def weights(
         self, position: FieldPosition, settings: LensSettings
     ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
@@ -438,15 +449,7 @@ class LensModel:
 
         def told_by(mode: str) -> Predict:
             model = LensModel(seen, self.settings, replace(fit, mode=mode))
-            return lambda s: np.asarray(
-                model.kernels(
-                    [s.position],
-                    s.settings,
-                    s.kernel.shape[0],
-                    pitch_um=s.pixel_pitch_um,
-                    half_diagonal_px=s.half_diagonal_px,
-                )[0]
-            )
+            return model.kernel_of
 
         return {mode: told_by(mode) for mode in MODES if mode != LIKELIEST and open_.get(mode, True)}
 

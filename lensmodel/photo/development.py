@@ -85,7 +85,8 @@ def _develop_raster(path: Path, header: Header, info: PhotoInfo) -> LinearPhoto:
     planes = _linear(pixels, transfer, icc)
     curve = curves_of(transfer, icc)[1]
     code = {1: CODES // 255, 2: 1}.get(pixels.dtype.itemsize, 1)
-    noise = [estimate_noise(plane, step=float(curve[code] - curve[0])) for plane in planes]
+    codes = curve[::code] if pixels.dtype.itemsize == 1 else None
+    noise = [estimate_noise(plane, step=float(curve[code] - curve[0]), codes=codes) for plane in planes]
     top = float(planes.max()) if pixels.dtype.kind == "f" else 1.0
     return LinearPhoto(
         planes=planes,

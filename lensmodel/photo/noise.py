@@ -20,19 +20,26 @@ _FLAT_SHARE: Final = 0.15
 _MIN_BLOCKS: Final = 24
 _ENOUGH_PIXELS: Final = 3_000_000
 _MAD_TO_SIGMA: Final = 1.4826
+_CUT: Final = 1.5
+"""Standard deviations beyond which a difference counts as no more than that: see `_scale`."""
+
+_CUT_POWER: Final = 0.778465
+"""Mean of min(z^2, _CUT^2) of a standard normal z."""
 
 # The difference of two Laplacians: unit gain for white noise, blind to planes and to edges
 # along the axes. J. Immerkaer, "Fast noise variance estimation", CVIU 64, 1996, eq. 2.
 _HIGH_PASS: Final = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]) / 6.0
 
 
-def estimate_noise(plane: Plane, clip: float = 1.0, step: float = 0.0) -> NoiseModel:
+def estimate_noise(
+    plane: Plane, clip: float = 1.0, step: float = 0.0, codes: NDArray[np.floating] | None = None
+) -> NoiseModel:
     """Fit var(y) = shot * y + read to the flat places of a plane.
 
     Blocks are sorted by level; of each level the blocks with the least texture count. Texture
     is judged on the low-passed plane and noise on the high-passed one, so that the choice does
-    not favour blocks whose noise happens to be small. The variance of a level is that of the
-    median absolute deviation of all its high-passed pixels together.
+    not favour blocks whose noise happens to be small. The variance of a level is a robust one of
+    all its high-passed pixels together, and no less than what rounding to the file's numbers makes.
 
     Parameters
     ----------
@@ -43,6 +50,9 @@ def estimate_noise(plane: Plane, clip: float = 1.0, step: float = 0.0) -> NoiseM
     step : float
         Smallest step between the file's numbers near black, in linear light. Rounding alone
         makes a variance of step^2 / 12, and no less is reported.
+    codes : ndarray, optional
+        Linear light of each of the file's numbers, ascending, where they are so few that their steps
+        are of the noise's size: those of 8 bits.
 
     Returns
     -------
@@ -58,7 +68,10 @@ def estimate_noise(plane: Plane, clip: float = 1.0, step: float = 0.0) -> NoiseM
     A. Foi, M. Trimeche, V. Katkovnik, K. Egiazarian, "Practical Poissonian-Gaussian noise
     modeling and fitting for single-image raw-data", IEEE TIP 17, 2008.
     """
-    model = _fit(*_levels(_sampled(np.asarray(plane, dtype=np.float32)), clip))
+    levels, variances, counts = _levels(_sampled(np.asarray(plane, dtype=np.float32)), clip)
+    if codes is not None and len(levels):
+        variances = np.maximum(variances, np.interp(levels, codes, np.gradient(codes) ** 2 / 12.0))
+    model = _fit(levels, variances, counts)
     return NoiseModel(model.shot, max(model.read, step * step / 12.0))
 
 
@@ -98,11 +111,31 @@ def _levels(
         keep = max(_MIN_BLOCKS, int(_FLAT_SHARE * len(part)))
         flat = part[np.argsort(texture[part])[:keep]]
         values = high_blocks[flat]
-        sigma = _MAD_TO_SIGMA * float(np.median(np.abs(values)))
+        sigma = _scale(values)
         if sigma > 0:  # else most differences are exactly 0: rounding or compression ate the noise
             found.append((float(mean[flat].mean()), sigma * sigma, float(values.size)))
     table = np.array(found).reshape(-1, 3)
     return table[:, 0], table[:, 1], table[:, 2]
+
+
+def _scale(values: NDArray[np.float32]) -> float:
+    """Robust standard deviation: the s for which the mean of min(v^2, (1.5 s)^2) is that of a normal v.
+
+    A median would do where numbers are fine. Differences of a camera's 8-bit numbers are few, and their
+    median jumps from one to the next: by a factor of 2 where the noise is half a step.
+    P. J. Huber, "Robust estimation of a location parameter", Ann. Math. Stat. 35, 1964, proposal 2.
+    """
+    power = np.square(values, dtype=np.float32).ravel()
+    sigma = _MAD_TO_SIGMA * float(np.sqrt(np.median(power)))
+    for _ in range(20):
+        if sigma == 0.0:
+            break
+        before = sigma
+        clipped = np.minimum(power, np.float32((_CUT * sigma) ** 2))
+        sigma = float(np.sqrt(clipped.mean(dtype=np.float64) / _CUT_POWER))
+        if abs(sigma - before) < 1e-3 * before:
+            break
+    return sigma
 
 
 def _blocks(plane: NDArray[np.float32]) -> NDArray[np.float32]:

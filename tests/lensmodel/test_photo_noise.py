@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lensmodel import photo
+from lensmodel.photo.colour import curves_of
 from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.photo.noise import estimate_noise
 from lensmodel.types import NoiseModel
@@ -15,6 +17,7 @@ from lensmodel.types import NoiseModel
 BLACK, WHITE = 512, 15000
 
 
+@lru_cache(maxsize=4)  # most tests photograph the same one
 def scene(height: int, width: int, seed: int, blur: float = 1.0) -> NDArray[np.float64]:
     """Leaves of random grey one over the other, out to the pixel, then a lens of some blur."""
     rng = np.random.default_rng(seed)
@@ -39,6 +42,29 @@ def test_noise_is_recovered_to_15_percent_from_a_textured_scene(shot: float, rea
 
     levels = np.array([0.05, 0.2, 0.5])
     assert found.variance(levels) == pytest.approx(truth.variance(levels), rel=0.15)
+
+
+@pytest.mark.parametrize("shot", [5e-6, 2e-5, 5e-5])
+def test_noise_below_the_steps_of_8_bits_is_recovered_to_10_percent(shot: float) -> None:
+    steps = curves_of("srgb")[1][::257]
+    light = noisy(scene(600, 800, seed=1), NoiseModel(shot, 1e-7), seed=2)
+    numbers = np.rint(np.interp(light, steps, np.arange(256.0))).astype(np.intp)
+    found = estimate_noise(steps[numbers].astype(np.float32), codes=steps)
+
+    levels = np.array([0.05, 0.2, 0.5])
+    # what rounding adds is noise of the file as well
+    truth = shot * levels + 1e-7 + np.interp(levels, steps, np.gradient(steps)) ** 2 / 12
+    assert found.variance(levels) == pytest.approx(truth, rel=0.1)
+
+
+def test_numbers_of_8_bits_without_other_noise_have_that_of_rounding_at_every_level() -> None:
+    steps = curves_of("srgb")[1][::257]
+    numbers = np.rint(np.interp(scene(600, 800, seed=1, blur=3.0), steps, np.arange(256.0))).astype(np.intp)
+    found = estimate_noise(steps[numbers].astype(np.float32), codes=steps)
+
+    levels = np.array([0.1, 0.3, 0.6])
+    rounding = np.interp(levels, steps, np.gradient(steps) ** 2 / 12)
+    assert (found.variance(levels) > 0.8 * rounding).all()
 
 
 def test_both_terms_are_recovered_from_a_smooth_ramp() -> None:

@@ -13,6 +13,7 @@ from lensmodel.photo.colour import CODES, curves_of, decode, icc_curves, icc_spa
 from lensmodel.photo.containers import opened_header
 from lensmodel.photo.header import Header
 from lensmodel.photo.inspection import info_of
+from lensmodel.photo.metadata import baseline_exposure_of
 from lensmodel.photo.model import Encoding, Limits, LinearPhoto, PhotoInfo, Transfer
 from lensmodel.photo.noise import estimate_noise
 from lensmodel.photo.raster import Pixels, read_pixels
@@ -46,11 +47,11 @@ def develop(path: Path | str, *, limits: Limits | None = None, demosaic: Demosai
     with opened_header(path, limits) as header:
         info = info_of(path, header, limits)
         if info.kind in {"raw", "dng"}:
-            return _develop_raw(path, info, demosaic)
+            return _develop_raw(path, info, demosaic, baseline_exposure_of(header))
         return _develop_raster(path, header, info)
 
 
-def _develop_raw(path: Path, info: PhotoInfo, demosaic: Demosaic) -> LinearPhoto:
+def _develop_raw(path: Path, info: PhotoInfo, demosaic: Demosaic, baseline: float | None) -> LinearPhoto:
     raw = develop_raw(path, demosaic)
     _, height, width = raw.planes.shape
     encoding = Encoding(
@@ -59,6 +60,7 @@ def _develop_raw(path: Path, info: PhotoInfo, demosaic: Demosaic) -> LinearPhoto
         white_balance=raw.white_balance,
         to_srgb=raw.to_srgb,
         xyz_to_camera=raw.xyz_to_camera,
+        baseline_exposure=baseline,
     )
     return LinearPhoto(
         planes=raw.planes,

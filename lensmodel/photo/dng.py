@@ -74,6 +74,8 @@ class ShotInfo:
         EXIF orientation, 1 to 8.
     software, description : str
         Free texts.
+    baseline_exposure : float or None
+        Stops by which a raw converter is asked to brighten the picture.
     """
 
     camera_maker: str = ""
@@ -94,6 +96,7 @@ class ShotInfo:
     orientation: int = 1
     software: str = "lensmodel"
     description: str = ""
+    baseline_exposure: float | None = None
 
     def __post_init__(self) -> None:
         if self.orientation not in range(1, 9):
@@ -280,6 +283,8 @@ def _common_tags(height: int, width: int, samples: int, photometric: int, shot: 
     named = shot.camera_model.lower().startswith(shot.camera_maker.lower())
     unique = shot.camera_model if named else f"{shot.camera_maker} {shot.camera_model}"
     tags.text(50708, unique.strip() or "Unknown")  # UniqueCameraModel
+    if shot.baseline_exposure is not None:
+        tags.signed_rationals(50730, [shot.baseline_exposure])
     tags.text(50735, shot.body_serial)  # CameraSerialNumber
     return tags
 

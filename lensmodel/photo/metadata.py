@@ -82,6 +82,11 @@ def metadata_of(header: Header) -> PhotoMetadata:
     )
 
 
+def baseline_exposure_of(header: Header) -> float | None:
+    """Stops by which a DNG asks to be brightened (tag 50730), None where it does not say or is absurd."""
+    return _first_within(-10.0, 10.0, _Exif.of(header).number(0xC62A))
+
+
 @dataclass(frozen=True, slots=True)
 class _Exif:
     """The tags of IFD0 and the EXIF directory together; the latter win."""

@@ -140,6 +140,8 @@ class Encoding:
         of `icc`, or of sRGB.
     xyz_to_camera : 3 x 3 tuple or None
         CIE XYZ (D65) to camera RGB, for DNG output.
+    baseline_exposure : float or None
+        Stops by which a DNG asks raw converters to brighten it; `None` where the file does not say.
     """
 
     bit_depth: int = 8
@@ -149,6 +151,7 @@ class Encoding:
     white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
     to_srgb: Matrix3 | None = None
     xyz_to_camera: Matrix3 | None = None
+    baseline_exposure: float | None = None
 
     @property
     def orientation(self) -> int:

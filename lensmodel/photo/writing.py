@@ -269,6 +269,7 @@ def _write_dng(path: Path, planes: Planes, encoding: Encoding, description: str)
         pixel_pitch_um=metadata.pixel_pitch_um,
         orientation=encoding.orientation,
         description=description,
+        baseline_exposure=encoding.baseline_exposure,
     )
     r, g, b = encoding.white_balance
     numbers = np.empty(planes.shape, dtype=np.uint16)

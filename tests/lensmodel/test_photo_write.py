@@ -21,7 +21,7 @@ from skimage import io
 from lensmodel import photo
 from lensmodel.errors import InvalidInputError
 from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, srgb_to_linear
-from lensmodel.photo.dng import write_bayer_dng
+from lensmodel.photo.dng import ShotInfo, write_bayer_dng
 
 METADATA = photo.PhotoMetadata(
     camera_maker="Canon",
@@ -208,9 +208,10 @@ OPENERS = {
 
 
 @pytest.mark.tools
+@pytest.mark.parametrize("stops", [None, 0.75])
 @pytest.mark.parametrize("program", OPENERS)
 def test_raw_converters_show_a_linear_dng_as_bright_as_the_mosaic_it_came_from(
-    tmp_path: Path, program: str
+    tmp_path: Path, program: str, stops: float | None
 ) -> None:
     if shutil.which(program) is None:
         pytest.skip(f"the program {program} is not installed")
@@ -219,7 +220,14 @@ def test_raw_converters_show_a_linear_dng_as_bright_as_the_mosaic_it_came_from(
     mosaic[::2, ::2] = np.rint(512 + 15360 * smooth[0, ::2, ::2])
     mosaic[1::2, 1::2] = np.rint(512 + 15360 * smooth[2, 1::2, 1::2])
     neutral = (0.5, 1.0, 0.6)
-    write_bayer_dng(tmp_path / "mosaic.dng", mosaic, black=512, white=15872, as_shot_neutral=neutral)
+    write_bayer_dng(
+        tmp_path / "mosaic.dng",
+        mosaic,
+        black=512,
+        white=15872,
+        as_shot_neutral=neutral,
+        shot=ShotInfo(baseline_exposure=stops),
+    )
     developed = photo.develop(tmp_path / "mosaic.dng")
     photo.write_image(tmp_path / "linear.dng", developed.planes, developed.encoding, format="dng")
 
@@ -232,6 +240,22 @@ def test_raw_converters_show_a_linear_dng_as_bright_as_the_mosaic_it_came_from(
         return srgb_to_linear(picture[20:-20, 20:-20].mean(axis=(0, 1)) / 65535)
 
     assert shown("linear") == pytest.approx(shown("mosaic"), rel=0.01)
+
+
+@pytest.mark.parametrize("stops", [None, -1.25, 0.35])
+def test_a_linear_dng_asks_for_the_baseline_exposure_of_the_dng_it_came_from(
+    tmp_path: Path, stops: float | None
+) -> None:
+    mosaic = np.rint(512 + 15360 * planes(32, 48)[1]).astype(np.uint16)
+    shot = ShotInfo(baseline_exposure=stops)
+    write_bayer_dng(tmp_path / "mosaic.dng", mosaic, black=512, white=15872, shot=shot)
+    developed = photo.develop(tmp_path / "mosaic.dng")
+    photo.write_image(tmp_path / "linear.dng", developed.planes, developed.encoding, format="dng")
+
+    assert developed.encoding.baseline_exposure == stops
+    assert photo.develop(tmp_path / "linear.dng").encoding.baseline_exposure == stops
+    with tifffile.TiffFile(tmp_path / "linear.dng") as file:
+        assert (50730 in file.pages[0].tags) == (stops is not None)
 
 
 @pytest.mark.parametrize("output", FORMATS)

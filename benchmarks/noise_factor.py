@@ -3,8 +3,8 @@
     LENSMODEL_TEST_DATA=... python benchmarks/noise_factor.py [--seeds 8] [--factors 0.25 1 4 16 64]
 
 A photo of a lens of a development seed as raw, as a 16-bit TIFF and as a JPEG of quality 92, both developed
-by us in sRGB; method `standard`. Where the best factor is far from 1, what the file does to the picture
-(demosaicing, quantisation, blocks) is not in its noise model.
+by us in sRGB; method `standard`. Factor 1 is `LinearPhoto.correction_noise`. Where the best one is far from
+it, what the file does to the picture (demosaicing, quantisation, blocks) is not in its noise model.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def scaled(photo: LinearPhoto, factor: float) -> LinearPhoto:
         return r, g, b
 
     sensor = None if photo.sensor_noise is None else noisier(photo.sensor_noise)
-    return replace(photo, noise=noisier(photo.noise), sensor_noise=sensor)
+    return replace(photo, noise=noisier(photo.correction_noise), sensor_noise=sensor)
 
 
 def case_of(seed: int, files: Sequence[Path], condition: str) -> Case:

@@ -15,7 +15,7 @@ from lensmodel.photo.header import Header
 from lensmodel.photo.inspection import info_of
 from lensmodel.photo.metadata import baseline_exposure_of
 from lensmodel.photo.model import Encoding, Limits, LinearPhoto, PhotoInfo, Transfer
-from lensmodel.photo.noise import estimate_noise
+from lensmodel.photo.noise import coding_noise, estimate_noise
 from lensmodel.photo.raster import Pixels, read_pixels
 from lensmodel.photo.raw import Demosaic, develop_raw
 from lensmodel.types import Planes
@@ -103,6 +103,7 @@ def _develop_raster(path: Path, header: Header, info: PhotoInfo) -> LinearPhoto:
             metadata=info.metadata.without_serials(),
         ),
         pipeline=f"{info.kind}/{transfer}/1",
+        coding_noise=coding_noise(header.coarseness, curve[::257]) if header.coarseness else None,
     )
 
 

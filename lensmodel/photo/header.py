@@ -44,6 +44,8 @@ class Header:
         XMP packet and ICC profile.
     linear : bool
         The file declares its numbers to be linear light (PNG gamma 1).
+    coarseness : float
+        Median step of the quantised cosine coefficients of a JPEG's luma, in 8-bit numbers; 0 unknown.
     """
 
     kind: FileKind
@@ -56,6 +58,7 @@ class Header:
     xmp: bytes | None = None
     icc: bytes | None = None
     linear: bool = False
+    coarseness: float = 0.0
 
 
 def check_size(width: int, height: int, file_bytes: int, limits: Limits) -> None:

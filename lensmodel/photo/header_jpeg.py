@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 import struct
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,12 +15,13 @@ from lensmodel.photo.model import Limits
 
 _START_OF_SCAN: Final = 0xDA
 _END_OF_IMAGE: Final = 0xD9
+_TABLES: Final = 0xDB
 _NO_FRAMES: Final = {0xC4, 0xC8, 0xCC}
 """Markers in the range of the frame headers that are none: tables and an extension."""
 
 
 def read_jpeg(buffer: Buffer, limits: Limits) -> Header:
-    """Read the segments up to the first scan: frame size, EXIF, XMP and ICC profile.
+    """Read the segments up to the first scan: frame size, EXIF, XMP, ICC profile, quantisation.
 
     Raises
     ------
@@ -35,6 +37,8 @@ def read_jpeg(buffer: Buffer, limits: Limits) -> Header:
                 raise TruncatedImageError("the JPEG's frame header is cut off")
             bits, height, width, channels = struct.unpack(">BHHB", body[:6])
             header = replace(header, width=width, height=height, channels=channels, bits=bits)
+        elif code == _TABLES:
+            header = replace(header, coarseness=_coarseness(body) or header.coarseness)
         elif body.startswith(b"Exif\0") and (reader := TiffReader.open(body, 6)):
             header = replace(header, tiff=(*header.tiff, reader))
         elif body.startswith(b"http://ns.adobe.com/xap/1.0/\0"):
@@ -46,6 +50,18 @@ def read_jpeg(buffer: Buffer, limits: Limits) -> Header:
     check_size(header.width, header.height, len(buffer), limits)
     icc = b"".join(part for _, part in sorted(icc_parts.items()))
     return replace(header, icc=icc or None)
+
+
+def _coarseness(tables: bytes) -> float:
+    """Median step of the first quantisation table, which cameras give to luma; 0 where it is not there."""
+    at = 0
+    while at < len(tables):
+        size = 128 if tables[at] >> 4 else 64
+        steps = tables[at + 1 : at + 1 + size]
+        if tables[at] & 15 == 0 and len(steps) == size:
+            return statistics.median(struct.unpack(">64H" if size == 128 else "64B", steps))
+        at += 1 + size
+    return 0.0
 
 
 def _segments(buffer: Buffer) -> Iterator[tuple[int, bytes]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from datetime import datetime
-from typing import Literal, TypeAlias
+from typing import Final, Literal, TypeAlias
 
 from lensmodel.errors import InvalidInputError
 from lensmodel.geometry import Frame
@@ -17,6 +17,9 @@ OutputFormat: TypeAlias = Literal["tiff16", "png16", "png8", "jpeg", "dng"]
 ColorSpace: TypeAlias = Literal["same", "srgb", "camera-linear"]
 PlaneNoise: TypeAlias = tuple[NoiseModel, NoiseModel, NoiseModel]
 Matrix3: TypeAlias = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+
+_PROCESSED: Final = 16.0
+"""How much more noise variance a photo without its mosaic has than its flat places show."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,6 +187,8 @@ class LinearPhoto:
     sensor_noise : tuple of NoiseModel or None
         Noise of the sensor itself, measured on the mosaic: white, unlike that of demosaiced
         planes, whose pixels share their neighbours' noise. `None` where there is no mosaic.
+    coding_noise : NoiseModel or None
+        What lossy compression adds where there is detail; `None` where there was none.
     cfa : BayerPattern or None
         Which pixels of each plane were measured, and not filled in by demosaicing. `None` where
         the planes are no longer on the sensor's grid, or there was no Bayer mosaic.
@@ -198,4 +203,21 @@ class LinearPhoto:
     pipeline: str
     white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
     sensor_noise: PlaneNoise | None = None
+    coding_noise: NoiseModel | None = None
     cfa: BayerPattern | None = None
+
+    @property
+    def correction_noise(self) -> PlaneNoise:
+        """Noise as a correction must count it, as if it were white.
+
+        That of the sensor where it is known. Demosaicing, denoising and compression leave less of it in
+        a pixel than there is in a patch, and make errors of their own where there is detail.
+        """
+        if self.sensor_noise is not None:
+            return self.sensor_noise
+        coded = self.coding_noise or NoiseModel(0.0, 0.0)
+        r, g, b = (
+            NoiseModel(max(_PROCESSED * n.shot, coded.shot), max(_PROCESSED * n.read, coded.read))
+            for n in self.noise
+        )
+        return r, g, b

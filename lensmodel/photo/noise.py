@@ -75,6 +75,26 @@ def estimate_noise(
     return NoiseModel(model.shot, max(model.read, step * step / 12.0))
 
 
+def coding_noise(coarseness: float, codes: NDArray[np.floating]) -> NoiseModel:
+    """Noise that a JPEG's rounding of cosine coefficients makes: a uniform error of step^2 / 12 in each.
+
+    It is not seen in flat places, where the coefficients are zero before and after, but where detail is.
+    The middle one of the steps speaks for all: the coarsest are those of frequencies of which a lens
+    leaves little.
+
+    Parameters
+    ----------
+    coarseness : float
+        Step in the file's numbers.
+    codes : ndarray
+        Linear light of each of these numbers, ascending.
+    """
+    levels, widths = codes[1:-1].astype(np.float64), np.gradient(codes)[1:-1]
+    variances = np.maximum((coarseness * widths) ** 2 / 12.0, 1e-16)
+    design = np.stack([levels, np.ones_like(levels)], axis=1) / variances[:, None]
+    return NoiseModel(*_non_negative(design, np.ones_like(levels)))
+
+
 def _sampled(plane: Plane) -> Plane:
     """Evenly spaced bands of rows of a large plane: more pixels would not change the fit."""
     band = 8 * BLOCK

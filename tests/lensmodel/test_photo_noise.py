@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 from scipy import ndimage
 
 from lensmodel import photo
@@ -142,3 +143,31 @@ def test_the_noise_of_the_planes_follows_the_white_balance(tmp_path: Path, demos
     inside = developed.planes[:, 16:-16, 16:-16].astype(np.float64)
     for plane, model in zip(inside, developed.noise, strict=True):
         assert model.variance(plane.mean()) == pytest.approx(plane.var(), rel=0.1)
+
+
+@pytest.mark.parametrize("quality", [75, 92])
+def test_the_noise_of_a_jpeg_counts_what_compression_takes_from_detail(tmp_path: Path, quality: int) -> None:
+    curve = curves_of("srgb")[1]
+    rng = np.random.default_rng(3)
+    # as much detail at all frequencies, far above the rounding of the coefficients
+    light = np.clip(0.2 + 0.06 * rng.standard_normal((256, 256)), 0.05, 0.5)
+    numbers = np.rint(np.interp(light, curve[::257], np.arange(256.0))).astype(np.uint8)
+    Image.fromarray(numbers).save(tmp_path / "x.jpg", quality=quality)
+    developed = photo.develop(tmp_path / "x.jpg")
+
+    assert developed.coding_noise is not None
+    error = developed.planes[1] - curve[::257][numbers]
+    # the middle step stands for all 64, of which some are twice as coarse
+    assert 0.3 < developed.coding_noise.variance(np.array(0.2)) / error.var() < 1.2
+    assert all(
+        model.variance(np.array(0.2)) >= 0.99 * developed.coding_noise.variance(np.array(0.2))
+        for model in developed.correction_noise
+    )
+
+
+def test_a_photo_with_its_mosaic_is_corrected_by_the_noise_of_the_sensor(tmp_path: Path) -> None:
+    flat = noisy(np.full((128, 128), 0.3), NoiseModel.white(0.01), seed=7) * (WHITE - BLACK) + BLACK
+    write_bayer_dng(tmp_path / "x.dng", np.rint(flat).astype(np.uint16), black=BLACK, white=WHITE)
+    developed = photo.develop(tmp_path / "x.dng")
+
+    assert developed.correction_noise == developed.sensor_noise

@@ -85,3 +85,16 @@ def seam(rows: int, length: int) -> tuple[NDArray[np.intp], NDArray[np.intp], ND
     t = np.arange(length - rows)
     fade = ((t + 0.5) / max(length - rows, 1)).astype(np.float32)
     return np.maximum(rows - 1 - t, 0), np.minimum(length - rows - 1 - t, rows - 1), fade
+
+
+def fitted_halo(cell: tuple[int, int], least: int) -> int:
+    """Widest halo of a cell for which its canvas is no larger than for the least one.
+
+    Sizes that are quick to transform are few: what a canvas has more than it needs is better filled
+    with data than with a longer seam.
+    """
+    spare = []
+    for extent in cell:
+        needed = extent + 2 * (least + _JOINT)
+        spare.append(int(fft.next_fast_len(needed, real=True)) - needed)
+    return least + min(spare) // 2

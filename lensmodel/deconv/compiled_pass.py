@@ -10,7 +10,7 @@ from lensmodel.deconv.compiled_base import BACK, FORWARD, ONE, ZERO, Complex, Re
 
 
 @jit
-def one_pass(  # noqa: C901 - one pass over memory per loop
+def one_pass(  # noqa: C901, PLR0915 - one pass over memory for both contrasts
     x: Real,
     y: Real,
     K: Complex,
@@ -27,7 +27,7 @@ def one_pass(  # noqa: C901 - one pass over memory per loop
     axes = np.array([0, 1])
     norm = 1.0 / (height * width)
     Y = np.empty((3, height, half), np.complex64)
-    X = np.empty((3, height, half), np.complex64)
+    X, Z = np.empty((3, height, half), np.complex64), np.empty((3, height, half), np.complex64)
     work = np.empty((height, width), np.float32)
     for c in range(3):
         rocket_fft.r2c(y[c], Y[c], axes, FORWARD, 1.0, 1)
@@ -41,30 +41,52 @@ def one_pass(  # noqa: C901 - one pass over memory per loop
         seen += part
     seen /= 3.0
     n0, n1, n2 = ONE / noise[0], ONE / noise[1], ONE / noise[2]
+    lumas, chromas = np.empty(2, np.float32), np.empty(2, np.float32)
     for level in range(2):
-        luma = np.float32(seen / (height * width) / levels[level, 0])
-        chroma = np.float32(seen / (height * width) / levels[level, 1])
+        lumas[level] = np.float32(seen / (height * width) / levels[level, 0])
+        chromas[level] = np.float32(seen / (height * width) / levels[level, 1])
+    k, yy, xx, zz = K.view(np.float32), Y.view(np.float32), X.view(np.float32), Z.view(np.float32)
+    for i in range(height):
+        for j in range(half):
+            re, im = 2 * j, 2 * j + 1
+            ar, ai, br, bi, dr, di = (
+                k[0, i, re],
+                k[0, i, im],
+                k[1, i, re],
+                k[1, i, im],
+                k[2, i, re],
+                k[2, i, im],
+            )
+            a = (ar * ar + ai * ai + floor) * n0
+            b = (br * br + bi * bi + floor) * n1
+            d = (dr * dr + di * di + floor) * n2
+            pr = (ar * yy[0, i, re] + ai * yy[0, i, im]) * n0
+            pi = (ar * yy[0, i, im] - ai * yy[0, i, re]) * n0
+            qr = (br * yy[1, i, re] + bi * yy[1, i, im]) * n1
+            qi = (br * yy[1, i, im] - bi * yy[1, i, re]) * n1
+            rr = (dr * yy[2, i, re] + di * yy[2, i, im]) * n2
+            ri = (dr * yy[2, i, im] - di * yy[2, i, re]) * n2
+            s = decay[i, j] * chromas[0]
+            g = decay[i, j] * ((lumas[0] - chromas[0]) / np.float32(3.0))
+            u, v, w = ONE / (a + s), ONE / (b + s), ONE / (d + s)
+            t = g / (ONE + g * (u + v + w))
+            tr, ti = (pr * u + qr * v + rr * w) * t, (pi * u + qi * v + ri * w) * t
+            xx[0, i, re], xx[0, i, im] = (pr - tr) * u, (pi - ti) * u
+            xx[1, i, re], xx[1, i, im] = (qr - tr) * v, (qi - ti) * v
+            xx[2, i, re], xx[2, i, im] = (rr - tr) * w, (ri - ti) * w
+            s = decay[i, j] * chromas[1]
+            g = decay[i, j] * ((lumas[1] - chromas[1]) / np.float32(3.0))
+            u, v, w = ONE / (a + s), ONE / (b + s), ONE / (d + s)
+            t = g / (ONE + g * (u + v + w))
+            tr, ti = (pr * u + qr * v + rr * w) * t, (pi * u + qi * v + ri * w) * t
+            zz[0, i, re], zz[0, i, im] = (pr - tr) * u, (pi - ti) * u
+            zz[1, i, re], zz[1, i, im] = (qr - tr) * v, (qi - ti) * v
+            zz[2, i, re], zz[2, i, im] = (rr - tr) * w, (ri - ti) * w
+    for c in range(3):
+        X[c, 0, 0] = Y[c, 0, 0]
+        Z[c, 0, 0] = Y[c, 0, 0]
+        rocket_fft.c2r(X[c], x[c], axes, BACK, norm, 1)
+        rocket_fft.c2r(Z[c], work, axes, BACK, norm, 1)
         for i in range(height):
-            for j in range(half):
-                a, b, d = K[0, i, j], K[1, i, j], K[2, i, j]
-                s = decay[i, j] * chroma
-                g = decay[i, j] * ((luma - chroma) / np.float32(3.0))
-                u = ONE / ((a.real * a.real + a.imag * a.imag + floor) * n0 + s)
-                v = ONE / ((b.real * b.real + b.imag * b.imag + floor) * n1 + s)
-                w = ONE / ((d.real * d.real + d.imag * d.imag + floor) * n2 + s)
-                p = np.conj(a) * Y[0, i, j] * (n0 * u)
-                q = np.conj(b) * Y[1, i, j] * (n1 * v)
-                r = np.conj(d) * Y[2, i, j] * (n2 * w)
-                t = (p + q + r) * (g / (ONE + g * (u + v + w)))
-                X[0, i, j] = p - t * u
-                X[1, i, j] = q - t * v
-                X[2, i, j] = r - t * w
-        for c in range(3):
-            X[c, 0, 0] = Y[c, 0, 0]
-            if level == 0:
-                rocket_fft.c2r(X[c], x[c], axes, BACK, norm, 1)
-            else:
-                rocket_fft.c2r(X[c], work, axes, BACK, norm, 1)
-                for i in range(height):
-                    for j in range(width):
-                        x[c, i, j] = work[i, j] + busy[i, j] * (x[c, i, j] - work[i, j])
+            for j in range(width):
+                x[c, i, j] = work[i, j] + busy[i, j] * (x[c, i, j] - work[i, j])

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from lensmodel.blur import Drift, UniformBlur, crop_to_support
 from lensmodel.deconv.base import CoarseMethod, Deconvolver, Sensor, restore_planes
+from lensmodel.deconv.canvas import fitted_halo
 from lensmodel.deconv.lattice import Cell, Roi, cells, usual_pitch
 from lensmodel.deconv.limits import Bounds
 from lensmodel.deconv.methods import deconvolvers
@@ -47,7 +48,8 @@ class LateralShift(Protocol):
 
 
 KERNEL_SIZE = 55
-MIN_HALO = 16
+MIN_HALO, MORE = 12, 6
+"""Least halo of a cell in pixels, and pixels beyond the reach of its blur: less costs quality."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -291,7 +293,7 @@ def _restore(job: _Job, cell: Cell) -> tuple[Planes, CellForecast]:
     reach = max(
         job.reach(cell.position, channel, error) for channel, error in zip(CHANNELS, errors, strict=True)
     )
-    halo = max(MIN_HALO, reach + 10)
+    halo = fitted_halo((len(cell.rise), len(cell.run)), max(MIN_HALO, reach + MORE))
     top, left = max(cell.top - halo, 0), max(cell.left - halo, 0)
     blurs = [
         job.blur(cell, channel, error, (top, left)) for channel, error in zip(CHANNELS, errors, strict=True)

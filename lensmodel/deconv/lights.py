@@ -65,9 +65,11 @@ class Lights:
         Divided by F^T 1 instead, lights of which little is measured take several times the steps.
         Positive and unrestrained, x is a poor picture, so only what lies above t is taken from it.
         """
-        clips = [blown(plane, sensor) for plane, sensor in zip(tile, sensors, strict=True)]
-        if not any(clipped.any() for clipped in clips):
+        if not any(
+            plane.max() >= np.float32(sensor.clip) for plane, sensor in zip(tile, sensors, strict=True)
+        ):
             return None
+        clips = [blown(plane, sensor) for plane, sensor in zip(tile, sensors, strict=True)]
         rest, beyond, glow = tile.copy(), np.zeros_like(tile), np.zeros_like(tile)
         for c, (clipped, blur, sensor) in enumerate(zip(clips, blurs, sensors, strict=True)):
             if clipped.any():

@@ -31,9 +31,15 @@ def coarse(plane: NDArray[np.float32]) -> NDArray[np.float32]:
 def smoothed(blocks: NDArray[np.float32]) -> NDArray[np.float32]:
     """Local mean of a coarse plane over some 13 pixels of the fine one."""
     for axis in (0, 1):
-        lines = np.moveaxis(blocks, axis, 0)
-        wide = np.concatenate([lines[:1], lines, lines[-1:]])
-        blocks = np.moveaxis((wide[:-2] + np.float32(4.0) * lines + wide[2:]) / np.float32(6.0), 0, axis)
+        sums = np.float32(4.0) * blocks
+        # The same array seen along the other axis: sums are taken in place.
+        lines, into = (blocks, sums) if axis == 0 else (blocks.T, sums.T)
+        into[1:] += lines[:-1]
+        into[:-1] += lines[1:]
+        into[0] += lines[0]
+        into[-1] += lines[-1]
+        blocks = sums
+    blocks *= np.float32(1.0 / 36.0)
     return blocks
 
 

@@ -19,6 +19,7 @@ from lensmodel.types import ZONES, Planes, Zone
 
 _GRID = (64, 64)
 _EVERY = 3  # of the rows and columns suffice for a variance; odd, so that all colours of a mosaic are met
+_SAMPLES = 80  # along a side are enough, whatever its length
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +66,8 @@ def forecast(
     """
     before = after = 0.0
     shape = _scene_power()
-    for plane, blur, sensor in zip(tile[:, ::_EVERY, ::_EVERY], blurs, sensors, strict=True):
+    every = max(_EVERY, min(tile.shape[1:]) // _SAMPLES // 2 * 2 + 1)
+    for plane, blur, sensor in zip(tile[:, ::every, ::every], blurs, sensors, strict=True):
         noise = float(sensor.noise.variance(plane).mean())
         K = blur.spectrum(_GRID) if blur.kernel.shape[0] <= min(_GRID) else np.ones(shape.shape)
         power = K.real**2 + K.imag**2

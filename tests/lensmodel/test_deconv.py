@@ -139,6 +139,20 @@ def test_light_beyond_saturation_and_the_rest_make_up_the_photo_where_it_was_not
     assert Lights.of(tile, blurs, [CLEAN] * 3, 20, "auto") is None
 
 
+def test_automatic_strength_is_near_the_best_where_noise_is_strong_and_the_kernel_wide() -> None:
+    rng, noise = np.random.default_rng(7), NoiseModel(1 / 2500, 0.003**2)
+    blur, sharp = UniformBlur(gaussian(21, np.eye(2) * 2.5**2)), scene(170, 180, seed=2)
+    seen = blur.forward(sharp)
+    seen = (seen + np.sqrt(noise.variance(seen)) * rng.standard_normal(seen.shape)).astype(np.float32)
+
+    def decibels(factor: float) -> float:
+        method = SparseGradient(weight=factor * SparseGradient().weight)
+        made = method.deconvolve(seen, blur, sensor=Sensor(noise, np.inf)).plane
+        return -20 * np.log10(rmse(made[8:-8, 8:-8], blur.frame(sharp)[8:-8, 8:-8]))
+
+    assert decibels(1.0) > max(decibels(factor) for factor in (0.35, 0.5, 0.7, 1.4, 2.0)) - 0.1
+
+
 @pytest.mark.parametrize("width", [0.6, 2.0])
 @pytest.mark.parametrize("name", ["standard", "fast"])
 def test_method_beats_richardson_lucy_around_clipped_lamps_and_rings_less(name: str, width: float) -> None:

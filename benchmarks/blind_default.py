@@ -108,6 +108,7 @@ def rows(
             if name == "default":
                 d = answer.diagnostics
                 found["features"] = [
+                    d["apart"],
                     d["disagreement"],
                     d["gaussian_width"],
                     d["slope"],
@@ -148,11 +149,17 @@ def main() -> None:
             f"| {np.median(v[:, 3]):.2f} |"
         )
     features, error = np.array([f["features"] for f in found]), np.array([f["default"][1] for f in found])
-    rank = stats.spearmanr(features[:, 3], error).statistic
+    rank = stats.spearmanr(features[:, 4], error).statistic
     print(f"predicted against true error of the default: Spearman {rank:.2f}")
     design = np.stack(
-        [np.ones(len(error)), features[:, 0], np.log(np.maximum(features[:, 1], 0.2)), features[:, 2] - 2.5],
-        1,
+        [
+            np.ones(len(error)),
+            np.log(np.maximum(features[:, 0], 1e-3)),
+            features[:, 1],
+            np.log(np.maximum(features[:, 2], 0.2)),
+            features[:, 3] - 2.5,
+        ],
+        axis=1,
     )
     fit = np.linalg.lstsq(design, np.log(error), rcond=None)[0]
     print("constants of predicted_error fitted to these cases:", np.round(fit, 2))

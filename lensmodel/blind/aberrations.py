@@ -4,11 +4,14 @@ Power says how wide the blur is in every direction, the better the more patches 
 its phase; a kernel found by other means knows the phase and has a width of its own bias. The eight
 numbers of a wavefront have to please both, so that this is least::
 
-    temper * sum t(residuals of log power)  +  weight |k(g) - k_found|² / |k_found|²  +  |g / usual|²
+    temper * sum t(residuals of log power)  -  parts * ln L(local spectra)
+        +  weight |k(g) - k_found|² / |k_found|²  +  |g / usual|²
 
 found by Levenberg-Marquardt from random wavefronts about as wide as the kernel. t is the log-likelihood of
-Student's t: scenes have stripes that no polynomial follows. For the true wavefront the likelihood is best
-where the scene's prior holds (`tests/lensmodel/test_blind_aberrations.py`).
+Student's t: scenes have stripes that no polynomial follows. L is that of `local_spectra`, where such spectra
+are given; its curvature in the normal equations is Fisher's information with the components of the tiles
+known. For the true wavefront the likelihood is best where the scene's prior holds
+(`tests/lensmodel/test_blind_aberrations.py`).
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.blind.local_spectra import LocalSpectra, log_local_power
 from lensmodel.blind.pupil import COMA, TERMS, Pupil
 from lensmodel.blind.scene_spectra import SceneSpectra, log_power
 from lensmodel.psf import as_kernel, centred, resized, rms_width
@@ -54,7 +58,9 @@ class AberrationFit:
         Random wavefronts, each moved `approach` steps towards the kernel alone and `first` steps with
         the spectra.
     kept, rounds : int
-        So many of the best go on for at most `rounds` steps.
+        So many of the best go on for at most `rounds` steps; only these see local spectra.
+    parts : float
+        Share of the likelihood of local spectra that counts.
     """
 
     weight: float = 20.0
@@ -64,8 +70,15 @@ class AberrationFit:
     first: int = 4
     kept: int = 8
     rounds: int = 12
+    parts: float = 0.02
 
-    def fit(self, spectra: SceneSpectra, found: Kernel, on_step: StepHook = ignore_step) -> LocalWavefront:
+    def fit(
+        self,
+        spectra: SceneSpectra,
+        found: Kernel,
+        on_step: StepHook = ignore_step,
+        local: LocalSpectra | None = None,
+    ) -> LocalWavefront:
         """Fit.
 
         Parameters
@@ -75,6 +88,8 @@ class AberrationFit:
             Centred.
         on_step : StepHook
             Progress; raising `CancelledError` there stops the work.
+        local : LocalSpectra, optional
+            Spectra of small tiles of the same patches.
         """
         wide = max(rms_width(found), 0.3)
         pupil = Pupil.of(_SIDES[wide > _WIDE_PX])
@@ -85,24 +100,24 @@ class AberrationFit:
         for done in range(self.starts):
             start = np.zeros(TERMS)
             start[: len(_USUAL_SHAPE)] = rng.standard_normal(len(_USUAL_SHAPE)) * _USUAL_SHAPE * wide
-            near = self._descend(pupil, aim, start, None, self.approach)
-            fits.append(self._descend(pupil, aim, near.terms, spectra, self.first))
+            near = self._descend(pupil, aim, start, _Seen(None), self.approach)
+            fits.append(self._descend(pupil, aim, near.terms, _Seen(spectra), self.first))
             on_step(done + 1, total)
-        best = min(fits, key=_cost)
+        seen = _Seen(spectra, local)
+        refined = []
         for done, fit in enumerate(sorted(fits, key=_cost)[: self.kept]):
-            best = min(best, self._descend(pupil, aim, fit.terms, spectra, self.rounds), key=_cost)
+            refined.append(self._descend(pupil, aim, fit.terms, seen, self.rounds))
             on_step(self.starts + done + 1, total)
+        best = min(refined, key=_cost)
         # The spectra of a kernel and of its turned copy are equal: only the kernel found tells.
         turned = best.terms.copy()
         turned[[*COMA, -2, -1]] *= -1.0
-        best = min(best, self._descend(pupil, aim, turned, spectra, self.rounds // 2), key=_cost)
+        best = min(best, self._descend(pupil, aim, turned, seen, self.rounds // 2), key=_cost)
         on_step(total, total)
         return best
 
-    def _descend(
-        self, pupil: Pupil, aim: Kernel, terms: Floats, spectra: SceneSpectra | None, rounds: int
-    ) -> LocalWavefront:
-        state = self._state(pupil, aim, terms, spectra, None)
+    def _descend(self, pupil: Pupil, aim: Kernel, terms: Floats, seen: _Seen, rounds: int) -> LocalWavefront:
+        state = self._state(pupil, aim, terms, seen, None)
         damping = 1e-2
         for _ in range(rounds):
             better = None
@@ -110,9 +125,7 @@ class AberrationFit:
                 lifted = state.normal + np.diag(damping * np.diag(state.normal))
                 step = np.linalg.solve(lifted, state.gradient)
                 step *= min(1.0, _STRIDE_PX / max(float(np.abs(step[:TERMS]).max()), 1e-9))
-                after = self._state(
-                    pupil, aim, state.terms + step[:TERMS], spectra, state.amplitudes + step[TERMS:]
-                )
+                after = self._state(pupil, aim, state.terms + step[:TERMS], seen, state.levels + step[TERMS:])
                 if after.cost < state.cost:
                     better = after
                     break
@@ -125,33 +138,63 @@ class AberrationFit:
                 break
         return LocalWavefront(state.terms, state.kernel, state.cost)
 
-    def _state(
-        self,
-        pupil: Pupil,
-        aim: Kernel,
-        terms: Floats,
-        spectra: SceneSpectra | None,
-        amplitudes: Floats | None,
-    ) -> _State:
+    def _state(self, pupil: Pupil, aim: Kernel, terms: Floats, seen: _Seen, levels: Floats | None) -> _State:
         kernel, changes = pupil.kernel(terms)
         off, flat = (kernel - aim).ravel(), changes.reshape(TERMS, -1)
         weight = self.weight / float((aim**2).sum())
         usual = terms / _USUAL_PX
-        cost = float(usual @ usual) + weight * float(off @ off)
-        normal = np.diag(1.0 / _USUAL_PX**2) + weight * (flat @ flat.T)
-        gradient = -usual / _USUAL_PX - weight * (flat @ off)
-        if spectra is None:
-            return _State(terms, np.zeros(0), kernel, cost, normal, gradient)
-        blur, by_terms = log_power(kernel, changes)
+        state = _State(
+            terms,
+            np.zeros(0),
+            kernel,
+            float(usual @ usual) + weight * float(off @ off),
+            np.diag(1.0 / _USUAL_PX**2) + weight * (flat @ flat.T),
+            -usual / _USUAL_PX - weight * (flat @ off),
+        )
+        if seen.whole is not None:
+            count = len(seen.whole.seen)
+            state = self._with_whole(state, changes, seen.whole, None if levels is None else levels[:count])
+            if seen.local is not None:
+                state = self._with_local(
+                    state, changes, seen.local, None if levels is None else levels[count:]
+                )
+        return state
+
+    def _with_whole(
+        self, state: _State, changes: Floats, spectra: SceneSpectra, amplitudes: Floats | None
+    ) -> _State:
+        """Add what whole spectra say; the amplitudes of the scenes become unknowns."""
+        blur, by_terms = log_power(state.kernel, changes)
         if amplitudes is None:
             amplitudes = spectra.begin(blur)
         left, change = spectra.residuals(blur, by_terms, amplitudes)
-        cost += self.temper * (_TAILS + 1.0) * float(np.log1p(left**2 / _TAILS).sum())
         weighted = change * (self.temper * (_TAILS + 1.0) / (_TAILS + left**2))[:, None]
-        every, pull = change.T @ weighted, -(weighted.T @ left)
-        every[:TERMS, :TERMS] += normal
-        pull[:TERMS] += gradient
-        return _State(terms, amplitudes, kernel, cost, every, pull)
+        normal, gradient = change.T @ weighted, -(weighted.T @ left)
+        normal[:TERMS, :TERMS] += state.normal
+        gradient[:TERMS] += state.gradient
+        cost = state.cost + self.temper * (_TAILS + 1.0) * float(np.log1p(left**2 / _TAILS).sum())
+        return _State(state.terms, amplitudes, state.kernel, cost, normal, gradient)
+
+    def _with_local(
+        self, state: _State, changes: Floats, local: LocalSpectra, gains: Floats | None
+    ) -> _State:
+        """Add what local spectra say; the gains of the patches become unknowns."""
+        power, by_terms = log_local_power(state.kernel, changes)
+        if gains is None:
+            gains = local.gains(power)
+        known, cost = len(state.gradient), state.cost
+        every = known + len(gains)
+        normal, gradient = np.zeros((every, every)), np.zeros(every)
+        normal[:known, :known], gradient[:known] = state.normal, state.gradient
+        moved = np.column_stack([by_terms, np.ones(len(power))])
+        for i, gain in enumerate(gains):
+            value, slope, curvature = local.pull(i, power + gain)
+            at = np.append(np.arange(TERMS), known + i)
+            cost -= self.parts * value
+            normal[np.ix_(at, at)] += self.parts * (moved.T * curvature) @ moved
+            gradient[at] += self.parts * (moved.T @ slope)
+        levels = np.concatenate([state.levels, gains])
+        return _State(state.terms, levels, state.kernel, cost, normal, gradient)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,9 +220,19 @@ def _cost(fit: LocalWavefront) -> float:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """Which spectra a descent looks at."""
+
+    whole: SceneSpectra | None
+    local: LocalSpectra | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _State:
+    """Where a descent is: the terms, the amplitudes and gains of the patches, and which way down."""
+
     terms: Floats
-    amplitudes: Floats
+    levels: Floats
     kernel: Floats
     cost: float
     normal: Floats

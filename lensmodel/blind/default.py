@@ -23,14 +23,14 @@ from lensmodel.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
 _POOLED_SUPPORT, _POOLED_ITERATIONS, _POOLED_SIDE = 21, 3, 160
 _STARTS, _STARTS_OF_CHANNEL = 10, 6
 _PIXEL_SIGMA = 0.29
-_PER_WIDTH = 40.0
+_PER_WIDTH = 60.0
 """Cost of a kernel e times as wide: in doubt the narrower one, which does less harm."""
 
 _POOLED_ERROR = 0.7
 """Relative error of a wavefront agreed on by n patches, times the root of n."""
 
-_AT_TYPICAL = -1.08
-"""Logarithm of the error where both estimates agree on a Gaussian of 1 px and a usual scene."""
+_AT_TYPICAL = -0.65
+"""Logarithm of the error where all agree on a usual scene, but wavefront and patch recurrence differ by 1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,26 +39,26 @@ class Cautious:
 
     A kernel that is too wide ruins a photo, one too narrow only helps less, and both of the first two
     methods take the softness of a scene for blur, each in its own way. With few patches there are four
-    kernels: the Gaussian, that of patch recurrence, the mean of both, and a wavefront fitted to the spectra
-    and, with the weight `trust`, to the result of patch recurrence (see `aberrations`). The likelihood of
-    the spectra of whole patches and of small tiles (see `judgement`) chooses among them. Where the Gaussian
-    is narrower than `trusted_px`, most lenses are as sharp as it says: then the mean, or the Gaussian if
-    patch recurrence ran more than `apart` times as wide, stays unless another is likelier by `sure`. A sharp
-    core with wide wings is.
+    kernels: the Gaussian, that of patch recurrence, the mean of both, and a wavefront fitted to the
+    spectra, whole and local, and, with the weight `trust`, to the result of patch recurrence (see
+    `aberrations`). The likelihood of the spectra of whole patches and of small tiles (see `judgement`)
+    chooses among them. Where the Gaussian is narrower than `trusted_px`, most lenses are as sharp as it
+    says: then the mean, or the Gaussian if patch recurrence ran more than `apart` times as wide, stays
+    unless another is likelier by `sure`. A sharp core with wide wings is.
 
     From `pooled` patches on the slopes of the scenes average out, the wavefront is all but given by the
-    spectra, and patch recurrence only has to tell the phase. The root mean square distance of the MTFs
-    of the Gaussian and patch recurrence is the best predictor of the true error of few patches.
+    spectra, and patch recurrence only has to tell the phase. How far the wavefront is from
+    the kernel of patch recurrence is the best single predictor of the true error of few patches.
     """
 
     trusted_px: float = 0.95
     apart: float = 2.2
     sure: float = 60.0
     pooled: int = 6
-    trust: float = 20.0
+    trust: float = 5.0
 
     name = "default"
-    version = 9
+    version = 10
 
     def estimate(
         self,
@@ -143,7 +143,7 @@ class Cautious:
         fit = AberrationFit(
             weight=self.trust, temper=judgement.temper, starts=starts, kept=max(starts // 5, 2)
         )
-        fitted = fit.fit(judgement.whole, found.kernel, _half(on_step, 1))
+        fitted = fit.fit(judgement.whole, found.kernel, _half(on_step, 1), judgement.local)
         options = {
             "gaussian": gaussian.kernel,
             "recurrence": found.kernel,
@@ -161,14 +161,18 @@ class Cautious:
         chosen = min(costs, key=lambda name: costs[name])
         kernel = options[chosen]
         on_step(1, 1)
-        error = predicted_error(disagreement, rms_width(gaussian.kernel), gaussian.diagnostics["slope"])
+        apart = distance(found.kernel, options["wavefront"]).rel_l2
         more = {
             "gaussian_width": gaussian.diagnostics["width"],
             "slope": gaussian.diagnostics["slope"],
             "disagreement": disagreement,
+            "apart": apart,
             "width": rms_width(kernel),
             **{f"chose_{name}": float(name == chosen) for name in options},
         }
+        error = predicted_error(
+            apart, disagreement, rms_width(gaussian.kernel), gaussian.diagnostics["slope"]
+        )
         return _told(found, kernel, error, more, began)
 
 
@@ -198,11 +202,16 @@ def _half(on_step: StepHook, which: int) -> StepHook:
     return lambda done, total: on_step(done + which * total, 2 * total)
 
 
-def predicted_error(disagreement: float, width: float, slope: float) -> float:
-    """Expected relative L2 error of the kernel, a log-linear fit to simulated lenses.
+def predicted_error(apart: float, disagreement: float, width: float, slope: float) -> float:
+    """Expected relative L2 error of the kernel.
+
+    The geometric mean of two log-linear fits to the development half: one to the benchmark's PSFs, which
+    sees the first argument only, one to whole fields of lenses, which sees the others.
 
     Parameters
     ----------
+    apart : float
+        Relative L2 distance of the kernel of patch recurrence from the fitted wavefront.
     disagreement : float
         Root mean square distance of the MTFs of the Gaussian and patch recurrence.
     width : float
@@ -210,5 +219,6 @@ def predicted_error(disagreement: float, width: float, slope: float) -> float:
     slope : float
         Slope of the scene's power spectrum that went with it; a steep one hides blur or is it.
     """
-    logarithm = _AT_TYPICAL + 2.19 * disagreement + 0.66 * math.log(max(width, 0.2)) + 2.23 * (slope - 2.5)
-    return min(max(math.exp(logarithm), 0.05), 1.0)
+    by_kernels = 0.43 * math.log(max(apart, 1e-3)) + 1.1 * disagreement
+    by_scene = 0.33 * math.log(max(width, 0.2)) + 1.1 * (slope - 2.5)
+    return min(max(math.exp(_AT_TYPICAL + by_kernels + by_scene), 0.05), 1.0)

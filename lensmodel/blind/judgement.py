@@ -35,7 +35,7 @@ class Judgement:
     whole: SceneSpectra
     local: LocalSpectra
     temper: float = 0.5
-    parts: float = 0.05
+    parts: float = 0.07
 
     @classmethod
     def of(cls, kept: Sequence[tuple[Plane, NoiseModel]]) -> Judgement:

@@ -38,7 +38,7 @@ COUPLED: Final = 0.5
 _DATA = Path(__file__).parent / "data" / "local_spectra.npz"
 _LOWEST, _HIGHEST = 0.04, 0.5
 _STRIDE = 16
-_GAINS: Final = tuple(float(g) for g in np.exp(np.linspace(-2.5, 2.5, 11)))
+_LOG_GAINS: Final = np.linspace(-2.5, 2.5, 11)
 _SCENE_FALL = 2.3
 _FAINTEST = 1e-4  # of |K|^2: leakage and rounding hide what lies below
 
@@ -91,6 +91,23 @@ def local_power(kernel: Floats) -> Floats:
     """|K|² at the frequencies of a tile, shape (FREQUENCIES,), of a kernel of at most 64 x 64."""
     found = fft.rfft2(kernel, (2 * SIDE, 2 * SIDE))[::2, ::2]
     return np.maximum(_leaked(found.real**2 + found.imag**2) / _OPEN, 0.0) + _FAINTEST
+
+
+def log_local_power(kernel: Floats, changes: Floats) -> tuple[Floats, Floats]:
+    """Ln |K|² at the frequencies of a tile, shape (FREQUENCIES,), and its derivatives, (FREQUENCIES, n).
+
+    Parameters
+    ----------
+    kernel : ndarray, shape (k, k)
+        k at most 63.
+    changes : ndarray, shape (n, k, k)
+        Derivatives of the kernel.
+    """
+    found = fft.rfft2(np.concatenate([kernel[None], changes]), (2 * SIDE, 2 * SIDE))[:, ::2, ::2]
+    crossed = found.real * found[0].real + found.imag * found[0].imag
+    power = _leaked(crossed) / _OPEN
+    value = np.maximum(power[0], 0.0) + _FAINTEST
+    return np.log(value), (2.0 * power[1:] / value).T
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,7 +165,7 @@ class LocalSpectra:
 
     def likelihood(self, power: Floats) -> float:
         """Ln L behind a blur of this power, summed over patches, each at its likeliest gain."""
-        scaled = [self.mixture.power * (gain * power).astype(np.float32) for gain in _GAINS]
+        scaled = [self.mixture.power * (gain * power).astype(np.float32) for gain in np.exp(_LOG_GAINS)]
         return sum(max(self._patch(i, signal) for signal in scaled) for i in range(len(self.seen)))
 
     def _patch(self, i: int, signal: NDArray[np.float32]) -> float:
@@ -158,3 +175,35 @@ class LocalSpectra:
         scores = logs - COUPLED * (self.seen[i] @ inverse.T)
         most = scores.max(axis=1, keepdims=True)
         return float((most + np.log(np.exp(scores - most).sum(axis=1, keepdims=True))).sum(dtype=np.float64))
+
+    def pull(self, i: int, log_power: Floats) -> tuple[float, Floats, Floats]:
+        """Ln L of one patch behind a blur of this log power, gain included, its slope and its curvature.
+
+        Returns
+        -------
+        value : float
+        slope : ndarray, shape (FREQUENCIES,)
+            Derivative by ln power at each frequency.
+        curvature : ndarray, shape (FREQUENCIES,)
+            Fisher information of ln power, the components of the tiles given.
+        """
+        signal = self.mixture.power * np.exp(log_power).astype(np.float32)
+        inverse = 1.0 / (signal + np.float32(self.noise[i]))
+        logs = np.log(self.mixture.share) + COUPLED * np.log(inverse).sum(axis=1)
+        scores = logs - COUPLED * (self.seen[i] @ inverse.T)
+        most = scores.max(axis=1, keepdims=True)
+        own = np.exp(scores - most)
+        total = own.sum(axis=1, keepdims=True)
+        value = float((most + np.log(total)).sum(dtype=np.float64))
+        own /= total
+        count, power = own.sum(axis=0)[:, None], own.T @ self.seen[i]
+        part = signal * inverse
+        slope = COUPLED * (part * (power * inverse - count)).sum(axis=0, dtype=np.float64)
+        curvature = COUPLED * (count * part**2).sum(axis=0, dtype=np.float64)
+        return value, slope, curvature
+
+    def gains(self, log_power: Floats) -> Floats:
+        """Log gain of each patch, the likeliest of a few, behind a blur of this log power."""
+        scaled = [self.mixture.power * np.exp(log_power + step).astype(np.float32) for step in _LOG_GAINS]
+        best = [int(np.argmax([self._patch(i, signal) for signal in scaled])) for i in range(len(self.seen))]
+        return np.asarray(_LOG_GAINS[best], dtype=np.float64)

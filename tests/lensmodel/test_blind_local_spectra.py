@@ -8,6 +8,7 @@ from lensmodel.blind.local_spectra import (
     LocalSpectra,
     SpectrumMixture,
     local_power,
+    log_local_power,
     periodograms,
 )
 from lensmodel.blind.pupil import TERMS, Pupil
@@ -66,6 +67,40 @@ def test_the_true_wavefront_scores_best(terms: np.ndarray) -> None:
     for term in range(6):
         moved = terms + 0.5 * np.eye(TERMS)[term]
         assert spectra.likelihood(power_of(kernel_of(moved))) < best
+
+
+def test_derivatives_of_local_log_power_agree_with_differences() -> None:
+    kernel, changes = Pupil.of(31).kernel(LENS)
+    value, derivatives = log_local_power(kernel, changes)
+
+    np.testing.assert_allclose(value, np.log(local_power(kernel)), rtol=1e-6)
+    for term in range(6):
+        step = 1e-2 * np.eye(TERMS)[term]
+        ahead, behind = (np.log(local_power(Pupil.of(31).kernel(LENS + s)[0])) for s in (step, -step))
+        clear = value > np.log(1e-2)  # the light is in single precision, its faintest parts are rounding
+        np.testing.assert_allclose(
+            derivatives[clear, term], ((ahead - behind) / 2e-2)[clear], atol=0.02 * np.abs(derivatives).max()
+        )
+
+
+def test_slope_of_the_likelihood_agrees_with_differences() -> None:
+    spectra = drawn(kernel_of(LENS), 100)
+    power = np.log(power_of(kernel_of(0.8 * LENS)))
+    value, slope, curvature = spectra.pull(0, power)
+    towards = np.random.default_rng(3).normal(size=FREQUENCIES)
+
+    ahead, behind = (spectra.pull(0, power + step * towards)[0] for step in (1e-2, -1e-2))
+    assert (ahead - behind) / 2e-2 == pytest.approx(float(slope @ towards), rel=1e-2)
+    assert (curvature > 0.0).all()
+    assert value < spectra.pull(0, np.log(power_of(kernel_of(LENS))))[0]
+
+
+def test_the_likeliest_gain_is_that_of_the_scene() -> None:
+    power = np.log(power_of(kernel_of(LENS)))
+    spectra = drawn(kernel_of(LENS), 200)
+
+    for step in (-1.0, 0.0, 1.5):
+        assert spectra.gains(power + step)[0] == pytest.approx(-step, abs=0.25)
 
 
 def test_a_scene_of_more_contrast_is_as_likely_with_another_gain() -> None:

@@ -57,6 +57,14 @@ def test_forward_is_the_convolution_where_all_light_is_known(kernel: np.ndarray,
     np.testing.assert_allclose(UniformBlur(kernel).forward(latent), expected, atol=1e-6)
 
 
+@pytest.mark.parametrize("offset", [(0.0, 0.0), (0.4, -1.3)])
+def test_blur_of_a_constant_is_the_constant(offset: tuple[float, float]) -> None:
+    blur = UniformBlur(gaussian(9, np.eye(2)), offset=offset)
+    latent = np.full(blur.adjoint(np.ones((24, 31), dtype=np.float32)).shape, 0.7, dtype=np.float32)
+
+    np.testing.assert_allclose(blur.forward(latent), 0.7, rtol=1e-4)
+
+
 def test_blur_moves_a_point_to_where_the_kernel_says() -> None:
     kernel, point = np.zeros((5, 5)), np.zeros((9, 9), dtype=np.float32)
     kernel[2, 4] = point[4, 4] = 1.0  # two columns to the right of the middle

@@ -73,6 +73,16 @@ def test_cells_sum_to_one_at_every_pixel() -> None:
     np.testing.assert_allclose(total, 1.0, atol=1e-6)
 
 
+@pytest.mark.parametrize("method", ["fast", "standard", "paper"])
+def test_correction_of_a_constant_is_the_constant_up_to_the_border(method: str) -> None:
+    flat = np.empty((3, FRAME.height, FRAME.width), dtype=np.float32)
+    flat[:] = np.array([0.2, 0.4, 0.3], dtype=np.float32)[:, None, None]
+
+    found = correct_planes(flat, Soft(), FRAME, noise=BASE, method=method).planes
+
+    np.testing.assert_allclose(found, flat, rtol=2e-3)
+
+
 def test_cells_of_a_large_frame_stay_within_their_bounds() -> None:
     sides = [cell.bottom - cell.top for cell in cells(Frame(4000, 6000))]
 

@@ -17,7 +17,7 @@ import json
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from multiprocessing import get_context
@@ -214,6 +214,7 @@ def run_blind_benchmark(
     workers: int = 1,
     cache: Path | None = None,
     methods: Registry[PsfEstimator] | None = None,
+    only: Collection[str] | None = None,
     on_step: StepHook = ignore_step,
 ) -> BlindReport:
     """Run the benchmark; what the cache folder already holds is not computed again.
@@ -229,6 +230,8 @@ def run_blind_benchmark(
         method and settings. A run that was stopped goes on from there.
     methods : Registry of PsfEstimator or None
         Where the method names are looked up; None means `lensmodel.blind.estimators`.
+    only : collection of str or None
+        Names of photographs, without suffix; cases that begin with another one are left out.
     on_step : StepHook
         Called after each case.
 
@@ -258,6 +261,7 @@ def run_blind_benchmark(
             limit=settings.cases,
             choice=settings.selection,
         )
+        if only is None or case.photos[0].stem in only
     ]
     store = _Store(cache, photos, settings, judge)
     jobs = []

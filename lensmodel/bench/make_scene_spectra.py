@@ -39,6 +39,19 @@ def log_spectra(photos: Sequence[Path]) -> NDArray[np.float64]:
     return np.array(found)
 
 
+def measured(photos: Sequence[Path]) -> dict[str, NDArray[np.float64]]:
+    """Return the arrays that `ScenePrior` is made of, by name."""
+    seen = log_spectra(photos)
+    fitted = np.linalg.lstsq(SHAPES, seen.T, rcond=None)[0].T
+    usual, spread = np.median(fitted, axis=0), np.cov(fitted.T)
+    usual[[4, 6, 8]] = 0.0  # scenes lean to neither side
+    spread[0, :] = spread[:, 0] = 0.0
+    left = (seen - fitted @ SHAPES.T).reshape(len(seen), RINGS - FIRST_RING, SECTORS)
+    bias = np.median(left.mean(axis=2), axis=0)
+    roughness = 1.4826 * np.median(np.abs(left - bias[:, None]), axis=(0, 2))
+    return {"usual": usual, "spread": spread, "bias": bias, "roughness": roughness}
+
+
 def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(
@@ -49,15 +62,14 @@ def main() -> None:
         "--output", type=Path, default=Path(blind.__file__).parent / "data" / "scene_spectra.npz"
     )
     asked = parser.parse_args()
-    seen = log_spectra([p for p in list_photos(asked.photos) if photo_half(p.stem) == "dev"])
-    fitted = np.linalg.lstsq(SHAPES, seen.T, rcond=None)[0].T
-    usual, spread = np.median(fitted, axis=0), np.cov(fitted.T)
-    usual[[4, 6, 8]] = 0.0  # scenes lean to neither side
-    spread[0, :] = spread[:, 0] = 0.0
-    left = (seen - fitted @ SHAPES.T).reshape(len(seen), RINGS - FIRST_RING, SECTORS)
-    bias = np.median(left.mean(axis=2), axis=0)
-    roughness = 1.4826 * np.median(np.abs(left - bias[:, None]), axis=(0, 2))
-    np.savez(asked.output, usual=usual, spread=spread, bias=bias, roughness=roughness)
+    learned = measured([p for p in list_photos(asked.photos) if photo_half(p.stem) == "dev"])
+    np.savez(
+        asked.output,
+        usual=learned["usual"],
+        spread=learned["spread"],
+        bias=learned["bias"],
+        roughness=learned["roughness"],
+    )
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ a steep scene looks like a blurred one; from window to window the scene changes 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -138,9 +138,14 @@ class ScenePrior:
     def load(cls) -> ScenePrior:
         """Read what `lensmodel.bench.make_scene_spectra` wrote."""
         with np.load(_DATA, allow_pickle=False) as stored:
-            rings = {name: np.repeat(stored[name], SECTORS) for name in ("bias", "roughness")}
-            usual = SHAPES[:, 1:] @ stored["usual"][1:] + rings["bias"]
-            return cls(usual, np.array(stored["spread"], dtype=np.float64), rings["roughness"])
+            return cls.of({name: np.array(stored[name], dtype=np.float64) for name in stored.files})
+
+    @classmethod
+    def of(cls, measured: Mapping[str, Floats]) -> ScenePrior:
+        """Make one of the coefficients' medians, their covariance, and the rings' bias and roughness."""
+        rings = {name: np.repeat(measured[name], SECTORS) for name in ("bias", "roughness")}
+        usual = SHAPES[:, 1:] @ measured["usual"][1:] + rings["bias"]
+        return cls(usual, measured["spread"], rings["roughness"])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

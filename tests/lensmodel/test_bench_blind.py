@@ -329,6 +329,16 @@ def test_a_second_run_computes_nothing_and_says_the_same(tmp_path: Path) -> None
     assert two.to_json() == one.to_json()
 
 
+def test_cases_of_other_photographs_can_be_left_out(tmp_path: Path) -> None:
+    wanted = BlindBenchmark(methods=("fake",), **SMALL)
+    every = run_blind_benchmark(wanted, cache=tmp_path, methods=registry(fake=Fake()))
+    one = every.results[0].case.split("/")[0]
+    some = run_blind_benchmark(wanted, cache=tmp_path, methods=registry(fake=Fake()), only={one})
+
+    assert some.results == tuple(r for r in every.results if r.case.startswith(f"{one}/"))
+    assert run_blind_benchmark(wanted, methods=registry(fake=Fake()), only=()).results == ()
+
+
 def test_a_stopped_run_goes_on_where_it_was(tmp_path: Path) -> None:
     run_blind_benchmark(
         BlindBenchmark(methods=("fake",), **{**SMALL, "cases": 2}),

@@ -13,7 +13,8 @@ from lensmodel.psf import PsfSample, distance, gaussian, rms_width
 from lensmodel.regression import LensModel, LensProfile, load_profile, save_profile
 from lensmodel.regression.experts import agreed_share
 from lensmodel.regression.pooled import MIN_PLACES, pool
-from lensmodel.regression.pooled.fit import PatchView, fit_spectra
+from lensmodel.regression.pooled.fit import BALANCE, PatchView, PooledFit, fit_spectra
+from lensmodel.regression.pooled.refine import Pooled
 from lensmodel.regression.pooled.scene import BIAS, SceneView
 from lensmodel.regression.pooled.transfer import (
     BINS,
@@ -275,3 +276,29 @@ def test_wide_blur_leaves_the_say_to_the_wavefront() -> None:
     assert share[0] < 0.05
     assert 0.7 < share[1] < 0.9
     assert 0.95 < share[2] < share[3] < 1.0
+
+
+def test_error_is_told_even_where_the_cat_s_eye_is_hardly_known() -> None:
+    front, unknown = true_front(), np.zeros((21, 21))
+    unknown[19:, 19:] = np.diag([1.0, 9.0])  # many a drawn pupil would let no light pass at the corner
+    fitted = Pooled(PooledFit(front, 0.0, unknown, np.ones(1)), 0.0, {"a": 1.0})
+    samples = [
+        PsfSample(gaussian(31, 1.0), FieldPosition(1.0, phi), SETTINGS, photo="a") for phi in (0.0, 2.0)
+    ]
+
+    found = fitted.errors(samples)
+
+    known = Pooled(PooledFit(front, 0.0, np.zeros((21, 21)), np.ones(1)), 0.0, {}).errors(samples)
+    assert found.min() > known.max()
+
+
+def test_focus_that_balances_spherical_aberration_is_expected() -> None:
+    noise = PatchSpectrum(np.full((RINGS, SECTORS), 1e-7, np.float32), 1e-7)
+    nothing = view(FieldPosition(0.5, 0.0), dict.fromkeys(CHANNELS, noise))
+    alone, both = (replace(true_front(), terms=np.zeros(19)) for _ in range(2))
+    alone.terms[0] = both.terms[0] = 0.5
+    both.terms[6] = BALANCE * 0.5
+
+    costs = [fit_spectra([nothing], front, rounds=0).cost for front in (alone, both)]
+
+    assert costs[0] - costs[1] > 3.0

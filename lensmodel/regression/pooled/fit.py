@@ -44,9 +44,23 @@ _HELD = 1e12
 _USUAL = np.concatenate([np.zeros(len(NAMES)), USUAL_EYE])
 # What third-order theory does not know is small; a copy's own faults are smaller than the design's.
 _SPREAD_PX = np.array(
-    [4.0, 0.25, 4.0, 0.5, 0.5, 0.25, 4.0, 0.7, 0.7, 4.0, 0.25, 1.0, 1.0, 4.0, 0.4, 0.4, 0.4, 0.4, 0.25]
+    [0.9, 0.15, 3.0, 0.3, 0.3, 0.15, 4.0, 0.5, 0.5, 2.5, 0.15, 0.3, 0.5, 2.5, 0.25, 0.25, 0.15, 0.15, 0.15]
 )
-_VOTE = 1.0 / np.concatenate([_SPREAD_PX, _EYE_SPREAD]) ** 2
+BALANCE: Final = -1.1
+"""Focus over spherical aberration: who focuses balances them, the spot is smallest between -1 and -4/3."""
+
+_BALANCE_SPREAD_PX = 0.25
+
+
+def _precision() -> Floats:
+    """Inverse covariance of the lens's unknowns, before any patch is seen."""
+    found = np.diag(1.0 / np.concatenate([_SPREAD_PX, _EYE_SPREAD]) ** 2)
+    balanced = np.zeros(_LENS)
+    balanced[[NAMES.index("focus"), NAMES.index("spherical")]] = 1.0, -BALANCE
+    return np.asarray(found + np.outer(balanced, balanced) / _BALANCE_SPREAD_PX**2)
+
+
+_PRECISION = _precision()
 _TEMPER = 0.1
 """Share of the likelihood that counts: neighbouring bins and patches of one motif err alike."""
 
@@ -58,7 +72,7 @@ _SCENE_ROUNDS, _SCENE_ROUNDS_AGAIN = 3, 2
 _TRIES = 5
 _STRIDE_PX = 1.5
 _ENOUGH = 0.2
-_SMALLEST_EYE = 0.5
+_SMALLEST_EYE, _FARTHEST_EYE = 0.5, 1.0  # the two circles of the pupil have to overlap all over the field
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,7 +140,7 @@ def fit_spectra(
     """
     photos = sorted({patch.photo for patch in patches})
     problem = _Problem(tuple(patches), {name: i for i, name in enumerate(photos)}, begin, coarse)
-    lens = np.concatenate([begin.terms, begin.eye])
+    lens = np.concatenate([begin.terms, open_eye(np.asarray(begin.eye))])
     shared = np.zeros((len(photos), len(PHOTO_SPREAD)))
     state = problem.state(lens, shared, None)
     held = np.zeros(_LENS + shared.size)
@@ -140,7 +154,7 @@ def fit_spectra(
             )
             step = step * min(1.0, _STRIDE_PX / max(float(np.abs(step[: len(NAMES)]).max()), 1e-9))
             moved = lens + step[:_LENS]
-            moved[-2] = max(moved[-2], _SMALLEST_EYE)
+            moved[-2:] = open_eye(moved[-2:])
             moved_shared = shared + step[_LENS:].reshape(shared.shape)
             after = problem.state(moved, moved_shared, state.scenes)
             if after.cost < state.cost:
@@ -158,6 +172,11 @@ def fit_spectra(
     on_step(rounds, rounds)
     covariance = np.asarray(np.linalg.inv(state.normal), dtype=np.float64)[:_LENS, :_LENS]
     return PooledFit(problem.front(lens), state.cost, covariance, state.trust)
+
+
+def open_eye(eye: Floats) -> tuple[float, float]:
+    """Nearest cat's eye, radius and shift, that leaves light everywhere in the field."""
+    return max(float(eye[0]), _SMALLEST_EYE), float(np.clip(eye[1], -_FARTHEST_EYE, _FARTHEST_EYE))
 
 
 def fit_scene(view: SceneView, offset: Floats) -> tuple[Floats, Floats, Floats]:
@@ -213,10 +232,12 @@ class _Problem:
             gradient[places] += weight * own_gradient
             found.append(fitted.z)
             trust.append(trusted)
-        vote = np.concatenate([_VOTE, np.tile(1.0 / PHOTO_SPREAD**2, len(self.photos))])
-        off = np.concatenate([lens - _USUAL, shared.ravel()])
-        cost += float(vote @ off**2)
-        return _State(cost, normal + np.diag(vote), gradient - vote * off, found, np.array(trust))
+        off, vote = lens - _USUAL, np.tile(1.0 / PHOTO_SPREAD**2, len(self.photos))
+        pull = np.concatenate([_PRECISION @ off, vote * shared.ravel()])
+        cost += float(pull @ np.concatenate([off, shared.ravel()]))
+        normal[:_LENS, :_LENS] += _PRECISION
+        normal[range(_LENS, count), range(_LENS, count)] += vote
+        return _State(cost, normal, gradient - pull, found, np.array(trust))
 
     def _lens(self, lens: Floats, patch: PatchView) -> tuple[Floats, Floats]:
         """Return ln |OTF|^2 in the bins, shape (BINS, c), and its derivatives (BINS, c, 21)."""

@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.psf import PsfSample, distance, rms_width
-from lensmodel.regression.pooled.fit import SYMMETRIC, PatchView, PooledFit, fit_spectra
+from lensmodel.regression.pooled.fit import (
+    BALANCE,
+    SYMMETRIC,
+    PatchView,
+    PooledFit,
+    fit_spectra,
+    open_eye,
+)
 from lensmodel.regression.pooled.scene import SceneView
 from lensmodel.regression.starts import starts
 from lensmodel.regression.wavefront import NAMES, Wavefront, design, stopped
@@ -40,8 +47,7 @@ _USUAL_SHAPE: Final = {
 }
 """Spread of the terms of a random wavefront, in widths of the samples' kernels."""
 
-_BALANCED, _FOCUS_SPREAD = -1.1, 0.5
-"""Who focuses balances spherical aberration: the spot is smallest between -1 and -4/3 of it."""
+_FOCUS_SPREAD = 0.5  # about `BALANCE`
 
 _TAIL_SIDE = 31
 _DRAWS, _SEED = 6, 0
@@ -93,7 +99,7 @@ class Pooled:
         right = [self.front.kernel(s.position, s.settings, _TAIL_SIDE) for s in few]
         for _ in range(_DRAWS):
             drawn = lens + root @ rng.standard_normal(len(lens))
-            other = replace(self.front, terms=drawn[:-2], eye=(max(drawn[-2], 0.5), float(drawn[-1])))
+            other = replace(self.front, terms=drawn[:-2], eye=open_eye(drawn[-2:]))
             found += [
                 distance(other.kernel(s.position, s.settings, _TAIL_SIDE), k).rel_l2 ** 2
                 for s, k in zip(few, right, strict=True)
@@ -190,7 +196,7 @@ def _random_fronts(first: Wavefront, width: float) -> list[Wavefront]:
         terms = np.zeros(len(NAMES))
         for name, usual in _USUAL_SHAPE.items():
             terms[NAMES.index(name)] = rng.normal(0.0, usual)
-        balance = _BALANCED * terms[NAMES.index("spherical")]
+        balance = BALANCE * terms[NAMES.index("spherical")]
         terms[NAMES.index("focus")] = balance + rng.normal(0.0, _FOCUS_SPREAD)
         found.append(replace(first, terms=width * terms, eye=USUAL_EYE))
     return found

@@ -34,6 +34,9 @@ class Sensor:
     surrounded : bool
         Whether a rim as wide as the blur reaches will be cut off on all sides. What is beyond the plane
         then need not be solved for.
+    edges : tuple of bool
+        Which sides of the plane, top, bottom, left and right, are the frame's own. The others are cuts:
+        what is beyond them was measured, but not given.
     """
 
     noise: NoiseModel = field(default_factory=lambda: NoiseModel.white(0.005))
@@ -41,6 +44,7 @@ class Sensor:
     extra: NDArray[np.float32] | None = None
     measured: NDArray[np.bool_] | None = None
     surrounded: bool = False
+    edges: tuple[bool, bool, bool, bool] = (True, True, True, True)
 
     def __post_init__(self) -> None:
         if not self.clip > 0.0:

@@ -304,6 +304,12 @@ def _restore(job: _Job, cell: Cell) -> tuple[Planes, CellForecast]:
         and cell.bottom + halo <= job.frame.height
         and cell.right + halo <= job.frame.width
     )
+    edges = (
+        top == 0,
+        cell.bottom + halo >= job.frame.height,
+        left == 0,
+        cell.right + halo >= job.frame.width,
+    )
     sensors = [
         Sensor(
             job.noise[c],
@@ -313,6 +319,7 @@ def _restore(job: _Job, cell: Cell) -> tuple[Planes, CellForecast]:
             None,
             job.measured(c, top, left, plane.shape),
             surrounded,
+            edges,
         )
         for c, plane in enumerate(tile)
     ]

@@ -17,6 +17,7 @@ from lensmodel.deconv.canvas import Canvas, seam
 from lensmodel.deconv.engine import Engine, compiled
 from lensmodel.deconv.lights import Lights
 from lensmodel.deconv.local import Blocks, signal_variance, smoothed, spread
+from lensmodel.deconv.outside import fill_outside
 from lensmodel.deconv.shrinkage import Shrinkage
 from lensmodel.deconv.transfers import transfers
 from lensmodel.deconv.wiener import prior, wiener_spectrum
@@ -70,7 +71,7 @@ class SparseGradient:
         First b, in units of one over the squared light, and its factor per step.
         What a kernel's change within the tile adds is found anew in the first step and half way.
     light_steps : int
-        Steps by which the light of clipped pixels is found.
+        Steps by which the light of clipped pixels is found, and that from beyond the frame.
     engine : {"auto", "numpy"}
         "numpy" never uses compiled loops; the numbers are the same.
 
@@ -178,6 +179,9 @@ class SparseGradient:
                 y,
             )
 
+        if not all(sensor.surrounded for sensor in sensors):
+            fill_outside(y, blurred, light, K, blurs, sensors, canvas, self.light_steps, self.engine)
+
         def ramp(axis: int) -> NDArray[np.float32]:
             """Pixels from where the kernel is K; held at the ends of the data, beyond which lies no datum."""
             at = np.clip(np.arange(canvas.shape[axis]) - canvas.margin, 0, blurred.shape[1 + axis] - 1)
@@ -204,6 +208,7 @@ class SparseGradient:
 
 _RAMP = 0.1  # of the jump of the shrinkage: see `Shrinkage`
 _TYPICAL_CONTRAST = np.float32(0.02)  # variance over squared light of a scene for which kappa is `weight`
+_SCENE = 0.2  # variance over squared light of a cell of an average scene
 _OPEN, _TOLD, _LEAST = 0.25, 0.87, 0.4  # chosen on lenses of development seeds: see `_reliance`
 _BUSIEST, _CALMEST = 0.7, 50.0
 _DARK = np.float32(0.02)  # share of a tile's mean light below which the prior follows it no further
@@ -233,11 +238,12 @@ class _Problem:
 def _told(K: NDArray[np.complex64], shape: tuple[int, int], noise: np.float32, variance: np.float32) -> float:
     """Share of the power of a natural scene's gradients that the data tell: sum |F|² S W / sum |F|² S.
 
-    S is the scene's spectrum and W = |K|² S / (|K|² S + noise) what of it Wiener's filter keeps.
+    S is the scene's spectrum, in a flat cell that of an average one, and
+    W = |K|² S / (|K|² S + noise) what of it Wiener's filter keeps.
     """
     likely = prior(shape)[1]
     shown = likely * (K.real**2 + K.imag**2)
-    signal = max(float(variance - noise), 0.005 * float(variance) + 1e-12)
+    signal = max(float(variance - noise), _SCENE)
     level = np.float32(float(noise) * float(shown.sum(dtype=np.float64)) / (signal * shape[0] * shape[1]))
     gradients = likely * _gradient_power(shape)
     return float((gradients * (shown / (shown + level))).sum() / gradients.sum())

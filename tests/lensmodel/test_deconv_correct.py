@@ -165,6 +165,21 @@ def test_border_is_restored_like_the_inside_from_the_fourth_pixel_on() -> None:
     assert left["rim"] < 1.25 * left["inside"]
 
 
+def test_light_from_beyond_the_frame_leaves_no_ripples_at_the_border_of_a_soft_lens() -> None:
+    lens = Soft(2.5, 2.5)
+    seen, sharp = photo(lens, BASE)
+
+    restored = correct_planes(seen, lens, FRAME, noise=BASE).planes
+
+    inside = np.zeros((FRAME.height, FRAME.width), dtype=np.bool_)
+    inside[16:-16, 16:-16] = True
+    border, middle = (
+        rmse(restored[:, where], sharp[:, where]) / rmse(seen[:, where], sharp[:, where])
+        for where in (~inside, inside)
+    )
+    assert border < 1.2 * middle
+
+
 def test_result_hardly_depends_on_the_size_of_the_cells() -> None:
     lens = Soft(1.0, 1.0)
     seen, _ = photo(lens, BASE)

@@ -1,0 +1,91 @@
+"""Light from beyond the frame: what it makes of the pixels just outside, which nobody measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from lensmodel.blur import UniformBlur
+from lensmodel.deconv.base import Sensor
+from lensmodel.deconv.canvas import Canvas
+from lensmodel.deconv.engine import Engine
+from lensmodel.deconv.richardson_lucy import climbed, first_guess
+from lensmodel.types import Planes
+
+_DEPTH, _MORE = 4, 8  # reaches of the blur, and pixels, of data that tell of what lies beyond a side
+_SHARPNESS: Final = 50.0  # unused where nothing clips, but asked for
+
+
+def fill_outside(
+    y: Planes,
+    tile: Planes,
+    light: NDArray[np.float32],
+    K: NDArray[np.complex64],
+    blurs: Sequence[UniformBlur],
+    sensors: Sequence[Sensor],
+    canvas: Canvas,
+    steps: int,
+    engine: Engine,
+) -> None:
+    """Predict the margin of a canvas along the sides of the frame, in place.
+
+    A mirror image of the frame is a poor guess: what is wrong with it comes back as ripples
+    inside, the stronger the less noise there is. Richardson-Lucy steps on a strip of the data find the
+    light on both sides of the border, each point divided by what of its light was measured, and that
+    light blurred is what a larger sensor would have seen.
+
+    Parameters
+    ----------
+    y : Planes
+        The canvas, scaled by one over `light`.
+    tile : Planes
+        The data, nothing of it beyond saturation.
+    light : ndarray, shape (channels,)
+        Mean light of each colour.
+    K : ndarray, shape (channels, rows, cols)
+        Transfer functions on the canvas.
+    steps : int
+        Richardson-Lucy steps.
+    """
+    outside = np.ones(canvas.shape, dtype=np.bool_)
+    outside[canvas.data] = False
+    for c, (plane, blur, sensor) in enumerate(zip(tile, blurs, sensors, strict=True)):
+        wide = blur.reach
+        if wide > 0:
+            latent = _wider(plane, blur, sensor, steps, engine)
+            for axis in (0, 1):
+                lines = np.moveaxis(latent, axis, 0)
+                latent = np.moveaxis(Canvas.wrap(lines, canvas.margin - wide, canvas.shape[axis]), 0, axis)
+            seen = fft.irfft2(K[c] * fft.rfft2(latent / light[c]), canvas.shape)
+            y[c][outside] = seen[outside]
+
+
+def _wider(
+    plane: NDArray[np.float32], blur: UniformBlur, sensor: Sensor, steps: int, engine: Engine
+) -> NDArray[np.float32]:
+    """Data, and light wherever it reaches them from beyond a side of the frame: wider by the reach."""
+    wide = blur.reach
+    depth, both = _DEPTH * wide + _MORE, 2 * wide
+    found = np.pad(plane, wide, mode="symmetric" if wide <= min(plane.shape) else "edge")
+    plain = replace(sensor, clip=float("inf"), measured=None)
+
+    def light_of(part: NDArray[np.float32]) -> NDArray[np.float32]:
+        part = np.ascontiguousarray(part)
+        latent, reach = first_guess(part, blur)
+        return climbed(latent, part, reach, blur, plain, steps=steps, sharpness=_SHARPNESS, engine=engine)
+
+    top, bottom, left, right = sensor.edges
+    if left:
+        found[:, :both] = light_of(plane[:, :depth])[:, :both]
+    if right:
+        found[:, -both:] = light_of(plane[:, -depth:])[:, -both:]
+    if top:
+        found[:both] = light_of(plane[:depth])[:both]
+    if bottom:
+        found[-both:] = light_of(plane[-depth:])[-both:]
+    return found

@@ -17,6 +17,7 @@ from lensmodel.deconv.canvas import Canvas, seam
 from lensmodel.deconv.engine import Engine, compiled
 from lensmodel.deconv.lights import Lights
 from lensmodel.deconv.local import BLOCK, Blocks, signal_variance, smoothed, spread
+from lensmodel.deconv.outside import fill_outside
 from lensmodel.deconv.sparse_gradient import SparseGradient
 from lensmodel.deconv.transfers import transfers
 from lensmodel.deconv.wiener import frequency_squared, prior
@@ -54,6 +55,8 @@ class DirectFilter:
         cell. Without it strong frequencies of the scene come back as coloured ripples.
     light_steps : int
         Steps by which the light of clipped pixels is found.
+    outside_steps : int
+        Steps by which light from beyond the frame is found.
     engine : {"auto", "numpy"}
         "numpy" never uses compiled loops; the numbers are the same.
     """
@@ -62,6 +65,7 @@ class DirectFilter:
     calm: float = 0.0015
     floor: float = 1e-3
     light_steps: int = 15
+    outside_steps: int = 10
     engine: Engine = "auto"
     mosaic: Deconvolver = field(default_factory=_steps)
 
@@ -99,11 +103,15 @@ class DirectFilter:
         )
         if loops is None:
             y = np.stack([canvas.fill(plane / bright) for plane, bright in zip(blurred, light, strict=True)])
-            x = _filtered(y, K, noise, levels, busy, self.floor)
         else:
             y = np.empty((len(blurred), *canvas.shape), dtype=np.float32)
             rows, cols = seam(canvas.rows, canvas.shape[0]), seam(canvas.cols, canvas.shape[1])
             loops.fill(blurred, np.float32(1.0) / light, canvas.margin, rows, cols, y)
+        if not all(sensor.surrounded for sensor in sensors):
+            fill_outside(y, blurred, light, K, blurs, sensors, canvas, self.outside_steps, self.engine)
+        if loops is None:
+            x = _filtered(y, K, noise, levels, busy, self.floor)
+        else:
             x = np.empty_like(y)
             loops.one_pass(
                 x,

@@ -165,11 +165,12 @@ def test_border_is_restored_like_the_inside_from_the_fourth_pixel_on() -> None:
     assert left["rim"] < 1.25 * left["inside"]
 
 
-def test_light_from_beyond_the_frame_leaves_no_ripples_at_the_border_of_a_soft_lens() -> None:
+@pytest.mark.parametrize("method", ["fast", "standard"])
+def test_light_from_beyond_the_frame_leaves_no_ripples_at_the_border_of_a_soft_lens(method: str) -> None:
     lens = Soft(2.5, 2.5)
     seen, sharp = photo(lens, BASE)
 
-    restored = correct_planes(seen, lens, FRAME, noise=BASE).planes
+    restored = correct_planes(seen, lens, FRAME, noise=BASE, method=method).planes
 
     inside = np.zeros((FRAME.height, FRAME.width), dtype=np.bool_)
     inside[16:-16, 16:-16] = True

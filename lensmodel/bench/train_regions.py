@@ -2,11 +2,12 @@
 
     python -m lensmodel.bench.train_regions collect PHOTOS TABLE.jsonl [GROUPS [METHOD]]
     python -m lensmodel.bench.train_regions fit TABLE.jsonl MODEL.npz
+    python -m lensmodel.bench.train_regions judge TABLE.jsonl MODEL.npz
 
 `collect` blurs photographs by simulated lenses, estimates the kernel in some windows of each and
 writes one line a window: its features and how wrong the kernel was. It goes on where it stopped.
 `fit` learns from the development half of the photos and reports on the test half; lenses of the
-two halves differ as well.
+two halves differ as well. `judge` reports on the test half for a model that is there.
 """
 
 from __future__ import annotations
@@ -264,14 +265,19 @@ def main(arguments: Sequence[str]) -> None:
     """Run `collect` or `fit` from the command line."""
     if len(arguments) < _ARGUMENTS - 1:
         raise InvalidInputError(
-            "usage: train_regions collect PHOTOS TABLE [GROUPS [METHOD]] | fit TABLE MODEL"
+            "usage: train_regions collect PHOTOS TABLE [GROUPS [METHOD]] | (fit or judge) TABLE MODEL"
         )
     verb, first, second, *rest = arguments
     if verb == "collect":
         groups, method = int(rest[0]) if rest else 240, rest[1] if len(rest) > 1 else "default"
         collect(Path(first), Path(second), groups, method)
     else:
-        report = fit(Path(first), Path(second))
+        table, model = Path(first), Path(second)
+        if verb == "judge":
+            held = [row for row in read_table(table) if row.half == "test"]
+            report = judged(TreeEnsemble.load(model), held)
+        else:
+            report = fit(table, model)
         sys.stdout.write(json.dumps(asdict(report), indent=1) + "\n")
 
 

@@ -93,7 +93,9 @@ class CorrectionWork:
             "description": _description(plan),
         }
         with self._bench.sandbox.folder() as folder:
-            self._samples(plan.lens.public_id, plan.correction.lens_version, folder)
+            lens_id, version = plan.lens.public_id, plan.correction.lens_version
+            state = self._samples(lens_id, version, folder)
+            known = (folder / LEARNED).is_file()
             leaning = self._family(params.get("family", []), folder)
             done = self._bench.attempt(
                 "correct",
@@ -103,6 +105,8 @@ class CorrectionWork:
                 wanted=wanted,
                 on_progress=self._teller(key),
             )
+            if not known and self._is_newest(lens_id, version):
+                self._keep_learned(lens_id, version, state, folder / LEARNED)
             report = {"zones": done["zones"]} | ({"family": {"lenses": leaning}} if leaning else {})
             self._hand_in(plan, folder / Path(done["file"]).name, report)
 
@@ -163,8 +167,7 @@ class CorrectionWork:
         lenses = self._bench.store.lenses
 
         def wanted() -> bool:
-            lens = lenses.get(lens_id)
-            return lens is not None and lens.version == version
+            return self._is_newest(lens_id, version)
 
         limits = Limits(memory_mb=2 * SPARE_MB, wall_s=self._bench.settings.patch_seconds)
         try:
@@ -181,6 +184,11 @@ class CorrectionWork:
             log.warning("lens %s version %d could not be measured: %s", lens_id, version, error.detail)
             metrics = {"error": None, "coverage": None, "problem": error.code}
         lenses.record_metrics(lens_id, version, metrics)
+
+    def _is_newest(self, lens_id: str, version: int) -> bool:
+        """Whether a version counts; what was learned of an earlier one has been deleted."""
+        lens = self._bench.store.lenses.get(lens_id)
+        return lens is not None and lens.version == version
 
     def _keep_learned(self, lens_id: str, version: int, state: LensState, path: Path) -> None:
         """Keep what was learned of the newest version for every process that answers questions."""

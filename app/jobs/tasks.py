@@ -107,7 +107,10 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: Progress) -> lis
 
 
 def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
-    """Correct the photo in `developed` with the samples in the folder; write the result there."""
+    """Correct the photo in `developed` with the samples in the folder; write the result there.
+
+    What the model has learned of them is written there as well, where it was not known before.
+    """
     developed = pipeline.load_developed(Path(arguments["developed"]))
     stored = arguments["lateral"]
     lateral = _lateral(developed) if stored is None else codec.from_json(LateralColour, stored)
@@ -180,8 +183,11 @@ def _model(folder: Path, settings: ModelSettings) -> LensModel:
 
 
 def _leaning(folder: Path, settings: ModelSettings) -> LensModel:
-    """Build the model of the samples in a folder, which leans on other copies if they are handed over."""
+    """Build the whole model of the samples in a folder; it leans on other copies if they are handed over."""
     model, family = _model(folder, settings), folder / FAMILY
+    if not (folder / LEARNED).is_file():
+        model = model.warmed()
+        (folder / LEARNED).write_bytes(model.learned())
     return model.with_prior(_model(family, settings)) if family.is_dir() else model
 
 

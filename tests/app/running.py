@@ -88,6 +88,17 @@ class Service:
         assert answer.status_code == status, answer.text
         return answer.json()
 
+    def settled(self, path: str, **options: Any) -> httpx2.Response:
+        """Return the answer for a lens once a worker has fitted its model wholly."""
+        end = time.monotonic() + PATIENCE_S
+        while True:
+            answer = self.http.get(path, **options)
+            assert answer.status_code == 200, answer.text
+            if "-l-" in answer.headers["etag"]:
+                return answer
+            assert time.monotonic() < end, self.log.read_text()[-4000:]
+            time.sleep(0.1)
+
     def upload(self, path: Path, status: int = 202, **fields: str) -> dict[str, Any]:
         """Send a photo; return its description."""
         with path.open("rb") as file:

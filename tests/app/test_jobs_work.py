@@ -14,13 +14,14 @@ import pytest
 from app.jobs.child import Progress
 from app.jobs.correction_work import CorrectionWork
 from app.jobs.engine import Handler, Job, Kind, Status
-from app.jobs.handover import KERNELS, SAMPLES
+from app.jobs.handover import KERNELS, LEARNED, SAMPLES
 from app.jobs.photo_work import PhotoWork
 from app.jobs.sandbox import Budget, Limits, Outcome
 from app.jobs.workbench import JobFailedError, NotWantedError, Workbench
 from app.settings import Settings
 from app.storage import Storage
 from app.store import Store
+from app.store.versions import learned_key
 from app.tables import PhotoRow
 from lensmodel.psf import gaussian
 
@@ -496,6 +497,45 @@ def test_a_correction_ends_with_a_file(
     assert row.report == {"zones": {"center": {"gain_db": 3.0}}}
     assert bench.storage.get(row.result_key or "") == b"a picture"
     assert sandbox.files >= {KERNELS, SAMPLES}
+
+
+def test_what_a_correction_learned_of_the_newest_version_is_kept(
+    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+) -> None:
+    def learn(arguments: dict[str, Any], folder: Path) -> Outcome:
+        assert not (folder / LEARNED).exists()
+        (folder / LEARNED).write_bytes(b"fitted")
+        return write_result(arguments, folder)
+
+    def find(arguments: dict[str, Any], folder: Path) -> Outcome:
+        assert (folder / LEARNED).read_bytes() == b"fitted"
+        return write_result(arguments, folder)
+
+    lens_id = steps.lens_id(counted)
+    state, _ = bench.store.samples.of_lens(lens_id)
+    sandbox.answers["correct"] = [learn, find]
+    for strength in (1.0, 0.5):
+        CorrectionWork(bench).correction(ask(bench, counted, steps, strength=strength))
+
+    assert bench.storage.get(learned_key(lens_id, 1, state.rebuild_epoch)) == b"fitted"
+
+
+def test_what_a_correction_learned_of_an_earlier_version_is_not_kept(
+    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+) -> None:
+    def learn(arguments: dict[str, Any], folder: Path) -> Outcome:
+        (folder / LEARNED).write_bytes(b"fitted")
+        return write_result(arguments, folder)
+
+    lens_id = steps.lens_id(counted)
+    state, _ = bench.store.samples.of_lens(lens_id)
+    steps.counted()
+    sandbox.answers["correct"] = [learn]
+    CorrectionWork(bench).correction(ask(bench, counted, steps, version=1))
+
+    assert bench.store.samples.of_lens(lens_id)[0].version == 2
+    with pytest.raises(FileNotFoundError):
+        bench.storage.get(learned_key(lens_id, 1, state.rebuild_epoch))
 
 
 def test_a_photographers_bounds_reach_the_correction_and_its_tag(

@@ -21,7 +21,7 @@ from lensmodel.types import LensSettings
 
 Size: TypeAlias = Literal["quick", "default", "full"]
 
-PROTOCOL: Final = 2
+PROTOCOL: Final = 3
 """Part of every key of a stored result; raised when what is measured changes."""
 
 FIRST_SEED: Final = 1000

@@ -248,8 +248,6 @@ class Job:
             # no model: a user gets no correction, so the photos stay as they are
             before = read(self.folder / "truth.json")["before"]
             return {**unit, "psf": None, "methods": dict.fromkeys(self.methods, before)}
-        answers = route.answers(measure.places(), case.settings, measure.PSF_SIZE)
-        unit["psf"] = measure.psf_errors(answers, self.truth)
         unit["methods"] = {}
         chart = None if shots.chart is None else develop(shots.chart).planes
         for method in self.methods:
@@ -257,6 +255,9 @@ class Job:
             edges = None if shots.chart is None else route.corrected(shots.chart, method)
             unit["methods"][method] = measure.state(edges, after, shots, case, before=chart)
             unit["pictures"][f"n{n}-{method}"] = self._picture(f"n{n}-{method}", after)
+        # not before: until a correction, or its own leisure, has fitted the model, a service answers in part
+        answers = route.answers(measure.places(), case.settings, measure.PSF_SIZE)
+        unit["psf"] = measure.psf_errors(answers, self.truth)
         return unit
 
     def _picture(self, label: str, planes: Planes) -> str:

@@ -111,7 +111,8 @@ class DirectRoute:
                 refused.write_text(json.dumps(str(error)), encoding="utf-8")
                 return str(error)
             save_profile(stored, LensProfile(LensModel.fit(samples)))
-        self._model = LensModel.fit(samples) if self._model is None else self._model.added(samples)
+        model = LensModel.fit(samples) if self._model is None else self._model.added(samples)
+        self._model = model.warmed()
         return ""
 
     def answers(self, places: Sequence[Place], settings: LensSettings, size: int) -> list[Answer]:

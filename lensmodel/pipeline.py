@@ -56,9 +56,6 @@ log = logging.getLogger(__name__)
 DEFAULT_PATCHES = 24
 """Patches asked for in one photo: enough for every ring and octant of the field to get one."""
 
-PROCESSED_NOISE = 16.0
-"""How much more noise variance a photo without its mosaic has than its pixels show."""
-
 BLIND_BIAS = 0.4
 """Relative L2 error that blind estimates share, so that their scatter in the model does not show it."""
 
@@ -411,15 +408,6 @@ def lateral_of(developed: LinearPhoto) -> LateralColour:
     return estimate_lateral(developed.planes, developed.frame)
 
 
-def _correlated(noise: NoiseModel) -> NoiseModel:
-    """Noise of a photo that was demosaiced elsewhere, as if its pixels were independent.
-
-    Demosaicing, denoising and compression correlate it, so that less of it is seen in a pixel than there
-    is in a patch. Measured with `benchmarks/noise_factor.py`.
-    """
-    return NoiseModel(noise.shot * PROCESSED_NOISE, noise.read * PROCESSED_NOISE)
-
-
 def correct_photo(
     developed: LinearPhoto,
     model: LensModel,
@@ -468,7 +456,7 @@ def correct_photo(
         developed.frame,
         method=method,
         strength=strength,
-        noise=developed.sensor_noise or [_correlated(model) for model in developed.noise],
+        noise=developed.correction_noise,
         clip=developed.clip,
         psf_error=psf_error,
         lateral=lateral,

@@ -176,7 +176,7 @@ def corrected_with(developed: LinearPhoto, field: PsfField, method: str, *, work
         field,
         developed.frame,
         method=method,
-        noise=developed.sensor_noise or developed.noise,
+        noise=developed.correction_noise,
         clip=developed.clip,
         lateral=lateral,
         cfa=cfa,

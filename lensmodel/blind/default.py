@@ -23,7 +23,7 @@ from lensmodel.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
 _POOLED_SUPPORT, _POOLED_ITERATIONS, _POOLED_SIDE = 21, 3, 160
 _STARTS, _STARTS_OF_CHANNEL = 10, 6
 _PIXEL_SIGMA = 0.29
-_PER_WIDTH = 60.0
+_PER_WIDTH = 40.0
 """Cost of a kernel e times as wide: in doubt the narrower one, which does less harm."""
 
 _POOLED_ERROR = 0.7
@@ -58,7 +58,7 @@ class Cautious:
     trust: float = 5.0
 
     name = "default"
-    version = 10
+    version = 11
 
     def estimate(
         self,

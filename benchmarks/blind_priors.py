@@ -4,8 +4,8 @@
 
 The photographs of the development half are dealt into folds; the priors of scenes (`make_scene_spectra` and
 `make_local_spectra`) are learned without the fold that is judged. What wins here may be chosen without a look
-at the test half. Printed are the rows of `lensmodel bench blind --half dev`, all folds together, and what
-`blind_confidence.py` tells of them.
+at the test half. Printed are the rows of `lensmodel bench blind --half dev`, all folds together, the
+geometric mean of error ratios over those of the untouched patch, and what `blind_confidence.py` tells.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 from unittest import mock
 
+import numpy as np
 from blind_confidence import told
 
 from lensmodel.bench import make_local_spectra, make_scene_spectra
@@ -65,7 +66,8 @@ def main() -> None:
         )
     for noise in settings.noise:
         rows = [asdict(r) for r in results if r.noise == noise and r.method != UNTOUCHED and not r.declined]
-        print(f"{100 * noise:g} %: {told(rows)}")
+        gained = np.exp(np.mean([np.log(row["error_ratio"] / row["untouched_ratio"]) for row in rows]))
+        print(f"{100 * noise:g} %: ER over untouched {gained:.3f}; {told(rows)}")
 
 
 if __name__ == "__main__":

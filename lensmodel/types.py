@@ -138,3 +138,26 @@ class NoiseModel:
     def white(cls, sigma: float) -> NoiseModel:
         """Signal-independent noise of standard deviation `sigma`."""
         return cls(shot=0.0, read=sigma * sigma)
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeGain:
+    """What a correction did to the edges of a photographed chart in one zone: medians.
+
+    Parameters
+    ----------
+    edges : int
+        How many were measured before and after.
+    mtf50_before, mtf50_after : float
+        Cycles/pixel.
+    gain : float
+        MTF50 after over before.
+    overshoot_after : float
+        How far the edge profile rises above its bright level, in percent of the step.
+    """
+
+    edges: int
+    mtf50_before: float
+    mtf50_after: float
+    gain: float
+    overshoot_after: float

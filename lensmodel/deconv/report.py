@@ -15,7 +15,7 @@ from lensmodel.deconv.base import Sensor
 from lensmodel.deconv.lattice import Cell
 from lensmodel.deconv.wiener import SLOPE, frequency_squared
 from lensmodel.geometry import zone_of
-from lensmodel.types import ZONES, Planes, Zone
+from lensmodel.types import ZONES, EdgeGain, Planes, Zone
 
 _GRID = (64, 64)
 _EVERY = 3  # of the rows and columns suffice for a variance; odd, so that all colours of a mosaic are met
@@ -44,11 +44,14 @@ class ZoneReport:
         Expected gain in PSNR of linear light against the sharp scene, decibels, never below 0.
     psf_error : float
         Mean expected relative error of the PSFs.
+    measured : EdgeGain or None
+        What the edges of a chart gained, where the photo shows one; `pipeline.correct_photo` measures it.
     """
 
     cells: int
     gain_db: float
     psf_error: float
+    measured: EdgeGain | None = None
 
 
 def forecast(

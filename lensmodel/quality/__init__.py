@@ -2,6 +2,7 @@
 
 from lensmodel.quality.charts import EdgeMeasurement, ZoneSharpness, by_zone, measure_edges
 from lensmodel.quality.edge import EdgeResponse, crossing, pixel_mtf, slanted_edge
+from lensmodel.quality.find import edge_gains, find_edges
 from lensmodel.quality.images import (
     best_shift,
     flat_noise,
@@ -31,8 +32,10 @@ __all__ = [
     "best_shift",
     "by_zone",
     "crossing",
+    "edge_gains",
     "encircled_energy",
     "encircled_radius",
+    "find_edges",
     "flat_noise",
     "lp_per_mm",
     "lp_per_ph",

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
 from lensmodel.errors import InvalidInputError, NotEnoughEvidenceError
@@ -218,7 +219,7 @@ def _edge_line(crop: NDArray[np.float64]) -> tuple[float, float, float]:
     sign = 1.0 if crop[:, -quarter:].mean() >= crop[:, :quarter].mean() else -1.0
     # first windows: where the smoothed derivative of each row is largest, not blindly the middle,
     # because a strongly leaning edge is far from it in the outer rows
-    smooth = np.apply_along_axis(np.convolve, 1, sign * derivative, np.ones(9) / 9.0, "same")
+    smooth = sliding_window_view(np.pad(sign * derivative, ((0, 0), (4, 4))), 9, axis=1).mean(axis=2)
     intercept, slope = _robust_line(y, x[smooth.argmax(axis=1)])
     for half in (cols / 4.0, 12.0, 12.0):
         reach = max(min(half, cols / 2.0 - 2.0), 4.0)

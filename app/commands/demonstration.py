@@ -10,9 +10,10 @@ from typing import Annotated, Final
 
 import typer
 
-from app.commands import display
+from app.commands import display, files
 from app.commands.failure import UsageError
 from app.commands.options import Quiet, Verbose
+from lensmodel import blind
 
 MARKER: Final = ".lensmodel-demo.json"
 """Lists the files that a demo wrote into its folder, each with its SHA-256."""
@@ -23,6 +24,9 @@ def demo(
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for the pictures and the report.")
     ] = Path("demo-output"),
+    estimator: Annotated[
+        str, typer.Option(metavar="NAME", help="Blind estimator: default, michaeli-irani, whittle, ...")
+    ] = "default",
     json_output: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Use a folder that holds other files too.")] = False,
     quiet: Quiet = False,
@@ -41,13 +45,19 @@ def demo(
     Exit status: 0 the figures show an improvement, 1 they do not or something failed, 2 called wrongly.
     """
     shown = display.of(context, quiet=quiet, verbose=verbose)
+    with files.as_usage():
+        blind.estimators.create(estimator)
     _refuse_what_others_wrote(output, force=force)
     from app.demo.run import run  # noqa: PLC0415 - only this command needs the simulation
 
     before = _digests(output)
     began = time.monotonic()
     try:
-        improved = run(output, lambda text, left: shown.progress_line(text, time.monotonic() - began, left))
+        improved = run(
+            output,
+            lambda text, left: shown.progress_line(text, time.monotonic() - began, left),
+            estimator=estimator,
+        )
     finally:
         _mark(output, before)
     if json_output:

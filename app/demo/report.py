@@ -26,6 +26,7 @@ class Report:
     chart_after: dict[Zone, Sharpness] = field(default_factory=dict)
     answers: list[tuple[float, float, int, float | None]] = field(default_factory=list)
     real: dict[str, Any] = field(default_factory=dict)
+    estimator: str = "default"
     seconds: float = 0.0
 
     @property
@@ -45,7 +46,8 @@ class Report:
             "# What the demo measured",
             "",
             f"Lens: {self.lens}, at f/{self.aperture:g}, simulated, so that the truth is known. The photo "
-            f"that it was never calibrated with became **{verdict}** in center and corner.",
+            f"that it was never calibrated with became **{verdict}** in center and corner. "
+            f"Blind estimator: {self.estimator}.",
             "",
             "| photos learned from | PSF error center / mid / corner | PSNR center / mid / corner (dB) |",
             "| --- | --- | --- |",

@@ -22,7 +22,7 @@ from lensmodel.simulate import demo_data_path
 REAL_RAW = "canon_kissx4_colorchart.dng"
 
 
-def run(output: Path, tell: Tell) -> bool:
+def run(output: Path, tell: Tell, *, estimator: str = "default") -> bool:
     """Run the demo; return whether the figures show an improvement.
 
     Parameters
@@ -31,6 +31,8 @@ def run(output: Path, tell: Tell) -> bool:
         Folder for what it leaves behind; files of an earlier demo there are replaced.
     tell : callable
         Takes one line of progress at a time, and the seconds that are left.
+    estimator : str
+        Blind estimator by which the lens is learned.
     """
     output.mkdir(parents=True, exist_ok=True)
     stages = Stages(tell)
@@ -48,11 +50,12 @@ def run(output: Path, tell: Tell) -> bool:
             ),
         )
         stages.begin("start", "Starting the service ...")
-        with own_service(work / "data", output / "service.log") as client:
+        settings = {"LENS_ESTIMATOR": estimator}
+        with own_service(work / "data", output / "service.log", settings) as client:
             report = _simulated(client, shots, work, output, stages)
             _real(client, report, work, output, stages)
             stages.finish("Stopping the service ...")
-    report.seconds = time.monotonic() - began
+    report.estimator, report.seconds = estimator, time.monotonic() - began
     report.write(output)
     stages.finish(f"Report: {output / 'report.md'}")
     return report.improved

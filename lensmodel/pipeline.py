@@ -26,7 +26,7 @@ from typing import Literal
 
 import numpy as np
 
-from lensmodel import blind, codec, deconv, patches, photo
+from lensmodel import blind, codec, deconv, patches, photo, quality
 from lensmodel.errors import (
     InvalidInputError,
     LensModelError,
@@ -433,6 +433,11 @@ def correct_photo(
         What to allow beside edges and in flat areas.
     roi : tuple of int, optional
         `(row, col, height, width)` in sensor orientation; only that part is corrected.
+
+    Returns
+    -------
+    Corrected
+        Of a chart, with what was measured on its edges (`find_edges`) in each zone.
     """
     model, pitch_um = model.warmed(), developed.info.metadata.pixel_pitch_um
     half_px, doubt = developed.frame.half_diagonal, Doubt(model)
@@ -450,7 +455,7 @@ def correct_photo(
         # As the paper did (section 8): the channels are warped first. All other methods carry the
         # shift in their PSFs and spare the picture that resampling.
         planes, lateral, cfa = resample(planes, developed.frame, lateral), None, None
-    return deconv.correct_planes(
+    corrected = deconv.correct_planes(
         planes,
         model.field(settings, pitch_um=pitch_um, half_diagonal_px=half_px),
         developed.frame,
@@ -466,6 +471,27 @@ def correct_photo(
         workers=workers,
         on_step=on_step,
     )
+    return _with_measured_gain(corrected, developed, roi)
+
+
+def _with_measured_gain(
+    corrected: deconv.Corrected, developed: LinearPhoto, roi: tuple[int, int, int, int] | None
+) -> deconv.Corrected:
+    """Say what the correction did to the edges of a chart, where the photo shows one."""
+    top, left, height, width = roi or (0, 0, developed.frame.height, developed.frame.width)
+    gains = quality.edge_gains(
+        developed.planes[1, top : top + height, left : left + width],
+        corrected.planes[1],
+        developed.frame,
+        origin=(top, left),
+        noise=developed.noise[1],
+        clip=developed.clip[1],
+    )
+    zones = {
+        zone: dataclasses.replace(report, measured=gains.get(zone))
+        for zone, report in corrected.zones.items()
+    }
+    return dataclasses.replace(corrected, zones=zones)
 
 
 def correct(

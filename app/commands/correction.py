@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,7 @@ from lensmodel import deconv, pipeline
 from lensmodel.errors import InvalidInputError, LensModelError
 from lensmodel.photo import OutputFormat
 from lensmodel.regression import LensProfile
-from lensmodel.types import LensSettings
+from lensmodel.types import LensSettings, Zone
 
 EXTENSION: Final[dict[OutputFormat, str]] = {
     "tiff16": ".tif",
@@ -81,6 +81,9 @@ def run(
                 display.note(f"{target} is there already and was left alone; --force replaces it")
             elif result["state"] == "corrected" and not as_json:
                 display.result(str(target))
+            if result["state"] == "corrected":
+                for line in measured(result["zones"]):
+                    display.note(f"{path.name}, {line}")
             results.append({"photo": str(path), "output": str(target), **result})
             bars.update(task, completed=number + 1)
     if as_json:
@@ -138,6 +141,17 @@ def _one(
         on_step=on_step,
     )
     return {"state": "corrected", "zones": corrected.zones}
+
+
+def measured(zones: Mapping[Zone, deconv.ZoneReport]) -> list[str]:
+    """Tell in words what the edges of a chart gained; nothing of any other photo."""
+    return [
+        f"{zone} of the chart: MTF50 from {seen.mtf50_before:.3f} to {seen.mtf50_after:.3f} cycles/pixel, "
+        f"{seen.gain:.1f} times (median of {seen.edges} edges), overshoot {seen.overshoot_after:.1f} %; "
+        f"predicted for a usual scene {report.gain_db:+.1f} dB"
+        for zone, report in zones.items()
+        if (seen := report.measured) is not None
+    ]
 
 
 def _named(profile: LensProfile) -> str:

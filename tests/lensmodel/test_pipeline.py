@@ -138,8 +138,11 @@ def test_json_refuses_what_it_could_not_read_back() -> None:
 def test_paper_method_warps_the_channels_before_it_corrects(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: dict[str, object] = {}
 
-    def record(planes: np.ndarray, *args: object, lateral: object, **rest: object) -> None:
+    def record(
+        planes: np.ndarray, *args: object, lateral: object, **rest: object
+    ) -> pipeline.deconv.Corrected:
         seen.update(planes=planes, lateral=lateral)
+        return pipeline.deconv.Corrected(planes, {})
 
     monkeypatch.setattr(pipeline.deconv, "correct_planes", record)
     monkeypatch.setattr(pipeline, "resample", lambda planes, *_: planes + 1)

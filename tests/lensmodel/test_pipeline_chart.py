@@ -1,0 +1,67 @@
+"""A corrected chart says how much sharper its edges are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from lensmodel import codec, photo, pipeline
+from lensmodel.geometry import Frame
+from lensmodel.photo import LinearPhoto
+from lensmodel.psf import PsfSample, gaussian
+from lensmodel.regression import LensModel
+from lensmodel.simulate import edge_chart
+from lensmodel.types import FieldPosition, LensSettings, NoiseModel, Planes
+
+FRAME = Frame(900, 1200)
+NOISE = NoiseModel.white(0.003)
+
+
+def developed(planes: Planes) -> LinearPhoto:
+    return LinearPhoto(
+        planes=planes,
+        frame=FRAME,
+        noise=(NOISE,) * 3,
+        clip=(1.0, 1.0, 1.0),
+        info=photo.PhotoInfo("tiff", FRAME.width, FRAME.height),
+        encoding=photo.Encoding(),
+        pipeline="test",
+    )
+
+
+@pytest.fixture(scope="module")
+def model() -> LensModel:
+    kernel = gaussian(15, np.eye(2) * 1.7)
+    places = [FieldPosition(r, phi) for r in (0.1, 0.5, 0.9) for phi in (-2.0, 0.5, 2.5)]
+    return LensModel.fit([PsfSample(kernel, place, photo="x") for place in places])
+
+
+def test_corrected_chart_has_a_measured_gain_in_each_zone_and_its_part_in_the_zones_of_the_part(
+    model: LensModel,
+) -> None:
+    scene = ndimage.gaussian_filter(edge_chart(FRAME).scene[1], 1.3)[40:-40, 40:-40]
+    noise = np.random.default_rng(1).normal(0.0, 0.003, (3, *scene.shape))
+    chart = developed((scene + noise).astype(np.float32))
+
+    whole = pipeline.correct_photo(chart, model, LensSettings(), method="fast")
+    part = pipeline.correct_photo(chart, model, LensSettings(), method="fast", roi=(0, 700, 420, 500))
+
+    for report in whole.zones.values():
+        assert report.measured is not None
+        assert report.measured.edges >= 2
+        assert report.measured.gain > 1.3
+    assert part.zones["corner"].measured is not None
+    stored = codec.to_json(whole.zones)
+    assert stored["corner"]["measured"]["mtf50_after"] > stored["corner"]["measured"]["mtf50_before"]
+
+
+def test_corrected_photo_without_a_chart_has_no_measured_gain(model: LensModel) -> None:
+    rng = np.random.default_rng(2)
+    grain = ndimage.gaussian_filter(rng.random((3, FRAME.height, FRAME.width)), (0, 2, 2)).astype(np.float32)
+
+    found = pipeline.correct_photo(
+        developed(grain), model, LensSettings(), method="fast", roi=(300, 400, 200, 300)
+    )
+
+    assert {report.measured for report in found.zones.values()} == {None}

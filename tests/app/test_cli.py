@@ -276,6 +276,7 @@ REFUSED = {
     "export format": (["export", PROFILE, "-o", "new.bmp", "--format", "bmp"], 2, "known: csv, fits, json"),
     "report of nothing": (["report", "gone"], 2, "no lens profile at gone; make it"),
     "demo into a file": (["demo", "-o", "bad"], 2, "bad is a file"),
+    "demo by no estimator": (["demo", "--estimator", "x"], 2, "no estimator 'x'; known: .*default"),
     "bench json there": (["bench", "model", "--json", "there.npy"], 2, "there.npy is there already; --force"),
 }
 
@@ -329,7 +330,8 @@ def shown_off(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Put a demo in place of the real one that writes two files at once, and counts its runs."""
     runs: list[int] = []
 
-    def run(output: Path, tell: Callable[[str, float | None], None]) -> bool:
+    def run(output: Path, tell: Callable[[str, float | None], None], *, estimator: str) -> bool:
+        assert estimator == "default"
         runs.append(len(runs))
         tell("working", 83.4)
         tell("done", None)

@@ -25,6 +25,9 @@ from rich.progress import (
 
 from lensmodel.codec import to_json
 
+COMPILING = "lensmodel.deconv.engine.first_use"
+"""Logs when loops are compiled, once on a machine."""
+
 LONG_S = 3600.0
 """Speed is taken over so many seconds: one step may take minutes, and the default forgets in 30 s."""
 
@@ -59,6 +62,8 @@ class Display:
             stream=sys.stderr,
             force=True,
         )
+        if not self.quiet and sys.stderr.isatty():  # so long a silence looks like a fault
+            logging.getLogger(COMPILING).setLevel(logging.INFO)
 
     def result(self, text: str) -> None:
         """Print what was asked for."""

@@ -8,11 +8,17 @@ import logging
 import threading
 from functools import cache
 from types import ModuleType
-from typing import Literal
+from typing import Final, Literal
 
 Engine = Literal["auto", "numpy"]
 
+COMPILE_S: Final = 30
+"""Seconds that compiling takes on a usual machine."""
+
 logger = logging.getLogger(__name__)
+first_use = logging.getLogger(f"{__name__}.first_use")
+"""Says when loops are compiled: a time in which nothing else is to be seen."""
+
 _loading = threading.Lock()
 
 
@@ -29,5 +35,24 @@ def _load() -> ModuleType | None:
     if importlib.util.find_spec("numba") is None or importlib.util.find_spec("rocket_fft") is None:
         logger.info("numba or rocket-fft is missing: correcting with SciPy, about half as fast")
         return None
-    logger.info("loading the compiled tile engine; the first run on a machine compiles it, some 20 seconds")
+    tell_of_compiling()
     return importlib.import_module("lensmodel.deconv.compiled")
+
+
+def tell_of_compiling() -> None:
+    """Log once when Numba compiles; loading what was compiled before is no such event."""
+    event = importlib.import_module("numba.core.event")
+
+    class Teller(event.Listener):  # type: ignore[misc, name-defined] # Numba has no types
+        told = False
+
+        def on_start(self, event: object) -> None:
+            del event
+            if not self.told:
+                self.told = True
+                first_use.info("compiling the inner loops, once on this machine: about %d s", COMPILE_S)
+
+        def on_end(self, event: object) -> None:
+            """Nothing is said of the end: the progress shows it."""
+
+    event.register("numba:compile", Teller())

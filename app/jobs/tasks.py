@@ -18,6 +18,7 @@ import numpy as np
 from app.jobs.child import Progress, Task
 from app.jobs.handover import EVIDENCE, FAMILY, INFINITY, KERNELS, LEARNED, SAMPLES, SUFFIX
 from lensmodel import codec, deconv, photo, pipeline
+from lensmodel.deconv.engine import first_use
 from lensmodel.errors import InvalidInputError, LensModelError
 from lensmodel.evidence import PatchEvidence
 from lensmodel.patches import Patch
@@ -111,6 +112,7 @@ def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
 
     What the model has learned of them is written there as well, where it was not known before.
     """
+    _log_compiling()
     developed = pipeline.load_developed(Path(arguments["developed"]))
     stored = arguments["lateral"]
     lateral = _lateral(developed) if stored is None else codec.from_json(LateralColour, stored)
@@ -160,6 +162,15 @@ TASKS: Final[Mapping[str, Task]] = {
     "correct": correct,
     "measure": measure,
 }
+
+
+def _log_compiling() -> None:
+    """Write to the service's log when loops are compiled: a child logs nothing else below warnings."""
+    if not first_use.handlers:
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s task %(name)s: %(message)s"))
+        first_use.addHandler(handler)
+        first_use.setLevel(logging.INFO)
 
 
 def _lateral(developed: photo.LinearPhoto) -> LateralColour | None:

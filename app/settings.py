@@ -14,6 +14,8 @@ from typing import Literal
 from pydantic import Field, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from lensmodel.errors import UnknownMethodError
+
 PREFIX = "LENS_"
 MIB = 1024 * 1024
 
@@ -120,6 +122,18 @@ class Settings(BaseSettings):
     def _odd_kernel(self) -> Settings:
         if self.kernel_size % 2 == 0:
             raise ValueError(f"kernel_size must be odd, got {self.kernel_size}")
+        return self
+
+    @model_validator(mode="after")
+    def _known_estimator(self) -> Settings:
+        if self.estimator != "default":
+            # not at the top: heavy, and most processes never ask for another one
+            from lensmodel.blind import estimators  # noqa: PLC0415
+
+            try:
+                estimators.create(self.estimator)
+            except UnknownMethodError as error:
+                raise ValueError(str(error)) from error
         return self
 
     @model_validator(mode="after")

@@ -344,6 +344,9 @@ def test_a_port_open_to_the_world_needs_a_word(monkeypatch: pytest.MonkeyPatch) 
 
     with pytest.raises(ValueError, match="LENS_PUBLIC"):
         Settings()
+    with pytest.raises(ValueError, match="no estimator 'nothing'; known: .*whittle"):
+        Settings(estimator="nothing")
+    assert Settings(estimator="whittle").estimator == "whittle"
 
 
 def test_a_database_server_needs_shared_storage() -> None:

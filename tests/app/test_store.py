@@ -344,7 +344,10 @@ def test_a_port_open_to_the_world_needs_a_word(monkeypatch: pytest.MonkeyPatch) 
 
     with pytest.raises(ValueError, match="LENS_PUBLIC"):
         Settings()
-    with pytest.raises(ValueError, match="no estimator 'nothing'; known: .*whittle"):
+
+
+def test_an_unknown_estimator_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(ValueError, match=r"no estimator 'nothing'; known: .*whittle"):
         Settings(estimator="nothing")
     assert Settings(estimator="whittle").estimator == "whittle"
 

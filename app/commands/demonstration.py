@@ -35,7 +35,7 @@ def demo(
     """Show the whole way on a real RAW file and on a lens whose truth is known.
 
     Starts a service of its own, uploads photos, calibrates their lens, corrects a photo, measures,
-    and stops the service: about five minutes on two cores. What an earlier demo left in the folder
+    and stops the service: about six minutes on two cores. What an earlier demo left in the folder
     is renewed; a folder with anything else in it is refused without --force.
 
     Example:

@@ -10,7 +10,32 @@ from lensmodel.deconv.compiled_base import BACK, FORWARD, ONE, ZERO, Complex, Re
 
 
 @jit
-def one_pass(  # noqa: C901, PLR0915 - one pass over memory for both contrasts
+def _restored(
+    out: Real,
+    i: int,
+    j: int,
+    gain: tuple[np.float32, np.float32, np.float32],
+    seen: tuple[np.float32, np.float32, np.float32, np.float32, np.float32, np.float32],
+    luma: np.float32,
+    chroma: np.float32,
+) -> None:
+    """Solve (diag(gain + chroma) + (luma - chroma) / 3 1 1') x = seen at a frequency, by Sherman and Morrison.
+
+    `out`, shape (3, rows, 2 cols), and `seen` hold real and imaginary parts in turn.
+    """
+    g = (luma - chroma) / np.float32(3.0)
+    u, v, w = ONE / (gain[0] + chroma), ONE / (gain[1] + chroma), ONE / (gain[2] + chroma)
+    t = g / (ONE + g * (u + v + w))
+    for part in range(2):
+        p, q, r = seen[part], seen[2 + part], seen[4 + part]
+        common = (p * u + q * v + r * w) * t
+        out[0, i, j + part] = (p - common) * u
+        out[1, i, j + part] = (q - common) * v
+        out[2, i, j + part] = (r - common) * w
+
+
+@jit
+def one_pass(  # noqa: C901 - one pass over memory for both contrasts
     x: Real,
     y: Real,
     K: Complex,
@@ -66,22 +91,9 @@ def one_pass(  # noqa: C901, PLR0915 - one pass over memory for both contrasts
             qi = (br * yy[1, i, im] - bi * yy[1, i, re]) * n1
             rr = (dr * yy[2, i, re] + di * yy[2, i, im]) * n2
             ri = (dr * yy[2, i, im] - di * yy[2, i, re]) * n2
-            s = decay[i, j] * chromas[0]
-            g = decay[i, j] * ((lumas[0] - chromas[0]) / np.float32(3.0))
-            u, v, w = ONE / (a + s), ONE / (b + s), ONE / (d + s)
-            t = g / (ONE + g * (u + v + w))
-            tr, ti = (pr * u + qr * v + rr * w) * t, (pi * u + qi * v + ri * w) * t
-            xx[0, i, re], xx[0, i, im] = (pr - tr) * u, (pi - ti) * u
-            xx[1, i, re], xx[1, i, im] = (qr - tr) * v, (qi - ti) * v
-            xx[2, i, re], xx[2, i, im] = (rr - tr) * w, (ri - ti) * w
-            s = decay[i, j] * chromas[1]
-            g = decay[i, j] * ((lumas[1] - chromas[1]) / np.float32(3.0))
-            u, v, w = ONE / (a + s), ONE / (b + s), ONE / (d + s)
-            t = g / (ONE + g * (u + v + w))
-            tr, ti = (pr * u + qr * v + rr * w) * t, (pi * u + qi * v + ri * w) * t
-            zz[0, i, re], zz[0, i, im] = (pr - tr) * u, (pi - ti) * u
-            zz[1, i, re], zz[1, i, im] = (qr - tr) * v, (qi - ti) * v
-            zz[2, i, re], zz[2, i, im] = (rr - tr) * w, (ri - ti) * w
+            w = decay[i, j]
+            _restored(xx, i, re, (a, b, d), (pr, pi, qr, qi, rr, ri), w * lumas[0], w * chromas[0])
+            _restored(zz, i, re, (a, b, d), (pr, pi, qr, qi, rr, ri), w * lumas[1], w * chromas[1])
     for c in range(3):
         X[c, 0, 0] = Y[c, 0, 0]
         Z[c, 0, 0] = Y[c, 0, 0]

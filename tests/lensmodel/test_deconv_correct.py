@@ -165,8 +165,10 @@ def test_border_is_restored_like_the_inside_from_the_fourth_pixel_on() -> None:
     assert left["rim"] < 1.25 * left["inside"]
 
 
-@pytest.mark.parametrize("method", ["fast", "standard"])
-def test_light_from_beyond_the_frame_leaves_no_ripples_at_the_border_of_a_soft_lens(method: str) -> None:
+@pytest.mark.parametrize(("method", "bound"), [("fast", 1.06), ("standard", 1.15)])
+def test_light_from_beyond_the_frame_leaves_no_ripples_at_the_border_of_a_soft_lens(
+    method: str, bound: float
+) -> None:
     lens = Soft(2.5, 2.5)
     seen, sharp = photo(lens, BASE)
 
@@ -178,7 +180,7 @@ def test_light_from_beyond_the_frame_leaves_no_ripples_at_the_border_of_a_soft_l
         rmse(restored[:, where], sharp[:, where]) / rmse(seen[:, where], sharp[:, where])
         for where in (~inside, inside)
     )
-    assert border < 1.2 * middle
+    assert border < bound * middle
 
 
 def test_result_hardly_depends_on_the_size_of_the_cells() -> None:

@@ -19,7 +19,7 @@ def _restored(
     luma: np.float32,
     chroma: np.float32,
 ) -> None:
-    """Solve (diag(gain + chroma) + (luma - chroma) / 3 1 1') x = seen at a frequency, by Sherman and Morrison.
+    """Solve (diag(gain + chroma) + (luma - chroma) / 3 1 1') x = seen of a frequency (Sherman, Morrison).
 
     `out`, shape (3, rows, 2 cols), and `seen` hold real and imaginary parts in turn.
     """

@@ -157,7 +157,8 @@ class Wavefront:
         for _ in range(_STEPS):
             fine, away, gap = grid.fine_light(g, amplitude), still, math.inf
             for _ in range(_MOVES):
-                light = grid.binned(fine, size, away)
+                # where light is narrower than the fine grid, a cubic between its samples dips below zero
+                light = np.maximum(grid.binned(fine, size, away), 0.0)
                 found = np.array(centroid(light))
                 gap, away = math.hypot(*found), away + found
                 if gap < _CENTRED_PX or np.abs(away).max() > _SPARE:

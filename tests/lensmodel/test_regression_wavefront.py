@@ -129,3 +129,14 @@ def test_a_kernel_whose_centre_goes_to_and_fro_is_rendered_all_the_same() -> Non
 
     assert kernel.sum() == pytest.approx(1.0)
     assert math.hypot(*centroid(kernel)) < 0.01
+
+
+def test_light_narrower_than_the_fine_grid_is_never_negative() -> None:
+    terms = [-0.045, 0.106, -0.494, 0.164, 0.032, 0.081, -0.174, 0.053, -0.465, -0.503]
+    terms += [-0.114, 0.113, 0.222, -0.165, 0.015, -0.159, -0.065, 0.186, -0.176]
+    front = Wavefront(np.array(terms), -1.532, (0.901, 0.124), 1.8, 11)
+
+    kernel = front.kernel(FieldPosition(0.9, -2.58), LensSettings(aperture=1.8, focal_mm=35.0), 31)
+
+    assert kernel.min() >= 0.0
+    assert math.hypot(*centroid(kernel)) < 0.01

@@ -117,6 +117,28 @@ class UniformBlur:
         back = fft.irfft2(spectrum, shape)[: latent.shape[0], : latent.shape[1]]
         return np.ascontiguousarray(back, dtype=np.float32)
 
+    def covered(self, shape: tuple[int, ...]) -> Plane:
+        """Share of the light of each latent point that falls into a frame of `shape`: F^T 1.
+
+        A point sees a rectangle of the kernel, so that its sums from one corner on tell all, and no
+        transform is needed. A shift by parts of a pixel does need one.
+        """
+        if self.offset != (0.0, 0.0):
+            return self.adjoint(np.ones(shape, dtype=np.float32))
+        side = self.kernel.shape[0]
+        sums = np.pad(self.kernel.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+        (above, below), (before, after) = (
+            (
+                np.clip(side - 1 - np.arange(extent + side - 1), 0, side),
+                np.clip(side - 1 - np.arange(extent + side - 1) + extent, 0, side),
+            )
+            for extent in shape
+        )
+        inside = sums[np.ix_(below, after)] - sums[np.ix_(above, after)]
+        return np.asarray(
+            inside - sums[np.ix_(below, before)] + sums[np.ix_(above, before)], dtype=np.float32
+        )
+
     def frame(self, latent: Plane) -> Plane:
         """Return the part of the latent plane that the photo shows."""
         cut = self.reach

@@ -10,6 +10,7 @@ from typing import Any, Final, TypeVar, cast
 
 import numba
 import numpy as np
+import rocket_fft
 from numpy.typing import NDArray
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -30,3 +31,21 @@ def jit(function: F) -> F:
             cache=True, nogil=True, fastmath={"nsz", "contract", "reassoc", "arcp"}, error_model="numpy"
         )(function),
     )
+
+
+@jit
+def to_spectrum(plane: Real, spectrum: Complex) -> None:
+    """Real transform of a plane, rows first.
+
+    Rows and columns are transformed one after the other because one call for both ways back allocates
+    its own memory: to and fro takes 0.91 to 0.93 of the time so.
+    """
+    rocket_fft.r2c(plane, spectrum, np.array([1]), FORWARD, 1.0, 1)
+    rocket_fft.c2c(spectrum, spectrum, np.array([0]), FORWARD, 1.0, 1)
+
+
+@jit
+def to_plane(spectrum: Complex, plane: Real) -> None:
+    """The way back, one over the number of pixels included; `spectrum` is lost."""
+    rocket_fft.c2c(spectrum, spectrum, np.array([0]), BACK, 1.0, 1)
+    rocket_fft.c2r(spectrum, plane, np.array([1]), BACK, 1.0 / plane.size, 1)

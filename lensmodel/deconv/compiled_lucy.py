@@ -7,7 +7,17 @@ from typing import Final
 import numpy as np
 import rocket_fft
 
-from lensmodel.deconv.compiled_base import BACK, FORWARD, ONE, ZERO, Complex, Real, jit
+from lensmodel.deconv.compiled_base import (
+    BACK,
+    FORWARD,
+    ONE,
+    ZERO,
+    Complex,
+    Real,
+    jit,
+    to_plane,
+    to_spectrum,
+)
 
 _EPS: Final = np.float32(1e-6)
 _LIGHT: Final = np.float32(0.9)
@@ -84,7 +94,59 @@ def _lights(  # noqa: C901, PLR0912 - a few passes over one small tile
 
 
 @jit
-def richardson_lucy(  # noqa: C901, PLR0912, PLR0915 - one pass over memory per loop
+def through(
+    work: Real, P: Complex, K: Complex, forward: bool, first: int, last: int, begin: int, end: int
+) -> None:
+    """Blur a plane on its canvas, or what is adjoint to that, in place.
+
+    Light stands in rows `first` to `last` alone, and only rows `begin` to `end` are made; the others hold
+    anything. Rows that are empty or will not be looked at are left out of the transforms along rows.
+    """
+    height, half = K.shape
+    down, across = np.array([0]), np.array([1])
+    norm = ONE / np.float32(height * work.shape[1])
+    P[:first] = 0
+    P[last:] = 0
+    rocket_fft.r2c(work[first:last], P[first:last], across, FORWARD, 1.0, 1)
+    rocket_fft.c2c(P, P, down, FORWARD, 1.0, 1)
+    if forward:
+        for i in range(height):
+            for j in range(half):
+                P[i, j] = P[i, j] * (K[i, j] * norm)
+    else:
+        for i in range(height):
+            for j in range(half):
+                P[i, j] = P[i, j] * (np.conj(K[i, j]) * norm)
+    rocket_fft.c2c(P, P, down, BACK, 1.0, 1)
+    rocket_fft.c2r(P[begin:end], work[begin:end], across, BACK, 1.0, 1)
+
+
+@jit
+def _errors(light: Real, data: Real, base: float, clip: float, sharpness: float) -> None:
+    """Error of what a row of light predicts, in place: ( data / (R + base) - 1 ) R'."""
+    bend_from = np.float32(0.7) * clip
+    brightest = ZERO
+    for j in range(light.size):
+        brightest = max(brightest, light[j])
+    if brightest <= bend_from:  # no branch in the loop: several pixels at a time
+        for j in range(light.size):
+            light[j] = data[j] / max(max(light[j], ZERO) + base, _EPS) - ONE
+        return
+    for j in range(light.size):
+        predicted = max(light[j], ZERO)
+        if predicted > bend_from:
+            over = sharpness * (predicted / clip - ONE)
+            # Stable softplus: log(1 + e^x) = max(x, 0) + log1p(e^-|x|).
+            bend = max(over, ZERO) + np.log1p(np.exp(-abs(over)))
+            seen = clip * (predicted / clip - bend / sharpness)
+            slope = np.float32(0.5) * (ONE - np.tanh(np.float32(0.5) * over))
+            light[j] = (data[j] / max(seen + base, _EPS) - ONE) * slope
+        else:
+            light[j] = data[j] / max(predicted + base, _EPS) - ONE
+
+
+@jit
+def richardson_lucy(  # noqa: C901 - one pass over memory per loop
     latent: Real,
     data: Real,
     reach: Real,
@@ -102,80 +164,51 @@ def richardson_lucy(  # noqa: C901, PLR0912, PLR0915 - one pass over memory per 
     first corner, the data in the middle of the latent plane.
     """
     rows, cols = latent.shape
-    height, half = K.shape
     high, wide = data.shape
     top, left = (rows - high) // 2, (cols - wide) // 2
-    axes = np.array([0, 1])
-    norm = 1.0 / (height * width)
-    P = np.empty((height, half), np.complex64)
-    work = np.zeros((height, width), np.float32)
-    start = np.empty_like(latent)
-    previous = latent.copy()
-    clips = np.isfinite(clip)
+    bottom, right = top + high, left + wide
+    steps = alphas.shape[0]
+    P = np.empty(K.shape, np.complex64)
+    work = np.zeros((K.shape[0], width), np.float32)
+    calm = np.zeros_like(work) if lights else work
+    start = latent.copy()
+    work[:rows, :cols] = latent
+    share = ONE / reach
     clean = np.empty_like(data)
     soft = np.empty_like(latent)
-    calm = np.empty((height, width), np.float32)
-    for step in range(alphas.shape[0]):
-        alpha = alphas[step]
-        work[:] = ZERO
-        for i in range(rows):
-            for j in range(cols):
-                light = max(latent[i, j] + alpha * (latent[i, j] - previous[i, j]), _EPS)
-                start[i, j] = light
-                work[i, j] = light
-        rocket_fft.r2c(work, P, axes, FORWARD, 1.0, 1)
-        for i in range(height):
-            for j in range(half):
-                P[i, j] = P[i, j] * K[i, j]
-        rocket_fft.c2r(P, work, axes, BACK, norm, 1)
-        for i in range(height):
-            inside = top <= i < top + high
-            for j in range(width):
-                if inside and left <= j < left + wide:
-                    predicted = max(work[i, j], ZERO)
-                    if clips and predicted > np.float32(0.7) * clip:
-                        over = sharpness * (predicted / clip - ONE)
-                        # Stable softplus: log(1 + e^x) = max(x, 0) + log1p(e^-|x|).
-                        bend = max(over, ZERO) + np.log1p(np.exp(-abs(over)))
-                        seen = clip * (predicted / clip - bend / sharpness)
-                        slope = np.float32(0.5) * (ONE - np.tanh(np.float32(0.5) * over))
-                        work[i, j] = (data[i - top, j - left] / max(seen + base, _EPS) - ONE) * slope
-                    else:
-                        work[i, j] = data[i - top, j - left] / max(predicted + base, _EPS) - ONE
-                else:
-                    work[i, j] = ZERO
+    for step in range(steps):
+        through(work, P, K, FORWARD, 0, rows, top, bottom)
+        for i in range(high):
+            _errors(work[top + i, left:right], data[i], base, clip, sharpness)
+            work[top + i, :left] = ZERO
+            work[top + i, right:] = ZERO
         split = lights and _lights(start, np.float32(_LIGHT * clip), top, clean, soft)
         if split:
-            calm[:] = ZERO
             for i in range(high):
+                calm[top + i] = ZERO
                 for j in range(wide):
                     calm[i + top, j + left] = work[i + top, j + left] * clean[i, j]
-            rocket_fft.r2c(calm, P, axes, FORWARD, 1.0, 1)
-            for i in range(height):
-                for j in range(half):
-                    P[i, j] = P[i, j] * np.conj(K[i, j])
-            rocket_fft.c2r(P, calm, axes, BACK, norm, 1)
-        rocket_fft.r2c(work, P, axes, FORWARD, 1.0, 1)
-        for i in range(height):
-            for j in range(half):
-                P[i, j] = P[i, j] * np.conj(K[i, j])
-        rocket_fft.c2r(P, work, axes, BACK, norm, 1)
+            through(calm, P, K, BACK, top, bottom, 0, rows)
+        through(work, P, K, BACK, top, bottom, 0, rows)
         if split:
             for i in range(rows):
                 for j in range(cols):
                     work[i, j] = calm[i, j] + (work[i, j] - calm[i, j]) * soft[i, j]
+        alpha = alphas[step + 1] if step + 1 < steps else ZERO
         for i in range(rows):
             for j in range(cols):
-                update = max(ONE + work[i, j] / reach[i, j], ZERO)
-                previous[i, j] = latent[i, j]
-                latent[i, j] = max(start[i, j] * update, _EPS)
+                light = max(start[i, j] * max(ONE + work[i, j] * share[i, j], ZERO), _EPS)
+                ahead = max(light + alpha * (light - latent[i, j]), _EPS)
+                latent[i, j] = light
+                start[i, j] = ahead
+                work[i, j] = ahead
+            work[i, cols:] = ZERO
 
 
 @jit
 def bare_transforms(plane: Real, pairs: int) -> None:
     """Transform a plane to and fro, and nothing else: the floor that a benchmark compares with."""
-    axes = np.array([0, 1])
     spectrum = np.empty((plane.shape[0], plane.shape[1] // 2 + 1), np.complex64)
     for _ in range(pairs):
-        rocket_fft.r2c(plane, spectrum, axes, FORWARD, 1.0, 1)
-        rocket_fft.c2r(spectrum, plane, axes, BACK, 1.0 / plane.size, 1)
+        to_spectrum(plane, spectrum)
+        to_plane(spectrum, plane)

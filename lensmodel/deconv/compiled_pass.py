@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import rocket_fft
 from numpy.typing import NDArray
 
-from lensmodel.deconv.compiled_base import BACK, FORWARD, ONE, ZERO, Complex, Real, jit
+from lensmodel.deconv.compiled_base import ONE, ZERO, Complex, Real, jit, to_plane, to_spectrum
 
 
 @jit
@@ -49,13 +48,11 @@ def one_pass(  # noqa: C901 - one pass over memory for both contrasts
     """Filter three planes for two contrasts, `levels` of (luma, chroma), and mix by `busy` into `x`."""
     height, width = busy.shape
     half = width // 2 + 1
-    axes = np.array([0, 1])
-    norm = 1.0 / (height * width)
     Y = np.empty((3, height, half), np.complex64)
     X, Z = np.empty((3, height, half), np.complex64), np.empty((3, height, half), np.complex64)
     work = np.empty((height, width), np.float32)
     for c in range(3):
-        rocket_fft.r2c(y[c], Y[c], axes, FORWARD, 1.0, 1)
+        to_spectrum(y[c], Y[c])
     seen = np.float64(0.0)
     for i in range(height):
         part = ZERO
@@ -97,8 +94,8 @@ def one_pass(  # noqa: C901 - one pass over memory for both contrasts
     for c in range(3):
         X[c, 0, 0] = Y[c, 0, 0]
         Z[c, 0, 0] = Y[c, 0, 0]
-        rocket_fft.c2r(X[c], x[c], axes, BACK, norm, 1)
-        rocket_fft.c2r(Z[c], work, axes, BACK, norm, 1)
+        to_plane(X[c], x[c])
+        to_plane(Z[c], work)
         for i in range(height):
             for j in range(width):
                 x[c, i, j] = work[i, j] + busy[i, j] * (x[c, i, j] - work[i, j])

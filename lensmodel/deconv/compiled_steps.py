@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
-import rocket_fft
 from numpy.typing import NDArray
 
-from lensmodel.deconv.compiled_base import BACK, FORWARD, ONE, ZERO, Complex, Real, jit
+from lensmodel.deconv.compiled_base import ONE, ZERO, Complex, Real, jit, to_plane, to_spectrum
 
 _REACH: Final = np.float32(1.0 / 24.0)
 
@@ -123,13 +122,12 @@ def _wiener(
 @jit
 def _drifted(x: Real, drift: Complex, down: Real, across: Real, work: Real, D: Complex, E: Complex) -> None:
     """What the change of the kernel adds to the prediction, as a spectrum, into `E`."""
-    axes = np.array([0, 1])
     height, width = x.shape
     for way in range(2):
         for i in range(height):
             for j in range(width):
                 work[i, j] = x[i, j] * (down[i] if way == 0 else across[j])
-        rocket_fft.r2c(work, D, axes, FORWARD, 1.0, 1)
+        to_spectrum(work, D)
         for i in range(height):
             for j in range(D.shape[1]):
                 more = drift[way, i, j] * D[i, j]
@@ -169,8 +167,6 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
     """
     channels, height, width = x.shape
     half = width // 2 + 1
-    axes = np.array([0, 1])
-    norm = 1.0 / (height * width)
     X = np.empty((channels, height, half), np.complex64)
     E = np.zeros((channels if drift.shape[0] > 0 else 0, height, half), np.complex64)
     D = np.empty((height, half), np.complex64)
@@ -179,11 +175,11 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
     work = np.empty((height, width), np.float32)
     for c in range(channels):
         # Where the data are whole, X keeps their spectrum from here on, else that of the estimate.
-        rocket_fft.r2c(y[c], X[c], axes, FORWARD, 1.0, 1)
+        to_spectrum(y[c], X[c])
         _wiener(X[c], K[c], decay, likely, height * width, noise[c], variance[c], P)
         if not whole:
             X[c] = P
-        rocket_fft.c2r(P, x[c], axes, BACK, norm, 1)
+        to_plane(P, x[c])
     for step in range(couplings.shape[0]):
         pull_of(x, scale, factors[step], rotation, edge, steepness, terms, pull)
         for c in range(channels):
@@ -195,12 +191,12 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
                         P[i, j] = K[c, i, j] * X[c, i, j]
                 if drift.shape[0] > 0:
                     P += E[c]
-                rocket_fft.c2r(P, work, axes, BACK, norm, 1)
+                to_plane(P, work)
                 for i in range(height):
                     for j in range(width):
                         work[i, j] = y[c, i, j] - work[i, j] if known[c, i, j] else ZERO
-                rocket_fft.r2c(work, D, axes, FORWARD, 1.0, 1)
-            rocket_fft.r2c(pull[c], P, axes, FORWARD, 1.0, 1)
+                to_spectrum(work, D)
+            to_spectrum(pull[c], P)
             weight = couplings[step] * noise[c]
             if whole:
                 for i in range(height):
@@ -221,4 +217,4 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
                         found = power * X[c, i, j] + np.conj(k) * D[i, j]
                         P[i, j] = (found + weight * P[i, j]) * (ONE / (power + weight * smooth[i, j]))
                 X[c] = P
-            rocket_fft.c2r(P, x[c], axes, BACK, norm, 1)
+            to_plane(P, x[c])

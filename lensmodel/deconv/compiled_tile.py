@@ -113,3 +113,14 @@ def block_means(  # noqa: C901 - one pass over memory
                     luma[row, col] = total / size
                 else:
                     square[row, col] = total / size
+
+
+@jit
+def add(out: Real, rise: Real, run: Real, made: Real) -> None:
+    """Add planes times the product of a weight for each row and one for each column."""
+    channels, height, width = made.shape
+    for c in range(channels):
+        for i in range(height):
+            weight = rise[i]
+            for j in range(width):
+                out[c, i, j] += weight * run[j] * made[c, i, j]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from lensmodel.blur import Drift, UniformBlur, crop_to_support
 from lensmodel.deconv.base import CoarseMethod, Deconvolver, Sensor, restore_planes
 from lensmodel.deconv.canvas import fitted_halo
+from lensmodel.deconv.engine import compiled
 from lensmodel.deconv.lattice import Cell, Roi, cells, usual_pitch
 from lensmodel.deconv.limits import Bounds
 from lensmodel.deconv.methods import deconvolvers
@@ -355,10 +356,13 @@ def _add(out: Planes, window: Roi, cell: Cell, restored: Planes) -> None:
     bottom = min(cell.bottom, window.top + window.height)
     right = min(cell.right, window.left + window.width)
     rows, cols = slice(top - cell.top, bottom - cell.top), slice(left - cell.left, right - cell.left)
-    weight = np.outer(cell.rise[rows], cell.run[cols])
     target = (
         slice(None),
         slice(top - window.top, bottom - window.top),
         slice(left - window.left, right - window.left),
     )
-    out[target] += weight * restored[:, rows, cols]
+    loops = compiled("auto")
+    if loops is None:
+        out[target] += np.outer(cell.rise[rows], cell.run[cols]) * restored[:, rows, cols]
+    else:
+        loops.add(np.asarray(out[target]), cell.rise[rows], cell.run[cols], restored[:, rows, cols])

@@ -12,7 +12,9 @@ from scipy import ndimage
 
 from lensmodel.blur import UniformBlur
 from lensmodel.deconv.base import Sensor
-from lensmodel.deconv.engine import Engine
+from lensmodel.deconv.clipped import Region, around, regions
+from lensmodel.deconv.compiled_blur import CompiledBlur
+from lensmodel.deconv.engine import Engine, compiled
 from lensmodel.deconv.richardson_lucy import climbed, first_guess
 from lensmodel.types import Planes
 
@@ -63,21 +65,21 @@ class Lights:
             x <- x ( 1 + F^T e / F^T 1[y < t] ),     e = ( y / R(F x) - 1 ) R'(F x)
 
         Divided by F^T 1 instead, lights of which little is measured take several times the steps.
+        Only around clipped pixels near measured ones: see `lensmodel.deconv.clipped.regions`.
         Positive and unrestrained, x is a poor picture, so only what lies above t is taken from it.
         """
         if not any(
             plane.max() >= np.float32(sensor.clip) for plane, sensor in zip(tile, sensors, strict=True)
         ):
             return None
-        clips = [blown(plane, sensor) for plane, sensor in zip(tile, sensors, strict=True)]
         rest, beyond, glow = tile.copy(), np.zeros_like(tile), np.zeros_like(tile)
-        for c, (clipped, blur, sensor) in enumerate(zip(clips, blurs, sensors, strict=True)):
-            if clipped.any():
-                rows, cols = (_around(clipped, axis, 2 * blur.reach) for axis in (0, 1))
-                here = (c, rows, cols)
-                rest[here], beyond[here], glow[here] = _split(
-                    tile[here], clipped[rows, cols], blur, sensor, steps, engine
-                )
+        loops = compiled(engine)
+        for c, (plane, blur, sensor) in enumerate(zip(tile, blurs, sensors, strict=True)):
+            clipped = blown(plane, sensor)
+            quick = CompiledBlur.of(blur, loops)
+            for region in regions(clipped, blur.reach):
+                _find(region, plane, clipped, quick, sensor, steps, engine, (rest[c], beyond[c], glow[c]))
+            rest[c] -= np.where(clipped, np.float32(0.0), glow[c])
         return cls(rest, beyond, glow, np.array([_spread(blur) for blur in blurs], dtype=np.float32))
 
     def put_back(self, photo: Planes, restored: Planes) -> Planes:
@@ -87,13 +89,22 @@ class Lights:
         the lens spreads the more of it comes back as a dark ring. So the result stays above a share of
         the darkest light nearby there.
         """
-        near = ndimage.maximum_filter(self.glow, (1, 5, 5), mode="nearest")
-        likely = np.maximum(self.rest, np.float32(0.0)) + _DOUBT * self.glow
+        made = restored + self.beyond
+        shining: NDArray[np.bool_] = np.asarray(self.glow.any(axis=0))
+        if not shining.any():
+            return np.asarray(made, dtype=np.float32)
+        # What the filters of 5 pixels see, and no more of the tile.
+        rows, cols = (around(shining, axis, 4) for axis in (0, 1))
+        here = (slice(None), rows, cols)
+        glow = self.glow[here]
+        near = ndimage.maximum_filter(glow, (1, 5, 5), mode="nearest")
+        likely = np.maximum(self.rest[here], np.float32(0.0)) + _DOUBT * glow
         darkest = ndimage.minimum_filter(likely, (1, 5, 5), mode="nearest")
-        glare = np.minimum(near / (_GLARE * np.maximum(photo, np.float32(1e-6))), np.float32(1.0))
+        glare = np.minimum(near / (_GLARE * np.maximum(photo[here], np.float32(1e-6))), np.float32(1.0))
         depth = (np.float32(_DARKEST) * self.spread)[:, None, None]
-        held = np.maximum(restored, depth * glare * darkest)
-        return np.asarray(np.where(glare > _NO_GLARE, held, restored) + self.beyond, dtype=np.float32)
+        held = np.maximum(restored[here], depth * glare * darkest)
+        made[here] = np.where(glare > _NO_GLARE, held, restored[here]) + self.beyond[here]
+        return np.asarray(made, dtype=np.float32)
 
 
 def blown(plane: NDArray[np.float32], sensor: Sensor) -> NDArray[np.bool_]:
@@ -108,27 +119,26 @@ def _spread(blur: UniformBlur) -> float:
     return 1.0 - float(blur.kernel[near, near].sum())
 
 
-def _around(marked: NDArray[np.bool_], axis: int, reach: int) -> slice:
-    """From `reach` before the first mark along an axis to `reach` after the last."""
-    at = np.flatnonzero(marked.any(axis=1 - axis))
-    return slice(max(int(at[0]) - reach, 0), int(at[-1]) + reach + 1)
-
-
-def _split(
+def _find(
+    region: Region,
     plane: NDArray[np.float32],
     clipped: NDArray[np.bool_],
     blur: UniformBlur,
     sensor: Sensor,
     steps: int,
     engine: Engine,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Rest, light beyond saturation and its glow, of one colour."""
-    latent, reach = first_guess(plane, blur)
-    seen = np.minimum(blur.adjoint((~clipped).astype(np.float32)), reach)
+    into: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
+) -> None:
+    """Find the light of one region of one colour; add it to `into`: rest, light beyond saturation, glow."""
+    rest, beyond, glow = into
+    here = region.seen
+    data, lost = plane[here], clipped[here]
+    latent, reach = first_guess(data, blur)
+    seen = np.minimum(blur.adjoint((~lost).astype(np.float32)), reach)
     seen = np.maximum(seen, np.float32(_LEAST_SEEN * float(reach.max())))
     latent = climbed(
         latent,
-        plane,
+        data,
         seen,
         blur,
         sensor,
@@ -136,13 +146,13 @@ def _split(
         sharpness=_SHARPNESS,
         engine=engine,
     )
-    beyond = np.maximum(latent - np.float32(sensor.clip), 0.0)
-    # What shines too far off to reach a clipped pixel is no concern of the tile's other side.
-    for axis in (0, 1):
-        marked = np.flatnonzero(clipped.any(axis=1 - axis))
-        lines = np.moveaxis(beyond, axis, 0)
-        lines[: int(marked[0])] = 0.0
-        lines[int(marked[-1]) + 2 * blur.reach + 1 :] = 0.0
-    glow = blur.forward(beyond)
-    filled = np.where(clipped, np.maximum(blur.forward(latent), 0.0), plane)
-    return filled - glow, np.ascontiguousarray(blur.frame(beyond)), glow
+    clip = np.float32(sensor.clip)
+    held = np.minimum(latent, clip)
+    # What shines too far off to reach a clipped pixel, or nearer to those of another region, is no concern.
+    own = np.zeros_like(latent)
+    own[region.own] = (latent - held)[region.own]
+    glow[here] += blur.forward(own)
+    beyond[here] += blur.frame(own)
+    answered = np.zeros_like(lost)
+    answered[region.answers] = lost[region.answers]
+    rest[here][answered] = np.maximum(blur.forward(held), np.float32(0.0))[answered]

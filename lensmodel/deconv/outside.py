@@ -13,7 +13,8 @@ from scipy import fft
 from lensmodel.blur import UniformBlur
 from lensmodel.deconv.base import Sensor
 from lensmodel.deconv.canvas import Canvas
-from lensmodel.deconv.engine import Engine
+from lensmodel.deconv.compiled_blur import CompiledBlur
+from lensmodel.deconv.engine import Engine, compiled
 from lensmodel.deconv.richardson_lucy import climbed, first_guess
 from lensmodel.types import Planes
 
@@ -54,14 +55,21 @@ def fill_outside(
     """
     outside = np.ones(canvas.shape, dtype=np.bool_)
     outside[canvas.data] = False
+    loops = compiled(engine)
     for c, (plane, blur, sensor) in enumerate(zip(tile, blurs, sensors, strict=True)):
         wide = blur.reach
         if wide > 0:
-            latent = _wider(plane, blur, sensor, steps, engine)
+            latent = _wider(plane, CompiledBlur.of(blur, loops), sensor, steps, engine)
             for axis in (0, 1):
                 lines = np.moveaxis(latent, axis, 0)
                 latent = np.moveaxis(Canvas.wrap(lines, canvas.margin - wide, canvas.shape[axis]), 0, axis)
-            seen = fft.irfft2(K[c] * fft.rfft2(latent / light[c]), canvas.shape)
+            latent = np.ascontiguousarray(latent / light[c])
+            if loops is None:
+                seen = fft.irfft2(K[c] * fft.rfft2(latent), canvas.shape)
+            else:
+                seen, rows = latent, canvas.shape[0]
+                room = np.empty_like(K[c])
+                loops.through(seen, room, K[c], forward=True, first=0, last=rows, begin=0, end=rows)
             y[c][outside] = seen[outside]
 
 

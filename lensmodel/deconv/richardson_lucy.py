@@ -214,7 +214,9 @@ def first_guess(blurred: Plane, blur: BlurOperator) -> tuple[Plane, Plane]:
     pixels that hardly touch the data must not explode; they start from the nearest data.
     """
     light = np.maximum(blurred, TINY)
-    reach = blur.adjoint(np.ones_like(blurred))
+    reach = (
+        blur.covered(blurred.shape) if isinstance(blur, UniformBlur) else blur.adjoint(np.ones_like(blurred))
+    )
     floor = _REACH_FLOOR * float(reach.max())
     wide = (reach.shape[0] - blurred.shape[0]) // 2
     start = np.where(

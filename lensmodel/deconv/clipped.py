@@ -1,0 +1,144 @@
+"""Where in a tile the light of clipped pixels can be found, cut into regions that cost little."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+_BLOCK: Final = 8
+"""Side in pixels of the blocks of which regions are made."""
+
+_FIXED: Final = 5000
+"""What a region costs beside its pixels, in pixels: calls on small arrays, tables of its own size."""
+
+Window = tuple[slice, slice]
+_Span = tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """A part of a tile whose lights are found together.
+
+    Parameters
+    ----------
+    seen : tuple of slice
+        The data that tell, in pixels of the tile.
+    own : tuple of slice
+        The light that this region alone answers for, in pixels of the latent plane, wider than `seen` by
+        the reach of the blur on each side.
+    answers : tuple of slice
+        The clipped pixels that it answers for, in pixels of `seen`.
+    """
+
+    seen: Window
+    own: Window
+    answers: Window
+
+
+def regions(clipped: NDArray[np.bool_], reach: int) -> list[Region]:
+    """Cut clipped pixels into regions.
+
+    Light tells of itself on measured pixels only: those further inside a blown area than twice the blur's
+    reach are left as they are. The rest is cut along gaps, or in the middle, as long as the pieces
+    with twice the reach around them are cheaper than the whole.
+
+    Parameters
+    ----------
+    clipped : ndarray of bool, shape (rows, cols)
+        Pixels of which only a lower bound is known.
+    reach : int
+        Reach of the blur in pixels.
+    """
+    if not clipped.any():
+        return []
+    told = _blocks(~clipped)
+    if not told.any():
+        return []
+    near = 2 * (-(-2 * reach // _BLOCK)) + 1
+    active = _blocks(clipped) & ndimage.binary_dilation(told, np.ones((near, near), dtype=np.bool_))
+    everything = ((0, active.shape[0]), (0, active.shape[1]))
+    found = _cut(active, everything, 6 * reach)[1]
+    return [_region(piece, tight, clipped.shape, active.shape, reach) for piece, tight in found]
+
+
+def around(marked: NDArray[np.bool_], axis: int, reach: int) -> slice:
+    """From `reach` before the first mark along an axis to `reach` after the last."""
+    at = np.flatnonzero(marked.any(axis=1 - axis))
+    return slice(max(int(at[0]) - reach, 0), int(at[-1]) + reach + 1)
+
+
+def _blocks(marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Whether any pixel of a block is marked."""
+    rows, cols = (np.arange(0, extent, _BLOCK) for extent in marked.shape)
+    return np.logical_or.reduceat(np.logical_or.reduceat(marked, rows, axis=0), cols, axis=1)
+
+
+def _cut(
+    active: NDArray[np.bool_], piece: tuple[_Span, _Span], rim: int
+) -> tuple[float, list[tuple[tuple[_Span, _Span], tuple[_Span, _Span]]]]:
+    """Cheapest pieces found, each with the least window around its active blocks, and what they cost."""
+    (top, bottom), (left, right) = piece
+    part = active[top:bottom, left:right]
+    rows, cols = np.flatnonzero(part.any(axis=1)), np.flatnonzero(part.any(axis=0))
+    if rows.size == 0:
+        return 0.0, []
+    tight = (
+        (top + int(rows[0]), top + int(rows[-1]) + 1),
+        (left + int(cols[0]), left + int(cols[-1]) + 1),
+    )
+    whole = _cost(tight, rim)
+    best: tuple[float, list[tuple[tuple[_Span, _Span], tuple[_Span, _Span]]]] = (whole, [(piece, tight)])
+    if whole <= 2 * _cost(((0, 1), (0, 1)), rim):
+        return best
+    for axis, marks in ((0, rows), (1, cols)):
+        at = piece[axis][0] + _where(marks)
+        if at > piece[axis][0]:
+            one = ((top, at), (left, right)) if axis == 0 else ((top, bottom), (left, at))
+            two = ((at, bottom), (left, right)) if axis == 0 else ((top, bottom), (at, right))
+            first = _cut(active, one, rim)
+            if first[0] < best[0]:
+                second = _cut(active, two, rim)
+                if first[0] + second[0] < best[0]:
+                    best = first[0] + second[0], first[1] + second[1]
+    return best
+
+
+def _where(marks: NDArray[np.intp]) -> int:
+    """Where to cut: in the middle of the widest gap, or of the whole; 0 where that is no cut."""
+    gaps = np.diff(marks)
+    if gaps.size and gaps.max() > 1:
+        widest = int(gaps.argmax())
+        return int(marks[widest] + marks[widest + 1] + 1) // 2
+    return int(marks[0] + marks[-1] + 1) // 2 if marks.size > 1 else 0
+
+
+def _cost(tight: tuple[_Span, _Span], rim: int) -> float:
+    """Pixels of the plane on which a piece is solved, and what it costs beside."""
+    high, wide = (_BLOCK * (last - first) + rim for first, last in tight)
+    return float(high * wide + _FIXED)
+
+
+def _region(
+    piece: tuple[_Span, _Span],
+    tight: tuple[_Span, _Span],
+    shape: tuple[int, ...],
+    blocks: tuple[int, ...],
+    reach: int,
+) -> Region:
+    """The windows of a piece, in pixels."""
+    seen, own, answers = [], [], []
+    for (first, last), (low, high), extent, count in zip(piece, tight, shape, blocks, strict=True):
+        # A piece at the tile's rim answers for the light beyond it as well.
+        begin = low * _BLOCK - reach if first == 0 else max(low * _BLOCK - reach, first * _BLOCK)
+        end = high * _BLOCK + reach if last == count else min(high * _BLOCK + reach, last * _BLOCK)
+        start = max(low * _BLOCK - 2 * reach, 0)
+        stop = min(high * _BLOCK + 2 * reach, extent)
+        end = min(end, extent + reach)
+        seen.append(slice(start, stop))
+        own.append(slice(begin + reach - start, end + reach - start))
+        answers.append(slice(max(begin - start, 0), end - start))
+    return Region((seen[0], seen[1]), (own[0], own[1]), (answers[0], answers[1]))

@@ -1,0 +1,137 @@
+"""Light beyond saturation: where it is looked for, and the compiled products it is found with."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from lensmodel.blur import UniformBlur
+from lensmodel.deconv.base import Sensor
+from lensmodel.deconv.clipped import Region, regions
+from lensmodel.deconv.compiled_blur import CompiledBlur
+from lensmodel.deconv.engine import compiled
+from lensmodel.deconv.lights import Lights
+from lensmodel.psf import gaussian
+from lensmodel.types import NoiseModel
+
+REACH = 4
+KERNEL = gaussian(2 * REACH + 1, np.eye(2) * 1.2)
+
+
+def lamps(*places: tuple[int, int], shape: tuple[int, int] = (160, 200), radius: float = 3.0) -> np.ndarray:
+    """Light of lamps of 8 times saturation over a dim slope, wider than `shape` by the reach."""
+    rows, cols = np.mgrid[: shape[0] + 2 * REACH, : shape[1] + 2 * REACH]
+    light = 0.1 + 0.1 * rows / shape[0]
+    for row, col in places:
+        light[np.hypot(rows - row - REACH, cols - col - REACH) < radius] = 8.0
+    return light.astype(np.float32)
+
+
+def answered(found: list[Region], shape: tuple[int, int]) -> np.ndarray:
+    """How many regions answer for each pixel."""
+    count = np.zeros(shape, dtype=int)
+    for region in found:
+        count[region.seen][region.answers] += 1
+    return count
+
+
+def owned(found: list[Region], shape: tuple[int, int]) -> np.ndarray:
+    """How many regions own the light of each pixel of the latent plane."""
+    count = np.zeros((shape[0] + 2 * REACH, shape[1] + 2 * REACH), dtype=int)
+    for region in found:
+        wide = tuple(slice(part.start, part.stop + 2 * REACH) for part in region.seen)
+        count[wide][region.own] += 1
+    return count
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_clipped_pixels_near_measured_ones_have_one_region_that_answers(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    field = ndimage.gaussian_filter(rng.standard_normal((170, 210)), (2, 4, 8, 16)[seed])
+    clipped = field > np.quantile(field, (0.995, 0.97, 0.8, 0.5)[seed])
+    found = regions(clipped, REACH)
+
+    count = answered(found, clipped.shape)
+    near = ndimage.maximum_filter(~clipped, 4 * REACH + 1)
+    assert count.max() == 1
+    assert (count[clipped & near] == 1).all()
+    assert owned(found, clipped.shape).max() == 1
+
+
+def test_lamps_far_apart_are_regions_of_their_own_and_cost_less() -> None:
+    clipped = np.zeros((400, 400), dtype=bool)
+    clipped[20:24, 30:33] = clipped[350:360, 340:350] = True
+
+    found = regions(clipped, REACH)
+
+    assert len(found) == 2
+    pixels = sum((r.seen[0].stop - r.seen[0].start) * (r.seen[1].stop - r.seen[1].start) for r in found)
+    assert pixels < 0.05 * clipped.size
+
+
+def test_the_inside_of_a_blown_area_is_left_alone() -> None:
+    clipped = np.zeros((300, 300), dtype=bool)
+    clipped[:, 100:] = True
+
+    count = answered(regions(clipped, REACH), clipped.shape)
+
+    assert count[:, 100 : 100 + 2 * REACH].all()
+    assert not count[:, 140:].any()
+
+
+@pytest.mark.parametrize("value", [False, True])
+def test_nothing_is_to_be_found_where_nothing_or_everything_is_clipped(value: bool) -> None:
+    assert regions(np.full((40, 50), value), REACH) == []
+
+
+def test_lamps_far_apart_shine_as_each_does_alone() -> None:
+    blur, sensor = UniformBlur(KERNEL), Sensor(NoiseModel(1e-5, 1e-6), 1.0)
+    both = np.minimum(blur.forward(lamps((40, 50), (120, 150))), 1.0)
+    one = np.minimum(blur.forward(lamps((40, 50))), 1.0)
+
+    found, alone = (Lights.of(plane[None], [blur], [sensor], 20, "auto") for plane in (both, one))
+
+    assert found is not None
+    assert alone is not None
+    here = (0, slice(0, 80), slice(0, 100))
+    np.testing.assert_allclose(found.beyond[here], alone.beyond[here], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(found.rest[here], alone.rest[here], atol=1e-5)
+
+
+def test_a_lamp_that_is_cut_by_two_regions_shines_like_a_whole_one() -> None:
+    """A long lamp is cut in the middle; its light there is that of its other parts."""
+    blur, sensor = UniformBlur(KERNEL), Sensor(NoiseModel(1e-5, 1e-6), 1.0)
+    light = lamps(shape=(60, 900))
+    light[30 + REACH : 36 + REACH, 40:860] = 3.0
+    seen = np.minimum(blur.forward(light), 1.0)
+
+    found = Lights.of(seen[None], [blur], [sensor], 20, "auto")
+
+    assert found is not None
+    along = found.beyond[0, 28:40].sum(axis=0)[100:800]
+    assert np.ptp(along) < 0.02 * along.mean()
+
+
+@pytest.mark.parametrize("shape", [(30, 41), (5, 60), (3, 3)])
+def test_covered_light_is_the_adjoint_of_a_frame_of_ones(shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(1)
+    kernel = rng.random((7, 7)) ** 3
+    for blur in (UniformBlur(kernel / kernel.sum()), UniformBlur(kernel / kernel.sum(), (0.3, -0.6))):
+        expected = blur.adjoint(np.ones(shape, dtype=np.float32))
+        np.testing.assert_allclose(blur.covered(shape), expected, atol=2e-6)
+
+
+@pytest.mark.parametrize("offset", [(0.0, 0.0), (0.4, -1.2)])
+def test_compiled_blur_gives_the_products_of_scipy(offset: tuple[float, float]) -> None:
+    pytest.importorskip("numba")
+    pytest.importorskip("rocket_fft")
+    rng = np.random.default_rng(2)
+    kernel = rng.random((9, 9)) ** 3
+    slow = UniformBlur(kernel / kernel.sum(), offset)
+    quick = CompiledBlur.of(slow, compiled("auto"))
+    latent = rng.random((60, 77), dtype=np.float32)
+    blurred = slow.forward(latent)
+
+    np.testing.assert_allclose(quick.forward(latent), blurred, atol=2e-6)
+    np.testing.assert_allclose(quick.adjoint(blurred), slow.adjoint(blurred), atol=2e-6)

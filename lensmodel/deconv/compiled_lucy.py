@@ -122,27 +122,33 @@ def through(
 
 
 @jit
-def _errors(light: Real, data: Real, base: float, clip: float, sharpness: float) -> None:
-    """Error of what a row of light predicts, in place: ( data / (R + base) - 1 ) R'."""
-    bend_from = np.float32(0.7) * clip
+def _errors(light: Real, data: Real, base: float, clip: float, bend: Real, first: float, last: float) -> None:
+    """Error of what a row of light predicts, in place: ( data / (R + base) - 1 ) R'.
+
+    `bend` holds R / clip and R' at even steps of light / clip from `first` to `last`; before, the sensor
+    answers light for light, beyond with `clip`. A logarithm and two exponentials for each pixel of
+    a blown area would take ten times as long as all transforms.
+    """
     brightest = ZERO
     for j in range(light.size):
         brightest = max(brightest, light[j])
-    if brightest <= bend_from:  # no branch in the loop: several pixels at a time
+    if brightest <= first * clip:  # no branch in the loop: several pixels at a time
         for j in range(light.size):
             light[j] = data[j] / max(max(light[j], ZERO) + base, _EPS) - ONE
         return
+    top = np.float32(bend.shape[1] - 1)
+    share, steps = ONE / clip, top / (last - first)
     for j in range(light.size):
         predicted = max(light[j], ZERO)
-        if predicted > bend_from:
-            over = sharpness * (predicted / clip - ONE)
-            # Stable softplus: log(1 + e^x) = max(x, 0) + log1p(e^-|x|).
-            bend = max(over, ZERO) + np.log1p(np.exp(-abs(over)))
-            seen = clip * (predicted / clip - bend / sharpness)
-            slope = np.float32(0.5) * (ONE - np.tanh(np.float32(0.5) * over))
-            light[j] = (data[j] / max(seen + base, _EPS) - ONE) * slope
-        else:
+        at = min((predicted * share - first) * steps, top)
+        if not at > ZERO:  # what is no number stays none
             light[j] = data[j] / max(predicted + base, _EPS) - ONE
+        else:
+            k = min(np.int32(at), np.int32(bend.shape[1] - 2))
+            part = at - np.float32(k)
+            seen = clip * (bend[0, k] + part * (bend[0, k + 1] - bend[0, k]))
+            slope = bend[1, k] + part * (bend[1, k + 1] - bend[1, k])
+            light[j] = (data[j] / max(seen + base, _EPS) - ONE) * slope
 
 
 @jit
@@ -153,7 +159,9 @@ def richardson_lucy(  # noqa: C901 - one pass over memory per loop
     K: Complex,
     base: float,
     clip: float,
-    sharpness: float,
+    bend: Real,
+    first: float,
+    last: float,
     alphas: Real,
     width: int,
     lights: bool,
@@ -161,7 +169,8 @@ def richardson_lucy(  # noqa: C901 - one pass over memory per loop
     """Accelerated saturation-aware steps; `latent` is start and result.
 
     The transforms live on the grid of `K`, `width` columns wide; the latent plane stands in its
-    first corner, the data in the middle of the latent plane.
+    first corner, the data in the middle of the latent plane. `bend`, `first` and `last` are those of
+    `_errors`.
     """
     rows, cols = latent.shape
     high, wide = data.shape
@@ -179,7 +188,7 @@ def richardson_lucy(  # noqa: C901 - one pass over memory per loop
     for step in range(steps):
         through(work, P, K, FORWARD, 0, rows, top, bottom)
         for i in range(high):
-            _errors(work[top + i, left:right], data[i], base, clip, sharpness)
+            _errors(work[top + i, left:right], data[i], base, clip, bend, first, last)
             work[top + i, :left] = ZERO
             work[top + i, right:] = ZERO
         split = lights and _lights(start, np.float32(_LIGHT * clip), top, clean, soft)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lensmodel.blur import Drift, UniformBlur, crop_to_support
 from lensmodel.deconv.base import CoarseMethod, Deconvolver, Sensor, restore_planes
 from lensmodel.deconv.canvas import fitted_halo
-from lensmodel.deconv.engine import compiled
+from lensmodel.deconv.engine import compiled, keep_freed_memory
 from lensmodel.deconv.lattice import Cell, Roi, cells, usual_pitch
 from lensmodel.deconv.limits import Bounds
 from lensmodel.deconv.methods import deconvolvers
@@ -209,6 +209,7 @@ def correct_planes(
         )
     window = Roi.of(frame, roi)
     shape = (len(CHANNELS), window.height, window.width)
+    keep_freed_memory()
     if out is None:
         out = np.zeros(shape, dtype=np.float32)
     elif out.shape != shape or out.dtype != np.float32:

@@ -10,10 +10,15 @@ from functools import cache
 from types import ModuleType
 from typing import Final, Literal
 
+import numpy as np
+
 Engine = Literal["auto", "numpy"]
 
 COMPILE_S: Final = 30
 """Seconds that compiling takes on a usual machine."""
+
+_KEPT: Final = 31 << 20
+"""Bytes of the largest block worth keeping."""
 
 logger = logging.getLogger(__name__)
 first_use = logging.getLogger(f"{__name__}.first_use")
@@ -56,3 +61,14 @@ def tell_of_compiling() -> None:
             """Nothing is said of the end: the progress shows it."""
 
     event.register("numba:compile", Teller())
+
+
+def keep_freed_memory() -> None:
+    """Let the C library keep what a cell frees for the next one.
+
+    The arrays of a cell are of some megabytes each. glibc gives such memory back as soon as it is freed, and
+    the system clears every page of it anew for the next cell, which took a quarter of the time of "fast". It
+    stops doing so for blocks smaller than the largest one of up to 32 MiB that it has seen freed; the
+    pages of this one are never touched. Elsewhere nothing happens.
+    """
+    np.empty(_KEPT, dtype=np.uint8)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from lensmodel.blur import BlurOperator, UniformBlur
@@ -179,7 +181,7 @@ def climbed(
             blur.spectrum(shape),
             np.float32(base),
             np.float32(sensor.clip),
-            np.float32(sharpness),
+            *_bend(sharpness),
             alphas,
             shape[1],
             lights,
@@ -198,6 +200,17 @@ def climbed(
         previous, latent = latent, np.maximum(start * np.maximum(update, 0.0), TINY)
         on_step(step, steps)
     return latent
+
+
+@lru_cache(maxsize=8)
+def _bend(sharpness: float) -> tuple[NDArray[np.float32], np.float32, np.float32]:
+    """R and R' of `response` at even steps of light over clipping level, and the first and last of them.
+
+    Before and beyond, R is the light and the clipping level to a millionth.
+    """
+    first, last = max(1.0 - 15.0 / sharpness, 0.0), 1.0 + 25.0 / sharpness
+    light = np.linspace(first, last, 4097)
+    return np.stack(response(light.astype(np.float32), 1.0, sharpness)), np.float32(first), np.float32(last)
 
 
 def background(sensor: Sensor) -> float:

@@ -127,17 +127,18 @@ class UniformBlur:
             return self.adjoint(np.ones(shape, dtype=np.float32))
         side = self.kernel.shape[0]
         sums = np.pad(self.kernel.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
-        (above, below), (before, after) = (
-            (
-                np.clip(side - 1 - np.arange(extent + side - 1), 0, side),
-                np.clip(side - 1 - np.arange(extent + side - 1) + extent, 0, side),
-            )
-            for extent in shape
-        )
+        spans, kinds = [], []
+        for extent in shape:
+            start = side - 1 - np.arange(extent + side - 1)
+            ends = np.clip(start, 0, side) * (side + 1) + np.clip(start + extent, 0, side)
+            # Points far from the rim all see the whole kernel: one of them is looked up for all.
+            distinct, kind = np.unique(ends, return_inverse=True)
+            spans.append(np.divmod(distinct, side + 1))
+            kinds.append(kind)
+        (above, below), (before, after) = spans
         inside = sums[np.ix_(below, after)] - sums[np.ix_(above, after)]
-        return np.asarray(
-            inside - sums[np.ix_(below, before)] + sums[np.ix_(above, before)], dtype=np.float32
-        )
+        inside += sums[np.ix_(above, before)] - sums[np.ix_(below, before)]
+        return inside.astype(np.float32)[np.ix_(*kinds)]
 
     def frame(self, latent: Plane) -> Plane:
         """Return the part of the latent plane that the photo shows."""

@@ -15,7 +15,7 @@ from lensmodel.photo.header import Header
 from lensmodel.photo.inspection import info_of
 from lensmodel.photo.metadata import baseline_exposure_of
 from lensmodel.photo.model import Encoding, Limits, LinearPhoto, PhotoInfo, Transfer
-from lensmodel.photo.noise import coding_noise, estimate_noise
+from lensmodel.photo.noise import coding_noise, estimate_noise, graininess
 from lensmodel.photo.raster import Pixels, read_pixels
 from lensmodel.photo.raw import Demosaic, develop_raw
 from lensmodel.types import Planes
@@ -89,6 +89,7 @@ def _develop_raster(path: Path, header: Header, info: PhotoInfo) -> LinearPhoto:
     code = {1: CODES // 255, 2: 1}.get(pixels.dtype.itemsize, 1)
     codes = curve[::code] if pixels.dtype.itemsize == 1 else None
     noise = [estimate_noise(plane, step=float(curve[code] - curve[0]), codes=codes) for plane in planes]
+    grain = [graininess(plane, model) for plane, model in zip(planes, noise, strict=True)]
     top = float(planes.max()) if pixels.dtype.kind == "f" else 1.0
     return LinearPhoto(
         planes=planes,
@@ -103,6 +104,7 @@ def _develop_raster(path: Path, header: Header, info: PhotoInfo) -> LinearPhoto:
             metadata=info.metadata.without_serials(),
         ),
         pipeline=f"{info.kind}/{transfer}/1",
+        grain=(grain[0], grain[1], grain[2]),
         coding_noise=coding_noise(header.coarseness, curve[::257]) if header.coarseness else None,
     )
 

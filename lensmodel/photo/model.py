@@ -20,6 +20,11 @@ Matrix3: TypeAlias = tuple[tuple[float, float, float], tuple[float, float, float
 
 _PROCESSED: Final = 16.0
 """How much more noise variance a photo without its mosaic has than its flat places show."""
+_USUAL_GRAIN, _COARSEST = 14.0, 4.0
+"""How coarse grain may be, by `noise.graininess`, before more of it counts, and how much more at most.
+
+Demosaicing leaves 6 to 9; texture in places that are none too flat looks coarse as well.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,6 +194,8 @@ class LinearPhoto:
         planes, whose pixels share their neighbours' noise. `None` where there is no mosaic.
     coding_noise : NoiseModel or None
         What lossy compression adds where there is detail; `None` where there was none.
+    grain : tuple of float
+        How much coarser than white the noise of each plane is: see `noise.graininess`.
     cfa : BayerPattern or None
         Which pixels of each plane were measured, and not filled in by demosaicing. `None` where
         the planes are no longer on the sensor's grid, or there was no Bayer mosaic.
@@ -205,19 +212,23 @@ class LinearPhoto:
     sensor_noise: PlaneNoise | None = None
     coding_noise: NoiseModel | None = None
     cfa: BayerPattern | None = None
+    grain: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     @property
     def correction_noise(self) -> PlaneNoise:
         """Noise as a correction must count it, as if it were white.
 
         That of the sensor where it is known. Demosaicing, denoising and compression leave less of it in
-        a pixel than there is in a patch, and make errors of their own where there is detail.
+        a pixel than there is in a patch, and make errors of their own where there is detail. Where a
+        camera's denoising took the fine grain and left the coarse one, that counts, or a correction that
+        was told of the fine one alone would take it for a scene and sharpen it.
         """
         if self.sensor_noise is not None:
             return self.sensor_noise
         coded = self.coding_noise or NoiseModel(0.0, 0.0)
+        factors = [_PROCESSED * min(max(grain / _USUAL_GRAIN, 1.0), _COARSEST) for grain in self.grain]
         r, g, b = (
-            NoiseModel(max(_PROCESSED * n.shot, coded.shot), max(_PROCESSED * n.read, coded.read))
-            for n in self.noise
+            NoiseModel(max(factor * n.shot, coded.shot), max(factor * n.read, coded.read))
+            for n, factor in zip(self.noise, factors, strict=True)
         )
         return r, g, b

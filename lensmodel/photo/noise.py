@@ -13,6 +13,12 @@ from lensmodel.types import NoiseModel, Plane
 BLOCK: Final = 8
 """Side of the blocks in pixels: flat places of this size exist in almost any photo."""
 
+GRAIN: Final = 4
+"""Side in pixels of the blocks whose means tell of coarse grain."""
+
+_GRAIN_LEVELS: Final = (0.25, 0.5, 0.75)
+"""Shares of the pixels that are darker than the levels at which grain is compared."""
+
 _BINS: Final = 24
 _FLAT_SHARE: Final = 0.15
 """Share of the blocks of one level, the least textured, that count."""
@@ -93,6 +99,36 @@ def coding_noise(coarseness: float, codes: NDArray[np.floating]) -> NoiseModel:
     variances = np.maximum((coarseness * widths) ** 2 / 12.0, 1e-16)
     design = np.stack([levels, np.ones_like(levels)], axis=1) / variances[:, None]
     return NoiseModel(*_non_negative(design, np.ones_like(levels)))
+
+
+def graininess(plane: Plane, noise: NoiseModel, clip: float = 1.0) -> float:
+    """How much coarser than white the noise of flat places is: 1 for white, more where pixels share theirs.
+
+    The variance of means over 4 x 4 pixels, times 16, over that of the pixels, both of differences between
+    neighbours. Demosaicing leaves 6 to 9, a camera's own denoising 40 and more.
+
+    Parameters
+    ----------
+    plane, clip
+        As `estimate_noise` takes them.
+    noise : NoiseModel
+        What it found.
+
+    Returns
+    -------
+    float
+        1 where nothing can be measured.
+    """
+    fine = _sampled(np.asarray(plane, dtype=np.float32))
+    rows, cols = (extent // GRAIN for extent in fine.shape)
+    if rows == 0 or cols == 0:
+        return 1.0
+    blocks = fine[: rows * GRAIN, : cols * GRAIN].reshape(rows, GRAIN, cols, GRAIN)
+    levels = np.quantile(fine[::GRAIN, ::GRAIN], _GRAIN_LEVELS)
+    single = noise.variance(levels)
+    several = estimate_noise(blocks.mean(axis=(1, 3), dtype=np.float32), clip).variance(levels)
+    told = (single > 0.0) & (several > 0.0)
+    return float(np.exp(np.log(GRAIN**2 * several[told] / single[told]).mean())) if told.any() else 1.0
 
 
 def _sampled(plane: Plane) -> Plane:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
@@ -12,7 +13,7 @@ from scipy import ndimage
 from lensmodel import photo
 from lensmodel.photo.colour import curves_of
 from lensmodel.photo.dng import write_bayer_dng
-from lensmodel.photo.noise import estimate_noise
+from lensmodel.photo.noise import estimate_noise, graininess
 from lensmodel.types import NoiseModel
 
 BLACK, WHITE = 512, 15000
@@ -163,6 +164,40 @@ def test_the_noise_of_a_jpeg_counts_what_compression_takes_from_detail(tmp_path:
         model.variance(np.array(0.2)) >= 0.99 * developed.coding_noise.variance(np.array(0.2))
         for model in developed.correction_noise
     )
+
+
+@pytest.mark.parametrize("width", [0.0, 0.5, 1.0])
+def test_the_coarseness_of_correlated_noise_is_what_its_spectrum_says(width: float) -> None:
+    white = np.random.default_rng(9).standard_normal((1024, 1024))
+    plane = (0.3 + 0.01 * ndimage.gaussian_filter(white, width, mode="wrap")).astype(np.float32)
+
+    # The power that each of the two high passes sees: of pixels, and of means over 4 x 4 of them.
+    f = np.fft.fftfreq(1024)
+    point = np.zeros(1024)
+    point[0] = 1.0
+    power = np.abs(np.fft.fft(ndimage.gaussian_filter(point, width, mode="wrap"))) ** 2
+    box = np.abs(np.exp(-2j * np.pi * np.outer(f, np.arange(4))).mean(axis=1)) ** 2
+    fine = (power * (2 - 2 * np.cos(2 * np.pi * f)) ** 2).mean()
+    coarse = 4 * (power * box * (2 - 2 * np.cos(8 * np.pi * f)) ** 2).mean()
+    expected = (coarse / fine) ** 2
+    found = graininess(plane, estimate_noise(plane))
+
+    assert found == pytest.approx(expected, rel=0.1)
+
+
+def test_noise_that_denoising_left_coarse_counts_more_than_that_of_demosaicing(tmp_path: Path) -> None:
+    rng = np.random.default_rng(10)
+    noise = [ndimage.gaussian_filter(rng.standard_normal((400, 400, 3)), (s, s, 0)) for s in (0.0, 1.6)]
+    told = []
+    for grain in noise:
+        numbers = np.rint(np.clip(30000 + 600 * grain / grain.std(), 0, 65535)).astype(np.uint16)
+        tifffile.imwrite(tmp_path / "x.tif", numbers, photometric="rgb")
+        developed = photo.develop(tmp_path / "x.tif")
+        levels = np.array(0.2)
+        told.append([developed.correction_noise[1].variance(levels) / developed.noise[1].variance(levels)])
+
+    assert told[0] == pytest.approx([16.0])
+    assert told[1] == pytest.approx([64.0])
 
 
 def test_a_photo_with_its_mosaic_is_corrected_by_the_noise_of_the_sensor(tmp_path: Path) -> None:

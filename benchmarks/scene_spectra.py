@@ -38,20 +38,20 @@ _WIDE = 9.0  # how much wider than usual the priors are
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """Spectra of a patch and the true ln |OTF|^2 of its channels, shape (BINS, 3)."""
+    """Spectra of a patch and the true |OTF|^2 of its channels, shape (BINS, 3)."""
 
     photo: str
     scene: SceneView
     truth: Floats
 
 
-def log_power(kernel: Floats) -> Floats:
-    """Ln |OTF|^2 of a kernel at the middles of the bins, by a direct sum."""
+def power_of(kernel: Floats) -> Floats:
+    """|OTF|^2 of a kernel at the middles of the bins, by a direct sum."""
     modulus, angle = bin_frequencies()
     half = kernel.shape[0] // 2
     row, col = np.mgrid[-half : half + 1, -half : half + 1]
     along = np.outer(modulus * np.sin(angle), row.ravel()) + np.outer(modulus * np.cos(angle), col.ravel())
-    return np.asarray(np.log(np.abs(np.exp(-2j * np.pi * along) @ kernel.ravel()) ** 2 + 4e-3))
+    return np.asarray(np.abs(np.exp(-2j * np.pi * along) @ kernel.ravel()) ** 2)
 
 
 def patches(seed: int, files: list[Path], folder: Path) -> Iterator[Seen]:
@@ -74,7 +74,7 @@ def patches(seed: int, files: list[Path], folder: Path) -> Iterator[Seen]:
                 index = CHANNELS.index(channel)
                 plane = np.ascontiguousarray(developed.planes[index][window])
                 spectra[channel] = PatchSpectrum.of(plane, developed.noise[index], 1.0)
-                truth.append(log_power(field.kernel_at(patch.position, channel, _SIDE)))
+                truth.append(power_of(field.kernel_at(patch.position, channel, _SIDE)))
             yield Seen(f"{seed}/{file.stem}", SceneView.of(spectra), np.stack(truth, axis=1))
 
 
@@ -86,7 +86,7 @@ def spread(values: Floats) -> Floats:
 def report(seen: list[Seen]) -> None:
     """Fit the scenes and print."""
     shapes = SHAPES.shape[1]
-    fits = [fit_scene(replace(s.scene, vote=s.scene.vote / _WIDE), s.truth + BIAS[:, None]) for s in seen]
+    fits = [fit_scene(replace(s.scene, vote=s.scene.vote / _WIDE), s.truth, BIAS[:, None]) for s in seen]
     unknowns = np.stack([z for z, _, _ in fits])
     photos = np.array([s.photo for s in seen])
     centres = np.stack([np.median(unknowns[photos == p], axis=0) for p in sorted(set(photos))])
@@ -99,7 +99,8 @@ def report(seen: list[Seen]) -> None:
     print("spread, all        ", spread(unknowns)[:shapes])
     print("spread within photo", spread(within)[:shapes])
     print("spread of photos   ", spread(centres)[:shapes])
-    print("channels about it  ", spread(unknowns)[shapes:].reshape(3, 3))
+    print("channels about it  ", spread(unknowns)[shapes:-1].reshape(3, 3))
+    print("floor: usual, spread", np.array([np.median(unknowns[:, -1]), spread(unknowns)[-1]]))
     rest, signal = np.stack([r for _, r, _ in fits]), np.stack([s for _, _, s in fits])
     for k, channel in enumerate(_ORDER):
         ring_rest = rest[:, :, k].reshape(len(seen), -1, SECTORS)

@@ -19,7 +19,7 @@ from lensmodel.regression.model import LensModel
 from lensmodel.types import FieldPosition, LensSettings
 
 _NARROWER: Final = 0.7  # of the width
-_OPEN, _SURE = 5.0, 20.0  # rise of a patch's negative log likelihood behind the narrower kernel
+_OPEN, _SURE = 4.0, 16.0  # rise of a patch's negative log likelihood behind the narrower kernel
 _LEAST: Final = 0.5
 _NEIGHBOURS: Final = 8
 

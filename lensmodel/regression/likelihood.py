@@ -70,9 +70,9 @@ def surprise(sample: PsfSample, kernel: Kernel, share: float = 1.0) -> float:
     if sample.spectrum is None:
         error = max(distance(kernel, sample.kernel).rel_l2, _LEAST_ERROR)
         return BINS * math.log(error)
-    view = SceneView.of({sample.settings.channel: sample.spectrum})
-    offset = np.log(_power(kernel, share) + _FLOOR) + BIAS
-    unknowns, residual, _ = fit_scene(view, offset[:, None])
+    # a floor of its own would excuse a kernel of the wrong shape
+    view = SceneView.of({sample.settings.channel: sample.spectrum}).held_at(_FLOOR)
+    unknowns, residual, _ = fit_scene(view, _power(kernel, share)[:, None], BIAS[:, None])
     squared = np.einsum("bi,bij,bj->b", residual, view.precision, residual)
     cost = float((_TAILS + 1.0) * np.log1p(squared / _TAILS).sum() + view.vote @ (unknowns - view.usual) ** 2)
     nu = _PATCH_TAILS * BINS

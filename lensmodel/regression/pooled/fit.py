@@ -6,9 +6,9 @@ lens, and all of them are estimated at once (P. Whittle's idea, with log spectra
 against outliers), so that photos add up::
 
     minimise  sum_patches rho(chi^2)  +  |priors|^2,
-    chi^2 = sum_bins t(r' V^-1 r),   r = ln S - ln(exp(s(z) + bias) |OTF(theta)|^2 + n)
+    chi^2 = sum_bins t(r' V^-1 r),   r = ln S - ln(exp(s(z) + bias) (|OTF(theta)|^2 + exp(w)) + n)
 
-by Levenberg-Marquardt, the unknowns z of a patch eliminated from the normal equations (Schur). Power
+by Levenberg-Marquardt, the unknowns z and w of a patch eliminated from the normal equations (Schur). Power
 knows nothing of the phase: a wavefront and its negative, which turns the kernels by 180 degrees, have
 equal spectra. Which of the two it is has to come from elsewhere (`refine`).
 """
@@ -64,7 +64,7 @@ _PRECISION = _precision()
 _TEMPER = 0.1
 """Share of the likelihood that counts: neighbouring bins and patches of one motif err alike."""
 
-_FLOOR = 4e-3  # of |OTF|^2: below, zeros are smeared by more than the model knows
+_FLOOR_RANGE = (-12.0, -1.0)  # of its logarithm
 _LARGEST_RESIDUAL = 3.0
 _TAILS = 6.0  # degrees of freedom of Student's t of a bin
 _PATCH_TAILS = 3.0  # of a patch, in units of its bins
@@ -179,14 +179,16 @@ def open_eye(eye: Floats) -> tuple[float, float]:
     return max(float(eye[0]), _SMALLEST_EYE), float(np.clip(eye[1], -_FARTHEST_EYE, _FARTHEST_EYE))
 
 
-def fit_scene(view: SceneView, offset: Floats) -> tuple[Floats, Floats, Floats]:
+def fit_scene(view: SceneView, power: Floats, rest: Floats) -> tuple[Floats, Floats, Floats]:
     """Fit the scene of one patch behind a lens that is known.
 
     Parameters
     ----------
     view : SceneView
-    offset : ndarray, shape (BINS, c)
-        Logarithm of |OTF|^2, and what else is known of the log power.
+    power : ndarray, shape (BINS, c)
+        |OTF|^2.
+    rest : ndarray, shape (BINS, c) or (BINS, 1)
+        What else is known of the log power.
 
     Returns
     -------
@@ -194,9 +196,8 @@ def fit_scene(view: SceneView, offset: Floats) -> tuple[Floats, Floats, Floats]:
     residual, signal : ndarray, shape (BINS, c)
         What is left of the log power, and the share of the scene in the power.
     """
-    fitted = _Scene.fitted(view, offset, None)
-    scene = np.exp(np.clip(view.shapes @ fitted.z + offset, -60.0, 60.0))
-    return fitted.z, view.log_power - np.log(scene + view.noise), fitted.signal
+    fitted = _Scene.fitted(view, power, rest, None)
+    return fitted.z, fitted.residual, fitted.signal
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -219,9 +220,9 @@ class _Problem:
         for i, patch in enumerate(self.patches):
             at = _LENS + len(PHOTO_SPREAD) * self.photos[patch.photo]
             seen, by_lens = self._lens(lens, patch)
-            offset = seen + (BIAS + SHAPES[:, 1:3] @ shared[self.photos[patch.photo]])[:, None]
+            rest = (BIAS + SHAPES[:, 1:3] @ shared[self.photos[patch.photo]])[:, None]
             z = None if scenes is None else scenes[i]
-            fitted = _Scene.fitted(patch.scene, offset, z)
+            fitted = _Scene.fitted(patch.scene, seen, rest, z)
             nu = _PATCH_TAILS * BINS * len(patch.scene.channels)
             cost += _TEMPER * nu * math.log1p(fitted.cost / nu)
             trusted = 1.0 / (1.0 + fitted.cost / nu)
@@ -240,7 +241,7 @@ class _Problem:
         return _State(cost, normal, gradient - pull, found, np.array(trust))
 
     def _lens(self, lens: Floats, patch: PatchView) -> tuple[Floats, Floats]:
-        """Return ln |OTF|^2 in the bins, shape (BINS, c), and its derivatives (BINS, c, 21)."""
+        """Return |OTF|^2 in the bins, shape (BINS, c), and the derivatives of its logarithm (BINS, c, 21)."""
         x = patch.position.r * math.cos(patch.position.phi)
         y = patch.position.r * math.sin(patch.position.phi)
         values, derivatives = [], []
@@ -256,11 +257,9 @@ class _Problem:
             value, by_blur, by_eye = transfer.log_power(
                 linear @ lens[: len(NAMES)], radius, (move * x, move * y)
             )
-            kept = np.exp(value) / (np.exp(value) + _FLOOR)
-            values.append(np.log(np.exp(value) + _FLOOR))
+            values.append(np.exp(value))
             by_move = by_eye[:, 1] * x + by_eye[:, 2] * y
-            every = np.column_stack([by_blur @ linear, by_eye[:, 0] / stop, by_move / stop])
-            derivatives.append(every * kept[:, None])
+            derivatives.append(np.column_stack([by_blur @ linear, by_eye[:, 0] / stop, by_move / stop]))
         return np.stack(values, axis=1), np.stack(derivatives, axis=1)
 
 
@@ -270,7 +269,9 @@ class _Scene:
 
     z: Floats
     cost: float
+    residual: Floats  # (BINS, c)
     signal: Floats  # (BINS, c): derivative of the log power by that of the scene
+    kept: Floats  # (BINS, c): derivative of ln(|OTF|^2 + floor) by that of |OTF|^2
     precision: Floats  # (BINS, c, c), outliers weighted down
     weighted: Floats  # (BINS, c): precision times residual
     by_scene: Floats  # (BINS, c, z)
@@ -278,25 +279,28 @@ class _Scene:
     gradient: Floats
 
     @classmethod
-    def fitted(cls, view: SceneView, offset: Floats, begin: Floats | None) -> _Scene:
+    def fitted(cls, view: SceneView, power: Floats, rest: Floats, begin: Floats | None) -> _Scene:
         """Solve for the patch's own unknowns by Gauss-Newton."""
         rounds = _SCENE_ROUNDS_AGAIN
         if begin is None:
             rounds = _SCENE_ROUNDS
             z = view.usual.copy()
-            rest = view.log_power - offset - view.shapes @ z
-            z[SHAPES.shape[1] :: 3] += np.median(rest, axis=0)
+            left = view.log_power - np.log(power + math.exp(z[-1])) - rest - view.shapes @ z
+            z[SHAPES.shape[1] : -1 : 3] += np.median(left, axis=0)
         else:
             z = begin
-        state = cls._about(view, offset, z)
+        state = cls._about(view, power, rest, z)
         for _ in range(rounds):
             z = z + np.clip(np.linalg.solve(state.normal, state.gradient), -3.0, 3.0)
-            state = cls._about(view, offset, z)
+            z[-1] = np.clip(z[-1], *_FLOOR_RANGE)
+            state = cls._about(view, power, rest, z)
         return state
 
     @classmethod
-    def _about(cls, view: SceneView, offset: Floats, z: Floats) -> _Scene:
-        scene = np.exp(np.clip(view.shapes @ z + offset, -60.0, 60.0))
+    def _about(cls, view: SceneView, power: Floats, rest: Floats, z: Floats) -> _Scene:
+        floor = math.exp(z[-1])
+        passed = power + floor
+        scene = np.exp(np.clip(view.shapes @ z + np.log(passed) + rest, -60.0, 60.0))
         signal = scene / (scene + view.noise)
         residual = np.clip(view.log_power - np.log(scene + view.noise), -_LARGEST_RESIDUAL, _LARGEST_RESIDUAL)
         count = residual.shape[1]
@@ -305,18 +309,20 @@ class _Scene:
         off = z - view.usual
         cost = float((_TAILS + count) * np.log1p(distance / _TAILS).sum() + view.vote @ off**2)
         by_scene = view.shapes * signal[:, :, None]
+        by_scene[:, :, -1] = floor / passed * signal
         unknowns = by_scene.shape[2]
         flat = by_scene.reshape(-1, unknowns)
         weighted = np.einsum("bij,bj->bi", precision, residual)
         normal = np.einsum("bij,bjz->biz", precision, by_scene).reshape(-1, unknowns).T @ flat
         normal += np.diag(view.vote)
         gradient = flat.T @ weighted.ravel() - view.vote * off
-        return cls(z, cost, signal, precision, weighted, by_scene, normal, gradient)
+        kept = power / passed
+        return cls(z, cost, residual, signal, kept, precision, weighted, by_scene, normal, gradient)
 
     def reduced(self, by_lens: Floats) -> tuple[Floats, Floats, int]:
         """Normal equations of the lens and of the photo's share, the scene eliminated."""
         shared = np.broadcast_to(SHAPES[:, None, 1:3], (*self.signal.shape, len(PHOTO_SPREAD)))
-        columns = np.concatenate([by_lens, shared], axis=2) * self.signal[:, :, None]
+        columns = np.concatenate([by_lens * self.kept[:, :, None], shared], axis=2) * self.signal[:, :, None]
         count = columns.shape[2]
         flat = columns.reshape(-1, count)
         voted = np.einsum("bij,bjn->bin", self.precision, columns).reshape(-1, count)

@@ -3,12 +3,19 @@
 In the bins of a patch, with L = ln(f / 0.1) and the angle t of the frequency, a scene's log power is
 
     s(f, t) = a + z1 L + z2 L^2 + z3 cos 2t + z4 sin 2t + z5 cos 4t + z6 sin 4t + z7 L cos 2t + z8 L sin 2t
+                + z9 cos 6t + z10 sin 6t + z11 cos 8t + z12 sin 8t + z13 L cos 4t + z14 L sin 4t
 
 with normal priors on z: natural images fall off with about the square of the frequency (D. J. Field,
-JOSA A 4, 1987), buildings prefer two directions. Red and blue differ a little from green; all
-patches of one photo share a part of their slope and curvature, since one motif and one focus are theirs.
-What is seen is ln(exp(s) |OTF|^2 + n) with the power n of the noise, and a roughness that the
-polynomial does not follow, which is the same in all channels.
+JOSA A 4, 1987), what people build has few directions, each of them a narrow ridge. Red and blue differ a
+little from green; all patches of one photo share a part of their slope and curvature, since one motif and
+one focus are theirs. What is seen is
+
+    ln(exp(s) (|OTF|^2 + exp(w)) + n)
+
+with the power n of the noise, and a roughness that the polynomial does not follow, which is the same in
+all channels. The floor exp(w) is the patch's own: the blur changes within it, and a mosaic is
+interpolated, so that no zero of the OTF is seen as one. Held at any one value it makes lenses of even
+blur likelier than the true ones.
 
 The numbers were measured on simulated photographs of the development half (lens seeds 0..7, Bayer DNG
 files): `benchmarks/scene_spectra.py` prints them.
@@ -16,7 +23,8 @@ files): `benchmarks/scene_spectra.py` prints them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -35,19 +43,22 @@ SHAPES: Final = np.stack(
     [
         *(np.ones(BINS), _L, _L**2, np.cos(2 * _ANGLE), np.sin(2 * _ANGLE)),
         *(np.cos(4 * _ANGLE), np.sin(4 * _ANGLE), _L * np.cos(2 * _ANGLE), _L * np.sin(2 * _ANGLE)),
+        *(np.cos(6 * _ANGLE), np.sin(6 * _ANGLE), np.cos(8 * _ANGLE), np.sin(8 * _ANGLE)),
+        *(_L * np.cos(4 * _ANGLE), _L * np.sin(4 * _ANGLE)),
     ],
     axis=1,
 )
-"""Values of the polynomial's terms in the bins, shape (BINS, 9)."""
+"""Values of the polynomial's terms in the bins, shape (BINS, 15)."""
 
-_USUAL = (0.0, -2.06, -0.08, -0.2, 0.0, 0.09, 0.02, 0.0, 0.0)
-_SPREAD = (1e-3, 0.5, 0.28, 0.45, 0.32, 0.16, 0.14, 0.25, 0.16)
+_USUAL = (0.0, -2.11, -0.25, -0.19, 0.0, 0.09, 0.03) + (0.0,) * 8
+_SPREAD = (1e-3, 0.5, 0.3, 0.45, 0.32, 0.16, 0.15, 0.24, 0.15, 0.25, 0.25, 0.2, 0.2, 0.13, 0.13)
 _AMPLITUDE = (-4.0, 6.0)  # of each channel: usual, spread
 _CHANNEL_SPREAD = (0.13, 0.13)  # of its slope and curvature about those of the patch
+_FLOOR = (-4.8, 1.3)  # logarithm of what fills the zeros of |OTF|^2: usual, spread
 PHOTO_SPREAD: Final = np.array([0.37, 0.2])
 """Standard deviations of what all patches of a photo share: slope and curvature."""
 
-_BIAS = (0.17, -0.06, -0.11, -0.05, 0.0, 0.03, 0.07, 0.07, 0.02, -0.11, -0.26)
+_BIAS = (0.17, -0.07, -0.12, -0.07, -0.01, 0.02, 0.06, 0.07, 0.01, -0.15, -0.3)
 _ROUGHNESS = (0.42, 0.36, 0.31, 0.30, 0.27, 0.25, 0.24, 0.24, 0.24, 0.28, 0.4)
 _OWN, _NOISY = 0.13, 0.35
 # Demosaicing borrows the finest detail of red and blue from green, and smooths their noise.
@@ -55,6 +66,7 @@ _BORROWED = (0.0, 0.0, 0.0, 0.0, 0.05, 0.1, 0.2, 0.5) + (1e3,) * BORROWED_RINGS
 _NOISE_GREEN = (1.0,) * 9 + (0.81, 0.68)
 _NOISE_OTHER = (1.0,) * 8 + (0.95, 0.68, 0.46)
 _SMALLEST = 1e-15
+_HELD = 1e12
 
 
 def _rings(values: tuple[float, ...]) -> Floats:
@@ -79,7 +91,8 @@ class SceneView:
     precision : ndarray, shape (BINS, c, c)
         Inverse covariance of the log powers of a bin about the model.
     shapes : ndarray, shape (BINS, c, z)
-        Derivatives of the scene's log power by the patch's own unknowns.
+        Derivatives of the scene's log power by the patch's own unknowns; 0 by the last, the logarithm w of
+        the floor, which is no part of the scene.
     usual, vote : ndarray, shape (z,)
         Their prior means and inverse variances.
     """
@@ -110,13 +123,13 @@ class SceneView:
             if channel != "g":
                 covariance[:, k, k] += _rings(_BORROWED) ** 2
         own = SHAPES[:, :3]
-        shapes = np.zeros((BINS, count, SHAPES.shape[1] + 3 * count))
+        shapes = np.zeros((BINS, count, SHAPES.shape[1] + 3 * count + 1))
         shapes[:, :, : SHAPES.shape[1]] = SHAPES[:, None, :]
         for k in range(count):
             at = SHAPES.shape[1] + 3 * k
             shapes[:, k, at : at + 3] = own
-        usual = np.concatenate([_USUAL, np.tile([_AMPLITUDE[0], 0.0, 0.0], count)])
-        spread = np.concatenate([_SPREAD, np.tile([_AMPLITUDE[1], *_CHANNEL_SPREAD], count)])
+        usual = np.concatenate([_USUAL, np.tile([_AMPLITUDE[0], 0.0, 0.0], count), _FLOOR[:1]])
+        spread = np.concatenate([_SPREAD, np.tile([_AMPLITUDE[1], *_CHANNEL_SPREAD], count), _FLOOR[1:]])
         return cls(
             channels,
             np.log(power),
@@ -126,6 +139,12 @@ class SceneView:
             usual,
             1.0 / spread**2,
         )
+
+    def held_at(self, floor: float) -> SceneView:
+        """Return the same with a floor that is known."""
+        usual, vote = self.usual.copy(), self.vote.copy()
+        usual[-1], vote[-1] = math.log(floor), _HELD
+        return replace(self, usual=usual, vote=vote)
 
 
 def _of_ring(values: Floats) -> Floats:

@@ -4,10 +4,9 @@ With e the relative L2 of samples that an expert had not seen, weighed as the qu
 its share is proportional to e^-4: where one is much worse than the others it loses its say by itself.
 
 A wavefront fitted to the spectra of all patches (`pooled`) makes other mistakes than kernels that were
-estimated one by one: those fail where blur is wide, it cannot tell blur below half a pixel from a soft scene,
-and between the mean of both is better than either. The rules below were chosen on simulated lenses of
-development seeds (0, 1, 2, 4, 5, 6 and 7, one photo or two) with versions 4 and 7 of the blind estimator
-`default`; `benchmarks/pooled_evidence.py` prints what they give.
+estimated one by one: those fail where blur is wide, it cannot tell blur below half a pixel from a soft scene.
+The rules below were chosen on simulated lenses of development seeds (0 to 7, one photo to three);
+`benchmarks/pooled_evidence.py` prints what they give.
 """
 
 from __future__ import annotations
@@ -28,18 +27,20 @@ from lensmodel.regression.physical import Physics
 from lensmodel.types import FieldPosition, LensSettings
 
 _SILENT = 1e-3
-_KERNEL_ERROR, _NARROW_PX = 0.35, 0.8
-_EVEN_PX = 0.75
+_KERNEL_ERROR, _LEAST_KERNEL_ERROR, _NARROW_PX = 0.35, 0.1, 0.8
+_EVEN_PX, _STEEP = 0.52, 12
+_NARROWEST_PX = 0.3
+"""Kernels that end in a point, outside all samples for example, say no more than that blur may be narrow."""
 
 
 def agreed_share(width: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Share of an agreed wavefront, by root mean square width in pixels: a half at 0.75 px, more above."""
-    return np.asarray(width**8 / (width**8 + _EVEN_PX**8))
+    """Share of an agreed wavefront, by root mean square width in pixels: a half at 0.52 px, more above."""
+    return np.asarray(width**_STEEP / (width**_STEEP + _EVEN_PX**_STEEP))
 
 
 def kernel_error(width: NDArray[np.float64]) -> NDArray[np.float64]:
     """Expected relative L2 of kernels that each patch gave alone, by width in pixels."""
-    return np.asarray(_KERNEL_ERROR * np.minimum(width / _NARROW_PX, 1.0))
+    return np.maximum(_KERNEL_ERROR * np.minimum(width / _NARROW_PX, 1.0), _LEAST_KERNEL_ERROR)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,7 +127,10 @@ class Experts:
             if agreed:
                 light = light / light.sum(axis=(1, 2), keepdims=True)
                 width = np.sqrt(
-                    [rms_width(one) * rms_width(other) for one, other in zip(light, rows, strict=True)]
+                    [
+                        max(rms_width(one), _NARROWEST_PX) * rms_width(other)
+                        for one, other in zip(light, rows, strict=True)
+                    ]
                 )
                 share = agreed_share(width)
                 shares *= (1.0 - share)[:, None]

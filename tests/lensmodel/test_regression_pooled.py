@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lensmodel.psf import PsfSample, distance, gaussian, rms_width
+from lensmodel.psf import PsfSample, delta, distance, gaussian, rms_width
 from lensmodel.regression import LensModel, LensProfile, load_profile, save_profile
-from lensmodel.regression.experts import agreed_share
+from lensmodel.regression.experts import Experts, agreed_share, kernel_error
+from lensmodel.regression.local import Answers
 from lensmodel.regression.pooled import MIN_PLACES, pool
 from lensmodel.regression.pooled.fit import BALANCE, PatchView, PooledFit, fit_spectra
 from lensmodel.regression.pooled.refine import Pooled
@@ -259,6 +260,18 @@ def test_blur_that_no_wavefront_makes_is_left_to_the_kernels() -> None:
     assert distance(answer.kernel, gaussian(31, 1.3**2 * np.eye(2))).rel_l2 < 0.05
 
 
+def test_kernels_that_end_in_a_point_neither_silence_the_wavefront_nor_pass_for_sure() -> None:
+    fit = LensModel.fit(samples(MIN_PLACES + 2)).warmed()._fit
+    experts = Experts(fit.judgement, np.ones(7), fit.physical)
+    near = Answers(np.array([0]), np.array([1.0]), np.array([0, 1]))
+
+    wide = experts.mixed(delta(31)[None], near, [FieldPosition(0.9, 0.3)], SETTINGS)
+
+    assert wide.shares[0, 2] > 0.9
+    assert rms_width(wide.kernels[0]) > 1.0
+    assert kernel_error(np.array([0.0])) >= 0.1
+
+
 def test_few_patches_are_not_pooled() -> None:
     assert pool(samples(MIN_PLACES - 1)) is None
     assert pool([replace(s, spectrum=None) for s in samples(20)]) is None
@@ -288,10 +301,10 @@ def test_pooled_lens_is_nearer_to_the_truth_than_its_samples_and_kept_by_profile
 
 
 def test_wide_blur_leaves_the_say_to_the_wavefront() -> None:
-    share = agreed_share(np.array([0.4, 0.9, 1.5, 3.0]))
+    share = agreed_share(np.array([0.4, 0.6, 0.9, 1.5, 3.0]))
     assert share[0] < 0.05
     assert 0.7 < share[1] < 0.9
-    assert 0.95 < share[2] < share[3] < 1.0
+    assert 0.95 < share[2] < share[3] < share[4] < 1.0
 
 
 def test_error_is_told_even_where_the_cat_s_eye_is_hardly_known() -> None:

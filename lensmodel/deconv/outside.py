@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from types import ModuleType
 from typing import Final
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy import fft
 
 from lensmodel.blur import UniformBlur
 from lensmodel.deconv.base import Sensor
-from lensmodel.deconv.canvas import Canvas
+from lensmodel.deconv.canvas import Canvas, seam
 from lensmodel.deconv.compiled_blur import CompiledBlur
 from lensmodel.deconv.engine import Engine, compiled
 from lensmodel.deconv.richardson_lucy import climbed, first_guess
@@ -60,17 +61,29 @@ def fill_outside(
         wide = blur.reach
         if wide > 0:
             latent = _wider(plane, CompiledBlur.of(blur, loops), sensor, steps, engine)
-            for axis in (0, 1):
-                lines = np.moveaxis(latent, axis, 0)
-                latent = np.moveaxis(Canvas.wrap(lines, canvas.margin - wide, canvas.shape[axis]), 0, axis)
-            latent = np.ascontiguousarray(latent / light[c])
-            if loops is None:
-                seen = fft.irfft2(K[c] * fft.rfft2(latent), canvas.shape)
-            else:
-                seen, rows = latent, canvas.shape[0]
-                room = np.empty_like(K[c])
-                loops.through(seen, room, K[c], forward=True, first=0, last=rows, begin=0, end=rows)
-            y[c][outside] = seen[outside]
+            np.copyto(
+                y[c], _predicted(latent, light[c], K[c], canvas, canvas.margin - wide, loops), where=outside
+            )
+
+
+def _predicted(
+    latent: NDArray[np.float32],
+    light: np.float32,
+    K: NDArray[np.complex64],
+    canvas: Canvas,
+    margin: int,
+    loops: ModuleType | None,
+) -> NDArray[np.float32]:
+    """What a larger sensor would have seen of the light found, over `light`, on the canvas."""
+    rows, cols = canvas.shape
+    if loops is None:
+        wide = Canvas.wrap(Canvas.wrap(latent, margin, rows).T, margin, cols).T
+        return np.asarray(fft.irfft2(K * fft.rfft2(wide / light), canvas.shape), dtype=np.float32)
+    seen = np.empty((1, rows, cols), dtype=np.float32)
+    joints = seam(latent.shape[0], rows), seam(latent.shape[1], cols)
+    loops.fill(latent[None], np.ones(1, dtype=np.float32) / light, margin, *joints, seen)
+    loops.through(seen[0], np.empty_like(K), K, forward=True, first=0, last=rows, begin=0, end=rows)
+    return np.asarray(seen[0])
 
 
 def _wider(

@@ -7,8 +7,8 @@ of the samples is kriged with mean zero, so that far from all samples the wavefr
     f(x, y) = N(x, y) + c'(x, y) K^-1 (C - N),    K = c + nugget / q
 
 Where the samples carry the spectra of their patches, the wavefront is fitted to those instead (`pooled`) and
-stands alone: all patches agree on it, while finished kernels carry each patch's own mistake. That is so as
-long as the patches are likelier behind it than behind the kernels of their neighbours.
+stands alone: all patches agree on it, while finished kernels carry each patch's own mistake. That is so
+unless the patches are clearly likelier behind the kernels of their neighbours.
 
 Cost: some seconds of CPU for the fit, one or two milliseconds at each question.
 """
@@ -43,6 +43,7 @@ _AROUND = 6  # pixels beyond the side that was fitted, for corners wider than ev
 _NOTHING_LEFT = 1e3
 _WORST = 1.5
 _ALIKE = 1e-7
+_CLEARLY = 2.0  # standard errors
 _STEPS = 2
 
 
@@ -151,15 +152,17 @@ class Physics:
 
 
 def _suits(pooled: Pooled, samples: Sequence[PsfSample]) -> bool:
-    """Whether the patches are likelier behind the wavefront than behind the kernels of their neighbours.
+    """Whether patches are not clearly less likely behind the wavefront than behind their neighbours' kernels.
 
-    A blur that no wavefront of a few numbers makes, of a plain Gaussian for example, leaves them less likely.
-    The kernel that a patch gave itself follows its own scene as well, so that it is no judge.
+    A blur that no wavefront of a few numbers makes, of a plain Gaussian for example, leaves them less likely,
+    one patch as the other. The kernel that a patch gave itself follows its own scene too: it is no judge.
     """
     seen = [s for s in samples if s.spectrum is not None and s.settings.channel == "g"]
     seen = seen or [s for s in samples if s.spectrum is not None]
-    agreed = sum(surprise(s, pooled.kernel(s, s.kernel.shape[0])) for s in seen)
-    return agreed < sum(surprise(s, _neighbour(s, seen)) for s in seen)
+    worse = [
+        surprise(s, pooled.kernel(s, s.kernel.shape[0])) - surprise(s, _neighbour(s, seen)) for s in seen
+    ]
+    return float(np.mean(worse)) < _CLEARLY * float(np.std(worse)) / math.sqrt(len(worse))
 
 
 def _neighbour(sample: PsfSample, others: Sequence[PsfSample]) -> Kernel:

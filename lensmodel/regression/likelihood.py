@@ -28,7 +28,7 @@ Predict = Callable[[PsfSample], Kernel]
 _FOLDS, _FEWEST_GROUPS = 3, 2
 _MOST = 32  # patches of a fold that are asked
 _TAILS, _PATCH_TAILS = 6.0, 3.0  # degrees of freedom of a bin, and of a patch in units of its bins
-_FLOOR = 1e-5  # of |OTF|^2
+_FLOOR = (-6.5, 3.0)  # logarithm of what is added to |OTF|^2: whoever sees none may have none
 _INSIDE = (-1.0 / 3.0, 0.0, 1.0 / 3.0)  # where a bin is sampled, in parts of its width
 _LEAST_ERROR = 1e-3
 
@@ -70,8 +70,7 @@ def surprise(sample: PsfSample, kernel: Kernel, share: float = 1.0) -> float:
     if sample.spectrum is None:
         error = max(distance(kernel, sample.kernel).rel_l2, _LEAST_ERROR)
         return BINS * math.log(error)
-    # a floor of its own would excuse a kernel of the wrong shape
-    view = SceneView.of({sample.settings.channel: sample.spectrum}).held_at(_FLOOR)
+    view = SceneView.of({sample.settings.channel: sample.spectrum}).with_floor(*_FLOOR)
     unknowns, residual, _ = fit_scene(view, _power(kernel, share)[:, None], BIAS[:, None])
     squared = np.einsum("bi,bij,bj->b", residual, view.precision, residual)
     cost = float((_TAILS + 1.0) * np.log1p(squared / _TAILS).sum() + view.vote @ (unknowns - view.usual) ** 2)

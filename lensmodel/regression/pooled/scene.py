@@ -23,7 +23,6 @@ files): `benchmarks/scene_spectra.py` prints them.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -66,7 +65,6 @@ _BORROWED = (0.0, 0.0, 0.0, 0.0, 0.05, 0.1, 0.2, 0.5) + (1e3,) * BORROWED_RINGS
 _NOISE_GREEN = (1.0,) * 9 + (0.81, 0.68)
 _NOISE_OTHER = (1.0,) * 8 + (0.95, 0.68, 0.46)
 _SMALLEST = 1e-15
-_HELD = 1e12
 
 
 def _rings(values: tuple[float, ...]) -> Floats:
@@ -140,11 +138,11 @@ class SceneView:
             1.0 / spread**2,
         )
 
-    def held_at(self, floor: float) -> SceneView:
-        """Return the same with a floor that is known."""
-        usual, vote = self.usual.copy(), self.vote.copy()
-        usual[-1], vote[-1] = math.log(floor), _HELD
-        return replace(self, usual=usual, vote=vote)
+    def with_floor(self, usual: float, spread: float) -> SceneView:
+        """Return the same with another prior of the floor's logarithm."""
+        means, vote = self.usual.copy(), self.vote.copy()
+        means[-1], vote[-1] = usual, spread**-2
+        return replace(self, usual=means, vote=vote)
 
 
 def _of_ring(values: Floats) -> Floats:

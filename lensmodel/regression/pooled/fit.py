@@ -23,10 +23,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.regression.pooled.expected import unlikeliness
 from lensmodel.regression.pooled.scene import BIAS, PHOTO_SPREAD, SHAPES, SceneView
 from lensmodel.regression.pooled.transfer import BINS, BORROWED_RINGS, Transfer
 from lensmodel.regression.wavefront import NAMES, Wavefront, design, stopped
-from lensmodel.regression.wavefront_problem import USUAL_EYE
 from lensmodel.spectrum import SECTORS
 from lensmodel.types import WAVELENGTH_NM, FieldPosition, LensSettings, StepHook, ignore_step
 
@@ -34,33 +34,12 @@ Floats = NDArray[np.float64]
 
 _RINGS = BINS // SECTORS
 _LENS = len(NAMES) + 2  # and the cat's eye
-_EYE_SPREAD = (0.15, 0.3)
 SYMMETRIC: Final = np.array(
     [name in {"spherical", "coma", "focus", "field curvature", "astigmatism"} for name in NAMES] + [False] * 2
 )
 """Which unknowns a centred lens of third order has in one colour."""
 
 _HELD = 1e12
-_USUAL = np.concatenate([np.zeros(len(NAMES)), USUAL_EYE])
-# What third-order theory does not know is small; a copy's own faults are smaller than the design's.
-_SPREAD_PX = np.array(
-    [0.9, 0.15, 3.0, 0.3, 0.3, 0.15, 4.0, 0.5, 0.5, 2.5, 0.15, 0.3, 0.5, 2.5, 0.25, 0.25, 0.15, 0.15, 0.15]
-)
-BALANCE: Final = -1.1
-"""Focus over spherical aberration: who focuses balances them, the spot is smallest between -1 and -4/3."""
-
-_BALANCE_SPREAD_PX = 0.25
-
-
-def _precision() -> Floats:
-    """Inverse covariance of the lens's unknowns, before any patch is seen."""
-    found = np.diag(1.0 / np.concatenate([_SPREAD_PX, _EYE_SPREAD]) ** 2)
-    balanced = np.zeros(_LENS)
-    balanced[[NAMES.index("focus"), NAMES.index("spherical")]] = 1.0, -BALANCE
-    return np.asarray(found + np.outer(balanced, balanced) / _BALANCE_SPREAD_PX**2)
-
-
-_PRECISION = _precision()
 _TEMPER = 0.1
 """Share of the likelihood that counts: neighbouring bins and patches of one motif err alike."""
 
@@ -233,12 +212,13 @@ class _Problem:
             gradient[places] += weight * own_gradient
             found.append(fitted.z)
             trust.append(trusted)
-        off, vote = lens - _USUAL, np.tile(1.0 / PHOTO_SPREAD**2, len(self.photos))
-        pull = np.concatenate([_PRECISION @ off, vote * shared.ravel()])
-        cost += float(pull @ np.concatenate([off, shared.ravel()]))
-        normal[:_LENS, :_LENS] += _PRECISION
+        unusual, curvature, pull = unlikeliness(lens)
+        vote = np.tile(1.0 / PHOTO_SPREAD**2, len(self.photos))
+        cost += unusual + float(vote @ shared.ravel() ** 2)
+        normal[:_LENS, :_LENS] += curvature
         normal[range(_LENS, count), range(_LENS, count)] += vote
-        return _State(cost, normal, gradient - pull, found, np.array(trust))
+        gradient -= np.concatenate([pull, vote * shared.ravel()])
+        return _State(cost, normal, gradient, found, np.array(trust))
 
     def _lens(self, lens: Floats, patch: PatchView) -> tuple[Floats, Floats]:
         """Return |OTF|^2 in the bins, shape (BINS, c), and the derivatives of its logarithm (BINS, c, 21)."""

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.psf import PsfSample, distance, rms_width
+from lensmodel.regression.pooled.expected import BALANCE
 from lensmodel.regression.pooled.fit import (
-    BALANCE,
     SYMMETRIC,
     PatchView,
     PooledFit,

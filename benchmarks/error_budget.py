@@ -110,9 +110,10 @@ def shoot(case: Case, files: Sequence[Path], folder: Path, how: str) -> Shot:
 
 
 def true_samples(samples: Sequence[PsfSample], truth: PsfField) -> list[PsfSample]:
-    """Put the true kernels at the places of the estimated ones."""
+    """Put the true kernels at the places of the estimated ones; spectra of patches no longer count."""
     return [
-        replace(s, kernel=truth.kernel_at(s.position, s.settings.channel, SIZE), weight=1.0) for s in samples
+        replace(s, kernel=truth.kernel_at(s.position, s.settings.channel, SIZE), weight=1.0, spectrum=None)
+        for s in samples
     ]
 
 
@@ -169,7 +170,7 @@ def rows_of(shot: Shot, how: str, estimator: str, count: int, workers: int) -> I
         for path in shot.learn
         for sample in pipeline.samples_of_photo(path, estimator=estimator, count=count, workers=workers)
     ]
-    model = LensModel.fit(samples)
+    model = LensModel.fit(samples).warmed()
     before = reached(shot.chart.planes, shot.held_out.planes, shot)
     true = reached(
         corrected_with(shot.chart, truth, "paper", workers=workers),
@@ -200,7 +201,7 @@ def rows_of(shot: Shot, how: str, estimator: str, count: int, workers: int) -> I
     pairs = [(s.position, s.kernel, truth.kernel_at(s.position, "g", SIZE)) for s in green]
     yield "patch kernels", {"PSF L2": by_zone(pairs)}
     yield "without caution", chain(model, uncautious)
-    yield "true patch PSFs", chain(LensModel.fit(true_samples(samples, truth)))
+    yield "true patch PSFs", chain(LensModel.fit(true_samples(samples, truth)).warmed())
     yield (
         "denoised only",
         row(

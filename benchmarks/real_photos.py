@@ -70,7 +70,7 @@ class Seen:
     def model(self, half: int | None = None) -> LensModel:
         """Fit the model of one half, or of all samples."""
         chosen = [*self.halves[0], *self.halves[1]] if half is None else self.halves[half]
-        return LensModel.fit(chosen)
+        return LensModel.fit(chosen).warmed()
 
 
 def look_at(path: Path, aperture: float | None, estimator: str, count: int) -> Seen:

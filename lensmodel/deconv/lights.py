@@ -18,7 +18,6 @@ from lensmodel.deconv.engine import Engine, compiled
 from lensmodel.deconv.richardson_lucy import climbed, first_guess
 from lensmodel.types import Planes
 
-_SHARPNESS: Final = 50.0  # of the sensor's bend at the clipping level, as in SaturationAwareRichardsonLucy
 _LEAST_SEEN: Final = 0.02  # share of a point's light that counts as measured where less of it is
 _DARKEST: Final = 0.9  # times what a kernel spreads: share of the darkest light nearby that must be left
 _DOUBT: Final = np.float32(0.25)  # share of the glow that may be none
@@ -136,16 +135,7 @@ def _find(
     latent, reach = first_guess(data, blur)
     seen = np.minimum(blur.adjoint((~lost).astype(np.float32)), reach)
     seen = np.maximum(seen, np.float32(_LEAST_SEEN * float(reach.max())))
-    latent = climbed(
-        latent,
-        data,
-        seen,
-        blur,
-        sensor,
-        steps=steps,
-        sharpness=_SHARPNESS,
-        engine=engine,
-    )
+    latent = climbed(latent, data, seen, blur, sensor, steps=steps, engine=engine)
     clip = np.float32(sensor.clip)
     held = np.minimum(latent, clip)
     # What shines too far off to reach a clipped pixel, or nearer to those of another region, is no concern.

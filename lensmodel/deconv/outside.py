@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from types import ModuleType
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,6 @@ from lensmodel.deconv.richardson_lucy import climbed, first_guess
 from lensmodel.types import Planes
 
 _DEPTH, _MORE = 4, 8  # reaches of the blur, and pixels, of data that tell of what lies beyond a side
-_SHARPNESS: Final = 50.0  # unused where nothing clips, but asked for
 
 
 def fill_outside(
@@ -98,7 +96,7 @@ def _wider(
     def light_of(part: NDArray[np.float32]) -> NDArray[np.float32]:
         part = np.ascontiguousarray(part)
         latent, reach = first_guess(part, blur)
-        return climbed(latent, part, reach, blur, plain, steps=steps, sharpness=_SHARPNESS, engine=engine)
+        return climbed(latent, part, reach, blur, plain, steps=steps, engine=engine)
 
     top, bottom, left, right = sensor.edges
     if left:

@@ -19,6 +19,9 @@ from lensmodel.types import Plane, StepHook, ignore_step
 ALPHA_MAX = 0.9
 """Cap of the extrapolation; above it the noise is accelerated as well."""
 
+SHARPNESS = 50.0
+"""Of the sensor's bend at the clipping level, per clipping level, as Whyte has it."""
+
 
 @dataclass(frozen=True, slots=True)
 class RichardsonLucy:
@@ -103,7 +106,7 @@ class SaturationAwareRichardsonLucy:
     """
 
     iterations: int = 25
-    sharpness: float = 50.0
+    sharpness: float = SHARPNESS
     accelerated: bool = True
     engine: Engine = "auto"
 
@@ -145,7 +148,7 @@ def climbed(
     sensor: Sensor,
     *,
     steps: int,
-    sharpness: float,
+    sharpness: float = SHARPNESS,
     accelerated: bool = True,
     lights: bool = False,
     engine: Engine = "auto",

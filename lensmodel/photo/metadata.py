@@ -37,6 +37,10 @@ _SENSOR_WIDTHS_MM: Final = (
 )
 """One inch, Four Thirds, APS-C, APS-H, 24 x 36 and medium format."""
 
+_FILM_DIAGONAL_MM: Final = 43.27
+_CROP_FACTORS: Final = (0.5, 15.0)
+_PITCHES_UM: Final = (0.3, 60.0)
+
 
 def read_metadata(path: Path | str) -> PhotoMetadata:
     """Read what a photo file says, without decoding it.
@@ -139,18 +143,34 @@ class _Exif:
         return None
 
     def pixel_pitch_um(self, header: Header) -> float | None:
-        """Pitch from the focal plane resolution, where it fits a sensor.
+        """Pitch from the focal plane resolution, else from the focal length for 35 mm film.
 
-        Programs that scale a photo down rarely correct the tag; then width times pitch is the
-        width of no common sensor, and the pitch is unknown.
+        Programs that scale a photo down rarely correct the former; then width times pitch is the
+        width of no common sensor, and it says nothing. A mosaic was never scaled.
         """
+        side = max(header.width, header.height)
+        pitch = self._focal_plane_pitch_um()
+        if pitch is not None:
+            mosaic = header.kind == "raw" or (header.kind == "dng" and header.channels == 1)
+            fits = any(low <= side * pitch / 1000.0 <= high for low, high in _SENSOR_WIDTHS_MM)
+            if mosaic or fits:
+                return _first_within(*_PITCHES_UM, pitch)
+        return self._film_pitch_um(math.hypot(header.width, header.height))
+
+    def _focal_plane_pitch_um(self) -> float | None:
         per_unit, unit = self.number(0xA20E), self.number(0xA210) or 2.0
         unit_um = {2.0: 25400.0, 3.0: 10000.0, 4.0: 1000.0, 5.0: 1.0}.get(unit)
-        if not per_unit or per_unit <= 0 or unit_um is None:
+        return None if not per_unit or per_unit <= 0 or unit_um is None else unit_um / per_unit
+
+    def _film_pitch_um(self, diagonal_px: float) -> float | None:
+        """Pitch of a frame whose diagonal is that of 35 mm film over the crop factor."""
+        focal, film = self.number(0x920A), self.number(0xA405)
+        if not focal or not film or focal <= 0 or film <= 0 or diagonal_px <= 0:
             return None
-        pitch, side = unit_um / per_unit, max(header.width, header.height)
-        fits = any(low <= side * pitch / 1000.0 <= high for low, high in _SENSOR_WIDTHS_MM)
-        return pitch if fits else None
+        crop = _first_within(*_CROP_FACTORS, film / focal)
+        if crop is None:
+            return None
+        return _first_within(*_PITCHES_UM, 1000.0 * _FILM_DIAGONAL_MM / crop / diagonal_px)
 
 
 def _lens(exif: _Exif, note: MakerNote, xmp: Mapping[str, str]) -> LensIdentity:

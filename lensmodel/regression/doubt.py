@@ -55,7 +55,8 @@ class Doubt:
         total = sum(weight for weight, _ in nearest)
         if total <= 0.0:
             return 1.0
-        rise = sum(weight * self._rise(row) for weight, row in nearest) / total
+        # one patch whose zeros fit by chance must not speak for all
+        rise = sum(weight * min(self._rise(row), _SURE) for weight, row in nearest) / total
         return float(np.interp(rise, (_OPEN, _SURE), (1.0, _LEAST)))
 
     def _rise(self, row: int) -> float:

@@ -67,6 +67,8 @@ class Physics:
         wavefront if `agreed`.
     agreed : bool
         Whether the wavefront was fitted to the spectra of all patches, and nothing is left to krige.
+    diffraction_known : bool
+        Whether aperture and pixel pitch of an agreed wavefront are known.
     """
 
     front: Wavefront
@@ -77,6 +79,7 @@ class Physics:
     rest: NDArray[np.float64]
     errors: NDArray[np.float64]
     agreed: bool = False
+    diffraction_known: bool = False
 
     @classmethod
     def fit(
@@ -109,7 +112,11 @@ class Physics:
         if pooled is not None and _suits(pooled, trusted):
             side = max(s.kernel.shape[0] for s in samples)
             empty = np.empty((0, 2)), np.empty((0, len(scale))), scale, np.empty((0, side**2))
-            return cls(pooled.front, side, *empty, pooled.errors(samples), agreed=True)
+            return cls(
+                *(pooled.front, side, *empty, pooled.errors(samples)),
+                agreed=True,
+                diffraction_known=pooled.diffraction_known,
+            )
         known = {id(samples[i]): i for i in voting}
         front = fit_wavefront(trusted)
         if front is None:

@@ -14,7 +14,10 @@ from lensmodel.regression.wavefront import NAMES, Wavefront, design, stopped
 from lensmodel.regression.wavefront_problem import PRIOR_PX, SLOPE_PX, USUAL_EYE, Problem
 from lensmodel.types import WAVELENGTH_NM, Kernel
 
-_USUAL_F, _USUAL_PITCH_UM = 2.8, 4.5
+_USUAL_F = 2.8
+USUAL_PITCH_UM = 4.5
+"""Of sensors whose pixel pitch nobody knows."""
+
 _LARGEST = 35
 _COARSE, _FINE = 12, 36
 _COARSE_ROUNDS, _FINE_ROUNDS = 8, 12
@@ -56,13 +59,13 @@ def fit_wavefront(samples: Sequence[PsfSample], start: Wavefront | None = None) 
     apertures = [s.settings.aperture for s in kept if s.settings.aperture is not None]
     widest = min(apertures) if apertures else _USUAL_F
     pitches = [s.pixel_pitch_um for s in kept if s.pixel_pitch_um is not None]
-    pitch = float(np.median(pitches)) if pitches else _USUAL_PITCH_UM
+    pitch = float(np.median(pitches)) if pitches else USUAL_PITCH_UM
     kept.sort(key=_order)
     log_q = math.log(WAVELENGTH_NM["g"] / 1000.0 * widest / pitch)
     vague = 0.03 if apertures and pitches else (0.3 if apertures else 0.5)
     zoom = focal_range(kept) > ONE_FOCAL_LENGTH
     few, many = spread(kept, _COARSE * (1 + zoom)), spread(kept, _FINE * (1 + zoom))
-    size = max(_side_of_light(s.kernel) for s in many)
+    size = max(side_of_light(s.kernel) for s in many)
     begins = [start] if start is not None else []
     if start is None:
         usual = Wavefront(np.zeros(len(NAMES)), log_q, USUAL_EYE, widest, size)
@@ -103,6 +106,15 @@ def focal_range(samples: Sequence[PsfSample]) -> float:
     return math.log2(max(known) / min(known)) if known else 0.0
 
 
+def side_of_light(kernel: Kernel) -> int:
+    """Odd side of the middle square that holds nearly all light."""
+    middle = kernel.shape[0] // 2
+    for half in range(min(_LEAST_HALF, middle), min(middle, _LARGEST // 2)):
+        if kernel[middle - half : middle + half + 1, middle - half : middle + half + 1].sum() > _HELD_LIGHT:
+            return 2 * half + 1
+    return 2 * min(middle, _LARGEST // 2) + 1
+
+
 def _starts(samples: Sequence[PsfSample], usual: Wavefront) -> list[Wavefront]:
     """Wavefronts whose ray spots have the moments of samples."""
     designs = np.stack([stopped(design(s.position, s.settings), usual.stop(s.settings)) for s in samples])
@@ -128,15 +140,6 @@ def _turned_at_one_end(front: Wavefront, samples: Sequence[PsfSample]) -> Wavefr
 def _order(sample: PsfSample) -> tuple[float, float, float, str, str]:
     place = sample.position
     return place.r, place.phi, sample.settings.aperture or 0.0, sample.settings.channel, sample.photo
-
-
-def _side_of_light(kernel: Kernel) -> int:
-    """Odd side of the middle square that holds nearly all light."""
-    middle = kernel.shape[0] // 2
-    for half in range(min(_LEAST_HALF, middle), min(middle, _LARGEST // 2)):
-        if kernel[middle - half : middle + half + 1, middle - half : middle + half + 1].sum() > _HELD_LIGHT:
-            return 2 * half + 1
-    return 2 * min(middle, _LARGEST // 2) + 1
 
 
 def spread(samples: Sequence[PsfSample], count: int) -> list[PsfSample]:

@@ -11,11 +11,13 @@ from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from lensmodel import photo
+from lensmodel.photo.dng import ShotInfo, write_bayer_dng
 from lensmodel.photo.xmp import read_xmp
 
 # Lens names that EXPECTED.tsv gives from ExifTool's own tables, not from text in the file.
@@ -218,6 +220,33 @@ def test_the_pixel_pitch_follows_from_the_focal_plane_resolution(tmp_path: Path)
 
 def test_the_pitch_of_a_photo_that_was_scaled_down_is_unknown(metadata_of: Read) -> None:
     assert metadata_of(jpeg_with({}, {0xA20E: IFDRational(5728, 1), 0xA210: 2})).pixel_pitch_um is None
+
+
+def test_the_pitch_of_a_small_mosaic_is_known_because_it_was_never_scaled(tmp_path: Path) -> None:
+    shot = ShotInfo(pixel_pitch_um=4.5)
+    write_bayer_dng(
+        tmp_path / "mosaic.dng", np.full((64, 96), 600, np.uint16), black=512, white=4095, shot=shot
+    )
+
+    assert photo.read_metadata(tmp_path / "mosaic.dng").pixel_pitch_um == pytest.approx(4.5)
+
+
+@pytest.mark.parametrize(
+    ("focal", "film", "pitch"),
+    [
+        (IFDRational(50, 1), 75, 1000.0 * 43.27 / 1.5 / math.hypot(1200, 900)),
+        (IFDRational(50, 1), 0, None),  # the camera does not know
+        (IFDRational(50, 1), 2000, None),  # no sensor is that small
+    ],
+)
+def test_the_focal_length_for_film_tells_the_pitch_where_the_sensor_does_not(
+    focal: IFDRational, film: int, pitch: float | None, tmp_path: Path
+) -> None:
+    block = Image.Exif()
+    block.get_ifd(0x8769).update({0x920A: focal, 0xA405: film})
+    Image.new("RGB", (1200, 900)).save(tmp_path / "small.jpg", exif=block)
+
+    assert photo.read_metadata(tmp_path / "small.jpg").pixel_pitch_um == (pitch and pytest.approx(pitch))
 
 
 def test_an_orientation_outside_one_to_eight_is_upright(metadata_of: Read) -> None:

@@ -321,23 +321,45 @@ def test_pooled_lens_is_nearer_to_the_truth_than_its_samples_and_kept_by_profile
 
 
 def test_wide_blur_leaves_the_say_to_the_wavefront() -> None:
-    share = agreed_share(np.array([0.4, 0.6, 0.9, 1.5, 3.0]))
+    share = agreed_share(np.array([0.4, 0.6, 0.9, 1.5, 3.0]), diffraction_known=False)
     assert share[0] < 0.05
     assert 0.7 < share[1] < 0.9
     assert 0.95 < share[2] < share[3] < share[4] < 1.0
 
 
+def test_wavefront_has_the_say_at_any_width_where_its_diffraction_is_known() -> None:
+    known = samples(MIN_PLACES + 2)
+    place = FieldPosition(0.0, 0.0)
+
+    assert LensModel.fit(known).warmed().query(place, SETTINGS, 31).wavefront_share == 1.0
+    unknown = [replace(s, pixel_pitch_um=None) for s in known]
+    assert LensModel.fit(unknown).warmed().query(place, SETTINGS, 31).wavefront_share < 1.0
+
+
+def test_unknown_pitch_is_taken_as_a_usual_one_not_as_wide_kernels_suggest() -> None:
+    unknown = [
+        replace(s, kernel=gaussian(31, 4.0 * np.eye(2)), pixel_pitch_um=None) for s in samples(MIN_PLACES + 2)
+    ]
+    found = pool(unknown)
+
+    assert found is not None
+    assert not found.diffraction_known
+    assert found.front.log_q == pytest.approx(LOG_Q)
+
+
 def test_error_is_told_even_where_the_cat_s_eye_is_hardly_known() -> None:
     front, unknown = true_front(), np.zeros((21, 21))
     unknown[19:, 19:] = np.diag([1.0, 9.0])  # many a drawn pupil would let no light pass at the corner
-    fitted = Pooled(PooledFit(front, 0.0, unknown, np.ones(1)), 0.0, {"a": 1.0})
+    fitted = Pooled(PooledFit(front, 0.0, unknown, np.ones(1)), 0.0, {"a": 1.0}, diffraction_known=True)
     samples = [
         PsfSample(gaussian(31, 1.0), FieldPosition(1.0, phi), SETTINGS, photo="a") for phi in (0.0, 2.0)
     ]
 
     found = fitted.errors(samples)
 
-    known = Pooled(PooledFit(front, 0.0, np.zeros((21, 21)), np.ones(1)), 0.0, {}).errors(samples)
+    known = Pooled(
+        PooledFit(front, 0.0, np.zeros((21, 21)), np.ones(1)), 0.0, {}, diffraction_known=True
+    ).errors(samples)
     assert found.min() > known.max()
 
 

@@ -94,7 +94,7 @@ def _fig4(plan: Reproduction, case: Case, folder: Path, workers: int | None) -> 
             return {"failed": str(error)}
     green = [s for s in samples if s.settings.channel == "g"]
     frame, settings = developed.frame, case.settings
-    model = LensModel.fit(samples)
+    model = LensModel.fit(samples).warmed()
     boxes = [(p.row, p.col, p.size) for p in chosen.patches]
     Image.fromarray(_small_photo(as_shown(developed.planes, case.camera.white_balance), boxes)).save(
         folder / "fig4-patches.png", optimize=True

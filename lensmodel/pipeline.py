@@ -220,7 +220,8 @@ def estimate_cell(
                 pixel_pitch_um=developed.info.metadata.pixel_pitch_um,
                 estimator=f"{method.name}/{method.version}",
                 error=estimate.predicted_error if math.isfinite(estimate.predicted_error) else None,
-                spectrum=PatchSpectrum.of(plane, noise, width),
+                # cameras sharpen their JPEGs: no power law of a scene times a lens is left in them
+                spectrum=None if developed.info.kind == "jpeg" else PatchSpectrum.of(plane, noise, width),
                 evidence=evidence,
                 half_diagonal_px=developed.frame.half_diagonal,
             )

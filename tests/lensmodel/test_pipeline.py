@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +92,21 @@ def test_calibrated_lens_makes_another_photo_sharper(
     stages = [event.stage for event in events]
     assert stages[0] == "developing"
     assert stages[-1] == "counted"
+
+
+@pytest.mark.parametrize(("kind", "kept"), [("dng", True), ("tiff", True), ("jpeg", False)])
+def test_spectra_of_photos_that_a_camera_sharpened_are_not_kept(
+    kind: photo.FileKind, kept: bool, photos: dict[str, tuple[Path, SimulatedPhoto]]
+) -> None:
+    developed = photo.develop(photos["city"][0])
+    developed = replace(developed, info=replace(developed.info, kind=kind))
+    patch = Patch(128, 192, 128, developed.frame.position(192, 256), 1.0, 0)
+
+    found = pipeline.estimate_cell(
+        developed, [patch], settings=SETTINGS, photo_id="a", estimator="whittle", channels=("g",)
+    )
+
+    assert (found[0].sample.spectrum is not None) == kept
 
 
 def test_photos_that_cannot_help_are_skipped_with_the_reason(tmp_path: Path) -> None:

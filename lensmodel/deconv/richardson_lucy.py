@@ -20,7 +20,7 @@ ALPHA_MAX = 0.9
 """Cap of the extrapolation; above it the noise is accelerated as well."""
 
 SHARPNESS = 50.0
-"""Of the sensor's bend at the clipping level, per clipping level, as Whyte has it."""
+"""a of the sensor's answer, per clipping level: how sharply it bends where it clips."""
 
 
 @dataclass(frozen=True, slots=True)

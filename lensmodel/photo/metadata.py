@@ -37,8 +37,9 @@ _SENSOR_WIDTHS_MM: Final = (
 )
 """One inch, Four Thirds, APS-C, APS-H, 24 x 36 and medium format."""
 
-_FILM_DIAGONAL_MM: Final = 43.27
-_CROP_FACTORS: Final = (0.5, 15.0)
+_LARGEST_SENSOR_MM: Final = max(high for _, high in _SENSOR_WIDTHS_MM)
+_FILM_DIAGONAL_MM: Final = math.hypot(36.0, 24.0)
+_CROP_FACTORS: Final = (0.5, 15.0)  # from medium format to the smallest phones
 _PITCHES_UM: Final = (0.3, 60.0)
 
 
@@ -146,15 +147,18 @@ class _Exif:
         """Pitch from the focal plane resolution, else from the focal length for 35 mm film.
 
         Programs that scale a photo down rarely correct the former; then width times pitch is the
-        width of no common sensor, and it says nothing. A mosaic was never scaled.
+        width of no common sensor, and it says nothing. A mosaic was never scaled, only cut.
+
+        Source: CIPA DC-008-2023, tags FocalPlaneXResolution and FocalLengthIn35mmFilm.
         """
-        side = max(header.width, header.height)
-        pitch = self._focal_plane_pitch_um()
+        pitch = _first_within(*_PITCHES_UM, self._focal_plane_pitch_um())
         if pitch is not None:
+            width_mm = max(header.width, header.height) * pitch / 1000.0
             mosaic = header.kind == "raw" or (header.kind == "dng" and header.channels == 1)
-            fits = any(low <= side * pitch / 1000.0 <= high for low, high in _SENSOR_WIDTHS_MM)
-            if mosaic or fits:
-                return _first_within(*_PITCHES_UM, pitch)
+            if mosaic and width_mm <= _LARGEST_SENSOR_MM:
+                return pitch
+            if any(low <= width_mm <= high for low, high in _SENSOR_WIDTHS_MM):
+                return pitch
         return self._film_pitch_um(math.hypot(header.width, header.height))
 
     def _focal_plane_pitch_um(self) -> float | None:

@@ -63,7 +63,9 @@ class WidthField:
         """Widths of `at` for points `(n, 7)` of `variables`, shape (n, 2)."""
         if self.slopes is None:
             return np.ones((len(where), 2))
-        return np.clip(np.exp(self._features(where) @ self.slopes - self.reference), *_RANGE)
+        # no matrix product: how that rounds hangs on how many places are asked for at once
+        found = (self._features(where)[:, :, None] * self.slopes).sum(axis=1)
+        return np.clip(np.exp(found - self.reference), *_RANGE)
 
     def _features(self, where: NDArray[np.float64]) -> NDArray[np.float64]:
         r2 = where[:, 0] ** 2

@@ -222,19 +222,28 @@ def test_the_pitch_of_a_photo_that_was_scaled_down_is_unknown(metadata_of: Read)
     assert metadata_of(jpeg_with({}, {0xA20E: IFDRational(5728, 1), 0xA210: 2})).pixel_pitch_um is None
 
 
-def test_the_pitch_of_a_small_mosaic_is_known_because_it_was_never_scaled(tmp_path: Path) -> None:
-    shot = ShotInfo(pixel_pitch_um=4.5)
-    write_bayer_dng(
-        tmp_path / "mosaic.dng", np.full((64, 96), 600, np.uint16), black=512, white=4095, shot=shot
-    )
+@pytest.mark.parametrize(("told", "pitch"), [(4.5, 4.5), (59.0, 59.0), (352.8, None)])
+def test_the_pitch_of_a_small_mosaic_is_known_because_it_was_never_scaled(
+    told: float, pitch: float | None, tmp_path: Path
+) -> None:
+    shot, path = ShotInfo(pixel_pitch_um=told), tmp_path / "mosaic.dng"
+    write_bayer_dng(path, np.full((64, 96), 600, np.uint16), black=512, white=4095, shot=shot)
 
-    assert photo.read_metadata(tmp_path / "mosaic.dng").pixel_pitch_um == pytest.approx(4.5)
+    # 72 pixels to the inch, as some cameras write, is a sensor of nothing
+    assert photo.read_metadata(path).pixel_pitch_um == (pitch and pytest.approx(pitch))
+
+
+def test_no_sensor_is_larger_than_medium_format(tmp_path: Path) -> None:
+    shot, path = ShotInfo(pixel_pitch_um=50.0), tmp_path / "mosaic.dng"
+    write_bayer_dng(path, np.full((64, 1200), 600, np.uint16), black=512, white=4095, shot=shot)
+
+    assert photo.read_metadata(path).pixel_pitch_um is None
 
 
 @pytest.mark.parametrize(
     ("focal", "film", "pitch"),
     [
-        (IFDRational(50, 1), 75, 1000.0 * 43.27 / 1.5 / math.hypot(1200, 900)),
+        (IFDRational(50, 1), 75, 1000.0 * math.hypot(36, 24) / 1.5 / math.hypot(1200, 900)),
         (IFDRational(50, 1), 0, None),  # the camera does not know
         (IFDRational(50, 1), 2000, None),  # no sensor is that small
     ],
@@ -243,7 +252,8 @@ def test_the_focal_length_for_film_tells_the_pitch_where_the_sensor_does_not(
     focal: IFDRational, film: int, pitch: float | None, tmp_path: Path
 ) -> None:
     block = Image.Exif()
-    block.get_ifd(0x8769).update({0x920A: focal, 0xA405: film})
+    # 72 pixels to the inch say nothing of a sensor
+    block.get_ifd(0x8769).update({0x920A: focal, 0xA405: film, 0xA20E: IFDRational(72, 1), 0xA210: 2})
     Image.new("RGB", (1200, 900)).save(tmp_path / "small.jpg", exif=block)
 
     assert photo.read_metadata(tmp_path / "small.jpg").pixel_pitch_um == (pitch and pytest.approx(pitch))

@@ -94,7 +94,11 @@ class Pooled:
         return self.front.kernel(sample.position, sample.settings, size)
 
     def errors(self, samples: Sequence[PsfSample]) -> NDArray[np.float64]:
-        """Expected relative L2 of the kernels at samples, by draws from the fit's covariance."""
+        """Expected relative L2 of the kernels at samples, shape (n,).
+
+        hypot(c d, 0.1 exp(r)), with d the scatter of draws from the fit's covariance and c one over the
+        number of photos, 0.3 at least.
+        """
         few = spread(samples, _ERROR_PLACES)
         rng = np.random.default_rng(_SEED)
         lens = np.concatenate([self.front.terms, self.front.eye])
@@ -141,12 +145,11 @@ def pool(samples: Sequence[PsfSample], on_step: StepHook = ignore_step) -> Poole
     if first is None:
         return None
     widest = min((s.settings.aperture for s in seen if s.settings.aperture is not None), default=None)
-    first = replace(
-        first,
-        log_q=_log_q(seen, first.log_q),
-        f_number=widest or first.f_number,
-        size=max(side_of_light(s.kernel) for s in heads),
-    )
+    pitches = [s.pixel_pitch_um for s in seen if s.pixel_pitch_um is not None]
+    first = replace(first, size=max(side_of_light(s.kernel) for s in heads))
+    if widest is not None:
+        pitch = float(np.median(pitches)) if pitches else USUAL_PITCH_UM
+        first = replace(first, f_number=widest, log_q=_log_q(widest, pitch))
     begins = [first]
     centred = np.where(SYMMETRIC[: len(PRIOR_PX)], PRIOR_PX, 0.0)
     designs = np.stack([stopped(design(s.position, s.settings), first.stop(s.settings)) for s in heads])
@@ -165,7 +168,7 @@ def pool(samples: Sequence[PsfSample], on_step: StepHook = ignore_step) -> Poole
     trust: dict[str, list[float]] = {}
     for group, value in zip(chosen, best.trust, strict=True):
         trust.setdefault(next(iter(group.values())).photo, []).append(float(value))
-    known = any(s.settings.aperture is not None and s.pixel_pitch_um is not None for s in seen)
+    known = widest is not None and bool(pitches)
     return Pooled(best, tails, {photo: float(np.median(values)) for photo, values in trust.items()}, known)
 
 
@@ -228,18 +231,13 @@ def _mirrored(front: Wavefront) -> Wavefront:
     return replace(front, terms=terms)
 
 
-def _log_q(samples: Sequence[PsfSample], fitted: float) -> float:
-    """Width of diffraction by the metadata; the fitted one where no sample names an aperture.
+def _log_q(aperture: float, pitch_um: float) -> float:
+    """Logarithm of wavelength x f-number / pixel pitch, the width of diffraction, in green.
 
-    The pixels of a power spectrum follow it little, so that it stays fixed. Kernels that were estimated
-    one by one are too wide where blur is narrow, so a usual pitch is the better guess of an unknown one.
+    It stays fixed: the pixels of a power spectrum follow it little, and kernels that were estimated one by
+    one, to which it might be fitted, are too wide where blur is narrow.
     """
-    apertures = [s.settings.aperture for s in samples if s.settings.aperture is not None]
-    pitches = [s.pixel_pitch_um for s in samples if s.pixel_pitch_um is not None]
-    if not apertures:
-        return fitted
-    pitch = float(np.median(pitches)) if pitches else USUAL_PITCH_UM
-    return math.log(WAVELENGTH_NM["g"] / 1000.0 * min(apertures) / pitch)
+    return math.log(WAVELENGTH_NM["g"] / 1000.0 * aperture / pitch_um)
 
 
 def _cost(fit: PooledFit) -> float:

@@ -54,6 +54,8 @@ TILE = 64
 SIZE = 31
 SLOPES = np.linspace(1.6, 3.2, 17)
 USUAL_SLOPE, SLOPE_SCATTER = 2.4, 0.35
+FILL = 0.01
+"""What fills the zeros of |OTF|^2 where blur changes within a patch; the same for all that are compared."""
 WIDTHS_PX = (0.3, 0.45, 0.6, 0.75, 0.9, 1.1, 1.3, 1.6, 2.0, 2.5)
 
 
@@ -132,12 +134,12 @@ def periodogram(patch: Plane) -> NDArray[np.float64]:
 def log_likelihood(power: NDArray[np.float64], noise: float, kernel: Kernel, tiles: float) -> float:
     """Whittle's log likelihood of a spectrum, the best over slope and height of the scene's own.
 
-    sum_f -(log P + I / P), P = a |f|^-s |K|² + noise; tiles that overlap by half count by a quarter.
+    sum_f -(log P + I / P), P = a |f|^-s (|K|² + FILL) + noise; tiles that overlap by half count by a quarter.
     """
     rows, cols = fft.fftfreq(TILE)[:, None], fft.rfftfreq(TILE)[None, :]
     radius = np.hypot(rows, cols)
     used = (radius > 0.04) & (radius < 0.5)
-    transfer = np.square(psf.mtf(psf.resized(kernel, SIZE), TILE))[used]
+    transfer = np.square(psf.mtf(psf.resized(kernel, SIZE), TILE))[used] + FILL
     seen, f = power[used], radius[used]
     best = -np.inf
     for slope in SLOPES:

@@ -24,7 +24,7 @@ from lensmodel import photo, pipeline
 from lensmodel.bench.cases import list_photos, photo_half
 from lensmodel.bench.reproduce.scenes import centred_cut
 from lensmodel.regression.pooled.fit import fit_scene
-from lensmodel.regression.pooled.scene import BIAS, SHAPES, SceneView
+from lensmodel.regression.pooled.scene import ORBITS, SHAPES, SceneView
 from lensmodel.regression.pooled.transfer import bin_frequencies
 from lensmodel.simulate import SimulatedCamera, SimulatedField, draw_lens, load_scene, photograph, write_photo
 from lensmodel.spectrum import SECTORS, PatchSpectrum
@@ -86,7 +86,7 @@ def spread(values: Floats) -> Floats:
 def report(seen: list[Seen]) -> None:
     """Fit the scenes and print."""
     shapes = SHAPES.shape[1]
-    fits = [fit_scene(replace(s.scene, vote=s.scene.vote / _WIDE), s.truth, BIAS[:, None]) for s in seen]
+    fits = [fit_scene(replace(s.scene, vote=s.scene.vote / _WIDE), s.truth) for s in seen]
     unknowns = np.stack([z for z, _, _ in fits])
     photos = np.array([s.photo for s in seen])
     centres = np.stack([np.median(unknowns[photos == p], axis=0) for p in sorted(set(photos))])
@@ -106,10 +106,26 @@ def report(seen: list[Seen]) -> None:
         ring_rest = rest[:, :, k].reshape(len(seen), -1, SECTORS)
         strong = signal[:, :, k].reshape(ring_rest.shape) > 0.5
         rings = range(ring_rest.shape[1])
-        print(
-            channel, "bias beyond BIAS", np.array([np.median(ring_rest[:, i][strong[:, i]]) for i in rings])
-        )
+        middle = np.array([np.median(ring_rest[:, i][strong[:, i]]) for i in rings])
+        print(channel, "beyond our bias ", middle)
         print(channel, "roughness       ", np.array([spread(ring_rest[:, i][strong[:, i]]) for i in rings]))
+
+    pattern(rest[:, :, 0], signal[:, :, 0], np.stack([s.truth[:, 0] for s in seen]))
+
+
+def pattern(rest: Floats, signal: Floats, power: Floats) -> None:
+    """Print what green has beyond our bias by the angle to the sensor's axes, and as it goes with |OTF|^4."""
+    print("g, beyond our bias at axes, diagonals, between: steady, per |OTF|^4")
+    shape = len(rest), -1, SECTORS
+    rest, strong, power = rest.reshape(shape), signal.reshape(shape) > 0.5, power.reshape(shape)
+    for ring in range(rest.shape[1]):
+        lines = []
+        for orbit in range(3):
+            here = np.s_[:, ring, orbit == ORBITS]
+            known = strong[here]
+            terms = np.stack([np.ones(known.sum()), power[here][known] ** 2], axis=1)
+            lines.append(np.linalg.lstsq(terms, rest[here][known], rcond=None)[0])
+        print(ring, np.array(lines).T)
 
 
 def main() -> None:

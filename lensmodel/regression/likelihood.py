@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from lensmodel.psf import PsfSample, distance
 from lensmodel.regression.answer import MIXED
 from lensmodel.regression.pooled.fit import fit_scene
-from lensmodel.regression.pooled.scene import BIAS, SceneView
+from lensmodel.regression.pooled.scene import SceneView
 from lensmodel.regression.pooled.transfer import BINS, bin_frequencies
 from lensmodel.spectrum import SECTORS
 from lensmodel.types import Kernel
@@ -71,7 +71,7 @@ def surprise(sample: PsfSample, kernel: Kernel, share: float = 1.0) -> float:
         error = max(distance(kernel, sample.kernel).rel_l2, _LEAST_ERROR)
         return BINS * math.log(error)
     view = SceneView.of({sample.settings.channel: sample.spectrum}).with_floor(*_FLOOR)
-    unknowns, residual, _ = fit_scene(view, _power(kernel, share)[:, None], BIAS[:, None])
+    unknowns, residual, _ = fit_scene(view, _power(kernel, share)[:, None])
     squared = np.einsum("bi,bij,bj->b", residual, view.precision, residual)
     cost = float((_TAILS + 1.0) * np.log1p(squared / _TAILS).sum() + view.vote @ (unknowns - view.usual) ** 2)
     nu = _PATCH_TAILS * BINS

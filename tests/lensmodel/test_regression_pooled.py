@@ -17,7 +17,7 @@ from lensmodel.regression.pooled import MIN_PLACES, pool
 from lensmodel.regression.pooled.expected import BALANCE, corner_ratio, unlikeliness
 from lensmodel.regression.pooled.fit import PatchView, PooledFit, fit_spectra
 from lensmodel.regression.pooled.refine import Pooled
-from lensmodel.regression.pooled.scene import BIAS, SceneView
+from lensmodel.regression.pooled.scene import BIAS, WITH_POWER, SceneView
 from lensmodel.regression.pooled.transfer import (
     BINS,
     COLUMNS,
@@ -78,13 +78,16 @@ def seen_at(
     modulus, angle = bin_frequencies()
     slope, turned = rng.normal(2.1, 0.3), rng.uniform(0, math.pi)
     scene = 1e-2 * (modulus / 0.1) ** -slope * np.exp(0.3 * np.cos(2 * (angle - turned)))
-    scene = scene * np.exp(BIAS + rough * rng.standard_normal(BINS))
+    scene = scene * np.exp(rough * rng.standard_normal(BINS))
     found = {}
     for channel in CHANNELS:
         kernel = LENS.kernel(place, SETTINGS.with_channel(channel), 41) if blur is None else blur
         noise = 1e-7
         power = np.zeros((RINGS, SECTORS), np.float32)
-        power[FIRST_RING:] = (scene * (power_of(kernel) + filled) + noise).reshape(-1, SECTORS)
+        passed = power_of(kernel)
+        # what photographs have beyond a polynomial, as `scene` measured it
+        seen = scene * np.exp(BIAS + WITH_POWER * passed**2) * (passed + filled)
+        power[FIRST_RING:] = (seen + noise).reshape(-1, SECTORS)
         found[channel] = PatchSpectrum(power, noise)
     return found
 
@@ -132,6 +135,17 @@ def test_power_is_that_of_the_simulated_lens() -> None:
         assert strong.sum() > 60
         assert np.abs(found - np.log(truth))[strong].max() < 0.3
         assert np.abs(found - np.log(truth))[strong].mean() < 0.06
+
+
+def test_the_bias_has_the_symmetries_of_a_square_lattice() -> None:
+    _, angle = bin_frequencies()
+    by_ring = (BIAS + 0.4 * WITH_POWER).reshape(-1, SECTORS)
+    folded = np.abs((angle[:SECTORS] + math.pi / 4) % (math.pi / 2) - math.pi / 4)
+
+    for same in np.unique(folded.round(9)):
+        alike = by_ring[:, np.isclose(folded, same)]
+        assert alike.shape[1] == 4
+        assert np.ptp(alike, axis=1).max() == 0.0
 
 
 def test_zeros_that_are_filled_do_not_move_the_lens() -> None:

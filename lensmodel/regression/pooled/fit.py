@@ -6,7 +6,7 @@ lens, and all of them are estimated at once (P. Whittle's idea, with log spectra
 against outliers), so that photos add up::
 
     minimise  sum_patches rho(chi^2)  +  |priors|^2,
-    chi^2 = sum_bins t(r' V^-1 r),   r = ln S - ln(exp(s(z) + bias) (|OTF(theta)|^2 + exp(w)) + n)
+    chi^2 = sum_bins t(r' V^-1 r),   r = ln S - ln(exp(s(z) + b) (|OTF(theta)|^2 + exp(w)) + n)
 
 by Levenberg-Marquardt, the unknowns z and w of a patch eliminated from the normal equations (Schur). Power
 knows nothing of the phase: a wavefront and its negative, which turns the kernels by 180 degrees, have
@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.regression.pooled.expected import unlikeliness
-from lensmodel.regression.pooled.scene import BIAS, PHOTO_SPREAD, SHAPES, SceneView
+from lensmodel.regression.pooled.scene import BIAS, PHOTO_SPREAD, SHAPES, WITH_POWER, SceneView
 from lensmodel.regression.pooled.transfer import BINS, BORROWED_RINGS, Transfer
 from lensmodel.regression.wavefront import NAMES, Wavefront, design, stopped
 from lensmodel.spectrum import SECTORS
@@ -158,7 +158,7 @@ def open_eye(eye: Floats) -> tuple[float, float]:
     return max(float(eye[0]), _SMALLEST_EYE), float(np.clip(eye[1], -_FARTHEST_EYE, _FARTHEST_EYE))
 
 
-def fit_scene(view: SceneView, power: Floats, rest: Floats) -> tuple[Floats, Floats, Floats]:
+def fit_scene(view: SceneView, power: Floats) -> tuple[Floats, Floats, Floats]:
     """Fit the scene of one patch behind a lens that is known.
 
     Parameters
@@ -166,8 +166,6 @@ def fit_scene(view: SceneView, power: Floats, rest: Floats) -> tuple[Floats, Flo
     view : SceneView
     power : ndarray, shape (BINS, c)
         |OTF|^2.
-    rest : ndarray, shape (BINS, c) or (BINS, 1)
-        What else is known of the log power.
 
     Returns
     -------
@@ -175,7 +173,7 @@ def fit_scene(view: SceneView, power: Floats, rest: Floats) -> tuple[Floats, Flo
     residual, signal : ndarray, shape (BINS, c)
         What is left of the log power, and the share of the scene in the power.
     """
-    fitted = _Scene.fitted(view, power, rest, None)
+    fitted = _Scene.fitted(view, power, BIAS[:, None], None)
     return fitted.z, fitted.residual, fitted.signal
 
 
@@ -199,7 +197,9 @@ class _Problem:
         for i, patch in enumerate(self.patches):
             at = _LENS + len(PHOTO_SPREAD) * self.photos[patch.photo]
             seen, by_lens = self._lens(lens, patch)
+            # its change with the lens is no part of the derivatives: lenses far too sharp would gain by it
             rest = (BIAS + SHAPES[:, 1:3] @ shared[self.photos[patch.photo]])[:, None]
+            rest = rest + WITH_POWER[:, None] * seen**2
             z = None if scenes is None else scenes[i]
             fitted = _Scene.fitted(patch.scene, seen, rest, z)
             nu = _PATCH_TAILS * BINS * len(patch.scene.channels)

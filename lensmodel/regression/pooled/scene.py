@@ -10,14 +10,17 @@ JOSA A 4, 1987), what people build has few directions, each of them a narrow rid
 little from green; all patches of one photo share a part of their slope and curvature, since one motif and
 one focus are theirs. What is seen is
 
-    ln(exp(s) (|OTF|^2 + exp(w)) + n)
+    ln(exp(s + b + d |OTF|^4) (|OTF|^2 + exp(w)) + n)
 
 with the power n of the noise, and a roughness that the polynomial does not follow, which is the same in
-all channels. The floor exp(w) is the patch's own: the blur changes within it, and a mosaic is
-interpolated, so that no zero of the OTF is seen as one. The same floor for all patches makes lenses of
-even blur likelier than the true ones.
+all channels. What the polynomial misses on average is b. It hangs on the angle to the sensor's axes: bins
+of few frequencies hold others than their middles say, what people build has more edges along the axes, and
+a mosaic is interpolated. What `Transfer` misses behind sharp lenses is d: it leaves out aliases beyond 0.75
+cycles/pixel. Without b and d, sharp lenses came out half as wide again as they are. The floor exp(w) is the
+patch's own: the blur changes within it, so that no zero of the OTF is seen as one. The same floor for all
+patches makes lenses of even blur likelier than the true ones.
 
-The numbers were measured on simulated photographs of the development half (lens seeds 0..7, Bayer DNG
+The numbers were measured on simulated photographs of the development half (lens seeds 0..30, Bayer DNG
 files): `benchmarks/scene_spectra.py` prints their like. Channels are tied to each other less closely than
 measured there: what is seen of red and blue errs alike in all bins of a patch, which no scatter of bins
 tells, and held together closely they outvoted green for wrong lenses.
@@ -60,6 +63,27 @@ PHOTO_SPREAD: Final = np.array([0.37, 0.2])
 """Standard deviations of what all patches of a photo share: slope and curvature."""
 
 _BIAS = (0.17, -0.07, -0.12, -0.07, -0.01, 0.02, 0.06, 0.07, 0.01, -0.15, -0.3)
+# Of each ring what its bins next to the axes, next to the diagonals, and those between have beyond that.
+_PATTERN = (
+    (-0.25, 0.09, 0.21),
+    (-0.14, -0.04, 0.19),
+    (-0.07, 0.06, 0.02),
+    (0.04, 0.0, -0.03),
+    (0.04, -0.02, -0.01),
+    (0.0, 0.06, -0.06),
+    (-0.04, 0.06, -0.06),
+    (-0.14, 0.03, -0.04),
+    (-0.17, -0.06, -0.06),
+    (-0.12, -0.04, -0.02),
+    (0.10, 0.0, 0.05),
+)
+_WITH_POWER = (
+    *(((0.0, 0.0, 0.0),) * 7),
+    (0.1, 0.35, 0.45),
+    (0.0, 1.4, 0.05),
+    (0.05, 0.65, 0.05),
+    (-0.1, -0.8, -0.3),
+)
 _ROUGHNESS = (0.42, 0.36, 0.31, 0.30, 0.27, 0.25, 0.24, 0.24, 0.24, 0.28, 0.4)
 _OWN, _NOISY = 0.22, 0.35
 # Demosaicing borrows the finest detail of red and blue from green, and smooths their noise.
@@ -73,8 +97,19 @@ def _rings(values: tuple[float, ...]) -> Floats:
     return np.repeat(np.asarray(values, dtype=np.float64), SECTORS)
 
 
-BIAS: Final = _rings(_BIAS)
-"""Mean of the log power about the polynomial, shape (BINS,)."""
+ORBITS: Final = np.array((0, 2, 1, 1, 2, 0) * 2)
+"""Which sectors of a half turn are alike on a square lattice: at its axes, its diagonals, between them."""
+
+
+def _angles(values: tuple[tuple[float, float, float], ...]) -> Floats:
+    return np.asarray(values, dtype=np.float64)[:, ORBITS].ravel()
+
+
+BIAS: Final = _rings(_BIAS) + _angles(_PATTERN)
+"""Mean of the log power about the polynomial and ln |OTF|^2, shape (BINS,)."""
+
+WITH_POWER: Final = _angles(_WITH_POWER)
+"""What is seen beyond that behind `Transfer`, per |OTF|^4, shape (BINS,)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,11 +21,11 @@ patch's own: the blur changes within it, so that no zero of the OTF is seen as o
 patches makes lenses of even blur likelier than the true ones.
 
 The numbers were measured on simulated photographs of the development half (lens seeds 0..30, Bayer DNG
-files): `benchmarks/scene_spectra.py` prints their like, but for d, which was fitted behind `Transfer` in turns
-with the scenes, by a script that is not kept: it is larger than what the aliases lack by themselves, and was
-kept for the lenses that it makes. Channels are tied to each other less closely than
-measured there: what is seen of red and blue errs alike in all bins of a patch, which no scatter of bins
-tells, and held together closely they outvoted green for wrong lenses.
+files): `benchmarks/scene_spectra.py` prints their like, but for d. That was fitted behind `Transfer` in
+turns with the scenes, by a script that is not kept: it is larger than what the aliases lack by themselves,
+and was kept for the lenses that it makes. Channels are tied to each other less closely than measured there:
+what is seen of red and blue errs alike in all bins of a patch, which no scatter of bins tells, and held
+together closely they outvoted green for wrong lenses.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from lensmodel.regression.pooled import MIN_PLACES, pool
 from lensmodel.regression.pooled.expected import BALANCE, corner_ratio, unlikeliness
 from lensmodel.regression.pooled.fit import PatchView, PooledFit, fit_spectra
 from lensmodel.regression.pooled.refine import Pooled
-from lensmodel.regression.pooled.scene import BIAS, WITH_POWER, SceneView
+from lensmodel.regression.pooled.scene import BIAS, WITH_POWER, Floats, SceneView
 from lensmodel.regression.pooled.transfer import (
     BINS,
     COLUMNS,
@@ -70,10 +70,12 @@ def seen_at(
     rough: float,
     blur: Kernel | None = None,
     filled: float = 0.0,
+    beyond: Floats = WITH_POWER,
 ) -> dict[Channel, PatchSpectrum]:
     """Spectra of a scene that falls off by a power law, behind the lens or behind one kernel.
 
-    `filled` is added to |OTF|^2, as a blur that changes within the patch fills its zeros.
+    `filled` is added to |OTF|^2, as a blur that changes within the patch fills its zeros; `beyond` is what
+    the fit expects behind sharp lenses beyond their own |OTF|^2, which is exact here.
     """
     modulus, angle = bin_frequencies()
     slope, turned = rng.normal(2.1, 0.3), rng.uniform(0, math.pi)
@@ -85,8 +87,7 @@ def seen_at(
         noise = 1e-7
         power = np.zeros((RINGS, SECTORS), np.float32)
         passed = power_of(kernel)
-        # what photographs have beyond a polynomial, as `scene` measured it
-        seen = scene * np.exp(BIAS + WITH_POWER * passed**2) * (passed + filled)
+        seen = scene * np.exp(BIAS + beyond * passed**2) * (passed + filled)
         power[FIRST_RING:] = (seen + noise).reshape(-1, SECTORS)
         found[channel] = PatchSpectrum(power, noise)
     return found
@@ -155,6 +156,19 @@ def test_zeros_that_are_filled_do_not_move_the_lens() -> None:
     fitted = fit_spectra(seen, true_front(), rounds=12)
 
     assert max(errors_of(fitted.front)) < 0.1
+
+
+@pytest.mark.xfail(
+    strict=True, reason="WITH_POWER moves lenses of half a pixel; it was kept for sharper ones"
+)
+def test_zeros_that_are_filled_do_not_move_the_lens_behind_exact_power() -> None:
+    rng = np.random.default_rng(3)
+    beyond = np.zeros(BINS)
+    seen = [view(p, seen_at(p, rng, 0.1, filled=rng.uniform(0.01, 0.04), beyond=beyond)) for p in places(16)]
+
+    fitted = fit_spectra(seen, true_front(), rounds=12)
+
+    assert max(errors_of(fitted.front)) < 0.15
 
 
 def test_derivatives_of_the_power_are_those_of_its_values() -> None:

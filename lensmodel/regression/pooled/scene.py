@@ -100,7 +100,7 @@ def _rings(values: tuple[float, ...]) -> Floats:
 
 
 ORBITS: Final = np.array((0, 2, 1, 1, 2, 0) * 2)
-"""Which sectors of a half turn are alike on a square lattice: at its axes, its diagonals, between them."""
+"""Which sectors are alike on a square lattice, shape (SECTORS,): at its axes 0, diagonals 1, between 2."""
 
 
 def _angles(values: tuple[tuple[float, float, float], ...]) -> Floats:

@@ -143,7 +143,10 @@ def _order(sample: PsfSample) -> tuple[float, float, float, str, str]:
 
 
 def spread(samples: Sequence[PsfSample], count: int) -> list[PsfSample]:
-    """Choose samples far from each other in place and settings; the first is the best one."""
+    """Choose samples far from each other in place and settings; the first is the best one.
+
+    Where every place is taken, those of the larger votes follow, and of equal votes by photo.
+    """
     if len(samples) <= count:
         return list(samples)
     where = np.array(
@@ -161,7 +164,9 @@ def spread(samples: Sequence[PsfSample], count: int) -> list[PsfSample]:
     vote = np.array([s.weight for s in samples])
     chosen = [int(vote.argmax())]
     distance = ((where - where[chosen[0]]) ** 2).sum(axis=1)
-    while len(chosen) < count:
+    while len(chosen) < count and (distance * vote).max() > 0:
         chosen.append(int((distance * vote).argmax()))
         distance = np.minimum(distance, ((where - where[chosen[-1]]) ** 2).sum(axis=1))
-    return [samples[i] for i in chosen]
+    left = [i for i in range(len(samples)) if i not in chosen]
+    left.sort(key=lambda i: (-vote[i], samples[i].photo))
+    return [samples[i] for i in (*chosen, *left)][:count]

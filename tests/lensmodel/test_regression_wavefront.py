@@ -11,7 +11,7 @@ from lensmodel.psf import PsfSample, as_kernel, centroid, distance
 from lensmodel.regression import LensModel, ModelSettings
 from lensmodel.regression.pupil import TERMS, PupilGrid
 from lensmodel.regression.wavefront import Wavefront
-from lensmodel.regression.wavefront_fit import fit_wavefront
+from lensmodel.regression.wavefront_fit import fit_wavefront, spread
 from lensmodel.simulate import draw_lens
 from lensmodel.types import FieldPosition, Kernel, LensSettings
 
@@ -58,6 +58,21 @@ def test_too_few_samples_make_no_wavefront(count: int) -> None:
     kernel = draw_lens(4).kernel(FieldPosition(0.2, 0.0), None, 11)
 
     assert fit_wavefront([PsfSample(kernel, FieldPosition(0.2, 0.0))] * count) is None
+
+
+def test_no_sample_is_chosen_twice_where_photos_share_their_places() -> None:
+    kernel = as_kernel(np.ones((3, 3)))
+    samples = [
+        PsfSample(kernel, FieldPosition(0.09 * i, i), weight=weight, photo=photo)
+        for photo, weight in (("b", 0.5), ("c", 0.5), ("a", 0.2))
+        for i in range(10)
+    ]
+
+    chosen = spread(samples, 24)
+
+    assert len({id(s) for s in chosen}) == 24
+    assert len({s.position for s in chosen[:10]}) == 10
+    assert [s.photo for s in chosen].count("a") == 4  # the lesser votes come last
 
 
 def of_lens(seed: int, photos: int) -> list[PsfSample]:

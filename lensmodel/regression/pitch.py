@@ -20,12 +20,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.errors import InvalidInputError
 from lensmodel.psf import PsfSample, as_kernel
 from lensmodel.regression.answer import HALF_DIAGONAL
 from lensmodel.types import Kernel
 
 _SAME = 0.005
 _PADDED = 2
+_WIDEST = 8192  # pixels of the samples
 
 
 def pixel_of(sample: PsfSample, unit: str) -> float | None:
@@ -92,17 +94,27 @@ def rescaled(kernel: Kernel, own: float, wanted: float, size: int) -> Kernel:
         Pixel that it was seen with, and the one that is asked for, in one unit.
     size : int
         Odd side of the result.
+
+    Raises
+    ------
+    InvalidInputError
+        If the result would cover more than 8192 pixels of the kernel's own.
     """
     ratio = wanted / own
     side = kernel.shape[0]
     reach = max(size * ratio, side)
+    if reach > _WIDEST:
+        raise InvalidInputError(
+            f"a kernel of {size} pixels, each {ratio:.3g} times one of the samples, is wider than "
+            f"{_WIDEST} of theirs; ask for smaller pixels or fewer"
+        )
     period = _PADDED * (2 * math.ceil(reach / 2) + 1)
     frequency = np.fft.fftfreq(period)
     pixel = np.sinc(ratio * frequency) / np.sinc(frequency)
     into = _wave(frequency, side, -1.0) / period
     out = _wave(frequency, size, ratio)
-    spectrum = into @ kernel @ into.T * np.outer(pixel, pixel)
-    found = (out.T @ spectrum @ out).real
+    along = (out.T * pixel) @ into  # what is done on one axis; the spectrum itself may be huge
+    found = (along @ kernel @ along.T).real
     return as_kernel(np.maximum(found, 0.0))
 
 

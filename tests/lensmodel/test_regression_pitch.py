@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,6 +56,21 @@ def test_kernel_of_one_pitch_becomes_that_of_another(before: float, after: float
     found = rescaled(seen(place, before, 31), before, after, 25)
 
     assert distance(found, seen(place, after, 25)).rel_l2 < 0.01
+
+
+def test_kernel_in_huge_pixels_is_a_point_and_takes_little_memory() -> None:
+    tracemalloc.start()
+    found = rescaled(gaussian(9, 4.0 * np.eye(2)), 1.0, 60.0, 55)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+
+    assert found[27, 27] > 0.9
+    assert peak < 32 << 20
+
+
+def test_pixels_that_are_absurdly_wide_are_refused() -> None:
+    with pytest.raises(InvalidInputError, match="smaller pixels"):
+        rescaled(gaussian(9, np.eye(2)), 1e-6, 100.0, 55)
 
 
 def test_two_bodies_share_one_lens(both: list[PsfSample]) -> None:

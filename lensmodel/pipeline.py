@@ -34,6 +34,7 @@ from lensmodel.errors import (
     NotEnoughEvidenceError,
     NoUsablePatchesError,
 )
+from lensmodel.files import atomic
 from lensmodel.patches import Patch, Selection
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.lateral import LateralColour, estimate_lateral, resample
@@ -70,16 +71,15 @@ DEFAULT_KERNEL_SIZE = 31
 def save_developed(developed: LinearPhoto, folder: Path) -> None:
     """Keep a developed photo so that other processes can map it: planes.npy and photo.json.
 
-    The planes are written last and renamed into place: a folder that has them is complete.
+    The planes are written last: a folder that has them is complete.
     """
     folder.mkdir(parents=True, exist_ok=True)
     fields = {
         f.name: getattr(developed, f.name) for f in dataclasses.fields(LinearPhoto) if f.name != "planes"
     }
     (folder / "photo.json").write_text(json.dumps(codec.to_json(fields)), encoding="utf-8")
-    with tempfile.NamedTemporaryFile(dir=folder, suffix=".part", delete=False) as part:
-        np.save(part, developed.planes, allow_pickle=False)
-    Path(part.name).replace(folder / "planes.npy")
+    with atomic(folder / "planes.npy") as file:
+        np.save(file, developed.planes, allow_pickle=False)
 
 
 def load_developed(folder: Path) -> LinearPhoto:

@@ -8,11 +8,8 @@ which lens a photo was taken with. Sources: Adobe, "Digital Negative (DNG) Speci
 from __future__ import annotations
 
 import math
-import os
 import struct
-import tempfile
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from fractions import Fraction
@@ -23,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lensmodel.errors import InvalidInputError
+from lensmodel.files import atomic
 
 BAYER_PATTERNS: Final = ("RGGB", "BGGR", "GRBG", "GBRG")
 
@@ -348,16 +346,6 @@ def _write(path: Path, tags: _Directory, exif: _Directory, pixels: NDArray[np.ui
     tags.longs(_STRIP_OFFSETS, pixels_at)
     head = (struct.pack("<2sHI", b"II", 42, start) + tags.packed(start)).ljust(exif_at, b"\x00")
     head = (head + exif.packed(exif_at)).ljust(pixels_at, b"\x00")
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(head)
-            file.write(np.ascontiguousarray(pixels).astype("<u2", copy=False).data)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(temporary).chmod(0o644)  # mkstemp makes files that only their owner can read
-        Path(temporary).replace(path)
-    except BaseException:
-        with suppress(FileNotFoundError):
-            Path(temporary).unlink()
-        raise
+    with atomic(path) as file:
+        file.write(head)
+        file.write(np.ascontiguousarray(pixels).astype("<u2", copy=False).data)

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import io
-import os
-import secrets
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Final, TypeAlias, get_args
@@ -20,6 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
 from lensmodel.errors import InvalidInputError
+from lensmodel.files import atomic
 from lensmodel.photo import exif_block
 from lensmodel.photo.colour import (
     D65_TO_D50,
@@ -114,7 +112,7 @@ def write_image(
         _write_dng(Path(path), planes, encoding, description)
         return
     target = _target(encoding, color_space)
-    with _atomic(Path(path)) as file:
+    with atomic(Path(path)) as file:
         if format == "jpeg":
             pixels = _encoded(planes, target, 255)
             _write_jpeg(file, pixels, target.icc, encoding, description, quality=quality)
@@ -123,21 +121,6 @@ def write_image(
         else:
             top = 255 if format == "png8" else 65535
             _write_png(file, _encoded(planes, target, top), target.icc, encoding, description)
-
-
-@contextmanager
-def _atomic(path: Path) -> Iterator[BinaryIO]:
-    """Open a temporary neighbour that takes the name of `path` once it is written and on the disk."""
-    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
-    try:
-        with part.open("xb+") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
 
 
 # --- colour ------------------------------------------------------------------------------------

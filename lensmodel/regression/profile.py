@@ -18,8 +18,6 @@ import io
 import json
 import logging
 import math
-import os
-import secrets
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -32,6 +30,7 @@ from numpy.typing import NDArray
 
 from lensmodel.errors import InvalidInputError, LensModelError
 from lensmodel.evidence import PatchEvidence
+from lensmodel.files import atomic
 from lensmodel.psf import PsfSample, resized
 from lensmodel.regression.answer import ModelSettings
 from lensmodel.regression.model import LensModel
@@ -82,17 +81,8 @@ class LensProfile:
 
 def save_profile(path: Path | str, profile: LensProfile) -> None:
     """Write a profile; the file appears complete or not at all."""
-    target = Path(path)
-    part = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
-    try:
-        with part.open("xb") as file:
-            _write(file, profile)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(target)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+    with atomic(Path(path)) as file:
+        _write(file, profile)
 
 
 def _write(file: IO[bytes], profile: LensProfile) -> None:

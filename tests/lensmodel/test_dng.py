@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from datetime import datetime
 from pathlib import Path
 
@@ -182,6 +183,16 @@ def test_failed_write_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.
 
     assert target.read_bytes() == b"before"
     assert list(tmp_path.iterdir()) == [target]
+
+
+def test_files_are_as_private_as_their_writer_asks(tmp_path: Path) -> None:
+    before = os.umask(0o077)
+    try:
+        write_bayer_dng(tmp_path / "x.dng", mosaic(), black=512, white=15872)
+    finally:
+        os.umask(before)
+
+    assert (tmp_path / "x.dng").stat().st_mode & 0o777 == 0o600
 
 
 def test_texts_beyond_ascii_do_not_break_the_file(tmp_path: Path) -> None:

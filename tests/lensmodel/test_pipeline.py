@@ -64,6 +64,21 @@ def test_half_written_folder_is_no_developed_photo(tmp_path: Path) -> None:
         pipeline.load_developed(tmp_path)
 
 
+def test_a_developed_photo_that_does_not_fit_the_disk_leaves_no_remains(
+    photos: dict[str, tuple[Path, SimulatedPhoto]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    developed = photo.develop(photos["city"][0])
+
+    def full_disk(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("numpy.save", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        pipeline.save_developed(developed, tmp_path)
+
+    assert [path.name for path in tmp_path.iterdir()] == ["photo.json"]
+
+
 def test_cells_hold_every_patch_once_largest_first() -> None:
     place = FieldPosition(0.1, 0.0)
     patches = tuple(Patch(i, i, 64, place, 1.0, cell) for i, cell in enumerate((2, 1, 2, 0, 2, 1)))

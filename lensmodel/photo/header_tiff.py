@@ -62,8 +62,8 @@ def _block(directory: Directory, tag: int) -> bytes | None:
 
 def _value(directory: Directory, tag: int, default: int) -> int:
     entry = directory.get(tag)
-    value = None if entry is None else entry.integer()
-    return default if value is None else value
+    values = () if entry is None else entry.integers(1)
+    return values[0] if values else default
 
 
 def _sized(header: Header, directory: Directory) -> Header:
@@ -81,7 +81,7 @@ def _with_children(reader: TiffReader, directories: Sequence[Directory]) -> Iter
     for directory in directories[:MAX_DIRECTORIES]:
         yield directory
         children = directory.get(330)
-        for offset in () if children is None else children.integers()[:16]:
+        for offset in () if children is None else children.integers(16):
             yield reader.directory(offset)[0]
 
 

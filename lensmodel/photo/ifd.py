@@ -56,11 +56,12 @@ class Entry:
             return b""
         return bytes(self.buffer[self.offset : end])
 
-    def numbers(self) -> tuple[float, ...]:
-        """Values as numbers; rationals as quotients, those over zero as NaN; text gives none."""
+    def numbers(self, most: int = MAX_VALUE_BYTES) -> tuple[float, ...]:
+        """The first `most` values as numbers; rationals as quotients, those over zero as NaN; text gives none."""
         code, raw = _FORMATS[self.kind], self.raw()
         if code == "s":
             return ()
+        raw = raw[: most * struct.calcsize("=" + code)]
         values = struct.unpack(f"{self.order}{len(raw) // struct.calcsize('=' + code[0])}{code[0]}", raw)
         if len(code) == 1:
             return values
@@ -69,7 +70,7 @@ class Entry:
 
     def number(self) -> float | None:
         """First value as a number, `None` where there is none or it is not finite."""
-        values = self.numbers()
+        values = self.numbers(1)
         return values[0] if values and abs(values[0]) < float("inf") else None
 
     def integer(self) -> int | None:
@@ -77,9 +78,9 @@ class Entry:
         value = self.number()
         return None if value is None else int(value)
 
-    def integers(self) -> tuple[int, ...]:
-        """Values where they are whole numbers by their type; others give none."""
-        return tuple(int(v) for v in self.numbers()) if _FORMATS[self.kind] in "BHIbhiQq" else ()
+    def integers(self, most: int = MAX_VALUE_BYTES) -> tuple[int, ...]:
+        """The first `most` values where they are whole numbers by their type; others give none."""
+        return tuple(int(v) for v in self.numbers(most)) if _FORMATS[self.kind] in "BHIbhiQq" else ()
 
     def text(self) -> str:
         """Value as text up to the first NUL, stripped; bytes outside UTF-8 read as Latin-1."""

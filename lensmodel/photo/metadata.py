@@ -13,7 +13,6 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
-from fractions import Fraction
 from pathlib import Path
 from typing import Final
 
@@ -224,9 +223,12 @@ def _focus(exif: _Exif, note: MakerNote, xmp: Mapping[str, str]) -> float | None
 
 def _quotient(text: str | None) -> float | None:
     """Value of an XMP rational such as "71/10"."""
+    if text is None:
+        return None
+    over, _, under = text.partition("/")
     try:
-        return None if text is None else float(Fraction(text))
-    except (ValueError, ZeroDivisionError, OverflowError):
+        return float(over) / float(under or 1)  # a Fraction would write 1e1000000000 out
+    except (ValueError, ZeroDivisionError):
         return None
 
 

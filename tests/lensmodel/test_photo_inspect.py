@@ -3,6 +3,7 @@ from __future__ import annotations
 import contextlib
 import io
 import struct
+import time
 import zlib
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from lensmodel.errors import (
     UnsupportedFormatError,
 )
 from lensmodel.photo.dng import write_bayer_dng, write_linear_dng
+from lensmodel.photo.ifd import Entry
 
 
 def chunk(name: bytes, body: bytes) -> bytes:
@@ -201,6 +203,32 @@ def test_a_tiff_of_a_hundred_pictures_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "many.tif"
     tifffile.imwrite(path, np.zeros((100, 32, 32), dtype=np.uint8), photometric="minisblack", metadata=None)
     with pytest.raises(UnsupportedFormatError, match="pictures"):
+        photo.inspect(path)
+
+
+def test_one_number_of_a_huge_tag_is_read_at_once() -> None:
+    entry = Entry(kind=5, count=1 << 21, offset=0, order="<", buffer=struct.pack("<II", 7, 2) * (1 << 21))
+    start = time.process_time()
+
+    assert entry.number() == 3.5
+    assert time.process_time() - start < 0.2
+
+
+@pytest.mark.parametrize("kind", ["tif", "dng"])
+def test_a_size_that_is_no_whole_number_is_no_size(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / f"x.{kind}"
+    if kind == "tif":
+        path.write_bytes(encoded("TIFF"))
+    else:
+        write_bayer_dng(path, np.full((32, 32), 900, dtype=np.uint16), black=512, white=15000)
+    data = bytearray(path.read_bytes())
+    first, far = struct.unpack("<I", data[4:8])[0], struct.pack("<I", len(data))
+    for tag in (256, 257):
+        at = next(i for i in range(first + 2, len(data), 12) if data[i : i + 2] == struct.pack("<H", tag))
+        data[at + 2 : at + 12] = struct.pack("<HI", 12, 1) + far  # a double
+    path.write_bytes(bytes(data) + struct.pack("<d", 1e300))
+
+    with pytest.raises(LensModelError):
         photo.inspect(path)
 
 

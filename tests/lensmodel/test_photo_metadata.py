@@ -288,6 +288,15 @@ def test_xmp_properties_are_read_from_elements_and_lists_too() -> None:
     assert read_xmp(packet.encode()) == {"aux:Lens": "EF 50", "exif:ISOSpeedRatings": "200"}
 
 
+@pytest.mark.parametrize(
+    ("text", "value"), [("71/10", 7.1), ("2.8", 2.8), ("1e1000000000", None), ("5/0", None), ("f/2", None)]
+)
+def test_xmp_numbers_are_read_and_absurd_ones_at_once_refused(
+    metadata_of: Read, text: str, value: float | None
+) -> None:
+    assert metadata_of(jpeg_with({}, {}, xmp_with(f'exif:FNumber="{text}"'))).aperture == value
+
+
 def test_metadata_without_serials_keep_everything_else(metadata_of: Read) -> None:
     seen = metadata_of(jpeg_with({}, {0xA431: "B1", 0xA434: "L", 0xA435: "S1", 0x829D: IFDRational(2, 1)}))
     bare = seen.without_serials()

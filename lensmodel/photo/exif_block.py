@@ -8,6 +8,7 @@ Source: CIPA DC-008-2023 (Exif 3.0), sections 4.5 and 4.6.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -48,6 +49,8 @@ def short(tag: int, value: float | None) -> list[Field]:
 
 def rational(tag: int, value: float | None) -> list[Field]:
     """Field of one quotient with a denominator up to 10000, finer for short times."""
+    if value == math.inf:
+        return [Field(tag, _RATIONAL, 1, struct.pack("<II", 2**32 - 1, 1))]  # EXIF's word for infinity
     if value is None or not 0 < value < 2**31:
         return []
     limit = 10_000 if value >= 1e-3 else 2**31

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -267,6 +268,14 @@ def test_our_own_reader_finds_the_safe_metadata_again(tmp_path: Path, output: ph
     assert seen == METADATA.without_serials()
 
 
+@pytest.mark.parametrize("output", FORMATS)
+def test_focus_at_infinity_stays_there(tmp_path: Path, output: photo.OutputFormat) -> None:
+    far = replace(PLAIN, metadata=replace(METADATA, focus_m=math.inf))
+    photo.write_image(tmp_path / "x", planes(), far, format=output)
+
+    assert photo.read_metadata(tmp_path / "x").focus_m == math.inf
+
+
 @pytest.mark.parametrize("output", ["tiff16", "jpeg", "png8"])
 def test_pillow_reads_the_numbers_in_exif(tmp_path: Path, output: photo.OutputFormat) -> None:
     path = tmp_path / "x"
@@ -383,7 +392,7 @@ def test_a_failed_write_leaves_the_old_file_and_no_remains(
     def full_disk(_: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("lensmodel.photo.writing.os.fsync", full_disk)
+    monkeypatch.setattr("os.fsync", full_disk)
     with pytest.raises(OSError, match="No space left"):
         photo.write_image(path, planes(), PLAIN, format=output)
 

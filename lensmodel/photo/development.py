@@ -54,9 +54,12 @@ def develop(path: Path | str, *, limits: Limits | None = None, demosaic: Demosai
 def _develop_raw(path: Path, info: PhotoInfo, demosaic: Demosaic, baseline: float | None) -> LinearPhoto:
     raw = develop_raw(path, demosaic)
     _, height, width = raw.planes.shape
+    metadata, binned = info.metadata, max(round(info.width / width), 1)
+    if metadata.pixel_pitch_um is not None:
+        metadata = replace(metadata, pixel_pitch_um=binned * metadata.pixel_pitch_um)
     encoding = Encoding(
         bit_depth=raw.bits,
-        metadata=info.metadata.without_serials(),
+        metadata=metadata.without_serials(),
         white_balance=raw.white_balance,
         to_srgb=raw.to_srgb,
         xyz_to_camera=raw.xyz_to_camera,
@@ -67,7 +70,7 @@ def _develop_raw(path: Path, info: PhotoInfo, demosaic: Demosaic, baseline: floa
         frame=Frame(height, width),
         noise=raw.noise,
         clip=raw.clip,
-        info=replace(info, width=width, height=height),
+        info=replace(info, width=width, height=height, metadata=metadata),
         encoding=encoding,
         pipeline=raw.pipeline,
         white_balance=raw.white_balance,
@@ -88,14 +91,15 @@ def _develop_raster(path: Path, header: Header, info: PhotoInfo) -> LinearPhoto:
     curve = curves_of(transfer, icc)[1]
     code = {1: CODES // 255, 2: 1}.get(pixels.dtype.itemsize, 1)
     codes = curve[::code] if pixels.dtype.itemsize == 1 else None
-    noise = [estimate_noise(plane, step=float(curve[code] - curve[0]), codes=codes) for plane in planes]
-    grain = [graininess(plane, model) for plane, model in zip(planes, noise, strict=True)]
-    top = float(planes.max()) if pixels.dtype.kind == "f" else 1.0
+    clip = max(1.0, float(planes.max())) if pixels.dtype.kind == "f" else 1.0
+    step = float(curve[code] - curve[0])
+    noise = [estimate_noise(plane, clip, step, codes) for plane in planes]
+    grain = [graininess(plane, model, clip) for plane, model in zip(planes, noise, strict=True)]
     return LinearPhoto(
         planes=planes,
         frame=Frame(height, width),
         noise=(noise[0], noise[1], noise[2]),
-        clip=(max(1.0, top),) * 3,
+        clip=(clip,) * 3,
         info=info,
         encoding=Encoding(
             bit_depth=8 * pixels.dtype.itemsize,

@@ -167,6 +167,16 @@ def test_half_size_makes_one_pixel_of_each_cell(tmp_path: Path) -> None:
     assert developed.planes[0] == pytest.approx(red, abs=2e-4)
 
 
+def test_pixels_of_half_size_planes_are_twice_as_wide(tmp_path: Path) -> None:
+    mosaic, shot = raw_numbers(textured(64, 96)), ShotInfo(pixel_pitch_um=5.0)
+    write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE, shot=shot)
+    whole, half = (photo.develop(tmp_path / "x.dng", demosaic=how) for how in ("linear", "half"))
+
+    assert whole.info.metadata.pixel_pitch_um == pytest.approx(5.0)
+    assert half.info.metadata.pixel_pitch_um == pytest.approx(10.0)
+    assert half.encoding.metadata.pixel_pitch_um == pytest.approx(10.0)
+
+
 def test_the_pipeline_names_what_was_done(tmp_path: Path) -> None:
     write_bayer_dng(tmp_path / "x.dng", raw_numbers(textured(64, 96)), black=BLACK, white=WHITE)
 

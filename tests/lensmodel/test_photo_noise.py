@@ -87,6 +87,16 @@ def test_saturated_areas_do_not_count() -> None:
     assert found.variance(np.array([0.3])) == pytest.approx(truth.variance(np.array([0.3])), rel=0.15)
 
 
+def test_noise_of_a_float_file_is_told_whatever_its_white(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).normal(50.0, 1.0, (256, 256, 3)).astype(np.float32)
+    tifffile.imwrite(tmp_path / "x.tif", pixels, photometric="rgb")
+
+    developed = photo.develop(tmp_path / "x.tif")
+
+    assert [model.variance(np.array(50.0)) for model in developed.noise] == pytest.approx([1.0] * 3, rel=0.1)
+    assert developed.grain == pytest.approx((1.0,) * 3, rel=0.2)
+
+
 def test_a_plane_without_noise_has_only_that_of_rounding() -> None:
     assert estimate_noise(np.full((64, 64), 0.5, dtype=np.float32)) == NoiseModel(0.0, 0.0)
     assert estimate_noise(np.full((64, 64), 0.5, dtype=np.float32), step=0.01).read == pytest.approx(

@@ -282,10 +282,12 @@ class PsfSample:
         object.__setattr__(self, "kernel", as_kernel(self.kernel))
         if not 0.0 <= self.weight <= 1.0:
             raise InvalidInputError(f"weight must lie in 0..1, got {self.weight}")
-        if self.half_diagonal_px is not None and not (
-            math.isfinite(self.half_diagonal_px) and self.half_diagonal_px > 0
+        for name, unit, size in (
+            ("pixel pitch", "micrometres", self.pixel_pitch_um),
+            ("half diagonal", "pixels", self.half_diagonal_px),
         ):
-            raise InvalidInputError(f"the half diagonal must be positive pixels, got {self.half_diagonal_px}")
+            if size is not None and not (math.isfinite(size) and size > 0):
+                raise InvalidInputError(f"the {name} must be positive {unit}, got {size}")
         if self.error is not None and not (math.isfinite(self.error) and self.error >= 0.0):
             raise InvalidInputError(f"the expected error must be finite and not negative, got {self.error}")
 

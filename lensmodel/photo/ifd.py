@@ -57,7 +57,7 @@ class Entry:
         return bytes(self.buffer[self.offset : end])
 
     def numbers(self, most: int = MAX_VALUE_BYTES) -> tuple[float, ...]:
-        """The first `most` values as numbers; rationals as quotients, those over zero as NaN; text gives none."""
+        """The first `most` values as numbers: rationals as quotients, NaN over zero; text gives none."""
         code, raw = _FORMATS[self.kind], self.raw()
         if code == "s":
             return ()

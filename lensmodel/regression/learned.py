@@ -44,6 +44,7 @@ _DAMAGED = (
     ValueError,
     KeyError,
     TypeError,
+    ArithmeticError,
     IndexError,
     EOFError,
     MemoryError,
@@ -150,8 +151,11 @@ def _checked(arrays: Mapping[str, NDArray[Any]], count: int) -> Arrays:
     for name, values in arrays.items():
         numbers = np.asarray(values, dtype=np.float64)
         # an unknown setting is NaN, and only points have settings
-        if not name.endswith("where") and not np.isfinite(numbers).all():
+        known = numbers[~np.isnan(numbers)] if name.endswith("where") else numbers
+        if not np.isfinite(known).all():
             raise ValueError(f"{name} is not finite")
+        if name.endswith(("votes", "errors", "noise")) and numbers.min(initial=0.0) < 0:
+            raise ValueError(f"{name} is negative")
         told = name.startswith("physical") and name.endswith(".errors")
         if (told or name in {"votes", "errors", "noise", "image_errors"}) and len(numbers) != count:
             raise ValueError(f"{name} has {len(numbers)} entries for {count} samples")
@@ -172,7 +176,7 @@ def _physical(document: Mapping[str, Any], lines: dict[str, Any], arrays: dict[s
     del scalars["front"]
     wavefront = Wavefront(**lines, **{**front, "eye": tuple(front["eye"])})
     found = Physics(front=wavefront, **scalars, **arrays)
-    if found.rest.shape != (len(found.vectors), found.side**2):
+    if found.side < 1 or found.side % 2 == 0 or found.rest.shape != (len(found.vectors), found.side**2):
         raise ValueError("a wavefront and the rest of its samples do not fit together")
     return found
 
@@ -213,7 +217,11 @@ def _fit(
     mode = str(document["mode"])
     if mode not in MODES or mode == LIKELIEST:
         raise ValueError(f"no mode {mode!r}")
-    va.scales(rule), va.scales(used)
+    scales = np.concatenate([va.scales(rule), va.scales(used)])
+    if not (np.isfinite(scales).all() and scales.min() > 0):
+        raise ValueError("a bandwidth is not positive")
+    if not judgement.votes.any():
+        raise ValueError("no sample may vote")
     return Fit(
         pixel=pixel,
         size=int(document["size"]),

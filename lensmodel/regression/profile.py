@@ -173,7 +173,7 @@ def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> 
         return LensProfile(model, _texts(document["lens"]), _texts(document["photos"]))
     except LensModelError:
         raise
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise InvalidInputError(f"{name} is damaged: {error}") from error
 
 

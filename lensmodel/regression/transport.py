@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.errors import InvalidInputError
 from lensmodel.psf import PsfSample, second_moments
 from lensmodel.regression import variables as va
 from lensmodel.types import WAVELENGTH_NM, FieldPosition, LensSettings
@@ -53,6 +54,10 @@ class WidthField:
     stops: float = 0.0
     focal: float = 0.0
     wavelength: float = WAVELENGTH_NM["g"]
+
+    def __post_init__(self) -> None:
+        if not np.isfinite((self.reference, self.stops, self.focal, self.wavelength)).all():
+            raise InvalidInputError(f"the origins of a width field must be finite, got {self}")
 
     def at(self, position: FieldPosition, settings: LensSettings) -> Scale:
         """Widths along u and v at a place, over the reference width; kept within 0.45 and 2.5."""

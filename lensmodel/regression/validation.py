@@ -18,6 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.errors import InvalidInputError
+
 MULTIPLES = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
 PHI_MULTIPLES = (0.5, 0.7, 1.0, 1.4, 2.0, 4.0, 20.0)
 MIRRORS = (0.0, 0.3, 1.0)
@@ -98,7 +100,7 @@ class Held:
         own = np.diag(self.gram)
         direct, across = weight @ self.gram, weight @ self.mirrored
         whole = 1.0 + mirror
-        linear = np.einsum("ij,ij->i", np.eye(len(own)), direct + mirror * across) / whole
+        linear = np.diag(direct + mirror * across) / whole
         square = ((1 + mirror**2) * direct + 2 * mirror * across) / whole**2
         found = own - 2 * linear + np.einsum("ij,ij->i", square, weight)
         relative = np.sqrt(np.maximum(found, 0.0) / np.maximum(own, 1e-30))
@@ -127,6 +129,14 @@ class Choice:
     phi: float = 1.0
     mirror: float = 0.0
     error: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.r < np.inf and 0.0 < self.phi < np.inf and 0.0 <= self.mirror <= 1.0):
+            raise InvalidInputError(
+                f"factors on bandwidths must be positive and a mirror lie in 0..1, got {self}"
+            )
+        if not 0.0 <= self.error < np.inf:
+            raise InvalidInputError(f"a held-out error must be finite and not negative, got {self.error}")
 
 
 def choose(held: Held, *, r: bool = True, phi: bool = True, mirror: bool = True) -> Choice:

@@ -27,6 +27,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.errors import InvalidInputError
 from lensmodel.psf import as_kernel, centroid, resized
 from lensmodel.regression.pupil import PupilGrid, largest_side
 from lensmodel.types import WAVELENGTH_NM, FieldPosition, Kernel, LensSettings
@@ -40,6 +41,7 @@ NAMES: Final = (
 )
 """The linear unknowns, in pixels of blur at the widest aperture."""
 
+_LARGEST_LOG_Q = 20.0  # far beyond all pixels and apertures
 _STEPS = 4
 _MOVES = 8  # a centre of mass may go to and fro between two places
 _BAND_NM = 35.0  # half the distance between the outer wavelengths of one channel
@@ -94,6 +96,17 @@ class Wavefront:
     error: float = 1.0
     slopes: NDArray[np.float64] | None = None
     focal_octaves: float = 0.0
+
+    def __post_init__(self) -> None:
+        scalars = (self.log_q, *self.eye, self.f_number, self.error, self.focal_octaves)
+        if not np.isfinite(scalars).all() or abs(self.log_q) > _LARGEST_LOG_Q:
+            raise InvalidInputError(f"a wavefront must be finite and its log q moderate, got {scalars}")
+        if not (
+            self.eye[0] > 0 and self.f_number > 0 and self.error >= 0 and self.size > 0 and self.size % 2
+        ):
+            raise InvalidInputError(
+                f"a wavefront needs a pupil, an f-number and an odd side, got {scalars} and {self.size}"
+            )
 
     def kernel(self, position: FieldPosition, settings: LensSettings, size: int) -> Kernel:
         """Kernel of the image frame, centred, of odd side `size`; three wavelengths to a channel."""

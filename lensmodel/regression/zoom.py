@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.errors import InvalidInputError
 from lensmodel.psf import PsfSample, distance
 from lensmodel.regression.physical import Physics
 from lensmodel.regression.wavefront import Wavefront
@@ -40,6 +41,10 @@ class End:
 
     octaves: float
     physical: Physics
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.octaves):
+            raise InvalidInputError(f"a focal length must be finite octaves, got {self.octaves}")
 
     def share(self, settings: LensSettings) -> float:
         """Say in a question, 0..1; none where the focal length is unknown."""

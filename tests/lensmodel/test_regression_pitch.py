@@ -152,6 +152,10 @@ class TestHalfDiagonals:
         with pytest.raises(InvalidInputError, match="half diagonal"):
             replace(photo("a", 0, FINE_UM)[0], half_diagonal_px=bad)
 
+    def test_a_sample_of_impossible_pixels_is_refused(self) -> None:
+        with pytest.raises(InvalidInputError, match="pixel pitch"):
+            replace(photo("a", 0, FINE_UM)[0], pixel_pitch_um=0.0)
+
     def test_unknown_units_are_refused(self) -> None:
         with pytest.raises(UnknownMethodError, match="micrometre"):
             ModelSettings(unit="inch")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import math
 import zipfile
@@ -330,6 +331,7 @@ class TestProfile:
             {"samples": []},
             {"lens": 7},
             {"samples": [{"r": "far"}] * 48},
+            {"samples": [{"r": 10**400}] * 48},
         ],
     )
     def test_tampered_document_is_refused(self, change: dict[str, object], tmp_path: Path) -> None:
@@ -400,6 +402,35 @@ class TestLearned:
             LensModel.restored(good[1], learned)
         with pytest.raises(InvalidInputError, match="other samples"):
             LensModel.restored(good[0], learned, ModelSettings(method="blended"))
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            {"widths": {"reference": math.nan}},
+            {"choice": {"mirror": -1.0}},
+            {"choice": {"r": 0.0}},
+            {"rule": {"r": 0.0}},
+            {"bandwidth": {"phi": math.inf}},
+            {"size": math.inf},
+            {"votes": 0.0},
+            {"errors": -1.0},
+        ],
+    )
+    def test_out_of_range_is_refused(self, change: dict[str, object], good: list[list[PsfSample]]) -> None:
+        with np.load(io.BytesIO(LensModel.fit(good[0]).learned())) as stored:
+            arrays = dict(stored)
+        document = json.loads(arrays["document"].tobytes())
+        for name, value in change.items():
+            if name in arrays:
+                arrays[name][:] = value
+            else:
+                document[name] = {**document[name], **value} if isinstance(value, dict) else value
+        arrays["document"] = np.frombuffer(json.dumps(document).encode(), dtype=np.uint8)
+        buffer = io.BytesIO()
+        np.savez(buffer, **arrays)
+
+        with pytest.raises(InvalidInputError):
+            LensModel.restored(good[0], buffer.getvalue())
 
     def test_damaged_is_refused_or_harmless(self, good: list[list[PsfSample]]) -> None:
         samples = good[0][:4]

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from lensmodel.errors import InvalidInputError
 from lensmodel.psf import PsfSample, as_kernel, centroid, distance
 from lensmodel.regression import LensModel, ModelSettings
 from lensmodel.regression.pupil import TERMS, PupilGrid
@@ -51,6 +54,22 @@ def test_one_photo_of_true_kernels_tells_the_corner_that_it_did_not_see() -> Non
 
     assert front is not None
     assert distance(front.kernel(corner, settings, 31), lens.kernel(corner, settings, 31)).rel_l2 < 0.08
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"log_q": math.nan},
+        {"log_q": -700.0},
+        {"eye": (0.0, 0.1)},
+        {"f_number": 0.0},
+        {"size": 14},
+        {"error": -1.0},
+    ],
+)
+def test_impossible_wavefronts_are_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(InvalidInputError, match="wavefront"):
+        replace(Wavefront(np.zeros(19), -0.5, (1.0, 0.1), 2.0, 15), **change)
 
 
 @pytest.mark.parametrize("count", [0, 11])

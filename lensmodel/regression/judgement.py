@@ -18,6 +18,7 @@ from lensmodel.regression.local import LocalKernels
 from lensmodel.regression.robust import Flag
 from lensmodel.regression.validation import Choice, Held, choose
 from lensmodel.regression.wavefront_fit import ONE_FOCAL_LENGTH
+from lensmodel.types import WAVELENGTH_NM
 
 _CV_PHOTOS = 3
 _CV_SAMPLES = 300
@@ -133,7 +134,7 @@ def judge(
         flat = kernels.reshape(len(rows), -1)
         return Held.of(flat, kernels.shape[1], where[rows], scale, votes[rows], groups[rows])
 
-    green = voting[where[voting, 4] == where[voting[len(voting) // 2], 4]]
+    green = voting[where[voting, 4] == _judging_channel(where[voting, 4])]
     choice = Choice(mirror=settings.mirror or 0.0)
     automatic = len(np.unique(photo[voting])) >= _CV_PHOTOS
 
@@ -186,6 +187,13 @@ def judge(
     image_errors = np.full(len(samples), float(np.median(seen)))
     image_errors[trusted] = seen
     return Judgement(votes, errors, noise, choice, flags, image, image_errors)
+
+
+def _judging_channel(wavelengths: NDArray[np.float64]) -> float:
+    """Green, which has the least noise; without any, the channel of the most samples."""
+    known, counts = np.unique(wavelengths, return_counts=True)
+    green = WAVELENGTH_NM["g"]
+    return green if green in known else float(known[counts.argmax()])
 
 
 def _thinned(rows: NDArray[np.intp], most: int) -> NDArray[np.intp]:

@@ -34,7 +34,7 @@ from lensmodel.regression.validation import Choice
 from lensmodel.regression.wavefront import NAMES, Wavefront
 from lensmodel.regression.zoom import End
 
-VERSION: Final = 13
+VERSION: Final = 14
 """Raised whenever the same samples would be fitted otherwise."""
 
 _MOST_BYTES = 1 << 27

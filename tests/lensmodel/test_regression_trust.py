@@ -121,6 +121,17 @@ def test_bandwidth_of_the_paper_taken_literally_widens_the_psf() -> None:
     assert distance(literal, truth(where)).rel_l2 > 3 * distance(ours, truth(where)).rel_l2
 
 
+def test_bandwidths_are_those_of_green_in_whatever_order_channels_come(good: list[list[PsfSample]]) -> None:
+    green = merged(good[:3])
+    noisy = merged([photo(f"p{i}", i, noise=0.5) for i in range(3)])
+    blue = [replace(s, settings=s.settings.with_channel("b")) for s in noisy]
+    plain = ModelSettings(method="nadaraya-watson", robust=False)
+    of_green = LensModel.fit(green, plain).bandwidth
+
+    for samples in ([*green, *blue], [*blue, *green]):
+        assert LensModel.fit(samples, plain).bandwidth == of_green
+
+
 class TestOutliers:
     def test_shaken_photo_is_flagged_with_a_reason(self, good: list[list[PsfSample]]) -> None:
         model = LensModel.fit([*merged(good), *photo("shaken", 50, blur=16.0)])

@@ -406,7 +406,7 @@ def calibrate(
 
 def lateral_of(developed: LinearPhoto) -> LateralColour:
     """Estimate the lateral colour of a photo from its own edges."""
-    return estimate_lateral(developed.planes, developed.frame)
+    return estimate_lateral(developed.planes, developed.frame, clip=developed.clip)
 
 
 def correct_photo(

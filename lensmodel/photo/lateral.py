@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -106,7 +106,7 @@ class LateralColour:
         return cls(_rescaled(red, scale), _rescaled(blue, scale), frame.half_diagonal)
 
 
-def estimate_lateral(planes: Planes, frame: Frame, *, clip: float = 1.0) -> LateralColour:
+def estimate_lateral(planes: Planes, frame: Frame, *, clip: float | Sequence[float] = 1.0) -> LateralColour:
     """Estimate lateral colour from corners and edges of the photo.
 
     In each of 10 x 10 cells up to five points with structure in both directions are taken from
@@ -121,8 +121,8 @@ def estimate_lateral(planes: Planes, frame: Frame, *, clip: float = 1.0) -> Late
         Linear light, not yet corrected for lateral colour.
     frame : Frame
         Size of the photo.
-    clip : float
-        Windows that reach this level are left out.
+    clip : float or sequence of float
+        Windows that reach this level, of all channels or of each, are left out.
 
     Returns
     -------
@@ -135,11 +135,12 @@ def estimate_lateral(planes: Planes, frame: Frame, *, clip: float = 1.0) -> Late
     """
     if planes.shape != (3, frame.height, frame.width):
         raise InvalidInputError(f"planes must be (3, {frame.height}, {frame.width}), got {planes.shape}")
+    full = 0.98 * np.broadcast_to(clip, 3)
     radii: dict[int, list[float]] = {0: [], 2: []}
     shifts: dict[int, list[float]] = {0: [], 2: []}
     for row, col in _points(planes[1], frame):
         window = _cut(planes, row, col)
-        if window is None or float(window.max()) >= 0.98 * clip:
+        if window is None or (window.max(axis=(1, 2)) >= full).any():
             continue
         # Same geometry as FieldPosition: u points outwards from the centre.
         position = frame.position(row, col)

@@ -85,6 +85,14 @@ def test_clipped_planes_claim_nothing() -> None:
     assert found.red_points == 0
 
 
+def test_a_channel_that_clips_below_the_others_is_judged_by_its_own_level() -> None:
+    planes = photo()
+    planes[0] = np.minimum(planes[0], 0.15)  # most of red
+
+    assert estimate_lateral(planes, FRAME, clip=(1.0, 1.0, 1.0)).red_points > 0
+    assert estimate_lateral(planes, FRAME, clip=(0.15, 1.0, 1.0)).red_points == 0
+
+
 def test_resampling_moves_red_and_blue_onto_green() -> None:
     planes = photo()
 

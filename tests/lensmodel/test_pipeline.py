@@ -79,6 +79,16 @@ def test_a_developed_photo_that_does_not_fit_the_disk_leaves_no_remains(
     assert [path.name for path in tmp_path.iterdir()] == ["photo.json"]
 
 
+def test_lateral_colour_does_not_hang_on_the_level_of_white(
+    photos: dict[str, tuple[Path, SimulatedPhoto]],
+) -> None:
+    developed = photo.develop(photos["city"][0])
+    brighter = replace(developed, planes=4.0 * developed.planes, clip=(4.0, 4.0, 4.0))
+
+    assert pipeline.lateral_of(developed).red_points > 0
+    assert pipeline.lateral_of(brighter).red_points == pipeline.lateral_of(developed).red_points
+
+
 def test_cells_hold_every_patch_once_largest_first() -> None:
     place = FieldPosition(0.1, 0.0)
     patches = tuple(Patch(i, i, 64, place, 1.0, cell) for i, cell in enumerate((2, 1, 2, 0, 2, 1)))

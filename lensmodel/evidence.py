@@ -71,6 +71,11 @@ class PatchEvidence:
         for array in (self.autocorrelation, self.crosscorrelation, self.spectrum):
             if not np.isfinite(array).all():
                 raise InvalidInputError("evidence must be finite; estimate the patch again")
+        if self.pixels < 1 or not all(0.0 <= value < math.inf for value in (self.noise, self.spectrum_noise)):
+            raise InvalidInputError(
+                "evidence needs pixels, and noise that is finite and not negative, got "
+                f"{self.pixels}, {self.noise} and {self.spectrum_noise}"
+            )
 
     def to_bytes(self) -> bytes:
         """Serialise to an npz without pickle."""
@@ -144,7 +149,10 @@ def nonnegative_least_squares(
     a : ndarray, shape (n, n)
         Symmetric; directions of negative curvature, which noise correction can leave, are lifted.
     b, start : ndarray, shape (n,)
+        Where A is zero, nothing is known and the start is returned.
     """
+    if not a.any():
+        return start.copy()
     eigenvalues = np.linalg.eigvalsh(a)
     largest = float(eigenvalues[-1])
     lift = max(1e-6 * largest - float(eigenvalues[0]), 0.0)
@@ -191,6 +199,8 @@ def solve_kernel(
         vote = weight / max(evidence.noise**2, 1e-8)
         correlation += vote * evidence.autocorrelation
         cross += vote * evidence.crosscorrelation
+    if not correlation.any():
+        raise InvalidInputError("the pooled evidence determines no kernel")
     rows, cols = np.divmod(np.arange(k * k), k)
     a = correlation[rows[:, None] - rows + k - 1, cols[:, None] - cols + k - 1]
     a[np.diag_indices_from(a)] += ridge * np.trace(a) / a.shape[0]

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import io
+import math
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -111,6 +113,21 @@ def test_least_squares_respects_the_sign_constraint() -> None:
     k = nonnegative_least_squares(a, np.array([2.0, -3.0, 0.5]), np.ones(3))
 
     assert np.allclose(k, [1.0, 0.0, 0.5], atol=1e-6)
+
+
+def test_a_patch_without_any_light_determines_nothing() -> None:
+    dark = evidence_of(0, gaussian(K, np.eye(2)), 0.1)
+    dark = replace(dark, autocorrelation=0 * dark.autocorrelation, crosscorrelation=0 * dark.crosscorrelation)
+
+    assert nonnegative_least_squares(np.zeros((2, 2)), np.zeros(2), np.ones(2)).tolist() == [1.0, 1.0]
+    with pytest.raises(InvalidInputError, match="no kernel"):
+        solve_kernel([dark], [1.0], K)
+
+
+@pytest.mark.parametrize("change", [{"pixels": 0}, {"noise": math.nan}, {"spectrum_noise": -1.0}])
+def test_impossible_scalars_are_refused(change: dict[str, float]) -> None:
+    with pytest.raises(InvalidInputError, match="noise"):
+        replace(evidence_of(0, gaussian(K, np.eye(2)), 0.1), **change)
 
 
 def test_a_header_that_promises_more_than_its_bytes_is_refused() -> None:

@@ -23,6 +23,7 @@ _FREE: Final = (
 )
 _WIDEST: Final = 4.0  # share of the range beyond which a bound would cut nothing but noise
 _DARKEST, _DARKER = 0.5, 0.2  # of the darkest light nearby where no room is left, and per room
+_LEAST_VARIANCE: Final = 1e-12  # black without read noise has none
 _CALM, _BUSY = 1.5, 3.0  # standard deviation over the noise's, of a flat area and of one that is none
 
 
@@ -142,7 +143,7 @@ def flats_kept(photo: Planes, restored: Planes, noise: Sequence[NoiseModel], sha
     for plane, model in zip(photo, noise, strict=True):
         mean = ndimage.uniform_filter(plane, _SIDE)
         local = ndimage.uniform_filter(plane * plane, _SIDE) - mean * mean
-        ratio = np.maximum(ratio, _middle(local / model.variance(mean)))
+        ratio = np.maximum(ratio, _middle(local / np.maximum(model.variance(mean), _LEAST_VARIANCE)))
     contrast = np.sqrt(np.maximum(ratio, np.float32(0.0)))
     t = np.clip((contrast - _CALM) / (_BUSY - _CALM), 0.0, 1.0)
     keep: NDArray[np.float32] = (share * (1.0 - t * t * (3.0 - 2.0 * t))).astype(np.float32)

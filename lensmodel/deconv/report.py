@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lensmodel.blur import UniformBlur
 from lensmodel.deconv.base import Sensor
 from lensmodel.deconv.lattice import Cell
-from lensmodel.deconv.wiener import SLOPE, frequency_squared
+from lensmodel.deconv.wiener import SLOPE, counts, frequency_squared
 from lensmodel.geometry import zone_of
 from lensmodel.types import ZONES, EdgeGain, Planes, Zone
 
@@ -68,16 +68,16 @@ def forecast(
     before = sum_f S |1 - K|² + n,     after = sum_f S n / (S |K|² + n),   S = c |f|^-2.2
     """
     before = after = 0.0
-    shape = _scene_power()
+    shape, times = _scene_power(), counts(_GRID)
     every = max(_EVERY, min(tile.shape[1:]) // _SAMPLES // 2 * 2 + 1)
     for plane, blur, sensor in zip(tile[:, ::every, ::every], blurs, sensors, strict=True):
         noise = float(sensor.noise.variance(plane).mean())
         K = blur.spectrum(_GRID) if blur.kernel.shape[0] <= min(_GRID) else np.ones(shape.shape)
         power = K.real**2 + K.imag**2
-        scale = max(float(plane.var()) - noise, 0.0) / float((shape * power).sum())
-        S, n = scale * shape, noise / shape.size
-        before += float((S * ((1.0 - K.real) ** 2 + K.imag**2) + n).sum())
-        after += float((S * n / np.maximum(S * power + n, 1e-30)).sum())
+        scale = max(float(plane.var()) - noise, 0.0) / float((times * shape * power).sum())
+        S, n = scale * shape, noise / float(times.sum())
+        before += float((times * (S * ((1.0 - K.real) ** 2 + K.imag**2) + n)).sum())
+        after += float((times * S * n / np.maximum(S * power + n, 1e-30)).sum())
     return CellForecast(zone_of(cell.position.r), before, after, float(np.mean(errors)))
 
 

@@ -74,16 +74,16 @@ def frequency_squared(shape: tuple[int, int]) -> NDArray[np.float32]:
 def prior(shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """1 / S(f) for c = 1, and S(f) times how often each frequency of the half spectrum counts."""
     decay = frequency_squared(shape) ** np.float32(SLOPE / 2)
-    likely = _counts(shape) / decay
+    likely = counts(shape) / decay
     decay.setflags(write=False)
     return decay, np.ascontiguousarray(likely, dtype=np.float32)
 
 
-def _counts(shape: tuple[int, int]) -> NDArray[np.float32]:
+def counts(shape: tuple[int, int]) -> NDArray[np.float32]:
     """How often each column of the half spectrum stands in the whole; the mean stands nowhere."""
-    counts = np.full((shape[0], shape[1] // 2 + 1), 2.0, dtype=np.float32)
-    counts[:, 0] = 1.0
+    found = np.full((shape[0], shape[1] // 2 + 1), 2.0, dtype=np.float32)
+    found[:, 0] = 1.0
     if shape[1] % 2 == 0:
-        counts[:, -1] = 1.0
-    counts[0, 0] = 0.0
-    return counts
+        found[:, -1] = 1.0
+    found[0, 0] = 0.0
+    return found

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from lensmodel.blur import EfficientFilterFlow
+from lensmodel.blur import EfficientFilterFlow, UniformBlur
 from lensmodel.deconv import Bounds, Corrected, Roi, correct_planes
+from lensmodel.deconv.base import Sensor
 from lensmodel.deconv.engine import compiled
 from lensmodel.deconv.lattice import cells
 from lensmodel.deconv.limits import allowance, flats_kept, limited
+from lensmodel.deconv.report import forecast
 from lensmodel.errors import CancelledError, InvalidInputError
 from lensmodel.geometry import Frame
 from lensmodel.psf import gaussian
@@ -291,6 +293,25 @@ def test_flat_areas_keep_their_grain_where_asked_and_edges_their_sharpness() -> 
     assert rmse(kept[:, :, :30], inside[:, :, :30]) < 0.3 * rmse(made[:, :, :30], inside[:, :, :30])
     np.testing.assert_allclose(kept[:, :, 38:42], made[:, :, 38:42], atol=1e-6)
     np.testing.assert_array_equal(flats_kept(seen, made, [model], 0.0), made)
+
+
+def test_black_without_read_noise_is_a_flat_area() -> None:
+    seen, made = np.zeros((1, 24, 24), dtype=np.float32), np.full((1, 20, 20), 0.1, dtype=np.float32)
+
+    np.testing.assert_array_equal(flats_kept(seen, made, [NoiseModel(1e-3, 0.0)], 1.0), 0.0)
+
+
+def test_forecast_of_a_blur_turns_with_it() -> None:
+    plane = np.random.default_rng(0).random((3, 72, 72), dtype=np.float32)
+    cell, sensors = next(iter(cells(FRAME, 64))), [Sensor(NoiseModel.white(0.01))] * 3
+
+    lying, standing = (
+        forecast(cell, plane, [UniformBlur(gaussian(15, np.diag(width)))] * 3, sensors, [0.0] * 3)
+        for width in ((0.1, 6.0), (6.0, 0.1))
+    )
+
+    assert lying.before == pytest.approx(standing.before, rel=1e-5)
+    assert lying.after == pytest.approx(standing.after, rel=1e-5)
 
 
 def test_zone_report_expects_less_gain_from_a_noisier_photo() -> None:

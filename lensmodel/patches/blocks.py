@@ -165,14 +165,28 @@ def _measure_strip(
     blocks.histogram[:] += np.bincount(group, minlength=GROUPS * R_BINS).reshape(GROUPS, R_BINS)
     for i, product in enumerate((gr_at * gr_at, gr_at * gc_at, gc_at * gc_at)):
         blocks.tensor[rows, :, i] = np.bincount(where, product, count).reshape(shape)
-    _measure_widths(blocks, rows, smooth, (gr, gc, modulus, unit), inner)
+    ridge = _ridge(along_rows, along_cols, size)[inner] & (modulus > WIDTH_SIGMAS * unit)
+    _measure_widths(blocks, rows, smooth, (gr, gc, modulus), np.flatnonzero(ridge), inner)
+
+
+def _ridge(along_rows: Plane, along_cols: Plane, modulus: Plane) -> NDArray[np.bool_]:
+    """Where no neighbour across the edge is steeper; the rim has one neighbour only and is let through."""
+    here, inside = modulus[1:-1, 1:-1], (slice(1, -1), slice(1, -1))
+    ridge = np.ones(modulus.shape, dtype=np.bool_)
+    ridge[inside] = np.where(
+        np.abs(along_rows[inside]) > np.abs(along_cols[inside]),
+        (here >= modulus[:-2, 1:-1]) & (here >= modulus[2:, 1:-1]),
+        (here >= modulus[1:-1, :-2]) & (here >= modulus[1:-1, 2:]),
+    )
+    return ridge
 
 
 def _measure_widths(
     blocks: Blocks,
     rows: slice,
     smooth: Plane,
-    gradients: tuple[Plane, Plane, Plane, Plane],
+    gradients: tuple[Plane, Plane, Plane],
+    at: NDArray[np.intp],
     inner: tuple[slice, slice],
 ) -> None:
     """Width of the blur at edge ridges by re-blurring.
@@ -184,20 +198,12 @@ def _measure_widths(
 
     S. Zhuo and T. Sim, "Defocus map estimation from a single image", Pattern Recognition 44,
     2011, eq. (3) to (5), with the smoothing taken into account. It holds on the ridge of the
-    gradient only, so pixels with a stronger neighbour across the edge are left out.
+    gradient only: `at` are the pixels of the inner part that lie there.
     """
-    gr, gc, modulus, unit = gradients
+    gr, gc, modulus = gradients
     side, m = blocks.side, blocks.level.shape[1]
     again = np.asarray(ndimage.gaussian_filter(smooth, 1.0, truncate=3.0), dtype=np.float32)
     second = np.hypot(*(np.asarray(part)[inner] for part in np.gradient(again)))
-    steep = np.abs(gr) > np.abs(gc)
-    ridge = modulus > WIDTH_SIGMAS * unit
-    ridge[1:-1, 1:-1] &= np.where(
-        steep[1:-1, 1:-1],
-        (modulus[1:-1, 1:-1] >= modulus[:-2, 1:-1]) & (modulus[1:-1, 1:-1] >= modulus[2:, 1:-1]),
-        (modulus[1:-1, 1:-1] >= modulus[1:-1, :-2]) & (modulus[1:-1, 1:-1] >= modulus[1:-1, 2:]),
-    )
-    at = np.flatnonzero(ridge)
     excess = np.square(modulus.ravel()[at] / np.maximum(second.ravel()[at], 1e-12)) - 1.0
     square = 1.0 / np.maximum(excess, 1e-3) - 1.0
     square = np.clip(square, 0.0, (WIDTH_BINS * WIDTH_STEP_PX) ** 2 - 1e-3)

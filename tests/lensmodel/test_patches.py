@@ -12,8 +12,8 @@ from scipy import ndimage
 
 from lensmodel.errors import InvalidInputError, NoUsablePatchesError, UnknownMethodError
 from lensmodel.geometry import Frame
-from lensmodel.patches import REASONS, Patch, Selection, r_map, select, selectors
-from lensmodel.types import NoiseModel, Plane
+from lensmodel.patches import REASONS, Patch, Selection, blocks, r_map, select, selectors
+from lensmodel.types import NoiseModel, Plane, ignore_step
 
 NOISE = NoiseModel.white(0.003)
 
@@ -192,6 +192,18 @@ def test_progress_is_reported_to_the_end(photo: Plane) -> None:
 
 
 # ---- what is rejected
+
+
+def test_strips_leave_no_trace_in_the_sums(photo: Plane, monkeypatch: pytest.MonkeyPatch) -> None:
+    def measured(pixels: int) -> blocks.Blocks:
+        monkeypatch.setattr(blocks, "_STRIP_PIXELS", pixels)
+        return blocks.measure_blocks(photo[:300, :400], NOISE, 32, 1.0, ignore_step)
+
+    whole, cut = measured(10**9), measured(32 * 400)
+
+    assert whole.widths.sum() > 1000
+    for name in ("energy", "tensor", "level", "widths", "width_sums", "histogram"):
+        np.testing.assert_allclose(getattr(cut, name), getattr(whole, name), rtol=1e-5)
 
 
 def test_every_window_is_chosen_or_has_a_reason(selection: Selection) -> None:

@@ -88,6 +88,10 @@ def save_profile(path: Path | str, profile: LensProfile) -> None:
 def _write(file: IO[bytes], profile: LensProfile) -> None:
     samples, prior = profile.model.samples, profile.model.prior
     side = max(sample.kernel.shape[0] for sample in samples)
+    if not _within_limits(len(samples), side):
+        raise InvalidInputError(
+            f"a profile holds {_MAX_SAMPLES} samples of side {_MAX_SIDE}, not {len(samples)} of side {side}"
+        )
     stack = np.stack([resized(sample.kernel, side) for sample in samples]).astype(np.float32)
     document = {
         "format": FORMAT,
@@ -114,6 +118,16 @@ def _write(file: IO[bytes], profile: LensProfile) -> None:
             family = io.BytesIO()
             _write(family, LensProfile(prior.source))
             archive.writestr(_FAMILY, family.getvalue(), zipfile.ZIP_STORED)
+        if _unpacked(archive) > _MAX_BYTES:
+            raise InvalidInputError(f"a profile holds {_MAX_BYTES >> 20} MiB at most; save fewer samples")
+
+
+def _within_limits(count: int, side: int) -> bool:
+    return 0 < count <= _MAX_SAMPLES and side <= _MAX_SIDE
+
+
+def _unpacked(archive: zipfile.ZipFile) -> int:
+    return sum(entry.file_size for entry in archive.infolist())
 
 
 def load_profile(path: Path | str) -> LensProfile:
@@ -131,17 +145,17 @@ def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> 
     """Open a profile; `alone` passes over the family, which has none of its own."""
     try:
         with zipfile.ZipFile(source) as archive:
-            sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
-            if sum(sizes.values()) > _MAX_BYTES:
+            names = set(archive.namelist())
+            if _unpacked(archive) > _MAX_BYTES:
                 raise InvalidInputError(
                     f"{name} unpacks to more than {_MAX_BYTES >> 20} MiB; it is no lens profile"
                 )
             document = json.loads(archive.read("profile.json"))
             stack = np.load(io.BytesIO(archive.read("kernels.npy")), allow_pickle=False)
-            spectra = archive.read(_SPECTRA) if _SPECTRA in sizes else None
-            evidence = {name: archive.read(name) for name in sizes if name.startswith(_EVIDENCE)}
-            learned = archive.read(_LEARNED) if _LEARNED in sizes else None
-            family = archive.read(_FAMILY) if _FAMILY in sizes and not alone else None
+            spectra = archive.read(_SPECTRA) if _SPECTRA in names else None
+            evidence = {name: archive.read(name) for name in names if name.startswith(_EVIDENCE)}
+            learned = archive.read(_LEARNED) if _LEARNED in names else None
+            family = archive.read(_FAMILY) if _FAMILY in names and not alone else None
     except FileNotFoundError:
         raise
     except _UNREADABLE as error:
@@ -155,9 +169,8 @@ def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> 
         entries = document["samples"]
         fits = (
             stack.ndim == 3
-            and stack.shape[1] <= _MAX_SIDE
             and len(entries) == stack.shape[0]
-            and 0 < len(entries) <= _MAX_SAMPLES
+            and _within_limits(len(entries), stack.shape[1])
         )
         if not fits or stack.dtype != np.float32:
             raise InvalidInputError(

@@ -38,7 +38,7 @@ _RIM = 4
 
 def largest_side(q: float) -> int:
     """Odd side of the largest kernel that shows no copy of the light beside it: one period of the pupil."""
-    return 2 * int(_MAX_ACROSS * q / 2.0 / _ALONE) - 1
+    return max(2 * int(_MAX_ACROSS * q / 2.0 / _ALONE) - 1, 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -358,6 +358,15 @@ class TestProfile:
         with pytest.raises(InvalidInputError):
             load_profile(path)
 
+    def test_what_could_not_be_opened_is_not_written(self, tmp_path: Path) -> None:
+        kernel = np.zeros((257, 257))
+        kernel[128, 128] = 1.0
+        model = LensModel.fit([PsfSample(kernel, FieldPosition(0.1, 0.0))])
+
+        with pytest.raises(InvalidInputError, match="side 255"):
+            save_profile(tmp_path / "a.lensprofile", LensProfile(model))
+        assert not list(tmp_path.iterdir())
+
     def test_every_truncation_and_flipped_byte_is_refused_or_harmless(self, tmp_path: Path) -> None:
         path = tmp_path / "a.lensprofile"
         save_profile(path, LensProfile(LensModel.fit(photo("a", 0, count=3))))

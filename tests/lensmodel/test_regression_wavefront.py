@@ -72,6 +72,14 @@ def test_impossible_wavefronts_are_refused(change: dict[str, Any]) -> None:
         replace(Wavefront(np.zeros(19), -0.5, (1.0, 0.1), 2.0, 15), **change)
 
 
+def test_in_huge_pixels_the_light_is_in_one() -> None:
+    front = Wavefront(np.zeros(19), math.log(1e-3), (1.0, 0.1), 2.0, 15)
+
+    kernel = front.kernel(FieldPosition(0.0, 0.0), LensSettings(), 5)
+
+    assert kernel[2, 2] == pytest.approx(1.0)
+
+
 @pytest.mark.parametrize("count", [0, 11])
 def test_too_few_samples_make_no_wavefront(count: int) -> None:
     kernel = draw_lens(4).kernel(FieldPosition(0.2, 0.0), None, 11)

@@ -210,7 +210,7 @@ def estimate_cell(
             green = estimate
         width = rms_width(estimate.kernel)
         proofs = estimate.evidence or (None,) * len(group)
-        for patch, evidence, plane, noise in zip(group, proofs, planes, noises, strict=False):
+        for patch, evidence, plane, noise in zip(group, proofs, planes, noises, strict=True):
             sample = PsfSample(
                 kernel=estimate.kernel,
                 position=patch.position,
@@ -370,18 +370,28 @@ def calibrate(
     paths : iterable of Path
         Photos of one lens. RAW is best, JPEG worst.
     model : LensModel, optional
-        What is known already; the photos are added to it.
+        What is known already; photos that it has not seen are added to it.
     settings : LensSettings, optional
         Values that the files do not say, or say wrongly.
+    model_settings : ModelSettings, optional
+        Choices of a new model; one that is given keeps its own.
 
     Raises
     ------
+    InvalidInputError
+        If both a model and settings for a new one are given.
     NotEnoughEvidenceError
         If no photo gave a sample and there was no model to start from.
     """
+    if model is not None and model_settings is not None:
+        raise InvalidInputError("the model has settings of its own; give a model or model_settings")
     samples: list[PsfSample] = []
     reasons: list[str] = []
+    known = set() if model is None else {sample.photo for sample in model.samples}
     for path in paths:
+        if (key := photo_id(path)) in known:
+            on_event(CalibrationEvent(path, "skipped", detail="its samples are in the model already"))
+            continue
         try:
             found = samples_of_photo(
                 path, settings=settings, estimator=estimator, count=count, workers=workers, on_event=on_event
@@ -391,6 +401,7 @@ def calibrate(
             on_event(CalibrationEvent(path, "skipped", detail=str(error)))
             continue
         samples.extend(found)
+        known.add(key)
         on_event(CalibrationEvent(path, "counted", len(found), len(found)))
     if model is not None:
         return model.added(samples) if samples else model

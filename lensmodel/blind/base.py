@@ -40,8 +40,8 @@ class PsfEstimate:
         What the estimator reports of itself.
     seconds : float
         CPU time.
-    evidence : tuple of PatchEvidence
-        One for each patch that took part, in order; empty where the method keeps none.
+    evidence : tuple of PatchEvidence or None
+        One for each patch, None for one that took no part; empty where the method keeps none.
     no_blur : bool
         The kernel is too narrow to be told from none.
     """
@@ -52,7 +52,7 @@ class PsfEstimate:
     predicted_error: float
     diagnostics: Mapping[str, float]
     seconds: float
-    evidence: tuple[PatchEvidence, ...] = ()
+    evidence: tuple[PatchEvidence | None, ...] = ()
     no_blur: bool = False
 
 

@@ -154,19 +154,19 @@ class PatchRecurrence:
                 on_step(done, total)
         if state is None:
             raise NotEnoughEvidenceError("the patches determine no kernel; choose parts with more detail")
-        evidence = tuple(
-            _evidence(a, b, n, view.noise, patch, model)
+        own = {
+            id(patch): _evidence(a, b, n, view.noise, patch, model)
             for (a, b, n), view, (patch, model) in zip(state.parts, scaled, kept, strict=True)
-        )
+        }
         final = resized(centred(state.kernel), size)
         return PsfEstimate(
             kernel=final,
             confidence=0.5,
-            reliability=reliability(evidence),
+            reliability=reliability(list(own.values())),
             predicted_error=0.5,
             diagnostics={"width": rms_width(final), "support": float(widest), "levels": float(levels)},
             seconds=time.process_time() - began,
-            evidence=evidence,
+            evidence=tuple(own.get(id(patch)) for patch in patches),
             no_blur=is_no_blur(final),
         )
 

@@ -117,6 +117,8 @@ def test_calibrated_lens_makes_another_photo_sharper(
     stages = [event.stage for event in events]
     assert stages[0] == "developing"
     assert stages[-1] == "counted"
+    assert pipeline.calibrate([photos["city"][0]] * 2, model=model, on_event=events.append) is model
+    assert [event.stage for event in events][len(stages) :] == ["skipped"] * 2
 
 
 @pytest.mark.parametrize(("kind", "kept"), [("dng", True), ("tiff", True), ("jpeg", False)])
@@ -132,6 +134,28 @@ def test_spectra_of_photos_that_a_camera_sharpened_are_not_kept(
     )
 
     assert (found[0].sample.spectrum is not None) == kept
+
+
+def test_a_patch_that_took_no_part_has_no_evidence_of_its_own(
+    photos: dict[str, tuple[Path, SimulatedPhoto]],
+) -> None:
+    developed = photo.develop(photos["city"][0])
+    planes = developed.planes.copy()
+    planes[:, :128, :128] = 0.4  # nothing is seen here
+    group = [Patch(row, row, 128, developed.frame.position(row, row), 1.0, 0) for row in (0, 192)]
+
+    found = pipeline.estimate_cell(
+        replace(developed, planes=planes),
+        group,
+        settings=SETTINGS,
+        photo_id="a",
+        estimator="michaeli-irani",
+        channels=("g",),
+        size=11,
+    )
+
+    assert [cell.patch for cell in found] == group
+    assert [cell.evidence is None for cell in found] == [True, False]
 
 
 def test_photos_that_cannot_help_are_skipped_with_the_reason(tmp_path: Path) -> None:

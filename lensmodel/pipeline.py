@@ -435,9 +435,8 @@ def correct_photo(
 ) -> deconv.Corrected:
     """Remove the blur of the lens from a developed photo.
 
-    The model's own predicted error of each PSF goes into the noise model of the correction:
-    where the PSF is uncertain, the correction is gentler, less so where the patches exclude that it
-    is too wide (`Doubt`).
+    The model's own predicted error of each PSF makes the correction gentler where it is large, less so
+    where the patches exclude that the PSF is too wide (`Doubt`).
 
     Parameters
     ----------
@@ -463,15 +462,14 @@ def correct_photo(
         return error if answer.extrapolated else error * doubt.share(position, settings)
 
     planes, cfa = developed.planes, developed.cfa
-    if method == "paper" and lateral is not None:
-        # As the paper did (section 8): the channels are warped first. All other methods carry the
-        # shift in their PSFs and spare the picture that resampling.
+    solver = deconv.deconvolvers.create(method)
+    if isinstance(solver, deconv.WarpableMethod) and solver.warped and lateral is not None:
         planes, lateral, cfa = resample(planes, developed.frame, lateral), None, None
     corrected = deconv.correct_planes(
         planes,
         model.field(settings, pitch_um=pitch_um, half_diagonal_px=half_px),
         developed.frame,
-        method=method,
+        method=solver,
         strength=strength,
         noise=developed.correction_noise,
         clip=developed.clip,

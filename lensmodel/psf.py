@@ -51,7 +51,7 @@ def delta(size: int) -> Kernel:
 
 
 def gaussian(size: int, covariance: npt.ArrayLike) -> Kernel:
-    """Gaussian kernel integrated over the pixel, by its spectrum on a grid oversampled 5 times.
+    """Gaussian kernel integrated over the pixel: the sum of 5 x 5 samples in each.
 
     Parameters
     ----------
@@ -94,8 +94,9 @@ def centroid(kernel: npt.NDArray[np.float64]) -> tuple[float, float]:
 def centred(kernel: npt.ArrayLike) -> Kernel:
     """Shift the centre of mass onto the middle pixel.
 
-    Whole pixels are rolled in; the rest is a cubic-spline shift. Clipping its undershoot moves
-    the centre a little, so the shift is repeated until less than a thousandth of a pixel is left.
+    Whole pixels are moved first, and what leaves the array is lost; the rest is a cubic-spline shift.
+    Clipping its undershoot moves the centre a little, so the shift is repeated until less than a
+    thousandth of a pixel is left.
     """
     current = np.array(as_kernel(kernel))
     for _ in range(12):

@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
-from lensmodel.deconv.base import ColourDeconvolver, Deconvolver, Restored, Sensor, restore_planes
+from lensmodel.deconv.base import (
+    ColourDeconvolver,
+    Deconvolver,
+    Restored,
+    Sensor,
+    WarpableMethod,
+    restore_planes,
+)
 from lensmodel.deconv.correct import Corrected, PsfError, correct_planes
 from lensmodel.deconv.direct import DirectFilter
 from lensmodel.deconv.epll import Epll
@@ -30,6 +37,7 @@ __all__ = [
     "SaturationAwareRichardsonLucy",
     "Sensor",
     "SparseGradient",
+    "WarpableMethod",
     "Wiener",
     "ZoneReport",
     "correct_planes",

@@ -27,8 +27,6 @@ class Sensor:
         Variance against level.
     clip : float
         Level from which on a value is only a lower bound; infinity where nothing clips.
-    extra : ndarray or None
-        Further variance per pixel, of the plane's shape: what an uncertain kernel leaves behind.
     measured : ndarray of bool or None
         Where the sensor measured this plane; demosaicing filled in the rest. `None` for everywhere.
     surrounded : bool
@@ -41,7 +39,6 @@ class Sensor:
 
     noise: NoiseModel = field(default_factory=lambda: NoiseModel.white(0.005))
     clip: float = float("inf")
-    extra: NDArray[np.float32] | None = None
     measured: NDArray[np.bool_] | None = None
     surrounded: bool = False
     edges: tuple[bool, bool, bool, bool] = (True, True, True, True)
@@ -52,8 +49,7 @@ class Sensor:
 
     def variance(self, plane: NDArray[np.floating]) -> NDArray[np.float32]:
         """Variance of the noise at each pixel."""
-        var = self.noise.variance(plane).astype(np.float32)
-        return var if self.extra is None else np.asarray(var + self.extra, dtype=np.float32)
+        return self.noise.variance(plane).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,6 +101,19 @@ class CoarseMethod(Protocol):
     """
 
     cell_factor: int
+
+
+@runtime_checkable
+class WarpableMethod(Protocol):
+    """A method that may want planes whose lateral colour was removed by resampling.
+
+    Attributes
+    ----------
+    warped : bool
+        Whether it does; else the shift is better left to the kernels, which spare the picture that.
+    """
+
+    warped: bool
 
 
 def restore_planes(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lensmodel.deconv.compiled_base import Real, jit
+from lensmodel.deconv.compiled_base import Real
+from lensmodel.jit import jit
 
 
 @jit

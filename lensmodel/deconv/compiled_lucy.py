@@ -14,10 +14,10 @@ from lensmodel.deconv.compiled_base import (
     ZERO,
     Complex,
     Real,
-    jit,
     to_plane,
     to_spectrum,
 )
+from lensmodel.jit import jit
 
 _EPS: Final = np.float32(1e-6)
 _LIGHT: Final = np.float32(0.9)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.deconv.compiled_base import ONE, ZERO, Complex, Real, jit, to_plane, to_spectrum
+from lensmodel.deconv.compiled_base import ONE, ZERO, Complex, Real, to_plane, to_spectrum
+from lensmodel.jit import jit
 
 
 @jit

@@ -7,7 +7,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.deconv.compiled_base import ONE, ZERO, Complex, Real, jit, to_plane, to_spectrum
+from lensmodel.deconv.compiled_base import ONE, ZERO, Complex, Real, to_plane, to_spectrum
+from lensmodel.jit import jit
 
 _REACH: Final = np.float32(1.0 / 24.0)
 
@@ -100,7 +101,7 @@ def pull_of(  # noqa: C901 - loops over rows and colours, one pass over memory
 def _wiener(
     Y: Complex, K: Complex, decay: Real, likely: Real, size: int, noise: float, variance: float, P: Complex
 ) -> None:
-    """Spectrum of the Wiener estimate; see `wiener_canvas`."""
+    """Spectrum of the Wiener estimate; see `wiener.wiener_spectrum`."""
     height, half = Y.shape
     shown = np.float64(0.0)
     for i in range(height):

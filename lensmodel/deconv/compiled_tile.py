@@ -6,7 +6,8 @@ import numpy as np
 import rocket_fft
 from numpy.typing import NDArray
 
-from lensmodel.deconv.compiled_base import FORWARD, ONE, ZERO, Complex, Real, jit
+from lensmodel.deconv.compiled_base import FORWARD, ONE, ZERO, Complex, Real
+from lensmodel.jit import jit
 
 Seam = tuple[NDArray[np.intp], NDArray[np.intp], Real]
 
@@ -53,7 +54,7 @@ def transfer(taps: Real, out: Complex, width: int) -> None:
 
 @jit
 def _limit(K: Complex, rates: Complex, reach: float) -> None:
-    """Hold the change of a transfer function within half of it; see `drifts` of `kernels`."""
+    """Hold the change of a transfer function within half of it; see `transfers`."""
     for i in range(K.shape[0]):
         for j in range(K.shape[1]):
             k, d, a = K[i, j], rates[0, i, j], rates[1, i, j]

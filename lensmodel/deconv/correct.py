@@ -159,8 +159,8 @@ def correct_planes(
     strength : float
         0 leaves the photo as it is, 1 applies what the noise allows.
     psf_error : float or callable
-        Expected relative L2 error of the PSF: it is mixed with a point, and, where the planes are no
-        mosaic, raises the noise where the picture has detail.
+        Expected relative L2 error of the PSF: the more, the more of a point is mixed into it, and the less
+        is allowed beside edges.
     lateral : LateralShift or None
         Lateral colour to remove in the same step: it becomes part of the red and blue PSFs, so
         nothing is interpolated. Leave it out where the planes were resampled before.
@@ -316,9 +316,6 @@ def _restore(job: _Job, cell: Cell) -> tuple[Planes, CellForecast]:
         Sensor(
             job.noise[c],
             job.clip[c],
-            # What a wrong kernel leaves is no noise: counted as such, it would hand strong edges to the
-            # prior, which paints their colour over what lies beside them. `_cautious` answers for it.
-            None,
             job.measured(c, top, left, plane.shape),
             surrounded,
             edges,
@@ -343,7 +340,8 @@ def _restore(job: _Job, cell: Cell) -> tuple[Planes, CellForecast]:
 def _cautious(kernel: NDArray[np.float64], error: float) -> NDArray[np.float64]:
     """Mix an uncertain kernel with a point, s k + (1 - s) delta, s = 1 / (1 + e²).
 
-    Too wide a kernel costs far more than too narrow a one.
+    Too wide a kernel costs far more than too narrow a one. What a wrong kernel leaves is no noise: counted
+    as such, it would hand strong edges to the prior, which paints their colour over what lies beside them.
     """
     if error == 0.0:
         return kernel

@@ -13,7 +13,7 @@ from lensmodel.registry import Registry
 
 
 def _paper() -> SaturationAwareRichardsonLucy:
-    return SaturationAwareRichardsonLucy(iterations=25)
+    return SaturationAwareRichardsonLucy(iterations=25, warped=True)  # section 8
 
 
 def _whyte(iterations: int = 50) -> SaturationAwareRichardsonLucy:

@@ -94,6 +94,8 @@ class SaturationAwareRichardsonLucy:
         a, per clipping level.
     accelerated : bool
         Whether to extrapolate.
+    warped : bool
+        Whether lateral colour is to be removed by resampling before: see `WarpableMethod`.
     engine : {"auto", "numpy"}
         "numpy" never uses compiled loops; the numbers are the same.
 
@@ -108,6 +110,7 @@ class SaturationAwareRichardsonLucy:
     iterations: int = 25
     sharpness: float = SHARPNESS
     accelerated: bool = True
+    warped: bool = False
     engine: Engine = "auto"
 
     def __post_init__(self) -> None:

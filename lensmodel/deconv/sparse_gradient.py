@@ -349,7 +349,7 @@ def _calm(
 
 @lru_cache(maxsize=8)
 def _gradient_power(shape: tuple[int, int]) -> NDArray[np.float32]:
-    """sum_j |F_j|² of the two forward differences, plus a trace that keeps the quotient finite."""
+    """sum_j |F_j|² of the two forward differences."""
     rows = 2.0 - 2.0 * np.cos(2.0 * np.pi * fft.fftfreq(shape[0]))
     cols = 2.0 - 2.0 * np.cos(2.0 * np.pi * fft.rfftfreq(shape[1]))
     return (rows[:, None] + cols[None, :]).astype(np.float32)

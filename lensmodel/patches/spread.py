@@ -13,8 +13,9 @@ from lensmodel.patches.windows import Windows
 RINGS: Final = 8
 OCTANTS: Final = 8
 PATCHES_A_CELL: Final = 3
-"""Pooling the normal equations of four patches is worth most of what twelve give."""
+"""Of all that were asked for, on average."""
 MOST_A_CELL: Final = 4
+"""Pooling the normal equations of four patches is worth most of what twelve give."""
 CELL_R: Final = 0.12
 CELL_ANGLE: Final = math.radians(24.0)
 MOST_APART: Final = 3.0

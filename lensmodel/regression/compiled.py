@@ -3,27 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-F = TypeVar("F", bound=Callable[..., Any])
+from lensmodel.jit import jit
 
 _ONE, _HALF = np.float32(1.0), np.float32(0.5)
 _SIXTH, _TWO_THIRDS = np.float32(1.0 / 6.0), np.float32(2.0 / 3.0)
-
-
-def jit(function: F) -> F:
-    """Compile without the interpreter's lock, keep the machine code on disk."""
-    return cast(
-        "F",
-        numba.njit(
-            cache=True, nogil=True, fastmath={"nsz", "contract", "reassoc", "arcp"}, error_model="numpy"
-        )(function),
-    )
 
 
 @jit

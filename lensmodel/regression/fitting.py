@@ -133,12 +133,12 @@ class Fit:
         )
 
     def warmed(self, samples: Sequence[PsfSample], on_step: StepHook = ignore_step) -> Fit:
-        """Return it with the wavefront of its samples."""
+        """Return it with the wavefront of its samples; the steps of each end of a zoom begin anew."""
         groups = held_together(samples, self.roster.photo)
         common, scale = pitches.at_pixel(samples, self.pixel, self.unit), va.scales(self.bandwidth)
         votes = self.judgement.votes
         physical = Physics.fit(common, votes, groups, scale, on_step)
-        ends = () if physical is None else ends_of(common, votes, groups, scale, physical)
+        ends = () if physical is None else ends_of(common, votes, groups, scale, physical, on_step)
         return replace(self, physical=physical, ends=ends)
 
     def physical_at(self, settings: LensSettings) -> Physics | None:

@@ -20,7 +20,7 @@ from lensmodel.psf import PsfSample, distance
 from lensmodel.regression.physical import Physics
 from lensmodel.regression.wavefront import Wavefront
 from lensmodel.regression.wavefront_fit import MIN_SAMPLES, ONE_FOCAL_LENGTH, focal_range, refined
-from lensmodel.types import LensSettings
+from lensmodel.types import LensSettings, StepHook, ignore_step
 
 _REACH_OCTAVES, _SILENT = 0.15, 1e-3
 _HALVES = 2
@@ -68,6 +68,7 @@ def ends_of(
     groups: NDArray[np.intp],
     scale: NDArray[np.float64],
     shared: Physics,
+    on_step: StepHook = ignore_step,
 ) -> tuple[End, ...]:
     """Find the focal lengths that answer by themselves.
 
@@ -79,12 +80,14 @@ def ends_of(
         As of `Physics.fit`.
     shared : Physics
         Fitted to all of them.
+    on_step : StepHook
+        Called as by `Physics.fit`, anew for each focal length.
     """
     if shared.front.slopes is None:
         return ()
     found = []
     for rows in _one_by_one(samples, votes):
-        own = Physics.fit(samples, _only(rows, votes), groups, scale)
+        own = Physics.fit(samples, _only(rows, votes), groups, scale, on_step)
         if own is None:
             continue
         voting = [samples[i].with_weight(float(votes[i])) for i in np.flatnonzero(votes > 0).tolist()]

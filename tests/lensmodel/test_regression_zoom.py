@@ -9,13 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lensmodel.errors import CancelledError
 from lensmodel.psf import PsfSample, distance, gaussian
 from lensmodel.regression import LensModel
 from lensmodel.regression.judgement import held_together
 from lensmodel.regression.physical import Physics
 from lensmodel.regression.wavefront import NAMES, Wavefront
 from lensmodel.regression.wavefront_fit import fit_wavefront
-from lensmodel.regression.zoom import End, nearest
+from lensmodel.regression.zoom import End, ends_of, nearest
 from lensmodel.simulate import SimulatedLens, draw_lens
 from lensmodel.types import FieldPosition, Kernel, LensSettings
 
@@ -116,6 +117,20 @@ def test_zoom_in_the_mixture_is_kept_by_what_was_learned_and_not_worse_at_the_ot
     for place in (CORNER, MID):
         own = error(alone.query(place, at(SHORT), SIZE).kernel, place, SHORT)
         assert error(model.query(place, at(SHORT), SIZE).kernel, place, SHORT) < own + 0.002
+
+
+def test_fits_to_the_ends_of_a_zoom_can_be_stopped(many: list[PsfSample]) -> None:
+    front = Wavefront(
+        np.zeros(len(NAMES)), math.log(0.3), (1.15, 0.3), 2.8, SIZE, slopes=np.zeros(len(NAMES))
+    )
+    empty = np.empty((0, 2)), np.empty((0, 7)), np.ones(7), np.empty((0, SIZE**2)), np.empty(0)
+
+    def stop(*_: int) -> None:
+        raise CancelledError("enough")
+
+    votes, groups = np.ones(len(many)), np.arange(len(many))
+    with pytest.raises(CancelledError):
+        ends_of(many, votes, groups, np.ones(7), Physics(front, SIZE, *empty), stop)
 
 
 def test_the_say_of_one_focal_length_fades_without_a_step(many: list[PsfSample]) -> None:

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.regression.compiled import jit
+from lensmodel.jit import jit
 
 _HALF, _ONE, _TWO = np.float32(0.5), np.float32(1.0), np.float32(2.0)
 # Of sin(pi x) and cos(pi x) for |x| <= 1/2, by least squares: within 2e-6.

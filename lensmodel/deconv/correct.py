@@ -85,6 +85,17 @@ class _Job:
     bounds: Bounds
     cell_factor: int
 
+    def __post_init__(self) -> None:
+        wanted = (len(CHANNELS), self.frame.height, self.frame.width)
+        if self.planes.shape != wanted:
+            raise InvalidInputError(f"planes must be {wanted} as the frame says, got {self.planes.shape}")
+        if not 0.0 <= self.strength <= 1.0:
+            raise InvalidInputError(f"strength must lie in 0..1, got {self.strength}")
+        if len(self.noise) != len(CHANNELS) or len(self.clip) != len(CHANNELS):
+            raise InvalidInputError(
+                f"noise and clip need one entry per channel, got {len(self.noise)} and {len(self.clip)}"
+            )
+
     def measured(self, channel: int, top: int, left: int, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
         """Where the sensor measured a channel, on the part of the frame that begins at (top, left)."""
         if self.cfa is None:
@@ -191,33 +202,9 @@ def correct_planes(
     UnknownMethodError
         If `method` is in no registry.
     """
-    if (
-        planes.ndim != 3
-        or planes.shape[0] != len(CHANNELS)
-        or planes.shape[1:] != (frame.height, frame.width)
-    ):
-        raise InvalidInputError(
-            f"planes must be (3, {frame.height}, {frame.width}) as the frame says, got {planes.shape}"
-        )
-    if not 0.0 <= strength <= 1.0:
-        raise InvalidInputError(f"strength must lie in 0..1, got {strength}")
     if workers < 1:
         raise InvalidInputError(f"workers must be at least 1, got {workers}")
-    if len(noise) != len(CHANNELS) or len(clip) != len(CHANNELS):
-        raise InvalidInputError(
-            f"noise and clip need one entry per channel, got {len(noise)} and {len(clip)}"
-        )
-    window = Roi.of(frame, roi)
-    shape = (len(CHANNELS), window.height, window.width)
-    keep_freed_memory()
-    if out is None:
-        out = np.zeros(shape, dtype=np.float32)
-    elif out.shape != shape or out.dtype != np.float32:
-        raise InvalidInputError(f"out must be float32 {shape}, got {out.dtype} {out.shape}")
-    else:
-        out[:] = 0.0
     solver = deconvolvers.create(method) if isinstance(method, str) else method
-
     job = _Job(
         planes,
         _blurs_of(field, lateral),
@@ -232,6 +219,9 @@ def correct_planes(
         # Kernels do not change within cells that are larger than usual.
         solver.cell_factor if isinstance(solver, CoarseMethod) and cfa is None else 1,
     )
+    window = Roi.of(frame, roi)
+    keep_freed_memory()
+    out = _zeroed(out, (len(CHANNELS), window.height, window.width))
     if pitch is None:
         pitch = usual_pitch(frame, job.cell_factor)
     wanted = [cell for cell in cells(frame, pitch) if cell.meets(window)]
@@ -241,6 +231,16 @@ def correct_planes(
         forecasts.append(expected)
         on_step(done, len(wanted))
     return Corrected(out, zone_reports(forecasts))
+
+
+def _zeroed(out: Planes | None, shape: tuple[int, int, int]) -> Planes:
+    """What the caller gave to write to, or something new."""
+    if out is None:
+        return np.zeros(shape, dtype=np.float32)
+    if out.shape != shape or out.dtype != np.float32:
+        raise InvalidInputError(f"out must be float32 {shape}, got {out.dtype} {out.shape}")
+    out[:] = 0.0
+    return out
 
 
 def _blurs_of(

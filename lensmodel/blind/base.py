@@ -142,6 +142,16 @@ def usable(
     return kept
 
 
+def placed(
+    evidence: Sequence[PatchEvidence | None],
+    kept: Sequence[tuple[Plane, NoiseModel]],
+    patches: Sequence[Plane],
+) -> tuple[PatchEvidence | None, ...]:
+    """Evidence of the patches that `usable` kept, at their places among all."""
+    own = {id(patch): one for (patch, _), one in zip(kept, evidence, strict=True)}
+    return tuple(own.get(id(patch)) for patch in patches)
+
+
 def _unfit(patch: Plane, model: NoiseModel) -> str | None:
     sigma = model.sigma_at(float(patch.mean()))
     if float(patch.std()) <= _CONTRAST_IN_NOISE * sigma or float(np.ptp(patch)) < 1e-6:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lensmodel.blind.aberrations import AberrationFit
-from lensmodel.blind.base import PsfEstimate, is_no_blur, usable
+from lensmodel.blind.base import PsfEstimate, is_no_blur, placed, usable
 from lensmodel.blind.finish import signal_share
 from lensmodel.blind.judgement import Judgement
 from lensmodel.blind.patch_recurrence import PatchRecurrence
@@ -76,6 +76,7 @@ class Cautious:
             inner, models = [_middle(patch) for patch, _ in kept], [model for _, model in kept]
             recurrence = PatchRecurrence(support=min(_POOLED_SUPPORT, size), iterations=_POOLED_ITERATIONS)
             found = recurrence.estimate(inner, models, size=size, on_step=_half(on_step, 0))
+            found = replace(found, evidence=placed(found.evidence, kept, patches))
             return self._agreed(kept, found, began, size, on_step)
         gaussian = Whittle().estimate(patches, noise, size=size)
         support = min(max(2 * round(3.0 * gaussian.diagnostics["width"] + 3.0) + 1, 15), 31, size)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from lensmodel.blind.base import PsfEstimate, is_no_blur, usable
+from lensmodel.blind.base import PsfEstimate, is_no_blur, placed, usable
 from lensmodel.blind.gram import window_products
 from lensmodel.blind.recurrence import (
     ALPHA,
@@ -154,19 +154,19 @@ class PatchRecurrence:
                 on_step(done, total)
         if state is None:
             raise NotEnoughEvidenceError("the patches determine no kernel; choose parts with more detail")
-        own = {
-            id(patch): _evidence(a, b, n, view.noise, patch, model)
+        evidence = [
+            _evidence(a, b, n, view.noise, patch, model)
             for (a, b, n), view, (patch, model) in zip(state.parts, scaled, kept, strict=True)
-        }
+        ]
         final = resized(centred(state.kernel), size)
         return PsfEstimate(
             kernel=final,
             confidence=0.5,
-            reliability=reliability(list(own.values())),
+            reliability=reliability(evidence),
             predicted_error=0.5,
             diagnostics={"width": rms_width(final), "support": float(widest), "levels": float(levels)},
             seconds=time.process_time() - began,
-            evidence=tuple(own.get(id(patch)) for patch in patches),
+            evidence=placed(evidence, kept, patches),
             no_blur=is_no_blur(final),
         )
 

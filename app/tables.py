@@ -180,6 +180,8 @@ class PhotoRow(Base):
     aperture: Mapped[float | None]
     focal_mm: Mapped[float | None]
     focus_m: Mapped[float | None]
+    """As `app.distances` writes it."""
+
     pixel_pitch_um: Mapped[float | None]
     iso: Mapped[float | None]
     exposure_s: Mapped[float | None]

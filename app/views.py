@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from datetime import datetime
 from typing import Final, cast
 
+from app import distances
 from app import schemas as s
 from app.errors import problem_of
 from app.store.corrections import CorrectionPlan
@@ -41,7 +42,7 @@ def photo_out(row: PhotoRow, lens_id: str | None, candidates: Sequence[str] = ()
         lens_id=lens_id,
         aperture=row.aperture,
         focal_length_mm=row.focal_mm,
-        focus_distance_m=row.focus_m,
+        focus_distance_m=None if row.focus_m == distances.INFINITY else row.focus_m,
         pixel_pitch_um=row.pixel_pitch_um,
         camera=camera or None,
         lens_model=row.lens_model,

@@ -1,4 +1,4 @@
-"""How workers and their tasks hand things to each other: names of files, and numbers JSON lacks."""
+"""How workers and their tasks hand things to each other: names of files."""
 
 from __future__ import annotations
 
@@ -28,6 +28,3 @@ SUFFIX: Final[Mapping[str, str]] = {
     "dng": ".dng",
 }
 """Ending of a corrected file, by its format."""
-
-INFINITY: Final = -1.0
-"""Stands for a focus distance of infinity where JSON and SQL have none."""

@@ -15,8 +15,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from app import distances
 from app.jobs.child import Progress, Task
-from app.jobs.handover import EVIDENCE, FAMILY, INFINITY, KERNELS, LEARNED, SAMPLES, SUFFIX
+from app.jobs.handover import EVIDENCE, FAMILY, KERNELS, LEARNED, SAMPLES, SUFFIX
 from lensmodel import codec, deconv, photo, pipeline
 from lensmodel.deconv.engine import first_use
 from lensmodel.errors import InvalidInputError, LensModelError
@@ -36,7 +37,7 @@ def inspect(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
     del folder, progress
     info = photo.inspect(Path(arguments["path"]), photo.Limits(max_megapixels=arguments["max_megapixels"]))
     found: dict[str, Any] = codec.to_json(info)
-    found["metadata"]["focus_m"] = _finite(info.metadata.focus_m)
+    found["metadata"]["focus_m"] = distances.written(info.metadata.focus_m)
     return found
 
 
@@ -236,19 +237,16 @@ def _evidence(path: Path) -> PatchEvidence | None:
 
 
 def _settings(stored: Mapping[str, Any]) -> LensSettings:
-    focus = stored["focus_m"]
     return LensSettings(
         aperture=stored["aperture"],
         focal_mm=stored["focal_mm"],
-        focus_m=math.inf if focus is not None and focus < 0 else focus,
+        focus_m=distances.read(stored["focus_m"]),
         channel=stored.get("channel", "g"),
     )
 
 
 def _finite(value: float | None) -> float | None:
-    if value is None or math.isnan(value):
-        return None
-    return INFINITY if math.isinf(value) else float(value)
+    return None if value is None or not math.isfinite(value) else float(value)
 
 
 def _numbers(value: Any) -> Any:  # noqa: ANN401 - JSON of any shape

@@ -17,8 +17,9 @@ from typing import Any, Final, NoReturn
 
 import numpy as np
 
+from app import distances
 from app.jobs.child import Progress
-from app.jobs.handover import EVIDENCE, INFINITY, KERNELS, SAMPLES
+from app.jobs.handover import EVIDENCE, KERNELS, SAMPLES
 from app.jobs.sandbox import Limits, Outcome, Sandbox
 from app.settings import Settings
 from app.storage import Storage
@@ -180,7 +181,6 @@ def write_samples(folder: Path, stored: Sequence[StoredSample]) -> None:
         size = sample.kernel.shape[0]
         margin = (side - size) // 2
         kernels[number, margin : margin + size, margin : margin + size] = sample.kernel
-        focus = sample.settings.focus_m
         if isinstance(sample.evidence, PatchEvidence):
             (folder / EVIDENCE.format(number)).write_bytes(sample.evidence.to_bytes())
         listed.append(
@@ -198,7 +198,7 @@ def write_samples(folder: Path, stored: Sequence[StoredSample]) -> None:
                 "settings": {
                     "aperture": sample.settings.aperture,
                     "focal_mm": sample.settings.focal_mm,
-                    "focus_m": INFINITY if focus == float("inf") else focus,
+                    "focus_m": distances.written(sample.settings.focus_m),
                     "channel": sample.settings.channel,
                 },
             }

@@ -12,6 +12,7 @@ import numpy as np
 from sqlalchemy import Row, and_, bindparam, select
 from sqlalchemy.orm import aliased
 
+from app import distances
 from app.store.database import Database
 from app.store.lenses import kind_key
 from app.store.patches import DTYPE
@@ -196,7 +197,9 @@ def _stored(row: Row[*tuple[Any, ...]]) -> StoredSample:
         PsfSample(
             kernel=kernel.astype(np.float64),
             position=FieldPosition(row.r, row.phi),
-            settings=LensSettings(row.aperture, row.focal_mm, row.focus_m, cast("Channel", row.channel)),
+            settings=LensSettings(
+                row.aperture, row.focal_mm, distances.read(row.focus_m), cast("Channel", row.channel)
+            ),
             weight=row.weight,
             photo=row.photo,
             pixel_pitch_um=row.pixel_pitch_um,

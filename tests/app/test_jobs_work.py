@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import datetime
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from app import views
 from app.jobs.child import Progress
 from app.jobs.correction_work import CorrectionWork
 from app.jobs.engine import Handler, Job, Kind, Status
@@ -218,6 +220,16 @@ def test_a_photo_goes_all_the_way(work: PhotoWork, bench: Workbench, photo: Phot
     assert (done.state, done.patches_done, done.width, done.aperture) == ("counted", 2, 600, 2.8)
     assert lens is not None
     assert (lens.version, lens.sample_count, lens.serial) == (1, 6, "123")
+
+
+def test_a_photo_focused_at_infinity_says_so_to_the_model(
+    work: PhotoWork, bench: Workbench, photo: PhotoRow, steps: Any
+) -> None:
+    work.photo(photo.public_id, 1)
+
+    _, samples = bench.store.samples.of_lens(steps.lens_id(photo))
+    assert {stored.sample.settings.focus_m for stored in samples} == {math.inf}
+    assert views.photo_out(steps.fresh(photo), None).focus_distance_m is None
 
 
 def test_running_a_finished_photo_again_changes_nothing(

@@ -127,7 +127,8 @@ class _Form:
         self._value += data[start:end]
 
     def on_header_end(self) -> None:
-        self._headers[self._name.decode("latin-1").lower()] = self._value.decode("utf-8", "replace")
+        # latin-1 keeps the bytes: the options come back as such, and are UTF-8
+        self._headers[self._name.decode("latin-1").lower()] = self._value.decode("latin-1")
         self._name, self._value = bytearray(), bytearray()
 
     def on_headers_finished(self) -> None:

@@ -255,6 +255,13 @@ def test_a_name_is_only_shown_and_never_a_path(sent: str | None, shown: str) -> 
     assert safe_name(sent) == shown
 
 
+@pytest.mark.parametrize("name", ["фото.dng", "Müller.dng"])
+def test_a_form_names_its_file_in_any_script(client: TestClient, name: str) -> None:
+    body = form((f'name="file"; filename="{name}"', TIFF))
+
+    assert client.post("/v1/photos", content=body, headers=FORM).json()["filename"] == name
+
+
 def test_a_name_with_folders_does_not_leave_the_storage(client: TestClient, settings: Settings) -> None:
     photo = client.post("/v1/photos", files={"file": ("../../../evil.dng", TIFF)}).json()
 

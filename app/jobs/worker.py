@@ -180,11 +180,11 @@ class Worker:
         photos, corrections = self._store.photos, self._store.corrections
         for photo_id, epoch, owner in [*photos.to_do(), *photos.running()]:
             ended = self._lost(Job("photo", (photo_id, epoch), owner))
-            if ended and photos.is_live(photo_id, epoch):
+            if ended:  # and only if it is still so: it may have come to its end meanwhile
                 photos.fail(photo_id, epoch, *ended)
         for correction_id, _, owner in [*corrections.to_do(), *corrections.running()]:
             ended = self._lost(Job("correction", (correction_id,), owner))
-            if ended and corrections.is_live(correction_id):
+            if ended:
                 corrections.fail(correction_id, *ended)
 
     def _lost(self, job: Job) -> tuple[str, str] | None:

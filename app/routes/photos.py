@@ -21,8 +21,9 @@ from app.ids import new_id
 from app.routes.common import Cursor, Limit, OnlyId, cut, next_link, problems
 from app.schemas import PatchPage, PhotoChange, PhotoOut, PhotoPage, PhotoState
 from app.settings import MIB
+from app.store import LensName
 from app.store.photos import GIVEN_SETTINGS
-from app.tables import PHOTO_FINAL, PhotoRow
+from app.tables import PhotoRow
 
 router = APIRouter(tags=["photos"])
 GIB = 1024 * MIB
@@ -100,7 +101,8 @@ def _admit(call: Call) -> None:
     unfinished, stored = call.store.photos.load_of(call.owner)
     if unfinished >= limits.max_queued_photos:
         raise QuotaError(
-            f"{unfinished} photos are unfinished, {limits.max_queued_photos} may be: wait for some to finish",
+            f"{unfinished} photos are unfinished, {limits.max_queued_photos} may be: "
+            "wait for some to finish, and name the lens of those that need one",
             headers={"Retry-After": "30"},
         )
     if stored >= limits.max_stored_gb * GIB:
@@ -208,21 +210,18 @@ def change_photo(photo_id: str, change: PhotoChange, call: CallDep) -> PhotoOut:
             "nothing to change: send lens_id, new_lens, aperture, excluded or another field"
         )
     given: dict[str, Any] = change.model_dump(include=set(GIVEN_SETTINGS), exclude_none=True)
-    lens_id = _target_lens(call, photo, change)
-    if photo.state in PHOTO_FINAL and photo.state not in {"failed", "cancelled"}:
-        if given:
-            columns = {GIVEN_SETTINGS[name]: value for name, value in given.items()}
-            call.store.lenses.change_settings(photo_id, call.owner, given, columns)
-        if lens_id is not None:
-            call.store.lenses.move(photo_id, call.owner, lens_id)
-    elif given or lens_id is not None:
-        call.store.photos.restart(photo_id, call.owner, given | ({"lens_id": lens_id} if lens_id else {}))
-    if change.excluded is not None:
-        _exclude(call, photo_id, excluded=change.excluded)
-    return describe(call, find_photo(call, photo_id))
+    lens = _target_lens(call, photo, change)
+    done = call.store.photos.change(photo_id, call.owner, given, lens=lens, excluded=change.excluded)
+    photo = find_photo(call, photo_id)
+    if not done:
+        raise ConflictError(
+            f"excluded={change.excluded}: a photo in state {photo.state} does not count; "
+            "only counted ones can be excluded"
+        )
+    return describe(call, photo)
 
 
-def _target_lens(call: Call, photo: PhotoRow, change: PhotoChange) -> str | None:
+def _target_lens(call: Call, photo: PhotoRow, change: PhotoChange) -> LensName | str | None:
     ways = (change.lens_id, change.lens_serial, change.new_lens)
     if sum(way is not None for way in ways) > 1:
         raise InvalidParameterError("lens_id, lens_serial and new_lens each name the lens: send one of them")
@@ -234,21 +233,9 @@ def _target_lens(call: Call, photo: PhotoRow, change: PhotoChange) -> str | None
         return change.lens_id
     maker, model = change.lens_maker or photo.lens_maker, change.lens_model or photo.lens_model
     if change.new_lens is not None:
-        label = change.new_lens.label
-        return call.store.lenses.create(photo.owner_id, label=label, maker=maker, model=model).public_id
+        return LensName(maker, model, None, label=change.new_lens.label)
     if change.lens_serial is not None:
-        return call.store.lenses.named(photo.owner_id, maker, model, change.lens_serial).public_id
+        return LensName(maker, model, change.lens_serial)
     if change.lens_model is not None or change.lens_maker is not None:
         raise InvalidParameterError("lens_model alone does not tell copies apart: send lens_serial with it")
     return None
-
-
-def _exclude(call: Call, photo_id: str, *, excluded: bool) -> None:
-    lenses = call.store.lenses
-    if lenses.exclude(photo_id, call.owner) if excluded else lenses.include(photo_id, call.owner):
-        return
-    state = find_photo(call, photo_id).state
-    if state != ("excluded" if excluded else "counted"):
-        raise ConflictError(
-            f"excluded={excluded}: a photo in state {state} does not count; only counted ones can be excluded"
-        )

@@ -10,9 +10,9 @@ from __future__ import annotations
 from app.settings import Settings
 from app.store.corrections import CorrectionStore
 from app.store.database import Database
-from app.store.lenses import LensStore
+from app.store.lenses import LensName, LensStore
 from app.store.patches import NewPatch, NewSample, PatchStore
-from app.store.photos import LensName, PhotoStore
+from app.store.photos import PhotoStore
 from app.store.samples import SampleStore, StoredSample
 from app.store.workers import WorkerStore
 

@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
 
 from sqlalchemy import delete, func, select, update
 from sqlalchemy.orm import Session
 
 from app.ids import new_id
 from app.store.database import Database, insert_new
-from app.store.owners import find, now, owned
+from app.store.owners import find, find_to_change, now, owned
 from app.store.versions import drop_samples, new_version, take_samples
-from app.tables import CorrectionRow, EventRow, GarbageRow, LensRow, PhotoRow, SampleRow
+from app.tables import CorrectionRow, EventRow, GarbageRow, LensRow, PhotoRow
+
+
+@dataclass(frozen=True, slots=True)
+class LensName:
+    """Which copy of which lens: told by its serial, or by a label that its owner gives it."""
+
+    maker: str | None
+    model: str | None
+    serial: str | None
+    serial_source: str = "user"
+    label: str | None = None
 
 
 def identity_key(maker: str | None, model: str | None, serial: str | None) -> str:
@@ -81,6 +93,22 @@ def _new_lens(
     }
 
 
+def named(session: Session, owner_id: int, name: LensName) -> LensRow:
+    """Find or make the lens that its owner names: by its serial, or always a new one by its label."""
+    key = f"label|{new_id()}" if name.label else identity_key(name.maker, name.model, name.serial)
+    fresh = _new_lens(
+        owner_id, key, maker=name.maker, model=name.model, serial=name.serial, source=name.serial_source
+    )
+    if name.label:
+        fresh |= {"label": name.label, "serial_source": "user"}
+    insert_new(session, LensRow, [fresh])
+    return session.scalars(
+        select(LensRow).where(
+            LensRow.owner_id == owner_id, LensRow.identity_key == key, LensRow.deleted_at.is_(None)
+        )
+    ).one()
+
+
 def record_event(
     session: Session, lens_id: int, version: int, kind: str, photo: PhotoRow | None, *, samples_added: int
 ) -> None:
@@ -117,6 +145,46 @@ def bring_in(session: Session, photo: PhotoRow, kind: str) -> None:
     version = new_version(session, photo.lens_id, rebuild=True)
     added = take_samples(session, photo, version)
     record_event(session, photo.lens_id, version, kind, photo, samples_added=added)
+
+
+def switch(session: Session, photo: PhotoRow, after: Literal["counted", "excluded"]) -> bool:
+    """Take a counted photo out of its lens's model, or bring it back; False if it is in another state."""
+    if photo.state != ("counted" if after == "excluded" else "excluded"):
+        return False
+    photo.state, photo.stage_at = after, now()
+    session.flush()
+    if after == "excluded":
+        give_back(session, photo, "photo_excluded")
+    else:
+        bring_in(session, photo, "photo_included")
+    return True
+
+
+def move(session: Session, photo: PhotoRow, lens: LensRow) -> None:
+    """Give a finished photo to another lens; both get a new version if it counts."""
+    if photo.lens_id == lens.id:
+        return
+    counted = photo.state == "counted"
+    if counted:
+        give_back(session, photo, "photo_removed")
+    photo.lens_id = lens.id
+    photo.given = {**photo.given, "lens_id": lens.public_id}
+    session.flush()
+    if counted:
+        bring_in(session, photo, "photo_included")
+
+
+def change_settings(
+    session: Session, photo: PhotoRow, given: Mapping[str, Any], columns: Mapping[str, Any]
+) -> None:
+    """Correct the settings of a finished photo; a counted one renews its lens's model."""
+    photo.given = {**photo.given, **given}
+    for column, value in columns.items():
+        setattr(photo, column, value)
+    session.flush()
+    if photo.state == "counted" and photo.lens_id is not None:
+        version = new_version(session, photo.lens_id, rebuild=True)
+        record_event(session, photo.lens_id, version, "photo_changed", photo, samples_added=0)
 
 
 def delete_corrections(session: Session, photo: PhotoRow) -> None:
@@ -161,25 +229,7 @@ class LensStore:
     def create(self, owner_id: int, *, label: str, maker: str | None, model: str | None) -> LensRow:
         """Make a lens that only its owner can tell from others of its kind."""
         with self._db.writing() as session:
-            row = _new_lens(
-                owner_id, f"label|{new_id()}", maker=maker, model=model, serial=None, source="user"
-            )
-            lens = LensRow(**{**row, "label": label, "serial_source": "user"})
-            session.add(lens)
-            session.flush()
-            return lens
-
-    def named(self, owner_id: int, maker: str | None, model: str | None, serial: str) -> LensRow:
-        """Find or make the lens of a maker, model and serial that its owner tells."""
-        key = identity_key(maker, model, serial)
-        fresh = _new_lens(owner_id, key, maker=maker, model=model, serial=serial, source="user")
-        with self._db.writing() as session:
-            insert_new(session, LensRow, [fresh])
-            return session.scalars(
-                select(LensRow).where(
-                    LensRow.owner_id == owner_id, LensRow.identity_key == key, LensRow.deleted_at.is_(None)
-                )
-            ).one()
+            return named(session, owner_id, LensName(maker, model, None, label=label))
 
     def candidates(self, photo: PhotoRow, limit: int = 10) -> list[LensRow]:
         """Return the owner's lenses that a photo without a serial may belong to."""
@@ -263,62 +313,35 @@ class LensStore:
 
     def exclude(self, photo_id: str, owner: str) -> bool:
         """Take a counted photo out of its lens's model; False if it is not counted."""
-        return self._switch(photo_id, owner, "counted", "excluded")
+        return self._change(photo_id, owner, lambda session, photo: switch(session, photo, "excluded"))
 
     def include(self, photo_id: str, owner: str) -> bool:
         """Let an excluded photo count again; False if it is not excluded."""
-        return self._switch(photo_id, owner, "excluded", "counted")
-
-    def _switch(self, photo_id: str, owner: str, before: str, after: str) -> bool:
-        with self._db.writing() as session:
-            photo = find(session, PhotoRow, photo_id, owner)
-            if photo is None or photo.state != before:
-                return False
-            photo.state, photo.stage_at = after, now()
-            session.flush()
-            if after == "excluded":
-                give_back(session, photo, "photo_excluded")
-            else:
-                bring_in(session, photo, "photo_included")
-            return True
+        return self._change(photo_id, owner, lambda session, photo: switch(session, photo, "counted"))
 
     def move(self, photo_id: str, owner: str, lens_id: str) -> bool:
-        """Give a finished photo to another lens; both get a new version if it counts."""
-        with self._db.writing() as session:
-            photo = find(session, PhotoRow, photo_id, owner)
+        """Do as the function `move`; False if there is no such photo or lens."""
+
+        def to_lens(session: Session, photo: PhotoRow) -> bool:
             lens = find(session, LensRow, lens_id, owner)
-            if photo is None or lens is None:
-                return False
-            if photo.lens_id == lens.id:
-                return True
-            counted = photo.state == "counted"
-            if counted:
-                give_back(session, photo, "photo_removed")
-            photo.lens_id = lens.id
-            photo.given = {**photo.given, "lens_id": lens_id}
-            session.flush()
-            if counted:
-                bring_in(session, photo, "photo_included")
-            return True
+            if lens is not None:
+                move(session, photo, lens)
+            return lens is not None
+
+        return self._change(photo_id, owner, to_lens)
 
     def change_settings(
-        self, photo_id: str, owner: str, given: dict[str, Any], columns: dict[str, Any]
+        self, photo_id: str, owner: str, given: Mapping[str, Any], columns: Mapping[str, Any]
     ) -> bool:
-        """Correct the settings of a finished photo; a counted one renews its lens's model."""
-        with self._db.writing() as session:
-            photo = find(session, PhotoRow, photo_id, owner)
-            if photo is None:
-                return False
-            photo.given = {**photo.given, **given}
-            for column, value in columns.items():
-                setattr(photo, column, value)
-            session.flush()
-            if photo.state == "counted" and photo.lens_id is not None:
-                version = new_version(session, photo.lens_id, rebuild=True)
-                record_event(session, photo.lens_id, version, "photo_changed", photo, samples_added=0)
+        """Do as the function `change_settings`; False if there is no such photo."""
+
+        def set_them(session: Session, photo: PhotoRow) -> bool:
+            change_settings(session, photo, given, columns)
             return True
 
-    def sample_count_of(self, photo: PhotoRow) -> int:
-        """Return how many samples a photo has, counted or not."""
-        with self._db.reading() as session:
-            return session.scalar(select(func.count()).where(SampleRow.photo_id == photo.id)) or 0
+        return self._change(photo_id, owner, set_them)
+
+    def _change(self, photo_id: str, owner: str, change: Callable[[Session, PhotoRow], bool]) -> bool:
+        with self._db.writing() as session:
+            photo = find_to_change(session, PhotoRow, photo_id, owner)
+            return photo is not None and change(session, photo)

@@ -49,6 +49,23 @@ def owned(table: type[Owned], owner: str | None) -> Select[Owned]:
 
 def find(session: Session, table: type[Owned], public_id: str, owner: str | None) -> Owned | None:
     """Return one row by its public id if it is this owner's."""
-    if not public_id.isalnum():  # no id of ours; PostgreSQL refuses some such texts with an error
+    return None if not is_id(public_id) else session.scalar(_one(table, public_id, owner))
+
+
+def find_to_change(session: Session, table: type[Owned], public_id: str, owner: str | None) -> Owned | None:
+    """Return as `find`, locked until the transaction ends: what is read now still holds when it is changed.
+
+    SQLite has one writer at a time anyway.
+    """
+    if not is_id(public_id):
         return None
-    return session.scalar(owned(table, owner).where(table.public_id == public_id))
+    return session.scalar(_one(table, public_id, owner).with_for_update(of=table))
+
+
+def is_id(text: str) -> bool:
+    """Say whether a text can be an id of ours; PostgreSQL refuses some others with an error."""
+    return text.isascii() and text.isalnum()
+
+
+def _one(table: type[Owned], public_id: str, owner: str | None) -> Select[Owned]:
+    return owned(table, owner).where(table.public_id == public_id)

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
-from sqlalchemy import delete, func, select, update
+from sqlalchemy import case, delete, func, select, update
 from sqlalchemy.orm import Session
 
 from app.store import lenses
 from app.store.database import Database, insert_new
-from app.store.owners import ensure_owner, find, now, owned
+from app.store.lenses import LensName
+from app.store.owners import ensure_owner, find, find_to_change, now, owned
 from app.store.versions import new_version, take_samples
 from app.tables import (
     PHOTO_FINAL,
@@ -55,16 +56,6 @@ class Identity(Protocol):
         """Where the serial was found."""
 
 
-@dataclass(frozen=True, slots=True)
-class LensName:
-    """Which copy of which lens; the service's own `Identity`."""
-
-    maker: str | None
-    model: str | None
-    serial: str | None
-    serial_source: str = "user"
-
-
 LATE = timedelta(minutes=10)
 """Blobs of what is deleted are deleted again after this time: a worker may have written one more."""
 
@@ -104,8 +95,8 @@ class PhotoStore:
     ) -> Received:
         """Store an upload, or find the photo with the same bytes.
 
-        A known photo starts again where that makes sense: it had failed or was cancelled, or it
-        was only stored so far and shall now calibrate its lens.
+        A known photo starts again where that makes sense: it had failed or was cancelled, it shall
+        calibrate its lens and until now should not, or it waits to be told what it is told now.
         """
         with self._db.writing(durable=True) as session:
             owner_key = ensure_owner(session, owner)
@@ -129,10 +120,15 @@ class PhotoStore:
                 session.execute(delete(GarbageRow).where(GarbageRow.prefix == prefix))
                 return Received(_known(session, owner_key, sha256), fresh=True)
             known = _known(session, owner_key, sha256)
-            again = known.state in {"failed", "cancelled"} or (known.state == "stored" and calibrate)
+            told = {**known.given, **given}
+            again = (
+                known.state in {"failed", "cancelled"}
+                or (calibrate and not known.calibrate)
+                or (known.state == "needs_lens" and told != known.given)
+            )
             if again:
                 known.calibrate = calibrate
-                known.given = {**known.given, **given}
+                known.given = told
                 _restart(session, known)
             return Received(known, fresh=again)
 
@@ -270,7 +266,7 @@ class PhotoStore:
             "pixel_pitch_um": pixel_pitch_um,
         }
         with self._db.writing() as session:
-            photo = find(session, PhotoRow, photo_id, None)
+            photo = find_to_change(session, PhotoRow, photo_id, None)
             if photo is None:
                 return
             for field, column in GIVEN_SETTINGS.items():
@@ -298,7 +294,7 @@ class PhotoStore:
         exists but make none.
         """
         with self._db.writing() as session:
-            photo = find(session, PhotoRow, photo_id, None)
+            photo = find_to_change(session, PhotoRow, photo_id, None)
             if photo is None:
                 return None
             lens = lenses.lens_of_photo(session, photo, single_copy=single_copy)
@@ -310,17 +306,55 @@ class PhotoStore:
     def restart(self, photo_id: str, owner: str, given: Mapping[str, Any]) -> PhotoRow | None:
         """Add what the owner now says and run the photo again from the start."""
         with self._db.writing() as session:
-            photo = find(session, PhotoRow, photo_id, owner)
+            photo = find_to_change(session, PhotoRow, photo_id, owner)
             if photo is not None:
                 photo.given = {**photo.given, **given}
                 _restart(session, photo)
             return photo
 
+    def change(
+        self,
+        photo_id: str,
+        owner: str,
+        given: Mapping[str, Any],
+        *,
+        lens: LensName | str | None = None,
+        excluded: bool | None = None,
+    ) -> bool:
+        """Take over what the owner says now: settings, the lens or its id, whether the photo counts.
+
+        All of it, or nothing and False where the photo cannot be excluded or included. A photo that has
+        a result changes its lens's model at once, any other starts again.
+        """
+        with self._db.writing() as session:
+            photo = find_to_change(session, PhotoRow, photo_id, owner)
+            if photo is None:
+                return False
+            if excluded is not None:
+                wish: Final = "excluded" if excluded else "counted"
+                if photo.state != wish and not lenses.switch(session, photo, wish):
+                    return False
+            if isinstance(lens, LensName):
+                chosen = lenses.named(session, photo.owner_id, lens)
+            else:
+                chosen = None if lens is None else find(session, LensRow, lens, owner)
+            if photo.state in {"counted", "stored", "excluded"}:
+                if given:
+                    columns = {GIVEN_SETTINGS[name]: value for name, value in given.items()}
+                    lenses.change_settings(session, photo, given, columns)
+                if chosen is not None:
+                    lenses.move(session, photo, chosen)
+            elif given or chosen is not None:
+                named = {} if chosen is None else {"lens_id": chosen.public_id}
+                photo.given = {**photo.given, **given, **named}
+                _restart(session, photo)
+            return True
+
     def fail(self, photo_id: str, epoch: int, code: str, detail: str) -> bool:
-        """End a photo with a reason; its samples never count."""
+        """End a photo that is being worked on with a reason; its samples never count."""
         with self._db.writing() as session:
             fields = {"error_code": code, "error_detail": detail, "finished_at": now()}
-            return _move(session, photo_id, UNFINISHED, "failed", epoch=epoch, **fields)
+            return _move(session, photo_id, ("received", *PHOTO_RUNNING), "failed", epoch=epoch, **fields)
 
     def cancel(self, photo_id: str, owner: str | None = None) -> bool:
         """Cancel an unfinished photo; False if it was finished already.
@@ -328,10 +362,10 @@ class PhotoStore:
         The state is the truth: whatever still runs finds the photo cancelled and changes nothing.
         """
         with self._db.writing() as session:
-            photo = find(session, PhotoRow, photo_id, owner)
+            photo = find_to_change(session, PhotoRow, photo_id, owner)
             if photo is None or not _move(session, photo_id, UNFINISHED, "cancelled", finished_at=now()):
                 return False
-            session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
+            _drop_patches(session, photo)
             return True
 
     def finish(self, photo_id: str, epoch: int) -> int | None:
@@ -358,7 +392,7 @@ class PhotoStore:
         The row stays, emptied, so that the lens's history can name it.
         """
         with self._db.writing() as session:
-            photo = find(session, PhotoRow, photo_id, owner)
+            photo = find_to_change(session, PhotoRow, photo_id, owner)
             if photo is None:
                 return None
             if photo.state == "counted":
@@ -376,15 +410,25 @@ class PhotoStore:
 
 def _known(session: Session, owner_key: int, sha256: str) -> PhotoRow:
     return session.scalars(
-        select(PhotoRow).where(
-            PhotoRow.owner_id == owner_key, PhotoRow.sha256 == sha256, PhotoRow.deleted_at.is_(None)
-        )
+        select(PhotoRow)
+        .where(PhotoRow.owner_id == owner_key, PhotoRow.sha256 == sha256, PhotoRow.deleted_at.is_(None))
+        .with_for_update()
     ).one()
+
+
+def _drop_patches(session: Session, photo: PhotoRow) -> None:
+    """Forget the patches of an epoch with their samples; a worker may write one more blob of them."""
+    session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
+    base = photo.blob_key.rpartition("/")[0]
+    row = {"prefix": f"{base}/statistics/e{photo.epoch}/", "not_before": now() + LATE}
+    insert_new(session, GarbageRow, [row])
 
 
 def _restart(session: Session, photo: PhotoRow) -> None:
     """Begin a new epoch: work of the old one, if any still runs, no longer counts."""
-    session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
+    if photo.state == "counted":
+        lenses.give_back(session, photo, "photo_removed")
+    _drop_patches(session, photo)
     photo.epoch += 1
     photo.state, photo.stage_at = "received", now()
     photo.error_code = photo.error_detail = photo.started_at = photo.finished_at = photo.counted_at = None
@@ -407,7 +451,8 @@ def _move(
     ]
     if epoch is not None:
         conditions.append(PhotoRow.epoch == epoch)
-    changes = {"state": to, "stage_at": now(), **fields}
+    since = case((PhotoRow.state == to, PhotoRow.stage_at), else_=now())
+    changes = {"state": to, "stage_at": since, **fields}
     statement = update(PhotoRow).where(*conditions).values(**changes)
     return session.connection().execute(statement).rowcount == 1
 

@@ -199,6 +199,18 @@ def test_naming_the_lens_starts_a_waiting_photo_again(
     assert (steps.lens_id(photo) == known) == (way != "new_lens")
 
 
+def test_a_change_happens_wholly_or_not_at_all(client: TestClient, steps: Steps, store: Store) -> None:
+    photo = steps.receive()
+    store.photos.fail(photo.public_id, 1, "no_usable_patches", "all is sky")
+    change = {"aperture": 2.0, "new_lens": {"label": "mine"}, "excluded": True}
+
+    answer = client.patch(f"/v1/photos/{photo.public_id}", json=change)
+
+    assert (answer.status_code, answer.json()["code"]) == (409, "conflict")
+    assert get(client, "/v1/lenses")["items"] == []
+    assert (steps.fresh(photo).state, steps.fresh(photo).epoch) == ("failed", 1)
+
+
 def test_a_counted_photo_moves_to_the_lens_that_the_owner_names(client: TestClient, steps: Steps) -> None:
     mine, other = steps.counted(serial="1"), steps.counted(serial="2")
 

@@ -94,6 +94,43 @@ def test_work_of_an_old_epoch_changes_nothing(store: Store, steps: Steps) -> Non
     assert steps.fresh(photo).state == "received"
 
 
+def test_a_counted_photo_that_starts_anew_leaves_its_lens_first(store: Store, steps: Steps) -> None:
+    photo = steps.counted()
+    lens = steps.lens_id(photo)
+    store.photos.restart(photo.public_id, OWNER, {"aperture": 2.0})
+    assert store.samples.of_lens(lens)[1] == []
+
+    again = steps.fresh(photo)
+    steps.inspect(again)
+    steps.plan(again)
+    steps.estimate(again)
+    store.photos.finish(again.public_id, again.epoch)
+
+    state, samples = store.samples.of_lens(lens)
+    assert (state.rebuild_epoch, len(samples)) == (1, 6)  # models in memory were told to forget the old ones
+
+
+def test_a_photo_that_waits_for_its_lens_does_not_fail_for_the_end_of_its_job(
+    store: Store, steps: Steps
+) -> None:
+    photo = steps.receive()
+    steps.inspect(photo, serial=None)
+    store.photos.set_state(photo.public_id, ("inspecting",), "needs_lens")
+
+    assert not store.photos.fail(photo.public_id, 1, "internal_error", "its job is done")
+
+
+def test_a_photo_taken_up_again_keeps_the_time_since_its_stage_began(store: Store, steps: Steps) -> None:
+    photo = steps.receive()
+    steps.inspect(photo)
+    steps.plan(photo)
+    since = steps.fresh(photo).stage_at
+
+    store.photos.set_state(photo.public_id, ("estimating",), "estimating")
+
+    assert steps.fresh(photo).stage_at == since
+
+
 def test_a_failed_photo_starts_anew_when_it_is_sent_again(store: Store, steps: Steps) -> None:
     photo = steps.receive()
     store.photos.fail(photo.public_id, 1, "no_usable_patches", "flat")

@@ -262,6 +262,18 @@ def test_a_form_names_its_file_in_any_script(client: TestClient, name: str) -> N
     assert client.post("/v1/photos", content=body, headers=FORM).json()["filename"] == name
 
 
+def test_what_is_said_with_the_same_bytes_later_counts(client: TestClient, store: Store) -> None:
+    photo = client.post("/v1/photos?calibrate=false", content=TIFF).json()["id"]
+
+    learn = client.post("/v1/photos", content=TIFF)
+    assert (learn.status_code, learn.json()["calibrate"]) == (202, True)
+    assert client.post("/v1/photos", content=TIFF).status_code == 200
+
+    store.photos.set_state(photo, ("received",), "needs_lens")
+    assert client.post("/v1/photos", content=TIFF).json()["state"] == "needs_lens"
+    assert client.post("/v1/photos?lens_serial=7", content=TIFF).json()["state"] == "received"
+
+
 def test_a_name_with_folders_does_not_leave_the_storage(client: TestClient, settings: Settings) -> None:
     photo = client.post("/v1/photos", files={"file": ("../../../evil.dng", TIFF)}).json()
 

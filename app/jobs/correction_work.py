@@ -21,10 +21,10 @@ from app.jobs.workbench import (
     JobFailedError,
     NotWantedError,
     Workbench,
-    settings_of,
     write_samples,
 )
 from app.store.corrections import CorrectionPlan, Result
+from app.store.photos import settings_of
 from app.store.samples import LensState, Relative, StoredSample
 from app.store.versions import learned_key
 from lensmodel import deconv
@@ -81,7 +81,7 @@ class CorrectionWork:
         )
         arguments = {
             "developed": str(developed),
-            "settings": settings_of(photo),
+            "settings": params.get("settings") or settings_of(photo),  # those of the moment of the wish
             "model": settings.of_models,
             "lateral": photo.lateral,
             "method": params["method"],
@@ -160,7 +160,14 @@ class CorrectionWork:
             size=path.stat().st_size,
             name=f"{stem}-corrected{path.suffix}",
         )
-        self._corrections.finish(plan.correction.public_id, result, report)
+        if not self._corrections.finish(plan.correction.public_id, result, report):
+            self._drop_unless_done(plan.correction.public_id)
+
+    def _drop_unless_done(self, correction_id: str) -> None:
+        """Delete the file of a correction that was cancelled or deleted while it was stored."""
+        row = self._corrections.get(correction_id)
+        if row is None or row.state != "succeeded":  # another worker may have handed it in
+            self._bench.storage.delete(f"corrections/{correction_id}/")
 
     def measure(self, lens_id: str, version: int) -> None:
         """Measure how well one version of a lens predicts photos that it was not shown."""

@@ -19,9 +19,10 @@ import numpy as np
 from app.jobs.engine import Job, JobEngine
 from app.jobs.handover import KERNELS
 from app.jobs.sandbox import Limits
-from app.jobs.workbench import SPARE_MB, JobFailedError, NotWantedError, Workbench, settings_of
+from app.jobs.workbench import SPARE_MB, JobFailedError, NotWantedError, Workbench
 from app.store import LensName, NewPatch, NewSample
-from app.tables import PatchRow, PhotoRow
+from app.store.photos import settings_of
+from app.tables import PHOTO_RUNNING, PatchRow, PhotoRow
 from lensmodel.errors import InvalidInputError, InvalidKernelError
 from lensmodel.psf import as_kernel
 from lensmodel.spectrum import PatchSpectrum
@@ -30,7 +31,6 @@ log = logging.getLogger(__name__)
 
 WAIT_S: Final = 0.2
 LOOK_AFTER_S: Final = 5.0
-OPEN: Final = ("pending", "running")
 
 
 class PhotoWork:
@@ -73,12 +73,13 @@ class PhotoWork:
 
     def _begin(self, photo_id: str, epoch: int) -> PhotoRow:
         photos = self._store.photos
-        again = ("inspecting", "developing", "selecting", "estimating")
         started = {"started_at": datetime.now(UTC), "attempt": 1}
         if not photos.set_state(photo_id, ("received",), "inspecting", epoch=epoch, **started):
             state = self._get(photo_id).state
-            attempt = {"attempt": PhotoRow.attempt + 1}
-            if state not in again or not photos.set_state(photo_id, (state,), state, epoch=epoch, **attempt):
+            attempt = PhotoRow.attempt + 1
+            if state not in PHOTO_RUNNING or not photos.set_state(
+                photo_id, (state,), state, epoch=epoch, attempt=attempt
+            ):
                 raise NotWantedError
         return self._get(photo_id)
 

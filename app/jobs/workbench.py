@@ -166,11 +166,6 @@ class Workbench:
             return target
 
 
-def settings_of(photo: PhotoRow) -> dict[str, Any]:
-    """Return how the lens was set, as tasks read it."""
-    return {"aperture": photo.aperture, "focal_mm": photo.focal_mm, "focus_m": photo.focus_m}
-
-
 def write_samples(folder: Path, stored: Sequence[StoredSample]) -> None:
     """Hand samples to a task: the kernels as one npy file, the rest as JSON."""
     side = max(entry.sample.kernel.shape[0] for entry in stored)

@@ -13,6 +13,7 @@ from starlette.responses import StreamingResponse
 from app import views
 from app.dependencies import Call, CallDep
 from app.errors import (
+    ConflictError,
     InvalidParameterError,
     NotReadyError,
     RangeError,
@@ -24,6 +25,7 @@ from app.routes.common import Cursor, Limit, OnlyId, next_link, problems
 from app.routes.photos import find_photo
 from app.schemas import CorrectionIn, CorrectionOut, CorrectionPage
 from app.store.corrections import CorrectionPlan
+from app.store.photos import settings_of
 from app.store.samples import LensState
 from app.tables import LensRow, PhotoRow
 from lensmodel.deconv import deconvolvers
@@ -49,10 +51,13 @@ def create_correction(wish: CorrectionIn, call: CallDep) -> CorrectionOut:
         raise UnknownMethodError(
             f"no method {wish.method!r}; known: {', '.join(sorted(deconvolvers.entries))}"
         )
+    _check_read(photo)
     _check_region(photo, wish)
     lens = _lens_for(call, photo, wish.lens_id)
     version = _version_for(call, lens, wish.lens_version)
     params = wish.model_dump(mode="json", include={"method", "strength", "output", "roi"})
+    # with other settings the same wish is another one
+    params["settings"] = settings_of(photo)
     # only where asked for: a wish of before there were bounds is still the same wish
     params |= wish.model_dump(mode="json", include={"halo", "keep_flats"}, exclude_defaults=True)
     if wish.family and wish.lens_version is None and call.settings.family:
@@ -66,10 +71,24 @@ def create_correction(wish: CorrectionIn, call: CallDep) -> CorrectionOut:
     return views.correction_out(CorrectionPlan(row, photo, lens))
 
 
+def _check_read(photo: PhotoRow) -> None:
+    """Make sure that the file was looked into: its size and settings are part of the wish."""
+    if photo.width is not None:
+        return
+    if photo.state in {"received", "inspecting"}:
+        raise NotReadyError(
+            f"photo {photo.public_id} is still being read ({photo.state}): wait for its job",
+            headers={"Retry-After": "1"},
+        )
+    raise ConflictError(f"photo {photo.public_id} could not be read ({photo.state}): send it again")
+
+
 def _check_region(photo: PhotoRow, wish: CorrectionIn) -> None:
     roi = wish.roi
-    if roi is None or photo.width is None or photo.height is None:
+    if roi is None:
         return
+    assert photo.width is not None
+    assert photo.height is not None
     if roi.x + roi.width > photo.width or roi.y + roi.height > photo.height:
         raise InvalidParameterError(
             f"roi {roi.x},{roi.y} {roi.width}x{roi.height} reaches beyond the photo of "
@@ -86,11 +105,6 @@ def _lens_for(call: Call, photo: PhotoRow, lens_id: str | None) -> LensRow:
     lens = call.store.photos.lens_of(photo) or call.store.lenses.by_identity(photo)
     if lens is not None:
         return lens
-    if photo.width is None and photo.error_code is None:
-        raise NotReadyError(
-            f"photo {photo.public_id} is still being read ({photo.state}): wait for its job, or send lens_id",
-            headers={"Retry-After": "1"},
-        )
     raise MetadataMissingError(
         f"photo {photo.public_id} does not say which lens it was taken with: send lens_id"
     )

@@ -408,6 +408,11 @@ class PhotoStore:
             return f"{prefix}/"
 
 
+def settings_of(photo: PhotoRow) -> dict[str, Any]:
+    """Return how the lens was set, as tasks read it."""
+    return {"aperture": photo.aperture, "focal_mm": photo.focal_mm, "focus_m": photo.focus_m}
+
+
 def _known(session: Session, owner_key: int, sha256: str) -> PhotoRow:
     return session.scalars(
         select(PhotoRow)

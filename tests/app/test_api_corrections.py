@@ -110,16 +110,35 @@ def test_a_stored_photo_finds_the_lens_that_was_calibrated_later(client: TestCli
     assert (answer.status_code, answer.json()["lens_id"]) == (202, lens_id)
 
 
-def test_a_photo_not_yet_read_asks_for_patience_or_a_lens(client: TestClient, steps: Steps) -> None:
+def test_a_photo_not_yet_read_asks_for_patience(client: TestClient, steps: Steps) -> None:
     lens_id = steps.lens_id(steps.counted())
     photo = steps.receive(calibrate=False)
 
     without = post(client, photo_id=photo.public_id)
     named = post(client, photo_id=photo.public_id, lens_id=lens_id)
 
-    assert (without.status_code, without.json()["code"]) == (409, "not_ready")
-    assert "retry-after" in without.headers
-    assert named.status_code == 202
+    for answer in (without, named):
+        assert (answer.status_code, answer.json()["code"]) == (409, "not_ready")
+        assert "retry-after" in answer.headers
+
+
+def test_a_photo_with_other_settings_is_corrected_anew(
+    client: TestClient, steps: Steps, store: Store, settings: Settings
+) -> None:
+    lens_id = steps.lens_id(steps.counted())
+    photo = steps.receive(calibrate=False)
+    steps.inspect(photo)
+    store.photos.set_state(photo.public_id, ("inspecting",), "stored")
+    first = post(client, photo_id=photo.public_id, lens_id=lens_id).json()["id"]
+    finish(store, settings, first)
+
+    client.patch(f"/v1/photos/{photo.public_id}", json={"aperture": 8.0})
+    again = post(client, photo_id=photo.public_id, lens_id=lens_id)
+
+    assert (again.status_code, again.json()["id"] != first) == (202, True)
+    row = store.corrections.get(again.json()["id"])
+    assert row is not None
+    assert row.params["settings"]["aperture"] == 8.0
 
 
 def test_a_photo_without_a_lens_must_be_told_one(client: TestClient, steps: Steps) -> None:

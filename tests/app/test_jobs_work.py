@@ -598,6 +598,23 @@ def test_a_cancelled_correction_stays_cancelled(
     assert (row.state, row.result_key) == ("cancelled", None)
 
 
+def test_a_correction_cancelled_while_its_file_was_stored_leaves_no_file(
+    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    key, put_file = ask(bench, counted, steps), bench.storage.put_file
+
+    def cancelled_meanwhile(blob: str, path: Path) -> None:
+        put_file(blob, path)
+        bench.store.corrections.cancel(key)
+
+    monkeypatch.setattr(bench.storage, "put_file", cancelled_meanwhile)
+    sandbox.answers["correct"] = [write_result]
+    CorrectionWork(bench).correction(key)
+
+    with pytest.raises(FileNotFoundError):
+        bench.storage.info(f"corrections/{key}/result.tif")
+
+
 def test_a_child_cannot_hand_in_a_file_from_elsewhere(
     bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
 ) -> None:

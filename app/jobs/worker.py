@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -66,24 +67,38 @@ class Worker:
                 "photo": self._safe(photos.photo, self._photo_broke),
                 "cell": self._safe(photos.cell, self._cell_broke),
                 "correction": self._safe(corrections.correction, self._correction_broke),
-                "measure": self._safe(corrections.measure, lambda *_: None),
+                "measure": self._safe(corrections.measure, self._measure_broke),
             }
         )
         self._bury_the_gone(host)
+        beat_s = min(self._settings.lease_seconds / 4, 5.0)
+        # in threads of their own: nothing may delay the lease, and deleting may take long
+        lease = self._start_thread(beat_s, self._keep_lease)
+        self._start_thread(TIDY_S, self._tidy)
         duties = (
             (self._settings.sweep_seconds, self._sweep),
-            (min(self._settings.lease_seconds / 4, 5.0), self._keep_lease),
+            (beat_s, self._bury_the_silent),
             (RECONCILE_S, self._reconcile),
-            (TIDY_S, self._tidy),
         )
-        due = [0.0, 0.0, time.monotonic() + RECONCILE_S, 0.0]
+        due = [0.0, 0.0, time.monotonic() + RECONCILE_S]
         while not self._stop.is_set():
             for number, (period, duty) in enumerate(duties):
                 if time.monotonic() >= due[number]:
                     self._do(duty)
                     due[number] = time.monotonic() + period
             self._stop.wait(max(min(due) - time.monotonic(), 0.01))
+        lease.join(beat_s)  # or it would find our row dead, and take that for the word of others
         self._leave()
+
+    def _start_thread(self, period: float, duty: Callable[[], None]) -> threading.Thread:
+        def repeat() -> None:
+            while not self._stop.is_set():
+                self._do(duty)
+                self._stop.wait(period)
+
+        thread = threading.Thread(target=repeat, daemon=True)
+        thread.start()
+        return thread
 
     def stop(self) -> None:
         """Stop soon: what runs is left to the next worker."""
@@ -97,7 +112,7 @@ class Worker:
         logging.shutdown()
         os._exit(0)  # threads in the middle of a job must not go on to report it finished
 
-    def _do(self, duty: Callable[[], None]) -> None:
+    def _do(self, duty: Callable[[], object]) -> None:
         try:
             duty()
         except Exception:
@@ -131,6 +146,10 @@ class Worker:
     def _correction_broke(self, correction_id: str) -> None:
         self._store.corrections.fail(correction_id, "internal_error", _OURS)
 
+    def _measure_broke(self, lens_id: str, version: int) -> None:
+        unknown = {"error": None, "coverage": None, "problem": "internal_error"}
+        self._store.lenses.record_metrics(lens_id, version, unknown)
+
     # --- duties -------------------------------------------------------------------------------
 
     def _sweep(self) -> None:
@@ -156,6 +175,9 @@ class Worker:
         if not alive:
             self._die("this worker was silent for too long and others took over its work")
         self._last_beat = time.monotonic()
+
+    def _bury_the_silent(self) -> None:
+        """Take over from workers that were not heard of for a whole lease."""
         for dead in self._store.workers.bury_stale(self._settings.lease_seconds):
             self._take_over(dead)
 
@@ -186,6 +208,9 @@ class Worker:
             ended = self._lost(Job("correction", (correction_id,), owner))
             if ended:
                 corrections.fail(correction_id, *ended)
+        for lens_id, version in self._store.lenses.unmeasured():
+            if self._lost(Job("measure", (lens_id, version))):
+                self._measure_broke(lens_id, version)
 
     def _lost(self, job: Job) -> tuple[str, str] | None:
         status = self._engine.status(job)
@@ -198,10 +223,13 @@ class Worker:
     def _tidy(self) -> None:
         """Delete what nobody needs any more."""
         for prefix in self._store.workers.garbage():
-            self._bench.storage.delete(prefix)
-            self._store.workers.forget_garbage(prefix)
-        self._engine.forget(datetime.now(UTC) - KEEP_JOBS)
+            self._do(partial(self._delete, prefix))  # what cannot be deleted keeps nothing else
+        self._do(lambda: self._engine.forget(datetime.now(UTC) - KEEP_JOBS))
         self._drop_developed()
+
+    def _delete(self, prefix: str) -> None:
+        self._bench.storage.delete(prefix)
+        self._store.workers.forget_garbage(prefix)
 
     def _drop_developed(self) -> None:
         """Bound the cache of developed photos; those of deleted photos go first."""

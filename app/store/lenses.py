@@ -290,13 +290,15 @@ class LensStore:
             return list(session.scalars(query))
 
     def record_metrics(self, lens_id: str, version: int, metrics: dict[str, Any]) -> None:
-        """Add what was measured of one version: held-out `error`, `coverage`, `bandwidth`."""
+        """Add what was measured of one version, once: held-out `error`, `coverage`, `bandwidth`."""
         with self._db.writing() as session:
             lens = find(session, LensRow, lens_id, None)
             if lens is not None:
                 session.execute(
                     update(EventRow)
-                    .where(EventRow.lens_id == lens.id, EventRow.version == version)
+                    .where(
+                        EventRow.lens_id == lens.id, EventRow.version == version, EventRow.metrics.is_(None)
+                    )
                     .values(metrics=metrics)
                 )
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from datetime import datetime, timedelta
 
-from sqlalchemy import delete, select, update
+from sqlalchemy import delete, func, select, update
+from sqlalchemy.orm import Session
 
 from app.store.database import Database
 from app.store.owners import now
@@ -17,9 +18,14 @@ class WorkerStore:
     def __init__(self, database: Database) -> None:
         self._db = database
 
+    def _now(self, session: Session) -> datetime:
+        """Return the time that all workers share: a database server's, whatever their own clocks say."""
+        return now() if self._db.is_sqlite else session.scalars(select(func.now())).one()
+
     def register(self, worker_id: str, *, host: str, pid: int, pid_started: float) -> None:
         """Enter a new worker."""
         with self._db.writing() as session:
+            at = self._now(session)
             session.add(
                 WorkerRow(
                     id=worker_id,
@@ -27,8 +33,8 @@ class WorkerStore:
                     pid=pid,
                     pid_started=pid_started,
                     state="live",
-                    started_at=now(),
-                    heartbeat_at=now(),
+                    started_at=at,
+                    heartbeat_at=at,
                 )
             )
 
@@ -38,16 +44,15 @@ class WorkerStore:
             statement = (
                 update(WorkerRow)
                 .where(WorkerRow.id == worker_id, WorkerRow.state == "live")
-                .values(heartbeat_at=now())
+                .values(heartbeat_at=self._now(session))
             )
             return session.connection().execute(statement).rowcount == 1
 
     def live(self, lease_seconds: float) -> list[WorkerRow]:
         """Return the workers that were heard of within the lease."""
-        query = select(WorkerRow).where(
-            WorkerRow.state == "live", WorkerRow.heartbeat_at > now() - timedelta(seconds=lease_seconds)
-        )
         with self._db.reading() as session:
+            since = self._now(session) - timedelta(seconds=lease_seconds)
+            query = select(WorkerRow).where(WorkerRow.state == "live", WorkerRow.heartbeat_at > since)
             return list(session.scalars(query))
 
     def all(self) -> list[WorkerRow]:
@@ -58,12 +63,10 @@ class WorkerStore:
     def bury_stale(self, lease_seconds: float) -> list[str]:
         """Declare workers dead that missed their lease; return the ids of all dead ones."""
         with self._db.writing() as session:
+            before = self._now(session) - timedelta(seconds=lease_seconds)
             session.execute(
                 update(WorkerRow)
-                .where(
-                    WorkerRow.state == "live",
-                    WorkerRow.heartbeat_at < now() - timedelta(seconds=lease_seconds),
-                )
+                .where(WorkerRow.state == "live", WorkerRow.heartbeat_at < before)
                 .values(state="dead")
             )
             return list(session.scalars(select(WorkerRow.id).where(WorkerRow.state == "dead")))

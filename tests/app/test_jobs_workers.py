@@ -11,12 +11,15 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from sqlalchemy import func, select
 
+from app.jobs.worker import Worker
 from app.settings import Settings
 from app.storage import Storage
 from app.store import Store
@@ -130,6 +133,49 @@ def check_counts(store: Store, photos: int) -> None:
     assert (lens.version, lens.photo_count, lens.sample_count) == (photos, photos, photos * CELLS * 3)
     assert (samples, events) == (photos * CELLS * 3, photos)
     assert done_patches(store) == photos * CELLS
+
+
+def test_a_worker_in_doubt_ends_what_broke_and_nothing_else(
+    settings: Settings, store: Store, steps: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    engine = SimpleNamespace(holders=set, status=lambda _: "done")  # all jobs ended, whatever they did
+    lens_id = steps.lens_id(steps.counted())
+    broken, waiting = steps.receive(), steps.receive()
+    steps.inspect(waiting, serial=None)
+    worker = Worker(settings)
+    monkeypatch.setattr(worker, "_engine", engine)
+    listed = store.photos.running()
+    store.photos.set_state(waiting.public_id, ("inspecting",), "needs_lens")
+    monkeypatch.setattr(worker._store.photos, "running", lambda: listed)  # it came to wait after we looked
+
+    worker._reconcile()
+
+    assert (steps.fresh(broken).state, steps.fresh(waiting).state) == ("failed", "needs_lens")
+    lens = store.lenses.get(lens_id)
+    assert lens is not None
+    assert [event.metrics for event in store.lenses.history(lens)] == [
+        {"error": None, "coverage": None, "problem": "internal_error"}
+    ]
+
+
+def test_blobs_that_cannot_be_deleted_keep_no_others(
+    settings: Settings, store: Store, steps: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photos = [steps.receive() for _ in range(2)]
+    stuck, other = (store.photos.delete(photo.public_id, "local") for photo in photos)
+    worker = Worker(settings)
+
+    def delete(prefix: str) -> None:
+        if prefix == stuck:
+            raise OSError("read-only")
+
+    monkeypatch.setattr(worker._bench.storage, "delete", delete)
+    monkeypatch.setattr(worker, "_engine", SimpleNamespace(forget=lambda _: 0))
+    monkeypatch.setattr(worker._store.workers, "garbage", lambda: [stuck, other])
+
+    worker._tidy()
+
+    assert store.workers.garbage(at=datetime.now(UTC) + timedelta(hours=1)) == [stuck]
 
 
 def test_another_worker_takes_over_from_one_that_died_for_ever(

@@ -14,6 +14,7 @@ from typing import Any, ClassVar, Final
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
+from obstore.exceptions import BaseError as StorageError
 from pydantic import ValidationError
 from sqlalchemy.exc import OperationalError
 from starlette.exceptions import HTTPException
@@ -25,6 +26,9 @@ from lensmodel import errors as library
 log = logging.getLogger(__name__)
 
 MEDIA_TYPE: Final = "application/problem+json"
+REQUEST_ID: Final = "X-Request-ID"
+NO_ROOM: Final = ("os error 28", "os error 122")
+"""How the storage says that the disk, or the share of its user, is full."""
 
 
 class ServiceError(library.LensModelError):
@@ -116,12 +120,6 @@ class QuotaError(ServiceError):
     status, code = 429, "quota_exceeded"
 
 
-class BusyError(ServiceError):
-    """The service cannot take more at the moment."""
-
-    status, code = 503, "busy"
-
-
 class StorageFullError(ServiceError):
     """No room for another photo."""
 
@@ -195,7 +193,7 @@ def problem_of(code: str, detail: str | None, *, candidates: Sequence[str] = ())
     status = STATUS_OF_CODE.get(code, 500)
     return Problem(
         type=f"urn:lensmodel:{code}",
-        title=code.replace("_", " ").capitalize(),
+        title=_title(code),
         status=status,
         detail=detail or "",
         code=code,
@@ -213,28 +211,34 @@ def respond(
     headers: Mapping[str, str] | None = None,
 ) -> Response:
     """Build the answer for a problem."""
+    request_id = getattr(request.state, "request_id", None)
     problem = Problem(
         type=f"urn:lensmodel:{code}",
-        title=HTTPStatus(status).phrase,
+        title=_title(code),
         status=status,
         detail=detail,
         instance=request.url.path,
         code=code,
         errors=list(errors),
-        request_id=request.state.request_id if hasattr(request.state, "request_id") else None,
+        request_id=request_id,
     )
-    return Response(
-        problem.model_dump_json(exclude_none=True), status, media_type=MEDIA_TYPE, headers=dict(headers or {})
-    )
+    every = dict(headers or {})
+    if request_id is not None:
+        every[REQUEST_ID] = request_id  # here too: what nobody foresaw is answered outside of RequestLog
+    return Response(problem.model_dump_json(exclude_none=True), status, media_type=MEDIA_TYPE, headers=every)
+
+
+def _title(code: str) -> str:
+    return code.replace("_", " ").capitalize()
 
 
 def field_errors(found: Sequence[Any]) -> list[FieldError]:
     """Turn pydantic's findings into ours: where, what was sent, what is allowed."""
     return [
         FieldError(
-            field=".".join(str(part) for part in error["loc"]) or "body",
+            field=".".join(_writable(part) for part in error["loc"]) or "body",
             value=_shortened(error.get("input")),
-            message=str(error["msg"]),
+            message=_writable(error["msg"]),
         )
         for error in found
     ]
@@ -243,8 +247,13 @@ def field_errors(found: Sequence[Any]) -> list[FieldError]:
 def _shortened(value: object) -> str | None:
     if value is None or isinstance(value, dict | list | bytes):
         return None  # a whole document is no value to quote
-    text = str(value)
+    text = _writable(value)
     return text if len(text) <= 100 else f"{text[:100]}…"
+
+
+def _writable(value: object) -> str:
+    """Return a value as text that UTF-8 can hold: JSON may name halves of signs, which it cannot."""
+    return str(value).encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def _sentence(errors: Sequence[FieldError]) -> str:
@@ -264,12 +273,8 @@ def install(app: FastAPI) -> None:
         return respond(request, status, error.code, str(error), errors=extra.errors, headers=extra.headers)
 
     @app.exception_handler(RequestValidationError)
-    async def _invalid(request: Request, error: RequestValidationError) -> Response:
-        found = field_errors(error.errors())
-        return respond(request, 422, "invalid_parameter", _sentence(found), errors=found)
-
     @app.exception_handler(ValidationError)
-    async def _invalid_form(request: Request, error: ValidationError) -> Response:
+    async def _invalid(request: Request, error: RequestValidationError | ValidationError) -> Response:
         found = field_errors(error.errors())
         return respond(request, 422, "invalid_parameter", _sentence(found), errors=found)
 
@@ -288,6 +293,14 @@ def install(app: FastAPI) -> None:
     async def _database(request: Request, error: OperationalError) -> Response:
         log.error("database: %s", error.orig)
         detail = "the database does not answer; try again in a few seconds"
+        return respond(request, 503, "busy", detail, headers={"Retry-After": "5"})
+
+    @app.exception_handler(StorageError)
+    async def _storage(request: Request, error: StorageError) -> Response:
+        log.error("storage: %s", error)
+        if any(sign in str(error) for sign in NO_ROOM):
+            return respond(request, 507, "quota_exceeded", "there is no room for it: make room on the disk")
+        detail = "the storage does not answer; try again in a few seconds"
         return respond(request, 503, "busy", detail, headers={"Retry-After": "5"})
 
     @app.exception_handler(Exception)

@@ -10,7 +10,7 @@ from fastapi import FastAPI
 
 from app import errors, pages
 from app.dependencies import Services
-from app.middleware import RequestLog
+from app.middleware import OwnNames, RequestLog
 from app.models import ModelCache
 from app.routes import corrections, health, jobs, lenses, photos, psf
 from app.settings import MIB, Settings
@@ -50,7 +50,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         docs_url="/docs",
         redoc_url=None,
     )
-    app.add_middleware(RequestLog)
+    if not chosen.public:
+        app.add_middleware(OwnNames)
+    app.add_middleware(RequestLog)  # the last is the outermost
     errors.install(app)
     pages.install(app)
     app.include_router(health.probes)

@@ -1,4 +1,4 @@
-"""Around every request: an id that answers and log lines share, and one line in the log."""
+"""Around every request: its id, one line in the log, and the names that the service answers to."""
 
 from __future__ import annotations
 
@@ -6,15 +6,17 @@ import logging
 import re
 import time
 from typing import Final
+from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from app.errors import REQUEST_ID, respond
 from app.ids import new_id
 
 log = logging.getLogger("app.access")
 
-HEADER: Final = "X-Request-ID"
 _ACCEPTED: Final = re.compile(r"[A-Za-z0-9._-]{1,64}", re.ASCII)
 
 
@@ -32,7 +34,7 @@ class RequestLog:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        sent = Headers(scope=scope).get(HEADER, "")
+        sent = Headers(scope=scope).get(REQUEST_ID, "")
         request_id = sent if _ACCEPTED.fullmatch(sent) else new_id()
         scope.setdefault("state", {})["request_id"] = request_id
         began, status = time.perf_counter(), 500
@@ -41,7 +43,7 @@ class RequestLog:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
-                MutableHeaders(scope=message)[HEADER] = request_id
+                MutableHeaders(scope=message)[REQUEST_ID] = request_id
             await send(message)
 
         try:
@@ -51,3 +53,35 @@ class RequestLog:
             log.info(
                 "%s %s %d %.1f ms request_id=%s", scope["method"], scope["path"], status, millis, request_id
             )
+
+
+class OwnNames:
+    """Refuses requests for names that anybody can register.
+
+    A page of a stranger may let its own name point to this machine, and would then be allowed by the
+    browser to read everything here. It cannot do so with an address or a local name.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on, or refuse it."""
+        host = Headers(scope=scope).get("host", "") if scope["type"] == "http" else ""
+        if is_local(host):
+            await self._app(scope, receive, send)
+            return
+        detail = (
+            f"Host {host[:100]!r}: this service answers to addresses and local names such as localhost; "
+            "set LENS_PUBLIC=true where a proxy stands before it and checks who asks"
+        )
+        await respond(Request(scope), 400, "invalid_parameter", detail)(scope, receive, send)
+
+
+def is_local(host: str) -> bool:
+    """Say whether a Host header is an address or a name of one word, which no stranger can own."""
+    try:
+        name = urlsplit(f"//{host}").hostname or ""
+    except ValueError:
+        return False
+    return "." not in name or name.endswith(".localhost") or name.replace(".", "").isdecimal()

@@ -10,6 +10,8 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from lensmodel.types import Channel
 
 MAX_PSF_SIZE = 255
+MAX_VERSION: Final = 2**31 - 1
+"""The largest that a column holds."""
 
 PhotoState = Literal[
     "received",
@@ -278,7 +280,7 @@ class PsfQuery(Question):
         allow_inf_nan=False,
         description="half the diagonal of the frame, if bodies agree in those",
     )
-    version: int | None = Field(None, ge=1, description="an earlier version of the lens")
+    version: int | None = Field(None, ge=1, le=MAX_VERSION, description="an earlier version of the lens")
     strict: bool = Field(default=False, description="refuse answers outside what the samples cover")
     std: bool = Field(default=False, description="JSON only: the standard error of each pixel as well")
     family: bool = Field(default=True, description=_FAMILY)
@@ -409,7 +411,7 @@ class CorrectionIn(Question):
 
     photo_id: Id
     lens_id: Id | None = Field(None, description="default: the lens of the photo")
-    lens_version: int | None = Field(None, ge=1, description="default: the newest")
+    lens_version: int | None = Field(None, ge=1, le=MAX_VERSION, description="default: the newest")
     method: str = Field("standard", min_length=1, max_length=60)
     strength: float = Field(1.0, ge=0, le=1, allow_inf_nan=False)
     halo: float | None = Field(

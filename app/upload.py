@@ -204,7 +204,8 @@ async def receive(request: Request, storage: Storage, key: str, *, limit: int) -
     """
     query = {name: value for name, value in request.query_params.items() if name != "filename"}
     UploadFields.model_validate(query)  # before the body: what is wrong already need not be sent
-    _check_length(request, limit)
+    if declared_length(request) > limit + 2 * MAX_FORM_BYTES:
+        raise too_large(limit)
     media_type, options = parse_options_header(request.headers.get("content-type", ""))
     async with storage.writer(key) as blob:
         sink = _Sink(blob, limit)
@@ -222,14 +223,12 @@ async def receive(request: Request, storage: Storage, key: str, *, limit: int) -
     return Uploaded(sha256, sink.size, kind, safe_name(name), checked)
 
 
-def _check_length(request: Request, limit: int) -> None:
-    declared = request.headers.get("content-length")
-    if declared is None:
-        return
-    if not declared.isdecimal():
+def declared_length(request: Request) -> int:
+    """Return how many bytes are said to come; 0 where nothing is said."""
+    declared = request.headers.get("content-length", "0")
+    if not declared.isdecimal() or len(declared) > 18:
         raise MalformedUploadError(f"Content-Length {declared[:40]!r} is no number: send the number of bytes")
-    if int(declared) > limit + 2 * MAX_FORM_BYTES:
-        raise too_large(limit)
+    return int(declared)
 
 
 async def _body(request: Request) -> AsyncIterator[bytes]:

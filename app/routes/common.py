@@ -10,14 +10,14 @@ from fastapi import Query
 
 from app.dependencies import Call
 from app.errors import MEDIA_TYPE
-from app.schemas import Name, Problem
+from app.schemas import OptionalName, Problem
 
 Limit = Annotated[int, Query(ge=1, le=200, description="items on a page")]
 Cursor = Annotated[
     str | None, Query(pattern="^[A-Za-z0-9]{1,40}$", description="from `next` of the page before")
 ]
 OnlyId = Annotated[str | None, Query(pattern="^[A-Za-z0-9]{1,40}$")]
-OnlyName = Annotated[Name | None, Query()]
+OnlyName = Annotated[OptionalName, Query()]
 
 
 class HasPublicId(Protocol):

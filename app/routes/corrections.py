@@ -32,7 +32,7 @@ from lensmodel.deconv import deconvolvers
 from lensmodel.errors import MetadataMissingError, NoSamplesError, UnknownMethodError
 
 router = APIRouter(tags=["corrections"])
-_RANGE: Final = re.compile(r"bytes=(\d*)-(\d*)", re.ASCII)
+_RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.ASCII)
 
 
 @router.post(

@@ -11,7 +11,7 @@ from app import views
 from app.dependencies import Call, CallDep
 from app.errors import UnknownLensError
 from app.routes.common import Cursor, Limit, OnlyName, cut, next_link, problems
-from app.schemas import CalibrationPage, LateralOut, LensOut, LensPage
+from app.schemas import MAX_VERSION, CalibrationPage, LateralOut, LensOut, LensPage
 from app.tables import LensRow
 from lensmodel.errors import NoSamplesError
 
@@ -54,7 +54,7 @@ def list_calibrations(
     lens_id: str,
     call: CallDep,
     limit: Limit = 200,
-    cursor: Annotated[int, Query(ge=0, description="from `next` of the page before")] = 0,
+    cursor: Annotated[int, Query(ge=0, le=MAX_VERSION, description="from `next` of the page before")] = 0,
 ) -> CalibrationPage:
     """Return the history of a lens, oldest first: one item for each version."""
     lens = find_lens(call, lens_id)

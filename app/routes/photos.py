@@ -93,10 +93,11 @@ def _admit(call: Call) -> None:
     """Refuse before the body is read what cannot be taken anyway."""
     limits = call.settings
     free = call.storage.free_bytes()
-    if free is not None and free < limits.min_free_mb * MIB:
+    coming = min(upload.declared_length(call.request), limits.max_upload_bytes)
+    if free is not None and free - coming < limits.min_free_mb * MIB:
         raise StorageFullError(
-            f"{free // MIB} MiB are free where photos are kept, {limits.min_free_mb} MiB must stay so: "
-            "delete photos, or make room on the disk"
+            f"{free // MIB} MiB are free where photos are kept, {limits.min_free_mb} MiB must stay so, and "
+            f"{coming / MIB:.1f} MiB are to come: delete photos, or make room on the disk"
         )
     unfinished, stored = call.store.photos.load_of(call.owner)
     if unfinished >= limits.max_queued_photos:

@@ -15,6 +15,7 @@ from sqlalchemy.orm import aliased
 from app import distances
 from app.store.database import Database
 from app.store.lenses import kind_key
+from app.store.owners import is_id
 from app.store.patches import DTYPE
 from app.tables import LensRow, OwnerRow, PhotoRow, SampleRow
 from lensmodel.errors import LensModelError
@@ -113,6 +114,8 @@ class SampleStore:
 
     def known_of(self, lens_id: str, owner: str) -> tuple[LensState, Family] | None:
         """Return `state_of` and `family_of` by one read; None if the owner has no such lens."""
+        if not is_id(lens_id):
+            return None
         with self._db.reader.connect() as connection:  # no session: this is part of every warm request
             rows = connection.execute(_KNOWN, {"lens": lens_id, "owner": owner}).all()
         if not rows:

@@ -284,6 +284,7 @@ def test_a_range_beyond_the_end_is_not_satisfiable(client: TestClient, finished:
         ("bytes=0-1,5-6", (0, 1000)),
         ("bytes=-", (0, 1000)),
         ("lines=1-2", (0, 1000)),
+        ("bytes=0-" + "9" * 5000, (0, 1000)),
         ("nonsense", (0, 1000)),
     ],
 )

@@ -58,6 +58,12 @@ def test_lenses_are_found_by_model_and_serial(client: TestClient, steps: Steps) 
     assert client.get("/v1/lenses?serial=3").json()["items"] == []
 
 
+def test_a_blank_filter_asks_for_all_lenses(client: TestClient, lens: str) -> None:
+    found = client.get("/v1/lenses?model=&serial=").json()["items"]
+
+    assert [f"/v1/lenses/{one['id']}" for one in found] == [lens]
+
+
 def test_a_psf_is_a_normalised_centred_kernel(client: TestClient, lens: str) -> None:
     answer = ask(client, lens)
 

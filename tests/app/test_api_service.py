@@ -5,10 +5,13 @@ from __future__ import annotations
 import logging
 import random
 import re
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from typing import Any
 from urllib.parse import quote
 
 import pytest
+from obstore.exceptions import GenericError
 from sqlalchemy.exc import OperationalError
 from starlette.testclient import TestClient
 
@@ -87,7 +90,7 @@ def test_our_own_fault_is_a_problem_without_its_cause(
 
     assert (answer.status_code, answer.json()["code"]) == (500, "internal_error")
     assert "secret" not in answer.text
-    assert answer.json()["request_id"] == "abc-1"
+    assert answer.json()["request_id"] == answer.headers["x-request-id"] == "abc-1"
 
 
 def test_a_locked_database_is_busy_and_not_broken(
@@ -103,6 +106,44 @@ def test_a_locked_database_is_busy_and_not_broken(
 
     assert (answer.status_code, answer.json()["code"]) == (503, "busy")
     assert answer.headers["retry-after"] == "5"
+
+
+@pytest.mark.parametrize(
+    ("said", "status", "code"),
+    [
+        ("Generic LocalFileSystem error: No space left on device (os error 28)", 507, "quota_exceeded"),
+        ("Generic S3 error: 503 Service Unavailable", 503, "busy"),
+    ],
+)
+def test_a_storage_that_is_full_or_away_is_told_so(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch, said: str, status: int, code: str
+) -> None:
+    services = client.app.state.services  # type: ignore[attr-defined] # Starlette's own attribute
+
+    @asynccontextmanager
+    async def broken(key: str) -> AsyncIterator[None]:
+        raise GenericError(said)
+        yield
+
+    monkeypatch.setattr(services.storage, "writer", broken)
+    answer = client.post("/v1/photos", content=b"II*\x00" + bytes(9000))
+
+    assert (answer.status_code, answer.json()["code"]) == (status, code)
+    assert client.get("/v1/photos").json()["items"] == []
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("localhost:8000", 200),
+        ("127.0.0.1", 200),
+        ("[::1]:8000", 200),
+        ("rebound.example.org", 400),
+        ("127.0.0.1.example.org:8000", 400),
+    ],
+)
+def test_a_name_that_a_stranger_may_own_is_not_served(client: TestClient, host: str, status: int) -> None:
+    assert client.get("/v1/photos", headers={"Host": host}).status_code == status
 
 
 @pytest.mark.parametrize("bad", ["", "a b", "x" * 65, "naïve", "a;b"])
@@ -194,6 +235,7 @@ def test_the_description_names_all_endpoints_of_the_contract(client: TestClient)
 HOSTILE = [
     "",
     "0",
+    "9" * 20,
     "-1",
     "1e999",
     "nan",
@@ -205,6 +247,29 @@ HOSTILE = [
     "{}",
     "true",
 ]
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body"),
+    [
+        ("GET", f"/v1/lenses/LENS/psf?r=0&version={10**20}", None),
+        ("GET", f"/v1/lenses/LENS/calibrations?cursor={10**20}", None),
+        ("POST", "/v1/corrections", b'{"photo_id": "PHOTO", "lens_version": 100000000000000000000}'),
+        ("POST", "/v1/corrections", b'{"photo_id": "\\ud800", "\\ud800": 1}'),
+    ],
+)
+def test_what_no_column_and_no_text_can_hold_is_refused(
+    client: TestClient, steps: Any, method: str, path: str, body: bytes | None
+) -> None:
+    photo = steps.counted()
+    lens = steps.lens_id(photo)
+    content = None if body is None else body.replace(b"PHOTO", photo.public_id.encode())
+
+    answer = client.request(
+        method, path.replace("LENS", lens), content=content, headers={"Content-Type": "application/json"}
+    )
+
+    assert (answer.status_code, answer.json()["code"]) == (422, "invalid_parameter")
 
 
 def test_no_question_that_the_description_allows_for_brings_the_service_down(

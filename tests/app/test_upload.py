@@ -237,6 +237,15 @@ def test_a_full_disk_refuses_uploads(client: TestClient, settings: Settings) -> 
     assert answer.status_code == 507
 
 
+def test_a_photo_that_would_fill_the_disk_is_refused_unread(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    storage = client.app.state.services.storage  # type: ignore[attr-defined] # Starlette's own attribute
+    monkeypatch.setattr(storage, "free_bytes", lambda: len(TIFF) - 1)
+
+    assert client.post("/v1/photos", content=TIFF).status_code == 507
+
+
 @pytest.mark.parametrize(
     ("sent", "shown"),
     [

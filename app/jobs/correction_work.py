@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from app.evidence import with_evidence
 from app.jobs.child import Progress
-from app.jobs.handover import FAMILY, LEARNED, SUFFIX
+from app.jobs.handover import BEFORE, FAMILY, LEARNED, SUFFIX
 from app.jobs.sandbox import Limits
 from app.jobs.workbench import (
     SPARE_MB,
@@ -23,10 +23,11 @@ from app.jobs.workbench import (
     Workbench,
     write_samples,
 )
-from app.store.corrections import CorrectionPlan, Result
+from app.store.corrections import CorrectionPlan, Result, folder_of
 from app.store.photos import settings_of
 from app.store.samples import LensState, Relative, StoredSample
 from app.store.versions import learned_key
+from app.tables import CorrectionRow
 from lensmodel import deconv
 
 log = logging.getLogger(__name__)
@@ -150,8 +151,11 @@ class CorrectionWork:
             raise JobFailedError("internal_error", "the correction wrote no file; retry, or report the photo")
         with path.open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
-        key = f"corrections/{plan.correction.public_id}/result{path.suffix}"
+        base = folder_of(plan.correction)
+        key = f"{base}result{path.suffix}"
         self._bench.storage.put_file(key, path)
+        if (path.parent / BEFORE).is_file():
+            self._bench.storage.put_file(f"{base}{BEFORE}", path.parent / BEFORE)
         stem = PurePath(plan.photo.filename).stem or "photo"
         result = Result(
             key=key,
@@ -161,13 +165,13 @@ class CorrectionWork:
             name=f"{stem}-corrected{path.suffix}",
         )
         if not self._corrections.finish(plan.correction.public_id, result, report):
-            self._drop_unless_done(plan.correction.public_id)
+            self._drop_unless_done(plan.correction)
 
-    def _drop_unless_done(self, correction_id: str) -> None:
-        """Delete the file of a correction that was cancelled or deleted while it was stored."""
-        row = self._corrections.get(correction_id)
+    def _drop_unless_done(self, correction: CorrectionRow) -> None:
+        """Delete the files of a correction that was cancelled or deleted while they were stored."""
+        row = self._corrections.get(correction.public_id)
         if row is None or row.state != "succeeded":  # another worker may have handed it in
-            self._bench.storage.delete(f"corrections/{correction_id}/")
+            self._bench.storage.delete(folder_of(correction))
 
     def measure(self, lens_id: str, version: int) -> None:
         """Measure how well one version of a lens predicts photos that it was not shown."""

@@ -20,6 +20,13 @@ FAMILY: Final = "family"
 LEARNED: Final = "learned.npz"
 """What a model has learned from the samples."""
 
+PREVIEW: Final = "preview.jpg"
+R_MAP: Final = "r-map.png"
+"""What `app.previews` makes of a developed photo."""
+
+BEFORE: Final = "before.jpg"
+"""What a corrected file shows, as it was before; none for DNG, which is no picture yet."""
+
 SUFFIX: Final[Mapping[str, str]] = {
     "tiff16": ".tif",
     "png16": ".png",

@@ -21,7 +21,7 @@ from app.jobs.handover import KERNELS
 from app.jobs.sandbox import Limits
 from app.jobs.workbench import SPARE_MB, JobFailedError, NotWantedError, Workbench
 from app.store import LensName, NewPatch, NewSample
-from app.store.photos import settings_of
+from app.store.photos import settings_of, statistics_of
 from app.tables import PHOTO_RUNNING, PatchRow, PhotoRow
 from lensmodel.errors import InvalidInputError, InvalidKernelError
 from lensmodel.psf import as_kernel
@@ -266,8 +266,7 @@ class PhotoWork:
             raise JobFailedError("internal_error", f"the estimator gave no kernel: {error}") from error
         key = None
         if entry["evidence"] is not None:
-            base = photo.blob_key.rpartition("/")[0]
-            key = f"{base}/statistics/e{photo.epoch}/{entry['idx']}-{entry['channel']}.npz"
+            key = f"{statistics_of(photo)}{entry['idx']}-{entry['channel']}.npz"
             self._bench.storage.put_file(key, folder / Path(entry["evidence"]).name)
         return NewSample(
             idx=entry["idx"],

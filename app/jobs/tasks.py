@@ -15,9 +15,19 @@ from typing import Any, Final
 
 import numpy as np
 
-from app import distances
+from app import distances, previews
 from app.jobs.child import Progress, Task
-from app.jobs.handover import EVIDENCE, FAMILY, KERNELS, LEARNED, SAMPLES, SUFFIX
+from app.jobs.handover import (
+    BEFORE,
+    EVIDENCE,
+    FAMILY,
+    KERNELS,
+    LEARNED,
+    PREVIEW,
+    R_MAP,
+    SAMPLES,
+    SUFFIX,
+)
 from lensmodel import codec, deconv, photo, pipeline
 from lensmodel.deconv.engine import first_use
 from lensmodel.errors import InvalidInputError, LensModelError
@@ -47,6 +57,8 @@ def develop(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
     limits = photo.Limits(max_megapixels=arguments["max_megapixels"])
     developed = photo.develop(Path(arguments["path"]), limits=limits)
     pipeline.save_developed(developed, folder)
+    (folder / PREVIEW).write_bytes(previews.preview(developed))
+    (folder / R_MAP).write_bytes(previews.confidence_map(developed))
     return {"height": developed.frame.height, "width": developed.frame.width, "pipeline": developed.pipeline}
 
 
@@ -141,6 +153,13 @@ def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
         quality=output["quality"],
         description=arguments["description"],
     )
+    if output["format"] != "dng":
+        height, width = corrected.planes.shape[1:]
+        top, left = (0, 0) if roi is None else (roi["y"], roi["x"])
+        part = np.ascontiguousarray(developed.planes[:, top : top + height, left : left + width])
+        photo.write_image(
+            folder / BEFORE, part, developed.encoding, format="jpeg", color_space="srgb", quality=97
+        )
     return {"file": name, "zones": _numbers(codec.to_json(corrected.zones))}
 
 

@@ -19,12 +19,13 @@ import numpy as np
 
 from app import distances
 from app.jobs.child import Progress
-from app.jobs.handover import EVIDENCE, KERNELS, SAMPLES
+from app.jobs.handover import EVIDENCE, KERNELS, PREVIEW, R_MAP, SAMPLES
 from app.jobs.sandbox import Limits, Outcome, Sandbox
 from app.settings import Settings
 from app.storage import Storage
 from app.store import Store, StoredSample
 from app.store.jobs import JobStore
+from app.store.photos import folder_of
 from app.tables import PhotoRow
 from lensmodel.evidence import PatchEvidence
 from lensmodel.types import ignore_step
@@ -161,6 +162,9 @@ class Workbench:
             with self.original(photo) as path, self.sandbox.folder() as folder:
                 arguments = {"path": str(path), "max_megapixels": self.settings.max_megapixels}
                 self.attempt("develop", arguments, folder=folder, limits=limits, wanted=wanted)
+                for name in (PREVIEW, R_MAP):
+                    if (folder / name).is_file():
+                        self.storage.put_file(f"{folder_of(photo)}{name}", folder / name)
                 shutil.rmtree(target, ignore_errors=True)
                 folder.rename(target)  # complete or not there
             return target

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Awaitable, Callable
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeAlias
 
@@ -18,16 +17,21 @@ from starlette.exceptions import HTTPException
 
 from app import views
 from app.dependencies import Call, CallDep
-from app.errors import NotReadyError
+from app.errors import InvalidParameterError, NotReadyError
+from app.jobs.handover import BEFORE, PREVIEW, R_MAP
 from app.pages import pictures, words
 from app.routes import corrections as correction_routes
 from app.routes import lenses as lens_routes
 from app.routes import photos as photo_routes
 from app.schemas import LensOut, PhotoOut
+from app.store.corrections import CorrectionPlan
+from app.store.corrections import folder_of as folder_of_correction
+from app.store.photos import folder_of
 from lensmodel.errors import LensModelError
 
 HERE: Final = Path(__file__).parent
 SHOWN: Final = 60
+SHOWN_VERSIONS: Final = 200
 ROWS: Final = (("upper", 0.0), ("", 0.5), ("lower", 1.0))
 COLUMNS: Final = (("left", 0.0), ("middle", 0.5), ("right", 1.0))
 PLACES: Final = tuple(
@@ -123,7 +127,8 @@ def lenses_fragment(call: CallDep) -> HTMLResponse:
 def lens_page(lens_id: str, call: CallDep) -> HTMLResponse:
     """Show a lens: its field of blur, its history, its photos."""
     lens = lens_routes.read_lens(lens_id, call)
-    history = lens_routes.list_calibrations(lens_id, call, limit=200).items
+    before = max(lens.version - SHOWN_VERSIONS, 0)  # the newest are shown
+    history = lens_routes.list_calibrations(lens_id, call, limit=SHOWN_VERSIONS, cursor=before).items
     photos, more = _photos(call, lens_id)
     newest = next((event.coverage for event in reversed(history) if event.coverage), None)
     return _page(
@@ -233,27 +238,33 @@ def _picture(data: bytes, media_type: str) -> Response:
 @router.get("/ui/photos/{photo_id}/preview.jpg")
 def photo_preview(photo_id: str, call: CallDep, size: Side = 1200) -> Response:
     """Show a photo in small."""
-    photo_routes.find_photo(call, photo_id)
-    developed = pictures.open_developed(call.settings.data_dir, photo_id)
-    return _picture(pictures.preview(developed, size), "image/jpeg")
+    key = f"{folder_of(photo_routes.find_photo(call, photo_id))}{PREVIEW}"
+    return _picture(pictures.resized(pictures.stored(call.storage, key), size), "image/jpeg")
 
 
 @router.get("/ui/photos/{photo_id}/r-map.png")
 def photo_r_map(photo_id: str, call: CallDep, size: Side = 1200) -> Response:
     """Show where the edges of a photo tell about the blur."""
-    photo_routes.find_photo(call, photo_id)
-    developed = pictures.open_developed(call.settings.data_dir, photo_id)
-    return _picture(pictures.confidence_map(developed, size), "image/png")
+    key = f"{folder_of(photo_routes.find_photo(call, photo_id))}{R_MAP}"
+    return _picture(pictures.resized(pictures.stored(call.storage, key), size), "image/png")
 
 
 @router.get("/ui/photos/{photo_id}/crop.png")
 def photo_crop(
-    photo_id: str, call: CallDep, row: Share, col: Share, width: Side = 640, height: Side = 420
+    photo_id: str,
+    correction: str,
+    call: CallDep,
+    row: Share,
+    col: Share,
+    width: Side = 640,
+    height: Side = 420,
 ) -> Response:
-    """Show a part of the photo as it was, 1:1."""
+    """Show a part of the photo as it was before a correction, 1:1."""
     photo_routes.find_photo(call, photo_id)
-    developed = pictures.open_developed(call.settings.data_dir, photo_id)
-    return _picture(pictures.crop_of_photo(developed, row, col, height, width), "image/png")
+    plan = _compared(call, correction)
+    key = f"{folder_of_correction(plan.correction)}{BEFORE}"
+    picture = pictures.decoded(call.storage, key, "image/jpeg", plan.photo.orientation or 1)
+    return _picture(pictures.crop(picture, row, col, height, width), "image/png")
 
 
 @router.get("/ui/corrections/{correction_id}/crop.png")
@@ -261,28 +272,19 @@ def correction_crop(
     correction_id: str, call: CallDep, row: Share, col: Share, width: Side = 640, height: Side = 420
 ) -> Response:
     """Show a part of the corrected photo, 1:1."""
-    plan = correction_routes.find_plan(call, correction_id)
+    plan = _compared(call, correction_id)
     done = plan.correction
-    if done.state != "succeeded" or done.result_key is None or done.result_media_type is None:
-        raise NotReadyError(f"correction {correction_id} is {done.state}: wait for its job")
-    read = partial(call.storage.get, done.result_key)
-    picture = pictures.decoded(
-        _Named(read, done.result_key), done.result_key, done.result_media_type, plan.photo.orientation or 1
-    )
-    return _picture(pictures.crop_of_result(picture, row, col, height, width), "image/png")
+    assert done.result_key is not None
+    assert done.result_media_type is not None
+    turned = plan.photo.orientation or 1
+    picture = pictures.decoded(call.storage, done.result_key, done.result_media_type, turned)
+    return _picture(pictures.crop(picture, row, col, height, width), "image/png")
 
 
-class _Named:
-    """A reader that is equal to another of the same key, so that what it read can be cached."""
-
-    def __init__(self, read: partial[bytes], key: str) -> None:
-        self._read, self._key = read, key
-
-    def __call__(self) -> bytes:
-        return self._read()
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Named) and other._key == self._key
-
-    def __hash__(self) -> int:
-        return hash(self._key)
+def _compared(call: Call, correction_id: str) -> CorrectionPlan:
+    plan = correction_routes.find_plan(call, correction_id)
+    if plan.correction.state != "succeeded":
+        raise NotReadyError(f"correction {correction_id} is {plan.correction.state}: wait for its job")
+    if plan.correction.params["output"]["format"] == "dng":
+        raise InvalidParameterError("a DNG is not a picture yet: download it and develop it to compare")
+    return plan

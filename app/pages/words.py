@@ -91,6 +91,8 @@ def photo_state(photo: PhotoOut) -> str:
     """Say where a photo stands."""
     if photo.state == "failed":
         return f"Not used: {failure(photo.error)}"
+    if photo.state == "needs_lens" and photo.lens_id is not None:
+        return "Waiting for you: at which aperture was it?"
     if photo.state == "estimating":
         return f"Measuring blur: {photo.patches.done} of {photo.patches.total} places"
     words = PHOTO_STATES.get(photo.state, photo.state)

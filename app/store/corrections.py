@@ -43,6 +43,11 @@ def params_hash(params: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(params, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
+def folder_of(correction: CorrectionRow) -> str:
+    """Return the prefix of a correction's blobs."""
+    return f"corrections/{correction.public_id}/"
+
+
 class CorrectionStore:
     """Corrections of all owners. `owner=None` asks as the service itself."""
 
@@ -189,7 +194,7 @@ class CorrectionStore:
             row = find(session, CorrectionRow, correction_id, owner)
             if row is None:
                 return None
-            prefix = f"corrections/{row.public_id}/"
+            prefix = folder_of(row)
             insert_new(session, GarbageRow, [{"prefix": prefix, "not_before": now()}])
             session.delete(row)
             return prefix

@@ -403,9 +403,19 @@ class PhotoStore:
             photo.deleted_at = now()
             photo.state = "cancelled" if photo.state in UNFINISHED else photo.state
             photo.given, photo.lens_serial, photo.filename = {}, None, ""
-            prefix = photo.blob_key.rpartition("/")[0]
-            insert_new(session, GarbageRow, [{"prefix": f"{prefix}/", "not_before": now() + LATE}])
-            return f"{prefix}/"
+            prefix = folder_of(photo)
+            insert_new(session, GarbageRow, [{"prefix": prefix, "not_before": now() + LATE}])
+            return prefix
+
+
+def folder_of(photo: PhotoRow) -> str:
+    """Return the prefix of a photo's blobs."""
+    return f"{photo.blob_key.rpartition('/')[0]}/"
+
+
+def statistics_of(photo: PhotoRow) -> str:
+    """Return the prefix of what the patches of this epoch of a photo say besides their kernels."""
+    return f"{folder_of(photo)}statistics/e{photo.epoch}/"
 
 
 def settings_of(photo: PhotoRow) -> dict[str, Any]:
@@ -424,9 +434,7 @@ def _known(session: Session, owner_key: int, sha256: str) -> PhotoRow:
 def _drop_patches(session: Session, photo: PhotoRow) -> None:
     """Forget the patches of an epoch with their samples; a worker may write one more blob of them."""
     session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
-    base = photo.blob_key.rpartition("/")[0]
-    row = {"prefix": f"{base}/statistics/e{photo.epoch}/", "not_before": now() + LATE}
-    insert_new(session, GarbageRow, [row])
+    insert_new(session, GarbageRow, [{"prefix": statistics_of(photo), "not_before": now() + LATE}])
 
 
 def _restart(session: Session, photo: PhotoRow) -> None:

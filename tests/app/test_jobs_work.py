@@ -16,7 +16,7 @@ from app import views
 from app.jobs.child import Progress
 from app.jobs.correction_work import CorrectionWork
 from app.jobs.engine import Handler, Job, Kind, Status
-from app.jobs.handover import KERNELS, LEARNED, SAMPLES
+from app.jobs.handover import KERNELS, LEARNED, PREVIEW, SAMPLES
 from app.jobs.photo_work import PhotoWork
 from app.jobs.sandbox import Budget, Limits, Outcome
 from app.jobs.workbench import JobFailedError, NotWantedError, Workbench
@@ -230,6 +230,19 @@ def test_a_photo_focused_at_infinity_says_so_to_the_model(
     _, samples = bench.store.samples.of_lens(steps.lens_id(photo))
     assert {stored.sample.settings.focus_m for stored in samples} == {math.inf}
     assert views.photo_out(steps.fresh(photo), None).focus_distance_m is None
+
+
+def test_a_developed_photo_leaves_its_pictures_with_the_blobs(
+    work: PhotoWork, bench: Workbench, photo: PhotoRow, sandbox: Scripted
+) -> None:
+    def with_preview(arguments: dict[str, Any], folder: Path) -> Outcome:
+        (folder / PREVIEW).write_bytes(b"a small picture")
+        return develop(arguments, folder)
+
+    sandbox.answers["develop"] = [with_preview]
+    work.photo(photo.public_id, 1)
+
+    assert bench.storage.get(f"photos/{photo.public_id}/{PREVIEW}") == b"a small picture"
 
 
 def test_running_a_finished_photo_again_changes_nothing(

@@ -39,7 +39,7 @@ export function setUpCompare() {
     const { row, col } = place.dataset;
     const query = new URLSearchParams({ row, col, width: String(width), height: String(height) });
     for (const picture of [before, after, hold]) Object.assign(picture, { width, height });
-    before.src = `/ui/photos/${holder.dataset.photo}/crop.png?${query}`;
+    before.src = `/ui/photos/${holder.dataset.photo}/crop.png?correction=${holder.dataset.id}&${query}`;
     hold.src = before.src;
     after.src = `/ui/corrections/${holder.dataset.id}/crop.png?${query}`;
     slider.setAttribute("aria-valuetext", `${place.textContent.trim()}: half before, half after`);

@@ -25,12 +25,14 @@ function setUpForm(id, act) {
 export function setUpForms() {
   setUpForm("name-lens", async (fields, photo) => {
     const change = {};
-    const label = fields.get("label").trim();
+    const known = !fields.has("label"); // the lens: only its aperture is asked for
+    const label = fields.get("label")?.trim();
     if (label) change.new_lens = { label };
     else if (fields.get("lens_id")) change.lens_id = fields.get("lens_id");
-    else throw new Error("Choose a lens, or give a new one a name.");
+    else if (!known) throw new Error("Choose a lens, or give a new one a name.");
     const aperture = (fields.get("aperture") ?? "").replace(",", ".").trim();
     if (aperture) change.aperture = Number(aperture);
+    else if (known) throw new Error("Give the aperture, a number such as 2.8.");
     if (Number.isNaN(change.aperture)) throw new Error(`The aperture must be a number such as 2.8, not "${aperture}".`);
     await send("PATCH", `/v1/photos/${photo}`, change);
     location.reload();

@@ -152,10 +152,16 @@ function plot(holder, events) {
 export async function setUpHistory() {
   const holder = byId("history");
   if (!holder) return;
-  const response = await fetch(`/v1/lenses/${holder.dataset.lens}/calibrations`);
-  if (!response.ok) return;
+  const all = [];
+  for (let next = `/v1/lenses/${holder.dataset.lens}/calibrations`; next; ) {
+    const response = await fetch(next);
+    if (!response.ok) return;
+    const page = await response.json();
+    all.push(...page.items);
+    next = page.next;
+  }
   const known = (event) => (typeof event.error === "object" ? Object.keys(event.error ?? {}).length : true);
-  const events = (await response.json()).items.filter(known);
+  const events = all.filter(known);
   if (events.length < 2) return; // one point is no curve: the page says it in words
   const made = plot(holder, events);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {

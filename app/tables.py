@@ -8,7 +8,7 @@ updates give every effect exactly once, however often a step is repeated.
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, get_args
 
 from sqlalchemy import (
     JSON,
@@ -29,27 +29,14 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-PHOTO_STATES: Final = (
-    "received",
-    "inspecting",
-    "developing",
-    "selecting",
-    "estimating",
-    "counted",
-    "stored",
-    "needs_lens",
-    "excluded",
-    "failed",
-    "cancelled",
-)
-PHOTO_QUEUED: Final = ("received",)
+from app.schemas import CorrectionState, PhotoState
+
+PHOTO_STATES: Final[tuple[str, ...]] = get_args(PhotoState)
 PHOTO_RUNNING: Final = ("inspecting", "developing", "selecting", "estimating")
-PHOTO_WAITING: Final = ("needs_lens",)
 PHOTO_FINAL: Final = ("counted", "stored", "excluded", "failed", "cancelled")
 
 PATCH_STATES: Final = ("pending", "running", "done", "rejected", "failed", "cancelled")
-CORRECTION_STATES: Final = ("queued", "running", "succeeded", "failed", "cancelled")
-CORRECTION_FINAL: Final = ("succeeded", "failed", "cancelled")
+CORRECTION_STATES: Final[tuple[str, ...]] = get_args(CorrectionState)
 EVENT_KINDS: Final = ("photo_added", "photo_included", "photo_excluded", "photo_removed", "photo_changed")
 
 

@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import select, update
+from sqlalchemy import Select, select, update
 
 from app.ids import new_id
 from app.store.database import Database, insert_new
-from app.store.owners import find, now, owned
+from app.store.owners import find, is_id, now, owned
 from app.tables import CorrectionRow, GarbageRow, LensRow, OwnerRow, PhotoRow
 
 ACTIVE = ("queued", "running")
@@ -46,6 +46,16 @@ def params_hash(params: Mapping[str, Any]) -> str:
 def folder_of(correction: CorrectionRow) -> str:
     """Return the prefix of a correction's blobs."""
     return f"corrections/{correction.public_id}/"
+
+
+def _plans(owner: str | None) -> Select[Any]:
+    """Select an owner's corrections, each with its photo and lens."""
+    return (
+        owned(CorrectionRow, owner)
+        .join(PhotoRow, PhotoRow.id == CorrectionRow.photo_id)
+        .join(LensRow, LensRow.id == CorrectionRow.lens_id)
+        .add_columns(PhotoRow, LensRow)
+    )
 
 
 class CorrectionStore:
@@ -92,28 +102,24 @@ class CorrectionStore:
 
     def plan(self, correction_id: str, owner: str | None = None) -> CorrectionPlan | None:
         """Return a correction with its photo and lens, or None."""
+        if not is_id(correction_id):
+            return None
+        query = _plans(owner).where(CorrectionRow.public_id == correction_id)
         with self._db.reading() as session:
-            row = find(session, CorrectionRow, correction_id, owner)
-            if row is None:
-                return None
-            photo, lens = session.get(PhotoRow, row.photo_id), session.get(LensRow, row.lens_id)
-            assert photo is not None
-            assert lens is not None
-            return CorrectionPlan(row, photo, lens)
+            row = session.execute(query).one_or_none()
+            return None if row is None else CorrectionPlan(*row)
 
     def page(
         self, owner: str, *, before: str | None, limit: int, photo: PhotoRow | None = None
     ) -> list[CorrectionPlan]:
         """Return corrections, newest first."""
-        query = owned(CorrectionRow, owner).order_by(CorrectionRow.public_id.desc()).limit(limit)
+        query = _plans(owner).order_by(CorrectionRow.public_id.desc()).limit(limit)
         if before is not None:
             query = query.where(CorrectionRow.public_id < before)
         if photo is not None:
             query = query.where(CorrectionRow.photo_id == photo.id)
         with self._db.reading() as session:
-            ids = [row.public_id for row in session.scalars(query)]
-        plans = (self.plan(correction_id, owner) for correction_id in ids)
-        return [plan for plan in plans if plan is not None]
+            return [CorrectionPlan(*row) for row in session.execute(query)]
 
     def to_do(self, limit: int = 100) -> list[tuple[str, int, str]]:
         """Return `(correction_id, attempt, owner)` of queued corrections, oldest first: the intent sweep."""

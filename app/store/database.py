@@ -44,7 +44,7 @@ class Database:
             self.durable = _sqlite(url, "BEGIN IMMEDIATE", "FULL")
             self.reader = _sqlite(url, "BEGIN", synchronous, read_only=True)
         else:
-            self.writer = self.durable = create_engine(url, pool_pre_ping=True)
+            self.writer = self.durable = create_engine(url, pool_pre_ping=True, hide_parameters=True)
             self.reader = self.writer.execution_options(postgresql_readonly=True)
 
     @contextmanager
@@ -72,7 +72,10 @@ class Database:
 
 def _sqlite(url: str, begin: str, synchronous: str, *, read_only: bool = False) -> Engine:
     engine = create_engine(
-        url, connect_args={"check_same_thread": False, "timeout": BUSY_TIMEOUT_MS / 1000}, pool_size=10
+        url,
+        connect_args={"check_same_thread": False, "timeout": BUSY_TIMEOUT_MS / 1000},
+        pool_size=10,
+        hide_parameters=True,  # serials are personal data: none in a log
     )
 
     @event.listens_for(engine, "connect")

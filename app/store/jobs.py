@@ -19,8 +19,8 @@ class JobStore:
     def begin_cell(self, photo_id: str, epoch: int, cell: int) -> list[PatchRow]:
         """Take up the open patches of one cell; empty if there are none, or nobody wants them.
 
-        The attempt is counted before it is made: a patch that kills its worker must not be
-        tried for ever.
+        The attempt is noted before it is made; that a patch which kills its workers is given up is
+        the engine's part.
         """
         query = (
             select(PatchRow)

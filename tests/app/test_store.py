@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from sqlalchemy import text
+from sqlalchemy.exc import DBAPIError
 
 from app.settings import Settings
 from app.store import NewPatch, Store
@@ -343,6 +344,13 @@ def test_no_update_is_lost_when_many_threads_raise_the_version(store: Store, ste
     state = store.samples.state_of(lens)
     assert state is not None
     assert state.version == 21
+
+
+def test_an_error_of_the_database_names_no_serial(store: Store) -> None:
+    with pytest.raises(DBAPIError) as caught, store.database.writing() as session:
+        session.execute(text("SELECT 1 FROM nowhere WHERE serial = :serial"), {"serial": "SECRET-77"})
+
+    assert "SECRET-77" not in str(caught.value)
 
 
 def test_the_reader_cannot_write(store: Store, steps: Steps) -> None:

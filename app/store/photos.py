@@ -334,10 +334,11 @@ class PhotoStore:
                 wish: Final = "excluded" if excluded else "counted"
                 if photo.state != wish and not lenses.switch(session, photo, wish):
                     return False
+            chosen = None
             if isinstance(lens, LensName):
                 chosen = lenses.named(session, photo.owner_id, lens)
-            else:
-                chosen = None if lens is None else find(session, LensRow, lens, owner)
+            elif lens is not None:
+                chosen = find(session, LensRow, lens, owner)
             if photo.state in {"counted", "stored", "excluded"}:
                 if given:
                     columns = {GIVEN_SETTINGS[name]: value for name, value in given.items()}

@@ -54,7 +54,8 @@ def confidence_map(developed: LinearPhoto) -> bytes:
 
 
 def _step(developed: LinearPhoto) -> int:
-    return -(-max(developed.frame.height, developed.frame.width) // SIDE)
+    short, long = sorted((developed.frame.height, developed.frame.width))
+    return min(-(-long // SIDE), short // 2)  # a panorama keeps two rows at least
 
 
 def _encoded(picture: NDArray[np.uint8], developed: LinearPhoto, kind: str, **options: Any) -> bytes:  # noqa: ANN401 - of PIL

@@ -48,6 +48,14 @@ def test_a_preview_and_an_r_map_come_from_the_blobs_upright_in_any_size(
         assert opened(client, f"/ui/photos/{photo.public_id}/{name}?size=40").size == (30, 40)
 
 
+def test_no_photo_is_too_long_for_a_preview(tmp_path: Path) -> None:
+    Image.new("RGB", (30000, 16), "gray").save(tmp_path / "p.png")
+
+    tasks.develop({"path": str(tmp_path / "p.png"), "max_megapixels": 1.0}, tmp_path, ignore_step)
+
+    assert {PREVIEW, R_MAP} <= {path.name for path in tmp_path.iterdir()}
+
+
 @pytest.fixture
 def corrected(client: TestClient, steps: Steps, store: Store, settings: Settings) -> dict[str, Any]:
     """A correction that has changed nothing: the file is the photo as it was."""

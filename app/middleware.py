@@ -79,9 +79,9 @@ class OwnNames:
 
 
 def is_local(host: str) -> bool:
-    """Say whether a Host header is an address or a name of one word, which no stranger can own."""
+    """Say whether a Host header is an address or a local name, which no stranger can own."""
     try:
         name = urlsplit(f"//{host}").hostname or ""
     except ValueError:
         return False
-    return "." not in name or name.endswith(".localhost") or name.replace(".", "").isdecimal()
+    return "." not in name or name.endswith((".localhost", ".local")) or name.replace(".", "").isdecimal()

@@ -48,8 +48,6 @@ def run(
     with files.as_usage():
         place = FieldPosition(asked.r, asked.phi)
         settings = LensSettings(aperture=asked.aperture, channel=asked.channel)
-    if asked.size % 2 == 0:
-        raise UsageError(f"--size must be odd, got {asked.size}; a PSF has one middle pixel")
     if output is not None and output.suffix.lower() not in WRITTEN:
         raise UsageError(f"no format for {output.name}; give a name that ends in {', '.join(WRITTEN)}")
     files.refuse_existing(output, force=force)

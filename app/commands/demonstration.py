@@ -12,7 +12,7 @@ import typer
 
 from app.commands import display, files
 from app.commands.failure import UsageError
-from app.commands.options import Quiet, Verbose
+from app.commands.options import Estimator, Quiet, Verbose
 from lensmodel import blind
 
 MARKER: Final = ".lensmodel-demo.json"
@@ -24,9 +24,7 @@ def demo(
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for the pictures and the report.")
     ] = Path("demo-output"),
-    estimator: Annotated[
-        str, typer.Option(metavar="NAME", help="Blind estimator: default, michaeli-irani, whittle, ...")
-    ] = "default",
+    estimator: Estimator = "default",
     json_output: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Use a folder that holds other files too.")] = False,
     quiet: Quiet = False,

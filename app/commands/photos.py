@@ -6,23 +6,34 @@ Here stand the options and the help; the work is in the modules of the same subj
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, get_args
 
 import typer
 
-from app.commands import answer, calibration, correction, display, files
+from app.commands import answer, calibration, correction, display
+from app.commands.failure import UsageError
 from app.commands.options import (
+    ANGLE,
+    RADIUS,
     AnyLens,
     Aperture,
+    Channel,
+    Estimator,
     Force,
     Json,
     Photos,
     Profile,
+    ProfileFile,
     Quiet,
+    Size,
     Verbose,
     Workers,
+    aperture_option,
+    choice,
 )
-from lensmodel.deconv import Bounds
+from lensmodel.deconv import Bounds, deconvolvers
+from lensmodel.photo import OutputFormat
+from lensmodel.regression.answer import MODES, UNITS
 
 
 def calibrate(
@@ -30,9 +41,7 @@ def calibrate(
     photos: Photos,
     profile: Profile,
     aperture: Aperture = None,
-    estimator: Annotated[
-        str, typer.Option(metavar="NAME", help="Blind estimator: default, michaeli-irani, whittle, ...")
-    ] = "default",
+    estimator: Estimator = "default",
     workers: Workers = None,
     any_lens: AnyLens = False,
     force: Annotated[bool, typer.Option("--force", help="Forget what the profile knew; begin anew.")] = False,
@@ -42,14 +51,22 @@ def calibrate(
     ] = None,
     no_family: Annotated[bool, typer.Option("--no-family", help="Lean on no other copy any more.")] = False,
     mode: Annotated[
-        Literal["mixed", "kernels", "evidence", "wavefront", "likeliest"] | None,
-        typer.Option(
-            help="What answers are made of; likeliest chooses by photos held out. Kept from then on."
+        str | None,
+        choice(
+            "--mode",
+            MODES,
+            "What answers are made of: mixed (default), or likeliest, which chooses by photos held out. "
+            "Kept from then on.",
         ),
     ] = None,
     unit: Annotated[
-        Literal["micrometre", "half-diagonal"] | None,
-        typer.Option(help="In what bodies with other pixels agree. Kept from then on."),
+        str | None,
+        choice(
+            "--unit",
+            UNITS,
+            "In what bodies with other pixels agree: micrometre (default), or half-diagonal where the pixel "
+            "size is unknown. Kept from then on.",
+        ),
     ] = None,
     json_output: Json = False,
     quiet: Quiet = False,
@@ -100,9 +117,7 @@ def correct(
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for the corrected photos.")
     ],
-    method: Annotated[
-        str, typer.Option(metavar="NAME", help="standard, fast, paper, wiener, ...")
-    ] = "standard",
+    method: Annotated[str, typer.Option(metavar="NAME", help=f"{', '.join(deconvolvers)}.")] = "standard",
     strength: Annotated[
         float, typer.Option(min=0.0, max=1.0, metavar="0..1", help="0 nothing, 1 all that the noise allows.")
     ] = 1.0,
@@ -110,8 +125,8 @@ def correct(
         float | None,
         typer.Option(
             metavar="SHARE",
-            help="How far beside edges to leave the light of the photo around, in shares of its range: "
-            "0 never. Default: the less sure the profile, the less.",
+            help="How far results may go beyond the photo's own range beside edges, as a share of that "
+            "range: 0 not at all, inf without bound. Default: the less sure the profile, the less.",
         ),
     ] = None,
     keep_flats: Annotated[
@@ -119,8 +134,7 @@ def correct(
         typer.Option(min=0.0, max=1.0, metavar="0..1", help="How much of its grain a flat area keeps."),
     ] = 0.0,
     file_format: Annotated[
-        Literal["tiff16", "png16", "png8", "jpeg", "dng"],
-        typer.Option("--format", help="dng: linear, for a raw converter; only from RAW photos."),
+        OutputFormat, choice("--format", get_args(OutputFormat), "dng: linear, for a raw converter.")
     ] = "tiff16",
     aperture: Aperture = None,
     workers: Workers = None,
@@ -149,8 +163,8 @@ def correct(
     Exit status: 0 all photos are corrected, 1 some are not, 2 called wrongly.
     """
     shown = display.of(context, quiet=quiet, verbose=verbose)
-    with files.as_usage():
-        bounds = Bounds(halo, keep_flats)
+    if halo is not None and not halo >= 0.0:
+        raise UsageError(f"--halo must not be negative, got {halo:g}")
     correction.run(
         photos,
         profile,
@@ -159,7 +173,7 @@ def correct(
             aperture,
             method,
             strength,
-            bounds,
+            Bounds(halo, keep_flats),
             file_format,
             workers,
             any_lens=any_lens,
@@ -172,14 +186,12 @@ def correct(
 
 def psf(
     context: typer.Context,
-    profile: Annotated[Path, typer.Argument(metavar="FILE", help="The lens profile.")],
-    r: Annotated[float, typer.Option(min=0.0, max=1.0, metavar="0..1", help="0 center, 1 corner.")] = 0.0,
-    phi: Annotated[float, typer.Option(metavar="RADIAN", help="Counter-clockwise from the right.")] = 0.0,
-    aperture: Annotated[
-        float | None, typer.Option("--aperture", "-a", metavar="N", help="f-number; default: all together.")
-    ] = None,
-    channel: Annotated[Literal["r", "g", "b"], typer.Option(help="Which color.")] = "g",
-    size: Annotated[int, typer.Option(min=3, max=255, metavar="N", help="Odd side in pixels.")] = 55,
+    profile: ProfileFile,
+    r: Annotated[float, RADIUS] = 0.0,
+    phi: Annotated[float, ANGLE] = 0.0,
+    aperture: Annotated[float | None, aperture_option("f-number; default: all together.")] = None,
+    channel: Channel = "g",
+    size: Size = 55,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", metavar="FILE", help="Write it: .npy, .json, .tif or .png."),

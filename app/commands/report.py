@@ -12,7 +12,18 @@ import typer
 
 from app.commands import display, files
 from app.commands.failure import UsageError
-from app.commands.options import Quiet, Verbose
+from app.commands.options import (
+    ANGLE,
+    RADIUS,
+    Channel,
+    Force,
+    Json,
+    ProfileFile,
+    Quiet,
+    Size,
+    Verbose,
+    aperture_option,
+)
 from lensmodel.codec import to_json
 from lensmodel.regression import LensModel
 from lensmodel.report import (
@@ -24,35 +35,34 @@ from lensmodel.report import (
     curves_svg,
     export,
     exporters,
+    format_of,
     lens_report,
     mtf_map_svg,
     psf_grid,
 )
 from lensmodel.report.exporters import write_atomically
 from lensmodel.report.lens_report import widest
-from lensmodel.types import CHANNELS, Channel, FieldPosition, LensSettings
+from lensmodel.types import FieldPosition, LensSettings
 
-Profile = Annotated[Path, typer.Argument(help="The lens profile file.")]
-Aperture = Annotated[
-    float | None, typer.Option("--aperture", "-a", help="f-number; default: the widest that a photo had.")
+Aperture = Annotated[float | None, aperture_option("f-number; default: the widest that a photo had.")]
+Aspect = Annotated[
+    float, typer.Option(min=0.2, max=5.0, metavar="RATIO", help="Width over height of the picture.")
 ]
-ChannelName = Annotated[str, typer.Option("--channel", help="r, g or b.")]
-Aspect = Annotated[float, typer.Option(help="Width over height of the picture.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace files that are there already.")]
 
 _FILES: Final = ("report.json", "mtf.csv", "mtf-map.svg", "mtf-curves.svg", "apertures.svg")
 
 
 def report(
     context: typer.Context,
-    profile: Profile,
+    profile: ProfileFile,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder for report.json, mtf.csv and pictures.")
+        Path | None,
+        typer.Option("--output", "-o", metavar="DIR", help="Folder for report.json, mtf.csv and pictures."),
     ] = None,
     aperture: Aperture = None,
-    channel: ChannelName = "g",
+    channel: Channel = "g",
     aspect: Aspect = 1.5,
-    json_output: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+    json_output: Json = False,
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = 0,
@@ -97,22 +107,27 @@ def report(
 
 def export_psfs(
     context: typer.Context,
-    profile: Profile,
-    output: Annotated[Path, typer.Option("--output", "-o", help="The file to write.")],
-    file_format: Annotated[str, typer.Option("--format", help="csv, fits, json, npz, png, tiff.")] = "tiff",
-    aperture: Aperture = None,
-    channel: ChannelName = "g",
-    rows: Annotated[int, typer.Option(min=1, max=100, help="Rows of the grid of places.")] = 5,
-    cols: Annotated[int, typer.Option(min=1, max=100, help="Columns of the grid of places.")] = 7,
-    r: Annotated[
-        float | None, typer.Option(min=0.0, max=1.0, help="A single place: 0 center, 1 corner.")
+    profile: ProfileFile,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The file to write.")],
+    file_format: Annotated[
+        str | None,
+        typer.Option(
+            "--format",
+            metavar=f"<{'|'.join(exporters)}>",
+            help="Default: what the name of the file ends in.",
+        ),
     ] = None,
-    phi: Annotated[
-        float, typer.Option(help="Of a single place: radians, counter-clockwise from the right.")
-    ] = 0.0,
-    size: Annotated[int, typer.Option(min=3, max=255, help="Odd side in pixels.")] = 31,
+    aperture: Aperture = None,
+    channel: Channel = "g",
+    rows: Annotated[int, typer.Option(min=1, max=100, metavar="N", help="Rows of the grid of places.")] = 5,
+    cols: Annotated[
+        int, typer.Option(min=1, max=100, metavar="N", help="Columns of the grid of places.")
+    ] = 7,
+    r: Annotated[float | None, RADIUS] = None,
+    phi: Annotated[float | None, ANGLE] = None,
+    size: Size = 31,
     aspect: Aspect = 1.5,
-    json_output: Annotated[bool, typer.Option("--json", help="Say what was written as JSON.")] = False,
+    json_output: Json = False,
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = 0,
@@ -121,19 +136,21 @@ def export_psfs(
 
     Examples:
 
-        lensmodel export my-24mm.lensprofile --format tiff -o my-24mm.tif
+        lensmodel export my-24mm.lensprofile -o my-24mm.tif
 
         lensmodel export my-24mm.lensprofile --format json --r 0.9 --phi 0.6 -o corner-for-art.json
 
-        lensmodel export my-24mm.lensprofile --format csv --aperture 2 -o mtf.csv
+        lensmodel export my-24mm.lensprofile --aperture 2 -o mtf.csv
 
     Exit status: 0 written, 1 the profile cannot be used, 2 called wrongly.
     """
     shown = display.of(context, quiet=quiet, verbose=verbose)
+    written = _format(output, file_format)
     files.refuse_existing(output, force=force)
+    if phi is not None and r is None:
+        raise UsageError("--phi needs --r: together they name a single place")
     with files.as_usage():
-        exporters.create(file_format)
-    place = None if r is None else FieldPosition(r, phi)
+        place = None if r is None else FieldPosition(r, phi or 0.0)
     with shown.busy("asking the lens"):
         model = files.profile_at(profile).model
         psfs = psf_grid(
@@ -145,19 +162,35 @@ def export_psfs(
             aspect=aspect,
             at=place,
         )
-    export(output, psfs, file_format)
+    export(output, psfs, written)
     if json_output:
-        shown.document({"output": str(output), "format": file_format, "psfs": len(psfs.positions)})
+        shown.document({"output": str(output), "format": written, "psfs": len(psfs.positions)})
     else:
         shown.result(str(output))
 
 
-def _settings(model: LensModel, aperture: float | None, channel: str) -> LensSettings:
-    if channel not in CHANNELS:
-        raise UsageError(f"channel must be r, g or b, got {channel!r}")
-    named: Channel = channel
-    chosen = widest(model) if aperture is None else LensSettings(aperture=aperture)
-    return chosen.with_channel(named)
+def _format(output: Path, named: str | None) -> str:
+    """Tell the format by the option and by the ending of the file; they must not contradict each other."""
+    ending = format_of(output)
+    found = named or ending
+    if found is None:
+        raise UsageError(
+            f"no format for {output.name}; add --format, or give a name that ends in "
+            + ", ".join(f".{name}" for name in exporters)
+        )
+    with files.as_usage():
+        exporters.create(found)
+    if ending not in {None, found}:
+        raise UsageError(
+            f"{output.name} ends as {ending} does, but --format says {found}; change one of them"
+        )
+    return found
+
+
+def _settings(model: LensModel, aperture: float | None, channel: Channel) -> LensSettings:
+    with files.as_usage():
+        chosen = widest(model) if aperture is None else LensSettings(aperture=aperture)
+    return chosen.with_channel(channel)
 
 
 def _words(found: LensReport, wish: Advice, output: Path | None) -> str:

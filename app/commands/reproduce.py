@@ -14,7 +14,7 @@ import typer
 from app.commands import display
 from app.commands.failure import UsageError
 from app.commands.files import refuse_existing
-from app.commands.options import Force, Quiet, Verbose
+from app.commands.options import Estimator, Force, Quiet, Verbose
 
 if TYPE_CHECKING:
     from lensmodel.bench.reproduce import Case, DirectRoute, OpenRoute, Size
@@ -61,7 +61,7 @@ def reproduce(
     benchmark: Annotated[
         Path, typer.Option(help="Output of `lensmodel bench blind`: Fig. 1 where it is there.")
     ] = Path("bench-output"),
-    estimator: Annotated[str, typer.Option(help="Blind estimator of the calibration.")] = "default",
+    estimator: Estimator = "default",
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = 0,

@@ -2,7 +2,7 @@
 
 from lensmodel.report.advice import Advice, Wish, advice
 from lensmodel.report.decentring import Asymmetry, Decentring, decentring
-from lensmodel.report.exporters import Exporter, PsfGrid, export, exporters, psf_grid
+from lensmodel.report.exporters import Exporter, PsfGrid, export, exporters, format_of, psf_grid
 from lensmodel.report.lens_report import (
     ApertureRow,
     Curve,
@@ -35,6 +35,7 @@ __all__ = [
     "direction_in_words",
     "export",
     "exporters",
+    "format_of",
     "lens_report",
     "mtf_map_svg",
     "place_in_words",

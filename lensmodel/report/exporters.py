@@ -282,6 +282,12 @@ exporters: Registry[Exporter] = Registry(
 )
 
 
+def format_of(path: Path) -> str | None:
+    """Return the format that the name of a file ends in, None where that is no format of ours."""
+    ending = path.suffix.lower()
+    return next((name for name in exporters if ending in {f".{name}", exporters.create(name).suffix}), None)
+
+
 def export(path: Path | str, psfs: PsfGrid, file_format: str) -> None:
     """Write a grid in a format; the file appears complete or not at all.
 
@@ -336,6 +342,6 @@ def _astropy_fits() -> ModuleType:
         return importlib.import_module("astropy.io.fits")
     except ImportError as error:
         raise InvalidInputError(
-            "writing FITS needs astropy; install it with `pip install 'lensmodel[fits]'`, "
+            "writing FITS needs astropy; install it with `pip install '.[fits]'` in this program's folder, "
             "or export tiff instead"
         ) from error

@@ -95,7 +95,7 @@ def test_fits_without_astropy_names_the_remedy(
 ) -> None:
     monkeypatch.setitem(sys.modules, "astropy.io.fits", None)
 
-    with pytest.raises(InvalidInputError, match=r"pip install 'lensmodel\[fits\]'"):
+    with pytest.raises(InvalidInputError, match=r"pip install '\.\[fits\]'"):
         export(tmp_path / "psf.fits", psfs, "fits")
     assert list(tmp_path.iterdir()) == []
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import typer
 from rich.progress import Progress, TaskID
@@ -15,10 +15,13 @@ from app.commands import files
 from app.commands.display import Display
 from app.commands.failure import UsageError
 from lensmodel import blind, pipeline
-from lensmodel.errors import InvalidInputError, LensModelError
+from lensmodel.errors import InvalidInputError, LensModelError, MetadataMissingError
 from lensmodel.regression import LensModel, LensProfile, ModelSettings, save_profile
 from lensmodel.regression.answer import MICROMETRE, MIXED
 from lensmodel.types import LensSettings, StepHook
+
+_ZIP: Final = b"PK"
+"""How a profile begins, damaged or not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,16 +50,13 @@ def run(names: Sequence[str], target: Path, wishes: Wishes, display: Display, *,
         With 1 if a photo could not be used.
     """
     paths = files.photos(names)
+    _refuse(target, paths, wishes)
     with files.as_usage():
         blind.estimators.create(wishes.estimator)
         settings = LensSettings(aperture=wishes.aperture)
-    with files.as_usage():
         family = None if wishes.family is None else files.profile_at(wishes.family)
         chosen = ModelSettings(mode=wishes.mode or MIXED, unit=wishes.unit or MICROMETRE)
-    calibration = _Calibration(target, _known(target, force=wishes.force), wishes, settings, chosen)
-    if family is not None or wishes.no_family:
-        calibration.lean_on(family)
-    target.parent.mkdir(parents=True, exist_ok=True)
+    calibration = _Calibration(target, wishes, settings, chosen, family)
     results: list[dict[str, Any]] = []
     with display.progress() as bars:
         task = bars.add_task("", total=len(paths))
@@ -96,15 +96,19 @@ def run(names: Sequence[str], target: Path, wishes: Wishes, display: Display, *,
         raise typer.Exit(1)
 
 
-def _known(target: Path, *, force: bool) -> LensProfile | None:
+def _refuse(target: Path, photos: Sequence[Path], wishes: Wishes) -> None:
+    """Make sure that no photo is replaced, and that the options do not contradict each other."""
     if target.is_dir():
         raise UsageError(f"{target} is a folder; give the file of a lens profile")
-    if force or not target.exists():
-        return None
-    try:
-        return files.profile_at(target)
-    except InvalidInputError as error:
-        raise InvalidInputError(f"{error}; --force replaces the file") from error
+    # of `--profile holiday/*.dng` a shell makes a profile and photos
+    if target.suffix.lower() in files.SUFFIXES or any(files.same(target, path) for path in photos):
+        raise UsageError(
+            f"{target.name} is a photo; name a new file after --profile, for example my-24mm.lensprofile"
+        )
+    if wishes.family is not None and wishes.no_family:
+        raise UsageError("--family and --no-family exclude each other; give one of them")
+    if wishes.family is not None and files.same(target, wishes.family):
+        raise UsageError(f"{wishes.family} is the profile itself; give that of another copy after --family")
 
 
 def _show(bars: Progress, task: TaskID, number: int, event: pipeline.CalibrationEvent) -> None:
@@ -113,43 +117,33 @@ def _show(bars: Progress, task: TaskID, number: int, event: pipeline.Calibration
 
 
 class _Calibration:
-    """A profile that grows, and the file that keeps up with it."""
+    """A profile that grows, and the file that keeps up with it.
+
+    Another run may add to the same file meanwhile: before each look at the profile it is read again
+    if it changed, so that no run drops what another one learned.
+    """
 
     def __init__(
         self,
         target: Path,
-        profile: LensProfile | None,
         wishes: Wishes,
         settings: LensSettings,
         chosen: ModelSettings,
+        family: LensProfile | None,
     ) -> None:
-        self.profile = profile
+        self.profile: LensProfile | None = None
         self._target, self._wishes, self._settings, self._chosen = target, wishes, settings, chosen
-        self._grown = False
-        if profile is not None:
-            model = profile.model.answering(mode=wishes.mode, unit=wishes.unit)
-            self.profile, self._grown = replace(profile, model=model), model is not profile.model
-        self._family: LensProfile | None = None
-
-    def lean_on(self, family: LensProfile | None) -> None:
-        """Start from the profile of another copy where this one has seen little; None no longer does."""
-        self._family = family
-        if self.profile is not None:
-            self.profile = replace(self.profile, model=self._leaning(self.profile.model))
-            self._grown = True
-
-    def _leaning(self, model: LensModel) -> LensModel:
-        if self._family is None:
-            return model.with_prior(None)
-        lens = self._family.lens
-        name = " ".join(lens[key] for key in ("maker", "model", "serial") if lens.get(key))
-        return model.with_prior(self._family.model, name=name or "another copy")
+        self._family, self._grown = family, False
+        self._seen = _stamp(target) if wishes.force else None
+        self._follow()
 
     def finish(self, on_step: StepHook) -> None:
         """Fit what takes long and need be done only once, when all photos are in."""
+        self._follow()
         if self.profile is not None and self._grown:
-            self.profile = replace(self.profile, model=self.profile.model.warmed(on_step))
-            save_profile(self._target, self.profile)
+            whole = replace(self.profile, model=self.profile.model.warmed(on_step))
+            if _stamp(self._target) == self._seen:  # else another run goes on, and fits it at its own end
+                self._save(whole)
 
     def add(self, path: Path, on_event: pipeline.EventHook) -> dict[str, Any]:
         """Learn from one photo; say what became of it."""
@@ -158,25 +152,83 @@ class _Calibration:
                 "it was corrected already and tells nothing of the lens; give the original"
             )
         key = pipeline.photo_id(path)
-        names = dict(self.profile.photos) if self.profile else {}
-        if key in names:
+        if self._has(key):
             return {"state": "known"}
-        lens = dict(self.profile.lens) if self.profile else {}
         seen = files.identity(path)
-        if not self._wishes.any_lens:
-            files.refuse_other_lens(lens, seen, "give it a profile of its own, or add --any-lens")
+        self._refuse_other_lens(seen)
+        says_aperture = files.says_aperture(path)
+        if not says_aperture and self._settings.aperture is None:
+            raise MetadataMissingError("it does not say its aperture; add it, for example --aperture 2.8")
         samples = pipeline.samples_of_photo(
             path,
-            settings=None if files.says_aperture(path) else self._settings,
+            settings=None if says_aperture else self._settings,
             estimator=self._wishes.estimator,
             workers=self._wishes.workers,
             on_event=on_event,
         )
-        if self.profile is not None:
-            model = self.profile.model.added(samples)
+        if self._has(key):
+            return {"state": "known"}
+        self._refuse_other_lens(seen)
+        if self.profile is None:
+            grown = LensProfile(self._leaning(LensModel.fit(samples, self._chosen)), seen, {key: path.name})
         else:
-            model = self._leaning(LensModel.fit(samples, self._chosen))
-        grown = LensProfile(model, seen | lens, {**names, key: path.name})
-        save_profile(self._target, grown)
-        self.profile, self._grown = grown, True
+            known = self.profile
+            grown = LensProfile(
+                known.model.added(samples), seen | known.lens, {**known.photos, key: path.name}
+            )
+        self._save(grown)
+        self._grown = True
         return {"state": "counted", "samples": len(samples)}
+
+    def _has(self, photo: str) -> bool:
+        self._follow()
+        return self.profile is not None and photo in self.profile.photos
+
+    def _refuse_other_lens(self, seen: dict[str, str]) -> None:
+        if self.profile is not None and not self._wishes.any_lens:
+            remedy = "give it a profile of its own, or add --any-lens"
+            files.refuse_other_lens(self.profile.lens, seen, remedy)
+
+    def _follow(self) -> None:
+        """Read the profile if it is not as this run left it, and make it answer as was wished."""
+        stamp = _stamp(self._target)
+        if stamp in {None, self._seen}:
+            return
+        profile = _opened(self._target)
+        model = self._leaning(profile.model.answering(mode=self._wishes.mode, unit=self._wishes.unit))
+        self.profile, self._seen = replace(profile, model=model), stamp
+        self._grown = self._grown or model is not profile.model
+
+    def _leaning(self, model: LensModel) -> LensModel:
+        """Start from the profile of another copy where this one has seen little, if that was wished."""
+        if self._wishes.no_family:
+            return model.with_prior(None)
+        if self._family is None:
+            return model
+        lens = self._family.lens
+        name = " ".join(lens[key] for key in ("maker", "model", "serial") if lens.get(key))
+        return model.with_prior(self._family.model, name=name or "another copy")
+
+    def _save(self, profile: LensProfile) -> None:
+        self._target.parent.mkdir(parents=True, exist_ok=True)
+        save_profile(self._target, profile)
+        self.profile, self._seen = profile, _stamp(self._target)
+
+
+def _opened(target: Path) -> LensProfile:
+    try:
+        return files.profile_at(target)
+    except InvalidInputError as error:
+        with target.open("rb") as file:
+            damaged = file.read(len(_ZIP)) == _ZIP
+        remedy = "--force replaces the file" if damaged else "name a new file after --profile"
+        raise InvalidInputError(f"{error}; {remedy}") from error
+
+
+def _stamp(path: Path) -> tuple[int, int, int] | None:
+    """What changes when a file is replaced; None where there is none."""
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return None
+    return found.st_ino, found.st_size, found.st_mtime_ns

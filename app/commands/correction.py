@@ -99,7 +99,8 @@ def _targets(paths: Sequence[Path], output: Path, extension: str) -> dict[Path, 
         target = output / f"{path.stem}{files.CORRECTED}{extension}"
         if target in found:
             raise UsageError(
-                f"{found[target]} and {path} would both become {target}; correct them into different folders"
+                f"{found[target]} and {path} would both become {target}; "
+                "name each by itself, and correct them into different folders"
             )
         found[target] = path
     return found

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from app.commands.failure import UsageError
+from app.identity import name_key, serial_key
 from lensmodel.errors import InvalidInputError
 from lensmodel.photo import inspect
 from lensmodel.regression import LensProfile, load_profile
@@ -41,8 +42,7 @@ RAW: Final = frozenset(
         ".mos",
     ]
 )
-JPEG: Final = frozenset({".jpg", ".jpeg"})
-SUFFIXES: Final = RAW | JPEG | {".tif", ".tiff", ".png"}
+SUFFIXES: Final = RAW | {".jpg", ".jpeg", ".tif", ".tiff", ".png"}
 CORRECTED: Final = "-corrected"
 """Ends the names of what `lensmodel correct` wrote."""
 
@@ -50,8 +50,8 @@ CORRECTED: Final = "-corrected"
 def photos(names: Iterable[str]) -> list[Path]:
     """Turn files, folders and patterns into a list of photos without repeats.
 
-    Of folders and patterns, corrected photos are left out, and JPEG files beside a RAW file of the
-    same name, which show the same exposure again.
+    Of folders and patterns, corrected photos are left out, and what is no RAW file beside a RAW file
+    of the same name, which shows the same exposure again.
 
     Raises
     ------
@@ -84,7 +84,12 @@ def photos(names: Iterable[str]) -> list[Path]:
 def _sources(found: Iterable[Path]) -> list[Path]:
     given = sorted(p for p in found if not p.stem.endswith(CORRECTED))
     raw = {p.with_suffix("") for p in given if p.suffix.lower() in RAW}
-    return [p for p in given if p.suffix.lower() not in JPEG or p.with_suffix("") not in raw]
+    return [p for p in given if p.suffix.lower() in RAW or p.with_suffix("") not in raw]
+
+
+def same(one: Path, other: Path) -> bool:
+    """Tell whether two names are of one file."""
+    return one.exists() and other.exists() and one.samefile(other)
 
 
 def profile_at(path: Path) -> LensProfile:
@@ -119,7 +124,7 @@ def says_aperture(path: Path) -> bool:
 
 
 def refuse_other_lens(known: dict[str, str], seen: dict[str, str], remedy: str) -> None:
-    """Compare two lenses as far as both are named.
+    """Compare two lenses as far as both are named, by the rule of the service.
 
     Raises
     ------
@@ -127,7 +132,8 @@ def refuse_other_lens(known: dict[str, str], seen: dict[str, str], remedy: str) 
         If they differ.
     """
     for name, value in seen.items():
-        if known.get(name, value) != value:
+        key = serial_key if name == "serial" else name_key
+        if key(known.get(name, value)) != key(value):
             raise InvalidInputError(
                 f"it was taken with another lens, {name} {value}, "
                 f"and the profile is of {name} {known[name]}; {remedy}"

@@ -75,8 +75,8 @@ def calibrate(
     """Learn the blur of one lens from photos, into a profile.
 
     A profile that exists is added to. Photos that it has seen are skipped, and it is saved after
-    each photo: a run that was stopped goes on where it was. In folders, the camera's JPEG beside a
-    RAW file of the same name is passed over, and so are corrected photos.
+    each photo: a run that was stopped goes on where it was. In folders, JPEG, TIFF and PNG files
+    beside a RAW file of the same name are passed over, and so are corrected photos.
 
     Examples:
 

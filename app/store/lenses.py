@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -10,6 +9,7 @@ from typing import Any, Literal
 from sqlalchemy import delete, func, select, update
 from sqlalchemy.orm import Session
 
+from app.identity import name_key, serial_key
 from app.ids import new_id
 from app.store.database import Database, insert_new
 from app.store.owners import find, find_to_change, now, owned
@@ -29,17 +29,13 @@ class LensName:
 
 
 def identity_key(maker: str | None, model: str | None, serial: str | None) -> str:
-    """Return the key by which two photos are known to show the same copy.
-
-    Case, punctuation and blanks differ between programs that write the same name; the serial
-    keeps its punctuation, since it may be all that tells two copies apart.
-    """
-    return f"{kind_key(maker, model)}|{(serial or '').strip().casefold()}"
+    """Return the key by which two photos are known to show the same copy."""
+    return f"{kind_key(maker, model)}|{serial_key(serial)}"
 
 
 def kind_key(maker: str | None, model: str | None) -> str:
     """Return the key by which two lenses are known to be of one kind, see `identity_key`."""
-    return "|".join(re.sub(r"[\W_]+", "", (text or "").casefold()) for text in (maker, model))
+    return f"{name_key(maker)}|{name_key(model)}"
 
 
 def lens_of_photo(session: Session, photo: PhotoRow, *, single_copy: bool) -> LensRow | None:

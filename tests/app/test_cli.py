@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,8 @@ from scipy import ndimage
 from typer.testing import CliRunner
 
 from app.cli import app, main
+from app.commands.files import refuse_other_lens
+from lensmodel.errors import InvalidInputError
 from lensmodel.psf import PsfSample, gaussian
 from lensmodel.regression import LensModel, LensProfile, load_profile, save_profile
 from lensmodel.types import FieldPosition, LensSettings
@@ -208,8 +211,9 @@ def test_corrected_dng_opens_as_raw(folder: Path, here: Here) -> None:
         assert raw.sizes.width > 400
 
 
-def test_folders_pass_over_corrected_photos_and_the_jpeg_beside_a_raw_file(folder: Path, here: Here) -> None:
-    Image.fromarray(_picture()).save(folder / "one.jpg")
+def test_folders_pass_over_corrected_photos_and_what_was_made_of_a_raw_file(folder: Path, here: Here) -> None:
+    for name in ("one.jpg", "one.tif"):
+        Image.fromarray(_picture()).save(folder / name)
     Image.fromarray(_picture()).save(folder / "one-corrected.tif")
     done = here("correct", ".", "-p", PROFILE, "-o", "out", "--method", "fast", "--json")
 
@@ -243,6 +247,38 @@ def test_psf_writes_files_that_open(folder: Path, suffix: str) -> None:
     assert shape == (15, 15)
 
 
+def test_two_runs_on_one_profile_drop_nothing_of_each_other(
+    folder: Path, made: Path, here: Here, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def estimated(path: Path, **options: Any) -> list[PsfSample]:
+        known = load_profile(folder / PROFILE)  # the other run saves while this one estimates
+        save_profile(folder / PROFILE, replace(known, photos={**known.photos, "fedcba9876543210": "y.dng"}))
+        return [PsfSample(gaussian(15, np.eye(2)), FieldPosition(0.5, 0.0), LensSettings(2.8), photo="z")]
+
+    monkeypatch.setattr("lensmodel.pipeline.samples_of_photo", estimated)
+    done = here("calibrate", "one.dng", "-p", PROFILE)
+
+    assert done.returncode == 0, done.stderr
+    assert sorted(load_profile(folder / PROFILE).photos.values()) == ["one.dng", "x.dng", "y.dng"]
+
+
+def test_a_photo_that_does_not_count_leaves_no_trace(folder: Path, here: Here) -> None:
+    Image.fromarray(_picture()).save(folder / "scan.png")
+    done = here("calibrate", "scan.png", "-p", "no/such/lens.lensprofile")
+
+    assert done.returncode == 1
+    assert done.stderr.startswith("lensmodel: scan.png: it does not say its aperture")
+    assert not (folder / "no").exists()
+
+
+def test_a_lens_is_known_however_a_program_writes_its_name() -> None:
+    known = {"maker": "Canon", "model": "EF24mm f/1.4L II USM", "serial": "ab-1"}
+    refuse_other_lens(known, {"maker": "CANON", "model": "EF 24mm F1.4L II USM", "serial": "AB-1 "}, "")
+
+    with pytest.raises(InvalidInputError, match="serial AB1"):
+        refuse_other_lens(known, {"serial": "AB1"}, "")
+
+
 # --- refusals ----------------------------------------------------------------------------------
 
 REFUSED = {
@@ -254,6 +290,27 @@ REFUSED = {
     "no profile": (["correct", "one.dng", "-p", "gone", "-o", "out"], 2, "no lens profile at gone; make it"),
     "bad profile": (["correct", "one.dng", "-p", "bad", "-o", "out"], 1, "bad is no lens profile"),
     "bad profile to add to": (["calibrate", "one.dng", "-p", "bad"], 1, "bad is no lens profile.*--force"),
+    "profile is a photo": (
+        ["calibrate", "one.dng", "-p", "sub/one.dng", "--force"],
+        2,
+        "one.dng is a photo; name a new file after --profile",
+    ),
+    "profile is the photo": (["calibrate", "there.npy", "-p", "there.npy", "--force"], 2, "npy is a photo"),
+    "no profile to add to": (
+        ["calibrate", "one.dng", "-p", "there.npy"],
+        1,
+        "no lens profile.*new file after",
+    ),
+    "family and none": (
+        ["calibrate", "one.dng", "-p", "n", "--family", PROFILE, "--no-family"],
+        2,
+        "exclude",
+    ),
+    "family of itself": (
+        ["calibrate", "one.dng", "-p", PROFILE, "--family", PROFILE],
+        2,
+        "the profile itself",
+    ),
     "profile is a folder": (["calibrate", "one.dng", "-p", "empty"], 2, "empty is a folder"),
     "output is a file": (["correct", "one.dng", "-p", PROFILE, "-o", "bad"], 2, "bad is a file"),
     "negative halo": (["correct", "one.dng", "-p", PROFILE, "-o", "o", "--halo", "-1"], 2, "must not be neg"),
@@ -262,18 +319,32 @@ REFUSED = {
         2,
         "halo must not be negative.*nan",
     ),
+    "nearly a format": (
+        ["correct", "one.dng", "-p", PROFILE, "-o", "o", "--format", "tiff"],
+        2,
+        "must be tiff16, .* or dng, got 'tiff'; did you mean tiff16",
+    ),
     "unknown method": (["correct", "one.dng", "-p", PROFILE, "-o", "o", "--method", "x"], 2, "known: .*fast"),
     "unknown estimator": (["calibrate", "one.dng", "-p", "new", "--estimator", "x"], 2, "known: .*whittle"),
     "aperture": (["calibrate", "one.dng", "-p", "new", "--aperture", "-2"], 2, "-2"),
     "same name twice": (["correct", "one.dng", "sub/one.dng", "-p", PROFILE, "-o", "o"], 2, "would both"),
     "even size": (["psf", PROFILE, "--size", "20"], 2, "must be odd, got 20"),
     "psf file there": (["psf", PROFILE, "-o", "there.npy"], 2, "there.npy is there already; --force"),
+    "degrees": (["psf", PROFILE, "--phi", "90"], 2, "--phi is in radians; 90 degrees are 1.571"),
+    "aperture in words": (["psf", PROFILE, "--aperture", "wide"], 2, "such as 2.8 or f/2.8, got 'wide'"),
     "psf format": (["psf", PROFILE, "-o", "psf.xyz"], 2, "psf.xyz"),
     "quick and full": (["reproduce", "--quick", "--full"], 2, "exclude each other"),
     "noise in words": (["bench", "blind", "--noise", "much"], 2, "numbers such as 0.01,0.003, got 'much'"),
     "unknown half": (["bench", "blind", "--half", "x"], 2, "half must be one of .*got 'x'"),
     "report there": (["report", PROFILE, "-o", "reported"], 2, "mtf.csv is there already; --force"),
     "export format": (["export", PROFILE, "-o", "new.bmp", "--format", "bmp"], 2, "known: csv, fits, json"),
+    "export by no format": (["export", PROFILE, "-o", "new.bmp"], 2, "ends in .csv, .fits, .json"),
+    "export by two formats": (
+        ["export", PROFILE, "-o", "new.fits", "--format", "tiff"],
+        2,
+        "fits does, .* tiff",
+    ),
+    "half a place": (["export", PROFILE, "-o", "new.csv", "--phi", "1"], 2, "--phi needs --r"),
     "report of nothing": (["report", "gone"], 2, "no lens profile at gone; make it"),
     "demo into a file": (["demo", "-o", "bad"], 2, "bad is a file"),
     "demo by no estimator": (["demo", "--estimator", "x"], 2, "no estimator 'x'; known: .*default"),

@@ -45,7 +45,7 @@ class Settings(BaseSettings):
     )
 
     host: str = Field(default="127.0.0.1", description="Address to listen on.")
-    port: int = Field(default=8000, ge=0, le=65535)
+    port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 takes any free one.")
     auth: Literal["none"] = Field(
         default="none", description="Who may ask: none = anybody who reaches the port."
     )
@@ -75,10 +75,18 @@ class Settings(BaseSettings):
     sweep_seconds: float = Field(
         default=0.5, gt=0, description="How often a worker looks for new work in the tables."
     )
-    inspect_seconds: float = Field(default=20.0, gt=0)
-    develop_seconds: float = Field(default=180.0, gt=0)
-    patch_seconds: float = Field(default=600.0, gt=0)
-    correct_seconds: float = Field(default=3600.0, gt=0)
+    inspect_seconds: float = Field(
+        default=20.0, gt=0, description="Longest that reading the header of a photo may take."
+    )
+    develop_seconds: float = Field(
+        default=180.0, gt=0, description="Longest that developing a photo may take."
+    )
+    patch_seconds: float = Field(
+        default=600.0, gt=0, description="Longest that estimating one patch may take."
+    )
+    correct_seconds: float = Field(
+        default=3600.0, gt=0, description="Longest that correcting a photo may take."
+    )
 
     patches: int = Field(default=24, ge=1, le=1000, description="Patches that are used of one photo.")
     min_good_patches: int = Field(default=1, ge=1, description="Fewer than this and the photo fails.")
@@ -104,8 +112,12 @@ class Settings(BaseSettings):
     model_cache_mb: int = Field(
         default=1024, ge=1, description="Memory for fitted lens models in one process, in MiB."
     )
-    long_poll_seconds: float = Field(default=20.0, ge=0, le=60)
-    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    long_poll_seconds: float = Field(
+        default=20.0, ge=0, le=60, description="Longest that a question for a job waits for a change of it."
+    )
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        default="info", description="Least that is logged."
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -143,6 +155,11 @@ class Settings(BaseSettings):
             raise ValueError(
                 "a database server means several machines, but storage_url is a folder of one: "
                 "use s3://..., or set LENS_SHARED_FILESYSTEM=true where all machines see that folder"
+            )
+        if many and not self.jobs_url:
+            raise ValueError(
+                "a database server means several machines, but the jobs would be in a file of each: "
+                "set LENS_JOBS_URL to a database of that server"
             )
         return self
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -62,7 +63,7 @@ def serve(port: Port = None, host: Host = None, data: Data = None) -> None:
     typer.echo("lensmodel is starting ...", err=True)
     from app import supervisor  # noqa: PLC0415 - only this command needs the service
 
-    raise typer.Exit(supervisor.serve(settings, host=settings.host, port=settings.port))
+    raise typer.Exit(supervisor.serve(settings))
 
 
 def api(port: Port = None, host: Host = None, data: Data = None) -> None:
@@ -95,14 +96,17 @@ def config(
 
     Exit status: 0 printed, 2 a setting is wrong.
     """
-    from urllib.parse import urlsplit  # noqa: PLC0415 - only this command needs it
+    from app.settings import PREFIX  # noqa: PLC0415 - only these commands need the service
 
-    shown = {f"LENS_{n.upper()}": v for n, v in sorted(_settings(data).model_dump(mode="json").items())}
-    for name, value in shown.items():
-        if name.endswith("_URL") and (password := urlsplit(str(value)).password):
-            shown[name] = str(value).replace(f":{password}@", ":********@")
+    settings = _settings(data)
+    # up to the last @: a password may hold any sign, and need not be quoted everywhere
+    shown = {
+        name: re.sub(r"(://[^:/@]*):.*@", r"\1:********@", value) if isinstance(value, str) else value
+        for name, value in sorted(settings.model_dump(mode="json").items())
+    }
     if json_output:
-        typer.echo(json.dumps(shown, indent=2))
+        typer.echo(json.dumps({f"{PREFIX}{name.upper()}": value for name, value in shown.items()}, indent=2))
         return
     for name, value in shown.items():
-        typer.echo(f"{name}={value}")
+        typer.echo(f"# {type(settings).model_fields[name].description}")
+        typer.echo(f"{PREFIX}{name.upper()}={value}")

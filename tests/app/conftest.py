@@ -104,6 +104,7 @@ def settings(tmp_path: Path) -> Settings:
     return Settings(
         data_dir=tmp_path / "data",
         database_url=SERVER,
+        jobs_url=f"sqlite:///{tmp_path / 'data' / 'jobs.db'}",
         shared_filesystem=True,
         long_poll_seconds=2.0,
         min_free_mb=0,

@@ -15,13 +15,14 @@ from pathlib import Path
 import httpx2
 
 from app.client import Client
+from lensmodel.errors import LensModelError
 
 _START_SECONDS = 90.0
 _STOP_SECONDS = 40.0
 
 
-class ServiceDidNotStartError(Exception):
-    """The service was not ready in time; the text says where its log is."""
+class ServiceDidNotStartError(LensModelError):
+    """The service ended, or was not ready in time; the text says where its log is."""
 
 
 @contextmanager
@@ -68,4 +69,6 @@ def _ready(process: subprocess.Popen[bytes], data: Path, log_file: Path) -> str:
         except (OSError, ValueError, KeyError, httpx2.HTTPError):
             pass  # not there yet: asked again until the time is up
         time.sleep(0.2)
-    raise ServiceDidNotStartError(f"the service was not ready within {_START_SECONDS:g} s; see {log_file}")
+    status = process.poll()
+    became = f"was not ready within {_START_SECONDS:g} s" if status is None else f"ended with status {status}"
+    raise ServiceDidNotStartError(f"the service {became}; {log_file} says why")

@@ -21,7 +21,14 @@ GRACE_S: Final = 5
 
 
 def run(settings: Settings, listener: socket.socket) -> None:
-    """Serve until SIGTERM, or until the supervisor is gone."""
+    """Serve until SIGTERM, or until the supervisor is gone; log as a service does."""
+    logging.basicConfig(
+        level=settings.log_level.upper(),
+        format="%(asctime)s %(levelname)s api %(name)s: %(message)s",
+        stream=sys.stderr,
+        force=True,  # in place of what the command line set up
+    )
+    logging.getLogger("alembic").setLevel(logging.WARNING)  # it tells of every look at the schema
     from app.main import create_app  # noqa: PLC0415 - the supervisor need not load the application
 
     config = uvicorn.Config(
@@ -62,12 +69,6 @@ def listen(host: str, port: int) -> socket.socket:
 def main() -> None:
     """Serve on the socket that the environment names."""
     settings = Settings()
-    logging.basicConfig(
-        level=settings.log_level.upper(),
-        format="%(asctime)s %(levelname)s api %(name)s: %(message)s",
-        stream=sys.stderr,
-    )
-    logging.getLogger("alembic").setLevel(logging.WARNING)  # it tells of every look at the schema
     number = os.environ.pop(SOCKET, None)
     listener = listen(settings.host, settings.port) if number is None else socket.socket(fileno=int(number))
     run(settings, listener)

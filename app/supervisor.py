@@ -25,13 +25,13 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
-from pydantic import ValidationError
-
 from app import server
+from app.commands.failure import UsageError
 from app.jobs.lifeline import VARIABLE as LIFELINE
 from app.settings import PREFIX, Settings
 from app.store import migrate
 from app.store.database import Database
+from lensmodel.errors import InvalidInputError
 
 log = logging.getLogger(__name__)
 
@@ -45,28 +45,27 @@ MAX_EARLY_DEATHS: Final = 6
 ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
-def serve(settings: Settings, host: str | None = None, port: int | None = None) -> int:
-    """Run the whole service until SIGTERM or Ctrl-C; return the exit status."""
-    try:
-        chosen = _with_address(settings, host, port)
-        chosen.data_dir.mkdir(parents=True, exist_ok=True)
-        with _alone(chosen.data_dir), contextlib.closing(server.listen(chosen.host, chosen.port)) as listener:
-            _migrate(chosen)
-            return _Supervisor(chosen, listener).run()
-    except (ValidationError, _TakenError) as error:
-        print(f"lensmodel: {error}", file=sys.stderr)  # noqa: T201 - what a person at the terminal must know
-        return 2
-    except OSError as error:
-        print(f"lensmodel: cannot listen on {host}:{port}: {error}; try --port 0", file=sys.stderr)  # noqa: T201
-        return 1
+def serve(settings: Settings) -> int:
+    """Run the whole service until SIGTERM or Ctrl-C; return the exit status.
+
+    Raises
+    ------
+    UsageError
+        If another service works on the same data.
+    InvalidInputError
+        If the address cannot be listened on, or the database is of a newer program.
+    """
+    settings.data_dir.mkdir(parents=True, exist_ok=True)
+    with _alone(settings.data_dir), contextlib.closing(_listener(settings)) as listener:
+        _migrate(settings)
+        return _Supervisor(settings, listener).run()
 
 
-def run_api(settings: Settings, host: str | None = None, port: int | None = None) -> None:
+def run_api(settings: Settings) -> None:
     """Run one API process in this process."""
-    chosen = _with_address(settings, host, port)
-    _migrate(chosen)
-    with contextlib.closing(server.listen(chosen.host, chosen.port)) as listener:
-        server.run(chosen, listener)
+    _migrate(settings)
+    with contextlib.closing(_listener(settings)) as listener:
+        server.run(settings, listener)
 
 
 def run_worker(settings: Settings) -> None:
@@ -96,15 +95,14 @@ def environment(settings: Settings) -> dict[str, str]:
     return {f"{PREFIX}{name.upper()}": str(value) for name, value in values.items()}
 
 
-def _with_address(settings: Settings, host: str | None, port: int | None) -> Settings:
-    values = settings.model_dump()
-    values["host"] = settings.host if host is None else host
-    values["port"] = settings.port if port is None else port
-    return Settings(**values)
-
-
-class _TakenError(Exception):
-    """Another service works on the same data."""
+def _listener(settings: Settings) -> socket.socket:
+    try:
+        return server.listen(settings.host, settings.port)
+    except OSError as error:
+        raise InvalidInputError(
+            f"cannot listen on {settings.host}:{settings.port}: {error.strerror or error}; "
+            "give another --port (0 takes any free one) or --host"
+        ) from error
 
 
 @contextmanager
@@ -114,7 +112,7 @@ def _alone(data_dir: Path) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise _TakenError(
+            raise UsageError(
                 f"another service already works on {data_dir}: stop it, or give another folder by --data"
             ) from error
         yield

@@ -15,6 +15,7 @@ from sqlalchemy import Connection, text
 
 import migrations
 from app.store.database import Database
+from lensmodel.errors import InvalidInputError
 
 _LOCK = 0x1E45  # any number that only this program uses
 
@@ -48,10 +49,19 @@ def upgrade(database: Database) -> bool:
 
     Only one process at a time gets in; the others wait and then find nothing left to do. A
     SQLite file that holds data is copied first, beside itself.
+
+    Raises
+    ------
+    InvalidInputError
+        If a newer program made the database.
     """
-    if is_current(database):
+    before, steps = current(database), ScriptDirectory.from_config(config())
+    if before == steps.get_current_head():
         return False
-    before = current(database)
+    if before is not None and before not in {step.revision for step in steps.walk_revisions()}:
+        raise InvalidInputError(
+            f"the database was made by a newer program, schema {before}; update lensmodel, or use other data"
+        )
     if database.is_sqlite and before is not None:
         _copy(database.path, before)
     with _alone(database) as connection:

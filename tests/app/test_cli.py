@@ -9,6 +9,7 @@ import pty
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -391,6 +392,35 @@ def test_unknown_options_and_settings_are_wrong_usage(folder: Path, monkeypatch:
 
     assert option.returncode == setting.returncode == 2
     assert "did you mean LENS_PORT" in one_sentence(setting.stderr)
+
+
+def test_the_settings_are_told_with_what_they_mean_and_without_passwords(
+    here: Here, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("DATABASE", "JOBS"):
+        monkeypatch.setenv(f"LENS_{name}_URL", "postgresql+psycopg://lens:a[b@c/d@db:5432/lens")
+    monkeypatch.setenv("LENS_STORAGE_URL", "s3://lensmodel")
+    lines = here("config").stdout.splitlines()
+
+    assert "LENS_DATABASE_URL=postgresql+psycopg://lens:********@db:5432/lens" in lines
+    assert lines[lines.index("LENS_PORT=8000") - 1] == "# Port to listen on; 0 takes any free one."
+    assert not [line for line in lines if "a[b" in line or "None" in line]
+
+
+@pytest.mark.parametrize("part", ["serve", "api"])
+def test_a_taken_port_is_told_as_such(part: str, here: Here) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        done = here(part, "--port", str(taken.getsockname()[1]), "--data", "data")
+
+    assert done.returncode == 1
+    assert re.search("cannot listen on 127.0.0.1:.* give another --port", done.stderr.splitlines()[-1])
+
+
+def test_the_api_alone_logs_as_much_as_its_setting_says(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LENS_LOG_LEVEL", "info")
+    monkeypatch.setattr("uvicorn.Server.run", lambda *_, **__: logging.getLogger("app").info("GET /readyz"))
+
+    assert "INFO api app: GET /readyz" in here("api", "--port", "0", "--data", "data").stderr
 
 
 # --- what is there already ---------------------------------------------------------------------

@@ -17,6 +17,7 @@ from app.store.corrections import Result
 from app.store.database import Database
 from app.store.migrate import current, downgrade, head, is_current, upgrade
 from app.tables import Base
+from lensmodel.errors import InvalidInputError
 from lensmodel.psf import gaussian
 
 OWNER = "local"
@@ -400,3 +401,16 @@ def test_an_unknown_estimator_is_refused_with_the_known_ones() -> None:
 def test_a_database_server_needs_shared_storage() -> None:
     with pytest.raises(ValueError, match="s3://"):
         Settings(database_url="postgresql+psycopg://db/lens")
+
+
+def test_a_database_server_needs_jobs_that_all_machines_see() -> None:
+    with pytest.raises(ValueError, match="LENS_JOBS_URL"):
+        Settings(database_url="postgresql+psycopg://db/lens", storage_url="s3://lensmodel")
+
+
+def test_a_database_of_a_newer_program_is_refused(store: Store) -> None:
+    with store.database.writer.begin() as connection:
+        connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
+
+    with pytest.raises(InvalidInputError, match="newer program, schema 9999"):
+        upgrade(store.database)

@@ -34,6 +34,7 @@ Query: TypeAlias = Mapping[str, str | int | float | bool | None]
 
 DEFAULT_URL: Final = "http://127.0.0.1:8000"
 LONG_POLL_SECONDS: Final = 20
+PAUSE_SECONDS: Final = 0.1
 ANSWER_SECONDS: Final = 60.0
 FINAL: Final = {"succeeded", "failed", "cancelled"}
 
@@ -205,6 +206,7 @@ class Client:
                 raise JobPatienceError(
                     f"job {job_id} did not end within {timeout:g} s: wait longer or cancel it"
                 )
+            time.sleep(PAUSE_SECONDS)  # a service may be set to answer at once
 
     def lenses(self, *, model: str | None = None, serial: str | None = None) -> list[s.LensOut]:
         """Return all lenses, newest first, optionally of one model or serial."""

@@ -11,11 +11,14 @@ import pytest
 from starlette.testclient import TestClient
 
 from app.client import Client, JobEndedError, JobPatienceError, ServiceProblemError
+from app.main import create_app
+from app.own_service import own_service
 from app.schemas import JobOut
 from app.settings import Settings
 from app.storage import Storage
 from app.store import Store
 from app.store.corrections import Result
+from lensmodel.errors import LensModelError
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 
@@ -83,6 +86,30 @@ def test_waiting_for_a_failed_or_stuck_job_raises_why(api: Client, steps: Steps,
     with pytest.raises(JobPatienceError, match=slow.public_id):
         api.wait(slow.public_id, timeout=0.2)
     assert api.cancel(slow.public_id).state == "cancelled"
+
+
+def test_waiting_leaves_a_service_in_peace_that_answers_at_once(steps: Steps, settings: Settings) -> None:
+    photo = steps.receive()
+    hasty = settings.model_copy(update={"long_poll_seconds": 0.0})
+    asked: list[httpx2.Request] = []
+    with TestClient(create_app(hasty)) as http:
+        http.event_hooks["request"].append(asked.append)
+        with pytest.raises(JobPatienceError):
+            Client(http=http).wait(photo.public_id, timeout=0.5)
+
+    assert 2 <= len(asked) <= 7
+
+
+def test_a_service_that_does_not_start_is_told_with_its_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.executable", "false")
+
+    with (
+        pytest.raises(LensModelError, match=r"ended with status 1; .*service.log says why"),
+        own_service(tmp_path / "data", tmp_path / "service.log"),
+    ):
+        pass
 
 
 def test_a_lens_is_asked_for_its_psf(api: Client, steps: Steps) -> None:

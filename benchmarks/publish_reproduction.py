@@ -122,15 +122,15 @@ def main() -> None:
     parser.add_argument("figures", type=Path)
     parser.add_argument("--lenses", type=int, default=3, help="so many lenses keep their pictures")
     asked = parser.parse_args()
-    result = json.loads(asked.figures.read_text(encoding="utf-8"))
-    cases = result["cases"]
-    count = page(asked.folder, {case["name"] for case in cases[: asked.lenses]})
-    picture(asked.folder, cases[0])
     readme = ROOT / "README.md"
     before, _, rest = readme.read_text(encoding="utf-8").partition(BEGIN)
     _, found, after = rest.partition(END)
     if not found:
         parser.error(f"README.md has no lines {BEGIN} and {END}")
+    result = json.loads(asked.figures.read_text(encoding="utf-8"))
+    cases = result["cases"]
+    count = page(asked.folder, {case["name"] for case in cases[: asked.lenses]})
+    picture(asked.folder, cases[0])
     words = f"Means over {len(cases)} simulated lenses; MTF50 in line pairs per picture height, PSNR in dB."
     readme.write_text(f"{before}{BEGIN}\n{table(cases)}\n\n{words}\n{END}{after}", encoding="utf-8")
     print(f"{count} pictures; {PAGE / 'reproduction.md'}, {PICTURE}, {readme}")

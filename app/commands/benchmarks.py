@@ -150,7 +150,7 @@ def blind(
 def _blind(settings: BlindBenchmark, workers: int, output: Path, shown: Display) -> BlindReport:
     from lensmodel.bench.blind import run_blind_benchmark  # noqa: PLC0415 - see the top of the module
 
-    with shown.progress() as bars:
+    with as_usage(), shown.progress() as bars:
         task = bars.add_task("cases", total=None)
         return run_blind_benchmark(
             settings,
@@ -223,7 +223,7 @@ def _model(
 ) -> dict[str, Any]:
     from lensmodel.bench.model import run_model_benchmark  # noqa: PLC0415 - see the top of the module
 
-    with shown.progress() as bars:
+    with as_usage(), shown.progress() as bars:
         task = bars.add_task("fits", total=None)
         return run_model_benchmark(
             seeds=seeds,
@@ -239,7 +239,13 @@ def _model(
 def correct(
     context: typer.Context,
     photo: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="A photo of yours; default: one of the library's.")
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            exists=True,
+            dir_okay=False,
+            help="A photo of yours; default: one of the library's.",
+        ),
     ] = None,
     methods: Annotated[str, typer.Option(help="Names, comma separated.")] = "fast,standard,paper",
     workers: Annotated[int, typer.Option(min=1, metavar="N", help="Threads.")] = 1,
@@ -294,7 +300,7 @@ def _correct(
     from lensmodel.simulate import demo_data_path  # noqa: PLC0415 - same
 
     planes = develop(photo or demo_data_path("lake.jpg")).planes
-    with shown.progress() as bars:
+    with as_usage(), shown.progress() as bars:
         task = bars.add_task("methods", total=None)
         return run_correct_benchmark(
             planes,

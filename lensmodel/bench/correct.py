@@ -63,7 +63,6 @@ def run_correct_benchmark(
     peers: Sequence[Peer] = (),
     roi: tuple[int, int, int, int] | None = None,
     beside: int | None = None,
-    out: Planes | None = None,
     on_step: StepHook = ignore_step,
 ) -> dict[str, object]:
     """Time the methods on a photo, and the Richardson-Lucy kernel against its peers.
@@ -87,8 +86,6 @@ def run_correct_benchmark(
         given it alone.
     beside : int or None
         Threads of a second run of each method beside each of `workers`, so that their CPU times compare.
-    out : Planes or None
-        Where results are written; None allocates.
     on_step : StepHook
         Called after each method and once for the kernels.
 
@@ -126,7 +123,7 @@ def run_correct_benchmark(
 
         def run(threads: int, name: str = method) -> tuple[float, float]:
             wall, cpu = time.perf_counter(), time.process_time()
-            correct_planes(photo, lens, frame, noise=noise, method=name, workers=threads, roi=roi, out=out)
+            correct_planes(photo, lens, frame, noise=noise, method=name, workers=threads, roi=roi)
             return time.process_time() - cpu, time.perf_counter() - wall
 
         runs = np.array([[run(count) for count in counts] for _ in range(repeats)])

@@ -58,4 +58,4 @@ container-check: ## build the image without an engine, start it and use it (root
 	tools/container_check.sh
 
 clean: ## remove what the targets made
-	rm -rf $(VENV) demo-output bench-output .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) demo-output bench-output .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

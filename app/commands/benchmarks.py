@@ -239,13 +239,7 @@ def _model(
 def correct(
     context: typer.Context,
     photo: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            exists=True,
-            dir_okay=False,
-            help="A photo of yours; default: one of the library's.",
-        ),
+        Path | None, typer.Option(metavar="FILE", help="A photo of yours; default: one of the library's.")
     ] = None,
     methods: Annotated[str, typer.Option(help="Names, comma separated.")] = "fast,standard,paper",
     workers: Annotated[int, typer.Option(min=1, metavar="N", help="Threads.")] = 1,
@@ -278,6 +272,8 @@ def correct(
 
     shown = display.of(context, quiet=quiet, verbose=verbose)
     refuse_existing(_file(json_output), force=force)
+    if photo is not None and not photo.is_file():
+        raise UsageError(f"no photo called {photo}; check the name and the folder")
     window = _window(roi)
     result = _correct(photo, methods, workers, shown, repeats=repeats, peers=peers, roi=window, beside=beside)
     _tell(shown, json_output, result, correct_table(result))

@@ -19,6 +19,9 @@ from lensmodel.deconv.richardson_lucy import climbed, first_guess
 from lensmodel.types import Planes
 
 _LEAST_SEEN: Final = 0.02  # share of a point's light that counts as measured where less of it is
+_UNSEEN: Final = 1e-3  # share of a point's light below which nothing is known of it
+_SIGMAS: Final = np.float32(3.0)
+_ABSURD: Final = np.float32(2.0)  # times what was measured: more glow than steps that end anywhere leave
 _DARKEST: Final = 0.9  # times what a kernel spreads: share of the darkest light nearby that must be left
 _DOUBT: Final = np.float32(0.25)  # share of the glow that may be none
 _GLARE: Final = np.float32(0.5)  # share of glow in the photo's light from which on the bound holds in full
@@ -63,7 +66,8 @@ class Lights:
 
             x <- x ( 1 + F^T e / F^T 1[y < t] ),     e = ( y / R(F x) - 1 ) R'(F x)
 
-        Divided by F^T 1 instead, lights of which little is measured take several times the steps.
+        Divided by F^T 1 instead, lights of which little is measured take several times the steps; those
+        of which nothing is would grow without end otherwise.
         Only around clipped pixels near measured ones: see `lensmodel.deconv.clipped.regions`.
         Positive and unrestrained, x is a poor picture, so only what lies above t is taken from it.
         """
@@ -134,15 +138,39 @@ def _find(
     data, lost = plane[here], clipped[here]
     latent, reach = first_guess(data, blur)
     seen = np.minimum(blur.adjoint((~lost).astype(np.float32)), reach)
-    seen = np.maximum(seen, np.float32(_LEAST_SEEN * float(reach.max())))
+    most = float(reach.max())
+    seen = np.where(seen < _UNSEEN * most, reach, np.maximum(seen, np.float32(_LEAST_SEEN * most)))
     latent = climbed(latent, data, seen, blur, sensor, steps=steps, engine=engine)
     clip = np.float32(sensor.clip)
     held = np.minimum(latent, clip)
     # What shines too far off to reach a clipped pixel, or nearer to those of another region, is no concern.
     own = np.zeros_like(latent)
     own[region.own] = (latent - held)[region.own]
+    bound = np.maximum(data, np.float32(0.0)) + _SIGMAS * np.sqrt(sensor.variance(data))
+    own = _believable(own, np.where(lost, np.float32(np.inf), bound), blur)
     glow[here] += blur.forward(own)
     beyond[here] += blur.frame(own)
     answered = np.zeros_like(lost)
     answered[region.answers] = lost[region.answers]
     rest[here][answered] = np.maximum(blur.forward(held), np.float32(0.0))[answered]
+
+
+def _believable(
+    own: NDArray[np.float32], bound: NDArray[np.float32], blur: UniformBlur
+) -> NDArray[np.float32]:
+    """Dim light whose glow by far exceeds a bound; none of it is left where that does not help.
+
+    Steps may run away: just below clipping the response hardly rises, and the transfer function of next to
+    no blur, moved by a part of a pixel, belongs to no kernel that is positive.
+    """
+
+    def absurd(glow: NDArray[np.float32]) -> NDArray[np.bool_]:
+        return np.asarray(~(np.abs(glow) <= _ABSURD * bound))
+
+    glow = blur.forward(own)
+    too_much = absurd(glow)
+    if not too_much.any():
+        return own
+    share = np.where(too_much, bound / np.where(too_much, np.abs(glow), np.float32(1.0)), np.float32(1.0))
+    own = own * ndimage.minimum_filter(np.pad(share, blur.reach, mode="edge"), 2 * blur.reach + 1)
+    return np.zeros_like(own) if absurd(blur.forward(own)).any() else own

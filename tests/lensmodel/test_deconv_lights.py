@@ -135,3 +135,17 @@ def test_compiled_blur_gives_the_products_of_scipy(offset: tuple[float, float]) 
 
     np.testing.assert_allclose(quick.forward(latent), blurred, atol=2e-6)
     np.testing.assert_allclose(quick.adjoint(blurred), slow.adjoint(blurred), atol=2e-6)
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.3, -0.4)])
+def test_lights_behind_next_to_no_blur_do_not_run_away(shift: tuple[float, float]) -> None:
+    # eight bits just below clipping, as a JPEG of a white wall has them, and lateral colour
+    levels = np.array([0.973, 0.982, 0.991, 1.0], dtype=np.float32)
+    tile = levels[np.random.default_rng(0).integers(0, 4, (1, 12, 12))].repeat(8, 1).repeat(8, 2)
+    sensor = Sensor(NoiseModel(shot=6e-6, read=2e-7), clip=1.0)
+
+    found = Lights.of(tile, [UniformBlur(np.ones((1, 1)), shift)], [sensor], 20, "auto")
+
+    assert found is not None
+    assert np.abs(found.rest).max() < 4.0
+    assert found.beyond.max() < 4.0

@@ -16,6 +16,11 @@ from lensmodel.types import NoiseModel, Plane, Planes, StepHook, ignore_step
 TINY = 1e-6
 """Smallest light that a quotient may have below the bar."""
 
+LEAST_PREDICTED = 0.1
+"""Share of a datum that Richardson-Lucy's prediction of it has at least, so that a step lifts light tenfold
+at most: a transfer function that belongs to no positive kernel, as of a point moved by a part of a pixel,
+predicts nothing or less here and there."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sensor:

@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 import rocket_fft
 
+from lensmodel.deconv.base import LEAST_PREDICTED
 from lensmodel.deconv.compiled_base import (
     BACK,
     FORWARD,
@@ -20,6 +21,7 @@ from lensmodel.deconv.compiled_base import (
 from lensmodel.jit import jit
 
 _EPS: Final = np.float32(1e-6)
+_LEAST: Final = np.float32(LEAST_PREDICTED)
 _LIGHT: Final = np.float32(0.9)
 
 
@@ -134,7 +136,7 @@ def _errors(light: Real, data: Real, base: float, clip: float, bend: Real, first
         brightest = max(brightest, light[j])
     if brightest <= first * clip:  # no branch in the loop: several pixels at a time
         for j in range(light.size):
-            light[j] = data[j] / max(max(light[j], ZERO) + base, _EPS) - ONE
+            light[j] = data[j] / max(max(light[j], ZERO) + base, _LEAST * data[j], _EPS) - ONE
         return
     top = np.float32(bend.shape[1] - 1)
     share, steps = ONE / clip, top / (last - first)
@@ -142,13 +144,13 @@ def _errors(light: Real, data: Real, base: float, clip: float, bend: Real, first
         predicted = max(light[j], ZERO)
         at = min((predicted * share - first) * steps, top)
         if not at > ZERO:  # what is no number stays none
-            light[j] = data[j] / max(predicted + base, _EPS) - ONE
+            light[j] = data[j] / max(predicted + base, _LEAST * data[j], _EPS) - ONE
         else:
             k = min(np.int32(at), np.int32(bend.shape[1] - 2))
             part = at - np.float32(k)
             seen = clip * (bend[0, k] + part * (bend[0, k + 1] - bend[0, k]))
             slope = bend[1, k] + part * (bend[1, k + 1] - bend[1, k])
-            light[j] = (data[j] / max(seen + base, _EPS) - ONE) * slope
+            light[j] = (data[j] / max(seen + base, _LEAST * data[j], _EPS) - ONE) * slope
 
 
 @jit

@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from lensmodel.blur import BlurOperator, UniformBlur
 from lensmodel.blur.uniform import fast_shape
-from lensmodel.deconv.base import TINY, Restored, Sensor
+from lensmodel.deconv.base import LEAST_PREDICTED, TINY, Restored, Sensor
 from lensmodel.deconv.engine import Engine, compiled
 from lensmodel.errors import InvalidInputError
 from lensmodel.types import Plane, StepHook, ignore_step
@@ -199,7 +199,8 @@ def climbed(
         start = np.maximum(latent + alpha * (latent - previous), TINY)
         predicted = np.maximum(blur.forward(start), 0.0)
         seen, slope = response(predicted, sensor.clip, sharpness)
-        error = (data / np.maximum(seen + base, TINY) - 1.0) * slope
+        predictable = np.maximum(seen + base, LEAST_PREDICTED * data)
+        error = (data / np.maximum(predictable, TINY) - 1.0) * slope
         update = 1.0 + blur.adjoint(error) / reach
         if lights:
             update = _split(update, error, start, blur=blur, reach=reach, clip=sensor.clip)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 from app.identity import name_key, serial_key
 from app.ids import new_id
 from app.store.database import Database, insert_new
-from app.store.owners import find, find_to_change, now, owned
+from app.store.owners import find, now, owned
 from app.store.versions import drop_samples, new_version, take_samples
 from app.tables import CorrectionRow, EventRow, GarbageRow, LensRow, PhotoRow
 
@@ -222,11 +222,6 @@ class LensStore:
         with self._db.reading() as session:
             return list(session.scalars(query))
 
-    def create(self, owner_id: int, *, label: str, maker: str | None, model: str | None) -> LensRow:
-        """Make a lens that only its owner can tell from others of its kind."""
-        with self._db.writing() as session:
-            return named(session, owner_id, LensName(maker, model, None, label=label))
-
     def candidates(self, photo: PhotoRow, limit: int = 10) -> list[LensRow]:
         """Return the owner's lenses that a photo without a serial may belong to."""
         query = select(LensRow).where(LensRow.owner_id == photo.owner_id, LensRow.deleted_at.is_(None))
@@ -308,38 +303,3 @@ class LensStore:
         )
         with self._db.reading() as session:
             return [(row[0], row[1]) for row in session.execute(query)]
-
-    def exclude(self, photo_id: str, owner: str) -> bool:
-        """Take a counted photo out of its lens's model; False if it is not counted."""
-        return self._change(photo_id, owner, lambda session, photo: switch(session, photo, "excluded"))
-
-    def include(self, photo_id: str, owner: str) -> bool:
-        """Let an excluded photo count again; False if it is not excluded."""
-        return self._change(photo_id, owner, lambda session, photo: switch(session, photo, "counted"))
-
-    def move(self, photo_id: str, owner: str, lens_id: str) -> bool:
-        """Do as the function `move`; False if there is no such photo or lens."""
-
-        def to_lens(session: Session, photo: PhotoRow) -> bool:
-            lens = find(session, LensRow, lens_id, owner)
-            if lens is not None:
-                move(session, photo, lens)
-            return lens is not None
-
-        return self._change(photo_id, owner, to_lens)
-
-    def change_settings(
-        self, photo_id: str, owner: str, given: Mapping[str, Any], columns: Mapping[str, Any]
-    ) -> bool:
-        """Do as the function `change_settings`; False if there is no such photo."""
-
-        def set_them(session: Session, photo: PhotoRow) -> bool:
-            change_settings(session, photo, given, columns)
-            return True
-
-        return self._change(photo_id, owner, set_them)
-
-    def _change(self, photo_id: str, owner: str, change: Callable[[Session, PhotoRow], bool]) -> bool:
-        with self._db.writing() as session:
-            photo = find_to_change(session, PhotoRow, photo_id, owner)
-            return photo is not None and change(session, photo)

@@ -132,11 +132,6 @@ class PhotoStore:
                 _restart(session, known)
             return Received(known, fresh=again)
 
-    def known(self, owner: str, sha256: str) -> PhotoRow | None:
-        """Return the owner's photo with these bytes."""
-        with self._db.reading() as session:
-            return session.scalar(owned(PhotoRow, owner).where(PhotoRow.sha256 == sha256))
-
     def get(self, photo_id: str, owner: str | None = None) -> PhotoRow | None:
         """Return one photo, or None."""
         with self._db.reading() as session:
@@ -303,15 +298,6 @@ class PhotoStore:
                 _widen(lens, photo)
             return lens
 
-    def restart(self, photo_id: str, owner: str, given: Mapping[str, Any]) -> PhotoRow | None:
-        """Add what the owner now says and run the photo again from the start."""
-        with self._db.writing() as session:
-            photo = find_to_change(session, PhotoRow, photo_id, owner)
-            if photo is not None:
-                photo.given = {**photo.given, **given}
-                _restart(session, photo)
-            return photo
-
     def change(
         self,
         photo_id: str,
@@ -439,9 +425,7 @@ def _drop_patches(session: Session, photo: PhotoRow) -> None:
 
 
 def _restart(session: Session, photo: PhotoRow) -> None:
-    """Begin a new epoch: work of the old one, if any still runs, no longer counts."""
-    if photo.state == "counted":
-        lenses.give_back(session, photo, "photo_removed")
+    """Begin a new epoch of a photo that does not count: work of the old one, if any still runs, is void."""
     _drop_patches(session, photo)
     photo.epoch += 1
     photo.state, photo.stage_at = "received", now()

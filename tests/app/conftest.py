@@ -32,18 +32,31 @@ class Steps:
         self._numbers = itertools.count(1)
 
     def receive(self, *, calibrate: bool = True, **given: Any) -> PhotoRow:
-        number, public_id = next(self._numbers), new_id()
+        return self._receive(f"{next(self._numbers):064x}", calibrate=calibrate, given=given)
+
+    def receive_again(self, photo: PhotoRow) -> PhotoRow:
+        return self._receive(photo.sha256, calibrate=photo.calibrate, given={})
+
+    def _receive(self, sha256: str, *, calibrate: bool, given: dict[str, Any]) -> PhotoRow:
+        public_id = new_id()
         return self.store.photos.receive(
             self.owner,
             public_id=public_id,
-            sha256=f"{number:064x}",
-            filename=f"p{number}.dng",
+            sha256=sha256,
+            filename=f"p{int(sha256, 16)}.dng",
             kind="dng",
             byte_size=1000,
             blob_key=f"photos/{public_id}/original",
             calibrate=calibrate,
             given=given,
         ).photo
+
+    def named(self, name: LensName) -> str:
+        """Give a lens to a photo that waits for one; return its id."""
+        photo = self.receive()
+        assert self.store.photos.change(photo.public_id, self.owner, {}, lens=name)
+        lens_id: str = self.fresh(photo).given["lens_id"]
+        return lens_id
 
     def inspect(self, photo: PhotoRow, *, serial: str | None = "123", aperture: float | None = 1.4) -> None:
         self.store.photos.set_state(photo.public_id, ("received",), "inspecting")

@@ -10,7 +10,7 @@ from starlette.testclient import TestClient
 
 from app.main import create_app
 from app.settings import Settings
-from app.store import Store
+from app.store import LensName, Store
 from lensmodel.psf import rms_width
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
@@ -105,17 +105,17 @@ def test_lenses_of_another_owner_and_of_another_model_say_nothing(
     stranger.plan(photo, 6)
     stranger.estimate(photo, tuple(range(6)), width=WIDE)
     store.photos.finish(photo.public_id, photo.epoch)
-    other = store.lenses.create(steps.fresh(photo).owner_id, label="x", maker="Canon", model="EF35mm f/2")
+    other = stranger.named(LensName("Canon", "EF35mm f/2", None, label="x"))
 
-    assert store.samples.family_of(other.public_id) == ()
+    assert store.samples.family_of(other) == ()
     assert ask(client, young)["support"]["family"] is None
 
 
 def test_the_name_of_the_model_may_be_written_in_another_way(store: Store, steps: Steps, young: str) -> None:
-    owner = steps.counted(serial="young").owner_id
-    named = store.lenses.create(owner, label="mine", maker="CANON", model="EF 24mm F1.4L")
+    steps.counted(serial="young")
+    named = steps.named(LensName("CANON", "EF 24mm F1.4L", None, label="mine"))
 
-    found = store.samples.family_of(named.public_id)
+    found = store.samples.family_of(named)
 
     assert [one.lens_id for one in found] == [young.rpartition("/")[2]]
 

@@ -420,7 +420,7 @@ def test_work_of_an_old_epoch_changes_nothing(
     work: PhotoWork, bench: Workbench, photo: PhotoRow, sandbox: Scripted, steps: Any
 ) -> None:
     def restart(arguments: dict[str, Any], folder: Path) -> Outcome:
-        bench.store.photos.restart(photo.public_id, "local", {"aperture": 4.0})
+        bench.store.photos.change(photo.public_id, "local", {"aperture": 4.0})
         return ok({"patches": [patch(0)], "rejected": [], "lateral": None})(arguments, folder)
 
     sandbox.answers["select"].insert(0, restart)
@@ -585,7 +585,7 @@ def test_a_correction_with_a_version_without_samples_fails(
     bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
 ) -> None:
     key = ask(bench, counted, steps)
-    bench.store.lenses.exclude(counted.public_id, "local")
+    bench.store.photos.change(counted.public_id, "local", {}, excluded=True)
 
     CorrectionWork(bench).correction(key)
 

@@ -129,7 +129,7 @@ def test_a_lens_page_shows_the_newest_of_many_versions(
     photo = steps.counted()
     lens_id = steps.lens_id(photo)
     for _ in range(201):
-        store.lenses.change_settings(photo.public_id, "local", {}, {})
+        store.photos.change(photo.public_id, "local", {"aperture": 2.0})
     store.lenses.record_metrics(lens_id, 202, {"error": {}, "coverage": {"corner": 77}})
 
     page = client.get(f"/lenses/{lens_id}").text

@@ -87,7 +87,7 @@ def test_work_of_an_old_epoch_changes_nothing(store: Store, steps: Steps) -> Non
     photo = steps.receive()
     steps.inspect(photo)
     steps.plan(photo)
-    store.photos.restart(photo.public_id, OWNER, {})
+    store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
 
     assert steps.estimate(photo) == 0
     assert not store.photos.is_live(photo.public_id, 1)
@@ -96,20 +96,16 @@ def test_work_of_an_old_epoch_changes_nothing(store: Store, steps: Steps) -> Non
     assert steps.fresh(photo).state == "received"
 
 
-def test_a_counted_photo_that_starts_anew_leaves_its_lens_first(store: Store, steps: Steps) -> None:
+def test_a_counted_photo_never_starts_anew(store: Store, steps: Steps) -> None:
     photo = steps.counted()
     lens = steps.lens_id(photo)
-    store.photos.restart(photo.public_id, OWNER, {"aperture": 2.0})
-    assert store.samples.of_lens(lens)[1] == []
 
-    again = steps.fresh(photo)
-    steps.inspect(again)
-    steps.plan(again)
-    steps.estimate(again)
-    store.photos.finish(again.public_id, again.epoch)
+    assert store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
 
+    after = steps.fresh(photo)
     state, samples = store.samples.of_lens(lens)
-    assert (state.rebuild_epoch, len(samples)) == (1, 6)  # models in memory were told to forget the old ones
+    assert (after.state, after.epoch) == ("counted", photo.epoch)
+    assert (state.rebuild_epoch, len(samples)) == (1, 6)  # models in memory are told to forget the old ones
 
 
 def test_a_photo_that_waits_for_its_lens_does_not_fail_for_the_end_of_its_job(
@@ -222,10 +218,10 @@ def test_excluding_takes_the_samples_out_and_including_brings_them_back(store: S
     photo = steps.counted()
     lens = steps.lens_id(photo)
 
-    assert store.lenses.exclude(photo.public_id, OWNER)
+    assert store.photos.change(photo.public_id, OWNER, {}, excluded=True)
     assert store.samples.of_lens(lens)[1] == []
-    assert not store.lenses.exclude(photo.public_id, OWNER)
-    assert store.lenses.include(photo.public_id, OWNER)
+    assert store.photos.change(photo.public_id, OWNER, {}, excluded=True)  # again: no version of its own
+    assert store.photos.change(photo.public_id, OWNER, {}, excluded=False)
 
     state, samples = store.samples.of_lens(lens)
     assert (state.version, state.rebuild_epoch, len(samples)) == (3, 2, 6)
@@ -251,14 +247,14 @@ def test_the_same_bytes_may_come_again_after_deletion(store: Store, steps: Steps
     photo = steps.receive()
     store.photos.delete(photo.public_id, OWNER)
 
-    assert store.photos.known(OWNER, photo.sha256) is None
+    assert steps.receive_again(photo).public_id != photo.public_id
 
 
 def test_a_photo_moved_to_another_lens_renews_both(store: Store, steps: Steps) -> None:
     mine, other = steps.counted(serial="123"), steps.counted(serial="124")
     old, new = steps.lens_id(mine), steps.lens_id(other)
 
-    assert store.lenses.move(mine.public_id, OWNER, new)
+    assert store.photos.change(mine.public_id, OWNER, {}, lens=new)
 
     assert store.samples.of_lens(old)[1] == []
     assert len(store.samples.of_lens(new)[1]) == 12
@@ -267,7 +263,7 @@ def test_a_photo_moved_to_another_lens_renews_both(store: Store, steps: Steps) -
 def test_a_corrected_aperture_reaches_the_samples_and_the_version(store: Store, steps: Steps) -> None:
     photo = steps.counted()
 
-    store.lenses.change_settings(photo.public_id, OWNER, {"aperture": 2.0}, {"aperture": 2.0})
+    store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
 
     state, samples = store.samples.of_lens(steps.lens_id(photo))
     assert state.version == 2
@@ -334,7 +330,7 @@ def test_no_update_is_lost_when_many_threads_raise_the_version(store: Store, ste
 
     def toggle() -> None:
         for _ in range(5):
-            store.lenses.change_settings(photo.public_id, OWNER, {}, {})
+            store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
 
     threads = [threading.Thread(target=toggle) for _ in range(4)]
     for thread in threads:

@@ -147,8 +147,8 @@ def _find(
     own = np.zeros_like(latent)
     own[region.own] = (latent - held)[region.own]
     bound = np.maximum(data, np.float32(0.0)) + _SIGMAS * np.sqrt(sensor.variance(data))
-    own = _believable(own, np.where(lost, np.float32(np.inf), bound), blur)
-    glow[here] += blur.forward(own)
+    own, shed = _believable(own, np.where(lost, np.float32(np.inf), bound), blur)
+    glow[here] += shed
     beyond[here] += blur.frame(own)
     answered = np.zeros_like(lost)
     answered[region.answers] = lost[region.answers]
@@ -157,11 +157,12 @@ def _find(
 
 def _believable(
     own: NDArray[np.float32], bound: NDArray[np.float32], blur: UniformBlur
-) -> NDArray[np.float32]:
-    """Dim light whose glow by far exceeds a bound; none of it is left where that does not help.
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the light that was found and its glow, dimmed where that by far exceeds a bound.
 
-    Steps may run away: just below clipping the response hardly rises, and the transfer function of next to
-    no blur, moved by a part of a pixel, belongs to no kernel that is positive.
+    Where it still does then, none of it is left. Steps may run away: just below clipping the response
+    hardly rises, and the transfer function of next to no blur, moved by a part of a pixel, belongs to no
+    kernel that is positive.
     """
 
     def absurd(glow: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -170,7 +171,8 @@ def _believable(
     glow = blur.forward(own)
     too_much = absurd(glow)
     if not too_much.any():
-        return own
+        return own, glow
     share = np.where(too_much, bound / np.where(too_much, np.abs(glow), np.float32(1.0)), np.float32(1.0))
     own = own * ndimage.minimum_filter(np.pad(share, blur.reach, mode="edge"), 2 * blur.reach + 1)
-    return np.zeros_like(own) if absurd(blur.forward(own)).any() else own
+    glow = blur.forward(own)
+    return (np.zeros_like(own), np.zeros_like(glow)) if absurd(glow).any() else (own, glow)

@@ -6,7 +6,8 @@ lens, and all of them are estimated at once (P. Whittle's idea, with log spectra
 against outliers), so that photos add up::
 
     minimise  sum_patches rho(chi^2)  +  |priors|^2,
-    chi^2 = sum_bins t(r' V^-1 r),   r = ln S - ln(exp(s(z) + b) (|OTF(theta)|^2 + exp(w)) + n)
+    chi^2 = sum_bins t(r' V^-1 r),
+    r = ln S - ln(exp(s(z) + b + d |OTF(theta)|^4) (|OTF(theta)|^2 + exp(w)) + n)
 
 by Levenberg-Marquardt, the unknowns z and w of a patch eliminated from the normal equations (Schur). Power
 knows nothing of the phase: a wavefront and its negative, which turns the kernels by 180 degrees, have

@@ -118,25 +118,30 @@ _TABLE_REACH: Final = 1.5
 
 @lru_cache(maxsize=32)
 def _shrink_table(beta: float, exponent: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Minimiser of |w|^a + beta/2 (w - v)² on a grid of v >= 0, found on a grid and refined by Newton."""
-    v = np.linspace(0.0, _TABLE_REACH, 3001)
+    """Minimiser of |w|^a + beta/2 (w - v)² where it is not 0: from the jump upwards.
+
+    With s = beta^(-1 / (2 - a)), both minima cost the same at w = s (2 - 2a)^(1 / (2 - a)). Nothing may be
+    interpolated across the jump: between 0 and that w lies no minimum.
+    """
+    scale = beta ** (-1.0 / (2.0 - exponent))
+    least = scale * (2.0 - 2.0 * exponent) ** (1.0 / (2.0 - exponent))
+    jump = least + exponent / beta * least ** (exponent - 1.0)
+    v = np.linspace(jump, max(_TABLE_REACH, 2.0 * jump), 3001)
     w = v.copy()
     for _ in range(30):
-        w = np.maximum(w, 1e-9)
         slope = exponent * w ** (exponent - 1.0) + beta * (w - v)
         curvature = exponent * (exponent - 1.0) * w ** (exponent - 2.0) + beta
-        w = np.where(curvature > 0.0, w - slope / np.where(curvature > 0.0, curvature, 1.0), 0.0)
-    w = np.clip(w, 0.0, v)
-    cost = np.where(w > 1e-8, w, 0.0) ** exponent + 0.5 * beta * (w - v) ** 2
-    return v, np.where((w > 1e-8) & (cost < 0.5 * beta * v * v), w, 0.0)
+        w = np.clip(w - slope / curvature, least, v)
+    return v, w
 
 
 def _shrink(v: NDArray[np.float64], beta: float, exponent: float) -> NDArray[np.float64]:
     grid, value = _shrink_table(beta, exponent)
     size = np.abs(v)
     # Beyond the table the power hardly moves the minimum.
-    beyond = size - exponent / beta * np.maximum(size, _TABLE_REACH) ** (exponent - 1.0)
-    return np.copysign(np.where(size > _TABLE_REACH, beyond, np.interp(size, grid, value)), v)
+    beyond = size - exponent / beta * np.maximum(size, grid[-1]) ** (exponent - 1.0)
+    inside = np.where(size < grid[0], 0.0, np.interp(size, grid, value))
+    return np.copysign(np.where(size > grid[-1], beyond, inside), v)
 
 
 def _inner(x: NDArray[np.float64]) -> Plane:

@@ -102,8 +102,8 @@ class Settings(BaseSettings):
         default=True,
         description="A lens that has seen little leans on its owner's other copies of the same model.",
     )
-    model_mode: Literal["mixed", "kernels", "evidence", "wavefront", "likeliest"] = Field(
-        default="mixed",
+    model_mode: Literal["kernels", "mixed", "evidence", "wavefront", "likeliest"] = Field(
+        default="kernels",
         description="What lens models make of their samples; likeliest chooses for each lens.",
     )
     model_unit: Literal["micrometre", "half-diagonal"] = Field(

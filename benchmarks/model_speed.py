@@ -110,7 +110,7 @@ def main() -> None:
     for method in wanted.methods:
         for chosen in (few, samples[: wanted.many]):
             start = time.process_time()
-            model = LensModel.fit(chosen, ModelSettings(method=method))
+            model = LensModel.fit(chosen, ModelSettings(method=method, mode="mixed"))
             fit = time.process_time() - start
             start = time.process_time()
             model = model.warmed()

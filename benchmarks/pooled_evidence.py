@@ -25,13 +25,14 @@ from lensmodel.bench.cases import list_photos, photo_half
 from lensmodel.bench.reproduce.scenes import centred_cut
 from lensmodel.geometry import zone_of
 from lensmodel.psf import PsfSample, distance, rms_width
-from lensmodel.regression import LensModel
+from lensmodel.regression import LensModel, ModelSettings
 from lensmodel.simulate import SimulatedCamera, SimulatedField, draw_lens, load_scene, photograph, write_photo
 from lensmodel.types import ZONES, FieldPosition, LensSettings
 
 _PLACES = 48
 _GOLDEN = math.pi * (3.0 - math.sqrt(5.0))
 _SIZE = 31
+MIXED = ModelSettings(mode="mixed")
 
 
 def places() -> list[FieldPosition]:
@@ -105,8 +106,8 @@ def main() -> None:
                 samples = [sample for photo in photos[:count] for sample in photo]
                 name = f"{seed} {truth.lens.model.removeprefix('Simulated ')}, {count}"
                 alone = [replace(sample, spectrum=None) for sample in samples]
-                row(f"{name}, kernels", LensModel.fit(alone).warmed(), truth)
-                row(f"{name}, pooled", LensModel.fit(samples).warmed(), truth)
+                row(f"{name}, kernels", LensModel.fit(alone, MIXED).warmed(), truth)
+                row(f"{name}, pooled", LensModel.fit(samples, MIXED).warmed(), truth)
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ from app.store import LensName, NewPatch, NewSample, Store, migrate
 from app.store.versions import learned_key
 from app.supervisor import ONE_THREAD, environment
 from lensmodel.bench.model import patch_places
-from lensmodel.regression import LensModel
+from lensmodel.regression import LensModel, ModelSettings
 from lensmodel.simulate import SimulatedLens, draw_lens
 from lensmodel.types import CHANNELS, LensSettings
 
@@ -121,7 +121,7 @@ def count_photo(store: Store, lens: SimulatedLens, rng: np.random.Generator) -> 
 def learn(store: Store, storage: Storage, lens_id: str) -> int:
     """Fit the newest version wholly, as a worker does; return how many samples it has."""
     state, stored = store.samples.of_lens(lens_id)
-    model = LensModel.fit([one.sample for one in stored]).warmed()
+    model = LensModel.fit([one.sample for one in stored], ModelSettings(mode="mixed")).warmed()
     storage.put(learned_key(lens_id, state.version, state.rebuild_epoch), model.learned())
     return len(stored)
 
@@ -180,7 +180,7 @@ def main() -> None:
     wanted = parser.parse_args()
     lens, rng = draw_lens(SEED), np.random.default_rng(0)
     with tempfile.TemporaryDirectory(prefix="lensmodel-") as folder:
-        settings = Settings(data_dir=Path(folder), log_level="warning")
+        settings = Settings(data_dir=Path(folder), log_level="warning", model_mode="mixed")
         store, storage = Store(settings), Storage(settings.storage)
         migrate.upgrade(store.database)
         for _ in range(wanted.photos):

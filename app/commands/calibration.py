@@ -17,7 +17,7 @@ from app.commands.failure import UsageError
 from lensmodel import blind, pipeline
 from lensmodel.errors import InvalidInputError, LensModelError, MetadataMissingError
 from lensmodel.regression import LensModel, LensProfile, ModelSettings, save_profile
-from lensmodel.regression.answer import MICROMETRE, MIXED
+from lensmodel.regression.answer import KERNELS, MICROMETRE
 from lensmodel.types import LensSettings, StepHook
 
 _ZIP: Final = b"PK"
@@ -55,7 +55,7 @@ def run(names: Sequence[str], target: Path, wishes: Wishes, display: Display, *,
         blind.estimators.create(wishes.estimator)
         settings = LensSettings(aperture=wishes.aperture)
         family = None if wishes.family is None else files.profile_at(wishes.family)
-        chosen = ModelSettings(mode=wishes.mode or MIXED, unit=wishes.unit or MICROMETRE)
+        chosen = ModelSettings(mode=wishes.mode or KERNELS, unit=wishes.unit or MICROMETRE)
     calibration = _Calibration(target, wishes, settings, chosen, family)
     results: list[dict[str, Any]] = []
     with display.progress() as bars:

@@ -55,8 +55,8 @@ def calibrate(
         choice(
             "--mode",
             MODES,
-            "What answers are made of: mixed (default), or likeliest, which chooses by photos held out. "
-            "Kept from then on.",
+            "What answers are made of: kernels (default), mixed with a fitted wavefront, or likeliest, which "
+            "chooses by photos held out. Kept from then on.",
         ),
     ] = None,
     unit: Annotated[

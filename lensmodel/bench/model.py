@@ -129,8 +129,9 @@ def run_model_benchmark(
     photos : sequence of int
         How many photos of 24 patches a model sees.
     methods : sequence of str, optional
-        Names in `smoothers`, "eff-linear", "polynomial", "wavefront", "paper", or the modes "mode-kernels",
-        "mode-evidence", "mode-wavefront", "mode-likeliest"; by default all, but modes only of `photographs`.
+        Names in `smoothers` (each in mode "mixed"), "eff-linear", "polynomial", "wavefront", "paper", or the
+        modes "mode-kernels", "mode-evidence", "mode-wavefront", "mode-likeliest"; by default all, but modes
+        only of `photographs`.
     psf_field : Path, optional
         Measured PSFs; then `seeds` and `photos` play no part.
     spoiled : float
@@ -251,7 +252,7 @@ def _fits(methods: Sequence[str] | None, *, evidence: bool = False) -> dict[str,
         "polynomial": _polynomial,
         "paper": _paper,
         "wavefront": _wavefront,
-        **{name: _regression(ModelSettings(method=name)) for name in smoothers},
+        **{name: _regression(ModelSettings(method=name, mode=MIXED)) for name in smoothers},
         **{f"mode-{mode}": _regression(ModelSettings(mode=mode)) for mode in MODES if mode != MIXED},
     }
     unknown = [name for name in methods or () if name not in known]

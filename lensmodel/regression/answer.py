@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from lensmodel.errors import InvalidInputError, UnknownMethodError
 from lensmodel.types import Kernel
 
+KERNELS: Final = "kernels"
 MIXED: Final = "mixed"
 LIKELIEST: Final = "likeliest"
-MODES: Final = (MIXED, "kernels", "evidence", "wavefront", LIKELIEST)
+MODES: Final = (KERNELS, MIXED, "evidence", "wavefront", LIKELIEST)
 """What can be made of the neighbours of a question; `modes` tells what they are."""
 
 NEEDING_EVIDENCE: Final = frozenset({"evidence", LIKELIEST})
@@ -60,7 +61,7 @@ class ModelSettings:
     mirror: float | None = None
     robust: bool = True
     excluded: tuple[str, ...] = ()
-    mode: str = MIXED
+    mode: str = KERNELS
     unit: str = MICROMETRE
 
     def __post_init__(self) -> None:
@@ -133,7 +134,7 @@ class PsfAnswer:
     prior_share: float = 0.0
     image_frame_share: float = 0.0
     wavefront_share: float = 0.0
-    mode: str = MIXED
+    mode: str = KERNELS
     scatter: Callable[[], NDArray[np.float64]] | None = field(default=None, repr=False)
 
     @property

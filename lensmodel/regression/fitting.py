@@ -12,7 +12,7 @@ from lensmodel.errors import NoSamplesError
 from lensmodel.psf import PsfSample
 from lensmodel.regression import pitch as pitches
 from lensmodel.regression import variables as va
-from lensmodel.regression.answer import LIKELIEST, MICROMETRE, MIXED, NEEDING_EVIDENCE, ModelSettings
+from lensmodel.regression.answer import KERNELS, LIKELIEST, MICROMETRE, NEEDING_EVIDENCE, ModelSettings
 from lensmodel.regression.index import SampleIndex
 from lensmodel.regression.judgement import Judgement, bandwidth, held_together, judge
 from lensmodel.regression.local import LocalKernels
@@ -90,7 +90,7 @@ class Fit:
     bandwidth: dict[str, float]
     physical: Physics | None = None
     statistics: NormalEquations | None = None
-    mode: str = MIXED
+    mode: str = KERNELS
     unit: str = MICROMETRE
     ends: tuple[End, ...] = ()
 
@@ -128,7 +128,7 @@ class Fit:
         return cls(
             *(pixel, len(samples), widths, local, index, roster, judgement, told_errors(samples), rule, used),
             statistics=statistics_of(common, settings),
-            mode=MIXED if settings.mode == LIKELIEST else settings.mode,
+            mode=KERNELS if settings.mode == LIKELIEST else settings.mode,
             unit=settings.unit,
         )
 

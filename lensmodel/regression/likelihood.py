@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.psf import PsfSample, distance
-from lensmodel.regression.answer import MIXED
+from lensmodel.regression.answer import KERNELS
 from lensmodel.regression.pooled.fit import fit_scene
 from lensmodel.regression.pooled.scene import SceneView
 from lensmodel.regression.pooled.transfer import BINS, bin_frequencies
@@ -49,7 +49,7 @@ def likeliest(
     """
     groups = _groups(samples)
     if len(np.unique(groups)) < _FEWEST_GROUPS:
-        return MIXED  # nothing can be held out
+        return KERNELS  # nothing can be held out
     costs: dict[str, list[float]] = {}
     for group in range(int(groups.max()) + 1):
         held = [s for s, g in zip(samples, groups, strict=True) if g == group]

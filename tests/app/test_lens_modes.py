@@ -99,10 +99,10 @@ def test_worker_and_model_agree_on_what_needs_evidence() -> None:
 def test_pooled_evidence_answers_over_http(
     settings: Settings, store: Store, storage: Storage, lens: str
 ) -> None:
-    with serve(settings, "mixed") as plain, serve(settings, "evidence") as pooling:
+    with serve(settings, "kernels") as plain, serve(settings, "evidence") as pooling:
         averaged, pooled = psf(plain, lens), psf(pooling, lens)
 
-    assert (averaged["support"]["mode"], pooled["support"]["mode"]) == ("mixed", "evidence")
+    assert (averaged["support"]["mode"], pooled["support"]["mode"]) == ("kernels", "evidence")
     assert width(averaged) == pytest.approx(1.0, abs=0.05)
     assert width(pooled) > 1.2  # the patches know better than the kernels that came with them
     samples = with_evidence(store.samples.of_lens(lens)[1], storage, "evidence")
@@ -148,7 +148,7 @@ def test_evidence_is_bounded_and_the_newest_kept(store: Store, storage: Storage,
     found = with_evidence(stored, storage, "evidence", most_bytes=room)
 
     assert [s.sample.evidence is not None for s in found] == [False] * 4 + [True] * 2
-    assert all(s.sample.evidence is None for s in with_evidence(stored, storage, "mixed"))
+    assert all(s.sample.evidence is None for s in with_evidence(stored, storage, "kernels"))
 
 
 def test_likeliest_mode_is_found_by_a_worker_and_served(

@@ -209,7 +209,7 @@ def test_patches_that_share_one_kernel_choose_no_mode(noisy: list[PsfSample]) ->
 
     model = LensModel.fit(twins, wide("likeliest")).warmed()
 
-    assert model.query(FieldPosition(0.5, 1.0), SETTINGS, SIZE).mode == "mixed"
+    assert model.query(FieldPosition(0.5, 1.0), SETTINGS, SIZE).mode == "kernels"
 
 
 def test_likeliest_mode_is_found_by_warming_and_kept_by_what_was_learned(noisy: list[PsfSample]) -> None:
@@ -221,7 +221,7 @@ def test_likeliest_mode_is_found_by_warming_and_kept_by_what_was_learned(noisy: 
     warmed = model.warmed()
     place = FieldPosition(0.5, 1.0)
 
-    assert model.query(place, SETTINGS, SIZE).mode == "mixed"
+    assert model.query(place, SETTINGS, SIZE).mode == "kernels"
     found = warmed.query(place, SETTINGS, SIZE).mode
     assert found in {"mixed", "kernels"}
     again = LensModel.restored(samples, warmed.learned(), wide("likeliest"))

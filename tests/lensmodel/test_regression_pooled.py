@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lensmodel.psf import PsfSample, delta, distance, gaussian, rms_width
-from lensmodel.regression import LensModel, LensProfile, load_profile, save_profile
+from lensmodel.regression import LensModel, LensProfile, ModelSettings, load_profile, save_profile
 from lensmodel.regression.experts import Experts, agreed_share, kernel_error
 from lensmodel.regression.local import Answers
 from lensmodel.regression.pooled import MIN_PLACES, pool
@@ -34,6 +34,7 @@ from lensmodel.types import CHANNELS, Channel, FieldPosition, Kernel, LensSettin
 
 PITCH = 4.5
 SETTINGS = LensSettings(aperture=2.0)
+MIXED = ModelSettings(mode="mixed")
 LENS = SimulatedLens(
     (
         Aberrations(
@@ -284,13 +285,13 @@ def test_blur_that_no_wavefront_makes_is_left_to_the_kernels() -> None:
         for settings in [SETTINGS.with_channel(c)]
     ]
 
-    answer = LensModel.fit(known).warmed().query(FieldPosition(0.5, 0.4), SETTINGS, 31)
+    answer = LensModel.fit(known, MIXED).warmed().query(FieldPosition(0.5, 0.4), SETTINGS, 31)
 
     assert distance(answer.kernel, gaussian(31, 1.3**2 * np.eye(2))).rel_l2 < 0.05
 
 
 def test_kernels_that_end_in_a_point_neither_silence_the_wavefront_nor_pass_for_sure() -> None:
-    fit = LensModel.fit(samples(MIN_PLACES + 2)).warmed()._fit
+    fit = LensModel.fit(samples(MIN_PLACES + 2), MIXED).warmed()._fit
     experts = Experts(fit.judgement, np.ones(7), fit.physical)
     near = Answers(np.array([0]), np.array([1.0]), np.array([0, 1]))
 
@@ -328,8 +329,8 @@ def test_few_patches_are_not_pooled() -> None:
 @pytest.mark.slow
 def test_pooled_lens_is_nearer_to_the_truth_than_its_samples_and_kept_by_profiles(tmp_path: Path) -> None:
     known = samples(24, photos=2)
-    model = LensModel.fit(known).warmed()
-    plain = LensModel.fit([replace(s, spectrum=None) for s in known]).warmed()
+    model = LensModel.fit(known, MIXED).warmed()
+    plain = LensModel.fit([replace(s, spectrum=None) for s in known], MIXED).warmed()
 
     place = FieldPosition(0.85, 0.4)
     truth = LENS.kernel(place, SETTINGS, 31)
@@ -359,9 +360,9 @@ def test_wavefront_has_the_say_at_any_width_where_its_diffraction_is_known() -> 
     known = samples(MIN_PLACES + 2)
     place = FieldPosition(0.0, 0.0)
 
-    assert LensModel.fit(known).warmed().query(place, SETTINGS, 31).wavefront_share == 1.0
+    assert LensModel.fit(known, MIXED).warmed().query(place, SETTINGS, 31).wavefront_share == 1.0
     unknown = [replace(s, pixel_pitch_um=None) for s in known]
-    assert LensModel.fit(unknown).warmed().query(place, SETTINGS, 31).wavefront_share < 1.0
+    assert LensModel.fit(unknown, MIXED).warmed().query(place, SETTINGS, 31).wavefront_share < 1.0
 
 
 def test_unknown_pitch_is_taken_as_a_usual_one_not_as_wide_kernels_suggest() -> None:

@@ -115,12 +115,9 @@ class TestCombined:
     def test_leans_on_the_wavefront_in_a_corner_without_samples(self) -> None:
         samples, corner = of_lens(4, 1), FieldPosition(0.97, 0.58)
         truth = draw_lens(4).kernel(corner, None, 21)
-        plain = LensModel.fit(samples).query(corner, LensSettings(), 21)
-        combined = (
-            LensModel.fit(samples, ModelSettings(method="combined"))
-            .warmed()
-            .query(corner, LensSettings(), 21)
-        )
+        mixed = ModelSettings(mode="mixed")
+        plain = LensModel.fit(samples, mixed).query(corner, LensSettings(), 21)
+        combined = LensModel.fit(samples, mixed).warmed().query(corner, LensSettings(), 21)
 
         assert plain.wavefront_share == 0.0
         assert combined.wavefront_share > 0.5
@@ -137,14 +134,14 @@ class TestCombined:
         asked = [FieldPosition(r, a) for r in (0.2, 0.5, 0.8) for a in (-2.0, 0.3, 2.2)]
 
         def error(method: str) -> float:
-            model = LensModel.fit(samples, ModelSettings(method=method)).warmed()
+            model = LensModel.fit(samples, ModelSettings(method=method, mode="mixed")).warmed()
             kernels = [(model.query(p, LensSettings(), 21).kernel, spots(p)) for p in asked]
             return float(np.mean([distance(k, t).rel_l2 for k, t in kernels]))
 
         assert error("combined") < 1.1 * error("blended")
 
     def test_waits_for_the_wavefront_until_it_is_asked_to_be_warm(self) -> None:
-        model = LensModel.fit(of_lens(4, 2))
+        model = LensModel.fit(of_lens(4, 2), ModelSettings(mode="mixed"))
         steps: list[tuple[int, int]] = []
         warm = model.warmed(lambda done, total: steps.append((done, total)))
 
@@ -155,10 +152,22 @@ class TestCombined:
         assert warm.query(FieldPosition(0.5, 0.2), LensSettings(), 21).wavefront_share > 0.0
         assert steps[-1][0] == steps[-1][1]
 
+    def test_default_mode_has_no_wavefront_and_is_warm_without_work(self) -> None:
+        model = LensModel.fit(of_lens(4, 2))
+
+        assert model.warm
+        assert model.warmed() is model
+        answer = model.query(FieldPosition(0.5, 0.2), LensSettings(), 21)
+        assert (answer.mode, answer.wavefront_share) == ("kernels", 0.0)
+
     def test_same_samples_give_the_same_wavefront(self) -> None:
         samples, corner = of_lens(2, 1), FieldPosition(0.97, 0.58)
-        one, two = (LensModel.fit(samples).warmed().query(corner, LensSettings(), 21) for _ in range(2))
+        mixed = ModelSettings(mode="mixed")
+        one, two = (
+            LensModel.fit(samples, mixed).warmed().query(corner, LensSettings(), 21) for _ in range(2)
+        )
 
+        assert one.wavefront_share > 0.0
         assert np.array_equal(one.kernel, two.kernel)
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from lensmodel.errors import CancelledError
 from lensmodel.psf import PsfSample, distance, gaussian
-from lensmodel.regression import LensModel
+from lensmodel.regression import LensModel, ModelSettings
 from lensmodel.regression.judgement import held_together
 from lensmodel.regression.physical import Physics
 from lensmodel.regression.wavefront import NAMES, Wavefront
@@ -21,6 +21,7 @@ from lensmodel.simulate import SimulatedLens, draw_lens
 from lensmodel.types import FieldPosition, Kernel, LensSettings
 
 SIZE = 31
+MIXED = ModelSettings(mode="mixed")
 LENS = draw_lens(1001, "zoom")
 SHORT, LONG = LENS.focal_mm
 CORNER, MID = FieldPosition(0.85, 0.9), FieldPosition(0.5, -2.0)
@@ -74,7 +75,7 @@ def test_terms_follow_a_straight_line_over_octaves() -> None:
 def test_few_samples_at_one_end_of_a_zoom_lean_on_those_of_the_other(
     many: list[PsfSample], few: list[PsfSample]
 ) -> None:
-    alone = LensModel.fit(few).warmed()
+    alone = LensModel.fit(few, MIXED).warmed()
 
     front = fit_wavefront([*many, *few])
 
@@ -92,7 +93,7 @@ def test_other_end_of_a_zoom_never_gets_worse(seed: int) -> None:
     for mine, other in (lens.focal_mm, lens.focal_mm[::-1]):
         rings = (0.15, 0.4, 0.6, 0.75, 0.9)
         own, few = taken(mine, rings, "mine", lens), taken(other, (0.3, 0.7), "other", lens)[1:7]
-        alone, both = LensModel.fit(own).warmed(), LensModel.fit([*own, *few]).warmed()
+        alone, both = LensModel.fit(own, MIXED).warmed(), LensModel.fit([*own, *few], MIXED).warmed()
 
         def missed(model: LensModel, focal: float = mine) -> float:
             kernels = model.kernels(FIELD, at(focal, lens), SIZE)
@@ -106,9 +107,9 @@ def test_zoom_in_the_mixture_is_kept_by_what_was_learned_and_not_worse_at_the_ot
     many: list[PsfSample], few: list[PsfSample]
 ) -> None:
     samples = [*many, *few]
-    model, alone = LensModel.fit(samples).warmed(), LensModel.fit(many).warmed()
+    model, alone = LensModel.fit(samples, MIXED).warmed(), LensModel.fit(many, MIXED).warmed()
 
-    again = LensModel.restored(samples, model.learned())
+    again = LensModel.restored(samples, model.learned(), MIXED)
 
     for focal in (SHORT, 1.05 * SHORT, LONG):
         both = model.query(CORNER, at(focal), SIZE), again.query(CORNER, at(focal), SIZE)

@@ -420,8 +420,8 @@ class CorrectionIn(Question):
         allow_inf_nan=False,
         description="how far beside edges to leave the range of light around; default: by the model's error",
     )
-    keep_flats: float = Field(
-        0.0, ge=0, le=1, allow_inf_nan=False, description="how much of its grain a flat area keeps"
+    denoise: float = Field(
+        0.0, ge=0, le=1, allow_inf_nan=False, description="how much of the photo's grain to take away"
     )
     output: OutputOptions = OutputOptions()
     roi: Region | None = None

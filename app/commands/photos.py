@@ -129,9 +129,9 @@ def correct(
             "range: 0 not at all, inf without bound. Default: the less sure the profile, the less.",
         ),
     ] = None,
-    keep_flats: Annotated[
+    denoise: Annotated[
         float,
-        typer.Option(min=0.0, max=1.0, metavar="0..1", help="How much of its grain a flat area keeps."),
+        typer.Option(min=0.0, max=1.0, metavar="0..1", help="How much of the photo's grain to take away."),
     ] = 0.0,
     file_format: Annotated[
         OutputFormat, choice("--format", get_args(OutputFormat), "dng: linear, for a raw converter.")
@@ -156,7 +156,7 @@ def correct(
 
         lensmodel correct one.dng --profile my-24mm.lensprofile -o web --format jpeg --strength 0.7
 
-        lensmodel correct one.dng --profile my-24mm.lensprofile -o soft --halo 0.2 --keep-flats 0.5
+        lensmodel correct one.dng --profile my-24mm.lensprofile -o soft --halo 0.2 --denoise 0.5
 
         lensmodel correct one.dng --profile my-24mm.lensprofile -o linear --format dng --method fast --json
 
@@ -173,7 +173,7 @@ def correct(
             aperture,
             method,
             strength,
-            Bounds(halo, keep_flats),
+            Bounds(halo, denoise),
             file_format,
             workers,
             any_lens=any_lens,

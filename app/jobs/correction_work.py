@@ -209,7 +209,7 @@ class CorrectionWork:
 
 
 def _bounds(params: dict[str, Any]) -> dict[str, float]:
-    return {name: params[name] for name in ("halo", "keep_flats") if name in params}
+    return {name: params[name] for name in ("halo", "denoise") if name in params}
 
 
 def _description(plan: CorrectionPlan) -> str:

@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 
 from lensmodel.blur import Drift, UniformBlur, crop_to_support
 from lensmodel.deconv.base import CoarseMethod, Deconvolver, Sensor, restore_planes
+from lensmodel.deconv.beside_clipped import held_beside_clipped
 from lensmodel.deconv.canvas import fitted_halo
 from lensmodel.deconv.engine import compiled, keep_freed_memory
 from lensmodel.deconv.lattice import Cell, Roi, cells, usual_pitch
 from lensmodel.deconv.limits import Bounds
 from lensmodel.deconv.methods import deconvolvers
 from lensmodel.deconv.report import CellForecast, ZoneReport, forecast, zone_reports
+from lensmodel.deconv.texture import texture_kept
 from lensmodel.errors import InvalidInputError
 from lensmodel.geometry import Frame
 from lensmodel.psf import PsfField, as_kernel, delta
@@ -330,8 +332,10 @@ def _restore(job: _Job, cell: Cell) -> tuple[Planes, CellForecast]:
     expected = forecast(cell, tile, blurs, sensors, errors)
     if job.strength == 0.0:
         return tile[inner], expected
-    restored = restore_planes(job.method, tile, blurs, sensors)[inner]
-    restored = job.bounds.hold(job.planes, (cell.top, cell.left), restored, errors, job.noise)
+    restored = restore_planes(job.method, tile, blurs, sensors)
+    restored = texture_kept(tile, restored, blurs, sensors, job.bounds.texture)
+    restored = held_beside_clipped(tile, restored, blurs, sensors, errors)[inner]
+    restored = job.bounds.hold(job.planes, (cell.top, cell.left), restored, errors)
     if job.strength < 1.0:
         restored = tile[inner] + np.float32(job.strength) * (restored - tile[inner])
     return restored, expected

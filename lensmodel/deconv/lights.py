@@ -16,12 +16,16 @@ from lensmodel.deconv.clipped import Region, around, regions
 from lensmodel.deconv.compiled_blur import CompiledBlur
 from lensmodel.deconv.engine import Engine, compiled
 from lensmodel.deconv.richardson_lucy import climbed, first_guess
+from lensmodel.psf import as_kernel
 from lensmodel.types import Planes
 
 _LEAST_SEEN: Final = 0.02  # share of a point's light that counts as measured where less of it is
 _UNSEEN: Final = 1e-3  # share of a point's light below which nothing is known of it
 _SIGMAS: Final = np.float32(3.0)
 _ABSURD: Final = np.float32(2.0)  # times what was measured: more glow than steps that end anywhere leave
+_ENERGY: Final = 0.98
+"""Share of a kernel's light within its reach: what is further out of a light at saturation is a fiftieth of
+it, and hardly seen (chosen)."""
 _DARKEST: Final = 0.9  # times what a kernel spreads: share of the darkest light nearby that must be left
 _DOUBT: Final = np.float32(0.25)  # share of the glow that may be none
 _GLARE: Final = np.float32(0.5)  # share of glow in the photo's light from which on the bound holds in full
@@ -68,7 +72,8 @@ class Lights:
 
         Divided by F^T 1 instead, lights of which little is measured take several times the steps; those
         of which nothing is would grow without end otherwise.
-        Only around clipped pixels near measured ones: see `lensmodel.deconv.clipped.regions`.
+        Only of lights that the lens may have spread (`compact`), around clipped pixels near measured ones
+        (`lensmodel.deconv.clipped.regions`). Broad clipped areas are taken for light at saturation.
         Positive and unrestrained, x is a poor picture, so only what lies above t is taken from it.
         """
         if not any(
@@ -79,8 +84,8 @@ class Lights:
         loops = compiled(engine)
         for c, (plane, blur, sensor) in enumerate(zip(tile, blurs, sensors, strict=True)):
             clipped = blown(plane, sensor)
-            quick = CompiledBlur.of(blur, loops)
-            for region in regions(clipped, blur.reach):
+            quick = CompiledBlur.of(positive(blur), loops)
+            for region in regions(compact(clipped, far(blur)), blur.reach):
                 _find(region, plane, clipped, quick, sensor, steps, engine, (rest[c], beyond[c], glow[c]))
             rest[c] -= np.where(clipped, np.float32(0.0), glow[c])
         return cls(rest, beyond, glow, np.array([_spread(blur) for blur in blurs], dtype=np.float32))
@@ -113,6 +118,44 @@ class Lights:
 def blown(plane: NDArray[np.float32], sensor: Sensor) -> NDArray[np.bool_]:
     """Pixels of which only a lower bound is known."""
     return np.asarray(plane >= np.float32(sensor.clip))
+
+
+def compact(clipped: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+    """Clipped pixels of areas that a lamp may have made through a kernel of this reach.
+
+    An area with a clipped pixel further than the reach from all measured ones is broad: how bright it is
+    inside, nothing tells.
+    """
+    if not clipped.any():
+        return clipped
+    depth = ndimage.distance_transform_cdt(np.pad(clipped, 1), "chessboard")[1:-1, 1:-1]
+    labels, count = ndimage.label(clipped, structure=np.ones((3, 3), dtype=np.int8))
+    deepest = ndimage.maximum(depth, labels, np.arange(count + 1))
+    broad = np.asarray(deepest) > reach
+    broad[0] = True
+    return np.asarray(~broad[labels])
+
+
+def far(blur: UniformBlur) -> int:
+    """Radius in pixels that holds nearly all light of a kernel and its shift, and a pixel more."""
+    half = blur.kernel.shape[0] // 2
+    rows, cols = np.mgrid[-half : half + 1, -half : half + 1]
+    light = np.bincount(np.maximum(np.abs(rows), np.abs(cols)).ravel(), blur.kernel.ravel()).cumsum()
+    inner = int(np.searchsorted(light, _ENERGY * light[-1]))
+    return max(inner, 1) + int(np.ceil(max(abs(blur.offset[0]), abs(blur.offset[1])))) + 1
+
+
+def positive(blur: UniformBlur) -> UniformBlur:
+    """The same blur, its shift by parts of a pixel in the kernel, so that no light becomes negative.
+
+    A shift that acts as a phase belongs to a kernel with negative lobes, behind which Richardson-Lucy steps
+    run away.
+    """
+    if blur.offset == (0.0, 0.0):
+        return blur
+    wide = blur.reach - blur.kernel.shape[0] // 2
+    moved = ndimage.shift(np.pad(blur.kernel, wide), blur.offset, order=1)
+    return UniformBlur(as_kernel(np.maximum(moved, 0.0)))
 
 
 def _spread(blur: UniformBlur) -> float:

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lensmodel.deconv.engine import compiled
+from lensmodel.deconv.texture import SHARE
 from lensmodel.errors import InvalidInputError
-from lensmodel.types import NoiseModel, Planes
+from lensmodel.types import Planes
 
 WINDOW: Final = 2
 """Pixels around each one in which the photo is looked at."""
@@ -23,8 +24,6 @@ _FREE: Final = (
 )
 _WIDEST: Final = 4.0  # share of the range beyond which a bound would cut nothing but noise
 _DARKEST, _DARKER = 0.5, 0.2  # of the darkest light nearby where no room is left, and per room
-_LEAST_VARIANCE: Final = 1e-12  # black without read noise has none
-_CALM, _BUSY = 1.5, 3.0  # standard deviation over the noise's, of a flat area and of one that is none
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,22 +35,27 @@ class Bounds:
     halo : float or None
         By how much of the photo's range within 2 pixels the result may leave it: 0 not at all, infinity
         without bound. None takes it from the expected error of the kernels.
-    keep_flats : float
-        0 to 1: how much of its own grain the photo keeps where it shows nothing else.
+    denoise : float
+        0 to 1: 0 keeps the photo's own grain and faint texture, 1 leaves what the prior makes of them.
     """
 
     halo: float | None = None
-    keep_flats: float = 0.0
+    denoise: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (self.halo is None or self.halo >= 0.0) or not 0.0 <= self.keep_flats <= 1.0:
-            raise InvalidInputError(f"halo must not be negative and keep_flats lie in 0..1, got {self}")
+        if not (self.halo is None or self.halo >= 0.0) or not 0.0 <= self.denoise <= 1.0:
+            raise InvalidInputError(f"halo must not be negative and denoise lie in 0..1, got {self}")
 
     @property
     def described(self) -> str:
         """What was asked for, for the tag of a corrected photo; nothing where nothing was."""
         halo = "" if self.halo is None else f", halo {self.halo:g}"
-        return halo + (f", flats kept {self.keep_flats:g}" if self.keep_flats > 0.0 else "")
+        return halo + (f", denoised {self.denoise:g}" if self.denoise > 0.0 else "")
+
+    @property
+    def texture(self) -> float:
+        """Share of what a correction leaves unexplained that the photo keeps."""
+        return SHARE * (1.0 - self.denoise)
 
     def hold(
         self,
@@ -59,11 +63,10 @@ class Bounds:
         at: tuple[int, int],
         restored: Planes,
         errors: Sequence[float],
-        noise: Sequence[NoiseModel],
     ) -> Planes:
         """Hold what was made of the part of a photo that begins at `at` within these bounds."""
         shares = [allowance(error) if self.halo is None else self.halo for error in errors]
-        if self.keep_flats == 0.0 and not np.isfinite(shares).any():
+        if not np.isfinite(shares).any():
             return restored
         rows, cols = (
             np.clip(np.arange(first - WINDOW, first + extent + WINDOW), 0, end - 1)
@@ -71,8 +74,7 @@ class Bounds:
         )
         photo = np.asarray(planes[:, rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1], dtype=np.float32)
         photo = photo[:, (rows - rows[0])[:, None], (cols - cols[0])[None, :]]
-        restored = limited(photo, restored, shares, compiled("auto"))
-        return flats_kept(photo, restored, noise, self.keep_flats) if self.keep_flats > 0.0 else restored
+        return limited(photo, restored, shares, compiled("auto"))
 
 
 def allowance(error: float) -> float:
@@ -125,26 +127,3 @@ def _middle(wide: NDArray[np.floating]) -> NDArray[np.floating]:
 def _dark(share: float) -> np.float32:
     """Share of the darkest light nearby below which nothing falls: black lines are seen before all else."""
     return np.float32(max(_DARKEST - _DARKER * share, 0.0))
-
-
-def flats_kept(photo: Planes, restored: Planes, noise: Sequence[NoiseModel], share: float) -> Planes:
-    """Give back the photo's own grain where it shows nothing but grain.
-
-    Parameters
-    ----------
-    photo, restored : Planes
-        As `limited` takes them.
-    noise : sequence of NoiseModel
-        By colour.
-    share : float
-        0 changes nothing, 1 leaves flat areas as they were.
-    """
-    ratio = np.zeros(restored.shape[1:], dtype=np.float32)
-    for plane, model in zip(photo, noise, strict=True):
-        mean = ndimage.uniform_filter(plane, _SIDE)
-        local = ndimage.uniform_filter(plane * plane, _SIDE) - mean * mean
-        ratio = np.maximum(ratio, _middle(local / np.maximum(model.variance(mean), _LEAST_VARIANCE)))
-    contrast = np.sqrt(np.maximum(ratio, np.float32(0.0)))
-    t = np.clip((contrast - _CALM) / (_BUSY - _CALM), 0.0, 1.0)
-    keep: NDArray[np.float32] = (share * (1.0 - t * t * (3.0 - 2.0 * t))).astype(np.float32)
-    return np.asarray(restored + keep * (_middle(photo) - restored), dtype=np.float32)

@@ -17,6 +17,7 @@ from lensmodel.deconv.canvas import Canvas, seam
 from lensmodel.deconv.engine import Engine, compiled
 from lensmodel.deconv.lights import Lights
 from lensmodel.deconv.local import Blocks, signal_variance, smoothed, spread
+from lensmodel.deconv.mosaic import refilled
 from lensmodel.deconv.outside import fill_outside
 from lensmodel.deconv.shrinkage import Shrinkage
 from lensmodel.deconv.transfers import transfers
@@ -181,6 +182,8 @@ class SparseGradient:
 
         if not all(sensor.surrounded for sensor in sensors):
             fill_outside(y, blurred, light, K, blurs, sensors, canvas, self.light_steps, self.engine)
+        if any(sensor.measured is not None for sensor in sensors) and len(blurred) == len(CHANNELS):
+            refilled(y, K, noise, variance, sensors, canvas)
 
         def ramp(axis: int) -> NDArray[np.float32]:
             """Pixels from where the kernel is K; held at the ends of the data, beyond which lies no datum."""

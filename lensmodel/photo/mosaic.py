@@ -18,6 +18,9 @@ _BAND: Final = 16
 _CLUSTER: Final = 0.005
 """Width of the pile of saturated pixels, relative to the range: full wells differ a little."""
 
+_STRAYS: Final = 0.02
+"""Share of a pile that may lie above it: hot pixels; more is a bright part of the picture."""
+
 _LOWEST_PILE: Final = 0.8
 """Lowest level, relative to the stated one, at which sensors were seen to clip."""
 
@@ -115,9 +118,8 @@ class Mosaic:
             For r, g, b the level of saturation on that scale, at most 1.
         """
         piles = {k: self._pile(k) for k in range(4) if self.is_bayer or k < 3}
-        top = int(self.values.max())
-        ends = [high for pile in piles.values() if pile is not None for high in pile[1:]]
-        white = top if ends and max(ends) == top < self.white else self.white
+        ends = [pile[1] for pile in piles.values() if pile is not None]
+        white = min(max(ends), self.white) if ends else self.white
         clip = [1.0, 1.0, 1.0]
         for k, pile in piles.items():
             if pile is not None:
@@ -127,20 +129,39 @@ class Mosaic:
         return white, (clip[0], clip[1], clip[2])
 
     def _pile(self, colour: int) -> tuple[int, int] | None:
-        """Lower and upper end of the pile of saturated pixels of one colour; `None` without one."""
+        """Lower and upper end of the pile of saturated pixels of one colour; `None` without one.
+
+        Full wells differ from pixel to pixel, by a hundredth on old sensors, and a few hot pixels shine
+        beyond them. So the pile is where most pixels of the upper end of the range are, far more than below
+        it and next to none above.
+        """
         counts = np.bincount(self.values[self.colours == colour])
-        if not counts.sum():
+        scale = self.white - self.black[colour]
+        first = max(int(self.black[colour] + _LOWEST_PILE * scale), 0)
+        width = max(2, round(_CLUSTER * scale))
+        if len(counts) <= first + 1:
             return None
-        top = len(counts) - 1
-        width = max(2, round(_CLUSTER * (self.white - self.black[colour])))
-        if top < self.black[colour] + _LOWEST_PILE * (self.white - self.black[colour]):
-            return None
-        pile, below = counts[top - width + 1 :], counts[top - 3 * width + 1 : top - width + 1]
+        sums = np.concatenate([[0], counts.cumsum()])
+
+        def within(low: int, high: int) -> int:
+            low, high = (min(max(level, 0), len(counts)) for level in (low, high))
+            return int(sums[high] - sums[low])
+
+        at = np.arange(first, len(counts))
+        middle = int(at[np.argmax(sums[np.minimum(at + width, len(counts))] - sums[at])]) + width // 2
+        low, high = middle - 2 * width, middle + 2 * width
+        pile, below, above = (
+            within(low, high),
+            within(2 * low - high, low),
+            within(high, len(counts)),
+        )
+        total = within(0, len(counts))
         # More than half of a colour in one pile is an even area of a drawing, not a clipped light.
-        if not max(50, 2e-5 * counts.sum()) < pile.sum() < 0.5 * counts.sum() or pile.sum() < 5 * below.sum():
+        if not max(50, 2e-5 * total) < pile < 0.5 * total or pile < 5 * below or above > _STRAYS * pile:
             return None
-        low = int(np.searchsorted(np.cumsum(pile), 0.02 * pile.sum()))
-        return top - width + 1 + low, top
+        inside = np.cumsum(counts[max(low, 0) :])
+        ends = np.searchsorted(inside, (0.02 * pile, (1.0 - _STRAYS / 2.0) * inside[-1]))
+        return max(low, 0) + int(ends[0]), max(low, 0) + int(ends[1])
 
     def bayer_pattern(self) -> BayerPattern | None:
         """Channel of each pixel of the top left 2 x 2; `None` for X-Trans."""

@@ -80,12 +80,12 @@ def test_bounds_make_another_correction_and_none_the_same_as_before_there_were_a
 ) -> None:
     photo = steps.counted()
     plain = post(client, photo_id=photo.public_id).json()["id"]
-    unbound = post(client, photo_id=photo.public_id, halo=None, keep_flats=0.0).json()["id"]
-    bound = post(client, photo_id=photo.public_id, halo=0.2, keep_flats=0.5).json()["id"]
+    unbound = post(client, photo_id=photo.public_id, halo=None, denoise=0.0).json()["id"]
+    bound = post(client, photo_id=photo.public_id, halo=0.2, denoise=0.5).json()["id"]
 
     assert unbound == plain != bound
     rows = [store.corrections.get(key) for key in (plain, bound)]
-    assert [[row.params.get(name) for name in ("halo", "keep_flats")] for row in rows if row] == [
+    assert [[row.params.get(name) for name in ("halo", "denoise")] for row in rows if row] == [
         [None, None],
         [0.2, 0.5],
     ]
@@ -169,7 +169,7 @@ def test_a_lens_without_samples_cannot_correct(client: TestClient, steps: Steps)
         ({"strength": "NaN"}, 422, "invalid_parameter"),
         ({"halo": -0.1}, 422, "invalid_parameter"),
         ({"halo": "NaN"}, 422, "invalid_parameter"),
-        ({"keep_flats": 1.5}, 422, "invalid_parameter"),
+        ({"denoise": 1.5}, 422, "invalid_parameter"),
         ({"output": {"format": "bmp"}}, 422, "invalid_parameter"),
         ({"output": {"quality": 0}}, 422, "invalid_parameter"),
         ({"output": {"color_space": "adobe"}}, 422, "invalid_parameter"),

@@ -185,15 +185,15 @@ def test_correct_leaves_what_is_there_alone_unless_forced(folder: Path, here: He
     assert forced.stdout == forced.stderr == ""
 
 
-def test_photographer_bounds_halos_and_keeps_the_grain_of_flats(folder: Path, here: Here) -> None:
+def test_photographer_bounds_halos_and_takes_the_grain_away(folder: Path, here: Here) -> None:
     words = ("correct", "one.dng", "-p", PROFILE, "--method", "fast")
     here(*words, "-o", "plain", "--strength", "0")
     here(*words, "-o", "free", "--halo", "inf")
-    done = here(*words, "-o", "bound", "--halo", "0", "--keep-flats", "1")
+    done = here(*words, "-o", "bound", "--halo", "0", "--denoise", "1")
 
     assert done.returncode == 0, done.stderr
     with tifffile.TiffFile(folder / "bound/one-corrected.tif") as file:
-        assert "method fast, strength 1, halo 0, flats kept 1" in file.pages[0].description
+        assert "method fast, strength 1, halo 0, denoised 1" in file.pages[0].description
         assert "profile of 1 photo," in file.pages[0].description
     plain, free, bound = (
         tifffile.imread(folder / name / "one-corrected.tif").astype(float)

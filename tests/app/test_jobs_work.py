@@ -573,10 +573,10 @@ def test_a_photographers_bounds_reach_the_correction_and_its_tag(
         return write_result(arguments, folder)
 
     sandbox.answers["correct"] = [keep, keep]
-    for bounds in ({}, {"halo": 0.2, "keep_flats": 0.5}):
+    for bounds in ({}, {"halo": 0.2, "denoise": 0.5}):
         CorrectionWork(bench).correction(ask(bench, counted, steps, **bounds))
 
-    assert [one["bounds"] for one in told] == [{}, {"halo": 0.2, "keep_flats": 0.5}]
+    assert [one["bounds"] for one in told] == [{}, {"halo": 0.2, "denoise": 0.5}]
     assert told[0]["description"].endswith("strength 1")
     assert told[1]["description"].endswith("strength 1, halo 0.2, flats kept 0.5")
 

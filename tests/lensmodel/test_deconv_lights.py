@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from scipy import ndimage
 
 from lensmodel.blur import UniformBlur
+from lensmodel.deconv import correct_planes
 from lensmodel.deconv.base import Sensor
 from lensmodel.deconv.clipped import Region, regions
 from lensmodel.deconv.compiled_blur import CompiledBlur
 from lensmodel.deconv.engine import compiled
 from lensmodel.deconv.lights import Lights
-from lensmodel.psf import gaussian
-from lensmodel.types import NoiseModel
+from lensmodel.geometry import Frame
+from lensmodel.psf import as_kernel, gaussian
+from lensmodel.types import CHANNELS, Channel, FieldPosition, Kernel, NoiseModel
 
 REACH = 4
 KERNEL = gaussian(2 * REACH + 1, np.eye(2) * 1.2)
@@ -149,3 +153,69 @@ def test_lights_behind_next_to_no_blur_do_not_run_away(shift: tuple[float, float
     assert found is not None
     assert np.abs(found.rest).max() < 4.0
     assert found.beyond.max() < 4.0
+
+
+@dataclass(frozen=True)
+class Lens:
+    """One kernel, and red and blue images that are larger and smaller than the green one."""
+
+    kernel: np.ndarray
+    shift: float
+
+    def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
+        return as_kernel(np.pad(self.kernel, (size - self.kernel.shape[0]) // 2))
+
+    def displacement(self, r: float, channel: Channel) -> float:
+        return {"r": self.shift, "g": 0.0, "b": -self.shift}[channel] * r
+
+
+def surface(clipped: int) -> np.ndarray:
+    """A lacquered surface in the sun, grooved, with a bright label, of which `clipped` colours saturate."""
+    rows, cols = np.mgrid[:160, :200].astype(np.float64)
+    rng = np.random.default_rng(7)
+    grooves = 1.0 + 0.25 * (np.sin(rows / 1.9) > 0.4) + 0.05 * rng.standard_normal(rows.shape)
+    label = (abs(cols - 120) < 22) & (abs(rows - 80) < 60) & ~((rows % 16 < 4) & (cols % 12 < 8))
+    colour = np.array([1.1, 1.1 if clipped > 1 else 0.4, 1.1 if clipped > 2 else 0.25])
+    light = colour[:, None, None] * (0.72 + 0.25 * (cols < 60)) * grooves
+    return np.where(label, 1.15 * colour[:, None, None], light).astype(np.float32)
+
+
+@pytest.mark.parametrize("method", ["standard", "fast", "paper"])
+@pytest.mark.parametrize("clipped", [1, 2, 3])
+@pytest.mark.parametrize(
+    ("width", "shift"), [(0.05, 1.0001), (0.5, 0.0), (0.5, 1.0001), (1.5, 0.3), (1.5, 3.0), (4.0, 1.0001)]
+)
+def test_clipped_surfaces_beside_lateral_colour_show_no_dots(
+    method: str, clipped: int, width: float, shift: float
+) -> None:
+    scene, frame = surface(clipped), Frame(120, 160)
+    lens = Lens(gaussian(19, np.eye(2) * width**2), shift)
+    rows, cols = np.indices((frame.height, frame.width), dtype=np.float64)
+    row, col = frame.center
+    truth, light = scene[:, 20:-20, 20:-20], []
+    for plane, channel in zip(scene.astype(np.float64), CHANNELS, strict=True):
+        soft = ndimage.convolve(plane, lens.kernel)
+        size = 1.0 + lens.displacement(1.0, channel) / frame.half_diagonal
+        where = [(rows - row) / size + row + 20, (cols - col) / size + col + 20]
+        light.append(ndimage.map_coordinates(soft, where, order=3))
+    noise = NoiseModel(2e-5, 1e-6)
+    seen = np.stack(light) + np.random.default_rng(8).standard_normal(truth.shape) * 4e-3
+    photo = np.minimum(seen, 1.0).astype(np.float32)
+
+    made = correct_planes(
+        photo,
+        lens,
+        frame,
+        noise=[noise] * 3,
+        method=method,
+        lateral=lens if shift > 0.0 else None,
+        clip=(0.995, 0.995, 0.995),
+    ).planes
+
+    lost = ndimage.binary_dilation((photo >= 0.995).any(axis=0), iterations=2)
+    window = (1, 9, 9)  # a dot is out of range of all that the blur reaches
+    low, high = ndimage.minimum_filter(photo, window), ndimage.maximum_filter(photo, window)
+    shown, wanted = np.minimum(made, 1.0), np.minimum(truth, 1.0)
+    dots = (shown < low - 0.05) | (shown > high + 0.05)
+    assert dots[:, lost].mean() < 0.001
+    assert np.sqrt(np.mean((shown - wanted) ** 2)) < 1.02 * np.sqrt(np.mean((photo - wanted) ** 2))

@@ -94,6 +94,23 @@ def test_saturation_is_where_the_clipped_pixels_pile_up_and_not_where_the_file_s
     assert planes[:, 10, 10] == pytest.approx(expected, rel=0.05)
 
 
+def test_full_wells_that_differ_by_a_hundredth_are_one_pile_although_hot_pixels_shine_beyond(
+    tmp_path: Path,
+) -> None:
+    rng = np.random.default_rng(5)
+    scene = textured(128, 128) * 1.0
+    scene[40:80, 40:80] = 2.0
+    wells = 0.93 + 0.003 * np.clip(rng.standard_normal(scene.shape), -3.0, 3.0)
+    wells[41, 42] = wells[60, 60] = 0.97
+    mosaic = BLACK + np.rint(np.minimum(scene, wells) * (WHITE - BLACK)).astype(np.uint16)
+    write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE)
+    developed = photo.develop(tmp_path / "x.dng")
+
+    blown = developed.planes[:, 44:76, 44:76]
+    assert (blown >= np.array(developed.clip)[:, None, None] - 0.005).mean() > 0.97
+    assert developed.planes[:, 90:, 90:].max() < min(developed.clip)
+
+
 def test_a_colour_that_clips_below_the_others_says_so(tmp_path: Path) -> None:
     scene = textured(128, 128)
     scene[40:80, 40:80] = 1.0

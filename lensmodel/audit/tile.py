@@ -1,0 +1,113 @@
+"""The audit of one tile: every check, one smooth map of what is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lensmodel.audit.base import Evidence, Finding, TileAudit, check_pair
+from lensmodel.audit.hue import foreign_hue
+from lensmodel.audit.light import black_light, isolated
+from lensmodel.audit.reblur import misfit
+from lensmodel.types import Plane, Planes
+
+Check: TypeAlias = Callable[[Planes, Planes, Evidence], Plane]
+"""Severity at each pixel of an original, its correction and what is known of them; above 1 is a fault."""
+
+CHECKS: Final[Mapping[str, Check]] = MappingProxyType(
+    {"black light": black_light, "isolated pixels": isolated, "hue": foreign_hue, "re-blur": misfit}
+)
+"""Every check by name."""
+
+_SOFTNESS: Final = 1.5
+"""Standard deviation in pixels of what makes the map smooth: a fault of one pixel leaves no edge."""
+_GROWN: Final = 3
+"""Side of the square over which the least that is kept spreads before."""
+
+Inner: TypeAlias = tuple[slice, slice]
+
+
+def audit_tile(
+    original: Planes, corrected: Planes, evidence: Evidence, *, inner: Inner | None = None
+) -> TileAudit:
+    """Audit the correction of a tile.
+
+    A check's severity s says how many times what is allowed was found: of a correction that is in order,
+    s <= 1, all is kept, of one twice beyond nothing, and 2 - s between.
+
+    Parameters
+    ----------
+    original, corrected : Planes, shape (3, rows, cols)
+        Linear light, saturation 1, with the pixels around if there are any: the more, the surer the
+        verdict on the rim.
+    evidence : Evidence
+        What is known besides.
+    inner : tuple of slice or None
+        The part that is judged; the rest is context. None for all.
+
+    Returns
+    -------
+    TileAudit
+        Of the inner part.
+
+    Raises
+    ------
+    InvalidInputError
+        If the planes have different sizes.
+    """
+    check_pair(original, corrected)
+    inner = inner or (slice(None), slice(None))
+    kept = np.ones(original.shape[1:], dtype=np.float32)
+    findings = []
+    for name, check in CHECKS.items():
+        severity = check(original, corrected, evidence)
+        one = _softened(np.clip(2.0 - severity, 0.0, 1.0))
+        findings.append(_finding(name, severity[inner], one[inner]))
+        np.minimum(kept, one, out=kept)
+    return TileAudit(kept[inner], tuple(findings))
+
+
+def held_back(
+    original: Planes, corrected: Planes, evidence: Evidence, *, inner: Inner | None = None
+) -> tuple[Planes, TileAudit]:
+    """Audit the correction of a tile and mix it back towards the original as far as it fails.
+
+    Parameters and errors as `audit_tile`.
+
+    Returns
+    -------
+    planes : Planes, shape (3, rows, cols) of the inner part
+        original + keep (corrected - original); where all is kept, the very values of the correction.
+    audit : TileAudit
+        Why.
+    """
+    audit = audit_tile(original, corrected, evidence, inner=inner)
+    part = (slice(None), *(inner or (slice(None), slice(None))))
+    before, after = original[part], corrected[part]
+    if audit.keep.min(initial=1.0) == 1.0:
+        return after, audit
+    return np.asarray(before + audit.keep * (after - before), dtype=np.float32), audit
+
+
+def _softened(keep: NDArray[np.floating]) -> Plane:
+    """Spread the least that is kept and smooth it, so that it ends nowhere at once."""
+    if keep.min(initial=1.0) == 1.0:
+        return np.asarray(keep, dtype=np.float32)
+    grown = ndimage.minimum_filter(np.asarray(keep, dtype=np.float32), _GROWN)
+    return np.minimum(ndimage.gaussian_filter(grown, _SOFTNESS, mode="nearest"), np.float32(1.0))
+
+
+def _finding(name: str, severity: Plane, keep: Plane) -> Finding:
+    row, col = np.unravel_index(int(severity.argmax()), severity.shape)
+    return Finding(
+        name,
+        float(1.0 - keep.mean(dtype=np.float64)),
+        float((keep < 0.5).mean()),
+        float(severity[row, col]),
+        (int(row), int(col)),
+    )

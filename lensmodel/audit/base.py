@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -50,19 +50,71 @@ class Evidence:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fault:
-    """What one check found in a tile.
+class Spectra:
+    """Power in overlapping windows of the mean of the colours.
 
     Parameters
     ----------
-    check : str
-        Name of the check, as in `checks`.
-    severity : Plane, shape (rows, cols)
-        How many times what is allowed was found, at each pixel; 1 and less is in order.
+    original, corrected : ndarray of float32, shape (down, across, side, side // 2 + 1)
+        On the `rfft2` grid of a window.
+    noise : ndarray of float32, shape (down, across)
+        Power of white noise as strong as the photo's.
     """
 
-    check: str
-    severity: Plane
+    original: NDArray[np.float32]
+    corrected: NDArray[np.float32]
+    noise: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pair:
+    """A tile of a photo and what was made of it, with what several checks need.
+
+    Parameters
+    ----------
+    original, corrected : Planes, shape (3, rows, cols)
+        Linear light, saturation 1; the correction no brighter than what the file can hold.
+    sigma : Planes
+        Standard deviation of the photo's noise at each pixel.
+    evidence : Evidence
+        What else is known.
+    spectra : list of Spectra
+        None or one: what the checks of the spectrum share.
+    """
+
+    original: Planes
+    corrected: Planes
+    sigma: Planes
+    evidence: Evidence
+    spectra: list[Spectra] = field(default_factory=list, init=False)
+
+    @classmethod
+    def of(cls, original: Planes, corrected: Planes, evidence: Evidence) -> Pair:
+        """Check that the planes belong together.
+
+        Light beyond the level at which the photo clips is written as that level: it is judged so too.
+
+        Raises
+        ------
+        InvalidInputError
+            If they are no three planes of one size.
+        """
+        if original.shape != corrected.shape or original.ndim != 3 or original.shape[0] != len(CHANNELS):
+            raise InvalidInputError(
+                f"original and correction must be (3, rows, cols) of one size, got {original.shape} and "
+                f"{corrected.shape}"
+            )
+        top = np.asarray(evidence.clip, dtype=np.float32)[:, None, None]
+        sigma = [
+            np.sqrt(np.maximum(n.variance(y), LEAST_VARIANCE))
+            for n, y in zip(evidence.noise, original, strict=True)
+        ]
+        return cls(original, np.minimum(corrected, top), np.asarray(sigma, dtype=np.float32), evidence)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.original.shape[1], self.original.shape[2]
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,38 +152,25 @@ class TileAudit:
         Share of the correction that is kept, 0 to 1; 1 everywhere on a sound tile.
     findings : tuple of Finding
         One for each check that ran, in their order.
+    held_back : float
+        Mean share of the correction that is held back.
     """
 
     keep: Plane
     findings: tuple[Finding, ...]
+    held_back: float
 
-    @property
-    def held_back(self) -> float:
-        """Mean share of the correction that is held back."""
-        return float(1.0 - self.keep.mean(dtype=np.float64))
+    @classmethod
+    def of(cls, keep: Plane, findings: tuple[Finding, ...]) -> TileAudit:
+        """Take the mean of a map."""
+        return cls(keep, findings, float(1.0 - keep.mean(dtype=np.float64)))
+
+    def without_map(self) -> TileAudit:
+        """Return the figures alone, for a report: the maps of a whole photo are as large as a plane of it."""
+        return replace(self, keep=np.zeros((0, 0), dtype=np.float32))
 
     @property
     def reasons(self) -> tuple[str, ...]:
         """Names of the checks that held something back, the one that held back most first."""
         at_fault = [finding for finding in self.findings if finding.held_back > 0.0]
         return tuple(f.check for f in sorted(at_fault, key=lambda f: -f.held_back))
-
-
-def sigma_of(noise: NoiseModel, plane: Plane) -> Plane:
-    """Standard deviation of the noise at each pixel of the photo."""
-    return np.sqrt(np.maximum(noise.variance(plane), LEAST_VARIANCE)).astype(np.float32)
-
-
-def check_pair(original: Planes, corrected: Planes) -> None:
-    """Refuse planes that do not belong together.
-
-    Raises
-    ------
-    InvalidInputError
-        If they are no three planes of one size.
-    """
-    if original.shape != corrected.shape or original.ndim != 3 or original.shape[0] != len(CHANNELS):
-        raise InvalidInputError(
-            f"original and correction must be (3, rows, cols) of one size, got {original.shape} and "
-            f"{corrected.shape}"
-        )

@@ -46,12 +46,16 @@ def around(totals: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def to_pixels(figures: NDArray[np.float32], shape: tuple[int, int]) -> Plane:
     """Bilinear interpolation of one figure per block to the pixels; constant beyond the outer blocks."""
+    return spread(figures, shape, first=(SIDE - 1) / 2.0, step=SIDE)
+
+
+def spread(figures: NDArray[np.float32], shape: tuple[int, int], *, first: float, step: int) -> Plane:
+    """Bilinear interpolation of figures that stand `step` pixels apart, the first of them at `first`."""
     along = []
     for extent, count in zip(shape, figures.shape, strict=True):
-        at = np.clip((np.arange(extent, dtype=np.float32) + 0.5) / SIDE - 0.5, 0.0, count - 1)
+        at = np.clip((np.arange(extent, dtype=np.float32) - np.float32(first)) / step, 0.0, count - 1)
         low = np.minimum(at.astype(np.intp), max(count - 2, 0))
-        along.append((low, (at - low).astype(np.float32)))
-    (top, down), (left, right) = along
-    below, beside = np.minimum(top + 1, figures.shape[0] - 1), np.minimum(left + 1, figures.shape[1] - 1)
+        along.append((low, np.minimum(low + 1, count - 1), (at - low).astype(np.float32)))
+    (top, below, down), (left, beside, right) = along
     rows = figures[top] + down[:, None] * (figures[below] - figures[top])
     return np.asarray(rows[:, left] + right * (rows[:, beside] - rows[:, left]), dtype=np.float32)

@@ -5,35 +5,42 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from scipy import ndimage
 
-from lensmodel.audit.base import Evidence, sigma_of
-from lensmodel.types import Plane, Planes
+from lensmodel.audit import blocks, near
+from lensmodel.audit.base import Pair
+from lensmodel.types import Plane
 
+AREA: Final = 1.0
+PIXEL: Final = 1.0
 _SIDE: Final = 7
-_FREE: Final = 0.1
-_SHARE: Final = 2.0
+_LEAST: Final = 0.02
+_FREE, _SHARE = 0.25, 2.0
 _NOISE: Final = 4.0
+_FLOOR: Final = 12.0
 
 
-def foreign_hue(original: Planes, corrected: Planes, evidence: Evidence) -> Plane:
+def foreign_hue(pair: Pair) -> Plane:
     """Severity of colours beyond those that the photo shows within 3 pixels.
 
-    Colour is (r - g) / (r + g + b) and (b - g) / (r + g + b), a share of the light, so that what is dark has
-    none to speak of.
+    Colour is (r - g) / (r + g + b) and (b - g) / (r + g + b) of the photo smoothed over 3 x 3 pixels, where
+    noise adds to the light, so that what is dark has no colour to speak of. What lies beyond is judged
+    pixel by pixel against a fixed bound, and over an area against the range that the photo has there.
     """
-    sigma = np.mean([sigma_of(n, y) for n, y in zip(evidence.noise, original, strict=True)], axis=0)
-    calm = ndimage.uniform_filter(original, (1, 3, 3))
-    floor = np.float32(12.0) * sigma
+    sigma = pair.sigma.mean(axis=0)
+    calm = near.mean(pair.original, 3)
+    floor = np.float32(_FLOOR) * sigma
     light = np.maximum(calm, 0.0).sum(axis=0) + floor
-    bounded = np.minimum(corrected, np.asarray(evidence.clip, dtype=np.float32)[:, None, None])
-    made = np.maximum(bounded, 0.0).sum(axis=0) + floor
-    worst = np.zeros(original.shape[1:], dtype=np.float32)
+    made = np.maximum(pair.corrected, 0.0).sum(axis=0) + floor
+    worst = np.zeros(pair.shape, dtype=np.float32)
     for one in (0, 2):
         before = (calm[one] - calm[1]) / light
-        after = (bounded[one] - bounded[1]) / made
-        low, high = ndimage.minimum_filter(before, _SIDE), ndimage.maximum_filter(before, _SIDE)
-        beyond = np.maximum(after - high, low - after)
-        allowed = _FREE + _SHARE * (high - low) + _NOISE * sigma / made
-        np.maximum(worst, beyond / allowed, out=worst)
+        after = (pair.corrected[one] - pair.corrected[1]) / made
+        low, high = near.lowest(before, _SIDE), near.highest(before, _SIDE)
+        span = high - low
+        beyond = np.maximum(after - high, low - after) - np.float32(_NOISE) * sigma / made
+        beyond = np.maximum(beyond, np.float32(0.0))
+        np.maximum(worst, beyond / (PIXEL * (_FREE + _SHARE * span)), out=worst)
+        part = blocks.around(blocks.sums(np.square(beyond)))
+        whole = blocks.around(blocks.sums(np.square(span) + np.float32(_LEAST**2)))
+        np.maximum(worst, blocks.to_pixels(np.sqrt(part / whole) / np.float32(AREA), pair.shape), out=worst)
     return worst

@@ -6,55 +6,68 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
-from lensmodel.audit import blocks
-from lensmodel.audit.base import Evidence, sigma_of
-from lensmodel.types import Plane, Planes
+from lensmodel.audit import blocks, near
+from lensmodel.audit.base import Pair
+from lensmodel.types import Plane
 
-_BLACK_SHARE: Final = 0.16
-_GONE: Final = 0.05
+NEGATIVE: Final = 0.15
+DARK: Final = 0.3
+BRIGHT: Final = 0.75
+SPIKE: Final = 8.0
+_NEAR: Final = 9
+"""Side in pixels of the neighbourhood whose light bounds that of its middle: most of the light of a usual
+lens's point falls within 4 pixels."""
+_FREE: Final = 2.0
 _SURE: Final = 4.0
-_NOISE: Final = 4.0
-"""Standard deviations of the photo's noise that a value may move without a reason."""
+"""Standard deviations of noise that may be negative light, and that a value may move without a reason."""
 
 
-def black_light(original: Planes, corrected: Planes, evidence: Evidence) -> Plane:
-    """Severity of light that was taken away down to nothing, or below, where the photo has some.
+def negative_light(pair: Pair) -> Plane:
+    """Severity of light below nothing.
 
-    Light is not negative. A correction that takes the lens for worse than it is subtracts more than there
-    was, beside every edge; how much of what the correction changed is of this kind::
+    A correction that takes the lens for worse than it is subtracts more light beside every edge than there
+    was. How much of what it changed is of this kind::
 
-        s = sqrt( sum (x < 0.05 y) (y - x)² / sum (x - y)² ) / limit
+        s² = sum max(-x - 2 sigma, 0)² / sum ((x - y)² + sigma²)
     """
-    gone: NDArray[np.float32] = np.zeros(1, dtype=np.float32)
-    lost = gone
-    for x, y, noise in zip(corrected, original, evidence.noise, strict=True):
-        sigma = sigma_of(noise, y)
-        change = np.square(x - y)
-        black = (x < _GONE * y) & (y > _SURE * sigma)
-        gone = gone + blocks.around(blocks.sums(np.where(black, change, np.float32(0.0))))
-        lost = lost + blocks.around(blocks.sums(change + np.square(sigma)))
-    share = np.sqrt(gone / np.maximum(lost, np.float32(1e-12)))
-    return blocks.to_pixels((share / _BLACK_SHARE).astype(np.float32), (original.shape[1], original.shape[2]))
+    below = np.maximum(-pair.corrected - np.float32(_FREE) * pair.sigma, np.float32(0.0))
+    return _share(pair, below, NEGATIVE)
 
 
-def isolated(original: Planes, corrected: Planes, evidence: Evidence) -> Plane:
+def too_dark(pair: Pair) -> Plane:
+    """Severity of light below the photo's darkest within 4 pixels, as a share of what was changed."""
+    low = near.lowest(pair.original, _NEAR)
+    beyond = np.maximum(low - pair.corrected - np.float32(_SURE) * pair.sigma, np.float32(0.0))
+    return _share(pair, beyond, DARK)
+
+
+def too_bright(pair: Pair) -> Plane:
+    """Severity of light above the photo's brightest within 4 pixels, as a share of what was changed.
+
+    Details narrower than the PSF rise above it with good reason, so that more is allowed than below.
+    """
+    high = near.highest(pair.original, _NEAR)
+    beyond = np.maximum(pair.corrected - high - np.float32(_SURE) * pair.sigma, np.float32(0.0))
+    return _share(pair, beyond, BRIGHT)
+
+
+def _share(pair: Pair, beyond: NDArray[np.float32], limit: float) -> Plane:
+    """Root of the share that something has in what was changed around each pixel, over a limit."""
+    change = np.square(pair.corrected - pair.original) + np.square(pair.sigma)
+    part = blocks.around(blocks.sums(np.square(beyond).sum(axis=0)))
+    whole = blocks.around(blocks.sums(change.sum(axis=0)))
+    return blocks.to_pixels(np.sqrt(part / whole) / np.float32(limit), pair.shape)
+
+
+def isolated(pair: Pair) -> Plane:
     """Severity of single pixels that stand out of their neighbours and not in the photo.
 
-    A pixel may stand out of its 8 neighbours by some times what it stands out of the ring around in the
-    photo, and by the noise.
+    What it stands out of its 8 neighbours, over what it stands out of a mean of 5 x 5 in the photo and
+    four times the noise.
     """
-    worst = np.zeros(original.shape[1:], dtype=np.float32)
-    for x, y, noise in zip(corrected, original, evidence.noise, strict=True):
-        high = ndimage.maximum_filter(x, footprint=_AROUND)
-        low = ndimage.minimum_filter(x, footprint=_AROUND)
-        spike = np.maximum(x - high, low - x)
-        bump = np.abs(y - ndimage.uniform_filter(y, 5))
-        allowed = np.float32(_GAIN) * bump + np.float32(_NOISE) * sigma_of(noise, y)
-        np.maximum(worst, spike / allowed, out=worst)
-    return worst
-
-
-_GAIN: Final = 6.0
-_AROUND: Final = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=bool)
+    low, high = near.neighbours(pair.corrected)
+    spike = np.maximum(pair.corrected - high, low - pair.corrected)
+    bump = np.abs(pair.original - near.mean(pair.original, 5))
+    worst = (spike / (bump + np.float32(_SURE) * pair.sigma)).max(axis=0)
+    return np.asarray(worst / np.float32(SPIKE), dtype=np.float32)

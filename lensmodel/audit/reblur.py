@@ -6,42 +6,67 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from lensmodel.audit import blocks
-from lensmodel.audit.base import Evidence, sigma_of
+from lensmodel.audit.base import Pair
 from lensmodel.blur import UniformBlur
-from lensmodel.types import Plane, Planes
+from lensmodel.blur.uniform import fast_shape
+from lensmodel.types import Plane
 
-_LIMIT: Final = 6.0
+RMS: Final = 2.0
+COARSE: Final = 4.0
+"""Root mean square of what may be left in a pixel, and in the mean over a block, over the noise's."""
+MODEL_ERROR: Final = 0.1
+"""Share of what the blur changes that may be left on top of the noise: PSFs change within a tile, and
+a prior gives way at edges."""
+_CLIPPED: Final = 0.98
 
 
-def misfit(original: Planes, corrected: Planes, evidence: Evidence) -> Plane:
-    """Severity of what is left of the photo after the blurred result is taken off, in the noise's measure.
+def misfit(pair: Pair) -> Plane:
+    """Severity of what is left of the photo y after the blurred result is taken off.
 
-    Without PSFs nothing can be said: zero everywhere.
+    With k the PSF, whose relative error is e, and x the result::
+
+        r = (y - k * x) / sqrt( sigma² + e² (x - k * x)² )
+
+    where the photo was measured and did not clip. Two figures of it are judged around each place: the root
+    mean square, and that of the means over blocks, which is as small only if r is white. Without PSFs
+    nothing can be said: zero everywhere.
     """
-    shape = (original.shape[1], original.shape[2])
-    worst = np.zeros(shape, dtype=np.float32)
+    worst = np.zeros(pair.shape, dtype=np.float32)
+    evidence = pair.evidence
     if evidence.blurs is None:
         return worst
-    for c, (x, y) in enumerate(zip(corrected, original, strict=True)):
-        again = reblurred(x, evidence.blurs[c])
-        variance = np.square(sigma_of(evidence.noise[c], y))
-        error = evidence.psf_errors[c]
-        if error > 0.0:
-            variance = variance + np.float32(error * error) * np.square(again - x)
-        counted = usable(y, evidence.blurs[c], evidence.clip[c], evidence.measured[c])
-        power = np.where(counted, np.square(y - again) / variance, np.float32(0.0))
-        total = blocks.around(blocks.sums(power))
-        count = blocks.around(blocks.sums(counted))
-        rms = np.sqrt(total / np.maximum(count, np.float32(1.0)))
-        np.maximum(worst, blocks.to_pixels((rms / _LIMIT).astype(np.float32), shape), out=worst)
+    for c, blur in enumerate(evidence.blurs):
+        x, y = pair.corrected[c], pair.original[c]
+        again = reblurred(x, blur)
+        error = np.float32(max(evidence.psf_errors[c], MODEL_ERROR))
+        left = (y - again) / np.sqrt(np.square(pair.sigma[c]) + np.square(error * (x - again)))
+        counted = usable(y, blur, evidence.clip[c], evidence.measured[c])
+        left = np.where(counted, left, np.float32(0.0))
+        number = np.maximum(blocks.sums(counted), np.float32(1.0)).astype(np.float32)
+        count = np.maximum(blocks.around(number), np.float32(1.0))
+        fine = np.sqrt(blocks.around(blocks.sums(np.square(left))) / count)
+        means = np.square(blocks.sums(left)) / number
+        coarse = np.sqrt(blocks.around(means.astype(np.float32)) / blocks.around(np.ones_like(number)))
+        figures = np.maximum(fine / np.float32(RMS), coarse / np.float32(COARSE))
+        np.maximum(worst, blocks.to_pixels(figures, pair.shape), out=worst)
     return worst
 
 
 def reblurred(plane: Plane, blur: UniformBlur) -> Plane:
-    """Blur a plane of the frame, continued beyond its rim by the rim's own light."""
-    return blur.forward(np.pad(plane, blur.reach, mode="edge"))
+    """Blur a plane as if it went on at its other side: right but for a rim as wide as the blur reaches."""
+    shape = fast_shape(plane.shape)
+    if blur.offset == (0.0, 0.0) and blur.kernel.shape[0] <= min(shape):
+        kernel = np.zeros(shape, dtype=np.float32)
+        side = blur.kernel.shape[0]
+        kernel[:side, :side] = blur.kernel
+        transfer = fft.rfft2(np.roll(kernel, (-(side // 2), -(side // 2)), axis=(0, 1)))
+    else:
+        transfer = blur.spectrum(shape)
+    blurred = fft.irfft2(fft.rfft2(plane, shape) * transfer, shape)
+    return np.asarray(blurred[: plane.shape[0], : plane.shape[1]], dtype=np.float32)
 
 
 def usable(
@@ -51,5 +76,5 @@ def usable(
     rim = min(blur.reach, (min(plane.shape) - 1) // 2)
     counted = np.zeros(plane.shape, dtype=bool)
     counted[rim : plane.shape[0] - rim, rim : plane.shape[1] - rim] = True
-    counted &= plane < 0.98 * clip
+    counted &= plane < _CLIPPED * clip
     return counted if measured is None else counted & measured

@@ -10,17 +10,31 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lensmodel.audit.base import Evidence, Finding, TileAudit, check_pair
+from lensmodel.audit.base import Evidence, Finding, Pair, TileAudit
+from lensmodel.audit.grain import amplified
 from lensmodel.audit.hue import foreign_hue
-from lensmodel.audit.light import black_light, isolated
+from lensmodel.audit.light import isolated, negative_light, too_bright, too_dark
 from lensmodel.audit.reblur import misfit
+from lensmodel.audit.ringing import swing
+from lensmodel.audit.spectrum import comb, overcorrected
 from lensmodel.types import Plane, Planes
 
-Check: TypeAlias = Callable[[Planes, Planes, Evidence], Plane]
-"""Severity at each pixel of an original, its correction and what is known of them; above 1 is a fault."""
+Check: TypeAlias = Callable[[Pair], Plane]
+"""Severity at each pixel of a tile; above 1 is a fault."""
 
 CHECKS: Final[Mapping[str, Check]] = MappingProxyType(
-    {"black light": black_light, "isolated pixels": isolated, "hue": foreign_hue, "re-blur": misfit}
+    {
+        "negative light": negative_light,
+        "too dark": too_dark,
+        "too bright": too_bright,
+        "isolated pixels": isolated,
+        "hue": foreign_hue,
+        "re-blur": misfit,
+        "spectrum": overcorrected,
+        "comb": comb,
+        "ringing": swing,
+        "grain": amplified,
+    }
 )
 """Every check by name."""
 
@@ -60,16 +74,16 @@ def audit_tile(
     InvalidInputError
         If the planes have different sizes.
     """
-    check_pair(original, corrected)
+    pair = Pair.of(original, corrected, evidence)
     inner = inner or (slice(None), slice(None))
     kept = np.ones(original.shape[1:], dtype=np.float32)
     findings = []
     for name, check in CHECKS.items():
-        severity = check(original, corrected, evidence)
+        severity = check(pair)
         one = _softened(np.clip(2.0 - severity, 0.0, 1.0))
         findings.append(_finding(name, severity[inner], one[inner]))
         np.minimum(kept, one, out=kept)
-    return TileAudit(kept[inner], tuple(findings))
+    return TileAudit.of(kept[inner], tuple(findings))
 
 
 def held_back(

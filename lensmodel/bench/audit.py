@@ -274,9 +274,9 @@ def demosaiced(light: Planes, pattern: BayerPattern) -> Planes:
 
 
 def dots(sound: Planes, rng: np.random.Generator) -> Planes:
-    """Set one pixel in four hundred, in one or all colours, far off its neighbours."""
+    """Set one pixel in two hundred, in one or all colours, far off its neighbours."""
     found = sound.copy()
-    count = sound[0].size // 400
+    count = sound[0].size // 200
     rows, cols = (rng.integers(0, extent, count) for extent in sound.shape[1:])
     for row, col in zip(rows, cols, strict=True):
         colours = slice(None) if rng.random() < 0.5 else int(rng.integers(3))
@@ -300,20 +300,20 @@ def hue_flips(sound: Planes, rng: np.random.Generator) -> Planes:
 
 
 def comb(sound: Planes, rng: np.random.Generator) -> Planes:
-    """Add lines of a period of 2 to 3 pixels, of a tenth to a third of the light, on half the picture."""
+    """Add lines of a period of 2 to 3 pixels, of a fifth to a half of the light, on half the picture."""
     frequency = 1.0 / rng.uniform(2.0, 3.0)
     angle = rng.choice([0.0, np.pi / 2.0]) + rng.uniform(-0.1, 0.1)
     rows, cols = np.indices(sound.shape[1:])
     wave = np.cos(2 * np.pi * frequency * (np.cos(angle) * cols + np.sin(angle) * rows) + rng.uniform(0, 6))
     field = ndimage.gaussian_filter(rng.standard_normal(sound.shape[1:]), 20.0)
     where = ndimage.gaussian_filter((field > 0).astype(np.float64), 2.0)
-    return (sound * (1.0 + rng.uniform(0.1, 0.33) * where * wave)).astype(np.float32)
+    return (sound * (1.0 + rng.uniform(0.2, 0.5) * where * wave)).astype(np.float32)
 
 
 def erased(sound: Planes, rng: np.random.Generator) -> Planes:
     """Paint all but the strongest edges flat: total variation, of a strength in the texture's own size."""
     detail = sound - ndimage.gaussian_filter(sound, (0, 2, 2))
-    weight = float(rng.uniform(1.5, 4.0) * detail.std())
+    weight = float(rng.uniform(3.0, 8.0) * detail.std())
     return restoration.denoise_tv_chambolle(sound, weight, channel_axis=0).astype(np.float32)  # type: ignore[no-untyped-call]
 
 
@@ -324,7 +324,7 @@ def rings(sound: Planes, rng: np.random.Generator) -> Planes:
     r = np.hypot(y, x)
     echo = np.cos(2 * np.pi * r / rng.uniform(4.0, 7.0)) * np.exp(-r / 4.0)
     echo -= echo.mean()
-    echo *= rng.uniform(0.3, 0.8) / np.abs(echo).sum()
+    echo *= rng.uniform(1.0, 2.5) / np.abs(echo).sum()
     detail = sound - ndimage.gaussian_filter(sound, (0, 1, 1))
     echoes = [ndimage.convolve(plane, 8.0 * echo) for plane in detail]
     return (sound + np.asarray(echoes)).astype(np.float32)

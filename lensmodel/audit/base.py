@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,23 +50,6 @@ class Evidence:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Spectra:
-    """Power in overlapping windows of the mean of the colours.
-
-    Parameters
-    ----------
-    original, corrected : ndarray of float32, shape (down, across, side, side // 2 + 1)
-        On the `rfft2` grid of a window.
-    noise : ndarray of float32, shape (down, across)
-        Power of white noise as strong as the photo's.
-    """
-
-    original: NDArray[np.float32]
-    corrected: NDArray[np.float32]
-    noise: NDArray[np.float32]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Pair:
     """A tile of a photo and what was made of it, with what several checks need.
 
@@ -78,15 +61,18 @@ class Pair:
         Standard deviation of the photo's noise at each pixel.
     evidence : Evidence
         What else is known.
-    spectra : list of Spectra
-        None or one: what the checks of the spectrum share.
+    luma : ndarray of float32, shape (2, rows, cols)
+        Mean of the colours, of the photo and of the correction.
+    memo : dict
+        What one check made and another may use.
     """
 
     original: Planes
     corrected: Planes
     sigma: Planes
     evidence: Evidence
-    spectra: list[Spectra] = field(default_factory=list, init=False)
+    luma: NDArray[np.float32]
+    memo: dict[str, Any] = field(default_factory=dict, init=False)
 
     @classmethod
     def of(cls, original: Planes, corrected: Planes, evidence: Evidence) -> Pair:
@@ -109,7 +95,18 @@ class Pair:
             np.sqrt(np.maximum(n.variance(y), LEAST_VARIANCE))
             for n, y in zip(evidence.noise, original, strict=True)
         ]
-        return cls(original, np.minimum(corrected, top), np.asarray(sigma, dtype=np.float32), evidence)
+        made = np.minimum(corrected, top)
+        third = np.float32(1.0 / 3.0)
+        luma = np.stack([(p[0] + p[1] + p[2]) * third for p in (original, made)])
+        return cls(original, made, np.asarray(sigma, dtype=np.float32), evidence, luma)
+
+    @property
+    def luma_sigma(self) -> Plane:
+        """Standard deviation of the noise of the mean of the colours."""
+        if "luma_sigma" not in self.memo:
+            variance = np.square(self.sigma).sum(axis=0)
+            self.memo["luma_sigma"] = np.sqrt(variance) * np.float32(1.0 / 3.0)
+        return np.asarray(self.memo["luma_sigma"])
 
     @property
     def shape(self) -> tuple[int, int]:

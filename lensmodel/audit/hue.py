@@ -8,10 +8,9 @@ import numpy as np
 
 from lensmodel.audit import blocks, near
 from lensmodel.audit.base import Pair
+from lensmodel.audit.limits import LIMITS
 from lensmodel.types import Plane
 
-AREA: Final = 1.0
-PIXEL: Final = 1.0
 _SIDE: Final = 7
 _LEAST: Final = 0.02
 _FREE, _SHARE = 0.25, 2.0
@@ -39,8 +38,8 @@ def foreign_hue(pair: Pair) -> Plane:
         span = high - low
         beyond = np.maximum(after - high, low - after) - np.float32(_NOISE) * sigma / made
         beyond = np.maximum(beyond, np.float32(0.0))
-        np.maximum(worst, beyond / (PIXEL * (_FREE + _SHARE * span)), out=worst)
+        np.maximum(worst, beyond / (_FREE + _SHARE * span), out=worst)
         part = blocks.around(blocks.sums(np.square(beyond)))
         whole = blocks.around(blocks.sums(np.square(span) + np.float32(_LEAST**2)))
-        np.maximum(worst, blocks.to_pixels(np.sqrt(part / whole) / np.float32(AREA), pair.shape), out=worst)
-    return worst
+        np.maximum(worst, blocks.to_pixels(np.sqrt(part / whole), pair.shape), out=worst)
+    return worst / np.float32(LIMITS["hue"])

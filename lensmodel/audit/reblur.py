@@ -10,13 +10,13 @@ from scipy import fft
 
 from lensmodel.audit import blocks
 from lensmodel.audit.base import Pair
+from lensmodel.audit.limits import LIMITS
 from lensmodel.blur import UniformBlur
 from lensmodel.blur.uniform import fast_shape
 from lensmodel.types import Plane
 
-RMS: Final = 2.0
-COARSE: Final = 4.0
-"""Root mean square of what may be left in a pixel, and in the mean over a block, over the noise's."""
+_COARSE: Final = 0.5
+"""Weight of what is left in the means over blocks: there are fewer of them, so that chance plays more."""
 MODEL_ERROR: Final = 0.1
 """Share of what the blur changes that may be left on top of the noise: PSFs change within a tile, and
 a prior gives way at edges."""
@@ -50,9 +50,9 @@ def misfit(pair: Pair) -> Plane:
         fine = np.sqrt(blocks.around(blocks.sums(np.square(left))) / count)
         means = np.square(blocks.sums(left)) / number
         coarse = np.sqrt(blocks.around(means.astype(np.float32)) / blocks.around(np.ones_like(number)))
-        figures = np.maximum(fine / np.float32(RMS), coarse / np.float32(COARSE))
+        figures = np.maximum(fine, np.float32(_COARSE) * coarse)
         np.maximum(worst, blocks.to_pixels(figures, pair.shape), out=worst)
-    return worst
+    return worst / np.float32(LIMITS["re-blur"])
 
 
 def reblurred(plane: Plane, blur: UniformBlur) -> Plane:

@@ -8,9 +8,9 @@ import numpy as np
 
 from lensmodel.audit import blocks, near
 from lensmodel.audit.base import Pair
+from lensmodel.audit.limits import LIMITS
 from lensmodel.types import Plane
 
-SWING: Final = 0.5
 _SMALL, _WIDE = 5, 15
 _FLAT: Final = 0.08
 _NOISE: Final = 8.0
@@ -23,15 +23,16 @@ def swing(pair: Pair) -> Plane:
     Flat is where the photo's own range within 2 pixels is no more than 8 standard deviations of its
     noise and 8 percent of the step, and the step more than 40.
     """
-    y, x = pair.original.mean(axis=0), pair.corrected.mean(axis=0)
-    sigma = pair.sigma.mean(axis=0) / np.float32(np.sqrt(3.0))
+    (y, x), sigma = pair.luma, pair.luma_sigma
     step = near.highest(y, _WIDE) - near.lowest(y, _WIDE)
     own = near.highest(y, _SMALL) - near.lowest(y, _SMALL)
     wave = near.highest(x, _SMALL) - near.lowest(x, _SMALL)
-    flat = (own <= _NOISE * sigma + _FLAT * step) & (step > _STRONG * sigma)
+    flat = (own <= np.float32(_NOISE) * sigma + np.float32(_FLAT) * step) & (
+        step > np.float32(_STRONG) * sigma
+    )
     part = blocks.around(blocks.sums(np.where(flat, np.square(wave), np.float32(0.0))))
     whole = blocks.around(blocks.sums(np.where(flat, np.square(step), np.float32(0.0))))
     count = blocks.around(blocks.sums(flat))
     trust = np.minimum(count / np.float32(128.0), 1.0)
     share = trust * np.sqrt(part / np.maximum(whole, np.float32(1e-12)))
-    return blocks.to_pixels((share / SWING).astype(np.float32), pair.shape)
+    return blocks.to_pixels((share / LIMITS["ringing"]).astype(np.float32), pair.shape)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
@@ -10,11 +11,10 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from lensmodel.audit import blocks
-from lensmodel.audit.base import Pair, Spectra
+from lensmodel.audit.base import Pair
+from lensmodel.audit.limits import LIMITS
 from lensmodel.types import Plane
 
-RISE: Final = 3.0
-LINE: Final = 10.0
 SLOPE: Final = 2.2
 """Power of natural pictures falls as |f|^-2.2. Source: A. Torralba, A. Oliva, "Statistics of natural image
 categories", Network 14, 2003: 1.9 to 2.6 by category."""
@@ -46,34 +46,49 @@ def overcorrected(pair: Pair) -> Plane:
         for band, share in bands:
             foretold = share * base + np.float32(_NOISE) * power.noise
             worst = np.maximum(worst, power.corrected[..., band].mean(axis=-1) / foretold)
-    return _to_pixels((np.sqrt(worst) / RISE).astype(np.float32), pair.shape)
+    return _to_pixels((np.sqrt(worst) / LIMITS["spectrum"]).astype(np.float32), pair.shape)
 
 
 def comb(pair: Pair) -> Plane:
     """Severity of lines near the limit of the grid that the photo has not.
 
-    A line is a frequency that stands out of the median of its band; as far as it does so in the photo, it
-    belongs to the scene.
+    A line is a frequency that stands out of the geometric mean of its band, to which a few lines add
+    little; as far as it does so in the photo, it belongs to the scene.
     """
     power, edge = _spectra(pair), _near_limit()
     noise = power.noise[..., None]
     was, now = power.original[..., edge], power.corrected[..., edge]
-    own = was / (np.median(was, axis=-1, keepdims=True) + noise)
-    made = now / (np.median(now, axis=-1, keepdims=True) + noise)
+    own = was / _level(was + noise)
+    made = now / _level(now + noise)
     line = (made / np.maximum(own, np.float32(1.0))).max(axis=-1)
-    return _to_pixels((np.sqrt(line) / LINE).astype(np.float32), pair.shape)
+    return _to_pixels((np.sqrt(line) / LIMITS["comb"]).astype(np.float32), pair.shape)
 
 
-def _spectra(pair: Pair) -> Spectra:
-    """Power of the mean of the colours in overlapping windows, before and after; made once for a pair."""
-    if not pair.spectra:
-        variance = np.square(pair.sigma).sum(axis=0) / np.float32(9.0)
-        energy = np.float32(np.square(_window()).sum())
-        noise = _windows(variance).mean(axis=(-1, -2), dtype=np.float32) * energy
-        pair.spectra.append(
-            Spectra(_power(pair.original.mean(axis=0)), _power(pair.corrected.mean(axis=0)), noise)
-        )
-    return pair.spectra[0]
+@dataclass(frozen=True, slots=True, eq=False)
+class _Spectra:
+    """Power in overlapping windows of the mean of the colours, before and after, and that of white noise."""
+
+    original: NDArray[np.float32]
+    corrected: NDArray[np.float32]
+    noise: NDArray[np.float32]
+
+
+def _spectra(pair: Pair) -> _Spectra:
+    """Power of a pair, made once."""
+    if "spectra" not in pair.memo:
+        variance = blocks.sums(np.square(pair.luma_sigma))
+        level = blocks.spread(variance, pair.shape, first=(blocks.SIDE - 1) / 2.0, step=blocks.SIDE)
+        energy = np.float32(np.square(_window()).sum() / blocks.SIDE**2)
+        noise = _windows(level)[..., SIDE // 2, SIDE // 2] * energy
+        pair.memo["spectra"] = _Spectra(_power(pair.luma[0]), _power(pair.luma[1]), noise)
+    spectra: _Spectra = pair.memo["spectra"]
+    return spectra
+
+
+def _level(power: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Geometric mean over the last axis."""
+    logarithms = np.log(np.maximum(power, np.float32(1e-20)))
+    return np.asarray(np.exp(logarithms.mean(axis=-1, keepdims=True)))
 
 
 def _power(plane: Plane) -> NDArray[np.float32]:

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lensmodel.audit import near
 from lensmodel.audit.base import Evidence, Finding, Pair, TileAudit
 from lensmodel.audit.grain import amplified
 from lensmodel.audit.hue import foreign_hue
-from lensmodel.audit.light import isolated, negative_light, too_bright, too_dark
+from lensmodel.audit.light import isolated, too_bright, too_dark
 from lensmodel.audit.reblur import misfit
 from lensmodel.audit.ringing import swing
 from lensmodel.audit.spectrum import comb, overcorrected
@@ -24,7 +25,6 @@ Check: TypeAlias = Callable[[Pair], Plane]
 
 CHECKS: Final[Mapping[str, Check]] = MappingProxyType(
     {
-        "negative light": negative_light,
         "too dark": too_dark,
         "too bright": too_bright,
         "isolated pixels": isolated,
@@ -38,10 +38,11 @@ CHECKS: Final[Mapping[str, Check]] = MappingProxyType(
 )
 """Every check by name."""
 
-_SOFTNESS: Final = 1.5
+_SOFTNESS: Final = 1.0
 """Standard deviation in pixels of what makes the map smooth: a fault of one pixel leaves no edge."""
-_GROWN: Final = 3
-"""Side of the square over which the least that is kept spreads before."""
+GROWN: Final = 5
+"""Side of the square over which the least that is kept spreads before: wide enough that of a faulty pixel
+itself nothing comes back when the map is smoothed."""
 
 Inner: TypeAlias = tuple[slice, slice]
 
@@ -76,14 +77,14 @@ def audit_tile(
     """
     pair = Pair.of(original, corrected, evidence)
     inner = inner or (slice(None), slice(None))
-    kept = np.ones(original.shape[1:], dtype=np.float32)
+    keep = np.ones(original.shape[1:], dtype=np.float32)
     findings = []
     for name, check in CHECKS.items():
         severity = check(pair)
-        one = _softened(np.clip(2.0 - severity, 0.0, 1.0))
+        one = kept(severity)
         findings.append(_finding(name, severity[inner], one[inner]))
-        np.minimum(kept, one, out=kept)
-    return TileAudit.of(kept[inner], tuple(findings))
+        np.minimum(keep, one, out=keep)
+    return TileAudit.of(keep[inner], tuple(findings))
 
 
 def held_back(
@@ -108,11 +109,15 @@ def held_back(
     return np.asarray(before + audit.keep * (after - before), dtype=np.float32), audit
 
 
-def _softened(keep: NDArray[np.floating]) -> Plane:
-    """Spread the least that is kept and smooth it, so that it ends nowhere at once."""
-    if keep.min(initial=1.0) == 1.0:
-        return np.asarray(keep, dtype=np.float32)
-    grown = ndimage.minimum_filter(np.asarray(keep, dtype=np.float32), _GROWN)
+def kept(severity: NDArray[np.floating]) -> Plane:
+    """Share of the correction that is kept at each pixel: 2 - s of a severity s in 1..2, smooth.
+
+    The least spreads over its neighbours before it is smoothed, so that a fault of one pixel is gone.
+    """
+    share = np.clip(np.float32(2.0) - severity, 0.0, 1.0).astype(np.float32)
+    if share.min(initial=1.0) == 1.0:
+        return share
+    grown = near.lowest(share, GROWN)
     return np.minimum(ndimage.gaussian_filter(grown, _SOFTNESS, mode="nearest"), np.float32(1.0))
 
 

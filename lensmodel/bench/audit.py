@@ -42,6 +42,11 @@ from lensmodel.types import (
     Planes,
 )
 
+SOUND: Final = ("true PSF", "true PSF, fast")
+"""Names of the corrections of a trial that are sound, if they gain."""
+WRONG: Final = ("kernel 1.6 times too wide", "kernel turned")
+"""Names of those that were made with other kernels; the audit is given these kernels too."""
+
 BLOCK: Final = 128
 """Side of the blocks that are judged, in pixels."""
 
@@ -107,6 +112,10 @@ def widened(factor: float) -> Callable[[Kernel], NDArray[np.float64]]:
 def turned(kernel: Kernel) -> NDArray[np.float64]:
     """Turn a kernel by a quarter."""
     return np.rot90(kernel)
+
+
+CHANGES: Final = dict(zip(WRONG, (widened(1.6), turned), strict=True))
+"""What is done to the kernels of each of the wrong corrections."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,10 +193,12 @@ class Trial:
         """Noise of the photo's sensor."""
         return EXPOSURES[self.case.exposure]
 
-    @property
-    def cfa(self) -> BayerPattern | None:
-        """Mosaic of the photo's first pixels."""
-        return RGGB if self.case.mosaic else None
+    def measured(self, channel: int, window: tuple[slice, ...]) -> NDArray[np.bool_] | None:
+        """Where the sensor measured a channel in a window; None for everywhere."""
+        if not self.case.mosaic:
+            return None
+        rows, cols = (np.arange(part.start, part.stop) % 2 for part in window)
+        return np.asarray(np.asarray(RGGB)[rows[:, None], cols[None, :]] == channel)
 
     def blocks(self) -> Iterator[tuple[int, int, NDArray[np.float64]]]:
         """First row and column of each block, and its three true kernels."""
@@ -241,12 +252,8 @@ def _made(case: Case, folder: Path) -> Trial:
         result = correct_planes(whole, field, FRAME, noise=[noise] * 3, method=method, cfa=cfa, roi=at.roi)
         return np.ascontiguousarray(result.planes[:, _RIM:-_RIM, _RIM:-_RIM])
 
-    made = {
-        "true PSF": corrected(lens),
-        "true PSF, fast": corrected(lens, "fast"),
-        "kernel 1.6 times too wide": corrected(lens.changed(widened(1.6))),
-        "kernel turned": corrected(lens.changed(turned)),
-    }
+    made = {SOUND[0]: corrected(lens), SOUND[1]: corrected(lens, "fast")}
+    made |= {name: corrected(lens.changed(change)) for name, change in CHANGES.items()}
     scene = np.ascontiguousarray(at.inner(at.scene))
     middles = [
         FRAME.position(at.roi[0] + _RIM + row + BLOCK / 2, at.roi[1] + _RIM + col + BLOCK / 2)
@@ -314,7 +321,8 @@ def erased(sound: Planes, rng: np.random.Generator) -> Planes:
     """Paint all but the strongest edges flat: total variation, of a strength in the texture's own size."""
     detail = sound - ndimage.gaussian_filter(sound, (0, 2, 2))
     weight = float(rng.uniform(3.0, 8.0) * detail.std())
-    return restoration.denoise_tv_chambolle(sound, weight, channel_axis=0).astype(np.float32)  # type: ignore[no-untyped-call]
+    flat = restoration.denoise_tv_chambolle(sound, weight, max_num_iter=40, channel_axis=0)  # type: ignore[no-untyped-call]
+    return np.asarray(flat, dtype=np.float32)
 
 
 def rings(sound: Planes, rng: np.random.Generator) -> Planes:

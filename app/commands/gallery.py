@@ -71,7 +71,9 @@ def gallery(
     def told(words: str, done: int, total: int) -> None:
         shown.progress_line(f"{done} of {total} finished, {words}", time.monotonic() - began)
 
-    entries = hall.hang(pictures, output, wishes, on_picture=told)
-    page = hall.write_page(entries, output)
+    entries = []
+    for entry in hall.hang(pictures, output, wishes, on_picture=told):
+        entries.append(entry)
+        page = hall.write_page(entries, output)  # after each: a run that is stopped leaves a page
     shown.result(hall.text(entries))
     shown.note(f"written: {page}")

@@ -411,7 +411,7 @@ def test_the_page_shows_a_corrected_picture_and_its_figures(
     monkeypatch.setattr(working.peers.Peer, "installed", property(lambda _: False))
     output = tmp_path / "gallery"
 
-    entries = hang(real_pictures(folder), output, Wishes(mode="kernels", workers=1), on_picture=ignore)
+    entries = list(hang(real_pictures(folder), output, Wishes(mode="kernels", workers=1), on_picture=ignore))
     page = write_page(entries, output).read_text(encoding="utf-8")
 
     assert entries[0].work["state"] == "corrected"
@@ -430,7 +430,7 @@ def test_a_photo_whose_calibration_is_refused_is_shown_as_it_was(
     monkeypatch.setattr(pipeline, "calibrate", refused)
     monkeypatch.setattr(working.peers.Peer, "installed", property(lambda _: False))
 
-    entries = hang(real_pictures(folder), tmp_path / "gallery", Wishes(), on_picture=ignore)
+    entries = list(hang(real_pictures(folder), tmp_path / "gallery", Wishes(), on_picture=ignore))
 
     assert entries[0].work["state"] == "left alone"
     assert "calibration was refused: no photo could be used" in write_page(
@@ -454,7 +454,7 @@ def test_what_is_stored_is_not_made_again_unless_asked(
     pictures = real_pictures(folder)
 
     for fresh in (False, False, True):
-        hang(pictures, tmp_path / "gallery", Wishes(fresh=fresh), on_picture=ignore)
+        list(hang(pictures, tmp_path / "gallery", Wishes(fresh=fresh), on_picture=ignore))
 
     assert len(calls) == 2
 
@@ -462,7 +462,7 @@ def test_what_is_stored_is_not_made_again_unless_asked(
 def test_an_unreadable_file_is_named_with_its_reason(tmp_path: Path) -> None:
     picture = Picture("raw/odd.gpr", tmp_path / "odd.gpr", unreadable="packed as VC-5 is not read")
 
-    entries = hang([picture], tmp_path / "gallery", Wishes(), on_picture=ignore)
+    entries = list(hang([picture], tmp_path / "gallery", Wishes(), on_picture=ignore))
 
     assert "packed as VC-5 is not read" in write_page(entries, tmp_path / "gallery").read_text(
         encoding="utf-8"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -72,8 +72,10 @@ class Entry:
     audit: str = ""
 
 
-def hang(pictures: Sequence[Picture], output: Path, wishes: Wishes, *, on_picture: OnPicture) -> list[Entry]:
-    """Make everything that the page shows, one picture after the other.
+def hang(
+    pictures: Sequence[Picture], output: Path, wishes: Wishes, *, on_picture: OnPicture
+) -> Iterator[Entry]:
+    """Make what the page shows, one picture after the other.
 
     Parameters
     ----------
@@ -82,17 +84,21 @@ def hang(pictures: Sequence[Picture], output: Path, wishes: Wishes, *, on_pictur
         Folder of the page; crops and stored results go below it.
     wishes : Wishes
     on_picture : OnPicture
+
+    Yields
+    ------
+    Entry
+        Of each picture as soon as it is finished.
     """
     (output / CROPS).mkdir(parents=True, exist_ok=True)
-    entries = []
     for done, picture in enumerate(pictures):
 
         def say(words: str, done: int = done, name: str = picture.name) -> None:
             on_picture(f"{name}: {words}", done, len(pictures))
 
-        entries.append(_entry(picture, output, wishes, say))
+        entry = _entry(picture, output, wishes, say)
         say("done", done + 1)
-    return entries
+        yield entry
 
 
 def _entry(picture: Picture, output: Path, wishes: Wishes, say: Callable[[str], None]) -> Entry:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from scipy import ndimage, special
 
 from lensmodel import pipeline
 from lensmodel.bench.gallery import Picture, Wishes, chosen, hang, real_pictures, text, write_page
+from lensmodel.bench.gallery import audit as auditing
 from lensmodel.bench.gallery import work as working
 from lensmodel.bench.gallery.crops import ZOOM, places, sheet
 from lensmodel.bench.gallery.figures import (
@@ -422,6 +424,36 @@ def test_the_page_shows_a_corrected_picture_and_its_figures(
         assert (output / place.file).is_file()
         assert f'src="{place.file}"' in page
     assert "| real/leaves.png | corrected |" in text(entries)
+
+
+def test_the_audits_map_and_its_worst_places_are_shown_where_there_is_an_audit(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def audit_photo(original: Any, corrected: Any, evidence: Any) -> SimpleNamespace:
+        assert evidence("a place", "a window").clip == (1.0, 1.0, 1.0)
+        keep = np.ones(corrected.shape[1:])
+        keep[96:144, 48:96] = 0.0
+        return SimpleNamespace(keep=keep)
+
+    fake = SimpleNamespace(audit_photo=audit_photo, Evidence=SimpleNamespace)
+    monkeypatch.setattr(auditing, "find_spec", lambda _: object())
+    monkeypatch.setattr(auditing, "import_module", lambda _: fake)
+    monkeypatch.setattr(pipeline, "calibrate", known_lens)
+    monkeypatch.setattr(working.peers.Peer, "installed", property(lambda _: False))
+    output = tmp_path / "gallery"
+
+    entries = list(hang(real_pictures(folder), output, Wishes(mode="kernels", workers=1), on_picture=ignore))
+
+    worst = next(place for place in entries[0].places if place.name == "audit 1")
+    assert (worst.row, worst.col) == (120 - 48, 72 - 48)
+    assert "audit 2" not in {place.name for place in entries[0].places}
+    assert (np.asarray(Image.open(output / entries[0].audit))[100:140, 50:90] == 255).all()
+
+
+def test_without_an_audit_there_is_no_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(auditing, "find_spec", lambda _: None)
+
+    assert auditing.audit_map(SimpleNamespace(), np.zeros((3, 8, 8), dtype=np.float32)) is None  # type: ignore[arg-type]
 
 
 def test_a_photo_whose_calibration_is_refused_is_shown_as_it_was(

@@ -38,14 +38,16 @@ def places(
     ----------
     before, after : ndarray of uint16, shape (row, col, 3)
     keep : ndarray, shape (row, col), or None
-        Share of the correction that the audit would keep.
+        Share of the correction that the audit would keep; its worst places are where it takes most away.
     named : sequence of (str, (row, col) or None)
         Further places by the pixel in their middle; left out where another crop shows most of them.
     """
     height, width = before.shape[:2]
     side = side_of(before)
     found: list[Place] = [(name, *box) for name, box in crop_boxes(height, width, side).items()]
-    score = _change(before, after) if keep is None else _held_back(keep)
+    score = _change(before, after)
+    if keep is not None:
+        score = score * _held_back(keep)  # where nothing was changed there is nothing to hold back
     word = "most changed" if keep is None else "audit"
     for number, (row, col) in enumerate(_peaks(score, side), start=1):
         found.append((f"{word} {number}", *_inside(row, col, side, height, width)))

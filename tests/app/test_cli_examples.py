@@ -91,7 +91,6 @@ KEPT = {
     "reproduce": Path("reproduction", "cache"),
     "bench": Path("bench-output", "cache"),
     "bench blind": Path("bench-output", "cache"),
-    "bench gallery": Path("gallery-output", "cache"),
 }
 """Where a command keeps finished pieces of work, which its next example need not do again."""
 

@@ -469,6 +469,12 @@ class PatchPage(Model):
     next: str | None = None
 
 
+class RetriedOut(Model):
+    """How many jobs were started anew."""
+
+    retried: int
+
+
 class JobPage(Model):
     """Some jobs, newest first."""
 

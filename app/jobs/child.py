@@ -61,10 +61,12 @@ def main(order: dict[str, Any], line: Connection) -> None:
     except MemoryError:
         _tell(line, end="memory_limit")
     except OSError as error:
-        if error.errno not in {errno.EFBIG, errno.ENOMEM}:
-            _tell(line, end="bug", code=type(error).__name__, text=_last_lines())
-        else:
+        if error.errno in {errno.ENOSPC, errno.EDQUOT}:
+            _tell(line, end="no_room")
+        elif error.errno in {errno.EFBIG, errno.ENOMEM}:
             _tell(line, end="memory_limit")
+        else:
+            _tell(line, end="bug", code=type(error).__name__, text=_last_lines())
     except Exception as error:  # noqa: BLE001 - whatever it is, the parent must hear of it
         _tell(line, end="bug", code=type(error).__name__, text=_last_lines())
     finally:

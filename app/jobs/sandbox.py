@@ -33,7 +33,7 @@ from lensmodel.types import ignore_step
 
 log = logging.getLogger(__name__)
 
-Ending: TypeAlias = Literal["ok", "error", "memory_limit", "time_limit", "crashed", "cancelled"]
+Ending: TypeAlias = Literal["ok", "error", "memory_limit", "time_limit", "outage", "crashed", "cancelled"]
 
 POLL_S: Final = 0.25
 MAX_MESSAGE: Final = 64 * 1024
@@ -79,7 +79,8 @@ class Outcome:
     ----------
     ending : str
         `ok`, `error` (the library refused, with its reason), `memory_limit`, `time_limit`,
-        `crashed` (a signal, or an exception that nobody foresaw) or `cancelled`.
+        `outage` (the machine had no room, or killed it), `crashed` (another signal, or an
+        exception that nobody foresaw) or `cancelled`.
     value : object
         What the task returned.
     code, detail : str
@@ -317,23 +318,51 @@ def _read(line: Connection) -> dict[str, Any] | None:
 
 def _outcome(ended: dict[str, Any] | None, status: int, folder: Path, limits: Limits) -> Outcome:
     ending = None if ended is None else ended.get("end")
-    code, text = (str((ended or {}).get(key, "")) for key in ("code", "text"))
     if ending == "ok" and status == 0:
         return _result(folder / child.RESULT)
-    if ending == "error":
-        return Outcome("error", code=code, detail=text)
-    if ending == "memory_limit":
-        detail = f"needs more than the {limits.memory_mb} MiB it may take; give a smaller photo"
-        return Outcome("memory_limit", code="memory_limit", detail=detail)
+    if ending in _SAID:
+        code, text = (str((ended or {}).get(key, "")) for key in ("code", "text"))
+        return _SAID[ending](code, text, limits)
     if -status == signal.SIGXCPU:
         detail = f"took more than {limits.cpu_s or limits.wall_s:g} s of processor time; give a smaller photo"
         return Outcome("time_limit", code="time_limit", detail=detail)
-    if ending == "bug":
-        log.error("unforeseen %s in a task:\n%s", code, text)
-        why = f"an unforeseen {code} stopped the work; the log of the worker says where"
-        return Outcome("crashed", code="internal_error", detail=why)
     why = f"signal {-status} ({_signal_name(-status)})" if status < 0 else f"exit status {status}"
-    return Outcome("crashed", code="crashed", detail=f"the process that did the work died: {why}")
+    detail = f"the process that did the work died: {why}"
+    if -status == signal.SIGKILL:  # neither by itself nor by us: the kernel does so for want of memory
+        return Outcome("outage", code="outage", detail=detail)
+    return Outcome("crashed", code="crashed", detail=detail)
+
+
+def _refused(code: str, text: str, limits: Limits) -> Outcome:
+    del limits
+    return Outcome("error", code=code, detail=text)
+
+
+def _swollen(code: str, text: str, limits: Limits) -> Outcome:
+    del code, text
+    detail = f"needs more than the {limits.memory_mb} MiB it may take; give a smaller photo"
+    return Outcome("memory_limit", code="memory_limit", detail=detail)
+
+
+def _no_room(code: str, text: str, limits: Limits) -> Outcome:
+    del code, text, limits
+    return Outcome("outage", code="outage", detail="there is no room on the disk for the work")
+
+
+def _bug(code: str, text: str, limits: Limits) -> Outcome:
+    del limits
+    log.error("unforeseen %s in a task:\n%s", code, text)
+    why = f"an unforeseen {code} stopped the work; the log of the worker says where"
+    return Outcome("crashed", code="internal_error", detail=why)
+
+
+_SAID: Final[Mapping[object, Callable[[str, str, Limits], Outcome]]] = {
+    "error": _refused,
+    "memory_limit": _swollen,
+    "no_room": _no_room,
+    "bug": _bug,
+}
+"""What to make of the last words of a child, by how it says that it ended."""
 
 
 def _result(path: Path) -> Outcome:

@@ -20,6 +20,7 @@ import numpy as np
 from app import distances
 from app.jobs.child import Progress
 from app.jobs.handover import EVIDENCE, KERNELS, PREVIEW, R_MAP, SAMPLES
+from app.jobs.outage import OutageError, is_outage
 from app.jobs.sandbox import Limits, Outcome, Sandbox
 from app.settings import Settings
 from app.storage import Storage
@@ -88,7 +89,10 @@ class Workbench:
             If the job was cancelled meanwhile.
         JobFailedError
             If the task cannot be done.
+        OutageError
+            If the machine could not do it: no room, or no memory.
         """
+        wanted = _patient(wanted)
         crashes = 0
         enlarged = False
         while True:
@@ -99,6 +103,8 @@ class Workbench:
                 return outcome.value
             if outcome.ending == "cancelled":
                 self._give_way()
+            if outcome.ending == "outage":
+                raise OutageError(f"task {task}: {outcome.detail}")
             twice = min(2 * limits.memory_mb, self.sandbox.budget.memory_mb)
             if outcome.ending == "memory_limit" and not enlarged and twice > limits.memory_mb:
                 enlarged, limits = True, limits.with_memory(twice)
@@ -168,6 +174,20 @@ class Workbench:
                 shutil.rmtree(target, ignore_errors=True)
                 folder.rename(target)  # complete or not there
             return target
+
+
+def _patient(wanted: Callable[[], bool]) -> Callable[[], bool]:
+    """Ask on while the database is away: hours of work are not thrown away for a restart of it."""
+
+    def ask() -> bool:
+        try:
+            return wanted()
+        except Exception as error:
+            if not is_outage(error):
+                raise
+            return True
+
+    return ask
 
 
 def write_samples(folder: Path, stored: Sequence[StoredSample]) -> None:

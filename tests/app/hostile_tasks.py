@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import os
 import signal
 import subprocess
@@ -77,11 +78,29 @@ def open_files(arguments: dict[str, Any], folder: Path, progress: Progress) -> i
         return len(held)
 
 
+def fill_the_disk(arguments: dict[str, Any], folder: Path, progress: Progress) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
 def shout(arguments: dict[str, Any], folder: Path, progress: Progress) -> None:
     raise NoUsablePatchesError("x" * 1_000_000)
 
 
 TASKS = {
     f.__name__: f
-    for f in (add, refuse, swell, spin, sleep, spawn, crash, die, blunder, write, open_files, shout)
+    for f in (
+        add,
+        refuse,
+        swell,
+        spin,
+        sleep,
+        spawn,
+        crash,
+        die,
+        blunder,
+        write,
+        open_files,
+        fill_the_disk,
+        shout,
+    )
 }

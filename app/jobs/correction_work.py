@@ -105,6 +105,8 @@ class CorrectionWork:
                 folder=folder,
                 limits=limits,
                 wanted=wanted,
+                reads=[developed],
+                compiles=True,
                 on_progress=self._teller(key),
             )
             if not known and self._is_newest(lens_id, version):
@@ -188,7 +190,7 @@ class CorrectionWork:
                 state = self._samples(lens_id, version, folder)
                 model = self._bench.settings.of_models
                 metrics = self._bench.attempt(
-                    "measure", {"model": model}, folder=folder, limits=limits, wanted=wanted
+                    "measure", {"model": model}, folder=folder, limits=limits, wanted=wanted, compiles=True
                 )
                 self._keep_learned(lens_id, version, state, folder / LEARNED)
         except NotWantedError:

@@ -4,7 +4,8 @@ Photos come from anywhere, and the libraries that decode them are large. So each
 runs in a child of a fork server: limited in memory, processor time, wall time, file size and
 open files, without the service's environment, killed when nobody wants the result any more or
 when the parent is gone. What comes back is JSON and files, never a pickle: a child that was
-taken over by a hostile file cannot run code in its parent.
+taken over by a hostile file cannot run code in its parent; nor, where the kernel has the means of
+`app.jobs.confine`, read what is not its task's, reach a network, or start a program.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
@@ -163,6 +165,10 @@ class Sandbox:
         Module whose `TASKS` maps names to functions; see `app.jobs.child.Task`.
     preload : sequence of str, optional
         Modules that the fork server imports once, for all children; by default that module.
+    confined : bool
+        Whether children are kept from files, network and programs; see `app.jobs.confine`.
+    cache : Path, optional
+        Where tasks that decode nothing of strangers keep what they compiled.
     """
 
     def __init__(
@@ -172,8 +178,12 @@ class Sandbox:
         *,
         module: str | None = None,
         preload: Sequence[str] | None = None,
+        confined: bool = True,
+        cache: Path | None = None,
     ) -> None:
-        self.scratch, self.budget = scratch, budget
+        self.scratch, self.budget, self._confined = scratch, budget, confined
+        kept = os.environ.get("NUMBA_CACHE_DIR")
+        self._cache = Path(kept).resolve() if kept else cache
         self._module = module or TASKS_MODULE
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload(["numpy", self._module] if preload is None else list(preload))
@@ -181,6 +191,30 @@ class Sandbox:
         self._stopping = threading.Event()
         shutil.rmtree(scratch, ignore_errors=True)
         scratch.mkdir(parents=True, mode=0o700)
+        if self._cache is not None:
+            self._cache.mkdir(parents=True, exist_ok=True)
+        self._serve()
+
+    def _serve(self) -> None:
+        """Start the fork server where none runs: children have its environment, which holds no secret.
+
+        The environment changes under the whole process for that moment. So this is done once, before
+        there are threads, and else only after the server died.
+        """
+        with self._alone:
+            server = getattr(forkserver._forkserver, "_forkserver_pid", None)  # noqa: SLF001 - no public way
+            if server is not None and _lives(server):
+                return
+            before, clean = dict(os.environ), child.clean_environment()
+            if self._cache is not None:
+                clean["NUMBA_CACHE_DIR"] = str(self._cache)
+            os.environ.clear()
+            os.environ.update(clean)
+            try:
+                forkserver.ensure_running()
+            finally:
+                os.environ.clear()
+                os.environ.update(before)
 
     @contextlib.contextmanager
     def folder(self) -> Iterator[Path]:
@@ -207,6 +241,8 @@ class Sandbox:
         *,
         folder: Path,
         limits: Limits,
+        reads: Sequence[Path] = (),
+        compiles: bool = False,
         wanted: Callable[[], bool] = lambda: True,
         on_progress: child.Progress = ignore_step,
     ) -> Outcome:
@@ -220,6 +256,10 @@ class Sandbox:
             What JSON can write: names, numbers, paths. Arrays travel as files.
         folder : Path
             The task's own folder, from `folder()`.
+        reads : sequence of Path
+            Files and folders that the task may read besides its own.
+        compiles : bool
+            Whether it may add to what all tasks share of compiled code: not if it decodes a stranger's file.
         wanted : callable
             Asked every quarter of a second; once it says no, the child is killed.
         on_progress : callable
@@ -234,7 +274,10 @@ class Sandbox:
                 return _cancelled()
             line, far_end = self._context.Pipe(duplex=True)
             with line:
-                process = self._start(task, arguments, folder, limits, far_end)
+                order = self._order(task, arguments, folder, limits)
+                order["reads"] = [str(path.resolve()) for path in reads] if self._confined else None
+                order["writes"] = [str(self._cache)] if compiles and self._cache else []
+                process = self._start(order, far_end)
                 try:
                     watched = _Watched(process, line, time.monotonic() + limits.wall_s)
                     cut = self._watch(watched, limits, still_wanted, on_progress)
@@ -242,24 +285,22 @@ class Sandbox:
                 finally:
                     self._end(process)
 
-    def _start(
-        self, task: str, arguments: Mapping[str, Any], folder: Path, limits: Limits, far_end: Connection
-    ) -> ForkServerProcess:
+    def _order(self, task: str, arguments: Mapping[str, Any], folder: Path, limits: Limits) -> dict[str, Any]:
         numbers = asdict(limits)
         numbers["cpu_s"] = limits.cpu_s or math.ceil(limits.wall_s * 1.25) + 5
-        order = {
+        return {
             "module": self._module,
             "task": task,
             "arguments": json.dumps(dict(arguments)),
-            "folder": str(folder),
+            "folder": str(folder.resolve()),
             "limits": numbers,
         }
+
+    def _start(self, order: dict[str, Any], far_end: Connection) -> ForkServerProcess:
         process = self._context.Process(
-            target=child.main,
-            args=(order, far_end),
-            name=f"task-{task}",
-            daemon=True,
+            target=child.main, args=(order, far_end), name=f"task-{order['task']}", daemon=True
         )
+        self._serve()
         with far_end, self._alone:
             process.start()
         return process
@@ -305,6 +346,14 @@ class Sandbox:
                 process.kill()
             process.join()
             process.close()
+
+
+def _lives(pid: int) -> bool:
+    """Say whether a child process still runs, and leave its exit status to whoever waits for it."""
+    try:
+        return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
+    except ChildProcessError:
+        return False
 
 
 def _read(line: Connection) -> dict[str, Any] | None:

@@ -76,6 +76,8 @@ class Workbench:
         folder: Path,
         limits: Limits,
         wanted: Callable[[], bool],
+        reads: Sequence[Path] = (),
+        compiles: bool = False,
         on_progress: Progress = ignore_step,
     ) -> Any:  # noqa: ANN401 - JSON of any shape
         """Run a task; try again where that can help; return what it returned.
@@ -97,7 +99,14 @@ class Workbench:
         enlarged = False
         while True:
             outcome = self.sandbox.run(
-                task, arguments, folder=folder, limits=limits, wanted=wanted, on_progress=on_progress
+                task,
+                arguments,
+                folder=folder,
+                limits=limits,
+                reads=reads,
+                compiles=compiles,
+                wanted=wanted,
+                on_progress=on_progress,
             )
             if outcome.ending == "ok":
                 return outcome.value
@@ -167,7 +176,7 @@ class Workbench:
             limits = self.limits(photo, self.settings.develop_seconds, 120)
             with self.original(photo) as path, self.sandbox.folder() as folder:
                 arguments = {"path": str(path), "max_megapixels": self.settings.max_megapixels}
-                self.attempt("develop", arguments, folder=folder, limits=limits, wanted=wanted)
+                self.attempt("develop", arguments, folder=folder, limits=limits, wanted=wanted, reads=[path])
                 for name in (PREVIEW, R_MAP):
                     if (folder / name).is_file():
                         self.storage.put_file(f"{folder_of(photo)}{name}", folder / name)

@@ -21,6 +21,7 @@ from typing import Final, TypeAlias
 from sqlalchemy.exc import OperationalError
 
 from app.ids import new_id
+from app.jobs import confine
 from app.jobs.correction_work import CorrectionWork
 from app.jobs.engine import DbosEngine, Handler, Job, JobEngine
 from app.jobs.lifeline import on_parents_end
@@ -78,7 +79,11 @@ class Worker:
         self._store = Store(settings)
         scratch = settings.data_dir.resolve() / "scratch"
         self._scratch = scratch
-        self._sandbox = Sandbox(scratch / self.id, Budget(settings.worker_slots, settings.worker_memory_mb))
+        self._sandbox = Sandbox(
+            scratch / self.id,
+            Budget(settings.worker_slots, settings.worker_memory_mb),
+            cache=settings.data_dir.resolve() / "cache",
+        )
         self._bench = Workbench(settings, self._store, Storage(settings.storage), self._sandbox)
         self._engine: JobEngine = DbosEngine(settings.jobs, self.id, slots=settings.worker_slots)
         self._stop = threading.Event()
@@ -320,6 +325,10 @@ class Worker:
         os._exit(EXIT_FENCED)
 
 
+def _in_force() -> list[str]:
+    return [name for name, is_so in confine.available().items() if is_so]
+
+
 def _correction_job(correction_id: str, epoch: int, owner: str) -> Job:
     """Name the job; the first try has no number, as in jobs that an older program asked for."""
     return Job("correction", (correction_id,) if epoch == 1 else (correction_id, epoch), owner)
@@ -351,6 +360,8 @@ def main() -> None:
         stream=sys.stderr,
     )
     logging.getLogger("alembic").setLevel(logging.WARNING)  # it tells of every look at the schema
+    confine.hide_memory()
+    log.info("children are confined by: %s", ", ".join(_in_force()) or "nothing that the kernel has")
     worker = Worker(settings)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: worker.stop())

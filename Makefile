@@ -9,7 +9,7 @@ STAMP := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo test test-all serve check format bench lock container-check clean
+.PHONY: help install demo test test-all serve check format bench gallery lock container-check clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -48,6 +48,9 @@ format: install ## let the formatter and the linter mend what they can
 bench: install ## quality and speed benchmarks, tables on standard output
 	@$(BIN)/lensmodel bench
 
+gallery: install ## pictures to look at, gallery-output/index.html (real ones with LENSMODEL_TEST_DATA)
+	@$(BIN)/lensmodel bench gallery --output gallery-output
+
 LOCK := uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --no-annotate
 lock: ## renew the files of requirements/ from pyproject.toml (needs uv)
 	$(LOCK) --extra dev --output-file requirements/lock.txt pyproject.toml
@@ -58,4 +61,4 @@ container-check: ## build the image without an engine, start it and use it (root
 	tools/container_check.sh
 
 clean: ## remove what the targets made
-	rm -rf $(VENV) demo-output bench-output .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) demo-output bench-output gallery-output .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

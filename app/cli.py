@@ -14,7 +14,17 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 import typer
 
-from app.commands import benchmarks, demonstration, display, interrupt, photos, report, reproduce, service
+from app.commands import (
+    benchmarks,
+    checking,
+    demonstration,
+    display,
+    interrupt,
+    photos,
+    report,
+    reproduce,
+    service,
+)
 from app.commands.failure import InterruptedByUser, UsageError
 from lensmodel.errors import LensModelError
 
@@ -33,6 +43,7 @@ Exit status: 0 done, 1 something failed, 2 called wrongly, 130 stopped by Ctrl-C
 )
 app.command()(photos.calibrate)
 app.command()(photos.correct)
+app.command()(checking.check)
 app.command()(photos.psf)
 app.command()(report.report)
 app.command(name="export")(report.export_psfs)

@@ -157,6 +157,20 @@ class Client:
         """Cancel a job."""
         return _read(s.JobOut, self._http.post(f"/v1/jobs/{job_id}/cancel"))
 
+    def retry(self, job_id: str) -> s.JobOut:
+        """Start a failed or cancelled job anew."""
+        return _read(s.JobOut, self._http.post(f"/v1/jobs/{job_id}/retry"))
+
+    def retry_all(self, code: str = "outage") -> int:
+        """Start anew all jobs that failed with a code; return how many."""
+        again = 0
+        while True:
+            answer = self._http.post("/v1/jobs/retry", params={"code": code})
+            retried = _read(s.RetriedOut, answer).retried
+            again += retried
+            if retried == 0:
+                return again
+
     def wait(
         self,
         work: s.PhotoOut | s.CorrectionOut | s.JobOut | str,

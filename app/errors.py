@@ -166,6 +166,7 @@ STATUS_OF_CODE: Final[Mapping[str, int]] = {
     "memory_limit": 422,
     "time_limit": 422,
     "crashed_repeatedly": 500,
+    "outage": 503,
 }
 """Codes that a job can end with, by the status that the same error has as an answer."""
 

@@ -469,6 +469,12 @@ class PatchPage(Model):
     next: str | None = None
 
 
+class RetriedOut(Model):
+    """How many jobs were started anew."""
+
+    retried: int
+
+
 class JobPage(Model):
     """Some jobs, newest first."""
 
@@ -508,6 +514,9 @@ class Readiness(Model):
 
     status: Literal["ready", "not ready"]
     checks: dict[str, str]
+    sandbox: dict[str, bool] = Field(
+        description="Which measures of the kernel confine what decodes photos, on the machine that answers."
+    )
 
 
 class VersionOut(Model):

@@ -10,6 +10,7 @@ from typing import Final
 
 import uvicorn
 
+from app.jobs import confine
 from app.jobs.lifeline import on_parents_end
 from app.settings import Settings
 
@@ -29,6 +30,7 @@ def run(settings: Settings, listener: socket.socket) -> None:
         force=True,  # in place of what the command line set up
     )
     logging.getLogger("alembic").setLevel(logging.WARNING)  # it tells of every look at the schema
+    confine.hide_memory()
     from app.main import create_app  # noqa: PLC0415 - the supervisor need not load the application
 
     config = uvicorn.Config(

@@ -75,6 +75,11 @@ class Settings(BaseSettings):
     sweep_seconds: float = Field(
         default=0.5, gt=0, description="How often a worker looks for new work in the tables."
     )
+    outage_hours: float = Field(
+        default=12.0,
+        ge=0,
+        description="How long a job waits for a database, a storage or a disk before it fails.",
+    )
     inspect_seconds: float = Field(
         default=20.0, gt=0, description="Longest that reading the header of a photo may take."
     )

@@ -6,6 +6,7 @@ key when it is complete, and not before.
 
 from __future__ import annotations
 
+import errno
 import shutil
 from collections.abc import AsyncIterator, Iterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, contextmanager
@@ -97,6 +98,7 @@ class Storage:
         if self.folder is not None:
             path = self.folder / key
             if not path.is_file():
+                self._check_folder()
                 raise FileNotFoundError(key)
             yield path
             return
@@ -108,6 +110,11 @@ class Storage:
             yield copy
         finally:
             copy.unlink(missing_ok=True)
+
+    def _check_folder(self) -> None:
+        """Tell a folder that is away, such as a disk that is not mounted, from a blob that is gone."""
+        if self.folder is not None and not self.folder.is_dir():
+            raise OSError(errno.ENODEV, "the folder of the blobs is away", str(self.folder))
 
     def delete(self, prefix: str) -> None:
         """Delete all blobs below a prefix that ends in a slash; none there is no error."""

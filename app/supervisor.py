@@ -27,6 +27,7 @@ from typing import Final
 
 from app import server
 from app.commands.failure import UsageError
+from app.jobs import confine
 from app.jobs.lifeline import VARIABLE as LIFELINE
 from app.settings import PREFIX, Settings
 from app.store import migrate
@@ -55,6 +56,7 @@ def serve(settings: Settings) -> int:
     InvalidInputError
         If the address cannot be listened on, or the database is of a newer program.
     """
+    confine.hide_memory()
     settings.data_dir.mkdir(parents=True, exist_ok=True)
     with _alone(settings.data_dir), contextlib.closing(_listener(settings)) as listener:
         _migrate(settings)

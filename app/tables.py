@@ -316,6 +316,9 @@ class CorrectionRow(Base):
     lens_version: Mapped[int]
     params: Mapped[dict[str, Any]]
     params_hash: Mapped[str] = mapped_column(String(64))
+    epoch: Mapped[int] = mapped_column(default=1)
+    """Grows when it is started anew after its end."""
+
     attempt: Mapped[int] = mapped_column(default=0)
     state: Mapped[str] = mapped_column(String(20))
     stage: Mapped[str | None] = mapped_column(String(20))

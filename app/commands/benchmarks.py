@@ -16,6 +16,7 @@ from app.commands import display
 from app.commands.display import Display
 from app.commands.failure import UsageError
 from app.commands.files import as_usage, refuse_existing
+from app.commands.gallery import gallery
 from app.commands.options import Force, Quiet, Verbose
 from lensmodel.codec import to_json
 
@@ -63,6 +64,8 @@ bench = typer.Typer(
     """,
     invoke_without_command=True,
 )
+
+bench.command()(gallery)
 
 
 @bench.callback()

@@ -88,6 +88,8 @@ def config(
 ) -> None:
     """Print the effective settings as the environment that would give them; secrets are masked.
 
+    The last lines tell which measures of this machine's kernel confine what decodes photos.
+
     Examples:
 
         lensmodel config
@@ -110,3 +112,7 @@ def config(
     for name, value in shown.items():
         typer.echo(f"# {type(settings).model_fields[name].description}")
         typer.echo(f"{PREFIX}{name.upper()}={value}")
+    from app.jobs import confine  # noqa: PLC0415 - only this command asks
+
+    for name, in_force in confine.available().items():
+        typer.echo(f"# sandbox {name}: {'in force' if in_force else 'not to be had here'}")

@@ -23,6 +23,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
+from app.jobs import confine
 from lensmodel.errors import LensModelError
 
 Progress: TypeAlias = Callable[[int, int], None]
@@ -34,15 +35,28 @@ MAX_TEXT: Final = 4000
 _MIB: Final = 1024 * 1024
 _PROGRESS_S: Final = 0.1
 _PR_SET_PDEATHSIG: Final = 1
-_KEPT_ENVIRONMENT: Final = ("LANG", "LC_ALL", "NUMBA_CACHE_DIR", "PYTHONWARNINGS", "SYSTEMROOT")
+_KEPT_ENVIRONMENT: Final = (
+    *("LANG", "LC_ALL", "NUMBA_CACHE_DIR", "SYSTEMROOT"),
+    *("PYTHONPATH", "PYTHONHASHSEED", "PYTHONDONTWRITEBYTECODE", "PYTHONWARNINGS"),
+)
 _ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 def main(order: dict[str, Any], line: Connection) -> None:
-    """Carry out one order: `module`, `task`, `arguments` (JSON), `folder` and `limits`."""
-    threading.Thread(target=_end_with_parent, args=(line,), daemon=True).start()
+    """Carry out one order: `module`, `task`, `arguments` (JSON), `folder`, `limits`, and what it may touch.
+
+    `reads` are files and folders that it may read, `writes` folders that it may write besides its own;
+    None in place of `reads` leaves the file system, the network and other programs open to it.
+    """
     folder = Path(order["folder"])
+    tasks = importlib.import_module(order["module"])  # our own code: it may still be read
     contain(folder, order["limits"])
+    if order["reads"] is not None:
+        writes = [folder, *map(Path, order["writes"])]
+        confine.confine(writes, map(Path, order["reads"]))
+        _die_with_parent()  # again: the kernel forgets it when a process changes what it may
+    # no thread before this line: it would keep what the others gave up
+    threading.Thread(target=_end_with_parent, args=(line,), daemon=True).start()
     last = 0.0
 
     def progress(done: int, total: int) -> None:
@@ -52,7 +66,7 @@ def main(order: dict[str, Any], line: Connection) -> None:
             _tell(line, done=int(done), total=int(total))
 
     try:
-        function: Task = importlib.import_module(order["module"]).TASKS[order["task"]]
+        function: Task = tasks.TASKS[order["task"]]
         result = json.dumps(function(json.loads(order["arguments"]), folder, progress), allow_nan=False)
         (folder / RESULT).write_text(result, encoding="utf-8")
         _tell(line, end="ok")
@@ -61,14 +75,22 @@ def main(order: dict[str, Any], line: Connection) -> None:
     except MemoryError:
         _tell(line, end="memory_limit")
     except OSError as error:
-        if error.errno not in {errno.EFBIG, errno.ENOMEM}:
-            _tell(line, end="bug", code=type(error).__name__, text=_last_lines())
-        else:
+        if error.errno in {errno.ENOSPC, errno.EDQUOT}:
+            _tell(line, end="no_room")
+        elif error.errno in {errno.EFBIG, errno.ENOMEM}:
             _tell(line, end="memory_limit")
+        else:
+            _tell(line, end="bug", code=type(error).__name__, text=_last_lines())
     except Exception as error:  # noqa: BLE001 - whatever it is, the parent must hear of it
         _tell(line, end="bug", code=type(error).__name__, text=_last_lines())
     finally:
         sys.stdout.flush()
+
+
+def clean_environment() -> dict[str, str]:
+    """Return what of this process's environment a child needs: no address, no password, no key."""
+    kept = {name: os.environ[name] for name in _KEPT_ENVIRONMENT if name in os.environ}
+    return {**kept, "PATH": os.defpath, **dict.fromkeys(_ONE_THREAD, "1")}
 
 
 def contain(folder: Path, limits: dict[str, int]) -> None:
@@ -80,14 +102,12 @@ def contain(folder: Path, limits: dict[str, int]) -> None:
     _close_fork_server_line()
     with contextlib.suppress(OSError):
         os.setsid()  # a Ctrl-C at the terminal is for the parent; a kill reaches the whole group
-    if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    _die_with_parent()
     os.umask(0o077)
     os.chdir(folder)
-    kept = {name: os.environ[name] for name in _KEPT_ENVIRONMENT if name in os.environ}
+    kept = clean_environment()
     os.environ.clear()
-    os.environ.update(kept, PATH=os.defpath, HOME=str(folder), TMPDIR=str(folder))
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+    os.environ.update(kept, HOME=str(folder), TMPDIR=str(folder))
     _limit(resource.RLIMIT_CORE, 0)
     _limit(resource.RLIMIT_NOFILE, limits["open_files"])
     _limit(resource.RLIMIT_FSIZE, limits["file_mb"] * _MIB)
@@ -121,6 +141,14 @@ def _close_fork_server_line() -> None:
     if server is not None and inherited is not None:
         server._forkserver_alive_fd = None  # noqa: SLF001 - there is no public way
         os.close(inherited)
+
+
+def _die_with_parent() -> None:
+    if sys.platform == "linux":
+        parent = os.getppid()
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:
+            os._exit(70)  # it died before we asked to die with it
 
 
 def _end_with_parent(line: Connection) -> None:

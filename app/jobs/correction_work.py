@@ -15,6 +15,7 @@ from typing import Any, Final
 from app.evidence import with_evidence
 from app.jobs.child import Progress
 from app.jobs.handover import BEFORE, FAMILY, LEARNED, SUFFIX
+from app.jobs.outage import missable
 from app.jobs.sandbox import Limits
 from app.jobs.workbench import (
     SPARE_MB,
@@ -50,13 +51,13 @@ class CorrectionWork:
         self._bench = bench
         self._corrections = bench.store.corrections
 
-    def correction(self, correction_id: str) -> None:
+    def correction(self, correction_id: str, epoch: int = 1) -> None:
         """Make the corrected file."""
 
         def wanted() -> bool:
-            return self._corrections.is_live(correction_id)
+            return self._corrections.is_live(correction_id, epoch)
 
-        if not self._corrections.start(correction_id):
+        if not self._corrections.start(correction_id, epoch):
             return
         plan = self._corrections.plan(correction_id)
         if plan is None:
@@ -66,7 +67,7 @@ class CorrectionWork:
         except NotWantedError:
             log.info("correction %s is not wanted any more", correction_id)
         except JobFailedError as error:
-            self._corrections.fail(correction_id, error.code, error.detail)
+            self._corrections.fail(correction_id, error.code, error.detail, epoch=epoch)
 
     def _correct(self, plan: CorrectionPlan, wanted: Callable[[], bool]) -> None:
         key, photo, params = plan.correction.public_id, plan.photo, plan.correction.params
@@ -104,6 +105,8 @@ class CorrectionWork:
                 folder=folder,
                 limits=limits,
                 wanted=wanted,
+                reads=[developed],
+                compiles=True,
                 on_progress=self._teller(key),
             )
             if not known and self._is_newest(lens_id, version):
@@ -142,7 +145,8 @@ class CorrectionWork:
             nonlocal last
             if time.monotonic() - last > TELL_S or done == total:
                 last = time.monotonic()
-                self._corrections.progress(correction_id, done, total)
+                with missable():
+                    self._corrections.progress(correction_id, done, total)
 
         return tell
 
@@ -186,7 +190,7 @@ class CorrectionWork:
                 state = self._samples(lens_id, version, folder)
                 model = self._bench.settings.of_models
                 metrics = self._bench.attempt(
-                    "measure", {"model": model}, folder=folder, limits=limits, wanted=wanted
+                    "measure", {"model": model}, folder=folder, limits=limits, wanted=wanted, compiles=True
                 )
                 self._keep_learned(lens_id, version, state, folder / LEARNED)
         except NotWantedError:

@@ -96,7 +96,9 @@ class PhotoWork:
         limits = Limits(memory_mb=SPARE_MB, wall_s=self._bench.settings.inspect_seconds)
         with self._bench.original(photo) as path, self._bench.sandbox.folder() as folder:
             arguments = {"path": str(path), "max_megapixels": self._bench.settings.max_megapixels}
-            info = self._bench.attempt("inspect", arguments, folder=folder, limits=limits, wanted=wanted)
+            info = self._bench.attempt(
+                "inspect", arguments, folder=folder, limits=limits, wanted=wanted, reads=[path]
+            )
         self._record(photo, info)
         return self._get(photo.public_id)
 
@@ -151,7 +153,9 @@ class PhotoWork:
         arguments = {"developed": str(developed), "count": self._bench.settings.patches}
         with self._bench.sandbox.folder() as folder:
             try:
-                found = self._bench.attempt("select", arguments, folder=folder, limits=limits, wanted=wanted)
+                found = self._bench.attempt(
+                    "select", arguments, folder=folder, limits=limits, wanted=wanted, reads=[developed]
+                )
             except JobFailedError as error:
                 if error.code != "invalid_parameter":
                     raise
@@ -235,8 +239,9 @@ class PhotoWork:
             return self._store.photos.is_live(photo.public_id, photo.epoch)
 
         settings = self._bench.settings
+        developed = self._bench.developed(photo, wanted)
         arguments = {
-            "developed": str(self._bench.developed(photo, wanted)),
+            "developed": str(developed),
             "photo": photo.public_id,
             "patches": [_patch(row) for row in rows],
             "numbers": [row.idx for row in rows],
@@ -247,7 +252,15 @@ class PhotoWork:
         }
         limits = self._bench.limits(photo, settings.patch_seconds, 24)
         with self._bench.sandbox.folder() as folder:
-            listed = self._bench.attempt("estimate", arguments, folder=folder, limits=limits, wanted=wanted)
+            listed = self._bench.attempt(
+                "estimate",
+                arguments,
+                folder=folder,
+                limits=limits,
+                wanted=wanted,
+                reads=[developed],
+                compiles=True,
+            )
             return [self._sample(photo, folder, number, entry) for number, entry in enumerate(listed)]
 
     def _sample(self, photo: PhotoRow, folder: Path, number: int, entry: dict[str, Any]) -> NewSample:

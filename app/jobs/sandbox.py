@@ -4,7 +4,8 @@ Photos come from anywhere, and the libraries that decode them are large. So each
 runs in a child of a fork server: limited in memory, processor time, wall time, file size and
 open files, without the service's environment, killed when nobody wants the result any more or
 when the parent is gone. What comes back is JSON and files, never a pickle: a child that was
-taken over by a hostile file cannot run code in its parent.
+taken over by a hostile file cannot run code in its parent; nor, where the kernel has the means of
+`app.jobs.confine`, read what is not its task's, reach a network, or start a program.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
@@ -33,7 +35,7 @@ from lensmodel.types import ignore_step
 
 log = logging.getLogger(__name__)
 
-Ending: TypeAlias = Literal["ok", "error", "memory_limit", "time_limit", "crashed", "cancelled"]
+Ending: TypeAlias = Literal["ok", "error", "memory_limit", "time_limit", "outage", "crashed", "cancelled"]
 
 POLL_S: Final = 0.25
 MAX_MESSAGE: Final = 64 * 1024
@@ -79,7 +81,8 @@ class Outcome:
     ----------
     ending : str
         `ok`, `error` (the library refused, with its reason), `memory_limit`, `time_limit`,
-        `crashed` (a signal, or an exception that nobody foresaw) or `cancelled`.
+        `outage` (the machine had no room, or killed it), `crashed` (another signal, or an
+        exception that nobody foresaw) or `cancelled`.
     value : object
         What the task returned.
     code, detail : str
@@ -162,6 +165,10 @@ class Sandbox:
         Module whose `TASKS` maps names to functions; see `app.jobs.child.Task`.
     preload : sequence of str, optional
         Modules that the fork server imports once, for all children; by default that module.
+    confined : bool
+        Whether children are kept from files, network and programs; see `app.jobs.confine`.
+    cache : Path, optional
+        Where tasks that decode nothing of strangers keep what they compiled.
     """
 
     def __init__(
@@ -171,8 +178,12 @@ class Sandbox:
         *,
         module: str | None = None,
         preload: Sequence[str] | None = None,
+        confined: bool = True,
+        cache: Path | None = None,
     ) -> None:
-        self.scratch, self.budget = scratch, budget
+        self.scratch, self.budget, self._confined = scratch, budget, confined
+        kept = os.environ.get("NUMBA_CACHE_DIR")
+        self._cache = Path(kept).resolve() if kept else cache
         self._module = module or TASKS_MODULE
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload(["numpy", self._module] if preload is None else list(preload))
@@ -180,6 +191,30 @@ class Sandbox:
         self._stopping = threading.Event()
         shutil.rmtree(scratch, ignore_errors=True)
         scratch.mkdir(parents=True, mode=0o700)
+        if self._cache is not None:
+            self._cache.mkdir(parents=True, exist_ok=True)
+        self._serve()
+
+    def _serve(self) -> None:
+        """Start the fork server where none runs: children have its environment, which holds no secret.
+
+        The environment changes under the whole process for that moment. So this is done once, before
+        there are threads, and else only after the server died.
+        """
+        with self._alone:
+            server = getattr(forkserver._forkserver, "_forkserver_pid", None)  # noqa: SLF001 - no public way
+            if server is not None and _lives(server):
+                return
+            before, clean = dict(os.environ), child.clean_environment()
+            if self._cache is not None:
+                clean["NUMBA_CACHE_DIR"] = str(self._cache)
+            os.environ.clear()
+            os.environ.update(clean)
+            try:
+                forkserver.ensure_running()
+            finally:
+                os.environ.clear()
+                os.environ.update(before)
 
     @contextlib.contextmanager
     def folder(self) -> Iterator[Path]:
@@ -206,6 +241,8 @@ class Sandbox:
         *,
         folder: Path,
         limits: Limits,
+        reads: Sequence[Path] = (),
+        compiles: bool = False,
         wanted: Callable[[], bool] = lambda: True,
         on_progress: child.Progress = ignore_step,
     ) -> Outcome:
@@ -219,6 +256,10 @@ class Sandbox:
             What JSON can write: names, numbers, paths. Arrays travel as files.
         folder : Path
             The task's own folder, from `folder()`.
+        reads : sequence of Path
+            Files and folders that the task may read besides its own.
+        compiles : bool
+            Whether it may add to what all tasks share of compiled code: not if it decodes a stranger's file.
         wanted : callable
             Asked every quarter of a second; once it says no, the child is killed.
         on_progress : callable
@@ -233,7 +274,10 @@ class Sandbox:
                 return _cancelled()
             line, far_end = self._context.Pipe(duplex=True)
             with line:
-                process = self._start(task, arguments, folder, limits, far_end)
+                order = self._order(task, arguments, folder, limits)
+                order["reads"] = [str(path.resolve()) for path in reads] if self._confined else None
+                order["writes"] = [str(self._cache)] if compiles and self._cache else []
+                process = self._start(order, far_end)
                 try:
                     watched = _Watched(process, line, time.monotonic() + limits.wall_s)
                     cut = self._watch(watched, limits, still_wanted, on_progress)
@@ -241,24 +285,22 @@ class Sandbox:
                 finally:
                     self._end(process)
 
-    def _start(
-        self, task: str, arguments: Mapping[str, Any], folder: Path, limits: Limits, far_end: Connection
-    ) -> ForkServerProcess:
+    def _order(self, task: str, arguments: Mapping[str, Any], folder: Path, limits: Limits) -> dict[str, Any]:
         numbers = asdict(limits)
         numbers["cpu_s"] = limits.cpu_s or math.ceil(limits.wall_s * 1.25) + 5
-        order = {
+        return {
             "module": self._module,
             "task": task,
             "arguments": json.dumps(dict(arguments)),
-            "folder": str(folder),
+            "folder": str(folder.resolve()),
             "limits": numbers,
         }
+
+    def _start(self, order: dict[str, Any], far_end: Connection) -> ForkServerProcess:
         process = self._context.Process(
-            target=child.main,
-            args=(order, far_end),
-            name=f"task-{task}",
-            daemon=True,
+            target=child.main, args=(order, far_end), name=f"task-{order['task']}", daemon=True
         )
+        self._serve()
         with far_end, self._alone:
             process.start()
         return process
@@ -306,6 +348,14 @@ class Sandbox:
             process.close()
 
 
+def _lives(pid: int) -> bool:
+    """Say whether a child process still runs, and leave its exit status to whoever waits for it."""
+    try:
+        return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
+    except ChildProcessError:
+        return False
+
+
 def _read(line: Connection) -> dict[str, Any] | None:
     """Return the next message; None at the end of the line, or where the child breaks the rules."""
     try:
@@ -317,23 +367,51 @@ def _read(line: Connection) -> dict[str, Any] | None:
 
 def _outcome(ended: dict[str, Any] | None, status: int, folder: Path, limits: Limits) -> Outcome:
     ending = None if ended is None else ended.get("end")
-    code, text = (str((ended or {}).get(key, "")) for key in ("code", "text"))
     if ending == "ok" and status == 0:
         return _result(folder / child.RESULT)
-    if ending == "error":
-        return Outcome("error", code=code, detail=text)
-    if ending == "memory_limit":
-        detail = f"needs more than the {limits.memory_mb} MiB it may take; give a smaller photo"
-        return Outcome("memory_limit", code="memory_limit", detail=detail)
+    if ending in _SAID:
+        code, text = (str((ended or {}).get(key, "")) for key in ("code", "text"))
+        return _SAID[ending](code, text, limits)
     if -status == signal.SIGXCPU:
         detail = f"took more than {limits.cpu_s or limits.wall_s:g} s of processor time; give a smaller photo"
         return Outcome("time_limit", code="time_limit", detail=detail)
-    if ending == "bug":
-        log.error("unforeseen %s in a task:\n%s", code, text)
-        why = f"an unforeseen {code} stopped the work; the log of the worker says where"
-        return Outcome("crashed", code="internal_error", detail=why)
     why = f"signal {-status} ({_signal_name(-status)})" if status < 0 else f"exit status {status}"
-    return Outcome("crashed", code="crashed", detail=f"the process that did the work died: {why}")
+    detail = f"the process that did the work died: {why}"
+    if -status == signal.SIGKILL:  # neither by itself nor by us: the kernel does so for want of memory
+        return Outcome("outage", code="outage", detail=detail)
+    return Outcome("crashed", code="crashed", detail=detail)
+
+
+def _refused(code: str, text: str, limits: Limits) -> Outcome:
+    del limits
+    return Outcome("error", code=code, detail=text)
+
+
+def _swollen(code: str, text: str, limits: Limits) -> Outcome:
+    del code, text
+    detail = f"needs more than the {limits.memory_mb} MiB it may take; give a smaller photo"
+    return Outcome("memory_limit", code="memory_limit", detail=detail)
+
+
+def _no_room(code: str, text: str, limits: Limits) -> Outcome:
+    del code, text, limits
+    return Outcome("outage", code="outage", detail="there is no room on the disk for the work")
+
+
+def _bug(code: str, text: str, limits: Limits) -> Outcome:
+    del limits
+    log.error("unforeseen %s in a task:\n%s", code, text)
+    why = f"an unforeseen {code} stopped the work; the log of the worker says where"
+    return Outcome("crashed", code="internal_error", detail=why)
+
+
+_SAID: Final[Mapping[object, Callable[[str, str, Limits], Outcome]]] = {
+    "error": _refused,
+    "memory_limit": _swollen,
+    "no_room": _no_room,
+    "bug": _bug,
+}
+"""What to make of the last words of a child, by how it says that it ended."""
 
 
 def _result(path: Path) -> Outcome:

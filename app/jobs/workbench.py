@@ -20,6 +20,7 @@ import numpy as np
 from app import distances
 from app.jobs.child import Progress
 from app.jobs.handover import EVIDENCE, KERNELS, PREVIEW, R_MAP, SAMPLES
+from app.jobs.outage import OutageError, is_outage
 from app.jobs.sandbox import Limits, Outcome, Sandbox
 from app.settings import Settings
 from app.storage import Storage
@@ -75,6 +76,8 @@ class Workbench:
         folder: Path,
         limits: Limits,
         wanted: Callable[[], bool],
+        reads: Sequence[Path] = (),
+        compiles: bool = False,
         on_progress: Progress = ignore_step,
     ) -> Any:  # noqa: ANN401 - JSON of any shape
         """Run a task; try again where that can help; return what it returned.
@@ -88,17 +91,29 @@ class Workbench:
             If the job was cancelled meanwhile.
         JobFailedError
             If the task cannot be done.
+        OutageError
+            If the machine could not do it: no room, or no memory.
         """
+        wanted = _patient(wanted)
         crashes = 0
         enlarged = False
         while True:
             outcome = self.sandbox.run(
-                task, arguments, folder=folder, limits=limits, wanted=wanted, on_progress=on_progress
+                task,
+                arguments,
+                folder=folder,
+                limits=limits,
+                reads=reads,
+                compiles=compiles,
+                wanted=wanted,
+                on_progress=on_progress,
             )
             if outcome.ending == "ok":
                 return outcome.value
             if outcome.ending == "cancelled":
                 self._give_way()
+            if outcome.ending == "outage":
+                raise OutageError(f"task {task}: {outcome.detail}")
             twice = min(2 * limits.memory_mb, self.sandbox.budget.memory_mb)
             if outcome.ending == "memory_limit" and not enlarged and twice > limits.memory_mb:
                 enlarged, limits = True, limits.with_memory(twice)
@@ -161,13 +176,27 @@ class Workbench:
             limits = self.limits(photo, self.settings.develop_seconds, 120)
             with self.original(photo) as path, self.sandbox.folder() as folder:
                 arguments = {"path": str(path), "max_megapixels": self.settings.max_megapixels}
-                self.attempt("develop", arguments, folder=folder, limits=limits, wanted=wanted)
+                self.attempt("develop", arguments, folder=folder, limits=limits, wanted=wanted, reads=[path])
                 for name in (PREVIEW, R_MAP):
                     if (folder / name).is_file():
                         self.storage.put_file(f"{folder_of(photo)}{name}", folder / name)
                 shutil.rmtree(target, ignore_errors=True)
                 folder.rename(target)  # complete or not there
             return target
+
+
+def _patient(wanted: Callable[[], bool]) -> Callable[[], bool]:
+    """Ask on while the database is away: hours of work are not thrown away for a restart of it."""
+
+    def ask() -> bool:
+        try:
+            return wanted()
+        except Exception as error:
+            if not is_outage(error):
+                raise
+            return True
+
+    return ask
 
 
 def write_samples(folder: Path, stored: Sequence[StoredSample]) -> None:

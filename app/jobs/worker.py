@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import shutil
 import signal
@@ -11,17 +12,21 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
 from sqlalchemy.exc import OperationalError
 
 from app.ids import new_id
+from app.jobs import confine
 from app.jobs.correction_work import CorrectionWork
 from app.jobs.engine import DbosEngine, Handler, Job, JobEngine
 from app.jobs.lifeline import on_parents_end
+from app.jobs.outage import CODE as OUTAGE
+from app.jobs.outage import LONGEST_PAUSE_S, Patience, is_outage
 from app.jobs.photo_work import PhotoWork
 from app.jobs.processes import is_running, started_at
 from app.jobs.sandbox import Budget, Sandbox
@@ -40,6 +45,30 @@ TIDY_S: Final = 60.0
 KEEP_JOBS: Final = timedelta(days=2)
 KEEP_DEVELOPED_BYTES: Final = 20 << 30
 
+_OURS: Final = "an error of ours; the log of the worker has it; retry later, or report the file"
+_LATER: Final = "retry once its operator has mended that"
+
+
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """Why a job was given up: a fixed code and a sentence for its owner."""
+
+    code: str
+    detail: str
+
+    @classmethod
+    def of(cls, error: BaseException) -> Ending:
+        """Return the ending of a job whose last try failed so."""
+        if is_outage(error):
+            return cls(
+                OUTAGE, f"the service waited in vain for what it needs ({type(error).__name__}): {_LATER}"
+            )
+        return cls("internal_error", _OURS)
+
+
+Broke: TypeAlias = Callable[..., None]
+"""Called as `broke(ending, *arguments of the job)`."""
+
 
 class Worker:
     """One worker: its lease, its sweeps, its engine."""
@@ -50,7 +79,11 @@ class Worker:
         self._store = Store(settings)
         scratch = settings.data_dir.resolve() / "scratch"
         self._scratch = scratch
-        self._sandbox = Sandbox(scratch / self.id, Budget(settings.worker_slots, settings.worker_memory_mb))
+        self._sandbox = Sandbox(
+            scratch / self.id,
+            Budget(settings.worker_slots, settings.worker_memory_mb),
+            cache=settings.data_dir.resolve() / "cache",
+        )
         self._bench = Workbench(settings, self._store, Storage(settings.storage), self._sandbox)
         self._engine: JobEngine = DbosEngine(settings.jobs, self.id, slots=settings.worker_slots)
         self._stop = threading.Event()
@@ -60,7 +93,11 @@ class Worker:
     def run(self) -> None:
         """Work until told to stop."""
         host = socket.gethostname()
-        self._store.workers.register(self.id, host=host, pid=os.getpid(), pid_started=started_at(os.getpid()))
+        began = started_at(os.getpid())
+        self._insist(
+            lambda: self._store.workers.register(self.id, host=host, pid=os.getpid(), pid_started=began)
+        )
+        self._last_beat = time.monotonic()
         photos, corrections = PhotoWork(self._bench, self._engine), CorrectionWork(self._bench)
         self._engine.start(
             {
@@ -120,34 +157,66 @@ class Worker:
 
     # --- jobs ---------------------------------------------------------------------------------
 
-    def _safe(self, handler: Handler, broke: Handler) -> Handler:
-        """Wrap a job: what nobody foresaw is tried again, then ends the job with a reason."""
+    def _insist(self, call: Callable[[], object]) -> None:
+        """Do something that needs the database, however long that is away."""
+        patience = Patience(math.inf)
+        while not self._stop.is_set():
+            try:
+                call()
+            except Exception as error:
+                pause = patience.pause_after(error)
+                if pause is None or not is_outage(error):
+                    raise
+                log.warning("waiting %.0f s: %s", pause, error)
+                self._stop.wait(pause)
+            else:
+                return
+
+    def _safe(self, handler: Handler, broke: Broke) -> Handler:
+        """Wrap a job: what went wrong is tried again, and in the end has a reason."""
 
         def run(*arguments: str | int) -> None:
-            for attempt in range(3):
+            patience = Patience(self._settings.outage_hours * 3600.0)
+            while True:
                 try:
                     handler(*arguments)
-                except Exception:
-                    log.exception("job %s%s, attempt %d", handler.__name__, arguments, attempt + 1)
-                    time.sleep(2.0**attempt)
+                except Exception as error:
+                    pause = patience.pause_after(error)
+                    name = f"{handler.__name__}{arguments}"
+                    if is_outage(error):
+                        log.warning("job %s: %s: %s", name, type(error).__name__, error)
+                    else:
+                        log.exception("job %s", name)
+                    if pause is None:
+                        ending = Ending.of(error)
+                        break
+                    self._rest(pause)
                 else:
                     return
-            broke(*arguments)
+            self._insist(lambda: broke(ending, *arguments))
 
         return run
 
-    def _photo_broke(self, photo_id: str, epoch: int) -> None:
-        self._store.photos.fail(photo_id, epoch, "internal_error", _OURS)
+    def _rest(self, seconds: float) -> None:
+        """Wait; while this process ends, until it is gone, since the job must not seem finished."""
+        if self._stop.wait(seconds):
+            time.sleep(LONGEST_PAUSE_S)
 
-    def _cell_broke(self, photo_id: str, epoch: int, cell: int) -> None:
+    def _photo_broke(self, ending: Ending, photo_id: str, epoch: int) -> None:
+        self._store.photos.fail(photo_id, epoch, ending.code, ending.detail)
+
+    def _cell_broke(self, ending: Ending, photo_id: str, epoch: int, cell: int) -> None:
+        if ending.code == OUTAGE:  # nothing is known of the patches: the photo can be tried again as a whole
+            self._photo_broke(ending, photo_id, epoch)
+            return
         rows = self._store.patches.of_cell(photo_id, epoch, cell)
-        self._store.patches.fail(photo_id, epoch, [row.idx for row in rows], "internal_error")
+        self._store.patches.fail(photo_id, epoch, [row.idx for row in rows], ending.code)
 
-    def _correction_broke(self, correction_id: str) -> None:
-        self._store.corrections.fail(correction_id, "internal_error", _OURS)
+    def _correction_broke(self, ending: Ending, correction_id: str, epoch: int = 1) -> None:
+        self._store.corrections.fail(correction_id, ending.code, ending.detail, epoch=epoch)
 
-    def _measure_broke(self, lens_id: str, version: int) -> None:
-        unknown = {"error": None, "coverage": None, "problem": "internal_error"}
+    def _measure_broke(self, ending: Ending, lens_id: str, version: int) -> None:
+        unknown = {"error": None, "coverage": None, "problem": ending.code}
         self._store.lenses.record_metrics(lens_id, version, unknown)
 
     # --- duties -------------------------------------------------------------------------------
@@ -156,8 +225,8 @@ class Worker:
         """Put into the queue what the tables ask for; what is there already stays as it is."""
         for photo_id, epoch, owner in self._store.photos.to_do():
             self._engine.enqueue(Job("photo", (photo_id, epoch), owner))
-        for correction_id, _, owner in self._store.corrections.to_do():
-            self._engine.enqueue(Job("correction", (correction_id,), owner))
+        for correction_id, epoch, owner in self._store.corrections.to_do():
+            self._engine.enqueue(_correction_job(correction_id, epoch, owner))
         for lens_id, version in self._store.lenses.unmeasured():
             self._engine.enqueue(Job("measure", (lens_id, version)))
 
@@ -203,22 +272,23 @@ class Worker:
         for photo_id, epoch, owner in [*photos.to_do(), *photos.running()]:
             ended = self._lost(Job("photo", (photo_id, epoch), owner))
             if ended:  # and only if it is still so: it may have come to its end meanwhile
-                photos.fail(photo_id, epoch, *ended)
-        for correction_id, _, owner in [*corrections.to_do(), *corrections.running()]:
-            ended = self._lost(Job("correction", (correction_id,), owner))
+                photos.fail(photo_id, epoch, ended.code, ended.detail)
+        for correction_id, epoch, owner in [*corrections.to_do(), *corrections.running()]:
+            ended = self._lost(_correction_job(correction_id, epoch, owner))
             if ended:
-                corrections.fail(correction_id, *ended)
+                corrections.fail(correction_id, ended.code, ended.detail, epoch=epoch)
         for lens_id, version in self._store.lenses.unmeasured():
-            if self._lost(Job("measure", (lens_id, version))):
-                self._measure_broke(lens_id, version)
+            ended = self._lost(Job("measure", (lens_id, version)))
+            if ended:
+                self._measure_broke(ended, lens_id, version)
 
-    def _lost(self, job: Job) -> tuple[str, str] | None:
+    def _lost(self, job: Job) -> Ending | None:
         status = self._engine.status(job)
         if status == "unknown":
             self._engine.enqueue(job)
         if status == "lost":
-            return "crashed_repeatedly", "the worker died each time that it tried; report the file"
-        return ("internal_error", _OURS) if status == "done" else None
+            return Ending("crashed_repeatedly", "the worker died each time that it tried; report the file")
+        return Ending("internal_error", _OURS) if status == "done" else None
 
     def _tidy(self) -> None:
         """Delete what nobody needs any more."""
@@ -255,7 +325,13 @@ class Worker:
         os._exit(EXIT_FENCED)
 
 
-_OURS: Final = "an error of ours; the log of the worker has it; retry later, or report the file"
+def _in_force() -> list[str]:
+    return [name for name, is_so in confine.available().items() if is_so]
+
+
+def _correction_job(correction_id: str, epoch: int, owner: str) -> Job:
+    """Name the job; the first try has no number, as in jobs that an older program asked for."""
+    return Job("correction", (correction_id,) if epoch == 1 else (correction_id, epoch), owner)
 
 
 def _identity(path: Path) -> tuple[int, int]:
@@ -284,6 +360,8 @@ def main() -> None:
         stream=sys.stderr,
     )
     logging.getLogger("alembic").setLevel(logging.WARNING)  # it tells of every look at the schema
+    confine.hide_memory()
+    log.info("children are confined by: %s", ", ".join(_in_force()) or "nothing that the kernel has")
     worker = Worker(settings)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: worker.stop())

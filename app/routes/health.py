@@ -9,6 +9,7 @@ from typing import get_args
 from fastapi import APIRouter, status
 
 from app.dependencies import Call, CallDep
+from app.jobs import confine
 from app.routes.common import problems
 from app.routes.photos import GIB
 from app.routes.psf import MEDIA_TYPES
@@ -51,7 +52,7 @@ def readyz(call: CallDep) -> Readiness:
     ready = all(said == "ok" for said in checks.values())
     if not ready:
         call.response.status_code = status.HTTP_503_SERVICE_UNAVAILABLE
-    return Readiness(status="ready" if ready else "not ready", checks=checks)
+    return Readiness(status="ready" if ready else "not ready", checks=checks, sandbox=confine.available())
 
 
 def _check(probe: Callable[[], None]) -> str:

@@ -15,9 +15,10 @@ from starlette.concurrency import run_in_threadpool
 from app import views
 from app.dependencies import Call, CallDep
 from app.errors import ConflictError, UnknownJobError
+from app.jobs.outage import CODE as OUTAGE
 from app.routes.common import Cursor, Limit, next_link, problems
 from app.routes.photos import candidates
-from app.schemas import JobOut, JobPage
+from app.schemas import JobOut, JobPage, RetriedOut
 
 router = APIRouter(tags=["jobs"])
 
@@ -110,6 +111,45 @@ def cancel_job(job_id: str, call: CallDep) -> JobOut:
     if not done:
         raise ConflictError(f"job {job_id} is finished ({job.state}): there is nothing left to cancel")
     return job
+
+
+@router.post(
+    "/jobs/{job_id}/retry",
+    operation_id="retryJob",
+    status_code=status.HTTP_202_ACCEPTED,
+    responses=problems(404, 409, 422),
+)
+def retry_job(job_id: str, call: CallDep) -> JobOut:
+    """Start a failed or cancelled job anew."""
+    done = call.store.photos.retry(job_id, call.owner) or call.store.corrections.retry(job_id, call.owner)
+    job = find_job(call, job_id)
+    if not done:
+        raise ConflictError(
+            f"job {job_id} is {job.state}, or what it makes was asked for again: "
+            "only what failed or was cancelled can be retried"
+        )
+    return job
+
+
+@router.post(
+    "/jobs/retry",
+    operation_id="retryJobs",
+    status_code=status.HTTP_202_ACCEPTED,
+    responses=problems(422),
+)
+def retry_jobs(
+    call: CallDep,
+    code: Annotated[str, Query(pattern="^[a-z_]{1,40}$", description="with which they failed")] = OUTAGE,
+    limit: Annotated[int, Query(ge=1, le=1000, description="jobs at once")] = 1000,
+) -> RetriedOut:
+    """Start anew all jobs that failed with a code, the oldest first; by default those that an outage ended.
+
+    Call it again until it says 0 where there are more than `limit`.
+    """
+    photos, corrections = call.store.photos, call.store.corrections
+    again = sum(photos.retry(key, call.owner) for key in photos.failed_by(call.owner, code, limit))
+    rest = corrections.failed_by(call.owner, code, limit - again) if again < limit else []
+    return RetriedOut(retried=again + sum(corrections.retry(key, call.owner) for key in rest))
 
 
 @router.get(

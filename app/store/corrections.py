@@ -12,7 +12,7 @@ from sqlalchemy import Select, select, update
 
 from app.ids import new_id
 from app.store.database import Database, insert_new
-from app.store.owners import find, is_id, now, owned
+from app.store.owners import find, find_to_change, is_id, now, owned
 from app.tables import CorrectionRow, GarbageRow, LensRow, OwnerRow, PhotoRow
 
 ACTIVE = ("queued", "running")
@@ -122,16 +122,16 @@ class CorrectionStore:
             return [CorrectionPlan(*row) for row in session.execute(query)]
 
     def to_do(self, limit: int = 100) -> list[tuple[str, int, str]]:
-        """Return `(correction_id, attempt, owner)` of queued corrections, oldest first: the intent sweep."""
+        """Return `(correction_id, epoch, owner)` of queued corrections, oldest first: the intent sweep."""
         return self._in_states(("queued",), limit)
 
     def running(self, limit: int = 1000) -> list[tuple[str, int, str]]:
-        """Return `(correction_id, attempt, owner)` of corrections that a worker is busy with."""
+        """Return `(correction_id, epoch, owner)` of corrections that a worker is busy with."""
         return self._in_states(("running",), limit)
 
     def _in_states(self, states: Sequence[str], limit: int) -> list[tuple[str, int, str]]:
         query = (
-            select(CorrectionRow.public_id, CorrectionRow.attempt, OwnerRow.name)
+            select(CorrectionRow.public_id, CorrectionRow.epoch, OwnerRow.name)
             .join(OwnerRow, OwnerRow.id == CorrectionRow.owner_id)
             .where(CorrectionRow.state.in_(states))
             .order_by(CorrectionRow.id)
@@ -140,26 +140,70 @@ class CorrectionStore:
         with self._db.reading() as session:
             return [(row[0], row[1], row[2]) for row in session.execute(query)]
 
-    def is_live(self, correction_id: str) -> bool:
+    def is_live(self, correction_id: str, epoch: int | None = None) -> bool:
         """Say whether the correction is still wanted: the cancel poll."""
         row = self.get(correction_id)
-        return row is not None and row.state in ACTIVE
+        return row is not None and row.state in ACTIVE and epoch in {None, row.epoch}
 
-    def set_state(self, correction_id: str, from_states: Sequence[str], to: str, **fields: object) -> bool:
-        """Move a correction from one of `from_states` to `to`; False where it was in none of them."""
+    def set_state(
+        self,
+        correction_id: str,
+        from_states: Sequence[str],
+        to: str,
+        *,
+        epoch: int | None = None,
+        **fields: object,
+    ) -> bool:
+        """Move a correction from one of `from_states` to `to`; False where it was in none of them.
+
+        With `epoch` only if it was not started anew since.
+        """
+        conditions = [CorrectionRow.public_id == correction_id, CorrectionRow.state.in_(from_states)]
+        if epoch is not None:
+            conditions.append(CorrectionRow.epoch == epoch)
         with self._db.writing() as session:
-            statement = (
-                update(CorrectionRow)
-                .where(CorrectionRow.public_id == correction_id, CorrectionRow.state.in_(from_states))
-                .values(state=to, **fields)
-            )
+            statement = update(CorrectionRow).where(*conditions).values(state=to, **fields)
             return session.connection().execute(statement).rowcount == 1
 
-    def start(self, correction_id: str) -> bool:
+    def start(self, correction_id: str, epoch: int | None = None) -> bool:
         """Begin, or begin again after the death of a worker."""
-        return self.set_state(
-            correction_id, ACTIVE, "running", started_at=now(), attempt=CorrectionRow.attempt + 1
+        begun = {"started_at": now(), "attempt": CorrectionRow.attempt + 1}
+        return self.set_state(correction_id, ACTIVE, "running", epoch=epoch, **begun)
+
+    def retry(self, correction_id: str, owner: str | None = None) -> bool:
+        """Start a failed or cancelled correction anew; False if it is in another state.
+
+        Also where the same correction was asked for again meanwhile: there is nothing left to do.
+        """
+        with self._db.writing() as session:
+            row = find_to_change(session, CorrectionRow, correction_id, owner)
+            if row is None or row.state not in {"failed", "cancelled"}:
+                return False
+            twin = select(CorrectionRow.id).where(
+                CorrectionRow.photo_id == row.photo_id,
+                CorrectionRow.lens_id == row.lens_id,
+                CorrectionRow.lens_version == row.lens_version,
+                CorrectionRow.params_hash == row.params_hash,
+                CorrectionRow.state.not_in(("failed", "cancelled")),
+            )
+            if session.scalar(twin) is not None:
+                return False
+            row.epoch += 1
+            row.state, row.stage = "queued", None
+            row.error_code = row.error_detail = row.started_at = row.finished_at = None
+            row.attempt = row.progress_done = row.progress_total = 0
+            return True
+
+    def failed_by(self, owner: str, code: str, limit: int) -> list[str]:
+        """Return the corrections that ended with a code, oldest first."""
+        query = (
+            owned(CorrectionRow, owner)
+            .where(CorrectionRow.state == "failed", CorrectionRow.error_code == code)
+            .order_by(CorrectionRow.id)
+            .limit(limit)
         )
+        with self._db.reading() as session:
+            return [row.public_id for row in session.scalars(query)]
 
     def progress(self, correction_id: str, done: int, total: int, stage: str = "correcting") -> None:
         """Say how far a running correction is."""
@@ -182,11 +226,10 @@ class CorrectionStore:
             finished_at=now(),
         )
 
-    def fail(self, correction_id: str, code: str, detail: str) -> bool:
+    def fail(self, correction_id: str, code: str, detail: str, *, epoch: int | None = None) -> bool:
         """End with a reason."""
-        return self.set_state(
-            correction_id, ACTIVE, "failed", error_code=code, error_detail=detail, finished_at=now()
-        )
+        fields = {"error_code": code, "error_detail": detail, "finished_at": now()}
+        return self.set_state(correction_id, ACTIVE, "failed", epoch=epoch, **fields)
 
     def cancel(self, correction_id: str, owner: str | None = None) -> bool:
         """Cancel an unfinished correction; False if it was finished already."""

@@ -343,6 +343,26 @@ class PhotoStore:
             fields = {"error_code": code, "error_detail": detail, "finished_at": now()}
             return _move(session, photo_id, ("received", *PHOTO_RUNNING), "failed", epoch=epoch, **fields)
 
+    def retry(self, photo_id: str, owner: str | None = None) -> bool:
+        """Start a failed or cancelled photo anew; False if it is in another state."""
+        with self._db.writing() as session:
+            photo = find_to_change(session, PhotoRow, photo_id, owner)
+            if photo is None or photo.state not in {"failed", "cancelled"}:
+                return False
+            _restart(session, photo)
+            return True
+
+    def failed_by(self, owner: str, code: str, limit: int) -> list[str]:
+        """Return the photos that ended with a code, oldest first."""
+        query = (
+            owned(PhotoRow, owner)
+            .where(PhotoRow.state == "failed", PhotoRow.error_code == code)
+            .order_by(PhotoRow.id)
+            .limit(limit)
+        )
+        with self._db.reading() as session:
+            return [row.public_id for row in session.scalars(query)]
+
     def cancel(self, photo_id: str, owner: str | None = None) -> bool:
         """Cancel an unfinished photo; False if it was finished already.
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from lensmodel.errors import DecompressionBombError, ImageTooLargeError
+from lensmodel.photo.ciff import CiffShot
 from lensmodel.photo.ifd import TiffReader
 from lensmodel.photo.model import FileKind, Limits
 
@@ -40,6 +41,8 @@ class Header:
         TIFF tag 259; 1 is none.
     tiff : tuple of TiffReader
         TIFF structures with EXIF in them.
+    ciff : CiffShot or None
+        What the heap of a CRW file says, which has no TIFF structure.
     xmp, icc : bytes or None
         XMP packet and ICC profile.
     linear : bool
@@ -55,6 +58,7 @@ class Header:
     bits: int = 0
     compression: int = 1
     tiff: tuple[TiffReader, ...] = ()
+    ciff: CiffShot | None = None
     xmp: bytes | None = None
     icc: bytes | None = None
     linear: bool = False

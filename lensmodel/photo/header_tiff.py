@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Final
 
 from lensmodel.errors import NotAnImageError, TruncatedImageError, UnsupportedFormatError
+from lensmodel.photo.ciff import read_ciff
 from lensmodel.photo.header import MAX_BLOCK_BYTES, Header, check_size
 from lensmodel.photo.header_jpeg import read_jpeg
 from lensmodel.photo.ifd import MAX_DIRECTORIES, Buffer, Directory, TiffReader
@@ -127,17 +128,13 @@ def _check_strips(directory: Directory, file_bytes: int) -> None:
 
 def read_raw(buffer: Buffer, limits: Limits) -> Header:
     """Find the TIFF structures of RAW files that are not plain TIFF; LibRaw tells their size."""
-    head = bytes(buffer[:128])
+    head = bytes(buffer[:12])
     if head[4:12] == b"ftypcrx ":
         return Header("raw", tiff=tuple(_canon_boxes(buffer)))
-    if head.startswith(b"FUJIFILMCCD-RAW"):
-        at = int.from_bytes(head[84:88], "big")
-        if bytes(buffer[at : at + 3]) != b"\xff\xd8\xff":
-            return Header("raw")
-        with contextlib.suppress(NotAnImageError, TruncatedImageError):
-            preview = read_jpeg(bytes(buffer[at : at + MAX_BLOCK_BYTES]), limits)
-            return Header("raw", tiff=preview.tiff, xmp=preview.xmp)
-        return Header("raw")
+    if (ciff := read_ciff(buffer)) is not None:
+        return Header("raw", ciff=ciff)
+    if head.startswith(b"FUJIFILMCCD"):
+        return _fujifilm(buffer, limits)
     reader = TiffReader.open(buffer)
     if reader is None:
         return Header("raw")
@@ -146,6 +143,16 @@ def read_raw(buffer: Buffer, limits: Limits) -> Header:
         header = _sized(replace(header, xmp=_block(directories[0], 700)), _largest(reader, directories))
     check_size(header.width, header.height, len(buffer), limits)
     return header
+
+
+def _fujifilm(buffer: Buffer, limits: Limits) -> Header:
+    """Read what the JPEG in a RAF says."""
+    at = int.from_bytes(bytes(buffer[84:88]), "big")
+    if bytes(buffer[at : at + 3]) == b"\xff\xd8\xff":
+        with contextlib.suppress(NotAnImageError, TruncatedImageError):
+            preview = read_jpeg(bytes(buffer[at : at + MAX_BLOCK_BYTES]), limits)
+            return Header("raw", tiff=preview.tiff, xmp=preview.xmp)
+    return Header("raw")
 
 
 def _canon_boxes(buffer: Buffer) -> Iterator[TiffReader]:

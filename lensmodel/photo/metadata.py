@@ -1,5 +1,7 @@
 """What the file says about camera, lens and exposure, from EXIF, maker note and XMP.
 
+CRW files, which are older than all three, say it in a heap of their own (`ciff`).
+
 The order of trust is EXIF, maker note, XMP. A serial that the camera fills in without knowing
 one is no serial, and an f-number or focal length of zero is unknown: manual lenses say so.
 
@@ -16,6 +18,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Final
 
+from lensmodel.photo.ciff import CiffShot
 from lensmodel.photo.containers import opened_header
 from lensmodel.photo.header import Header
 from lensmodel.photo.ifd import Directory, Entry
@@ -40,6 +43,10 @@ _LARGEST_SENSOR_MM: Final = max(high for _, high in _SENSOR_WIDTHS_MM)
 _FILM_DIAGONAL_MM: Final = math.hypot(36.0, 24.0)
 _CROP_FACTORS: Final = (0.5, 15.0)  # from medium format to the smallest phones
 _PITCHES_UM: Final = (0.3, 60.0)
+_APERTURES: Final = (0.5, 128.0)
+_FOCALS_MM: Final = (0.1, 20000.0)
+_SPEEDS: Final = (1.0, 1e7)
+_EXPOSURES_S: Final = (1e-7, 1e6)
 
 
 def read_metadata(path: Path | str) -> PhotoMetadata:
@@ -63,6 +70,8 @@ def is_placeholder(serial: str) -> bool:
 
 def metadata_of(header: Header) -> PhotoMetadata:
     """Put together what a parsed header holds; see `read_metadata`."""
+    if header.ciff is not None:
+        return _of_ciff(header.ciff)
     exif = _Exif.of(header)
     xmp = read_xmp(header.xmp)
     note = (
@@ -75,14 +84,32 @@ def metadata_of(header: Header) -> PhotoMetadata:
         camera_model=exif.text(0x0110) or xmp.get("tiff:Model"),
         body_serial=_body_serial(exif, note, xmp),
         lens=_lens(exif, note, xmp),
-        aperture=_first_within(0.5, 128.0, exif.aperture(), _quotient(xmp.get("exif:FNumber"))),
-        focal_mm=_first_within(0.1, 20000.0, exif.number(0x920A), _quotient(xmp.get("exif:FocalLength"))),
+        aperture=_first_within(*_APERTURES, exif.aperture(), _quotient(xmp.get("exif:FNumber"))),
+        focal_mm=_first_within(*_FOCALS_MM, exif.number(0x920A), _quotient(xmp.get("exif:FocalLength"))),
         focus_m=_focus(exif, note, xmp),
-        iso=_first_within(1.0, 1e7, exif.iso(), note.iso, _quotient(xmp.get("exif:ISOSpeedRatings"))),
-        exposure_s=_first_within(1e-7, 1e6, exif.number(0x829A), _quotient(xmp.get("exif:ExposureTime"))),
+        iso=_first_within(*_SPEEDS, exif.iso(), note.iso, _quotient(xmp.get("exif:ISOSpeedRatings"))),
+        exposure_s=_first_within(*_EXPOSURES_S, exif.number(0x829A), _quotient(xmp.get("exif:ExposureTime"))),
         taken_at=exif.taken_at(),
         orientation=exif.orientation(),
         pixel_pitch_um=exif.pixel_pitch_um(header),
+    )
+
+
+def _of_ciff(shot: CiffShot) -> PhotoMetadata:
+    serial = shot.body_serial
+    return PhotoMetadata(
+        camera_maker=shot.maker,
+        camera_model=shot.model,
+        body_serial=None if serial is None or is_placeholder(serial) else serial,
+        lens=LensIdentity(model=shot.lens_model),
+        aperture=_first_within(*_APERTURES, shot.aperture),
+        focal_mm=_first_within(*_FOCALS_MM, shot.focal_mm),
+        focus_m=shot.focus_m,
+        iso=_first_within(*_SPEEDS, shot.iso),
+        exposure_s=_first_within(*_EXPOSURES_S, shot.exposure_s),
+        taken_at=shot.taken_at,
+        orientation=shot.orientation,
+        pixel_pitch_um=_first_within(*_PITCHES_UM, shot.pitch_um),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,7 +23,10 @@ from lensmodel.photo.colour import SRGB_TO_XYZ_D65, Matrix, camera_to_srgb, matr
 from lensmodel.photo.model import Matrix3, PlaneNoise
 from lensmodel.photo.mosaic import Mosaic
 from lensmodel.photo.noise import estimate_noise
+from lensmodel.photo.rendition import balance_of_rendition
 from lensmodel.types import BayerPattern, NoiseModel, Planes
+
+log = logging.getLogger(__name__)
 
 Demosaic = Literal["default", "ahd", "dht", "linear", "half"]
 
@@ -132,7 +136,7 @@ def develop_raw(path: Path, demosaic: Demosaic = "default") -> DevelopedRaw:
             mosaic.check()
             white, clip = mosaic.saturation()
         sensor_noise = _sensor_noise(mosaic, white)
-        balance = _white_balance(raw)
+        balance = _white_balance(raw, mosaic)
         planes = _developed(raw, method, white, balance)
         to_srgb, xyz_to_camera = _colour(raw, balance)
         return DevelopedRaw(
@@ -223,13 +227,24 @@ def _plane_noise(
     return r, g, b
 
 
-def _white_balance(raw: rawpy.RawPy) -> tuple[float, float, float]:
-    """Multipliers of the camera, green 1; daylight where the camera gave none."""
-    for source in (raw.camera_whitebalance, raw.daylight_whitebalance):
-        r, g, b = (float(v) for v in source[:3])
-        if min(r, g, b) > 0 and max(r, g, b) / min(r, g, b) < 20:
-            return r / g, 1.0, b / g
+def _white_balance(raw: rawpy.RawPy, mosaic: Mosaic | None) -> tuple[float, float, float]:
+    """Multipliers of the camera, green 1: as written, else as its own JPEG shows, else daylight."""
+    r, g, b = (float(v) for v in raw.camera_whitebalance[:3])
+    if _sound(r, g, b):
+        return r / g, 1.0, b / g
+    table = np.asarray(raw.rgb_xyz_matrix, dtype=np.float64)[:3]
+    seen = balance_of_rendition(raw, mosaic, camera_to_srgb(table) if table.any() else None)
+    if seen is not None and _sound(seen[0], 1.0, seen[1]):
+        return seen[0], 1.0, seen[1]
+    r, g, b = (float(v) for v in raw.daylight_whitebalance[:3])
+    if _sound(r, g, b):
+        log.info("the RAW file does not say its white balance; daylight is assumed")
+        return r / g, 1.0, b / g
     return 1.0, 1.0, 1.0
+
+
+def _sound(r: float, g: float, b: float) -> bool:
+    return min(r, g, b) > 0 and max(r, g, b) / min(r, g, b) < 20
 
 
 def _colour(

@@ -62,12 +62,18 @@ class Mixture:
         The same of the best expert, all over the field.
     shares : ndarray, shape (q, 3)
         Weights of the local frame, the image frame and the wavefront.
+    averaged : ndarray, shape (q,)
+        Squared held-out errors of the local frame alone near the places.
+    apart : ndarray, shape (q,)
+        How far the wavefront moves the answer from the local frame's kernel, relative L2.
     """
 
     kernels: NDArray[np.float64]
     squared: NDArray[np.float64]
     usual: float
     shares: NDArray[np.float64]
+    averaged: NDArray[np.float64]
+    apart: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,6 +127,7 @@ class Experts:
         shares = parts / parts.sum(axis=1, keepdims=True)
         shares[shares < _SILENT] = 0.0
         shares /= shares.sum(axis=1, keepdims=True)
+        averaged, apart = squared[:, 0].copy(), np.zeros(len(positions))
         light = shares[:, 0, None, None] * kernels
         told = np.flatnonzero(shares[:, 1])
         if judgement.image is not None and told.size:
@@ -143,6 +150,14 @@ class Experts:
                 shares[:, 2] = share
                 light = light * (1.0 - share)[:, None, None]
                 squared[:, :2] = kernel_error(width)[:, None] ** 2
+            apart[told] = shares[told, 2] * relative_l2(rows, kernels[told])
             light[told] += shares[told, 2, None, None] * rows
         error = np.where(shares > 0, shares * np.where(shares > 0, squared, 0.0), 0.0).sum(axis=1)
-        return Mixture(light / light.sum(axis=(1, 2), keepdims=True), error, float(usual.min()), shares)
+        made = light / light.sum(axis=(1, 2), keepdims=True)
+        return Mixture(made, error, float(usual.min()), shares, averaged, apart)
+
+
+def relative_l2(kernels: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Relative L2 of kernels about others of any brightness, shape (q,)."""
+    others = others / others.sum(axis=(1, 2), keepdims=True)
+    return np.asarray(np.linalg.norm(kernels - others, axis=(1, 2)) / np.linalg.norm(others, axis=(1, 2)))

@@ -281,13 +281,23 @@ class LensModel:
         independent = 1.0 / float((per_photo**2).sum())
         nearest, beyond = support(fit.index.points[rows], va.point(position, settings), fit.rule)
         # how well the nearest samples agree says nothing of a place without samples
-        held_out = float(mixture.usual if beyond else mixture.squared[0])
         noise = float(weight @ fit.judgement.noise[rows])
-        error = field_error(held_out, noise, independent) * (1.0 + 0.5 * max(nearest - 1.0, 0.0))
+        far = 1.0 + 0.5 * max(nearest - 1.0, 0.0)
         shared = shared_error(float(weight @ fit.told[rows]), noise)
-        error, share = math.hypot(error, shared), float(prior_shares[0])
+
+        def expected(held_out: float) -> float:
+            return math.hypot(field_error(held_out, noise, independent) * far, shared)
+
+        error = expected(float(mixture.usual if beyond else mixture.squared[0]))
+        share = float(prior_shares[0])
         if agreed:
-            error = shared = math.sqrt(float(mixture.squared[0])) * (1.0 + 0.5 * max(nearest - 1.0, 0.0))
+            error = math.sqrt(float(mixture.squared[0])) * far
+        if mixture.shares[0, 2] > 0.0:
+            # a wavefront that cannot bend as the lens does agrees with itself all over the field: it is
+            # never surer than the kernels would be, nor than it agrees with them
+            usual = float(np.mean(fit.judgement.errors**2))
+            averaged = expected(usual if beyond else float(mixture.averaged[0]))
+            error = max(error, averaged, float(mixture.apart[0]))
         if self.prior is not None and share > _LISTED:
             error = math.sqrt((1.0 - share) * error**2 + share * self.prior.error(position, settings) ** 2)
 

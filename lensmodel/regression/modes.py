@@ -18,13 +18,14 @@ gains.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.regression.answer import LIKELIEST, MIXED
-from lensmodel.regression.experts import Experts, Mixture
+from lensmodel.regression.experts import Experts, Mixture, relative_l2
 from lensmodel.regression.kriging import as_kernels
 from lensmodel.regression.local import Answers, LocalKernels
 from lensmodel.regression.normal_equations import NormalEquations
@@ -62,11 +63,13 @@ def answered(
     """
     angles, mirror = np.array([p.phi for p in positions]), experts.judgement.choice.mirror
     physical = experts.physical
-    if mode == "wavefront" and physical is not None:
-        kernels = as_kernels(physical.rows(positions, settings), size)
-        errors = physical.extended_errors(len(experts.judgement.votes))
-        return _alone(kernels, near, errors, 2)
     kernels = local.kernels(near, angles, widths, size, mirror)
+    if mode == "wavefront" and physical is not None:
+        rows = as_kernels(physical.rows(positions, settings), size)
+        errors = physical.extended_errors(len(experts.judgement.votes))
+        alone = _alone(rows, near, errors, 2)
+        averaged, apart = near.mean(experts.judgement.errors**2), relative_l2(rows, kernels)
+        return replace(alone, averaged=averaged, apart=apart)
     if mode == MIXED:
         return experts.mixed(kernels, near, positions, settings)
     if mode == "evidence" and statistics is not None:
@@ -82,7 +85,10 @@ def answered(
 def _alone(kernels: NDArray[np.float64], near: Answers, errors: NDArray[np.float64], expert: int) -> Mixture:
     shares = np.zeros((len(kernels), 3))
     shares[:, expert] = 1.0
-    return Mixture(kernels, near.mean(errors**2), float(errors @ errors) / len(errors), shares)
+    squared = near.mean(errors**2)
+    return Mixture(
+        kernels, squared, float(errors @ errors) / len(errors), shares, squared, np.zeros(len(kernels))
+    )
 
 
 def between(one: Mixture, other: Mixture, share: float) -> Mixture:
@@ -93,4 +99,6 @@ def between(one: Mixture, other: Mixture, share: float) -> Mixture:
         share * one.squared + rest * other.squared,
         share * one.usual + rest * other.usual,
         share * one.shares + rest * other.shares,
+        share * one.averaged + rest * other.averaged,
+        share * one.apart + rest * other.apart,
     )

@@ -21,6 +21,9 @@ from app.store.migrate import downgrade, upgrade
 from app.tables import PhotoRow
 from lensmodel.psf import gaussian
 
+# Services of tests keep their data for a moment only; what they compile is kept longer than that.
+os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(__file__).parents[2] / ".pytest_cache" / "numba"))
+
 PLACES = [(0.05, 0.0), (0.3, 0.6), (0.5, 2.2), (0.6, -2.2), (0.8, -0.6), (0.9, 0.59)]
 
 

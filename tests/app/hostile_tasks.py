@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import ctypes
+import errno
+import importlib
 import os
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -77,11 +82,102 @@ def open_files(arguments: dict[str, Any], folder: Path, progress: Progress) -> i
         return len(held)
 
 
+def fill_the_disk(arguments: dict[str, Any], folder: Path, progress: Progress) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def probe(  # noqa: C901 - one try each
+    arguments: dict[str, Any], folder: Path, progress: Progress
+) -> dict[str, str]:
+    """Try what a task that a hostile file took over would try; say how far each came."""
+
+    def connect() -> str:
+        with socket.create_connection(("127.0.0.1", arguments["port"]), timeout=5):
+            return "connected"
+
+    def speak_up() -> str:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
+            return str(opened.sendto(b"x", ("127.0.0.1", arguments["port"])))
+
+    def fork() -> str:
+        pid = os.fork()
+        if pid == 0:
+            os._exit(0)
+        os.waitpid(pid, 0)
+        return "forked"
+
+    def trace() -> str:
+        if ctypes.CDLL(None, use_errno=True).ptrace(16, arguments["parent"], 0, 0) < 0:
+            raise OSError(ctypes.get_errno(), "ptrace")
+        return "attached"
+
+    def signal_the_parent() -> str:
+        os.kill(arguments["parent"], 0)
+        return "signalled"
+
+    def thread() -> str:
+        said: list[str] = []
+        started = threading.Thread(target=said.append, args=("ran",))
+        started.start()
+        started.join()
+        return said[0]
+
+    parent = Path(f"/proc/{arguments['parent']}")
+    tries: dict[str, Callable[[], object]] = {
+        "own environment": lambda: Path("/proc/self/environ").read_text(),
+        "environment of the service": (parent / "environ").read_text,
+        "memory of the service": lambda: (parent / "mem").open("rb").close(),
+        "files of the service": lambda: list((parent / "fd").iterdir()),
+        "database": lambda: Path(arguments["database"]).read_bytes(),
+        "photo of another": lambda: Path(arguments["other"]).read_bytes(),
+        "list of photos": lambda: list(Path(arguments["other"]).parent.iterdir()),
+        "accounts of the machine": lambda: Path("/etc/passwd").read_text(),
+        "write to the data": lambda: Path(arguments["database"]).write_bytes(b"gone"),
+        "make a file": lambda: Path(arguments["database"]).with_name("planted").touch(),
+        "change the cache": (Path(arguments["cache"]) / "planted").touch,
+        "remove a photo": lambda: Path(arguments["other"]).unlink(),
+        "connect": connect,
+        "send a datagram": speak_up,
+        "fork": fork,
+        "run a program": lambda: subprocess.run(["/bin/true"], check=True).returncode,
+        "become another program": lambda: os.execv("/bin/true", ["/bin/true"]),
+        "trace the service": trace,
+        "signal the service": signal_the_parent,
+        # what it must be able to do
+        "own photo": lambda: Path(arguments["own"]).read_text(),
+        "own folder": lambda: (folder / "made").write_text("made"),
+        "thread": thread,
+        "import": lambda: importlib.import_module("scipy.interpolate").__name__,
+    }
+    found = {}
+    for name, attempt in tries.items():
+        try:
+            found[name] = f"done: {attempt()}"[:4000]
+        except OSError as error:
+            found[name] = f"refused: {type(error).__name__}"
+    return found
+
+
 def shout(arguments: dict[str, Any], folder: Path, progress: Progress) -> None:
     raise NoUsablePatchesError("x" * 1_000_000)
 
 
 TASKS = {
     f.__name__: f
-    for f in (add, refuse, swell, spin, sleep, spawn, crash, die, blunder, write, open_files, shout)
+    for f in (
+        add,
+        refuse,
+        swell,
+        spin,
+        sleep,
+        spawn,
+        crash,
+        die,
+        blunder,
+        write,
+        open_files,
+        fill_the_disk,
+        probe,
+        shout,
+    )
 }

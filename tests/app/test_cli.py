@@ -338,6 +338,7 @@ REFUSED = {
     "noise in words": (["bench", "blind", "--noise", "much"], 2, "numbers such as 0.01,0.003, got 'much'"),
     "photo to time": (["bench", "correct", "--photo", "gone.jpg"], 2, "no photo called gone.jpg"),
     "photos to blur": (["bench", "blind", "--photos", "empty", "-o", "o"], 2, "empty holds no PNG, JPEG"),
+    "no such picture": (["bench", "gallery", "--only", "rose", "-o", "o"], 2, "no picture is called 'rose'"),
     "unknown half": (["bench", "blind", "--half", "x"], 2, "half must be one of .*got 'x'"),
     "report there": (["report", PROFILE, "-o", "reported"], 2, "mtf.csv is there already; --force"),
     "export format": (["export", PROFILE, "-o", "new.bmp", "--format", "bmp"], 2, "known: csv, fits, json"),

@@ -99,6 +99,7 @@ QUICK = {
     "calibrate scan.tif --aperture 2.8 --profile old-lens.lensprofile",
     "psf my-24mm.lensprofile --r 0.9 --channel b --output corner.npy",
     "report my-24mm.lensprofile --aperture 2 -o my-24mm-report",
+    "check scan.tif scan-sharpened.tif --profile my-24mm.lensprofile --map faults.png",
     "export my-24mm.lensprofile --format json --r 0.9 --phi 0.6 -o corner-for-art.json",
     "config --json",
     "serve",
@@ -129,6 +130,9 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copy(folder / "sharp" / "0.png", folder / "scan.png")
     with Image.open(folder / "scan.png") as scan:
         scan.save(folder / "scan.tif")
+    shutil.copy(folder / "scan.tif", folder / "scan-sharpened.tif")
+    (folder / "linear").mkdir()
+    shutil.copy(folder / "one.dng", folder / "linear" / "one-corrected.dng")
     kernels = np.stack([gaussian(31, np.eye(2) * (0.8 + 0.3 * k)) for k in range(4)])
     np.savez(folder / "mine.npz", psf=kernels)
     places = [FieldPosition(r, phi) for r in (0.1, 0.3, 0.5, 0.7, 0.9) for phi in (-2.4, -0.8, 0.8, 2.4)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -126,6 +126,8 @@ class Scripted:
         *,
         folder: Path,
         limits: Limits,
+        reads: Sequence[Path],
+        compiles: bool,
         wanted: Callable[[], bool],
         on_progress: Progress,
     ) -> Outcome:

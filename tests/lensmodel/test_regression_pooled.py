@@ -402,3 +402,17 @@ def test_focus_that_balances_spherical_aberration_is_expected() -> None:
     costs = [fit_spectra([nothing], front, rounds=0).cost for front in (alone, both)]
 
     assert costs[0] - costs[1] > 3.0
+
+
+def test_wavefront_is_never_surer_than_the_kernels_nor_than_it_agrees_with_them() -> None:
+    wide = [replace(s, kernel=gaussian(31, 2.0**2 * np.eye(2)), error=0.3) for s in samples(MIN_PLACES + 2)]
+    place = FieldPosition(0.2, 0.4)
+    mixed, plain = LensModel.fit(wide, MIXED).warmed(), LensModel.fit(wide)
+
+    answer, other = mixed.query(place, SETTINGS, 31), plain.query(place, SETTINGS, 31)
+
+    assert answer.wavefront_share == 1.0
+    apart = distance(answer.kernel, other.kernel).rel_l2
+    assert apart > 0.3
+    assert answer.predicted_error >= min(apart, 1.0) - 1e-6
+    assert answer.predicted_error >= other.predicted_error

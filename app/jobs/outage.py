@@ -1,0 +1,117 @@
+"""Errors of what surrounds a photo, not of the photo: told apart, and waited for until they end.
+
+A database that restarts, an object store that is away, a full disk, a child that the kernel
+killed for memory: none of them says anything about the photo. So such a job is tried again, with
+pauses that grow, until hours have passed; only then it ends, with a code by which its owner can
+have all such jobs done again in one call.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import random
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Final
+
+from obstore import exceptions as stored
+from sqlalchemy import exc
+
+log = logging.getLogger(__name__)
+
+CODE: Final = "outage"
+"""With what a job ends that waited in vain."""
+
+FIRST_PAUSE_S: Final = 1.0
+LONGEST_PAUSE_S: Final = 60.0
+BUGS: Final = 3
+"""Tries of a job that fails in a way that nobody foresaw."""
+
+_SQLITE_ERROR: Final = 1
+"""SQLite's code for a statement that is wrong; everything else it reports is the machine's."""
+
+NO_ROOM: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
+_MACHINE: Final = NO_ROOM | {
+    *(errno.EIO, errno.EROFS, errno.ENODEV, errno.ENXIO, errno.ESTALE, errno.EBUSY),
+    *(errno.ENOMEM, errno.EAGAIN, errno.EMFILE, errno.ENFILE),
+    *(errno.ENETDOWN, errno.ENETUNREACH, errno.EHOSTDOWN, errno.EHOSTUNREACH),
+}
+_OF_THE_REQUEST: Final = (
+    stored.NotFoundError,
+    stored.AlreadyExistsError,
+    stored.InvalidPathError,
+    stored.NotModifiedError,
+    stored.NotSupportedError,
+    stored.PreconditionError,
+)
+"""What a store says that works; the rest, wrong credentials included, can be mended under way."""
+
+
+class OutageError(Exception):
+    """The machinery could not do it: try again later."""
+
+
+def is_outage(error: BaseException) -> bool:
+    """Say whether an error is of the machinery: the same job can succeed once that is mended."""
+    if isinstance(error, exc.DBAPIError):
+        code = getattr(error.orig, "sqlite_errorcode", None)
+        away = isinstance(error, exc.OperationalError | exc.InterfaceError) or error.connection_invalidated
+        return away and code != _SQLITE_ERROR
+    if isinstance(error, stored.BaseError):
+        return not isinstance(error, _OF_THE_REQUEST)
+    if isinstance(error, OSError):
+        return isinstance(error, ConnectionError | TimeoutError) or error.errno in _MACHINE
+    return isinstance(error, OutageError | exc.TimeoutError | MemoryError | EOFError)
+
+
+@contextmanager
+def missable() -> Iterator[None]:
+    """Let an outage pass unnoticed: what is inside is said again soon, or not needed."""
+    try:
+        yield
+    except Exception as error:
+        if not is_outage(error):
+            raise
+        log.info("left out: %s", error)
+
+
+class Patience:
+    """How long to wait after each failure of one job, and when to give up.
+
+    Parameters
+    ----------
+    outage_s : float
+        How long outages are waited for, from the first one on.
+    clock, rng
+        Replaced in tests.
+    """
+
+    def __init__(
+        self,
+        outage_s: float,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        rng: random.Random | None = None,
+    ) -> None:
+        self._outage_s, self._clock = outage_s, clock
+        self._rng = rng or random.Random()  # noqa: S311 - spreads the load, keeps no secret
+        self._began: float | None = None
+        self._outages = self._bugs = 0
+
+    def pause_after(self, error: BaseException) -> float | None:
+        """Return how many seconds to wait before the next try; None = give up.
+
+        The pause doubles from 1 s to at most 60 s, and is drawn between 1 s and that: jobs that
+        failed together do not come back together.
+        """
+        if is_outage(error):
+            now = self._clock()
+            self._began = now if self._began is None else self._began
+            if now - self._began > self._outage_s:
+                return None
+            self._outages += 1
+            return self._rng.uniform(FIRST_PAUSE_S, min(2.0 ** min(self._outages, 6), LONGEST_PAUSE_S))
+        self._bugs += 1
+        return None if self._bugs >= BUGS else 2.0 ** (self._bugs - 1)

@@ -1,0 +1,38 @@
+"""Ringing: waves beside strong edges, where the photo is flat."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from lensmodel.audit import blocks, near
+from lensmodel.audit.base import Pair
+from lensmodel.audit.limits import LIMITS
+from lensmodel.types import Plane
+
+_SMALL, _WIDE = 5, 15
+_FLAT: Final = 0.08
+_NOISE: Final = 8.0
+_STRONG: Final = 40.0
+
+
+def swing(pair: Pair) -> Plane:
+    """Severity of waves of the light within 2 pixels, over the step of the photo within 7, where it is flat.
+
+    Flat is where the photo's own range within 2 pixels is no more than 8 standard deviations of its
+    noise and 8 percent of the step, and the step more than 40.
+    """
+    (y, x), sigma = pair.luma, pair.luma_sigma
+    step = near.highest(y, _WIDE) - near.lowest(y, _WIDE)
+    own = near.highest(y, _SMALL) - near.lowest(y, _SMALL)
+    wave = near.highest(x, _SMALL) - near.lowest(x, _SMALL)
+    flat = (own <= np.float32(_NOISE) * sigma + np.float32(_FLAT) * step) & (
+        step > np.float32(_STRONG) * sigma
+    )
+    part = blocks.around(blocks.sums(np.where(flat, np.square(wave), np.float32(0.0))))
+    whole = blocks.around(blocks.sums(np.where(flat, np.square(step), np.float32(0.0))))
+    count = blocks.around(blocks.sums(flat))
+    trust = np.minimum(count / np.float32(128.0), 1.0)
+    share = trust * np.sqrt(part / np.maximum(whole, np.float32(1e-12)))
+    return blocks.to_pixels((share / LIMITS["ringing"]).astype(np.float32), pair.shape)

@@ -420,6 +420,9 @@ class CorrectionIn(Question):
         allow_inf_nan=False,
         description="how far beside edges to leave the range of light around; default: by the model's error",
     )
+    texture: float = Field(
+        1.0, ge=0, le=1, allow_inf_nan=False, description="how much of its faint texture the photo keeps"
+    )
     denoise: float = Field(
         0.0, ge=0, le=1, allow_inf_nan=False, description="how much of the photo's grain to take away"
     )

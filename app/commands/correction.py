@@ -15,7 +15,9 @@ from rich.progress import Progress, TaskID
 from app.commands import files
 from app.commands.display import Display
 from app.commands.failure import UsageError
+from app.words import gain_words
 from lensmodel import deconv, pipeline
+from lensmodel.audit import HELD, AuditReport
 from lensmodel.errors import InvalidInputError, LensModelError
 from lensmodel.photo import OutputFormat
 from lensmodel.regression import LensProfile
@@ -82,7 +84,7 @@ def run(
             elif result["state"] == "corrected" and not as_json:
                 display.result(str(target))
             if result["state"] == "corrected":
-                for line in measured(result["zones"]):
+                for line in remarks(result):
                     display.note(f"{path.name}, {line}")
             results.append({"photo": str(path), "output": str(target), **result})
             bars.update(task, completed=number + 1)
@@ -141,7 +143,19 @@ def _one(
         workers=wishes.workers or os.cpu_count() or 1,
         on_step=on_step,
     )
-    return {"state": "corrected", "zones": corrected.zones}
+    return {
+        "state": "corrected",
+        "zones": corrected.zones,
+        "nothing_to_correct": corrected.nothing_to_correct,
+        "audit": corrected.audit,
+    }
+
+
+def remarks(result: Mapping[str, Any]) -> list[str]:
+    """What is worth saying of a corrected photo, in words."""
+    if result["nothing_to_correct"]:
+        return ["nothing to correct: its pixels stayed as they were"]
+    return [*measured(result["zones"]), *audited(result["audit"])]
 
 
 def measured(zones: Mapping[Zone, deconv.ZoneReport]) -> list[str]:
@@ -149,9 +163,19 @@ def measured(zones: Mapping[Zone, deconv.ZoneReport]) -> list[str]:
     return [
         f"{zone} of the chart: MTF50 from {seen.mtf50_before:.3f} to {seen.mtf50_after:.3f} cycles/pixel, "
         f"{seen.gain:.1f} times (median of {seen.edges} edges), overshoot {seen.overshoot_after:.1f} %; "
-        f"predicted for a usual scene {report.gain_db:+.1f} dB"
+        f"predicted for a usual scene {gain_words(report.expected_gain_db)}"
         for zone, report in zones.items()
         if (seen := report.measured) is not None
+    ]
+
+
+def audited(audit: AuditReport) -> list[str]:
+    """Tell in words where the audit held back more than a tenth of the correction."""
+    return [
+        f"{zone}: {zone_audit.held_back:.0%} of the correction was held back ({', '.join(most)})"
+        for zone, zone_audit in audit.zones.items()
+        if zone_audit.held_back > HELD
+        and (most := sorted(zone_audit.checks, key=lambda name: -zone_audit.checks[name])[:3])
     ]
 
 

@@ -129,6 +129,10 @@ def correct(
             "range: 0 not at all, inf without bound. Default: the less sure the profile, the less.",
         ),
     ] = None,
+    texture: Annotated[
+        float,
+        typer.Option(min=0.0, max=1.0, metavar="0..1", help="How much of its faint texture a photo keeps."),
+    ] = 1.0,
     denoise: Annotated[
         float,
         typer.Option(min=0.0, max=1.0, metavar="0..1", help="How much of the photo's grain to take away."),
@@ -173,7 +177,7 @@ def correct(
             aperture,
             method,
             strength,
-            Bounds(halo, denoise),
+            Bounds(halo, texture, denoise),
             file_format,
             workers,
             any_lens=any_lens,

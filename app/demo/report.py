@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from app.demo.measure import Sharpness, improved
+from app.words import gain_words
 from lensmodel.types import ZONES, Zone
 
 _JUDGED: tuple[Zone, ...] = ("center", "corner")
@@ -93,7 +94,9 @@ class Report:
             "",
             f"One RAW file of a Canon EOS Kiss X4, {self.real.get('patches', 0)} patches. Its truth is "
             "unknown: look at before-after-real.png. Expected gain by zone: "
-            + "; ".join(f"{zone} {values.get('gain_db', 0.0):.1f} dB" for zone, values in self._real_zones())
+            + "; ".join(
+                f"{zone} {gain_words(values.get('expected_gain_db'))}" for zone, values in self._real_zones()
+            )
             + ".",
             "",
             f"The whole demo took {self.seconds:.0f} s.",

@@ -111,7 +111,7 @@ class CorrectionWork:
             )
             if not known and self._is_newest(lens_id, version):
                 self._keep_learned(lens_id, version, state, folder / LEARNED)
-            report = {"zones": done["zones"]} | ({"family": {"lenses": leaning}} if leaning else {})
+            report = done["report"] | ({"family": {"lenses": leaning}} if leaning else {})
             self._hand_in(plan, folder / Path(done["file"]).name, report)
 
     def _family(self, listed: list[dict[str, Any]], folder: Path) -> int:
@@ -213,7 +213,7 @@ class CorrectionWork:
 
 
 def _bounds(params: dict[str, Any]) -> dict[str, float]:
-    return {name: params[name] for name in ("halo", "denoise") if name in params}
+    return {name: params[name] for name in ("halo", "texture", "denoise") if name in params}
 
 
 def _description(plan: CorrectionPlan) -> str:

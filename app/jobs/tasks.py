@@ -160,7 +160,12 @@ def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
         photo.write_image(
             folder / BEFORE, part, developed.encoding, format="jpeg", color_space="srgb", quality=97
         )
-    return {"file": name, "zones": _numbers(codec.to_json(corrected.zones))}
+    report = {
+        "zones": corrected.zones,
+        "nothing_to_correct": corrected.nothing_to_correct,
+        "audit": corrected.audit,
+    }
+    return {"file": name, "report": _numbers(codec.to_json(report))}
 
 
 def measure(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:

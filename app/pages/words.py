@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from app.schemas import CalibrationOut, CorrectionOut, LensOut, PatchOut, PhotoOut, Problem
+from app.words import gain_words
+from lensmodel.audit import HELD
 
 PHOTO_STATES: Final[Mapping[str, str]] = {
     "received": "Waiting its turn",
@@ -218,17 +220,23 @@ def coverage_advice(bars: Sequence[ZoneBar]) -> str:
 
 def gain_bars(zones: Mapping[str, Mapping[str, Any]]) -> list[ZoneBar]:
     """Compare the expected gains of the zones."""
-    gains = {zone: zones[zone].get("gain_db") or 0.0 for zone in ZONES if zones.get(zone, {}).get("cells")}
-    most = max([1.0, *gains.values()])
+    gains = {zone: zones[zone].get("expected_gain_db") for zone in ZONES if zones.get(zone, {}).get("cells")}
+    most = max([1.0, *(gain for gain in gains.values() if gain is not None)])
     return [
         ZoneBar(
             zone,
             ZONES[zone],
-            round(100 * gain / most),
-            gain=f"+{gain:.1f} dB" if gain >= 0.05 else "no change",
+            round(100 * max(gain or 0.0, 0.0) / most),
+            gain=gain_words(gain) + held_words(zones[zone]),
         )
         for zone, gain in gains.items()
     ]
+
+
+def held_words(zone: Mapping[str, Any]) -> str:
+    """Say where much of the correction was held back, and why."""
+    held, reasons = zone.get("held_back") or 0.0, zone.get("reasons") or []
+    return f", {held:.0%} held back ({', '.join(reasons[:3])})" if held > HELD else ""
 
 
 def figure(value: object) -> str:

@@ -59,7 +59,7 @@ def create_correction(wish: CorrectionIn, call: CallDep) -> CorrectionOut:
     # with other settings the same wish is another one
     params["settings"] = settings_of(photo)
     # only where asked for: a wish of before there were bounds is still the same wish
-    params |= wish.model_dump(mode="json", include={"halo", "denoise"}, exclude_defaults=True)
+    params |= wish.model_dump(mode="json", include={"halo", "texture", "denoise"}, exclude_defaults=True)
     if wish.family and wish.lens_version is None and call.settings.family:
         # the copies and versions of this moment: the same wish after one of them learned is another one
         leaning = call.store.samples.family_of(lens.public_id)

@@ -2,11 +2,12 @@
 
 from lensmodel.audit.base import Evidence, Finding, TileAudit
 from lensmodel.audit.photo import PhotoAudit, audit_photo
-from lensmodel.audit.report import AuditReport, Place, ZoneAudit, pooled
+from lensmodel.audit.report import HELD, AuditReport, Place, ZoneAudit, pooled
 from lensmodel.audit.tile import CHECKS, audit_tile, held_back
 
 __all__ = [
     "CHECKS",
+    "HELD",
     "AuditReport",
     "Evidence",
     "Finding",

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.audit import AuditReport, Evidence, TileAudit, held_back, pooled
 from lensmodel.blur import Drift, UniformBlur, crop_to_support
 from lensmodel.deconv.base import CoarseMethod, Deconvolver, Sensor, restore_planes
 from lensmodel.deconv.beside_clipped import held_beside_clipped
@@ -21,10 +22,10 @@ from lensmodel.deconv.engine import compiled, keep_freed_memory
 from lensmodel.deconv.lattice import Cell, Roi, cells, usual_pitch
 from lensmodel.deconv.limits import Bounds
 from lensmodel.deconv.methods import deconvolvers
-from lensmodel.deconv.report import CellForecast, ZoneReport, forecast, zone_reports
+from lensmodel.deconv.report import WORTH_DB, CellForecast, ZoneReport, forecast, zone_reports
 from lensmodel.deconv.texture import texture_kept
 from lensmodel.errors import InvalidInputError
-from lensmodel.geometry import Frame
+from lensmodel.geometry import Frame, zone_of
 from lensmodel.psf import PsfField, as_kernel, delta
 from lensmodel.types import (
     CHANNELS,
@@ -65,10 +66,18 @@ class Corrected:
         The photo, or the part of it that was asked for.
     zones : Mapping[Zone, ZoneReport]
         What the correction is expected to have gained in each zone of the field.
+    audit : AuditReport
+        What was held back of it, why, and where most.
     """
 
     planes: Planes
     zones: dict[Zone, ZoneReport]
+    audit: AuditReport = field(default_factory=lambda: pooled(()))
+
+    @property
+    def nothing_to_correct(self) -> bool:
+        """Whether every pixel stayed as it was."""
+        return all(zone.left == zone.cells for zone in self.zones.values())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,6 +137,16 @@ class _Job:
     def reach(self, position: FieldPosition, channel: Channel, error: float) -> int:
         """How far the blur of a place reaches, in pixels."""
         return self.blurs(position, channel, error).reach
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Restored:
+    """One cell as it leaves: its pixels, what they should have gained, and what the audit said of them."""
+
+    planes: Planes
+    forecast: CellForecast
+    audit: TileAudit | None
+    left: bool = False
 
 
 def correct_planes(
@@ -227,12 +246,16 @@ def correct_planes(
     if pitch is None:
         pitch = usual_pitch(frame, job.cell_factor)
     wanted = [cell for cell in cells(frame, pitch) if cell.meets(window)]
-    forecasts = []
-    for done, (cell, restored, expected) in enumerate(_restored(job, wanted, workers), start=1):
-        _add(out, window, cell, restored)
-        forecasts.append(expected)
+    forecasts, audits, left = [], [], Counter[Zone]()
+    for done, (cell, restored) in enumerate(_restored(job, wanted, workers), start=1):
+        _add(out, window, cell, restored.planes)
+        forecasts.append(restored.forecast)
+        left[restored.forecast.zone] += restored.left
+        if restored.audit is not None:
+            audits.append((zone_of(cell.position.r), (cell.top, cell.left), restored.audit))
         on_step(done, len(wanted))
-    return Corrected(out, zone_reports(forecasts))
+    report = pooled(audits)
+    return Corrected(out, zone_reports(forecasts, left, report), report)
 
 
 def _zeroed(out: Planes | None, shape: tuple[int, int, int]) -> Planes:
@@ -268,30 +291,30 @@ def _blurs_of(
     return blurs
 
 
-def _restored(job: _Job, wanted: Sequence[Cell], workers: int) -> Iterator[tuple[Cell, Planes, CellForecast]]:
+def _restored(job: _Job, wanted: Sequence[Cell], workers: int) -> Iterator[tuple[Cell, _Restored]]:
     """Restore cells in order, a few ahead of the one that is being added."""
     if workers == 1:
         for cell in wanted:
-            yield cell, *_restore(job, cell)
+            yield cell, _restore(job, cell)
         return
     with ThreadPoolExecutor(workers) as pool:
-        ahead: deque[tuple[Cell, Future[tuple[Planes, CellForecast]]]] = deque()
+        ahead: deque[tuple[Cell, Future[_Restored]]] = deque()
         queue = iter(wanted)
         try:
             for cell in queue:
                 ahead.append((cell, pool.submit(_restore, job, cell)))
                 if len(ahead) > 2 * workers:
                     first, future = ahead.popleft()
-                    yield first, *future.result()
+                    yield first, future.result()
             while ahead:
                 first, future = ahead.popleft()
-                yield first, *future.result()
+                yield first, future.result()
         finally:
             for _, future in ahead:
                 future.cancel()
 
 
-def _restore(job: _Job, cell: Cell) -> tuple[Planes, CellForecast]:
+def _restore(job: _Job, cell: Cell) -> _Restored:
     """Restore one cell, halo cut off again."""
     errors = [job.uncertainty(cell.position, channel) for channel in CHANNELS]
     reach = max(
@@ -330,15 +353,20 @@ def _restore(job: _Job, cell: Cell) -> tuple[Planes, CellForecast]:
         slice(cell.left - left, cell.right - left),
     )
     expected = forecast(cell, tile, blurs, sensors, errors)
-    if job.strength == 0.0:
-        return tile[inner], expected
+    if job.strength == 0.0 or expected.gain_db < WORTH_DB:
+        untouched = replace(expected, after=expected.before)
+        return _Restored(tile[inner], untouched, None, left=True)
     restored = restore_planes(job.method, tile, blurs, sensors)
-    restored = texture_kept(tile, restored, blurs, sensors, job.bounds.texture)
-    restored = held_beside_clipped(tile, restored, blurs, sensors, errors)[inner]
-    restored = job.bounds.hold(job.planes, (cell.top, cell.left), restored, errors)
+    restored = texture_kept(
+        tile, restored, blurs, sensors, texture=job.bounds.texture, denoise=job.bounds.denoise
+    )
+    restored = held_beside_clipped(tile, restored, blurs, sensors, errors)
+    restored[inner] = job.bounds.hold(job.planes, (cell.top, cell.left), restored[inner], errors)
+    evidence = Evidence(job.noise, job.clip, blurs, errors, [sensor.measured for sensor in sensors])
+    restored, verdict = held_back(tile, restored, evidence, inner=inner[1:])
     if job.strength < 1.0:
         restored = tile[inner] + np.float32(job.strength) * (restored - tile[inner])
-    return restored, expected
+    return _Restored(restored, expected.held(verdict.held_back), verdict.without_map())
 
 
 def _cautious(kernel: NDArray[np.float64], error: float) -> NDArray[np.float64]:

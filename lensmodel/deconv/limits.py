@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lensmodel.deconv.engine import compiled
-from lensmodel.deconv.texture import SHARE
 from lensmodel.errors import InvalidInputError
 from lensmodel.types import Planes
 
@@ -35,27 +34,29 @@ class Bounds:
     halo : float or None
         By how much of the photo's range within 2 pixels the result may leave it: 0 not at all, infinity
         without bound. None takes it from the expected error of the kernels.
+    texture : float
+        0 to 1: how much of what the correction leaves unexplained the photo keeps, its faint texture and
+        its grain.
     denoise : float
-        0 to 1: 0 keeps the photo's own grain and faint texture, 1 leaves what the prior makes of them.
+        0 to 1: how much of that is taken away where it looks like noise alone.
     """
 
     halo: float | None = None
+    texture: float = 1.0
     denoise: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (self.halo is None or self.halo >= 0.0) or not 0.0 <= self.denoise <= 1.0:
-            raise InvalidInputError(f"halo must not be negative and denoise lie in 0..1, got {self}")
+        if not (self.halo is None or self.halo >= 0.0):
+            raise InvalidInputError(f"halo must not be negative, got {self.halo}")
+        if not (0.0 <= self.texture <= 1.0 and 0.0 <= self.denoise <= 1.0):
+            raise InvalidInputError(f"texture and denoise must lie in 0..1, got {self}")
 
     @property
     def described(self) -> str:
         """What was asked for, for the tag of a corrected photo; nothing where nothing was."""
         halo = "" if self.halo is None else f", halo {self.halo:g}"
-        return halo + (f", denoised {self.denoise:g}" if self.denoise > 0.0 else "")
-
-    @property
-    def texture(self) -> float:
-        """Share of what a correction leaves unexplained that the photo keeps."""
-        return SHARE * (1.0 - self.denoise)
+        texture = f", texture {self.texture:g}" if self.texture < 1.0 else ""
+        return halo + texture + (f", denoised {self.denoise:g}" if self.denoise > 0.0 else "")
 
     def hold(
         self,

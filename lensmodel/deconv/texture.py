@@ -19,13 +19,28 @@ SHARE: Final = 0.87
 """How much of what a correction leaves unexplained the photo keeps: three quarters of the power of its grain,
 so that grain which the inverse of the blur amplifies does not add up to more than there was (chosen)."""
 
+_LEAST_VARIANCE: Final = 1e-12  # black without read noise has none
+
 _SMOOTH: Final = 1.2
 """Standard deviation in pixels of the means of what is left of a colour of a mosaic: two of its pixels
 (chosen)."""
 
 
+_WINDOW: Final = 7
+"""Pixels along a side over which what is left is compared with the noise (chosen)."""
+_NOISE, _TEXTURE = 1.5, 4.0
+"""Power of what is left over that of the noise, up to which it is noise alone, and from which on texture: the
+former is beyond what a variance over so few pixels leaves to chance (chosen)."""
+
+
 def texture_kept(
-    photo: Planes, restored: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor], share: float
+    photo: Planes,
+    restored: Planes,
+    blurs: Sequence[UniformBlur],
+    sensors: Sequence[Sensor],
+    *,
+    texture: float = 1.0,
+    denoise: float = 0.0,
 ) -> Planes:
     """Give back what a restored picture, blurred again, does not explain of the photo.
 
@@ -47,16 +62,19 @@ def texture_kept(
         A tile, and what was made of it.
     blurs, sensors : sequence
         By colour.
-    share : float
-        0 to 1.
+    texture : float
+        0 to 1: how much of it is given back, of `SHARE`.
+    denoise : float
+        0 to 1: how much less where it looks like noise alone.
     """
-    if share <= 0.0:
+    if texture <= 0.0:
         return restored
     left = np.stack(
         [_left(*colour) for colour in zip(photo, restored, blurs, sensors, strict=True)], dtype=np.float32
     )
+    share = np.float32(SHARE * texture) * _kept(left, photo, sensors, denoise)
     if all(sensor.measured is None for sensor in sensors):
-        return np.asarray(restored + np.float32(share) * left, dtype=np.float32)
+        return np.asarray(restored + share * left, dtype=np.float32)
     light = np.maximum(photo.mean(axis=(1, 2)), np.float32(1e-4))
     grain = [
         max(float(np.sqrt(sensor.noise.variance(bright))) / float(bright), 1e-9)
@@ -73,7 +91,25 @@ def texture_kept(
     for c in range(len(left)):
         for k, part in enumerate(fine):
             left[c] += light[c] * np.float32(min(1.0, grain[c] / grain[k])) * part
-    return np.asarray(restored + np.float32(share) * left, dtype=np.float32)
+    return np.asarray(restored + share * left, dtype=np.float32)
+
+
+def _kept(
+    left: Planes, photo: Planes, sensors: Sequence[Sensor], denoise: float
+) -> NDArray[np.float32] | np.float32:
+    """1 where what is left is texture, 1 - denoise where it is noise."""
+    if denoise <= 0.0:
+        return np.float32(1.0)
+    ratio = np.zeros(photo.shape[1:], dtype=np.float32)
+    for plane, light, sensor in zip(left, photo, sensors, strict=True):
+        known = np.ones(plane.shape, np.float32) if sensor.measured is None else sensor.measured
+        known = np.asarray(known, dtype=np.float32)
+        expected = ndimage.uniform_filter(known * sensor.variance(light), _WINDOW)
+        ratio += ndimage.uniform_filter(known * plane * plane, _WINDOW) / np.maximum(
+            expected, _LEAST_VARIANCE
+        )
+    t = np.clip((ratio / len(left) - _NOISE) / (_TEXTURE - _NOISE), 0.0, 1.0)
+    return np.asarray(1.0 - denoise * (1.0 - t * t * (3.0 - 2.0 * t)), dtype=np.float32)
 
 
 def _left(

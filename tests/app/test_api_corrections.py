@@ -28,7 +28,7 @@ def finish(store: Store, settings: Settings, correction_id: str) -> None:
     etag = hashlib.sha256(FILE).hexdigest()
     store.corrections.start(correction_id)
     result = Result(key, etag, "image/tiff", len(FILE), "Größe p1-corrected.tif")
-    report = {"zones": {"corner": {"gain_db": 2.0}}}
+    report = {"zones": {"corner": {"expected_gain_db": 2.0}}}
     assert store.corrections.finish(correction_id, result, report)
 
 
@@ -70,7 +70,7 @@ def test_the_same_wish_is_the_same_correction(
 
     third = post(client, photo_id=photo.public_id, strength=0.5)
     assert (third.status_code, third.json()["id"]) == (200, first.json()["id"])
-    assert third.json()["report"] == {"zones": {"corner": {"gain_db": 2.0}}}
+    assert third.json()["report"] == {"zones": {"corner": {"expected_gain_db": 2.0}}}
     other = post(client, photo_id=photo.public_id, strength=0.6)
     assert other.json()["id"] != first.json()["id"]
 

@@ -507,7 +507,9 @@ def ask(bench: Workbench, photo: PhotoRow, steps: Any, version: int = 1, **param
 
 def write_result(arguments: dict[str, Any], folder: Path) -> Outcome:
     (folder / "result.jpg").write_bytes(b"a picture")
-    return Outcome("ok", value={"file": "result.jpg", "zones": {"center": {"gain_db": 3.0}}})
+    return Outcome(
+        "ok", value={"file": "result.jpg", "report": {"zones": {"center": {"expected_gain_db": 3.0}}}}
+    )
 
 
 def test_a_correction_ends_with_a_file(
@@ -521,7 +523,7 @@ def test_a_correction_ends_with_a_file(
     row = bench.store.corrections.get(key)
     assert row is not None
     assert (row.state, row.result_media_type, row.result_bytes) == ("succeeded", "image/jpeg", 9)
-    assert row.report == {"zones": {"center": {"gain_db": 3.0}}}
+    assert row.report == {"zones": {"center": {"expected_gain_db": 3.0}}}
     assert bench.storage.get(row.result_key or "") == b"a picture"
     assert sandbox.files >= {KERNELS, SAMPLES}
 

@@ -326,7 +326,7 @@ def test_zone_report_expects_less_gain_from_a_noisier_photo() -> None:
 
     assert set(clean) == {"center", "mid", "corner"}
     for zone, report in clean.items():
-        assert report.gain_db > noisy[zone].gain_db > 0
+        assert report.expected_gain_db > noisy[zone].expected_gain_db > 0
         assert report.psf_error == pytest.approx(0.1)
 
 
@@ -362,7 +362,7 @@ def test_correction_refuses_what_makes_no_sense(change: dict, text: str) -> None
 
 @pytest.mark.parametrize("change", [{"halo": -0.1}, {"denoise": 1.5}])
 def test_bounds_refuse_what_makes_no_sense(change: dict) -> None:
-    with pytest.raises(InvalidInputError, match="halo must not be negative"):
+    with pytest.raises(InvalidInputError, match=next(iter(change))):
         Bounds(**change)
 
 

@@ -185,7 +185,7 @@ def _worked(picture: Picture, room: Room, wishes: Wishes, say: Words) -> Unit:
     found = audit_map(developed, corrected.planes)
     if found is not None:
         room.save(room.audit, found)
-    announced = {zone: _finite(getattr(report, "gain_db", None)) for zone, report in corrected.zones.items()}
+    announced = {zone: _finite(report.expected_gain_db) for zone, report in corrected.zones.items()}
     return {**unit, "state": "corrected", "announced": announced, "seconds": seconds}
 
 

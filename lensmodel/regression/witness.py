@@ -6,7 +6,7 @@ the very photo that is to be corrected: behind the right kernel nothing narrower
 (`likelihood`). With D_ia the rise of the negative log likelihood of patch i from the model's kernel k_0 to an
 alternative k_a, bounded so that no patch speaks for all,
 
-    M_a(x) = sum_i w_i(x) D_ia / max(sum_i w_i(x), n)        q_a(x) ~ p_a(x) exp(-M_a(x))
+    M_a(x) = sum_i w_i(x) D_ia / max(sum_i w_i(x), n)        q_a(x) ~ p_a(x) exp(-t M_a(x))
 
 where w falls off with the distance in the field and in the settings: a mean over patches, since neighbouring
 bins and patches of one motif err alike, and less than a mean below n patches. There the prior p of the
@@ -47,10 +47,11 @@ COUNT: Final = len(WIDTHS) + len(SHARES) + 2
 
 # Chosen on simulated lenses of development seeds (0 to 5) with kernels that are right, too wide, turned and
 # displaced; `benchmarks/witness.py` prints what they give on others.
-_PRIOR: Final = 0.8  # of the model's kernel
-_BOUND: Final = 12.0  # of what one patch says
-_RADIUS: Final = 0.25  # half-diagonals
-_FEWEST: Final = 5.0  # patches whose mean counts in full
+_PRIOR: Final = 0.9  # of the model's kernel
+_AGAINST, _FOR = 12.0, 6.0  # bounds of what one patch says: a neighbour's support is no excuse for a place
+_RADIUS: Final = 0.2  # half-diagonals
+_FEWEST: Final = 5.0  # patches whose mean counts in full; one alone overrules nothing
+_TEMPER: Final = 1.5  # t
 _MOST: Final = 96  # patches of a model that are asked: some 30 ms each
 _ALIKE: Final = 0.05  # least weight by settings
 _SURE: Final = 0.995  # probability from which on a kernel stays as it is
@@ -139,7 +140,9 @@ class Witness:
         weights = self.votes * np.exp(-0.5 * gaps / _RADIUS**2)
         total = max(float(weights.sum()), _FEWEST)
         open_ = (1.0 - _PRIOR) * float(weights.sum()) / total
-        shares = np.concatenate([[1.0 - open_], open_ / COUNT * np.exp(-(weights @ self.rises) / total)])
+        shares = np.concatenate(
+            [[1.0 - open_], open_ / COUNT * np.exp(-_TEMPER / total * (weights @ self.rises))]
+        )
         return Verdict(shares / shares.sum(), position.phi)
 
 
@@ -186,7 +189,7 @@ def _rises(patch: PsfSample, kernel: Kernel) -> NDArray[np.float64]:
     usual = surprise(patch, kernel)
     others = alternatives(kernel, patch.position.phi)
     rises = [surprise(patch, as_kernel(other)) - usual for other in others]
-    return np.clip(rises, -_BOUND, _BOUND)
+    return np.clip(rises, -_AGAINST, _FOR)
 
 
 def _own(model: LensModel, settings: LensSettings) -> list[tuple[PsfSample, float]]:

@@ -38,9 +38,9 @@ from lensmodel.files import atomic
 from lensmodel.patches import Patch, Selection
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.lateral import LateralColour, estimate_lateral, resample
-from lensmodel.psf import PsfSample, rms_width
-from lensmodel.regression import Doubt, LensModel, ModelSettings
-from lensmodel.spectrum import PatchSpectrum
+from lensmodel.psf import PsfSample, delta, rms_width
+from lensmodel.regression import Doubt, LensModel, ModelSettings, Witness, WitnessedField
+from lensmodel.spectrum import PatchSpectrum, binned_spectrum
 from lensmodel.types import (
     CHANNELS,
     Channel,
@@ -420,6 +420,31 @@ def lateral_of(developed: LinearPhoto) -> LateralColour:
     return estimate_lateral(developed.planes, developed.frame, clip=developed.clip)
 
 
+def witnesses_of(developed: LinearPhoto, settings: LensSettings) -> list[PsfSample]:
+    """Patches of a photo that tell whether a model's kernels fit it: spectra without kernels of their own.
+
+    None of a JPEG file: cameras sharpen them, and a sharpened spectrum speaks against every right kernel.
+    """
+    if developed.info.kind == "jpeg":
+        return []
+    try:
+        selection = find_patches(developed)
+    except (NoUsablePatchesError, InvalidInputError):  # nothing to see, or too small a picture
+        return []
+    known, none = developed.info.metadata, delta(DEFAULT_KERNEL_SIZE)
+    return [
+        PsfSample(
+            kernel=none,
+            position=patch.position,
+            settings=settings.with_channel("g"),
+            pixel_pitch_um=known.pixel_pitch_um,
+            half_diagonal_px=developed.frame.half_diagonal,
+            spectrum=PatchSpectrum(*binned_spectrum(*_view(developed, patch, "g"))),
+        )
+        for patch in selection.patches
+    ]
+
+
 def correct_photo(
     developed: LinearPhoto,
     model: LensModel,
@@ -436,7 +461,8 @@ def correct_photo(
     """Remove the blur of the lens from a developed photo.
 
     The model's own predicted error of each PSF makes the correction gentler where it is large, less so
-    where the patches exclude that the PSF is too wide (`Doubt`).
+    where the patches exclude that the PSF is too wide (`Doubt`). Where patches of the model and of this photo
+    object to a PSF, it is narrowed and its error grows (`Witness`).
 
     Parameters
     ----------
@@ -452,6 +478,7 @@ def correct_photo(
     """
     model, pitch_um = model.warmed(), developed.info.metadata.pixel_pitch_um
     half_px, doubt = developed.frame.half_diagonal, Doubt(model)
+    witness = Witness.of(model, settings, witnesses_of(developed, settings))
 
     def psf_error(position: FieldPosition, channel: Channel) -> float:
         asked = settings.with_channel(channel)
@@ -459,7 +486,8 @@ def correct_photo(
         error = answer.predicted_error if math.isfinite(answer.predicted_error) else 1.0
         # samples whose estimator said nothing of itself share the error that is usual
         error = math.hypot(error, 0.0 if answer.shared_error > 0 else BLIND_BIAS)
-        return error if answer.extrapolated else error * doubt.share(position, settings)
+        own = error if answer.extrapolated else error * doubt.share(position, settings)
+        return math.hypot(own, witness.verdict(position).error(answer.kernel))
 
     planes, cfa = developed.planes, developed.cfa
     solver = deconv.deconvolvers.create(method)
@@ -467,7 +495,7 @@ def correct_photo(
         planes, lateral, cfa = resample(planes, developed.frame, lateral), None, None
     corrected = deconv.correct_planes(
         planes,
-        model.field(settings, pitch_um=pitch_um, half_diagonal_px=half_px),
+        WitnessedField(model.field(settings, pitch_um=pitch_um, half_diagonal_px=half_px), witness),
         developed.frame,
         method=solver,
         strength=strength,

@@ -9,6 +9,7 @@ from lensmodel.regression.robust import Flag
 from lensmodel.regression.smoothers import Neighbours, Smoother, smoothers
 from lensmodel.regression.wavefront import Wavefront
 from lensmodel.regression.wavefront_fit import fit_wavefront
+from lensmodel.regression.witness import Witness, WitnessedField
 
 __all__ = [
     "Doubt",
@@ -23,6 +24,8 @@ __all__ = [
     "PsfAnswer",
     "Smoother",
     "Wavefront",
+    "Witness",
+    "WitnessedField",
     "all_pairs",
     "factorised",
     "fit_wavefront",

@@ -395,6 +395,11 @@ class LensModel:
         """Which of `MODES` answers: that of the settings, or the one that `warmed` found likeliest."""
         return self._fit.mode
 
+    @property
+    def votes(self) -> NDArray[np.float64]:
+        """Votes of the samples after robust weighting, shape (n,); 0 of photos that are excluded."""
+        return self._fit.judgement.votes
+
     def flags(self) -> tuple[Flag, ...]:
         """Photos and samples that count less than they claim, with reasons."""
         return self._fit.judgement.flags

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import ndimage
 
 from lensmodel import codec, photo, pipeline
+from lensmodel.deconv import Corrected
+from lensmodel.deconv.correct import PsfError
 from lensmodel.geometry import Frame
 from lensmodel.photo import LinearPhoto
-from lensmodel.psf import PsfSample, gaussian
+from lensmodel.psf import PsfField, PsfSample, gaussian, rms_width
 from lensmodel.regression import LensModel
 from lensmodel.simulate import edge_chart
 from lensmodel.types import FieldPosition, LensSettings, NoiseModel, Planes
@@ -65,3 +69,31 @@ def test_corrected_photo_without_a_chart_has_no_measured_gain(model: LensModel) 
     )
 
     assert {report.measured for report in found.zones.values()} == {None}
+
+
+def test_photo_that_is_sharper_than_the_model_says_is_corrected_with_care(
+    model: LensModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(4)
+    rows, cols = np.fft.fftfreq(FRAME.height)[:, None], np.fft.rfftfreq(FRAME.width)
+    fall = np.maximum(np.hypot(rows, cols), 1e-3) ** -1.05
+    scene = np.fft.irfft2(np.fft.rfft2(rng.normal(size=(FRAME.height, FRAME.width))) * fall)
+    soft = 0.4 + 0.06 * ndimage.gaussian_filter(scene, 0.6) / scene.std()
+    seen = np.stack([soft + rng.normal(0.0, 0.003, soft.shape) for _ in range(3)]).astype(np.float32)
+    told: dict[str, tuple[float, float]] = {}
+    name = ""
+
+    def record(planes: Planes, field: PsfField, *_: object, psf_error: PsfError, **__: object) -> Corrected:
+        place = FieldPosition(0.3, 0.5)
+        assert callable(psf_error)
+        told[name] = rms_width(field.kernel_at(place, "g", 31)), psf_error(place, "g")
+        return Corrected(planes, {})
+
+    monkeypatch.setattr(pipeline.deconv, "correct_planes", record)
+    for name in ("tiff", "jpeg"):
+        picture = developed(seen)
+        info = photo.PhotoInfo(name, FRAME.width, FRAME.height)  # type: ignore[arg-type] # of a tuple
+        pipeline.correct_photo(replace(picture, info=info), model, LensSettings())
+
+    assert told["tiff"][0] < 0.85 * told["jpeg"][0]
+    assert told["tiff"][1] > told["jpeg"][1] + 0.1

@@ -65,7 +65,7 @@ designs: Final[Registry[Design]] = Registry(
                 "N-LAK12",
                 None,
             ),
-            3.3,
+            6.7,
             30.0,
         ),
         "field-corrector": _sample(

@@ -78,7 +78,7 @@ class TracedLens:
 
     Notes
     -----
-    Cost: 0.1 to 0.3 CPU seconds a kernel.
+    Cost: 0.1 to 0.4 CPU seconds a kernel.
     """
 
     copy: Copy

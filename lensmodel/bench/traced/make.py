@@ -13,7 +13,8 @@ from lensmodel.bench.traced.designs import designs
 from lensmodel.bench.traced.grid import GridField
 from lensmodel.bench.traced.image import kernel_of, transmission
 from lensmodel.bench.traced.lens import TracedLens
-from lensmodel.types import CHANNELS, StepHook, ignore_step
+from lensmodel.psf import distance
+from lensmodel.types import CHANNELS, FieldPosition, StepHook, ignore_step
 
 logger = logging.getLogger(__name__)
 
@@ -52,7 +53,8 @@ def make_grid(
 
     Notes
     -----
-    Cost: about a CPU second a node. Nodes that no place inside the frame depends on repeat a neighbour.
+    Cost: 0.2 to 0.7 CPU seconds a node, about 450 nodes. Nodes that no place inside the frame depends
+    on repeat a neighbour.
     """
     n = f_number or lens.copy.f_number
     reach = round(1.0 / step) + 1
@@ -102,9 +104,6 @@ def interpolation_error(
     lens: TracedLens, grid: GridField, places: int, rng: np.random.Generator
 ) -> list[float]:
     """Relative L2 distance between the grid's answer and the exact PSF at random places of the frame."""
-    from lensmodel.psf import distance
-    from lensmodel.types import FieldPosition
-
     found = []
     for _ in range(places):
         place = FieldPosition(math.sqrt(rng.random()), float(rng.uniform(-math.pi, math.pi)))

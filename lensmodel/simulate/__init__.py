@@ -6,7 +6,7 @@ from lensmodel.simulate.camera import SimulatedCamera, SimulatedPhoto, Truth, ph
 from lensmodel.simulate.charts import Chart, ChartEdge, edge_area, edge_chart, slanted_edge_scene
 from lensmodel.simulate.draw import LENS_KINDS, draw_lens
 from lensmodel.simulate.files import shot_info, write_photo
-from lensmodel.simulate.lens import SimulatedField, SimulatedLens
+from lensmodel.simulate.lens import CameraLens, SimulatedField, SimulatedLens
 from lensmodel.simulate.scenes import (
     DEMO_SCENES,
     constant,
@@ -25,6 +25,7 @@ __all__ = [
     "LENS_KINDS",
     "Aberrations",
     "BlurOptions",
+    "CameraLens",
     "Chart",
     "ChartEdge",
     "SimulatedCamera",

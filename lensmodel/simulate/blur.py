@@ -19,7 +19,7 @@ from scipy.interpolate import CubicSpline
 
 from lensmodel.errors import InvalidInputError
 from lensmodel.geometry import Frame
-from lensmodel.simulate.lens import DEFAULT_PITCH_UM, DEFAULT_SIZE, SimulatedLens
+from lensmodel.simulate.lens import DEFAULT_PITCH_UM, DEFAULT_SIZE, CameraLens
 from lensmodel.types import CHANNELS, Channel, LensSettings, Planes, StepHook, ignore_step
 
 DEFAULT_STEP: Final = 0.1
@@ -62,7 +62,7 @@ class BlurOptions:
 
 def blurred(
     scene: Planes,
-    lens: SimulatedLens,
+    lens: CameraLens,
     settings: LensSettings,
     frame: Frame,
     options: BlurOptions | None = None,
@@ -245,7 +245,7 @@ def _spline(known: int, wanted: int) -> NDArray[np.float32]:
 
 @lru_cache(maxsize=2048)  # photos of one lens and frame share all their kernels, 50 MB at most
 def _kernel(
-    lens: SimulatedLens, settings: LensSettings, h: tuple[float, float], frame: Frame, options: BlurOptions
+    lens: CameraLens, settings: LensSettings, h: tuple[float, float], frame: Frame, options: BlurOptions
 ) -> NDArray[np.float64]:
     channel: Channel = settings.channel
     offset, r = (0.0, 0.0), math.hypot(*h)

@@ -15,7 +15,7 @@ from lensmodel.errors import InvalidInputError
 from lensmodel.geometry import Frame
 from lensmodel.photo.dng import XYZ_TO_SRGB
 from lensmodel.simulate.blur import BlurOptions, blurred, with_margin
-from lensmodel.simulate.lens import SimulatedLens
+from lensmodel.simulate.lens import CameraLens
 from lensmodel.types import CHANNELS, LensSettings, NoiseModel, Planes, StepHook, ignore_step
 
 logger = logging.getLogger(__name__)
@@ -173,7 +173,7 @@ class Truth:
         that the borders are honest.
     """
 
-    lens: SimulatedLens
+    lens: CameraLens
     camera: SimulatedCamera
     settings: LensSettings
     scene_sha256: str
@@ -208,7 +208,7 @@ class SimulatedPhoto:
 
 def photograph(
     scene: Planes,
-    lens: SimulatedLens,
+    lens: CameraLens,
     settings: LensSettings,
     camera: SimulatedCamera,
     rng: np.random.Generator | None,

@@ -17,7 +17,7 @@ def shot_info(photo: SimulatedPhoto, *, taken_at: datetime | None = None, orient
     """Metadata of a simulated photo as its camera would write it."""
     truth = photo.truth
     lens, camera, settings = truth.lens, truth.camera, truth.settings
-    widest = lens.optics[0].f_number, lens.optics[-1].f_number
+    widest = lens.widest(lens.focal_mm[0]), lens.widest(lens.focal_mm[-1])
     return ShotInfo(
         camera_maker=camera.maker,
         camera_model=camera.model,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -24,6 +24,56 @@ def spectrum(channel: Channel) -> tuple[tuple[float, float], ...]:
     """Wavelengths in micrometres of a colour channel, with their weights."""
     middle = WAVELENGTH_NM[channel] / 1000.0
     return (middle - _BAND_UM, 0.25), (middle, 0.5), (middle + _BAND_UM, 0.25)
+
+
+class CameraLens(Protocol):
+    """What a simulated camera needs to know of the lens in front of it; hashable.
+
+    Methods are as those of `SimulatedLens`.
+    """
+
+    @property
+    def focal_mm(self) -> tuple[float, ...]:
+        """Ascending focal lengths; one for a prime lens."""
+
+    @property
+    def maker(self) -> str:
+        """As written into the metadata of its photos."""
+
+    @property
+    def model(self) -> str:
+        """As written into the metadata of its photos."""
+
+    @property
+    def serial(self) -> str:
+        """As written into the metadata of its photos."""
+
+    def __hash__(self) -> int:
+        """Kernels are remembered by lens."""
+
+    def widest(self, focal_mm: float | None = None) -> float:
+        """Widest aperture at a focal length; None means the shortest."""
+
+    def f_number(self, settings: LensSettings) -> float:
+        """Working f-number of the settings; unknown means wide open."""
+
+    def kernel_at_field(
+        self,
+        h: tuple[float, float],
+        settings: LensSettings,
+        size: int,
+        *,
+        pitch_um: float,
+        defocus: float,
+        offset: tuple[float, float],
+    ) -> Kernel:
+        """Kernel at field vector `h` (right, up), its centre of mass at `offset` (row, col) pixels."""
+
+    def transmission(self, h: tuple[float, float], settings: LensSettings) -> float:
+        """Light that arrives at field vector `h`, over that of the full pupil."""
+
+    def lateral_shift(self, r: float, channel: Channel, focal_mm: float | None = None) -> float:
+        """Displacement of a channel's image against green at radius `r`, outwards, in half diagonals."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +128,10 @@ class SimulatedLens:
         a, b = self.focal_mm[upper - 1], self.focal_mm[upper]
         share = math.log(focal_mm / a) / math.log(b / a)
         return self.optics[upper - 1].mixed(self.optics[upper], share)
+
+    def widest(self, focal_mm: float | None = None) -> float:
+        """Widest aperture at a focal length; None means the shortest."""
+        return self.at_focal(focal_mm).f_number
 
     def f_number(self, settings: LensSettings) -> float:
         """Working f-number of the settings; unknown means wide open.

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.audit import blocks
 from lensmodel.blur import UniformBlur
 from lensmodel.errors import InvalidInputError
 from lensmodel.types import CHANNELS, NoiseModel, Plane, Planes
@@ -112,6 +113,40 @@ class Pair:
     def shape(self) -> tuple[int, int]:
         """Rows and columns."""
         return self.original.shape[1], self.original.shape[2]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Severity:
+    """How many times what is allowed a check found, on a grid of places; 1 and less is in order.
+
+    Parameters
+    ----------
+    values : ndarray of float32, shape (down, across)
+        One for each place.
+    step : int
+        Pixels from one place to the next; 1 for every pixel.
+    first : float
+        Pixel of the first place, in rows and in columns.
+    """
+
+    values: NDArray[np.float32]
+    step: int = 1
+    first: float = 0.0
+
+    @classmethod
+    def of_blocks(cls, values: NDArray[np.float32]) -> Severity:
+        """Figures of `blocks`, which stand in their middles."""
+        return cls(values, blocks.SIDE, (blocks.SIDE - 1) / 2.0)
+
+    def part(self, inner: tuple[slice, slice], shape: tuple[int, int]) -> tuple[slice, slice]:
+        """Places of the grid that lie in a part of a tile of `shape`; the nearest one if none does."""
+        found = []
+        for part, extent, count in zip(inner, shape, self.values.shape, strict=True):
+            start, stop, _ = part.indices(extent)
+            low = int(np.clip(np.ceil((start - self.first) / self.step), 0, count - 1))
+            high = int(np.clip(np.floor((stop - 1 - self.first) / self.step), low, count - 1))
+            found.append(slice(low, high + 1))
+        return found[0], found[1]
 
 
 @dataclass(frozen=True, slots=True)

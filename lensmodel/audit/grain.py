@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.audit import blocks
-from lensmodel.audit.base import Pair
+from lensmodel.audit import blocks, near
+from lensmodel.audit.base import Pair, Severity
 from lensmodel.audit.limits import LIMITS
 from lensmodel.types import Plane
 
@@ -18,7 +18,7 @@ _SCALES: Final = (1, 2)
 """Distances of the second differences: grain of a period of 2 pixels and of 4."""
 
 
-def amplified(pair: Pair) -> Plane:
+def amplified(pair: Pair) -> Severity:
     """Severity of more grain in flat places than the photo has there: root of the ratio of powers.
 
     Less is no fault of this kind: what a correction's own settings keep of it is up to the photographer.
@@ -33,7 +33,7 @@ def amplified(pair: Pair) -> Plane:
     for scale in _SCALES:
         was, now = (blocks.around(flat * blocks.sums(_detail(plane, scale))) for plane in (y, x))
         worst = np.maximum(worst, now / (was + least))
-    return blocks.to_pixels((np.sqrt(worst) / LIMITS["grain"]).astype(np.float32), pair.shape)
+    return Severity.of_blocks((np.sqrt(worst) / LIMITS["grain"]).astype(np.float32))
 
 
 def _detail(plane: Plane, scale: int) -> NDArray[np.float32]:
@@ -41,7 +41,7 @@ def _detail(plane: Plane, scale: int) -> NDArray[np.float32]:
 
     Its gain for white noise is 1. J. Immerkaer, "Fast noise variance estimation", CVIU 64, 1996, eq. 2.
     """
-    wide, two = np.pad(plane, scale, mode="edge"), np.float32(2.0)
+    wide, two = near.padded(plane, scale), np.float32(2.0)
     rows = wide[: -2 * scale] - two * wide[scale:-scale] + wide[2 * scale :]
     both = rows[:, : -2 * scale] - two * rows[:, scale:-scale] + rows[:, 2 * scale :]
     return np.asarray(np.square(both) / np.float32(36.0), dtype=np.float32)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lensmodel.audit import blocks, near
-from lensmodel.audit.base import Pair
+from lensmodel.audit.base import Pair, Severity
 from lensmodel.audit.limits import LIMITS
-from lensmodel.types import Plane
 
 _SIDE: Final = 7
 _LEAST: Final = 0.02
@@ -18,28 +18,43 @@ _NOISE: Final = 4.0
 _FLOOR: Final = 12.0
 
 
-def foreign_hue(pair: Pair) -> Plane:
-    """Severity of colours beyond those that the photo shows within 3 pixels.
+def foreign_spots(pair: Pair) -> Severity:
+    """Severity of single colours beyond those that the photo shows within 3 pixels.
 
     Colour is (r - g) / (r + g + b) and (b - g) / (r + g + b) of the photo smoothed over 3 x 3 pixels, where
-    noise adds to the light, so that what is dark has no colour to speak of. What lies beyond is judged
-    pixel by pixel against a fixed bound, and over an area against the range that the photo has there.
+    noise adds to the light, so that what is dark has no colour to speak of.
     """
-    sigma = pair.sigma.mean(axis=0)
-    calm = near.mean(pair.original, 3)
-    floor = np.float32(_FLOOR) * sigma
-    light = np.maximum(calm, 0.0).sum(axis=0) + floor
-    made = np.maximum(pair.corrected, 0.0).sum(axis=0) + floor
     worst = np.zeros(pair.shape, dtype=np.float32)
-    for one in (0, 2):
-        before = (calm[one] - calm[1]) / light
-        after = (pair.corrected[one] - pair.corrected[1]) / made
+    for beyond, span in _colours(pair):
+        np.maximum(worst, beyond / (np.float32(_FREE) + np.float32(_SHARE) * span), out=worst)
+    return Severity(worst / np.float32(LIMITS["hue, spots"]))
+
+
+def foreign_area(pair: Pair) -> Severity:
+    """Severity of colours beyond those of the photo over an area, in the measure of their range there."""
+    worst: NDArray[np.float32] = np.zeros((1, 1), dtype=np.float32)
+    for beyond, span in _colours(pair):
+        part = blocks.windows(np.square(beyond))
+        whole = blocks.windows(np.square(span) + np.float32(_LEAST**2))
+        worst = np.maximum(worst, np.sqrt(part / whole))
+    return Severity.of_blocks(worst / np.float32(LIMITS["hue, area"]))
+
+
+def _colours(pair: Pair) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+    """How far each of two colours lies beyond its range in the photo, and that range; made once."""
+    if "colours" not in pair.memo:
+        sigma = (pair.sigma[0] + pair.sigma[1] + pair.sigma[2]) * np.float32(1.0 / 3.0)
+        calm = near.mean(pair.original, 3)
+        floor = np.float32(_FLOOR) * sigma
+        light, made = (
+            np.maximum(p[0], 0.0) + np.maximum(p[1], 0.0) + np.maximum(p[2], 0.0) + floor
+            for p in (calm, pair.corrected)
+        )
+        before = np.stack([calm[0] - calm[1], calm[2] - calm[1]]) / light
+        x = pair.corrected
+        after = np.stack([x[0] - x[1], x[2] - x[1]]) / made
         low, high = near.lowest(before, _SIDE), near.highest(before, _SIDE)
-        span = high - low
         beyond = np.maximum(after - high, low - after) - np.float32(_NOISE) * sigma / made
-        beyond = np.maximum(beyond, np.float32(0.0))
-        np.maximum(worst, beyond / (_FREE + _SHARE * span), out=worst)
-        part = blocks.around(blocks.sums(np.square(beyond)))
-        whole = blocks.around(blocks.sums(np.square(span) + np.float32(_LEAST**2)))
-        np.maximum(worst, blocks.to_pixels(np.sqrt(part / whole), pair.shape), out=worst)
-    return worst / np.float32(LIMITS["hue"])
+        pair.memo["colours"] = list(zip(np.maximum(beyond, np.float32(0.0)), high - low, strict=True))
+    found: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = pair.memo["colours"]
+    return found

@@ -16,7 +16,7 @@ from lensmodel.geometry import Frame, zone_of
 from lensmodel.types import FieldPosition, Plane, Planes, StepHook, ignore_step
 
 TILE: Final = 192
-HALO: Final = 32
+HALO: Final = 48
 """Side of a tile in pixels and what is seen around it. Both are multiples of the step of the checks'
 windows, so that neighbouring tiles see the same windows and no seam shows."""
 

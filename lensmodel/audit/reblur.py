@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from lensmodel.audit import blocks
-from lensmodel.audit.base import Pair
+from lensmodel.audit.base import Pair, Severity
 from lensmodel.audit.limits import LIMITS
 from lensmodel.blur import UniformBlur
 from lensmodel.blur.uniform import fast_shape
@@ -23,7 +23,7 @@ a prior gives way at edges."""
 _CLIPPED: Final = 0.98
 
 
-def misfit(pair: Pair) -> Plane:
+def misfit(pair: Pair) -> Severity:
     """Severity of what is left of the photo y after the blurred result is taken off.
 
     With k the PSF, whose relative error is e, and x the result::
@@ -34,10 +34,10 @@ def misfit(pair: Pair) -> Plane:
     mean square, and that of the means over blocks, which is as small only if r is white. Without PSFs
     nothing can be said: zero everywhere.
     """
-    worst = np.zeros(pair.shape, dtype=np.float32)
     evidence = pair.evidence
+    worst: NDArray[np.float32] = np.zeros((1, 1), dtype=np.float32)
     if evidence.blurs is None:
-        return worst
+        return Severity.of_blocks(worst)
     for c, blur in enumerate(evidence.blurs):
         x, y = pair.corrected[c], pair.original[c]
         again = reblurred(x, blur)
@@ -47,12 +47,12 @@ def misfit(pair: Pair) -> Plane:
         left = np.where(counted, left, np.float32(0.0))
         number = np.maximum(blocks.sums(counted), np.float32(1.0)).astype(np.float32)
         count = np.maximum(blocks.around(number), np.float32(1.0))
-        fine = np.sqrt(blocks.around(blocks.sums(np.square(left))) / count)
+        fine = np.sqrt(blocks.windows(np.square(left)) / count)
         means = np.square(blocks.sums(left)) / number
         coarse = np.sqrt(blocks.around(means.astype(np.float32)) / blocks.around(np.ones_like(number)))
         figures = np.maximum(fine, np.float32(_COARSE) * coarse)
-        np.maximum(worst, blocks.to_pixels(figures, pair.shape), out=worst)
-    return worst / np.float32(LIMITS["re-blur"])
+        worst = np.maximum(worst, figures)
+    return Severity.of_blocks(worst / np.float32(LIMITS["re-blur"]))
 
 
 def reblurred(plane: Plane, blur: UniformBlur) -> Plane:

@@ -7,9 +7,8 @@ from typing import Final
 import numpy as np
 
 from lensmodel.audit import blocks, near
-from lensmodel.audit.base import Pair
+from lensmodel.audit.base import Pair, Severity
 from lensmodel.audit.limits import LIMITS
-from lensmodel.types import Plane
 
 _SMALL, _WIDE = 5, 15
 _FLAT: Final = 0.08
@@ -17,7 +16,7 @@ _NOISE: Final = 8.0
 _STRONG: Final = 40.0
 
 
-def swing(pair: Pair) -> Plane:
+def swing(pair: Pair) -> Severity:
     """Severity of waves of the light within 2 pixels, over the step of the photo within 7, where it is flat.
 
     Flat is where the photo's own range within 2 pixels is no more than 8 standard deviations of its
@@ -30,9 +29,9 @@ def swing(pair: Pair) -> Plane:
     flat = (own <= np.float32(_NOISE) * sigma + np.float32(_FLAT) * step) & (
         step > np.float32(_STRONG) * sigma
     )
-    part = blocks.around(blocks.sums(np.where(flat, np.square(wave), np.float32(0.0))))
-    whole = blocks.around(blocks.sums(np.where(flat, np.square(step), np.float32(0.0))))
-    count = blocks.around(blocks.sums(flat))
+    part = blocks.windows(flat * np.square(wave))
+    whole = blocks.windows(flat * np.square(step))
+    count = blocks.windows(flat)
     trust = np.minimum(count / np.float32(128.0), 1.0)
     share = trust * np.sqrt(part / np.maximum(whole, np.float32(1e-12)))
-    return blocks.to_pixels((share / LIMITS["ringing"]).astype(np.float32), pair.shape)
+    return Severity.of_blocks((share / LIMITS["ringing"]).astype(np.float32))

@@ -8,10 +8,10 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
+from scipy import fft, ndimage
 
 from lensmodel.audit import blocks
-from lensmodel.audit.base import Pair
+from lensmodel.audit.base import Pair, Severity
 from lensmodel.audit.limits import LIMITS
 from lensmodel.types import Plane
 
@@ -28,9 +28,10 @@ _LIMIT: Final = 0.29
 """Frequency along an axis beyond which lines are looked for: periods below 3.5 pixels."""
 _SECTORS: Final = 4
 _NOISE: Final = 4.0
+_NEAR: Final = np.outer([1.0, 2.0, 1.0], [1.0, 2.0, 1.0]).astype(np.float32)
 
 
-def overcorrected(pair: Pair) -> Plane:
+def overcorrected(pair: Pair) -> Severity:
     """Severity of power at higher frequencies beyond what the photo's lower ones foretell, by direction.
 
     With the power Y of the photo, X of the result and n of the noise in windows of 32 pixels::
@@ -42,14 +43,15 @@ def overcorrected(pair: Pair) -> Plane:
     power = _spectra(pair)
     worst = np.zeros(power.noise.shape, dtype=np.float32)
     for low, bands in _masks():
-        base = power.original[..., low].mean(axis=-1)
+        base = _around(power.original[..., low].mean(axis=-1))
         for band, share in bands:
-            foretold = share * base + np.float32(_NOISE) * power.noise
-            worst = np.maximum(worst, power.corrected[..., band].mean(axis=-1) / foretold)
-    return _to_pixels((np.sqrt(worst) / LIMITS["spectrum"]).astype(np.float32), pair.shape)
+            foretold = share * base + np.float32(_NOISE) * _around(power.noise)
+            made = _around(power.corrected[..., band].mean(axis=-1))
+            worst = np.maximum(worst, made / foretold)
+    return _severity(worst, LIMITS["spectrum"])
 
 
-def comb(pair: Pair) -> Plane:
+def comb(pair: Pair) -> Severity:
     """Severity of lines near the limit of the grid that the photo has not.
 
     A line is a frequency that stands out of the geometric mean of its band, to which a few lines add
@@ -61,7 +63,7 @@ def comb(pair: Pair) -> Plane:
     own = was / _level(was + noise)
     made = now / _level(now + noise)
     line = (made / np.maximum(own, np.float32(1.0))).max(axis=-1)
-    return _to_pixels((np.sqrt(line) / LIMITS["comb"]).astype(np.float32), pair.shape)
+    return _severity(line, LIMITS["comb"])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,12 +79,17 @@ def _spectra(pair: Pair) -> _Spectra:
     """Power of a pair, made once."""
     if "spectra" not in pair.memo:
         variance = blocks.sums(np.square(pair.luma_sigma))
-        level = blocks.spread(variance, pair.shape, first=(blocks.SIDE - 1) / 2.0, step=blocks.SIDE)
+        level = blocks.to_pixels(variance, pair.shape, first=(blocks.SIDE - 1) / 2.0, step=blocks.SIDE)
         energy = np.float32(np.square(_window()).sum() / blocks.SIDE**2)
         noise = _windows(level)[..., SIDE // 2, SIDE // 2] * energy
         pair.memo["spectra"] = _Spectra(_power(pair.luma[0]), _power(pair.luma[1]), noise)
     spectra: _Spectra = pair.memo["spectra"]
     return spectra
+
+
+def _around(figures: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Sum over the 3 x 3 windows around each, the near ones twice: some 64 pixels, as wide as `blocks`'."""
+    return np.asarray(ndimage.correlate(figures, _NEAR, mode="constant"))
 
 
 def _level(power: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -146,5 +153,5 @@ def _near_limit() -> NDArray[np.bool_]:
     return np.asarray(np.maximum(abs(down), abs(across)) >= _LIMIT)
 
 
-def _to_pixels(figures: NDArray[np.float32], shape: tuple[int, int]) -> Plane:
-    return blocks.spread(figures, shape, first=(SIDE - 1) / 2.0, step=HOP)
+def _severity(power: NDArray[np.floating], limit: float) -> Severity:
+    return Severity((np.sqrt(power) / limit).astype(np.float32), HOP, (SIDE - 1) / 2.0)

@@ -10,25 +10,26 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lensmodel.audit import near
-from lensmodel.audit.base import Evidence, Finding, Pair, TileAudit
+from lensmodel.audit import blocks, near
+from lensmodel.audit.base import Evidence, Finding, Pair, Severity, TileAudit
 from lensmodel.audit.grain import amplified
-from lensmodel.audit.hue import foreign_hue
+from lensmodel.audit.hue import foreign_area, foreign_spots
 from lensmodel.audit.light import isolated, too_bright, too_dark
 from lensmodel.audit.reblur import misfit
 from lensmodel.audit.ringing import swing
 from lensmodel.audit.spectrum import comb, overcorrected
 from lensmodel.types import Plane, Planes
 
-Check: TypeAlias = Callable[[Pair], Plane]
-"""Severity at each pixel of a tile; above 1 is a fault."""
+Check: TypeAlias = Callable[[Pair], Severity]
+"""Severity on a grid of places of a tile; above 1 is a fault."""
 
 CHECKS: Final[Mapping[str, Check]] = MappingProxyType(
     {
         "too dark": too_dark,
         "too bright": too_bright,
         "isolated pixels": isolated,
-        "hue": foreign_hue,
+        "hue, spots": foreign_spots,
+        "hue, area": foreign_area,
         "re-blur": misfit,
         "spectrum": overcorrected,
         "comb": comb,
@@ -40,7 +41,7 @@ CHECKS: Final[Mapping[str, Check]] = MappingProxyType(
 
 _SOFTNESS: Final = 1.0
 """Standard deviation in pixels of what makes the map smooth: a fault of one pixel leaves no edge."""
-GROWN: Final = 5
+_GROWN: Final = 5
 """Side of the square over which the least that is kept spreads before: wide enough that of a faulty pixel
 itself nothing comes back when the map is smoothed."""
 
@@ -77,13 +78,23 @@ def audit_tile(
     """
     pair = Pair.of(original, corrected, evidence)
     inner = inner or (slice(None), slice(None))
-    keep = np.ones(original.shape[1:], dtype=np.float32)
     findings = []
+    grids: dict[tuple[int, float, tuple[int, ...]], NDArray[np.float32]] = {}
     for name, check in CHECKS.items():
         severity = check(pair)
-        one = kept(severity)
-        findings.append(_finding(name, severity[inner], one[inner]))
-        np.minimum(keep, one, out=keep)
+        findings.append(_finding(name, severity, inner, pair.shape))
+        if findings[-1].worst > 1.0 or severity.values.max(initial=0.0) > 1.0:
+            key = (severity.step, severity.first, severity.values.shape)
+            worst = grids.get(key)
+            grids[key] = severity.values if worst is None else np.maximum(worst, severity.values)
+    keep = np.ones(pair.shape, dtype=np.float32)
+    for (step, first, _), values in grids.items():
+        share = _share(values)
+        if step > 1:
+            share = blocks.to_pixels(share, pair.shape, first=first, step=step)
+        np.minimum(keep, share, out=keep)
+    if grids:
+        keep = softened(keep)
     return TileAudit.of(keep[inner], tuple(findings))
 
 
@@ -109,24 +120,35 @@ def held_back(
     return np.asarray(before + audit.keep * (after - before), dtype=np.float32), audit
 
 
-def kept(severity: NDArray[np.floating]) -> Plane:
-    """Share of the correction that is kept at each pixel: 2 - s of a severity s in 1..2, smooth.
-
-    The least spreads over its neighbours before it is smoothed, so that a fault of one pixel is gone.
-    """
-    share = np.clip(np.float32(2.0) - severity, 0.0, 1.0).astype(np.float32)
-    if share.min(initial=1.0) == 1.0:
-        return share
-    grown = near.lowest(share, GROWN)
-    return np.minimum(ndimage.gaussian_filter(grown, _SOFTNESS, mode="nearest"), np.float32(1.0))
+def softened(keep: Plane) -> Plane:
+    """Spread the least that is kept over its neighbours and smooth it, so that it ends nowhere at once."""
+    grown = near.lowest(keep, _GROWN)
+    return np.clip(ndimage.gaussian_filter(grown, _SOFTNESS, mode="nearest"), 0.0, 1.0)
 
 
-def _finding(name: str, severity: Plane, keep: Plane) -> Finding:
-    row, col = np.unravel_index(int(severity.argmax()), severity.shape)
+def _share(severity: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Share of the correction that is kept: all up to a severity of 1, nothing from 2 on."""
+    return np.clip(np.float32(2.0) - severity, np.float32(0.0), np.float32(1.0))
+
+
+def _finding(name: str, severity: Severity, inner: Inner, shape: tuple[int, int]) -> Finding:
+    """Sum up one check in the inner part, before it is smoothed."""
+    part = severity.part(inner, shape)
+    values = severity.values[part]
+    row, col = np.unravel_index(int(values.argmax()), values.shape)
+    worst = float(values[row, col])
+    place = (int(row) + part[0].start, int(col) + part[1].start)
+    at = [
+        int(np.clip(round(severity.first + severity.step * k) - (s.start or 0), 0, extent - 1))
+        for k, s, extent in zip(place, inner, shape, strict=True)
+    ]
+    if worst <= 1.0:
+        return Finding(name, 0.0, 0.0, worst, (at[0], at[1]))
+    share = _share(values)
     return Finding(
         name,
-        float(1.0 - keep.mean(dtype=np.float64)),
-        float((keep < 0.5).mean()),
-        float(severity[row, col]),
-        (int(row), int(col)),
+        float(1.0 - share.mean(dtype=np.float64)),
+        float((share < 0.5).mean()),
+        worst,
+        (at[0], at[1]),
     )

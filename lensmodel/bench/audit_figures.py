@@ -9,10 +9,9 @@ from typing import Final
 
 import numpy as np
 
-from lensmodel.audit import CHECKS, Evidence, held_back, near
+from lensmodel.audit import CHECKS, Evidence, held_back
 from lensmodel.audit.base import Pair
 from lensmodel.audit.report import HELD
-from lensmodel.audit.tile import GROWN
 from lensmodel.bench.audit import BLOCK, CHANGES, FAULTS, SOUND, Trial
 from lensmodel.blur import UniformBlur, crop_to_support
 from lensmodel.psf import as_kernel
@@ -143,12 +142,12 @@ def factors(block: Block) -> dict[str, float]:
     pair = Pair.of(block.photo, block.corrected, block.evidence)
     found = {}
     for name, check in CHECKS.items():
-        severity = check(pair)[INNER[1:]]
-        worst = near.highest(severity, GROWN)  # as `kept` spreads it; smoothing leaves the mean
+        severity = check(pair)
+        values = severity.values[severity.part((INNER[1], INNER[2]), pair.shape)]
         low, high = 1e-3, 1e3
         for _ in range(20):
             middle = float(np.sqrt(low * high))
-            share = float(np.clip(worst / np.float32(middle) - 1.0, 0.0, 1.0).mean())
+            share = float(np.clip(values / np.float32(middle) - 1.0, 0.0, 1.0).mean())
             low, high = (middle, high) if share > HELD else (low, middle)
         found[name] = high
     return found

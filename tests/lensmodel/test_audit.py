@@ -135,8 +135,9 @@ def test_exchanged_colours_are_a_foreign_hue() -> None:
     flipped = SOUND.copy()
     flipped[0, 60:100, 60:100] *= 0.3
 
-    assert share_of("hue", flipped) > 0.03
-    assert share_of("hue", SOUND) < 0.005
+    assert share_of("hue, spots", flipped) > 0.015
+    assert share_of("hue, spots", SOUND) < 0.005
+    assert share_of("hue, area", SOUND) < 0.005
 
 
 @pytest.mark.parametrize("period", [2.0, 2.5, 3.0])
@@ -145,7 +146,7 @@ def test_fine_lines_are_a_comb(period: float) -> None:
 
     assert share_of("comb", SOUND + lines) > 0.5
     assert share_of("comb", SOUND + lines.T) > 0.5
-    assert share_of("comb", SOUND) == 0.0
+    assert share_of("comb", SOUND) < 0.01
 
 
 def test_lines_that_the_photo_shows_too_are_no_comb() -> None:
@@ -168,7 +169,7 @@ def test_erased_texture_does_not_blur_to_the_photo() -> None:
 
 
 def test_an_uncertain_kernel_may_leave_more() -> None:
-    wide = evidence(gaussian(11, np.eye(2) * 2.2))
+    wide = evidence(gaussian(11, np.eye(2) * 3.0))
 
     sure = share_of("re-blur", LIGHT, wide)
     unsure = share_of("re-blur", LIGHT, replace(wide, psf_errors=(1.0, 1.0, 1.0)))
@@ -279,7 +280,7 @@ def test_a_report_names_zone_check_and_place() -> None:
     assert {name: zone.tiles for name, zone in report.zones.items()} == {"mid": 4}
     assert report.worst[0].row < 48
     assert report.worst[0].col < 48
-    assert {place.check for place in report.worst} & {"hue", "re-blur", "too dark"}
+    assert {place.check for place in report.worst} & {"hue, spots", "hue, area", "re-blur", "too dark"}
     assert 0.0 < report.held_back < 0.2
     assert from_json(AuditReport, to_json(report)) == report
 

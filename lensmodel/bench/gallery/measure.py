@@ -72,14 +72,10 @@ def measured(before: Rendered, after: Rendered, truth: Rendered | None) -> Figur
 
 
 def bars(found: Figures) -> dict[str, bool]:
-    """Say which bars a picture keeps; one that could not be measured on it is left out.
-
-    A camera's own halos are no fault of the correction: the overshoot may be the original's.
-    """
+    """Say which bars a picture keeps; one that could not be measured on it is left out."""
     kept = {"dots": found["dots"] == 0, "hue flips": found["hue_flips"] == 0}
     if found["overshoot"] is not None:
-        old, new = found["overshoot"]
-        kept["overshoot"] = new <= max(OVERSHOOT_PERCENT, old)
+        kept["overshoot"] = found["overshoot"][1] <= OVERSHOOT_PERCENT
     if found["grain"] is not None:
         kept["grain"] = all(GRAIN[0] <= round(ratio, 2) <= GRAIN[1] for ratio in found["grain"].values())
     if found["gains"] is not None:

@@ -17,6 +17,9 @@ FOLDERS: Final = ("real", "large", "raw", "series", "meta")
 STARS: Final = ("psf", (".tif", ".tiff"))
 """Star fields lie among other measurements of points."""
 
+SUBJECTS: Final = {"faces": (215, 230)}
+"""An eye and the skin below it."""
+
 SMALLEST: Final = 64
 """Shorter side of a picture that shows anything; stand-ins for metadata are smaller."""
 
@@ -35,12 +38,15 @@ class Picture:
         npy of what a perfect lens would have shown; only of simulated frames.
     unreadable : str
         Why the file cannot be read; "" where it can.
+    subject : tuple of int or None
+        Pixel `(row, col)` of what the picture is about, where the usual places may miss it.
     """
 
     name: str
     path: Path
     truth: Path | None = None
     unreadable: str = ""
+    subject: tuple[int, int] | None = None
 
     @property
     def slug(self) -> str:
@@ -81,7 +87,12 @@ def simulated_pictures(cache: Path) -> list[Picture]:
     """Name the simulated frames; they are taken when their turn comes."""
     folder = cache / f"frames-{frames_version()}"
     return [
-        Picture(f"simulated/{frame.name}", folder / frame.file, folder / f"{frame.name}-truth.npy")
+        Picture(
+            f"simulated/{frame.name}",
+            folder / frame.file,
+            folder / f"{frame.name}-truth.npy",
+            subject=SUBJECTS.get(frame.name),
+        )
         for frame in FRAMES
     ]
 

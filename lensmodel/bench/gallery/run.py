@@ -122,7 +122,8 @@ def _entry(picture: Picture, output: Path, wishes: Wishes, say: Callable[[str], 
     say("cutting crops")
     keep = room.kept()
     side = crops.side_of(before)
-    named = [("most dots", found["dots_at"]), ("most hue flips", found["hue_flips_at"])]
+    named: list[tuple[str, Sequence[int] | None]] = [("subject", picture.subject)]
+    named += [("most dots", found["dots_at"]), ("most hue flips", found["hue_flips_at"])]
     if found["gains"] is not None and found["gains"]["worst_db"] < 0.0:
         middle = [k + truth.BLOCK // 2 for k in found["gains"]["worst_at"]]
         named.append((f"worst block, {found['gains']['worst_db']:+.2f} dB", middle))

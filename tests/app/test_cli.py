@@ -270,6 +270,19 @@ def test_a_photo_that_does_not_count_leaves_no_trace(folder: Path, here: Here) -
     assert not (folder / "no").exists()
 
 
+@pytest.mark.parametrize("consent", ["--any-lens", "--force"])
+@pytest.mark.slow
+def test_a_photo_of_another_lens_is_corrected_on_demand_and_said_to_be_one(
+    folder: Path, here: Here, made: Path, consent: str
+) -> None:
+    shutil.copy(made / "other.dng", folder)
+    done = here("correct", "other.dng", "-p", PROFILE, "-o", "out", consent, "--method", "wiener")
+
+    assert done.returncode == 0, done.stderr
+    assert "another lens, serial L-43" in done.stderr
+    assert (folder / "out/other-corrected.tif").exists()
+
+
 # --- refusals ----------------------------------------------------------------------------------
 
 REFUSED = {

@@ -150,4 +150,4 @@ def _real(client: Client, report: Report, stages: Stages) -> None:
     try:
         follow(client, photo, on_job=stages.job)
     except JobEndedError as ended:
-        report.refusal = str(ended)
+        report.refusal = str(ended) if ended.job.error is None else ended.job.error.detail or str(ended)

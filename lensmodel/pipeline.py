@@ -138,11 +138,11 @@ def find_patches(
     Raises
     ------
     NoUsablePatchesError
-        If no part of the photo does.
+        If no part of the photo does, or too few parts to count for a lens (`patches.require_enough`).
     """
     third = (min(developed.frame.height, developed.frame.width) // 3) // 2 * 2
     size = min(DEFAULT_PATCH_SIZE, max(third, SMALLEST_PATCH))
-    return patches.select(
+    selection = patches.select(
         developed.planes[1],
         developed.noise[1],
         developed.frame,
@@ -151,8 +151,30 @@ def find_patches(
         size=size,
         selector=selector,
         jpeg=developed.info.kind == "jpeg",
+        coarse_noise=developed.coarse_noise[1],
         on_step=on_step,
     )
+    # the selector makes cells of about three patches: of few that were asked for, few lie apart
+    patches.require_enough(selection.patches, least=min(patches.LEAST_PATCHES, math.ceil(count / 3)))
+    return selection
+
+
+def require_spread(determined: Sequence[Patch], *, count: int = DEFAULT_PATCHES) -> None:
+    """Refuse a photo of whose patches too few gave a PSF: three parts of the picture must be left.
+
+    Parameters
+    ----------
+    determined : sequence of Patch
+        Patches with a PSF.
+    count : int
+        How many patches were asked for.
+
+    Raises
+    ------
+    NoUsablePatchesError
+        If what is left does not tell how the blur changes over the field.
+    """
+    patches.require_enough(determined, least=min(patches.LEAST_PARTS, math.ceil(count / 3)))
 
 
 def cells(selection: Selection) -> list[tuple[Patch, ...]]:
@@ -296,7 +318,7 @@ def samples_of_photo(
     MetadataMissingError
         If the aperture is neither in the file nor given.
     NoUsablePatchesError
-        If the photo tells nothing about the blur.
+        If the photo tells nothing about the blur, or too little, or of one place only.
     """
     on_event(CalibrationEvent(path, "developing"))
     developed = photo.develop(path)
@@ -339,6 +361,8 @@ def samples_of_photo(
             f"none of the {total} patches of {path.name} determines a PSF; "
             "use a photo with more fine detail in focus"
         )
+    determined = [cell.patch for index in sorted(found) for cell in found[index] if cell.channel == "g"]
+    require_spread(determined, count=count)
     return samples
 
 

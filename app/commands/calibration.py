@@ -14,9 +14,10 @@ from rich.progress import Progress, TaskID
 from app.commands import files
 from app.commands.display import Display
 from app.commands.failure import UsageError
+from app.identity import Identity, difference
 from lensmodel import blind, pipeline
 from lensmodel.errors import InvalidInputError, LensModelError, MetadataMissingError
-from lensmodel.regression import LensModel, LensProfile, ModelSettings, save_profile
+from lensmodel.regression import Camera, LensModel, LensProfile, ModelSettings, save_profile
 from lensmodel.regression.answer import KERNELS, MICROMETRE
 from lensmodel.types import LensSettings, StepHook
 
@@ -170,11 +171,19 @@ class _Calibration:
             return {"state": "known"}
         self._refuse_other_lens(seen)
         if self.profile is None:
-            grown = LensProfile(self._leaning(LensModel.fit(samples, self._chosen)), seen, {key: path.name})
+            grown = LensProfile(
+                self._leaning(LensModel.fit(samples, self._chosen)),
+                dict(seen.lens),
+                {key: path.name},
+                () if seen.camera is None else (seen.camera,),
+            )
         else:
             known = self.profile
             grown = LensProfile(
-                known.model.added(samples), seen | known.lens, {**known.photos, key: path.name}
+                known.model.added(samples),
+                self._named(known.lens, seen),
+                {**known.photos, key: path.name},
+                _with(known.cameras, seen.camera),
             )
         self._save(grown)
         self._grown = True
@@ -184,10 +193,16 @@ class _Calibration:
         self._follow()
         return self.profile is not None and photo in self.profile.photos
 
-    def _refuse_other_lens(self, seen: dict[str, str]) -> None:
-        if self.profile is not None and not self._wishes.any_lens:
-            remedy = "give it a profile of its own, or add --any-lens"
-            files.refuse_other_lens(self.profile.lens, seen, remedy)
+    def _refuse_other_lens(self, seen: Identity) -> None:
+        if self.profile is None or self._wishes.any_lens:
+            return
+        why = difference(self.profile.lens, self.profile.cameras, seen)
+        if why is not None:
+            raise InvalidInputError(f"{why}; give it a profile of its own, or add --any-lens")
+
+    def _named(self, known: dict[str, str], seen: Identity) -> dict[str, str]:
+        """What is known of the lens after one more photo; one of any lens gives the profile no name."""
+        return known if self._wishes.any_lens else {**seen.lens, **known}
 
     def _follow(self) -> None:
         """Read the profile if it is not as this run left it, and make it answer as was wished."""
@@ -213,6 +228,10 @@ class _Calibration:
         self._target.parent.mkdir(parents=True, exist_ok=True)
         save_profile(self._target, profile)
         self.profile, self._seen = profile, _stamp(self._target)
+
+
+def _with(cameras: tuple[Camera, ...], camera: Camera | None) -> tuple[Camera, ...]:
+    return cameras if camera is None or camera in cameras else (*cameras, camera)
 
 
 def _opened(target: Path) -> LensProfile:

@@ -15,6 +15,7 @@ from rich.progress import Progress, TaskID
 from app.commands import files
 from app.commands.display import Display
 from app.commands.failure import UsageError
+from app.identity import difference
 from app.words import gain_words
 from lensmodel import deconv, pipeline
 from lensmodel.audit import HELD, AuditReport
@@ -122,14 +123,16 @@ def _one(
     if target.exists() and not wishes.force:
         return {"state": "kept"}
     seen = files.identity(path)
-    if not seen:
+    why = difference(profile.lens, profile.cameras, seen)
+    if why is not None and not (wishes.any_lens or wishes.force):
+        raise InvalidInputError(f"{why}; use the profile of its own lens, or add --any-lens")
+    if why is not None:
+        display.note(f"{path}: {why}; it is corrected all the same, as you asked")
+    elif not seen.names_lens:
         display.note(f"{path} does not name its lens; it is taken for a photo of the profile's lens")
     needs_help = not files.says_aperture(path)
     if needs_help and settings.aperture is None:
         display.note(f"{path} does not say its aperture; all apertures of the profile are taken together")
-    if not wishes.any_lens:
-        remedy = "use the profile of its own lens, or add --any-lens"
-        files.refuse_other_lens(profile.lens, seen, remedy)
     corrected = pipeline.correct(
         path,
         profile.model,

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Final
 
 from app.commands.failure import UsageError
-from app.identity import name_key, serial_key
+from app.identity import Identity
 from lensmodel.errors import InvalidInputError
 from lensmodel.photo import inspect
-from lensmodel.regression import LensProfile, load_profile
+from lensmodel.regression import Camera, LensProfile, load_profile
 
 RAW: Final = frozenset(
     [
@@ -111,33 +111,18 @@ def profile_at(path: Path) -> LensProfile:
     return load_profile(path)
 
 
-def identity(path: Path) -> dict[str, str]:
-    """Return what a photo says of its lens: maker, model, serial, as far as it does."""
-    seen = inspect(path).metadata.lens
+def identity(path: Path) -> Identity:
+    """Return what a photo says of its lens and its camera."""
+    metadata = inspect(path).metadata
+    seen = metadata.lens
     named = {"maker": seen.maker, "model": seen.model, "serial": seen.serial}
-    return {name: value for name, value in named.items() if value}
+    camera = Camera(metadata.camera_maker, metadata.camera_model, metadata.body_serial)
+    return Identity({name: value for name, value in named.items() if value}, camera if camera.model else None)
 
 
 def says_aperture(path: Path) -> bool:
     """Tell whether a photo says its own aperture; what the command line says is then not needed."""
     return inspect(path).metadata.aperture is not None
-
-
-def refuse_other_lens(known: dict[str, str], seen: dict[str, str], remedy: str) -> None:
-    """Compare two lenses as far as both are named, by the rule of the service.
-
-    Raises
-    ------
-    InvalidInputError
-        If they differ.
-    """
-    for name, value in seen.items():
-        key = serial_key if name == "serial" else name_key
-        if key(known.get(name, value)) != key(value):
-            raise InvalidInputError(
-                f"it was taken with another lens, {name} {value}, "
-                f"and the profile is of {name} {known[name]}; {remedy}"
-            )
 
 
 def refuse_existing(*paths: Path | None, force: bool) -> None:

@@ -61,7 +61,7 @@ Profile = Annotated[Path, typer.Option("--profile", "-p", metavar="FILE", help="
 ProfileFile = Annotated[Path, typer.Argument(metavar="FILE", help="The lens profile.")]
 Aperture = Annotated[float | None, aperture_option("f-number, where a photo does not say its own.")]
 AnyLens = Annotated[
-    bool, typer.Option("--any-lens", help="Also photos that name another lens than the profile.")
+    bool, typer.Option("--any-lens", help="Also photos that seem to be of another lens than the profile.")
 ]
 Estimator = Annotated[
     str, typer.Option(metavar="NAME", help=f"Blind estimator: {', '.join(blind.estimators)}.")

@@ -5,10 +5,8 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 from app.demo.measure import Sharpness, improved
-from app.words import gain_words
 from lensmodel.types import ZONES, Zone
 
 _JUDGED: tuple[Zone, ...] = ("center", "corner")
@@ -26,7 +24,7 @@ class Report:
     chart_before: dict[Zone, Sharpness] = field(default_factory=dict)
     chart_after: dict[Zone, Sharpness] = field(default_factory=dict)
     answers: list[tuple[float, float, int, float | None]] = field(default_factory=list)
-    real: dict[str, Any] = field(default_factory=dict)
+    refusal: str = ""
     estimator: str = "default"
     seconds: float = 0.0
 
@@ -90,24 +88,22 @@ class Report:
             lines.append(f"| {r:g} | {samples:.1f} | {photos} | {'' if error is None else f'{error:.2f}'} |")
         lines += [
             "",
-            "## A real photo",
+            "## A photo that shows too little",
             "",
-            f"One RAW file of a Canon EOS Kiss X4, {self.real.get('patches', 0)} patches. Its truth is "
-            "unknown: look at before-after-real.png. Expected gain by zone: "
-            + "; ".join(
-                f"{zone} {gain_words(values.get('expected_gain_db'))}" for zone, values in self._real_zones()
-            )
-            + ".",
+            "One RAW file of a Canon EOS Kiss X4: a chart of even patches before a background out of focus. "
+            f"{self._refused()}",
             "",
             f"The whole demo took {self.seconds:.0f} s.",
             "",
-            "Files: corrected.tif and corrected-real.tif (16 bit), before-after.png, before-after-real.png, "
-            "psf-field.png, calibration-history.svg and .json, report.json, service.log.",
+            "Files: corrected.tif (16 bit), before-after.png, psf-field.png, calibration-history.svg and "
+            ".json, report.json, service.log.",
         ]
         return lines
 
-    def _real_zones(self) -> list[tuple[str, dict[str, float]]]:
-        return list(self.real.get("zones", {}).items())
+    def _refused(self) -> str:
+        if not self.refusal:
+            return "The service learned from it."
+        return f"The service does not learn a lens from it: {self.refusal}"
 
 
 def _row(values: dict[Zone, float], digits: int) -> str:

@@ -24,9 +24,7 @@ WEIGHTS: Final[Mapping[str, float]] = {
     "compare": 3.0,
     "correct chart": 12.0,
     "correct": 13.0,
-    "learn from a real photo": 4.0,
-    "correct a real photo": 8.0,
-    "correct a real photo again": 8.0,
+    "refuse a real photo": 4.0,
 }
 """Seconds of each stage on a machine of two cores; only their ratios count once some are over."""
 

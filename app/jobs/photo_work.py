@@ -23,9 +23,12 @@ from app.jobs.workbench import SPARE_MB, JobFailedError, NotWantedError, Workben
 from app.store import LensName, NewPatch, NewSample
 from app.store.photos import settings_of, statistics_of
 from app.tables import PHOTO_RUNNING, PatchRow, PhotoRow
-from lensmodel.errors import InvalidInputError, InvalidKernelError
+from lensmodel import pipeline
+from lensmodel.errors import InvalidInputError, InvalidKernelError, NoUsablePatchesError
+from lensmodel.patches import Patch
 from lensmodel.psf import as_kernel
 from lensmodel.spectrum import PatchSpectrum
+from lensmodel.types import FieldPosition
 
 log = logging.getLogger(__name__)
 
@@ -206,12 +209,22 @@ class PhotoWork:
         rows = self._store.patches.all_of(photo.public_id, photo.epoch)
         tried = [row for row in rows if row.cell is not None]
         good = sum(row.state == "done" for row in tried)
+        self._require_spread([row for row in tried if row.state == "done"])
         if good >= self._bench.settings.min_good_patches:
             version = self._store.photos.finish(photo.public_id, photo.epoch)
             if version is not None:
                 log.info("photo %s counted, lens version %d", photo.public_id, version)
             return
         raise JobFailedError(*_why_not(tried, good))
+
+    def _require_spread(self, done: list[PatchRow]) -> None:
+        """Refuse a photo whose patches, as far as they gave a PSF, tell of one place only."""
+        if not done:
+            return
+        try:
+            pipeline.require_spread([_place(row) for row in done], count=self._bench.settings.patches)
+        except NoUsablePatchesError as error:
+            raise JobFailedError(error.code, str(error)) from error
 
     def cell(self, photo_id: str, epoch: int, cell: int) -> None:
         """Estimate the PSF of one field cell of a photo."""
@@ -347,6 +360,10 @@ def _patch(row: PatchRow) -> dict[str, Any]:
         "score": score,
         "cell": row.cell,
     }
+
+
+def _place(row: PatchRow) -> Patch:
+    return Patch(row.row, row.col, row.size, FieldPosition(row.r, row.phi), row.score or 0.0, row.cell or 0)
 
 
 def _why_not(tried: list[PatchRow], good: int) -> tuple[str, str]:

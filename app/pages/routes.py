@@ -28,6 +28,7 @@ from app.store.corrections import CorrectionPlan
 from app.store.corrections import folder_of as folder_of_correction
 from app.store.photos import folder_of
 from lensmodel.errors import LensModelError
+from lensmodel.types import FieldPosition
 
 HERE: Final = Path(__file__).parent
 SHOWN: Final = 60
@@ -130,6 +131,7 @@ def lens_page(lens_id: str, call: CallDep) -> HTMLResponse:
     before = max(lens.version - SHOWN_VERSIONS, 0)  # the newest are shown
     history = lens_routes.list_calibrations(lens_id, call, limit=SHOWN_VERSIONS, cursor=before).items
     photos, more = _photos(call, lens_id)
+    seen = _seen(call, photos)
     newest = next((event.coverage for event in reversed(history) if event.coverage), None)
     return _page(
         "lens.html",
@@ -137,7 +139,8 @@ def lens_page(lens_id: str, call: CallDep) -> HTMLResponse:
         counting=_counting(call, lens_id),
         history=history,
         coverage=words.coverage_bars(newest),
-        spots=_spots(call, photos),
+        seen=seen,
+        spots=_spots(seen),
         photos=photos,
         more=more,
     )
@@ -157,11 +160,16 @@ def _counting(call: Call, lens_id: str) -> bool:
     return lens.sample_count > 0 and any(event.metrics is None for event in newest)
 
 
-def _spots(call: Call, photos: list[PhotoOut]) -> list[tuple[float, float]]:
-    """Return where the patches of photos lie in a field of 3:2 from (-1.5, -1) to (1.5, 1), y downwards."""
+def _spots(seen: list[FieldPosition]) -> list[tuple[float, float]]:
+    """Return where places lie in a field of 3:2 from (-1.5, -1) to (1.5, 1), y downwards."""
     corner = math.hypot(1.5, 1.0)
+    return [(corner * p.r * math.cos(p.phi), -corner * p.r * math.sin(p.phi)) for p in seen]
+
+
+def _seen(call: Call, photos: list[PhotoOut]) -> list[FieldPosition]:
+    """Return where patches of counted photos gave a PSF."""
     return [
-        (corner * patch.r * math.cos(patch.phi), -corner * patch.r * math.sin(patch.phi))
+        FieldPosition(patch.r, patch.phi)
         for photo in photos
         if photo.state == "counted"
         for patch in call.store.patches.all_of(photo.id)

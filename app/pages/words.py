@@ -9,6 +9,8 @@ from typing import Any, Final
 from app.schemas import CalibrationOut, CorrectionOut, LensOut, PatchOut, PhotoOut, Problem
 from app.words import gain_words
 from lensmodel.audit import HELD
+from lensmodel.report import little_seen, place_in_words
+from lensmodel.types import FieldPosition
 
 PHOTO_STATES: Final[Mapping[str, str]] = {
     "received": "Waiting its turn",
@@ -32,6 +34,7 @@ FAILURES: Final[Mapping[str, str]] = {
 }
 ZONES: Final[Mapping[str, str]] = {"center": "Center", "mid": "Middle", "corner": "Corners"}
 ENOUGH_PLACES: Final = 20
+SHOWN_PLACES: Final = 3
 FULL_STOPS: Final = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0, 22.0)
 STOP: Final = 1.45
 """One stop as a factor of the f-number, with room for their rounding."""
@@ -208,11 +211,20 @@ def coverage_bars(coverage: Mapping[str, Any] | None) -> list[ZoneBar]:
     return [ZoneBar(zone, ZONES[zone], round(100 * count / most), count) for zone, count in counts.items()]
 
 
-def coverage_advice(bars: Sequence[ZoneBar]) -> str:
-    """Say which photo would teach most."""
+def coverage_advice(bars: Sequence[ZoneBar], seen: Sequence[FieldPosition]) -> str:
+    """Say which photo would teach most.
+
+    Parameters
+    ----------
+    bars : sequence of ZoneBar
+        How many places were seen in each zone.
+    seen : sequence of FieldPosition
+        Those places: a zone with many may still have a corner with none.
+    """
     if not bars:
         return "Not counted yet."
     few = [bar.words.lower() for bar in bars if bar.count < ENOUGH_PLACES]
+    few = few or [place_in_words(place) for place in little_seen(seen)[:SHOWN_PLACES]]
     if not few:
         return "Every part of the picture has been seen well."
     return f"Little seen yet of: {', '.join(few)}. A photo with fine detail there, in focus, helps most."

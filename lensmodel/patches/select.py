@@ -36,11 +36,14 @@ PERIOD_LIMIT: Final = 0.8
 BLOCKINESS_LIMIT: Final = 1.8
 JPEG_WEIGHT: Final = 0.3
 """JPEG files were sharpened and gamma-coded: their patches count for less."""
+EVIDENCE_FLOOR: Final = 0.25
+"""Bits a frequency between 0.1 and 0.4 cycles/pixel that a patch needs: signal as strong as the noise over a
+quarter of them, or 1.4 times as strong over the lowest fifth, which is all that a soft corner leaves."""
 SHORTLIST_A_SECTOR: Final = 8
 FOCUS_SOFTNESS: Final = 0.33
 
 _ADVICE: Final[dict[str, str]] = {
-    "flat": "take a scene with more fine detail",
+    "flat": "take a scene with more fine detail, at a lower ISO",
     "dark": "expose longer",
     "clipped": "expose shorter",
     "one-directional": "take a scene with edges in all directions",
@@ -101,6 +104,7 @@ def select(
     size: int = 192,
     selector: str | Selector = "r-map",
     jpeg: bool = False,
+    coarse_noise: NoiseModel | None = None,
     on_step: StepHook = ignore_step,
 ) -> Selection:
     """Choose patches that tell about the PSF, spread over the field.
@@ -124,6 +128,9 @@ def select(
         Name in `selectors`, or an object of one's own.
     jpeg : bool
         Whether the photo was a JPEG file; scores are then scaled by 0.3.
+    coarse_noise : NoiseModel, optional
+        Noise power of that plane between 0.1 and 0.4 cycles/pixel, where it is more than `noise`, as
+        that of demosaiced and denoised pixels is. A patch must stand above it.
     on_step : StepHook
         Progress.
 
@@ -159,7 +166,7 @@ def select(
     chosen: list[tuple[int, int]] = []
     score = np.zeros(len(windows))
     if short.size:
-        looked = details.joined([_look(plane, windows, int(i), clip) for i in short])
+        looked = details.joined([_look(plane, windows, int(i), clip, coarse_noise) for i in short])
         reasons[short] = second_reasons(looked)
         fine = reasons[short] == ""
         left = short[fine]
@@ -211,6 +218,7 @@ def second_reasons(looked: Details) -> NDArray[np.str_]:
     """Reason of each window from its own pixels; empty where none holds."""
     tests: list[tuple[Reason, NDArray[np.bool_]]] = [
         ("clipped", looked.blob > BLOB_LIMIT),
+        ("flat", looked.evidence < EVIDENCE_FLOOR),
         ("periodic", looked.period > PERIOD_LIMIT),
         ("jpeg-blocks", looked.blockiness > BLOCKINESS_LIMIT),
         ("one-directional", looked.information[:, 0].min(axis=1) < SECTOR_INFORMATION),
@@ -224,10 +232,12 @@ def _focus_weight(excess: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.exp(-np.square(over / FOCUS_SOFTNESS))
 
 
-def _look(plane: Plane, windows: Windows, i: int, clip: float) -> Details:
+def _look(plane: Plane, windows: Windows, i: int, clip: float, coarse: NoiseModel | None) -> Details:
     row, col, size = int(windows.rows[i]), int(windows.cols[i]), windows.size
     patch = np.array(plane[row : row + size, col : col + size])
-    return details.look_at(patch, float(windows.sigma[i]), clip, (row, col))
+    level = float(windows.level[i])
+    coarse_sigma = None if coarse is None else float(np.sqrt(coarse.variance(np.array(level))))
+    return details.look_at(patch, float(windows.sigma[i]), clip, (row, col), coarse_sigma)
 
 
 def _patch(windows: Windows, i: int, score: float, cell: int) -> Patch:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -16,6 +17,7 @@ from lensmodel.patches.blocks import (
     WIDTH_STEP_PX,
     Blocks,
 )
+from lensmodel.patches.details import SLOPE_ORDER
 from lensmodel.patches.rmap import FLAT_WINDOW, R_BINS, automatic_threshold, gradient_noise
 from lensmodel.types import NoiseModel
 
@@ -46,7 +48,7 @@ class Windows:
     eigenvalues : ndarray of float64, shape (n, 2)
         Of the structure tensor, smaller first, over that of noise.
     contrast : ndarray of float64, shape (n,)
-        Variance of the signal over variance of the noise.
+        Variance of the signal over variance of the noise; a slope, as of a sky, is no signal.
     level, sigma : ndarray of float64, shape (n,)
         Mean level and the noise's standard deviation there.
     clipped, dark, missing : ndarray of float64, shape (n,)
@@ -93,7 +95,7 @@ def windows_of(blocks: Blocks, frame: Frame, noise: NoiseModel) -> Windows:
     size = blocks.side * BLOCKS_A_SIDE
     area = size * size
     level = _window_sum(blocks.level) / area
-    variance = _window_sum(blocks.square) / area - level**2
+    variance = _window_sum(blocks.square) / area - level**2 - _slope_variance(blocks)
     noise_variance = np.maximum(noise.variance(level), 1e-12)
     gradient_power = noise_variance * gradient_noise(1.0) ** 2
     energy = _window_sum(blocks.energy)
@@ -134,6 +136,31 @@ def _window_sum(values: NDArray[np.generic]) -> NDArray[np.float64]:
         view = np.lib.stride_tricks.sliding_window_view(out, BLOCKS_A_SIDE, axis=axis)
         out = view.sum(axis=-1)
     return out.reshape(-1, *out.shape[2:])
+
+
+def _slope_variance(blocks: Blocks) -> NDArray[np.float64]:
+    """Variance of the polynomial of order `SLOPE_ORDER` that fits the means of a window's blocks.
+
+    With M the polynomials without the constant averaged over blocks, G their covariance over the pixels and
+    m the 16 means, c = M^+ m and the variance is c' G c.
+    """
+    averaged, covariance = _slopes(blocks.side)
+    means = np.asarray(blocks.level, dtype=np.float64) / blocks.side**2
+    view = np.lib.stride_tricks.sliding_window_view(means, (BLOCKS_A_SIDE, BLOCKS_A_SIDE))
+    fit = view.reshape(-1, BLOCKS_A_SIDE**2) @ np.linalg.pinv(averaged).T
+    return np.asarray(np.einsum("ni,ij,nj->n", fit, covariance, fit))
+
+
+@lru_cache(maxsize=4)
+def _slopes(side: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    size = side * BLOCKS_A_SIDE
+    t = np.linspace(-1.0, 1.0, size)
+    orders = range(SLOPE_ORDER + 1)
+    parts = [np.outer(t**i, t**j) for i in orders for j in orders if 0 < i + j <= SLOPE_ORDER]
+    basis = np.stack([part - part.mean() for part in parts])
+    averaged = basis.reshape(-1, BLOCKS_A_SIDE, side, BLOCKS_A_SIDE, side).mean(axis=(2, 4))
+    flat = basis.reshape(len(parts), -1)
+    return averaged.reshape(len(parts), -1).T, flat @ flat.T / size**2
 
 
 def _corners(blocks: Blocks) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -14,7 +14,7 @@ from lensmodel.photo.containers import opened_header
 from lensmodel.photo.header import Header
 from lensmodel.photo.inspection import info_of
 from lensmodel.photo.metadata import baseline_exposure_of
-from lensmodel.photo.model import Encoding, Limits, LinearPhoto, PhotoInfo, Transfer
+from lensmodel.photo.model import Encoding, Limits, LinearPhoto, PhotoInfo, PlaneNoise, Transfer
 from lensmodel.photo.noise import coding_noise, estimate_noise, graininess
 from lensmodel.photo.raster import Pixels, read_pixels
 from lensmodel.photo.raw import Demosaic, develop_raw
@@ -76,6 +76,7 @@ def _develop_raw(path: Path, info: PhotoInfo, demosaic: Demosaic, baseline: floa
         white_balance=raw.white_balance,
         sensor_noise=raw.sensor_noise,
         cfa=raw.cfa,
+        grain=(1.0, 1.0, 1.0) if raw.sensor_noise is not None else _grain(raw.planes, raw.noise, raw.clip),
     )
 
 
@@ -94,7 +95,6 @@ def _develop_raster(path: Path, header: Header, info: PhotoInfo) -> LinearPhoto:
     clip = max(1.0, float(planes.max())) if pixels.dtype.kind == "f" else 1.0
     step = float(curve[code] - curve[0])
     noise = [estimate_noise(plane, clip, step, codes) for plane in planes]
-    grain = [graininess(plane, model, clip) for plane, model in zip(planes, noise, strict=True)]
     return LinearPhoto(
         planes=planes,
         frame=Frame(height, width),
@@ -108,9 +108,14 @@ def _develop_raster(path: Path, header: Header, info: PhotoInfo) -> LinearPhoto:
             metadata=info.metadata.without_serials(),
         ),
         pipeline=f"{info.kind}/{transfer}/1",
-        grain=(grain[0], grain[1], grain[2]),
+        grain=_grain(planes, (noise[0], noise[1], noise[2]), (clip,) * 3),
         coding_noise=coding_noise(header.coarseness, curve[::257]) if header.coarseness else None,
     )
+
+
+def _grain(planes: Planes, noise: PlaneNoise, clip: tuple[float, float, float]) -> tuple[float, float, float]:
+    r, g, b = (graininess(*of_plane) for of_plane in zip(planes, noise, clip, strict=True))
+    return r, g, b
 
 
 def _transfer_of(header: Header, pixels: Pixels) -> tuple[Transfer, bytes | None]:

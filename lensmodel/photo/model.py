@@ -25,6 +25,10 @@ _USUAL_GRAIN, _COARSEST = 14.0, 4.0
 
 Demosaicing leaves 6 to 9; texture in places that are none too flat looks coarse as well.
 """
+_DEMOSAICED: Final = (3.7, 1.9, 3.7)
+"""Noise power of demosaiced planes at low frequencies over that of the sensor: see `raw._NOISE_MIX`."""
+_COARSEST_POWER: Final = 64.0
+"""Largest `noise.graininess` that is believed: cameras that denoise reach about 60, texture far more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,6 +217,25 @@ class LinearPhoto:
     coding_noise: NoiseModel | None = None
     cfa: BayerPattern | None = None
     grain: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+    @property
+    def coarse_noise(self) -> PlaneNoise:
+        """Noise power of each plane at 0.1 to 0.4 cycles/pixel, above which detail tells of the lens.
+
+        Flat places of a photo that was denoised show little noise from pixel to pixel and all of it in
+        coarser grain; what compression adds is seen only where there is detail.
+        """
+        if self.sensor_noise is not None:
+            factors, base = _DEMOSAICED, self.sensor_noise
+        else:
+            red, green, blue = (min(max(grain, 1.0), _COARSEST_POWER) for grain in self.grain)
+            factors, base = (red, green, blue), self.noise
+        coded = self.coding_noise or NoiseModel(0.0, 0.0)
+        r, g, b = (
+            NoiseModel(max(factor * n.shot, coded.shot), max(factor * n.read, coded.read))
+            for n, factor in zip(base, factors, strict=True)
+        )
+        return r, g, b
 
     @property
     def correction_noise(self) -> PlaneNoise:

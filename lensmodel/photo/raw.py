@@ -11,6 +11,7 @@ from typing import Final, Literal
 
 import numpy as np
 import rawpy
+from numpy.typing import NDArray
 
 from lensmodel.errors import (
     InvalidInputError,
@@ -24,7 +25,7 @@ from lensmodel.photo.model import Matrix3, PlaneNoise
 from lensmodel.photo.mosaic import Mosaic
 from lensmodel.photo.noise import estimate_noise
 from lensmodel.photo.rendition import balance_of_rendition
-from lensmodel.types import BayerPattern, NoiseModel, Planes
+from lensmodel.types import BayerPattern, NoiseModel, Plane, Planes
 
 log = logging.getLogger(__name__)
 
@@ -51,6 +52,9 @@ method, its power at low frequencies is about 3.7 times that of the sensor in re
 """
 
 _FULL: Final = 65535.0
+
+_FEW_CODES: Final = 1024
+"""Levels of a plane that make rounding the larger part of its noise; sensors count 4096 and more."""
 
 _LEAST_SHARE: Final = 0.25
 """No channel is balanced by more than this relative to the strongest: it costs two of 16 bits."""
@@ -217,7 +221,7 @@ def _plane_noise(
         shot_c = sum_s M_cs shot_s  w_s / w_c      (where the scene is grey)
     """
     if sensor is None:
-        r, g, b = (estimate_noise(plane, step=1 / _FULL) for plane in planes)
+        r, g, b = (estimate_noise(plane, step=1 / _FULL, codes=_codes(plane)) for plane in planes)
         return r, g, b
     weight = np.asarray(balance)[None, :] / np.asarray(balance)[:, None]
     mix = _NOISE_MIX[method]
@@ -225,6 +229,12 @@ def _plane_noise(
     read = (mix * weight**2) @ np.array([model.read for model in sensor])
     r, g, b = (NoiseModel(float(a), float(c)) for a, c in zip(shot, read, strict=True))
     return r, g, b
+
+
+def _codes(plane: Plane) -> NDArray[np.floating] | None:
+    """Levels of a plane where they are as few as in files that were rounded to 8 bits and packed."""
+    levels = np.unique(plane[:: max(1, plane.shape[0] // 256)])
+    return levels if 2 < levels.size <= _FEW_CODES else None
 
 
 def _white_balance(raw: rawpy.RawPy, mosaic: Mosaic | None) -> tuple[float, float, float]:

@@ -4,7 +4,7 @@ from lensmodel.regression.answer import ModelSettings, PsfAnswer
 from lensmodel.regression.doubt import Doubt
 from lensmodel.regression.exact import PaperModel, all_pairs, factorised
 from lensmodel.regression.model import LensModel, ModelField, Prior
-from lensmodel.regression.profile import LensProfile, load_profile, save_profile
+from lensmodel.regression.profile import Camera, LensProfile, load_profile, save_profile
 from lensmodel.regression.robust import Flag
 from lensmodel.regression.smoothers import Neighbours, Smoother, smoothers
 from lensmodel.regression.wavefront import Wavefront
@@ -12,6 +12,7 @@ from lensmodel.regression.wavefront_fit import fit_wavefront
 from lensmodel.regression.witness import Witness, WitnessedField
 
 __all__ = [
+    "Camera",
     "Doubt",
     "Flag",
     "LensModel",

@@ -2,7 +2,7 @@
 
 Layout of a `.lensprofile`, format 1::
 
-    profile.json    format, lens, provenance, settings of the model, one entry for each sample
+    profile.json    format, lens, cameras, provenance, settings of the model, one entry for each sample
     kernels.npy     (n, k, k) float32, sum 1, centred, in the order of the entries
     spectra.npy     optional: what each patch says without a kernel, see `PatchSpectrum`
     evidence/N.npz  optional: the normal equations of sample N, see `PatchEvidence`
@@ -61,6 +61,15 @@ _UNREADABLE = (
 )
 
 
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A body that photos of a lens were taken with, as far as they say; the lens may be part of it."""
+
+    maker: str | None = None
+    model: str | None = None
+    serial: str | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class LensProfile:
     """A model with what is known of its lens and of the photos that it came from.
@@ -72,11 +81,14 @@ class LensProfile:
         Texts: maker, model, serial, label; whatever is known.
     photos : dict
         File name of each photo by the id that samples carry.
+    cameras : tuple of Camera
+        What these were taken with, each once; empty where no photo says, and in older profiles.
     """
 
     model: LensModel
     lens: dict[str, str] = field(default_factory=dict)
     photos: dict[str, str] = field(default_factory=dict)
+    cameras: tuple[Camera, ...] = ()
 
 
 def save_profile(path: Path | str, profile: LensProfile) -> None:
@@ -98,6 +110,7 @@ def _write(file: IO[bytes], profile: LensProfile) -> None:
         "units": {"r": "half-diagonal", "phi": "radian, counter-clockwise from the right", "kernel": "pixel"},
         "lens": profile.lens,
         "photos": profile.photos,
+        "cameras": [_named(asdict(camera)) for camera in profile.cameras],
         "model": asdict(profile.model.settings),
         "samples": [_entry(sample) for sample in samples],
     }
@@ -183,7 +196,8 @@ def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> 
             other = _read(io.BytesIO(family), f"the family in {name}", alone=True)
             told = document["family"]
             model = model.with_prior(other.model, float(told["strength"]), str(told["name"])[:200])
-        return LensProfile(model, _texts(document["lens"]), _texts(document["photos"]))
+        cameras = tuple(_camera(_texts(camera)) for camera in document.get("cameras", []))
+        return LensProfile(model, _texts(document["lens"]), _texts(document["photos"]), cameras)
     except LensModelError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
@@ -273,6 +287,14 @@ def _model(samples: list[PsfSample], settings: ModelSettings, learned: bytes | N
 def _settings(values: dict[str, Any]) -> ModelSettings:
     # written until 0.2; it changed how finely kernels were kept, and no answer
     return ModelSettings(**{key: value for key, value in values.items() if key != "oversampling"})
+
+
+def _named(values: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in values.items() if value is not None}
+
+
+def _camera(texts: dict[str, str]) -> Camera:
+    return Camera(texts.get("maker"), texts.get("model"), texts.get("serial"))
 
 
 def _texts(values: dict[str, Any]) -> dict[str, str]:

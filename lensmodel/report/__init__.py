@@ -13,7 +13,7 @@ from lensmodel.report.lens_report import (
     lens_report,
 )
 from lensmodel.report.pictures import apertures_svg, curves_svg, mtf_map_svg
-from lensmodel.report.places import direction_in_words, place_in_words
+from lensmodel.report.places import direction_in_words, little_seen, place_in_words
 
 __all__ = [
     "Advice",
@@ -37,6 +37,7 @@ __all__ = [
     "exporters",
     "format_of",
     "lens_report",
+    "little_seen",
     "mtf_map_svg",
     "place_in_words",
     "psf_grid",

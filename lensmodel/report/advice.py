@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from lensmodel.regression import LensModel, PsfAnswer
-from lensmodel.report.places import DEFAULT_ASPECT, half_sides, place_in_words
+from lensmodel.report.places import landmarks, little_seen, place_in_words
 from lensmodel.types import CHANNELS, Channel, FieldPosition, LensSettings
 
 _SIZE: Final = 15  # the kernel itself plays no part
@@ -79,7 +79,8 @@ class Advice:
     wishes : tuple of Wish
         At most three, the most helpful first; different places or apertures.
     enough : bool
-        True where no single photo would help much any more.
+        True where no single photo would help much any more, and every part of the picture has patches
+        near it (`places.little_seen`).
     """
 
     text: str
@@ -107,7 +108,7 @@ def advice(model: LensModel, settings: LensSettings | None = None) -> Advice:
         _wish(model, place, each.with_channel(channel))
         for each in wanted
         for channel in CHANNELS
-        for place in _places()
+        for place in landmarks()
     ]
     # green before red and blue, near before far, right before left: ties must not depend on anything else
     found.sort(
@@ -125,8 +126,13 @@ def advice(model: LensModel, settings: LensSettings | None = None) -> Advice:
         known = {(w.position, w.settings.aperture) for w in best}
         if len(best) < 3 and (wish.position, wish.settings.aperture) not in known:
             best.append(wish)
-    enough = best[0].gain < _SATISFIED
-    if enough:
+    satisfied = best[0].gain < _SATISFIED
+    dark = little_seen(_seen(model)) if satisfied else []
+    enough = satisfied and not dark
+    if dark:
+        first = next(w for w in found if w.position == dark[0])
+        text = f"What would help most is a photo of {first.text}: little fine detail was seen there yet."
+    elif enough:
         text = (
             f"The photos cover the picture well; another one changes little. If you add one: {best[0].text}."
         )
@@ -135,18 +141,10 @@ def advice(model: LensModel, settings: LensSettings | None = None) -> Advice:
     return Advice(text, tuple(best), enough)
 
 
-def _places() -> list[FieldPosition]:
-    """The centre, the four corners, the four edges and the four quarters between."""
-    width, height = half_sides(DEFAULT_ASPECT)
-    corner = math.atan2(height, width)
-    diagonals = (corner, math.pi - corner, corner - math.pi, -corner)
-    return [
-        FieldPosition(0.0, 0.0),
-        *(FieldPosition(0.9, phi) for phi in diagonals),
-        *(FieldPosition(0.5, phi) for phi in diagonals),
-        *(FieldPosition(0.8 * width, phi) for phi in (0.0, math.pi)),
-        *(FieldPosition(0.8 * height, phi) for phi in (math.pi / 2, -math.pi / 2)),
-    ]
+def _seen(model: LensModel) -> list[FieldPosition]:
+    """Where patches of photos that vote gave a PSF."""
+    voting = (s for s in model.samples if s.photo not in model.settings.excluded)
+    return [s.position for s in voting if s.settings.channel == "g"]
 
 
 def _settings(model: LensModel) -> list[LensSettings]:

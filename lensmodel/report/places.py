@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Final
+
+import numpy as np
 
 from lensmodel.errors import InvalidInputError
 from lensmodel.geometry import CENTER_ZONE_R, CORNER_ZONE_R
@@ -11,6 +14,13 @@ from lensmodel.types import FieldPosition
 
 DEFAULT_ASPECT: Final = 1.5
 """Width over height of a 35 mm frame; a profile does not say how wide its photos were."""
+
+NEAR_R: Final = 0.3
+"""Distance in half diagonals within which a patch speaks for a place: no spot of the picture is further from
+all `landmarks`, and blur changes little over it."""
+
+ENOUGH_NEAR: Final = 5
+"""Patches near a place that has been seen well: a mean of five is known twice as well as one of them."""
 
 _DIRECTIONS: Final = (
     *("right", "upper right", "top", "upper left"),
@@ -100,3 +110,35 @@ def ring(r: float, count: int, aspect: float) -> tuple[FieldPosition, ...]:
     quarter = [low + (high - low) * (k + 0.5) / count for k in range(count)]
     angles = [s * (a if side > 0 else math.pi - a) for s in (1, -1) for side in (1, -1) for a in quarter]
     return tuple(FieldPosition(r, a) for a in angles)
+
+
+def landmarks() -> list[FieldPosition]:
+    """The centre, the four corners, the four quarters between, and the middles of the four edges."""
+    width, height = half_sides(DEFAULT_ASPECT)
+    corner = math.atan2(height, width)
+    diagonals = (corner, math.pi - corner, corner - math.pi, -corner)
+    return [
+        FieldPosition(0.0, 0.0),
+        *(FieldPosition(0.9, phi) for phi in diagonals),
+        *(FieldPosition(0.5, phi) for phi in diagonals),
+        *(FieldPosition(0.8 * width, phi) for phi in (0.0, math.pi)),
+        *(FieldPosition(0.8 * height, phi) for phi in (math.pi / 2, -math.pi / 2)),
+    ]
+
+
+def little_seen(positions: Iterable[FieldPosition], least: int = ENOUGH_NEAR) -> list[FieldPosition]:
+    """Landmarks with too little evidence near them, the emptiest first.
+
+    Parameters
+    ----------
+    positions : iterable of FieldPosition
+        Where patches gave a PSF.
+    least : int
+        Patches within `NEAR_R` that are enough.
+    """
+    seen = np.array([(p.r * math.cos(p.phi), p.r * math.sin(p.phi)) for p in positions]).reshape(-1, 2)
+    counts = []
+    for place in landmarks():
+        offset = seen - (place.r * math.cos(place.phi), place.r * math.sin(place.phi))
+        counts.append((int((np.hypot(*offset.T) <= NEAR_R).sum()), place))
+    return [place for count, place in sorted(counts, key=lambda item: item[0]) if count < least]

@@ -125,6 +125,7 @@ def settings(tmp_path: Path) -> Settings:
         long_poll_seconds=2.0,
         min_free_mb=0,
         max_upload_mb=1,
+        patches=3,  # of so few one is enough: the made-up photos of these tests have two
     )
 
 

@@ -37,8 +37,15 @@ def develop(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
 
 def select(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
     patches = [
-        {"row": 0, "col": k, "size": 8, "position": {"r": k / CELLS, "phi": 1.0}, "score": 1.0, "cell": k}
-        for k in range(CELLS)
+        {
+            "row": 0,
+            "col": 8 * k,
+            "size": 8,
+            "position": {"r": k / CELLS, "phi": turn},
+            "score": 1.0,
+            "cell": k,
+        }
+        for k, turn in enumerate(np.linspace(-3.0, 3.0, CELLS).tolist())
     ]
     return {"patches": patches, "rejected": [], "lateral": None}
 

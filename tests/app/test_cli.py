@@ -27,8 +27,6 @@ from scipy import ndimage
 from typer.testing import CliRunner
 
 from app.cli import app, main
-from app.commands.files import refuse_other_lens
-from lensmodel.errors import InvalidInputError
 from lensmodel.psf import PsfSample, gaussian
 from lensmodel.regression import LensModel, LensProfile, load_profile, save_profile
 from lensmodel.types import FieldPosition, LensSettings
@@ -272,12 +270,17 @@ def test_a_photo_that_does_not_count_leaves_no_trace(folder: Path, here: Here) -
     assert not (folder / "no").exists()
 
 
-def test_a_lens_is_known_however_a_program_writes_its_name() -> None:
-    known = {"maker": "Canon", "model": "EF24mm f/1.4L II USM", "serial": "ab-1"}
-    refuse_other_lens(known, {"maker": "CANON", "model": "EF 24mm F1.4L II USM", "serial": "AB-1 "}, "")
+@pytest.mark.parametrize("consent", ["--any-lens", "--force"])
+@pytest.mark.slow
+def test_a_photo_of_another_lens_is_corrected_on_demand_and_said_to_be_one(
+    folder: Path, here: Here, made: Path, consent: str
+) -> None:
+    shutil.copy(made / "other.dng", folder)
+    done = here("correct", "other.dng", "-p", PROFILE, "-o", "out", consent, "--method", "wiener")
 
-    with pytest.raises(InvalidInputError, match="serial AB1"):
-        refuse_other_lens(known, {"serial": "AB1"}, "")
+    assert done.returncode == 0, done.stderr
+    assert "another lens, serial L-43" in done.stderr
+    assert (folder / "out/other-corrected.tif").exists()
 
 
 # --- refusals ----------------------------------------------------------------------------------

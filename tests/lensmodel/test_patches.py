@@ -12,8 +12,12 @@ from scipy import ndimage
 
 from lensmodel.errors import InvalidInputError, NoUsablePatchesError, UnknownMethodError
 from lensmodel.geometry import Frame
-from lensmodel.patches import REASONS, Patch, Selection, blocks, r_map, select, selectors
-from lensmodel.types import NoiseModel, Plane, ignore_step
+from lensmodel.patches import REASONS, Patch, Selection, blocks, r_map, require_enough, select, selectors
+from lensmodel.patches.details import look_at
+from lensmodel.patches.enough import part_of
+from lensmodel.patches.select import EVIDENCE_FLOOR
+from lensmodel.patches.windows import windows_of
+from lensmodel.types import FieldPosition, NoiseModel, Plane, ignore_step
 
 NOISE = NoiseModel.white(0.003)
 
@@ -348,3 +352,109 @@ def test_every_selector_scores_within_zero_and_one(photo: Plane) -> None:
         patches = select(photo, NOISE, Frame(*photo.shape), count=12, selector=name).patches
         assert len(patches) == 12
         assert all(0.0 <= p.score <= 1.0 for p in patches)
+
+
+# ---- evidence
+
+
+def vignetted_sky(height: int, width: int, sigma: float, grain_px: float = 0.0) -> Plane:
+    """Bright sky that falls off towards the corners, with noise; coarse where a camera denoised it."""
+    y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
+    noise = np.random.default_rng(3).normal(0.0, 1.0, (height, width))
+    if grain_px:
+        noise = ndimage.gaussian_filter(noise, grain_px)
+    return (0.6 * (1.0 - 0.3 * (x * x + y * y)) + 0.05 * y + sigma * noise / noise.std()).astype(np.float32)
+
+
+def test_a_slope_is_no_contrast() -> None:
+    sky = vignetted_sky(512, 768, 0.003)
+    found = windows_of(blocks.measure_blocks(sky, NOISE, 48, 1.0, ignore_step), Frame(512, 768), NOISE)
+
+    assert np.square(sky.std() / 0.003) > 100.0
+    assert found.contrast.max() < 4.0
+
+
+def test_detail_counts_the_same_on_a_slope(photo: Plane) -> None:
+    slope = np.linspace(0.0, 0.2, photo.shape[1], dtype=np.float32)
+    plain, sloping = (
+        windows_of(blocks.measure_blocks(plane, NOISE, 48, 2.0, ignore_step), Frame(*plane.shape), NOISE)
+        for plane in (photo, photo + slope)
+    )
+
+    np.testing.assert_allclose(sloping.contrast, plain.contrast, rtol=0.15)
+
+
+@pytest.mark.parametrize("sigma", [0.002, 0.01])
+def test_noise_is_no_evidence_and_a_slope_none_either(sigma: float) -> None:
+    sky = vignetted_sky(192, 192, sigma)
+
+    assert look_at(sky, sigma, 1.0, (0, 0)).evidence[0] < 0.05
+
+
+def test_evidence_is_the_capacity_of_white_signal() -> None:
+    rng = np.random.default_rng(0)
+    white = 0.001 + 0.04 * rng.normal(size=(192, 192))  # so dark that the gain of pixels plays no part
+
+    # P / N = 4: log2(1 + 3) bits at every frequency
+    assert look_at(white, 0.02, 1.0, (0, 0)).evidence[0] == pytest.approx(2.0, abs=0.05)
+
+
+def test_a_soft_corner_is_evidence_by_its_lowest_frequencies(scene: Plane) -> None:
+    soft = photo_of(scene, blur_px=2.5)[200:392, 200:392]
+
+    assert look_at(soft, 0.003, 1.0, (0, 0)).evidence[0] > 0.5
+
+
+def test_structure_below_the_uniformity_of_sensors_is_no_evidence(scene: Plane) -> None:
+    faint = 0.5 + 0.004 * (scene[:192, :192] - scene[:192, :192].mean())
+
+    assert look_at(faint, 1e-6, 1.0, (0, 0)).evidence[0] < EVIDENCE_FLOOR
+
+
+def test_patches_avoid_a_sky_whose_noise_the_camera_smoothed(scene: Plane) -> None:
+    plane = photo_of(scene)
+    plane[:500] = vignetted_sky(500, 1500, 0.004, grain_px=2.0)
+    single = NoiseModel.white(0.0006)  # from pixel to pixel it is as low as that
+    coarse = NoiseModel.white(0.02)
+
+    careless = select(plane, single, Frame(*plane.shape), count=36)
+    careful = select(plane, single, Frame(*plane.shape), count=36, coarse_noise=coarse)
+
+    assert any(patch.row + patch.size < 480 for patch in careless.patches)
+    assert all(patch.row + patch.size > 480 for patch in careful.patches)
+
+
+def placed(*places: tuple[int, int], size: int = 100) -> list[Patch]:
+    frame = Frame(1000, 1500)
+    return [
+        Patch(row, col, size, frame.position(row + size / 2, col + size / 2), 0.5, k)
+        for k, (row, col) in enumerate(places)
+    ]
+
+
+def test_six_patches_apart_in_three_parts_are_enough() -> None:
+    require_enough(placed((450, 700), (450, 800), (100, 100), (100, 300), (800, 1300), (700, 1200)))
+
+
+def test_patches_that_share_pixels_count_once() -> None:
+    shifted = placed(*((450 + 50 * (k % 2), 200 + 50 * k) for k in range(10)))
+
+    with pytest.raises(NoUsablePatchesError, match="counts from 6 on"):
+        require_enough(shifted)
+
+
+def test_patches_of_one_quarter_are_not_spread() -> None:
+    with pytest.raises(NoUsablePatchesError, match="only 1 of 9 parts"):
+        require_enough(placed(*((120 + 110 * i, 220 + 110 * j) for i in range(2) for j in range(3))))
+
+
+def test_every_part_of_the_picture_has_a_number_of_its_own() -> None:
+    turn = math.pi / 2
+    places = [
+        FieldPosition(0.1, 1.0),
+        *(FieldPosition(r, 0.5 + k * turn) for r in (0.5, 0.9) for k in range(4)),
+    ]
+
+    assert sorted(part_of(FieldPosition(p.r, math.remainder(p.phi, math.tau))) for p in places) == list(
+        range(9)
+    )

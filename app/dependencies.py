@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -22,6 +24,25 @@ class Services:
     store: Store
     storage: Storage
     models: ModelCache
+    uploads: Places
+
+
+class Places:
+    """How many of something there may be at once, counted in the event loop."""
+
+    def __init__(self, free: int) -> None:
+        self.free = free
+
+    @contextmanager
+    def one(self, refusal: Exception) -> Iterator[None]:
+        """Take a place; raise the refusal where none is free."""
+        if self.free <= 0:
+            raise refusal
+        self.free -= 1
+        try:
+            yield
+        finally:
+            self.free += 1
 
 
 @dataclass(frozen=True, slots=True)

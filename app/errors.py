@@ -27,6 +27,14 @@ log = logging.getLogger(__name__)
 
 MEDIA_TYPE: Final = "application/problem+json"
 REQUEST_ID: Final = "X-Request-ID"
+HEADERS: Final[Mapping[str, str]] = {
+    "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+"""On every answer, unless it says otherwise: nothing of it runs, is guessed at, or is shown elsewhere."""
+
 NO_ROOM: Final = ("os error 28", "os error 122")
 """How the storage says that the disk, or the share of its user, is full."""
 
@@ -114,6 +122,18 @@ class TooLargeError(ServiceError):
     status, code = 413, "image_too_large"
 
 
+class SlowBodyError(ServiceError):
+    """A body that does not come, or hardly."""
+
+    status, code = 408, "too_slow"
+
+
+class BusyError(ServiceError):
+    """Too much is being done already."""
+
+    status, code = 503, "busy"
+
+
 class QuotaError(ServiceError):
     """The owner has too much unfinished or stored already."""
 
@@ -174,6 +194,7 @@ CODE_OF_STATUS: Final[Mapping[int, str]] = {
     404: "not_found",
     405: "method_not_allowed",
     413: "image_too_large",
+    415: "unsupported_format",
     422: "invalid_parameter",
     503: "busy",
 }
@@ -223,7 +244,7 @@ def respond(
         errors=list(errors),
         request_id=request_id,
     )
-    every = dict(headers or {})
+    every = {**HEADERS, **(headers or {})}
     if request_id is not None:
         every[REQUEST_ID] = request_id  # here too: what nobody foresaw is answered outside of RequestLog
     return Response(problem.model_dump_json(exclude_none=True), status, media_type=MEDIA_TYPE, headers=every)

@@ -10,6 +10,7 @@ from typing import Annotated
 from fastapi import Depends, Request, Response
 
 from app.models import ModelCache
+from app.reserve import Reserve
 from app.settings import Settings
 from app.storage import Storage
 from app.store import Store
@@ -25,6 +26,7 @@ class Services:
     storage: Storage
     models: ModelCache
     uploads: Places
+    reserve: Reserve
 
 
 class Places:

@@ -13,6 +13,7 @@ from app.bodies import JsonBodies
 from app.dependencies import Places, Services
 from app.middleware import Heads, OwnNames, RequestLog, SameSite
 from app.models import ModelCache
+from app.reserve import Reserve
 from app.routes import corrections, health, jobs, lenses, photos, psf
 from app.settings import MIB, Settings
 from app.storage import Storage
@@ -31,7 +32,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         store = Store(chosen)
-        storage = Storage(chosen.storage)
+        storage = Storage(chosen.storage, patience_s=chosen.storage_seconds)
         cache = ModelCache(
             store,
             chosen.model_cache_mb * MIB,
@@ -39,7 +40,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             family=chosen.family,
             settings=ModelSettings(mode=chosen.model_mode, unit=chosen.model_unit),
         )
-        app.state.services = Services(chosen, store, storage, cache, Places(chosen.max_uploads))
+        reserve = Reserve(store.database.path.with_name("reserve") if store.database.is_sqlite else None)
+        app.state.services = Services(chosen, store, storage, cache, Places(chosen.max_uploads), reserve)
         yield
         store.close()
 

@@ -39,6 +39,9 @@ class Settings(BaseSettings):
     storage_url: str = Field(
         default="", description="file:// or s3:// address of the blobs; empty = in the data folder."
     )
+    storage_seconds: float = Field(
+        default=20.0, gt=0, description="Longest that one request to an object store may take."
+    )
     shared_filesystem: bool = Field(default=False, description="The file storage is seen by all machines.")
     sqlite_synchronous: Literal["NORMAL", "FULL"] = Field(
         default="NORMAL", description="FULL survives power loss too."

@@ -84,7 +84,12 @@ class Worker:
             Budget(settings.worker_slots, settings.worker_memory_mb),
             cache=settings.data_dir.resolve() / "cache",
         )
-        self._bench = Workbench(settings, self._store, Storage(settings.storage), self._sandbox)
+        self._bench = Workbench(
+            settings,
+            self._store,
+            Storage(settings.storage, patience_s=settings.storage_seconds),
+            self._sandbox,
+        )
         self._engine: JobEngine = DbosEngine(settings.jobs, self.id, slots=settings.worker_slots)
         self._stop = threading.Event()
         self._last_beat = time.monotonic()

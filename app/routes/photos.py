@@ -118,8 +118,8 @@ def _admit(call: Call) -> None:
     unfinished, stored = call.store.photos.load_of(call.owner)
     if unfinished >= limits.max_queued_photos:
         raise QuotaError(
-            f"{unfinished} photos are unfinished, {limits.max_queued_photos} may be: "
-            "wait for some to finish, and name the lens of those that need one",
+            f"{unfinished} photos are being worked on, {limits.max_queued_photos} may be: "
+            "wait for some to finish",
             headers={"Retry-After": "30"},
         )
     if stored >= limits.max_stored_gb * GIB:
@@ -208,7 +208,7 @@ def list_patches(photo_id: str, call: CallDep) -> PatchPage:
 )
 def delete_photo(photo_id: str, call: CallDep) -> None:
     """Delete a photo with its file, samples and corrections."""
-    prefix = call.store.photos.delete(photo_id, call.owner)
+    prefix = call.services.reserve.spend(lambda: call.store.photos.delete(photo_id, call.owner))
     if prefix is None:
         raise UnknownPhotoError(f"there is no photo {photo_id[:60]}: it may be deleted already")
     call.storage.delete(prefix)

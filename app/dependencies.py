@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated
 
 from fastapi import Depends, Request, Response
 
 from app.models import ModelCache
+from app.reserve import Reserve
 from app.settings import Settings
 from app.storage import Storage
 from app.store import Store
@@ -22,6 +25,26 @@ class Services:
     store: Store
     storage: Storage
     models: ModelCache
+    uploads: Places
+    reserve: Reserve
+
+
+class Places:
+    """How many of something there may be at once, counted in the event loop."""
+
+    def __init__(self, free: int) -> None:
+        self.free = free
+
+    @contextmanager
+    def one(self, refusal: Exception) -> Iterator[None]:
+        """Take a place; raise the refusal where none is free."""
+        if self.free <= 0:
+            raise refusal
+        self.free -= 1
+        try:
+            yield
+        finally:
+            self.free += 1
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,10 +16,12 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from obstore.exceptions import BaseError as StorageError
 from pydantic import ValidationError
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import DBAPIError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
+from app.jobs.outage import is_no_room, is_outage
 from app.schemas import FieldError, Problem
 from lensmodel import errors as library
 
@@ -27,8 +29,13 @@ log = logging.getLogger(__name__)
 
 MEDIA_TYPE: Final = "application/problem+json"
 REQUEST_ID: Final = "X-Request-ID"
-NO_ROOM: Final = ("os error 28", "os error 122")
-"""How the storage says that the disk, or the share of its user, is full."""
+HEADERS: Final[Mapping[str, str]] = {
+    "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+"""On every answer, unless it says otherwise: nothing of it runs, is guessed at, or is shown elsewhere."""
 
 
 class ServiceError(library.LensModelError):
@@ -114,6 +121,18 @@ class TooLargeError(ServiceError):
     status, code = 413, "image_too_large"
 
 
+class SlowBodyError(ServiceError):
+    """A body that does not come, or hardly."""
+
+    status, code = 408, "too_slow"
+
+
+class BusyError(ServiceError):
+    """Too much is being done already."""
+
+    status, code = 503, "busy"
+
+
 class QuotaError(ServiceError):
     """The owner has too much unfinished or stored already."""
 
@@ -174,6 +193,7 @@ CODE_OF_STATUS: Final[Mapping[int, str]] = {
     404: "not_found",
     405: "method_not_allowed",
     413: "image_too_large",
+    415: "unsupported_format",
     422: "invalid_parameter",
     503: "busy",
 }
@@ -223,7 +243,7 @@ def respond(
         errors=list(errors),
         request_id=request_id,
     )
-    every = dict(headers or {})
+    every = {**HEADERS, **(headers or {})}
     if request_id is not None:
         every[REQUEST_ID] = request_id  # here too: what nobody foresaw is answered outside of RequestLog
     return Response(problem.model_dump_json(exclude_none=True), status, media_type=MEDIA_TYPE, headers=every)
@@ -290,18 +310,21 @@ def install(app: FastAPI) -> None:
         del error
         return respond(request, 400, "malformed_upload", "the body ended early: send it again")
 
-    @app.exception_handler(OperationalError)
-    async def _database(request: Request, error: OperationalError) -> Response:
-        log.error("database: %s", error.orig)
-        detail = "the database does not answer; try again in a few seconds"
-        return respond(request, 503, "busy", detail, headers={"Retry-After": "5"})
-
+    @app.exception_handler(DBAPIError)
+    @app.exception_handler(PoolTimeoutError)
     @app.exception_handler(StorageError)
-    async def _storage(request: Request, error: StorageError) -> Response:
-        log.error("storage: %s", error)
-        if any(sign in str(error) for sign in NO_ROOM):
-            return respond(request, 507, "quota_exceeded", "there is no room for it: make room on the disk")
-        detail = "the storage does not answer; try again in a few seconds"
+    @app.exception_handler(OSError)
+    async def _away(request: Request, error: Exception) -> Response:
+        if is_no_room(error):
+            log.error("no room: %s", error)
+            detail = "there is no room for it: delete photos, or make room on the disk"
+            return respond(request, 507, "quota_exceeded", detail)
+        if not is_outage(error) and not isinstance(error, OperationalError):
+            return await _bug(request, error)
+        database = isinstance(error, SQLAlchemyError)
+        what = "database" if database else "storage"
+        log.error("%s: %s", what, getattr(error, "orig", error))
+        detail = f"the {what} does not answer; try again in a few seconds"
         return respond(request, 503, "busy", detail, headers={"Retry-After": "5"})
 
     @app.exception_handler(Exception)

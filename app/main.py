@@ -9,9 +9,11 @@ from importlib.metadata import version
 from fastapi import FastAPI
 
 from app import errors, pages
-from app.dependencies import Services
-from app.middleware import OwnNames, RequestLog
+from app.bodies import JsonBodies
+from app.dependencies import Places, Services
+from app.middleware import Heads, OwnNames, RequestLog, SameSite
 from app.models import ModelCache
+from app.reserve import Reserve
 from app.routes import corrections, health, jobs, lenses, photos, psf
 from app.settings import MIB, Settings
 from app.storage import Storage
@@ -30,7 +32,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         store = Store(chosen)
-        storage = Storage(chosen.storage)
+        storage = Storage(chosen.storage, patience_s=chosen.storage_seconds)
         cache = ModelCache(
             store,
             chosen.model_cache_mb * MIB,
@@ -38,7 +40,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             family=chosen.family,
             settings=ModelSettings(mode=chosen.model_mode, unit=chosen.model_unit),
         )
-        app.state.services = Services(chosen, store, storage, cache)
+        reserve = Reserve(store.database.path.with_name("reserve") if store.database.is_sqlite else None)
+        app.state.services = Services(chosen, store, storage, cache, Places(chosen.max_uploads), reserve)
         yield
         store.close()
 
@@ -47,11 +50,13 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         version=version("lensmodel"),
         summary="Learns the blur of one copy of a lens from ordinary photos and removes it.",
         lifespan=lifespan,
-        docs_url="/docs",
+        docs_url=None,  # it would load scripts from elsewhere: the pages have their own
         redoc_url=None,
     )
-    if not chosen.public:
-        app.add_middleware(OwnNames)
+    app.add_middleware(Heads)
+    app.add_middleware(JsonBodies, patience_s=chosen.stall_seconds)
+    app.add_middleware(SameSite, allowed=chosen.hosts)
+    app.add_middleware(OwnNames, allowed=chosen.hosts)
     app.add_middleware(RequestLog)  # the last is the outermost
     errors.install(app)
     pages.install(app)

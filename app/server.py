@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import socket
-import sys
 from typing import Final
 
 import uvicorn
 
+from app import logs
+from app.impatient import impatient
 from app.jobs import confine
 from app.jobs.lifeline import on_parents_end
 from app.settings import Settings
@@ -23,13 +23,7 @@ GRACE_S: Final = 5
 
 def run(settings: Settings, listener: socket.socket) -> None:
     """Serve until SIGTERM, or until the supervisor is gone; log as a service does."""
-    logging.basicConfig(
-        level=settings.log_level.upper(),
-        format="%(asctime)s %(levelname)s api %(name)s: %(message)s",
-        stream=sys.stderr,
-        force=True,  # in place of what the command line set up
-    )
-    logging.getLogger("alembic").setLevel(logging.WARNING)  # it tells of every look at the schema
+    logs.begin("api", settings.log_level)
     confine.hide_memory()
     from app.main import create_app  # noqa: PLC0415 - the supervisor need not load the application
 
@@ -38,6 +32,8 @@ def run(settings: Settings, listener: socket.socket) -> None:
         log_level=settings.log_level,
         access_log=False,  # the application writes its own, without serials
         timeout_graceful_shutdown=GRACE_S,
+        limit_concurrency=settings.max_connections,
+        http=impatient(settings.stall_seconds),
     )
     server = uvicorn.Server(config)
 

@@ -39,6 +39,9 @@ class Settings(BaseSettings):
     storage_url: str = Field(
         default="", description="file:// or s3:// address of the blobs; empty = in the data folder."
     )
+    storage_seconds: float = Field(
+        default=20.0, gt=0, description="Longest that one request to an object store may take."
+    )
     shared_filesystem: bool = Field(default=False, description="The file storage is seen by all machines.")
     sqlite_synchronous: Literal["NORMAL", "FULL"] = Field(
         default="NORMAL", description="FULL survives power loss too."
@@ -52,6 +55,16 @@ class Settings(BaseSettings):
     public: bool = Field(
         default=False, description="Allow an address other than loopback in spite of auth=none."
     )
+
+    allowed_hosts: str = Field(
+        default="",
+        description="Names that the service answers to, besides addresses and local ones; by commas.",
+    )
+    stall_seconds: float = Field(
+        default=30.0, gt=0, description="Longest that nothing of a request's head or body may come."
+    )
+    max_connections: int = Field(default=1000, ge=1, description="Connections at once; more get 503.")
+    max_uploads: int = Field(default=8, ge=1, description="Photos that are received at once.")
 
     max_upload_mb: int = Field(default=512, ge=1, description="Largest photo file, in MiB.")
     max_megapixels: float = Field(default=160.0, gt=0, description="Largest photo, in millions of pixels.")
@@ -175,7 +188,17 @@ class Settings(BaseSettings):
                 f"host {self.host} can be reached by others and auth=none lets everybody in: "
                 "listen on 127.0.0.1, or set LENS_PUBLIC=true behind a proxy that checks who asks"
             )
+        if self.public and not self.hosts:
+            raise ValueError(
+                "LENS_PUBLIC=true needs LENS_ALLOWED_HOSTS: the names under which browsers reach it, "
+                "such as lens.example.org, or localhost where there are none"
+            )
         return self
+
+    @property
+    def hosts(self) -> frozenset[str]:
+        """Names that the service answers to, besides addresses and local ones."""
+        return frozenset(name.strip().lower() for name in self.allowed_hosts.split(",") if name.strip())
 
     @property
     def database(self) -> str:

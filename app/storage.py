@@ -7,12 +7,14 @@ key when it is complete, and not before.
 from __future__ import annotations
 
 import errno
+import os
 import shutil
 from collections.abc import AsyncIterator, Iterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, contextmanager
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 from urllib.parse import unquote, urlsplit
 
 import obstore
@@ -20,7 +22,14 @@ from obstore.store import LocalStore, ObjectStore, from_url
 
 from app.ids import new_id
 
+if TYPE_CHECKING:
+    from obstore.store import ClientConfig
+
 CHUNK = 1 << 20
+PATIENCE_S: Final = 20.0
+"""One request moves 8 MiB at most: 20 s are 0.4 MiB/s."""
+
+CONNECT_S: Final = 5.0
 
 
 class AsyncBlobWriter(Protocol):
@@ -37,6 +46,23 @@ class BlobInfo:
     size: int
 
 
+def _client_options(patience_s: float) -> ClientConfig:
+    """Return the deadlines, and what the environment says besides: options replace those of AWS_... there."""
+    options: ClientConfig = {
+        "connect_timeout": f"{min(CONNECT_S, patience_s):g}s",
+        "timeout": f"{patience_s:g}s",
+        "allow_http": _is_on("AWS_ALLOW_HTTP"),
+        "allow_invalid_certificates": _is_on("AWS_ALLOW_INVALID_CERTIFICATES"),
+    }
+    if os.environ.get("AWS_PROXY_URL"):
+        options["proxy_url"] = os.environ["AWS_PROXY_URL"]
+    return options
+
+
+def _is_on(name: str) -> bool:
+    return os.environ.get(name, "").lower() in {"1", "true", "yes", "on"}
+
+
 class Storage:
     """All blobs of the service.
 
@@ -44,9 +70,12 @@ class Storage:
     ----------
     url : str
         ``file:///folder``, ``s3://bucket/prefix`` or another address that obstore knows.
+    patience_s : float
+        How long one request to an object store may take. It is tried once more, quickly; jobs wait for
+        longer outages, and callers are told of them.
     """
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, *, patience_s: float = PATIENCE_S) -> None:
         parts = urlsplit(url)
         self.folder: Path | None = None
         if parts.scheme == "file":
@@ -54,7 +83,11 @@ class Storage:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._store: ObjectStore = LocalStore(prefix=self.folder)
         else:
-            self._store = from_url(url)
+            self._store = from_url(
+                url,
+                client_options=_client_options(patience_s),
+                retry_config={"max_retries": 1, "retry_timeout": timedelta(seconds=patience_s)},
+            )
 
     def put(self, key: str, data: bytes) -> None:
         """Store bytes under a key, replacing what was there."""

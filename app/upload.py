@@ -15,7 +15,9 @@ from typing import Final
 from fastapi import Request
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
+from starlette.requests import ClientDisconnect
 
+from app.bodies import Pace
 from app.errors import MalformedUploadError, TooLargeError
 from app.schemas import UploadFields
 from app.storage import AsyncBlobWriter, Storage
@@ -188,7 +190,9 @@ class _Form:
         )
 
 
-async def receive(request: Request, storage: Storage, key: str, *, limit: int) -> Uploaded:
+async def receive(
+    request: Request, storage: Storage, key: str, *, limit: int, patience_s: float = 30.0
+) -> Uploaded:
     """Stream the body of a request into the blob `key`.
 
     Raises
@@ -199,6 +203,8 @@ async def receive(request: Request, storage: Storage, key: str, *, limit: int) -
         If it has more than `limit` bytes of photo.
     UnreadablePhotoError
         If the first bytes are no image that we read.
+    SlowBodyError
+        If nothing comes for `patience_s`, or hardly anything for longer.
     pydantic.ValidationError
         If a form or query field is out of range.
     """
@@ -210,12 +216,12 @@ async def receive(request: Request, storage: Storage, key: str, *, limit: int) -
     async with storage.writer(key) as blob:
         sink = _Sink(blob, limit)
         if media_type == b"multipart/form-data":
-            form = await _receive_form(request, options.get(b"boundary", b""), sink)
+            form = await _receive_form(request, options.get(b"boundary", b""), sink, patience_s)
             name, fields = form.filename, form.fields
         elif media_type == b"application/x-www-form-urlencoded":
             raise MalformedUploadError(f"a form without a file: {REMEDY}")
         else:
-            async for piece in _body(request):
+            async for piece in _body(request, patience_s):
                 await sink.write(piece)
             name, fields = request.query_params.get("filename"), {}
         sha256, kind = sink.finish()
@@ -231,19 +237,25 @@ def declared_length(request: Request) -> int:
     return int(declared)
 
 
-async def _body(request: Request) -> AsyncIterator[bytes]:
-    async for piece in request.stream():
-        if piece:
-            yield piece
+async def _body(request: Request, patience_s: float) -> AsyncIterator[bytes]:
+    pace = Pace(patience_s)
+    while True:
+        message = await pace.next(request.receive)
+        if message["type"] == "http.disconnect":
+            raise ClientDisconnect
+        if message.get("body"):
+            yield message["body"]
+        if not message.get("more_body", False):
+            return
 
 
-async def _receive_form(request: Request, boundary: bytes, sink: _Sink) -> _Form:
+async def _receive_form(request: Request, boundary: bytes, sink: _Sink, patience_s: float) -> _Form:
     form = _Form()
     if not boundary:
         raise MalformedUploadError(f"multipart/form-data without a boundary: {REMEDY}")
     try:
         parser = form.parser(boundary)
-        async for piece in _body(request):
+        async for piece in _body(request, patience_s):
             parser.write(piece)
             for data in form.pending:
                 await sink.write(data)

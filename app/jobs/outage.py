@@ -29,6 +29,11 @@ LONGEST_PAUSE_S: Final = 60.0
 BUGS: Final = 3
 """Tries of a job that fails in a way that nobody foresaw."""
 
+_SQLITE_FULL: Final = 13
+_POSTGRES_FULL: Final = "53100"
+_FULL: Final = ("os error 28", "os error 122")
+"""How the storage says that the disk, or the share of its user, is full."""
+
 _SQLITE_ERROR: Final = 1
 """SQLite's code for a statement that is wrong; everything else it reports is the machine's."""
 
@@ -62,8 +67,21 @@ def is_outage(error: BaseException) -> bool:
     if isinstance(error, stored.BaseError):
         return not isinstance(error, _OF_THE_REQUEST)
     if isinstance(error, OSError):
+        if error.errno is None and not isinstance(error, FileNotFoundError | PermissionError):
+            return True  # the writer of the storage has no better words
         return isinstance(error, ConnectionError | TimeoutError) or error.errno in _MACHINE
     return isinstance(error, OutageError | exc.TimeoutError | MemoryError | EOFError)
+
+
+def is_no_room(error: BaseException) -> bool:
+    """Say whether a disk, or the share of its user, is full."""
+    if isinstance(error, exc.DBAPIError):
+        return (
+            getattr(error.orig, "sqlite_errorcode", None) == _SQLITE_FULL
+            or getattr(error.orig, "sqlstate", None) == _POSTGRES_FULL
+        )
+    said = isinstance(error, OSError | stored.BaseError) and any(sign in str(error) for sign in _FULL)
+    return said or (isinstance(error, OSError) and error.errno in NO_ROOM)
 
 
 @contextmanager

@@ -8,7 +8,6 @@ import os
 import shutil
 import signal
 import socket
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -20,6 +19,7 @@ from typing import Final, TypeAlias
 
 from sqlalchemy.exc import OperationalError
 
+from app import logs
 from app.ids import new_id
 from app.jobs import confine
 from app.jobs.correction_work import CorrectionWork
@@ -84,7 +84,12 @@ class Worker:
             Budget(settings.worker_slots, settings.worker_memory_mb),
             cache=settings.data_dir.resolve() / "cache",
         )
-        self._bench = Workbench(settings, self._store, Storage(settings.storage), self._sandbox)
+        self._bench = Workbench(
+            settings,
+            self._store,
+            Storage(settings.storage, patience_s=settings.storage_seconds),
+            self._sandbox,
+        )
         self._engine: JobEngine = DbosEngine(settings.jobs, self.id, slots=settings.worker_slots)
         self._stop = threading.Event()
         self._last_beat = time.monotonic()
@@ -354,12 +359,7 @@ def _used(folder: Path) -> float:
 def main() -> None:
     """Run a worker with the settings of the environment until SIGTERM or the supervisor's end."""
     settings = Settings()
-    logging.basicConfig(
-        level=settings.log_level.upper(),
-        format="%(asctime)s %(levelname)s worker %(name)s: %(message)s",
-        stream=sys.stderr,
-    )
-    logging.getLogger("alembic").setLevel(logging.WARNING)  # it tells of every look at the schema
+    logs.begin("worker", settings.log_level)
     confine.hide_memory()
     log.info("children are confined by: %s", ", ".join(_in_force()) or "nothing that the kernel has")
     worker = Worker(settings)

@@ -20,6 +20,7 @@ from app.dependencies import Call, CallDep
 from app.errors import InvalidParameterError, NotReadyError
 from app.jobs.handover import BEFORE, PREVIEW, R_MAP
 from app.pages import pictures, words
+from app.pages.interface import operations
 from app.routes import corrections as correction_routes
 from app.routes import lenses as lens_routes
 from app.routes import photos as photo_routes
@@ -109,6 +110,13 @@ def home(call: CallDep) -> HTMLResponse:
     """Show where photos are given and what became of them."""
     photos, more = _photos(call)
     return _page("home.html", photos=photos, more=more, lenses=_lenses(call))
+
+
+@router.get("/docs")
+def interface(request: Request) -> HTMLResponse:
+    """Show what programs can ask, from the same description that programs read; nothing is loaded for it."""
+    description = request.app.openapi()
+    return _page("docs.html", title=description["info"]["title"], groups=operations(description))
 
 
 @router.get("/ui/photos")

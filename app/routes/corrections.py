@@ -20,6 +20,7 @@ from app.errors import (
     UnknownCorrectionError,
     UnknownLensError,
 )
+from app.middleware import ONLY_HEAD
 from app.models import check_version
 from app.routes.common import Cursor, Limit, OnlyId, next_link, problems
 from app.routes.photos import find_photo
@@ -160,7 +161,7 @@ def read_correction(correction_id: str, call: CallDep) -> CorrectionOut:
 )
 def delete_correction(correction_id: str, call: CallDep) -> None:
     """Delete a correction with its file; a running one stops."""
-    prefix = call.store.corrections.delete(correction_id, call.owner)
+    prefix = call.services.reserve.spend(lambda: call.store.corrections.delete(correction_id, call.owner))
     if prefix is None:
         raise UnknownCorrectionError(
             f"there is no correction {correction_id[:60]}: it may be deleted already"
@@ -209,7 +210,8 @@ def read_result(correction_id: str, call: CallDep) -> Response:
         "Content-Disposition": _disposition(row.result_name or "corrected"),
         "X-Content-Type-Options": "nosniff",
     }
-    if tag in {one.strip() for one in call.request.headers.get("if-none-match", "").split(",")}:
+    known = {one.strip() for one in call.request.headers.get("if-none-match", "").split(",")}
+    if known & {tag, f"W/{tag}", "*"}:
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
     part = call.request.headers.get("range")
     if call.request.headers.get("if-range", tag) != tag:
@@ -220,6 +222,8 @@ def read_result(correction_id: str, call: CallDep) -> Response:
     if (start, end) != (0, row.result_bytes):
         code = status.HTTP_206_PARTIAL_CONTENT
         headers["Content-Range"] = f"bytes {start}-{end - 1}/{row.result_bytes}"
+    if call.request.scope.get(ONLY_HEAD):
+        return Response(status_code=code, headers=headers, media_type=row.result_media_type)
     body = call.storage.stream(row.result_key, start, end)
     return StreamingResponse(body, code, headers, row.result_media_type)
 

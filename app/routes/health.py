@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from importlib.metadata import version
-from typing import get_args
+from typing import Final, get_args
 
 from fastapi import APIRouter, status
 
@@ -27,6 +30,9 @@ from app.store import migrate
 from lensmodel.blind import estimators
 from lensmodel.deconv import deconvolvers
 
+READY_S: Final = 3.0
+"""How long an answer may take: less than who asks waits, such as a container's engine, 5 s."""
+
 probes = APIRouter(tags=["service"])
 router = APIRouter(tags=["service"])
 
@@ -44,23 +50,42 @@ def healthz() -> Health:
 )
 def readyz(call: CallDep) -> Readiness:
     """Say whether work can be taken: schema, storage and a worker are there."""
-    checks = {
-        "schema": _check(lambda: _schema(call)),
-        "storage": _check(call.storage.check_writable),
-        "worker": _check(lambda: _worker(call)),
+    tried: dict[str, Callable[[], None]] = {
+        "schema": lambda: _schema(call),
+        "storage": call.storage.check_writable,
+        "worker": lambda: _worker(call),
     }
+    running = {name: _begun(probe) for name, probe in tried.items()}
+    end = time.monotonic() + READY_S
+    checks = {name: _said(check, max(end - time.monotonic(), 0.0)) for name, check in running.items()}
     ready = all(said == "ok" for said in checks.values())
     if not ready:
         call.response.status_code = status.HTTP_503_SERVICE_UNAVAILABLE
     return Readiness(status="ready" if ready else "not ready", checks=checks, sandbox=confine.available())
 
 
-def _check(probe: Callable[[], None]) -> str:
+def _begun(probe: Callable[[], None]) -> Future[None]:
+    """Run a probe in a thread that nobody waits for: what hangs must not hang the answer, nor the exit."""
+    check: Future[None] = Future()
+
+    def run() -> None:
+        try:
+            probe()
+        except Exception as error:  # noqa: BLE001 - whatever is wrong is what the probe has to tell
+            check.set_exception(error)
+        else:
+            check.set_result(None)
+
+    threading.Thread(target=run, daemon=True).start()
+    return check
+
+
+def _said(check: Future[None], seconds: float) -> str:
     try:
-        probe()
-    except Exception as error:  # noqa: BLE001 - whatever is wrong is what the probe has to tell
-        return f"{type(error).__name__}: {error}"[:300]
-    return "ok"
+        error = check.exception(seconds)
+    except TimeoutError:
+        return f"TimeoutError: no answer within {READY_S:g} s"
+    return "ok" if error is None else f"{type(error).__name__}: {error}"[:300]
 
 
 def _schema(call: Call) -> None:

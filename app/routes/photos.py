@@ -8,8 +8,10 @@ from fastapi import APIRouter, status
 from starlette.concurrency import run_in_threadpool
 
 from app import upload, views
+from app.bodies import CLOSE
 from app.dependencies import Call, CallDep
 from app.errors import (
+    BusyError,
     ConflictError,
     InvalidParameterError,
     QuotaError,
@@ -61,7 +63,9 @@ _UPLOAD_BODY = {
     response_model=PhotoOut,
     responses=problems(
         400,
+        403,
         404,
+        408,
         413,
         415,
         422,
@@ -77,12 +81,24 @@ async def create_photo(call: CallDep) -> PhotoOut:
     The fields may stand in the form or in the query. What they say goes before the file's own
     metadata.
     """
-    await run_in_threadpool(_admit, call)
-    public_id = new_id()
-    prefix = f"photos/{public_id}/"
-    key = f"{prefix}original"
-    await run_in_threadpool(call.store.photos.expect, prefix)
-    uploaded = await upload.receive(call.request, call.storage, key, limit=call.settings.max_upload_bytes)
+    limits = call.settings
+    many = BusyError(
+        f"{limits.max_uploads} photos are being received, more may not be: try again in a few seconds",
+        headers={"Retry-After": "5", **CLOSE},
+    )
+    with call.services.uploads.one(many):
+        await run_in_threadpool(_admit, call)
+        public_id = new_id()
+        prefix = f"photos/{public_id}/"
+        key = f"{prefix}original"
+        await run_in_threadpool(call.store.photos.expect, prefix)
+        uploaded = await upload.receive(
+            call.request,
+            call.storage,
+            key,
+            limit=limits.max_upload_bytes,
+            patience_s=limits.stall_seconds,
+        )
     photo, fresh = await run_in_threadpool(_record, call, public_id, uploaded, prefix)
     call.response.status_code = status.HTTP_202_ACCEPTED if fresh else status.HTTP_200_OK
     call.response.headers["Location"] = photo.links.self
@@ -102,8 +118,8 @@ def _admit(call: Call) -> None:
     unfinished, stored = call.store.photos.load_of(call.owner)
     if unfinished >= limits.max_queued_photos:
         raise QuotaError(
-            f"{unfinished} photos are unfinished, {limits.max_queued_photos} may be: "
-            "wait for some to finish, and name the lens of those that need one",
+            f"{unfinished} photos are being worked on, {limits.max_queued_photos} may be: "
+            "wait for some to finish",
             headers={"Retry-After": "30"},
         )
     if stored >= limits.max_stored_gb * GIB:
@@ -192,7 +208,7 @@ def list_patches(photo_id: str, call: CallDep) -> PatchPage:
 )
 def delete_photo(photo_id: str, call: CallDep) -> None:
     """Delete a photo with its file, samples and corrections."""
-    prefix = call.store.photos.delete(photo_id, call.owner)
+    prefix = call.services.reserve.spend(lambda: call.store.photos.delete(photo_id, call.owner))
     if prefix is None:
         raise UnknownPhotoError(f"there is no photo {photo_id[:60]}: it may be deleted already")
     call.storage.delete(prefix)

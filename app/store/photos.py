@@ -10,6 +10,7 @@ from typing import Any, Final, Protocol
 from sqlalchemy import case, delete, func, select, update
 from sqlalchemy.orm import Session
 
+from app.errors import BusyError
 from app.store import lenses
 from app.store.database import Database, insert_new
 from app.store.lenses import LensName
@@ -26,7 +27,13 @@ from app.tables import (
     SampleRow,
 )
 
-UNFINISHED = ("received", *PHOTO_RUNNING, "needs_lens")
+WORKED_ON = ("received", *PHOTO_RUNNING)
+"""What takes the service's time; a photo that waits for its owner's word takes room only."""
+
+UNFINISHED = (*WORKED_ON, "needs_lens")
+TRIES: Final = 100
+"""How often an upload looks again for the photo of the same bytes that was deleted when it looked."""
+
 GIVEN_SETTINGS = {
     "aperture": "aperture",
     "focal_length_mm": "focal_mm",
@@ -115,11 +122,11 @@ class PhotoStore:
                 "stage_at": now(),
                 **{column: given.get(field) for field, column in GIVEN_SETTINGS.items()},
             }
-            if insert_new(session, PhotoRow, [fresh]):
+            known, made = _insert_or_find(session, fresh)
+            if made:
                 prefix = f"{blob_key.rpartition('/')[0]}/"
                 session.execute(delete(GarbageRow).where(GarbageRow.prefix == prefix))
-                return Received(_known(session, owner_key, sha256), fresh=True)
-            known = _known(session, owner_key, sha256)
+                return Received(known, fresh=True)
             told = {**known.given, **given}
             again = (
                 known.state in {"failed", "cancelled"}
@@ -172,11 +179,11 @@ class PhotoStore:
             return {row.id: row.public_id for row in rows}
 
     def load_of(self, owner: str) -> tuple[int, int]:
-        """Return how many photos of an owner are unfinished, and the bytes of all of them."""
+        """Return how many photos of an owner are to be worked on, and the bytes of all of them."""
         with self._db.reading() as session:
             row = session.execute(
                 select(
-                    func.count().filter(PhotoRow.state.in_(UNFINISHED)),
+                    func.count().filter(PhotoRow.state.in_(WORKED_ON)),
                     func.coalesce(func.sum(PhotoRow.byte_size), 0),
                 )
                 .join(OwnerRow, OwnerRow.id == PhotoRow.owner_id)
@@ -430,12 +437,25 @@ def settings_of(photo: PhotoRow) -> dict[str, Any]:
     return {"aperture": photo.aperture, "focal_mm": photo.focal_mm, "focus_m": photo.focus_m}
 
 
-def _known(session: Session, owner_key: int, sha256: str) -> PhotoRow:
-    return session.scalars(
+def _insert_or_find(session: Session, fresh: dict[str, Any]) -> tuple[PhotoRow, bool]:
+    """Insert a photo, or find the one with the same bytes; True if inserted.
+
+    On PostgreSQL another transaction may delete that one after it kept ours out, and before we see it.
+    """
+    for _ in range(TRIES):
+        made = insert_new(session, PhotoRow, [fresh]) == 1
+        known = _known(session, fresh["owner_id"], fresh["sha256"])
+        if known is not None:
+            return known, made
+    raise BusyError(f"{TRIES} times the photo of the same bytes came and went: send it again")
+
+
+def _known(session: Session, owner_key: int, sha256: str) -> PhotoRow | None:
+    return session.scalar(
         select(PhotoRow)
         .where(PhotoRow.owner_id == owner_key, PhotoRow.sha256 == sha256, PhotoRow.deleted_at.is_(None))
         .with_for_update()
-    ).one()
+    )
 
 
 def _drop_patches(session: Session, photo: PhotoRow) -> None:

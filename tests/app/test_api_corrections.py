@@ -261,6 +261,12 @@ def test_an_unchanged_result_is_not_sent_again(client: TestClient, finished: str
     tag = client.get(path).headers["etag"]
 
     assert client.get(path, headers={"If-None-Match": tag}).status_code == 304
+    assert client.get(path, headers={"If-None-Match": "*"}).status_code == 304
+    only_head = client.head(path)
+    assert (only_head.content, only_head.headers["content-length"]) == (
+        b"",
+        str(len(client.get(path).content)),
+    )
 
 
 def test_a_range_beyond_the_end_is_not_satisfiable(client: TestClient, finished: str) -> None:

@@ -95,9 +95,9 @@ def test_waiting_leaves_a_service_in_peace_that_answers_at_once(steps: Steps, se
     with TestClient(create_app(hasty)) as http:
         http.event_hooks["request"].append(asked.append)
         with pytest.raises(JobPatienceError):
-            Client(http=http).wait(photo.public_id, timeout=0.5)
+            Client(http=http).wait(photo.public_id, timeout=3.0)
 
-    assert 2 <= len(asked) <= 7
+    assert 2 <= len(asked) <= 40  # without a pause it would be hundreds
 
 
 def test_a_service_that_does_not_start_is_told_with_its_log(

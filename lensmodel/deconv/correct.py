@@ -361,9 +361,10 @@ def _restore(job: _Job, cell: Cell) -> _Restored:
         tile, restored, blurs, sensors, texture=job.bounds.texture, denoise=job.bounds.denoise
     )
     restored = held_beside_clipped(tile, restored, blurs, sensors, errors)
-    restored[inner] = job.bounds.hold(job.planes, (cell.top, cell.left), restored[inner], errors)
     evidence = Evidence(job.noise, job.clip, blurs, errors, [sensor.measured for sensor in sensors])
+    # before the bounds, which would hide what tells of a wrong kernel: light below black, foreign hues
     restored, verdict = held_back(tile, restored, evidence, inner=inner[1:])
+    restored = job.bounds.hold(job.planes, (cell.top, cell.left), restored, errors)
     if job.strength < 1.0:
         restored = tile[inner] + np.float32(job.strength) * (restored - tile[inner])
     return _Restored(restored, expected.held(verdict.held_back), verdict.without_map())

@@ -13,6 +13,7 @@ from lensmodel.blur import UniformBlur
 from lensmodel.deconv.base import Sensor
 from lensmodel.deconv.compiled_blur import CompiledBlur
 from lensmodel.deconv.engine import compiled
+from lensmodel.deconv.mosaic import BETWEEN
 from lensmodel.types import Planes
 
 SHARE: Final = 0.87
@@ -25,6 +26,9 @@ _SMOOTH: Final = 1.2
 """Standard deviation in pixels of the means of what is left of a colour of a mosaic: two of its pixels
 (chosen)."""
 
+
+_GRAIN: Final = 3.0
+"""Standard deviations of the noise within which what is left is grain."""
 
 _WINDOW: Final = 7
 """Pixels along a side over which what is left is compared with the noise (chosen)."""
@@ -48,11 +52,13 @@ def texture_kept(
     erased texture that texture as the photo shows it, and where the data are explained nothing. Pixels that
     are clipped tell nothing.
 
-    Of a mosaic each pixel tells of one colour. Means around it, S_c, tell of all; what is finer is taken for
-    light of no colour, as fine detail nearly is, but never for more than the grain of a colour: where red is
-    next to nothing, its noise over its light is huge::
+    Of a mosaic each pixel tells of one colour, e_k = m_k ( y_k - K_k * x_k ). What is beyond the noise around
+    a mean S is detail of that colour, interpolated in it alone, or a coloured edge would show the mosaic. The
+    rest g, within the noise, is taken for light of no colour, or grain would be coloured and coarse, but
+    never for more than the grain of a colour: where red is next to nothing, its noise over its light is
+    huge::
 
-        r_c = S_c + L_c sum_k min(1, n_c / n_k) m_k ( e_k - S_k ) / L_k,     e_k = m_k ( y_k - K_k * x_k )
+        r_c = S_c + interpolated( e_c - S_c - g_c ) + L_c sum_k min(1, n_c / n_k) g_k / L_k
 
     with L the mean light of a colour in the tile and n its noise over L.
 
@@ -86,8 +92,12 @@ def texture_kept(
         known = np.asarray(known, dtype=np.float32)
         there = ndimage.gaussian_filter(known, _SMOOTH, mode="nearest")
         mean = ndimage.gaussian_filter(known * left[c], _SMOOTH, mode="nearest") / there
-        fine.append(known * (left[c] - mean) / light[c])
-        left[c] = mean
+        within = np.float32(_GRAIN) * np.sqrt(sensor.variance(photo[c]))
+        beyond = left[c] - mean
+        grainy = np.clip(beyond, -within, within)
+        beyond = ndimage.convolve(known * (beyond - grainy), BETWEEN, mode="nearest")
+        fine.append(known * grainy / light[c])
+        left[c] = mean + beyond / ndimage.convolve(known, BETWEEN, mode="nearest")
     for c in range(len(left)):
         for k, part in enumerate(fine):
             left[c] += light[c] * np.float32(min(1.0, grain[c] / grain[k])) * part

@@ -150,6 +150,21 @@ def test_a_single_colourful_pixel_is_a_spot_of_hue() -> None:
     assert audit.keep[80, 80] < 0.1
 
 
+def test_a_colour_that_falls_beside_white_is_a_spot_of_hue() -> None:
+    white = np.ones((3, SIDE, SIDE), dtype=np.float32)
+    yellow = white.copy()
+    yellow[2, 40:44, 50] = 0.6
+    grey, dim = 0.5 * white, 0.5 * yellow
+
+    beside_white, elsewhere = (
+        audit_tile(before, after, evidence(None)).keep[41, 50]
+        for before, after in ((white, yellow), (grey, dim))
+    )
+
+    assert beside_white < 0.1
+    assert elsewhere == 1.0
+
+
 @pytest.mark.parametrize("period", [2.0, 2.5, 3.0])
 def test_fine_lines_are_a_comb(period: float) -> None:
     lines = 0.03 * np.cos(2 * np.pi / period * np.arange(SIDE)[None, :])

@@ -14,6 +14,10 @@ from lensmodel.audit.limits import LIMITS
 _SIDE: Final = 7
 _LEAST: Final = 0.02
 _FREE, _SHARE = 0.25, 2.0
+_WHITE, _BESIDE = 0.95, 5
+"""Share of saturation from which on light is white, and side of the square around it that is beside it."""
+_FREE_WHITE, _SHARE_WHITE = 0.04, 0.5
+"""Chosen: a fifth of one colour of white away is -0.07, what the limit of 1.8 leaves free."""
 _NOISE: Final = 4.0
 _FLOOR: Final = 12.0
 
@@ -22,11 +26,18 @@ def foreign_spots(pair: Pair) -> Severity:
     """Severity of single colours beyond those that the photo shows within 3 pixels.
 
     Colour is (r - g) / (r + g + b) and (b - g) / (r + g + b) of the photo smoothed over 3 x 3 pixels, where
-    noise adds to the light, so that what is dark has no colour to speak of.
+    noise adds to the light, so that what is dark has no colour to speak of. Beside white, where all colours
+    are saturated, less is free: one that falls alone is seen at once.
     """
+    top = np.asarray(pair.evidence.clip, dtype=np.float32)[:, None, None]
+    white = near.highest((pair.original / top).min(axis=0), _BESIDE) >= np.float32(_WHITE)
+    free, share = (
+        np.where(white, np.float32(low), np.float32(usual))
+        for low, usual in ((_FREE_WHITE, _FREE), (_SHARE_WHITE, _SHARE))
+    )
     worst = np.zeros(pair.shape, dtype=np.float32)
     for beyond, span in _colours(pair):
-        np.maximum(worst, beyond / (np.float32(_FREE) + np.float32(_SHARE) * span), out=worst)
+        np.maximum(worst, beyond / (free + share * span), out=worst)
     return Severity(worst / np.float32(LIMITS["hue, spots"]))
 
 

@@ -25,10 +25,10 @@ _USUAL_GAIN: Final = 8.0
 _NOTHING: Final = 2.0
 """Standard deviations of noise that light may lie below nothing: half as many, since an estimate of black
 knows its bound."""
-_IMPOSSIBLE: Final = 3.0
-"""Weight of light below nothing on top of being too dark: no scene has any, while dark lines finer than the
-PSF are darker than all that the photo shows. Alone, the one would need a limit of 0.17 and the other of 0.31
-for the same sound blocks, and the square of their ratio is 3.3."""
+_POSSIBLE, _IMPOSSIBLE = 0.25, 3.0
+"""Weights of light below the photo's darkest and of light below nothing. No scene has the latter, while dark
+lines finer than the PSF are darker than all that the photo shows: with a weight of 1, pictures of slats and
+girders would need a limit 1.7 times that of others, with a quarter 1.1 times."""
 
 
 def too_dark(pair: Pair) -> Severity:
@@ -37,11 +37,12 @@ def too_dark(pair: Pair) -> Severity:
     A correction that takes the lens for worse than it is subtracts more light beside every edge than there
     was. How much of what it changed is of this kind, with m the least y around::
 
-        s² = sum ( max(m - x - 4 sigma, 0)² + 3 max(-x - 2 sigma, 0)² ) / sum ( (x - y)² + sigma² )
+        s² = sum ( max(m - x - 4 sigma, 0)² / 4 + 3 max(-x - 2 sigma, 0)² ) / sum ( (x - y)² + sigma² )
     """
     least = near.lowest(pair.original, _NEAR)
     below = np.square(np.maximum(least - pair.corrected - np.float32(_SURE) * pair.sigma, np.float32(0.0)))
     nothing = np.maximum(-pair.corrected - np.float32(_NOTHING) * pair.sigma, np.float32(0.0))
+    below *= np.float32(_POSSIBLE)
     below += np.float32(_IMPOSSIBLE) * np.square(nothing)
     return _share(pair, below, LIMITS["too dark"])
 

@@ -41,7 +41,7 @@ CHECKS: Final[Mapping[str, Check]] = MappingProxyType(
 
 _SOFTNESS: Final = 1.0
 """Standard deviation in pixels of what makes the map smooth: a fault of one pixel leaves no edge."""
-_GROWN: Final = 5
+GROWN: Final = 5
 """Side of the square over which the least that is kept spreads before: wide enough that of a faulty pixel
 itself nothing comes back when the map is smoothed."""
 
@@ -122,7 +122,7 @@ def held_back(
 
 def softened(keep: Plane) -> Plane:
     """Spread the least that is kept over its neighbours and smooth it, so that it ends nowhere at once."""
-    grown = near.lowest(keep, _GROWN)
+    grown = near.lowest(keep, GROWN)
     return np.clip(ndimage.gaussian_filter(grown, _SOFTNESS, mode="nearest"), 0.0, 1.0)
 
 

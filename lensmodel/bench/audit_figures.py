@@ -9,9 +9,10 @@ from typing import Final
 
 import numpy as np
 
-from lensmodel.audit import CHECKS, Evidence, held_back
+from lensmodel.audit import CHECKS, Evidence, held_back, near
 from lensmodel.audit.base import Pair
 from lensmodel.audit.report import HELD
+from lensmodel.audit.tile import GROWN
 from lensmodel.bench.audit import BLOCK, CHANGES, FAULTS, SOUND, Trial
 from lensmodel.blur import UniformBlur, crop_to_support
 from lensmodel.psf import as_kernel
@@ -143,7 +144,10 @@ def factors(block: Block) -> dict[str, float]:
     found = {}
     for name, check in CHECKS.items():
         severity = check(pair)
-        values = severity.values[severity.part((INNER[1], INNER[2]), pair.shape)]
+        values = severity.values
+        if severity.step == 1:
+            values = near.highest(values, GROWN)  # what is kept of a pixel spreads
+        values = values[severity.part((INNER[1], INNER[2]), pair.shape)]
         low, high = 1e-3, 1e3
         for _ in range(20):
             middle = float(np.sqrt(low * high))

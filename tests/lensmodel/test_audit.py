@@ -104,7 +104,7 @@ def share_of(check: str, corrected: Planes, known: Evidence | None = None) -> fl
 
 
 def test_light_below_nothing_is_too_dark() -> None:
-    sharpened = PHOTO + 4.0 * (PHOTO - ndimage.gaussian_filter(PHOTO, (0, 2, 2)))
+    sharpened = PHOTO + 8.0 * (PHOTO - ndimage.gaussian_filter(PHOTO, (0, 2, 2)))
 
     assert share_of("too dark", sharpened) > 10 * share_of("too dark", SOUND) + 0.1
 
@@ -131,13 +131,38 @@ def test_a_single_dot_is_isolated_and_taken_away_there_alone() -> None:
     assert np.array_equal(audit.keep[apart], clean.keep[apart])
 
 
-def test_exchanged_colours_are_a_foreign_hue() -> None:
-    flipped = SOUND.copy()
-    flipped[0, 60:100, 60:100] *= 0.3
+def test_a_colour_that_is_gone_is_a_foreign_hue() -> None:
+    cyan = SOUND.copy()
+    cyan[0, 60:100, 60:100] = 0.0
 
-    assert share_of("hue, spots", flipped) > 0.015
-    assert share_of("hue, spots", SOUND) < 0.005
+    assert share_of("hue, area", cyan) > 0.1
     assert share_of("hue, area", SOUND) < 0.005
+
+
+def test_a_single_colourful_pixel_is_a_spot_of_hue() -> None:
+    grey = np.full((3, SIDE, SIDE), 0.4, dtype=np.float32)
+    spotted = grey.copy()
+    spotted[:, 80, 80] = (0.6, 0.0, 0.0)
+
+    audit = audit_tile(grey, spotted, evidence(None))
+
+    assert next(f.worst for f in audit.findings if f.check == "hue, spots") > 1.5
+    assert audit.keep[80, 80] < 0.1
+
+
+def test_a_colour_that_falls_beside_white_is_a_spot_of_hue() -> None:
+    white = np.ones((3, SIDE, SIDE), dtype=np.float32)
+    yellow = white.copy()
+    yellow[2, 40:44, 50] = 0.6
+    grey, dim = 0.5 * white, 0.5 * yellow
+
+    beside_white, elsewhere = (
+        audit_tile(before, after, evidence(None)).keep[41, 50]
+        for before, after in ((white, yellow), (grey, dim))
+    )
+
+    assert beside_white < 0.1
+    assert elsewhere == 1.0
 
 
 @pytest.mark.parametrize("period", [2.0, 2.5, 3.0])

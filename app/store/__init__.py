@@ -13,6 +13,7 @@ from app.store.database import Database
 from app.store.lenses import LensName, LensStore
 from app.store.patches import NewPatch, NewSample, PatchStore
 from app.store.photos import PhotoStore
+from app.store.removal import RemovalStore
 from app.store.samples import SampleStore, StoredSample
 from app.store.workers import WorkerStore
 
@@ -29,6 +30,7 @@ class Store:
         self.lenses = LensStore(self.database)
         self.samples = SampleStore(self.database)
         self.corrections = CorrectionStore(self.database)
+        self.removal = RemovalStore(self.database)
         self.workers = WorkerStore(self.database)
 
     def close(self) -> None:

@@ -422,6 +422,7 @@ class PhotoStore:
             photo.deleted_at = now()
             photo.state = "cancelled" if photo.state in UNFINISHED else photo.state
             photo.given, photo.lens_serial, photo.filename, photo.sha256 = {}, None, "", ""
+            photo.windows, photo.windows_rejected = None, 0
             forget_if_empty(session, photo)
             prefix = folder_of(photo)
             insert_new(session, GarbageRow, [{"prefix": prefix, "not_before": now() + LATE}])
@@ -485,6 +486,7 @@ def _restart(session: Session, photo: PhotoRow) -> None:
     photo.state, photo.stage_at = "received", now()
     photo.error_code = photo.error_detail = photo.started_at = photo.finished_at = photo.counted_at = None
     photo.attempt = photo.patches_total = photo.patches_done = photo.patches_rejected = 0
+    photo.windows, photo.windows_rejected = None, 0
 
 
 def _move(

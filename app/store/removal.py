@@ -87,6 +87,7 @@ def _unlearn(session: Session, photo: PhotoRow) -> None:
     photo.lens_id, photo.counted_at = None, None
     photo.given = {name: value for name, value in photo.given.items() if name != "lens_id"}
     photo.patches_total = photo.patches_done = photo.patches_rejected = 0
+    photo.windows, photo.windows_rejected = None, 0
     session.execute(delete(SampleRow).where(SampleRow.photo_id == photo.id))
     session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
     statistics = f"{photo.blob_key.rpartition('/')[0]}/statistics/"

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import text
+from sqlalchemy import Text, cast, func, select, text
 from sqlalchemy.exc import DBAPIError
 
 from app.settings import Settings
@@ -16,7 +16,7 @@ from app.store import NewPatch, Store
 from app.store.corrections import Result
 from app.store.database import Database
 from app.store.migrate import current, downgrade, head, is_current, upgrade
-from app.tables import Base
+from app.tables import Base, PatchRow, PhotoRow
 from lensmodel.errors import InvalidInputError
 from lensmodel.psf import gaussian
 
@@ -67,8 +67,36 @@ def test_planning_twice_adds_nothing(store: Store, steps: Steps) -> None:
 
     store.patches.add(photo.public_id, 1, [NewPatch(0, 5, 5, 64, 0.5, 0.0)])
 
-    assert len(store.patches.all_of(photo.public_id)) == 3
+    assert len(store.patches.listed(photo.public_id)) == 3
     assert store.patches.all_of(photo.public_id)[0].row == 100
+
+
+def test_rejected_windows_are_a_map_and_no_rows(store: Store, steps: Steps) -> None:
+    photo = steps.receive()
+    steps.inspect(photo)
+    store.photos.set_state(photo.public_id, ("inspecting",), "selecting")
+    reasons = ("flat", "out-of-focus", "clipped")
+    rejected = [
+        NewPatch(k + 1, 16 * k, 8 * k, 64, 0.12345678, -2.5, rejected=reasons[k % 3]) for k in range(2000)
+    ]
+
+    count = store.patches.add(photo.public_id, 1, [NewPatch(0, 5, 5, 64, 0.5, 0.0, cell=0), *rejected])
+
+    listed = store.patches.listed(photo.public_id)
+    with store.database.reading() as session:
+        stored = session.scalar(select(func.count()).select_from(PatchRow))
+        size = session.scalar(select(func.length(cast(PhotoRow.windows, Text))))
+    again = steps.fresh(photo)
+    assert (count, stored, len(listed)) == (1, 1, 2001)
+    assert (again.patches_total, again.patches_rejected) == (1, 2000)
+    assert [row.idx for row in listed] == list(range(2001))
+    last = listed[-1]
+    assert (last.row, last.col, last.size, last.r, last.phi) == (31984, 15992, 64, 0.1235, -2.5)
+    assert (last.state, last.reason) == ("rejected", reasons[1999 % 3])
+    assert size is not None
+    assert size < 100_000
+    store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
+    assert store.patches.listed(photo.public_id) == []
 
 
 def test_cancel_and_finish_exclude_each_other(store: Store, steps: Steps) -> None:

@@ -157,6 +157,10 @@ class Client:
         """Cancel a job."""
         return _read(s.JobOut, self._http.post(f"/v1/jobs/{job_id}/cancel"))
 
+    def delete_lens(self, lens_id: str) -> None:
+        """Delete a lens with all that was learned of it."""
+        _check(self._http.delete(f"/v1/lenses/{lens_id}"))
+
     def retry(self, job_id: str) -> s.JobOut:
         """Start a failed or cancelled job anew."""
         return _read(s.JobOut, self._http.post(f"/v1/jobs/{job_id}/retry"))

@@ -9,6 +9,7 @@ from typing import Annotated
 
 from fastapi import Depends, Request, Response
 
+from app.drawn import Drawn
 from app.models import ModelCache
 from app.reserve import Reserve
 from app.settings import Settings
@@ -27,6 +28,7 @@ class Services:
     models: ModelCache
     uploads: Places
     reserve: Reserve
+    pictures: Drawn
 
 
 class Places:

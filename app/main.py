@@ -11,6 +11,7 @@ from fastapi import FastAPI
 from app import errors, pages
 from app.bodies import JsonBodies
 from app.dependencies import Places, Services
+from app.drawn import Drawn
 from app.middleware import Heads, OwnNames, RequestLog, SameSite
 from app.models import ModelCache
 from app.reserve import Reserve
@@ -41,7 +42,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             settings=ModelSettings(mode=chosen.model_mode, unit=chosen.model_unit),
         )
         reserve = Reserve(store.database.path.with_name("reserve") if store.database.is_sqlite else None)
-        app.state.services = Services(chosen, store, storage, cache, Places(chosen.max_uploads), reserve)
+        app.state.services = Services(
+            chosen, store, storage, cache, Places(chosen.max_uploads), reserve, Drawn()
+        )
         yield
         store.close()
 

@@ -186,6 +186,12 @@ class PhotoRow(Base):
     patches_total: Mapped[int] = mapped_column(default=0)
     patches_done: Mapped[int] = mapped_column(default=0)
     patches_rejected: Mapped[int] = mapped_column(default=0)
+    windows_rejected: Mapped[int] = mapped_column(default=0)
+    """How many windows were rejected before anything was estimated in them."""
+
+    windows: Mapped[dict[str, Any] | None] = mapped_column(deferred=True)
+    """Those windows, as `app.store.windows` writes them: thousands, which nobody asks for one by one."""
+
     received_at: Mapped[datetime]
     started_at: Mapped[datetime | None]
     stage_at: Mapped[datetime]

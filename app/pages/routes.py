@@ -191,7 +191,7 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
     row = photo_routes.find_photo(call, photo_id)
     photo = photo_routes.describe(call, row)
     turned = row.orientation or 1
-    patches = [views.patch_out(patch) for patch in call.store.patches.all_of(photo_id)]
+    patches = [views.patch_out(patch) for patch in call.store.patches.listed(photo_id)]
     if row.height and row.width:
         patches = [pictures.upright_patch(patch, row.height, row.width, turned) for patch in patches]
         if turned > 4:

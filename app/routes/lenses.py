@@ -5,7 +5,7 @@ from __future__ import annotations
 from statistics import median
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, Query, status
 
 from app import views
 from app.dependencies import Call, CallDep
@@ -47,6 +47,18 @@ def read_lens(lens_id: str, call: CallDep) -> LensOut:
     """Return one lens."""
     lens = find_lens(call, lens_id)
     return views.lens_out(lens, *call.store.lenses.coverage_of([lens])[lens.id])
+
+
+@router.delete(
+    "/lenses/{lens_id}",
+    operation_id="deleteLens",
+    status_code=status.HTTP_204_NO_CONTENT,
+    responses=problems(404, 422),
+)
+def delete_lens(lens_id: str, call: CallDep) -> None:
+    """Delete a lens with its serial and all that was learned of it; its photos stay and can be corrected."""
+    if not call.services.reserve.spend(lambda: call.store.removal.lens(lens_id, call.owner)):
+        raise UnknownLensError(f"there is no lens {lens_id[:60]}: it may be deleted already")
 
 
 @router.get("/lenses/{lens_id}/calibrations", operation_id="listCalibrations", responses=problems(404, 422))

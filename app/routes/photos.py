@@ -197,7 +197,7 @@ def read_photo(photo_id: str, call: CallDep) -> PhotoOut:
 def list_patches(photo_id: str, call: CallDep) -> PatchPage:
     """Return where PSFs were estimated in a photo, and which windows were rejected and why."""
     photo = find_photo(call, photo_id)
-    return PatchPage(items=[views.patch_out(row) for row in call.store.patches.all_of(photo.public_id)])
+    return PatchPage(items=[views.patch_out(row) for row in call.store.patches.listed(photo.public_id)])
 
 
 @router.delete(

@@ -11,9 +11,11 @@ from app.settings import Settings
 from app.store.corrections import CorrectionStore
 from app.store.database import Database
 from app.store.lenses import LensName, LensStore
-from app.store.patches import NewPatch, NewSample, PatchStore
+from app.store.patches import NewSample, PatchStore
 from app.store.photos import PhotoStore
+from app.store.removal import RemovalStore
 from app.store.samples import SampleStore, StoredSample
+from app.store.windows import NewPatch
 from app.store.workers import WorkerStore
 
 __all__ = ["LensName", "NewPatch", "NewSample", "Store", "StoredSample"]
@@ -29,6 +31,7 @@ class Store:
         self.lenses = LensStore(self.database)
         self.samples = SampleStore(self.database)
         self.corrections = CorrectionStore(self.database)
+        self.removal = RemovalStore(self.database)
         self.workers = WorkerStore(self.database)
 
     def close(self) -> None:

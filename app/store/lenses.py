@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from sqlalchemy import delete, func, select, update
 from sqlalchemy.orm import Session
@@ -15,6 +15,9 @@ from app.store.database import Database, insert_new
 from app.store.owners import find, now, owned
 from app.store.versions import drop_samples, new_version, take_samples
 from app.tables import CorrectionRow, EventRow, GarbageRow, LensRow, PhotoRow
+
+TRIES: Final = 10
+"""How often to look again for a lens that was deleted when we looked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,22 +55,28 @@ def lens_of_photo(session: Session, photo: PhotoRow, *, single_copy: bool) -> Le
     if photo.lens_serial is None and not (single_copy and photo.lens_model):
         return None
     key = identity_key(photo.lens_maker, photo.lens_model, photo.lens_serial)
-    if photo.calibrate:
-        source = photo.lens_serial_source or "none"
-        fresh = _new_lens(
-            photo.owner_id,
-            key,
-            maker=photo.lens_maker,
-            model=photo.lens_model,
-            serial=photo.lens_serial,
-            source=source,
-        )
-        insert_new(session, LensRow, [fresh])
-    return session.scalar(
-        select(LensRow).where(
-            LensRow.owner_id == photo.owner_id, LensRow.identity_key == key, LensRow.deleted_at.is_(None)
-        )
+    fresh = _new_lens(
+        photo.owner_id,
+        key,
+        maker=photo.lens_maker,
+        model=photo.lens_model,
+        serial=photo.lens_serial,
+        source=photo.lens_serial_source or "none",
     )
+    for _ in range(TRIES):
+        if photo.calibrate:
+            insert_new(session, LensRow, [fresh])
+        # locked: on PostgreSQL the last other photo of it may be going, and the lens with it
+        found = session.scalar(
+            select(LensRow)
+            .where(
+                LensRow.owner_id == photo.owner_id, LensRow.identity_key == key, LensRow.deleted_at.is_(None)
+            )
+            .with_for_update()
+        )
+        if found is not None or not photo.calibrate:
+            return found
+    return None
 
 
 def _new_lens(

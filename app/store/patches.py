@@ -8,31 +8,19 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
-from sqlalchemy import func, select, update
+from sqlalchemy import Select, func, select, update
 from sqlalchemy.orm import Session
 
+from app.store import windows
 from app.store.database import Database, insert_new
 from app.store.owners import now
+from app.store.windows import NewPatch
 from app.tables import PatchRow, PhotoRow, SampleRow
 from lensmodel.types import Channel, Kernel
 
 DTYPE: Final = "<f4"
 FORMAT_VERSION: Final = 1
-
-
-@dataclass(frozen=True, slots=True)
-class NewPatch:
-    """A window that was chosen, or rejected with a reason."""
-
-    idx: int
-    row: int
-    col: int
-    size: int
-    r: float
-    phi: float
-    cell: int | None = None
-    score: float | None = None
-    rejected: str | None = None
+OPEN: Final = ("pending", "running")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,43 +65,42 @@ class PatchStore:
                     "r": patch.r,
                     "phi": patch.phi,
                     "score": patch.score,
-                    "state": "pending" if patch.rejected is None else "rejected",
-                    "reason": patch.rejected,
+                    "state": "pending",
                     "attempts": 0,
-                    "finished_at": None if patch.rejected is None else now(),
                 }
                 for patch in patches
+                if patch.rejected is None
             ]
             insert_new(session, PatchRow, rows)
+            rejected = [patch for patch in patches if patch.rejected is not None]
+            if photo.windows is None:
+                photo.windows, photo.windows_rejected = windows.packed(rejected), len(rejected)
             return _recount(session, photo)
 
     def all_of(self, photo_id: str, epoch: int | None = None) -> list[PatchRow]:
-        """Return the patches of a photo in the order of their numbers."""
+        """Return the patches of a photo that were to be estimated, in the order of their numbers."""
         with self._db.reading() as session:
-            query = (
-                select(PatchRow)
-                .join(PhotoRow, PhotoRow.id == PatchRow.photo_id)
-                .where(PhotoRow.public_id == photo_id, PatchRow.epoch == (epoch or PhotoRow.epoch))
-                .order_by(PatchRow.idx)
-            )
-            return list(session.scalars(query))
+            return list(session.scalars(_of_photo(photo_id, epoch).order_by(PatchRow.idx)))
+
+    def listed(self, photo_id: str) -> list[PatchRow]:
+        """Return the patches of a photo, and after them the windows that were rejected at sight."""
+        with self._db.reading() as session:
+            rows = list(session.scalars(_of_photo(photo_id).order_by(PatchRow.idx)))
+            stored = session.scalar(select(PhotoRow.windows).where(PhotoRow.public_id == photo_id))
+        return rows + windows.unpacked(stored)
 
     def cells(self, photo_id: str, epoch: int) -> list[int]:
         """Return the numbers of the cells that still have patches to estimate."""
-        open_cells = {
-            patch.cell
-            for patch in self.all_of(photo_id, epoch)
-            if patch.state in {"pending", "running"} and patch.cell is not None
-        }
-        return sorted(open_cells)
+        query = _of_photo(photo_id, epoch).where(PatchRow.state.in_(OPEN))
+        with self._db.reading() as session:
+            found = session.scalars(query.with_only_columns(PatchRow.cell).distinct())
+            return sorted(cell for cell in found if cell is not None)
 
     def of_cell(self, photo_id: str, epoch: int, cell: int) -> list[PatchRow]:
         """Return the patches of one cell that are still to be estimated."""
-        return [
-            patch
-            for patch in self.all_of(photo_id, epoch)
-            if patch.cell == cell and patch.state in {"pending", "running"}
-        ]
+        query = _of_photo(photo_id, epoch).where(PatchRow.state.in_(OPEN), PatchRow.cell == cell)
+        with self._db.reading() as session:
+            return list(session.scalars(query.order_by(PatchRow.idx)))
 
     def finish(self, photo_id: str, epoch: int, samples: Sequence[NewSample]) -> int:
         """Store the samples of some patches and mark these done; return how many samples went in.
@@ -161,6 +148,14 @@ class PatchStore:
             _recount(session, photo)
 
 
+def _of_photo(photo_id: str, epoch: int | None = None) -> Select[PatchRow]:
+    return (
+        select(PatchRow)
+        .join(PhotoRow, PhotoRow.id == PatchRow.photo_id)
+        .where(PhotoRow.public_id == photo_id, PatchRow.epoch == (epoch or PhotoRow.epoch))
+    )
+
+
 def _live(session: Session, photo_id: str, epoch: int) -> PhotoRow | None:
     return session.scalar(
         select(PhotoRow)
@@ -182,9 +177,10 @@ def _recount(session: Session, photo: PhotoRow) -> int:
         .group_by(PatchRow.state)
     )
     counts = {row[0]: row[1] for row in rows}
-    photo.patches_rejected = counts.get("rejected", 0)
+    rejected = counts.get("rejected", 0)
+    photo.patches_rejected = rejected + photo.windows_rejected
     photo.patches_done = counts.get("done", 0) + counts.get("failed", 0)
-    photo.patches_total = sum(counts.values()) - photo.patches_rejected
+    photo.patches_total = sum(counts.values()) - rejected
     return photo.patches_total
 
 

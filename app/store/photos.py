@@ -15,6 +15,7 @@ from app.store import lenses
 from app.store.database import Database, insert_new
 from app.store.lenses import LensName
 from app.store.owners import ensure_owner, find, find_to_change, now, owned
+from app.store.removal import forget_if_empty
 from app.store.versions import new_version, take_samples
 from app.tables import (
     PHOTO_FINAL,
@@ -348,7 +349,10 @@ class PhotoStore:
         """End a photo that is being worked on with a reason; its samples never count."""
         with self._db.writing() as session:
             fields = {"error_code": code, "error_detail": detail, "finished_at": now()}
-            return _move(session, photo_id, ("received", *PHOTO_RUNNING), "failed", epoch=epoch, **fields)
+            failed = _move(session, photo_id, ("received", *PHOTO_RUNNING), "failed", epoch=epoch, **fields)
+            if failed:
+                _let_go(session, photo_id)
+            return failed
 
     def retry(self, photo_id: str, owner: str | None = None) -> bool:
         """Start a failed or cancelled photo anew; False if it is in another state."""
@@ -380,6 +384,7 @@ class PhotoStore:
             if photo is None or not _move(session, photo_id, UNFINISHED, "cancelled", finished_at=now()):
                 return False
             _drop_patches(session, photo)
+            _let_go(session, photo_id)
             return True
 
     def finish(self, photo_id: str, epoch: int) -> int | None:
@@ -416,7 +421,9 @@ class PhotoStore:
             lenses.delete_corrections(session, photo)
             photo.deleted_at = now()
             photo.state = "cancelled" if photo.state in UNFINISHED else photo.state
-            photo.given, photo.lens_serial, photo.filename = {}, None, ""
+            photo.given, photo.lens_serial, photo.filename, photo.sha256 = {}, None, "", ""
+            photo.windows, photo.windows_rejected = None, 0
+            forget_if_empty(session, photo)
             prefix = folder_of(photo)
             insert_new(session, GarbageRow, [{"prefix": prefix, "not_before": now() + LATE}])
             return prefix
@@ -435,6 +442,14 @@ def statistics_of(photo: PhotoRow) -> str:
 def settings_of(photo: PhotoRow) -> dict[str, Any]:
     """Return how the lens was set, as tasks read it."""
     return {"aperture": photo.aperture, "focal_mm": photo.focal_mm, "focus_m": photo.focus_m}
+
+
+def _let_go(session: Session, photo_id: str) -> None:
+    """Forget the lens that only a photo without a result speaks of: its serial is nobody's business now."""
+    photo = session.scalars(
+        select(PhotoRow).where(PhotoRow.public_id == photo_id).execution_options(populate_existing=True)
+    ).one()
+    forget_if_empty(session, photo)
 
 
 def _insert_or_find(session: Session, fresh: dict[str, Any]) -> tuple[PhotoRow, bool]:
@@ -471,6 +486,7 @@ def _restart(session: Session, photo: PhotoRow) -> None:
     photo.state, photo.stage_at = "received", now()
     photo.error_code = photo.error_detail = photo.started_at = photo.finished_at = photo.counted_at = None
     photo.attempt = photo.patches_total = photo.patches_done = photo.patches_rejected = 0
+    photo.windows, photo.windows_rejected = None, 0
 
 
 def _move(

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import text
+from sqlalchemy import Text, cast, func, select, text
 from sqlalchemy.exc import DBAPIError
 
 from app.settings import Settings
@@ -16,7 +16,7 @@ from app.store import NewPatch, Store
 from app.store.corrections import Result
 from app.store.database import Database
 from app.store.migrate import current, downgrade, head, is_current, upgrade
-from app.tables import Base
+from app.tables import Base, PatchRow, PhotoRow
 from lensmodel.errors import InvalidInputError
 from lensmodel.psf import gaussian
 
@@ -67,8 +67,36 @@ def test_planning_twice_adds_nothing(store: Store, steps: Steps) -> None:
 
     store.patches.add(photo.public_id, 1, [NewPatch(0, 5, 5, 64, 0.5, 0.0)])
 
-    assert len(store.patches.all_of(photo.public_id)) == 3
+    assert len(store.patches.listed(photo.public_id)) == 3
     assert store.patches.all_of(photo.public_id)[0].row == 100
+
+
+def test_rejected_windows_are_a_map_and_no_rows(store: Store, steps: Steps) -> None:
+    photo = steps.receive()
+    steps.inspect(photo)
+    store.photos.set_state(photo.public_id, ("inspecting",), "selecting")
+    reasons = ("flat", "out-of-focus", "clipped")
+    rejected = [
+        NewPatch(k + 1, 16 * k, 8 * k, 64, 0.12345678, -2.5, rejected=reasons[k % 3]) for k in range(2000)
+    ]
+
+    count = store.patches.add(photo.public_id, 1, [NewPatch(0, 5, 5, 64, 0.5, 0.0, cell=0), *rejected])
+
+    listed = store.patches.listed(photo.public_id)
+    with store.database.reading() as session:
+        stored = session.scalar(select(func.count()).select_from(PatchRow))
+        size = session.scalar(select(func.length(cast(PhotoRow.windows, Text))))
+    again = steps.fresh(photo)
+    assert (count, stored, len(listed)) == (1, 1, 2001)
+    assert (again.patches_total, again.patches_rejected) == (1, 2000)
+    assert [row.idx for row in listed] == list(range(2001))
+    last = listed[-1]
+    assert (last.row, last.col, last.size, last.r, last.phi) == (31984, 15992, 64, 0.1235, -2.5)
+    assert (last.state, last.reason) == ("rejected", reasons[1999 % 3])
+    assert size is not None
+    assert size < 100_000
+    store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
+    assert store.patches.listed(photo.public_id) == []
 
 
 def test_cancel_and_finish_exclude_each_other(store: Store, steps: Steps) -> None:
@@ -77,10 +105,11 @@ def test_cancel_and_finish_exclude_each_other(store: Store, steps: Steps) -> Non
     steps.plan(photo)
     steps.estimate(photo)
 
+    lens = steps.lens_id(steps.counted())
     assert store.photos.cancel(photo.public_id)
     assert store.photos.finish(photo.public_id, 1) is None
     assert not store.photos.cancel(photo.public_id)
-    assert store.samples.of_lens(steps.lens_id(photo))[1] == []
+    assert len(store.samples.of_lens(lens)[1]) == 6  # of the other photo alone
 
 
 def test_work_of_an_old_epoch_changes_nothing(store: Store, steps: Steps) -> None:
@@ -228,19 +257,22 @@ def test_excluding_takes_the_samples_out_and_including_brings_them_back(store: S
 
 
 def test_deleting_a_photo_forgets_its_samples_and_names_its_blobs(store: Store, steps: Steps) -> None:
-    photo = steps.counted()
+    other, photo = steps.counted(), steps.counted()
     lens = steps.lens_id(photo)
 
     assert store.photos.delete(photo.public_id, OWNER) == f"photos/{photo.public_id}/"
 
     assert store.photos.get(photo.public_id) is None
-    assert store.samples.of_lens(lens)[1] == []
+    assert {stored.sample.photo for stored in store.samples.of_lens(lens)[1]} == {other.public_id}
     assert store.workers.garbage() == []  # a worker may still write: once more in a while
     late = datetime.now(UTC) + timedelta(hours=1)
-    assert set(store.workers.garbage(at=late)) == {f"photos/{photo.public_id}/", f"models/{lens}/1-0/"}
+    models = {f"models/{lens}/{version}-0/" for version in (1, 2)}
+    assert set(store.workers.garbage(at=late)) == {f"photos/{photo.public_id}/"} | models
     found = store.lenses.get(lens)
     assert found is not None
-    assert [event.kind for event in store.lenses.history(found)] == ["photo_added", "photo_removed"]
+    assert [event.kind for event in store.lenses.history(found)] == [
+        *("photo_added", "photo_added", "photo_removed")
+    ]
 
 
 def test_the_same_bytes_may_come_again_after_deletion(store: Store, steps: Steps) -> None:

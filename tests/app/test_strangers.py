@@ -15,7 +15,7 @@ import pytest
 import uvicorn
 from starlette.testclient import TestClient
 
-from app import logs, server
+from app import encode, logs, server
 from app.bodies import MAX_JSON_BYTES
 from app.impatient import impatient
 from app.main import create_app
@@ -351,3 +351,37 @@ def test_true_is_a_truth(client: TestClient, steps: Any) -> None:
     answer = client.patch(f"/v1/photos/{photo.public_id}", json={"excluded": True})
 
     assert answer.json()["state"] == "excluded"
+
+
+# --- pictures ---------------------------------------------------------------------------------
+
+
+def test_a_map_of_the_field_is_bounded(client: TestClient, steps: Any) -> None:
+    lens = steps.lens_id(steps.counted())
+
+    largest = client.get(f"/v1/lenses/{lens}/field.png?grid=25x25&size=255&aperture=1.4")
+
+    assert (largest.status_code, largest.json()["code"]) == (422, "invalid_parameter")
+    assert "40.6 million pixels" in largest.json()["detail"]
+    assert client.get(f"/v1/lenses/{lens}/field.png?grid=9x6&size=55&aperture=1.4").status_code == 200
+
+
+def test_a_map_of_the_field_is_drawn_once_for_each_version(
+    client: TestClient, steps: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lens, drawn = steps.lens_id(steps.counted()), []
+    really = encode.field_map
+
+    def field_map(*arguments: Any, **options: Any) -> bytes:
+        drawn.append(options["columns"])
+        return really(*arguments, **options)
+
+    monkeypatch.setattr(encode, "field_map", field_map)
+    path = f"/v1/lenses/{lens}/field.png?grid=3x2&size=15&aperture=1.4"
+
+    same = {client.get(path).content for _ in range(3)}
+    once = len(drawn)
+    steps.counted()  # a new version
+    client.get(path)
+
+    assert (len(same), once, len(drawn)) == (1, 1, 2)

@@ -1,0 +1,44 @@
+"""Pictures that were drawn, by the tag of what they show: drawn once, however many ask at once."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict, defaultdict
+from collections.abc import Callable
+from typing import Final
+
+MAX_BYTES: Final = 32 << 20
+"""Chosen: some hundred maps of a field."""
+
+
+class Drawn:
+    """The least recently used pictures of one process.
+
+    A tag names the version of the lens and the whole question, so that a picture is never out of date.
+    """
+
+    def __init__(self, max_bytes: int = MAX_BYTES) -> None:
+        self._max_bytes = max_bytes
+        self._kept: OrderedDict[str, bytes] = OrderedDict()
+        self._guard = threading.Lock()
+        self._drawing: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
+
+    def get(self, tag: str, draw: Callable[[], bytes]) -> bytes:
+        """Return the picture of a tag; draw it if it is not there, and one at a time."""
+        with self._guard:
+            alone = self._drawing[tag]
+        with alone:
+            with self._guard:
+                if tag in self._kept:
+                    self._kept.move_to_end(tag)
+                    return self._kept[tag]
+            try:
+                picture = draw()
+            finally:
+                with self._guard:
+                    self._drawing.pop(tag, None)
+            with self._guard:
+                self._kept[tag] = picture
+                while len(self._kept) > 1 and sum(map(len, self._kept.values())) > self._max_bytes:
+                    self._kept.popitem(last=False)
+            return picture

@@ -1,0 +1,60 @@
+"""Windows of a photo that were rejected at sight: a compact map in place of thousands of rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from app.tables import PatchRow
+
+DIGITS: Final = 4
+"""Of r and phi: a tenth of a pixel in a photo of 24 megapixels is two of their last digit."""
+
+
+@dataclass(frozen=True, slots=True)
+class NewPatch:
+    """A window that was chosen, or rejected with a reason."""
+
+    idx: int
+    row: int
+    col: int
+    size: int
+    r: float
+    phi: float
+    cell: int | None = None
+    score: float | None = None
+    rejected: str | None = None
+
+
+def packed(rejected: Sequence[NewPatch]) -> dict[str, Any]:
+    """Return windows as one value that JSON can hold; each reason stands there once."""
+    reasons = sorted({patch.rejected or "" for patch in rejected})
+    numbers = {reason: number for number, reason in enumerate(reasons)}
+    listed = [
+        [
+            *(patch.idx, patch.row, patch.col, patch.size),
+            *(round(patch.r, DIGITS), round(patch.phi, DIGITS), numbers[patch.rejected or ""]),
+        ]
+        for patch in rejected
+    ]
+    return {"reasons": reasons, "windows": listed}
+
+
+def unpacked(stored: dict[str, Any] | None) -> list[PatchRow]:
+    """Return the windows of `packed` as rows that belong to no table."""
+    if stored is None:
+        return []
+    return [
+        PatchRow(
+            idx=idx,
+            row=row,
+            col=col,
+            size=size,
+            r=r,
+            phi=phi,
+            state="rejected",
+            reason=stored["reasons"][reason],
+        )
+        for idx, row, col, size, r, phi, reason in stored["windows"]
+    ]

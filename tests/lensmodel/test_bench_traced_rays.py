@@ -14,6 +14,7 @@ from lensmodel.bench.traced.copies import copies
 from lensmodel.bench.traced.designs import designs
 from lensmodel.bench.traced.image import kernel_of
 from lensmodel.bench.traced.lens import Copy, TracedLens
+from lensmodel.bench.traced.make import make_grid
 from lensmodel.bench.traced.patents import PATENTS
 from lensmodel.bench.traced.prescription import Design, Surface, optic_of
 from lensmodel.bench.traced.rays import Fault, Tracer
@@ -175,6 +176,16 @@ def test_wavefront_polynomial_leaves_no_error() -> None:
     for h in ((0.0, 0.0), (0.6, -0.4), (-0.8, 0.6)):
         for pupil, wave, _ in lens.pupils(h, "b", lens.copy.f_number):
             assert pupil.residual_um < 0.01 * wave
+
+
+def test_grid_holds_the_exact_kernels_at_its_nodes() -> None:
+    lens = TracedLens(copies["heliar"])
+    grid = make_grid(lens, step=1.0, size=15)
+    for place in (FieldPosition(0.0, 0.0), FieldPosition(1.0, 0.0), FieldPosition(1.0, -math.pi / 2)):
+        kernel = grid.kernel_at(place, "r", 15)
+        assert distance(kernel, lens.kernel(place, "r", 15)).rel_l2 < 2e-3
+    assert grid.facts["path_misfit_waves"] < 0.01
+    assert 0.3 < grid.transmission((1.0, 0.0)) < 0.8
 
 
 def test_field_vectors_turn_the_kernels_of_a_perfect_copy() -> None:

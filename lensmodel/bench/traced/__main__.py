@@ -47,6 +47,7 @@ def main() -> int:
         grid.write(path)
         spent = time.process_time() - start
         logger.info("%s: %d KB, %.0f CPU seconds", path, path.stat().st_size // 1024, spent)
+        logger.info("largest misfit of a path: %.4f waves", grid.facts["path_misfit_waves"])
         if asked.check:
             errors = interpolation_error(lens, grid, asked.check, np.random.default_rng(0))
             logger.info("error between nodes: median %.4f, largest %.4f", np.median(errors), max(errors))

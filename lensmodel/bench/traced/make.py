@@ -66,9 +66,12 @@ def make_grid(
     radius = np.hypot(*np.meshgrid(axis, axis))
     traced = [(int(i), int(j)) for i, j in np.argwhere(radius <= 1.0 + 1.5 * step)]
     stop, limits = lens.stop_radius(n), lens.limits
+    misfit = 0.0
     for done, (i, j) in enumerate(traced, start=1):
         h = (float(axis[j]), float(axis[i]))
         pupils = lens.pupils_of_all(h, n)
+        if radius[i, j] <= 1.0:
+            misfit = max(misfit, *(p.residual_um / wave for c in CHANNELS for p, wave, _ in pupils[c]))
         middles = []
         for c, channel in enumerate(CHANNELS):
             kernel, middle = kernel_of(
@@ -95,6 +98,7 @@ def make_grid(
         "focal_mm": lens.focal_mm,
         "pitch_um": pitch_um,
         "half_diagonal_mm": lens.copy.half_diagonal_mm,
+        "path_misfit_waves": misfit,
         "corner_light_reached": float(light[reach, -2]),
     }
     return GridField(axis, kernels, centers, light, facts)

@@ -14,6 +14,7 @@ from lensmodel.deconv.base import Sensor
 from lensmodel.deconv.clipped import around
 from lensmodel.deconv.compiled_blur import CompiledBlur
 from lensmodel.deconv.engine import compiled
+from lensmodel.deconv.hue import of_known_hue
 from lensmodel.deconv.lights import compact, far, positive
 from lensmodel.types import Planes
 
@@ -23,9 +24,6 @@ error of .1 of a light ten times beyond saturation is as bright as white (chosen
 
 _FADE: Final = 3
 """Pixels over which the bounds end (chosen)."""
-
-_LEAST_LIGHT: Final = 3.0
-"""Standard deviations of the noise below which light has no hue (chosen)."""
 
 
 def held_beside_clipped(
@@ -71,7 +69,7 @@ def held_beside_clipped(
     held = np.clip(made, low, high)
     if len(seen) > 1:
         noise = np.stack([s.variance(p) for p, s in zip(seen, sensors, strict=True)])
-        held = np.clip(_of_known_hue(seen, held, anywhere[rows, cols], noise, window), low, high)
+        held = np.clip(of_known_hue(seen, held, anywhere[rows, cols], noise, window), low, high)
     trust = 1.0 - min(max(errors) / _UNSURE, 1.0) * _light_of(broad, seen, blurs, sensors)
     held = np.where(broad, seen, seen + trust * (held - seen))
     distance = ndimage.distance_transform_cdt(~anywhere[rows, cols], "chessboard")
@@ -79,33 +77,6 @@ def held_beside_clipped(
     result = restored.copy()
     result[here] = restored[here] + share * (held - restored[here])
     return result
-
-
-def _of_known_hue(
-    photo: Planes,
-    made: Planes,
-    clipped: NDArray[np.bool_],
-    noise: NDArray[np.float32],
-    window: tuple[int, int, int],
-) -> Planes:
-    """Hold each colour's share of the light within those of the photo in a window; light stays the same.
-
-    Clipped pixels have no hue: all colours at saturation are grey on the sensor and pink in the picture.
-    """
-    floor = np.float32(_LEAST_LIGHT) * np.sqrt(noise.sum(axis=0)) + np.float32(1e-6)
-
-    def shares(planes: Planes) -> Planes:
-        positive = np.maximum(planes, np.float32(0.0))
-        return np.asarray((positive + floor / len(planes)) / (positive.sum(axis=0) + floor), dtype=np.float32)
-
-    known = shares(photo)
-    unknown = np.where(clipped, np.float32(np.inf), known), np.where(clipped, np.float32(-np.inf), known)
-    low = np.minimum(ndimage.minimum_filter(unknown[0], window, mode="nearest"), known)
-    high = np.maximum(ndimage.maximum_filter(unknown[1], window, mode="nearest"), known)
-    light = np.maximum(made, np.float32(0.0)).sum(axis=0) + floor
-    share = np.clip(shares(made), low, high)
-    share /= share.sum(axis=0)
-    return np.asarray(share * light - floor / len(made), dtype=np.float32)
 
 
 def _light_of(

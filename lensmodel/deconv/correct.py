@@ -19,6 +19,7 @@ from lensmodel.deconv.base import CoarseMethod, Deconvolver, Sensor, restore_pla
 from lensmodel.deconv.beside_clipped import held_beside_clipped
 from lensmodel.deconv.canvas import fitted_halo
 from lensmodel.deconv.engine import compiled, keep_freed_memory
+from lensmodel.deconv.hue import hue_held
 from lensmodel.deconv.lattice import Cell, Roi, cells, usual_pitch
 from lensmodel.deconv.limits import Bounds
 from lensmodel.deconv.methods import deconvolvers
@@ -360,6 +361,7 @@ def _restore(job: _Job, cell: Cell) -> _Restored:
     restored = texture_kept(
         tile, restored, blurs, sensors, texture=job.bounds.texture, denoise=job.bounds.denoise
     )
+    restored = hue_held(tile, restored, blurs, sensors, errors)
     restored = held_beside_clipped(tile, restored, blurs, sensors, errors)
     evidence = Evidence(job.noise, job.clip, blurs, errors, [sensor.measured for sensor in sensors])
     # before the bounds, which would hide what tells of a wrong kernel: light below black, foreign hues

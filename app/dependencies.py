@@ -16,6 +16,7 @@ from app.settings import Settings
 from app.storage import Storage
 from app.store import Store
 from app.store.owners import LOCAL
+from app.watch import Watch
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +30,7 @@ class Services:
     uploads: Places
     reserve: Reserve
     pictures: Drawn
+    watch: Watch
 
 
 class Places:

@@ -19,6 +19,8 @@ from app.routes import corrections, health, jobs, lenses, photos, psf
 from app.settings import MIB, Settings
 from app.storage import Storage
 from app.store import Store
+from app.store.jobs import JobStore
+from app.watch import Watch
 from lensmodel.regression import ModelSettings
 
 
@@ -42,10 +44,12 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             settings=ModelSettings(mode=chosen.model_mode, unit=chosen.model_unit),
         )
         reserve = Reserve(store.database.path.with_name("reserve") if store.database.is_sqlite else None)
+        watch = Watch(JobStore(store.database).marks)
         app.state.services = Services(
-            chosen, store, storage, cache, Places(chosen.max_uploads), reserve, Drawn()
+            chosen, store, storage, cache, Places(chosen.max_uploads), reserve, Drawn(), watch
         )
         yield
+        watch.stop()
         store.close()
 
     app = FastAPI(

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
 import hashlib
 import time
 from collections.abc import AsyncIterator
-from typing import Annotated
+from typing import Annotated, Final
 
 from fastapi import APIRouter, Query, Response, status
 from sse_starlette import EventSourceResponse, ServerSentEvent
@@ -22,8 +21,8 @@ from app.schemas import JobOut, JobPage, RetriedOut
 
 router = APIRouter(tags=["jobs"])
 
-POLL_SECONDS = 0.1
-"""How often a waiting request looks at the row: a read of some 0.1 ms."""
+LOOK_AGAIN_S: Final = 15.0
+"""How often a job is read that did not change: its estimate of the time left does."""
 
 FINAL = {"succeeded", "failed", "cancelled"}
 
@@ -85,9 +84,11 @@ async def read_job(
     seen = call.request.headers.get("if-none-match", "").strip('W/"')
     before = seen or fingerprint(job)
     deadline = time.monotonic() + min(wait, call.settings.long_poll_seconds)
-    while fingerprint(job) == before and job.state not in FINAL and time.monotonic() < deadline:
-        await asyncio.sleep(POLL_SECONDS)
-        job = await run_in_threadpool(find_job, call, job_id)
+    if wait > 0:
+        with call.services.watch.of(job_id) as changed:
+            while fingerprint(job) == before and job.state not in FINAL and time.monotonic() < deadline:
+                await changed(max(deadline - time.monotonic(), 0.0))
+                job = await run_in_threadpool(find_job, call, job_id)
     tag = fingerprint(job)
     headers = {"ETag": f'W/"{tag}"', "Cache-Control": "no-cache"}
     if job.state not in FINAL:
@@ -175,15 +176,16 @@ async def watch_job(job_id: str, call: CallDep) -> EventSourceResponse:
 
 async def _events(call: Call, job: JobOut) -> AsyncIterator[ServerSentEvent]:
     sent = ""
-    while True:
-        tag = fingerprint(job)
-        if tag != sent:
-            yield ServerSentEvent(data=job.model_dump_json(), event="job", id=tag)
-            sent = tag
-        if job.state in FINAL:
-            return
-        await asyncio.sleep(2 * POLL_SECONDS)
-        try:
-            job = await run_in_threadpool(find_job, call, job.id)
-        except UnknownJobError:  # deleted while watched
-            return
+    with call.services.watch.of(job.id) as changed:
+        while True:
+            tag = fingerprint(job)
+            if tag != sent:
+                yield ServerSentEvent(data=job.model_dump_json(), event="job", id=tag)
+                sent = tag
+            if job.state in FINAL:
+                return
+            await changed(LOOK_AGAIN_S)
+            try:
+                job = await run_in_threadpool(find_job, call, job.id)
+            except UnknownJobError:  # deleted while watched
+                return

@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable, Sequence
+from typing import Final
 
 from sqlalchemy import select
 
 from app.store.database import Database
-from app.tables import PatchRow, PhotoRow
+from app.tables import CorrectionRow, PatchRow, PhotoRow
+
+AT_ONCE: Final = 500
+"""Ids in one question: SQLite allows for some thousand."""
+
+_PHOTO_MARK: Final = (
+    *(PhotoRow.public_id, PhotoRow.state, PhotoRow.epoch, PhotoRow.attempt, PhotoRow.lens_id),
+    *(PhotoRow.patches_done, PhotoRow.patches_total, PhotoRow.error_code, PhotoRow.finished_at),
+)
+_CORRECTION_MARK: Final = (
+    *(CorrectionRow.public_id, CorrectionRow.state, CorrectionRow.epoch, CorrectionRow.attempt),
+    *(CorrectionRow.stage, CorrectionRow.progress_done, CorrectionRow.progress_total),
+    *(CorrectionRow.error_code, CorrectionRow.finished_at),
+)
 
 
 class JobStore:
@@ -41,6 +55,20 @@ class JobStore:
                 row.state = "running"
                 row.attempts += 1
             return rows
+
+    def marks(self, job_ids: Sequence[str]) -> dict[str, Hashable]:
+        """Return for each job what changes whenever something happens to it; see `app.watch`."""
+        found: dict[str, Hashable] = {}
+        with self._db.reading() as session:
+            for first in range(0, len(job_ids), AT_ONCE):
+                ids = job_ids[first : first + AT_ONCE]
+                photos = select(*_PHOTO_MARK).where(
+                    PhotoRow.public_id.in_(ids), PhotoRow.deleted_at.is_(None)
+                )
+                corrections = select(*_CORRECTION_MARK).where(CorrectionRow.public_id.in_(ids))
+                for query in (photos, corrections):
+                    found |= {row[0]: tuple(row[1:]) for row in session.execute(query)}
+        return found
 
     def existing_photos(self, photo_ids: Iterable[str]) -> set[str]:
         """Return which of these photos are not deleted."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
-from types import SimpleNamespace
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -336,11 +336,16 @@ def test_a_finished_job_does_not_make_anybody_wait(
         reads.append(job_id)
         return find(call, job_id)
 
-    async def nobody_sleeps(seconds: float) -> None:
-        pytest.fail(f"the request slept {seconds} s on a finished job")
+    @contextmanager
+    def nobody_waits(job_id: str) -> Iterator[Callable[[float], Awaitable[None]]]:
+        async def changed(seconds: float) -> None:
+            pytest.fail(f"the request waited {seconds} s for finished job {job_id}")
+
+        yield changed
 
     monkeypatch.setattr(jobs, "find_job", find_and_note)
-    monkeypatch.setattr(jobs, "asyncio", SimpleNamespace(sleep=nobody_sleeps))
+    watch = client.app.state.services.watch  # type: ignore[attr-defined]  # an application of ours
+    monkeypatch.setattr(watch, "of", nobody_waits)
 
     assert get(client, f"/v1/jobs/{photo.public_id}?wait=20")["state"] == "succeeded"
 

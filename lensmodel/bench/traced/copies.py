@@ -67,14 +67,6 @@ copies: Final = MappingProxyType(
             sensor_tilt_um=(-8.0, 6.0),
             corner_light=0.3,
         ),
-        "noct": Copy(
-            "noct",
-            1.4,
-            half_diagonal_mm=21.6,
-            faults=(Fault(2, (15.0, 8.0), (0.03, -0.02)),),
-            sensor_tilt_um=(10.0, 8.0),
-            corner_light=0.35,
-        ),
     }
 )
 """Copies by name."""

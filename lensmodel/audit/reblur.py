@@ -21,6 +21,9 @@ MODEL_ERROR: Final = 0.1
 """Share of what the blur changes that may be left on top of the noise: PSFs change within a tile, and
 a prior gives way at edges."""
 _CLIPPED: Final = 0.98
+_GLOW: Final = 0.005
+"""Share of its light that a clipped pixel sends to another from which on that tells nothing: the file holds
+no more than white of a lamp, and a lamp is up to some hundred times brighter (chosen)."""
 
 
 def misfit(pair: Pair) -> Severity:
@@ -72,9 +75,11 @@ def reblurred(plane: Plane, blur: UniformBlur) -> Plane:
 def usable(
     plane: Plane, blur: UniformBlur, clip: float, measured: NDArray[np.bool_] | None
 ) -> NDArray[np.bool_]:
-    """Pixels that were measured, are not clipped and lie inside the rim, which draws on the unknown."""
+    """Pixels that were measured, show no clipped light and lie inside the rim, which draws on the unknown."""
     rim = min(blur.reach, (min(plane.shape) - 1) // 2)
     counted = np.zeros(plane.shape, dtype=bool)
     counted[rim : plane.shape[0] - rim, rim : plane.shape[1] - rim] = True
-    counted &= plane < _CLIPPED * clip
+    clipped = plane >= _CLIPPED * clip
+    if clipped.any():
+        counted &= reblurred(clipped.astype(np.float32), blur) < _GLOW
     return counted if measured is None else counted & measured

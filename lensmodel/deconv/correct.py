@@ -354,7 +354,8 @@ def _restore(job: _Job, cell: Cell) -> _Restored:
         slice(cell.left - left, cell.right - left),
     )
     expected = forecast(cell, tile, blurs, sensors, errors)
-    if job.strength == 0.0 or expected.gain_db < WORTH_DB:
+    worth = expected.gain_db >= WORTH_DB or job.bounds.denoise > 0.0
+    if job.strength == 0.0 or not worth:
         untouched = replace(expected, after=expected.before)
         return _Restored(tile[inner], untouched, None, left=True)
     restored = restore_planes(job.method, tile, blurs, sensors)

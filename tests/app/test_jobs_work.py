@@ -582,7 +582,7 @@ def test_a_photographers_bounds_reach_the_correction_and_its_tag(
 
     assert [one["bounds"] for one in told] == [{}, {"halo": 0.2, "denoise": 0.5}]
     assert told[0]["description"].endswith("strength 1")
-    assert told[1]["description"].endswith("strength 1, halo 0.2, flats kept 0.5")
+    assert told[1]["description"].endswith("strength 1, halo 0.2, denoised 0.5")
 
 
 def test_a_correction_with_a_version_without_samples_fails(
@@ -635,7 +635,7 @@ def test_a_correction_cancelled_while_its_file_was_stored_leaves_no_file(
 def test_a_child_cannot_hand_in_a_file_from_elsewhere(
     bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
 ) -> None:
-    value = {"file": "../../../app.db", "zones": {}}
+    value = {"file": "../../../app.db", "report": {"zones": {}}}
     sandbox.answers["correct"] = [ok(value)]
     key = ask(bench, counted, steps)
 

@@ -251,11 +251,10 @@ def test_kernels_that_are_off_leave_no_dark_lines_beside_edges() -> None:
     seen, sharp = photo(Soft(0.7, 1.0), BASE)
     darkest = ndimage.minimum_filter(sharp, (1, 5, 5))
 
-    def line(bounds: Bounds) -> float:
-        made = correct_planes(seen, Soft(1.3, 1.8), FRAME, noise=BASE, psf_error=0.6, bounds=bounds).planes
-        return float(np.quantile(darkest - made, 0.999))
+    made = correct_planes(seen, Soft(1.3, 1.8), FRAME, noise=BASE, psf_error=0.6).planes
 
-    assert line(Bounds()) < 0.5 * line(Bounds(halo=np.inf))
+    # of white below the darkest light nearby; with neither bounds nor audit it is .18
+    assert float(np.quantile(darkest - made, 0.999)) < 0.07
 
 
 def test_range_is_wider_the_surer_the_kernel() -> None:
@@ -282,7 +281,8 @@ def test_compiled_limiter_gives_the_numbers_of_scipy() -> None:
 @pytest.mark.parametrize("mosaic", [False, True])
 def test_flat_areas_keep_their_grain_unless_it_is_to_be_taken_away(mosaic: bool) -> None:
     rng = np.random.default_rng(1)
-    level = np.array([0.3, 0.4, 0.2])[:, None, None]
+    level = np.array([0.3, 0.4, 0.2])[:, None, None] * np.ones((1, FRAME.height, FRAME.width))
+    level[:, :, :40:8] *= 0.4  # something to correct beside the flat area
     seen = level + rng.standard_normal((3, FRAME.height, FRAME.width)) * np.sqrt(HIGH[0].variance(level))
     seen = seen.astype(np.float32)
     cfa = ((0, 1), (1, 2)) if mosaic else None
@@ -296,7 +296,7 @@ def test_flat_areas_keep_their_grain_unless_it_is_to_be_taken_away(mosaic: bool)
 
     def grain(denoise: float) -> float:
         made = correct_planes(seen, Soft(), FRAME, noise=HIGH, cfa=cfa, bounds=Bounds(denoise=denoise)).planes
-        inside = made[1, 20:-20, 20:-20], seen[1, 20:-20, 20:-20]
+        inside = made[1, 20:-20, 60:-20], seen[1, 20:-20, 60:-20]
         return float(inside[0].var() / inside[1].var())
 
     assert 0.7 < grain(0.0) < 1.0

@@ -1,6 +1,6 @@
-"""What a photo gains that is corrected by a lens known only from other photos, and whether any part of it loses.
+"""What a photo gains that is corrected by a lens known only from other photos, and whether any of it loses.
 
-    LENSMODEL_TEST_DATA=... python benchmarks/blind_gain.py --seeds 1000:1008 --photos 1 2 [--grids FILE.npz ...]
+    LENSMODEL_TEST_DATA=... python benchmarks/blind_gain.py --seeds 1000:1008 --photos 1 2 [--grids FILE.npz]
 
 Each lens takes photos of 1.2 megapixels of different photographs of the test half (the development half for
 seeds below 1000), as Bayer DNG files of 20,000 electrons at saturation. The lens is learned from the first n
@@ -8,9 +8,9 @@ by default settings, and one that was not learned from is corrected by default s
 third-order theory by `--seeds`, or ray-traced ones by `--grids` (`lensmodel.bench.traced`).
 
 Printed are the gains in PSNR of the white-balanced sRGB picture against the sharp scene over the developed
-photo, by zone; the expected gains that the correction foretold; the median error of the PSFs of green at places
-all over the field, true and expected; the share of blocks of 128 pixels that lose more than 0.5 dB, and
-the worst of them. Some two minutes a photo on one core.
+photo, by zone; the expected gains that the correction foretold; the median error of the PSFs of green at
+places all over the field, true and expected; the share of blocks of 128 pixels that lose more than 0.5 dB,
+and the worst of them. Some two minutes a photo on one core.
 """
 
 from __future__ import annotations
@@ -203,11 +203,13 @@ class Tally:
         expected, true = np.array(self.pairs or [(0.0, 0.0)]).T
         falls, lost = np.array(self.zones) < -FALL_DB, np.array(self.blocks) < -LOSS_DB
         slope = float(expected @ true) / max(float(expected @ expected), 1e-9)
+        off = expected - true
         return (
-            f"\n{falls.sum()} of {falls.size} zones lose more than {FALL_DB} dB; {lost.sum()} of {lost.size} "
-            f"blocks lose more than {LOSS_DB} dB. Expected gains are off by "
-            f"{np.abs(expected - true).mean():.2f} dB on average ({(expected - true).mean():+.2f}; true ones are {slope:.2f} times as large), "
-            f"{int((np.sign(expected) != np.sign(true)).sum())} of {expected.size} of the wrong sign."
+            f"\n{falls.sum()} of {falls.size} zones lose more than {FALL_DB} dB; "
+            f"{lost.sum()} of {lost.size} blocks lose more than {LOSS_DB} dB.\n"
+            f"Expected gains are off by {np.abs(off).mean():.2f} dB on average ({off.mean():+.2f}), "
+            f"{int((np.sign(expected) != np.sign(true)).sum())} of {off.size} of the wrong sign; "
+            f"true gains are {slope:.2f} times as large."
         )
 
 

@@ -53,6 +53,8 @@ class LateralShift(Protocol):
 
 
 KERNEL_SIZE = 55
+_SURE, _LOST = 0.5, 0.8
+"""Expected errors of a kernel up to which a correction is trusted, and from which on not at all (chosen)."""
 MIN_HALO, MORE = 12, 6
 """Least halo of a cell in pixels, and pixels beyond the reach of its blur: less costs quality."""
 
@@ -354,7 +356,8 @@ def _restore(job: _Job, cell: Cell) -> _Restored:
         slice(cell.left - left, cell.right - left),
     )
     expected = forecast(cell, tile, blurs, sensors, errors)
-    worth = expected.gain_db >= WORTH_DB or job.bounds.denoise > 0.0
+    trust = trusted(sum(errors) / len(errors))
+    worth = expected.held(1.0 - trust).gain_db >= WORTH_DB or job.bounds.denoise > 0.0
     if job.strength == 0.0 or not worth:
         untouched = replace(expected, after=expected.before)
         return _Restored(tile[inner], untouched, None, left=True)
@@ -368,9 +371,19 @@ def _restore(job: _Job, cell: Cell) -> _Restored:
     # before the bounds, which would hide what tells of a wrong kernel: light below black, foreign hues
     restored, verdict = held_back(tile, restored, evidence, inner=inner[1:])
     restored = job.bounds.hold(job.planes, (cell.top, cell.left), restored, errors)
-    if job.strength < 1.0:
-        restored = tile[inner] + np.float32(job.strength) * (restored - tile[inner])
-    return _Restored(restored, expected.held(verdict.held_back), verdict.without_map())
+    if trust * job.strength < 1.0:
+        restored = tile[inner] + np.float32(trust * job.strength) * (restored - tile[inner])
+    held = 1.0 - trust * (1.0 - verdict.held_back)
+    return _Restored(restored, expected.held(held), verdict.without_map())
+
+
+def trusted(error: float) -> float:
+    """Share of a correction that is applied where its kernel has an expected relative L2 error.
+
+    All up to a half, nothing from 0.8 on, between which half of the kernel's power becomes error: what a
+    method makes of such a kernel is a picture of the kernel, however crisp.
+    """
+    return float(np.clip((_LOST - error) / (_LOST - _SURE), 0.0, 1.0))
 
 
 def _cautious(kernel: NDArray[np.float64], error: float) -> NDArray[np.float64]:

@@ -18,9 +18,9 @@ from lensmodel.types import Planes
 WINDOW: Final = 2
 """Pixels around each one in which the photo is looked at."""
 _SIDE: Final = 2 * WINDOW + 1
-_FREE: Final = (
-    0.25  # error of a kernel from which on a result may not leave the photo's range by more than it
-)
+_FREE: Final = 0.16
+"""Error of a kernel from which on a result may not leave the photo's range by more than it: the least that
+costs no gain behind a lens that is known to a quarter (chosen)."""
 _WIDEST: Final = 4.0  # share of the range beyond which a bound would cut nothing but noise
 _DARKEST, _DARKER = 0.5, 0.2  # of the darkest light nearby where no room is left, and per room
 
@@ -83,7 +83,7 @@ def allowance(error: float) -> float:
 
     Beside an edge the picture is all kernel: what a wrong one makes there leaves the range of light
     that the photo shows around, in one colour more than in the others. A right one does so as well, on
-    details narrower than itself, so the bound is wide where the kernel is sure: ( 0.25 / error )².
+    details narrower than itself, so the bound is wide where the kernel is sure: ( 0.16 / error )².
     """
     share = (_FREE / error) ** 2 if error > 0.0 else np.inf
     return float(share) if share <= _WIDEST else float("inf")

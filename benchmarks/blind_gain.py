@@ -33,8 +33,15 @@ from lensmodel.errors import NotEnoughEvidenceError
 from lensmodel.psf import PsfSample, distance
 from lensmodel.quality import psnr
 from lensmodel.regression import LensModel, ModelSettings
-from lensmodel.simulate import SimulatedCamera, SimulatedPhoto, draw_lens, load_scene, photograph, write_photo
-from lensmodel.simulate.lens import CameraLens
+from lensmodel.simulate import (
+    SimulatedCamera,
+    SimulatedLens,
+    SimulatedPhoto,
+    draw_lens,
+    load_scene,
+    photograph,
+    write_photo,
+)
 from lensmodel.types import ZONES, FieldPosition, LensSettings, Planes, Zone
 
 CAMERA: Final = SimulatedCamera(height=900, width=1350, full_well_electrons=20_000.0)
@@ -49,7 +56,7 @@ class Lens:
     """A lens with known PSFs, and where to read on about it."""
 
     name: str
-    lens: CameraLens
+    lens: SimulatedLens | GridLens
     f_number: float
     number: int
 
@@ -117,7 +124,7 @@ def gains(made: Planes, before: Planes, truth: Planes) -> tuple[dict[Zone, float
 
 def psf_errors(lens: Lens, model: LensModel) -> tuple[float, float]:
     """Median relative L2 error of green, true and expected."""
-    truth = lens.lens.field(lens.settings, pitch_um=CAMERA.pitch_um)
+    truth = lens.lens.field(lens.settings)  # of the usual pitch, which is that of the camera
     asked = lens.settings.with_channel("g")
     answers = [model.query(place, asked, 55) for place in PLACES]
     true = [

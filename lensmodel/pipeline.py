@@ -452,7 +452,7 @@ def lateral_of(developed: LinearPhoto) -> LateralColour:
 def witnesses_of(developed: LinearPhoto, settings: LensSettings) -> list[PsfSample]:
     """Patches of a photo that tell whether a model's kernels fit it: spectra without kernels of their own.
 
-    None of a JPEG file: cameras sharpen them, and a sharpened spectrum speaks against every right kernel.
+    None of a JPEG file: cameras sharpen them, and a sharpened spectrum passes for that of a sharper lens.
     """
     if developed.info.kind == "jpeg":
         return []

@@ -21,6 +21,9 @@ _CLUSTER: Final = 0.005
 _STRAYS: Final = 0.02
 """Share of a pile that may lie above it: hot pixels; more is a bright part of the picture."""
 
+_EDGE: Final = 0.02
+"""Share of a pile below its lower end (chosen)."""
+
 _LOWEST_PILE: Final = 0.8
 """Lowest level, relative to the stated one, at which sensors were seen to clip."""
 
@@ -159,9 +162,15 @@ class Mosaic:
         # More than half of a colour in one pile is an even area of a drawing, not a clipped light.
         if not max(50, 2e-5 * total) < pile < 0.5 * total or pile < 5 * below or above > _STRAYS * pile:
             return None
-        inside = np.cumsum(counts[max(low, 0) :])
-        ends = np.searchsorted(inside, (0.02 * pile, (1.0 - _STRAYS / 2.0) * inside[-1]))
-        return max(low, 0) + int(ends[0]), max(low, 0) + int(ends[1])
+        # what of the picture lies under the pile as it does below it does not belong to it
+        inside = np.cumsum(counts[max(low, 0) :] - below / (high - low))
+        first = int(np.argmax(inside >= _EDGE * pile))
+        last = int(
+            np.searchsorted(
+                np.cumsum(counts[max(low, 0) :]), (1.0 - _STRAYS / 2.0) * within(low, len(counts))
+            )
+        )
+        return max(low, 0) + first, max(low, 0) + last
 
     def bayer_pattern(self) -> BayerPattern | None:
         """Channel of each pixel of the top left 2 x 2; `None` for X-Trans."""

@@ -24,8 +24,9 @@ RUN groupadd --gid 10001 lens \
  && install --directory --owner=lens --group=lens --mode=0750 /data
 COPY --from=build /opt/lensmodel /opt/lensmodel
 # Listening on every address of a container reaches nobody: publishing its port does, and that is
-# the host's decision (compose.yaml publishes it on loopback). Hence LENS_PUBLIC. Whoever publishes it
-# under a name gives that name in LENS_ALLOWED_HOSTS; addresses and local names are answered to anyway.
+# the host's decision (compose.yaml publishes it on loopback). LENS_PUBLIC has it ask for keys; the first
+# is made by the command "keys create" in a container with the same volume. Whoever publishes it under a
+# name gives that name in LENS_ALLOWED_HOSTS; addresses and local names are answered to anyway.
 ENV PATH=/opt/lensmodel/bin:$PATH \
     HOME=/data \
     LENS_DATA_DIR=/data \
@@ -33,6 +34,7 @@ ENV PATH=/opt/lensmodel/bin:$PATH \
     LENS_PORT=8000 \
     LENS_PUBLIC=true \
     LENS_ALLOWED_HOSTS=localhost \
+    LENS_LOG_FORMAT=json \
     NUMBA_CACHE_DIR=/data/cache \
     OMP_NUM_THREADS=1 \
     OPENBLAS_NUM_THREADS=1 \

@@ -9,7 +9,9 @@ STAMP := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo test test-all serve check format bench gallery lock container-check clean
+.PHONY: help install demo test test-all serve check security torture fuzz format bench docs notebooks \
+  wheel-check gallery lock \
+  container-check clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -41,6 +43,20 @@ check: install ## format, lint, types, import layers
 	@$(BIN)/mypy lensmodel app
 	@$(BIN)/lint-imports
 
+security: install ## known holes in what we use (asks the network), and suspicious code of ours
+	@$(BIN)/pip-audit --require-hashes --disable-pip --requirement requirements/run.txt
+	@$(BIN)/bandit --quiet --recursive --severity-level medium --confidence-level medium app lensmodel
+
+SEEDS ?= 20
+torture: install ## random deaths and outages, SEEDS times on SQLite and on PostgreSQL with S3
+	@$(BIN)/python tests/app/torture.py --seeds $(SEEDS)
+	@$(BIN)/python tests/app/torture.py --seeds $(SEEDS) --servers
+
+MINUTES ?= 10
+fuzz: install ## made-up requests and damaged files, MINUTES each
+	@$(BIN)/python tests/app/fuzz_api.py --minutes $(MINUTES)
+	@$(BIN)/python tests/app/fuzz_parsers.py --minutes $(MINUTES)
+
 format: install ## let the formatter and the linter mend what they can
 	@$(BIN)/ruff format .
 	@$(BIN)/ruff check --fix .
@@ -48,13 +64,22 @@ format: install ## let the formatter and the linter mend what they can
 bench: install ## quality and speed benchmarks, tables on standard output
 	@$(BIN)/lensmodel bench
 
+docs: install ## the reference as a static site, site/index.html
+	@$(BIN)/mkdocs build --strict --quiet
+
+notebooks: install ## run the notebooks of docs/notebooks anew, minutes
+	@$(BIN)/python tools/run_notebooks.py docs/notebooks/*.ipynb
+
+wheel-check: ## build the wheel and use it in a clean environment (asks the network)
+	@tools/wheel_check.sh $(PYTHON)
+
 gallery: install ## pictures to look at, gallery-output/index.html (real ones with LENSMODEL_TEST_DATA)
 	@$(BIN)/lensmodel bench gallery --output gallery-output
 
 LOCK := uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --no-annotate
 lock: ## renew the files of requirements/ from pyproject.toml (needs uv)
 	$(LOCK) --extra dev --output-file requirements/lock.txt pyproject.toml
-	$(LOCK) --extra fast --output-file requirements/run.txt pyproject.toml
+	$(LOCK) --extra service --extra fast --output-file requirements/run.txt pyproject.toml
 	echo hatchling | $(LOCK) --output-file requirements/build.txt -
 
 container-check: ## build the image without an engine, start it and use it (root; Debian's buildah and debootstrap)

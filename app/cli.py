@@ -14,19 +14,11 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 import typer
 
-from app.commands import (
-    benchmarks,
-    checking,
-    demonstration,
-    display,
-    interrupt,
-    photos,
-    report,
-    reproduce,
-    service,
-)
-from app.commands.failure import InterruptedByUser, UsageError
-from lensmodel.errors import LensModelError
+from app.commands import checking, demonstration, keys, measurement, photos, report, service, upkeep
+from app.commands.console import display, extras, interrupt
+from app.commands.console.failure import InterruptedByUser, UsageError
+from app.lab import benchmarks, reproduce
+from lensmodel.core.errors import LensModelError
 
 interrupt.workers_ignore_it()
 
@@ -45,14 +37,21 @@ app.command()(photos.calibrate)
 app.command()(photos.correct)
 app.command()(checking.check)
 app.command()(photos.psf)
+app.command()(measurement.measure)
+app.command()(measurement.target)
 app.command()(report.report)
 app.command(name="export")(report.export_psfs)
 app.command()(service.serve)
 app.command(hidden=True)(service.api)
 app.command(hidden=True)(service.worker)
 app.command()(service.config)
+app.command()(upkeep.doctor)
+app.command()(upkeep.backup)
+app.command()(upkeep.restore)
+app.command()(upkeep.migrate)
 app.command()(demonstration.demo)
 app.command()(reproduce.reproduce)
+app.add_typer(keys.keys, name="keys")
 app.add_typer(benchmarks.bench, name="bench")
 
 
@@ -87,10 +86,16 @@ def main() -> None:
     """Run the command; exit 0 done, 1 something failed, 2 wrong usage, 128 + signal interrupted."""
     interrupt.install()
     try:
-        app()
+        app(prog_name="lensmodel")  # also where `python -m lensmodel` runs it
     except LensModelError as error:
         typer.echo(f"lensmodel: {error}", err=True)
         sys.exit(2 if isinstance(error, UsageError) else 1)
+    except ModuleNotFoundError as error:
+        remedy = extras.remedy(error)
+        if remedy is None:
+            raise
+        typer.echo(f"lensmodel: {remedy}", err=True)
+        sys.exit(1)
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         typer.echo(

@@ -13,6 +13,7 @@ with Client("http://127.0.0.1:8000") as client:
 from __future__ import annotations
 
 import io
+import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -26,8 +27,11 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
 from app import schemas as s
-from lensmodel.errors import LensModelError
-from lensmodel.types import Channel
+from app.client_retries import RETRIES, Retrying
+from app.runtime.settings import CLIENT_KEY
+from app.schemas.account import AccountOut
+from lensmodel.core.errors import LensModelError
+from lensmodel.core.types import Channel
 
 M = TypeVar("M", bound=BaseModel)
 Query: TypeAlias = Mapping[str, str | int | float | bool | None]
@@ -69,10 +73,29 @@ class Client:
         Where the service listens.
     http : httpx2.Client, optional
         A connection to use instead of an own one, for instance with other time limits.
+    key : str, optional
+        What `lensmodel keys create` printed, where the service asks for it; by default LENS_API_KEY of the
+        environment. It is not sent over a connection that is given as `http`.
+    retries : int
+        How often a request is sent again, after a pause, where the service cannot be reached or says that it
+        is busy; only requests that do no harm twice. Not of a connection that is given as `http`.
     """
 
-    def __init__(self, url: str = DEFAULT_URL, *, http: httpx2.Client | None = None) -> None:
-        self._http = httpx2.Client(base_url=url, timeout=ANSWER_SECONDS) if http is None else http
+    def __init__(
+        self,
+        url: str = DEFAULT_URL,
+        *,
+        http: httpx2.Client | None = None,
+        key: str | None = None,
+        retries: int = RETRIES,
+    ) -> None:
+        if http is None:
+            shown = os.environ.get(CLIENT_KEY, "") if key is None else key
+            headers = {"Authorization": f"Bearer {shown}"} if shown else {}
+            http = httpx2.Client(
+                base_url=url, timeout=ANSWER_SECONDS, headers=headers, transport=Retrying(retries)
+            )
+        self._http = http
 
     def __enter__(self) -> Self:
         """Return itself."""
@@ -101,8 +124,16 @@ class Client:
         focal_length_mm: float | None = None,
         focus_distance_m: float | None = None,
         pixel_pitch_um: float | None = None,
+        kind: s.MeasurementKind | None = None,
+        reference_id: str | None = None,
+        on_progress: Callable[[int, int], None] | None = None,
     ) -> s.PhotoOut:
         """Send a photo, streamed from its file; the same bytes give the photo that is there already.
+
+        `on_progress(sent, total)` is called in bytes after each mebibyte.
+
+        With `kind` it was made to measure the lens; of a pair it is the open photo, and `reference_id` is the
+        closed one, sent before with `calibrate=False`.
 
         Raises
         ------
@@ -122,12 +153,14 @@ class Client:
             "focal_length_mm": focal_length_mm,
             "focus_distance_m": focus_distance_m,
             "pixel_pitch_um": pixel_pitch_um,
+            "kind": kind,
+            "reference_id": reference_id,
         }
         with Path(path).open("rb") as file:
             answer = self._http.post(
                 "/v1/photos",
                 params=_said(said),
-                content=_pieces(file),
+                content=_pieces(file, on_progress),
                 headers={"Content-Type": "application/octet-stream"},
             )
         return _read(s.PhotoOut, answer)
@@ -140,7 +173,7 @@ class Client:
         """Return all photos, newest first."""
         return list(self._pages(s.PhotoPage, "/v1/photos", {"lens_id": lens_id, "state": state}))
 
-    def change_photo(self, photo_id: str, **changes: object) -> s.PhotoOut:
+    def change_photo(self, /, photo_id: str, **changes: object) -> s.PhotoOut:
         """Name the lens of a photo, correct its settings, or exclude it: fields of `PhotoChange`."""
         body = s.PhotoChange.model_validate(changes).model_dump(exclude_unset=True)
         return _read(s.PhotoOut, self._http.patch(f"/v1/photos/{photo_id}", json=body))
@@ -205,26 +238,22 @@ class Client:
         tag: str | None = None
         while True:
             left = LONG_POLL_SECONDS if until is None else max(until - time.monotonic(), 0.0)
-            headers = {} if tag is None else {"If-None-Match": tag}
-            answer = self._http.get(
-                f"/v1/jobs/{job_id}",
-                params={"wait": 0 if tag is None else min(left, LONG_POLL_SECONDS)},
-                headers=headers,
-            )
-            if answer.status_code != httpx2.codes.NOT_MODIFIED:
-                job = _read(s.JobOut, answer)
-                tag = answer.headers.get("ETag")
-                if on_change is not None:
-                    on_change(job)
-                if job.state == "succeeded":
-                    return job
-                if job.state in {"failed", "cancelled", "waiting"}:
-                    raise JobEndedError(job)
+            job, tag = self.poll(job_id, tag, 0.0 if tag is None else min(left, LONG_POLL_SECONDS))
+            if job is not None and ended(job, on_change):
+                return job
             if until is not None and time.monotonic() >= until:
                 raise JobPatienceError(
                     f"job {job_id} did not end within {timeout:g} s: wait longer or cancel it"
                 )
             time.sleep(PAUSE_SECONDS)  # a service may be set to answer at once
+
+    def poll(self, job_id: str, tag: str | None, seconds: float) -> tuple[s.JobOut | None, str | None]:
+        """Ask once for a job, waiting so many seconds for a change since `tag`; None where there was none."""
+        headers = {} if tag is None else {"If-None-Match": tag}
+        answer = self._http.get(f"/v1/jobs/{job_id}", params={"wait": seconds}, headers=headers)
+        if answer.status_code == httpx2.codes.NOT_MODIFIED:
+            return None, tag
+        return _read(s.JobOut, answer), answer.headers.get("ETag")
 
     def lenses(self, *, model: str | None = None, serial: str | None = None) -> list[s.LensOut]:
         """Return all lenses, newest first, optionally of one model or serial."""
@@ -244,6 +273,7 @@ class Client:
 
     def psf(
         self,
+        /,
         lens_id: str,
         *,
         r: float,
@@ -258,7 +288,7 @@ class Client:
         return self._get(s.PsfOut, f"/v1/lenses/{lens_id}/psf.json", query)
 
     def kernel(
-        self, lens_id: str, *, r: float, phi: float = 0.0, **query: str | float | None
+        self, /, lens_id: str, *, r: float, phi: float = 0.0, **query: str | float | None
     ) -> NDArray[np.float32]:
         """Return only the kernel, shape (size, size), float32; the parameters are those of `psf`."""
         params = _said({"r": r, "phi": phi, **query})
@@ -266,12 +296,12 @@ class Client:
         kernel: NDArray[np.float32] = np.load(io.BytesIO(answer.content), allow_pickle=False)
         return kernel
 
-    def field_png(self, lens_id: str, **query: str | float | None) -> bytes:
+    def field_png(self, /, lens_id: str, **query: str | float | None) -> bytes:
         """Return the map of PSFs over the field as a PNG; the parameters are those of the endpoint."""
         params = {name: value for name, value in query.items() if value is not None}
         return _check(self._http.get(f"/v1/lenses/{lens_id}/field.png", params=params)).content
 
-    def correct(self, photo_id: str, **wish: object) -> s.CorrectionOut:
+    def correct(self, /, photo_id: str, **wish: object) -> s.CorrectionOut:
         """Ask for a correction: fields of `CorrectionIn`."""
         body = s.CorrectionIn.model_validate({"photo_id": photo_id, **wish}).model_dump(mode="json")
         return _read(s.CorrectionOut, self._http.post("/v1/corrections", json=body))
@@ -280,10 +310,24 @@ class Client:
         """Return one correction."""
         return self._get(s.CorrectionOut, f"/v1/corrections/{correction_id}")
 
+    def account(self) -> AccountOut:
+        """Return who asks, what he has and what he may have."""
+        return self._get(AccountOut, "/v1/account")
+
+    def export_account(self, path: str | Path) -> Path:
+        """Save all that the service keeps of this owner as a ZIP file."""
+        return self._save("/v1/account/export", Path(path))
+
+    def erase_account(self) -> None:
+        """Erase all that the service keeps of this owner, its keys too. There is no way back."""
+        _check(self._http.delete("/v1/account"))
+
     def download(self, correction_id: str, path: str | Path) -> Path:
         """Save the corrected photo; the file appears under its name only when it is complete."""
-        target = Path(path)
-        with self._http.stream("GET", f"/v1/corrections/{correction_id}/result") as answer:
+        return self._save(f"/v1/corrections/{correction_id}/result", Path(path))
+
+    def _save(self, address: str, target: Path) -> Path:
+        with self._http.stream("GET", address) as answer:
             if answer.is_error:
                 answer.read()
             _check(answer)
@@ -309,13 +353,31 @@ class Client:
             yield from page.items
 
 
+def ended(job: s.JobOut, on_change: Callable[[s.JobOut], None] | None) -> bool:
+    """Tell a caller of a change; say whether the job has succeeded.
+
+    Raises
+    ------
+    JobEndedError
+        If it ended in another way, or cannot go on before its owner names the lens.
+    """
+    if on_change is not None:
+        on_change(job)
+    if job.state in {"failed", "cancelled", "waiting"}:
+        raise JobEndedError(job)
+    return job.state == "succeeded"
+
+
 def _said(query: Query) -> dict[str, str | int | float | bool]:
     return {name: value for name, value in query.items() if value is not None}
 
 
-def _pieces(file: io.BufferedReader) -> Iterator[bytes]:
+def _pieces(file: io.BufferedReader, on_progress: Callable[[int, int], None] | None) -> Iterator[bytes]:
+    total = os.fstat(file.fileno()).st_size
     while piece := file.read(1 << 20):
         yield piece
+        if on_progress is not None:
+            on_progress(file.tell(), total)
 
 
 def _check(answer: httpx2.Response) -> httpx2.Response:

@@ -6,22 +6,40 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import version
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 
-from app import errors, pages
-from app.bodies import JsonBodies
-from app.dependencies import Places, Services
-from app.drawn import Drawn
-from app.middleware import Heads, OwnNames, RequestLog, SameSite
-from app.models import ModelCache
-from app.reserve import Reserve
-from app.routes import corrections, health, jobs, lenses, photos, psf
-from app.settings import MIB, Settings
-from app.storage import Storage
+from app import pages
+from app.access.authentication import Gate
+from app.blobs.founding import settle
+from app.blobs.storage import Storage
+from app.http import errors
+from app.http.bodies import JsonBodies
+from app.http.dependencies import Places, Services, call_of
+from app.http.job_watch import Watch
+from app.http.middleware import Heads, OwnNames, RequestLog, SameSite
+from app.http.model_cache import ModelCache
+from app.http.picture_cache import Drawn
+from app.routes import (
+    account,
+    corrections,
+    health,
+    jobs,
+    lens_changes,
+    lens_profiles,
+    lens_reports,
+    lenses,
+    photo_sets,
+    photos,
+    psf,
+    session,
+)
+from app.routes.common import problems
+from app.runtime.disk_reserve import Reserve
+from app.runtime.outage import missable
+from app.runtime.settings import MIB, Settings
 from app.store import Store
 from app.store.jobs import JobStore
-from app.watch import Watch
-from lensmodel.regression import ModelSettings
+from lensmodel.model import ModelSettings
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
@@ -35,7 +53,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         store = Store(chosen)
-        storage = Storage(chosen.storage, patience_s=chosen.storage_seconds)
+        storage = Storage(chosen.storage, patience_s=chosen.storage_seconds, create=False)
+        with missable():  # /readyz tries it again
+            settle(store, storage)
         cache = ModelCache(
             store,
             chosen.model_cache_mb * MIB,
@@ -46,7 +66,15 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         reserve = Reserve(store.database.path.with_name("reserve") if store.database.is_sqlite else None)
         watch = Watch(JobStore(store.database).marks)
         app.state.services = Services(
-            chosen, store, storage, cache, Places(chosen.max_uploads), reserve, Drawn(), watch
+            chosen,
+            store,
+            storage,
+            cache,
+            Places(chosen.max_uploads),
+            reserve,
+            Drawn(),
+            watch,
+            Gate(chosen, store.keys),
         )
         yield
         watch.stop()
@@ -68,6 +96,26 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     errors.install(app)
     pages.install(app)
     app.include_router(health.probes)
-    for router in (photos.router, jobs.router, lenses.router, psf.router, corrections.router, health.router):
-        app.include_router(router, prefix="/v1")
+    app.include_router(session.router, prefix="/v1")
+    resources = (
+        photos,
+        photo_sets,
+        jobs,
+        lenses,
+        lens_changes,
+        lens_profiles,
+        lens_reports,
+        psf,
+        corrections,
+        account,
+        health,
+    )
+    for resource in resources:
+        # the dependency stands here and not only in each route: one that forgot it would be open to all
+        app.include_router(
+            resource.router,
+            prefix="/v1",
+            dependencies=[Depends(call_of)],
+            responses=problems(401, 403, 429),
+        )
     return app

@@ -1,1 +1,92 @@
-"""lensmodel."""
+"""Learns the blur of one copy of a lens from ordinary photos, and removes it.
+
+    import lensmodel
+
+    lens = lensmodel.calibrate(["a.dng", "b.dng"])
+    kernel = lens.psf(r=0.9, phi=0.6, aperture=1.4).kernel
+    photo = lensmodel.correct("c.dng", lens, "c.tif")
+    lens.save("my-24mm.lensprofile")
+
+The public names are those of `__all__`; each is imported when it is first used, so that importing the
+package costs nothing. docs/library.md shows them at work.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from lensmodel.core.errors import CancelledError, LensModelError
+    from lensmodel.core.psf import PsfSample
+    from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel
+    from lensmodel.correction import Bounds, Corrected, Deconvolver, Restored, Sensor, deconvolvers
+    from lensmodel.estimation import PsfEstimate, PsfEstimator, estimators
+    from lensmodel.estimation.patches import Selector, selectors
+    from lensmodel.model import ModelSettings, PsfAnswer
+    from lensmodel.photo import LinearPhoto, develop
+    from lensmodel.photo.arrays import photo_from_array
+    from lensmodel.workflow.api import calibrate, correct
+    from lensmodel.workflow.lens import Lens, field_grid
+    from lensmodel.workflow.pipeline import CalibrationEvent
+
+__all__ = [
+    "Bounds",
+    "CalibrationEvent",
+    "CancelledError",
+    "Corrected",
+    "Deconvolver",
+    "FieldPosition",
+    "Lens",
+    "LensModelError",
+    "LensSettings",
+    "LinearPhoto",
+    "ModelSettings",
+    "NoiseModel",
+    "PsfAnswer",
+    "PsfEstimate",
+    "PsfEstimator",
+    "PsfSample",
+    "Restored",
+    "Selector",
+    "Sensor",
+    "calibrate",
+    "correct",
+    "deconvolvers",
+    "develop",
+    "estimators",
+    "field_grid",
+    "photo_from_array",
+    "selectors",
+]
+
+_HOMES: Final = {
+    "lensmodel.workflow.api": ("calibrate", "correct"),
+    "lensmodel.photo.arrays": ("photo_from_array",),
+    "lensmodel.estimation": ("PsfEstimate", "PsfEstimator", "estimators"),
+    "lensmodel.estimation.patches": ("Selector", "selectors"),
+    "lensmodel.correction": ("Bounds", "Corrected", "Deconvolver", "Restored", "Sensor", "deconvolvers"),
+    "lensmodel.core.errors": ("CancelledError", "LensModelError"),
+    "lensmodel.workflow.lens": ("Lens", "field_grid"),
+    "lensmodel.photo": ("LinearPhoto", "develop"),
+    "lensmodel.workflow.calibrating": ("CalibrationEvent",),
+    "lensmodel.core.psf": ("PsfSample",),
+    "lensmodel.model": ("ModelSettings", "PsfAnswer"),
+    "lensmodel.core.types": ("FieldPosition", "LensSettings", "NoiseModel"),
+}
+"""Where each public name is defined."""
+
+_HOME_OF: Final = {name: home for home, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:  # noqa: ANN401 - whatever the name stands for
+    """Import a public name when it is first asked for."""
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(_HOME_OF[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -8,7 +8,26 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 from pathlib import Path
 
+# Services of tests keep their data for a moment only: what is compiled is kept longer, once for all tests.
+os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "numba"))
+
 import pytest
+from hypothesis import settings
+
+settings.register_profile("tests", deadline=None)  # that others use the machine too is no fault of ours
+settings.load_profile("tests")
+
+
+@pytest.fixture
+def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fit wavefronts to spectra from a few beginnings, where a test asks what is made of the best of them.
+
+    That takes seconds instead of twenty. Whether the lens itself is found is asked with the whole search.
+    """
+    from lensmodel.model.wavefront import joint_kernels  # noqa: PLC0415 - not for tests of the service
+
+    for name, count in {"_STARTS": 2, "_RANDOM": 0, "_KEPT": 2, "_REFINED": 1}.items():
+        monkeypatch.setattr(joint_kernels, name, count)
 
 
 @pytest.fixture(scope="session")

@@ -10,19 +10,25 @@
 #
 # Checked: it builds on a bare base; runs as a user without rights, with a read-only root and as process 1;
 # becomes ready and healthy; takes a photo and calibrates from it; stops on SIGTERM with status 0; writes nothing
-# outside /data; and keeps what it knew over a restart.
+# outside /data; and keeps what it knew over a restart. Then, where Debian's postgresql and Python's moto[server]
+# are there too (PYTHON names an interpreter that has it; default: that of `make install`), the API and the worker
+# of compose.yaml run as two such containers on PostgreSQL and S3.
 set -euo pipefail
 
 here=$(cd "$(dirname "$0")/.." && pwd)
+patience=300 # seconds that each wait may take; a busy machine needs most of them
 folder=${1:-${TMPDIR:-/tmp}/lensmodel-container}
 photo=$here/lensmodel/demo_data/canon_kissx4_colorchart.dng
 packages=python3,python3-venv,ca-certificates
 service=""
+parts=()
 
 say() { printf 'container-check: %s\n' "$*"; }
 fail() {
   say "FAILED: $*" >&2
-  if [ -f "$folder/service.log" ]; then tail -n 40 "$folder/service.log" >&2; fi
+  for log in service api worker; do
+    if [ -f "$folder/$log.log" ]; then tail -n 20 "$folder/$log.log" >&2; fi
+  done
   exit 1
 }
 
@@ -35,7 +41,7 @@ mkdir -p "$folder"
 engine() { buildah --root "$folder/storage" --runroot "$folder/run" "$@"; }
 
 cleanup() {
-  if [ -n "$service" ]; then kill -KILL "$service" 2>/dev/null || true; fi
+  for started in $service ${parts[@]+"${parts[@]}"}; do kill -KILL "$started" 2>/dev/null || true; done
   engine rm --all >/dev/null 2>&1 || true
 }
 trap cleanup EXIT
@@ -82,7 +88,8 @@ lent=(--volume "$folder/pip.conf:/etc/pip.conf:ro")
 if [ -d /etc/ssl/certs ]; then lent+=(--volume /etc/ssl/certs:/etc/ssl/certs:ro); fi
 for path in $(grep -oE '(file://)?/[^ ]+' "$folder/pip.conf" | sed 's#^file://##' | sort -u); do
   path=${path%/simple}
-  if [ -d "$path" ]; then lent+=(--volume "$path:$path:ro"); fi
+  # folders of packages, and files such as one of constraints
+  if [ -e "$path" ]; then lent+=(--volume "$path:$path:ro"); fi
 done
 
 say "building the image ..."
@@ -114,18 +121,30 @@ mapfile -d '' -t health < <(engine inspect --type image lensmodel | python3 -c '
 import json, sys
 found = json.load(sys.stdin)["Docker"]["config"].get("Healthcheck") or {}
 sys.stdout.write("".join(part + "\0" for part in found.get("Test", [])[1:]))')
+mapfile -d '' -t entry < <(engine inspect --type image lensmodel | python3 -c '
+import json, sys
+sys.stdout.write("".join(part + "\0" for part in json.load(sys.stdin)["OCIv1"]["config"]["Entrypoint"]))')
 port=$(python3 -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])')
 # A cheap estimator and few patches: this is about the container.
 environment+=("LENS_PORT=$port" LENS_ESTIMATOR=whittle LENS_PATCHES=4 LENS_KERNEL_SIZE=15)
 inside=(setpriv --reuid=10001 --regid=10001 --clear-groups --no-new-privs --bounding-set=-all --inh-caps=-all)
 
-rm -rf "$folder/data" "$folder/mount" "$folder/service.log"
-mkdir "$folder/mount"
-install -d -o 10001 -g 10001 -m 0750 "$folder/data"
+rm -f "$folder"/{service,api,worker}.log
 
-start() {
-  # New mount and process namespaces; what an engine adds to the image's files: /proc, /dev, /dev/shm, the volume.
-  unshare --mount --propagation private --pid --fork --kill-child=KILL bash -euc '
+volume() {
+  # An empty volume of its own for what runs next, and where its root appears.
+  data=$folder/data$1 mount=$folder/mount$1
+  rm -rf "$data" "$mount"
+  mkdir "$mount"
+  install -d -o 10001 -g 10001 -m 0750 "$data"
+}
+
+volume ""
+
+isolated() {
+  # Become a container, in a subshell: new mount and process namespaces, and what an engine adds to the image's
+  # files: /proc, /dev, /dev/shm, the volume. Whoever kills the process that this becomes kills all inside.
+  exec unshare --mount --propagation private --pid --fork --kill-child=KILL bash -euc '
     root=$1 mount=$2 data=$3; shift 3
     mount --bind "$root" "$mount"
     mount -o remount,bind,ro "$mount"
@@ -136,54 +155,82 @@ start() {
     mount --bind "$data" "$mount/data"
     cd /
     exec "$@"
-  ' - "$root" "$folder/mount" "$folder/data" \
-    chroot "$folder/mount" /usr/bin/env -i "${environment[@]}" "${inside[@]}" "${command[@]}" \
-    >>"$folder/service.log" 2>&1 &
+  ' - "$root" "$mount" "$data" \
+    chroot "$mount" /usr/bin/env -i "${environment[@]}" "${inside[@]}" "$@"
+}
+
+start() {
+  isolated "${command[@]}" >>"$folder/service.log" 2>&1 &
   service=$!
-  for _ in $(seq 240); do
-    kill -0 "$service" 2>/dev/null || fail "the service ended before it was ready"
+  until_ready "$service"
+}
+
+until_ready() {
+  local each
+  for _ in $(seq $((2 * patience))); do
+    for each in "$@"; do kill -0 "$each" 2>/dev/null || fail "it ended before it was ready"; done
     if curl --silent --fail --output /dev/null "http://127.0.0.1:$port/readyz"; then return; fi
     sleep 0.5
   done
-  fail "not ready after two minutes"
+  fail "not ready after $patience s"
 }
 
-stop() {
+end() {
   local first status=0
-  first=$(pgrep -P "$service" | head -n 1)
+  first=$(pgrep -P "$1" | head -n 1)
   kill -TERM "$first"
-  wait "$service" || status=$?
-  service=""
+  wait "$1" || status=$?
   [ "$status" = 0 ] || fail "SIGTERM ended it with status $status"
 }
 
+stop() {
+  end "$service"
+  service=""
+}
+
 listing() { find "$root" -xdev -printf '%p %y %s %T@ %m %u\n' | sort | sha256sum; }
-ask() { curl --silent --show-error --fail "http://127.0.0.1:$port$1"; }
+ask() { curl --silent --show-error --fail --header "Authorization: Bearer $key" "http://127.0.0.1:$port$1"; }
+
+calibrate() {
+  # Send the photo and wait until it counts.
+  local photo_id state=""
+  photo_id=$(curl --silent --show-error --fail --header "Authorization: Bearer $key" --form "file=@$photo" \
+    --form lens_maker=Check --form lens_model=Check --form lens_serial=container-1 --form aperture=5.6 \
+    "http://127.0.0.1:$port/v1/photos" | python3 -c 'import json, sys; print(json.load(sys.stdin)["id"])')
+  for _ in $(seq $((2 * patience))); do
+    state=$(ask "/v1/jobs/$photo_id" | python3 -c 'import json, sys; print(json.load(sys.stdin)["state"])')
+    case $state in
+      succeeded) return ;;
+      failed | cancelled) fail "the photo's job: $(ask "/v1/jobs/$photo_id")" ;;
+    esac
+    sleep 0.5
+  done
+  fail "the photo's job is still '$state' after $patience s"
+}
 
 before=$(listing)
+say "without a key it does not start ..."
+if (isolated "${command[@]}") >"$folder/refusal.log" 2>&1; then fail "it starts though nobody could use it"; fi
+grep -q 'lensmodel keys create' "$folder/refusal.log" || fail "it does not say how to make a key: $folder/refusal.log"
+key=$(isolated "${entry[@]}" keys create --owner check 2>>"$folder/service.log") || fail "keys create"
+case $key in lpk_*) ;; *) fail "keys create printed no key" ;; esac
+
 say "starting it: uid 10001, read-only root, process 1 ..."
 start
 first=$(pgrep -P "$service" | head -n 1)
 [ "$(awk '/^Uid:/ { print $2 }' "/proc/$first/status")" = 10001 ] || fail "process 1 is not of uid 10001"
 [ "$(awk '/^CapEff:/ { print $2 }' "/proc/$first/status")" = 0000000000000000 ] || fail "process 1 has capabilities"
-if nsenter --target "$first" --mount --pid chroot "$folder/mount" touch /opt/probe 2>/dev/null; then
+if nsenter --target "$first" --mount --pid chroot "$mount" touch /opt/probe 2>/dev/null; then
   fail "the root is not read-only"
 fi
 [ "${#health[@]}" -gt 0 ] || fail "the image has no health check"
-nsenter --target "$first" --mount --pid chroot "$folder/mount" \
+nsenter --target "$first" --mount --pid chroot "$mount" \
   /usr/bin/env -i "${environment[@]}" "${inside[@]}" "${health[@]}" || fail "its health check says no"
 
 say "ready and healthy; uploading a photo ..."
-photo_id=$(curl --silent --show-error --fail --form "file=@$photo" --form lens_maker=Check --form lens_model=Check \
-  --form lens_serial=container-1 --form aperture=5.6 "http://127.0.0.1:$port/v1/photos" \
-  | python3 -c 'import json, sys; print(json.load(sys.stdin)["id"])')
-state=""
-for _ in $(seq 240); do
-  state=$(ask "/v1/jobs/$photo_id" | python3 -c 'import json, sys; print(json.load(sys.stdin)["state"])')
-  case $state in succeeded) break ;; failed | cancelled) fail "the photo's job: $(ask "/v1/jobs/$photo_id")" ;; esac
-  sleep 0.5
-done
-[ "$state" = succeeded ] || fail "the photo's job is still '$state' after two minutes"
+[ "$(curl --silent --output /dev/null --write-out '%{http_code}' "http://127.0.0.1:$port/v1/photos")" = 401 ] \
+  || fail "it answers somebody without a key"
+calibrate
 
 say "calibrated; stopping ..."
 stop
@@ -195,6 +242,37 @@ start
 photos=$(ask /v1/lenses | python3 -c 'import json, sys; print(sum(lens["photos"] for lens in json.load(sys.stdin)["items"]))')
 [ "$photos" = 1 ] || fail "after a restart its lenses know $photos photos instead of 1"
 stop
+
+# --- the services of compose.yaml ----------------------------------------------------------------------------------
+
+python=${PYTHON:-$here/.venv/bin/python}
+if ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 && "$python" -c 'import moto, flask' 2>/dev/null; then
+  say "starting an API and a worker from it, on PostgreSQL and S3 ..."
+  coproc SERVERS { PYTHONPATH=$here exec "$python" "$here/tests/app/servers.py" lensmodel; }
+  parts+=("$SERVERS_PID")
+  while read -r line <&"${SERVERS[0]}"; do
+    environment+=("$line")
+    case $line in AWS_SECRET_ACCESS_KEY=*) break ;; esac
+  done
+  volume -api
+  key=$(isolated "${entry[@]}" keys create --owner check 2>>"$folder/api.log") || fail "keys create on PostgreSQL"
+  isolated "${entry[@]}" api --port "$port" >>"$folder/api.log" 2>&1 &
+  api=$!
+  volume -worker
+  isolated "${entry[@]}" worker >>"$folder/worker.log" 2>&1 &
+  worker=$!
+  parts+=("$api" "$worker")
+  until_ready "$api" "$worker"
+  calibrate
+  end "$worker"
+  end "$api"
+  [ -z "$(find "$folder/data-api" "$folder/data-worker" -name '*.db')" ] || fail "a SQLite file beside PostgreSQL"
+  eval "exec ${SERVERS[1]}>&-"
+  wait "$SERVERS_PID" || true
+  say "calibrated by two containers, whose rows lie in PostgreSQL and whose photos in S3"
+else
+  say "the services of compose.yaml were not tried: Debian's postgresql, or moto for $python, is missing"
+fi
 
 size=$(du --summarize --block-size=1M "$root" | cut -f1)
 say "passed: built, ran and stopped; image $size MiB, of which the base $(du -sm --one-file-system "$folder/base" | cut -f1) MiB"

@@ -11,15 +11,16 @@ import numpy as np
 import tifffile
 from PIL import Image
 
-from app.commands import files
-from app.commands.display import Display, atomic
-from app.commands.failure import UsageError
+from app.commands.console import files
+from app.commands.console.display import Display, atomic
+from app.commands.console.failure import UsageError
+from app.words import mtf50_words
 from lensmodel import quality
-from lensmodel.codec import to_json
-from lensmodel.geometry import zone_of
-from lensmodel.psf import rms_width
-from lensmodel.regression import PsfAnswer
-from lensmodel.types import Channel, FieldPosition, LensSettings
+from lensmodel.core.codec import to_json
+from lensmodel.core.geometry import zone_of
+from lensmodel.core.psf import rms_width
+from lensmodel.core.types import Channel, FieldPosition, LensSettings
+from lensmodel.model import PsfAnswer
 
 WRITTEN: Final = (".npy", ".json", ".tif", ".png")
 
@@ -90,7 +91,7 @@ def _words(place: FieldPosition, answer: PsfAnswer, tangential: float, sagittal:
     photos = "1 photo" if answer.photos == 1 else f"{answer.photos} photos"
     return (
         f"{zone_of(place.r)}, r {place.r:g}: rms width {rms_width(answer.kernel):.2f} px, MTF50 tangential "
-        f"{tangential:.3f}, sagittal {sagittal:.3f} cycles/px; {photos}, "
+        f"{mtf50_words(tangential)}, sagittal {mtf50_words(sagittal)} cycles/px; {photos}, "
         f"{answer.effective_samples:.1f} effective samples, expected error "
         f"{answer.predicted_error:.2f}{beyond}{prior}"
     )

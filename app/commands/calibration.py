@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,15 +12,21 @@ from typing import Any, Final
 import typer
 from rich.progress import Progress, TaskID
 
-from app.commands import files
-from app.commands.display import Display
-from app.commands.failure import UsageError
-from app.identity import Identity, difference
-from lensmodel import blind, pipeline
-from lensmodel.errors import InvalidInputError, LensModelError, MetadataMissingError
-from lensmodel.regression import Camera, LensModel, LensProfile, ModelSettings, save_profile
-from lensmodel.regression.answer import KERNELS, MICROMETRE
-from lensmodel.types import LensSettings, StepHook
+from app.commands import cluster
+from app.commands.console import files
+from app.commands.console.display import Display
+from app.commands.console.failure import UsageError
+from lensmodel import estimation
+from lensmodel.core.errors import InvalidInputError, LensModelError, MetadataMissingError
+from lensmodel.core.psf import PsfSample
+from lensmodel.core.types import LensSettings, StepHook
+from lensmodel.estimation.patches import selectors
+from lensmodel.model import LensModel, LensProfile, ModelSettings, save_profile
+from lensmodel.model.answer import KERNELS, MICROMETRE
+from lensmodel.photo.endings import ENDINGS
+from lensmodel.workflow import pipeline
+from lensmodel.workflow.identity import Identity, difference
+from lensmodel.workflow.lens import Lens
 
 _ZIP: Final = b"PK"
 """How a profile begins, damaged or not."""
@@ -38,6 +45,8 @@ class Wishes:
     no_family: bool
     mode: str | None
     unit: str | None
+    scheduler: str | None = None
+    selector: str = "r-map"
 
 
 def run(names: Sequence[str], target: Path, wishes: Wishes, display: Display, *, as_json: bool) -> None:
@@ -53,17 +62,18 @@ def run(names: Sequence[str], target: Path, wishes: Wishes, display: Display, *,
     paths = files.photos(names)
     _refuse(target, paths, wishes)
     with files.as_usage():
-        blind.estimators.create(wishes.estimator)
+        estimation.estimators.create(wishes.estimator)
+        selectors.create(wishes.selector)
         settings = LensSettings(aperture=wishes.aperture)
         family = None if wishes.family is None else files.profile_at(wishes.family)
         chosen = ModelSettings(mode=wishes.mode or KERNELS, unit=wishes.unit or MICROMETRE)
-    calibration = _Calibration(target, wishes, settings, chosen, family)
+    calibration = Calibration(target, wishes, settings, chosen, family)
     results: list[dict[str, Any]] = []
     with display.progress() as bars:
         task = bars.add_task("", total=len(paths))
-        for number, path in enumerate(paths):
+        for number, (path, samples) in enumerate(cluster.estimated(wishes.scheduler, paths, calibration)):
             try:
-                result = calibration.add(path, partial(_show, bars, task, number))
+                result = calibration.add(path, partial(_show, bars, task, number), samples)
             except (LensModelError, OSError) as error:
                 code = error.code if isinstance(error, LensModelError) else "unreadable"
                 result = {"state": "failed", "code": code, "reason": files.reason(error)}
@@ -102,7 +112,7 @@ def _refuse(target: Path, photos: Sequence[Path], wishes: Wishes) -> None:
     if target.is_dir():
         raise UsageError(f"{target} is a folder; give the file of a lens profile")
     # of `--profile holiday/*.dng` a shell makes a profile and photos
-    if target.suffix.lower() in files.SUFFIXES or any(files.same(target, path) for path in photos):
+    if target.suffix.lower() in ENDINGS or any(files.same(target, path) for path in photos):
         raise UsageError(
             f"{target.name} is a photo; name a new file after --profile, for example my-24mm.lensprofile"
         )
@@ -117,7 +127,7 @@ def _show(bars: Progress, task: TaskID, number: int, event: pipeline.Calibration
     bars.update(task, description=f"{event.photo.name}: {event.stage}", completed=number + share)
 
 
-class _Calibration:
+class Calibration:
     """A profile that grows, and the file that keeps up with it.
 
     Another run may add to the same file meanwhile: before each look at the profile it is read again
@@ -146,8 +156,19 @@ class _Calibration:
             if _stamp(self._target) == self._seen:  # else another run goes on, and fits it at its own end
                 self._save(whole)
 
-    def add(self, path: Path, on_event: pipeline.EventHook) -> dict[str, Any]:
-        """Learn from one photo; say what became of it."""
+    def order(self, path: Path) -> tuple[Any, ...] | None:
+        """Return what a cluster needs to estimate a photo; None where nothing is to be estimated of it."""
+        if path.stem.endswith(files.CORRECTED) or self._has(pipeline.photo_id(path)):
+            return None
+        if self._settings.aperture is None and not files.says_aperture(path):
+            return None
+        wishes, count = self._wishes, pipeline.DEFAULT_PATCHES
+        return path.name, path.read_bytes(), self._settings, wishes.estimator, count, wishes.selector
+
+    def add(
+        self, path: Path, on_event: pipeline.EventHook, estimated: Future[list[PsfSample]] | None = None
+    ) -> dict[str, Any]:
+        """Learn from one photo, whose samples may come from elsewhere; say what became of it."""
         if path.stem.endswith(files.CORRECTED):
             raise InvalidInputError(
                 "it was corrected already and tells nothing of the lens; give the original"
@@ -157,35 +178,29 @@ class _Calibration:
             return {"state": "known"}
         seen = files.identity(path)
         self._refuse_other_lens(seen)
-        says_aperture = files.says_aperture(path)
-        if not says_aperture and self._settings.aperture is None:
+        if self._settings.aperture is None and not files.says_aperture(path):
             raise MetadataMissingError("it does not say its aperture; add it, for example --aperture 2.8")
-        samples = pipeline.samples_of_photo(
-            path,
-            settings=None if says_aperture else self._settings,
-            estimator=self._wishes.estimator,
-            workers=self._wishes.workers,
-            on_event=on_event,
+        samples = (
+            pipeline.samples_of_photo(
+                path,
+                settings=self._settings,
+                estimator=self._wishes.estimator,
+                selector=self._wishes.selector,
+                workers=self._wishes.workers,
+                on_event=on_event,
+            )
+            if estimated is None
+            else estimated.result()
         )
         if self._has(key):
             return {"state": "known"}
         self._refuse_other_lens(seen)
         if self.profile is None:
-            grown = LensProfile(
-                self._leaning(LensModel.fit(samples, self._chosen)),
-                dict(seen.lens),
-                {key: path.name},
-                () if seen.camera is None else (seen.camera,),
-            )
+            lens, model = None, self._leaning(LensModel.fit(samples, self._chosen))
         else:
-            known = self.profile
-            grown = LensProfile(
-                known.model.added(samples),
-                self._named(known.lens, seen),
-                {**known.photos, key: path.name},
-                _with(known.cameras, seen.camera),
-            )
-        self._save(grown)
+            lens, model = Lens(self.profile), self.profile.model.added(samples)
+        grown = Lens.grown(lens, model, {key: path.name}, [seen], any_lens=self._wishes.any_lens)
+        self._save(grown.profile)
         self._grown = True
         return {"state": "counted", "samples": len(samples)}
 
@@ -199,10 +214,6 @@ class _Calibration:
         why = difference(self.profile.lens, self.profile.cameras, seen)
         if why is not None:
             raise InvalidInputError(f"{why}; give it a profile of its own, or add --any-lens")
-
-    def _named(self, known: dict[str, str], seen: Identity) -> dict[str, str]:
-        """What is known of the lens after one more photo; one of any lens gives the profile no name."""
-        return known if self._wishes.any_lens else {**seen.lens, **known}
 
     def _follow(self) -> None:
         """Read the profile if it is not as this run left it, and make it answer as was wished."""
@@ -228,10 +239,6 @@ class _Calibration:
         self._target.parent.mkdir(parents=True, exist_ok=True)
         save_profile(self._target, profile)
         self.profile, self._seen = profile, _stamp(self._target)
-
-
-def _with(cameras: tuple[Camera, ...], camera: Camera | None) -> tuple[Camera, ...]:
-    return cameras if camera is None or camera in cameras else (*cameras, camera)
 
 
 def _opened(target: Path) -> LensProfile:

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from PIL import Image
 from rich.progress import Progress, TaskID
 
-from app.commands import display, files
-from app.commands.failure import UsageError
-from app.commands.options import Aperture, Force, Json, Quiet, Verbose
-from lensmodel import checking, photo
-from lensmodel.audit import AuditReport
-from lensmodel.types import LensSettings
+from app.commands.console import display, files
+from app.commands.console.failure import UsageError
+from app.commands.console.options import Aperture, Force, Json, Quiet, Verbose
+from lensmodel import photo
+from lensmodel.core.types import LensSettings
+from lensmodel.correction.audit import AuditReport
+from lensmodel.workflow import checking
 
 _GREY: Final = 0.5
 """Brightness of the photo on the map, so that the red of what was held back stands out."""
@@ -68,6 +69,8 @@ def check(
     if picture is not None:
         if picture.suffix.lower() != ".png":
             raise UsageError(f"the map is a PNG; give --map a name that ends in .png, got {picture.name}")
+        if not picture.parent.is_dir():
+            raise UsageError(f"no folder {picture.parent} for the map; check the name or make it")
         files.refuse_existing(picture, force=force)
     with files.as_usage():
         settings = LensSettings(aperture=aperture)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -12,17 +11,18 @@ from typing import Any, Final
 import typer
 from rich.progress import Progress, TaskID
 
-from app.commands import files
-from app.commands.display import Display
-from app.commands.failure import UsageError
-from app.identity import difference
-from app.words import gain_words
-from lensmodel import deconv, pipeline
-from lensmodel.audit import HELD, AuditReport
-from lensmodel.errors import InvalidInputError, LensModelError
+import lensmodel
+from app.commands.console import files
+from app.commands.console.display import Display
+from app.commands.console.failure import UsageError
+from app.words import gain_words, mtf50_words
+from lensmodel import correction
+from lensmodel.core.errors import InvalidInputError, LensModelError
+from lensmodel.core.types import LensSettings, StepHook, Zone
+from lensmodel.correction.audit import HELD, AuditReport
 from lensmodel.photo import OutputFormat
-from lensmodel.regression import LensProfile
-from lensmodel.types import LensSettings, Zone
+from lensmodel.workflow.identity import difference
+from lensmodel.workflow.lens import Lens
 
 EXTENSION: Final[dict[OutputFormat, str]] = {
     "tiff16": ".tif",
@@ -33,6 +33,10 @@ EXTENSION: Final[dict[OutputFormat, str]] = {
 }
 
 
+FOLDER: Final = "corrected"
+"""Beside the photos, where nothing else is said."""
+
+
 @dataclass(frozen=True, slots=True)
 class Wishes:
     """What the options said."""
@@ -40,15 +44,23 @@ class Wishes:
     aperture: float | None
     method: str
     strength: float
-    bounds: deconv.Bounds
+    bounds: correction.Bounds
     file_format: OutputFormat
     workers: int | None
     any_lens: bool
     force: bool
+    sidecar: bool = False
+    least_gain_db: float | None = None
 
 
 def run(
-    names: Sequence[str], source: Path, output: Path, wishes: Wishes, display: Display, *, as_json: bool
+    names: Sequence[str],
+    source: Path,
+    output: Path | None,
+    wishes: Wishes,
+    display: Display,
+    *,
+    as_json: bool,
 ) -> None:
     """Correct photos into a folder, one after the other.
 
@@ -59,22 +71,20 @@ def run(
     typer.Exit
         With 1 if a photo could not be corrected.
     """
-    targets = _targets(files.photos(names), output, EXTENSION[wishes.file_format])
+    targets = targets_of(files.photos(names), output, EXTENSION[wishes.file_format])
     with files.as_usage():
-        deconv.deconvolvers.create(wishes.method)
+        correction.deconvolvers.create(wishes.method)
         settings = LensSettings(aperture=wishes.aperture)
-    profile = files.profile_at(source)
-    if output.exists() and not output.is_dir():
-        raise UsageError(f"{output} is a file; give a folder to -o")
-    output.mkdir(parents=True, exist_ok=True)
+    lens = Lens(files.profile_at(source))
+    lens = lens.warmed()  # once for all photos, where a run that was stopped left it undone
     results: list[dict[str, Any]] = []
     with display.progress() as bars:
         task = bars.add_task("", total=len(targets))
         for number, (target, path) in enumerate(targets.items()):
             bars.update(task, description=path.name)
             try:
-                result = _one(
-                    path, target, profile, settings, wishes, display, partial(_show, bars, task, number)
+                result = correct_one(
+                    path, target, lens, settings, wishes, display, partial(_show, bars, task, number)
                 )
             except (LensModelError, OSError) as error:
                 code = error.code if isinstance(error, LensModelError) else "unreadable"
@@ -95,11 +105,20 @@ def run(
         raise typer.Exit(1)
 
 
-def _targets(paths: Sequence[Path], output: Path, extension: str) -> dict[Path, Path]:
-    """Name the file that each photo becomes; no two may become the same."""
+def targets_of(paths: Sequence[Path], output: Path | None, extension: str) -> dict[Path, Path]:
+    """Name the file that each photo becomes; no two may become the same.
+
+    Raises
+    ------
+    UsageError
+        If two would, or if a folder for them cannot be one.
+    """
     found: dict[Path, Path] = {}
     for path in paths:
-        target = output / f"{path.stem}{files.CORRECTED}{extension}"
+        folder = path.parent / FOLDER if output is None else output
+        if folder.exists() and not folder.is_dir():
+            raise UsageError(f"{folder} is a file; give a folder to -o")
+        target = folder / f"{path.stem}{files.CORRECTED}{extension}"
         if target in found:
             raise UsageError(
                 f"{found[target]} and {path} would both become {target}; "
@@ -109,48 +128,60 @@ def _targets(paths: Sequence[Path], output: Path, extension: str) -> dict[Path, 
     return found
 
 
-def _one(
+def correct_one(
     path: Path,
     target: Path,
-    profile: LensProfile,
+    lens: Lens,
     settings: LensSettings,
     wishes: Wishes,
     display: Display,
-    on_step: Any,  # noqa: ANN401 - a partial of `_show`
+    on_step: StepHook,
 ) -> dict[str, Any]:
+    """Correct one photo; say what became of it: `corrected`, `kept` or `left`.
+
+    Raises
+    ------
+    LensModelError, OSError
+        If it could not be done.
+    """
     if path.stem.endswith(files.CORRECTED):
         raise InvalidInputError("it was corrected already; give the original")
     if target.exists() and not wishes.force:
         return {"state": "kept"}
     seen = files.identity(path)
-    why = difference(profile.lens, profile.cameras, seen)
+    why = difference(lens.profile.lens, lens.profile.cameras, seen)
     if why is not None and not (wishes.any_lens or wishes.force):
         raise InvalidInputError(f"{why}; use the profile of its own lens, or add --any-lens")
     if why is not None:
         display.note(f"{path}: {why}; it is corrected all the same, as you asked")
     elif not seen.names_lens:
         display.note(f"{path} does not name its lens; it is taken for a photo of the profile's lens")
-    needs_help = not files.says_aperture(path)
-    if needs_help and settings.aperture is None:
+    if settings.aperture is None and not files.says_aperture(path):
         display.note(f"{path} does not say its aperture; all apertures of the profile are taken together")
-    corrected = pipeline.correct(
+    target.parent.mkdir(parents=True, exist_ok=True)
+    corrected = lensmodel.correct(
         path,
-        profile.model,
+        lens,
         target,
-        settings=settings if needs_help else LensSettings(),
+        aperture=settings.aperture,
         method=wishes.method,
         strength=wishes.strength,
         bounds=wishes.bounds,
-        lens=_named(profile),
         file_format=wishes.file_format,
-        workers=wishes.workers or os.cpu_count() or 1,
+        least_gain_db=wishes.least_gain_db,
+        sidecar=wishes.sidecar,
+        workers=wishes.workers,
         on_step=on_step,
     )
+    gain = corrected.expected_gain_db
+    left = wishes.least_gain_db is not None and gain < wishes.least_gain_db
     return {
-        "state": "corrected",
+        "state": "left" if left else "corrected",
+        "expected_gain_db": gain,
         "zones": corrected.zones,
         "nothing_to_correct": corrected.nothing_to_correct,
         "audit": corrected.audit,
+        "chroma_step": corrected.chroma_step,
     }
 
 
@@ -158,14 +189,25 @@ def remarks(result: Mapping[str, Any]) -> list[str]:
     """What is worth saying of a corrected photo, in words."""
     if result["nothing_to_correct"]:
         return ["nothing to correct: its pixels stayed as they were"]
-    return [*measured(result["zones"]), *audited(result["audit"])]
+    return [*measured(result["zones"]), *audited(result["audit"]), *colour(result["chroma_step"])]
 
 
-def measured(zones: Mapping[Zone, deconv.ZoneReport]) -> list[str]:
+def colour(step: tuple[int, int]) -> list[str]:
+    """Tell in words where a file stores colour too coarsely to be corrected pixel by pixel."""
+    if max(step) == 1:
+        return []
+    return [
+        f"the JPEG stores one colour for {step[0]} x {step[1]} pixels: "
+        "brightness is corrected pixel by pixel, colour no more finely than that"
+    ]
+
+
+def measured(zones: Mapping[Zone, correction.ZoneReport]) -> list[str]:
     """Tell in words what the edges of a chart gained; nothing of any other photo."""
     return [
-        f"{zone} of the chart: MTF50 from {seen.mtf50_before:.3f} to {seen.mtf50_after:.3f} cycles/pixel, "
-        f"{seen.gain:.1f} times (median of {seen.edges} edges), overshoot {seen.overshoot_after:.1f} %; "
+        f"{zone} of the chart: MTF50 from {mtf50_words(seen.mtf50_before)} "
+        f"to {mtf50_words(seen.mtf50_after)} cycles/pixel, {seen.gain:.1f} times "
+        f"(median of {seen.edges} edges), overshoot {seen.overshoot_after:.1f} %; "
         f"predicted for a usual scene {gain_words(report.expected_gain_db)}"
         for zone, report in zones.items()
         if (seen := report.measured) is not None
@@ -180,13 +222,6 @@ def audited(audit: AuditReport) -> list[str]:
         if zone_audit.held_back > HELD
         and (most := sorted(zone_audit.checks, key=lambda name: -zone_audit.checks[name])[:3])
     ]
-
-
-def _named(profile: LensProfile) -> str:
-    """Which lens, and how many photos its profile has seen, for the tag of a corrected photo."""
-    words = [profile.lens[key] for key in ("maker", "model") if profile.lens.get(key)]
-    count = len(profile.photos)
-    return f"{' '.join(words) or 'unknown lens'}, profile of {count} photo{'' if count == 1 else 's'}"
 
 
 def _show(bars: Progress, task: TaskID, number: int, done: int, total: int) -> None:

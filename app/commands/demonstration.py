@@ -10,10 +10,10 @@ from typing import Annotated, Final
 
 import typer
 
-from app.commands import display, files
-from app.commands.failure import UsageError
-from app.commands.options import Estimator, Quiet, Verbose
-from lensmodel import blind
+from app.commands.console import display, files
+from app.commands.console.failure import UsageError
+from app.commands.console.options import Estimator, Quiet, Verbose
+from lensmodel import estimation
 
 MARKER: Final = ".lensmodel-demo.json"
 """Lists the files that a demo wrote into its folder, each with its SHA-256."""
@@ -44,7 +44,7 @@ def demo(
     """
     shown = display.of(context, quiet=quiet, verbose=verbose)
     with files.as_usage():
-        blind.estimators.create(estimator)
+        estimation.estimators.create(estimator)
     _refuse_what_others_wrote(output, force=force)
     from app.demo.run import run  # noqa: PLC0415 - only this command needs the simulation
 

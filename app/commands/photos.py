@@ -10,9 +10,10 @@ from typing import Annotated, get_args
 
 import typer
 
-from app.commands import answer, calibration, correction, display
-from app.commands.failure import UsageError
-from app.commands.options import (
+from app.commands import answer, calibration, correction, folder, remote
+from app.commands.console import display
+from app.commands.console.failure import UsageError
+from app.commands.console.options import (
     ANGLE,
     RADIUS,
     AnyLens,
@@ -25,15 +26,16 @@ from app.commands.options import (
     Profile,
     ProfileFile,
     Quiet,
+    Selector,
     Size,
     Verbose,
     Workers,
     aperture_option,
     choice,
 )
-from lensmodel.deconv import Bounds, deconvolvers
+from lensmodel.correction import Bounds, deconvolvers
+from lensmodel.model.answer import MODES, UNITS
 from lensmodel.photo import OutputFormat
-from lensmodel.regression.answer import MODES, UNITS
 
 
 def calibrate(
@@ -42,21 +44,26 @@ def calibrate(
     profile: Profile,
     aperture: Aperture = None,
     estimator: Estimator = "default",
+    selector: Selector = "r-map",
     workers: Workers = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Of a Dask cluster, which then estimates the photos."),
+    ] = None,
     any_lens: AnyLens = False,
     force: Annotated[bool, typer.Option("--force", help="Forget what the profile knew; begin anew.")] = False,
     family: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Profile of another copy: leaned on where photos are missing."),
+        typer.Option(metavar="FILE", help="Profile of another copy, to borrow from where photos lack."),
     ] = None,
-    no_family: Annotated[bool, typer.Option("--no-family", help="Lean on no other copy any more.")] = False,
+    no_family: Annotated[bool, typer.Option("--no-family", help="Stop borrowing from another copy.")] = False,
     mode: Annotated[
         str | None,
         choice(
             "--mode",
             MODES,
             "What answers are made of: kernels (default), mixed with a fitted wavefront, or likeliest, which "
-            "chooses by photos held out. Kept from then on.",
+            "chooses by photos set aside. Kept from then on.",
         ),
     ] = None,
     unit: Annotated[
@@ -76,7 +83,8 @@ def calibrate(
 
     A profile that exists is added to. Photos that it has seen are skipped, and it is saved after
     each photo: a run that was stopped goes on where it was. In folders, JPEG, TIFF and PNG files
-    beside a RAW file of the same name are passed over, and so are corrected photos.
+    beside a RAW file of the same name are passed over, and so are corrected photos. --scheduler lets
+    the machines of a Dask cluster do the work, by their address such as tcp://10.0.0.1:8786.
 
     Examples:
 
@@ -104,6 +112,8 @@ def calibrate(
             no_family=no_family,
             mode=mode,
             unit=unit,
+            scheduler=scheduler,
+            selector=selector,
         ),
         shown,
         as_json=json_output,
@@ -113,10 +123,43 @@ def calibrate(
 def correct(
     context: typer.Context,
     photos: Photos,
-    profile: Profile,
+    profile: Annotated[
+        Path | None, typer.Option("--profile", "-p", metavar="FILE", help="The profile of their lens.")
+    ] = None,
+    lens: Annotated[
+        str | None,
+        typer.Option(
+            metavar="auto|ID",
+            help="auto: sort the photos by body, lens and focal length, learn each lens from them, and "
+            "correct those that gain by it. With --server also the id of a lens there.",
+        ),
+    ] = None,
+    server: Annotated[
+        str | None,
+        typer.Option(metavar="URL", help="Have a service elsewhere do the work; its key is LENS_API_KEY."),
+    ] = None,
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for the corrected photos.")
-    ],
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="DIR",
+            help="Folder for the corrected photos; default: `corrected` beside each photo.",
+        ),
+    ] = None,
+    profiles: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="With --lens auto: folder that keeps the lens profiles; default: `lenses` in the output.",
+        ),
+    ] = None,
+    learn_from: Annotated[
+        int,
+        typer.Option(min=1, metavar="N", help="With --lens auto: photos of a group to learn from at most."),
+    ] = folder.LEARN_FROM,
+    estimator: Estimator = "default",
+    selector: Selector = "r-map",
     method: Annotated[str, typer.Option(metavar="NAME", help=f"{', '.join(deconvolvers)}.")] = "standard",
     strength: Annotated[
         float, typer.Option(min=0.0, max=1.0, metavar="0..1", help="0 nothing, 1 all that the noise allows.")
@@ -140,6 +183,9 @@ def correct(
     file_format: Annotated[
         OutputFormat, choice("--format", get_args(OutputFormat), "dng: linear, for a raw converter.")
     ] = "tiff16",
+    sidecar: Annotated[
+        bool, typer.Option("--sidecar", help="Write an XMP file beside each: what was done, and the lens.")
+    ] = False,
     aperture: Aperture = None,
     workers: Workers = None,
     any_lens: AnyLens = False,
@@ -152,9 +198,14 @@ def correct(
 
     Corrected photos are new files, NAME-corrected. Those that are there already are left alone:
     a run that was stopped goes on where it was. Each appears complete or not at all. The names of
-    the written files go to standard output.
+    the written files go to standard output; with --lens auto a table does, one line for each lens,
+    and -v tells of every photo. The photos themselves are never changed.
 
     Examples:
+
+        lensmodel correct holiday --lens auto
+
+        lensmodel correct holiday --server http://127.0.0.1:8000 -o corrected
 
         lensmodel correct holiday --profile my-24mm.lensprofile -o corrected
 
@@ -169,23 +220,33 @@ def correct(
     shown = display.of(context, quiet=quiet, verbose=verbose)
     if halo is not None and not halo >= 0.0:
         raise UsageError(f"--halo must not be negative, got {halo:g}")
-    correction.run(
-        photos,
-        profile,
-        output,
-        correction.Wishes(
-            aperture,
-            method,
-            strength,
-            Bounds(halo, texture, denoise),
-            file_format,
-            workers,
-            any_lens=any_lens,
-            force=force,
-        ),
-        shown,
-        as_json=json_output,
+    wishes = correction.Wishes(
+        aperture,
+        method,
+        strength,
+        Bounds(halo, texture, denoise),
+        file_format,
+        workers,
+        any_lens=any_lens,
+        force=force,
+        sidecar=sidecar,
     )
+    if server is not None:
+        if profile is not None:
+            raise UsageError("--server has lenses of its own; leave out --profile, or give --lens ID")
+        remote.run(photos, server, lens or remote.AUTO, output, wishes, shown, as_json=json_output)
+        return
+    if (profile is None) == (lens is None):
+        raise UsageError(
+            "give --profile FILE, or --lens auto to learn the lens from these photos; one of them"
+        )
+    if profile is not None:
+        correction.run(photos, profile, output, wishes, shown, as_json=json_output)
+        return
+    if lens != "auto":
+        raise UsageError(f"--lens must be auto, got {lens!r}; for a profile of yours use --profile FILE")
+    learning = folder.Learning(profiles, learn_from, estimator, selector)
+    folder.run(photos, output, wishes, learning, shown, as_json=json_output)
 
 
 def psf(

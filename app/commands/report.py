@@ -10,9 +10,10 @@ from typing import Annotated, Final
 
 import typer
 
-from app.commands import display, files
-from app.commands.failure import UsageError
-from app.commands.options import (
+from app.commands import lens_test
+from app.commands.console import display, files
+from app.commands.console.failure import UsageError
+from app.commands.console.options import (
     ANGLE,
     RADIUS,
     Channel,
@@ -24,8 +25,9 @@ from app.commands.options import (
     Verbose,
     aperture_option,
 )
-from lensmodel.codec import to_json
-from lensmodel.regression import LensModel
+from lensmodel.core.codec import to_json
+from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.model import LensModel
 from lensmodel.report import (
     Advice,
     LensReport,
@@ -42,7 +44,6 @@ from lensmodel.report import (
 )
 from lensmodel.report.exporters import write_atomically
 from lensmodel.report.lens_report import widest
-from lensmodel.types import FieldPosition, LensSettings
 
 Aperture = Annotated[float | None, aperture_option("f-number; default: the widest that a photo had.")]
 Aspect = Annotated[
@@ -57,11 +58,17 @@ def report(
     profile: ProfileFile,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="DIR", help="Folder for report.json, mtf.csv and pictures."),
+        typer.Option(
+            "--output", "-o", metavar="DIR", help="Folder for the report, the lens test and pictures."
+        ),
     ] = None,
     aperture: Aperture = None,
     channel: Channel = "g",
     aspect: Aspect = 1.5,
+    against: Annotated[
+        Path | None,
+        typer.Option("--against", metavar="PROFILE", help="Another copy, to compare with; needs --output."),
+    ] = None,
     json_output: Json = False,
     force: Force = False,
     quiet: Quiet = False,
@@ -75,13 +82,18 @@ def report(
 
         lensmodel report my-24mm.lensprofile --aperture 2 -o my-24mm-report
 
+        lensmodel report my-24mm.lensprofile --against a-friends-24mm.lensprofile -o both
+
         lensmodel report my-24mm.lensprofile --json
 
-    Exit status: 0 told, 1 the profile cannot be used, 2 called wrongly.
+    Exit status: 0 reported, 1 the profile cannot be used, 2 called wrongly.
     """
     shown = display.of(context, quiet=quiet, verbose=verbose)
     if output is not None:
-        files.refuse_existing(*(output / name for name in _FILES), force=force)
+        names = (*_FILES, *lens_test.FILES, *(lens_test.COMPARED if against else ()))
+        files.refuse_existing(*(output / name for name in names), force=force)
+    elif against is not None:
+        raise UsageError("--against needs --output: the comparison is two files")
     with shown.busy("asking the lens at 200 places"):
         model = files.profile_at(profile).model
         found = lens_report(model, _settings(model, aperture, channel), ReportSettings(aspect=aspect))
@@ -99,10 +111,31 @@ def report(
         output.mkdir(parents=True, exist_ok=True)
         for name, text in texts.items():
             write_atomically(output / name, text.encode())
+        missing = _tested(shown, profile, against, output, aspect, aperture)
+        if missing:
+            shown.note(f"not written: {', '.join(missing)}; pip install 'lensmodel[report]' brings PDF")
     if json_output:
         typer.echo(document)
     else:
         shown.result(_words(found, wish, output))
+
+
+def _tested(
+    shown: display.Display,
+    profile: Path,
+    against: Path | None,
+    output: Path,
+    aspect: float,
+    aperture: float | None,
+) -> list[str]:
+    """Write the lens test; return the files that were left out."""
+    with shown.busy("testing the lens"):
+        first = lens_test.tested(files.profile_at(profile), profile, aspect)
+        missing = lens_test.write(output, first)
+        if against is not None:
+            second = lens_test.tested(files.profile_at(against), against, aspect)
+            missing += lens_test.write_comparison(output, first, second, aperture)
+    return missing
 
 
 def export_psfs(

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.commands.failure import UsageError
+from app.commands.console.failure import UsageError
 
 if TYPE_CHECKING:
-    from app.settings import Settings
+    from app.runtime.settings import Settings
 
 Data = Annotated[
     Path | None,
@@ -25,11 +25,11 @@ Port = Annotated[
 Host = Annotated[str | None, typer.Option("--host", help="Address to listen on.", show_default="127.0.0.1")]
 
 
-def _settings(data: Path | None, host: str | None = None, port: int | None = None) -> Settings:
-    """Read the settings; what the command line says goes before the environment."""
+def settings_from(data: Path | None, host: str | None = None, port: int | None = None) -> Settings:
+    """Read the settings of a service; what the command line says goes before the environment."""
     from pydantic import ValidationError  # noqa: PLC0415 - only these commands need the service
 
-    from app.settings import Settings  # noqa: PLC0415 - same
+    from app.runtime.settings import Settings  # noqa: PLC0415 - same
 
     given = {"data_dir": data, "host": host, "port": port}
     try:
@@ -57,27 +57,27 @@ def serve(port: Port = None, host: Host = None, data: Data = None) -> None:
 
         lensmodel serve --port 9000 --data ~/lenses
 
-    Exit status: 0 stopped as told by Ctrl-C or SIGTERM, 1 it could not run, 2 called wrongly.
+    Exit status: 0 stopped by Ctrl-C or SIGTERM, 1 it could not run, 2 called wrongly.
     """
-    settings = _settings(data, host, port)
+    settings = settings_from(data, host, port)
     typer.echo("lensmodel is starting ...", err=True)
-    from app import supervisor  # noqa: PLC0415 - only this command needs the service
+    from app.runtime import supervisor  # noqa: PLC0415 - only this command needs the service
 
     raise typer.Exit(supervisor.serve(settings))
 
 
 def api(port: Port = None, host: Host = None, data: Data = None) -> None:
     """Run only the API process, for installations on many machines."""
-    settings = _settings(data, host, port)
-    from app import supervisor  # noqa: PLC0415 - only this command needs the service
+    settings = settings_from(data, host, port)
+    from app.runtime import supervisor  # noqa: PLC0415 - only this command needs the service
 
     supervisor.run_api(settings)
 
 
 def worker(data: Data = None) -> None:
     """Run only a worker process, for installations on many machines."""
-    settings = _settings(data)
-    from app import supervisor  # noqa: PLC0415 - only this command needs the service
+    settings = settings_from(data)
+    from app.runtime import supervisor  # noqa: PLC0415 - only this command needs the service
 
     supervisor.run_worker(settings)
 
@@ -98,9 +98,9 @@ def config(
 
     Exit status: 0 printed, 2 a setting is wrong.
     """
-    from app.settings import PREFIX  # noqa: PLC0415 - only these commands need the service
+    from app.runtime.settings import PREFIX  # noqa: PLC0415 - only these commands need the service
 
-    settings = _settings(data)
+    settings = settings_from(data)
     # up to the last @: a password may hold any sign, and need not be quoted everywhere
     shown = {
         name: re.sub(r"(://[^:/@]*):.*@", r"\1:********@", value) if isinstance(value, str) else value
@@ -112,7 +112,7 @@ def config(
     for name, value in shown.items():
         typer.echo(f"# {type(settings).model_fields[name].description}")
         typer.echo(f"{PREFIX}{name.upper()}={value}")
-    from app.jobs import confine  # noqa: PLC0415 - only this command asks
+    from app.sandbox import confine  # noqa: PLC0415 - only this command asks
 
     for name, in_force in confine.available().items():
         typer.echo(f"# sandbox {name}: {'in force' if in_force else 'not to be had here'}")

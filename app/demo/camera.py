@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lensmodel.core.types import LensSettings, Planes
 from lensmodel.simulate import (
     ChartEdge,
     SimulatedCamera,
@@ -20,7 +21,6 @@ from lensmodel.simulate import (
     photograph,
     write_photo,
 )
-from lensmodel.types import LensSettings, Planes
 
 LENS_SEED = 2024
 LENS_KIND = "soft-fast"

@@ -9,7 +9,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from lensmodel.bench.pictures import Picture, crop_boxes
+from lensmodel.report.photo_crops import Picture, crop_boxes
 
 _GAP, _LABEL = 6, 18
 

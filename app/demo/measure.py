@@ -11,10 +11,10 @@ import numpy as np
 from app.client import Client
 from app.demo import camera
 from lensmodel import quality
-from lensmodel.geometry import zone_of
+from lensmodel.core.geometry import zone_of
+from lensmodel.core.psf import distance
+from lensmodel.core.types import ZONES, FieldPosition, Planes, Zone
 from lensmodel.photo import develop
-from lensmodel.psf import distance
-from lensmodel.types import ZONES, FieldPosition, Planes, Zone
 
 _BORDER = 8
 

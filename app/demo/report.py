@@ -7,7 +7,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from app.demo.measure import Sharpness, improved
-from lensmodel.types import ZONES, Zone
+from app.words import mtf50_words
+from lensmodel.core.types import ZONES, Zone
 
 _JUDGED: tuple[Zone, ...] = ("center", "corner")
 
@@ -73,8 +74,8 @@ class Report:
             if zone in self.chart_before and zone in self.chart_after:
                 before, after = self.chart_before[zone], self.chart_after[zone]
                 lines.append(
-                    f"| {zone} | {before.mtf50:.3f} | {after.mtf50:.3f} | {after.mtf_max:.2f} "
-                    f"| {after.overshoot:.1f} % |"
+                    f"| {zone} | {mtf50_words(before.mtf50)} | {mtf50_words(after.mtf50)} "
+                    f"| {after.mtf_max:.2f} | {after.overshoot:.1f} % |"
                 )
         lines += [
             "",

@@ -11,11 +11,11 @@ from pathlib import Path
 
 from app.client import Client, JobEndedError
 from app.demo import camera, figures, measure
+from app.demo.own_service import own_service
 from app.demo.report import Report
+from app.demo.service_tasks import corrected, follow, planes_of
 from app.demo.stages import Stages, Tell
-from app.errands import corrected, follow, planes_of
-from app.own_service import own_service
-from lensmodel.bench.pictures import as_shown
+from lensmodel.report.photo_crops import as_shown
 from lensmodel.simulate import demo_data_path
 
 REAL_RAW = "canon_kissx4_colorchart.dng"

@@ -12,24 +12,24 @@ from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any, Final
 
-from app.evidence import with_evidence
-from app.jobs.child import Progress
-from app.jobs.handover import BEFORE, FAMILY, LEARNED, SUFFIX
-from app.jobs.outage import missable
-from app.jobs.sandbox import Limits
-from app.jobs.workbench import (
+from app.blobs.evidence import with_evidence
+from app.jobs.context import (
     SPARE_MB,
     JobFailedError,
     NotWantedError,
     Workbench,
     write_samples,
 )
+from app.jobs.task_files import AFTER, BEFORE, FAMILY, LAYERS, LEARNED, REPORT, SUFFIX
+from app.runtime.outage import missable
+from app.sandbox.child import Progress
+from app.sandbox.runner import Limits
 from app.store.corrections import CorrectionPlan, Result, folder_of
-from app.store.photos import settings_of
+from app.store.photo_steps import settings_of
 from app.store.samples import LensState, Relative, StoredSample
-from app.store.versions import learned_key
-from app.tables import CorrectionRow
-from lensmodel import deconv
+from app.store.tables import CorrectionRow
+from app.store.versions import learned_key, report_key
+from lensmodel.correction import Bounds
 
 log = logging.getLogger(__name__)
 
@@ -91,8 +91,10 @@ class CorrectionWork:
             "bounds": _bounds(params),
             "output": params["output"],
             "roi": params.get("roi"),
+            "layers": params.get("layers", False),
             "workers": settings.worker_slots,
             "description": _description(plan),
+            "lens": plan.lens.label or "",
         }
         with self._bench.sandbox.folder() as folder:
             lens_id, version = plan.lens.public_id, plan.correction.lens_version
@@ -158,8 +160,9 @@ class CorrectionWork:
         base = folder_of(plan.correction)
         key = f"{base}result{path.suffix}"
         self._bench.storage.put_file(key, path)
-        if (path.parent / BEFORE).is_file():
-            self._bench.storage.put_file(f"{base}{BEFORE}", path.parent / BEFORE)
+        for shown in (BEFORE, AFTER, *LAYERS):
+            if (path.parent / shown).is_file():
+                self._bench.storage.put_file(f"{base}{shown}", path.parent / shown)
         stem = PurePath(plan.photo.filename).stem or "photo"
         result = Result(
             key=key,
@@ -193,12 +196,41 @@ class CorrectionWork:
                     "measure", {"model": model}, folder=folder, limits=limits, wanted=wanted, compiles=True
                 )
                 self._keep_learned(lens_id, version, state, folder / LEARNED)
+                self._report(lens_id, report_key(lens_id, version, state.rebuild_epoch), folder, wanted)
         except NotWantedError:
             return
         except JobFailedError as error:
             log.warning("lens %s version %d could not be measured: %s", lens_id, version, error.detail)
             metrics = {"error": None, "coverage": None, "problem": error.code}
         lenses.record_metrics(lens_id, version, metrics)
+
+    def _report(self, lens_id: str, key: str, folder: Path, wanted: Callable[[], bool]) -> None:
+        """Test the lens whose samples lie in a folder; a version is measured without a report too."""
+        settings = self._bench.settings
+        limits = Limits(memory_mb=2 * SPARE_MB, wall_s=settings.correct_seconds)
+        arguments = {"model": settings.of_models, "about": self._about(lens_id)}
+        try:
+            self._bench.attempt(
+                "report", arguments, folder=folder, limits=limits, wanted=wanted, compiles=True
+            )
+            self._bench.storage.put_file(key, folder / REPORT)
+        except (JobFailedError, FileNotFoundError) as error:
+            log.warning("lens %s has no report: %s", lens_id, error)
+
+    def _about(self, lens_id: str) -> dict[str, Any]:
+        """Return what the samples of a lens do not say of it: its name, the shape of its photos."""
+        lenses = self._bench.store.lenses
+        lens = lenses.get(lens_id)
+        if lens is None:
+            raise NotWantedError
+        named = " ".join(word for word in (lens.maker, lens.model) if word)
+        height, width = lenses.shape_of(lens) or (2, 3)
+        return {
+            "name": lens.label or named or "Unnamed lens",
+            "aspect": width / height,
+            "height_px": height if height > 2 else None,
+            "lateral": lenses.lateral_of(lens),
+        }
 
     def _is_newest(self, lens_id: str, version: int) -> bool:
         """Whether a version counts; what was learned of an earlier one has been deleted."""
@@ -218,9 +250,10 @@ def _bounds(params: dict[str, Any]) -> dict[str, float]:
 
 def _description(plan: CorrectionPlan) -> str:
     params = plan.correction.params
-    lens = " ".join(word for word in (plan.lens.maker, plan.lens.model) if word) or "unknown lens"
+    named = " ".join(word for word in (plan.lens.maker, plan.lens.model) if word)
+    lens = plan.lens.label or named or "unknown lens"
     return (
         f"lens blur corrected by lensmodel: {lens}, version {plan.correction.lens_version}, "
         f"method {params['method']}, strength {params['strength']:g}"
-        f"{deconv.Bounds(**_bounds(params)).described}"
+        f"{Bounds(**_bounds(params)).described}"
     )

@@ -16,19 +16,22 @@ from typing import Any, Final
 
 import numpy as np
 
-from app.jobs.engine import Job, JobEngine
-from app.jobs.handover import KERNELS
-from app.jobs.sandbox import Limits
-from app.jobs.workbench import SPARE_MB, JobFailedError, NotWantedError, Workbench
+from app.jobs.body_keys import body_key
+from app.jobs.context import SPARE_MB, JobFailedError, NotWantedError, Workbench
+from app.jobs.glance_work import keep_glance
+from app.jobs.measurement_work import MeasurementWork
+from app.jobs.queue import Job, JobEngine
+from app.jobs.task_files import KERNELS
+from app.sandbox.runner import Limits
 from app.store import LensName, NewPatch, NewSample
-from app.store.photos import settings_of, statistics_of
-from app.tables import PHOTO_RUNNING, PatchRow, PhotoRow
-from lensmodel import pipeline
-from lensmodel.errors import InvalidInputError, InvalidKernelError, NoUsablePatchesError
-from lensmodel.patches import Patch
-from lensmodel.psf import as_kernel
-from lensmodel.spectrum import PatchSpectrum
-from lensmodel.types import FieldPosition
+from app.store.photo_steps import settings_of, statistics_of
+from app.store.tables import PHOTO_RUNNING, PatchRow, PhotoRow
+from lensmodel.core.errors import InvalidInputError, InvalidKernelError, NoUsablePatchesError
+from lensmodel.core.psf import as_kernel
+from lensmodel.core.spectrum import PatchSpectrum
+from lensmodel.core.types import FieldPosition
+from lensmodel.estimation.patches import Patch
+from lensmodel.workflow import pipeline
 
 log = logging.getLogger(__name__)
 
@@ -42,6 +45,7 @@ class PhotoWork:
     def __init__(self, bench: Workbench, engine: JobEngine) -> None:
         self._bench, self._engine = bench, engine
         self._store = bench.store
+        self._measurements = MeasurementWork(bench)
 
     def photo(self, photo_id: str, epoch: int) -> None:
         """Bring a photo as far as it can get."""
@@ -59,6 +63,10 @@ class PhotoWork:
             self._move(photo, ("inspecting", "developing"), "developing")
             developed = self._bench.developed(photo, wanted)
             self._move(photo, ("developing", "selecting"), "selecting")
+            if photo.given.get("kind"):
+                self._measurements.measure(photo, developed, wanted)
+                self._finish_measured(photo)
+                return
             self._select(photo, developed, wanted)
             self._move(photo, ("selecting", "estimating"), "estimating")
             self._estimate(photo, wanted)
@@ -102,6 +110,7 @@ class PhotoWork:
             info = self._bench.attempt(
                 "inspect", arguments, folder=folder, limits=limits, wanted=wanted, reads=[path]
             )
+            keep_glance(self._bench, photo, info, path, wanted)
         self._record(photo, info)
         return self._get(photo.public_id)
 
@@ -120,6 +129,7 @@ class PhotoWork:
             orientation=seen["orientation"],
             camera_maker=seen["camera_maker"],
             camera_model=seen["camera_model"],
+            body_key=body_key(seen["camera_maker"], seen["camera_model"], seen.get("body_serial")),
             iso=seen["iso"],
             exposure_s=seen["exposure_s"],
             # Cameras write local time without a zone; as UTC it at least sorts.
@@ -153,7 +163,11 @@ class PhotoWork:
         if self._store.patches.all_of(photo.public_id, photo.epoch):
             return
         limits = self._bench.limits(photo, self._bench.settings.develop_seconds, 120)
-        arguments = {"developed": str(developed), "count": self._bench.settings.patches}
+        arguments = {
+            "developed": str(developed),
+            "count": self._bench.settings.patches,
+            "selector": self._bench.settings.selector,
+        }
         with self._bench.sandbox.folder() as folder:
             try:
                 found = self._bench.attempt(
@@ -216,6 +230,12 @@ class PhotoWork:
                 log.info("photo %s counted, lens version %d", photo.public_id, version)
             return
         raise JobFailedError(*_why_not(tried, good))
+
+    def _finish_measured(self, photo: PhotoRow) -> None:
+        """Count a measurement: it says itself how good it is, and one place is enough."""
+        version = self._store.photos.finish(photo.public_id, photo.epoch)
+        if version is not None:
+            log.info("measurement %s counted, lens version %d", photo.public_id, version)
 
     def _require_spread(self, done: list[PatchRow]) -> None:
         """Refuse a photo whose patches, as far as they gave a PSF, tell of one place only."""

@@ -10,34 +10,46 @@ import json
 import logging
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from app import distances, previews
-from app.jobs.child import Progress, Task
-from app.jobs.handover import (
+from app.blobs import glances, previews
+from app.jobs.task_files import (
+    AFTER,
     BEFORE,
     EVIDENCE,
     FAMILY,
+    GLANCE,
     KERNELS,
+    LAYERS,
     LEARNED,
     PREVIEW,
     R_MAP,
+    REPORT,
     SAMPLES,
+    SHOWN,
     SUFFIX,
 )
-from lensmodel import codec, deconv, photo, pipeline
-from lensmodel.deconv.engine import first_use
-from lensmodel.errors import InvalidInputError, LensModelError
-from lensmodel.evidence import PatchEvidence
-from lensmodel.patches import Patch
+from app.sandbox.child import Progress, Task
+from app.schemas import distances
+from lensmodel import correction, photo
+from lensmodel.core import codec
+from lensmodel.core.errors import InvalidInputError, LensModelError
+from lensmodel.core.evidence import PatchEvidence
+from lensmodel.core.psf import PsfSample
+from lensmodel.core.spectrum import PatchSpectrum
+from lensmodel.core.types import FieldPosition, LensSettings, Planes, StepHook, ignore_step
+from lensmodel.correction.engine import first_use
+from lensmodel.estimation import estimators
+from lensmodel.estimation import measure as lens_measure
+from lensmodel.estimation.patches import Patch, selectors
+from lensmodel.model import LensModel, ModelSettings
 from lensmodel.photo.lateral import LateralColour
-from lensmodel.psf import PsfSample
-from lensmodel.regression import LensModel, ModelSettings
-from lensmodel.spectrum import PatchSpectrum
-from lensmodel.types import FieldPosition, LensSettings
+from lensmodel.report.lens_test import lens_test
+from lensmodel.workflow import pipeline
 
 log = logging.getLogger(__name__)
 
@@ -51,6 +63,14 @@ def inspect(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
     return found
 
 
+def glance(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+    """Render the photo at `path` in small."""
+    del progress
+    picture = glances.glance(Path(arguments["path"]), arguments["kind"], arguments["orientation"] or 1)
+    (folder / GLANCE).write_bytes(picture)
+    return {}
+
+
 def develop(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
     """Develop `path` to linear planes in the folder."""
     del progress
@@ -59,6 +79,7 @@ def develop(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
     pipeline.save_developed(developed, folder)
     (folder / PREVIEW).write_bytes(previews.preview(developed))
     (folder / R_MAP).write_bytes(previews.confidence_map(developed))
+    _show(folder / SHOWN, developed.planes, developed)
     return {"height": developed.frame.height, "width": developed.frame.width, "pipeline": developed.pipeline}
 
 
@@ -66,7 +87,9 @@ def select(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[
     """Choose the patches of the photo developed in `developed`, and measure its lateral colour."""
     del folder
     developed = pipeline.load_developed(Path(arguments["developed"]))
-    found = pipeline.find_patches(developed, count=arguments["count"], on_step=progress)
+    found = pipeline.find_patches(
+        developed, count=arguments["count"], selector=arguments["selector"], on_step=progress
+    )
     rejected = []
     for window in found.rejected:
         centre = (window.row + (window.size - 1) / 2, window.col + (window.size - 1) / 2)
@@ -131,18 +154,24 @@ def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
     lateral = _lateral(developed) if stored is None else codec.from_json(LateralColour, stored)
     output = arguments["output"]
     roi = arguments["roi"]
-    corrected = pipeline.correct_photo(
-        developed,
-        _leaning(folder, ModelSettings(**arguments["model"])),
-        _settings(arguments["settings"]),
-        method=arguments["method"],
-        strength=arguments["strength"],
-        bounds=deconv.Bounds(**arguments["bounds"]),
-        lateral=lateral,
-        roi=None if roi is None else (roi["y"], roi["x"], roi["height"], roi["width"]),
-        workers=arguments["workers"],
-        on_step=progress,
-    )
+    model = _leaning(folder, ModelSettings(**arguments["model"]))
+
+    def corrected_with(bounds: correction.Bounds, on_step: StepHook) -> correction.Corrected:
+        return pipeline.correct_photo(
+            developed,
+            model,
+            _settings(arguments["settings"]),
+            method=arguments["method"],
+            strength=arguments["strength"],
+            bounds=bounds,
+            lateral=lateral,
+            roi=None if roi is None else (roi["y"], roi["x"], roi["height"], roi["width"]),
+            workers=arguments["workers"],
+            on_step=on_step,
+        )
+
+    bounds = correction.Bounds(**arguments["bounds"])
+    corrected = corrected_with(bounds, progress)
     name = f"result{SUFFIX[output['format']]}"
     photo.write_image(
         folder / name,
@@ -152,14 +181,18 @@ def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
         color_space=output["color_space"],
         quality=output["quality"],
         description=arguments["description"],
+        lens=arguments.get("lens", ""),
     )
-    if output["format"] != "dng":
-        height, width = corrected.planes.shape[1:]
-        top, left = (0, 0) if roi is None else (roi["y"], roi["x"])
-        part = np.ascontiguousarray(developed.planes[:, top : top + height, left : left + width])
-        photo.write_image(
-            folder / BEFORE, part, developed.encoding, format="jpeg", color_space="srgb", quality=97
-        )
+    height, width = corrected.planes.shape[1:]
+    top, left = (0, 0) if roi is None else (roi["y"], roi["x"])
+    part = np.ascontiguousarray(developed.planes[:, top : top + height, left : left + width])
+    _show(folder / BEFORE, part, developed)
+    _show(folder / AFTER, corrected.planes, developed)
+    if arguments.get("layers"):
+        extremes = (replace(bounds, texture=0.0), replace(bounds, texture=1.0, denoise=1.0))
+        for layer, extreme in zip(LAYERS, extremes, strict=True):
+            planes = corrected_with(extreme, ignore_step).planes
+            photo.write_image(folder / layer, planes, developed.encoding, format="png8", color_space="srgb")
     report = {
         "zones": corrected.zones,
         "nothing_to_correct": corrected.nothing_to_correct,
@@ -179,14 +212,65 @@ def measure(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
     return {"error": _numbers(error), "coverage": _numbers(codec.to_json(model.coverage()))}
 
 
+def report(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+    """Test the lens of the samples in the folder; its name and the shape of its photos are handed over."""
+    model = _model(folder, ModelSettings(**arguments["model"])).warmed()
+    about = arguments["about"]
+    lateral = [codec.from_json(LateralColour, stored) for stored in about["lateral"]]
+    found = lens_test(
+        model,
+        about["name"],
+        aspect=about["aspect"],
+        height_px=about["height_px"],
+        lateral=lateral,
+        on_step=progress,
+    )
+    (folder / REPORT).write_text(json.dumps(_numbers(codec.to_json(found))), encoding="utf-8")
+    return {}
+
+
+def measure_lens(arguments: dict[str, Any], folder: Path, progress: Progress) -> list[dict[str, Any]]:
+    """Measure the PSF on photos made for it, in `developed`; kernels go to the folder."""
+    photos = [pipeline.load_developed(Path(name)) for name in arguments["developed"]]
+    method = lens_measure.methods.create(arguments["kind"])
+    found = method.measure(photos, size=arguments["size"], on_step=progress)
+    np.save(folder / KERNELS, np.stack([np.asarray(one.kernel) for one in found]))
+    numbers: dict[tuple[float, float], int] = {}
+    return [
+        {
+            "idx": numbers.setdefault(one.pixel, len(numbers)),
+            "row": round(one.pixel[0] - (one.side - 1) / 2),
+            "col": round(one.pixel[1] - (one.side - 1) / 2),
+            "side": one.side,
+            "r": one.position.r,
+            "phi": one.position.phi,
+            "channel": one.channel,
+            "error": min(one.error, 1.0),
+            "estimator": lens_measure.estimator_of(method),
+        }
+        for one in found
+    ]
+
+
 TASKS: Final[Mapping[str, Task]] = {
     "inspect": inspect,
+    "glance": glance,
     "develop": develop,
     "select": select,
     "estimate": estimate,
     "correct": correct,
     "measure": measure,
+    "report": report,
+    "measure-lens": measure_lens,
 }
+
+for _registry in (estimators, selectors, correction.deconvolvers):
+    _registry.load_installed()  # here, in the fork server: a confined child may not read their files any more
+
+
+def _show(path: Path, planes: Planes, developed: photo.LinearPhoto) -> None:
+    """Write planes as a screen shows them."""
+    photo.write_image(path, planes, developed.encoding, format="jpeg", color_space="srgb", quality=95)
 
 
 def _log_compiling() -> None:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import os
 import shutil
-import signal
 import socket
 import threading
 import time
@@ -19,21 +19,26 @@ from typing import Final, TypeAlias
 
 from sqlalchemy.exc import OperationalError
 
-from app import logs
-from app.ids import new_id
-from app.jobs import confine
+from app.blobs.erasure import erase
+from app.blobs.founding import settle
+from app.blobs.storage import Storage
+from app.jobs.context import Workbench
 from app.jobs.correction_work import CorrectionWork
-from app.jobs.engine import DbosEngine, Handler, Job, JobEngine
-from app.jobs.lifeline import on_parents_end
-from app.jobs.outage import CODE as OUTAGE
-from app.jobs.outage import LONGEST_PAUSE_S, Patience, is_outage
+from app.jobs.job_log import Account, accounted
 from app.jobs.photo_work import PhotoWork
-from app.jobs.processes import is_running, started_at
-from app.jobs.sandbox import Budget, Sandbox
-from app.jobs.workbench import Workbench
-from app.settings import Settings
-from app.storage import Storage
+from app.jobs.queue import DbosEngine, Handler, Job, JobEngine
+from app.jobs.task_files import GLANCE, PREVIEW, R_MAP, SHOWN
+from app.runtime import logs, metrics
+from app.runtime.outage import CODE as OUTAGE
+from app.runtime.outage import LONGEST_PAUSE_S, Patience, is_outage
+from app.runtime.parent_watch import on_parents_end
+from app.runtime.processes import is_running, started_at
+from app.runtime.settings import Settings
+from app.runtime.signals import on_signals
+from app.sandbox import confine
+from app.sandbox.runner import Budget, Sandbox
 from app.store import Store
+from app.store.ids import new_id
 
 log = logging.getLogger(__name__)
 
@@ -83,11 +88,12 @@ class Worker:
             scratch / self.id,
             Budget(settings.worker_slots, settings.worker_memory_mb),
             cache=settings.data_dir.resolve() / "cache",
+            niceness=settings.task_niceness,
         )
         self._bench = Workbench(
             settings,
             self._store,
-            Storage(settings.storage, patience_s=settings.storage_seconds),
+            Storage(settings.storage, patience_s=settings.storage_seconds, create=False),
             self._sandbox,
         )
         self._engine: JobEngine = DbosEngine(settings.jobs, self.id, slots=settings.worker_slots)
@@ -103,6 +109,10 @@ class Worker:
             lambda: self._store.workers.register(self.id, host=host, pid=os.getpid(), pid_started=began)
         )
         self._last_beat = time.monotonic()
+        beat_s = min(self._settings.lease_seconds / 4, 5.0)
+        # in a thread of its own: nothing may delay the lease, neither what follows nor any duty
+        lease = self._start_thread(beat_s, self._keep_lease)
+        self._insist(lambda: settle(self._store, self._bench.storage))
         photos, corrections = PhotoWork(self._bench, self._engine), CorrectionWork(self._bench)
         self._engine.start(
             {
@@ -113,16 +123,14 @@ class Worker:
             }
         )
         self._bury_the_gone(host)
-        beat_s = min(self._settings.lease_seconds / 4, 5.0)
-        # in threads of their own: nothing may delay the lease, and deleting may take long
-        lease = self._start_thread(beat_s, self._keep_lease)
-        self._start_thread(TIDY_S, self._tidy)
+        self._start_thread(TIDY_S, self._tidy)  # deleting may take long
         duties = (
             (self._settings.sweep_seconds, self._sweep),
             (beat_s, self._bury_the_silent),
             (RECONCILE_S, self._reconcile),
+            (beat_s, self._leave_metrics),
         )
-        due = [0.0, 0.0, time.monotonic() + RECONCILE_S]
+        due = [0.0, 0.0, time.monotonic() + RECONCILE_S, 0.0]
         while not self._stop.is_set():
             for number, (period, duty) in enumerate(duties):
                 if time.monotonic() >= due[number]:
@@ -181,6 +189,10 @@ class Worker:
         """Wrap a job: what went wrong is tried again, and in the end has a reason."""
 
         def run(*arguments: str | int) -> None:
+            with accounted(handler.__name__, arguments) as account:
+                work(account, *arguments)
+
+        def work(account: Account, *arguments: str | int) -> None:
             patience = Patience(self._settings.outage_hours * 3600.0)
             while True:
                 try:
@@ -194,7 +206,9 @@ class Worker:
                         log.exception("job %s", name)
                     if pause is None:
                         ending = Ending.of(error)
+                        account.ending = ending.code
                         break
+                    account.retries(error)
                     self._rest(pause)
                 else:
                     return
@@ -235,6 +249,10 @@ class Worker:
         for lens_id, version in self._store.lenses.unmeasured():
             self._engine.enqueue(Job("measure", (lens_id, version)))
 
+    def _leave_metrics(self) -> None:
+        with contextlib.suppress(OSError):  # a full disk: numbers are no reason to stop
+            metrics.leave(self._settings.data_dir.resolve(), self.id)
+
     def _keep_lease(self) -> None:
         """Say that this worker lives; stop at once if others think otherwise."""
         for path, identity in self._files.items():
@@ -259,6 +277,7 @@ class Worker:
         if dead != self.id and self._engine.take_over(dead) == 0:
             self._store.workers.forget(dead)
             shutil.rmtree(self._scratch / dead, ignore_errors=True)
+            metrics.TAKEN_OVER.inc()
             log.info("took over the work of worker %s", dead)
 
     def _bury_the_gone(self, host: str) -> None:
@@ -297,13 +316,22 @@ class Worker:
 
     def _tidy(self) -> None:
         """Delete what nobody needs any more."""
+        for owner_key in self._store.accounts.to_erase():
+            self._do(partial(erase, self._store.accounts, self._bench.storage, owner_key))
+        for photo_id in self._store.photos.unneeded(self._settings.keep_photos):
+            self._do(partial(self._store.photos.give_up_file, photo_id, (GLANCE, PREVIEW, R_MAP, SHOWN)))
+        self._do(self._store.accounts.purge)
+        self._do(self._store.idempotency.tidy)
         for prefix in self._store.workers.garbage():
             self._do(partial(self._delete, prefix))  # what cannot be deleted keeps nothing else
         self._do(lambda: self._engine.forget(datetime.now(UTC) - KEEP_JOBS))
         self._drop_developed()
 
     def _delete(self, prefix: str) -> None:
-        self._bench.storage.delete(prefix)
+        if prefix.endswith("/"):
+            self._bench.storage.delete(prefix)
+        else:
+            self._bench.storage.remove(prefix)
         self._store.workers.forget_garbage(prefix)
 
     def _drop_developed(self) -> None:
@@ -326,6 +354,8 @@ class Worker:
 
     def _die(self, why: str) -> None:
         log.error("%s: this worker stops", why)
+        metrics.FENCED.inc()
+        self._leave_metrics()
         logging.shutdown()
         os._exit(EXIT_FENCED)
 
@@ -359,11 +389,12 @@ def _used(folder: Path) -> float:
 def main() -> None:
     """Run a worker with the settings of the environment until SIGTERM or the supervisor's end."""
     settings = Settings()
-    logs.begin("worker", settings.log_level)
+    logs.begin("worker", settings.log_level, settings.log_format)
     confine.hide_memory()
     log.info("children are confined by: %s", ", ".join(_in_force()) or "nothing that the kernel has")
+    if settings.metrics_port:
+        metrics.publish(settings.metrics_port, settings.host, settings.data_dir.resolve())
     worker = Worker(settings)
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: worker.stop())
+    on_signals(lambda _: worker.stop())
     on_parents_end(worker.stop)
     worker.run()

@@ -12,12 +12,15 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
-from app.errors import NotReadyError
-from app.previews import upright
-from app.schemas import PatchOut
-from app.storage import Storage
+from app.blobs.previews import upright
+from app.blobs.storage import Storage
+from app.http.errors import NotReadyError, UnknownPictureError
+from app.schemas import PatchOut, Region
 
 Picture = NDArray[np.uint8]
+
+TILE: Final = 512
+"""Side of a tile in pixels, as `static/tiles.js` has it."""
 
 
 def upright_patch(patch: PatchOut, height: int, width: int, orientation: int) -> PatchOut:
@@ -35,6 +38,58 @@ def upright_patch(patch: PatchOut, height: int, width: int, orientation: int) ->
         8: (right, row),
     }.get(orientation, (row, col))
     return patch.model_copy(update={"row": moved[0], "col": moved[1]})
+
+
+def upright_point(row: float, col: float, height: int, width: int, orientation: int) -> tuple[int, int]:
+    """Move a point, `(row, col)`, to where it lies in the upright picture."""
+    below, right = height - 1 - row, width - 1 - col
+    moved = {
+        1: (row, col),
+        2: (row, right),
+        3: (below, right),
+        4: (below, col),
+        5: (col, row),
+        6: (col, below),
+        7: (right, below),
+        8: (right, row),
+    }.get(orientation, (row, col))
+    return round(moved[0]), round(moved[1])
+
+
+_BACK: Final = {6: 8, 8: 6}
+"""Orientations that undo others, where they are not their own."""
+
+
+def in_sensor(part: Region, height: int, width: int, orientation: int) -> Region:
+    """Move a part of the upright picture to where it lies on the sensor.
+
+    Parameters
+    ----------
+    part : Region
+        In pixels of the upright picture.
+    height, width : int
+        Of the picture as the sensor has it.
+    orientation : int
+        EXIF orientation.
+    """
+    shape = (width, height) if orientation > 4 else (height, width)
+    back = _BACK.get(orientation, orientation)
+    corners = [
+        upright_point(row, col, *shape, back)
+        for row in (part.y, part.y + part.height - 1)
+        for col in (part.x, part.x + part.width - 1)
+    ]
+    rows, cols = [row for row, _ in corners], [col for _, col in corners]
+    return Region(x=min(cols), y=min(rows), width=max(cols) - min(cols) + 1, height=max(rows) - min(rows) + 1)
+
+
+def exists(storage: Storage, key: str) -> bool:
+    """Whether a picture is there."""
+    try:
+        storage.info(key)
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def stored(storage: Storage, key: str) -> bytes:
@@ -66,7 +121,7 @@ def resized(data: bytes, side: int) -> bytes:
 def crop(picture: Picture, row: float, col: float, height: int, width: int) -> bytes:
     """Render a 1:1 part of a picture, around a place given in shares of it."""
     top, left = corner(picture.shape[:2], row, col, height, width)
-    return png(Image.fromarray(np.ascontiguousarray(picture[top : top + height, left : left + width])))
+    return png(picture[top : top + height, left : left + width])
 
 
 def corner(shape: tuple[int, ...], row: float, col: float, height: int, width: int) -> tuple[int, int]:
@@ -76,19 +131,37 @@ def corner(shape: tuple[int, ...], row: float, col: float, height: int, width: i
     return max(0, min(top, shape[0] - height)), max(0, min(left, shape[1] - width))
 
 
-def decoded(storage: Storage, key: str, media_type: str, orientation: int) -> Picture:
-    """Decode a picture to an upright 8-bit one; the newest few are kept.
+def level(storage: Storage, key: str, media_type: str, orientation: int, half: int) -> Picture:
+    """Return an upright 8-bit picture, halved `half` times; the newest few are kept.
 
     The tiles of a page are asked for all at once: the first one decodes, the others wait for it.
     """
     with _DECODING[hash(key) % len(_DECODING)]:
-        return _decoded(storage, key, media_type, orientation)
+        return _level(storage, key, media_type, orientation, half)
 
 
-_DECODING: Final = tuple(threading.Lock() for _ in range(16))
+def decoded(storage: Storage, key: str, media_type: str, orientation: int) -> Picture:
+    """Return an upright 8-bit picture in its full size, see `level`."""
+    return level(storage, key, media_type, orientation, 0)
 
 
-@lru_cache(maxsize=4)
+_DECODING: Final = tuple(threading.RLock() for _ in range(16))
+
+
+@lru_cache(maxsize=12)
+def _level(storage: Storage, key: str, media_type: str, orientation: int, half: int) -> Picture:
+    if half > 0:
+        larger = _level(storage, key, media_type, orientation, half - 1)
+        height, width = larger.shape[0] // 2 * 2, larger.shape[1] // 2 * 2
+        if not height or not width:
+            return larger
+        four = larger[:height, :width].astype(np.uint16)
+        mean = (four[::2, ::2] + four[1::2, ::2] + four[::2, 1::2] + four[1::2, 1::2] + 2) >> 2
+        return mean.astype(np.uint8)
+    return _decoded(storage, key, media_type, orientation)
+
+
+@lru_cache(maxsize=3)
 def _decoded(storage: Storage, key: str, media_type: str, orientation: int) -> Picture:
     data = stored(storage, key)
     if media_type == "image/tiff":
@@ -101,8 +174,29 @@ def _decoded(storage: Storage, key: str, media_type: str, orientation: int) -> P
     return np.ascontiguousarray(upright(pixels, turned), dtype=np.uint8)
 
 
-def png(image: Image.Image) -> bytes:
+def tile(picture: Picture, col: int, row: int) -> bytes:
+    """Render one of the tiles that a picture is cut into, from the top left.
+
+    Raises
+    ------
+    UnknownPictureError
+        If the picture does not reach so far.
+    """
+    part = picture[row * TILE : (row + 1) * TILE, col * TILE : (col + 1) * TILE]
+    if not part.size:
+        raise UnknownPictureError(f"the picture has no tile in column {col}, row {row}")
+    return jpeg(part)
+
+
+def jpeg(picture: Picture) -> bytes:
+    """Encode as JPEG that shows each pixel: fine, and no colour shared between pixels."""
+    out = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(picture)).save(out, "JPEG", quality=92, subsampling=0)
+    return out.getvalue()
+
+
+def png(picture: Picture) -> bytes:
     """Encode as PNG."""
     out = io.BytesIO()
-    image.save(out, "PNG", compress_level=3)
+    Image.fromarray(np.ascontiguousarray(picture)).save(out, "PNG", compress_level=3)
     return out.getvalue()

@@ -6,11 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from app.pages.groups import Group
 from app.schemas import CalibrationOut, CorrectionOut, LensOut, PatchOut, PhotoOut, Problem
 from app.words import gain_words
-from lensmodel.audit import HELD
-from lensmodel.report import little_seen, place_in_words
-from lensmodel.types import FieldPosition
+from lensmodel.core.types import FieldPosition
+from lensmodel.correction.audit import HELD
+from lensmodel.report import Decentring, little_seen, place_in_words
+from lensmodel.report.units import Unit
 
 PHOTO_STATES: Final[Mapping[str, str]] = {
     "received": "Waiting its turn",
@@ -33,14 +35,15 @@ FAILURES: Final[Mapping[str, str]] = {
     "crashed_repeatedly": "reading it failed again and again. The file is probably damaged",
 }
 ZONES: Final[Mapping[str, str]] = {"center": "Center", "mid": "Middle", "corner": "Corners"}
+FILES: Final[Mapping[str, str]] = {
+    "tiff16": "TIFF, 16 bit",
+    "png16": "PNG, 16 bit",
+    "png8": "PNG, 8 bit",
+    "jpeg": "JPEG",
+    "dng": "Linear DNG",
+}
 ENOUGH_PLACES: Final = 20
 SHOWN_PLACES: Final = 3
-FULL_STOPS: Final = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0, 22.0)
-STOP: Final = 1.45
-"""One stop as a factor of the f-number, with room for their rounding."""
-
-NEAR: Final = 0.06
-"""Apertures closer than this share are written alike."""
 ACTIVE: Final = frozenset({"received", "inspecting", "developing", "selecting", "estimating"})
 UNDEVELOPED: Final = frozenset({"received", "inspecting", "developing", "needs_lens", "failed", "cancelled"})
 REASONS: Final[Mapping[str, str]] = {
@@ -77,19 +80,6 @@ def serial_words(lens: LensOut) -> str:
 def f_stop(number: float) -> str:
     """Write an aperture as photographers do."""
     return f"f/{number:.3g}"
-
-
-def f_stops(seen: Sequence[float]) -> list[tuple[float, bool]]:
-    """List the apertures to ask a lens for: those of its photos, and full stops within one stop of them.
-
-    Each comes with whether a photo was taken at it: the model answers in between too, and says how
-    far it trusts that.
-    """
-    if not seen:
-        return []
-    low, high = min(seen) / STOP, max(seen) * STOP
-    between = [n for n in FULL_STOPS if low <= n <= high and all(abs(n / a - 1.0) > NEAR for a in seen)]
-    return sorted([*((a, True) for a in seen), *((n, False) for n in between)])
 
 
 def photo_state(photo: PhotoOut) -> str:
@@ -141,6 +131,45 @@ def correction_state(correction: CorrectionOut) -> str:
     }.get(correction.state, correction.state)
 
 
+def correction_name(correction: CorrectionOut) -> str:
+    """Name a correction by how it differs from others."""
+    words = [correction.method.capitalize()]
+    if correction.strength < 1:
+        words.append(f"strength {correction.strength:.0%}")
+    words.append(FILES.get(correction.output["format"], correction.output["format"]))
+    return ", ".join(words)
+
+
+def file_words(correction: CorrectionOut) -> str:
+    """Say what kind of file a correction made, and what it is good for."""
+    name = FILES.get(correction.output["format"], correction.output["format"])
+    if correction.output["format"] == "dng":
+        return f"{name}: open it in your RAW developer, and leave its own sharpening off."
+    return f"{name}; it says in its metadata what was done, and with which lens."
+
+
+def waiting_words(groups: Sequence[Group]) -> str:
+    """Say how many photos wait for their lens."""
+    count = sum(len(group.photos) for group in groups)
+    if count == 1:
+        return "One photo does not say which copy of a lens it was taken with."
+    return f"{count} photos do not say which copy of a lens they were taken with."
+
+
+def group_name(group: Group) -> str:
+    """Say what the photos of a group have in common."""
+    camera = group.camera or "Unknown camera"
+    body = "" if group.body is None else f", body {group.body}"
+    lens = f", {group.lens_model}" if group.lens_model else ""
+    focal = f", {group.focal_mm:g} mm" if group.focal_mm else ""
+    return f"{camera}{body}{lens}{focal}: {counted(len(group.photos), 'photo')}"
+
+
+def group_example(group: Group) -> str:
+    """Suggest a name for the lens of a group."""
+    return f"My {group.focal_mm:g} mm" if group.focal_mm else "My 35 mm"
+
+
 def refusal(status: int, detail: str) -> tuple[str, str]:
     """Write title and text of a page that stands for one that cannot be shown."""
     if status == 404:
@@ -167,10 +196,46 @@ def patch_words(patch: PatchOut) -> str:
 
 
 def error_words(error: dict[str, Any] | float | None) -> str:
-    """Write a held-out error, one figure a zone."""
+    """Write a held-out error in percent, one figure a zone."""
     if isinstance(error, Mapping):
-        return ", ".join(figure(error.get(zone)) or "?" for zone in ZONES) if error else "not yet known"
-    return figure(error) or "not yet known"
+        return ", ".join(percent(error.get(zone)) for zone in ZONES) if error else "not yet known"
+    return "not yet known" if error is None else percent(error)
+
+
+def percent(share: float | None) -> str:
+    """Write a share in percent."""
+    return "?" if share is None else f"{share:.0%}"
+
+
+EVENTS: Final[Mapping[str, str]] = {
+    "photo_added": "learned from a photo",
+    "photo_included": "counted a photo again",
+    "photo_excluded": "left a photo out",
+    "photo_removed": "lost a photo",
+    "photo_changed": "took over what you said of a photo",
+}
+
+
+def event_words(event: CalibrationOut) -> str:
+    """Say what made a version."""
+    return EVENTS.get(event.kind, event.kind)
+
+
+def centring_verdict(found: Decentring) -> str:
+    """Say in a word or two whether a lens is centred."""
+    return {"centred": "Yes.", "decentred": "No.", "unknown": "Undecided."}[found.verdict]
+
+
+def centring_words(found: Decentring) -> str:
+    """Write why, with its error."""
+    return f"{found.text[:1].upper()}{found.text[1:]}."
+
+
+def unit_name(unit: Unit) -> str:
+    """Write a unit out."""
+    return {"c/px": "cycles/pixel", "lp/ph": "line pairs per picture height", "lp/mm": "line pairs per mm"}[
+        unit
+    ]
 
 
 def history_words(history: Sequence[CalibrationOut]) -> str:
@@ -179,7 +244,7 @@ def history_words(history: Sequence[CalibrationOut]) -> str:
     if tested:
         found = tested[-1].error
         zones = found if isinstance(found, Mapping) else dict.fromkeys(ZONES, found)
-        said = ", ".join(f"{ZONES[zone].lower()} {figure(zones.get(zone)) or '?'}" for zone in ZONES)
+        said = ", ".join(f"{ZONES[zone].lower()} {percent(zones.get(zone))}" for zone in ZONES)
         return f"With {counted(tested[-1].photos, 'photo')}: {said}. The curve begins with the next one."
     if history and history[-1].photos > 1:
         return "The photos are being tested on one another."
@@ -277,11 +342,20 @@ FILTERS: Final[Mapping[str, Callable[..., object]]] = {
         lens_name,
         serial_words,
         f_stop,
-        f_stops,
+        centring_verdict,
+        centring_words,
+        event_words,
+        unit_name,
         photo_state,
         state_class,
         counted,
         duration,
+        failure,
+        correction_name,
+        file_words,
+        waiting_words,
+        group_name,
+        group_example,
         correction_state,
         reason_words,
         patch_words,

@@ -8,8 +8,8 @@ from urllib.parse import urlencode
 
 from fastapi import Query
 
-from app.dependencies import Call
-from app.errors import MEDIA_TYPE
+from app.http.dependencies import Call
+from app.http.errors import MEDIA_TYPE
 from app.schemas import OptionalName, Problem
 
 Limit = Annotated[int, Query(ge=1, le=200, description="items on a page")]

@@ -10,9 +10,9 @@ from urllib.parse import quote
 from fastapi import APIRouter, Response, status
 from starlette.responses import StreamingResponse
 
-from app import views
-from app.dependencies import Call, CallDep
-from app.errors import (
+from app.http import views
+from app.http.dependencies import Call, CallDep
+from app.http.errors import (
     ConflictError,
     InvalidParameterError,
     NotReadyError,
@@ -20,17 +20,18 @@ from app.errors import (
     UnknownCorrectionError,
     UnknownLensError,
 )
-from app.middleware import ONLY_HEAD
-from app.models import check_version
+from app.http.idempotency import OnceDep
+from app.http.middleware import ONLY_HEAD
+from app.http.model_cache import check_version
 from app.routes.common import Cursor, Limit, OnlyId, next_link, problems
-from app.routes.photos import find_photo
+from app.routes.photos import SEND_AGAIN, find_photo
 from app.schemas import CorrectionIn, CorrectionOut, CorrectionPage
 from app.store.corrections import CorrectionPlan
-from app.store.photos import settings_of
+from app.store.photo_steps import settings_of
 from app.store.samples import LensState
-from app.tables import LensRow, PhotoRow
-from lensmodel.deconv import deconvolvers
-from lensmodel.errors import MetadataMissingError, NoSamplesError, UnknownMethodError
+from app.store.tables import LensRow, PhotoRow
+from lensmodel.core.errors import MetadataMissingError, NoSamplesError, UnknownMethodError
+from lensmodel.correction import deconvolvers
 
 router = APIRouter(tags=["corrections"])
 _RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.ASCII)
@@ -45,13 +46,16 @@ _RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.ASCII)
         404, 409, 422, also={200: {"model": CorrectionOut, "description": "The same correction is finished"}}
     ),
 )
-def create_correction(wish: CorrectionIn, call: CallDep) -> CorrectionOut:
+def create_correction(wish: CorrectionIn, call: CallDep, once: OnceDep) -> CorrectionOut | Response:
     """Correct a photo with the model of its lens, or of another."""
+    return once.answer(wish.model_dump_json(), lambda: create(wish, call), status=202, resource=wish.photo_id)
+
+
+def create(wish: CorrectionIn, call: Call) -> CorrectionOut:
+    """Write down what is wished, or find the same wish."""
     photo = find_photo(call, wish.photo_id)
-    if wish.method not in deconvolvers.entries:
-        raise UnknownMethodError(
-            f"no method {wish.method!r}; known: {', '.join(sorted(deconvolvers.entries))}"
-        )
+    if wish.method not in deconvolvers:
+        raise UnknownMethodError(f"no method {wish.method!r}; known: {', '.join(deconvolvers)}")
     _check_read(photo)
     _check_region(photo, wish)
     lens = _lens_for(call, photo, wish.lens_id)
@@ -60,7 +64,9 @@ def create_correction(wish: CorrectionIn, call: CallDep) -> CorrectionOut:
     # with other settings the same wish is another one
     params["settings"] = settings_of(photo)
     # only where asked for: a wish of before there were bounds is still the same wish
-    params |= wish.model_dump(mode="json", include={"halo", "texture", "denoise"}, exclude_defaults=True)
+    params |= wish.model_dump(
+        mode="json", include={"halo", "texture", "denoise", "layers"}, exclude_defaults=True
+    )
     if wish.family and wish.lens_version is None and call.settings.family:
         # the copies and versions of this moment: the same wish after one of them learned is another one
         leaning = call.store.samples.family_of(lens.public_id)
@@ -74,6 +80,8 @@ def create_correction(wish: CorrectionIn, call: CallDep) -> CorrectionOut:
 
 def _check_read(photo: PhotoRow) -> None:
     """Make sure that the file was looked into: its size and settings are part of the wish."""
+    if photo.file_gone_at is not None:
+        raise ConflictError(f"the file of photo {photo.public_id} is no longer kept: {SEND_AGAIN}")
     if photo.width is not None:
         return
     if photo.state in {"received", "inspecting"}:

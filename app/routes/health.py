@@ -9,13 +9,15 @@ from concurrent.futures import Future
 from importlib.metadata import version
 from typing import Final, get_args
 
-from fastapi import APIRouter, status
+from fastapi import APIRouter, Response, status
 
-from app.dependencies import Call, CallDep
-from app.jobs import confine
+from app.blobs.founding import settle
+from app.http.dependencies import Call, CallDep, ProbeDep
 from app.routes.common import problems
 from app.routes.photos import GIB
 from app.routes.psf import MEDIA_TYPES
+from app.runtime import metrics
+from app.sandbox import confine
 from app.schemas import (
     MAX_PSF_SIZE,
     ColorSpace,
@@ -26,9 +28,10 @@ from app.schemas import (
     Readiness,
     VersionOut,
 )
-from app.store import migrate
-from lensmodel.blind import estimators
-from lensmodel.deconv import deconvolvers
+from app.store.upkeep import migrate
+from lensmodel.correction import deconvolvers
+from lensmodel.estimation import estimators
+from lensmodel.estimation.patches import selectors
 
 READY_S: Final = 3.0
 """How long an answer may take: less than who asks waits, such as a container's engine, 5 s."""
@@ -48,16 +51,18 @@ def healthz() -> Health:
     operation_id="getReadiness",
     responses={503: {"model": Readiness, "description": "Something is missing"}},
 )
-def readyz(call: CallDep) -> Readiness:
+def readyz(call: ProbeDep) -> Readiness:
     """Say whether work can be taken: schema, storage and a worker are there."""
     tried: dict[str, Callable[[], None]] = {
         "schema": lambda: _schema(call),
-        "storage": call.storage.check_writable,
+        "storage": lambda: _storage(call),
         "worker": lambda: _worker(call),
     }
     running = {name: _begun(probe) for name, probe in tried.items()}
     end = time.monotonic() + READY_S
     checks = {name: _said(check, max(end - time.monotonic(), 0.0)) for name, check in running.items()}
+    if call.settings.needs_keys:  # strangers hear what is wrong, not where it lies
+        checks = {name: said.partition(":")[0] for name, said in checks.items()}
     ready = all(said == "ok" for said in checks.values())
     if not ready:
         call.response.status_code = status.HTTP_503_SERVICE_UNAVAILABLE
@@ -96,11 +101,24 @@ def _schema(call: Call) -> None:
         )
 
 
+def _storage(call: Call) -> None:
+    settle(call.store, call.storage)
+    call.storage.check_writable()
+
+
 def _worker(call: Call) -> None:
     if not call.store.workers.live(call.settings.lease_seconds):
         raise RuntimeError(
             f"no worker was heard of for {call.settings.lease_seconds:g} s: run `lensmodel worker`"
         )
+
+
+@probes.get("/metrics", include_in_schema=False)
+def read_metrics(call: CallDep) -> Response:
+    """Return the numbers of this service for Prometheus."""
+    settings = call.settings
+    told = metrics.of_service(call.store, settings.lease_seconds, settings.data_dir)
+    return Response(told, media_type=metrics.CONTENT_TYPE)
 
 
 @router.get("/version", operation_id="getVersion", responses=problems())
@@ -118,8 +136,9 @@ def read_formats() -> FormatsOut:
         write=list(get_args(OutputFormat)),
         color_spaces=list(get_args(ColorSpace)),
         psf=list(MEDIA_TYPES),
-        methods=sorted(deconvolvers.entries),
-        estimators=sorted(estimators.entries),
+        methods=list(deconvolvers),
+        estimators=list(estimators),
+        selectors=list(selectors),
     )
 
 

@@ -11,12 +11,13 @@ from fastapi import APIRouter, Query, Response, status
 from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.concurrency import run_in_threadpool
 
-from app import views
-from app.dependencies import Call, CallDep
-from app.errors import ConflictError, UnknownJobError
-from app.jobs.outage import CODE as OUTAGE
+from app.http import views
+from app.http.dependencies import Call, CallDep
+from app.http.errors import ConflictError, UnknownJobError
+from app.http.idempotency import OnceDep
 from app.routes.common import Cursor, Limit, next_link, problems
-from app.routes.photos import candidates
+from app.routes.photos import SEND_AGAIN, candidates
+from app.runtime.outage import CODE as OUTAGE
 from app.schemas import JobOut, JobPage, RetriedOut
 
 router = APIRouter(tags=["jobs"])
@@ -103,10 +104,15 @@ async def read_job(
     "/jobs/{job_id}/cancel",
     operation_id="cancelJob",
     status_code=status.HTTP_202_ACCEPTED,
+    response_model=JobOut,
     responses=problems(404, 409, 422),
 )
-def cancel_job(job_id: str, call: CallDep) -> JobOut:
+def cancel_job(job_id: str, call: CallDep, once: OnceDep) -> JobOut | Response:
     """Cancel a job: running parts of it stop within a second, nothing of it counts."""
+    return once.answer("", lambda: _cancel(job_id, call), status=202)
+
+
+def _cancel(job_id: str, call: Call) -> JobOut:
     done = call.store.photos.cancel(job_id, call.owner) or call.store.corrections.cancel(job_id, call.owner)
     job = find_job(call, job_id)
     if not done:
@@ -118,10 +124,18 @@ def cancel_job(job_id: str, call: CallDep) -> JobOut:
     "/jobs/{job_id}/retry",
     operation_id="retryJob",
     status_code=status.HTTP_202_ACCEPTED,
+    response_model=JobOut,
     responses=problems(404, 409, 422),
 )
-def retry_job(job_id: str, call: CallDep) -> JobOut:
+def retry_job(job_id: str, call: CallDep, once: OnceDep) -> JobOut | Response:
     """Start a failed or cancelled job anew."""
+    return once.answer("", lambda: _retry(job_id, call), status=202)
+
+
+def _retry(job_id: str, call: Call) -> JobOut:
+    photo = call.store.photos.get(job_id, call.owner)
+    if photo is not None and photo.file_gone_at is not None:
+        raise ConflictError(f"the file of photo {job_id} is no longer kept: {SEND_AGAIN}")
     done = call.store.photos.retry(job_id, call.owner) or call.store.corrections.retry(job_id, call.owner)
     job = find_job(call, job_id)
     if not done:
@@ -136,17 +150,23 @@ def retry_job(job_id: str, call: CallDep) -> JobOut:
     "/jobs/retry",
     operation_id="retryJobs",
     status_code=status.HTTP_202_ACCEPTED,
-    responses=problems(422),
+    response_model=RetriedOut,
+    responses=problems(409, 422),
 )
 def retry_jobs(
     call: CallDep,
+    once: OnceDep,
     code: Annotated[str, Query(pattern="^[a-z_]{1,40}$", description="with which they failed")] = OUTAGE,
     limit: Annotated[int, Query(ge=1, le=1000, description="jobs at once")] = 1000,
-) -> RetriedOut:
+) -> RetriedOut | Response:
     """Start anew all jobs that failed with a code, the oldest first; by default those that an outage ended.
 
     Call it again until it says 0 where there are more than `limit`.
     """
+    return once.answer("", lambda: _retry_all(call, code, limit), status=202)
+
+
+def _retry_all(call: Call, code: str, limit: int) -> RetriedOut:
     photos, corrections = call.store.photos, call.store.corrections
     again = sum(photos.retry(key, call.owner) for key in photos.failed_by(call.owner, code, limit))
     rest = corrections.failed_by(call.owner, code, limit - again) if again < limit else []
@@ -186,6 +206,8 @@ async def _events(call: Call, job: JobOut) -> AsyncIterator[ServerSentEvent]:
                 return
             await changed(LOOK_AGAIN_S)
             try:
+                if not await run_in_threadpool(call.services.gate.is_still, call.who):
+                    return  # his key was revoked while he watched
                 job = await run_in_threadpool(find_job, call, job.id)
             except UnknownJobError:  # deleted while watched
                 return

@@ -7,13 +7,13 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, status
 
-from app import views
-from app.dependencies import Call, CallDep
-from app.errors import UnknownLensError
+from app.http import views
+from app.http.dependencies import Call, CallDep
+from app.http.errors import UnknownLensError
 from app.routes.common import Cursor, Limit, OnlyName, cut, next_link, problems
 from app.schemas import MAX_VERSION, CalibrationPage, LateralOut, LensOut, LensPage
-from app.tables import LensRow
-from lensmodel.errors import NoSamplesError
+from app.store.tables import LensRow
+from lensmodel.core.errors import NoSamplesError
 
 router = APIRouter(tags=["lenses"])
 

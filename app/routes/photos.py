@@ -2,33 +2,40 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
-from fastapi import APIRouter, status
+from fastapi import APIRouter, Response, status
 from starlette.concurrency import run_in_threadpool
+from structlog.contextvars import bind_contextvars
 
-from app import upload, views
-from app.bodies import CLOSE
-from app.dependencies import Call, CallDep
-from app.errors import (
+from app.blobs import location
+from app.http import upload, views
+from app.http.bodies import CLOSE
+from app.http.dependencies import Call, CallDep
+from app.http.errors import (
     BusyError,
     ConflictError,
     InvalidParameterError,
     QuotaError,
+    ServiceError,
     StorageFullError,
     UnknownLensError,
     UnknownPhotoError,
 )
-from app.ids import new_id
+from app.http.idempotency import Once, OnceDep
 from app.routes.common import Cursor, Limit, OnlyId, cut, next_link, problems
-from app.schemas import PatchPage, PhotoChange, PhotoOut, PhotoPage, PhotoState
-from app.settings import MIB
+from app.runtime.settings import MIB, Settings
+from app.schemas import PatchPage, PhotoChange, PhotoOut, PhotoPage, PhotoState, UploadFields
 from app.store import LensName
-from app.store.photos import GIVEN_SETTINGS
-from app.tables import PhotoRow
+from app.store.access.accounts import Quota
+from app.store.ids import new_id
+from app.store.photo_steps import GIVEN_SETTINGS, folder_of
+from app.store.tables import PhotoRow
 
 router = APIRouter(tags=["photos"])
 GIB = 1024 * MIB
+SEND_AGAIN = "send the same file again, and ask then (LENS_KEEP_PHOTOS says how long files stay)"
 
 _UPLOAD_BODY = {
     "required": True,
@@ -40,6 +47,8 @@ _UPLOAD_BODY = {
                 "properties": {
                     "file": {"type": "string", "contentMediaType": "application/octet-stream"},
                     "calibrate": {"type": "boolean", "default": True},
+                    "kind": {"enum": ["target", "pair", "points", "edges"]},
+                    "reference_id": {"type": "string"},
                     "lens_id": {"type": "string"},
                     "lens_serial": {"type": "string"},
                     "lens_model": {"type": "string"},
@@ -66,6 +75,7 @@ _UPLOAD_BODY = {
         403,
         404,
         408,
+        409,
         413,
         415,
         422,
@@ -75,12 +85,46 @@ _UPLOAD_BODY = {
     ),
     openapi_extra={"requestBody": _UPLOAD_BODY},
 )
-async def create_photo(call: CallDep) -> PhotoOut:
+async def create_photo(once: OnceDep) -> PhotoOut | Response:
     """Store a photo, and calibrate its lens with it unless `calibrate=false`.
 
     The fields may stand in the form or in the query. What they say goes before the file's own
-    metadata.
+    metadata. With `kind` the photo was made to measure the lens: a `target`, `points`, `edges`, or the open
+    photo of a `pair`, whose closed one was sent before with `calibrate=false` and is its `reference_id`.
     """
+    return await _received(once)
+
+
+@router.post(
+    "/lenses/{lens_id}/measurements",
+    operation_id="createMeasurement",
+    status_code=status.HTTP_202_ACCEPTED,
+    response_model=PhotoOut,
+    responses=problems(
+        400,
+        403,
+        404,
+        408,
+        409,
+        413,
+        415,
+        422,
+        429,
+        507,
+        also={200: {"model": PhotoOut, "description": "The same bytes are known"}},
+    ),
+    openapi_extra={"requestBody": _UPLOAD_BODY},
+)
+async def create_measurement(lens_id: str, call: CallDep, once: OnceDep) -> PhotoOut | Response:
+    """Store a photo made to measure a lens that is known, and measure it; `kind` says what it shows."""
+    if await run_in_threadpool(call.store.lenses.get, lens_id, call.owner) is None:
+        raise UnknownLensError(f"there is no lens {lens_id[:60]}: GET /v1/lenses lists those there are")
+    return await _received(once, lens_id)
+
+
+async def _received(once: Once, lens_id: str | None = None) -> PhotoOut | Response:
+    """Take an upload; with a lens, it must be a measurement of that lens."""
+    call = once.call
     limits = call.settings
     many = BusyError(
         f"{limits.max_uploads} photos are being received, more may not be: try again in a few seconds",
@@ -89,6 +133,7 @@ async def create_photo(call: CallDep) -> PhotoOut:
     with call.services.uploads.one(many):
         await run_in_threadpool(_admit, call)
         public_id = new_id()
+        bind_contextvars(photo_id=public_id)
         prefix = f"photos/{public_id}/"
         key = f"{prefix}original"
         await run_in_threadpool(call.store.photos.expect, prefix)
@@ -98,11 +143,52 @@ async def create_photo(call: CallDep) -> PhotoOut:
             key,
             limit=limits.max_upload_bytes,
             patience_s=limits.stall_seconds,
+            within_s=limits.upload_seconds,
         )
-    photo, fresh = await run_in_threadpool(_record, call, public_id, uploaded, prefix)
-    call.response.status_code = status.HTTP_202_ACCEPTED if fresh else status.HTTP_200_OK
-    call.response.headers["Location"] = photo.links.self
-    return photo
+    if lens_id is not None:
+        fields = uploaded.fields.model_copy(update={"lens_id": lens_id})
+        uploaded = replace(uploaded, fields=fields)
+    return await run_in_threadpool(_take, once, public_id, uploaded, prefix, lens_id is not None)
+
+
+def _take(
+    once: Once, public_id: str, uploaded: upload.Uploaded, prefix: str, measured: bool
+) -> PhotoOut | Response:
+    """Make a photo of what has arrived, unless this very request was answered before."""
+    call = once.call
+
+    def record() -> PhotoOut:
+        _check_kind(call, uploaded.fields, measured=measured)
+        where = location.remove(call.storage, f"{prefix}original")
+        photo, fresh = _record(call, public_id, uploaded, prefix, where)
+        call.response.status_code = status.HTTP_202_ACCEPTED if fresh else status.HTTP_200_OK
+        call.response.headers["Location"] = photo.links.self
+        return photo
+
+    asked = f"{uploaded.sha256} {uploaded.filename} {uploaded.fields.model_dump_json()}"
+    try:
+        answer = once.answer(asked, record, status=202)
+    except ServiceError:
+        call.storage.delete(prefix)  # refused before there was a photo; after that nothing is refused
+        raise
+    if isinstance(answer, Response):
+        call.storage.delete(prefix)  # answered as before: what it speaks of is there
+    return answer
+
+
+def _check_kind(call: Call, fields: UploadFields, *, measured: bool) -> None:
+    """Refuse what contradicts itself about a photo made to measure a lens."""
+    if measured and fields.kind is None:
+        raise InvalidParameterError("kind is missing: send target, pair, points or edges")
+    if fields.kind is not None and not fields.calibrate:
+        raise InvalidParameterError("calibrate=false and kind exclude each other: leave one of them out")
+    if (fields.kind == "pair") != (fields.reference_id is not None):
+        raise InvalidParameterError(
+            "a pair needs kind=pair and reference_id together: send the photo at about f/8 first, with "
+            "calibrate=false, and its id as reference_id with the open one"
+        )
+    if fields.reference_id is not None:
+        find_photo(call, fields.reference_id)
 
 
 def _admit(call: Call) -> None:
@@ -115,24 +201,40 @@ def _admit(call: Call) -> None:
             f"{free // MIB} MiB are free where photos are kept, {limits.min_free_mb} MiB must stay so, and "
             f"{coming / MIB:.1f} MiB are to come: delete photos, or make room on the disk"
         )
-    unfinished, stored = call.store.photos.load_of(call.owner)
+    unfinished, stored, kept = call.store.photos.load_of(call.owner)
+    quota = call.store.accounts.quota_of(call.owner)
+    most_bytes, most_photos = most(limits, quota)
     if unfinished >= limits.max_queued_photos:
         raise QuotaError(
             f"{unfinished} photos are being worked on, {limits.max_queued_photos} may be: "
             "wait for some to finish",
             headers={"Retry-After": "30"},
         )
-    if stored >= limits.max_stored_gb * GIB:
+    if stored >= most_bytes:
         raise QuotaError(
-            f"{stored / GIB:.1f} GiB of photos are stored, {limits.max_stored_gb} GiB may be: delete some"
+            f"{stored / GIB:.1f} GiB of photos are stored, {most_bytes / GIB:g} GiB may be: delete some",
+            headers={"Retry-After": "3600"},
+        )
+    if kept >= most_photos:
+        raise QuotaError(
+            f"{kept} photos are there, {most_photos} may be: delete some", headers={"Retry-After": "3600"}
         )
 
 
-def _record(call: Call, public_id: str, uploaded: upload.Uploaded, prefix: str) -> tuple[PhotoOut, bool]:
+def most(settings: Settings, quota: Quota) -> tuple[int, int]:
+    """Return how many bytes and how many photos an owner may have."""
+    return (
+        int(settings.max_stored_gb * GIB) if quota.stored_bytes is None else quota.stored_bytes,
+        settings.max_photos if quota.photos is None else quota.photos,
+    )
+
+
+def _record(
+    call: Call, public_id: str, uploaded: upload.Uploaded, prefix: str, where: location.Location
+) -> tuple[PhotoOut, bool]:
     fields = uploaded.fields
     given = fields.model_dump(exclude={"calibrate"}, exclude_none=True)
     if fields.lens_id is not None and call.store.lenses.get(fields.lens_id, call.owner) is None:
-        call.storage.delete(prefix)
         raise UnknownLensError(f"lens_id {fields.lens_id}: there is no such lens; GET /v1/lenses lists them")
     received = call.store.photos.receive(
         call.owner,
@@ -144,10 +246,16 @@ def _record(call: Call, public_id: str, uploaded: upload.Uploaded, prefix: str) 
         blob_key=f"{prefix}original",
         calibrate=fields.calibrate,
         given=given,
+        location=where,
+        may_be_new=call.who.key_id is None,
     )
     if received.photo.public_id != public_id:
+        if received.wants_file:  # it was given up: this is the same one
+            key = f"{folder_of(received.photo)}original-{public_id}"
+            call.storage.rename(f"{prefix}original", key)
+            call.store.photos.restore_file(received.photo.public_id, key, where, again=received.fresh)
         call.storage.delete(prefix)  # the same bytes are there already
-    return describe(call, received.photo), received.fresh
+    return describe(call, find_photo(call, received.photo.public_id)), received.fresh
 
 
 def describe(call: Call, photo: PhotoRow) -> PhotoOut:

@@ -9,16 +9,17 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from fastapi import APIRouter, Query, Response, status
 
-from app import encode
-from app.dependencies import Call, CallDep
-from app.errors import InvalidParameterError, NotAcceptableError, UnknownLensError
-from app.models import Fitted
+from app.http import psf_formats
+from app.http.dependencies import Call, CallDep
+from app.http.errors import InvalidParameterError, NotAcceptableError, UnknownLensError
+from app.http.model_cache import Fitted
 from app.routes.common import Answers, problems
+from app.runtime import metrics
 from app.schemas import FieldQuery, PsfOut, PsfQuery, QueryOut
 from app.store.samples import Family, LensState
-from lensmodel.errors import OutsideSupportError
-from lensmodel.regression.answer import MICROMETRE
-from lensmodel.types import FieldPosition, LensSettings
+from lensmodel.core.errors import OutsideSupportError
+from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.model.answer import MICROMETRE
 
 router = APIRouter(tags=["psf"])
 
@@ -52,7 +53,8 @@ _ANSWERS: Final[Answers] = {
 )
 def read_psf(lens_id: str, at: Annotated[PsfQuery, Query()], call: CallDep) -> Response:
     """Return the PSF in the format that `Accept` asks for; JSON by default."""
-    return _answer(lens_id, at, accepted(call.request.headers.get("accept", "*/*")), call)
+    with metrics.QUERY_SECONDS.time():
+        return _answer(lens_id, at, accepted(call.request.headers.get("accept", "*/*")), call)
 
 
 @router.get(
@@ -68,7 +70,8 @@ def read_psf_as(
     call: CallDep,
 ) -> Response:
     """Return the PSF in the format of the suffix."""
-    return _answer(lens_id, at, suffix, call)
+    with metrics.QUERY_SECONDS.time():
+        return _answer(lens_id, at, suffix, call)
 
 
 def accepted(header: str) -> Format:
@@ -124,10 +127,10 @@ def _answer(lens_id: str, at: PsfQuery, form: Format, call: Call) -> Response:
     )
     in_micrometres = fitted.model.settings.unit == MICROMETRE
     pitch = (at.pixel_pitch_um if in_micrometres else None) or fitted.pixel_pitch_um
-    described = encode.describe(lens_id, fitted, question, answer, pitch)
+    described = psf_formats.describe(lens_id, fitted, question, answer, pitch)
     if at.std and form == "json" and answer.std is not None:
-        described = described.model_copy(update={"std": np.round(answer.std, encode.DIGITS).tolist()})
-    body, more = encode.psf(form, answer.kernel, described)
+        described = described.model_copy(update={"std": np.round(answer.std, psf_formats.DIGITS).tolist()})
+    body, more = psf_formats.psf(form, answer.kernel, described)
     return Response(body, media_type=MEDIA_TYPES[form], headers={**headers, **more})
 
 
@@ -183,7 +186,12 @@ def read_field(lens_id: str, at: Annotated[FieldQuery, Query()], call: CallDep) 
             f"{MAX_FIELD_PIXELS / 1e6:g} may be: ask for fewer or smaller kernels"
         )
     state, relatives = _known(call, lens_id)
-    fitted = call.models.get(lens_id, state=state, family=at.family, relatives=relatives)
+    left, top, wide, high = (float(share) for share in at.view.split(","))
+    if not (wide > 0 and high > 0 and left + wide <= 1.000001 and top + high <= 1.000001):
+        raise InvalidParameterError(
+            f"view {at.view} is no part of the picture: left, top, width, height in 0..1"
+        )
+    fitted = call.models.get(lens_id, at.version, state=state, family=at.family, relatives=relatives)
     tag = etag(fitted, at.model_dump_json())
     headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
     if _matches(call, tag):
@@ -192,7 +200,16 @@ def read_field(lens_id: str, at: Annotated[FieldQuery, Query()], call: CallDep) 
 
     def draw() -> bytes:
         field = fitted.model.field(setting)
-        return encode.field_map(field, at.channel, columns=columns, rows=rows, size=at.size, gamma=at.gamma)
+        return psf_formats.field_map(
+            field,
+            at.channel,
+            columns=columns,
+            rows=rows,
+            size=at.size,
+            gamma=at.gamma,
+            aspect=at.aspect,
+            view=(left, top, wide, high),
+        )
 
     picture = call.services.pictures.get(tag, draw)
     return Response(picture, media_type="image/png", headers=headers)

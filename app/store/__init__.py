@@ -7,14 +7,19 @@ step that runs twice, or loses a race against a cancel, changes nothing the seco
 
 from __future__ import annotations
 
-from app.settings import Settings
+from app.runtime.settings import Settings
+from app.store.access.accounts import AccountStore
+from app.store.access.idempotency import IdempotencyStore
+from app.store.access.keys import KeyStore
 from app.store.corrections import CorrectionStore
 from app.store.database import Database
+from app.store.lens_changes import LensChanges
 from app.store.lenses import LensName, LensStore
 from app.store.patches import NewSample, PatchStore
 from app.store.photos import PhotoStore
 from app.store.removal import RemovalStore
 from app.store.samples import SampleStore, StoredSample
+from app.store.upkeep.operation import OperationStore
 from app.store.windows import NewPatch
 from app.store.workers import WorkerStore
 
@@ -29,10 +34,15 @@ class Store:
         self.photos = PhotoStore(self.database)
         self.patches = PatchStore(self.database)
         self.lenses = LensStore(self.database)
+        self.lens_changes = LensChanges(self.database)
         self.samples = SampleStore(self.database)
         self.corrections = CorrectionStore(self.database)
         self.removal = RemovalStore(self.database)
+        self.keys = KeyStore(self.database)
+        self.accounts = AccountStore(self.database)
+        self.idempotency = IdempotencyStore(self.database)
         self.workers = WorkerStore(self.database)
+        self.operation = OperationStore(self.database)
 
     def close(self) -> None:
         """Close all connections."""

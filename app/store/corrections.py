@@ -10,10 +10,11 @@ from typing import Any
 
 from sqlalchemy import Select, select, update
 
-from app.ids import new_id
+from app.http.errors import ConflictError, UnknownPhotoError
+from app.store.access.owners import find, find_to_change, is_id, now, owned
 from app.store.database import Database, insert_new
-from app.store.owners import find, find_to_change, is_id, now, owned
-from app.tables import CorrectionRow, GarbageRow, LensRow, OwnerRow, PhotoRow
+from app.store.ids import new_id
+from app.store.tables import CorrectionRow, GarbageRow, LensRow, OwnerRow, PhotoRow
 
 ACTIVE = ("queued", "running")
 
@@ -83,6 +84,13 @@ class CorrectionStore:
             "created_at": now(),
         }
         with self._db.writing(durable=True) as session:
+            there = owned(PhotoRow, None).where(PhotoRow.public_id == photo.public_id)
+            still = session.scalar(there.with_for_update())
+            # by its public id: the key of a photo that is gone may be that of another by now
+            if still is None or (still.id, still.owner_id) != (photo.id, photo.owner_id):
+                raise UnknownPhotoError(f"photo {photo.public_id} was deleted meanwhile: send it again")
+            if still.file_gone_at is not None:
+                raise ConflictError(f"the file of photo {photo.public_id} is no longer kept: send it again")
             made = insert_new(session, CorrectionRow, [fresh]) == 1
             row = session.scalars(
                 select(CorrectionRow).where(

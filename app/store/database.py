@@ -12,15 +12,24 @@ import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from sqlalchemy import Connection, Engine, create_engine, event, make_url
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
-from app.tables import Base
+from app.store.tables import Base
 
 BUSY_TIMEOUT_MS = 30_000
+SERVER_DEADLINES: Final = {
+    "connect_timeout": 5,
+    "tcp_user_timeout": 15_000,
+    "keepalives_idle": 10,
+    "keepalives_interval": 5,
+    "keepalives_count": 3,
+}
+"""Of libpq, in s and ms. A server whose network is cut sends no end of a connection: without these a worker
+waits for it for a quarter of an hour, longer than any lease."""
 
 
 class Database:
@@ -44,7 +53,9 @@ class Database:
             self.durable = _sqlite(url, "BEGIN IMMEDIATE", "FULL")
             self.reader = _sqlite(url, "BEGIN", synchronous, read_only=True)
         else:
-            self.writer = self.durable = create_engine(url, pool_pre_ping=True, hide_parameters=True)
+            self.writer = self.durable = create_engine(
+                url, pool_pre_ping=True, hide_parameters=True, connect_args=SERVER_DEADLINES
+            )
             self.reader = self.writer.execution_options(postgresql_readonly=True)
 
     @contextmanager

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterable, Sequence
 from typing import Final
 
-from sqlalchemy import select
+from sqlalchemy import func, select
 
+from app.store.access.owners import owned
 from app.store.database import Database
-from app.tables import CorrectionRow, PatchRow, PhotoRow
+from app.store.tables import CorrectionRow, EventRow, LensRow, OwnerRow, PatchRow, PhotoRow
 
 AT_ONCE: Final = 500
 """Ids in one question: SQLite allows for some thousand."""
@@ -57,7 +58,7 @@ class JobStore:
             return rows
 
     def marks(self, job_ids: Sequence[str]) -> dict[str, Hashable]:
-        """Return for each job what changes whenever something happens to it; see `app.watch`."""
+        """Return for each job what changes whenever something happens to it; see `app.http.job_watch`."""
         found: dict[str, Hashable] = {}
         with self._db.reading() as session:
             for first in range(0, len(job_ids), AT_ONCE):
@@ -70,10 +71,34 @@ class JobStore:
                     found |= {row[0]: tuple(row[1:]) for row in session.execute(query)}
         return found
 
+    def mark_of_owner(self, owner: str, newest: int) -> Hashable:
+        """Return what changes whenever something happens to the newest photos, lenses or corrections."""
+        photos = owned(PhotoRow, owner).order_by(PhotoRow.public_id.desc()).limit(newest)
+        corrections = owned(CorrectionRow, owner).order_by(CorrectionRow.public_id.desc()).limit(newest)
+        lenses = owned(LensRow, owner).order_by(LensRow.public_id.desc()).limit(newest)
+        measured = (
+            select(func.count(EventRow.id), func.count(EventRow.metrics))
+            .join(LensRow, LensRow.id == EventRow.lens_id)
+            .join(OwnerRow, OwnerRow.id == LensRow.owner_id)
+            .where(OwnerRow.name == owner)
+        )
+        with self._db.reading() as session:
+            return tuple(
+                tuple(tuple(row) for row in session.execute(query))
+                for query in (
+                    photos.with_only_columns(*_PHOTO_MARK),
+                    corrections.with_only_columns(*_CORRECTION_MARK),
+                    lenses.with_only_columns(LensRow.public_id, LensRow.version, LensRow.label),
+                    measured,
+                )
+            )
+
     def existing_photos(self, photo_ids: Iterable[str]) -> set[str]:
-        """Return which of these photos are not deleted."""
+        """Return which of these photos are not deleted, and have their file still."""
         query = select(PhotoRow.public_id).where(
-            PhotoRow.public_id.in_(list(photo_ids)), PhotoRow.deleted_at.is_(None)
+            PhotoRow.public_id.in_(list(photo_ids)),
+            PhotoRow.deleted_at.is_(None),
+            PhotoRow.file_gone_at.is_(None),
         )
         with self._db.reading() as session:
             return set(session.scalars(query))

@@ -9,12 +9,12 @@ from typing import Any, Final, Literal
 from sqlalchemy import delete, func, select, update
 from sqlalchemy.orm import Session
 
-from app.identity import name_key, serial_key
-from app.ids import new_id
+from app.store.access.owners import find, now, owned
 from app.store.database import Database, insert_new
-from app.store.owners import find, now, owned
+from app.store.ids import new_id
+from app.store.tables import CorrectionRow, EventRow, GarbageRow, LensRow, PhotoRow
 from app.store.versions import drop_samples, new_version, take_samples
-from app.tables import CorrectionRow, EventRow, GarbageRow, LensRow, PhotoRow
+from lensmodel.workflow.identity import name_key, serial_key
 
 TRIES: Final = 10
 """How often to look again for a lens that was deleted when we looked."""
@@ -277,6 +277,26 @@ class LensStore:
         )
         with self._db.reading() as session:
             return [lateral for lateral in session.scalars(query) if lateral]
+
+    def shape_of(self, lens: LensRow) -> tuple[int, int] | None:
+        """Return height and width in pixels of most photos of a lens, as the sensor has them."""
+        count = func.count()
+        query = (
+            select(PhotoRow.height, PhotoRow.width)
+            .where(
+                PhotoRow.lens_id == lens.id,
+                PhotoRow.state == "counted",
+                PhotoRow.deleted_at.is_(None),
+                PhotoRow.width.is_not(None),
+                PhotoRow.height.is_not(None),
+            )
+            .group_by(PhotoRow.height, PhotoRow.width)
+            .order_by(count.desc(), PhotoRow.width.desc())
+            .limit(1)
+        )
+        with self._db.reading() as session:
+            row = session.execute(query).one_or_none()
+            return None if row is None else (row[0] or 0, row[1] or 0)
 
     def history(self, lens: LensRow, *, after: int = 0, limit: int = 1000) -> list[EventRow]:
         """Return the events of a lens beyond version `after`, oldest first."""

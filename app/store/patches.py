@@ -12,11 +12,11 @@ from sqlalchemy import Select, func, select, update
 from sqlalchemy.orm import Session
 
 from app.store import windows
+from app.store.access.owners import now
 from app.store.database import Database, insert_new
-from app.store.owners import now
+from app.store.tables import PatchRow, PhotoRow, SampleRow
 from app.store.windows import NewPatch
-from app.tables import PatchRow, PhotoRow, SampleRow
-from lensmodel.types import Channel, Kernel
+from lensmodel.core.types import Channel, Kernel
 
 DTYPE: Final = "<f4"
 FORMAT_VERSION: Final = 1
@@ -75,7 +75,7 @@ class PatchStore:
             rejected = [patch for patch in patches if patch.rejected is not None]
             if photo.windows is None:
                 photo.windows, photo.windows_rejected = windows.packed(rejected), len(rejected)
-            return _recount(session, photo)
+            return recount(session, photo)
 
     def all_of(self, photo_id: str, epoch: int | None = None) -> list[PatchRow]:
         """Return the patches of a photo that were to be estimated, in the order of their numbers."""
@@ -124,7 +124,7 @@ class PatchStore:
             for patch in patches.values():
                 patch.state, patch.finished_at = "done", patch.finished_at or now()
             session.flush()
-            _recount(session, photo)
+            recount(session, photo)
             return stored
 
     def fail(
@@ -145,7 +145,7 @@ class PatchStore:
                 )
                 .values(state="rejected" if rejected else "failed", reason=reason[:60], finished_at=now())
             )
-            _recount(session, photo)
+            recount(session, photo)
 
 
 def _of_photo(photo_id: str, epoch: int | None = None) -> Select[PatchRow]:
@@ -169,7 +169,7 @@ def _live(session: Session, photo_id: str, epoch: int) -> PhotoRow | None:
     )
 
 
-def _recount(session: Session, photo: PhotoRow) -> int:
+def recount(session: Session, photo: PhotoRow) -> int:
     """Count the patches anew: recomputed, never incremented, so that a repeat cannot count twice."""
     rows = session.execute(
         select(PatchRow.state, func.count())

@@ -5,67 +5,45 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
-from sqlalchemy import case, delete, func, select, update
+from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session
 
-from app.errors import BusyError
+from app.http.errors import BusyError
 from app.store import lenses
-from app.store.database import Database, insert_new
+from app.store.access.idempotency import forget_answers
+from app.store.access.owners import ensure_owner, find, find_to_change, now
+from app.store.database import insert_new
 from app.store.lenses import LensName
-from app.store.owners import ensure_owner, find, find_to_change, now, owned
+from app.store.photo_reads import PhotoReads
+from app.store.photo_steps import (
+    GIVEN_SETTINGS,
+    LATE,
+    UNFINISHED,
+    Identity,
+    drop_patches,
+    empty,
+    folder_of,
+    let_go,
+    move,
+    restart,
+    widen,
+)
 from app.store.removal import forget_if_empty
-from app.store.versions import new_version, take_samples
-from app.tables import (
-    PHOTO_FINAL,
+from app.store.tables import (
     PHOTO_RUNNING,
+    CorrectionRow,
     GarbageRow,
     LensRow,
-    OwnerRow,
     PatchRow,
     PhotoRow,
     SampleRow,
 )
+from app.store.versions import new_version, take_samples
 
-WORKED_ON = ("received", *PHOTO_RUNNING)
-"""What takes the service's time; a photo that waits for its owner's word takes room only."""
-
-UNFINISHED = (*WORKED_ON, "needs_lens")
 TRIES: Final = 100
 """How often an upload looks again for the photo of the same bytes that was deleted when it looked."""
-
-GIVEN_SETTINGS = {
-    "aperture": "aperture",
-    "focal_length_mm": "focal_mm",
-    "focus_distance_m": "focus_m",
-    "pixel_pitch_um": "pixel_pitch_um",
-}
-"""Fields that the owner may give, by the column that they fill."""
-
-
-class Identity(Protocol):
-    """Which copy of which lens, as `lensmodel.photo.LensIdentity` says it."""
-
-    @property
-    def maker(self) -> str | None:
-        """Who made it."""
-
-    @property
-    def model(self) -> str | None:
-        """What it is called."""
-
-    @property
-    def serial(self) -> str | None:
-        """Which copy it is; None where nothing says so."""
-
-    @property
-    def serial_source(self) -> str:
-        """Where the serial was found."""
-
-
-LATE = timedelta(minutes=10)
-"""Blobs of what is deleted are deleted again after this time: a worker may have written one more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,13 +52,12 @@ class Received:
 
     photo: PhotoRow
     fresh: bool
+    wants_file: bool = False
+    """Whether the photo is there without its file, which has now come again."""
 
 
-class PhotoStore:
+class PhotoStore(PhotoReads):
     """Photos of all owners. `owner=None` asks as the service itself."""
-
-    def __init__(self, database: Database) -> None:
-        self._db = database
 
     def expect(self, prefix: str) -> None:
         """Say that blobs will come below `prefix`: garbage in an hour unless a photo claims them."""
@@ -100,6 +77,8 @@ class PhotoStore:
         blob_key: str,
         calibrate: bool,
         given: Mapping[str, Any],
+        location: str | None = None,
+        may_be_new: bool = True,
     ) -> Received:
         """Store an upload, or find the photo with the same bytes.
 
@@ -107,7 +86,7 @@ class PhotoStore:
         calibrate its lens and until now should not, or it waits to be told what it is told now.
         """
         with self._db.writing(durable=True) as session:
-            owner_key = ensure_owner(session, owner)
+            owner_key = ensure_owner(session, owner, may_be_new=may_be_new)
             fresh = {
                 "public_id": public_id,
                 "owner_id": owner_key,
@@ -121,6 +100,7 @@ class PhotoStore:
                 "state": "received",
                 "received_at": now(),
                 "stage_at": now(),
+                "location": location,
                 **{column: given.get(field) for field, column in GIVEN_SETTINGS.items()},
             }
             known, made = _insert_or_find(session, fresh)
@@ -137,79 +117,39 @@ class PhotoStore:
             if again:
                 known.calibrate = calibrate
                 known.given = told
-                _restart(session, known)
-            return Received(known, fresh=again)
+                if known.file_gone_at is None:  # else once it is there: a worker would look for it
+                    restart(session, known)
+            return Received(known, fresh=again, wants_file=known.file_gone_at is not None)
 
-    def get(self, photo_id: str, owner: str | None = None) -> PhotoRow | None:
-        """Return one photo, or None."""
-        with self._db.reading() as session:
-            return find(session, PhotoRow, photo_id, owner)
+    def give_up_file(self, photo_id: str, names: Sequence[str]) -> bool:
+        """Give up the file of a photo and pictures of it; False if it is wanted, or gone already.
 
-    def lens_of(self, photo: PhotoRow) -> LensRow | None:
-        """Return the lens that a photo was taken with, where that is known."""
-        if photo.lens_id is None:
-            return None
-        with self._db.reading() as session:
-            return session.get(LensRow, photo.lens_id)
+        The row says so before the blobs go, and their keys are written down: nothing of them stays.
+        """
+        with self._db.writing() as session:
+            photo = find_to_change(session, PhotoRow, photo_id, None)
+            busy = CorrectionRow.state.in_(("queued", "running"))
+            if photo is None or photo.file_gone_at is not None or photo.state in UNFINISHED:
+                return False
+            asked = select(CorrectionRow.id).where(CorrectionRow.photo_id == photo.id, busy)
+            if session.scalar(asked.limit(1)) is not None:
+                return False
+            photo.file_gone_at = now()
+            keys = [photo.blob_key, *(f"{folder_of(photo)}{name}" for name in names)]
+            insert_new(session, GarbageRow, [{"prefix": key, "not_before": now()} for key in keys])
+            return True
 
-    def page(
-        self,
-        owner: str,
-        *,
-        before: str | None,
-        limit: int,
-        lens_id: str | None = None,
-        state: str | None = None,
-    ) -> list[PhotoRow]:
-        """Return photos, newest first, that came before the photo `before`."""
-        query = owned(PhotoRow, owner).order_by(PhotoRow.public_id.desc()).limit(limit)
-        if before is not None:
-            query = query.where(PhotoRow.public_id < before)
-        if lens_id is not None:
-            query = query.join(LensRow, LensRow.id == PhotoRow.lens_id).where(LensRow.public_id == lens_id)
-        if state is not None:
-            query = query.where(PhotoRow.state == state)
-        with self._db.reading() as session:
-            return list(session.scalars(query))
-
-    def lens_ids(self, photos: Sequence[PhotoRow]) -> dict[int, str]:
-        """Return the public ids of the lenses of these photos, by key."""
-        keys = {photo.lens_id for photo in photos if photo.lens_id is not None}
-        with self._db.reading() as session:
-            rows = session.execute(select(LensRow.id, LensRow.public_id).where(LensRow.id.in_(keys)))
-            return {row.id: row.public_id for row in rows}
-
-    def load_of(self, owner: str) -> tuple[int, int]:
-        """Return how many photos of an owner are to be worked on, and the bytes of all of them."""
-        with self._db.reading() as session:
-            row = session.execute(
-                select(
-                    func.count().filter(PhotoRow.state.in_(WORKED_ON)),
-                    func.coalesce(func.sum(PhotoRow.byte_size), 0),
-                )
-                .join(OwnerRow, OwnerRow.id == PhotoRow.owner_id)
-                .where(OwnerRow.name == owner, PhotoRow.deleted_at.is_(None))
-            ).one()
-            return int(row[0]), int(row[1])
-
-    def to_do(self, limit: int = 100) -> list[tuple[str, int, str]]:
-        """Return `(photo_id, epoch, owner)` of received photos, oldest first: the intent sweep."""
-        return self._in_states(("received",), limit)
-
-    def running(self, limit: int = 1000) -> list[tuple[str, int, str]]:
-        """Return `(photo_id, epoch, owner)` of photos that a worker is busy with."""
-        return self._in_states(PHOTO_RUNNING, limit)
-
-    def _in_states(self, states: Sequence[str], limit: int) -> list[tuple[str, int, str]]:
-        query = (
-            select(PhotoRow.public_id, PhotoRow.epoch, OwnerRow.name)
-            .join(OwnerRow, OwnerRow.id == PhotoRow.owner_id)
-            .where(PhotoRow.state.in_(states), PhotoRow.deleted_at.is_(None))
-            .order_by(PhotoRow.id)
-            .limit(limit)
-        )
-        with self._db.reading() as session:
-            return [(row[0], row[1], row[2]) for row in session.execute(query)]
+    def restore_file(
+        self, photo_id: str, blob_key: str, location: str | None, *, again: bool = False
+    ) -> None:
+        """Say that the file of a photo is there again, under a key of its own; begin `again` with it."""
+        with self._db.writing(durable=True) as session:
+            photo = find_to_change(session, PhotoRow, photo_id, None)
+            if photo is None:
+                return
+            photo.blob_key, photo.file_gone_at, photo.location = blob_key, None, location
+            if again:
+                restart(session, photo)
 
     def set_state(
         self,
@@ -226,22 +166,7 @@ class PhotoStore:
         long changes nothing.
         """
         with self._db.writing() as session:
-            return _move(session, photo_id, from_states, to, epoch=epoch, **fields)
-
-    def is_live(self, photo_id: str, epoch: int) -> bool:
-        """Say whether work for this epoch of the photo is still wanted: the cancel poll."""
-        with self._db.reading() as session:
-            return (
-                session.scalar(
-                    select(PhotoRow.id).where(
-                        PhotoRow.public_id == photo_id,
-                        PhotoRow.epoch == epoch,
-                        PhotoRow.state.not_in(PHOTO_FINAL),
-                        PhotoRow.deleted_at.is_(None),
-                    )
-                )
-                is not None
-            )
+            return move(session, photo_id, from_states, to, epoch=epoch, **fields)
 
     def record_inspection(
         self,
@@ -257,6 +182,7 @@ class PhotoStore:
         orientation: int | None = None,
         camera_maker: str | None = None,
         camera_model: str | None = None,
+        body_key: str | None = None,
         iso: float | None = None,
         exposure_s: float | None = None,
         taken_at: datetime | None = None,
@@ -277,7 +203,7 @@ class PhotoStore:
                 setattr(photo, column, read[column] if value is None else value)
             serial = photo.given.get("lens_serial")
             photo.width, photo.height, photo.orientation = width, height, orientation
-            photo.camera_maker, photo.camera_model = camera_maker, camera_model
+            photo.camera_maker, photo.camera_model, photo.body_key = camera_maker, camera_model, body_key
             photo.lens_maker = photo.given.get("lens_maker") or identity.maker
             photo.lens_model = photo.given.get("lens_model") or identity.model
             photo.lens_serial = serial or identity.serial
@@ -303,7 +229,7 @@ class PhotoStore:
             lens = lenses.lens_of_photo(session, photo, single_copy=single_copy)
             if lens is not None:
                 photo.lens_id = lens.id
-                _widen(lens, photo)
+                widen(lens, photo)
             return lens
 
     def change(
@@ -342,16 +268,16 @@ class PhotoStore:
             elif given or chosen is not None:
                 named = {} if chosen is None else {"lens_id": chosen.public_id}
                 photo.given = {**photo.given, **given, **named}
-                _restart(session, photo)
+                restart(session, photo)
             return True
 
     def fail(self, photo_id: str, epoch: int, code: str, detail: str) -> bool:
         """End a photo that is being worked on with a reason; its samples never count."""
         with self._db.writing() as session:
             fields = {"error_code": code, "error_detail": detail, "finished_at": now()}
-            failed = _move(session, photo_id, ("received", *PHOTO_RUNNING), "failed", epoch=epoch, **fields)
+            failed = move(session, photo_id, ("received", *PHOTO_RUNNING), "failed", epoch=epoch, **fields)
             if failed:
-                _let_go(session, photo_id)
+                let_go(session, photo_id)
             return failed
 
     def retry(self, photo_id: str, owner: str | None = None) -> bool:
@@ -360,19 +286,8 @@ class PhotoStore:
             photo = find_to_change(session, PhotoRow, photo_id, owner)
             if photo is None or photo.state not in {"failed", "cancelled"}:
                 return False
-            _restart(session, photo)
+            restart(session, photo)
             return True
-
-    def failed_by(self, owner: str, code: str, limit: int) -> list[str]:
-        """Return the photos that ended with a code, oldest first."""
-        query = (
-            owned(PhotoRow, owner)
-            .where(PhotoRow.state == "failed", PhotoRow.error_code == code)
-            .order_by(PhotoRow.id)
-            .limit(limit)
-        )
-        with self._db.reading() as session:
-            return [row.public_id for row in session.scalars(query)]
 
     def cancel(self, photo_id: str, owner: str | None = None) -> bool:
         """Cancel an unfinished photo; False if it was finished already.
@@ -381,10 +296,10 @@ class PhotoStore:
         """
         with self._db.writing() as session:
             photo = find_to_change(session, PhotoRow, photo_id, owner)
-            if photo is None or not _move(session, photo_id, UNFINISHED, "cancelled", finished_at=now()):
+            if photo is None or not move(session, photo_id, UNFINISHED, "cancelled", finished_at=now()):
                 return False
-            _drop_patches(session, photo)
-            _let_go(session, photo_id)
+            drop_patches(session, photo)
+            let_go(session, photo_id)
             return True
 
     def finish(self, photo_id: str, epoch: int) -> int | None:
@@ -395,7 +310,7 @@ class PhotoStore:
         """
         with self._db.writing() as session:
             done = {"finished_at": now(), "counted_at": now()}
-            if not _move(session, photo_id, ("estimating",), "counted", epoch=epoch, **done):
+            if not move(session, photo_id, ("estimating",), "counted", epoch=epoch, **done):
                 return None
             photo = session.scalars(select(PhotoRow).where(PhotoRow.public_id == photo_id)).one()
             if photo.lens_id is None:
@@ -421,35 +336,13 @@ class PhotoStore:
             lenses.delete_corrections(session, photo)
             photo.deleted_at = now()
             photo.state = "cancelled" if photo.state in UNFINISHED else photo.state
-            photo.given, photo.lens_serial, photo.filename, photo.sha256 = {}, None, "", ""
+            forget_answers(session, photo)
+            empty(photo)
             photo.windows, photo.windows_rejected = None, 0
             forget_if_empty(session, photo)
             prefix = folder_of(photo)
             insert_new(session, GarbageRow, [{"prefix": prefix, "not_before": now() + LATE}])
             return prefix
-
-
-def folder_of(photo: PhotoRow) -> str:
-    """Return the prefix of a photo's blobs."""
-    return f"{photo.blob_key.rpartition('/')[0]}/"
-
-
-def statistics_of(photo: PhotoRow) -> str:
-    """Return the prefix of what the patches of this epoch of a photo say besides their kernels."""
-    return f"{folder_of(photo)}statistics/e{photo.epoch}/"
-
-
-def settings_of(photo: PhotoRow) -> dict[str, Any]:
-    """Return how the lens was set, as tasks read it."""
-    return {"aperture": photo.aperture, "focal_mm": photo.focal_mm, "focus_m": photo.focus_m}
-
-
-def _let_go(session: Session, photo_id: str) -> None:
-    """Forget the lens that only a photo without a result speaks of: its serial is nobody's business now."""
-    photo = session.scalars(
-        select(PhotoRow).where(PhotoRow.public_id == photo_id).execution_options(populate_existing=True)
-    ).one()
-    forget_if_empty(session, photo)
 
 
 def _insert_or_find(session: Session, fresh: dict[str, Any]) -> tuple[PhotoRow, bool]:
@@ -471,46 +364,3 @@ def _known(session: Session, owner_key: int, sha256: str) -> PhotoRow | None:
         .where(PhotoRow.owner_id == owner_key, PhotoRow.sha256 == sha256, PhotoRow.deleted_at.is_(None))
         .with_for_update()
     )
-
-
-def _drop_patches(session: Session, photo: PhotoRow) -> None:
-    """Forget the patches of an epoch with their samples; a worker may write one more blob of them."""
-    session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
-    insert_new(session, GarbageRow, [{"prefix": statistics_of(photo), "not_before": now() + LATE}])
-
-
-def _restart(session: Session, photo: PhotoRow) -> None:
-    """Begin a new epoch of a photo that does not count: work of the old one, if any still runs, is void."""
-    _drop_patches(session, photo)
-    photo.epoch += 1
-    photo.state, photo.stage_at = "received", now()
-    photo.error_code = photo.error_detail = photo.started_at = photo.finished_at = photo.counted_at = None
-    photo.attempt = photo.patches_total = photo.patches_done = photo.patches_rejected = 0
-    photo.windows, photo.windows_rejected = None, 0
-
-
-def _move(
-    session: Session,
-    photo_id: str,
-    from_states: Sequence[str],
-    to: str,
-    *,
-    epoch: int | None = None,
-    **fields: object,
-) -> bool:
-    conditions = [
-        PhotoRow.public_id == photo_id,
-        PhotoRow.state.in_(from_states),
-        PhotoRow.deleted_at.is_(None),
-    ]
-    if epoch is not None:
-        conditions.append(PhotoRow.epoch == epoch)
-    since = case((PhotoRow.state == to, PhotoRow.stage_at), else_=now())
-    changes = {"state": to, "stage_at": since, **fields}
-    statement = update(PhotoRow).where(*conditions).values(**changes)
-    return session.connection().execute(statement).rowcount == 1
-
-
-def _widen(lens: LensRow, photo: PhotoRow) -> None:
-    lens.maker = lens.maker or photo.lens_maker
-    lens.model = lens.model or photo.lens_model

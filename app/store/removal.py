@@ -9,10 +9,9 @@ from __future__ import annotations
 from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session
 
+from app.store.access.owners import find_to_change, now
 from app.store.database import Database, insert_new
-from app.store.owners import find_to_change, now
-from app.store.versions import STILL_WRITTEN
-from app.tables import (
+from app.store.tables import (
     PHOTO_RUNNING,
     CorrectionRow,
     EventRow,
@@ -22,6 +21,7 @@ from app.tables import (
     PhotoRow,
     SampleRow,
 )
+from app.store.versions import STILL_WRITTEN
 
 NO_RESULT = ("failed", "cancelled")
 
@@ -50,7 +50,7 @@ class RemovalStore:
                 .values(state="cancelled", finished_at=now())
             )
             session.flush()
-            _erase(session, lens)
+            forget(session, lens)
             return True
 
 
@@ -75,7 +75,7 @@ def forget_if_empty(session: Session, photo: PhotoRow) -> None:
     session.execute(update(PhotoRow).where(PhotoRow.lens_id == lens.id).values(lens_id=None))
     photo.lens_id = None
     session.flush()
-    _erase(session, lens)
+    forget(session, lens)
 
 
 def _unlearn(session: Session, photo: PhotoRow) -> None:
@@ -94,7 +94,8 @@ def _unlearn(session: Session, photo: PhotoRow) -> None:
     insert_new(session, GarbageRow, [{"prefix": statistics, "not_before": now() + STILL_WRITTEN}])
 
 
-def _erase(session: Session, lens: LensRow) -> None:
+def forget(session: Session, lens: LensRow) -> None:
+    """Empty the row of a lens that no photo belongs to any more; what workers kept of it becomes garbage."""
     session.execute(delete(EventRow).where(EventRow.lens_id == lens.id))
     lens.serial = lens.label = None
     lens.serial_source = "none"

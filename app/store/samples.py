@@ -12,16 +12,16 @@ import numpy as np
 from sqlalchemy import Row, and_, bindparam, select
 from sqlalchemy.orm import aliased
 
-from app import distances
+from app.schemas import distances
+from app.store.access.owners import is_id
 from app.store.database import Database
 from app.store.lenses import kind_key
-from app.store.owners import is_id
 from app.store.patches import DTYPE
-from app.tables import LensRow, OwnerRow, PhotoRow, SampleRow
-from lensmodel.errors import LensModelError
-from lensmodel.psf import PsfSample
-from lensmodel.spectrum import PatchSpectrum
-from lensmodel.types import Channel, FieldPosition, LensSettings
+from app.store.tables import LensRow, OwnerRow, PhotoRow, SampleRow
+from lensmodel.core.errors import LensModelError
+from lensmodel.core.psf import PsfSample
+from lensmodel.core.spectrum import PatchSpectrum
+from lensmodel.core.types import Channel, FieldPosition, LensSettings
 
 _STATE = select(LensRow.version, LensRow.rebuild_epoch).where(
     LensRow.public_id == bindparam("lens"), LensRow.deleted_at.is_(None)

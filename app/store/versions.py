@@ -8,9 +8,9 @@ from typing import Final
 from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
+from app.store.access.owners import now
 from app.store.database import insert_new
-from app.store.owners import now
-from app.tables import GarbageRow, LensRow, PhotoRow, SampleRow
+from app.store.tables import GarbageRow, LensRow, PhotoRow, SampleRow
 
 STILL_WRITTEN: Final = timedelta(minutes=30)
 """A worker may be learning from the version before while the next one comes."""
@@ -44,6 +44,11 @@ def learned_prefix(lens_id: str, version: int, epoch: int) -> str:
 def learned_key(lens_id: str, version: int, epoch: int) -> str:
     """Key of the blob in `learned_prefix`."""
     return f"{learned_prefix(lens_id, version, epoch)}learned.npz"
+
+
+def report_key(lens_id: str, version: int, epoch: int) -> str:
+    """Key of the report of that version, beside what was learned."""
+    return f"{learned_prefix(lens_id, version, epoch)}report.json"
 
 
 def take_samples(session: Session, photo: PhotoRow, version: int) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from app.tables import PatchRow
+from app.store.tables import PatchRow
 
 DIGITS: Final = 4
 """Of r and phi: a tenth of a pixel in a photo of 24 megapixels is two of their last digit."""

@@ -7,9 +7,9 @@ from datetime import datetime, timedelta
 from sqlalchemy import delete, func, select, update
 from sqlalchemy.orm import Session
 
+from app.store.access.owners import now
 from app.store.database import Database
-from app.store.owners import now
-from app.tables import GarbageRow, WorkerRow
+from app.store.tables import GarbageRow, WorkerRow
 
 
 class WorkerStore:

@@ -1,9 +1,12 @@
 """Photo files in and out: RAW, DNG, TIFF, PNG, JPEG; EXIF, ICC; which lens it was."""
 
 from lensmodel.photo.development import develop
+from lensmodel.photo.headers.sniffing import HEAD_BYTES, sniff
 from lensmodel.photo.inspection import inspect
-from lensmodel.photo.metadata import is_placeholder, read_metadata
-from lensmodel.photo.model import (
+from lensmodel.photo.noise import estimate_noise
+from lensmodel.photo.raw import Demosaic
+from lensmodel.photo.tags.metadata import is_placeholder, read_metadata
+from lensmodel.photo.values import (
     ColorSpace,
     Encoding,
     FileKind,
@@ -14,9 +17,6 @@ from lensmodel.photo.model import (
     PhotoInfo,
     PhotoMetadata,
 )
-from lensmodel.photo.noise import estimate_noise
-from lensmodel.photo.raw import Demosaic
-from lensmodel.photo.sniffing import HEAD_BYTES, sniff
 from lensmodel.photo.writing import shown, write_image
 
 __all__ = [

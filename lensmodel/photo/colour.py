@@ -16,7 +16,7 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.photo.model import Matrix3, Transfer
+from lensmodel.photo.values import Matrix3, Transfer
 
 CODES: Final = 65536
 Curve: TypeAlias = NDArray[np.float32]

@@ -7,18 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
-from lensmodel.errors import UnreadablePhotoError
-from lensmodel.geometry import Frame
+from lensmodel.core.errors import UnreadablePhotoError
+from lensmodel.core.geometry import Frame
+from lensmodel.core.types import NoiseModel, Planes
 from lensmodel.photo.colour import CODES, curves_of, decode, icc_curves, icc_space
-from lensmodel.photo.containers import opened_header
-from lensmodel.photo.header import Header
+from lensmodel.photo.headers.header import Header
+from lensmodel.photo.headers.opening import opened_header
 from lensmodel.photo.inspection import info_of
-from lensmodel.photo.metadata import baseline_exposure_of
-from lensmodel.photo.model import Encoding, Limits, LinearPhoto, PhotoInfo, PlaneNoise, Transfer
 from lensmodel.photo.noise import coding_noise, estimate_noise, graininess
 from lensmodel.photo.raster import Pixels, read_pixels
-from lensmodel.photo.raw import Demosaic, develop_raw
-from lensmodel.types import Planes
+from lensmodel.photo.raw import Demosaic, develop_raw, stored_levels
+from lensmodel.photo.tags.metadata import baseline_exposure_of
+from lensmodel.photo.values import Encoding, Limits, LinearPhoto, PhotoInfo, PlaneNoise, Transfer
 
 
 def develop(path: Path | str, *, limits: Limits | None = None, demosaic: Demosaic = "default") -> LinearPhoto:
@@ -47,11 +47,11 @@ def develop(path: Path | str, *, limits: Limits | None = None, demosaic: Demosai
     with opened_header(path, limits) as header:
         info = info_of(path, header, limits)
         if info.kind in {"raw", "dng"}:
-            return _develop_raw(path, info, demosaic, baseline_exposure_of(header))
+            return _develop_raw(path, header, info, demosaic)
         return _develop_raster(path, header, info)
 
 
-def _develop_raw(path: Path, info: PhotoInfo, demosaic: Demosaic, baseline: float | None) -> LinearPhoto:
+def _develop_raw(path: Path, header: Header, info: PhotoInfo, demosaic: Demosaic) -> LinearPhoto:
     raw = develop_raw(path, demosaic)
     _, height, width = raw.planes.shape
     metadata, binned = info.metadata, max(round(info.width / width), 1)
@@ -63,7 +63,7 @@ def _develop_raw(path: Path, info: PhotoInfo, demosaic: Demosaic, baseline: floa
         white_balance=raw.white_balance,
         to_srgb=raw.to_srgb,
         xyz_to_camera=raw.xyz_to_camera,
-        baseline_exposure=baseline,
+        baseline_exposure=baseline_exposure_of(header),
     )
     return LinearPhoto(
         planes=raw.planes,
@@ -75,9 +75,21 @@ def _develop_raw(path: Path, info: PhotoInfo, demosaic: Demosaic, baseline: floa
         pipeline=raw.pipeline,
         white_balance=raw.white_balance,
         sensor_noise=raw.sensor_noise,
+        coding_noise=_coding_noise(raw.planes, header.coarseness),
         cfa=raw.cfa,
         grain=(1.0, 1.0, 1.0) if raw.sensor_noise is not None else _grain(raw.planes, raw.noise, raw.clip),
     )
+
+
+def _coding_noise(planes: Planes, coarseness: float) -> NoiseModel | None:
+    """Noise of a lossy DNG's compression; `None` where there was none.
+
+    Which light its eight-bit numbers stand for is read from the planes: from the one that shows most of them.
+    """
+    if not coarseness:
+        return None
+    levels = [found for plane in planes if (found := stored_levels(plane)) is not None]
+    return coding_noise(coarseness, max(levels, key=len)) if levels else None
 
 
 def _develop_raster(path: Path, header: Header, info: PhotoInfo) -> LinearPhoto:
@@ -110,6 +122,7 @@ def _develop_raster(path: Path, header: Header, info: PhotoInfo) -> LinearPhoto:
         pipeline=f"{info.kind}/{transfer}/1",
         grain=_grain(planes, (noise[0], noise[1], noise[2]), (clip,) * 3),
         coding_noise=coding_noise(header.coarseness, curve[::257]) if header.coarseness else None,
+        chroma_step=header.chroma_step,
     )
 
 

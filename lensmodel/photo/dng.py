@@ -19,8 +19,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lensmodel.errors import InvalidInputError
-from lensmodel.files import atomic
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.files import atomic
 
 BAYER_PATTERNS: Final = ("RGGB", "BGGR", "GRBG", "GBRG")
 
@@ -167,6 +167,7 @@ def write_linear_dng(
     color_matrix: ArrayLike = XYZ_TO_SRGB,
     as_shot_neutral: Sequence[float] = (1.0, 1.0, 1.0),
     shot: ShotInfo | None = None,
+    xmp: bytes = b"",
 ) -> None:
     """Write a demosaiced linear image as a DNG (LinearRaw); the file appears whole or not at all.
 
@@ -179,6 +180,8 @@ def write_linear_dng(
         linear images off the values but not off the white level.
     white, color_matrix, as_shot_neutral, shot
         See `write_bayer_dng`.
+    xmp : bytes
+        A packet to put in.
 
     Raises
     ------
@@ -190,6 +193,8 @@ def write_linear_dng(
     shot = shot or ShotInfo()
     tags = _Directory(_common_tags(planes.shape[1], planes.shape[2], 3, _LINEAR_RAW, shot))
     _colour_tags(tags, 3, black=0, white=white, color_matrix=color_matrix, as_shot_neutral=as_shot_neutral)
+    if xmp:
+        tags.raw(700, _BYTE, xmp)
     _write(Path(path), tags, _exif(shot), planes.transpose(1, 2, 0))
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from lensmodel.errors import NotAnImageError, UnsupportedFormatError
-from lensmodel.photo.containers import opened_header
-from lensmodel.photo.header import Header, check_size
-from lensmodel.photo.metadata import metadata_of
-from lensmodel.photo.model import Limits, PhotoInfo
+from lensmodel.core.errors import NotAnImageError, UnsupportedFormatError
+from lensmodel.photo.headers.header import Header, check_size
+from lensmodel.photo.headers.opening import opened_header
 from lensmodel.photo.raw import raw_size
+from lensmodel.photo.tags.metadata import metadata_of
+from lensmodel.photo.values import Limits, PhotoInfo
 
 MIN_SIDE = 16
 """Smaller pictures are icons, not photos."""

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from lensmodel.errors import InvalidInputError
-from lensmodel.geometry import Frame
-from lensmodel.types import Channel, Plane, Planes
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.geometry import Frame
+from lensmodel.core.types import Channel, Plane, Planes
 
 Polynomial = tuple[float, float, float, float]
 IDENTITY: Polynomial = (0.0, 0.0, 0.0, 1.0)

@@ -9,8 +9,8 @@ import numpy as np
 import rawpy
 from numpy.typing import NDArray
 
-from lensmodel.errors import RawDecodeError, TruncatedImageError
-from lensmodel.types import BayerPattern, Plane
+from lensmodel.core.errors import RawDecodeError, TruncatedImageError
+from lensmodel.core.types import BayerPattern, Plane
 
 _BAND: Final = 16
 """Rows that are judged together by `Mosaic.check`."""

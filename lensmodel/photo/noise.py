@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lensmodel.types import NoiseModel, Plane
+from lensmodel.core.types import NoiseModel, Plane
 
 BLOCK: Final = 8
 """Side of the blocks in pixels: flat places of this size exist in almost any photo."""

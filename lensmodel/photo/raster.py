@@ -13,14 +13,14 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
-from lensmodel.errors import (
+from lensmodel.core.errors import (
     ImageTooLargeError,
     LensModelError,
     NotAnImageError,
     TruncatedImageError,
     UnsupportedFormatError,
 )
-from lensmodel.photo.header import Header
+from lensmodel.photo.headers.header import Header
 
 Pixels: TypeAlias = NDArray[Any]
 """Numbers of a file, `(row, col)` or `(row, col, channel)`."""

@@ -13,19 +13,19 @@ import numpy as np
 import rawpy
 from numpy.typing import NDArray
 
-from lensmodel.errors import (
+from lensmodel.core.errors import (
     InvalidInputError,
     LensModelError,
     RawDecodeError,
     TruncatedImageError,
     UnsupportedFormatError,
 )
+from lensmodel.core.types import BayerPattern, NoiseModel, Plane, Planes
 from lensmodel.photo.colour import SRGB_TO_XYZ_D65, Matrix, camera_to_srgb, matrix3
-from lensmodel.photo.model import Matrix3, PlaneNoise
 from lensmodel.photo.mosaic import Mosaic
 from lensmodel.photo.noise import estimate_noise
 from lensmodel.photo.rendition import balance_of_rendition
-from lensmodel.types import BayerPattern, NoiseModel, Plane, Planes
+from lensmodel.photo.values import Matrix3, PlaneNoise
 
 log = logging.getLogger(__name__)
 
@@ -221,7 +221,7 @@ def _plane_noise(
         shot_c = sum_s M_cs shot_s  w_s / w_c      (where the scene is grey)
     """
     if sensor is None:
-        r, g, b = (estimate_noise(plane, step=1 / _FULL, codes=_codes(plane)) for plane in planes)
+        r, g, b = (estimate_noise(plane, step=1 / _FULL, codes=stored_levels(plane)) for plane in planes)
         return r, g, b
     weight = np.asarray(balance)[None, :] / np.asarray(balance)[:, None]
     mix = _NOISE_MIX[method]
@@ -231,7 +231,7 @@ def _plane_noise(
     return r, g, b
 
 
-def _codes(plane: Plane) -> NDArray[np.floating] | None:
+def stored_levels(plane: Plane) -> NDArray[np.floating] | None:
     """Levels of a plane where they are as few as in files that were rounded to 8 bits and packed."""
     levels = np.unique(plane[:: max(1, plane.shape[0] // 256)])
     return levels if 2 < levels.size <= _FEW_CODES else None

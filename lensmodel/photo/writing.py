@@ -16,9 +16,9 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
-from lensmodel.errors import InvalidInputError
-from lensmodel.files import atomic
-from lensmodel.photo import exif_block
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.files import atomic
+from lensmodel.core.types import Planes
 from lensmodel.photo.colour import (
     D65_TO_D50,
     SRGB_TO_XYZ_D65,
@@ -33,9 +33,10 @@ from lensmodel.photo.colour import (
     matrix3,
 )
 from lensmodel.photo.dng import ShotInfo, write_linear_dng
-from lensmodel.photo.ifd import TiffReader
-from lensmodel.photo.model import ColorSpace, Encoding, OutputFormat
-from lensmodel.types import Planes
+from lensmodel.photo.headers.ifd import TiffReader
+from lensmodel.photo.tags import exif_block
+from lensmodel.photo.tags.xmp_block import xmp_packet
+from lensmodel.photo.values import ColorSpace, Encoding, OutputFormat
 
 _ROWS: Final = 256
 """Rows that are encoded at a time: bounds the memory of the conversion."""
@@ -43,6 +44,7 @@ _ROWS: Final = 256
 _PNG_OPTIONS: Final = {"level": 2, "strategy": 3, "filter": 128}
 """Paeth filter and run lengths: on photos as small as the default search, three times faster."""
 
+XMP_TAG: Final = 700
 _PLACE_OF_POINTER: Final = exif_block.EXIF_POINTER - 1
 
 Pixels: TypeAlias = NDArray[Any]
@@ -68,6 +70,7 @@ def write_image(
     color_space: ColorSpace = "same",
     quality: int = 95,
     description: str = "",
+    lens: str = "",
 ) -> None:
     """Write planes as a file that shows the picture as its input did.
 
@@ -92,7 +95,9 @@ def write_image(
     quality : int
         JPEG quality, 1 to 100; colour is never subsampled.
     description : str
-        Text for the file's description tag.
+        Text for the file's description tag, and for the history of its XMP packet.
+    lens : str
+        What the owner calls the lens; by default the packet names it as the photo does.
 
     Raises
     ------
@@ -108,19 +113,20 @@ def write_image(
         )
     if not 1 <= quality <= 100:
         raise InvalidInputError(f"JPEG quality must lie in 1..100, got {quality}")
+    xmp = xmp_packet(encoding.metadata, description, lens)
     if format == "dng":
-        _write_dng(Path(path), planes, encoding, description)
+        _write_dng(Path(path), planes, encoding, description, xmp)
         return
     target = _target(encoding, color_space)
     with atomic(Path(path)) as file:
         if format == "jpeg":
             pixels = _encoded(planes, target, 255)
-            _write_jpeg(file, pixels, target.icc, encoding, description, quality=quality)
+            _write_jpeg(file, pixels, target.icc, encoding, description, xmp, quality=quality)
         elif format == "tiff16":
-            _write_tiff(file, _encoded(planes, target, 65535), target.icc, encoding, description)
+            _write_tiff(file, _encoded(planes, target, 65535), target.icc, encoding, description, xmp)
         else:
             top = 255 if format == "png8" else 65535
-            _write_png(file, _encoded(planes, target, top), target.icc, encoding, description)
+            _write_png(file, _encoded(planes, target, top), target.icc, encoding, description, xmp)
 
 
 # --- colour ------------------------------------------------------------------------------------
@@ -178,11 +184,14 @@ def _encoded(planes: Planes, target: _Target, top: int) -> Pixels:
 # --- files -------------------------------------------------------------------------------------
 
 
-def _write_tiff(file: BinaryIO, pixels: Pixels, icc: bytes, encoding: Encoding, description: str) -> None:
+def _write_tiff(
+    file: BinaryIO, pixels: Pixels, icc: bytes, encoding: Encoding, description: str, xmp: bytes
+) -> None:
     fields = exif_block.main_fields(encoding.metadata, encoding.orientation, description)
     extra: list[tuple[int, int, int, bytes | int, bool]] = [
         (f.tag, f.kind, f.count, f.data, True) for f in fields if f.tag != exif_block.SOFTWARE_TAG
     ]
+    extra.append((XMP_TAG, 1, len(xmp), xmp, True))
     extra.append((_PLACE_OF_POINTER, 4, 1, 0, True))
     tifffile.imwrite(
         file,
@@ -210,27 +219,44 @@ def _write_tiff(file: BinaryIO, pixels: Pixels, icc: bytes, encoding: Encoding, 
 
 
 def _write_jpeg(
-    file: BinaryIO, pixels: Pixels, icc: bytes, encoding: Encoding, description: str, *, quality: int
+    file: BinaryIO,
+    pixels: Pixels,
+    icc: bytes,
+    encoding: Encoding,
+    description: str,
+    xmp: bytes,
+    *,
+    quality: int,
 ) -> None:
     block = exif_block.exif_block(encoding.metadata, encoding.orientation, description)
     Image.fromarray(pixels).save(
-        file, "JPEG", quality=quality, subsampling=0, optimize=True, icc_profile=icc, exif=b"Exif\0\0" + block
+        file,
+        "JPEG",
+        quality=quality,
+        subsampling=0,
+        optimize=True,
+        icc_profile=icc,
+        exif=b"Exif\0\0" + block,
+        xmp=xmp,
     )
 
 
-def _write_png(file: BinaryIO, pixels: Pixels, icc: bytes, encoding: Encoding, description: str) -> None:
+def _write_png(
+    file: BinaryIO, pixels: Pixels, icc: bytes, encoding: Encoding, description: str, xmp: bytes
+) -> None:
     upright = np.ascontiguousarray(_UPRIGHT[encoding.orientation](pixels))
     data = imagecodecs.png_encode(upright, **_PNG_OPTIONS)
     header_end = 33  # signature and IHDR; the profile must come before the pixels
     file.write(data[:header_end])
     file.write(_chunk(b"iCCP", b"ICC\0\0" + zlib.compress(icc)))
     file.write(_chunk(b"eXIf", exif_block.exif_block(encoding.metadata, 1, description)))
+    file.write(_chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + xmp))
     if description:
         file.write(_chunk(b"tEXt", b"Description\0" + description.encode("latin-1", "replace")))
     file.write(data[header_end:])
 
 
-def _write_dng(path: Path, planes: Planes, encoding: Encoding, description: str) -> None:
+def _write_dng(path: Path, planes: Planes, encoding: Encoding, description: str, xmp: bytes) -> None:
     metadata = encoding.metadata
     rgb_icc = encoding.icc if encoding.icc is not None and icc_space(encoding.icc) == "RGB" else None
     to_camera = encoding.xyz_to_camera
@@ -259,7 +285,9 @@ def _write_dng(path: Path, planes: Planes, encoding: Encoding, description: str)
     for row in range(0, planes.shape[1], _ROWS):
         part = np.clip(planes[:, row : row + _ROWS], 0.0, 1.0)
         numbers[:, row : row + _ROWS] = np.rint(part * np.float32(65535))
-    write_linear_dng(path, numbers, color_matrix=to_camera, as_shot_neutral=(1 / r, 1 / g, 1 / b), shot=shot)
+    write_linear_dng(
+        path, numbers, color_matrix=to_camera, as_shot_neutral=(1 / r, 1 / g, 1 / b), shot=shot, xmp=xmp
+    )
 
 
 def _chunk(name: bytes, body: bytes) -> bytes:

@@ -2,7 +2,7 @@
 
 from lensmodel.quality.charts import EdgeMeasurement, ZoneSharpness, by_zone, measure_edges
 from lensmodel.quality.edge import EdgeResponse, crossing, pixel_mtf, slanted_edge
-from lensmodel.quality.find import edge_gains, find_edges
+from lensmodel.quality.edge_finder import edge_gains, find_edges
 from lensmodel.quality.images import (
     best_shift,
     flat_noise,

@@ -11,10 +11,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.errors import InvalidInputError, NotEnoughEvidenceError
-from lensmodel.geometry import Frame, zone_of
+from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.core.geometry import Frame, zone_of
+from lensmodel.core.types import ZONES, FieldPosition, Zone
 from lensmodel.quality.edge import EdgeResponse, slanted_edge
-from lensmodel.types import ZONES, FieldPosition, Zone
 
 logger = logging.getLogger(__name__)
 

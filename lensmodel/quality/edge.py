@@ -27,7 +27,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
-from lensmodel.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 
 OVERSAMPLING: Final = 4
 """Bins a pixel of the edge spread function."""

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy import fft
 from skimage.metrics import structural_similarity
 
-from lensmodel.errors import InvalidInputError
-from lensmodel.geometry import CENTER_ZONE_R, CORNER_ZONE_R, Frame
-from lensmodel.types import ZONES, Zone
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.geometry import CENTER_ZONE_R, CORNER_ZONE_R, Frame
+from lensmodel.core.types import ZONES, Zone
 
 _SSIM_WINDOW: Final = 11
 _SHIFT_STEPS: Final = 6

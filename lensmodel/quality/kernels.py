@@ -8,10 +8,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lensmodel.errors import InvalidInputError
-from lensmodel.psf import as_kernel, centroid
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.psf import as_kernel, centroid
+from lensmodel.core.types import Kernel
 from lensmodel.quality.edge import crossing
-from lensmodel.types import Kernel
 
 _FREQUENCIES: Final = 513
 _FINE: Final = 8

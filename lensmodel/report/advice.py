@@ -16,9 +16,9 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Final
 
-from lensmodel.regression import LensModel, PsfAnswer
+from lensmodel.core.types import CHANNELS, Channel, FieldPosition, LensSettings
+from lensmodel.model import LensModel, PsfAnswer
 from lensmodel.report.places import landmarks, little_seen, place_in_words
-from lensmodel.types import CHANNELS, Channel, FieldPosition, LensSettings
 
 _SIZE: Final = 15  # the kernel itself plays no part
 _SETTINGS: Final = 24

@@ -29,13 +29,12 @@ from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
-from lensmodel.geometry import zone_of
-from lensmodel.psf import PsfSample, second_moments
-from lensmodel.regression import LensModel
+from lensmodel.core.geometry import zone_of
+from lensmodel.core.psf import PsfSample, second_moments
+from lensmodel.core.types import ZONES, LensSettings, Zone
+from lensmodel.model import LensModel
 from lensmodel.report.places import direction_in_words
-from lensmodel.types import ZONES, LensSettings, Zone
 
 Verdict = Literal["centred", "decentred", "unknown"]
 
@@ -47,7 +46,7 @@ _NEAR_STOPS: Final = 0.7
 _FEWEST: Final = 12
 _SOFTER: Final = 0.10  # less is not seen between two sides of a print
 _COMATIC: Final = 0.15  # third moment over width cubed, at the middle of the picture
-_UNSURE_PERCENT: Final = 40.0  # sides that may differ by more are not called alike
+_UNSURE_PERCENT: Final = 40.0  # sides that may differ by more, error and all, are not called alike
 _CHANCE: Final = 0.01
 _WING: Final = 0.01
 
@@ -249,13 +248,22 @@ def _asymmetry(fit: _Fit, groups: NDArray[np.intp], scale: float) -> Asymmetry:
             error, freedom = by_photo, photos
     length = float(np.hypot(*vector))
     # |g|^2 / (2 s^2) is distributed as F with 2 and 2 (n - 1) degrees where there is only chance
-    limit = math.sqrt(2.0 * float(stats.f.ppf(1.0 - _CHANCE, 2, 2 * max(freedom, 1))))
+    limit = math.sqrt(2.0 * _exceeded_by_chance(max(freedom, 1)))
     return Asymmetry(
         amount=scale * length,
         direction=math.atan2(float(vector[1]), float(vector[0])),
         error=scale * error,
         significant=length > limit * error,
     )
+
+
+def _exceeded_by_chance(half_freedom: int) -> float:
+    """Value that F with 2 and 2 m degrees exceeds with probability p = `_CHANCE`.
+
+    Its survival function is (1 + x / m)^-m: the integral of the density of F with two degrees above has a
+    closed form, and `scipy.stats`, half a second of imports, is not needed for it.
+    """
+    return half_freedom * (_CHANCE ** (-1.0 / half_freedom) - 1.0)
 
 
 def _jackknife(fit: _Fit, groups: NDArray[np.intp]) -> tuple[float, int]:
@@ -283,7 +291,7 @@ def _verdict(softer: Asymmetry, coma: Asymmetry | None, photos: int) -> tuple[Ve
     if not signs:
         spread = 100.0 * math.expm1(2.0 * softer.error)
         sides = 100.0 * math.expm1(softer.amount)
-        if max(spread, sides) > _UNSURE_PERCENT:
+        if sides + spread > _UNSURE_PERCENT:
             return "unknown", (
                 f"{told} cannot tell whether the lens is centred: opposite sides differ by "
                 f"{sides:.0f} %, give or take {spread:.0f} %"

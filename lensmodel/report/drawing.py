@@ -26,13 +26,14 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """One text; `anchor` is start, middle or end."""
+    """One text; `anchor` is start, middle or end, `size` that of the font in pixels."""
 
     x: float
     y: float
     text: str
     colour: str = INK
     anchor: str = "start"
+    size: float = 12.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +47,30 @@ class Box:
     colour: str
 
 
-Part: TypeAlias = Line | Label | Box
+@dataclass(frozen=True, slots=True)
+class Area:
+    """One filled polygon, so pale that what lies under it is seen."""
+
+    points: tuple[tuple[float, float], ...]
+    colour: str
+    opacity: float = 0.18
+
+
+Part: TypeAlias = Line | Label | Box | Area
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """A picture of parts in picture coordinates, y downwards; it is written as SVG or into a PDF."""
+
+    title: str
+    width: int
+    height: int
+    parts: tuple[Part, ...]
+
+    def svg(self) -> str:
+        """Return the text of an SVG file."""
+        return svg(self.title, self.width, self.height, self.parts)
 
 
 def svg(title: str, width: int, height: int, parts: Sequence[Part]) -> str:
@@ -108,6 +132,12 @@ class Axes:
         points = tuple(self.place(x, y) for x, y in zip(xs, ys, strict=True))
         return Line(points, colour, 2.0, dashed)
 
+    def band(self, xs: Sequence[float], ys: Sequence[float], errors: Sequence[float], colour: str) -> Area:
+        """The area of one standard error around a curve."""
+        above = [self.place(x, y + e) for x, y, e in zip(xs, ys, errors, strict=True)]
+        below = [self.place(x, y - e) for x, y, e in zip(xs, ys, errors, strict=True)]
+        return Area(tuple(above + below[::-1]), colour)
+
     def key(self, number: int, text: str, colour: str, *, dashed: bool = False) -> list[Part]:
         """A line of the legend, to the right of the area."""
         x, y = self.right + 14, self.top + 12 + 20 * number
@@ -127,7 +157,8 @@ def _line(line: Line) -> str:
 
 def _label(label: Label) -> str:
     place = f'x="{label.x:.1f}" y="{label.y:.1f}" text-anchor="{label.anchor}"'
-    return f'<text {place} fill="{label.colour}">{escape(label.text)}</text>'
+    size = "" if label.size == 12.0 else f' font-size="{label.size:g}"'
+    return f'<text {place} fill="{label.colour}"{size}>{escape(label.text)}</text>'
 
 
 def _box(box: Box) -> str:
@@ -135,4 +166,14 @@ def _box(box: Box) -> str:
     return f'<rect x="{box.x:.1f}" y="{box.y:.1f}" {size} fill="{box.colour}"/>'
 
 
-_WRITERS: Final[dict[type[Part], Callable[..., str]]] = {Line: _line, Label: _label, Box: _box}
+def _area(area: Area) -> str:
+    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in area.points)
+    return f'<polygon points="{points}" fill="{area.colour}" fill-opacity="{area.opacity:g}"/>'
+
+
+_WRITERS: Final[dict[type[Part], Callable[..., str]]] = {
+    Line: _line,
+    Label: _label,
+    Box: _box,
+    Area: _area,
+}

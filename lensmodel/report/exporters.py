@@ -22,12 +22,12 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
-from lensmodel.errors import InvalidInputError
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.registry import Registry
+from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.model import LensModel
 from lensmodel.quality import mtf_from_kernel, tangential_sagittal_mtf50
-from lensmodel.registry import Registry
-from lensmodel.regression import LensModel
 from lensmodel.report.places import DEFAULT_ASPECT, grid
-from lensmodel.types import FieldPosition, LensSettings
 
 FREQUENCIES: Final = tuple(round(0.05 * i, 2) for i in range(1, 11))
 """Cycles/pixel of the MTF table, up to the Nyquist frequency."""

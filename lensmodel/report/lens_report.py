@@ -1,7 +1,7 @@
 """The report on one copy of a lens: sharpness over the field, best aperture, centring.
 
 Everything follows from the model and its samples. Frequencies are cycles/pixel; where the samples
-know their pixel pitch, the curves are drawn at 10 and 30 line pairs per millimetre, as lens tests are.
+know their pixel pitch, the curves are drawn at 10 to 40 line pairs per millimetre, as lens tests are.
 Tangential is the contrast along u (of lines across the radius), sagittal along v.
 """
 
@@ -14,17 +14,21 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.errors import InvalidInputError
-from lensmodel.psf import second_moments
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.psf import second_moments
+from lensmodel.core.types import ZONES, FieldPosition, Kernel, LensSettings, Zone
+from lensmodel.model import LensModel
 from lensmodel.quality import mtf_from_kernel, tangential_sagittal_mtf50
-from lensmodel.regression import LensModel
 from lensmodel.report.decentring import Decentring, decentring
 from lensmodel.report.places import DEFAULT_ASPECT, grid, ring
-from lensmodel.types import ZONES, FieldPosition, Kernel, LensSettings, Zone
+from lensmodel.report.units import Sensor
 
-LINE_PAIRS_MM: Final = (10.0, 30.0)
-FALLBACK_FREQUENCIES: Final = (0.05, 0.15)
-"""Cycles/pixel of the curves where no pixel pitch is known: 10 and 30 lp/mm at 5 micrometres."""
+_STEPS_MM: Final = (50.0, 20.0, 10.0)
+"""Curves are drawn at one to four times such a step in lp/mm: 10 to 40, as lens tests are, and for sensors
+with small pixels at the largest of which four lie below half of the Nyquist frequency (chosen)."""
+
+FALLBACK_FREQUENCIES: Final = (0.05, 0.1, 0.15, 0.2)
+"""Cycles/pixel of the curves where no pixel pitch is known: 10 to 40 lp/mm at 5 micrometres."""
 
 _RADII: Final = tuple(float(r) for r in np.linspace(0.0, 0.95, 11).round(4))
 _RING: Final = 3
@@ -46,7 +50,8 @@ class ReportSettings:
     size : int
         Odd side of the kernels, pixels.
     frequencies : tuple of float
-        Of the curves, cycles/pixel; empty: 10 and 30 lp/mm by the samples' pixel pitch, or 0.05 and 0.15.
+        Of the curves, cycles/pixel; empty: 10, 20, 30 and 40 lp/mm
+        by the samples' pixel pitch, or 0.05 to 0.2.
     """
 
     rows: int = 7
@@ -286,10 +291,13 @@ def _frequencies(options: ReportSettings, pitch_um: float | None) -> list[tuple[
     if options.frequencies or pitch_um is None:
         chosen = options.frequencies or FALLBACK_FREQUENCIES
         return [(f, None if pitch_um is None else f * 1000.0 / pitch_um) for f in chosen]
-    pairs = [(lp * pitch_um / 1000.0, lp) for lp in LINE_PAIRS_MM]
+    nyquist = 500.0 / pitch_um
+    step = next((step for step in _STEPS_MM if 4.0 * step <= nyquist / 2.0), _STEPS_MM[-1])
+    pairs = [(k * step * pitch_um / 1000.0, k * step) for k in range(1, 5)]
     return [(f, lp) for f, lp in pairs if f <= 0.5]
 
 
+_CYCLES: Final = Sensor()
 _Ring = list[tuple[FieldPosition, Kernel]]
 
 
@@ -326,13 +334,14 @@ def _shape(rings: list[_Ring]) -> FieldShape:
     apart = tuple(u - v for u, v in zip(along_u, along_v, strict=True))
     largest = max(range(len(apart)), key=lambda i: abs(apart[i]))
     grown = (along_u[-1] + along_v[-1]) / (along_u[0] + along_v[0])
-    growth = f"the blur grows to {grown:.1f} times its width at the center towards the corners"
+    way = "grows" if grown >= 1.0 else "shrinks"
+    growth = f"the blur {way} to {grown:.1f} times its width at the center towards the corners"
     if abs(apart[largest]) < _EVEN_PX:
         text = f"points stay round over the field; {growth}"
     else:
-        way = "radially" if apart[largest] > 0 else "around the center"
+        along = "radially" if apart[largest] > 0 else "around the center"
         text = (
-            f"points are drawn out {way}, most at r = {_RADII[largest]:.2f} by "
+            f"points are drawn out {along}, most at r = {_RADII[largest]:.2f} by "
             f"{abs(apart[largest]):.2f} px; {growth}"
         )
     return FieldShape(tuple(along_u), tuple(along_v), apart, text)
@@ -368,7 +377,8 @@ def _summary(
     sharpest = max(field, key=lambda point: point.mean)
     softest = min(field, key=lambda point: point.mean)
     lines = [
-        f"MTF50 lies between {softest.mean:.3f} and {sharpest.mean:.3f} cycles/px over the picture",
+        f"MTF50 lies between {_CYCLES.words(softest.mean)} and {_CYCLES.words(sharpest.mean)} cycles/px "
+        "over the picture",
         shape.text,
         centring.text,
     ]

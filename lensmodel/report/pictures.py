@@ -6,17 +6,15 @@ import math
 import textwrap
 from typing import Final
 
-from lensmodel.report.drawing import COLOURS, GREY, INK, Axes, Box, Label, Part, svg
+from lensmodel.report.drawing import COLOURS, GREY, Axes, Box, Label, Part, svg
 from lensmodel.report.lens_report import LensReport
+from lensmodel.report.palette import colour, ink, rgb
 
 WIDTH: Final = 640
 HEIGHT: Final = 400
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 170, 40, 52
 _MARGIN: Final = 20
 _LINE_CHARACTERS: Final = 100
-_SOFT: Final = (127, 29, 29)
-_MIDDLE: Final = (253, 246, 227)
-_SHARP: Final = (11, 110, 153)
 _TICKS: Final = tuple((i / 5, f"{i / 5:.1f}") for i in range(6))
 
 
@@ -33,12 +31,12 @@ def mtf_map_svg(report: LensReport) -> str:
         row, col = divmod(i, report.cols)
         x, y = _MARGIN + col * cell[0], _TOP + row * cell[1]
         share = 0.5 if top <= low else (point.mean - low) / (top - low)
-        fill = _colour(share)
-        parts.append(Box(x, y, cell[0] - 1, cell[1] - 1, _hex(fill)))
+        fill = colour(share)
+        parts.append(Box(x, y, cell[0] - 1, cell[1] - 1, rgb(fill)))
         doubt = "?" if point.extrapolated else ""
         middle = x + cell[0] / 2
         text = f"{point.mean:.3f}".removeprefix("0") + doubt
-        parts.append(Label(middle, y + cell[1] / 2 + 4, text, _ink(fill), "middle"))
+        parts.append(Label(middle, y + cell[1] / 2 + 4, text, ink(fill), "middle"))
     notes = [f"from {low:.3f} (red) to {top:.3f} (blue)"]
     if any(point.extrapolated for point in report.field):
         notes[0] += "; ? no photo shows this place, guessed"
@@ -55,12 +53,12 @@ def curves_svg(report: LensReport) -> str:
     parts: list[Part] = [Label(_LEFT, 24, title)]
     parts += axes.grid(_TICKS, _TICKS, "r: 0 center, 1 corner")
     for i, curve in enumerate(report.curves):
-        colour = COLOURS[i % len(COLOURS)]
+        own = COLOURS[i % len(COLOURS)]
         name = f"{curve.frequency:.3g} c/px" if curve.lp_mm is None else f"{curve.lp_mm:.3g} lp/mm"
-        parts.append(axes.curve(report.radii, curve.sagittal, colour))
-        parts.append(axes.curve(report.radii, curve.tangential, colour, dashed=True))
-        parts += axes.key(2 * i, f"{name} sagittal", colour)
-        parts += axes.key(2 * i + 1, f"{name} tangential", colour, dashed=True)
+        parts.append(axes.curve(report.radii, curve.sagittal, own))
+        parts.append(axes.curve(report.radii, curve.tangential, own, dashed=True))
+        parts += axes.key(2 * i, f"{name} sagittal", own)
+        parts += axes.key(2 * i + 1, f"{name} tangential", own, dashed=True)
     return svg(title, WIDTH, HEIGHT, parts)
 
 
@@ -92,22 +90,3 @@ def _steps(top: float) -> list[tuple[float, str]]:
     power = 10.0 ** math.floor(math.log10(top))
     step = next(power * m for m in (1.0, 0.5, 0.2, 0.1) if top / (power * m) >= 4.0)
     return [(step * i, f"{step * i:.2f}") for i in range(int(top / step + 1e-9) + 1)]
-
-
-def _colour(share: float) -> tuple[int, int, int]:
-    """Dark red for 0 through pale to blue for 1: it also tells apart by lightness and to the colour-blind."""
-    ends = (_SOFT, _MIDDLE) if share < 0.5 else (_MIDDLE, _SHARP)
-    t = 2.0 * share - (share >= 0.5)
-    red, green, blue = (round(a + (b - a) * t) for a, b in zip(*ends, strict=True))
-    return red, green, blue
-
-
-def _hex(colour: tuple[int, int, int]) -> str:
-    return "#" + "".join(f"{value:02x}" for value in colour)
-
-
-def _ink(colour: tuple[int, int, int]) -> str:
-    """Black or white, whichever has more contrast (WCAG 2.2, relative luminance)."""
-    linear = [(v / 255.0 + 0.055) ** 2.4 / 1.055**2.4 if v > 10 else v / 3294.6 for v in colour]
-    luminance = 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
-    return "#ffffff" if luminance < 0.18 else INK

@@ -8,9 +8,9 @@ from typing import Final
 
 import numpy as np
 
-from lensmodel.errors import InvalidInputError
-from lensmodel.geometry import CENTER_ZONE_R, CORNER_ZONE_R
-from lensmodel.types import FieldPosition
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.geometry import CENTER_ZONE_R, CORNER_ZONE_R
+from lensmodel.core.types import FieldPosition
 
 DEFAULT_ASPECT: Final = 1.5
 """Width over height of a 35 mm frame; a profile does not say how wide its photos were."""

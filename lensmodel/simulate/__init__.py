@@ -3,6 +3,7 @@
 from lensmodel.simulate.aberrations import Aberrations
 from lensmodel.simulate.blur import BlurOptions, blurred
 from lensmodel.simulate.camera import SimulatedCamera, SimulatedPhoto, Truth, photograph
+from lensmodel.simulate.camera_jpeg import CAMERA_JPEGS, CameraJpeg
 from lensmodel.simulate.charts import Chart, ChartEdge, edge_area, edge_chart, slanted_edge_scene
 from lensmodel.simulate.draw import LENS_KINDS, draw_lens
 from lensmodel.simulate.files import shot_info, write_photo
@@ -21,10 +22,12 @@ from lensmodel.simulate.scenes import (
 )
 
 __all__ = [
+    "CAMERA_JPEGS",
     "DEMO_SCENES",
     "LENS_KINDS",
     "Aberrations",
     "BlurOptions",
+    "CameraJpeg",
     "CameraLens",
     "Chart",
     "ChartEdge",

@@ -21,7 +21,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.errors import InvalidInputError
+from lensmodel.core.errors import InvalidInputError
 from lensmodel.simulate import pupil
 
 SMALLEST_F: Final = 32.0

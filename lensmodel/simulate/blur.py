@@ -1,7 +1,7 @@
 """Spatially varying blur of a scene by exact kernels.
 
-Independent of `lensmodel.blur` and `lensmodel.deconv` on purpose: what those are tested against
-must not come from them.
+Independent of `lensmodel.correction` and its operators on purpose: what those are tested against must not
+come from them.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.interpolate import CubicSpline
 
-from lensmodel.errors import InvalidInputError
-from lensmodel.geometry import Frame
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.geometry import Frame
+from lensmodel.core.types import CHANNELS, Channel, LensSettings, Planes, StepHook, ignore_step
 from lensmodel.simulate.lens import DEFAULT_PITCH_UM, DEFAULT_SIZE, CameraLens
-from lensmodel.types import CHANNELS, Channel, LensSettings, Planes, StepHook, ignore_step
 
 DEFAULT_STEP: Final = 0.1
 """Distance in half diagonals of the nodes where kernels are exact."""

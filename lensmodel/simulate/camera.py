@@ -11,12 +11,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.errors import InvalidInputError
-from lensmodel.geometry import Frame
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.geometry import Frame
+from lensmodel.core.types import CHANNELS, LensSettings, NoiseModel, Planes, StepHook, ignore_step
 from lensmodel.photo.dng import XYZ_TO_SRGB
 from lensmodel.simulate.blur import BlurOptions, blurred, with_margin
 from lensmodel.simulate.lens import CameraLens
-from lensmodel.types import CHANNELS, LensSettings, NoiseModel, Planes, StepHook, ignore_step
 
 logger = logging.getLogger(__name__)
 

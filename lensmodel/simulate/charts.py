@@ -9,9 +9,9 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.errors import InvalidInputError
-from lensmodel.geometry import Frame, zone_of
-from lensmodel.types import FieldPosition, Planes, Zone
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.geometry import Frame, zone_of
+from lensmodel.core.types import FieldPosition, Planes, Zone
 
 Direction = Literal["tangential", "sagittal"]
 

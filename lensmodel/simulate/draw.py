@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from lensmodel.errors import UnknownMethodError
+from lensmodel.core.errors import UnknownMethodError
 from lensmodel.simulate.aberrations import Aberrations
 from lensmodel.simulate.lens import DEFAULT_PITCH_UM, SimulatedLens
 from lensmodel.simulate.pupil import REFERENCE_UM

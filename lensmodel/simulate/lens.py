@@ -9,10 +9,10 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from lensmodel.errors import InvalidInputError
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.types import WAVELENGTH_NM, Channel, FieldPosition, Kernel, LensSettings
 from lensmodel.simulate import pupil
 from lensmodel.simulate.aberrations import SMALLEST_F, Aberrations, CatsEye, WaveError, ray_statistics
-from lensmodel.types import WAVELENGTH_NM, Channel, FieldPosition, Kernel, LensSettings
 
 DEFAULT_PITCH_UM: Final = 4.5
 DEFAULT_SIZE: Final = 55

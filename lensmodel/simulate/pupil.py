@@ -29,8 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from lensmodel.psf import as_kernel, centroid
-from lensmodel.types import Kernel
+from lensmodel.core.psf import as_kernel, centroid
+from lensmodel.core.types import Kernel
 
 REFERENCE_UM: Final = 0.54
 """Wavelength in micrometres in which wavefront errors are counted."""

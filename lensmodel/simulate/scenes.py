@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 from scipy import fft
 
-from lensmodel.errors import InvalidInputError, NotAnImageError
-from lensmodel.types import Planes
+from lensmodel.core.errors import InvalidInputError, NotAnImageError
+from lensmodel.core.types import Planes
 
 DEMO_SCENES: Final = ("city", "colosseum", "lake", "spices", "tea-gardens")
 """Names of the photographs that come with the library, see lensmodel/demo_data/README.md."""
@@ -55,10 +55,16 @@ def demo_data_path(name: str) -> Path:
     Raises
     ------
     InvalidInputError
-        If there is no such file; the text lists those that exist.
+        If there is no such file; the text lists those that exist. Packages that are installed from a wheel
+        have none of them: they come with the source tree.
     """
     folder = resources.files("lensmodel") / "demo_data"
-    known = sorted(entry.name for entry in folder.iterdir())
+    known = sorted(entry.name for entry in folder.iterdir()) if folder.is_dir() else []
+    if not set(known) - {"README.md"}:
+        raise InvalidInputError(
+            f"the demo photograph {name!r} is not part of an installed package; get the source tree and run "
+            "`make demo` there"
+        )
     if name not in known:
         raise InvalidInputError(f"no demo file {name!r}; known: {', '.join(known)}")
     return Path(str(folder / name))

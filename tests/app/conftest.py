@@ -13,16 +13,15 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from app.ids import new_id
-from app.settings import Settings
+from app.blobs.founding import settle
+from app.blobs.storage import Storage
+from app.runtime.settings import Settings
 from app.store import LensName, NewPatch, NewSample, Store
 from app.store.database import Database
-from app.store.migrate import downgrade, upgrade
-from app.tables import PhotoRow
-from lensmodel.psf import gaussian
-
-# Services of tests keep their data for a moment only; what they compile is kept longer than that.
-os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(__file__).parents[2] / ".pytest_cache" / "numba"))
+from app.store.ids import new_id
+from app.store.tables import PhotoRow
+from app.store.upkeep.migrate import downgrade, upgrade
+from lensmodel.core.psf import gaussian
 
 PLACES = [(0.05, 0.0), (0.3, 0.6), (0.5, 2.2), (0.6, -2.2), (0.8, -0.6), (0.9, 0.59)]
 
@@ -124,6 +123,7 @@ def settings(tmp_path: Path) -> Settings:
         shared_filesystem=True,
         long_poll_seconds=2.0,
         min_free_mb=0,
+        task_niceness=0,  # tests wait for photos too: beside other programs they would starve
         max_upload_mb=1,
         patches=3,  # of so few one is enough: the made-up photos of these tests have two
     )
@@ -150,6 +150,7 @@ def store(settings: Settings, empty_database: Path) -> Iterator[Store]:
     else:
         shutil.copy(empty_database, settings.data_dir / "app.db")
     opened = Store(settings)
+    settle(opened, Storage(settings.storage, create=False))  # before rows that name files which are not there
     yield opened
     opened.close()
 

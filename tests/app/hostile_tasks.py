@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from app.jobs.child import Progress
-from lensmodel.errors import NoUsablePatchesError
+from app.sandbox.child import Progress
+from lensmodel.core.errors import NoUsablePatchesError
 
 
 def add(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
@@ -27,6 +27,14 @@ def add(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str
     progress(1, 2)
     progress(2, 2)
     return {"environment": dict(os.environ), "folder": str(Path.cwd()), "pid": os.getpid()}
+
+
+def weight(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+    session = Path("/proc/self/autogroup")
+    return {
+        "nice": os.getpriority(os.PRIO_PROCESS, 0),
+        "session": session.read_text() if session.exists() else "",
+    }
 
 
 def refuse(arguments: dict[str, Any], folder: Path, progress: Progress) -> None:
@@ -166,6 +174,7 @@ TASKS = {
     f.__name__: f
     for f in (
         add,
+        weight,
         refuse,
         swell,
         spin,

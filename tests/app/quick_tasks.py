@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from app.jobs.child import Progress
-from app.jobs.handover import KERNELS
-from lensmodel.psf import gaussian
+from app.jobs.task_files import KERNELS
+from app.sandbox.child import Progress
+from lensmodel.core.psf import gaussian
 
 CELLS = 8
 SECONDS = 0.3
@@ -57,7 +58,7 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: Progress) -> lis
         "weight": 1.0,
         "estimator": "quick/1",
         "predicted_error": 0.1,
-        "diagnostics": {},
+        "diagnostics": {"worker": float(os.getppid())},  # its fork server: one of each worker
         "evidence": None,
         "spectrum": None,
     }

@@ -1,7 +1,8 @@
 """A worker process whose children run `quick_tasks`."""
 
 if __name__ == "__main__":
-    from app.jobs import sandbox, worker
+    from app.jobs import worker
+    from app.sandbox import runner
 
-    sandbox.TASKS_MODULE = "quick_tasks"
+    runner.TASKS_MODULE = "quick_tasks"
     worker.main()

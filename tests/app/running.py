@@ -7,37 +7,50 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import httpx2
 import numpy as np
+import uvicorn
+from deadline import Deadline, stretched
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from app.main import create_app
+from app.runtime import server
+from app.runtime.idle_connections import impatient
+from app.runtime.settings import Settings
 from lensmodel.photo.dng import ShotInfo, write_bayer_dng
 
 PATIENCE_S = 120.0
+"""Of an idle machine, see `deadline`."""
+
 SETTINGS = {
     "LENS_ESTIMATOR": "whittle",
-    "LENS_PATCHES": "4",
+    "LENS_PATCHES": "2",  # of so few no wavefront is fitted, which takes longer than all the rest
     "LENS_KERNEL_SIZE": "15",
     "LENS_SWEEP_SECONDS": "0.1",
     "LENS_WORKER_SLOTS": "2",
     "LENS_MIN_FREE_MB": "0",
+    "LENS_INSPECT_SECONDS": f"{stretched(20.0):.0f}",
+    "LENS_TASK_NICENESS": "0",  # tests wait for photos too: beside other programs they would starve
 }
-SERVE = [sys.executable, "-m", "app.cli", "serve", "--port", "0", "--data"]
+PROGRAM = [sys.executable, "-m", "app.cli"]
+LIGHT = [sys.executable, str(Path(__file__).with_name("light_service.py"))]
+"""The same whose workers estimate nothing."""
 FINAL = {"succeeded", "failed", "cancelled"}
 
 
 class Service:
     """The whole service as `lensmodel serve` runs it, on a free port."""
 
-    def __init__(self, data: Path, **settings: str) -> None:
-        self.data = data
+    def __init__(self, data: Path, program: Sequence[str] = PROGRAM, **settings: str) -> None:
+        self.data, self._program = data, program
         self.log = data.parent / f"{data.name}.log"
         self._environment = {
             **{name: value for name, value in os.environ.items() if not name.startswith("LENS_")},
@@ -45,13 +58,13 @@ class Service:
             **settings,
         }
         self.process: subprocess.Popen[str] | None = None
-        self.http = httpx2.Client(timeout=60.0)
+        self.http = httpx2.Client(timeout=stretched(60.0))
 
     def start(self) -> None:
         """Start and wait until it says that it is ready."""
         with self.log.open("a") as log:
             self.process = subprocess.Popen(
-                [*SERVE, str(self.data)],
+                [*self._program, "serve", "--port", "0", "--data", str(self.data)],
                 env=self._environment,
                 stdout=subprocess.PIPE,
                 stderr=log,
@@ -66,7 +79,7 @@ class Service:
         """Stop as Ctrl-C does; return the exit status."""
         assert self.process is not None
         self.process.send_signal(signal.SIGTERM)
-        return self.process.wait(30)
+        return self.process.wait(stretched(30))
 
     def close(self) -> None:
         """Leave nothing behind."""
@@ -90,13 +103,13 @@ class Service:
 
     def settled(self, path: str, **options: Any) -> httpx2.Response:
         """Return the answer for a lens once a worker has fitted its model wholly."""
-        end = time.monotonic() + PATIENCE_S
+        deadline = Deadline(PATIENCE_S)
         while True:
             answer = self.http.get(path, **options)
             assert answer.status_code == 200, answer.text
             if "-l-" in answer.headers["etag"]:
                 return answer
-            assert time.monotonic() < end, self.log.read_text()[-4000:]
+            assert not deadline.passed(), self.log.read_text()[-4000:]
             time.sleep(0.1)
 
     def upload(self, path: Path, status: int = 202, **fields: str) -> dict[str, Any]:
@@ -109,12 +122,12 @@ class Service:
 
     def job(self, job_id: str, until: Callable[[dict[str, Any]], object] | None = None) -> dict[str, Any]:
         """Return a job once it ended, or once `until` holds."""
-        end = time.monotonic() + PATIENCE_S
+        deadline = Deadline(PATIENCE_S)
         while True:
             job: dict[str, Any] = self.get(f"/v1/jobs/{job_id}")
             if job["state"] in FINAL or (until is not None and until(job)):
                 return job
-            assert time.monotonic() < end, f"{job}\n{self.log.read_text()[-4000:]}"
+            assert not deadline.passed(), f"{job}\n{self.log.read_text()[-4000:]}"
             time.sleep(0.1)
 
     def calibrated(self, path: Path, **fields: str) -> dict[str, Any]:
@@ -127,15 +140,33 @@ class Service:
 
 
 @contextmanager
-def running(data: Path, **settings: str) -> Iterator[Service]:
+def running(data: Path, program: Sequence[str] = PROGRAM, **settings: str) -> Iterator[Service]:
     """Give a service that runs, and end it afterwards."""
-    service = Service(data, **settings)
+    service = Service(data, program, **settings)
     try:
         service.start()
         yield service
         assert service.stop() == 0, service.log.read_text()[-4000:]
     finally:
         service.close()
+
+
+@contextmanager
+def served(settings: Settings) -> Iterator[int]:
+    """Serve on a real port, in a thread: slow clients need a real connection."""
+    listener = server.listen("127.0.0.1", 0)
+    config = uvicorn.Config(
+        create_app(settings), access_log=False, log_config=None, http=impatient(settings.stall_seconds)
+    )
+    running = uvicorn.Server(config)
+    thread = threading.Thread(target=running.run, kwargs={"sockets": [listener]})
+    thread.start()
+    try:
+        yield listener.getsockname()[1]
+    finally:
+        running.should_exit = True
+        thread.join()
+        listener.close()
 
 
 def scene(seed: int, height: int = 320, width: int = 448) -> NDArray[np.float64]:

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
+from app.blobs.storage import Storage
 from app.client import Client, JobEndedError, JobPatienceError, ServiceProblemError
+from app.demo.own_service import own_service
 from app.main import create_app
-from app.own_service import own_service
+from app.runtime.settings import Settings
 from app.schemas import JobOut
-from app.settings import Settings
-from app.storage import Storage
 from app.store import Store
 from app.store.corrections import Result
-from lensmodel.errors import LensModelError
+from lensmodel.core.errors import LensModelError
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 

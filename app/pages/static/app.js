@@ -1,16 +1,26 @@
 // Behaviour of the pages. Each part looks for its own element and does nothing where there is none.
 
-import { setUpCompare } from "./compare.js";
-import { setUpActions, setUpForms, setUpSettling } from "./forms.js";
-import { setUpField, setUpHistory } from "./lens.js";
+import { setUpActions, setUpForms, setUpGroups, setUpSettling } from "./forms.js";
+import { setUpCharts, setUpField, setUpHistory, setUpLensActions } from "./lens.js";
+import { setUpMeasure } from "./measure.js";
 import { setUpPhoto } from "./photo.js";
+import { setUpPreview } from "./preview.js";
+import { setUpSignIn, setUpSignOut } from "./session.js";
+import { setUpStream } from "./stream.js";
 import { setUpUpload } from "./upload.js";
+import { setUpViewer } from "./view_tools.js";
 
 setUpUpload();
 setUpForms();
+setUpGroups();
 setUpActions();
-setUpSettling();
 setUpField();
+setUpCharts();
+setUpLensActions();
 setUpHistory();
 setUpPhoto();
-setUpCompare();
+setUpMeasure();
+setUpSignIn();
+setUpSignOut();
+setUpPreview(setUpViewer());
+setUpStream(setUpSettling());

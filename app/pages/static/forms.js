@@ -6,11 +6,11 @@ function setUpForm(id, act) {
   const form = byId(id);
   if (!form) return;
   const error = form.querySelector(".alert");
-  form.querySelector("button").disabled = false; // until now a click would have gone nowhere
+  const button = form.querySelector("button");
+  button.disabled = false; // until now a click would have gone nowhere
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
     error.hidden = true;
-    const button = form.querySelector("button");
     button.disabled = true;
     try {
       await act(new FormData(form), form.dataset.photo);
@@ -24,16 +24,10 @@ function setUpForm(id, act) {
 
 export function setUpForms() {
   setUpForm("name-lens", async (fields, photo) => {
-    const change = {};
     const known = !fields.has("label"); // the lens: only its aperture is asked for
-    const label = fields.get("label")?.trim();
-    if (label) change.new_lens = { label };
-    else if (fields.get("lens_id")) change.lens_id = fields.get("lens_id");
-    else if (!known) throw new Error("Choose a lens, or give a new one a name.");
-    const aperture = (fields.get("aperture") ?? "").replace(",", ".").trim();
-    if (aperture) change.aperture = Number(aperture);
-    else if (known) throw new Error("Give the aperture, a number such as 2.8.");
-    if (Number.isNaN(change.aperture)) throw new Error(`The aperture must be a number such as 2.8, not "${aperture}".`);
+    const change = { ...namedLens(fields), ...givenAperture(fields) };
+    if (known && !change.aperture) throw new Error("Give the aperture, a number such as 2.8.");
+    if (!known && !change.lens_id && !change.new_lens) throw new Error("Choose a lens, or give a new one a name.");
     await send("PATCH", `/v1/photos/${photo}`, change);
     location.reload();
   });
@@ -42,16 +36,34 @@ export function setUpForms() {
       photo_id: photo,
       method: fields.get("method"),
       strength: Number(fields.get("strength")),
+      texture: Number(fields.get("texture")),
+      denoise: Number(fields.get("denoise")),
       output: { format: fields.get("format") },
     };
     if (fields.get("lens_id")) wish.lens_id = fields.get("lens_id");
     const made = await send("POST", "/v1/corrections", wish);
     location.assign(`/corrections/${made.id}`);
   });
-  const strength = document.querySelector("#correct [name=strength]");
-  strength?.addEventListener("input", () => {
-    byId("strength-words").textContent = strength.value === "1" ? "full" : `${Math.round(strength.value * 100)} %`;
-  });
+  const ends = { strength: ["none", "full"], texture: ["none", "all"], denoise: ["none", "all"] };
+  for (const output of document.querySelectorAll("#correct output")) {
+    const slider = byId("correct").elements[output.dataset.for];
+    const [least, most] = ends[slider.name];
+    const say = () => {
+      const value = Number(slider.value);
+      output.textContent = value === 0 ? least : value === 1 ? most : `${Math.round(value * 100)} %`;
+      slider.setAttribute("aria-valuetext", output.textContent);
+    };
+    slider.addEventListener("input", say);
+    say();
+  }
+  const stop = byId("stop-correction");
+  if (stop) {
+    stop.disabled = false;
+    stop.addEventListener("click", async () => {
+      stop.disabled = true;
+      await send("POST", `/v1/jobs/${stop.dataset.id}/cancel`).catch(() => {}); // it may be done already
+    });
+  }
 }
 
 export function setUpActions() {
@@ -61,6 +73,7 @@ export function setUpActions() {
   const error = holder.querySelector(".alert");
   const acts = {
     cancel: () => send("POST", `/v1/jobs/${photo}/cancel`),
+    retry: () => send("POST", `/v1/jobs/${photo}/retry`),
     exclude: () => send("PATCH", `/v1/photos/${photo}`, { excluded: true }),
     include: () => send("PATCH", `/v1/photos/${photo}`, { excluded: false }),
     delete: async () => {
@@ -87,11 +100,50 @@ export function setUpActions() {
 
 // A page whose work has come to its end shows the result.
 export function setUpSettling() {
-  for (const id of ["photo-state", "correction-state", "lens-state"]) {
-    const first = byId(id);
-    if (!first || "settled" in first.dataset) continue;
-    document.addEventListener("htmx:after:swap", () => {
-      if ("settled" in (byId(id)?.dataset ?? {})) location.reload();
+  const open = [...document.querySelectorAll("[id$='-state']")].filter((part) => !part.querySelector("[data-settled]"));
+  return (name) => {
+    const part = byId(name);
+    if (open.includes(part) && part.querySelector("[data-settled]")) location.reload();
+    if (name === "waiting") setUpGroups();
+  };
+}
+
+// Photos that do not say their lens, named group by group.
+export function setUpGroups() {
+  for (const form of document.querySelectorAll("[data-group]:not([data-ready])")) {
+    form.dataset.ready = "";
+    const error = form.querySelector(".alert");
+    const button = form.querySelector("button");
+    form.addEventListener("submit", async (event) => {
+      event.preventDefault();
+      error.hidden = true;
+      try {
+        const fields = new FormData(form);
+        const change = { photo_ids: fields.getAll("photo"), ...namedLens(fields), ...givenAperture(fields) };
+        if (!change.photo_ids.length) throw new Error("Choose at least one photo of this group.");
+        if (!change.lens_id && !change.new_lens) throw new Error("Choose a lens, or give a new one a name.");
+        button.disabled = true;
+        await send("PATCH", "/v1/photos", change);
+        byId("announce").textContent = `${change.photo_ids.length} photos go on.`;
+      } catch (reason) {
+        error.textContent = reason.message;
+        error.hidden = false;
+      }
+      button.disabled = false;
     });
   }
+}
+
+function namedLens(fields) {
+  const label = fields.get("label")?.trim();
+  if (label) return { new_lens: { label } };
+  return fields.get("lens_id") ? { lens_id: fields.get("lens_id") } : {};
+}
+
+function givenAperture(fields) {
+  const text = (fields.get("aperture") ?? "").replace(",", ".").replace(/^f\/?/i, "").trim();
+  if (!text) return {};
+  const aperture = Number(text);
+  if (Number.isNaN(aperture)) throw new Error(`The aperture must be a number such as 2.8, not "${text}".`);
+  return { aperture };
 }

@@ -1,8 +1,8 @@
 // The lens: its map of blur, the blur at a point, and how its error fell.
 
-import { byId, problemText } from "./common.js";
+import { byId, problemText, send } from "./common.js";
 
-const ASPECT = 1.5;
+const LEAST_VIEW = 0.02; // of the picture: the blur changes no more over less
 const ZONES = [
   ["center", "Center", []],
   ["mid", "Middle", [8, 4]],
@@ -42,34 +42,49 @@ function tell(list, pairs) {
   );
 }
 
+// Cells of the map: as many as its shape holds, about 50 in all, fewer on a phone.
+function gridFor(aspect, width) {
+  const count = width < 500 ? 24 : 54;
+  const rows = Math.max(2, Math.round(Math.sqrt(count / aspect)));
+  return [Math.max(2, Math.round(rows * aspect)), rows];
+}
+
 export function setUpField() {
   const field = byId("field");
   if (!field) return;
   const controls = byId("field-controls");
   const [map, spot] = [field.querySelector("img"), field.querySelector(".spot")];
   const lens = `/v1/lenses/${field.dataset.lens}`;
-  const [columns, rows] = field.clientWidth < 500 ? [6, 4] : [9, 6];
-  let [x, y] = [1 - 0.5 / columns, 0.5 / rows];
+  const aspect = Number(field.dataset.aspect);
+  const [columns, rows] = gridFor(aspect, field.clientWidth);
+  const dots = byId("coverage");
+  let view = { left: 0, top: 0, size: 1 }; // the part of the picture that is shown, in shares of it
+  let [x, y] = [1 - 0.5 / columns, 0.5 / rows]; // the point, in shares of the picture
   let asked = 0;
   const settings = () => {
     const chosen = new URLSearchParams(new FormData(controls));
-    if (!chosen.get("aperture")) chosen.delete("aperture");
+    for (const name of ["aperture", "version"]) if (!chosen.get(name)) chosen.delete(name);
     return chosen;
   };
   const showPoint = async () => {
-    spot.style.left = `${x * 100}%`;
-    spot.style.top = `${y * 100}%`;
-    const [right, up] = [(2 * x - 1) * ASPECT, 1 - 2 * y];
-    const r = Math.min(1, Math.hypot(right, up) / Math.hypot(ASPECT, 1));
+    spot.style.left = `${((x - view.left) / view.size) * 100}%`;
+    spot.style.top = `${((y - view.top) / view.size) * 100}%`;
+    const [right, up] = [(2 * x - 1) * aspect, 1 - 2 * y];
+    const r = Math.min(1, Math.hypot(right, up) / Math.hypot(aspect, 1));
     const query = settings();
     query.set("r", r.toFixed(4));
     query.set("phi", Math.atan2(up, right).toFixed(4));
     for (const kind of ["json", "npy", "tiff"]) byId(`psf-${kind}`).href = `${lens}/psf.${kind}?${query}`;
     asked += 1;
     const mine = asked;
-    const response = await fetch(`${lens}/psf.json?${query}`);
-    const failed = response.ok ? null : await problemText(response);
-    const answer = response.ok ? await response.json() : null;
+    let [answer, failed] = [null, null];
+    try {
+      const response = await fetch(`${lens}/psf.json?${query}`);
+      if (response.ok) answer = await response.json();
+      else failed = await problemText(response);
+    } catch {
+      failed = "The service does not answer. Try again in a moment.";
+    }
     if (mine !== asked) return; // the point has moved on meanwhile
     const where = r < 0.02 ? "In the center" : `${Math.round(r * 100)} % of the way to the corner`;
     if (failed) {
@@ -94,28 +109,140 @@ export function setUpField() {
   };
   const showField = () => {
     field.classList.add("loading");
-    map.src = `${lens}/field.png?grid=${columns}x${rows}&${settings()}`;
+    const query = settings();
+    query.set("grid", `${columns}x${rows}`);
+    query.set("aspect", aspect.toFixed(4));
+    query.set("view", [view.left, view.top, view.size, view.size].map((share) => String(Number(share.toFixed(6)))).join(","));
+    map.src = `${lens}/field.png?${query}`;
+    dots.setAttribute("viewBox", `${view.left} ${view.top} ${view.size} ${view.size}`);
     showPoint();
   };
+  const zoom = (factor) => {
+    const size = Math.min(1, Math.max(LEAST_VIEW, view.size * factor));
+    const within = (at) => Math.min(1 - size, Math.max(0, at - size / 2));
+    view = { left: within(x), top: within(y), size };
+    showField();
+  };
+  const follow = () => {
+    const outside = x < view.left || x > view.left + view.size || y < view.top || y > view.top + view.size;
+    if (outside) zoom(1);
+    else showPoint();
+  };
   for (const kind of ["load", "error"]) map.addEventListener(kind, () => field.classList.remove("loading"));
+  map.addEventListener("load", () => (map.alt = "The blur of the lens over the picture"));
   field.addEventListener("click", (event) => {
     const box = field.getBoundingClientRect();
-    [x, y] = [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
+    x = view.left + (view.size * (event.clientX - box.left)) / box.width;
+    y = view.top + (view.size * (event.clientY - box.top)) / box.height;
     showPoint();
   });
+  field.addEventListener("dblclick", () => zoom(0.5));
   field.addEventListener("keydown", (event) => {
     const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
-    if (!step) return;
+    const factor = { "+": 0.5, "=": 0.5, "-": 2 }[event.key];
+    if (!step && !factor) return;
     event.preventDefault();
-    x = Math.min(1, Math.max(0, x + step[0] / (2 * columns)));
-    y = Math.min(1, Math.max(0, y + step[1] / (2 * rows)));
-    showPoint();
+    if (factor) {
+      zoom(factor);
+      return;
+    }
+    x = Math.min(1, Math.max(0, x + (step[0] * view.size) / (2 * columns)));
+    y = Math.min(1, Math.max(0, y + (step[1] * view.size) / (2 * rows)));
+    follow();
   });
+  for (const button of controls.querySelectorAll("[data-zoom]")) {
+    button.disabled = false;
+    button.addEventListener("click", () => zoom(Number(button.dataset.zoom)));
+  }
   controls.addEventListener("change", showField);
   controls.addEventListener("submit", (event) => event.preventDefault());
   const seen = byId("show-coverage");
-  seen.addEventListener("change", () => byId("coverage").toggleAttribute("hidden", !seen.checked));
+  const showDots = () => dots.toggleAttribute("hidden", !seen.checked);
+  seen.addEventListener("change", showDots);
+  showDots(); // ticked before this script was there
   showField();
+}
+
+// Charts of another aperture, in another unit, or beside another lens: drawn by the service.
+export function setUpCharts() {
+  const controls = byId("chart-controls");
+  if (!controls) return;
+  const holder = byId("charts");
+  controls.addEventListener("submit", (event) => event.preventDefault());
+  controls.addEventListener("change", async () => {
+    holder.classList.add("loading");
+    try {
+      const response = await fetch(`/ui/lenses/${controls.dataset.lens}/charts?${new URLSearchParams(new FormData(controls))}`);
+      if (!response.ok) throw new Error(response.status === 409 ? "There are no charts of that lens yet." : await problemText(response));
+      holder.innerHTML = await response.text();
+    } catch (reason) {
+      holder.innerHTML = '<p class="alert" role="alert"></p>';
+      holder.firstChild.textContent = reason.message;
+    }
+    holder.classList.remove("loading");
+  });
+}
+
+// What is done with a lens as a whole.
+export function setUpLensActions() {
+  const holder = byId("lens-actions");
+  if (!holder) return;
+  const lens = `/v1/lenses/${holder.dataset.lens}`;
+  const error = holder.querySelector(".alert");
+  const acts = {
+    rename: async (fields) => {
+      await send("PATCH", lens, { label: fields.get("label").trim() || null });
+      location.reload();
+    },
+    merge: async (fields) => {
+      const into = fields.get("lens");
+      if (!into) throw new Error("Choose the lens that this one is a part of.");
+      if (!window.confirm("Merge? All photos of this lens then teach the other one. This cannot be undone.")) return;
+      await send("PATCH", lens, { merge_into: into });
+      location.assign(`/lenses/${into}`);
+    },
+    upload: async (fields) => {
+      const file = fields.get("profile");
+      if (!file?.size) throw new Error("Choose a profile first.");
+      const response = await fetch(`${lens}/profile`, { method: "PUT", body: file, headers: { "Content-Type": "application/zip" } });
+      if (!response.ok) throw new Error(await problemText(response));
+      location.reload();
+    },
+    delete: async () => {
+      if (!window.confirm("Delete this lens and all that was learned of it? Its photos stay.")) return;
+      await send("DELETE", lens);
+      location.assign("/");
+    },
+  };
+  const run = async (act, fields) => {
+    error.hidden = true;
+    try {
+      await acts[act](fields);
+    } catch (reason) {
+      error.textContent = reason.message;
+      error.hidden = false;
+    }
+  };
+  for (const button of holder.querySelectorAll("button")) button.disabled = false;
+  for (const form of holder.querySelectorAll("form"))
+    form.addEventListener("submit", (event) => {
+      event.preventDefault();
+      run(form.dataset.act, new FormData(form));
+    });
+  holder.querySelector("[data-act=delete]").addEventListener("click", () => run("delete"));
+  for (const button of document.querySelectorAll("[data-back]")) {
+    button.disabled = false;
+    button.addEventListener("click", async () => {
+      if (!window.confirm(`Go back to version ${button.dataset.back}? Photos that joined later are left out; they stay and can be counted again.`)) return;
+      try {
+        await send("PATCH", lens, { back_to: Number(button.dataset.back) });
+        location.reload();
+      } catch (reason) {
+        byId("back-alert").textContent = reason.message;
+        byId("back-alert").hidden = false;
+      }
+    });
+  }
 }
 
 function plot(holder, events) {
@@ -126,15 +253,16 @@ function plot(holder, events) {
   const colour = (name) => ((probe.style.color = `var(--${name})`), getComputedStyle(probe).color);
   const font = `14px ${style.fontFamily}`;
   const axis = { stroke: colour("soft"), grid: { stroke: colour("line"), width: 1 }, ticks: { show: false }, font, labelFont: font };
-  const of = (event, zone) => (typeof event.error === "object" ? (event.error?.[zone] ?? null) : event.error);
+  const share = (event, zone) => (typeof event.error === "object" ? (event.error?.[zone] ?? null) : event.error);
+  const of = (event, zone) => (share(event, zone) === null ? null : 100 * share(event, zone)); // in percent
   const options = {
     width: holder.clientWidth - 16,
     height: 280,
     legend: { live: false },
-    scales: { x: { time: false }, y: { range: (_, __, most) => [0, Math.max(0.1, most * 1.1)] } },
+    scales: { x: { time: false }, y: { range: (_, __, most) => [0, Math.max(10, most * 1.1)] } },
     axes: [
       { ...axis, label: "version of the lens", size: 34, labelSize: 26, incrs: [1, 2, 5, 10, 20, 50] },
-      { ...axis, label: "relative error", size: 60 },
+      { ...axis, label: "error, %", size: 60 },
     ],
     series: [
       { label: "Version" },

@@ -1,69 +1,81 @@
-// Photos chosen or dropped are sent one after the other; what became of them is in the list below.
+// Photos chosen or dropped are sent two at a time; those that were not taken are listed with the reason.
 
 import { byId, refusalText } from "./common.js";
 
-function uploadOne(file, calibrate, list) {
+const AT_ONCE = 2;
+
+function send(file, calibrate, onProgress) {
+  return new Promise((resolve) => {
+    const request = new XMLHttpRequest();
+    const query = new URLSearchParams({ filename: file.name, calibrate: String(calibrate) });
+    request.open("POST", `/v1/photos?${query}`);
+    request.setRequestHeader("Content-Type", "application/octet-stream");
+    request.upload.onprogress = (event) => onProgress(event.total ? event.loaded / event.total : 0);
+    request.onerror = () => resolve("The connection was lost. Choose the photo again; nothing is counted twice.");
+    request.onload = () => {
+      const taken = request.status === 202 || request.status === 200;
+      resolve(taken ? null : refusalText(request.responseText, request.status));
+    };
+    request.send(file);
+  });
+}
+
+function refused(file, text) {
   const item = document.createElement("li");
-  item.innerHTML = '<div class="grow"><b></b><p></p><progress max="1" value="0"></progress></div>';
-  const [name, words, bar] = [item.querySelector("b"), item.querySelector("p"), item.querySelector("progress")];
-  name.textContent = file.name;
-  words.textContent = "Waiting to be sent";
-  bar.setAttribute("aria-label", `Upload of ${file.name}`);
-  list.append(item);
-  return () =>
-    new Promise((resolve) => {
-      const request = new XMLHttpRequest();
-      const query = new URLSearchParams({ filename: file.name, calibrate: String(calibrate) });
-      request.open("POST", `/v1/photos?${query}`);
-      request.setRequestHeader("Content-Type", "application/octet-stream");
-      request.upload.onprogress = (event) => {
-        bar.value = event.total ? event.loaded / event.total : 0;
-        words.textContent = `Sending, ${Math.round(bar.value * 100)} %`;
-      };
-      const fail = (text) => {
-        bar.remove();
-        const close = document.createElement("button");
-        close.type = "button";
-        close.className = "quiet";
-        close.textContent = "Dismiss";
-        close.setAttribute("aria-label", `Dismiss the message about ${file.name}`);
-        close.addEventListener("click", () => item.remove());
-        item.append(close);
-        words.className = "error";
-        words.textContent = text;
-        resolve(false);
-      };
-      request.onerror = () => fail("The connection was lost. Choose the photo again; nothing is counted twice.");
-      request.onload = () => {
-        if (request.status === 202 || request.status === 200) {
-          item.remove();
-          resolve(true);
-          return;
-        }
-        fail(refusalText(request.responseText, request.status));
-      };
-      request.send(file);
-    });
+  item.innerHTML = '<div class="grow"><b></b><p class="error"></p></div><button type="button" class="quiet">Dismiss</button>';
+  item.querySelector("b").textContent = file.name;
+  item.querySelector("p").textContent = text;
+  const close = item.querySelector("button");
+  close.setAttribute("aria-label", `Dismiss the message about ${file.name}`);
+  close.addEventListener("click", () => item.remove());
+  byId("uploads").append(item);
 }
 
 export function setUpUpload() {
   const form = byId("drop");
   if (!form) return;
-  const [input, list, announce] = [byId("files"), byId("uploads"), byId("announce")];
-  const start = async (files) => {
-    const jobs = [...files].map((file) => uploadOne(file, byId("calibrate").checked, list));
-    let done = 0;
-    for (const job of jobs) {
-      if (await job()) done += 1;
-      window.htmx?.trigger("#photos", "refresh");
-    }
-    const refused = jobs.length - done;
-    announce.textContent = `${done} of ${jobs.length} photos sent${refused ? `, ${refused} refused` : ""}.`;
+  const [input, announce, sending] = [byId("files"), byId("announce"), byId("sending")];
+  const [words, bar] = [byId("sending-words"), byId("sending-bar")];
+  let [all, done, turnedAway] = [0, 0, 0];
+  const parts = new Map(); // how far those are that are being sent
+  const queue = [];
+  const show = () => {
+    const sent = done + [...parts.values()].reduce((sum, part) => sum + part, 0);
+    bar.value = all ? sent / all : 0;
+    words.textContent = `${done} of ${all} photos sent`;
+    sending.hidden = done === all;
   };
-  input.addEventListener("change", async () => {
+  const work = async () => {
+    for (let next = queue.shift(); next; next = queue.shift()) {
+      const { file, calibrate } = next;
+      parts.set(file, 0);
+      const problem = await send(file, calibrate, (part) => {
+        parts.set(file, part);
+        show();
+      });
+      parts.delete(file);
+      done += 1;
+      if (problem) {
+        turnedAway += 1;
+        refused(file, problem);
+      }
+      show();
+    }
+  };
+  const start = async (files) => {
+    const idle = done === all;
+    if (idle) [all, done, turnedAway] = [0, 0, 0];
+    all += files.length;
+    for (const file of files) queue.push({ file, calibrate: byId("calibrate").checked });
+    show();
+    if (!idle) return; // those that are sending go on with these
+    await Promise.all(Array.from({ length: AT_ONCE }, work));
+    announce.textContent = `${done - turnedAway} of ${all} photos sent${turnedAway ? `, ${turnedAway} refused` : ""}.`;
+  };
+  input.addEventListener("change", () => {
     const files = [...input.files];
     input.value = "";
-    await start(files);
+    start(files);
   });
   form.addEventListener("submit", (event) => event.preventDefault());
   // the whole page takes photos: a drop beside the frame would otherwise leave the page
@@ -82,6 +94,6 @@ export function setUpUpload() {
     if (!carriesFiles(event)) return;
     event.preventDefault();
     document.body.classList.remove("over");
-    start(event.dataTransfer.files);
+    start([...event.dataTransfer.files]);
   });
 }

@@ -1,0 +1,263 @@
+"""Who asks: the owner of a key, of a signed-in browser, or the one owner of a service on loopback."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import secrets
+import threading
+import time
+from collections import OrderedDict
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import TYPE_CHECKING, Final
+
+from starlette.requests import Request
+
+from app.access import keys
+from app.access.keys import SCOPES, Scope
+from app.access.rate_limits import Rates
+from app.http.errors import BusyError, ForbiddenError, NotSignedInError, QuotaError
+from app.store.access.keys import Holder, KeyStore
+from app.store.access.owners import LOCAL
+
+if TYPE_CHECKING:
+    from app.runtime.settings import Settings
+
+log = logging.getLogger(__name__)
+
+COOKIE: Final = "lens_session"
+FRESH_S: Final = 1.0
+"""How long a process goes by what it has read of a key: a revoked one works no longer than that."""
+
+KEPT: Final = 10_000
+HASHES_AT_ONCE: Final = 2
+HASHES_WAIT_S: Final = 5.0
+"""Each hash takes 19 MiB and some 20 ms; who waits longer than this is sent away."""
+
+HOW: Final = (
+    "send a key in the header `Authorization: Bearer lpk_...`, or sign in at /sign-in; "
+    "`lensmodel keys create` on the machine of the service makes one"
+)
+CHALLENGE: Final = {"WWW-Authenticate": "Bearer"}
+
+
+@dataclass(frozen=True, slots=True)
+class Who:
+    """Who asks, and what he may.
+
+    `key_id` is None for the one owner of a service that asks nobody who he is.
+    """
+
+    owner: str
+    scopes: tuple[str, ...]
+    key_id: int | None = None
+    token: str | None = None
+    """Digest of what he showed, by which he is asked for again while an answer goes on."""
+
+
+EVERYBODY: Final = Who(LOCAL, SCOPES)
+
+
+class Gate:
+    """Tells one process who asks, and sends away those who may not.
+
+    Blocking: it reads the database, and hashes keys that it does not know yet.
+    """
+
+    def __init__(self, settings: Settings, store: KeyStore) -> None:
+        self._settings, self._store = settings, store
+        self._closed = settings.needs_keys
+        self._looked = -FRESH_S
+        self._rates = Rates(settings.requests_per_minute)
+        self._known: OrderedDict[str, tuple[float, Who | None]] = OrderedDict()
+        self._proven: OrderedDict[str, str] = OrderedDict()
+        self._guard = threading.Lock()
+        self._hashing = threading.BoundedSemaphore(HASHES_AT_ONCE)
+
+    def is_closed(self) -> bool:
+        """Whether one must say who he is: always, or since there is a key."""
+        if self._closed or self._settings.auth == "none":
+            return self._closed
+        if time.monotonic() - self._looked > FRESH_S:
+            self._closed = self._store.any_made()
+            self._looked = time.monotonic()
+        return self._closed
+
+    def quick(self, request: Request) -> Who | None:
+        """Return who asks if that can be told without the database; None where it must be looked up."""
+        if not self._closed:
+            fresh = self._settings.auth == "none" or time.monotonic() - self._looked <= FRESH_S
+            return EVERYBODY if fresh else None
+        shown = shown_by(request)
+        return None if shown is None else self._remembered(_digest(shown))
+
+    def who(self, request: Request) -> Who:
+        """Return who asks.
+
+        Raises
+        ------
+        NotSignedInError
+            If he shows no key and no session, or none that is valid.
+        """
+        if not self.is_closed():
+            return EVERYBODY
+        shown = shown_by(request)
+        if shown is None:
+            raise NotSignedInError(f"this service answers only those it knows: {HOW}", headers=CHALLENGE)
+        found = self._look_up(shown)
+        if found is None:
+            raise NotSignedInError(
+                f"this key or sign-in is not valid, or no longer: {HOW}",
+                headers={**CHALLENGE, "Set-Cookie": f"{COOKIE}=; Path=/; Max-Age=0"},
+            )
+        return found
+
+    def admit(self, who: Who, method: str) -> None:
+        """Refuse what the scopes do not allow, and more requests than there may be.
+
+        Raises
+        ------
+        ForbiddenError, QuotaError
+            See above.
+        """
+        if who.key_id is None:
+            return
+        self.require(who, "read" if method in {"GET", "HEAD", "OPTIONS"} else "write")
+        wait = self._rates.wait_of(who.owner)
+        if wait > 0:
+            raise QuotaError(
+                f"more than {self._settings.requests_per_minute} requests a minute: wait {wait:.1f} s",
+                headers={"Retry-After": str(int(wait) + 1)},
+            )
+
+    def require(self, who: Who, scope: Scope) -> None:
+        """Refuse a key without a scope.
+
+        Raises
+        ------
+        ForbiddenError
+            If it has neither this scope nor a wider one.
+        """
+        if not keys.covers(who.scopes, scope):
+            raise ForbiddenError(
+                f"this key may {' and '.join(who.scopes)}, and this takes {scope}: use another key"
+            )
+
+    def is_still(self, who: Who) -> bool:
+        """Say whether who began to ask may go on: long answers are asked for again."""
+        if who.token is None:
+            return not self.is_closed()
+        with self._guard:
+            entry = self._known.get(who.token)
+        if entry is not None and time.monotonic() - entry[0] <= FRESH_S:
+            return entry[1] is not None
+        # of a session this digest is what is stored; a key was proven when the answer began
+        again = self._by_digest(who.token)
+        self._remember(who.token, again)
+        return again is not None
+
+    def sign_in(self, text: str) -> tuple[Who, str]:
+        """Begin a session with a key; return whose it is, and what the browser is to show.
+
+        Raises
+        ------
+        NotSignedInError
+            If the key is not valid.
+        """
+        who = self._look_up(text) if keys.prefix_of(text) else None
+        if who is None or who.key_id is None:
+            raise NotSignedInError("this key is not valid, or no longer: look for a blank or a missing end")
+        token = secrets.token_urlsafe(32)
+        self._store.sign_in(who.key_id, _digest(token), timedelta(hours=self._settings.session_hours))
+        return who, token
+
+    def sign_out(self, request: Request) -> None:
+        """End the session of a browser."""
+        token = request.cookies.get(COOKIE)
+        if token:
+            self._store.sign_out(_digest(token))
+            with self._guard:
+                self._known.pop(_digest(token), None)
+
+    def _remembered(self, digest: str) -> Who | None:
+        with self._guard:
+            entry = self._known.get(digest)
+        return entry[1] if entry is not None and time.monotonic() - entry[0] <= FRESH_S else None
+
+    def _look_up(self, shown: str) -> Who | None:
+        digest = _digest(shown)
+        known = self._remembered(digest)
+        if known is not None:
+            return known
+        prefix = keys.prefix_of(shown)
+        if prefix is None:
+            holder = self._store.by_session(digest)
+        else:
+            holder = self._store.by_prefix(prefix)
+            if holder is not None and not self._is_proven(shown, digest, holder):
+                return None
+        who = None if holder is None else Who(holder.owner, holder.scopes, holder.key_id, digest)
+        if holder is not None:
+            self._remember(digest, who)
+            with contextlib.suppress(Exception):  # a full disk or a busy database keeps nobody out
+                self._store.note_use(holder)
+        return who
+
+    def _is_proven(self, shown: str, digest: str, holder: Holder) -> bool:
+        """Compare a key with its hash, once in this process: the hash takes its time on purpose."""
+        with self._guard:
+            if self._proven.get(digest) == holder.key_hash:
+                return True
+        if not self._hashing.acquire(timeout=HASHES_WAIT_S):
+            raise BusyError(
+                "too many are signing in: try again in a few seconds", headers={"Retry-After": "5"}
+            )
+        try:
+            right = keys.matches(shown, holder.key_hash)
+        finally:
+            self._hashing.release()
+        if right:
+            with self._guard:
+                self._proven[digest] = holder.key_hash
+                while len(self._proven) > KEPT:
+                    self._proven.popitem(last=False)
+        return right
+
+    def _by_digest(self, digest: str) -> Who | None:
+        with self._guard:
+            key_hash = self._proven.get(digest)
+        holder = self._store.by_session(digest) if key_hash is None else self._store.by_hash(key_hash)
+        return None if holder is None else Who(holder.owner, holder.scopes, holder.key_id, digest)
+
+    def _remember(self, digest: str, who: Who | None) -> None:
+        with self._guard:
+            self._known[digest] = (time.monotonic(), who)
+            self._known.move_to_end(digest)
+            while len(self._known) > KEPT:
+                self._known.popitem(last=False)
+
+
+def shown_by(request: Request) -> str | None:
+    """Return the key of a request, or else the token of its session."""
+    scheme, _, text = request.headers.get("authorization", "").partition(" ")
+    if scheme.lower() == "bearer":
+        return text.strip()
+    return request.cookies.get(COOKIE) or None
+
+
+def require_somebody(settings: Settings, store: KeyStore) -> str | None:
+    """Say why a service cannot begin that others can reach and nobody could use; None if it can."""
+    if not settings.needs_keys or store.any_valid():
+        return None
+    return (
+        f"the service asks for keys (LENS_HOST={settings.host}, LENS_PUBLIC={str(settings.public).lower()}, "
+        f"LENS_AUTH={settings.auth}) and there is no valid key yet: make one by `lensmodel keys create "
+        "--owner NAME` with the same settings, or listen on 127.0.0.1 without LENS_PUBLIC"
+    )
+
+
+def _digest(shown: str) -> str:
+    # tokens have 256 random bits: there is nothing to guess that a slow hash would protect
+    return hashlib.sha256(shown.encode("utf-8", "replace")).hexdigest()

@@ -1,0 +1,24 @@
+"""Whether a place for blobs is new, or holds what the tables name and is only away."""
+
+from __future__ import annotations
+
+from sqlalchemy.exc import OperationalError, ProgrammingError
+
+from app.blobs.storage import Storage
+from app.store import Store
+
+
+def settle(store: Store, storage: Storage) -> None:
+    """Make the folder of the blobs where it is new; leave one that is away as it is.
+
+    It is new as long as no row names a file. One from before there were marks holds the file of the
+    newest photo.
+    """
+    if storage.is_there or storage.folder is None:
+        return
+    try:
+        newest = store.photos.newest_file()
+    except (OperationalError, ProgrammingError):
+        return  # the tables are missing or away: nothing is decided, and /readyz says so
+    if newest is None or (storage.folder / newest).is_file():
+        storage.create()

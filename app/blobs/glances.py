@@ -1,0 +1,81 @@
+"""A photo in small, before it is developed: by its picture an owner knows which lens it was."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import rawpy
+import tifffile
+from PIL import Image, ImageOps
+
+from app.blobs.previews import upright
+
+SIDE: Final = 480
+"""The longer side of a glance in pixels, at most: sharp at 240 of a fine screen."""
+
+_EXIF_OF_FLIP: Final = {3: 3, 5: 8, 6: 6}
+"""LibRaw's words for how to turn a picture, as EXIF orientations."""
+
+_PLAIN: Final = frozenset({"jpeg", "png"})
+_ORIENTATION: Final = 0x0112
+
+
+def glance(path: Path, kind: str, orientation: int) -> bytes:
+    """Render a photo file as a small upright JPEG, as cheaply as its kind allows.
+
+    Of RAW files the camera's own small picture is taken, or where there is none half of the pixels.
+
+    Parameters
+    ----------
+    path : Path
+    kind : str
+        As inspection names it: raw, dng, tiff, png, jpeg.
+    orientation : int
+        EXIF orientation of the photo.
+    """
+    if kind in _PLAIN:
+        with Image.open(path) as image:
+            image.draft("RGB", (2 * SIDE, 2 * SIDE))
+            return _small(_turned(image, orientation))
+    if kind == "tiff":
+        pixels = tifffile.imread(path)
+        step = max(1, max(pixels.shape[:2]) // SIDE)
+        return _small(Image.fromarray(upright(_eight_bits(pixels[::step, ::step]), orientation)))
+    with rawpy.imread(str(path)) as raw:
+        flip = _EXIF_OF_FLIP.get(int(raw.sizes.flip), 1)
+        try:
+            thumb = raw.extract_thumb()
+        except rawpy.LibRawError:  # type: ignore[attr-defined, unused-ignore]  # it has no types
+            return _small(Image.fromarray(raw.postprocess(half_size=True, use_camera_wb=True, output_bps=8)))
+        if isinstance(thumb.data, bytes):
+            with Image.open(io.BytesIO(thumb.data)) as image:
+                image.draft("RGB", (2 * SIDE, 2 * SIDE))
+                return _small(_turned(image, flip))
+        return _small(Image.fromarray(np.ascontiguousarray(upright(thumb.data, flip))))
+
+
+def _turned(image: Image.Image, otherwise: int) -> Image.Image:
+    """Turn a picture upright as it says itself, or as is said of it."""
+    if image.getexif().get(_ORIENTATION):
+        return ImageOps.exif_transpose(image)
+    return Image.fromarray(np.ascontiguousarray(upright(np.asarray(image.convert("RGB")), otherwise)))
+
+
+def _eight_bits(pixels: np.ndarray) -> np.ndarray:
+    if pixels.dtype == np.uint8:
+        return np.ascontiguousarray(pixels)
+    if pixels.dtype == np.uint16:
+        return (pixels >> 8).astype(np.uint8)
+    light = np.clip(np.nan_to_num(pixels.astype(np.float64)), 0.0, 1.0)
+    return np.rint(255.0 * light ** (1 / 2.2)).astype(np.uint8)
+
+
+def _small(image: Image.Image) -> bytes:
+    shown = image.convert("RGB")
+    shown.thumbnail((SIDE, SIDE))
+    out = io.BytesIO()
+    shown.save(out, "JPEG", quality=82)
+    return out.getvalue()

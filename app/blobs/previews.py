@@ -1,0 +1,65 @@
+"""A developed photo in small, upright, as the pages show it; made once, when it is developed."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from lensmodel.estimation.patches import r_map
+from lensmodel.photo import LinearPhoto, shown
+
+SIDE: Final = 1600
+"""The longer side of a preview in pixels, at most."""
+
+_TURN: dict[int, Callable[[NDArray[np.generic]], NDArray[np.generic]]] = {
+    1: lambda a: a,
+    2: lambda a: a[:, ::-1],
+    3: lambda a: a[::-1, ::-1],
+    4: lambda a: a[::-1],
+    5: lambda a: a.swapaxes(0, 1),
+    6: lambda a: a.swapaxes(0, 1)[:, ::-1],
+    7: lambda a: a[::-1, ::-1].swapaxes(0, 1),
+    8: lambda a: a.swapaxes(0, 1)[::-1],
+}
+"""Arrays in sensor orientation to upright ones, by EXIF orientation."""
+
+
+def upright(pixels: NDArray[np.generic], orientation: int) -> NDArray[np.generic]:
+    """Turn an array `(row, col, ...)` from sensor orientation to upright."""
+    return _TURN.get(orientation, _TURN[1])(pixels)
+
+
+def preview(developed: LinearPhoto) -> bytes:
+    """Render a whole photo as JPEG."""
+    step = _step(developed)
+    planes = developed.planes
+    height, width = planes.shape[1] // step * step, planes.shape[2] // step * step
+    mean = planes[:, :height, :width].reshape(3, height // step, step, width // step, step).mean(axis=(2, 4))
+    picture = shown(np.ascontiguousarray(mean, dtype=np.float32), developed.encoding)
+    return _encoded(picture, developed, "JPEG", quality=85)
+
+
+def confidence_map(developed: LinearPhoto) -> bytes:
+    """Render the r-map of the green plane as a PNG of the preview's shape: bright where edges tell."""
+    step = _step(developed)
+    values = r_map(np.ascontiguousarray(developed.planes[1][::step, ::step]))
+    scaled = (255 * np.clip(values / max(float(np.quantile(values, 0.99)), 1e-6), 0, 1)).astype(np.uint8)
+    heat = np.stack([scaled, scaled // 2, np.zeros_like(scaled)], axis=-1)
+    return _encoded(heat, developed, "PNG", compress_level=3)
+
+
+def _step(developed: LinearPhoto) -> int:
+    short, long = sorted((developed.frame.height, developed.frame.width))
+    return min(-(-long // SIDE), short // 2)  # a panorama keeps two rows at least
+
+
+def _encoded(picture: NDArray[np.uint8], developed: LinearPhoto, kind: str, **options: Any) -> bytes:  # noqa: ANN401 - of PIL
+    turned = upright(picture, developed.encoding.orientation)
+    out = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(turned)).save(out, kind, **options)
+    return out.getvalue()

@@ -1,0 +1,239 @@
+"""Blobs: photos, statistics and results, in a local folder or in an object store.
+
+Keys are made of our own ids only, never of a name that somebody sent. A blob appears under its
+key when it is complete, and not before.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import shutil
+from collections.abc import AsyncIterator, Iterator
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Protocol
+from urllib.parse import unquote, urlsplit
+
+import obstore
+from obstore.store import LocalStore, ObjectStore, from_url
+
+from app.store.ids import new_id
+
+if TYPE_CHECKING:
+    from obstore import GetResult
+    from obstore.store import ClientConfig
+
+CHUNK = 1 << 20
+PATIENCE_S: Final = 20.0
+"""One request moves 8 MiB at most: 20 s are 0.4 MiB/s."""
+
+CONNECT_S: Final = 5.0
+
+MARK: Final = "lensmodel-blobs"
+"""A file that lies in each folder of blobs: a disk that is not mounted leaves a folder without it."""
+
+
+class AsyncBlobWriter(Protocol):
+    """Where the bytes of a blob go, piece by piece."""
+
+    async def write(self, data: bytes) -> object:
+        """Take the next piece."""
+
+
+@dataclass(frozen=True, slots=True)
+class BlobInfo:
+    """What can be told of a blob without reading it."""
+
+    size: int
+
+
+def _client_options(patience_s: float) -> ClientConfig:
+    """Return the deadlines, and what the environment says besides: options replace those of AWS_... there."""
+    options: ClientConfig = {
+        "connect_timeout": f"{min(CONNECT_S, patience_s):g}s",
+        "timeout": f"{patience_s:g}s",
+        "allow_http": _is_on("AWS_ALLOW_HTTP"),
+        "allow_invalid_certificates": _is_on("AWS_ALLOW_INVALID_CERTIFICATES"),
+    }
+    if os.environ.get("AWS_PROXY_URL"):
+        options["proxy_url"] = os.environ["AWS_PROXY_URL"]
+    return options
+
+
+def _is_on(name: str) -> bool:
+    return os.environ.get(name, "").lower() in {"1", "true", "yes", "on"}
+
+
+class Storage:
+    """All blobs of the service.
+
+    Parameters
+    ----------
+    url : str
+        ``file:///folder``, ``s3://bucket/prefix`` or another address that obstore knows.
+    patience_s : float
+        How long one request to an object store may take. It is tried once more, quickly; jobs wait for
+        longer outages, and callers are told of them.
+    create : bool
+        Whether to make a folder that is not there. Whoever cannot know that it is new leaves it to
+        `app.blobs.founding`: a folder that is made while its disk is away hides that from everybody.
+    """
+
+    def __init__(self, url: str, *, patience_s: float = PATIENCE_S, create: bool = True) -> None:
+        parts = urlsplit(url)
+        self.folder: Path | None = None
+        if parts.scheme == "file":
+            self.folder = Path(unquote(parts.path))
+            self._opened: ObjectStore | None = None
+            if create:
+                self.create()
+        else:
+            self._opened = from_url(
+                url,
+                client_options=_client_options(patience_s),
+                retry_config={"max_retries": 1, "retry_timeout": timedelta(seconds=patience_s)},
+            )
+
+    def create(self) -> None:
+        """Make the folder and mark it as one of blobs; an object store is made by its owner."""
+        if self.folder is not None:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            (self.folder / MARK).write_text("Without this file the folder counts as not mounted.\n")
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the folder is there, mark and all; of an object store only its answers tell."""
+        return self.folder is None or (self.folder / MARK).is_file()
+
+    @property
+    def _store(self) -> ObjectStore:
+        """The blobs.
+
+        Raises
+        ------
+        OSError
+            If the folder is away: an error of the machine, not of the blob that is asked for.
+        """
+        if not self.is_there:
+            raise OSError(errno.ENODEV, "the folder of the blobs is away", str(self.folder))
+        if self._opened is None:
+            assert self.folder is not None
+            self._opened = LocalStore(prefix=self.folder)
+        return self._opened
+
+    def put(self, key: str, data: bytes) -> None:
+        """Store bytes under a key, replacing what was there."""
+        obstore.put(self._store, key, data)
+
+    def put_file(self, key: str, path: Path) -> None:
+        """Store a file under a key, replacing what was there."""
+        obstore.put(self._store, key, path)
+
+    @asynccontextmanager
+    async def writer(self, key: str) -> AsyncIterator[AsyncBlobWriter]:
+        """Open a blob for writing; an exception inside leaves nothing behind."""
+        opened: AbstractAsyncContextManager[AsyncBlobWriter] = obstore.open_writer_async(
+            self._store, key, buffer_size=8 * CHUNK
+        )
+        async with opened as sink:
+            yield sink
+
+    def rename(self, key: str, to: str) -> None:
+        """Give a blob another key, on which there is none yet; raises as `get`."""
+        obstore.rename(self._store, key, to)
+
+    def remove(self, key: str) -> None:
+        """Delete one blob; that there is none is no error."""
+        with contextlib.suppress(FileNotFoundError):
+            obstore.delete(self._store, key)
+
+    def get(self, key: str) -> bytes:
+        """Return a whole blob.
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is none of that key.
+        """
+        return bytes(obstore.get(self._store, key).bytes())
+
+    def info(self, key: str) -> BlobInfo:
+        """Return what is known of a blob; raises as `get`."""
+        return BlobInfo(size=int(obstore.head(self._store, key)["size"]))
+
+    def stream(self, key: str, start: int, end: int) -> Iterator[bytes]:
+        """Give the bytes `start` to `end`, the last one excluded, in pieces."""
+        for low in range(start, end, 4 * CHUNK):
+            yield bytes(obstore.get_range(self._store, key, start=low, end=min(end, low + 4 * CHUNK)))
+
+    @contextmanager
+    def as_file(self, key: str, scratch: Path) -> Iterator[Path]:
+        """Give a blob as a file to read: itself where it is one, else a copy in `scratch`."""
+        store = self._store
+        if self.folder is not None:
+            path = self.folder / key
+            if not path.is_file():
+                raise FileNotFoundError(key)
+            yield path
+            return
+        copy = scratch / new_id()
+        with copy.open("wb") as out:
+            for piece in self._found(store, key).stream(min_chunk_size=CHUNK):
+                out.write(piece)
+        try:
+            yield copy
+        finally:
+            copy.unlink(missing_ok=True)
+
+    @staticmethod
+    def _found(store: ObjectStore, key: str) -> GetResult:
+        """Return a blob; tell one that is gone from a bucket that is, which answers the same."""
+        try:
+            return obstore.get(store, key)
+        except FileNotFoundError as error:
+            try:
+                next(iter(obstore.list(store, chunk_size=1)), None)
+            except FileNotFoundError:
+                raise OSError(errno.ENODEV, "the bucket of the blobs is away") from error
+            raise
+
+    def delete(self, prefix: str) -> None:
+        """Delete all blobs below a prefix that ends in a slash; none there is no error."""
+        if not prefix.endswith("/") or prefix.count("/") < 2:
+            raise ValueError(f"refusing to delete everything below {prefix!r}")
+        for page in obstore.list(self._store, prefix):
+            obstore.delete(self._store, [entry["path"] for entry in page])
+        if self.folder is not None:
+            shutil.rmtree(self.folder / prefix, ignore_errors=True)  # the empty folders, and torn writes
+
+    def listed(self, prefix: str = "") -> Iterator[tuple[str, int]]:
+        """Give key and size in bytes of each blob below a prefix, or of all; torn writes are none."""
+        for page in obstore.list(self._store, prefix or None):
+            for entry in page:
+                if entry["path"] != MARK:
+                    yield str(entry["path"]), int(entry["size"])
+
+    def copy_to(self, other: Storage, key: str) -> None:
+        """Copy a blob to another storage, piece by piece; raises as `get`."""
+        pieces = obstore.get(self._store, key).stream(min_chunk_size=8 * CHUNK)
+        with obstore.open_writer(other._store, key, buffer_size=8 * CHUNK) as sink:
+            for (
+                piece
+            ) in pieces:  # not handed over as an iterator: obstore cannot read inside of its own writing
+                sink.write(bytes(piece))
+
+    def check_writable(self) -> None:
+        """Write and delete a small blob; raises what went wrong."""
+        prefix = f"probe/{new_id()}/"
+        self.put(f"{prefix}x", b"x")
+        self.delete(prefix)
+
+    def free_bytes(self) -> int | None:
+        """Return the room left on the disk; None where the store does not say."""
+        if self.folder is None or not self.is_there:
+            return None
+        return shutil.disk_usage(self.folder).free

@@ -1,0 +1,49 @@
+"""Which extra of the package brings a module that is missing."""
+
+from __future__ import annotations
+
+from typing import Final
+
+EXTRAS: Final = {
+    "service": (
+        "alembic",
+        "argon2",
+        "dbos",
+        "fastapi",
+        "httpx2",
+        "jinja2",
+        "obstore",
+        "prometheus_client",
+        "pydantic",
+        "pydantic_settings",
+        "python_multipart",
+        "sqlalchemy",
+        "sse_starlette",
+        "starlette",
+        "structlog",
+        "uvicorn",
+    ),
+    "report": ("reportlab",),
+    "lab": ("optiland",),
+    "train": ("sklearn",),
+}
+"""Modules by extra, as far as commands import them."""
+
+_WHAT: Final = {
+    "service": "the service",
+    "report": "reports as PDF",
+    "lab": "the laboratory",
+    "train": "training",
+}
+
+
+def remedy(missing: ModuleNotFoundError) -> str | None:
+    """Say what to install for a missing module; None where no extra brings it."""
+    top = (missing.name or "").partition(".")[0]
+    for extra, modules in EXTRAS.items():
+        if top in modules:
+            return (
+                f"this command needs {_WHAT[extra]}, which is not installed ({top} is missing): "
+                f"pip install 'lensmodel[{extra}]'"
+            )
+    return None

@@ -1,0 +1,122 @@
+"""From the words of a command line to photos and profiles."""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from app.commands.console.failure import UsageError
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.model import LensProfile, load_profile
+from lensmodel.photo import inspect
+from lensmodel.photo.endings import ENDINGS, RAW_ENDINGS
+from lensmodel.workflow.identity import Identity
+
+CORRECTED: Final = "-corrected"
+"""Ends the names of what `lensmodel correct` wrote."""
+
+
+def photos(names: Iterable[str]) -> list[Path]:
+    """Turn files, folders and patterns into a list of photos without repeats.
+
+    Of folders and patterns, corrected photos are left out, and what is no RAW file beside a RAW file
+    of the same name, which shows the same exposure again.
+
+    Raises
+    ------
+    UsageError
+        If a name matches nothing.
+    """
+    found: dict[Path, None] = {}
+    for name in names:
+        path = Path(name).expanduser()
+        if path.is_dir():
+            inside = (p for p in path.iterdir() if p.suffix.lower() in ENDINGS and not p.name.startswith("."))
+            matches = _sources(p for p in inside if p.is_file())
+            if not matches:
+                raise UsageError(
+                    f"no photo in the folder {name}; give one that holds RAW, TIFF, PNG or JPEG files"
+                )
+        elif path.is_file():
+            matches = [path]
+        else:
+            every = (Path(p) for p in glob.glob(str(path), recursive=True))  # noqa: PTH207 - absolute patterns too
+            matches = _sources(p for p in every if p.is_file())
+            if not matches:
+                raise UsageError(f"no photo called {name}; check the name and the folder")
+        found.update(dict.fromkeys(matches))
+    return list(found)
+
+
+def _sources(found: Iterable[Path]) -> list[Path]:
+    given = sorted(p for p in found if not p.stem.endswith(CORRECTED))
+    raw = {p.with_suffix("") for p in given if p.suffix.lower() in RAW_ENDINGS}
+    return [p for p in given if p.suffix.lower() in RAW_ENDINGS or p.with_suffix("") not in raw]
+
+
+def same(one: Path, other: Path) -> bool:
+    """Tell whether two names are of one file."""
+    return one.exists() and other.exists() and one.samefile(other)
+
+
+def profile_at(path: Path) -> LensProfile:
+    """Open a profile.
+
+    Raises
+    ------
+    UsageError
+        If there is none.
+    InvalidInputError
+        If the file is no profile, or a damaged one.
+    """
+    if path.is_dir():
+        raise UsageError(f"{path} is a folder; give the file of a lens profile")
+    if not path.exists():
+        raise UsageError(
+            f"no lens profile at {path}; make it with `lensmodel calibrate PHOTO... --profile {path}`"
+        )
+    return load_profile(path)
+
+
+def identity(path: Path) -> Identity:
+    """Return what a photo says of its lens and its camera."""
+    return Identity.of(inspect(path).metadata)
+
+
+def says_aperture(path: Path) -> bool:
+    """Tell whether a photo says its own aperture; what the command line says is then not needed."""
+    return inspect(path).metadata.aperture is not None
+
+
+def refuse_existing(*paths: Path | None, force: bool) -> None:
+    """Make sure, before any work, that nothing is replaced that the user did not give up.
+
+    Raises
+    ------
+    UsageError
+        If one of the files is there.
+    """
+    for path in paths:
+        if path is not None and not force and path.exists():
+            raise UsageError(f"{path} is there already; --force replaces it")
+
+
+@contextmanager
+def as_usage() -> Iterator[None]:
+    """Turn a refused value into wrong usage: nothing was begun."""
+    try:
+        yield
+    except InvalidInputError as error:
+        raise UsageError(str(error)) from error
+
+
+def reason(error: Exception) -> str:
+    """Say why a file could not be used; the system's errors in words."""
+    if isinstance(error, OSError) and error.strerror:
+        return (
+            f"{error.strerror[:1].lower()}{error.strerror[1:]}; check the file, its folder and their rights"
+        )
+    return str(error)

@@ -1,0 +1,50 @@
+"""Ctrl-C and SIGTERM end a command at once and leave nothing half done.
+
+The signal becomes an exception in the main thread, so that each `with` and `finally` on the way
+removes what is unfinished. Worker processes are killed first: pools wait for what they began.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from types import FrameType
+from typing import Final
+
+from app.commands.console.failure import InterruptedByUser
+
+_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+_PATIENCE_S: Final = 10.0
+"""Cleaning up takes far less; after this the process ends all the same."""
+
+
+def workers_ignore_it() -> None:
+    """In a worker process, leave Ctrl-C to the process of the command, which ends its workers."""
+    if multiprocessing.parent_process() is not None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def install() -> None:
+    """Handle the signals in the process of the command."""
+    for number in _SIGNALS:
+        signal.signal(number, _stop)
+
+
+def _stop(number: int, frame: FrameType | None) -> None:
+    del frame
+    for each in _SIGNALS:
+        signal.signal(each, signal.SIG_IGN)  # cleaning up is not to be interrupted
+    threading.Thread(target=_end_workers, args=(number,), daemon=True).start()
+    raise InterruptedByUser(number)
+
+
+def _end_workers(number: int) -> None:
+    end = time.monotonic() + _PATIENCE_S
+    while time.monotonic() < end:
+        for child in multiprocessing.active_children():
+            child.kill()
+        time.sleep(0.05)
+    os._exit(128 + number)

@@ -1,0 +1,336 @@
+"""`lensmodel correct FOLDER --lens auto`: sort photos by lens, learn each lens, correct what gains."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import typer
+from rich.progress import Progress, TaskID
+
+from app.commands import calibration, correction
+from app.commands.console import files
+from app.commands.console.display import Display
+from app.commands.console.table import aligned
+from app.commands.grouping import Group, Shot, groups
+from app.commands.journal import Journal
+from app.words import gain_words
+from lensmodel import correction as corrections
+from lensmodel import estimation
+from lensmodel.core.errors import LensModelError
+from lensmodel.core.types import LensSettings
+from lensmodel.correction.expected_gain import WORTH_DB
+from lensmodel.model import ModelSettings
+from lensmodel.workflow import pipeline
+from lensmodel.workflow.lens import Lens
+
+LEARN_FROM: Final = 8
+"""Photos that a group is learned from: five are the advice (docs/guide.md), three more for other
+apertures (chosen); each takes about a minute."""
+
+PROFILES: Final = "lenses"
+ENDING: Final = ".lensprofile"
+
+
+@dataclass(frozen=True, slots=True)
+class Learning:
+    """What the options said of learning.
+
+    Parameters
+    ----------
+    profiles : Path or None
+        Folder of the lens profiles; None is `lenses` in the folder of the corrected photos.
+    most : int
+        Photos that each group is learned from.
+    estimator, selector : str
+    """
+
+    profiles: Path | None
+    most: int
+    estimator: str
+    selector: str
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """What became of a group of photos; a line of the table."""
+
+    group: Group
+    profile: Path
+    learned: int
+    states: Mapping[str, int]
+    gains_db: tuple[float, ...]
+
+    @property
+    def gain_db(self) -> float | None:
+        """Expected gain, the mean over the photos that were corrected in this run."""
+        return sum(self.gains_db) / len(self.gains_db) if self.gains_db else None
+
+
+def run(
+    names: Sequence[str],
+    output: Path | None,
+    wishes: correction.Wishes,
+    learning: Learning,
+    display: Display,
+    *,
+    as_json: bool,
+) -> None:
+    """Learn the lens of every group of photos and correct them all.
+
+    Raises
+    ------
+    UsageError
+        If something is wrong that can be seen before any work.
+    typer.Exit
+        With 1 if a photo could not be read or corrected.
+    """
+    paths = files.photos(names)
+    targets = correction.targets_of(paths, output, correction.EXTENSION[wishes.file_format])
+    with files.as_usage():
+        estimation.estimators.create(learning.estimator)
+        estimation.patches.selectors.create(learning.selector)
+        corrections.deconvolvers.create(wishes.method)
+        LensSettings(aperture=wishes.aperture)
+    base = output or paths[0].parent / correction.FOLDER
+    wishes = replace(wishes, least_gain_db=WORTH_DB)
+    work = _Folder(base, learning.profiles or base / PROFILES, wishes, learning, display)
+    shots, results = _read(paths, display)
+    found = groups(shots)
+    by_path = {path: target for target, path in targets.items()}
+    with display.progress() as bars:
+        for group in found:
+            work.learn(group, bars)
+        work.finish(bars)
+        rows = [work.correct(group, by_path, bars, results, as_json=as_json) for group in found]
+    if as_json:
+        display.document({"groups": [_document(row) for row in rows], "results": results})
+    else:
+        display.result(_table(rows))
+    if any(result["state"] == "failed" for result in results):
+        raise typer.Exit(1)
+
+
+def _read(paths: Sequence[Path], display: Display) -> tuple[list[Shot], list[dict[str, Any]]]:
+    """Read what the files say; those that cannot be read are results already."""
+    shots: list[Shot] = []
+    results: list[dict[str, Any]] = []
+    for path in paths:
+        try:
+            shots.append(Shot.of(path))
+        except (LensModelError, OSError) as error:
+            results.append({"photo": str(path), "output": None, **_failed(error)})
+            display.error(f"{path}: {files.reason(error)}")
+    return shots, results
+
+
+def _failed(error: LensModelError | OSError) -> dict[str, Any]:
+    code = error.code if isinstance(error, LensModelError) else "unreadable"
+    return {"state": "failed", "code": code, "reason": files.reason(error)}
+
+
+class _Folder:
+    """The work on one folder, and what is remembered of it."""
+
+    def __init__(
+        self,
+        output: Path,
+        profiles: Path,
+        wishes: correction.Wishes,
+        learning: Learning,
+        display: Display,
+    ) -> None:
+        self._profiles, self._wishes, self._learning = profiles, wishes, learning
+        self._display = display
+        self._journal = Journal(output)
+        self._learned: Counter[tuple[str, str]] = Counter()
+        self._calibrations: dict[Path, calibration.Calibration] = {}
+
+    def profile_of(self, group: Group) -> Path:
+        """Name the file of a group's lens profile."""
+        return self._profiles / f"{group.name}{ENDING}"
+
+    def learn(self, group: Group, bars: Progress) -> None:
+        """Learn a group's lens from as many of its photos as are wished and can be used."""
+        target = self.profile_of(group)
+        if target not in self._calibrations:
+            self._calibrations[target] = self._calibration(target)
+        calibrated = self._calibrations[target]
+        counted, most = 0, min(self._learning.most, len(group.shots))
+        task = bars.add_task(f"learning {group.lens}", total=most)
+        for shot in group.to_learn_from():
+            if counted == most:
+                break
+            if self._learns(calibrated, shot, partial(_learning, bars, task, counted)):
+                counted += 1
+                bars.update(task, completed=counted)
+        if not counted:
+            self._display.note(f"{group.lens}, {group.focal}: no photo tells enough to learn its blur from")
+        bars.remove_task(task)
+        self._learned[group.name, group.focal] = counted
+
+    def finish(self, bars: Progress) -> None:
+        """Fit what takes long, once for each lens."""
+        task = bars.add_task("joining what all photos say", total=len(self._calibrations))
+        for number, calibrated in enumerate(self._calibrations.values()):
+            calibrated.finish(partial(_correcting, bars, task, number))
+        bars.remove_task(task)
+
+    def _calibration(self, target: Path) -> calibration.Calibration:
+        asked = calibration.Wishes(
+            aperture=self._wishes.aperture,
+            estimator=self._learning.estimator,
+            workers=self._wishes.workers,
+            any_lens=self._wishes.any_lens,
+            force=False,
+            family=None,
+            no_family=False,
+            mode=None,
+            unit=None,
+            selector=self._learning.selector,
+        )
+        settings = LensSettings(aperture=self._wishes.aperture)
+        return calibration.Calibration(target, asked, settings, ModelSettings(), None)
+
+    def _learns(self, calibrated: calibration.Calibration, shot: Shot, on_event: pipeline.EventHook) -> bool:
+        """Learn from one photo; tell whether it counts, now or from an earlier run."""
+        photo = pipeline.photo_id(shot.path)
+        learning, wishes = self._learning, self._wishes
+        under = (
+            f"{learning.estimator}, {learning.selector}, aperture {wishes.aperture}, any {wishes.any_lens}"
+        )
+        refused = self._journal.verdict("not learned from", photo, under)
+        if refused is not None:
+            self._display.detail(f"{shot.path}: {refused}")
+            return False
+        try:
+            calibrated.add(shot.path, on_event)
+        except LensModelError as error:
+            self._journal.note("not learned from", photo, under, str(error))
+            self._display.detail(f"{shot.path}: {error}")
+            return False
+        except OSError as error:  # another time it may be readable
+            self._display.detail(f"{shot.path}: {files.reason(error)}")
+            return False
+        return True
+
+    def correct(
+        self,
+        group: Group,
+        targets: Mapping[Path, Path],
+        bars: Progress,
+        results: list[dict[str, Any]],
+        *,
+        as_json: bool,
+    ) -> Row:
+        """Correct the photos of a group that gain by it; leave the others."""
+        profile = self.profile_of(group)
+        lens = Lens(files.profile_at(profile)).warmed() if profile.exists() else None
+        states: Counter[str] = Counter()
+        gains: list[float] = []
+        task = bars.add_task(f"correcting {group.lens}", total=len(group.shots))
+        for number, shot in enumerate(group.shots):
+            bars.update(task, description=f"correcting {shot.path.name}")
+            target = targets[shot.path]
+            result = self._one(shot, target, lens, partial(_correcting, bars, task, number))
+            states[result["state"]] += 1
+            self._say(shot.path, target, result, as_json=as_json)
+            if result["state"] == "corrected":
+                gains.append(result["expected_gain_db"])
+            results.append({"photo": str(shot.path), "output": str(target), **result})
+            bars.update(task, completed=number + 1)
+        bars.remove_task(task)
+        return Row(group, profile, self._learned[group.name, group.focal], states, tuple(gains))
+
+    def _one(
+        self, shot: Shot, target: Path, lens: Lens | None, on_step: Callable[[int, int], None]
+    ) -> dict[str, Any]:
+        if lens is None:
+            return {"state": "left", "reason": "its lens could not be learned from these photos"}
+        photo = pipeline.photo_id(shot.path)
+        samples = len(lens.profile.model.samples)
+        wishes = self._wishes
+        under = (
+            f"{target.name}, {samples} samples, {wishes.method}, strength {wishes.strength:g}, "
+            f"{wishes.bounds}, aperture {wishes.aperture}"
+        )
+        known = self._journal.verdict("left", photo, under)
+        if known is not None and not self._wishes.force:
+            return {"state": "left", "reason": known}
+        settings = LensSettings(aperture=self._wishes.aperture)
+        try:
+            result = correction.correct_one(
+                shot.path, target, lens, settings, self._wishes, self._display, on_step
+            )
+        except (LensModelError, OSError) as error:
+            return _failed(error)
+        if result["state"] == "left":
+            result["reason"] = "next to nothing would be gained"
+            self._journal.note("left", photo, under, result["reason"])
+        return result
+
+    def _say(self, path: Path, target: Path, result: Mapping[str, Any], *, as_json: bool) -> None:
+        if result["state"] == "failed":
+            self._display.error(f"{path}: {result['reason']}")
+        elif result["state"] == "left":
+            self._display.detail(f"{path}: left as it is, {result['reason']}")
+        elif result["state"] == "kept":
+            self._display.detail(f"{target} is there already and was left alone; --force replaces it")
+        else:
+            if not as_json:
+                self._display.detail(f"{target}: {gain_words(result['expected_gain_db'])} expected")
+            for line in correction.remarks(result):
+                self._display.detail(f"{path.name}, {line}")
+
+
+def _learning(bars: Progress, task: TaskID, number: int, event: pipeline.CalibrationEvent) -> None:
+    share = event.done / event.total if event.total else 0.0
+    bars.update(
+        task, description=f"learning from {event.photo.name}: {event.stage}", completed=number + share
+    )
+
+
+def _correcting(bars: Progress, task: TaskID, number: int, done: int, total: int) -> None:
+    bars.update(task, completed=number + done / max(total, 1))
+
+
+def _document(row: Row) -> dict[str, Any]:
+    return {
+        "camera": row.group.camera,
+        "lens": row.group.lens,
+        "focal_length": row.group.focal,
+        "profile": str(row.profile) if row.profile.exists() else None,
+        "photos": len(row.group.shots),
+        "learned_from": row.learned,
+        "corrected": row.states.get("corrected", 0),
+        "corrected_before": row.states.get("kept", 0),
+        "left": row.states.get("left", 0),
+        "failed": row.states.get("failed", 0),
+        "expected_gain_db": row.gain_db,
+    }
+
+
+def _table(rows: Sequence[Row]) -> str:
+    head = [
+        *("camera", "lens", "focal length", "photos", "learned from", "corrected", "left", "failed"),
+        "expected gain",
+    ]
+    lines = [
+        [
+            row.group.camera,
+            row.group.lens,
+            row.group.focal,
+            str(len(row.group.shots)),
+            str(row.learned),
+            str(row.states.get("corrected", 0) + row.states.get("kept", 0)),
+            str(row.states.get("left", 0)),
+            str(row.states.get("failed", 0)),
+            "" if row.gain_db is None else gain_words(row.gain_db),
+        ]
+        for row in rows
+    ]
+    return aligned(head, lines, numbers=range(3, 9))

@@ -1,0 +1,153 @@
+"""A folder of photos, sorted by what took them: one body, one lens, one focal length."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from lensmodel.photo import inspect
+from lensmodel.photo.values import PhotoMetadata
+from lensmodel.workflow.identity import Identity, name_key, serial_key
+
+SAME_FOCAL: Final = 1.19
+"""Focal lengths up to this ratio count as one: 2^(1/4), the reach of the lens model over focal lengths
+(`focal_octaves` in `lensmodel.model.variables`)."""
+
+MOST_IN_NAME: Final = 80
+"""Characters of a file name (chosen): file systems take 255 bytes, and the ending needs some."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One photo and what its file says."""
+
+    path: Path
+    metadata: PhotoMetadata
+
+    @classmethod
+    def of(cls, path: Path) -> Shot:
+        """Read the header of a photo."""
+        return cls(path, inspect(path).metadata)
+
+    @property
+    def owner(self) -> tuple[str, ...]:
+        """What two photos of one copy of a lens on one body agree in."""
+        said = self.metadata
+        body = (name_key(said.camera_model), serial_key(said.body_serial))
+        lens = (name_key(said.lens.model), serial_key(said.lens.serial))
+        return (*body, *lens)
+
+    @property
+    def names_lens(self) -> bool:
+        """Whether the file says which lens it was."""
+        return Identity.of(self.metadata).names_lens
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Photos of one body, one lens and about one focal length.
+
+    Parameters
+    ----------
+    shots : tuple of Shot
+        By name; at least one.
+    name : str
+        Of the lens profile that the group belongs to, without an ending. A lens that the files name has one
+        for all its focal lengths, since a profile tells them apart; photos that name no lens may be of as
+        many lenses as there are focal lengths.
+    """
+
+    shots: tuple[Shot, ...]
+    name: str
+
+    @property
+    def camera(self) -> str:
+        """The body in words."""
+        return self.shots[0].metadata.camera_model or "unknown camera"
+
+    @property
+    def lens(self) -> str:
+        """The lens in words; its serial shortened, as tables are shown around."""
+        said = self.shots[0].metadata.lens
+        serial = f" #{said.serial[-4:]}" if said.serial else ""
+        return f"{said.model or 'lens not named'}{serial}"
+
+    @property
+    def focal(self) -> str:
+        """The focal length in words."""
+        known = [shot.metadata.focal_mm for shot in self.shots if shot.metadata.focal_mm]
+        if not known:
+            return "unknown"
+        low, high = f"{min(known):.3g}", f"{max(known):.3g}"
+        return f"{low} mm" if low == high else f"{low}-{high} mm"
+
+    def to_learn_from(self) -> list[Shot]:
+        """Return the photos in the order in which they tell most: each aperture's first one, then the second.
+
+        A photo whose aperture is unknown comes last.
+        """
+        by_aperture: dict[float, list[Shot]] = {}
+        for shot in self.shots:
+            by_aperture.setdefault(shot.metadata.aperture or float("inf"), []).append(shot)
+        ordered = [by_aperture[aperture] for aperture in sorted(by_aperture)]
+        longest = max(map(len, ordered))
+        return [shots[i] for i in range(longest) for shots in ordered if i < len(shots)]
+
+
+def groups(shots: Iterable[Shot]) -> list[Group]:
+    """Sort photos by body, lens and focal length.
+
+    Parameters
+    ----------
+    shots : iterable of Shot
+
+    Returns
+    -------
+    list of Group
+        By the name of their profile, then by focal length.
+    """
+    owners: dict[tuple[str, ...], list[Shot]] = {}
+    for shot in shots:
+        owners.setdefault(shot.owner, []).append(shot)
+    found: list[Group] = []
+    names: set[str] = set()
+    for owner in sorted(owners):
+        runs = _by_focal(owners[owner])
+        shared = _free(_name(runs[0][0], with_focal=False), names) if runs[0][0].names_lens else None
+        for run in runs:
+            name = shared or _free(_name(run[0], with_focal=True), names)
+            names.add(name)
+            found.append(Group(tuple(sorted(run, key=lambda shot: shot.path)), name))
+    return found
+
+
+def _by_focal(shots: Sequence[Shot]) -> list[list[Shot]]:
+    """Cut into runs in which no focal length is more than `SAME_FOCAL` times the shortest."""
+    runs: list[list[Shot]] = []
+    start = -1.0
+    for shot in sorted(shots, key=lambda shot: shot.metadata.focal_mm or 0.0):
+        focal = shot.metadata.focal_mm or 0.0
+        if not runs or focal > start * SAME_FOCAL:
+            runs.append([])
+            start = focal
+        runs[-1].append(shot)
+    return runs
+
+
+def _name(shot: Shot, *, with_focal: bool) -> str:
+    said = shot.metadata
+    focal = f"{said.focal_mm:g}mm" if with_focal and said.focal_mm else None
+    words = [said.camera_model, said.lens.model, said.lens.serial and said.lens.serial[-4:], focal]
+    plain = re.sub(r"[^\w.+-]+", "-", "-".join(word for word in words if word)).strip("-.")
+    return plain[:MOST_IN_NAME] or "unknown-camera"
+
+
+def _free(name: str, taken: set[str]) -> str:
+    """Two copies whose serials end alike get a number."""
+    number, free = 2, name
+    while free in taken:
+        free, number = f"{name}-{number}", number + 1
+    return free

@@ -1,0 +1,222 @@
+"""`lensmodel keys`: who may use a service that others can reach."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from app.commands.console.failure import UsageError
+from app.commands.console.options import Json, choice
+from app.commands.service import Data, settings_from
+from lensmodel.core.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from app.store.access.keys import KeyStore, Listed
+
+keys = typer.Typer(
+    help="""Make, list, renew and end the keys of a service that others can reach.
+
+Examples:
+
+    lensmodel keys create --owner anna
+
+    lensmodel keys list
+
+Exit status: 0 done, 1 it could not be, 2 called wrongly.""",
+    no_args_is_help=True,
+)
+
+SPAN: Final = re.compile(r"(\d{1,6})(h|d|w|y)", re.ASCII)
+HOURS: Final = {"h": 1, "d": 24, "w": 24 * 7, "y": 24 * 365}
+GIB: Final = 1 << 30
+
+
+def _span(text: str) -> timedelta:
+    """Read a span of time as people write it: 12h, 90d, 6w, 1y."""
+    match = SPAN.fullmatch(text.strip().lower())
+    if match is None:
+        raise UsageError(f"a span of time is a number and h, d, w or y, such as 90d; got {text!r}")
+    return timedelta(hours=int(match[1]) * HOURS[match[2]])
+
+
+def _span_or_none(text: str | None) -> timedelta | None:
+    return None if text is None or text == "never" else _span(text)
+
+
+@contextmanager
+def _opened(data: Data) -> Iterator[KeyStore]:
+    """Open the keys of an installation, its schema brought up to date."""
+    from app.store.access.keys import KeyStore  # noqa: PLC0415 - same
+    from app.store.database import Database  # noqa: PLC0415 - same
+    from app.store.upkeep import migrate  # noqa: PLC0415 - only these commands need the service
+
+    settings = settings_from(data)
+    settings.data_dir.mkdir(parents=True, exist_ok=True)
+    database = Database(settings.database)
+    try:
+        migrate.upgrade(database)
+        yield KeyStore(database)
+    finally:
+        database.close()
+
+
+def _show(text: str) -> None:
+    """Print a new key alone on the standard output, so that it can be passed on."""
+    typer.echo("Shown once, and kept nowhere: store it where passwords are stored.", err=True)
+    typer.echo(text)
+
+
+@keys.command()
+def create(
+    owner: Annotated[
+        str, typer.Option(metavar="NAME", help="Whose photos the key opens; he is made if he is new.")
+    ] = "local",
+    scope: Annotated[
+        str,
+        choice(
+            "--scope",
+            ("read", "write", "admin"),
+            "What it allows: read asks, write also changes, admin also erases the account.",
+        ),
+    ] = "write",
+    expires: Annotated[
+        str, typer.Option(metavar="SPAN", help="When it ends: 12h, 90d, 6w, 1y or never.")
+    ] = "1y",
+    label: Annotated[
+        str | None, typer.Option(metavar="TEXT", help="What it is for, shown by keys list.")
+    ] = None,
+    quota_gb: Annotated[
+        float | None,
+        typer.Option(min=0.0, metavar="GIB", help="Most photo bytes of this owner."),
+    ] = None,
+    quota_photos: Annotated[
+        int | None, typer.Option(min=0, metavar="N", help="Most photos of this owner.")
+    ] = None,
+    data: Data = None,
+) -> None:
+    """Make a key and print it, once.
+
+    Photos of a service that had no keys yet belong to the owner "local": his key opens them.
+
+    Examples:
+
+        lensmodel keys create
+
+        lensmodel keys create --owner anna --scope read --expires 90d --label notebook
+
+    Exit status: 0 made, 1 it could not be, 2 called wrongly.
+    """
+    name = owner.strip()
+    if not (0 < len(name) <= 100 and name.isprintable() and "|" not in name):
+        raise UsageError(f"an owner's name has 1 to 100 printable signs and no bar, got {owner!r}")
+    lasts = _span_or_none(expires)
+    with _opened(data) as store:
+        made = store.create(
+            name,
+            [scope],  # type: ignore[list-item]  # the option takes no other
+            label=label,
+            lasts=lasts,
+            quota_bytes=None if quota_gb is None else int(quota_gb * GIB),
+            quota_photos=quota_photos,
+        )
+    _show(made.text)
+
+
+@keys.command(name="list")
+def listed(
+    owner: Annotated[str | None, typer.Option(metavar="NAME", help="Only those of this owner.")] = None,
+    data: Data = None,
+    json_output: Json = False,
+) -> None:
+    """List the keys, without what they consist of.
+
+    Examples:
+
+        lensmodel keys list
+
+        lensmodel keys list --owner anna --json
+
+    Exit status: 0 listed, 1 it could not be, 2 called wrongly.
+    """
+    with _opened(data) as store:
+        rows = [_described(one) for one in store.listed(owner)]
+    if json_output:
+        typer.echo(json.dumps(rows, indent=2))
+        return
+    for row in rows:
+        words = (f"{name} {value}" for name, value in row.items() if value is not None and name != "prefix")
+        typer.echo(f"{row['prefix']}  {', '.join(words)}")
+    if not rows:
+        typer.echo("no keys: lensmodel keys create makes one", err=True)
+
+
+def _described(one: Listed) -> dict[str, str | None]:
+    key, now = one.key, datetime.now(UTC)
+    ended = key.expires_at is not None and key.expires_at <= now
+    return {
+        "prefix": key.prefix,
+        "owner": one.owner,
+        "state": "revoked" if key.revoked_at else "expired" if ended else "valid",
+        "scope": key.scopes,
+        "label": key.label,
+        "created": _day(key.created_at),
+        "expires": _day(key.expires_at),
+        "used": _day(key.last_used_at),
+    }
+
+
+def _day(moment: datetime | None) -> str | None:
+    return None if moment is None else moment.isoformat(timespec="seconds")
+
+
+Prefix = Annotated[str, typer.Argument(metavar="PREFIX", help="The signs after lpk_, or the whole key.")]
+
+
+def _prefix(text: str) -> str:
+    """Return the prefix of a key that was given wholly or in part."""
+    return text.removeprefix("lpk_").partition("_")[0]
+
+
+@keys.command()
+def rotate(
+    prefix: Prefix,
+    keep: Annotated[
+        str, typer.Option(metavar="SPAN", help="How long the old key goes on: 0h ends it at once.")
+    ] = "24h",
+    data: Data = None,
+) -> None:
+    """Make a key in place of another, with the same owner and scope, and print it, once.
+
+    Example:
+
+        lensmodel keys rotate abcd2345 --keep 1h
+
+    Exit status: 0 made, 1 there is no such valid key, 2 called wrongly.
+    """
+    with _opened(data) as store:
+        made = store.rotate(_prefix(prefix), keep=_span(keep))
+    if made is None:
+        raise InvalidInputError(f"no valid key begins with {_prefix(prefix)}: lensmodel keys list shows them")
+    _show(made.text)
+
+
+@keys.command()
+def revoke(prefix: Prefix, data: Data = None) -> None:
+    """End a key, and all browsers that signed in with it, within a second.
+
+    Example:
+
+        lensmodel keys revoke abcd2345
+
+    Exit status: 0 ended, 1 there is no such key, 2 called wrongly.
+    """
+    with _opened(data) as store:
+        if not store.revoke(_prefix(prefix)):
+            raise InvalidInputError(f"no key begins with {_prefix(prefix)}: lensmodel keys list shows them")
+    typer.echo(f"key {_prefix(prefix)} is revoked")

@@ -1,0 +1,65 @@
+"""What `lensmodel report -o` writes besides its first pictures: the lens test, and a comparison."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from lensmodel.core.codec import to_json
+from lensmodel.model.profile import LensProfile
+from lensmodel.report import bootstrap
+from lensmodel.report.comparison import Side, compare
+from lensmodel.report.documents import comparison_html, to_html
+from lensmodel.report.exporters import write_atomically
+from lensmodel.report.lens_test import LensTest, lens_test
+from lensmodel.report.pdf import comparison_pdf, to_pdf
+from lensmodel.report.tables import to_csv
+
+FILES: Final = ("lens-test.html", "lens-test.pdf", "lens-test.csv", "lens-test.json")
+COMPARED: Final = ("comparison.html", "comparison.pdf")
+
+
+def tested(profile: LensProfile, path: Path, aspect: float) -> LensTest:
+    """Test the lens of a profile."""
+    words = [profile.lens[key] for key in ("maker", "model") if profile.lens.get(key)]
+    name = profile.lens.get("label") or " ".join(words) or path.stem
+    return lens_test(profile.model, name, aspect=aspect, draws=bootstrap.DRAWS)
+
+
+def write(folder: Path, test: LensTest) -> list[str]:
+    """Write a lens test; return the names of the files that were left out, since reportlab is missing."""
+    writers: dict[str, Callable[[], bytes]] = {
+        "lens-test.html": lambda: to_html(test).encode(),
+        "lens-test.csv": lambda: to_csv(test).encode(),
+        "lens-test.json": lambda: json.dumps(to_json(test), indent=1).encode(),
+        "lens-test.pdf": lambda: to_pdf(test),
+    }
+    return _written(folder, writers)
+
+
+def write_comparison(folder: Path, first: LensTest, second: LensTest, aperture: float | None) -> list[str]:
+    """Write two lens tests beside each other; return as `write`."""
+    names = [first.name, second.name if second.name != first.name else f"{second.name} (2)"]
+    sides = [Side(name, test.at(aperture)) for name, test in zip(names, (first, second), strict=True)]
+    found = compare(*sides)
+    return _written(
+        folder,
+        {
+            "comparison.html": lambda: comparison_html(found).encode(),
+            "comparison.pdf": lambda: comparison_pdf(found),
+        },
+    )
+
+
+def _written(folder: Path, writers: dict[str, Callable[[], bytes]]) -> list[str]:
+    missing = []
+    for name, made in writers.items():
+        try:
+            data = made()
+        except ModuleNotFoundError:
+            missing.append(name)
+            continue
+        write_atomically(folder / name, data)
+    return missing

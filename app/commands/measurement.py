@@ -1,0 +1,221 @@
+"""`lensmodel measure` and `lensmodel target`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Final, get_args
+
+import typer
+
+from app.commands.console import display, files
+from app.commands.console.display import Display
+from app.commands.console.failure import UsageError
+from app.commands.console.options import (
+    AnyLens,
+    Aperture,
+    Force,
+    Json,
+    Photos,
+    Profile,
+    Quiet,
+    Verbose,
+    choice,
+)
+from app.schemas import MeasurementKind
+from lensmodel.core.errors import InvalidInputError, LensModelError
+from lensmodel.core.types import LensSettings
+from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
+from lensmodel.photo.endings import ENDINGS
+from lensmodel.workflow import pipeline
+from lensmodel.workflow.identity import difference
+
+PAPERS: Final = ("a2", "a3", "a4")
+USUAL_DETAIL: Final = 4000
+
+
+@dataclass(frozen=True, slots=True)
+class Wishes:
+    """What the options said."""
+
+    kind: str
+    aperture: float | None
+    size: int
+    replace: bool
+    any_lens: bool
+
+
+def measure(
+    context: typer.Context,
+    kind: Annotated[
+        str,
+        typer.Argument(metavar="<target|pair|points|edges>", help="What the photos show."),
+    ],
+    photos: Photos,
+    profile: Profile,
+    aperture: Aperture = None,
+    size: Annotated[int, typer.Option(min=9, max=101, metavar="N", help="Odd side of a PSF in pixels.")] = 31,
+    replace_blind: Annotated[
+        bool,
+        typer.Option(
+            "--replace", help="Drop what was learned blindly at the same aperture and focal length."
+        ),
+    ] = False,
+    any_lens: AnyLens = False,
+    json_output: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = 0,
+) -> None:
+    """Measure the blur of a lens on photos made for it, into a profile.
+
+    A profile that exists is added to: measured samples stand beside the blind ones, and count more.
+
+    - target: the page that `lensmodel target` prints, photographed flat, nearly filling the frame.
+
+    - pair: one scene from a tripod, wide open and at about f/8. Photos are taken in twos.
+
+    - points: stars, or pinholes before a lamp; not saturated.
+
+    - edges: an ISO 12233 chart or a checkerboard that leans by 5 degrees.
+
+    Examples:
+
+        lensmodel measure target page.dng --profile my-24mm.lensprofile
+
+        lensmodel measure pair open.dng closed.dng --profile my-24mm.lensprofile --replace
+
+    Exit status: 0 all photos were used, 1 some were not, 2 called wrongly.
+    """
+    shown = display.of(context, quiet=quiet, verbose=verbose)
+    if kind not in get_args(MeasurementKind):
+        raise UsageError(f"measure one of {', '.join(get_args(MeasurementKind))}, not {kind!r}")
+    if size % 2 == 0:
+        raise UsageError(f"--size must be odd, got {size}; a PSF has one middle pixel")
+    wishes = Wishes(kind, aperture, size, replace_blind, any_lens)
+    _run(photos, profile, wishes, shown, as_json=json_output)
+
+
+def _run(names: list[str], target: Path, wishes: Wishes, shown: Display, *, as_json: bool) -> None:
+    from lensmodel.workflow import measuring  # noqa: PLC0415 - half of SciPy, which `--help` should not wait for
+
+    paths = files.photos(names)
+    if target.is_dir() or target.suffix.lower() in ENDINGS:
+        raise UsageError(f"{target} is no lens profile; name one, for example my-24mm.lensprofile")
+    with files.as_usage():
+        groups = measuring.measurements_of(wishes.kind, paths)
+    results: list[dict[str, Any]] = []
+    with shown.progress() as bars:
+        task = bars.add_task("", total=len(groups))
+        for number, group in enumerate(groups):
+
+            def on_step(done: int, total: int, number: int = number, name: str = group[0].name) -> None:
+                bars.update(task, description=f"{name}: measuring", completed=number + done / total)
+
+            try:
+                result = _add(group, target, wishes, on_step)
+            except (LensModelError, OSError) as error:
+                result = {"state": "failed", "reason": files.reason(error)}
+                shown.error(f"{group[0]}: {result['reason']}")
+            results.append({"photos": [str(path) for path in group], **result})
+            bars.update(task, completed=number + 1)
+    if as_json:
+        shown.document({"profile": str(target) if target.exists() else None, "results": results})
+    for result in results:
+        if result["state"] == "measured" and not as_json:
+            shown.result(
+                f"{target}: {result['places']} places measured on {Path(result['photos'][0]).name} "
+                f"({result['estimator']}), usual error {result['error']:.2f}"
+            )
+        elif result["state"] == "known":
+            shown.note(f"{result['photos'][0]}: the profile has it already")
+    if any(result["state"] == "failed" for result in results):
+        raise typer.Exit(1)
+
+
+def _add(group: tuple[Path, ...], target: Path, wishes: Wishes, on_step: Any) -> dict[str, Any]:  # noqa: ANN401
+    """Measure on the photos of one measurement and save the profile; say what became of it."""
+    from lensmodel.workflow import measuring  # noqa: PLC0415 - see `_run`
+    from lensmodel.workflow.joining import joined  # noqa: PLC0415 - see `_run`
+
+    path, key = group[0], pipeline.photo_id(group[0])
+    known = load_profile(target) if target.exists() else None
+    if known is not None and key in known.photos:
+        return {"state": "known"}
+    seen = files.identity(path)
+    if known is not None and not wishes.any_lens:
+        why = difference(known.lens, known.cameras, seen)
+        if why is not None:
+            raise InvalidInputError(f"{why}; give it a profile of its own, or add --any-lens")
+    given = None if files.says_aperture(path) else LensSettings(aperture=wishes.aperture)
+    samples = measuring.samples_of_measurement(
+        wishes.kind, group, settings=given, size=wishes.size, on_step=on_step
+    )
+    if target.exists():  # another run may have added to it meanwhile
+        known = load_profile(target)
+    model: LensModel = joined(None if known is None else known.model, samples, replace=wishes.replace)
+    cameras = () if seen.camera is None else (seen.camera,)
+    if known is None:
+        grown = LensProfile(model, dict(seen.lens), {key: path.name}, cameras)
+    else:
+        lens = known.lens if wishes.any_lens else {**seen.lens, **known.lens}
+        more = tuple(camera for camera in cameras if camera not in known.cameras)
+        photos = {name: label for name, label in known.photos.items() if _counts(name, model)}
+        grown = replace(
+            known, model=model, lens=lens, photos={**photos, key: path.name}, cameras=(*known.cameras, *more)
+        )
+    target.parent.mkdir(parents=True, exist_ok=True)
+    save_profile(target, grown)
+    green = sorted(s.error or 0.0 for s in samples if s.settings.channel == "g") or [1.0]
+    return {
+        "state": "measured",
+        "places": len({(s.position.r, s.position.phi) for s in samples}),
+        "samples": len(samples),
+        "estimator": samples[0].estimator,
+        "error": green[len(green) // 2],
+    }
+
+
+def _counts(photo: str, model: LensModel) -> bool:
+    """Whether a photo still has samples in the model; `--replace` may have taken them all."""
+    return any(sample.photo == photo for sample in model.samples)
+
+
+def target(
+    context: typer.Context,
+    output: Annotated[Path, typer.Argument(metavar="FILE", help="Name ending in .pdf, .png or .svg.")],
+    paper: Annotated[str, choice("--paper", PAPERS, "Size of the paper, lying.")] = "a3",
+    detail: Annotated[
+        int,
+        typer.Option(
+            metavar="N",
+            help="Samples along the long side: 1000, 1400, 2000, 2800, 4000 or 5600. Choose the nearest to "
+            "the pixels that the page will take in the photo.",
+        ),
+    ] = USUAL_DETAIL,
+    force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = 0,
+) -> None:
+    """Write the page to print for `lensmodel measure target`.
+
+    Print it at full size on matte paper, in grey, without sharpening; fix it flat.
+
+    Examples:
+
+        lensmodel target target.pdf
+
+        lensmodel target target.png --paper a4 --detail 2800
+
+    Exit status: 0 written, 1 failed, 2 called wrongly.
+    """
+    from lensmodel.estimation.measure import DETAILS, TargetPage, print_target  # noqa: PLC0415 - see `_run`
+
+    shown = display.of(context, quiet=quiet, verbose=verbose)
+    if detail not in DETAILS:
+        raise UsageError(f"--detail must be one of {', '.join(map(str, DETAILS))}, got {detail}")
+    if output.is_dir():
+        raise UsageError(f"{output} is a folder; name a file ending in .pdf, .png or .svg")
+    files.refuse_existing(output, force=force)
+    with files.as_usage():
+        print_target(output, TargetPage(detail), paper=paper)
+    shown.result(str(output))

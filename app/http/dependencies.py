@@ -1,0 +1,120 @@
+"""What routes need, handed to them: the parts of the application and who is asking."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Annotated
+
+from fastapi import Depends, Request, Response, Security
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from starlette.concurrency import run_in_threadpool
+
+from app.access.authentication import Gate, Who
+from app.blobs.storage import Storage
+from app.http.job_watch import Watch
+from app.http.model_cache import ModelCache
+from app.http.picture_cache import Drawn
+from app.runtime.disk_reserve import Reserve
+from app.runtime.settings import Settings
+from app.store import Store
+
+
+@dataclass(frozen=True, slots=True)
+class Services:
+    """Everything that one application is made of."""
+
+    settings: Settings
+    store: Store
+    storage: Storage
+    models: ModelCache
+    uploads: Places
+    reserve: Reserve
+    pictures: Drawn
+    watch: Watch
+    gate: Gate
+
+
+class Places:
+    """How many of something there may be at once, counted in the event loop."""
+
+    def __init__(self, free: int) -> None:
+        self.free = free
+
+    @contextmanager
+    def one(self, refusal: Exception) -> Iterator[None]:
+        """Take a place; raise the refusal where none is free."""
+        if self.free <= 0:
+            raise refusal
+        self.free -= 1
+        try:
+            yield
+        finally:
+            self.free += 1
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """One request: what serves it, who asks, and the head of its answer."""
+
+    request: Request
+    response: Response
+    services: Services
+    who: Who
+
+    @property
+    def owner(self) -> str:
+        """Whose data it is about."""
+        return self.who.owner
+
+    @property
+    def settings(self) -> Settings:
+        """What is configured."""
+        return self.services.settings
+
+    @property
+    def store(self) -> Store:
+        """The tables."""
+        return self.services.store
+
+    @property
+    def storage(self) -> Storage:
+        """The blobs."""
+        return self.services.storage
+
+    @property
+    def models(self) -> ModelCache:
+        """The fitted models."""
+        return self.services.models
+
+
+BEARER = HTTPBearer(auto_error=False, description="A key that `lensmodel keys create` made.")
+"""For the description of the interface; who asks is told by `Gate`."""
+
+NOBODY = Who("", ())
+
+
+async def call_of(
+    request: Request,
+    response: Response,
+    described: Annotated[HTTPAuthorizationCredentials | None, Security(BEARER)] = None,
+) -> Call:
+    """Put together what a route needs, for those who may ask it."""
+    del described
+    services: Services = request.app.state.services
+    # async: a plain function would cost each request a trip to a thread, which only new keys are worth
+    who = services.gate.quick(request)
+    if who is None:
+        who = await run_in_threadpool(services.gate.who, request)
+    services.gate.admit(who, request.method)
+    return Call(request, response, services, who)
+
+
+async def probe_of(request: Request, response: Response) -> Call:
+    """Put together what a probe needs, which anybody may ask: it owns nothing."""
+    return Call(request, response, request.app.state.services, NOBODY)
+
+
+ProbeDep = Annotated[Call, Depends(probe_of)]
+CallDep = Annotated[Call, Depends(call_of)]

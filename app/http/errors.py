@@ -1,0 +1,358 @@
+"""Exceptions to answers: one table, one shape (`application/problem+json`, RFC 9457).
+
+A route raises and contains no `try`. What is not in the table is our own fault: status 500,
+the cause goes to the log and not to the caller.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from http import HTTPStatus
+from typing import Any, ClassVar, Final
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import Response
+from obstore.exceptions import BaseError as StorageError
+from pydantic import ValidationError
+from sqlalchemy.exc import DBAPIError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
+
+from app.runtime.outage import is_no_room, is_outage
+from app.schemas import FieldError, Problem
+from lensmodel.core import errors as library
+
+log = logging.getLogger(__name__)
+
+MEDIA_TYPE: Final = "application/problem+json"
+REQUEST_ID: Final = "X-Request-ID"
+HEADERS: Final[Mapping[str, str]] = {
+    "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+"""On every answer, unless it says otherwise: nothing of it runs, is guessed at, or is shown elsewhere."""
+
+
+class ServiceError(library.LensModelError):
+    """Something that the service itself refuses.
+
+    Parameters
+    ----------
+    detail : str
+        The offending value and the remedy.
+    errors : sequence of FieldError
+        One entry for each offending field.
+    headers : mapping of str to str
+        For the answer.
+    """
+
+    status: ClassVar[int] = 400
+
+    def __init__(
+        self, detail: str, *, errors: Sequence[FieldError] = (), headers: Mapping[str, str] | None = None
+    ) -> None:
+        super().__init__(detail)
+        self.errors = tuple(errors)
+        self.headers = dict(headers or {})
+
+
+class MalformedUploadError(ServiceError):
+    """The body is not what an upload looks like."""
+
+    code = "malformed_upload"
+
+
+class InvalidParameterError(ServiceError):
+    """A value outside its range."""
+
+    status, code = 422, "invalid_parameter"
+
+
+class UnknownPhotoError(ServiceError):
+    """No photo of that id, or somebody else's."""
+
+    status, code = 404, "unknown_photo"
+
+
+class UnknownPictureError(ServiceError):
+    """No part of a picture there."""
+
+    status, code = 404, "unknown_photo"
+
+
+class UnknownLensError(ServiceError):
+    """No lens of that id, or somebody else's."""
+
+    status, code = 404, "unknown_lens"
+
+
+class UnknownCorrectionError(ServiceError):
+    """No correction of that id, or somebody else's."""
+
+    status, code = 404, "unknown_correction"
+
+
+class UnknownJobError(ServiceError):
+    """No job of that id, or somebody else's."""
+
+    status, code = 404, "unknown_job"
+
+
+class NotSignedInError(ServiceError):
+    """Nobody knows who asks."""
+
+    status, code = 401, "not_signed_in"
+
+
+class ForbiddenError(ServiceError):
+    """Who asks is known, and may not do this."""
+
+    status, code = 403, "forbidden"
+
+
+class NotReadyError(ServiceError):
+    """What was asked for is still being made."""
+
+    status, code = 409, "not_ready"
+
+
+class ConflictError(ServiceError):
+    """The state does not allow it."""
+
+    status, code = 409, "conflict"
+
+
+class NotAcceptableError(ServiceError):
+    """None of the formats that the caller accepts exists."""
+
+    status, code = 406, "not_acceptable"
+
+
+class TooLargeError(ServiceError):
+    """More bytes than an upload may have."""
+
+    status, code = 413, "image_too_large"
+
+
+class SlowBodyError(ServiceError):
+    """A body that does not come, or hardly."""
+
+    status, code = 408, "too_slow"
+
+
+class BusyError(ServiceError):
+    """Too much is being done already."""
+
+    status, code = 503, "busy"
+
+
+class QuotaError(ServiceError):
+    """The owner has too much unfinished or stored already."""
+
+    status, code = 429, "quota_exceeded"
+
+
+class StorageFullError(ServiceError):
+    """No room for another photo."""
+
+    status, code = 507, "quota_exceeded"
+
+
+class RangeError(ServiceError):
+    """A byte range beyond the end of the file."""
+
+    status, code = 416, "invalid_parameter"
+
+
+STATUS: Final[Mapping[type[Exception], int]] = {
+    library.InvalidInputError: 422,
+    library.UnreadablePhotoError: 415,
+    library.ImageTooLargeError: 413,
+    library.MetadataMissingError: 422,
+    library.OutsideSupportError: 422,
+    library.NotEnoughEvidenceError: 409,
+    library.CancelledError: 409,
+}
+"""Exceptions of the library by HTTP status; subclasses count as their nearest ancestor here."""
+
+STATUS_OF_CODE: Final[Mapping[str, int]] = {
+    "malformed_upload": 400,
+    "not_an_image": 415,
+    "truncated_image": 415,
+    "unsupported_format": 415,
+    "raw_decode_failed": 415,
+    "image_too_large": 413,
+    "decompression_bomb": 413,
+    "metadata_missing": 422,
+    "invalid_parameter": 422,
+    "no_usable_patches": 422,
+    "outside_support": 422,
+    "no_samples": 409,
+    "unknown_photo": 404,
+    "unknown_lens": 404,
+    "not_ready": 409,
+    "conflict": 409,
+    "cancelled": 409,
+    "quota_exceeded": 429,
+    "busy": 503,
+    "memory_limit": 422,
+    "time_limit": 422,
+    "crashed_repeatedly": 500,
+    "outage": 503,
+}
+"""Codes that a job can end with, by the status that the same error has as an answer."""
+
+CODE_OF_STATUS: Final[Mapping[int, str]] = {
+    404: "not_found",
+    405: "method_not_allowed",
+    413: "image_too_large",
+    415: "unsupported_format",
+    422: "invalid_parameter",
+    503: "busy",
+}
+
+
+def status_of(error: Exception) -> int:
+    """Return the HTTP status of an exception: its own, or that of its nearest known ancestor."""
+    if isinstance(error, ServiceError):
+        return error.status
+    for kind in type(error).__mro__:
+        if kind in STATUS:
+            return STATUS[kind]
+    return 500
+
+
+def problem_of(code: str, detail: str | None, *, candidates: Sequence[str] = ()) -> Problem:
+    """Describe why a job ended, in the words of an answer."""
+    status = STATUS_OF_CODE.get(code, 500)
+    return Problem(
+        type=f"urn:lensmodel:{code}",
+        title=_title(code),
+        status=status,
+        detail=detail or "",
+        code=code,
+        candidates=list(candidates) or None,
+    )
+
+
+def respond(
+    request: Request,
+    status: int,
+    code: str,
+    detail: str,
+    *,
+    errors: Sequence[FieldError] = (),
+    headers: Mapping[str, str] | None = None,
+) -> Response:
+    """Build the answer for a problem."""
+    request_id = getattr(request.state, "request_id", None)
+    problem = Problem(
+        type=f"urn:lensmodel:{code}",
+        title=_title(code),
+        status=status,
+        detail=detail,
+        instance=request.url.path,
+        code=code,
+        errors=list(errors),
+        request_id=request_id,
+    )
+    every = {**HEADERS, **(headers or {})}
+    if request_id is not None:
+        every[REQUEST_ID] = request_id  # here too: what nobody foresaw is answered outside of RequestLog
+    return Response(problem.model_dump_json(exclude_none=True), status, media_type=MEDIA_TYPE, headers=every)
+
+
+def _title(code: str) -> str:
+    return code.replace("_", " ").capitalize()
+
+
+def field_errors(found: Sequence[Any]) -> list[FieldError]:
+    """Turn pydantic's findings into ours: where, what was sent, what is allowed."""
+    return [
+        FieldError(
+            field=".".join(_writable(part) for part in error["loc"]) or "body",
+            value=_shortened(error.get("input")),
+            message=_writable(error["msg"]),
+        )
+        for error in found
+    ]
+
+
+def _shortened(value: object) -> str | None:
+    if value is None or isinstance(value, dict | list | bytes):
+        return None  # a whole document is no value to quote
+    text = _writable(value)
+    return text if len(text) <= 100 else f"{text[:100]}…"
+
+
+def _writable(value: object) -> str:
+    """Return a value as text that UTF-8 can hold: JSON may name halves of signs, which it cannot."""
+    return str(value).encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+def _sentence(errors: Sequence[FieldError]) -> str:
+    said = (f"{e.field}: {e.message}" + (f", got {e.value!r}" if e.value is not None else "") for e in errors)
+    return "; ".join(said)
+
+
+def install(app: FastAPI) -> None:
+    """Add the handlers to an application."""
+
+    @app.exception_handler(library.LensModelError)
+    async def _known(request: Request, error: library.LensModelError) -> Response:
+        status = status_of(error)
+        if status >= HTTPStatus.INTERNAL_SERVER_ERROR and not isinstance(error, ServiceError):
+            log.error("unexpected %s", error.code, exc_info=error)
+        extra = error if isinstance(error, ServiceError) else ServiceError("")
+        return respond(request, status, error.code, str(error), errors=extra.errors, headers=extra.headers)
+
+    @app.exception_handler(RequestValidationError)
+    @app.exception_handler(ValidationError)
+    async def _invalid(request: Request, error: RequestValidationError | ValidationError) -> Response:
+        found = field_errors(error.errors())
+        return respond(request, 422, "invalid_parameter", _sentence(found), errors=found)
+
+    @app.exception_handler(HTTPException)
+    async def _framework(request: Request, error: HTTPException) -> Response:
+        code = CODE_OF_STATUS.get(error.status_code, "invalid_request")
+        detail = f"{request.method} {request.url.path}: {error.detail}; see /openapi.json for what there is"
+        return respond(request, error.status_code, code, detail, headers=error.headers)
+
+    @app.exception_handler(ClientDisconnect)
+    async def _gone(request: Request, error: ClientDisconnect) -> Response:
+        del error
+        return respond(request, 400, "malformed_upload", "the body ended early: send it again")
+
+    @app.exception_handler(DBAPIError)
+    @app.exception_handler(PoolTimeoutError)
+    @app.exception_handler(StorageError)
+    @app.exception_handler(OSError)
+    async def _away(request: Request, error: Exception) -> Response:
+        if is_no_room(error):
+            log.error("no room: %s", error)
+            detail = "there is no room for it: delete photos, or make room on the disk"
+            return respond(request, 507, "quota_exceeded", detail)
+        if not is_outage(error) and not isinstance(error, OperationalError):
+            return await _bug(request, error)
+        database = isinstance(error, SQLAlchemyError)
+        what = "database" if database else "storage"
+        log.error("%s: %s", what, getattr(error, "orig", error))
+        detail = f"the {what} does not answer; try again in a few seconds"
+        return respond(request, 503, "busy", detail, headers={"Retry-After": "5"})
+
+    @app.exception_handler(Exception)
+    async def _bug(request: Request, error: Exception) -> Response:
+        request_id = getattr(request.state, "request_id", None)  # here the context has it no more
+        log.error(
+            "unexpected error, request_id=%s",
+            request_id,
+            exc_info=error,
+            extra={"request_id": request_id},
+        )
+        detail = "an error of ours; the log has it under this request_id"
+        return respond(request, 500, "internal_error", detail)

@@ -1,0 +1,191 @@
+"""Around every request: its id, one line in the log, the names that the service answers to, who may ask."""
+
+from __future__ import annotations
+
+import logging
+import re
+import time
+from typing import Final
+from urllib.parse import quote, urlsplit
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import Request
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from structlog.contextvars import bound_contextvars, clear_contextvars
+
+from app.http.bodies import CLOSE, SAFE
+from app.http.errors import HEADERS, REQUEST_ID, respond
+from app.runtime import logs, metrics
+from app.store.ids import new_id
+
+log = logging.getLogger("app.access")
+
+MAX_LOGGED: Final = 500
+ONLY_HEAD: Final = "lensmodel.only_head"
+"""In the scope of a request whose answer needs no body."""
+
+_ACCEPTED: Final = re.compile(r"[A-Za-z0-9._-]{1,64}", re.ASCII)
+
+
+class RequestLog:
+    """Gives each request its id and writes what became of it; sets the headers that each answer has.
+
+    The query is not logged: it may hold a serial, which is personal data.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        clear_contextvars()  # a connection that is kept runs in the context of its first request
+        sent = Headers(scope=scope).get(REQUEST_ID, "")
+        request_id = sent if _ACCEPTED.fullmatch(sent) else new_id()
+        scope.setdefault("state", {})["request_id"] = request_id
+        began, status = time.perf_counter(), 500
+
+        async def answer(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                headers = MutableHeaders(scope=message)
+                headers[REQUEST_ID] = request_id
+                for name, value in HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        try:
+            with bound_contextvars(request_id=request_id):
+                await self._app(scope, receive, answer)
+        finally:
+            seconds = time.perf_counter() - began
+            millis = seconds * 1000
+            metrics.REQUEST_SECONDS.labels(_known(scope["method"]), _route(scope), str(status)).observe(
+                seconds
+            )
+            path = quote(scope["path"][:MAX_LOGGED], safe="/:@!$&'()*+,;=~")  # as it came: in one line
+            ids = {
+                name: text[:60] for name, text in scope.get("path_params", {}).items() if name in logs.FIELDS
+            }
+            log.info(
+                "%s %s %d %.1f ms request_id=%s",
+                *(scope["method"], path, status, millis, request_id),
+                extra={
+                    **ids,
+                    "request_id": request_id,
+                    "method": scope["method"],
+                    "path": path,
+                    "status": status,
+                    "ms": round(millis, 1),
+                },
+            )
+
+
+class OwnNames:
+    """Refuses requests for names that anybody can register, unless they are ours.
+
+    A page of a stranger may let its own name point to this machine, and would then be allowed by the
+    browser to read everything here. It cannot do so with an address or a local name.
+    """
+
+    def __init__(self, app: ASGIApp, allowed: frozenset[str]) -> None:
+        self._app, self._allowed = app, allowed
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on, or refuse it."""
+        if scope["type"] != "http" or is_ours(Headers(scope=scope).get("host", ""), self._allowed):
+            await self._app(scope, receive, send)
+            return
+        host = Headers(scope=scope).get("host", "")
+        detail = (
+            f"Host {host[:100]!r}: this service answers to addresses and local names such as localhost; "
+            "name others that are yours in LENS_ALLOWED_HOSTS"
+        )
+        await respond(Request(scope), 400, "invalid_parameter", detail)(scope, receive, send)
+
+
+class SameSite:
+    """Refuses changes that the page of another site asks a browser for; programs are no browsers.
+
+    A browser sends such requests with whatever the user may do here, and without asking him. It says
+    of each where it comes from (Fetch Metadata, W3C; Origin, RFC 6454), which a page cannot forge.
+    """
+
+    def __init__(self, app: ASGIApp, allowed: frozenset[str]) -> None:
+        self._app, self._allowed = app, allowed
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on, or refuse it."""
+        if scope["type"] != "http" or scope["method"] in SAFE or self._is_own(Headers(scope=scope)):
+            await self._app(scope, receive, send)
+            return
+        origin = Headers(scope=scope).get("origin", "")[:100]
+        detail = (
+            f"a page of {origin or 'another site'!r} asked for this change: only pages of this service may, "
+            "and programs, which send no Origin; name a proxy's host in LENS_ALLOWED_HOSTS"
+        )
+        await respond(Request(scope), 403, "cross_site", detail, headers=CLOSE)(scope, receive, send)
+
+    def _is_own(self, headers: Headers) -> bool:
+        if headers.get("sec-fetch-site", "none") not in {"same-origin", "none"}:
+            return False
+        origin = headers.get("origin")
+        if origin is None:
+            return True
+        try:
+            parsed = urlsplit(origin)
+            place, name = parsed.netloc.lower(), (parsed.hostname or "").lower()
+        except ValueError:
+            return False
+        return bool(name) and (place == headers.get("host", "").lower() or name in self._allowed)
+
+
+class Heads:
+    """Answers HEAD as GET without the body (RFC 9110, 9.3.2); events have no end and no HEAD."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on; of the answer, only the head."""
+        if scope["type"] != "http" or scope["method"] != "HEAD" or scope["path"].endswith("/events"):
+            await self._app(scope, receive, send)
+            return
+
+        async def answer(message: Message) -> None:
+            await send({**message, "body": b""} if message["type"] == "http.response.body" else message)
+
+        await self._app({**scope, "method": "GET", ONLY_HEAD: True}, receive, answer)
+
+
+def _known(method: str) -> str:
+    """Return a method as a label: of what a stranger makes up there is no end."""
+    return method if method in {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"} else "other"
+
+
+def _route(scope: Scope) -> str:
+    """Return the route of a request as a label, with names in place of ids."""
+    route: str = getattr(scope.get("route"), "path", "none")
+    return f"/v1{route}" if scope["path"].startswith("/v1/") and route.startswith("/") else route
+
+
+def is_ours(host: str, allowed: frozenset[str]) -> bool:
+    """Say whether a Host header is local or one of the allowed names, with any port."""
+    if is_local(host):
+        return True
+    try:
+        return (urlsplit(f"//{host}").hostname or "").lower() in allowed
+    except ValueError:
+        return False
+
+
+def is_local(host: str) -> bool:
+    """Say whether a Host header is an address or a local name, which no stranger can own."""
+    try:
+        name = urlsplit(f"//{host}").hostname or ""
+    except ValueError:
+        return False
+    return "." not in name or name.endswith((".localhost", ".local")) or name.replace(".", "").isdecimal()

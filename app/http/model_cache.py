@@ -1,0 +1,287 @@
+"""Fitted lens models in memory: always current, fitted once, bounded.
+
+Each request compares the lens's version in the table (one primary-key read, microseconds) with
+that of the model in memory. So a new sample is seen by the very next request in every process,
+without messages between processes and without waiting for something to expire.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final, TypeAlias
+
+from app.blobs.evidence import with_evidence
+from app.blobs.storage import Storage
+from app.http.errors import ConflictError, UnknownLensError
+from app.runtime import metrics
+from app.store import Store, StoredSample
+from app.store.samples import Family, LensState
+from app.store.versions import learned_key
+from lensmodel.core.errors import InvalidInputError, NoSamplesError
+from lensmodel.core.psf import PsfSample
+from lensmodel.model import LensModel, ModelSettings, Prior
+
+log = logging.getLogger(__name__)
+
+LOOK_S = 1.0
+"""How often to look whether a worker has learned more."""
+
+BYTES_FACTOR = 4
+"""A fitted model keeps its samples as splines besides: some copies of each."""
+
+
+_Key: TypeAlias = tuple[str, int | str | None]
+_LEANING: Final = "leaning"
+
+
+@dataclass(frozen=True, slots=True)
+class Fitted:
+    """A model and the state of the lens that it belongs to.
+
+    `learned` says that a worker has fitted it wholly. Until then requests are answered by a model
+    without the wavefront of the lens, which takes seconds to fit. `family` are the other copies that
+    `model` leans on; `own` is then the model without them.
+    """
+
+    lens_id: str
+    state: LensState
+    model: LensModel
+    pixel_pitch_um: float | None
+    size_bytes: int
+    learned: bool
+    family: Family = ()
+    own: LensModel | None = None
+
+
+class ModelCache:
+    """Least recently used models of one process.
+
+    Parameters
+    ----------
+    store : Store
+        Where the samples are.
+    max_bytes : int
+        Bound of what is kept, by estimate; the model in use is kept in any case.
+    storage : Storage, optional
+        Where workers keep what they have learned from samples.
+    family : bool
+        Whether lenses lean on other copies at all.
+    settings : ModelSettings, optional
+        Of all models; must be those of the workers, or what they learn is of no use here.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        max_bytes: int,
+        storage: Storage | None = None,
+        *,
+        family: bool = True,
+        settings: ModelSettings | None = None,
+    ) -> None:
+        self._store, self._max_bytes, self._storage = store, max_bytes, storage
+        self._family, self._settings = family, settings or ModelSettings()
+        self._asked: dict[str, float] = {}
+        self._models: OrderedDict[_Key, Fitted] = OrderedDict()
+        self._guard = threading.Lock()
+        self._building: dict[str, threading.Lock] = {}
+
+    def get(
+        self,
+        lens_id: str,
+        version: int | None = None,
+        *,
+        state: LensState | None = None,
+        family: bool = True,
+        relatives: Family | None = None,
+    ) -> Fitted:
+        """Return the model of a lens, current or of an earlier version.
+
+        `state` and `relatives` are what the caller has just read of the lens, if he did. Where no version is
+        named, the model leans on the owner's other copies of the lens as they are now, unless `family` says
+        no; a named version is what the photos of that lens said, and stays so.
+
+        Raises
+        ------
+        UnknownLensError
+            If there is no such lens.
+        NoSamplesError
+            If the lens has none (in that version).
+        ConflictError
+            If samples of that version were removed since.
+        """
+        own = self._own(lens_id, version, state)
+        if not (self._family and family and version is None):
+            return own
+        return self._leaning(own, self._store.samples.family_of(lens_id) if relatives is None else relatives)
+
+    def _own(self, lens_id: str, version: int | None, state: LensState | None) -> Fitted:
+        state = self._store.samples.state_of(lens_id) if state is None else state
+        if state is None:
+            raise UnknownLensError(f"there is no lens {lens_id}: GET /v1/lenses lists those there are")
+        if version is not None and version != state.version:
+            return self._earlier(lens_id, version, state)
+        found = self._recall((lens_id, None))
+        if found is not None and found.state == state and not self._outdone(found):
+            metrics.MODELS.labels("known").inc()
+            return found
+        with self._lock_of(lens_id):  # one thread fits, the others wait for its result
+            found = self._recall((lens_id, None))
+            same = found is not None and found.state == self._store.samples.state_of(lens_id)
+            if found is not None and same and not self._outdone(found):
+                return found
+            metrics.MODELS.labels("fitted" if found is None or same else "extended").inc()
+            return self._keep((lens_id, None), self._build(lens_id, None if same else found))
+
+    def _leaning(self, own: Fitted, family: Family) -> Fitted:
+        """Let a model lean on the other copies of its lens, if there are any."""
+        if not family:
+            return own
+        key: _Key = (own.lens_id, _LEANING)
+        found = self._recall(key)
+        if found is not None and found.family == family and found.own is own.model:
+            return found
+        with self._lock_of(own.lens_id):
+            found = self._recall(key)
+            prior = None if found is None or found.family != family else found.model.prior
+            if prior is None:
+                others = self._whole(self._store.samples.of_family(family))
+                if not others:  # removed while we looked
+                    return own
+                source = LensModel.fit([stored.sample for stored in others], self._settings)
+                prior = Prior(source, name=family_name(family))
+            leaning = own.model.with_prior(prior.source, name=prior.name)
+            size = own.size_bytes
+            if isinstance(prior.source, LensModel):
+                size += BYTES_FACTOR * sum(sample.kernel.nbytes for sample in prior.source.samples)
+            return self._keep(key, replace(own, model=leaning, size_bytes=size, family=family, own=own.model))
+
+    def _outdone(self, fitted: Fitted) -> bool:
+        """Whether a worker has learned more of these samples; looked up now and then."""
+        if fitted.learned or self._storage is None:
+            return False
+        key = learned_key(fitted.lens_id, fitted.state.version, fitted.state.rebuild_epoch)
+        now = time.monotonic()
+        with self._guard:
+            if now - self._asked.get(key, -math.inf) < LOOK_S:
+                return False
+            self._asked = {key: now, **{k: t for k, t in self._asked.items() if now - t < LOOK_S}}
+        try:
+            self._storage.info(key)
+        except FileNotFoundError:
+            return False
+        with self._guard:
+            self._asked.pop(key, None)
+        return True
+
+    def _build(self, lens_id: str, old: Fitted | None) -> Fitted:
+        if old is not None:
+            state, samples = self._store.samples.of_lens(lens_id, after_version=old.state.version)
+            if state.rebuild_epoch == old.state.rebuild_epoch:
+                samples = self._whole(samples)
+                model = old.model.added([stored.sample for stored in samples]) if samples else old.model
+                size = old.size_bytes + _size(samples)
+                return Fitted(lens_id, state, model, model.pitch_um, size, learned=False)
+        state, samples = self._store.samples.of_lens(lens_id)
+        return self._fit(lens_id, state, samples)
+
+    def _earlier(self, lens_id: str, version: int, state: LensState) -> Fitted:
+        check_version(self._store, lens_id, version, state)
+        key = (lens_id, version)
+        with self._lock_of(lens_id):
+            found = self._recall(key)
+            if found is not None and found.state.rebuild_epoch == state.rebuild_epoch:
+                return found
+            _, samples = self._store.samples.of_lens(lens_id, up_to_version=version)
+            return self._keep(key, self._fit(lens_id, LensState(version, state.rebuild_epoch), samples))
+
+    def _fit(self, lens_id: str, state: LensState, samples: Sequence[StoredSample]) -> Fitted:
+        if not samples:
+            raise NoSamplesError(
+                f"lens {lens_id} has no samples yet (version {state.version}): "
+                "upload photos taken with it and wait until they are counted"
+            )
+        samples = self._whole(samples)
+        values = [stored.sample for stored in samples]
+        model = self._restored(lens_id, state, values)
+        learned = model is not None
+        model = model or LensModel.fit(values, self._settings)
+        return Fitted(lens_id, state, model, model.pitch_um, _size(samples), learned)
+
+    def _whole(self, samples: Sequence[StoredSample]) -> list[StoredSample]:
+        """Samples with all that the mode of the models needs."""
+        return with_evidence(samples, self._storage, self._settings.mode)
+
+    def _restored(self, lens_id: str, state: LensState, samples: Sequence[PsfSample]) -> LensModel | None:
+        if self._storage is None:
+            return None
+        try:
+            stored = self._storage.get(learned_key(lens_id, state.version, state.rebuild_epoch))
+            return LensModel.restored(samples, stored, self._settings)
+        except FileNotFoundError:
+            return None
+        except InvalidInputError as error:
+            log.info("model of lens %s is fitted here: %s", lens_id, error)
+            return None
+
+    def _lock_of(self, lens_id: str) -> threading.Lock:
+        with self._guard:
+            return self._building.setdefault(lens_id, threading.Lock())
+
+    def _recall(self, key: _Key) -> Fitted | None:
+        with self._guard:
+            if key in self._models:
+                self._models.move_to_end(key)
+            return self._models.get(key)
+
+    def _keep(self, key: _Key, fitted: Fitted) -> Fitted:
+        with self._guard:
+            self._models[key] = fitted
+            self._models.move_to_end(key)
+            while (
+                len(self._models) > 1 and sum(m.size_bytes for m in self._models.values()) > self._max_bytes
+            ):
+                dropped, _ = self._models.popitem(last=False)
+                metrics.MODELS.labels("dropped").inc()
+                log.info("model of lens %s dropped from memory", dropped[0])
+            metrics.MODEL_BYTES.set(sum(m.size_bytes for m in self._models.values()))
+        return fitted
+
+
+def family_name(family: Family) -> str:
+    """Say what a model leans on."""
+    return "another copy" if len(family) == 1 else f"{len(family)} other copies"
+
+
+def check_version(store: Store, lens_id: str, version: int, state: LensState) -> None:
+    """Make sure that an earlier version can still be had.
+
+    Raises
+    ------
+    ConflictError
+        If there is no such version, or samples were removed since.
+    """
+    lens = store.lenses.get(lens_id)
+    later = [] if lens is None else store.lenses.history(lens, after=version)
+    if version > state.version:
+        raise ConflictError(f"lens {lens_id} has no version {version} yet: the newest is {state.version}")
+    gone = [event.version for event in later if event.kind != "photo_added"]
+    if gone:
+        raise ConflictError(
+            f"version {version} of lens {lens_id} is gone: version {gone[0]} removed or changed photos; "
+            f"ask for version {state.version}, or leave the version out"
+        )
+
+
+def _size(samples: Sequence[StoredSample]) -> int:
+    return BYTES_FACTOR * sum(
+        stored.sample.kernel.nbytes
+        + (0 if stored.sample.evidence is None else stored.sample.evidence.autocorrelation.nbytes)
+        for stored in samples
+    )

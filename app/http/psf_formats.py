@@ -1,0 +1,123 @@
+"""Kernels as JSON, PNG, NumPy and TIFF; the field as a picture."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from typing import Final, Literal, TypeAlias
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image
+
+from app.http.model_cache import Fitted
+from app.schemas import FamilyOut, KernelOut, PsfOut, QueryOut, Support, Units
+from lensmodel.core.geometry import Frame
+from lensmodel.core.psf import PsfField
+from lensmodel.core.types import Channel, Kernel
+from lensmodel.model import PsfAnswer
+
+SIDE: Final = 1000
+"""Height of the frame that a map is drawn in; only its shape plays a part."""
+
+View: TypeAlias = tuple[float, float, float, float]
+"""Part of a picture: left, top, width and height as shares of it."""
+
+DIGITS: Final = 10
+GAP_PX: Final = 2
+
+
+def describe(
+    lens_id: str, fitted: Fitted, question: QueryOut, answer: PsfAnswer, pixel_pitch_um: float | None
+) -> PsfOut:
+    """Say what an answer rests on, with an empty kernel for formats that carry it themselves."""
+    size = answer.kernel.shape[0]
+    error = float(answer.predicted_error)
+    return PsfOut(
+        lens_id=lens_id,
+        version=fitted.state.version,
+        query=question,
+        psf=KernelOut(shape=(size, size), dtype="float32", data=[]),
+        support=Support(
+            effective_samples=float(answer.effective_samples),
+            photos=answer.photos,
+            extrapolated=answer.extrapolated,
+            beyond=list(answer.beyond),
+            predicted_error=error if np.isfinite(error) else None,
+            mode=answer.mode,
+            family=FamilyOut(lenses=len(fitted.family), weight=float(answer.prior_share))
+            if fitted.family
+            else None,
+        ),
+        bandwidth={name: float(value) for name, value in answer.bandwidth.items()},
+        units=Units(pixel_pitch_um=pixel_pitch_um),
+    )
+
+
+def psf(
+    form: Literal["json", "png", "npy", "tiff"], kernel: Kernel, described: PsfOut
+) -> tuple[bytes, Mapping[str, str]]:
+    """Encode a kernel; return the bytes and headers that explain them."""
+    if form == "json":
+        values = np.round(kernel, DIGITS).tolist()
+        full = described.model_copy(update={"psf": described.psf.model_copy(update={"data": values})})
+        return full.model_dump_json().encode(), {}
+    if form == "npy":
+        buffer = io.BytesIO()
+        np.save(buffer, kernel.astype("<f4"), allow_pickle=False)
+        return buffer.getvalue(), _named(described, "npy")
+    if form == "tiff":
+        buffer = io.BytesIO()
+        text = described.model_dump_json(exclude={"psf"})  # tifffile takes a "shape" in it for its own
+        tifffile.imwrite(
+            buffer, kernel.astype(np.float32), photometric="minisblack", description=text, metadata=None
+        )
+        return buffer.getvalue(), _named(described, "tiff")
+    peak = float(kernel.max())
+    scaled = np.round(kernel / peak * 65535).astype(np.uint16)
+    headers = {"X-PSF-Scale": f"max={peak:.9g}; gamma=1"}
+    return _png(Image.fromarray(scaled)), headers | _named(described, "png")
+
+
+def field_map(
+    field: PsfField,
+    channel: Channel,
+    *,
+    columns: int,
+    rows: int,
+    size: int,
+    gamma: float,
+    aspect: float = 1.5,
+    view: View = (0.0, 0.0, 1.0, 1.0),
+) -> bytes:
+    """Draw kernels on a grid over a part of the field as an 8-bit PNG, each scaled to its own peak."""
+    frame = Frame(SIDE, round(SIDE * aspect))
+    left_edge, top_edge, wide, high = view
+    pitch = size + GAP_PX
+    sheet = np.full((rows * pitch + GAP_PX, columns * pitch + GAP_PX), 40, dtype=np.uint8)
+    for row in range(rows):
+        for column in range(columns):
+            down, across = top_edge + (row + 0.5) / rows * high, left_edge + (column + 0.5) / columns * wide
+            place = frame.position(down * (frame.height - 1), across * (frame.width - 1))
+            kernel = field.kernel_at(place, channel, size)
+            top, left = row * pitch + GAP_PX, column * pitch + GAP_PX
+            sheet[top : top + size, left : left + size] = _bright(kernel, gamma)
+    return _png(Image.fromarray(sheet))
+
+
+def _bright(kernel: Kernel, gamma: float) -> NDArray[np.uint8]:
+    return np.round((kernel / kernel.max()) ** gamma * 255).astype(np.uint8)
+
+
+def _png(image: Image.Image) -> bytes:
+    buffer = io.BytesIO()
+    image.save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def _named(described: PsfOut, suffix: str) -> dict[str, str]:
+    at = described.query
+    aperture = "" if at.aperture is None else f"-f{at.aperture:g}"
+    name = f"psf-v{described.version}-r{at.r:.3f}-phi{at.phi:.3f}{aperture}-{at.channel}.{suffix}"
+    return {"Content-Disposition": f'inline; filename="{name}"'}

@@ -1,0 +1,15 @@
+"""What tells camera bodies apart without naming one."""
+
+from __future__ import annotations
+
+import hashlib
+
+from lensmodel.workflow.identity import name_key, serial_key
+
+
+def body_key(maker: str | None, model: str | None, serial: str | None) -> str | None:
+    """Return a digest of a camera's name and serial; None without a serial."""
+    if not serial:
+        return None
+    said = "|".join((name_key(maker), name_key(model), serial_key(serial)))
+    return hashlib.sha256(said.encode()).hexdigest()[:16]

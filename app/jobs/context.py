@@ -1,0 +1,237 @@
+"""What every job works with: the tables, the blobs, the sandbox, and the rules of trying again."""
+
+from __future__ import annotations
+
+import json
+import logging
+import random
+import shutil
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, NoReturn
+
+import numpy as np
+
+from app.blobs.storage import Storage
+from app.jobs.task_files import EVIDENCE, KERNELS, PREVIEW, R_MAP, SAMPLES, SHOWN
+from app.runtime import metrics
+from app.runtime.outage import OutageError, is_outage
+from app.runtime.settings import Settings
+from app.sandbox.child import Progress
+from app.sandbox.runner import Limits, Outcome, Sandbox
+from app.schemas import distances
+from app.store import Store, StoredSample
+from app.store.jobs import JobStore
+from app.store.photo_steps import folder_of
+from app.store.tables import PhotoRow
+from lensmodel.core.evidence import PatchEvidence
+from lensmodel.core.types import ignore_step
+
+log = logging.getLogger(__name__)
+
+CRASHES: Final = 3
+"""A child that dies by a signal so often is not started again."""
+
+BACKOFF_S: Final = 0.5
+SPARE_MB: Final = 768
+"""Address space of a task besides its picture."""
+
+
+class JobFailedError(Exception):
+    """A job cannot be done, whatever is tried: a fixed code and a sentence for its owner."""
+
+    def __init__(self, code: str, detail: str) -> None:
+        super().__init__(detail)
+        self.code, self.detail = code, detail
+
+
+class NotWantedError(Exception):
+    """The job was cancelled, or its photo deleted or started anew: stop, and change nothing."""
+
+
+@dataclass
+class Workbench:
+    """The parts of one worker."""
+
+    settings: Settings
+    store: Store
+    storage: Storage
+    sandbox: Sandbox
+    jobs: JobStore = field(init=False)
+    _locks: defaultdict[str, threading.Lock] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.jobs = JobStore(self.store.database)
+        self._locks = defaultdict(threading.Lock)
+
+    def attempt(
+        self,
+        task: str,
+        arguments: Mapping[str, Any],
+        *,
+        folder: Path,
+        limits: Limits,
+        wanted: Callable[[], bool],
+        reads: Sequence[Path] = (),
+        compiles: bool = False,
+        on_progress: Progress = ignore_step,
+    ) -> Any:  # noqa: ANN401 - JSON of any shape
+        """Run a task; try again where that can help; return what it returned.
+
+        A death by signal is tried again after a pause, too little memory once with twice as
+        much. Whatever the library refused with a reason would be refused again.
+
+        Raises
+        ------
+        NotWantedError
+            If the job was cancelled meanwhile.
+        JobFailedError
+            If the task cannot be done.
+        OutageError
+            If the machine could not do it: no room, or no memory.
+        """
+        wanted = _patient(wanted)
+        crashes = 0
+        enlarged = False
+        while True:
+            outcome = self.sandbox.run(
+                task,
+                arguments,
+                folder=folder,
+                limits=limits,
+                reads=reads,
+                compiles=compiles,
+                wanted=wanted,
+                on_progress=on_progress,
+            )
+            metrics.TASKS.labels(task, outcome.ending).inc()
+            if outcome.ending == "ok":
+                return outcome.value
+            if outcome.ending == "cancelled":
+                self._give_way()
+            if outcome.ending == "outage":
+                raise OutageError(f"task {task}: {outcome.detail}")
+            twice = min(2 * limits.memory_mb, self.sandbox.budget.memory_mb)
+            if outcome.ending == "memory_limit" and not enlarged and twice > limits.memory_mb:
+                enlarged, limits = True, limits.with_memory(twice)
+            elif outcome.code == "crashed":
+                crashes += 1
+                self._pause_after(outcome, task, crashes, wanted)
+            else:
+                raise JobFailedError(outcome.code, outcome.detail)
+
+    def _pause_after(self, outcome: Outcome, task: str, crashes: int, wanted: Callable[[], bool]) -> None:
+        log.warning("task %s: %s (%d of %d)", task, outcome.detail, crashes, CRASHES)
+        if crashes == CRASHES:
+            detail = f"{outcome.detail}; tried {crashes} times; please report the file to the developers"
+            raise JobFailedError("crashed_repeatedly", detail)
+        end = time.monotonic() + BACKOFF_S * 4 ** (crashes - 1) * random.uniform(0.5, 1.5)  # noqa: S311
+        while time.monotonic() < end:
+            if not wanted():
+                self._give_way()
+            time.sleep(0.05)
+
+    def _give_way(self) -> NoReturn:
+        """Leave a job: for good if nobody wants it, else until another worker takes it up.
+
+        While this process shuts down the job must not seem finished to the engine, so its
+        thread stays here until the process is gone.
+        """
+        while self.sandbox.stopping:
+            time.sleep(1.0)
+        raise NotWantedError
+
+    def limits(self, photo: PhotoRow, seconds: float, bytes_per_pixel: int) -> Limits:
+        """Return limits that grow with the photo; 12 bytes a pixel are the mapped planes alone."""
+        pixels = (photo.width or 0) * (photo.height or 0)
+        memory = SPARE_MB + bytes_per_pixel * pixels // (1 << 20)
+        return Limits(memory_mb=min(memory, max(self.sandbox.budget.memory_mb, SPARE_MB)), wall_s=seconds)
+
+    @contextmanager
+    def original(self, photo: PhotoRow) -> Iterator[Path]:
+        """Give the file of a photo."""
+        with self.sandbox.folder() as folder:
+            try:
+                with self.storage.as_file(photo.blob_key, folder) as path:
+                    yield path
+            except FileNotFoundError as error:
+                text = f"the file of photo {photo.public_id} is no longer stored; upload it again"
+                raise JobFailedError("unknown_photo", text) from error
+
+    def developed_folder(self, photo_id: str) -> Path:
+        """Return where the developed photo lies, or shall lie: a cache of this machine."""
+        return self.settings.data_dir.resolve() / "developed" / photo_id
+
+    def developed(self, photo: PhotoRow, wanted: Callable[[], bool]) -> Path:
+        """Return the folder of the developed photo; develop it if it is not there."""
+        target = self.developed_folder(photo.public_id)
+        with self._locks[photo.public_id]:
+            if (target / "planes.npy").is_file():
+                (target / "planes.npy").touch()  # the cache drops what was not used for long
+                return target
+            target.parent.mkdir(parents=True, exist_ok=True)
+            limits = self.limits(photo, self.settings.develop_seconds, 120)
+            with self.original(photo) as path, self.sandbox.folder() as folder:
+                arguments = {"path": str(path), "max_megapixels": self.settings.max_megapixels}
+                self.attempt("develop", arguments, folder=folder, limits=limits, wanted=wanted, reads=[path])
+                for name in (PREVIEW, R_MAP, SHOWN):
+                    if (folder / name).is_file():
+                        self.storage.put_file(f"{folder_of(photo)}{name}", folder / name)
+                shutil.rmtree(target, ignore_errors=True)
+                folder.rename(target)  # complete or not there
+            return target
+
+
+def _patient(wanted: Callable[[], bool]) -> Callable[[], bool]:
+    """Ask on while the database is away: hours of work are not thrown away for a restart of it."""
+
+    def ask() -> bool:
+        try:
+            return wanted()
+        except Exception as error:
+            if not is_outage(error):
+                raise
+            return True
+
+    return ask
+
+
+def write_samples(folder: Path, stored: Sequence[StoredSample]) -> None:
+    """Hand samples to a task: the kernels as one npy file, the rest as JSON."""
+    side = max(entry.sample.kernel.shape[0] for entry in stored)
+    kernels = np.zeros((len(stored), side, side), dtype=np.float32)
+    listed = []
+    for number, entry in enumerate(stored):
+        sample = entry.sample
+        size = sample.kernel.shape[0]
+        margin = (side - size) // 2
+        kernels[number, margin : margin + size, margin : margin + size] = sample.kernel
+        if isinstance(sample.evidence, PatchEvidence):
+            (folder / EVIDENCE.format(number)).write_bytes(sample.evidence.to_bytes())
+        listed.append(
+            {
+                "size": size,
+                "r": sample.position.r,
+                "phi": sample.position.phi,
+                "weight": sample.weight,
+                "photo": sample.photo,
+                "pixel_pitch_um": sample.pixel_pitch_um,
+                "estimator": sample.estimator,
+                "error": sample.error,
+                "spectrum": None if sample.spectrum is None else sample.spectrum.to_bytes().hex(),
+                "half_diagonal_px": sample.half_diagonal_px,
+                "settings": {
+                    "aperture": sample.settings.aperture,
+                    "focal_mm": sample.settings.focal_mm,
+                    "focus_m": distances.written(sample.settings.focus_m),
+                    "channel": sample.settings.channel,
+                },
+            }
+        )
+    np.save(folder / KERNELS, kernels)
+    (folder / SAMPLES).write_text(json.dumps(listed), encoding="utf-8")

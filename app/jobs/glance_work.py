@@ -1,0 +1,27 @@
+"""The small picture of a photo that is not developed yet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from app.jobs.context import SPARE_MB, Workbench
+from app.jobs.task_files import GLANCE
+from app.sandbox.runner import Limits
+from app.store.photo_steps import folder_of
+from app.store.tables import PhotoRow
+
+
+def keep_glance(
+    bench: Workbench, photo: PhotoRow, info: dict[str, Any], path: Path, wanted: Callable[[], bool]
+) -> None:
+    """Keep the photo at `path` in small; one that cannot be shown goes on without."""
+    limits = Limits(memory_mb=2 * SPARE_MB, wall_s=bench.settings.inspect_seconds)
+    arguments = {"path": str(path), "kind": info["kind"], "orientation": info["metadata"]["orientation"]}
+    with bench.sandbox.folder() as folder:
+        outcome = bench.sandbox.run(
+            "glance", arguments, folder=folder, limits=limits, reads=[path], wanted=wanted
+        )
+        if outcome.ending == "ok" and (folder / GLANCE).is_file():
+            bench.storage.put_file(f"{folder_of(photo)}{GLANCE}", folder / GLANCE)

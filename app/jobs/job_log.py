@@ -1,0 +1,51 @@
+"""Of each job: which log lines are its, how long it took, how it ended."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Final
+
+from structlog.contextvars import bound_contextvars
+
+from app.runtime import metrics
+from app.runtime.outage import is_outage
+
+_SUBJECT: Final = {
+    "photo": "photo_id",
+    "cell": "photo_id",
+    "correction": "correction_id",
+    "measure": "lens_id",
+}
+
+
+@dataclass
+class Account:
+    """What became of one job."""
+
+    kind: str
+    ending: str = "done"
+
+    def retries(self, error: BaseException) -> None:
+        """Say that the job is tried again after an error."""
+        metrics.RETRIES.labels(self.kind, "outage" if is_outage(error) else "unforeseen").inc()
+
+
+@contextmanager
+def accounted(kind: str, arguments: Sequence[str | int]) -> Iterator[Account]:
+    """Give the account of a job; inside, each log line names the job and what it is about."""
+    account = Account(kind)
+    ids = {"job_id": "/".join([kind, *map(str, arguments)])}
+    if kind in _SUBJECT:
+        ids[_SUBJECT[kind]] = str(arguments[0])
+    began = time.monotonic()
+    with bound_contextvars(**ids):
+        try:
+            yield account
+        except BaseException:
+            account.ending = "raised"
+            raise
+        finally:
+            metrics.JOB_SECONDS.labels(kind, account.ending).observe(time.monotonic() - began)

@@ -1,0 +1,129 @@
+"""The way of a photo made to measure a lens: one task, whose places and kernels are checked and kept."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from app.jobs.context import JobFailedError, Workbench
+from app.jobs.task_files import KERNELS
+from app.store import NewPatch, NewSample
+from app.store.photo_steps import settings_of
+from app.store.tables import PhotoRow
+from lensmodel.core.errors import InvalidInputError, InvalidKernelError
+from lensmodel.core.psf import as_kernel
+from lensmodel.core.types import CHANNELS, FieldPosition
+
+MOST_PLACES: Final = 1000
+"""More places than any way of measuring has cells; a child that names more is broken."""
+
+WAIT_S: Final = 60.0
+"""How long a pair waits for its closed photo to be looked at."""
+
+_UNREAD: Final = ("received", "inspecting")
+_BYTES_A_PIXEL: Final = 96  # two photos mapped, one plane of each in doubles, and what is made of them
+
+
+class MeasurementWork:
+    """Measures a photo in the sandbox."""
+
+    def __init__(self, bench: Workbench) -> None:
+        self._bench = bench
+
+    def measure(self, photo: PhotoRow, developed: Path, wanted: Callable[[], bool]) -> None:
+        """Measure the PSF all over a photo and store it as patches with samples.
+
+        A repeated call finds what is there, and adds nothing twice.
+
+        Raises
+        ------
+        JobFailedError
+            If the photo cannot be measured, or the child answered nonsense.
+        """
+        folders = [developed, *self._reference(photo, wanted)]
+        settings = self._bench.settings
+        arguments = {
+            "kind": photo.given["kind"],
+            "developed": [str(folder) for folder in folders],
+            "photo": photo.public_id,
+            "settings": settings_of(photo),
+            "size": settings.kernel_size,
+        }
+        limits = self._bench.limits(photo, settings.correct_seconds, _BYTES_A_PIXEL)
+        with self._bench.sandbox.folder() as folder:
+            listed = self._bench.attempt(
+                "measure-lens", arguments, folder=folder, limits=limits, wanted=wanted, reads=folders
+            )
+            patches, samples = _checked(listed, folder)
+        store = self._bench.store
+        store.patches.add(photo.public_id, photo.epoch, patches)
+        store.photos.set_state(photo.public_id, ("selecting",), "estimating", epoch=photo.epoch)
+        store.patches.finish(photo.public_id, photo.epoch, samples)
+
+    def _reference(self, photo: PhotoRow, wanted: Callable[[], bool]) -> list[Path]:
+        """Return the folder of the developed closed photo of a pair."""
+        name = photo.given.get("reference_id")
+        if name is None:
+            return []
+        row = self._bench.store.photos.get(name)
+        end = time.monotonic() + WAIT_S
+        while row is not None and row.state in _UNREAD and time.monotonic() < end and wanted():
+            time.sleep(0.2)
+            row = self._bench.store.photos.get(name)
+        if row is None or row.owner_id != photo.owner_id:
+            raise JobFailedError(
+                "unknown_photo", f"the reference photo {name} is not there any more; send both photos again"
+            )
+        if row.width is None:
+            raise JobFailedError(
+                "not_ready", f"the reference photo {name} was not read yet; send the open photo again"
+            )
+        return [self._bench.developed(row, wanted)]
+
+
+def _checked(listed: Any, folder: Path) -> tuple[list[NewPatch], list[NewSample]]:  # noqa: ANN401 - a child's JSON
+    """Check what a child measured as if a stranger had sent it."""
+    try:
+        kernels = np.load(folder / KERNELS, allow_pickle=False, mmap_mode="r")
+        if not 0 < len(listed) == len(kernels) <= MOST_PLACES * len(CHANNELS):
+            raise InvalidInputError(f"{len(listed)} samples and {len(kernels)} kernels")
+        patches: dict[int, NewPatch] = {}
+        samples = []
+        for kernel, entry in zip(kernels, listed, strict=True):
+            position = FieldPosition(float(entry["r"]), float(entry["phi"]))
+            number, channel, error = int(entry["idx"]), entry["channel"], float(entry["error"])
+            if channel not in CHANNELS or not 0.0 <= error <= 1.0 or not 0 <= number < MOST_PLACES:
+                raise InvalidInputError(f"a sample of channel {channel!r} with error {error}")
+            patches.setdefault(
+                number,
+                NewPatch(
+                    idx=number,
+                    row=int(entry["row"]),
+                    col=int(entry["col"]),
+                    size=int(entry["side"]),
+                    r=position.r,
+                    phi=position.phi,
+                    cell=number,
+                    score=1.0 - error,
+                ),
+            )
+            samples.append(
+                NewSample(
+                    idx=number,
+                    channel=channel,
+                    kernel=as_kernel(kernel),
+                    weight=1.0,
+                    estimator=str(entry["estimator"])[:60],
+                    predicted_error=error,
+                )
+            )
+    except (
+        *(InvalidKernelError, InvalidInputError, OSError),
+        *(ValueError, TypeError, LookupError),  # not the JSON that was agreed on
+    ) as error:
+        raise JobFailedError("internal_error", f"the measurement gave no kernels: {error}") from error
+    return list(patches.values()), samples

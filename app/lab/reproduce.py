@@ -1,0 +1,161 @@
+"""`lensmodel reproduce`."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from app.commands.console import display
+from app.commands.console.failure import UsageError
+from app.commands.console.files import refuse_existing
+from app.commands.console.options import Estimator, Force, Quiet, Verbose
+
+if TYPE_CHECKING:
+    from lensmodel.lab.reproduce import Case, DirectRoute, OpenRoute, Size
+
+DATA_VARIABLE = "LENSMODEL_TEST_DATA"
+PAGE = ("reproduction.md", "reproduction.html")
+"""What is in the folder of a finished reproduction, beside pictures and stored results."""
+
+
+def reproduce(
+    context: typer.Context,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for the page, its pictures and stored results.")
+    ] = Path("reproduction"),
+    json_output: Annotated[
+        Path | None, typer.Option("--json", help="Also write every figure to this file.")
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Two lenses, small photos, n = 1, 2: minutes.")
+    ] = False,
+    full: Annotated[
+        bool, typer.Option("--full", help="Two apertures a lens, n up to 20: over night.")
+    ] = False,
+    hard: Annotated[
+        bool,
+        typer.Option("--hard", help="Add scenes that hurt: depth, motion, night, sky, snow, text, foliage."),
+    ] = False,
+    lenses: Annotated[
+        int | None,
+        typer.Option(
+            "--lenses", metavar="N", min=1, help="Only the first N lenses; a later run adds others."
+        ),
+    ] = None,
+    direct: Annotated[
+        bool, typer.Option("--direct", help="Use the library in this process, not a service.")
+    ] = False,
+    scenes: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of sharp photographs; its test half is used. Default: the folder sharp of "
+            f"${DATA_VARIABLE} where that is set, else the library's five."
+        ),
+    ] = None,
+    benchmark: Annotated[
+        Path, typer.Option(help="Output of `lensmodel bench blind`: Fig. 1 where it is there.")
+    ] = Path("bench-output"),
+    estimator: Estimator = "default",
+    force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = 0,
+) -> None:
+    """Make the paper's figures and its Table 1 on simulated lenses that nothing was tuned on.
+
+    Each lens learns from Bayer DNG files uploaded to a service started for it; what the service
+    answers and corrects is measured against the truth. Finished results are kept: a run that was
+    stopped goes on, and a change of code or settings computes anew. A finished page is replaced
+    only with --force.
+
+    Examples:
+
+        lensmodel reproduce --quick -o reproduction
+
+        lensmodel reproduce --json reproduction.json
+
+    Exit status: 0 the page is written, 1 something failed, 2 called wrongly.
+    """
+    shown = display.of(context, quiet=quiet, verbose=verbose)
+    if quick and full:
+        raise UsageError("--quick and --full exclude each other; give one of them")
+    refuse_existing(json_output, *(output / name for name in PAGE), force=force)
+    from app.lab.service_route import CODE, ServiceRoutes  # noqa: PLC0415 - only this command needs them
+    from lensmodel.lab.reproduce import (  # noqa: PLC0415 - as above: the simulation is slow to import
+        collected,
+        planned,
+        run_reproduction,
+        write_json,
+        write_page,
+    )
+
+    size: Size = "quick" if quick else "full" if full else "default"
+    plan = planned(size, scenes=scenes or _external(), estimator=estimator, hard=hard, lenses=lenses)
+    result = run_reproduction(
+        plan,
+        _direct(estimator) if direct else ServiceRoutes(estimator),
+        output,
+        route="in the library" if direct else "by the service",
+        code=() if direct else CODE,
+        on_work=Progress(quiet=shown.quiet),
+    )
+    result["figures"]["fig1"] = collected(benchmark, output / "pictures")
+    written = [*write_page(result, output)]
+    if json_output is not None:
+        written.append(write_json(result, json_output))
+    shown.result("Written: " + ", ".join(str(path) for path in written))
+
+
+class Progress:
+    """One line on standard error after each piece of work, with the time left."""
+
+    def __init__(self, *, quiet: bool = False) -> None:
+        self._quiet = quiet
+        self._began = time.monotonic()
+        self._stored = 0.0
+        self._last = 0.0
+
+    def __call__(self, words: str, done: float, total: float, *, fresh: bool) -> None:
+        """Say what was done; see `OnWork`."""
+        if not fresh:
+            self._stored += done - self._last
+        self._last = done
+        if self._quiet:
+            return
+        spent, computed = time.monotonic() - self._began, done - self._stored
+        left = ""
+        if computed > 0 and done < total:
+            seconds = spent / computed * (total - done)
+            left = f", about {_duration(seconds)} left"
+        typer.echo(f"[{100 * done / total:3.0f} %] {words}{left}", err=True)
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def _external() -> Path | None:
+    named = os.environ.get(DATA_VARIABLE)
+    if not named:
+        return None
+    folder = Path(named) / "sharp"
+    return folder if folder.is_dir() else None
+
+
+def _direct(estimator: str) -> OpenRoute:
+    from lensmodel.lab.reproduce import DirectRoute  # noqa: PLC0415 - as above
+
+    @contextmanager
+    def opened(case: Case, folder: Path) -> Iterator[DirectRoute]:
+        del case
+        yield DirectRoute(folder / "models", estimator)
+
+    return opened

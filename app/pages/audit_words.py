@@ -1,0 +1,92 @@
+"""What the audit of a correction held back, in words and in places of the upright photo."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from app.pages.pictures import upright_point
+
+CHECKS: Final[Mapping[str, str]] = {
+    "too dark": "darker than anything there",
+    "too bright": "brighter than anything there",
+    "isolated pixels": "single pixels that stand out",
+    "hue, spots": "spots of a colour that is not there",
+    "hue, area": "a tint that is not there",
+    "re-blur": "detail that, blurred again, does not give the photo",
+    "spectrum": "sharper than this lens can have been blurred",
+    "comb": "lines beside lines",
+    "ringing": "rings beside edges",
+    "grain": "grain beyond that of the photo",
+}
+LEAST: Final = 0.005
+"""Share below which nothing is said of a check: less than can be seen."""
+
+NAMED: Final = 6
+SQUARE: Final = 96
+"""Least side of a square in photo pixels, where the tiles are too few to tell their own."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A place of the upright photo in its pixels, and what to say of it."""
+
+    x: int
+    y: int
+    words: str
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """What was held back: in a sentence, why, and where most."""
+
+    words: str
+    reasons: list[str]
+    places: list[Place]
+
+
+def check_words(name: str) -> str:
+    """Say what a check objects to."""
+    return CHECKS.get(name, name)
+
+
+def held_places(audit: Mapping[str, Any], height: int, width: int, orientation: int) -> Held | None:
+    """Say what was held back of a correction; None where nothing was checked."""
+    zones = audit.get("zones") or {}
+    tiles = sum(zone["tiles"] for zone in zones.values())
+    if not tiles:
+        return None
+    share = sum(zone["tiles"] * zone["held_back"] for zone in zones.values()) / tiles
+    checks: dict[str, float] = {}
+    for zone in zones.values():
+        for name, part in zone["checks"].items():
+            checks[name] = checks.get(name, 0.0) + part * zone["tiles"] / tiles
+    listed = sorted(checks.items(), key=lambda item: -item[1])
+    reasons = [f"{check_words(name)}: {part:.1%}" for name, part in listed if part >= LEAST]
+    words = (
+        "Next to nothing was held back."
+        if share < LEAST
+        else f"{share:.0%} of the correction was held back over the whole photo."
+    )
+    places = []
+    for found in audit.get("worst", [])[:NAMED]:
+        y, x = upright_point(found["row"], found["col"], height, width, orientation)
+        places.append(Place(x, y, f"{found['held_back']:.0%}: {check_words(found['check'])}"))
+    return Held(words, reasons, places)
+
+
+def held_squares(
+    audit: Mapping[str, Any], height: int, width: int, orientation: int
+) -> dict[str, Any] | None:
+    """Return the tiles of which something was held back, as squares of the upright photo."""
+    tiles = audit.get("tiles") or []
+    if not tiles:
+        return None
+    side = int(audit.get("tile_side") or SQUARE)
+    squares = []
+    for tile in tiles:
+        middle = (tile["row"] + side / 2, tile["col"] + side / 2)
+        y, x = upright_point(*middle, height, width, orientation)
+        squares.append({"x": round(x - side / 2), "y": round(y - side / 2), "held": tile["held_back"]})
+    return {"tiles": squares, "side": side, "most": max(tile["held_back"] for tile in tiles)}

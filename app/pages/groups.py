@@ -1,0 +1,74 @@
+"""Photos that wait for their lens, in groups that were probably taken with the same one."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from app.store.tables import PhotoRow
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Photos that wait for their lens and were probably taken with the same one.
+
+    Parameters
+    ----------
+    camera : str or None
+    body : int or None
+        Which of several bodies of that camera, counted from 1; None where there is but one.
+    focal_mm : float or None
+    lens_model : str or None
+        What the files call the lens, where they do.
+    needs_aperture : bool
+        Whether any of the files does not say its aperture.
+    photos : list of PhotoRow
+        Newest first.
+    """
+
+    camera: str | None
+    body: int | None
+    focal_mm: float | None
+    lens_model: str | None
+    needs_aperture: bool
+    photos: list[PhotoRow]
+
+    @property
+    def key(self) -> str:
+        """What stays the same while photos join and leave."""
+        first = self.photos[0]
+        said = f"{self.camera}|{first.body_key}|{self.focal_mm}|{self.lens_model}"
+        return hashlib.sha256(said.encode()).hexdigest()[:12]
+
+
+def camera_name(maker: str | None, model: str | None) -> str:
+    """Name a camera once: many models begin with their maker."""
+    known = (maker or "").strip()
+    if (model or "").lower().startswith(known.lower().split(" ")[0]):
+        known = ""
+    return f"{known} {model or ''}".strip()
+
+
+def grouped(rows: Sequence[PhotoRow]) -> list[Group]:
+    """Group photos by body, focal length and what they call the lens."""
+    groups: defaultdict[tuple[str, str, float, str], list[PhotoRow]] = defaultdict(list)
+    for row in rows:
+        camera = camera_name(row.camera_maker, row.camera_model)
+        groups[camera, row.body_key or "", row.focal_mm or 0.0, row.lens_model or ""].append(row)
+    bodies: defaultdict[str, list[str]] = defaultdict(list)
+    for camera, body, *_ in sorted(groups):
+        if body not in bodies[camera]:
+            bodies[camera].append(body)
+    return [
+        Group(
+            camera=camera or None,
+            body=bodies[camera].index(body) + 1 if len(bodies[camera]) > 1 else None,
+            focal_mm=focal or None,
+            lens_model=model or None,
+            needs_aperture=any(row.aperture is None for row in found),
+            photos=found,
+        )
+        for (camera, body, focal, model), found in sorted(groups.items())
+    ]

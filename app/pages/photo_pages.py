@@ -1,0 +1,125 @@
+"""The pages of a photo and of a correction, and the preview of a part."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Final
+
+from fastapi import APIRouter
+from fastapi.responses import HTMLResponse
+
+from app.http import views
+from app.http.dependencies import CallDep
+from app.http.errors import InvalidParameterError
+from app.jobs.task_files import AFTER, SHOWN
+from app.pages import pictures, shown, words
+from app.pages.audit_words import held_places, held_squares
+from app.pages.rendering import page
+from app.routes import corrections as correction_routes
+from app.routes import lenses as lens_routes
+from app.routes import photos as photo_routes
+from app.schemas import CorrectionIn, Id, PhotoOut, Region
+from app.store.corrections import folder_of as folder_of_correction
+from app.store.photo_steps import folder_of
+from app.store.tables import PhotoRow
+
+ROWS: Final = (("upper", 0.0), ("", 0.5), ("lower", 1.0))
+COLUMNS: Final = (("left", 0.0), ("middle", 0.5), ("right", 1.0))
+PLACES: Final = tuple(
+    (f"{above} {beside}".strip() if (above or beside != "middle") else "center", row, col)
+    for above, row in ROWS
+    for beside, col in COLUMNS
+)
+"""Nine places of a picture with their shares of its height and width."""
+
+MOST_PREVIEWED: Final = 1_500_000
+"""Pixels of a part that is corrected while somebody waits (chosen): a second or two of work."""
+
+router = APIRouter(include_in_schema=False)
+
+
+def _upright(photo: PhotoOut, row: PhotoRow) -> PhotoOut:
+    """Give the size of a photo as it is looked at."""
+    if (row.orientation or 1) <= 4:
+        return photo
+    return photo.model_copy(update={"width": row.height, "height": row.width})
+
+
+@router.get("/photos/{photo_id}")
+def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
+    """Show a photo: how to correct it, and what it taught."""
+    row = photo_routes.find_photo(call, photo_id)
+    photo = photo_routes.describe(call, row)
+    patches = [views.patch_out(patch) for patch in call.store.patches.listed(photo_id)]
+    if row.height and row.width:
+        turned = row.orientation or 1
+        patches = [pictures.upright_patch(patch, row.height, row.width, turned) for patch in patches]
+    left_out = Counter(patch.reason for patch in patches if patch.state in {"rejected", "failed"})
+    candidates = []
+    if photo.lens_id is None:
+        candidates = [lens for lens in shown.lenses(call) if lens.samples or photo.state == "needs_lens"]
+    mine = correction_routes.list_corrections(call, limit=50, photo_id=photo_id).items
+    return page(
+        "photo.html",
+        photo=_upright(photo, row),
+        can_look=pictures.exists(call.storage, f"{folder_of(row)}{SHOWN}"),
+        patches=patches,
+        used=sum(patch.state == "done" for patch in patches),
+        reasons=left_out.most_common(),
+        candidates=candidates,
+        lens=None if photo.lens_id is None else lens_routes.read_lens(photo.lens_id, call),
+        corrections=[one for one in mine if one.roi is None],
+        places=PLACES,
+    )
+
+
+class PreviewIn(Region):
+    """A part of the upright photo, in its pixels; and the lens, where the photo does not say it."""
+
+    lens_id: Id | None = None
+
+
+@router.post("/ui/photos/{photo_id}/preview", status_code=202)
+def preview(photo_id: str, wish: PreviewIn, call: CallDep) -> dict[str, str]:
+    """Begin to correct a part of a photo, in all the ways that the sliders mix."""
+    row = photo_routes.find_photo(call, photo_id)
+    if not row.width or not row.height:
+        raise InvalidParameterError("the photo is not read yet: wait a moment")
+    if wish.width * wish.height > MOST_PREVIEWED:
+        raise InvalidParameterError("the part is too large for a preview: zoom in")
+    turned = pictures.in_sensor(wish, row.height, row.width, row.orientation or 1)
+    asked = CorrectionIn.model_validate(
+        {
+            "photo_id": photo_id,
+            "lens_id": wish.lens_id,
+            "roi": turned.model_dump(),
+            "layers": True,
+            "output": {"format": "png8", "color_space": "srgb"},
+        }
+    )
+    made = correction_routes.create(asked, call)
+    return {"id": made.id}
+
+
+@router.get("/corrections/{correction_id}")
+def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
+    """Show a corrected photo beside the original."""
+    plan = correction_routes.find_plan(call, correction_id)
+    correction = views.correction_out(plan)
+    report = correction.report or {}
+    photo, row = photo_routes.describe(call, plan.photo), plan.photo
+    can_look = correction.roi is None and pictures.exists(
+        call.storage, f"{folder_of_correction(plan.correction)}{AFTER}"
+    )
+    size = (row.height or 1, row.width or 1, row.orientation or 1)
+    return page(
+        "correction.html",
+        correction=correction,
+        job=views.correction_job(plan),
+        photo=_upright(photo, row),
+        can_look=can_look,
+        zones=words.gain_bars(report.get("zones") or {}),
+        audit=held_places(report.get("audit") or {}, *size),
+        held=held_squares(report.get("audit") or {}, *size) if can_look else None,
+        places=PLACES,
+    )

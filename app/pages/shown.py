@@ -1,0 +1,53 @@
+"""What pages and their streams show of the tables, through the same routes as others use."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from app.http.dependencies import Call
+from app.pages.groups import Group, grouped
+from app.routes import lenses as lens_routes
+from app.routes import photos as photo_routes
+from app.schemas import LensOut, PhotoOut
+
+PHOTOS: Final = 60
+"""Photos and lenses of a list (chosen): the newest of them."""
+
+HOPELESS: Final = frozenset({"failed", "cancelled"})
+
+MOST_WAITING: Final = 1000
+"""Waiting photos that are asked about at once, as many as one answer may name."""
+
+
+def photos(call: Call, lens_id: str | None = None) -> tuple[list[PhotoOut], bool]:
+    """Return the newest photos, of one lens or of all, and whether there are more."""
+    page = photo_routes.list_photos(call, limit=PHOTOS, lens_id=lens_id)
+    return page.items, page.next is not None
+
+
+def lenses(call: Call) -> list[LensOut]:
+    """Return the newest lenses."""
+    return lens_routes.list_lenses(call, limit=PHOTOS).items
+
+
+def lenses_with_photos(call: Call) -> list[LensOut]:
+    """Return the newest lenses, but for those of which nothing is known and no photo can tell."""
+    return [lens for lens in lenses(call) if lens.samples or _hopeful(call, lens)]
+
+
+def _hopeful(call: Call, lens: LensOut) -> bool:
+    rows = call.store.photos.page(call.owner, before=None, limit=PHOTOS, lens_id=lens.id)
+    return any(row.state not in HOPELESS for row in rows)
+
+
+def counting(call: Call, lens_id: str) -> bool:
+    """Whether a worker has yet to measure the newest version of a lens."""
+    lens = lens_routes.find_lens(call, lens_id)
+    newest = call.store.lenses.history(lens, after=lens.version - 1)
+    return lens.sample_count > 0 and any(event.metrics is None for event in newest)
+
+
+def waiting(call: Call) -> list[Group]:
+    """Group the photos that wait for their owner to say which lens it was."""
+    rows = call.store.photos.page(call.owner, before=None, limit=MOST_WAITING, state="needs_lens")
+    return grouped([row for row in rows if row.lens_id is None])

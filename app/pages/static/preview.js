@@ -1,0 +1,128 @@
+// What a correction would do to the part of the photo that is seen: computed once for a place, mixed at once by the sliders.
+
+import { byId, problemText, send } from "./common.js";
+
+const MOST = 1_200_000; // pixels of a part that is computed: a second or two of work
+const PAUSE_MS = 500;
+const LIGHT = Float32Array.from({ length: 256 }, (_, code) => {
+  const value = code / 255;
+  return value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4;
+});
+const CODES = Uint8ClampedArray.from({ length: 4097 }, (_, step) => {
+  const value = step / 4096;
+  return 255 * (value <= 0.0031308 ? 12.92 * value : 1.055 * value ** (1 / 2.4) - 0.055);
+});
+
+async function pixelsOf(url) {
+  const image = new Image();
+  image.src = url;
+  await image.decode();
+  const canvas = new OffscreenCanvas(image.naturalWidth, image.naturalHeight);
+  const context = canvas.getContext("2d", { willReadFrequently: true });
+  context.drawImage(image, 0, 0);
+  return context.getImageData(0, 0, canvas.width, canvas.height);
+}
+
+// Strength, texture and grain enter a correction linearly in light, but for its last bounds: so they are mixed.
+export function mix({ before, after, smooth, clean }, { strength, texture, denoise }) {
+  const mixed = new ImageData(before.width, before.height);
+  const out = mixed.data;
+  for (let i = 0; i < out.length; i += 4) {
+    for (let k = i; k < i + 3; k += 1) {
+      const a = LIGHT[after.data[k]];
+      const b = LIGHT[smooth.data[k]];
+      const wanted = b + texture * (a - b + denoise * (LIGHT[clean.data[k]] - a));
+      const was = LIGHT[before.data[k]];
+      const light = was + strength * (wanted - was);
+      out[k] = CODES[light <= 0 ? 0 : light >= 1 ? 4096 : Math.round(light * 4096)];
+    }
+    out[i + 3] = 255;
+  }
+  return mixed;
+}
+
+export function setUpPreview(viewer) {
+  const form = byId("correct");
+  if (!viewer || !form || !("preview" in form.dataset)) return;
+  const words = byId("preview-words");
+  const canvas = document.createElement("canvas");
+  let [part, asked, timer] = [null, 0, 0];
+  const value = (name) => Number(form.elements[name].value);
+  const show = () => {
+    if (!part) return;
+    const mixed = mix(part.layers, { strength: value("strength"), texture: value("texture"), denoise: value("denoise") });
+    [canvas.width, canvas.height] = [mixed.width, mixed.height];
+    canvas.getContext("2d").putImageData(mixed, 0, 0);
+    const first = viewer.patches.length === 0;
+    viewer.patches = [{ ...part.region, image: canvas }];
+    if (first && viewer.mode === "before") viewer.setMode("split");
+    viewer.redraw();
+    viewer.root.dataset.previewed = "";
+  };
+  const covers = ({ region }, wanted) =>
+    wanted.x >= region.x &&
+    wanted.y >= region.y &&
+    wanted.x + wanted.width <= region.x + region.width &&
+    wanted.y + wanted.height <= region.y + region.height;
+  const compute = async (region) => {
+    asked += 1;
+    const mine = asked;
+    words.textContent = "Working out what a correction does here …";
+    try {
+      const lens = form.elements.lens_id?.value;
+      const made = await send("POST", `/ui/photos/${form.dataset.photo}/preview`, { ...region, ...(lens ? { lens_id: lens } : {}) });
+      const end = await settled(made.id, () => mine === asked);
+      if (mine !== asked) return;
+      if (end.state !== "succeeded") throw new Error(end.error?.detail ?? "the preview was stopped");
+      const base = `/ui/corrections/${made.id}/layer`;
+      const [before, after, smooth, clean] = await Promise.all(
+        ["before", "after", "smooth", "clean"].map((name) => pixelsOf(`${base}/${name}`)),
+      );
+      if (mine !== asked) return;
+      part = { region, layers: { before, after, smooth, clean } };
+      words.textContent = end.untouched
+        ? "Nothing to correct here: this part stays as it is."
+        : "This is what you get. The sliders show their effect at once.";
+      show();
+      fetch(`/v1/corrections/${made.id}`, { method: "DELETE" }); // its pictures are here now
+    } catch (reason) {
+      if (mine === asked) words.textContent = `No preview: ${reason.message}`;
+    }
+  };
+  const look = () => {
+    clearTimeout(timer);
+    timer = setTimeout(() => {
+      const region = viewer.region;
+      if (region.width * region.height > MOST) {
+        words.textContent = "Zoom in, or choose a place below, to see what a correction does there.";
+        return;
+      }
+      if (part && covers(part, region)) return;
+      compute(region);
+    }, PAUSE_MS);
+  };
+  viewer.onChange(look);
+  form.addEventListener("input", show);
+  form.elements.lens_id?.addEventListener("change", () => {
+    part = null;
+    look();
+  });
+  look();
+}
+
+async function settled(id, wanted) {
+  let tag = "";
+  for (;;) {
+    const response = await fetch(`/v1/jobs/${id}?wait=20`, { headers: tag ? { "If-None-Match": tag } : {} });
+    if (response.status !== 304 && !response.ok) throw new Error(await problemText(response));
+    if (response.status !== 304) {
+      tag = response.headers.get("ETag") ?? "";
+      const job = await response.json();
+      if (["succeeded", "failed", "cancelled"].includes(job.state)) {
+        const correction = await (await fetch(`/v1/corrections/${id}`)).json();
+        return { ...job, untouched: correction.report?.nothing_to_correct };
+      }
+    }
+    if (!wanted()) return { state: "left" };
+  }
+}

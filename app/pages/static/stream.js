@@ -1,0 +1,82 @@
+// One stream keeps the page current: the server sends a part of it whenever that part changes.
+
+import { byId } from "./common.js";
+
+const PATIENCE_MS = 4000;
+
+// Make `old` like `fresh` and keep what is alike: focus, open details, what was typed.
+export function merge(old, fresh) {
+  const kept = [...old.childNodes];
+  const known = new Map(kept.filter((node) => node.id).map((node) => [node.id, node]));
+  let at = 0;
+  for (const node of [...fresh.childNodes]) {
+    const place = old.childNodes[at] ?? null;
+    const same = node.id ? known.get(node.id) : place && !place.id && place.nodeName === node.nodeName ? place : null;
+    if (!same) old.insertBefore(node, place);
+    else {
+      if (same !== place) old.insertBefore(same, place);
+      mergeNode(same, node);
+    }
+    at += 1;
+  }
+  while (old.childNodes.length > at) old.lastChild.remove();
+}
+
+function mergeNode(old, fresh) {
+  if (old.isEqualNode(fresh)) return;
+  if (old.nodeType !== Node.ELEMENT_NODE) {
+    old.nodeValue = fresh.nodeValue;
+    return;
+  }
+  if (old.nodeName !== fresh.nodeName) {
+    old.replaceWith(fresh);
+    return;
+  }
+  const typed = old.matches("input, select, textarea");
+  for (const { name, value } of fresh.attributes) if (old.getAttribute(name) !== value) old.setAttribute(name, value);
+  for (const { name } of [...old.attributes])
+    if (!fresh.hasAttribute(name) && name !== "open" && !(typed && name === "disabled")) old.removeAttribute(name);
+  if (typed && old.nodeName !== "SELECT") return;
+  merge(old, fresh);
+}
+
+export function setUpStream(onPart) {
+  const { page, id } = document.body.dataset;
+  if (!page) return;
+  const away = byId("away");
+  let [source, timer] = [null, 0];
+  const open = () => {
+    source = new EventSource(`/ui/events?${new URLSearchParams({ page, id: id ?? "" })}`);
+    source.addEventListener("open", () => {
+      clearTimeout(timer);
+      timer = 0;
+      away.hidden = true;
+    });
+    source.addEventListener("error", () => {
+      timer ||= setTimeout(() => (away.hidden = false), PATIENCE_MS);
+      if (source.readyState === EventSource.CLOSED) setTimeout(() => document.hidden || reopen(), PATIENCE_MS);
+    });
+    source.addEventListener("part", (event) => {
+      const target = byId(event.lastEventId);
+      if (!target) return;
+      const fresh = document.createElement("template");
+      fresh.innerHTML = event.data;
+      merge(target, fresh.content);
+      onPart(event.lastEventId);
+    });
+    source.addEventListener("gone", () => {
+      source.close();
+      location.assign("/");
+    });
+  };
+  window.addEventListener("offline", () => (away.hidden = false));
+  window.addEventListener("online", () => reopen());
+  const reopen = () => {
+    source?.close();
+    open();
+  };
+  // a page in the background holds no connection; shown again it is brought up to date
+  document.addEventListener("visibilitychange", () => (document.hidden ? source?.close() : reopen()));
+  window.addEventListener("pagehide", () => source?.close());
+  open();
+}

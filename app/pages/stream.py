@@ -1,0 +1,106 @@
+"""What changes on an open page, sent to it as it happens: one stream, silent while nothing does."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Mapping
+from typing import Annotated, Final, Literal, TypeAlias
+
+from fastapi import APIRouter, Query
+from sse_starlette import EventSourceResponse, ServerSentEvent
+from starlette.concurrency import run_in_threadpool
+
+from app.http import views
+from app.http.dependencies import Call, CallDep
+from app.http.errors import UnknownCorrectionError, UnknownLensError, UnknownPhotoError
+from app.pages import shown
+from app.pages.rendering import fragment
+from app.routes import corrections as correction_routes
+from app.routes import lenses as lens_routes
+from app.routes import photos as photo_routes
+from app.store.jobs import JobStore
+
+router = APIRouter(include_in_schema=False)
+
+LOOK_S: Final = 0.5
+"""How often the tables are looked at for an open page: some milliseconds of reading."""
+
+REDRAW_S: Final = 15.0
+"""How often a page is drawn anew though nothing happened: estimates of the time left change."""
+
+Page = Literal["home", "photo", "correction", "lens"]
+Fragments: TypeAlias = Mapping[str, str]
+"""HTML by the id of the element that it belongs into."""
+
+
+@router.get("/ui/events")
+async def events(
+    call: CallDep,
+    page: Page = "home",
+    id: Annotated[str, Query(max_length=60)] = "",  # noqa: A002
+) -> EventSourceResponse:
+    """Send the parts of a page now and whenever they change."""
+    draw = _DRAWERS[page]
+    await run_in_threadpool(draw, call, id)  # what is not there is refused before the stream begins
+    return EventSourceResponse(_changes(call, lambda: draw(call, id)), ping=15)
+
+
+async def _changes(call: Call, draw: Callable[[], Fragments]) -> AsyncIterator[ServerSentEvent]:
+    jobs = JobStore(call.store.database)
+    sent: dict[str, str] = {}
+    mark, drawn_at = None, 0.0
+    clock = asyncio.get_running_loop().time
+    while True:
+        seen = await run_in_threadpool(jobs.mark_of_owner, call.owner, shown.PHOTOS)
+        if seen != mark or clock() - drawn_at > REDRAW_S:
+            mark, drawn_at = seen, clock()
+            if not await run_in_threadpool(call.services.gate.is_still, call.who):
+                return  # his key was revoked while he watched
+            try:
+                parts = await run_in_threadpool(draw)
+            except (UnknownPhotoError, UnknownLensError, UnknownCorrectionError):  # deleted while watched
+                yield ServerSentEvent(data="", event="gone")
+                return
+            for name, html in parts.items():
+                if sent.get(name) != html:
+                    sent[name] = html
+                    yield ServerSentEvent(data=html, event="part", id=name)
+        await asyncio.sleep(LOOK_S)
+
+
+def _home(call: Call, _: str) -> Fragments:
+    photos, more = shown.photos(call)
+    return {
+        "waiting": fragment(
+            "_waiting.html", groups=shown.waiting(call), lenses=shown.lenses_with_photos(call)
+        ),
+        "lenses": fragment("_lenses.html", lenses=shown.lenses_with_photos(call)),
+        "photos": fragment("_photos.html", photos=photos, more=more),
+    }
+
+
+def _photo(call: Call, photo_id: str) -> Fragments:
+    photo = photo_routes.describe(call, photo_routes.find_photo(call, photo_id))
+    return {"photo-state": fragment("_photo_state.html", photo=photo)}
+
+
+def _correction(call: Call, correction_id: str) -> Fragments:
+    plan = correction_routes.find_plan(call, correction_id)
+    return {
+        "correction-state": fragment(
+            "_correction_state.html", correction=views.correction_out(plan), job=views.correction_job(plan)
+        )
+    }
+
+
+def _lens(call: Call, lens_id: str) -> Fragments:
+    lens = lens_routes.read_lens(lens_id, call)
+    return {"lens-state": fragment("_lens_state.html", lens=lens, counting=shown.counting(call, lens_id))}
+
+
+_DRAWERS: Final[Mapping[Page, Callable[[Call, str], Fragments]]] = {
+    "home": _home,
+    "photo": _photo,
+    "correction": _correction,
+    "lens": _lens,
+}

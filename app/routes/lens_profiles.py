@@ -1,0 +1,111 @@
+"""The profile of a lens as a file: taken along, and brought back."""
+
+from __future__ import annotations
+
+import io
+import re
+from typing import Final
+
+from fastapi import APIRouter, Response
+from starlette.concurrency import run_in_threadpool
+
+from app.http.bodies import CLOSE, Pace
+from app.http.dependencies import Call, CallDep
+from app.http.errors import BusyError, MalformedUploadError, TooLargeError, UnknownLensError
+from app.routes.common import problems
+from app.routes.lenses import find_lens, read_lens
+from app.schemas import LensOut
+from app.store.profile_intake import take_in
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.model.profile import LensProfile, read_profile, write_profile
+
+router = APIRouter(tags=["lenses"])
+
+MAX_BYTES: Final = 64 << 20
+"""Of a profile that is sent (chosen): twenty times one of a hundred photos."""
+
+_PAGE: Final = 200
+_FILE: Final = {"application/zip": {"schema": {"type": "string", "format": "binary"}}}
+
+
+@router.get(
+    "/lenses/{lens_id}/profile",
+    operation_id="getLensProfile",
+    response_class=Response,
+    responses=problems(404, 409, 422, also={200: {"content": _FILE, "description": "A .lensprofile"}}),
+)
+def read_lens_profile(lens_id: str, call: CallDep) -> Response:
+    """Return all that was learned of a lens as one file, which the command line reads too."""
+    lens = find_lens(call, lens_id)
+    model = call.models.get(lens_id, family=False).model
+    named = {"maker": lens.maker, "model": lens.model, "serial": lens.serial, "label": lens.label}
+    profile = LensProfile(
+        model,
+        {name: value for name, value in named.items() if value},
+        _photos(call, lens_id, {sample.photo for sample in model.samples}),
+    )
+    out = io.BytesIO()
+    write_profile(out, profile)
+    words = lens.label or " ".join(word for word in (lens.maker, lens.model) if word)
+    plain = re.sub(r"[^A-Za-z0-9._-]+", "-", words).strip("-") or "lens"
+    headers = {
+        "Content-Disposition": f'attachment; filename="{plain}.lensprofile"',
+        "Cache-Control": "private, no-cache",
+        "X-Content-Type-Options": "nosniff",
+    }
+    return Response(out.getvalue(), media_type="application/zip", headers=headers)
+
+
+@router.put(
+    "/lenses/{lens_id}/profile",
+    operation_id="addLensProfile",
+    responses=problems(400, 404, 408, 413, 422),
+    openapi_extra={"requestBody": {"required": True, "content": _FILE}},
+)
+async def add_lens_profile(lens_id: str, call: CallDep) -> LensOut:
+    """Let what a profile knows join a lens; each of its photos counts as one, without its file.
+
+    The same profile a second time changes nothing.
+    """
+    await run_in_threadpool(find_lens, call, lens_id)
+    many = BusyError("too many files are being received: try again in a few seconds", headers=CLOSE)
+    with call.services.uploads.one(many):
+        return await run_in_threadpool(_add, lens_id, await _received(call), call)
+
+
+async def _received(call: Call) -> bytes:
+    """Return the body, no longer and no slower than a profile is."""
+    data, more = bytearray(), True
+    pace = Pace(call.settings.stall_seconds, call.settings.upload_seconds)
+    while more:
+        message = await pace.next(call.request.receive)
+        if message["type"] == "http.disconnect":
+            raise MalformedUploadError("the profile ended too early: send it again")
+        data += message.get("body", b"")
+        more = message.get("more_body", False)
+        if len(data) > MAX_BYTES:
+            raise TooLargeError(f"the profile is larger than {MAX_BYTES >> 20} MiB: send a smaller one")
+    return bytes(data)
+
+
+def _add(lens_id: str, data: bytes, call: Call) -> LensOut:
+    try:
+        profile = read_profile(io.BytesIO(data), "the file")
+    except InvalidInputError as error:
+        raise MalformedUploadError(f"{error}: send a .lensprofile") from error
+    names = {key: name for key, name in profile.photos.items() if name.isprintable()}
+    if take_in(call.store.database, lens_id, call.owner, profile.model.samples, names) is None:
+        raise UnknownLensError(f"there is no lens {lens_id[:60]}: it may be deleted already")
+    return read_lens(lens_id, call)
+
+
+def _photos(call: Call, lens_id: str, wanted: set[str]) -> dict[str, str]:
+    """Return the file names of the photos that a lens learned from, by id."""
+    found: dict[str, str] = {}
+    before = None
+    while True:
+        rows = call.store.photos.page(call.owner, before=before, limit=_PAGE, lens_id=lens_id)
+        found |= {row.public_id: row.filename for row in rows if row.public_id in wanted}
+        if len(rows) < _PAGE:
+            return found
+        before = rows[-1].public_id

@@ -1,0 +1,169 @@
+"""Reports of lenses, which workers make of each version, in the forms that people and programs read."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from typing import Annotated, Any, Final, Literal
+from urllib.parse import quote
+
+from fastapi import APIRouter, Query, Response, status
+
+from app.http.dependencies import Call, CallDep
+from app.http.errors import NotReadyError
+from app.routes.common import problems
+from app.routes.lenses import find_lens
+from app.schemas.fields import Aperture, OptionalId
+from app.store.tables import LensRow
+from app.store.versions import report_key
+from lensmodel.core.codec import from_json, to_json
+from lensmodel.core.errors import NoSamplesError
+from lensmodel.core.types import Channel
+from lensmodel.report.comparison import Comparison, Side, compare
+from lensmodel.report.documents import comparison_html, to_html
+from lensmodel.report.lens_test import LensTest
+from lensmodel.report.pdf import comparison_pdf, to_pdf
+from lensmodel.report.tables import to_csv
+
+router = APIRouter(tags=["lenses"])
+
+Form = Literal["json", "csv", "html", "pdf"]
+MEDIA_TYPES: Final[dict[Form, str]] = {
+    "json": "application/json",
+    "csv": "text/csv; charset=utf-8",
+    "html": "text/html; charset=utf-8",
+    "pdf": "application/pdf",
+}
+POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'self'"
+"""A report is one file: it loads nothing, and runs nothing."""
+
+_CONTENT: Final = {kind.partition(";")[0]: {"schema": {"type": "string"}} for kind in MEDIA_TYPES.values()}
+
+
+def stored_report(call: Call, lens: LensRow) -> LensTest:
+    """Return the report of the newest version of a lens.
+
+    Raises
+    ------
+    NoSamplesError
+        If nothing was learned of it yet.
+    NotReadyError
+        If a worker has yet to make it.
+    """
+    if lens.sample_count == 0:
+        raise NoSamplesError(f"lens {lens.public_id} has no samples yet: upload photos taken with it")
+    try:
+        stored = call.storage.get(report_key(lens.public_id, lens.version, lens.rebuild_epoch))
+    except FileNotFoundError as error:
+        raise NotReadyError(
+            f"the report of version {lens.version} is not made yet: it comes when that version is measured",
+            headers={"Retry-After": "2"},
+        ) from error
+    return from_json(LensTest, json.loads(stored))
+
+
+@router.get(
+    "/lenses/{lens_id}/report.{form}",
+    operation_id="getLensReport",
+    response_class=Response,
+    responses=problems(
+        404,
+        409,
+        422,
+        also={200: {"content": _CONTENT, "description": "Report"}, 304: {"description": "Not changed"}},
+    ),
+)
+def read_report(
+    lens_id: str,
+    form: Form,
+    call: CallDep,
+    against: Annotated[OptionalId, Query(description="another lens to compare it with")] = None,
+    aperture: Annotated[Aperture | None, Query(description="of a comparison")] = None,
+    against_aperture: Annotated[Aperture | None, Query(description="of the other one")] = None,
+    channel: Channel = "g",
+) -> Response:
+    """Return the test of a lens, or with `against` or `against_aperture` a comparison.
+
+    The first sentence is for photographers; the rest is what lens testers expect, with its errors.
+    """
+    lens = find_lens(call, lens_id)
+    test = stored_report(call, lens)
+    compared = against is not None or against_aperture is not None
+    other = lens if against in {None, lens_id} else find_lens(call, str(against))
+    question = f"{form} {other.public_id} {other.version} {other.rebuild_epoch} {aperture} {against_aperture}"
+    digest = hashlib.sha256(f"{question} {channel} {compared}".encode()).hexdigest()[:12]
+    tag = f'"{lens.public_id}-v{lens.version}-e{lens.rebuild_epoch}-r-{digest}"'
+    headers = {
+        "ETag": tag,
+        "Cache-Control": "private, no-cache",
+        "Content-Security-Policy": POLICY,
+        "X-Content-Type-Options": "nosniff",
+        "Content-Disposition": _disposition(test.name, form),
+    }
+    if tag in call.request.headers.get("if-none-match", ""):
+        return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
+    if compared:
+        second = test if other is lens else stored_report(call, other)
+        body = _compared(test, second, aperture, against_aperture, channel, form)
+    else:
+        body = _written(test, form)
+    return Response(body, media_type=MEDIA_TYPES[form], headers=headers)
+
+
+def _written(test: LensTest, form: Form) -> bytes:
+    if form == "json":
+        return json.dumps(to_json(test)).encode()
+    if form == "csv":
+        return to_csv(test).encode()
+    return to_html(test).encode() if form == "html" else to_pdf(test)
+
+
+def _compared(
+    first: LensTest,
+    second: LensTest,
+    aperture: float | None,
+    other: float | None,
+    channel: Channel,
+    form: Form,
+) -> bytes:
+    one, two = first.at(aperture, channel), second.at(other if other is not None else aperture, channel)
+    found = compare(
+        Side(_named(first, one.report.settings.aperture, second), one),
+        Side(_named(second, two.report.settings.aperture, first), two),
+    )
+    if form == "html":
+        return comparison_html(found).encode()
+    if form == "pdf":
+        return comparison_pdf(found)
+    if form == "json":
+        return json.dumps(_figures(found)).encode()
+    rows = ["zone,first_c_px,second_c_px,difference,standard_error"]
+    rows += [
+        f"{c.zone},{c.first:.6g},{c.second:.6g},{c.second - c.first:.6g},"
+        f"{'' if c.error is None else f'{c.error:.6g}'}"
+        for c in found.zones
+    ]
+    return ("\n".join(rows) + "\n").encode()
+
+
+def _named(test: LensTest, aperture: float | None, other: LensTest) -> str:
+    at = "" if aperture is None else f"f/{aperture:g}"
+    if test.name == other.name:
+        return at or test.name
+    return f"{test.name} {at}".strip()
+
+
+def _figures(found: Comparison) -> dict[str, Any]:
+    return {
+        "first": found.first.name,
+        "second": found.second.name,
+        "verdict": found.verdict,
+        "zones": to_json(found.zones),
+    }
+
+
+def _disposition(name: str, form: Form) -> str:
+    plain = re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-") or "lens"
+    how = "inline" if form in {"html", "pdf"} else "attachment"
+    return f"{how}; filename=\"{plain}-report.{form}\"; filename*=UTF-8''{quote(name, safe='')}-report.{form}"

@@ -1,0 +1,45 @@
+"""Several photos at once: name the lens of all that wait for it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import APIRouter
+
+from app.http.dependencies import CallDep
+from app.http.errors import InvalidParameterError, UnknownLensError
+from app.routes.common import problems
+from app.routes.photos import describe, find_photo
+from app.schemas import PhotoPage, PhotosChange
+from app.store import LensName
+from app.store.photo_steps import GIVEN_SETTINGS
+
+router = APIRouter(tags=["photos"])
+
+
+@router.patch("/photos", operation_id="changePhotos", responses=problems(404, 409, 422))
+def change_photos(change: PhotosChange, call: CallDep) -> PhotoPage:
+    """Name the lens of several photos, or correct their settings; a new lens becomes that of them all.
+
+    Each photo changes as by itself; where one is gone nothing changes.
+    """
+    if (change.lens_id is None) == (change.new_lens is None) and not change.model_fields_set & {
+        *GIVEN_SETTINGS
+    }:
+        raise InvalidParameterError("send lens_id or new_lens, or the settings of these photos")
+    if change.lens_id is not None and change.new_lens is not None:
+        raise InvalidParameterError("lens_id and new_lens each name the lens: send one of them")
+    if change.lens_id is not None and call.store.lenses.get(change.lens_id, call.owner) is None:
+        raise UnknownLensError(f"lens_id {change.lens_id}: there is no such lens; GET /v1/lenses lists them")
+    photos = [find_photo(call, key) for key in dict.fromkeys(change.photo_ids)]
+    given: dict[str, Any] = change.model_dump(include=set(GIVEN_SETTINGS), exclude_none=True)
+    lens: LensName | str | None = change.lens_id
+    for photo in photos:
+        if change.new_lens is not None and lens is None:
+            new = LensName(photo.lens_maker, photo.lens_model, None, label=change.new_lens.label)
+            call.store.photos.change(photo.public_id, call.owner, given, lens=new)
+            lens = find_photo(call, photo.public_id).given.get("lens_id")
+        else:
+            call.store.photos.change(photo.public_id, call.owner, given, lens=lens)
+    items = [describe(call, find_photo(call, photo.public_id)) for photo in photos]
+    return PhotoPage(items=items, next=None)

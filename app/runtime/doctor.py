@@ -1,0 +1,217 @@
+"""Examine an installation, running or not: whether all holds that must hold, and the blobs are there.
+
+The tables are examined by `app.store.upkeep.invariants`, the same checks that end the tests with random
+deaths. Here the blobs are compared with what the tables say of them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import Final
+
+from sqlalchemy import select, update
+
+from app.blobs.storage import Storage
+from app.runtime.outage import CODE as OUTAGE
+from app.runtime.settings import Settings
+from app.store import Store
+from app.store.access.owners import now
+from app.store.database import insert_new
+from app.store.tables import CorrectionRow, GarbageRow, LensRow, PhotoRow, SampleRow
+from app.store.upkeep.invariants import INVARIANTS
+
+STILL_COMING: Final = timedelta(minutes=30)
+"""What is written now may be named in the tables a moment later: nothing is deleted sooner."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that is not as it must be."""
+
+    check: str
+    subject: str
+    says: str
+    remedy: str
+    mended: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What was examined, and what was found."""
+
+    checks: tuple[str, ...]
+    findings: tuple[Finding, ...]
+
+    @property
+    def open(self) -> tuple[Finding, ...]:
+        """What is still not as it must be."""
+        return tuple(finding for finding in self.findings if not finding.mended)
+
+
+def examine(
+    settings: Settings, store: Store, storage: Storage, *, repair: bool = False, deep: bool = False
+) -> Report:
+    """Run all checks.
+
+    Parameters
+    ----------
+    settings, store, storage
+        The installation.
+    repair : bool
+        Mend what can be mended; each finding in a transaction of its own.
+    deep : bool
+        Read every photo and every kernel again and compare them with their checksums.
+    """
+    findings = list(_tables(store, repair=repair))
+    checks = [invariant.name for invariant in INVARIANTS]
+    blobs: dict[str, Callable[[], Iterator[Finding]]] = {
+        "work": lambda: _work(settings, store),
+        "blobs": lambda: _blobs(store, storage, repair=repair),
+    }
+    if deep:
+        blobs |= {"kernels": lambda: _kernels(store, storage), "photos": lambda: _photos(store, storage)}
+    for name, check in blobs.items():
+        checks.append(name)
+        findings.extend(check())
+    return Report(tuple(checks), tuple(findings))
+
+
+def _tables(store: Store, *, repair: bool) -> Iterator[Finding]:
+    for invariant in INVARIANTS:
+        with store.database.reading() as session:
+            broken = invariant.find(session)
+        for subject in broken:
+            if invariant.mend is None or not repair:
+                remedy = invariant.remedy if invariant.mend is None else "lensmodel doctor --repair mends it"
+                yield Finding(invariant.name, subject, f"not so: {invariant.sentence}", remedy)
+                continue
+            with store.database.writing() as session:
+                if subject in invariant.find(session):  # nobody else has mended it meanwhile
+                    invariant.mend(session, subject)
+            yield Finding(invariant.name, subject, f"was not so: {invariant.sentence}", "", mended=True)
+
+
+def _work(settings: Settings, store: Store) -> Iterator[Finding]:
+    waiting = sum(store.operation.load().jobs.values())
+    if waiting and not store.workers.live(settings.lease_seconds):
+        says = f"{waiting} jobs are unfinished and no worker lives"
+        yield Finding("work", "workers", says, "start lensmodel serve, or lensmodel worker")
+
+
+def _blobs(store: Store, storage: Storage, *, repair: bool) -> Iterator[Finding]:
+    """Compare what is stored with what the tables name; these are read last, since blobs come first."""
+    if not storage.is_there:
+        where = str(storage.folder)
+        yield Finding("blobs", where, "the folder of the blobs is away", "mount its disk, or restore it")
+        return
+    sizes = dict(storage.listed())
+    with store.database.reading() as session:
+        photos = session.execute(
+            select(PhotoRow.public_id, PhotoRow.blob_key, PhotoRow.byte_size).where(
+                PhotoRow.deleted_at.is_(None)
+            )
+        ).all()
+        results = session.execute(
+            select(CorrectionRow.public_id, CorrectionRow.result_key, CorrectionRow.result_bytes).where(
+                CorrectionRow.state == "succeeded"
+            )
+        ).all()
+        known = {f"photos/{public_id}/" for public_id, _, _ in photos}
+        known |= {f"corrections/{key}/" for key in session.scalars(select(CorrectionRow.public_id))}
+        lens_ids = select(LensRow.public_id).where(LensRow.deleted_at.is_(None))
+        known |= {f"models/{key}/" for key in session.scalars(lens_ids)}
+        garbage = tuple(session.scalars(select(GarbageRow.prefix)))
+    newer = dict(storage.listed()) if any(key not in sizes for _, key, _ in photos) else sizes
+    for public_id, key, size in photos:
+        if newer.get(key) != size:
+            said = "missing" if key not in newer else f"{newer[key]} bytes instead of {size}"
+            yield Finding(
+                "blobs", public_id, f"the file of the photo is {said}", "restore it, or delete the photo"
+            )
+    for correction_id, result, length in results:
+        if result is None or sizes.get(result) == length:
+            continue
+        if dict(storage.listed(f"{result.rpartition('/')[0]}/")).get(result) != length:
+            yield _lost_result(store, correction_id, repair=repair)
+    for prefix in sorted({_group(key) for key in sizes}):
+        if prefix in known or prefix.startswith(("probe/", *garbage)):
+            continue
+        yield _orphan(store, prefix, repair=repair)
+
+
+def _group(key: str) -> str:
+    return "/".join([*key.split("/")[:2], ""])
+
+
+def _lost_result(store: Store, correction_id: str, *, repair: bool) -> Finding:
+    says = "the result of the correction is missing"
+    if not repair:
+        return Finding("blobs", correction_id, says, "lensmodel doctor --repair lets it be made again")
+    with store.database.writing() as session:
+        session.execute(
+            update(CorrectionRow)
+            .where(CorrectionRow.public_id == correction_id, CorrectionRow.state == "succeeded")
+            .values(state="failed", error_code=OUTAGE, error_detail="its result was lost: retry it")
+        )
+    return Finding("blobs", correction_id, f"{says}; it can be retried now", "", mended=True)
+
+
+def _orphan(store: Store, prefix: str, *, repair: bool) -> Finding:
+    says = "no row names these blobs"
+    if not repair:
+        return Finding("blobs", prefix, says, "lensmodel doctor --repair gives them up for deletion")
+    with store.database.writing() as session:
+        insert_new(session, GarbageRow, [{"prefix": prefix, "not_before": now() + STILL_COMING}])
+    return Finding("blobs", prefix, f"{says}; they will be deleted", "", mended=True)
+
+
+def _kernels(store: Store, storage: Storage) -> Iterator[Finding]:
+    last = 0
+    while True:
+        with store.database.reading() as session:
+            rows = session.execute(
+                select(SampleRow.id, SampleRow.psf, SampleRow.crc32, SampleRow.statistics_key)
+                .where(SampleRow.id > last)
+                .order_by(SampleRow.id)
+                .limit(1000)
+            ).all()
+        if not rows:
+            return
+        for key, psf, crc32, statistics in rows:
+            if zlib.crc32(psf) != crc32:
+                yield Finding(
+                    "kernels", f"sample {key}", "differs from what was written", "restore the database"
+                )
+            if statistics is not None and not _exists(storage, statistics):
+                yield Finding("kernels", f"sample {key}", "its statistics are missing", "restore the blobs")
+        last = rows[-1][0]
+
+
+def _exists(storage: Storage, key: str) -> bool:
+    try:
+        storage.info(key)
+    except FileNotFoundError:
+        return False
+    return True
+
+
+def _photos(store: Store, storage: Storage) -> Iterator[Finding]:
+    with store.database.reading() as session:
+        rows = session.execute(
+            select(PhotoRow.public_id, PhotoRow.blob_key, PhotoRow.sha256, PhotoRow.byte_size).where(
+                PhotoRow.deleted_at.is_(None)
+            )
+        ).all()
+    for public_id, key, sha256, size in rows:
+        digest = hashlib.sha256()
+        try:
+            for piece in storage.stream(key, 0, size):
+                digest.update(piece)
+        except FileNotFoundError:
+            continue  # said already
+        if digest.hexdigest() != sha256:
+            yield Finding("photos", public_id, "the file differs from what was sent", "restore the blobs")

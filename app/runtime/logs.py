@@ -1,0 +1,84 @@
+"""How the service's processes log: one record begins one line, whatever its text holds.
+
+People read lines of text; collectors read one JSON object a line (`LENS_LOG_FORMAT=json`). Both name the
+request, the job and the photo that a record belongs to, from wherever in the program it came.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import sys
+from collections.abc import MutableMapping
+from typing import Any, Final, Literal, TypeAlias
+
+import structlog
+
+Format: TypeAlias = Literal["text", "json"]
+
+CONTINUED: Final = "\n    | "
+"""Before each further line of a record: no text from outside can look like a record of its own."""
+
+FIELDS: Final = (
+    "request_id",
+    "job_id",
+    "photo_id",
+    "lens_id",
+    "correction_id",
+    "method",
+    "path",
+    "status",
+    "ms",
+)
+"""What a record may carry besides its text; the same names in the context of a thread and in `extra`."""
+
+_CONTROL: Final = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
+
+
+class OneRecord(logging.Formatter):
+    """Writes a record so that neither a new line, nor an escape sequence for the terminal can be forged."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the text of a record with the ids of its context, its control characters made visible."""
+        context = structlog.contextvars.get_contextvars()
+        ids = "".join(f" {name}={context[name]}" for name in FIELDS if name in context)
+        head, end, rest = super().format(record).partition("\n")
+        text = _CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", f"{head}{ids}{end}{rest}")
+        return text.replace("\n", CONTINUED)
+
+
+def as_json(part: str) -> logging.Formatter:
+    """Return a formatter that writes each record as one JSON object on one line."""
+
+    def named(logger: object, method: str, event: MutableMapping[str, Any]) -> MutableMapping[str, Any]:
+        del logger, method
+        return {"time": event.pop("timestamp"), "level": event.pop("level"), "part": part, **event}
+
+    return structlog.stdlib.ProcessorFormatter(
+        foreign_pre_chain=[
+            structlog.contextvars.merge_contextvars,
+            structlog.stdlib.add_log_level,
+            structlog.stdlib.add_logger_name,
+            structlog.stdlib.ExtraAdder(allow=FIELDS),
+            structlog.processors.TimeStamper(fmt="iso", utc=True),
+        ],
+        processors=[
+            structlog.stdlib.ProcessorFormatter.remove_processors_meta,
+            structlog.processors.format_exc_info,
+            structlog.processors.EventRenamer("message"),
+            named,
+            structlog.processors.JSONRenderer(default=str),  # writes every control character as \u00..
+        ],
+    )
+
+
+def begin(part: str, level: str, form: Format = "text") -> None:
+    """Log to the standard error from now on, as the named part of the service."""
+    handler = logging.StreamHandler(sys.stderr)
+    text = OneRecord(f"%(asctime)s %(levelname)s {part} %(name)s: %(message)s")
+    handler.setFormatter(as_json(part) if form == "json" else text)
+    # in place of what the command line set up
+    logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
+    logging.getLogger("alembic").setLevel(logging.WARNING)  # it tells of every look at the schema
+    engine = logging.getLogger("dbos")  # it brings a handler with lines of its own, unless it finds one
+    engine.handlers, engine.propagate = [logging.NullHandler()], True

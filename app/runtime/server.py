@@ -1,0 +1,73 @@
+"""One API process: uvicorn on a socket of its own, or on the one that the supervisor holds."""
+
+from __future__ import annotations
+
+import os
+import socket
+from typing import Final
+
+import uvicorn
+
+from app.runtime import logs
+from app.runtime.idle_connections import impatient
+from app.runtime.parent_watch import on_parents_end
+from app.runtime.settings import Settings
+from app.sandbox import confine
+
+SOCKET: Final = "LENSMODEL_SOCKET"
+"""Name in the environment of the number of the listening socket."""
+
+GRACE_S: Final = 5
+"""How long open requests may take after the order to stop."""
+
+
+def run(settings: Settings, listener: socket.socket) -> None:
+    """Serve until SIGTERM, or until the supervisor is gone; log as a service does."""
+    logs.begin("api", settings.log_level, settings.log_format)
+    confine.hide_memory()
+    from app.main import create_app  # noqa: PLC0415 - the supervisor need not load the application
+
+    config = uvicorn.Config(
+        create_app(settings),
+        log_level=settings.log_level,
+        log_config=None,  # its lines go where ours go
+        access_log=False,  # the application writes its own, without serials
+        timeout_graceful_shutdown=GRACE_S,
+        limit_concurrency=settings.max_connections,
+        http=impatient(settings.stall_seconds),
+    )
+    server = uvicorn.Server(config)
+
+    def stop() -> None:
+        server.should_exit = True
+
+    on_parents_end(stop)
+    server.run(sockets=[listener])
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """Open a listening socket; port 0 takes a free one.
+
+    Raises
+    ------
+    OSError
+        If the address is taken, or not one of this machine.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+        listener.listen(2048)
+    except OSError:
+        listener.close()
+        raise
+    return listener
+
+
+def main() -> None:
+    """Serve on the socket that the environment names."""
+    settings = Settings()
+    number = os.environ.pop(SOCKET, None)
+    listener = listen(settings.host, settings.port) if number is None else socket.socket(fileno=int(number))
+    run(settings, listener)

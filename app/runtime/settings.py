@@ -1,0 +1,286 @@
+"""What can be configured, read once from the environment (prefix `LENS_`).
+
+Every setting has a default that works on one machine without anything else installed. A second
+machine needs other addresses for the database, the jobs and the storage, and nothing else.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, model_validator
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from lensmodel.core.errors import UnknownMethodError
+
+PREFIX = "LENS_"
+CLIENT_KEY = "LENS_API_KEY"
+"""No setting of the service: where its clients look for the key that they send."""
+
+MIB = 1024 * 1024
+LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
+
+
+class Settings(BaseSettings):
+    """Configuration of one process; frozen, passed on, never looked up again.
+
+    Names of the environment that begin with `LENS_` and mean nothing are an error: most likely
+    somebody mistyped a setting that he now believes to be in force.
+    """
+
+    model_config = SettingsConfigDict(env_prefix=PREFIX, extra="forbid", frozen=True)
+
+    data_dir: Path = Field(default=Path("lensmodel-data"), description="Folder of everything that is kept.")
+    database_url: str = Field(
+        default="", description="SQLAlchemy address; empty = sqlite file in the data folder."
+    )
+    jobs_url: str = Field(
+        default="", description="Database of the job engine; empty = sqlite file in the data folder."
+    )
+    storage_url: str = Field(
+        default="", description="file:// or s3:// address of the blobs; empty = in the data folder."
+    )
+    storage_seconds: float = Field(
+        default=20.0, gt=0, description="Longest that one request to an object store may take."
+    )
+    shared_filesystem: bool = Field(default=False, description="The file storage is seen by all machines.")
+    sqlite_synchronous: Literal["NORMAL", "FULL"] = Field(
+        default="NORMAL", description="FULL survives power loss too."
+    )
+
+    host: str = Field(default="127.0.0.1", description="Address to listen on.")
+    port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 takes any free one.")
+    auth: Literal["auto", "keys", "none"] = Field(
+        default="auto",
+        description=(
+            "Who may ask: keys = who has a key of `lensmodel keys`; none = anybody of this machine; auto = "
+            "keys where others can reach it, or once there is a key."
+        ),
+    )
+    public: bool = Field(
+        default=False, description="Others can reach it, also where it listens on loopback: behind a proxy."
+    )
+    session_hours: float = Field(
+        default=12.0, gt=0, description="How long a browser that has signed in stays so."
+    )
+    requests_per_minute: int = Field(
+        default=6000, ge=0, description="Requests of one owner with keys in one API process; 0 = any number."
+    )
+
+    allowed_hosts: str = Field(
+        default="",
+        description="Names that the service answers to, besides addresses and local ones; by commas.",
+    )
+    stall_seconds: float = Field(
+        default=30.0, gt=0, description="Longest that nothing of a request's head or body may come."
+    )
+    upload_seconds: float = Field(
+        default=3600.0, gt=0, description="Longest that a photo may be on its way to us."
+    )
+    max_connections: int = Field(default=1000, ge=1, description="Connections at once; more get 503.")
+    max_uploads: int = Field(default=8, ge=1, description="Photos that are received at once.")
+
+    max_upload_mb: int = Field(default=512, ge=1, description="Largest photo file, in MiB.")
+    max_megapixels: float = Field(default=160.0, gt=0, description="Largest photo, in millions of pixels.")
+    max_queued_photos: int = Field(
+        default=500, ge=1, description="Unfinished photos of one owner; more are refused."
+    )
+    max_stored_gb: float = Field(default=200.0, gt=0, description="Photo bytes of one owner, in GiB.")
+    max_photos: int = Field(default=100_000, ge=1, description="Photos of one owner.")
+    keep_photos: Literal["never", "corrections", "always"] = Field(
+        default="always",
+        description=(
+            "How long the files of photos stay: never = until their work is done; corrections = only of "
+            "photos that are there to be corrected; always = until they are deleted."
+        ),
+    )
+    min_free_mb: int = Field(
+        default=256, ge=0, description="Free disk below which uploads are refused, in MiB."
+    )
+
+    worker_slots: int = Field(
+        default_factory=lambda: os.cpu_count() or 1, ge=1, description="CPU jobs at once."
+    )
+    worker_memory_mb: int = Field(
+        default=4096, ge=256, description="Memory of all children of a worker, in MiB."
+    )
+    task_niceness: int = Field(
+        default=10,
+        ge=0,
+        le=19,
+        description="How far photo work gives way to requests, as of nice(1); 0 = not at all.",
+    )
+    lease_seconds: float = Field(
+        default=20.0, gt=0, description="A worker silent for so long is taken for dead."
+    )
+    sweep_seconds: float = Field(
+        default=0.5, gt=0, description="How often a worker looks for new work in the tables."
+    )
+    outage_hours: float = Field(
+        default=12.0,
+        ge=0,
+        description="How long a job waits for a database, a storage or a disk before it fails.",
+    )
+    inspect_seconds: float = Field(
+        default=20.0, gt=0, description="Longest that reading the header of a photo may take."
+    )
+    develop_seconds: float = Field(
+        default=180.0, gt=0, description="Longest that developing a photo may take."
+    )
+    patch_seconds: float = Field(
+        default=600.0, gt=0, description="Longest that estimating one patch may take."
+    )
+    correct_seconds: float = Field(
+        default=3600.0, gt=0, description="Longest that correcting a photo may take."
+    )
+
+    patches: int = Field(default=24, ge=1, le=1000, description="Patches that are used of one photo.")
+    min_good_patches: int = Field(default=1, ge=1, description="Fewer than this and the photo fails.")
+    kernel_size: int = Field(
+        default=31, ge=3, le=255, description="Side of the estimated kernels in pixels, odd."
+    )
+    estimator: str = Field(default="default", description="Name in the registry of blind estimators.")
+    selector: str = Field(default="r-map", description="Name in the registry of patch selectors.")
+    assume_single_copy: bool = Field(
+        default=False, description="Photos without a serial belong to the one lens of that model."
+    )
+
+    family: bool = Field(
+        default=True,
+        description="A lens that has seen little leans on its owner's other copies of the same model.",
+    )
+    model_mode: Literal["kernels", "mixed", "evidence", "wavefront", "likeliest"] = Field(
+        default="kernels",
+        description="What lens models make of their samples; likeliest chooses for each lens.",
+    )
+    model_unit: Literal["micrometre", "half-diagonal"] = Field(
+        default="micrometre", description="In what the kernels of bodies with different pixels agree."
+    )
+    model_cache_mb: int = Field(
+        default=1024, ge=1, description="Memory for fitted lens models in one process, in MiB."
+    )
+    long_poll_seconds: float = Field(
+        default=20.0, ge=0, le=60, description="Longest that a question for a job waits for a change of it."
+    )
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        default="info", description="Least that is logged."
+    )
+    log_format: Literal["text", "json"] = Field(
+        default="text", description="Lines for people, or one JSON object a line for collectors."
+    )
+    metrics_port: int = Field(
+        default=0, ge=0, le=65535, description="Port of a worker's own /metrics; 0 = none, the API has them."
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_unknown_names(cls, values: object) -> object:
+        known = {PREFIX + name.upper() for name in cls.model_fields} | {CLIENT_KEY}
+        for name in os.environ:
+            if name.upper().startswith(PREFIX) and name.upper() not in known:
+                near = difflib.get_close_matches(name.upper(), known, n=1)
+                hint = f"did you mean {near[0]}?" if near else "run `lensmodel config` to see all settings"
+                raise ValueError(f"unknown setting {name}: {hint}")
+        return values
+
+    @model_validator(mode="after")
+    def _odd_kernel(self) -> Settings:
+        if self.kernel_size % 2 == 0:
+            raise ValueError(f"kernel_size must be odd, got {self.kernel_size}")
+        return self
+
+    @model_validator(mode="after")
+    def _known_estimator(self) -> Settings:
+        if self.estimator != "default":
+            # not at the top: heavy, and most processes never ask for another one
+            from lensmodel.estimation import estimators  # noqa: PLC0415
+
+            try:
+                estimators.create(self.estimator)
+            except UnknownMethodError as error:
+                raise ValueError(str(error)) from error
+        return self
+
+    @model_validator(mode="after")
+    def _known_selector(self) -> Settings:
+        if self.selector != "r-map":
+            from lensmodel.estimation.patches import selectors  # noqa: PLC0415 - as above
+
+            try:
+                selectors.create(self.selector)
+            except UnknownMethodError as error:
+                raise ValueError(str(error)) from error
+        return self
+
+    @model_validator(mode="after")
+    def _one_machine_or_many(self) -> Settings:
+        many = not self.database.startswith("sqlite")
+        if many and self.storage.startswith("file://") and not self.shared_filesystem:
+            raise ValueError(
+                "a database server means several machines, but storage_url is a folder of one: "
+                "use s3://..., or set LENS_SHARED_FILESYSTEM=true where all machines see that folder"
+            )
+        if many and not self.jobs_url:
+            raise ValueError(
+                "a database server means several machines, but the jobs would be in a file of each: "
+                "set LENS_JOBS_URL to a database of that server"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _open_only_on_loopback(self) -> Settings:
+        if self.auth == "none" and self.is_open_to_others:
+            raise ValueError(
+                f"others can reach it (host {self.host}, LENS_PUBLIC={str(self.public).lower()}) and "
+                "LENS_AUTH=none lets everybody in: leave LENS_AUTH out and make keys by `lensmodel keys "
+                "create`, or listen on 127.0.0.1 without LENS_PUBLIC"
+            )
+        if self.public and not self.hosts:
+            raise ValueError(
+                "LENS_PUBLIC=true needs LENS_ALLOWED_HOSTS: the names under which browsers reach it, "
+                "such as lens.example.org, or localhost where there are none"
+            )
+        return self
+
+    @property
+    def is_open_to_others(self) -> bool:
+        """Whether more than this machine can reach it."""
+        return self.public or self.host not in LOOPBACK
+
+    @property
+    def needs_keys(self) -> bool:
+        """Whether everybody needs a key, whether or not there is one yet."""
+        return self.auth == "keys" or (self.auth == "auto" and self.is_open_to_others)
+
+    @property
+    def hosts(self) -> frozenset[str]:
+        """Names that the service answers to, besides addresses and local ones."""
+        return frozenset(name.strip().lower() for name in self.allowed_hosts.split(",") if name.strip())
+
+    @property
+    def database(self) -> str:
+        """SQLAlchemy address of our tables."""
+        return self.database_url or f"sqlite:///{self.data_dir.resolve() / 'app.db'}"
+
+    @property
+    def jobs(self) -> str:
+        """Address of the job engine's own tables."""
+        return self.jobs_url or f"sqlite:///{self.data_dir.resolve() / 'jobs.db'}"
+
+    @property
+    def storage(self) -> str:
+        """Address of the blobs."""
+        return self.storage_url or f"file://{self.data_dir.resolve() / 'blobs'}"
+
+    @property
+    def of_models(self) -> dict[str, str]:
+        """How all lens models of the service are made: arguments of `ModelSettings`."""
+        return {"mode": self.model_mode, "unit": self.model_unit}
+
+    @property
+    def max_upload_bytes(self) -> int:
+        """Largest photo file in bytes."""
+        return self.max_upload_mb * MIB

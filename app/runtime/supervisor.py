@@ -1,0 +1,268 @@
+"""`lensmodel serve`: one API process and one worker process, restarted whenever one dies.
+
+The supervisor holds the listening socket, so that while the API restarts callers wait instead of
+being refused; and a pipe whose end tells its children, however it ends itself, that it is gone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import http.client
+import json
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from app.access.authentication import require_somebody
+from app.commands.console.failure import UsageError
+from app.runtime import server
+from app.runtime.parent_watch import VARIABLE as LIFELINE
+from app.runtime.settings import PREFIX, Settings
+from app.runtime.signals import on_signals
+from app.sandbox import confine
+from app.store.access.keys import KeyStore
+from app.store.database import Database
+from app.store.upkeep import migrate
+from lensmodel.core.errors import InvalidInputError
+
+log = logging.getLogger(__name__)
+
+POLL_S: Final = 0.1
+READY_POLL_S: Final = 0.25
+STOP_S: Final = 15.0
+STEADY_S: Final = 20.0
+"""A process that lived so long is restarted at once, and its earlier deaths are forgotten."""
+
+MAX_EARLY_DEATHS: Final = 6
+WORKER, API = "app.runtime.worker_main", "app.runtime.api_main"
+"""Modules of the members; tests put in workers of their own."""
+
+ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+
+
+def serve(settings: Settings) -> int:
+    """Run the whole service until SIGTERM or Ctrl-C; return the exit status.
+
+    Raises
+    ------
+    UsageError
+        If another service works on the same data.
+    UsageError
+        If others could reach it, and nobody use it: there is no key.
+    InvalidInputError
+        If the address cannot be listened on, or the database is of a newer program.
+    """
+    confine.hide_memory()
+    settings.data_dir.mkdir(parents=True, exist_ok=True)
+    with alone(settings.data_dir), contextlib.closing(_listener(settings)) as listener:
+        _prepare(settings)
+        return _Supervisor(settings, listener).run()
+
+
+def run_api(settings: Settings) -> None:
+    """Run one API process in this process."""
+    _prepare(settings)
+    with contextlib.closing(_listener(settings)) as listener:
+        server.run(settings, listener)
+
+
+def run_worker(settings: Settings) -> None:
+    """Become one worker process.
+
+    A new program rather than a call: children import the main module of their parent again, and
+    that of a worker is small for this reason.
+    """
+    _migrate(settings)
+    os.environ.update(ONE_THREAD | environment(settings))
+    os.execv(sys.executable, [sys.executable, "-m", "app.runtime.worker_main"])  # noqa: S606 - no shell is wanted
+
+
+def _prepare(settings: Settings) -> None:
+    """Bring the schema up to date, and make sure that somebody could use what others can reach.
+
+    Raises
+    ------
+    UsageError
+        If there is no valid key where one is needed.
+    """
+    _migrate(settings)
+    database = Database(settings.database)
+    try:
+        refusal = require_somebody(settings, KeyStore(database))
+    finally:
+        database.close()
+    if refusal is not None:
+        raise UsageError(refusal)
+
+
+def _migrate(settings: Settings) -> None:
+    """Bring the schema up to date; of several processes that try, one does it."""
+    database = Database(settings.database)
+    try:
+        migrate.upgrade(database)
+    finally:
+        database.close()
+
+
+def environment(settings: Settings) -> dict[str, str]:
+    """Return the settings as the environment of another process."""
+    values = settings.model_dump(mode="json")
+    values["data_dir"] = str(settings.data_dir.resolve())
+    return {f"{PREFIX}{name.upper()}": str(value) for name, value in values.items()}
+
+
+def _listener(settings: Settings) -> socket.socket:
+    try:
+        return server.listen(settings.host, settings.port)
+    except OSError as error:
+        raise InvalidInputError(
+            f"cannot listen on {settings.host}:{settings.port}: {error.strerror or error}; "
+            "give another --port (0 takes any free one) or --host"
+        ) from error
+
+
+@contextmanager
+def alone(data_dir: Path) -> Iterator[None]:
+    """Make sure that only one supervisor works on this folder; the lock ends with the process."""
+    with (data_dir / "service.lock").open("w", encoding="ascii") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise UsageError(
+                f"another service already works on {data_dir}: stop it, or give another folder by --data"
+            ) from error
+        yield
+
+
+@dataclass
+class _Member:
+    """One process that is kept alive."""
+
+    name: str
+    module: str
+    process: subprocess.Popen[bytes] | None = None
+    started: float = 0.0
+    early_deaths: int = 0
+    due: float = 0.0
+
+
+@dataclass
+class _Supervisor:
+    """Starts, watches and stops the members."""
+
+    settings: Settings
+    listener: socket.socket
+    _stopping: threading.Event = field(default_factory=threading.Event)
+
+    def run(self) -> int:
+        """Watch until told to stop; return the exit status."""
+        members = [_Member("worker", WORKER), _Member("api", API)]
+        reading, writing = os.pipe()
+        on_signals(self._told)
+        threading.Thread(target=self._announce, daemon=True).start()
+        try:
+            while not self._stopping.is_set():
+                for member in members:
+                    if not self._keep(member, reading, members):
+                        return 1
+                self._stopping.wait(POLL_S)
+        finally:
+            self._end(members)
+            os.close(writing)
+            os.close(reading)
+            self._file.unlink(missing_ok=True)
+        return 0
+
+    def _told(self, number: signal.Signals) -> None:
+        log.info("%s: stopping", number.name)
+        self._stopping.set()
+
+    @property
+    def _file(self) -> Path:
+        return self.settings.data_dir / "service.json"
+
+    @property
+    def url(self) -> str:
+        """Where the service listens."""
+        host, port = self.listener.getsockname()[:2]
+        return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+    def _keep(self, member: _Member, lifeline: int, members: list[_Member]) -> bool:
+        """Start a member that does not run; False if it dies again and again right at its start."""
+        now = time.monotonic()
+        if member.process is not None:
+            status = member.process.poll()
+            if status is None:
+                return True
+            member.process = None
+            steady = now - member.started > STEADY_S
+            member.early_deaths = 0 if steady else member.early_deaths + 1
+            log.warning("the %s process ended with status %d; it is started again", member.name, status)
+            if member.early_deaths >= MAX_EARLY_DEATHS:
+                log.error(
+                    "the %s process ended %d times right after its start", member.name, MAX_EARLY_DEATHS
+                )
+                return False
+            member.due = now + (0.0 if member.early_deaths <= 1 else 0.25 * 2**member.early_deaths)
+        if now >= member.due:
+            self._start(member, lifeline)
+            self._write(members)
+        return True
+
+    def _start(self, member: _Member, lifeline: int) -> None:
+        inherited = {LIFELINE: str(lifeline), server.SOCKET: str(self.listener.fileno())}
+        member.process = subprocess.Popen(  # noqa: S603 - our own interpreter, our own modules
+            [sys.executable, "-m", member.module],
+            env=os.environ | environment(self.settings) | ONE_THREAD | inherited,
+            pass_fds=(lifeline, self.listener.fileno()),
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,  # a Ctrl-C reaches us alone, and we tell them
+        )
+        member.started = time.monotonic()
+
+    def _write(self, members: list[_Member]) -> None:
+        """Say in a file where the service is and which processes it consists of."""
+        pids = {f"{m.name}_pid": m.process.pid if m.process else None for m in members}
+        text = json.dumps({"url": self.url, "pid": os.getpid(), **pids}, indent=2)
+        part = self._file.with_suffix(".part")
+        part.write_text(text + "\n", encoding="utf-8")
+        part.replace(self._file)
+
+    def _announce(self) -> None:
+        """Print the address once the service can be used."""
+        host, port = self.listener.getsockname()[:2]
+        while not self._stopping.is_set():
+            with contextlib.suppress(OSError, http.client.HTTPException):
+                connection = http.client.HTTPConnection(host, port, timeout=5)
+                with contextlib.closing(connection):
+                    connection.request("GET", "/readyz")
+                    if connection.getresponse().status == http.client.OK:
+                        break
+            self._stopping.wait(READY_POLL_S)
+        else:
+            return
+        print(f"lensmodel is ready: {self.url}  (data in {self.settings.data_dir.resolve()})", flush=True)  # noqa: T201
+
+    def _end(self, members: list[_Member]) -> None:
+        """Tell all members to stop; kill those that do not."""
+        running = [m.process for m in members if m.process is not None and m.process.poll() is None]
+        for process in running:
+            process.terminate()
+        end = time.monotonic() + STOP_S
+        for process in running:
+            try:
+                process.wait(max(end - time.monotonic(), 0.1))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()

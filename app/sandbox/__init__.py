@@ -1,0 +1,1 @@
+"""Child processes that can do no harm: started, confined, watched."""

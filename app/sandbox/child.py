@@ -1,0 +1,188 @@
+"""The inside of a child process: contain it, run one task, say how it ended.
+
+This module is what a fresh child imports first, so it imports next to nothing itself.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import importlib
+import json
+import os
+import resource
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from multiprocessing import forkserver
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Final, TypeAlias
+
+from app.sandbox import confine
+from lensmodel.core.errors import LensModelError
+
+Progress: TypeAlias = Callable[[int, int], None]
+Task: TypeAlias = Callable[[dict[str, Any], Path, Progress], Any]
+"""Called as `task(arguments, folder, progress)`; returns what JSON can write."""
+
+RESULT: Final = "result.json"
+MAX_TEXT: Final = 4000
+_MIB: Final = 1024 * 1024
+NICENESS: Final = 10
+"""Of tasks above that of the worker, unless the operator says otherwise: a tenth of the weight of a process
+at 0 (sched(7)); chosen."""
+
+_PROGRESS_S: Final = 0.1
+_PR_SET_PDEATHSIG: Final = 1
+_KEPT_ENVIRONMENT: Final = (
+    *("LANG", "LC_ALL", "NUMBA_CACHE_DIR", "SYSTEMROOT"),
+    "TMPDIR",  # where the fork server listens; a task has a folder of its own instead
+    *("PYTHONPATH", "PYTHONHASHSEED", "PYTHONDONTWRITEBYTECODE", "PYTHONWARNINGS"),
+)
+_ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+def main(order: dict[str, Any], line: Connection) -> None:
+    """Carry out one order: `module`, `task`, `arguments` (JSON), `folder`, `limits`, `niceness`, its reach.
+
+    `reads` are files and folders that it may read, `writes` folders that it may write besides its own;
+    None in place of `reads` leaves the file system, the network and other programs open to it.
+    """
+    folder = Path(order["folder"])
+    tasks = importlib.import_module(order["module"])  # our own code: it may still be read
+    contain(folder, order["limits"], order["niceness"])
+    if order["reads"] is not None:
+        writes = [folder, *map(Path, order["writes"])]
+        confine.confine(writes, map(Path, order["reads"]))
+        _die_with_parent()  # again: the kernel forgets it when a process changes what it may
+    # no thread before this line: it would keep what the others gave up
+    threading.Thread(target=_end_with_parent, args=(line,), daemon=True).start()
+    last = 0.0
+
+    def progress(done: int, total: int) -> None:
+        nonlocal last
+        if done >= total or time.monotonic() - last > _PROGRESS_S:
+            last = time.monotonic()
+            _tell(line, done=int(done), total=int(total))
+
+    try:
+        function: Task = tasks.TASKS[order["task"]]
+        result = json.dumps(function(json.loads(order["arguments"]), folder, progress), allow_nan=False)
+        (folder / RESULT).write_text(result, encoding="utf-8")
+        _tell(line, end="ok")
+    except LensModelError as error:
+        _tell(line, end="error", code=error.code, text=str(error))
+    except MemoryError:
+        _tell(line, end="memory_limit")
+    except OSError as error:
+        if error.errno in {errno.ENOSPC, errno.EDQUOT}:
+            _tell(line, end="no_room")
+        elif error.errno in {errno.EFBIG, errno.ENOMEM}:
+            _tell(line, end="memory_limit")
+        else:
+            _tell(line, end="bug", code=type(error).__name__, text=_last_lines())
+    except Exception as error:  # noqa: BLE001 - whatever it is, the parent must hear of it
+        _tell(line, end="bug", code=type(error).__name__, text=_last_lines())
+    finally:
+        sys.stdout.flush()
+
+
+def clean_environment() -> dict[str, str]:
+    """Return what of this process's environment a child needs: no address, no password, no key."""
+    kept = {name: os.environ[name] for name in _KEPT_ENVIRONMENT if name in os.environ}
+    return {**kept, "PATH": os.defpath, **dict.fromkeys(_ONE_THREAD, "1")}
+
+
+def contain(folder: Path, limits: dict[str, int], niceness: int) -> None:
+    """Take away what a task does not need; it cannot be had back.
+
+    The memory limit counts from what the process takes already: libraries and thread stacks of
+    the program are not the task's fault.
+    """
+    _close_fork_server_line()
+    with contextlib.suppress(OSError):
+        os.setsid()  # a Ctrl-C at the terminal is for the parent; a kill reaches the whole group
+    give_way(niceness)
+    _die_with_parent()
+    os.umask(0o077)
+    os.chdir(folder)
+    kept = clean_environment()
+    os.environ.clear()
+    os.environ.update(kept, HOME=str(folder), TMPDIR=str(folder))
+    _limit(resource.RLIMIT_CORE, 0)
+    _limit(resource.RLIMIT_NOFILE, limits["open_files"])
+    _limit(resource.RLIMIT_FSIZE, limits["file_mb"] * _MIB)
+    _limit(resource.RLIMIT_CPU, limits["cpu_s"], slack=2)
+    if sys.platform != "darwin":  # there the limit is accepted and ignored
+        _limit(resource.RLIMIT_AS, _address_space() + limits["memory_mb"] * _MIB)
+
+
+def give_way(niceness: int) -> None:
+    """Let whoever waits for an answer go first: requests take milliseconds, tasks minutes.
+
+    Where the kernel shares processors out by sessions (sched(7), autogroup), a nice value counts only inside
+    of one, and the new session of a task began at that of all others; so it gets the same value.
+    """
+    with contextlib.suppress(OSError):
+        os.nice(niceness)
+        Path("/proc/self/autogroup").write_text(str(niceness), encoding="ascii")
+
+
+def _limit(which: int, value: int, slack: int = 0) -> None:
+    hard = resource.getrlimit(which)[1]
+    top = value + slack if hard == resource.RLIM_INFINITY else min(value + slack, hard)
+    resource.setrlimit(which, (min(value, top), top))
+
+
+def _address_space() -> int:
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    except OSError:
+        return 1024 * _MIB
+    return pages * resource.getpagesize()
+
+
+def _close_fork_server_line() -> None:
+    """Close the pipe whose end tells the fork server that its parent lives.
+
+    Every child inherits it, so that the server would outlive a killed parent for as long as one
+    child runs. Without it the server ends with the parent, and its end kills the children.
+    """
+    server = getattr(forkserver, "_forkserver", None)
+    inherited = getattr(server, "_forkserver_alive_fd", None)
+    if server is not None and inherited is not None:
+        server._forkserver_alive_fd = None  # noqa: SLF001 - there is no public way
+        os.close(inherited)
+
+
+def _die_with_parent() -> None:
+    if sys.platform == "linux":
+        parent = os.getppid()
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:
+            os._exit(70)  # it died before we asked to die with it
+
+
+def _end_with_parent(line: Connection) -> None:
+    """Exit when the parent's end of the line closes: portable, where the kernel does not help."""
+    with contextlib.suppress(OSError, EOFError):
+        line.recv_bytes()
+    os._exit(70)
+
+
+def _tell(line: Connection, **message: object) -> None:
+    if "text" in message:
+        message["text"] = str(message["text"])[-MAX_TEXT:]
+    try:
+        line.send_bytes(json.dumps(message).encode())
+    except OSError:
+        os._exit(70)  # nobody listens any more
+
+
+def _last_lines() -> str:
+    return traceback.format_exc()[-MAX_TEXT:]

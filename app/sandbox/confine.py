@@ -1,0 +1,188 @@
+"""Take from a process what the kernel lets it give up: files, network, other programs, other processes.
+
+What a child decodes comes from strangers. Should one of them take it over, there must be little to
+take: no secret in its environment, no file but those of its task, no network, no program to start.
+Each measure here is of the kernel and cannot be undone by the process. None needs privileges; which
+of them there are depends on the kernel and on what a container allows, so each says whether it is in
+force, and the service tells it under `/readyz`.
+
+References
+----------
+.. [1] Linux man-pages: landlock(7), seccomp(2), unshare(2), prctl(2), user_namespaces(7).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import functools
+import json
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Final
+
+from app.sandbox import seccomp
+
+MEASURES: Final = ("no_new_privs", "namespaces", "files", "system_calls")
+"""`namespaces`: a network without interfaces and a count of processes of its own; `files`: Landlock;
+`system_calls`: seccomp."""
+
+MAX_PROCESSES: Final = 128
+"""Threads of one task; chosen, far above what a machine's corrections start."""
+
+_PR_SET_DUMPABLE: Final = 4
+_PR_SET_NO_NEW_PRIVS: Final = 38
+_CLONE_NEWUSER, _CLONE_NEWNET, _CLONE_NEWIPC = 0x10000000, 0x40000000, 0x08000000
+
+# Landlock, from linux/landlock.h: what each version of it added to the rights over files
+_CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446
+_READ: Final = 1 << 2 | 1 << 3  # READ_FILE, READ_DIR
+_FILE_RIGHTS: Final = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 14  # EXECUTE, WRITE_FILE, READ_FILE, TRUNCATE
+_HANDLED: Final = {1: (1 << 13) - 1, 2: 1 << 13, 3: 1 << 14, 5: 1 << 15}
+_EXECUTE: Final = 1 << 0
+_NETWORK_SINCE, _SCOPE_SINCE = 4, 6
+_TCP: Final = 1 << 0 | 1 << 1  # bind, connect
+_SCOPES: Final = 1 << 0 | 1 << 1  # abstract sockets, signals
+_VERSION: Final = 1 << 0
+_PATH_BENEATH: Final = 1
+
+_DEVICES: Final = ("/dev/null", "/dev/zero", "/dev/urandom", "/dev/random")
+_MACHINE: Final = ("/usr", "/lib", "/lib64", "/etc/ld.so.cache", "/etc/localtime", "/sys/devices/system/cpu")
+_PROC: Final = ("/proc/self", "/proc/cpuinfo", "/proc/meminfo")
+"""The loader, the libraries, and what numerical libraries ask of the machine."""
+
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+class _Ruleset(ctypes.Structure):
+    _fields_ = (("files", ctypes.c_uint64), ("network", ctypes.c_uint64), ("scopes", ctypes.c_uint64))
+
+
+class _Beneath(ctypes.Structure):
+    _pack_ = 1
+    _fields_ = (("allowed", ctypes.c_uint64), ("parent", ctypes.c_int32))
+
+
+def confine(writes: Sequence[Path], reads: Iterable[Path] = ()) -> list[str]:
+    """Give up all but the program itself, `reads`, and `writes`; return which measures are in force.
+
+    Call it while the process has one thread: the others would keep what this one gives up.
+
+    Parameters
+    ----------
+    writes : sequence of Path
+        Folders where files may be made, changed and removed; the first is the task's own.
+    reads : iterable of Path
+        Files and folders that may be read besides the libraries.
+    """
+    if sys.platform != "linux":
+        return []
+    tried = {
+        "no_new_privs": lambda: _prctl(_PR_SET_NO_NEW_PRIVS, 1),
+        "namespaces": _separate,
+        "files": lambda: _restrict_files(writes, reads),
+        "system_calls": seccomp.refuse,
+    }
+    in_force = []
+    for name, measure in tried.items():
+        with contextlib.suppress(OSError):
+            measure()
+            in_force.append(name)
+    return in_force
+
+
+def hide_memory() -> None:
+    """Keep other processes of the same account from reading this one's memory and environment."""
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError):
+            _prctl(_PR_SET_DUMPABLE, 0)
+
+
+@functools.cache
+def available() -> dict[str, bool]:
+    """Say which measures children of this machine have: tried out, once, in a process of its own."""
+    try:
+        said = subprocess.run(
+            [sys.executable, "-m", "app.sandbox.confine"],
+            check=True,
+            capture_output=True,
+            timeout=60,
+            cwd=Path(__file__).parents[2],
+        ).stdout
+        in_force = json.loads(said)
+    except (OSError, ValueError, subprocess.SubprocessError):
+        in_force = []
+    return {name: name in in_force for name in MEASURES}
+
+
+def _prctl(option: int, value: int) -> None:
+    _check(_libc.prctl(option, value, 0, 0, 0))
+
+
+def _check(result: int) -> int:
+    if result < 0:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+    return result
+
+
+def _separate() -> None:
+    """Enter a network without interfaces, and a user namespace: whoever was root is nobody there."""
+    _check(_libc.unshare(_CLONE_NEWUSER | _CLONE_NEWNET | _CLONE_NEWIPC))
+    # Only here: elsewhere the kernel counts all processes of the account, those of others with it.
+    resource.setrlimit(resource.RLIMIT_NPROC, (MAX_PROCESSES, MAX_PROCESSES))
+
+
+def _restrict_files(writes: Sequence[Path], reads: Iterable[Path]) -> None:
+    version = _check(_libc.syscall(_CREATE_RULESET, None, ctypes.c_size_t(0), _VERSION))
+    handled = sum(rights for since, rights in _HANDLED.items() if version >= since)
+    ruleset = _Ruleset(
+        handled,
+        _TCP if version >= _NETWORK_SINCE else 0,
+        _SCOPES if version >= _SCOPE_SINCE else 0,
+    )
+    # older kernels refuse a structure that is longer than theirs, unless the rest is zero
+    rules = _check(
+        _libc.syscall(_CREATE_RULESET, ctypes.byref(ruleset), ctypes.c_size_t(ctypes.sizeof(ruleset)), 0)
+    )
+    try:
+        for path in writes:
+            _allow(rules, path, handled & ~_EXECUTE)
+        for path in [*_program(writes[0]), *reads]:
+            _allow(rules, path, _READ & handled)
+        for name in _DEVICES:
+            _allow(rules, Path(name), handled & (_READ | 1 << 1))
+        _check(_libc.syscall(_RESTRICT_SELF, rules, 0))
+    finally:
+        os.close(rules)
+
+
+def _program(own: Path) -> list[Path]:
+    """Return what the program itself reads: libraries and modules; nothing that holds the task's folder."""
+    packages = [Path(__file__).parents[1], Path(json.__file__).parents[1]]
+    library = Path(__file__).parents[2] / "lensmodel"
+    entries = [*sys.path, sys.prefix, sys.base_prefix, *_MACHINE, *_PROC]
+    listed = [*(Path(entry) for entry in entries if entry), *packages, library]
+    inside = own.resolve()
+    return [path for path in listed if path.exists() and not inside.is_relative_to(path.resolve())]
+
+
+def _allow(rules: int, path: Path, rights: int) -> None:
+    try:
+        opened = os.open(path, os.O_PATH | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return
+    try:
+        rights &= -1 if path.is_dir() else _FILE_RIGHTS
+        beneath = _Beneath(rights, opened)
+        _check(_libc.syscall(_ADD_RULE, rules, _PATH_BENEATH, ctypes.byref(beneath), 0))
+    finally:
+        os.close(opened)
+
+
+if __name__ == "__main__":
+    print(json.dumps(confine([Path("/nonexistent")])))  # noqa: T201 - this is its answer

@@ -1,0 +1,436 @@
+"""Run one task in a child process that can do no harm, and learn how it ended.
+
+Photos come from anywhere, and the libraries that decode them are large. So each piece of work
+runs in a child of a fork server: limited in memory, processor time, wall time, file size and
+open files, without the service's environment, killed when nobody wants the result any more or
+when the parent is gone. What comes back is JSON and files, never a pickle: a child that was
+taken over by a hostile file cannot run code in its parent; nor, where the kernel has the means of
+`app.sandbox.confine`, read what is not its task's, reach a network, or start a program.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import math
+import multiprocessing
+import os
+import shutil
+import signal
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import forkserver
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import ForkServerProcess
+from pathlib import Path
+from typing import Any, Final, Literal, TypeAlias
+
+from app.sandbox import child
+from lensmodel.core.types import ignore_step
+
+log = logging.getLogger(__name__)
+
+Ending: TypeAlias = Literal["ok", "error", "memory_limit", "time_limit", "outage", "crashed", "cancelled"]
+
+POLL_S: Final = 0.25
+MAX_MESSAGE: Final = 64 * 1024
+MAX_RESULT: Final = 16 * 1024 * 1024
+TASKS_MODULE = "app.jobs.tasks"
+"""Default module of the tasks; tests of the workers put in another."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What one task may take.
+
+    Parameters
+    ----------
+    memory_mb : int
+        Address space in MiB beyond that of the program itself; mapped files count.
+    wall_s : float
+        Seconds until it is killed.
+    cpu_s : int or None
+        Seconds of processor time; by default a little more than `wall_s`.
+    file_mb : int
+        Largest file it may write, in MiB.
+    open_files : int
+        Files it may have open at once.
+    """
+
+    memory_mb: int
+    wall_s: float
+    cpu_s: int | None = None
+    file_mb: int = 8192
+    open_files: int = 256
+
+    def with_memory(self, memory_mb: int) -> Limits:
+        """Return the same limits with another memory."""
+        return replace(self, memory_mb=memory_mb)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a task ended.
+
+    Parameters
+    ----------
+    ending : str
+        `ok`, `error` (the library refused, with its reason), `memory_limit`, `time_limit`,
+        `outage` (the machine had no room, or killed it), `crashed` (another signal, or an
+        exception that nobody foresaw) or `cancelled`.
+    value : object
+        What the task returned.
+    code, detail : str
+        The fixed word and the sentence for whoever asked for the work.
+    """
+
+    ending: Ending
+    value: Any = None
+    code: str = ""
+    detail: str = ""
+
+
+class Budget:
+    """How many children run at once, and how much memory they may take together; first come, first served."""
+
+    def __init__(self, slots: int, memory_mb: int) -> None:
+        self._changed = threading.Condition()
+        self._queue: deque[object] = deque()
+        self._slots, self._memory = slots, memory_mb
+        self.memory_mb = memory_mb
+
+    @contextlib.contextmanager
+    def share(self, memory_mb: int, wanted: Callable[[], bool]) -> Iterator[bool]:
+        """Wait for a slot and memory; give False if nobody wants it any more.
+
+        A task that asks for more than there is at all runs alone.
+        """
+        memory = min(memory_mb, self.memory_mb)
+        ticket = object()
+        entered = self._enter(ticket, memory, wanted)
+        try:
+            yield entered
+        finally:
+            if entered:
+                with self._changed:
+                    self._slots += 1
+                    self._memory += memory
+                    self._changed.notify_all()
+
+    def _enter(self, ticket: object, memory: int, wanted: Callable[[], bool]) -> bool:
+        with self._changed:
+            self._queue.append(ticket)
+        entered = False
+        try:
+            while not entered and wanted():
+                with self._changed:
+                    if self._queue[0] is ticket and self._slots > 0 and self._memory >= memory:
+                        self._slots -= 1
+                        self._memory -= memory
+                        entered = True
+                    else:
+                        self._changed.wait(POLL_S)
+        finally:
+            with self._changed:
+                self._queue.remove(ticket)
+                self._changed.notify_all()
+        return entered
+
+
+@dataclass(slots=True)
+class _Watched:
+    """One running child: its process, the line to it, when it must be done, what it said last."""
+
+    process: ForkServerProcess
+    line: Connection
+    deadline: float
+    ended: dict[str, Any] | None = None
+
+
+class Sandbox:
+    """Starts children, one a task.
+
+    Parameters
+    ----------
+    scratch : Path
+        Where the private folders of the tasks lie; of this process alone, emptied at start.
+    budget : Budget
+        What all children together may take.
+    module : str, optional
+        Module whose `TASKS` maps names to functions; see `app.sandbox.child.Task`.
+    preload : sequence of str, optional
+        Modules that the fork server imports once, for all children; by default that module.
+    confined : bool
+        Whether children are kept from files, network and programs; see `app.sandbox.confine`.
+    cache : Path, optional
+        Where tasks that decode nothing of strangers keep what they compiled.
+    niceness : int, optional
+        How far the children give way to this process, see nice(2); 0 = not at all.
+    """
+
+    def __init__(
+        self,
+        scratch: Path,
+        budget: Budget,
+        *,
+        module: str | None = None,
+        preload: Sequence[str] | None = None,
+        confined: bool = True,
+        cache: Path | None = None,
+        niceness: int = child.NICENESS,
+    ) -> None:
+        self._niceness = niceness
+        self.scratch, self.budget, self._confined = scratch, budget, confined
+        kept = os.environ.get("NUMBA_CACHE_DIR")
+        self._cache = Path(kept).resolve() if kept else cache
+        self._module = module or TASKS_MODULE
+        self._context = multiprocessing.get_context("forkserver")
+        self._context.set_forkserver_preload(["numpy", self._module] if preload is None else list(preload))
+        self._alone = threading.Lock()  # the exit status of a child can be read only once
+        self._stopping = threading.Event()
+        shutil.rmtree(scratch, ignore_errors=True)
+        scratch.mkdir(parents=True, mode=0o700)
+        if self._cache is not None:
+            self._cache.mkdir(parents=True, exist_ok=True)
+        self._serve()
+
+    def _serve(self) -> None:
+        """Start the fork server where none runs: children have its environment, which holds no secret.
+
+        The environment changes under the whole process for that moment. So this is done once, before
+        there are threads, and else only after the server died.
+        """
+        with self._alone:
+            server = getattr(forkserver._forkserver, "_forkserver_pid", None)  # noqa: SLF001 - no public way
+            if server is not None and _lives(server):
+                return
+            before, clean = dict(os.environ), child.clean_environment()
+            if self._cache is not None:
+                clean["NUMBA_CACHE_DIR"] = str(self._cache)
+            os.environ.clear()
+            os.environ.update(clean)
+            try:
+                forkserver.ensure_running()
+            finally:
+                os.environ.clear()
+                os.environ.update(before)
+
+    @contextlib.contextmanager
+    def folder(self) -> Iterator[Path]:
+        """Give an empty folder that only one task sees, removed afterwards."""
+        path = Path(tempfile.mkdtemp(dir=self.scratch))
+        try:
+            yield path
+        finally:
+            shutil.rmtree(path, ignore_errors=True)
+
+    def stop(self) -> None:
+        """Kill all children and start no more; their outcome is `cancelled`."""
+        self._stopping.set()
+
+    @property
+    def stopping(self) -> bool:
+        """Whether `stop` was called."""
+        return self._stopping.is_set()
+
+    def run(
+        self,
+        task: str,
+        arguments: Mapping[str, Any],
+        *,
+        folder: Path,
+        limits: Limits,
+        reads: Sequence[Path] = (),
+        compiles: bool = False,
+        wanted: Callable[[], bool] = lambda: True,
+        on_progress: child.Progress = ignore_step,
+    ) -> Outcome:
+        """Run one task to its end.
+
+        Parameters
+        ----------
+        task : str
+            Its name in `TASKS`.
+        arguments : mapping
+            What JSON can write: names, numbers, paths. Arrays travel as files.
+        folder : Path
+            The task's own folder, from `folder()`.
+        reads : sequence of Path
+            Files and folders that the task may read besides its own.
+        compiles : bool
+            Whether it may add to what all tasks share of compiled code: not if it decodes a stranger's file.
+        wanted : callable
+            Asked every quarter of a second; once it says no, the child is killed.
+        on_progress : callable
+            Called with `(done, total)` as the task tells.
+        """
+
+        def still_wanted() -> bool:
+            return not self._stopping.is_set() and wanted()
+
+        with self.budget.share(limits.memory_mb, still_wanted) as entered:
+            if not entered:
+                return _cancelled()
+            line, far_end = self._context.Pipe(duplex=True)
+            with line:
+                order = self._order(task, arguments, folder, limits)
+                order["reads"] = [str(path.resolve()) for path in reads] if self._confined else None
+                order["writes"] = [str(self._cache)] if compiles and self._cache else []
+                process = self._start(order, far_end)
+                try:
+                    watched = _Watched(process, line, time.monotonic() + limits.wall_s)
+                    cut = self._watch(watched, limits, still_wanted, on_progress)
+                    return cut or _outcome(watched.ended, self._exit_status(process), folder, limits)
+                finally:
+                    self._end(process)
+
+    def _order(self, task: str, arguments: Mapping[str, Any], folder: Path, limits: Limits) -> dict[str, Any]:
+        numbers = asdict(limits)
+        numbers["cpu_s"] = limits.cpu_s or math.ceil(limits.wall_s * 1.25) + 5
+        return {
+            "module": self._module,
+            "task": task,
+            "arguments": json.dumps(dict(arguments)),
+            "folder": str(folder.resolve()),
+            "limits": numbers,
+            "niceness": self._niceness,
+        }
+
+    def _start(self, order: dict[str, Any], far_end: Connection) -> ForkServerProcess:
+        process = self._context.Process(
+            target=child.main, args=(order, far_end), name=f"task-{order['task']}", daemon=True
+        )
+        self._serve()
+        with far_end, self._alone:
+            process.start()
+        return process
+
+    def _watch(
+        self, watched: _Watched, limits: Limits, wanted: Callable[[], bool], on_progress: child.Progress
+    ) -> Outcome | None:
+        """Listen until the child is gone; or return why it must not go on."""
+        asked = 0.0
+        waiting: list[Any] = [watched.line, watched.process.sentinel]
+        while True:
+            ready = wait(waiting, timeout=POLL_S)
+            if watched.line in ready:
+                message = _read(watched.line)
+                if message is None:
+                    waiting.remove(watched.line)
+                elif "end" in message:
+                    watched.ended = message
+                else:
+                    on_progress(int(message.get("done", 0)), int(message.get("total", 0)))
+            elif watched.process.sentinel in ready:
+                return None
+            if time.monotonic() - asked > POLL_S:
+                asked = time.monotonic()
+                if not wanted():
+                    return _cancelled()
+            if time.monotonic() > watched.deadline:
+                text = f"stopped after {limits.wall_s:g} s; give a smaller photo or raise the time limit"
+                return Outcome("time_limit", code="time_limit", detail=text)
+
+    def _exit_status(self, process: ForkServerProcess) -> int:
+        with self._alone:
+            process.join()
+            return process.exitcode or 0
+
+    def _end(self, process: ForkServerProcess) -> None:
+        """Make sure that the child, and whatever it started, is gone."""
+        assert process.pid is not None
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+        with self._alone:
+            if process.is_alive():
+                process.kill()
+            process.join()
+            process.close()
+
+
+def _lives(pid: int) -> bool:
+    """Say whether a child process still runs, and leave its exit status to whoever waits for it."""
+    try:
+        return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
+    except ChildProcessError:
+        return False
+
+
+def _read(line: Connection) -> dict[str, Any] | None:
+    """Return the next message; None at the end of the line, or where the child breaks the rules."""
+    try:
+        message = json.loads(line.recv_bytes(MAX_MESSAGE))
+    except (EOFError, OSError, ValueError):
+        return None
+    return message if isinstance(message, dict) else None
+
+
+def _outcome(ended: dict[str, Any] | None, status: int, folder: Path, limits: Limits) -> Outcome:
+    ending = None if ended is None else ended.get("end")
+    if ending == "ok" and status == 0:
+        return _result(folder / child.RESULT)
+    if ending in _SAID:
+        code, text = (str((ended or {}).get(key, "")) for key in ("code", "text"))
+        return _SAID[ending](code, text, limits)
+    if -status == signal.SIGXCPU:
+        detail = f"took more than {limits.cpu_s or limits.wall_s:g} s of processor time; give a smaller photo"
+        return Outcome("time_limit", code="time_limit", detail=detail)
+    why = f"signal {-status} ({_signal_name(-status)})" if status < 0 else f"exit status {status}"
+    detail = f"the process that did the work died: {why}"
+    if -status == signal.SIGKILL:  # neither by itself nor by us: the kernel does so for want of memory
+        return Outcome("outage", code="outage", detail=detail)
+    return Outcome("crashed", code="crashed", detail=detail)
+
+
+def _refused(code: str, text: str, limits: Limits) -> Outcome:
+    del limits
+    return Outcome("error", code=code, detail=text)
+
+
+def _swollen(code: str, text: str, limits: Limits) -> Outcome:
+    del code, text
+    detail = f"needs more than the {limits.memory_mb} MiB it may take; give a smaller photo"
+    return Outcome("memory_limit", code="memory_limit", detail=detail)
+
+
+def _no_room(code: str, text: str, limits: Limits) -> Outcome:
+    del code, text, limits
+    return Outcome("outage", code="outage", detail="there is no room on the disk for the work")
+
+
+def _bug(code: str, text: str, limits: Limits) -> Outcome:
+    del limits
+    log.error("unforeseen %s in a task:\n%s", code, text)
+    why = f"an unforeseen {code} stopped the work; the log of the worker says where"
+    return Outcome("crashed", code="internal_error", detail=why)
+
+
+_SAID: Final[Mapping[object, Callable[[str, str, Limits], Outcome]]] = {
+    "error": _refused,
+    "memory_limit": _swollen,
+    "no_room": _no_room,
+    "bug": _bug,
+}
+"""What to make of the last words of a child, by how it says that it ended."""
+
+
+def _result(path: Path) -> Outcome:
+    if path.stat().st_size > MAX_RESULT:
+        return Outcome("crashed", code="internal_error", detail="the task returned more than may be read")
+    return Outcome("ok", value=json.loads(path.read_text(encoding="utf-8")))
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return "unknown"
+
+
+def _cancelled() -> Outcome:
+    return Outcome("cancelled", code="cancelled", detail="the work was cancelled")

@@ -1,0 +1,1 @@
+"""Rows of owners, keys, sessions and answers that were given already."""

@@ -1,0 +1,62 @@
+"""Who may ask: keys, signed-in browsers, and answers that were given already. See `app.store.tables`."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+
+from sqlalchemy import ForeignKey, Index, String
+from sqlalchemy.orm import Mapped, mapped_column
+
+from app.store.tables import Base
+
+
+class KeyRow(Base):
+    """One key of an owner; what it consists of is nowhere, only its hash."""
+
+    __tablename__ = "api_key"
+    __table_args__ = (Index("ix_api_key_owner_id", "owner_id"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    owner_id: Mapped[int] = mapped_column(ForeignKey("owner.id"))
+    prefix: Mapped[str] = mapped_column(String(20), unique=True)
+    key_hash: Mapped[str] = mapped_column(String(200), unique=True)
+    label: Mapped[str | None]
+    scopes: Mapped[str] = mapped_column(String(60))
+    """Words of `app.access.keys.SCOPES`, by blanks."""
+
+    created_at: Mapped[datetime]
+    last_used_at: Mapped[datetime | None]
+    expires_at: Mapped[datetime | None]
+    revoked_at: Mapped[datetime | None]
+
+
+class SessionRow(Base):
+    """One browser that has signed in with a key; it ends with the key."""
+
+    __tablename__ = "session"
+
+    token_hash: Mapped[str] = mapped_column(String(64), primary_key=True)
+    key_id: Mapped[int] = mapped_column(ForeignKey("api_key.id", ondelete="CASCADE"))
+    created_at: Mapped[datetime]
+    expires_at: Mapped[datetime]
+
+
+class IdempotencyRow(Base):
+    """What was answered to a request that may be sent again."""
+
+    __tablename__ = "idempotency_key"
+    __table_args__ = (Index("ix_idempotency_key_created_at", "created_at"),)
+
+    owner_id: Mapped[int] = mapped_column(ForeignKey("owner.id"), primary_key=True)
+    key: Mapped[str] = mapped_column(String(200), primary_key=True)
+    request_hash: Mapped[str] = mapped_column(String(64))
+    status: Mapped[int | None]
+    """None while the first request is being answered."""
+
+    location: Mapped[str | None]
+    response: Mapped[dict[str, Any] | None]
+    resource: Mapped[str | None] = mapped_column(String(40))
+    """What the answer speaks of; it goes with that."""
+
+    created_at: Mapped[datetime]

@@ -1,0 +1,80 @@
+"""Whose rows these are: every question about a user's data goes through here."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Final, TypeVar
+
+from sqlalchemy import Select, select
+from sqlalchemy.orm import Session
+
+from app.http.errors import NotSignedInError
+from app.store.database import insert_new
+from app.store.tables import CorrectionRow, LensRow, OwnerRow, PhotoRow
+
+LOCAL: Final = "local"
+"""The one owner of a service that asks nobody who he is."""
+
+Owned = TypeVar("Owned", PhotoRow, LensRow, CorrectionRow)
+
+
+def now() -> datetime:
+    """Return the present, in UTC."""
+    return datetime.now(UTC)
+
+
+def owner_id(session: Session, name: str) -> int | None:
+    """Return the key of an owner, None if there is no such."""
+    return session.scalar(select(OwnerRow.id).where(OwnerRow.name == name))
+
+
+def ensure_owner(session: Session, name: str, *, may_be_new: bool = True) -> int:
+    """Return the key of an owner, made on first sight.
+
+    Raises
+    ------
+    NotSignedInError
+        If he is not there and may not be new: he was erased while he asked.
+    """
+    found = owner_id(session, name)
+    if found is None:
+        if not may_be_new:
+            raise NotSignedInError("this account was erased: nothing is kept of it")
+        insert_new(session, OwnerRow, [{"name": name, "created_at": now()}])
+        found = owner_id(session, name)
+    assert found is not None
+    return found
+
+
+def owned(table: type[Owned], owner: str | None) -> Select[Owned]:
+    """Select the rows of one owner that are not deleted; `None` = of all, for the workers."""
+    query: Select[Owned] = select(table)
+    if issubclass(table, PhotoRow | LensRow):  # corrections are removed outright
+        query = query.where(table.deleted_at.is_(None))
+    if owner is not None:
+        query = query.join(OwnerRow, OwnerRow.id == table.owner_id).where(OwnerRow.name == owner)
+    return query
+
+
+def find(session: Session, table: type[Owned], public_id: str, owner: str | None) -> Owned | None:
+    """Return one row by its public id if it is this owner's."""
+    return None if not is_id(public_id) else session.scalar(_one(table, public_id, owner))
+
+
+def find_to_change(session: Session, table: type[Owned], public_id: str, owner: str | None) -> Owned | None:
+    """Return as `find`, locked until the transaction ends: what is read now still holds when it is changed.
+
+    SQLite has one writer at a time anyway.
+    """
+    if not is_id(public_id):
+        return None
+    return session.scalar(_one(table, public_id, owner).with_for_update(of=table))
+
+
+def is_id(text: str) -> bool:
+    """Say whether a text can be an id of ours; PostgreSQL refuses some others with an error."""
+    return text.isascii() and text.isalnum()
+
+
+def _one(table: type[Owned], public_id: str, owner: str | None) -> Select[Owned]:
+    return owned(table, owner).where(table.public_id == public_id)

@@ -1,0 +1,79 @@
+"""What an owner does with a lens as a whole: names it, joins it with another, goes back to what it knew."""
+
+from __future__ import annotations
+
+from sqlalchemy import select
+
+from app.store.access.owners import find_to_change
+from app.store.database import Database
+from app.store.lenses import move, switch
+from app.store.removal import forget
+from app.store.tables import EventRow, LensRow, PhotoRow
+
+LEARNING = ("received", "inspecting", "developing", "selecting", "estimating")
+
+
+class LensChanges:
+    """Changes of lenses of one owner at a time."""
+
+    def __init__(self, database: Database) -> None:
+        self._db = database
+
+    def rename(self, lens_id: str, owner: str, label: str | None) -> bool:
+        """Give a lens a name of its owner's, or take it away; False if there is no such lens."""
+        with self._db.writing() as session:
+            lens = find_to_change(session, LensRow, lens_id, owner)
+            if lens is None:
+                return False
+            lens.label = label
+            return True
+
+    def merge(self, lens_id: str, into: str, owner: str) -> bool:
+        """Give all photos of a lens to another one and forget it: they were one copy all along.
+
+        False if one of them is not there, or photos of the first are still being learned from.
+        """
+        with self._db.writing() as session:
+            # in one order, whoever asks: two merges at once must not wait for each other
+            rows = {key: find_to_change(session, LensRow, key, owner) for key in sorted((lens_id, into))}
+            lens, target = rows[lens_id], rows[into]
+            if lens is None or target is None or lens.id == target.id:
+                return False
+            photos = list(
+                session.scalars(
+                    select(PhotoRow)
+                    .where(PhotoRow.lens_id == lens.id, PhotoRow.deleted_at.is_(None))
+                    .order_by(PhotoRow.id)
+                    .with_for_update()
+                )
+            )
+            if any(photo.state in LEARNING for photo in photos):
+                return False
+            for photo in photos:
+                move(session, photo, target)
+            target.maker, target.model = target.maker or lens.maker, target.model or lens.model
+            session.flush()
+            forget(session, lens)
+            return True
+
+    def go_back(self, lens_id: str, owner: str, version: int) -> int | None:
+        """Leave out of a lens the photos that joined it after a version; return how many, None without lens.
+
+        They stay, and can be counted again one by one.
+        """
+        with self._db.writing() as session:
+            lens = find_to_change(session, LensRow, lens_id, owner)
+            if lens is None:
+                return None
+            events = session.scalars(
+                select(EventRow).where(EventRow.lens_id == lens.id).order_by(EventRow.version)
+            )
+            joined: dict[str, int] = {}
+            for event in events:
+                if event.photo_public_id is not None and event.kind in {"photo_added", "photo_included"}:
+                    joined[event.photo_public_id] = event.version
+            later = [key for key, at in joined.items() if at > version]
+            photos = session.scalars(
+                select(PhotoRow).where(PhotoRow.public_id.in_(later), PhotoRow.lens_id == lens.id)
+            )
+            return sum(switch(session, photo, "excluded") for photo in photos)

@@ -1,0 +1,127 @@
+"""The samples of a profile, taken in as if their photos had been sent, which are not there."""
+
+from __future__ import annotations
+
+import hashlib
+import zlib
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.schemas import distances
+from app.store.access.owners import find_to_change, now
+from app.store.database import Database, insert_new
+from app.store.ids import new_id
+from app.store.lenses import record_event
+from app.store.patches import DTYPE, FORMAT_VERSION
+from app.store.tables import LensRow, PatchRow, PhotoRow, SampleRow
+from app.store.versions import new_version, take_samples
+from lensmodel.core.psf import PsfSample
+from lensmodel.core.types import LensSettings
+
+KIND = "profile"
+
+
+def take_in(
+    database: Database, lens_id: str, owner: str, samples: Sequence[PsfSample], names: dict[str, str]
+) -> int | None:
+    """Let the samples of a profile join a lens; return how many photos they are of, None without lens.
+
+    Each photo of the profile becomes a counted photo without a file, which can be left out or deleted as
+    any other. What was taken in before is not taken in again.
+    """
+    groups: defaultdict[tuple[str, LensSettings], list[PsfSample]] = defaultdict(list)
+    for sample in samples:
+        groups[sample.photo, sample.settings.with_channel("g")].append(sample)
+    with database.writing(durable=True) as session:
+        lens = find_to_change(session, LensRow, lens_id, owner)
+        if lens is None:
+            return None
+        taken = 0
+        for (photo, settings), own in groups.items():
+            row = _photo(session, lens, photo, settings, own[0], names.get(photo, photo or "profile"))
+            if row is None:
+                continue
+            _samples(session, row, own)
+            version = new_version(session, lens.id)
+            added = take_samples(session, row, version)
+            record_event(session, lens.id, version, "photo_added", row, samples_added=added)
+            taken += 1
+        return taken
+
+
+def _photo(
+    session: Session, lens: LensRow, photo: str, settings: LensSettings, first: PsfSample, name: str
+) -> PhotoRow | None:
+    digest = hashlib.sha256(f"{KIND}|{lens.public_id}|{photo}|{settings}".encode()).hexdigest()
+    public_id = new_id()
+    fresh: dict[str, Any] = {
+        "public_id": public_id,
+        "owner_id": lens.owner_id,
+        "lens_id": lens.id,
+        "sha256": digest,
+        "filename": name[:200],
+        "kind": KIND,
+        "byte_size": 0,
+        "blob_key": f"photos/{public_id}/original",
+        "calibrate": True,
+        "given": {"lens_id": lens.public_id},
+        "aperture": settings.aperture,
+        "focal_mm": settings.focal_mm,
+        "focus_m": distances.written(settings.focus_m),
+        "pixel_pitch_um": first.pixel_pitch_um,
+        "state": "counted",
+        **dict.fromkeys(("received_at", "stage_at", "started_at", "finished_at", "counted_at"), now()),
+        "file_gone_at": now(),
+    }
+    if insert_new(session, PhotoRow, [fresh]) != 1:
+        return None
+    return session.scalars(select(PhotoRow).where(PhotoRow.public_id == public_id)).one()
+
+
+def _samples(session: Session, photo: PhotoRow, samples: Sequence[PsfSample]) -> None:
+    places: dict[tuple[float, float], int] = {}
+    for sample in samples:
+        places.setdefault((sample.position.r, sample.position.phi), len(places))
+    done: dict[str, Any] = {"photo_id": photo.id, "epoch": photo.epoch, "state": "done", "attempts": 0}
+    box = {"row": 0, "col": 0, "size": 0, "finished_at": now()}  # a profile does not say where in pixels
+    insert_new(
+        session,
+        PatchRow,
+        [{**done, **box, "idx": idx, "cell": idx, "r": r, "phi": phi} for (r, phi), idx in places.items()],
+    )
+    keys = {row.idx: row.id for row in session.scalars(select(PatchRow).where(PatchRow.photo_id == photo.id))}
+    insert_new(session, SampleRow, [_row(photo, keys[places[_place(s)]], s) for s in samples])
+    photo.patches_total = photo.patches_done = len(places)
+    session.flush()
+
+
+def _place(sample: PsfSample) -> tuple[float, float]:
+    return sample.position.r, sample.position.phi
+
+
+def _row(photo: PhotoRow, patch_id: int, sample: PsfSample) -> dict[str, Any]:
+    blob = np.ascontiguousarray(sample.kernel, dtype=DTYPE).tobytes()
+    return {
+        "photo_id": photo.id,
+        "patch_id": patch_id,
+        "channel": sample.settings.channel,
+        "r": sample.position.r,
+        "phi": sample.position.phi,
+        "weight": sample.weight,
+        "predicted_error": sample.error,
+        "size": sample.kernel.shape[0],
+        "dtype": DTYPE,
+        "format_version": FORMAT_VERSION,
+        "crc32": zlib.crc32(blob),
+        "psf": blob,
+        "spectrum": None if sample.spectrum is None else sample.spectrum.to_bytes(),
+        "statistics_key": None,
+        "estimator": sample.estimator[:60] or "profile",
+        "diagnostics": {},
+        "created_at": now(),
+    }

@@ -1,0 +1,383 @@
+"""What crosses SQL: the tables of the application database.
+
+Text ids (`public_id`) are for the outside, integer keys stay inside. Times are UTC. The truth
+about photos, samples and versions lies here, not in the job engine: unique keys and conditional
+updates give every effect exactly once, however often a step is repeated.
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any, ClassVar, Final, get_args
+
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    CheckConstraint,
+    DateTime,
+    Dialect,
+    ForeignKey,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    String,
+    Text,
+    TypeDecorator,
+    UniqueConstraint,
+    text,
+)
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+from app.schemas import CorrectionState, PhotoState
+
+PHOTO_STATES: Final[tuple[str, ...]] = get_args(PhotoState)
+PHOTO_RUNNING: Final = ("inspecting", "developing", "selecting", "estimating")
+PHOTO_FINAL: Final = ("counted", "stored", "excluded", "failed", "cancelled")
+
+PATCH_STATES: Final = ("pending", "running", "done", "rejected", "failed", "cancelled")
+CORRECTION_STATES: Final[tuple[str, ...]] = get_args(CorrectionState)
+EVENT_KINDS: Final = ("photo_added", "photo_included", "photo_excluded", "photo_removed", "photo_changed")
+
+
+class UtcTime(TypeDecorator[datetime]):
+    """Points in time: aware in Python, UTC in the table, also where SQL knows no zones."""
+
+    impl = DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """Bring to UTC; naive times are a programming error."""
+        del dialect
+        if value is not None and value.tzinfo is None:
+            raise ValueError(f"time without a zone: {value}")
+        return None if value is None else value.astimezone(UTC)
+
+    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """Give back with the zone that SQLite forgets."""
+        del dialect
+        return value.replace(tzinfo=UTC) if value is not None and value.tzinfo is None else value
+
+
+BigKey = BigInteger().with_variant(Integer, "sqlite")  # SQLite counts rows only in INTEGER keys
+
+
+def _one_of(column: str, values: tuple[str, ...]) -> str:
+    return f"{column} IN ({', '.join(repr(value) for value in values)})"
+
+
+class Base(DeclarativeBase):
+    """Common to all tables."""
+
+    metadata = MetaData(
+        naming_convention={  # batch migrations must know the names of what they replace
+            "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+            "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+            "ck": "ck_%(table_name)s_%(constraint_name)s",
+            "fk": "fk_%(table_name)s_%(column_0_N_name)s",
+            "pk": "pk_%(table_name)s",
+        }
+    )
+    type_annotation_map: ClassVar[dict[Any, Any]] = {datetime: UtcTime(), dict[str, Any]: JSON(), str: Text()}
+
+
+class OwnerRow(Base):
+    """Whose photos and lenses these are."""
+
+    __tablename__ = "owner"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    name: Mapped[str] = mapped_column(String(200), unique=True)
+    quota_bytes: Mapped[int | None] = mapped_column(BigInteger)
+    """Of photos; None where the setting holds for him as for others, as with the next."""
+
+    quota_photos: Mapped[int | None]
+    created_at: Mapped[datetime]
+    erased_at: Mapped[datetime | None]
+    """When he asked that all of his be erased; the row goes last."""
+
+
+class LensRow(Base):
+    """One copy of a lens; `version` grows with every change of its samples."""
+
+    __tablename__ = "lens"
+    __table_args__ = (
+        CheckConstraint("version >= 0", name="version"),
+        Index(
+            "uq_lens_identity",
+            "owner_id",
+            "identity_key",
+            unique=True,
+            sqlite_where=text("deleted_at IS NULL"),
+            postgresql_where=text("deleted_at IS NULL"),
+        ),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    public_id: Mapped[str] = mapped_column(String(40), unique=True)
+    owner_id: Mapped[int] = mapped_column(ForeignKey("owner.id"))
+    maker: Mapped[str | None]
+    model: Mapped[str | None]
+    serial: Mapped[str | None]
+    serial_source: Mapped[str] = mapped_column(String(20))
+    identity_key: Mapped[str]
+    label: Mapped[str | None]
+    version: Mapped[int] = mapped_column(default=0)
+    rebuild_epoch: Mapped[int] = mapped_column(default=0)
+    photo_count: Mapped[int] = mapped_column(default=0)
+    sample_count: Mapped[int] = mapped_column(default=0)
+    created_at: Mapped[datetime]
+    deleted_at: Mapped[datetime | None]
+
+
+class PhotoRow(Base):
+    """One uploaded photo and how far its calibration is."""
+
+    __tablename__ = "photo"
+    __table_args__ = (
+        CheckConstraint(_one_of("state", PHOTO_STATES), name="state"),
+        Index(
+            "uq_photo_bytes",
+            "owner_id",
+            "sha256",
+            unique=True,
+            sqlite_where=text("deleted_at IS NULL"),
+            postgresql_where=text("deleted_at IS NULL"),
+        ),
+        Index("ix_photo_state", "state"),
+        Index("ix_photo_lens_id_state", "lens_id", "state"),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    public_id: Mapped[str] = mapped_column(String(40), unique=True)
+    owner_id: Mapped[int] = mapped_column(ForeignKey("owner.id"))
+    lens_id: Mapped[int | None] = mapped_column(ForeignKey("lens.id"))
+    sha256: Mapped[str] = mapped_column(String(64))
+    filename: Mapped[str]
+    kind: Mapped[str] = mapped_column(String(20))
+    byte_size: Mapped[int] = mapped_column(BigInteger)
+    blob_key: Mapped[str]
+    calibrate: Mapped[bool]
+    given: Mapped[dict[str, Any]]
+    """What the owner said about the photo; it goes before what the file says."""
+
+    width: Mapped[int | None]
+    height: Mapped[int | None]
+    orientation: Mapped[int | None]
+    camera_maker: Mapped[str | None]
+    camera_model: Mapped[str | None]
+    body_key: Mapped[str | None] = mapped_column(String(16))
+    """Digest of the camera and its serial: tells bodies apart without naming one."""
+
+    lens_maker: Mapped[str | None]
+    lens_model: Mapped[str | None]
+    lens_serial: Mapped[str | None]
+    lens_serial_source: Mapped[str | None] = mapped_column(String(20))
+    aperture: Mapped[float | None]
+    focal_mm: Mapped[float | None]
+    focus_m: Mapped[float | None]
+    """As `app.schemas.distances` writes it."""
+
+    pixel_pitch_um: Mapped[float | None]
+    iso: Mapped[float | None]
+    exposure_s: Mapped[float | None]
+    taken_at: Mapped[datetime | None] = mapped_column(DateTime())
+    """By the camera's clock, whose zone nobody knows."""
+
+    lateral: Mapped[dict[str, Any] | None] = mapped_column("lateral_colour")  # LATERAL is a word of SQL
+    """Lateral colour that this photo shows: radial polynomials of red and blue."""
+
+    epoch: Mapped[int] = mapped_column(default=1)
+    attempt: Mapped[int] = mapped_column(default=0)
+    state: Mapped[str] = mapped_column(String(20))
+    error_code: Mapped[str | None] = mapped_column(String(40))
+    error_detail: Mapped[str | None]
+    patches_total: Mapped[int] = mapped_column(default=0)
+    patches_done: Mapped[int] = mapped_column(default=0)
+    patches_rejected: Mapped[int] = mapped_column(default=0)
+    windows_rejected: Mapped[int] = mapped_column(default=0)
+    """How many windows were rejected before anything was estimated in them."""
+
+    windows: Mapped[dict[str, Any] | None] = mapped_column(deferred=True)
+    """Those windows, as `app.store.windows` writes them: thousands, which nobody asks for one by one."""
+
+    received_at: Mapped[datetime]
+    started_at: Mapped[datetime | None]
+    stage_at: Mapped[datetime]
+    """When `state` last changed."""
+
+    finished_at: Mapped[datetime | None]
+    counted_at: Mapped[datetime | None]
+    deleted_at: Mapped[datetime | None]
+    location: Mapped[str | None] = mapped_column(String(10))
+    """Whether the file said where it was taken: a word of `app.blobs.location`; None of old ones."""
+
+    file_gone_at: Mapped[datetime | None]
+    """When the file was given up, see the setting `keep_photos`."""
+
+
+class PatchRow(Base):
+    """One window of a photo, used or rejected."""
+
+    __tablename__ = "patch"
+    __table_args__ = (
+        CheckConstraint(_one_of("state", PATCH_STATES), name="state"),
+        UniqueConstraint("photo_id", "epoch", "idx"),
+    )
+
+    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
+    photo_id: Mapped[int] = mapped_column(ForeignKey("photo.id", ondelete="CASCADE"))
+    epoch: Mapped[int]
+    idx: Mapped[int]
+    cell: Mapped[int | None]
+    row: Mapped[int]
+    col: Mapped[int]
+    size: Mapped[int]
+    r: Mapped[float]
+    phi: Mapped[float]
+    score: Mapped[float | None]
+    state: Mapped[str] = mapped_column(String(20))
+    reason: Mapped[str | None] = mapped_column(String(60))
+    attempts: Mapped[int] = mapped_column(default=0)
+    finished_at: Mapped[datetime | None]
+
+
+class SampleRow(Base):
+    """One PSF estimate: the kernel of one channel of one patch.
+
+    `lens_id` and `version_added` are set together when the photo is counted, and taken away
+    when it is excluded: what carries them is exactly what the model reads.
+    """
+
+    __tablename__ = "psf_sample"
+    __table_args__ = (
+        UniqueConstraint("patch_id", "channel"),
+        Index("ix_psf_sample_lens_version", "lens_id", "version_added", "id"),
+        Index("ix_psf_sample_photo_id", "photo_id"),
+        {"sqlite_autoincrement": True},
+    )
+
+    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
+    photo_id: Mapped[int] = mapped_column(ForeignKey("photo.id", ondelete="CASCADE"))
+    patch_id: Mapped[int] = mapped_column(ForeignKey("patch.id", ondelete="CASCADE"))
+    lens_id: Mapped[int | None] = mapped_column(ForeignKey("lens.id"))
+    version_added: Mapped[int | None]
+    channel: Mapped[str] = mapped_column(String(1))
+    r: Mapped[float]
+    phi: Mapped[float]
+    weight: Mapped[float]
+    predicted_error: Mapped[float | None]
+    size: Mapped[int]
+    dtype: Mapped[str] = mapped_column(String(10))
+    format_version: Mapped[int]
+    crc32: Mapped[int] = mapped_column(BigInteger)
+    psf: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)
+    spectrum: Mapped[bytes | None] = mapped_column(LargeBinary)
+    statistics_key: Mapped[str | None]
+    estimator: Mapped[str]
+    diagnostics: Mapped[dict[str, Any]]
+    created_at: Mapped[datetime]
+
+
+class EventRow(Base):
+    """One step of a lens's history: why its version grew."""
+
+    __tablename__ = "calibration_event"
+    __table_args__ = (
+        CheckConstraint(_one_of("kind", EVENT_KINDS), name="kind"),
+        UniqueConstraint("lens_id", "version"),
+        Index(
+            "uq_calibration_event_counted_once",
+            "photo_public_id",
+            "epoch",
+            unique=True,
+            sqlite_where=text("kind = 'photo_added'"),
+            postgresql_where=text("kind = 'photo_added'"),
+        ),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    lens_id: Mapped[int] = mapped_column(ForeignKey("lens.id"))
+    version: Mapped[int]
+    kind: Mapped[str] = mapped_column(String(20))
+    photo_public_id: Mapped[str | None] = mapped_column(String(40))
+    epoch: Mapped[int]
+    samples_added: Mapped[int]
+    samples: Mapped[int]
+    photos: Mapped[int]
+    metrics: Mapped[dict[str, Any] | None]
+    created_at: Mapped[datetime]
+
+
+class CorrectionRow(Base):
+    """One photo to be corrected with one version of a lens's model."""
+
+    __tablename__ = "correction"
+    __table_args__ = (
+        CheckConstraint(_one_of("state", CORRECTION_STATES), name="state"),
+        Index(
+            "uq_correction_params",
+            "photo_id",
+            "lens_id",
+            "lens_version",
+            "params_hash",
+            unique=True,
+            sqlite_where=text("state NOT IN ('failed', 'cancelled')"),
+            postgresql_where=text("state NOT IN ('failed', 'cancelled')"),
+        ),
+        Index("ix_correction_state", "state"),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    public_id: Mapped[str] = mapped_column(String(40), unique=True)
+    owner_id: Mapped[int] = mapped_column(ForeignKey("owner.id"))
+    photo_id: Mapped[int] = mapped_column(ForeignKey("photo.id", ondelete="CASCADE"))
+    lens_id: Mapped[int] = mapped_column(ForeignKey("lens.id"))
+    lens_version: Mapped[int]
+    params: Mapped[dict[str, Any]]
+    params_hash: Mapped[str] = mapped_column(String(64))
+    epoch: Mapped[int] = mapped_column(default=1)
+    """Grows when it is started anew after its end."""
+
+    attempt: Mapped[int] = mapped_column(default=0)
+    state: Mapped[str] = mapped_column(String(20))
+    stage: Mapped[str | None] = mapped_column(String(20))
+    progress_done: Mapped[int] = mapped_column(default=0)
+    progress_total: Mapped[int] = mapped_column(default=0)
+    error_code: Mapped[str | None] = mapped_column(String(40))
+    error_detail: Mapped[str | None]
+    report: Mapped[dict[str, Any] | None]
+    result_key: Mapped[str | None]
+    result_etag: Mapped[str | None]
+    result_media_type: Mapped[str | None]
+    result_bytes: Mapped[int | None] = mapped_column(BigInteger)
+    result_name: Mapped[str | None]
+    created_at: Mapped[datetime]
+    started_at: Mapped[datetime | None]
+    finished_at: Mapped[datetime | None]
+
+
+class WorkerRow(Base):
+    """One worker process and when it was last heard of."""
+
+    __tablename__ = "worker"
+    __table_args__ = (CheckConstraint(_one_of("state", ("live", "dead")), name="state"),)
+
+    id: Mapped[str] = mapped_column(String(40), primary_key=True)
+    host: Mapped[str]
+    pid: Mapped[int]
+    pid_started: Mapped[float]
+    """When the process began: a pid alone may belong to another process by now."""
+
+    state: Mapped[str] = mapped_column(String(10))
+    started_at: Mapped[datetime]
+    heartbeat_at: Mapped[datetime]
+
+
+class GarbageRow(Base):
+    """Blobs to delete once nothing can still be reading them; all keys that begin so."""
+
+    __tablename__ = "blob_garbage"
+
+    prefix: Mapped[str] = mapped_column(primary_key=True)
+    not_before: Mapped[datetime]

@@ -1,0 +1,1 @@
+"""What keeps the tables sound: migrations, invariants, transfer, an operator's questions."""

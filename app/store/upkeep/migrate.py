@@ -1,0 +1,89 @@
+"""Bring the database to the schema that this program needs."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+from alembic import command
+from alembic.config import Config
+from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from sqlalchemy import Connection, text
+
+import migrations
+from app.store.database import Database
+from lensmodel.core.errors import InvalidInputError
+
+_LOCK = 0x1E45  # any number that only this program uses
+
+
+def config(connection: Connection | None = None) -> Config:
+    """Return Alembic's configuration for the steps that lie beside this package."""
+    found = Config()
+    found.set_main_option("script_location", str(Path(migrations.__file__).parent).replace("%", "%%"))
+    found.attributes["connection"] = connection
+    return found
+
+
+def head() -> str | None:
+    """Return the newest revision that this program knows."""
+    return ScriptDirectory.from_config(config()).get_current_head()
+
+
+def current(database: Database) -> str | None:
+    """Return the revision of the database; None if it is empty."""
+    with database.reader.connect() as connection:
+        return MigrationContext.configure(connection).get_current_revision()
+
+
+def is_current(database: Database) -> bool:
+    """Say whether the schema is what this program needs."""
+    return current(database) == head()
+
+
+def upgrade(database: Database) -> bool:
+    """Run the missing steps; return whether there were any.
+
+    Only one process at a time gets in; the others wait and then find nothing left to do. A
+    SQLite file that holds data is copied first, beside itself.
+
+    Raises
+    ------
+    InvalidInputError
+        If a newer program made the database.
+    """
+    before, steps = current(database), ScriptDirectory.from_config(config())
+    if before == steps.get_current_head():
+        return False
+    if before is not None and before not in {step.revision for step in steps.walk_revisions()}:
+        raise InvalidInputError(
+            f"the database was made by a newer program, schema {before}; update lensmodel, or use other data"
+        )
+    if database.is_sqlite and before is not None:
+        _copy(database.path, before)
+    with _alone(database) as connection:
+        command.upgrade(config(connection), "head")
+    return True
+
+
+def downgrade(database: Database, revision: str) -> None:
+    """Undo steps down to `revision` ("base" = all)."""
+    with _alone(database) as connection:
+        command.downgrade(config(connection), revision)
+
+
+@contextmanager
+def _alone(database: Database) -> Iterator[Connection]:
+    with database.writer.begin() as connection:  # SQLite: BEGIN IMMEDIATE shuts the others out
+        if not database.is_sqlite:
+            connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _LOCK})
+        yield connection
+
+
+def _copy(path: Path, revision: str) -> None:
+    target = path.with_name(f"{path.name}.before-{revision}")
+    with closing(sqlite3.connect(path)) as source, closing(sqlite3.connect(target)) as copy:
+        source.backup(copy)

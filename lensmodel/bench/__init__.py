@@ -1,1 +1,0 @@
-"""Accuracy benchmarks that a user can run too."""

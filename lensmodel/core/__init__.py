@@ -1,0 +1,1 @@
+"""What every part of the library shares: values, errors, geometry, kernels, files."""

@@ -1,0 +1,111 @@
+"""Where a pixel lies in the image field, and the local frame that turns with it.
+
+Pixels are `(row, col)` with integers at pixel centres and rows growing downwards. The field
+position is `(r, phi)`, with phi counter-clockwise from the right, so that +pi/2 points towards
+row 0. The local frame has `u` radially outwards and `v` turned +90 degrees from it in the
+sense of phi.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.types import FieldPosition, Zone
+
+CENTER_ZONE_R = 0.3
+"""Zone "center" lies below this r."""
+
+CORNER_ZONE_R = 0.75
+"""Zone "corner" lies above this r."""
+
+
+def zone_of(r: float) -> Zone:
+    """Name the zone of the field that `r` lies in: center r < 0.3, corner r > 0.75, else mid."""
+    if r < CENTER_ZONE_R:
+        return "center"
+    return "corner" if r > CORNER_ZONE_R else "mid"
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """The sensor frame of a photo, in sensor orientation.
+
+    Parameters
+    ----------
+    height, width : int
+        Size in pixels.
+    """
+
+    height: int
+    width: int
+
+    def __post_init__(self) -> None:
+        if self.height < 1 or self.width < 1:
+            raise InvalidInputError(f"a frame needs at least one pixel, got {self.height} x {self.width}")
+
+    @property
+    def center(self) -> tuple[float, float]:
+        """The image centre as `(row, col)`; between pixels where a side is even."""
+        return (self.height - 1) / 2.0, (self.width - 1) / 2.0
+
+    @property
+    def half_diagonal(self) -> float:
+        """Distance in pixels from the centre to the outer corner of the corner pixel."""
+        return math.hypot(self.height, self.width) / 2.0
+
+    def position(self, row: float, col: float) -> FieldPosition:
+        """Field position of a pixel; places outside the frame are drawn in to r = 1."""
+        row_c, col_c = self.center
+        up, right = row_c - row, col - col_c
+        return FieldPosition(min(math.hypot(up, right) / self.half_diagonal, 1.0), math.atan2(up, right))
+
+    def pixel(self, position: FieldPosition) -> tuple[float, float]:
+        """Pixel `(row, col)` of a field position, real-valued; the inverse of `position`."""
+        row_c, col_c = self.center
+        distance = position.r * self.half_diagonal
+        return row_c - distance * math.sin(position.phi), col_c + distance * math.cos(position.phi)
+
+    def polar(
+        self, rows: NDArray[np.floating], cols: NDArray[np.floating]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Arrays `r`, `phi` for arrays of rows and columns that broadcast together."""
+        row_c, col_c = self.center
+        up = row_c - np.asarray(rows, dtype=np.float64)
+        right = np.asarray(cols, dtype=np.float64) - col_c
+        return np.hypot(up, right) / self.half_diagonal, np.arctan2(up, right)
+
+    def radius_map(self) -> NDArray[np.float32]:
+        """Array `(height, width)` of r at every pixel, float32."""
+        row_c, col_c = self.center
+        up = (row_c - np.arange(self.height, dtype=np.float32))[:, None]
+        right = (np.arange(self.width, dtype=np.float32) - col_c)[None, :]
+        return np.asarray(np.hypot(up, right) / np.float32(self.half_diagonal), dtype=np.float32)
+
+
+def pixel_to_local(
+    drow: NDArray[np.floating] | float, dcol: NDArray[np.floating] | float, phi: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Turn pixel offsets into local `(u, v)` at a place of angle `phi`.
+
+    With a = dcol to the right and b = -drow upwards::
+
+        u =  a cos phi + b sin phi        radially outwards
+        v = -a sin phi + b cos phi        +90 degrees from u in the sense of phi
+    """
+    a, b = np.asarray(dcol, dtype=np.float64), -np.asarray(drow, dtype=np.float64)
+    c, s = math.cos(phi), math.sin(phi)
+    return a * c + b * s, b * c - a * s
+
+
+def local_to_pixel(
+    u: NDArray[np.floating] | float, v: NDArray[np.floating] | float, phi: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Turn local `(u, v)` into pixel offsets `(drow, dcol)`; the inverse of `pixel_to_local`."""
+    u, v = np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64)
+    c, s = math.cos(phi), math.sin(phi)
+    return -(u * s + v * c), u * c - v * s

@@ -1,0 +1,76 @@
+"""Where loops over patches, cells and photos run: any executor will do, here or on other machines."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context
+from typing import Any, ParamSpec, TypeVar
+
+A = TypeVar("A")
+T = TypeVar("T")
+P = ParamSpec("P")
+
+
+class Here(Executor):
+    """Runs each call at once in the thread that submits it: where no further processes are wanted."""
+
+    def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+        """Call, and return a future that is done."""
+        future: Future[T] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:  # noqa: BLE001 - a future hands on whatever it was
+            future.set_exception(error)
+        return future
+
+
+@contextmanager
+def pool(executor: Executor | None, workers: int | None) -> Iterator[Executor]:
+    """Give the executor, or else `workers` processes of our own (None = one a core) for as long as needed."""
+    if executor is not None:
+        yield executor
+        return
+    with ProcessPoolExecutor(max(1, workers or os.cpu_count() or 1), mp_context=get_context("spawn")) as own:
+        yield own
+
+
+def in_order(
+    executor: Executor,
+    call: Callable[..., T],
+    items: Iterable[A],
+    arguments: Callable[[A], tuple[Any, ...] | None],
+    *,
+    ahead: int,
+) -> Iterator[tuple[A, Future[T] | None]]:
+    """Give items in their order with the futures of their calls, of which few are submitted ahead.
+
+    Parameters
+    ----------
+    executor : Executor
+        Runs the calls.
+    call : callable
+        What is done with each item.
+    items : iterable
+        As many as there are: they are taken up one by one.
+    arguments : callable
+        Returns what to call with for an item, or None where nothing is to be done for it.
+    ahead : int
+        Calls at once; the memory that their arguments take grows with it.
+    """
+    waiting: deque[tuple[A, Future[T] | None]] = deque()
+    try:
+        for item in items:
+            given = arguments(item)
+            waiting.append((item, None if given is None else executor.submit(call, *given)))
+            if len(waiting) >= ahead:
+                yield waiting.popleft()
+        while waiting:
+            yield waiting.popleft()
+    finally:
+        for _, future in waiting:
+            if future is not None:
+                future.cancel()

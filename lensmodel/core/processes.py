@@ -1,0 +1,90 @@
+"""Worker processes that a script, a notebook or a command can start alike.
+
+Python's spawned processes import the main module again: of a script without `if __name__ == "__main__"`
+each worker would begin the script anew. The workers here only run functions of this library and what was
+sent to them, so they leave the main module out.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
+from multiprocessing.context import SpawnContext, SpawnProcess
+from multiprocessing.process import BaseProcess
+from types import ModuleType
+from typing import Any, Final
+
+_ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+"""The work is parallel over processes; threads of linear algebra in each only get in one another's way."""
+
+_starting = threading.Lock()
+
+
+def portable(part: object) -> bool:
+    """Tell whether another process can load an object: pickled, and not of a class of the main module."""
+    if type(part).__module__ == "__main__":
+        return False
+    try:
+        pickle.dumps(part)
+    except (pickle.PicklingError, AttributeError, TypeError):
+        return False
+    return True
+
+
+@contextmanager
+def pool(executor: Executor | None, workers: int | None, part: object = None) -> Iterator[Executor]:
+    """Give the executor, or else `workers` of our own for as long as needed.
+
+    Parameters
+    ----------
+    executor : Executor or None
+        Used as it is.
+    workers : int or None
+        How many; None is one a core.
+    part : object
+        What will be sent to them: where it is not `portable`, they are threads of this process.
+    """
+    if executor is not None:
+        yield executor
+        return
+    count = max(1, workers or os.cpu_count() or 1)
+    own: Executor = (
+        ProcessPoolExecutor(count, mp_context=_Context(), initializer=_begin)
+        if portable(part)
+        else ThreadPoolExecutor(count)
+    )
+    with own:
+        yield own
+
+
+def _begin() -> None:
+    """Prepare a worker, before it imports NumPy: one thread, and Ctrl-C is left to who started it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for name in _ONE_THREAD:
+        os.environ.setdefault(name, "1")
+
+
+class _Process(SpawnProcess):
+    """A spawned process that is told of an empty main module."""
+
+    @staticmethod
+    def _Popen(process_obj: BaseProcess) -> Any:  # noqa: ANN401, N802 - as multiprocessing calls it
+        with _starting:
+            main = sys.modules["__main__"]
+            sys.modules["__main__"] = ModuleType("__main__")
+            try:
+                return SpawnProcess._Popen(process_obj)  # noqa: SLF001 - the only place to step in
+            finally:
+                sys.modules["__main__"] = main
+
+
+class _Context(SpawnContext):
+    """`multiprocessing.get_context("spawn")` with such processes."""
+
+    Process = _Process

@@ -1,0 +1,304 @@
+"""A PSF as an array: normalise, centre, measure, compare; and the sample that travels."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+from scipy import fft, ndimage
+
+from lensmodel.core.errors import InvalidInputError, InvalidKernelError
+from lensmodel.core.spectrum import PatchSpectrum
+from lensmodel.core.types import Channel, FieldPosition, Kernel, LensSettings
+
+WING_LEVEL = 0.01
+"""Moments count values above this share of the peak: the width of faint wings is not the width."""
+
+_CENTRED_PX = 1e-3
+
+
+def as_kernel(values: npt.ArrayLike) -> Kernel:
+    """Check and normalise an array to a kernel of sum 1, read-only, not yet centred.
+
+    Parameters
+    ----------
+    values : array_like, shape (k, k)
+        k odd; finite, non-negative and not all zero.
+
+    Raises
+    ------
+    InvalidKernelError
+        If the array cannot be a PSF.
+    """
+    kernel = np.array(values, dtype=np.float64)  # a copy of our own, never the caller's
+    if kernel.ndim != 2 or kernel.shape[0] != kernel.shape[1] or kernel.shape[0] % 2 == 0:
+        raise InvalidKernelError(f"kernel must be square with an odd side, got shape {kernel.shape}")
+    if not np.isfinite(kernel).all() or kernel.min() < 0 or kernel.sum() <= 0:
+        raise InvalidKernelError("kernel must be finite, non-negative and not all zero")
+    kernel /= kernel.sum()
+    kernel.setflags(write=False)
+    return kernel
+
+
+def delta(size: int) -> Kernel:
+    """Kernel of side `size` that changes nothing."""
+    kernel = np.zeros((size, size))
+    kernel[size // 2, size // 2] = 1.0
+    return as_kernel(kernel)
+
+
+def gaussian(size: int, covariance: npt.ArrayLike) -> Kernel:
+    """Gaussian kernel integrated over the pixel: the sum of 5 x 5 samples in each.
+
+    Parameters
+    ----------
+    size : int
+        Odd side in pixels.
+    covariance : array_like, shape (2, 2)
+        Covariance in px², axes (row, col).
+    """
+    over = 5
+    cov = np.asarray(covariance, dtype=np.float64) + np.eye(2) * 1e-4
+    half = (size * over) // 2
+    t = np.arange(-half, half + 1) / over
+    inverse = np.linalg.inv(cov)
+    rows, cols = t[:, None], t[None, :]
+    fine = np.exp(
+        -0.5 * (inverse[0, 0] * rows**2 + 2 * inverse[0, 1] * rows * cols + inverse[1, 1] * cols**2)
+    )
+    return as_kernel(fine.reshape(size, over, size, over).sum(axis=(1, 3)))
+
+
+def resized(kernel: Kernel, size: int) -> Kernel:
+    """Crop or zero-pad to another odd side, centre kept, renormalised."""
+    if size < 1 or size % 2 == 0:
+        raise InvalidInputError(f"size must be odd and positive, got {size}")
+    old = kernel.shape[0]
+    if size <= old:
+        cut = (old - size) // 2
+        return as_kernel(kernel[cut : cut + size, cut : cut + size])
+    pad = (size - old) // 2
+    return as_kernel(np.pad(kernel, pad))
+
+
+def centroid(kernel: npt.NDArray[np.float64]) -> tuple[float, float]:
+    """Centre of mass `(row, col)` relative to the middle pixel, in pixels."""
+    t = np.arange(kernel.shape[0]) - kernel.shape[0] // 2
+    total = kernel.sum()
+    return float((kernel.sum(axis=1) * t).sum() / total), float((kernel.sum(axis=0) * t).sum() / total)
+
+
+def centred(kernel: npt.ArrayLike) -> Kernel:
+    """Shift the centre of mass onto the middle pixel.
+
+    Whole pixels are moved first, and what leaves the array is lost; the rest is a cubic-spline shift.
+    Clipping its undershoot moves the centre a little, so the shift is repeated until less than a
+    thousandth of a pixel is left.
+    """
+    current = np.array(as_kernel(kernel))
+    for _ in range(12):
+        row, col = centroid(current)
+        if max(abs(row), abs(col)) < _CENTRED_PX:
+            break
+        whole = (-round(row), -round(col))
+        order = 1 if whole != (0, 0) else 3
+        step = whole if whole != (0, 0) else (-row, -col)
+        current = ndimage.shift(current, step, order=order, mode="constant")
+        current = np.maximum(current, 0.0)
+        current /= current.sum()
+    return as_kernel(current)
+
+
+def second_moments(kernel: npt.NDArray[np.float64], level: float = WING_LEVEL) -> npt.NDArray[np.float64]:
+    """Central second moments in px² as the matrix [[rr, rc], [rc, cc]].
+
+    Only values above `level` times the peak count: faint wings would dominate the sum.
+    """
+    core = np.where(kernel > level * kernel.max(), kernel, 0.0)
+    core = core / core.sum()
+    row, col = centroid(core)
+    t = np.arange(kernel.shape[0]) - kernel.shape[0] // 2
+    dr, dc = (t - row)[:, None], (t - col)[None, :]
+    rc = float((core * dr * dc).sum())
+    return np.array([[float((core * dr * dr).sum()), rc], [rc, float((core * dc * dc).sum())]])
+
+
+def rms_width(kernel: npt.NDArray[np.float64], level: float = WING_LEVEL) -> float:
+    """Root of the mean second moment per axis, in pixels (the sigma of a round Gaussian)."""
+    return math.sqrt(max(float(np.trace(second_moments(kernel, level))) / 2.0, 0.0))
+
+
+def otf(kernel: npt.NDArray[np.float64], shape: tuple[int, int]) -> npt.NDArray[np.complex128]:
+    """Transfer function on an `rfft2` grid of `shape`, the middle pixel at the origin."""
+    size = kernel.shape[0]
+    if size > min(shape):
+        raise InvalidInputError(f"a kernel of side {size} does not fit a grid of {shape}")
+    grid = np.zeros(shape)
+    grid[:size, :size] = kernel
+    return fft.rfft2(np.roll(grid, (-(size // 2), -(size // 2)), axis=(0, 1)))
+
+
+def mtf(kernel: npt.NDArray[np.float64], size: int = 128) -> npt.NDArray[np.float64]:
+    """Modulus of the transfer function, `(size, size // 2 + 1)`, 1 at zero frequency."""
+    return np.abs(otf(kernel, (size, size))) / float(kernel.sum())
+
+
+@dataclass(frozen=True, slots=True)
+class KernelDistance:
+    """How far one kernel is from another after the best sub-pixel shift.
+
+    Parameters
+    ----------
+    ncc : float
+        Normalised cross-correlation; 1 for equal shapes.
+    rel_l2 : float
+        |a - b| / |b|.
+    mtf_rmse : float
+        Root mean square difference of the moduli for |f| <= 0.5 cycles/pixel.
+    shift : tuple of float
+        The shift `(row, col)` in pixels that was applied to `a`.
+    """
+
+    ncc: float
+    rel_l2: float
+    mtf_rmse: float
+    shift: tuple[float, float]
+
+
+def distance(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> KernelDistance:
+    """Compare kernel `a` with the reference `b`, both normalised, sub-pixel aligned.
+
+    The correlation c(d) = sum_f A(f) conj(B(f)) exp(-2 pi i f d) is maximised over the shift d,
+    first on whole pixels, then by Newton steps; by Parseval it yields both figures at once::
+
+        ncc = c / (|a| |b|)        rel_l2² = (|a|² + |b|² - 2 c) / |b|²
+    """
+    a, b = a / a.sum(), b / b.sum()
+    n = int(fft.next_fast_len(2 * max(a.shape[0], b.shape[0]), real=True))
+    fa, fb = _centred_fft(a, n), _centred_fft(b, n)
+    cross = fa * np.conj(fb)
+    surface = fft.ifft2(cross).real
+    peak = np.unravel_index(int(surface.argmax()), surface.shape)
+    # The peak of corr(a, b) at lag p says that a sits p pixels beyond b.
+    d = -np.array([(p + n // 2) % n - n // 2 for p in peak], dtype=np.float64)
+    freq = 2 * np.pi * fft.fftfreq(n)
+    w = np.stack(np.broadcast_arrays(freq[:, None], freq[None, :]))
+    for _ in range(8):
+        phased = cross * np.exp(-1j * (w[0] * d[0] + w[1] * d[1]))
+        gradient = np.array([(w[i] * phased.imag).sum() for i in range(2)])
+        hessian = -np.array([[(w[i] * w[j] * phased.real).sum() for j in range(2)] for i in range(2)])
+        if np.linalg.eigvalsh(hessian)[-1] >= 0:
+            break
+        step = np.clip(-np.linalg.solve(hessian, gradient), -0.5, 0.5)
+        d = d + step
+        if np.abs(step).max() < 1e-6:
+            break
+    c = float((cross * np.exp(-1j * (w[0] * d[0] + w[1] * d[1]))).real.sum()) / n**2
+    aa, bb = float((a * a).sum()), float((b * b).sum())
+    inside = np.hypot(w[0], w[1]) <= np.pi
+    difference = (np.abs(fa) - np.abs(fb))[inside]
+    return KernelDistance(
+        ncc=c / math.sqrt(aa * bb),
+        rel_l2=math.sqrt(max(aa + bb - 2 * c, 0.0) / bb),
+        mtf_rmse=float(np.sqrt(np.mean(difference**2))),
+        shift=(float(d[0]), float(d[1])),
+    )
+
+
+def _centred_fft(kernel: npt.NDArray[np.float64], n: int) -> npt.NDArray[np.complex128]:
+    half = kernel.shape[0] // 2
+    grid = np.zeros((n, n))
+    grid[: kernel.shape[0], : kernel.shape[1]] = kernel
+    return fft.fft2(np.roll(grid, (-half, -half), axis=(0, 1)))
+
+
+class PatchStatistics(Protocol):
+    """Sufficient statistics of one patch, which can be summed over patches before a kernel is solved for.
+
+    `evidence.PatchEvidence` is one; it lies above this module.
+    """
+
+    @property
+    def autocorrelation(self) -> npt.NDArray[np.float32]:
+        """Sums R of products of the latent patch with itself, shape (2 k - 1, 2 k - 1)."""
+
+    @property
+    def crosscorrelation(self) -> npt.NDArray[np.float32]:
+        """Sums r of products of the observed patch with the latent one, shape (k, k)."""
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the noise in units of the patch's own range."""
+
+    def to_bytes(self) -> bytes:
+        """Serialise, without pickle."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PsfSample:
+    """One local PSF estimate: what was seen, where, at which settings, how sure.
+
+    Parameters
+    ----------
+    kernel : Kernel, shape (k, k)
+        On the sensor's pixel grid in sensor orientation; normalised and read-only here.
+    position : FieldPosition
+        Centre of the patch that it was seen in.
+    settings : LensSettings
+        Aperture, focal length, focus distance and channel of the photo.
+    weight : float
+        Confidence in 0..1; scales this sample's vote.
+    photo : str
+        Which photo it came from: samples of one photo share its faults.
+    pixel_pitch_um : float or None
+        Size of a sensor pixel in micrometres; None where unknown.
+    estimator : str
+        Name and version of the method that made it.
+    spectrum : PatchSpectrum or None
+        What the patch says without a kernel, so that all patches of a lens can be solved together.
+    error : float or None
+        Relative L2 distance to the truth that the method expects of it; None where it says nothing.
+    evidence : PatchStatistics or None
+        Normal equations of the patch, for models that solve those of many patches at once.
+    half_diagonal_px : float or None
+        Half the diagonal of the frame in pixels; None where unknown.
+    """
+
+    kernel: Kernel
+    position: FieldPosition
+    settings: LensSettings = field(default_factory=LensSettings)
+    weight: float = 1.0
+    photo: str = ""
+    pixel_pitch_um: float | None = None
+    estimator: str = ""
+    spectrum: PatchSpectrum | None = None
+    error: float | None = None
+    evidence: PatchStatistics | None = None
+    half_diagonal_px: float | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "kernel", as_kernel(self.kernel))
+        if not 0.0 <= self.weight <= 1.0:
+            raise InvalidInputError(f"weight must lie in 0..1, got {self.weight}")
+        for name, unit, size in (
+            ("pixel pitch", "micrometres", self.pixel_pitch_um),
+            ("half diagonal", "pixels", self.half_diagonal_px),
+        ):
+            if size is not None and not (math.isfinite(size) and size > 0):
+                raise InvalidInputError(f"the {name} must be positive {unit}, got {size}")
+        if self.error is not None and not (math.isfinite(self.error) and self.error >= 0.0):
+            raise InvalidInputError(f"the expected error must be finite and not negative, got {self.error}")
+
+    def with_weight(self, weight: float) -> PsfSample:
+        """Return the same sample with another vote."""
+        return replace(self, weight=weight)
+
+
+class PsfField(Protocol):
+    """A PSF for every place and channel: what a correction needs to know of a lens."""
+
+    def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
+        """Return the kernel of odd side `size` at a field position, in the image frame."""

@@ -1,0 +1,126 @@
+"""Named factories: how anything swappable is chosen by name."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import metadata
+from typing import Generic, TypeVar
+
+from lensmodel.core.errors import InvalidInputError, UnknownMethodError
+
+T = TypeVar("T")
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Registry(Generic[T]):
+    """Named factories of one kind.
+
+    `extended` leaves this one as it is; `register` adds to it for the whole process. An installed package
+    makes its methods known to every process, those of the command and of the service too, by entry points::
+
+        [project.entry-points."lensmodel.estimators"]
+        mine = "my_package:MyEstimator"
+
+    Parameters
+    ----------
+    kind : str
+        What the entries are, for error messages.
+    entries : mapping of str to callable
+        Factories by name; each returns an entry from keyword parameters.
+    group : str
+        Entry points of this group in installed packages are entries too; empty for none. They are loaded when
+        they are first asked for, and never replace an entry that is there.
+    """
+
+    kind: str
+    entries: Mapping[str, Callable[..., T]]
+    group: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "entries", dict(self.entries))  # our own, never the caller's
+
+    def create(self, name: str, **params: object) -> T:
+        """Build the entry called `name` from keyword parameters.
+
+        Raises
+        ------
+        UnknownMethodError
+            If no entry has that name, or the package that brings it cannot be loaded; the text says which.
+        """
+        if name in self.entries:
+            return self.entries[name](**params)
+        if name not in self:
+            raise UnknownMethodError(f"no {self.kind} {name!r}; known: {', '.join(self)}")
+        return self._installed(name)(**params)
+
+    def load_installed(self) -> None:
+        """Load the methods of installed packages now: before a process gives up the right to read files."""
+        for name in _entry_points(self.group):
+            try:
+                self._installed(name)
+            except UnknownMethodError as error:  # said again to whoever asks for it
+                log.warning("%s", error)
+
+    def _installed(self, name: str) -> Callable[..., T]:
+        point = _entry_points(self.group)[name]
+        try:
+            factory: Callable[..., T] = point.load()
+        except Exception as error:
+            package = point.dist.name if point.dist else point.value
+            raise UnknownMethodError(
+                f"the {self.kind} {name!r} of the package {package} cannot be loaded: {error}; "
+                "mend or remove that package"
+            ) from error
+        return factory
+
+    def resolve(self, method: str | T) -> T:
+        """Return an entry that was given by its name, with its default parameters, or as an object.
+
+        Raises
+        ------
+        UnknownMethodError
+            If no entry has that name.
+        """
+        return self.create(method) if isinstance(method, str) else method
+
+    def register(self, name: str, factory: Callable[..., T]) -> None:
+        """Add an entry for as long as this process lives.
+
+        Parameters
+        ----------
+        name : str
+            A new name; those that exist keep their meaning.
+        factory : callable
+            Returns an entry; called with no arguments where only the name is given.
+
+        Raises
+        ------
+        InvalidInputError
+            If the name is taken or empty.
+        """
+        if not name or name in self:
+            raise InvalidInputError(f"the {self.kind} {name!r} exists already, or is no name; choose another")
+        assert isinstance(self.entries, dict)
+        self.entries[name] = factory
+
+    def extended(self, **entries: Callable[..., T]) -> Registry[T]:
+        """Return a registry with more entries; names with a hyphen are given with an underscore."""
+        added = {name.replace("_", "-"): factory for name, factory in entries.items()}
+        return Registry(self.kind, {**self.entries, **added}, self.group)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(sorted({*self.entries, *_entry_points(self.group)}))
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.entries or name in _entry_points(self.group)
+
+
+@lru_cache
+def _entry_points(group: str) -> dict[str, metadata.EntryPoint]:
+    """What installed packages bring; looked up once in a process, since it reads many files."""
+    return {point.name: point for point in metadata.entry_points(group=group)} if group else {}

@@ -1,0 +1,190 @@
+"""What a patch says about its blur without a kernel: its power in rings and sectors, and the tail's side.
+
+The power spectrum tells how wide the blur is in every direction, once for all apertures and photos that
+are compared, but nothing of its phase. Of two kernels with equal power, one the other turned by 180
+degrees, the right one leaves the sparser gradients when it is taken off: `tail` says so in two numbers.
+Both are small, hold no picture, and can be summed over patches and photos before anything is solved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.types import NoiseModel, Plane
+
+RINGS: Final = 14
+SECTORS: Final = 12
+RING_LIMITS: Final = (0.03, 0.5)
+"""Frequencies of the innermost and outermost ring, cycles/pixel; rings are equally wide in log."""
+
+_TILE = 64
+_TAIL_SIGMA = (0.5, 3.0)
+_TAIL_POWER = 0.8  # of the gradients: photographs are about as sparse as that
+_TAIL_PHASE = 1.5  # radians at most: beyond, frequencies hold little but noise
+_TAIL_SOFT_PX = 0.3
+_TAIL_RIM = 16
+_CORE_PX = (2, 4)  # nearer than this neighbours are alike: for the valley, for the peak
+_REPEATS = (-0.4, 0.9)  # correlation at the valley and the peak of what repeats
+_BYTES = 4 * (RINGS * SECTORS + 3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatchSpectrum:
+    """Power spectrum of one patch in one channel, and on which side its blur has a tail.
+
+    Parameters
+    ----------
+    power : ndarray of float32, shape (RINGS, SECTORS)
+        Mean power of rings and sectors, noise included, per pixel of the window.
+    noise : float
+        Power of the noise in the same units.
+    tail : tuple of float
+        (right, up): positive where taking off a blur with a tail to that side leaves sparser
+        gradients than one with a tail to the other. Relative change of mean |gradient|^0.8; its sign
+        counts, summed over patches.
+    """
+
+    power: NDArray[np.float32]
+    noise: float
+    tail: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        numbers = (*np.ravel(self.power), self.noise, *self.tail)
+        if (
+            np.shape(self.power) != (RINGS, SECTORS)
+            or not np.isfinite(numbers).all()
+            or min(numbers[:-2]) < 0
+        ):
+            raise InvalidInputError(
+                f"a patch spectrum must be finite, not negative and of shape {(RINGS, SECTORS)}, "
+                f"got {np.shape(self.power)}"
+            )
+
+    @classmethod
+    def of(cls, patch: Plane, noise: NoiseModel, width_px: float) -> PatchSpectrum:
+        """Measure a patch whose blur has about this root mean square width per axis."""
+        power, floor = binned_spectrum(patch, noise)
+        return cls(power, floor, tail_of(patch, width_px))
+
+    def to_bytes(self) -> bytes:
+        """Serialise to 684 bytes: little-endian float32 of power, noise and tail."""
+        return np.concatenate([self.power.ravel(), [self.noise], self.tail]).astype("<f4").tobytes()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> PatchSpectrum:
+        """Read what `to_bytes` wrote.
+
+        Raises
+        ------
+        InvalidInputError
+            For anything else.
+        """
+        if len(data) != _BYTES:
+            raise InvalidInputError(f"a patch spectrum takes {_BYTES} bytes, got {len(data)}")
+        values = np.frombuffer(data, dtype="<f4").astype(np.float32)
+        power = values[: RINGS * SECTORS].reshape(RINGS, SECTORS)
+        noise, right, up = (float(v) for v in values[RINGS * SECTORS :])
+        return cls(power, noise, (right, up))
+
+
+def binned_spectrum(patch: Plane, noise: NoiseModel) -> tuple[NDArray[np.float32], float]:
+    """Mean periodogram of Hann-windowed 64 px tiles at half overlap, in rings and sectors.
+
+    Returns
+    -------
+    spectrum : ndarray of float32, shape (RINGS, SECTORS)
+        Power per pixel of the window, noise included; frequencies 0.03 to 0.5 cycles/pixel.
+    floor : float
+        Power of the noise alone.
+    """
+    side = min(_TILE, *patch.shape)
+    hann = 0.5 - 0.5 * np.cos(2 * np.pi * (np.arange(side) + 0.5) / side)
+    window = hann[:, None] * hann[None, :]
+    energy = float((window**2).sum())
+    total = np.zeros((side, side // 2 + 1))
+    count = 0
+    for row in range(0, patch.shape[0] - side + 1, side // 2):
+        for col in range(0, patch.shape[1] - side + 1, side // 2):
+            tile = patch[row : row + side, col : col + side].astype(np.float64)
+            total += np.abs(fft.rfft2((tile - tile.mean()) * window)) ** 2
+            count += 1
+    power = total / (count * energy)
+    f_row, f_col = np.meshgrid(fft.fftfreq(side), fft.rfftfreq(side), indexing="ij")
+    frequency, angle = np.hypot(f_row, f_col), np.mod(np.arctan2(f_row, f_col), np.pi)
+    edges = np.geomspace(*RING_LIMITS, RINGS + 1)
+    ring = np.searchsorted(edges, frequency, side="right") - 1
+    sector = np.minimum((angle / np.pi * SECTORS).astype(int), SECTORS - 1)
+    spectrum = np.zeros((RINGS, SECTORS), dtype=np.float32)
+    for i in range(RINGS):
+        in_ring = ring == i
+        mean = float(power[in_ring].mean()) if in_ring.any() else 0.0
+        for j in range(SECTORS):
+            bin_ = in_ring & (sector == j)
+            spectrum[i, j] = float(power[bin_].mean()) if bin_.any() else mean
+    return spectrum, float(noise.sigma_at(float(patch.mean())) ** 2)
+
+
+def tail_of(patch: Plane, width_px: float) -> tuple[float, float]:
+    """Which sides, (right, up), the tail of a patch's blur lies on.
+
+    A kernel with the third moment k along a unit vector has the phase k w^3 / 6 there. Phases of such
+    a kernel of skewness 1 are taken off, once with the tail to one side and once to the other, and
+    the sparsity of the gradients is compared: blur removed in the wrong direction doubles edges.
+
+    Parameters
+    ----------
+    patch : Plane, shape (h, w)
+        At least 40 x 40.
+    width_px : float
+        About the root mean square width per axis of its blur.
+    """
+    height, width = patch.shape
+    if min(height, width) < 2 * _TAIL_RIM + 8:
+        raise InvalidInputError(f"a patch must measure at least 40 x 40 pixels, got {height} x {width}")
+    values = patch.astype(np.float64)
+    window = np.sqrt(np.hanning(height)[:, None] * np.hanning(width)[None, :])
+    down, right = np.meshgrid(fft.fftfreq(height), fft.rfftfreq(width), indexing="ij")
+    across, up = 2.0 * np.pi * right, -2.0 * np.pi * down
+    square = across**2 + up**2
+    spectrum = fft.rfft2((values - values.mean()) * window) * np.exp(-0.5 * _TAIL_SOFT_PX**2 * square)
+    skew = float(np.clip(width_px, *_TAIL_SIGMA)) ** 3 / 6.0
+    found = []
+    for along in (across, up):
+        phase = np.clip(skew * along * square, -_TAIL_PHASE, _TAIL_PHASE)
+        towards, away = (
+            _sparsity(fft.irfft2(spectrum * np.exp(sign * 1j * phase), s=patch.shape)) for sign in (-1, 1)
+        )
+        found.append((away - towards) / max(away + towards, 1e-12))
+    return found[0], found[1]
+
+
+def _sparsity(image: NDArray[np.float64]) -> float:
+    """Mean |gradient|^0.8 over that of a normal distribution of the same power; small is sparse."""
+    inner = image[_TAIL_RIM:-_TAIL_RIM, _TAIL_RIM:-_TAIL_RIM]
+    down, right = np.diff(inner, axis=0), np.diff(inner, axis=1)
+    scale = float(np.sqrt((down**2).mean() + (right**2).mean())) + 1e-12
+    return float((np.abs(down / scale) ** _TAIL_POWER).mean() + (np.abs(right / scale) ** _TAIL_POWER).mean())
+
+
+def repeats(patch: Plane) -> bool:
+    """Whether a patch repeats itself like a fence or an arcade, so that no blur can be told from it.
+
+    Its autocorrelation then falls far below zero and comes back nearly to one.
+    """
+    power = np.abs(fft.rfft2((patch - patch.mean()).astype(np.float64))) ** 2
+    correlation = fft.irfft2(power, s=patch.shape)
+    if not correlation[0, 0] > 0:
+        return False
+    correlation /= correlation[0, 0]
+    rows, cols = (np.minimum(np.arange(n), n - np.arange(n)) for n in patch.shape)
+    gap = np.hypot(rows[:, None], cols[None, :])
+    reach = gap < min(patch.shape) // 3
+    valley = float(correlation[(gap > _CORE_PX[0]) & reach].min())
+    peak = float(correlation[(gap > _CORE_PX[1]) & reach].max())
+    return valley < _REPEATS[0] and peak > _REPEATS[1]

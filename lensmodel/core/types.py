@@ -1,0 +1,163 @@
+"""Words that every layer shares: arrays by name, settings of the lens, noise of the sensor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Final, Literal, TypeAlias, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.errors import InvalidInputError
+
+Plane: TypeAlias = NDArray[np.float32]
+"""One colour plane `(row, col)`, linear light, black 0.0, sensor saturation 1.0."""
+
+Planes: TypeAlias = NDArray[np.float32]
+"""Colour planes `(channel, row, col)` in the order of `CHANNELS`, C-contiguous, else as `Plane`."""
+
+Kernel: TypeAlias = NDArray[np.float64]
+"""Square PSF with an odd side, non-negative, sum 1, centre of mass on the middle pixel."""
+
+Channel: TypeAlias = Literal["r", "g", "b"]
+CHANNELS: Final[tuple[Channel, ...]] = get_args(Channel)
+WAVELENGTH_NM: Final[dict[Channel, float]] = {"r": 610.0, "g": 540.0, "b": 465.0}
+"""Effective wavelength of each colour channel of a typical sensor, in nanometres."""
+
+Zone: TypeAlias = Literal["center", "mid", "corner"]
+ZONES: Final[tuple[Zone, ...]] = get_args(Zone)
+
+BayerPattern: TypeAlias = tuple[tuple[int, int], tuple[int, int]]
+"""Channel (0 r, 1 g, 2 b) that each pixel of the top left 2 x 2 measured; it repeats over the frame."""
+
+StepHook: TypeAlias = Callable[[int, int], None]
+"""Called as `on_step(done, total)`; it may raise `CancelledError` to stop the work."""
+
+
+def ignore_step(done: int, total: int) -> None:
+    """Do nothing: the default `StepHook`."""
+
+
+@dataclass(frozen=True, slots=True)
+class FieldPosition:
+    """A place in the image field, in sensor orientation.
+
+    Parameters
+    ----------
+    r : float
+        Distance to the image centre over the half diagonal: 0 centre, 1 corner.
+    phi : float
+        Angle in radians, counter-clockwise from the right: 0 right, +pi/2 towards row 0.
+        Stored wrapped into (-pi, pi].
+    """
+
+    r: float
+    phi: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.r) and 0.0 <= self.r <= 1.0):
+            raise InvalidInputError(f"r must lie in 0..1 (0 centre, 1 corner), got {self.r}")
+        if not math.isfinite(self.phi):
+            raise InvalidInputError(f"phi must be a finite angle in radians, got {self.phi}")
+        wrapped = math.pi - (math.pi - self.phi) % (2.0 * math.pi)
+        object.__setattr__(self, "phi", wrapped)
+
+
+@dataclass(frozen=True, slots=True)
+class LensSettings:
+    """How the lens was set: the variables Φ of the PSF function f(u, v, r, phi, Φ).
+
+    `None` means unknown, which is not zero: an unknown variable takes no part in distances.
+
+    Parameters
+    ----------
+    aperture : float or None
+        The f-number N, 0.5 to 128.
+    focal_mm : float or None
+        Focal length in millimetres.
+    focus_m : float or None
+        Focus distance in metres; infinity is allowed.
+    channel : {"r", "g", "b"}
+        Colour channel.
+    """
+
+    aperture: float | None = None
+    focal_mm: float | None = None
+    focus_m: float | None = None
+    channel: Channel = "g"
+
+    def __post_init__(self) -> None:
+        if self.aperture is not None and not 0.5 <= self.aperture <= 128.0:
+            raise InvalidInputError(f"aperture must be an f-number in 0.5..128, got {self.aperture}")
+        if self.focal_mm is not None and not 0.1 <= self.focal_mm <= 20000.0:
+            raise InvalidInputError(f"focal length must lie in 0.1..20000 mm, got {self.focal_mm}")
+        if self.focus_m is not None and not self.focus_m > 0.0:
+            raise InvalidInputError(f"focus distance must be positive metres, got {self.focus_m}")
+        if self.channel not in CHANNELS:
+            raise InvalidInputError(f"channel must be one of {', '.join(CHANNELS)}, got {self.channel!r}")
+
+    @property
+    def stops(self) -> float | None:
+        """Aperture in stops, 2 log2 N: the unit of distances and bandwidths."""
+        return None if self.aperture is None else 2.0 * math.log2(self.aperture)
+
+    def with_channel(self, channel: Channel) -> LensSettings:
+        """Return the same settings for another colour channel."""
+        return replace(self, channel=channel)
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseModel:
+    """Variance of one plane's noise as a function of its level, var(y) = shot * y + read.
+
+    Both in linear units where saturation is 1: `shot` is one over the full-well count in
+    electrons, `read` the squared read noise. Source: A. Foi et al., "Practical
+    Poissonian-Gaussian noise modeling and fitting", IEEE TIP 17, 2008, eq. 1 and 2.
+    """
+
+    shot: float
+    read: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.shot) and math.isfinite(self.read)) or min(self.shot, self.read) < 0:
+            raise InvalidInputError(
+                f"noise terms must be finite and not negative, got shot={self.shot}, read={self.read}"
+            )
+
+    def variance(self, level: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Variance at each level of `level`, same shape."""
+        return self.shot * np.maximum(np.asarray(level, dtype=np.float64), 0.0) + self.read
+
+    def sigma_at(self, level: float) -> float:
+        """Standard deviation at one level."""
+        return math.sqrt(self.shot * max(level, 0.0) + self.read)
+
+    @classmethod
+    def white(cls, sigma: float) -> NoiseModel:
+        """Signal-independent noise of standard deviation `sigma`."""
+        return cls(shot=0.0, read=sigma * sigma)
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeGain:
+    """What a correction did to the edges of a photographed chart in one zone: medians.
+
+    Parameters
+    ----------
+    edges : int
+        How many were measured before and after.
+    mtf50_before, mtf50_after : float
+        Cycles/pixel.
+    gain : float
+        MTF50 after over before.
+    overshoot_after : float
+        How far the edge profile rises above its bright level, in percent of the step.
+    """
+
+    edges: int
+    mtf50_before: float
+    mtf50_after: float
+    gain: float
+    overshoot_after: float

@@ -1,0 +1,48 @@
+"""Non-blind deconvolution, from one tile to a whole photo."""
+
+from __future__ import annotations
+
+from lensmodel.correction.deconvolver import (
+    ColourDeconvolver,
+    Deconvolver,
+    Restored,
+    Sensor,
+    WarpableMethod,
+    restore_planes,
+)
+from lensmodel.correction.expected_gain import ZoneReport
+from lensmodel.correction.limits.bounds import Bounds
+from lensmodel.correction.limits.chroma import StoredColour
+from lensmodel.correction.methods.catalogue import deconvolvers
+from lensmodel.correction.methods.direct import DirectFilter
+from lensmodel.correction.methods.epll import Epll
+from lensmodel.correction.methods.krishnan_fergus import KrishnanFergus
+from lensmodel.correction.methods.richardson_lucy import RichardsonLucy, SaturationAwareRichardsonLucy
+from lensmodel.correction.methods.sparse_gradient import SparseGradient
+from lensmodel.correction.methods.wiener import Wiener
+from lensmodel.correction.tiles.lattice import Roi
+from lensmodel.correction.whole_photo import Corrected, PsfError, correct_planes
+
+__all__ = [
+    "Bounds",
+    "ColourDeconvolver",
+    "Corrected",
+    "Deconvolver",
+    "DirectFilter",
+    "Epll",
+    "KrishnanFergus",
+    "PsfError",
+    "Restored",
+    "RichardsonLucy",
+    "Roi",
+    "SaturationAwareRichardsonLucy",
+    "Sensor",
+    "SparseGradient",
+    "StoredColour",
+    "WarpableMethod",
+    "Wiener",
+    "ZoneReport",
+    "correct_planes",
+    "deconvolvers",
+    "restore_planes",
+]

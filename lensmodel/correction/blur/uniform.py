@@ -1,0 +1,179 @@
+"""One kernel for the whole plane."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.psf import as_kernel, otf
+from lensmodel.core.types import Kernel, Plane
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drift:
+    """Linear change of a kernel over a tile, h(. ; q) = k + (q_row - row) k_down + (q_col - col) k_across.
+
+    A point at q of the sharp plane is spread by h(. ; q), so that k_down and k_across act on the
+    latent plane times its distance from the origin.
+
+    Parameters
+    ----------
+    down, across : tuple of (UniformBlur, UniformBlur, float)
+        Two blurs before and after, and the pixels between the places they were taken at.
+    origin : tuple of float
+        Pixel `(row, col)` of the tile where the kernel is k.
+    """
+
+    down: tuple[UniformBlur, UniformBlur, float]
+    across: tuple[UniformBlur, UniformBlur, float]
+    origin: tuple[float, float]
+
+    def spectra(self, shape: tuple[int, int]) -> NDArray[np.complex64]:
+        """Transfer functions of k_down and k_across on the `rfft2` grid of `shape`, `(2, rows, cols)`."""
+        rates = [
+            _change(before, after, shape) / np.float32(max(pixels, 1.0))
+            for before, after, pixels in (self.down, self.across)
+        ]
+        return np.stack(rates).astype(np.complex64)
+
+
+def _change(before: UniformBlur, after: UniformBlur, shape: tuple[int, int]) -> NDArray[np.complexfloating]:
+    """Difference of two transfer functions; one transform where no shift is in the way."""
+    if before.offset != (0.0, 0.0) or after.offset != (0.0, 0.0):
+        return np.asarray(after.transfer(shape) - before.transfer(shape))
+    side = max(before.kernel.shape[0], after.kernel.shape[0])
+    grid = np.zeros(shape, dtype=np.float32)
+    for blur, sign in ((before, -1.0), (after, 1.0)):
+        low = (side - blur.kernel.shape[0]) // 2
+        grid[low : side - low, low : side - low] += (sign * blur.kernel).astype(np.float32)
+    return np.asarray(fft.rfft2(np.roll(grid, (-(side // 2), -(side // 2)), axis=(0, 1))))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UniformBlur:
+    """Blur by one kernel, y = k * x, no wrapping.
+
+    The latent plane is larger than the frame by the kernel's half side on each side.
+
+    Parameters
+    ----------
+    kernel : Kernel, shape (k, k)
+        The impulse response.
+    offset : tuple of float
+        Shift `(row, col)` in pixels of the image of a point, on top of the kernel: lateral colour.
+    drift : Drift or None
+        How the kernel changes around the place that it was taken at. The operator itself is uniform;
+        a method may use it to model what a uniform operator leaves out.
+    """
+
+    kernel: Kernel
+    offset: tuple[float, float] = (0.0, 0.0)
+    drift: Drift | None = None
+    _spectra: dict[tuple[int, int], NDArray[np.complex64]] = field(
+        default_factory=dict, init=False, repr=False
+    )
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "kernel", as_kernel(self.kernel))
+
+    @property
+    def reach(self) -> int:
+        """By how many pixels the latent plane is wider than the frame on each side."""
+        beyond = max(abs(self.offset[0]), abs(self.offset[1]))
+        return int(self.kernel.shape[0] // 2) + math.ceil(beyond) + (beyond != math.floor(beyond))
+
+    def spectrum(self, shape: tuple[int, int]) -> NDArray[np.complex64]:
+        """Transfer function on the `rfft2` grid of `shape`, kept for the next call."""
+        if shape not in self._spectra:
+            self._spectra[shape] = self.transfer(shape).astype(np.complex64)
+        return self._spectra[shape]
+
+    def transfer(self, shape: tuple[int, int]) -> NDArray[np.complex128]:
+        """Transfer function on the `rfft2` grid of `shape`, kept nowhere."""
+        spectrum = otf(self.kernel, shape)
+        return spectrum * _phase(self.offset, shape) if self.offset != (0.0, 0.0) else spectrum
+
+    def forward(self, latent: Plane) -> Plane:
+        """Return k * x where every pixel of the kernel meets data: `(h + k - 1, ...)` to `(h, ...)`."""
+        if min(latent.shape) <= 2 * self.reach:
+            raise InvalidInputError(
+                f"a latent plane of {latent.shape} leaves no frame inside a kernel that reaches {self.reach}"
+            )
+        shape = fast_shape(latent.shape)
+        spectrum = fft.rfft2(latent, shape) * self.spectrum(shape)
+        blurred = fft.irfft2(spectrum, shape)[: latent.shape[0], : latent.shape[1]]
+        return np.ascontiguousarray(self.frame(blurred), dtype=np.float32)
+
+    def adjoint(self, blurred: Plane) -> Plane:
+        """Return the correlation of y with k on the latent plane: `(h, ...)` to `(h + k - 1, ...)`."""
+        latent = np.pad(blurred, self.reach)
+        shape = fast_shape(latent.shape)
+        spectrum = fft.rfft2(latent, shape) * np.conj(self.spectrum(shape))
+        back = fft.irfft2(spectrum, shape)[: latent.shape[0], : latent.shape[1]]
+        return np.ascontiguousarray(back, dtype=np.float32)
+
+    def covered(self, shape: tuple[int, ...]) -> Plane:
+        """Share of the light of each latent point that falls into a frame of `shape`: F^T 1.
+
+        A point sees a rectangle of the kernel, so that its sums from one corner on tell all, and no
+        transform is needed. A shift by parts of a pixel does need one.
+        """
+        if self.offset != (0.0, 0.0):
+            return self.adjoint(np.ones(shape, dtype=np.float32))
+        side = self.kernel.shape[0]
+        sums = np.pad(self.kernel.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+        spans, kinds = [], []
+        for extent in shape:
+            start = side - 1 - np.arange(extent + side - 1)
+            ends = np.clip(start, 0, side) * (side + 1) + np.clip(start + extent, 0, side)
+            # Points far from the rim all see the whole kernel: one of them is looked up for all.
+            distinct, kind = np.unique(ends, return_inverse=True)
+            spans.append(np.divmod(distinct, side + 1))
+            kinds.append(kind)
+        (above, below), (before, after) = spans
+        inside = sums[np.ix_(below, after)] - sums[np.ix_(above, after)]
+        inside += sums[np.ix_(above, before)] - sums[np.ix_(below, before)]
+        return inside.astype(np.float32)[np.ix_(*kinds)]
+
+    def frame(self, latent: Plane) -> Plane:
+        """Return the part of the latent plane that the photo shows."""
+        cut = self.reach
+        return latent[cut : latent.shape[0] - cut, cut : latent.shape[1] - cut]
+
+
+def _phase(offset: tuple[float, float], shape: tuple[int, int]) -> NDArray[np.complex128]:
+    """Spectrum of a shift by `offset`, by Keys' cubic convolution (IEEE Trans. ASSP 29, 1981).
+
+    A phase alone would be a sinc, whose tails cross the picture: where the kernel is next to a point, undoing
+    them drew nets of dots about every edge.
+    """
+    rows = _shifted(offset[0], fft.fftfreq(shape[0]))
+    cols = _shifted(offset[1], fft.rfftfreq(shape[1]))
+    return np.asarray(rows[:, None] * cols[None, :])
+
+
+def _shifted(offset: float, frequency: NDArray[np.floating]) -> NDArray[np.complex128]:
+    """Spectrum of a shift along one axis: four taps, or one where it is by whole pixels."""
+    whole = math.floor(offset)
+    x = offset - whole
+    taps = (
+        ((2.0 - x) * x - 1.0) * x / 2.0,
+        ((3.0 * x - 5.0) * x * x + 2.0) / 2.0,
+        ((4.0 - 3.0 * x) * x + 1.0) * x / 2.0,
+        (x - 1.0) * x * x / 2.0,
+    )
+    spectrum = sum(
+        tap * np.exp(-2j * np.pi * frequency * (whole - 1 + number)) for number, tap in enumerate(taps)
+    )
+    at_nyquist = np.abs(frequency) == 0.5  # real there, as a real picture needs
+    return np.asarray(np.where(at_nyquist, np.real(spectrum), spectrum))
+
+
+def fast_shape(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Return the smallest size not below `shape` that transforms quickly."""
+    return int(fft.next_fast_len(shape[0], real=True)), int(fft.next_fast_len(shape[1], real=True))

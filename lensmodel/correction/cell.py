@@ -1,0 +1,206 @@
+"""Correct one cell of a photo: plan, restore, give back, hold, audit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.belief import Belief
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.geometry import Frame
+from lensmodel.core.psf import as_kernel, delta
+from lensmodel.core.types import (
+    CHANNELS,
+    BayerPattern,
+    Channel,
+    FieldPosition,
+    Kernel,
+    NoiseModel,
+    Planes,
+)
+from lensmodel.correction.audit import Evidence, TileAudit, held_back
+from lensmodel.correction.blur import Drift, UniformBlur
+from lensmodel.correction.deconvolver import Deconvolver, Sensor, restore_planes
+from lensmodel.correction.expected_gain import WORTH_DB, CellForecast, plan
+from lensmodel.correction.lights.beside_clipped import held_beside_clipped
+from lensmodel.correction.lights.saturation import far
+from lensmodel.correction.limits.bounds import Bounds, photo_around
+from lensmodel.correction.limits.chroma import StoredColour
+from lensmodel.correction.limits.hue import HUE_REACH, hue_bounded, hue_held
+from lensmodel.correction.tiles.canvas import fitted_halo
+from lensmodel.correction.tiles.lattice import Cell
+from lensmodel.correction.tiles.texture import SHARE, texture_kept
+
+
+class LateralShift(Protocol):
+    """Lateral colour of a lens: how far red and blue images lie from the green one."""
+
+    def displacement(self, r: float, channel: Channel) -> float:
+        """Pixels outwards by which a channel's image of a point lies beyond the green one, at r."""
+
+
+MIN_HALO, MORE = 12, 6
+"""Least halo of a cell in pixels, and pixels beyond the reach of its blur: less costs quality."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CorrectionJob:
+    """Everything that a cell needs; shared by the threads and never changed."""
+
+    planes: Planes
+    beliefs: Callable[[FieldPosition, Channel], Belief]
+    lateral: LateralShift | None
+    frame: Frame
+    method: Deconvolver
+    strength: float
+    noise: Sequence[NoiseModel]
+    clip: Sequence[float]
+    cfa: BayerPattern | None
+    bounds: Bounds
+    cell_factor: int
+    audited: bool
+    stored: StoredColour | None
+
+    def __post_init__(self) -> None:
+        wanted = (len(CHANNELS), self.frame.height, self.frame.width)
+        if self.planes.shape != wanted:
+            raise InvalidInputError(f"planes must be {wanted} as the frame says, got {self.planes.shape}")
+        if not 0.0 <= self.strength <= 1.0:
+            raise InvalidInputError(f"strength must lie in 0..1, got {self.strength}")
+        if len(self.noise) != len(CHANNELS) or len(self.clip) != len(CHANNELS):
+            raise InvalidInputError(
+                f"noise and clip need one entry per channel, got {len(self.noise)} and {len(self.clip)}"
+            )
+
+    def measured(self, channel: int, top: int, left: int, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
+        """Where the sensor measured a channel, on the part of the frame that begins at (top, left)."""
+        if self.cfa is None:
+            return None
+        rows = (np.arange(shape[0]) + top) % 2
+        cols = (np.arange(shape[1]) + left) % 2
+        return np.asarray(np.asarray(self.cfa)[rows[:, None], cols[None, :]] == channel)
+
+    def offset(self, position: FieldPosition, channel: Channel) -> tuple[float, float]:
+        """Lateral shift of a channel at a place, `(row, col)` in pixels."""
+        if self.lateral is None or channel == "g":
+            return 0.0, 0.0
+        out = self.lateral.displacement(position.r, channel)
+        return -out * math.sin(position.phi), out * math.cos(position.phi)
+
+    def blur(self, cell: Cell, channel: Channel, share: float, corner: tuple[int, int]) -> UniformBlur:
+        """Kernel of one channel in a cell, and how it changes there, on a tile that begins at `corner`."""
+
+        def blur_at(position: FieldPosition) -> UniformBlur:
+            kernel = self.beliefs(position, channel).kernel
+            return UniformBlur(_mixed(kernel, share), self.offset(position, channel))
+
+        middle = blur_at(cell.position)
+        if self.cell_factor > 1:
+            return middle  # its spectra go with the cell
+        down, across = ((blur_at(before), blur_at(after), pixels) for before, after, pixels in cell.beside)
+        origin = (cell.middle[0] - corner[0], cell.middle[1] - corner[1])
+        return UniformBlur(middle.kernel, middle.offset, Drift(down, across, origin))
+
+    def reach(self, position: FieldPosition, channel: Channel) -> int:
+        """How far the blur of a place reaches, in pixels."""
+        return UniformBlur(self.beliefs(position, channel).kernel, self.offset(position, channel)).reach
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RestoredCell:
+    """One cell as it leaves: its pixels, what they should have gained, and what the audit said of them."""
+
+    planes: Planes
+    forecast: CellForecast
+    audit: TileAudit | None
+    left: bool = False
+
+
+def restore_cell(job: CorrectionJob, cell: Cell) -> RestoredCell:
+    """Restore one cell, halo cut off again."""
+    beliefs = [job.beliefs(cell.position, channel) for channel in CHANNELS]
+    errors = [belief.error for belief in beliefs]
+    reach = max(job.reach(cell.position, channel) for channel in CHANNELS)
+    halo = fitted_halo((len(cell.rise), len(cell.run)), max(MIN_HALO, reach + MORE))
+    top, left = max(cell.top - halo, 0), max(cell.left - halo, 0)
+    tile = np.asarray(job.planes[:, top : cell.bottom + halo, left : cell.right + halo], dtype=np.float32)
+    surrounded = (
+        min(cell.top - halo, cell.left - halo) >= 0
+        and cell.bottom + halo <= job.frame.height
+        and cell.right + halo <= job.frame.width
+    )
+    edges = (
+        top == 0,
+        cell.bottom + halo >= job.frame.height,
+        left == 0,
+        cell.right + halo >= job.frame.width,
+    )
+    sensors = [
+        Sensor(
+            job.noise[c],
+            job.clip[c],
+            job.measured(c, top, left, plane.shape),
+            surrounded,
+            edges,
+        )
+        for c, plane in enumerate(tile)
+    ]
+    inner = (
+        slice(None),
+        slice(cell.top - top, cell.bottom - top),
+        slice(cell.left - left, cell.right - left),
+    )
+    offsets = [job.offset(cell.position, channel) for channel in CHANNELS]
+    plans = plan(cell, tile, beliefs, offsets, sensors, SHARE * job.bounds.texture)
+    expected = plans.forecast
+    worth = expected.gain_db >= WORTH_DB or job.bounds.denoise > 0.0
+    if job.strength == 0.0 or not worth:
+        untouched = replace(expected, after=expected.before)
+        return RestoredCell(tile[inner], untouched, None, left=True)
+    blurs = [
+        job.blur(cell, channel, share, (top, left))
+        for channel, share in zip(CHANNELS, plans.shares, strict=True)
+    ]
+    restored = restore_planes(job.method, tile, blurs, sensors)
+    restored = texture_kept(
+        tile, restored, blurs, sensors, texture=job.bounds.texture, denoise=job.bounds.denoise
+    )
+    restored = hue_held(tile, restored, blurs, sensors, errors)
+    restored = held_beside_clipped(tile, restored, blurs, sensors, errors)
+    if job.stored is not None:
+        restored = job.stored.held(tile, restored)
+    verdict: TileAudit | None = None
+    if job.audited:
+        evidence = Evidence(job.noise, job.clip, blurs, errors, [sensor.measured for sensor in sensors])
+        # before the bounds, which would hide what tells of a wrong kernel: light below black, foreign hues
+        restored, verdict = held_back(tile, restored, evidence, inner=inner[1:])
+    else:
+        restored = restored[inner]
+    corner, spread = (cell.top, cell.left), max(map(far, blurs))
+    restored = job.bounds.hold(job.planes, corner, restored, errors, spread)
+    around = photo_around(job.planes, corner, restored, HUE_REACH)
+    dark = [sensor.noise.sigma_at(0.0) for sensor in sensors]
+    restored = hue_bounded(around, restored, job.clip, dark)
+    if job.bounds.halo is not None:  # a range that was asked for holds to the last bit
+        restored = job.bounds.hold(job.planes, corner, restored, errors, spread)
+    audit = None if verdict is None else verdict.without_map()
+    if expected.changed(tile[inner], restored).gain_db < WORTH_DB and job.bounds.denoise == 0.0:
+        # bounds and audit left so little that what remains is a photo smoothed, not one made sharper
+        return RestoredCell(tile[inner], replace(expected, after=expected.before), audit, left=True)
+    if job.strength < 1.0:
+        restored = tile[inner] + np.float32(job.strength) * (restored - tile[inner])
+    return RestoredCell(restored, expected.changed(tile[inner], restored), audit)
+
+
+def _mixed(kernel: Kernel, share: float) -> Kernel:
+    """Mix a kernel with a point, s k + (1 - s) delta.
+
+    Too wide a kernel costs far more than too narrow a one. What a wrong kernel leaves is no noise: counted
+    as such, it would hand strong edges to the prior, which paints their colour over what lies beside them.
+    """
+    return kernel if share == 1.0 else as_kernel(share * kernel + (1.0 - share) * delta(kernel.shape[0]))

@@ -1,0 +1,221 @@
+"""Half-quadratic steps, compiled: three colours of one tile, with transforms into given buffers."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.jit import jit
+from lensmodel.correction.compiled.common import ONE, ZERO, Complex, Real, to_plane, to_spectrum
+
+_REACH: Final = np.float32(1.0 / 24.0)
+
+
+@jit
+def _shrink(v: Any, scale: Any, edge: Any, steepness: Any, terms: Real) -> Any:  # noqa: ANN401 - float32
+    size = max(abs(v), np.float32(1e-20))
+    below = scale / size
+    inverse = min(max(below, _REACH), edge)
+    taken = terms[0]
+    taken = taken * inverse + terms[1]
+    taken = taken * inverse + terms[2]
+    taken = taken * inverse + terms[3]
+    taken = taken * inverse + terms[4]
+    taken = taken * inverse + terms[5]
+    taken = taken * inverse + terms[6]
+    taken = taken * inverse + terms[7]
+    taken = taken * inverse + terms[8]
+    taken = taken * inverse + terms[9]
+    kept = (size - scale * taken) * min(max((edge - below) * steepness, ZERO), ONE)
+    return kept if v >= ZERO else -kept
+
+
+@jit
+def _shrink_row(
+    slopes: Real,
+    scale: Real,
+    factors: Real,
+    rotation: Real,
+    edge: float,
+    steepness: float,
+    terms: Real,
+    kept: Real,
+) -> None:
+    """Rotate three gradients to luma and chroma, shrink each, rotate back."""
+    t00, t01, t02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
+    t10, t11, t12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
+    t20, t21, t22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
+    f0, f1, f2 = factors[0], factors[1], factors[2]
+    for j in range(scale.size):
+        r, g, b, s = slopes[0, j], slopes[1, j], slopes[2, j], scale[j]
+        p = _shrink(t00 * r + t01 * g + t02 * b, s * f0, edge, steepness, terms)
+        q = _shrink(t10 * r + t11 * g + t12 * b, s * f1, edge, steepness, terms)
+        o = _shrink(t20 * r + t21 * g + t22 * b, s * f2, edge, steepness, terms)
+        kept[0, j] = t00 * p + t10 * q + t20 * o
+        kept[1, j] = t01 * p + t11 * q + t21 * o
+        kept[2, j] = t02 * p + t12 * q + t22 * o
+
+
+@jit
+def pull_of(  # noqa: C901 - loops over rows and colours, one pass over memory
+    x: Real,
+    scale: Real,
+    factors: Real,
+    rotation: Real,
+    edge: float,
+    steepness: float,
+    terms: Real,
+    pull: Real,
+) -> None:
+    """sum_j F_j^T prox(F_j x) of three planes, periodic forward differences, into `pull`."""
+    channels, height, width = x.shape
+    slopes = np.empty((channels, width), np.float32)
+    kept = np.empty((channels, width), np.float32)
+    pull[:] = ZERO
+    for i in range(height):
+        below = i + 1 if i + 1 < height else 0
+        for c in range(channels):
+            for j in range(width):
+                slopes[c, j] = x[c, below, j] - x[c, i, j]
+        _shrink_row(slopes, scale[i], factors, rotation, edge, steepness, terms, kept)
+        for c in range(channels):
+            for j in range(width):
+                pull[c, below, j] += kept[c, j]
+                pull[c, i, j] -= kept[c, j]
+        for c in range(channels):
+            for j in range(width - 1):
+                slopes[c, j] = x[c, i, j + 1] - x[c, i, j]
+            slopes[c, width - 1] = x[c, i, 0] - x[c, i, width - 1]
+        _shrink_row(slopes, scale[i], factors, rotation, edge, steepness, terms, kept)
+        for c in range(channels):
+            pull[c, i, 0] += kept[c, width - 1]
+            for j in range(width):
+                pull[c, i, j] -= kept[c, j]
+            for j in range(1, width):
+                pull[c, i, j] += kept[c, j - 1]
+
+
+@jit
+def _wiener(
+    Y: Complex, K: Complex, decay: Real, likely: Real, size: int, noise: float, variance: float, P: Complex
+) -> None:
+    """Spectrum of the Wiener estimate; see `wiener.wiener_spectrum`."""
+    height, half = Y.shape
+    shown = np.float64(0.0)
+    for i in range(height):
+        part = ZERO
+        for j in range(half):
+            k = K[i, j]
+            part += likely[i, j] * (k.real * k.real + k.imag * k.imag)
+        shown += part
+    scale = max(variance - noise, 0.005 * variance + 1e-12) / shown
+    ratio = np.float32(noise / (scale * size))
+    for i in range(height):
+        for j in range(half):
+            k = K[i, j]
+            weight = ONE / (k.real * k.real + k.imag * k.imag + ratio * decay[i, j] + np.float32(1e-9))
+            P[i, j] = Y[i, j] * np.conj(k) * weight
+    P[0, 0] = Y[0, 0] * np.conj(K[0, 0])
+
+
+@jit
+def _drifted(x: Real, drift: Complex, down: Real, across: Real, work: Real, D: Complex, E: Complex) -> None:
+    """What the change of the kernel adds to the prediction, as a spectrum, into `E`."""
+    height, width = x.shape
+    for way in range(2):
+        for i in range(height):
+            for j in range(width):
+                work[i, j] = x[i, j] * (down[i] if way == 0 else across[j])
+        to_spectrum(work, D)
+        for i in range(height):
+            for j in range(D.shape[1]):
+                more = drift[way, i, j] * D[i, j]
+                E[i, j] = more if way == 0 else E[i, j] + more
+
+
+@jit
+def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
+    x: Real,
+    y: Real,
+    known: NDArray[np.bool_],
+    whole: bool,
+    K: Complex,
+    smooth: Real,
+    decay: Real,
+    likely: Real,
+    noise: Real,
+    variance: Real,
+    scale: Real,
+    factors: Real,
+    couplings: Real,
+    turns: NDArray[np.bool_],
+    drift: Complex,
+    down: Real,
+    across: Real,
+    rotation: Real,
+    edge: float,
+    steepness: float,
+    terms: Real,
+) -> None:
+    """Wiener start and half-quadratic steps of `SparseGradient` on a canvas; the result goes into `x`.
+
+    `known` tells which pixels hold data; `whole` says that all do, so that none needs a prediction.
+    `drift` is how K changes per
+    pixel down and across, and empty where it does not; `down` and `across` are the distances from
+    where it is K. What it adds is found anew in the steps that `turns` names.
+    """
+    channels, height, width = x.shape
+    half = width // 2 + 1
+    X = np.empty((channels, height, half), np.complex64)
+    E = np.zeros((channels if drift.shape[0] > 0 else 0, height, half), np.complex64)
+    D = np.empty((height, half), np.complex64)
+    P = np.empty((height, half), np.complex64)
+    pull = np.empty_like(x)
+    work = np.empty((height, width), np.float32)
+    for c in range(channels):
+        # Where the data are whole, X keeps their spectrum from here on, else that of the estimate.
+        to_spectrum(y[c], X[c])
+        _wiener(X[c], K[c], decay, likely, height * width, noise[c], variance[c], P)
+        if not whole:
+            X[c] = P
+        to_plane(P, x[c])
+    for step in range(couplings.shape[0]):
+        pull_of(x, scale, factors[step], rotation, edge, steepness, terms, pull)
+        for c in range(channels):
+            if drift.shape[0] > 0 and turns[step]:
+                _drifted(x[c], drift[c], down, across, work, D, E[c])
+            if not whole:
+                for i in range(height):
+                    for j in range(half):
+                        P[i, j] = K[c, i, j] * X[c, i, j]
+                if drift.shape[0] > 0:
+                    P += E[c]
+                to_plane(P, work)
+                for i in range(height):
+                    for j in range(width):
+                        work[i, j] = y[c, i, j] - work[i, j] if known[c, i, j] else ZERO
+                to_spectrum(work, D)
+            to_spectrum(pull[c], P)
+            weight = couplings[step] * noise[c]
+            if whole:
+                for i in range(height):
+                    for j in range(half):
+                        k = K[c, i, j]
+                        power = k.real * k.real + k.imag * k.imag
+                        seen = X[c, i, j]
+                        if drift.shape[0] > 0:
+                            seen -= E[c, i, j]
+                        P[i, j] = (np.conj(k) * seen + weight * P[i, j]) * (
+                            ONE / (power + weight * smooth[i, j])
+                        )
+            else:
+                for i in range(height):
+                    for j in range(half):
+                        k = K[c, i, j]
+                        power = k.real * k.real + k.imag * k.imag
+                        found = power * X[c, i, j] + np.conj(k) * D[i, j]
+                        P[i, j] = (found + weight * P[i, j]) * (ONE / (power + weight * smooth[i, j]))
+                X[c] = P
+            to_plane(P, x[c])

@@ -1,0 +1,150 @@
+"""What every non-blind deconvolver takes and gives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.types import NoiseModel, Plane, Planes, StepHook, ignore_step
+from lensmodel.correction.blur import BlurOperator, UniformBlur
+
+TINY = 1e-6
+"""Smallest light that a quotient may have below the bar."""
+
+LEAST_PREDICTED = 0.1
+"""Share of a datum that Richardson-Lucy's prediction of it has at least, so that a step lifts light tenfold
+at most: a transfer function that belongs to no positive kernel, as of a point moved by a part of a pixel,
+predicts nothing or less here and there."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sensor:
+    """What is known of one plane's sensor: its noise and where it clips.
+
+    Parameters
+    ----------
+    noise : NoiseModel
+        Variance against level.
+    clip : float
+        Level from which on a value is only a lower bound; infinity where nothing clips.
+    measured : ndarray of bool or None
+        Where the sensor measured this plane; demosaicing filled in the rest. `None` for everywhere.
+    surrounded : bool
+        Whether a rim as wide as the blur reaches will be cut off on all sides. What is beyond the plane
+        then need not be solved for.
+    edges : tuple of bool
+        Which sides of the plane, top, bottom, left and right, are the frame's own. The others are cuts:
+        what is beyond them was measured, but not given.
+    """
+
+    noise: NoiseModel = field(default_factory=lambda: NoiseModel.white(0.005))
+    clip: float = float("inf")
+    measured: NDArray[np.bool_] | None = None
+    surrounded: bool = False
+    edges: tuple[bool, bool, bool, bool] = (True, True, True, True)
+
+    def __post_init__(self) -> None:
+        if not self.clip > 0.0:
+            raise InvalidInputError(f"clip must be a positive level, got {self.clip}")
+
+    def variance(self, plane: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Variance of the noise at each pixel."""
+        return self.noise.variance(plane).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Restored:
+    """Result of a deconvolution.
+
+    Parameters
+    ----------
+    plane : Plane
+        The latent plane inside the frame.
+    steps : int
+        Steps that were taken.
+    """
+
+    plane: Plane
+    steps: int
+
+
+class Deconvolver(Protocol):
+    """Non-blind deconvolution of one plane."""
+
+    def deconvolve(
+        self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step
+    ) -> Restored:
+        """Estimate the latent plane; call `on_step(done, total)` after each step.
+
+        Compiled loops run through and call it once, at the end.
+        """
+
+
+@runtime_checkable
+class ColourDeconvolver(Protocol):
+    """A deconvolver that restores the three planes together, one from the other."""
+
+    def deconvolve_planes(
+        self, blurred: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor]
+    ) -> Planes:
+        """Estimate the latent planes inside the frame."""
+
+
+@runtime_checkable
+class CoarseMethod(Protocol):
+    """A method for cells that are larger than usual, each of one kernel.
+
+    Attributes
+    ----------
+    cell_factor : int
+        Sides of its cells over the usual ones. Mosaics are cut as usual.
+    """
+
+    cell_factor: int
+
+
+@runtime_checkable
+class WarpableMethod(Protocol):
+    """A method that may want planes whose lateral colour was removed by resampling.
+
+    Attributes
+    ----------
+    warped : bool
+        Whether it does; else the shift is better left to the kernels, which spare the picture that.
+    """
+
+    warped: bool
+
+
+def restore_planes(
+    method: Deconvolver, blurred: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor]
+) -> Planes:
+    """Restore `(channel, row, col)` planes: together where the method can, else one by one."""
+    if isinstance(method, ColourDeconvolver):
+        return method.deconvolve_planes(blurred, blurs, sensors)
+    restored = [
+        method.deconvolve(plane, blur, sensor=sensor).plane
+        for plane, blur, sensor in zip(blurred, blurs, sensors, strict=True)
+    ]
+    return np.stack(restored)
+
+
+def uniform(blur: BlurOperator, method: str) -> UniformBlur:
+    """Return `blur` if it is one kernel, which methods that solve in the Fourier domain need.
+
+    Raises
+    ------
+    InvalidInputError
+        For any other operator.
+    """
+    if not isinstance(blur, UniformBlur):
+        raise InvalidInputError(
+            f"method {method!r} needs one kernel, got {type(blur).__name__}; "
+            "use correct_planes, which cuts the field into cells of one kernel"
+        )
+    return blur

@@ -1,0 +1,248 @@
+"""What a correction is expected to gain, zone by zone, and what was held back of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from lensmodel.core.belief import GRID, WIDEST, Belief
+from lensmodel.core.geometry import zone_of
+from lensmodel.core.psf import delta
+from lensmodel.core.types import ZONES, EdgeGain, Plane, Planes, Zone
+from lensmodel.correction.audit import AuditReport
+from lensmodel.correction.blur import UniformBlur
+from lensmodel.correction.deconvolver import Sensor
+from lensmodel.correction.methods.wiener import counts, frequency_squared
+from lensmodel.correction.tiles.lattice import Cell
+
+WORTH_DB: Final = 0.1
+"""Expected gain below which a place is left as it is: a tenth of a decibel is not seen (chosen)."""
+
+_UNKNOWN: Final = 1.0
+"""Expected error of a kernel from which on no gain is foretold: all of its power may be error (chosen)."""
+
+_SHARES: Final = (1.0, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.35, 0.2, 0.1)
+"""Shares of a kernel that are tried; finer steps change the expected error by less than a hundredth."""
+
+_EDGES: Final = (0.05, 0.08, 0.12, 0.17, 0.24)
+_MIDDLES: Final = np.sqrt(np.array(_EDGES[1:]) * _EDGES[:-1])
+"""Rings of frequencies that a scene's power is fitted to, cycles/pixel: above them demosaicing takes part."""
+
+_SLOPES: Final = (2.0, 5.0)
+"""Least and greatest a: of sharp photographs of detail, and of what is out of focus."""
+
+_BLOCKS: Final = 3  # along a side are enough
+_GRID: Final = GRID
+_EVERY: Final = 3  # of the rows and columns suffice for a mean; odd: all colours of a mosaic are met
+_LEAST: Final = 1e-30
+_MOST: Final = 0.7  # of the error before is the most that a change is thought to have taken away (chosen)
+
+
+@dataclass(frozen=True, slots=True)
+class CellForecast:
+    """Expected squared error of one cell before and after, and how sure its PSF is."""
+
+    zone: Zone
+    before: float
+    after: float
+    psf_error: float
+
+    @property
+    def gain_db(self) -> float:
+        """Expected gain in decibels."""
+        return _decibels(self.before, self.after)
+
+    def changed(self, photo: Planes, result: Planes) -> CellForecast:
+        """The forecast of a cell that really became `result`, whatever held it back on the way.
+
+        The error of a posterior mean is orthogonal to it, so that it is less than before by the mean square
+        of the change; no more than the forecast, since what a change adds beyond that is no scene.
+        """
+        change = float(np.square(result - photo).mean(axis=(1, 2)).sum()) * _GRID[0] * _GRID[1]
+        after = self.before - min(change, _MOST * self.before)
+        return CellForecast(self.zone, self.before, max(after, self.after), self.psf_error)
+
+
+@dataclass(frozen=True, slots=True)
+class ZoneReport:
+    """What the correction is expected to have done in one zone.
+
+    Parameters
+    ----------
+    cells : int
+        Cells of the zone that were corrected.
+    expected_gain_db : float or None
+        Expected gain in PSNR of linear light against the sharp scene, decibels; may be negative. None where
+        the PSFs are too unsure to tell.
+    psf_error : float
+        Mean expected relative error of the PSFs.
+    measured : EdgeGain or None
+        What the edges of a chart gained, where the photo shows one; `pipeline.correct_photo` measures it.
+    left : int
+        Cells that stayed as they were, because nothing was to be gained.
+    held_back : float
+        Mean share of the correction that the audit held back, 0 to 1.
+    reasons : tuple of str
+        The checks that held something back, the one that held back most first.
+    """
+
+    cells: int
+    expected_gain_db: float | None
+    psf_error: float
+    measured: EdgeGain | None = None
+    left: int = 0
+    held_back: float = 0.0
+    reasons: tuple[str, ...] = field(default=())
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """The share of each channel's kernel to use in a cell, where the rest is a point, and what to expect."""
+
+    shares: tuple[float, ...]
+    forecast: CellForecast
+
+
+def plan(
+    cell: Cell,
+    tile: Planes,
+    beliefs: Sequence[Belief],
+    offsets: Sequence[tuple[float, float]],
+    sensors: Sequence[Sensor],
+    returned: float = 0.0,
+) -> Plan:
+    """Choose the share of each kernel that leaves the least expected error in this scene.
+
+    With the scene's power S, the noise n, the mean K and the variance D of the transfer function, the share s
+    of the kernel where the rest is a point, and the part t of what a result leaves unexplained that it is
+    given back (`texture`)::
+
+        K_s = s K + (1 - s),    W = K_s* S / (|K_s|² S + n),    G = W + t (1 - K_s W)
+        before = sum_f S ( |1 - K|² + D ) + n,    after = sum_f S ( |1 - G K|² + |G|² D ) + |G|² n
+
+    Parameters
+    ----------
+    offsets : sequence of tuple of float
+        Lateral shift of each channel, `(row, col)` in pixels.
+    returned : float
+        t.
+    """
+    before = after = 0.0
+    shares: list[float] = []
+    times = counts(_GRID)
+    for plane, belief, offset, sensor in zip(tile, beliefs, offsets, sensors, strict=True):
+        point = UniformBlur(delta(1), offset).spectrum(_GRID)
+        K = point if belief.kernel.shape[0] > WIDEST else UniformBlur(belief.kernel, offset).spectrum(_GRID)
+        power, D = np.maximum(K.real**2 + K.imag**2, _LEAST), belief.variance
+        n = float(sensor.noise.variance(plane[::_EVERY, ::_EVERY]).mean())
+        S = scene_power(plane, power + D, n)
+        before += float((times * (S * ((1.0 - K.real) ** 2 + K.imag**2 + D) + n)).sum())
+        left = []
+        for share in _SHARES:
+            used = share * K + (1.0 - share) * point
+            W = np.conj(used) * S / np.maximum(S * (used.real**2 + used.imag**2) + n, _LEAST)
+            G = W + returned * (1.0 - used * W)
+            kept, missed = G.real**2 + G.imag**2, 1.0 - G * K
+            left.append(float((times * (S * (missed.real**2 + missed.imag**2 + kept * D) + kept * n)).sum()))
+        least = int(np.argmin(left))
+        shares.append(_SHARES[least])
+        after += left[least]
+    error = float(np.mean([belief.error for belief in beliefs]))
+    return Plan(tuple(shares), CellForecast(zone_of(cell.position.r), before, after, error))
+
+
+def scene_power(plane: Plane, transferred: NDArray[np.floating], noise: float) -> NDArray[np.float64]:
+    """Power of the scene behind a blur, S = c |f|^-a, on the `rfft2` grid of `GRID`.
+
+    Of white noise it would be its variance. c and a are fitted to rings of the photo's own spectrum, where
+    blur and demosaicing leave it: a soft scene, or one without detail, has nothing that a correction could
+    bring back.
+
+    Parameters
+    ----------
+    plane : Plane
+        A part of the photo.
+    transferred : ndarray, shape (64, 33)
+        Expected |H|² of its blur.
+    noise : float
+        Variance of its noise.
+    """
+    seen = _ring_power(plane)
+    passed = _ring_means(transferred)
+    power = np.maximum(seen - noise, 0.1 * noise + 1e-12) / np.maximum(passed, 1e-3)
+    x, y = np.log(_MIDDLES), np.log(power)
+    # rings of more noise than scene tell the slope badly
+    weight = 1.0 / (0.05 + (noise / np.maximum(seen, 1e-12)) ** 2)
+    mean_x, mean_y = np.average(x, weights=weight), np.average(y, weights=weight)
+    slope = float(weight @ ((x - mean_x) * (y - mean_y)) / (weight @ (x - mean_x) ** 2))
+    slope = min(max(-slope, _SLOPES[0]), _SLOPES[1])
+    decay = frequency_squared(_GRID).astype(np.float64)
+    decay[0, 0] = np.inf
+    return np.asarray(math.exp(mean_y + slope * mean_x) * decay ** (-0.5 * slope))
+
+
+def _ring_power(plane: Plane) -> NDArray[np.float64]:
+    """Mean power of a plane in each ring, of blocks of the grid's shape; 1 for white noise of variance 1."""
+    window = np.outer(*(np.hanning(n + 2)[1:-1] for n in _GRID)).astype(np.float32)
+    window /= np.sqrt(np.mean(window**2))
+    total, blocks = np.zeros((_GRID[0], _GRID[1] // 2 + 1)), 0
+    rows, cols = (max(n // side, 1) for n, side in zip(plane.shape, _GRID, strict=True))
+    for top in np.linspace(0, max(plane.shape[0] - _GRID[0], 0), min(rows, _BLOCKS)).astype(int):
+        for left in np.linspace(0, max(plane.shape[1] - _GRID[1], 0), min(cols, _BLOCKS)).astype(int):
+            block = plane[top : top + _GRID[0], left : left + _GRID[1]]
+            if block.shape != _GRID:
+                block = np.pad(
+                    block, [(0, g - n) for g, n in zip(_GRID, block.shape, strict=True)], "reflect"
+                )
+            spectrum = fft.rfft2((block - block.mean()) * window)
+            total += spectrum.real**2 + spectrum.imag**2
+            blocks += 1
+    return _ring_means(total) / (blocks * _GRID[0] * _GRID[1])
+
+
+def _ring_means(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Mean of values on the grid in each ring."""
+    return np.array([float((ring * values).sum()) for ring in _rings()])
+
+
+@lru_cache(maxsize=1)
+def _rings() -> tuple[NDArray[np.float64], ...]:
+    """Weights of sum 1 of each ring's frequencies, as often as they count in the whole spectrum."""
+    modulus, times = np.sqrt(frequency_squared(_GRID)), counts(_GRID)
+    rings = [times * ((modulus >= low) & (modulus < high)) for low, high in pairwise(_EDGES)]
+    return tuple(ring / ring.sum() for ring in rings)
+
+
+def zone_reports(
+    forecasts: Sequence[CellForecast], left: Mapping[Zone, int], audit: AuditReport
+) -> dict[Zone, ZoneReport]:
+    """Pool the cells of each zone; zones without a cell are left out."""
+    reports: dict[Zone, ZoneReport] = {}
+    for zone in ZONES:
+        own = [f for f in forecasts if f.zone == zone]
+        if not own:
+            continue
+        error = sum(f.psf_error for f in own) / len(own)
+        gain = _decibels(sum(f.before for f in own), sum(f.after for f in own))
+        seen = audit.zones.get(zone)
+        reports[zone] = ZoneReport(
+            len(own),
+            gain if error < _UNKNOWN else None,
+            error,
+            left=left.get(zone, 0),
+            held_back=0.0 if seen is None else seen.held_back,
+            reasons=() if seen is None else tuple(sorted(seen.checks, key=lambda name: -seen.checks[name])),
+        )
+    return reports
+
+
+def _decibels(before: float, after: float) -> float:
+    return 10.0 * math.log10(before / after) if after > 0.0 and before > 0.0 else 0.0

@@ -1,0 +1,100 @@
+"""Nothing beside clipped light is darker, lighter or of another hue than the photo around it allows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lensmodel.core.types import Planes
+from lensmodel.correction.blur import UniformBlur
+from lensmodel.correction.blur.compiled_uniform import CompiledBlur
+from lensmodel.correction.deconvolver import Sensor
+from lensmodel.correction.engine import compiled
+from lensmodel.correction.lights.clipped import around
+from lensmodel.correction.lights.saturation import closed, compact, far, positive
+from lensmodel.correction.limits.hue import of_known_hue
+
+_UNSURE, _NEAREST = 0.1, 2
+"""Error of a kernel from which on the glow of a light is left alone, and pixels that count as nearby then: an
+error of .1 of a light ten times beyond saturation is as bright as white (chosen)."""
+
+_EVEN: Final = 1.5
+"""Standard deviation in pixels of the means that tell where light comes from: pixel by pixel noise and the
+mosaic decide, and edges of clipped areas get ragged (chosen)."""
+
+_BRIGHTER: Final = np.float32(4.0)
+"""Times saturation that a broad clipped area may shine: sunlit paint and white skies do (chosen)."""
+
+_FADE: Final = 3
+"""Pixels over which the bounds end (chosen)."""
+
+
+def held_beside_clipped(
+    photo: Planes,
+    restored: Planes,
+    blurs: Sequence[UniformBlur],
+    sensors: Sequence[Sensor],
+    errors: Sequence[float],
+) -> Planes:
+    """Hold a result within the photo's range and hues wherever clipped light reaches.
+
+    How much light a clipped pixel had is not known, and what a wrong guess of it does to its neighbours looks
+    like the worst of corrections: dark rings and pixels of another colour. So within the kernel's
+    reach of a clipped pixel each colour stays between the least and the most that the photo shows nearby, and
+    so does its share of the light of all colours. Nearby is the kernel's reach where the kernel is
+    sure, so that the glow of a lamp can be taken off, and two pixels where it is not. Clipped areas too
+    broad to be a light spread by the lens stay as they are, and where the kernel is not sure so does as much
+    of a pixel as its light comes from there.
+
+    Parameters
+    ----------
+    photo, restored : Planes, shape (channels, rows, cols)
+        A tile, and what was made of it.
+    blurs, sensors : sequence
+        By colour.
+    errors : sequence of float
+        Expected relative L2 errors of the kernels.
+    """
+    clipped = np.stack([closed(p >= np.float32(s.clip)) for p, s in zip(photo, sensors, strict=True)])
+    if not clipped.any():
+        return restored
+    reach = max(far(blur) for blur in blurs)
+    anywhere = np.asarray(clipped.any(axis=0))
+    rows, cols = (around(anywhere, axis, 2 * reach + _FADE + 1) for axis in (0, 1))
+    here = (slice(None), rows, cols)
+    seen, made, lost = photo[here], restored[here].copy(), clipped[here]
+    broad = np.stack([mask & ~compact(mask, reach) for mask in lost])
+    np.copyto(made, seen, where=broad)
+    near = max(round(reach * (1.0 - max(errors) / _UNSURE)), min(_NEAREST, reach))
+    window = (1, 2 * near + 1, 2 * near + 1)
+    low, high = (f(seen, window, mode="nearest") for f in (ndimage.minimum_filter, ndimage.maximum_filter))
+    low, high = np.minimum(low, seen), np.where(lost, np.float32(np.inf), high)
+    held = np.clip(made, low, high)
+    if len(seen) > 1:
+        noise = np.stack([s.variance(p) for p, s in zip(seen, sensors, strict=True)])
+        held = np.clip(of_known_hue(seen, held, anywhere[rows, cols], noise, window), low, high)
+    trust = 1.0 - min(max(errors) / _UNSURE, 1.0) * _light_of(broad, seen, blurs, sensors)
+    held = np.where(broad, seen, seen + trust * (held - seen))
+    distance = ndimage.distance_transform_cdt(~anywhere[rows, cols], "chessboard")
+    share = np.clip((reach + _FADE - distance) / np.float32(_FADE), 0.0, 1.0).astype(np.float32)
+    result = restored.copy()
+    result[here] = restored[here] + share * (held - restored[here])
+    return result
+
+
+def _light_of(
+    broad: NDArray[np.bool_], photo: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor]
+) -> NDArray[np.float32]:
+    """Share of each pixel's light that may come from broad clipped areas, the most of all colours, 0 to 1."""
+    share = np.zeros(photo.shape[1:], dtype=np.float32)
+    for mask, plane, blur, sensor in zip(broad, photo, blurs, sensors, strict=True):
+        if mask.any():
+            light = np.float32(sensor.clip) * np.pad(mask.astype(np.float32), blur.reach, mode="edge")
+            spread = CompiledBlur.of(positive(blur), compiled("auto")).forward(light)
+            spread, lit = (ndimage.gaussian_filter(p, _EVEN, mode="nearest") for p in (spread, plane))
+            share = np.maximum(share, _BRIGHTER * spread / np.maximum(lit, np.float32(1e-6)))
+    return np.clip(share, 0.0, 1.0)

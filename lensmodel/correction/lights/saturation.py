@@ -1,0 +1,228 @@
+"""Light beyond saturation: how much of it there is, and the photo as it would be without."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lensmodel.core.psf import as_kernel
+from lensmodel.core.types import Planes
+from lensmodel.correction.blur import UniformBlur
+from lensmodel.correction.blur.compiled_uniform import CompiledBlur
+from lensmodel.correction.deconvolver import Sensor
+from lensmodel.correction.engine import Engine, compiled
+from lensmodel.correction.lights.clipped import Region, around, regions
+from lensmodel.correction.methods.richardson_lucy import climbed, first_guess
+
+_LEAST_SEEN: Final = 0.02  # share of a point's light that counts as measured where less of it is
+_UNSEEN: Final = 1e-3  # share of a point's light below which nothing is known of it
+_SIGMAS: Final = np.float32(3.0)
+_ABSURD: Final = np.float32(2.0)  # times what was measured: more glow than steps that end anywhere leave
+_ENERGY: Final = 0.98
+"""Share of a kernel's light within its reach: what is further out of a light at saturation is a fiftieth of
+it, and hardly seen (chosen)."""
+_DARKEST: Final = 0.9  # times what a kernel spreads: share of the darkest light nearby that must be left
+_DOUBT: Final = np.float32(0.25)  # share of the glow that may be none
+_GLARE: Final = np.float32(0.5)  # share of glow in the photo's light from which on the bound holds in full
+_NO_GLARE: Final = np.float32(0.02)  # of that: rounding errors of transforms are no glow
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lights:
+    """What shines beyond saturation in a tile.
+
+    Parameters
+    ----------
+    rest : Planes
+        The tile without the glow; clipped pixels hold what the light below saturation makes of them.
+    beyond : Planes
+        Sharp light above the clipping level.
+    glow : Planes
+        The same as the lens spreads it.
+    spread : ndarray, shape (channels,)
+        Share of a point's light that falls beyond its neighbours.
+    """
+
+    rest: Planes
+    beyond: Planes
+    glow: Planes
+    spread: NDArray[np.float32]
+
+    @classmethod
+    def of(
+        cls,
+        tile: Planes,
+        blurs: Sequence[UniformBlur],
+        sensors: Sequence[Sensor],
+        steps: int,
+        engine: Engine,
+    ) -> Lights | None:
+        """Find the light above the clipping level of each colour; None where nothing is clipped.
+
+        How bright a clipped light is, only its glow on the pixels around it tells. Richardson-Lucy
+        steps find out, with clipped pixels as lower bounds, R and R' as in
+        `SaturationAwareRichardsonLucy`, and divided by what of a point's light was measured::
+
+            x <- x ( 1 + F^T e / F^T 1[y < t] ),     e = ( y / R(F x) - 1 ) R'(F x)
+
+        Divided by F^T 1 instead, lights of which little is measured take several times the steps; those of
+        which nothing is would grow without end otherwise. Only of lights that the lens may have spread
+        (`compact`), around clipped pixels near measured ones (`lensmodel.correction.lights.clipped.regions`).
+        Broad clipped areas are taken for light at saturation. Positive and unrestrained, x is a poor picture,
+        so only what lies above t is taken from it.
+        """
+        if not any(
+            plane.max() >= np.float32(sensor.clip) for plane, sensor in zip(tile, sensors, strict=True)
+        ):
+            return None
+        rest, beyond, glow = tile.copy(), np.zeros_like(tile), np.zeros_like(tile)
+        loops = compiled(engine)
+        for c, (plane, blur, sensor) in enumerate(zip(tile, blurs, sensors, strict=True)):
+            clipped = blown(plane, sensor)
+            quick = CompiledBlur.of(positive(blur), loops)
+            for region in regions(compact(clipped, far(blur)), blur.reach):
+                _find(region, plane, clipped, quick, sensor, steps, engine, (rest[c], beyond[c], glow[c]))
+            rest[c] -= np.where(clipped, np.float32(0.0), glow[c])
+        return cls(rest, beyond, glow, np.array([_spread(blur) for blur in blurs], dtype=np.float32))
+
+    def put_back(self, photo: Planes, restored: Planes) -> Planes:
+        """Add the light to what was made of the rest.
+
+        Where most of what a pixel got was glow, an error of it is large beside the scene, and the more
+        the lens spreads the more of it comes back as a dark ring. So the result stays above a share of
+        the darkest light nearby there.
+        """
+        made = restored + self.beyond
+        shining: NDArray[np.bool_] = np.asarray(self.glow.any(axis=0))
+        if not shining.any():
+            return np.asarray(made, dtype=np.float32)
+        # What the filters of 5 pixels see, and no more of the tile.
+        rows, cols = (around(shining, axis, 4) for axis in (0, 1))
+        here = (slice(None), rows, cols)
+        glow = self.glow[here]
+        near = ndimage.maximum_filter(glow, (1, 5, 5), mode="nearest")
+        likely = np.maximum(self.rest[here], np.float32(0.0)) + _DOUBT * glow
+        darkest = ndimage.minimum_filter(likely, (1, 5, 5), mode="nearest")
+        glare = np.minimum(near / (_GLARE * np.maximum(photo[here], np.float32(1e-6))), np.float32(1.0))
+        depth = (np.float32(_DARKEST) * self.spread)[:, None, None]
+        held = np.maximum(restored[here], depth * glare * darkest)
+        made[here] = np.where(glare > _NO_GLARE, held, restored[here]) + self.beyond[here]
+        return np.asarray(made, dtype=np.float32)
+
+
+def blown(plane: NDArray[np.float32], sensor: Sensor) -> NDArray[np.bool_]:
+    """Pixels of which only a lower bound is known."""
+    return np.asarray(plane >= np.float32(sensor.clip))
+
+
+def compact(clipped: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+    """Clipped pixels of areas that a lamp may have made through a kernel of this reach.
+
+    An area with a clipped pixel further than the reach from all measured ones is broad: how bright it is
+    inside, nothing tells.
+    """
+    if not clipped.any():
+        return clipped
+    known = clipped
+    clipped = closed(clipped)
+    depth = ndimage.distance_transform_cdt(np.pad(clipped, 1), "chessboard")[1:-1, 1:-1]
+    labels, count = ndimage.label(clipped, structure=np.ones((3, 3), dtype=np.int8))
+    deepest = ndimage.maximum(depth, labels, np.arange(count + 1))
+    broad = np.asarray(deepest) > reach
+    broad[0] = True
+    return np.asarray(known & ~broad[labels])
+
+
+def closed(clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Clipped pixels and those between them, which demosaicing left hardly below saturation."""
+    return np.asarray(ndimage.binary_closing(np.pad(clipped, 1), np.ones((3, 3)))[1:-1, 1:-1] | clipped)
+
+
+def far(blur: UniformBlur) -> int:
+    """Radius in pixels that holds nearly all light of a kernel and its shift, and a pixel more."""
+    half = blur.kernel.shape[0] // 2
+    rows, cols = np.mgrid[-half : half + 1, -half : half + 1]
+    light = np.bincount(np.maximum(np.abs(rows), np.abs(cols)).ravel(), blur.kernel.ravel()).cumsum()
+    inner = int(np.searchsorted(light, _ENERGY * light[-1]))
+    return max(inner, 1) + int(np.ceil(max(abs(blur.offset[0]), abs(blur.offset[1])))) + 1
+
+
+def positive(blur: UniformBlur) -> UniformBlur:
+    """The same blur, its shift by parts of a pixel in the kernel, so that no light becomes negative.
+
+    A shift that acts as a phase belongs to a kernel with negative lobes, behind which Richardson-Lucy steps
+    run away.
+    """
+    if blur.offset == (0.0, 0.0):
+        return blur
+    wide = blur.reach - blur.kernel.shape[0] // 2
+    moved = ndimage.shift(np.pad(blur.kernel, wide), blur.offset, order=1)
+    return UniformBlur(as_kernel(np.maximum(moved, 0.0)))
+
+
+def _spread(blur: UniformBlur) -> float:
+    """Share of a kernel outside its middle 3 x 3 pixels."""
+    middle = blur.kernel.shape[0] // 2
+    near = slice(max(middle - 1, 0), middle + 2)
+    return 1.0 - float(blur.kernel[near, near].sum())
+
+
+def _find(
+    region: Region,
+    plane: NDArray[np.float32],
+    clipped: NDArray[np.bool_],
+    blur: UniformBlur,
+    sensor: Sensor,
+    steps: int,
+    engine: Engine,
+    into: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
+) -> None:
+    """Find the light of one region of one colour; add it to `into`: rest, light beyond saturation, glow."""
+    rest, beyond, glow = into
+    here = region.seen
+    data, lost = plane[here], clipped[here]
+    latent, reach = first_guess(data, blur)
+    seen = np.minimum(blur.adjoint((~lost).astype(np.float32)), reach)
+    most = float(reach.max())
+    seen = np.where(seen < _UNSEEN * most, reach, np.maximum(seen, np.float32(_LEAST_SEEN * most)))
+    latent = climbed(latent, data, seen, blur, sensor, steps=steps, engine=engine)
+    clip = np.float32(sensor.clip)
+    held = np.minimum(latent, clip)
+    # What shines too far off to reach a clipped pixel, or nearer to those of another region, is no concern.
+    own = np.zeros_like(latent)
+    own[region.own] = (latent - held)[region.own]
+    bound = np.maximum(data, np.float32(0.0)) + _SIGMAS * np.sqrt(sensor.variance(data))
+    own, shed = _believable(own, np.where(lost, np.float32(np.inf), bound), blur)
+    glow[here] += shed
+    beyond[here] += blur.frame(own)
+    answered = np.zeros_like(lost)
+    answered[region.answers] = lost[region.answers]
+    rest[here][answered] = np.maximum(blur.forward(held), np.float32(0.0))[answered]
+
+
+def _believable(
+    own: NDArray[np.float32], bound: NDArray[np.float32], blur: UniformBlur
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the light that was found and its glow, dimmed where that by far exceeds a bound.
+
+    Where it still does then, none of it is left. Steps may run away: just below clipping the response
+    hardly rises, and the transfer function of next to no blur, moved by a part of a pixel, belongs to no
+    kernel that is positive.
+    """
+
+    def absurd(glow: NDArray[np.float32]) -> NDArray[np.bool_]:
+        return np.asarray(~(np.abs(glow) <= _ABSURD * bound))
+
+    glow = blur.forward(own)
+    too_much = absurd(glow)
+    if not too_much.any():
+        return own, glow
+    share = np.where(too_much, bound / np.where(too_much, np.abs(glow), np.float32(1.0)), np.float32(1.0))
+    own = own * ndimage.minimum_filter(np.pad(share, blur.reach, mode="edge"), 2 * blur.reach + 1)
+    glow = blur.forward(own)
+    return (np.zeros_like(own), np.zeros_like(glow)) if absurd(glow).any() else (own, glow)

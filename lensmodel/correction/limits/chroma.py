@@ -1,0 +1,113 @@
+"""What a JPEG can hold: its finest detail is coarse, its chroma often at half the resolution of luma."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.types import CHANNELS, Planes
+from lensmodel.photo import LinearPhoto
+from lensmodel.photo.colour import curves_of, decode, encode, inverse
+
+_LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
+"""Weights of r, g, b in luma: ITU-R BT.601, as JFIF 1.02 asks."""
+
+_PAIRED: Final = np.array([1.0, 4.0, 6.0, 4.0, 1.0], dtype=np.float32) / np.float32(16.0)
+"""What storing two pixels as their mean, and interpolating linearly between such means, makes of one pixel:
+the mean over the two places that it can have in its pair."""
+
+_FINEST: Final = np.array([1.0, -6.0, 15.0, 44.0, 15.0, -6.0, 1.0], dtype=np.float32) / np.float32(64.0)
+"""1 - sin^6(pi f) along an axis: 0.88 of a correction stays at 0.25 cycles/pixel, 0.50 at 0.35, none at 0.5.
+
+The highest coefficients of a block are rounded to about twice the steps of the middle ones, a camera's
+denoising takes what is left of them, and a blur's transfer function is smallest there: of a period of two
+pixels a correction makes the rounding of one coefficient, seen as a comb."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredColour:
+    """How a file stores colour.
+
+    Parameters
+    ----------
+    step : tuple of int
+        Rows and columns of pixels that share one value of chroma; powers of two.
+    curves : tuple of ndarray of float32, shape (65536,)
+        Linear light of evenly spaced file values, by channel.
+    tables : tuple of ndarray of float32
+        The way back, of `photo.colour.inverse`.
+    """
+
+    step: tuple[int, int]
+    curves: tuple[NDArray[np.float32], ...]
+    tables: tuple[NDArray[np.float32], ...]
+
+    @classmethod
+    def of(cls, step: tuple[int, int], curves: Sequence[NDArray[np.float32]]) -> StoredColour:
+        """Make one of the curves of a file.
+
+        Raises
+        ------
+        InvalidInputError
+            If the steps are no powers of two, or there are not three curves.
+        """
+        if len(curves) != len(CHANNELS) or any(size < 1 or size & (size - 1) for size in step):
+            raise InvalidInputError(
+                f"chroma needs three curves and steps that are powers of two, got {len(curves)} and {step}"
+            )
+        return cls(step, tuple(curves), tuple(inverse(curve) for curve in curves))
+
+    @classmethod
+    def of_photo(cls, photo: LinearPhoto) -> StoredColour | None:
+        """How the file of a photo stores colour; `None` of a file that is no JPEG."""
+        if photo.info.kind != "jpeg":
+            return None
+        return cls.of(photo.chroma_step, curves_of(photo.encoding.transfer, photo.encoding.icc))
+
+    def held(self, photo: Planes, restored: Planes) -> Planes:
+        """Take from a correction as much as the file can show of luma and of chroma.
+
+        With Y and C luma and chroma of file values, F what is kept of the finest detail, and H what the
+        file's resolution leaves of chroma::
+
+            Y = Y(photo) + F ( Y(restored) - Y(photo) ),   C = C(photo) + H F ( C(restored) - C(photo) )
+
+        A correction takes each colour for measured at every pixel. In a JPEG that holds for luma alone: the
+        finest detail of red and blue is that of luma, and colour that a correction makes of it beyond that
+        comes of rounding and of errors of the kernels, and is seen as coloured pixels.
+
+        Parameters
+        ----------
+        photo, restored : Planes, shape (3, rows, cols)
+            Linear light of a tile, and what was made of it.
+
+        Returns
+        -------
+        Planes
+            Within what the file can hold.
+        """
+        before = self._values(photo)
+        change = self._values(restored) - before
+        for axis in (-2, -1):
+            change = ndimage.convolve1d(change, _FINEST, axis=axis, mode="nearest")
+        luma = np.tensordot(_LUMA, change, axes=1)
+        # the same linear filter on all three differences: their weighted sum stays zero, and luma what it is
+        values = before + luma + self.shown(change - luma)
+        np.clip(values, np.float32(0.0), np.float32(1.0), out=values)
+        return np.stack([decode(v, curve) for v, curve in zip(values, self.curves, strict=True)])
+
+    def shown(self, chroma: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Chroma `(..., rows, cols)` as finely as the file shows it."""
+        for axis, size in zip((-2, -1), self.step, strict=True):
+            for _ in range(size.bit_length() - 1):
+                chroma = ndimage.convolve1d(chroma, _PAIRED, axis=axis, mode="nearest")
+        return chroma
+
+    def _values(self, planes: Planes) -> Planes:
+        return np.stack([encode(plane, table) for plane, table in zip(planes, self.tables, strict=True)])

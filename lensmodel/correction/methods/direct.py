@@ -1,0 +1,188 @@
+"""One pass: a linear filter for all colours together, gentle where the picture is calm."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from lensmodel.core.types import Plane, Planes, StepHook, ignore_step
+from lensmodel.correction.blur import BlurOperator, UniformBlur
+from lensmodel.correction.deconvolver import Deconvolver, Restored, Sensor, restore_planes, uniform
+from lensmodel.correction.engine import Engine, compiled
+from lensmodel.correction.lights.saturation import Lights
+from lensmodel.correction.methods.sparse_gradient import SparseGradient
+from lensmodel.correction.methods.wiener import frequency_squared, prior
+from lensmodel.correction.tiles.beyond_frame import fill_outside
+from lensmodel.correction.tiles.canvas import Canvas, seam
+from lensmodel.correction.tiles.local_statistics import BLOCK, Blocks, signal_variance, smoothed, spread
+from lensmodel.correction.tiles.transfers import transfers
+
+_FINE: Final = 1.0 / 16.0  # cycles per pixel above which a window of 13 pixels sees a frequency
+_LEAST_COLOUR: Final = 0.02  # variance of chroma over that of luma below which no scene is believed to be
+
+
+def _steps() -> Deconvolver:
+    """Half the steps of "standard", each a larger one."""
+    return SparseGradient(steps=4, coupling=4.0, growth=6.0)
+
+
+@dataclass(frozen=True, slots=True)
+class DirectFilter:
+    r"""Linear minimum-mean-square-error filter of three colours, for two contrasts of the scene.
+
+    The scene is natural in luma and in chroma, S_l = l |f|^-2.2 and S_c = c |f|^-2.2, so that its colours
+    tell of each other. With channels scaled to equal light, noise n_i and 1 a vector of ones::
+
+        M = diag( (|K_i|² + floor) / n_i + 1 / S_c ) + g 1 1',    g = ( 1 / S_l - 1 / S_c ) / 3
+        X = M^-1 ( conj(K_i) Y_i / n_i )
+
+    solved by the Sherman-Morrison formula. It is made for a busy scene and for a calm one, and each
+    pixel mixes the two by the logarithm of the contrast around it. Mosaics, of which two colours of three
+    are to be filled in, are restored in a few half-quadratic steps instead.
+
+    Parameters
+    ----------
+    busy, calm : float
+        The two contrasts: shares of the mean variance in windows of the tile.
+    floor : float
+        Added to |K_i|² in M: the square of what a transfer function is expected to be off by within a
+        cell. Without it strong frequencies of the scene come back as coloured ripples.
+    light_steps : int
+        Steps by which the light of clipped pixels is found.
+    outside_steps : int
+        Steps by which light from beyond the frame is found.
+    engine : {"auto", "numpy"}
+        "numpy" never uses compiled loops; the numbers are the same.
+    """
+
+    busy: float = 0.25
+    calm: float = 0.0015
+    floor: float = 1e-3
+    light_steps: int = 15
+    outside_steps: int = 10
+    engine: Engine = "auto"
+    mosaic: Deconvolver = field(default_factory=_steps)
+
+    cell_factor = 2
+    """Cells may be larger: a filter that is quick has no use for kernels that are exact everywhere."""
+
+    def deconvolve(
+        self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step
+    ) -> Restored:
+        """Deconvolve one plane; see `Deconvolver`."""
+        kernel = uniform(blur, "fast")
+        restored = self.deconvolve_planes(np.stack([blurred] * 3), [kernel] * 3, [sensor] * 3)
+        on_step(1, 1)
+        return Restored(restored[0], steps=1)
+
+    def deconvolve_planes(
+        self, blurred: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor]
+    ) -> Planes:
+        """Restore the colours together; see `ColourDeconvolver`."""
+        if any(sensor.measured is not None for sensor in sensors):
+            return restore_planes(self.mosaic, blurred, blurs, sensors)
+        lights = Lights.of(blurred, blurs, sensors, self.light_steps, self.engine)
+        photo, blurred = blurred, blurred if lights is None else lights.rest
+        light = np.maximum(blurred.mean(axis=(1, 2)), 1e-4).astype(np.float32)
+        canvas = Canvas.around(blurred, blurs, sensors)
+        loops = compiled(self.engine)
+        contrast, colour, noise = _contrasts(Blocks.of(blurred, light, loops), light, sensors)
+        mean = float(contrast.mean())
+        low, high = np.log(self.calm), np.log(self.busy)
+        share = np.clip((np.log(contrast / mean) - low) / (high - low), 0.0, 1.0)
+        busy = spread(share.astype(np.float32), canvas)
+        K, _ = transfers(blurs, canvas.shape, 1.0, loops, drifting=False)
+        levels = np.array(
+            [[3.0 * mean * f, max(colour, _LEAST_COLOUR * 3.0 * mean) * f] for f in (self.busy, self.calm)]
+        )
+        if loops is None:
+            y = np.stack([canvas.fill(plane / bright) for plane, bright in zip(blurred, light, strict=True)])
+        else:
+            y = np.empty((len(blurred), *canvas.shape), dtype=np.float32)
+            rows, cols = seam(canvas.rows, canvas.shape[0]), seam(canvas.cols, canvas.shape[1])
+            loops.fill(blurred, np.float32(1.0) / light, canvas.margin, rows, cols, y)
+        if not all(sensor.surrounded for sensor in sensors):
+            fill_outside(y, blurred, light, K, blurs, sensors, canvas, self.outside_steps, self.engine)
+        if loops is None:
+            x = _filtered(y, K, noise, levels, busy, self.floor)
+        else:
+            x = np.empty_like(y)
+            loops.one_pass(
+                x,
+                y,
+                K,
+                noise,
+                prior(canvas.shape)[0],
+                _fine(canvas.shape),
+                levels,
+                busy,
+                np.float32(self.floor),
+            )
+        restored = x[:, canvas.data[0], canvas.data[1]] * light[:, None, None]
+        return restored if lights is None else lights.put_back(photo, restored)
+
+
+def _contrasts(
+    blocks: Blocks, light: NDArray[np.float32], sensors: Sequence[Sensor]
+) -> tuple[NDArray[np.float32], float, NDArray[np.float32]]:
+    """Variance of luma around each block, of chroma in all, and of the noise of each colour.
+
+    Chroma is read off the blocks: what is finer is noise.
+    """
+    var = np.stack(
+        [
+            s.noise.variance(smoothed(b * bright)) / bright**2
+            for s, b, bright in zip(sensors, blocks.planes, light, strict=True)
+        ]
+    ).astype(np.float32)
+    noise = np.maximum(var.mean(axis=(1, 2)), np.float32(1e-9))
+    contrast = signal_variance(blocks, var.sum(axis=0) / np.float32(9.0))
+    r, g, b = blocks.planes
+    chroma = 0.0
+    for plane, part in (
+        ((r - b) / np.float32(np.sqrt(2)), (noise[0] + noise[2]) / 2),
+        ((2 * g - r - b) / np.float32(np.sqrt(6)), (noise[0] + 4 * noise[1] + noise[2]) / 6),
+    ):
+        detail = float((smoothed(plane * plane) - smoothed(plane) ** 2).mean())
+        chroma += max(detail - float(part) / BLOCK**2, 0.0) / 2.0
+    return contrast, chroma, noise
+
+
+def _filtered(
+    y: Planes,
+    K: NDArray[np.complex64],
+    noise: NDArray[np.float32],
+    levels: NDArray[np.float64],
+    busy: NDArray[np.float32],
+    floor: float,
+) -> Planes:
+    """The pass in NumPy; `compiled.one_pass` is its twin."""
+    shape = (y.shape[1], y.shape[2])
+    power = np.abs(K) ** 2
+    seen = float((_fine(shape) * power.sum(axis=0)).sum()) / 3.0
+    Y = fft.rfft2(y)
+    decay = prior(shape)[0] * np.float32(seen / y[0].size)
+    data = np.conj(K) * Y / noise[:, None, None]
+    found = []
+    for luma, chroma in levels:
+        D = (power + np.float32(floor)) / noise[:, None, None] + decay / np.float32(chroma)
+        z = data / D
+        g = decay * np.float32((1.0 / luma - 1.0 / chroma) / 3.0)
+        X = z - (g * z.sum(axis=0) / (1.0 + g * (1.0 / D).sum(axis=0))) / D
+        X[:, 0, 0] = Y[:, 0, 0]  # the mean is kept
+        found.append(fft.irfft2(X, shape).astype(np.float32))
+    return np.asarray(found[1] + busy * (found[0] - found[1]), dtype=np.float32)
+
+
+@lru_cache(maxsize=8)
+def _fine(shape: tuple[int, int]) -> NDArray[np.float32]:
+    """The prior's power where a local window sees it, zero elsewhere."""
+    likely = prior(shape)[1] * (frequency_squared(shape) > _FINE**2)
+    likely.setflags(write=False)
+    return np.ascontiguousarray(likely, dtype=np.float32)

@@ -1,0 +1,67 @@
+"""Deconvolution with a hyper-Laplacian prior, as published."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft
+
+from lensmodel.core.types import Plane, StepHook, ignore_step
+from lensmodel.correction.blur import BlurOperator
+from lensmodel.correction.deconvolver import Restored, Sensor, uniform
+from lensmodel.correction.methods.shrinkage import Shrinkage
+from lensmodel.correction.tiles.canvas import Canvas
+
+
+@dataclass(frozen=True, slots=True)
+class KrishnanFergus:
+    """Half-quadratic solution of min lambda/2 |k * x - y|² + sum_j |f_j * x|^alpha [1]_.
+
+    lambda follows the noise: 0.2 / var, which is the published 2000 at one percent.
+
+    Parameters
+    ----------
+    alpha : float
+        Exponent of the prior.
+
+    References
+    ----------
+    .. [1] D. Krishnan, R. Fergus, "Fast image deconvolution using hyper-Laplacian priors",
+       NIPS 2009, algorithm 1.
+    """
+
+    alpha: float = 2.0 / 3.0
+
+    def deconvolve(
+        self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step
+    ) -> Restored:
+        """Deconvolve one plane; see `Deconvolver`."""
+        kernel = uniform(blur, "krishnan-fergus")
+        canvas = Canvas(blurred.shape[0], blurred.shape[1], kernel.reach)
+        data = canvas.fill(blurred)
+        shape = canvas.shape
+        K = kernel.spectrum(shape)
+        fidelity = 0.2 / max(float(sensor.variance(blurred).mean()), 1e-9)
+        rows = 2.0 - 2.0 * np.cos(2.0 * np.pi * fft.fftfreq(shape[0]))
+        cols = 2.0 - 2.0 * np.cos(2.0 * np.pi * fft.rfftfreq(shape[1]))
+        slopes = (rows[:, None] + cols[None, :]).astype(np.float32)
+        pulled, power = np.conj(K) * fft.rfft2(data), np.abs(K) ** 2
+        prox = Shrinkage.of(self.alpha)
+        latent, beta, step = data, 1.0, 0
+        while beta < 256.0:
+            step += 1
+            back = np.zeros(shape, dtype=np.float32)
+            for axis in (0, 1):
+                slope = np.roll(latent, -1, axis=axis) - latent
+                kept = prox(slope, float(prox.scale(1.0 / beta)))
+                back += np.roll(kept, 1, axis=axis) - kept
+            weight = np.float32(beta / fidelity)
+            spectrum = (pulled + weight * fft.rfft2(back)) / (power + weight * slopes)
+            latent = fft.irfft2(spectrum, shape).astype(np.float32)
+            beta *= 2.0 * np.sqrt(2.0)
+            on_step(step, _STEPS)
+        return Restored(np.ascontiguousarray(canvas.cut(latent)), steps=step)
+
+
+_STEPS = 6

@@ -1,0 +1,101 @@
+"""A Gaussian mixture over small windows of sharp photographs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+_SHIPPED = Path(__file__).parents[1] / "data" / "epll.npz"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatchMixture:
+    """Gaussian mixture over small zero-mean windows of sharp linear light.
+
+    Parameters
+    ----------
+    log_weights : ndarray of float32, shape (m,)
+    vectors : ndarray of float32, shape (m, d, d)
+        Eigenvectors in columns.
+    values : ndarray of float32, shape (m, d)
+        Eigenvalues.
+    """
+
+    log_weights: NDArray[np.float32]
+    vectors: NDArray[np.float32]
+    values: NDArray[np.float32]
+
+    @classmethod
+    def load(cls, path: Path = _SHIPPED) -> PatchMixture:
+        """Read weights and packed covariances, as `train_epll` wrote them."""
+        with np.load(path, allow_pickle=False) as stored:
+            weights, packed = stored["weights"].astype(np.float64), stored["covariances"].astype(np.float64)
+        side = (math.isqrt(8 * packed.shape[1] + 1) - 1) // 2
+        covariances = np.zeros((len(weights), side, side))
+        at = np.tril_indices(side)
+        covariances[:, at[0], at[1]] = packed
+        covariances[:, at[1], at[0]] = packed
+        values, vectors = np.linalg.eigh(covariances)
+        return cls(
+            np.log(weights / weights.sum()).astype(np.float32),
+            vectors.astype(np.float32),
+            np.maximum(values, 1e-9).astype(np.float32),
+        )
+
+    def denoised(self, windows: NDArray[np.float32], variance: float) -> NDArray[np.float32]:
+        """Most likely clean windows, `(n, d)`: the likeliest component's Wiener filter."""
+        mean = windows.mean(axis=1, keepdims=True)
+        flat = windows - mean
+        best = np.full(len(flat), -np.inf, dtype=np.float32)
+        which = np.zeros(len(flat), dtype=np.intp)
+        for j in range(len(self.log_weights)):
+            noisy = self.values[j] + np.float32(variance)
+            turned = flat @ (self.vectors[j] / np.sqrt(noisy))
+            score = (
+                self.log_weights[j]
+                - 0.5 * np.log(noisy).sum()
+                - np.float32(0.5) * np.einsum("nd,nd->n", turned, turned)
+            )
+            better = score > best
+            best[better], which[better] = score[better], j
+        out = np.empty_like(flat)
+        for j in np.unique(which):
+            own = which == j
+            gain = self.values[j] / (self.values[j] + np.float32(variance))
+            out[own] = (flat[own] @ (self.vectors[j] * gain)) @ self.vectors[j].T
+        return out + mean
+
+    def cleaned(
+        self, x: NDArray[np.float32], variance: float, turn: int = 0, step: int = 3
+    ) -> NDArray[np.float64]:
+        """Clean the windows of a picture for white noise and average them.
+
+        One window in `step`² is used, on a grid that moves with `turn`.
+        """
+        side = math.isqrt(self.values.shape[1])
+        starts = []
+        for axis in (0, 1):
+            last = x.shape[axis] - side
+            grid = np.arange((turn * (axis + 1)) % step, last, step)
+            starts.append(np.unique(np.concatenate([[0], grid, [last]])))
+        view = np.lib.stride_tricks.sliding_window_view(x, (side, side))
+        windows = view[np.ix_(*starts)].reshape(-1, side * side)
+        clean = self.denoised(windows, variance).reshape(len(starts[0]), len(starts[1]), side, side)
+        total, count = np.zeros(x.shape), np.zeros(x.shape)
+        for i in range(side):
+            for j in range(side):
+                at = np.ix_(starts[0] + i, starts[1] + j)
+                total[at] += clean[:, :, i, j]
+                count[at] += 1.0
+        return total / count
+
+
+@lru_cache(maxsize=1)
+def shipped_mixture() -> PatchMixture:
+    """Return the mixture that was fitted to the development photographs of the benchmark."""
+    return PatchMixture.load()

@@ -1,0 +1,110 @@
+"""Light from beyond the frame: what it makes of the pixels just outside, which nobody measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from lensmodel.core.types import Planes
+from lensmodel.correction.blur import UniformBlur
+from lensmodel.correction.blur.compiled_uniform import CompiledBlur
+from lensmodel.correction.deconvolver import Sensor
+from lensmodel.correction.engine import Engine, compiled
+from lensmodel.correction.methods.richardson_lucy import climbed, first_guess
+from lensmodel.correction.tiles.canvas import Canvas, seam
+
+_DEPTH, _MORE = 4, 8  # reaches of the blur, and pixels, of data that tell of what lies beyond a side
+
+
+def fill_outside(
+    y: Planes,
+    tile: Planes,
+    light: NDArray[np.float32],
+    K: NDArray[np.complex64],
+    blurs: Sequence[UniformBlur],
+    sensors: Sequence[Sensor],
+    canvas: Canvas,
+    steps: int,
+    engine: Engine,
+) -> None:
+    """Predict the margin of a canvas along the sides of the frame, in place.
+
+    A mirror image of the frame is a poor guess: what is wrong with it comes back as ripples
+    inside, the stronger the less noise there is. Richardson-Lucy steps on a strip of the data find the
+    light on both sides of the border, each point divided by what of its light was measured, and that
+    light blurred is what a larger sensor would have seen.
+
+    Parameters
+    ----------
+    y : Planes
+        The canvas, scaled by one over `light`.
+    tile : Planes
+        The data, nothing of it beyond saturation.
+    light : ndarray, shape (channels,)
+        Mean light of each colour.
+    K : ndarray, shape (channels, rows, cols)
+        Transfer functions on the canvas.
+    steps : int
+        Richardson-Lucy steps.
+    """
+    outside = np.ones(canvas.shape, dtype=np.bool_)
+    outside[canvas.data] = False
+    loops = compiled(engine)
+    for c, (plane, blur, sensor) in enumerate(zip(tile, blurs, sensors, strict=True)):
+        wide = blur.reach
+        if wide > 0:
+            latent = _wider(plane, CompiledBlur.of(blur, loops), sensor, steps, engine)
+            np.copyto(
+                y[c], _predicted(latent, light[c], K[c], canvas, canvas.margin - wide, loops), where=outside
+            )
+
+
+def _predicted(
+    latent: NDArray[np.float32],
+    light: np.float32,
+    K: NDArray[np.complex64],
+    canvas: Canvas,
+    margin: int,
+    loops: ModuleType | None,
+) -> NDArray[np.float32]:
+    """What a larger sensor would have seen of the light found, over `light`, on the canvas."""
+    rows, cols = canvas.shape
+    if loops is None:
+        wide = Canvas.wrap(Canvas.wrap(latent, margin, rows).T, margin, cols).T
+        return np.asarray(fft.irfft2(K * fft.rfft2(wide / light), canvas.shape), dtype=np.float32)
+    seen = np.empty((1, rows, cols), dtype=np.float32)
+    joints = seam(latent.shape[0], rows), seam(latent.shape[1], cols)
+    loops.fill(latent[None], np.ones(1, dtype=np.float32) / light, margin, *joints, seen)
+    loops.through(seen[0], np.empty_like(K), K, forward=True, first=0, last=rows, begin=0, end=rows)
+    return np.asarray(seen[0])
+
+
+def _wider(
+    plane: NDArray[np.float32], blur: UniformBlur, sensor: Sensor, steps: int, engine: Engine
+) -> NDArray[np.float32]:
+    """Data, and light wherever it reaches them from beyond a side of the frame: wider by the reach."""
+    wide = blur.reach
+    depth, both = _DEPTH * wide + _MORE, 2 * wide
+    found = np.pad(plane, wide, mode="symmetric" if wide <= min(plane.shape) else "edge")
+    plain = replace(sensor, clip=float("inf"), measured=None)
+
+    def light_of(part: NDArray[np.float32]) -> NDArray[np.float32]:
+        part = np.ascontiguousarray(part)
+        latent, reach = first_guess(part, blur)
+        return climbed(latent, part, reach, blur, plain, steps=steps, engine=engine)
+
+    top, bottom, left, right = sensor.edges
+    if left:
+        found[:, :both] = light_of(plane[:, :depth])[:, :both]
+    if right:
+        found[:, -both:] = light_of(plane[:, -depth:])[:, -both:]
+    if top:
+        found[:both] = light_of(plane[:depth])[:both]
+    if bottom:
+        found[-both:] = light_of(plane[-depth:])[-both:]
+    return found

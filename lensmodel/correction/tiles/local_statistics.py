@@ -1,0 +1,107 @@
+"""Local statistics of a picture on a coarse grid: what is signal, what is noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from lensmodel.core.types import Planes
+from lensmodel.correction.tiles.canvas import Canvas
+
+BLOCK = 4
+_UNSURE = np.float32(0.1)  # share of the noise that a variance over so few pixels cannot tell from signal
+
+
+def coarse(plane: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Means over blocks of 4 pixels; blocks at the far ends hold what is left.
+
+    Light and contrast change slowly, so a sixteenth of the numbers tells as much.
+    """
+    rows, cols = (np.arange(0, extent, BLOCK) for extent in plane.shape)
+    sums = np.add.reduceat(np.add.reduceat(plane, rows, axis=0), cols, axis=1)
+    high, wide = (np.minimum(BLOCK, extent - np.arange(0, extent, BLOCK)) for extent in plane.shape)
+    return np.asarray(sums / (high[:, None] * wide[None, :]), dtype=np.float32)
+
+
+def smoothed(blocks: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Local mean of a coarse plane over some 13 pixels of the fine one."""
+    for axis in (0, 1):
+        sums = np.float32(4.0) * blocks
+        # The same array seen along the other axis: sums are taken in place.
+        lines, into = (blocks, sums) if axis == 0 else (blocks.T, sums.T)
+        into[1:] += lines[:-1]
+        into[:-1] += lines[1:]
+        into[0] += lines[0]
+        into[-1] += lines[-1]
+        blocks = sums
+    blocks *= np.float32(1.0 / 36.0)
+    return blocks
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Blocks:
+    """Means over blocks of a tile whose colours are scaled to equal light.
+
+    Parameters
+    ----------
+    planes : ndarray, shape (channels, rows, cols)
+        Of each colour.
+    luma, square : ndarray, shape (rows, cols)
+        Of the mean of the colours, and of its square.
+    """
+
+    planes: NDArray[np.float32]
+    luma: NDArray[np.float32]
+    square: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, tile: Planes, light: NDArray[np.float32], loops: ModuleType | None) -> Blocks:
+        """Take the means of a tile whose colours have the mean `light`."""
+        if loops is not None:
+            shape = tuple(-(-extent // BLOCK) for extent in tile.shape[1:])
+            planes = np.empty((len(tile), *shape), dtype=np.float32)
+            luma, square = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
+            loops.block_means(tile, np.float32(1.0) / light, planes, luma, square)
+            return cls(planes, luma, square)
+        scaled = tile / light[:, None, None]
+        luma = scaled.mean(axis=0)
+        return cls(np.stack([coarse(plane) for plane in scaled]), coarse(luma), coarse(luma * luma))
+
+
+def signal_variance(blocks: Blocks, noise: NDArray[np.float32] | float) -> NDArray[np.float32]:
+    """Local variance of luma less that of its noise, coarse; never below a tenth of the noise.
+
+    Parameters
+    ----------
+    blocks : Blocks
+        Of the tile.
+    noise : ndarray or float
+        Variance of its noise, coarse.
+    """
+    mean = smoothed(blocks.luma)
+    local = smoothed(blocks.square) - mean * mean
+    return np.asarray(np.maximum(local - noise, 0.0) + _UNSURE * noise + np.float32(1e-12), dtype=np.float32)
+
+
+def spread(blocks: NDArray[np.float32], canvas: Canvas) -> NDArray[np.float32]:
+    """Interpolate a coarse plane linearly onto a canvas, its margin cross-faded like the data's."""
+    height, width = canvas.shape
+    across = _interpolation(canvas.cols, canvas.margin, width) @ np.ascontiguousarray(blocks.T)
+    return np.asarray(
+        _interpolation(canvas.rows, canvas.margin, height) @ np.ascontiguousarray(across.T), dtype=np.float32
+    )
+
+
+@lru_cache(maxsize=64)
+def _interpolation(extent: int, margin: int, length: int) -> sparse.csr_array:
+    """Matrix that takes blocks of `extent` pixels to a canvas of `length`."""
+    starts = np.arange(0, extent, BLOCK)
+    middles = (starts + np.minimum(starts + BLOCK, extent) - 1) / 2.0
+    t = np.arange(extent)
+    fine = np.stack([np.interp(t, middles, row) for row in np.eye(starts.size)], axis=1)
+    return sparse.csr_array(Canvas.wrap(fine.astype(np.float32), margin, length))

@@ -1,0 +1,98 @@
+"""Red and blue between the pixels of a mosaic, led by green, behind a lens that blurs each differently."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from lensmodel.core.types import Planes
+from lensmodel.correction.deconvolver import Sensor
+from lensmodel.correction.methods.wiener import wiener_spectrum
+from lensmodel.correction.tiles.canvas import Canvas
+
+_WINDOW: Final = 2.0
+"""Standard deviation in pixels of the windows in which a colour is a straight line over green: some ten
+of red or blue, few enough for a line and enough against noise (chosen). Gaussian, because a square holds
+more of them or fewer by where it begins, which shows as the mosaic's own pattern beside coloured edges."""
+
+_RIDGE: Final = 0.02
+"""Share of the squared mean light of a window that is added to the variance of green in it: where green
+is flat, the slope is that of a constant hue (chosen)."""
+
+BETWEEN: Final = np.array([[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]], dtype=np.float32) / 16.0
+"""Bilinear interpolation over every second pixel, when it is divided by the same of the mask."""
+
+
+def refilled(
+    y: Planes,
+    K: NDArray[np.complex64],
+    noise: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    sensors: Sequence[Sensor],
+    canvas: Canvas,
+) -> None:
+    """Fill in red and blue where no pixel measured them, in place, as the lens would show them.
+
+    Demosaicing copies fine detail from green into red and blue. Behind a lens that is sharp in green and
+    soft in blue, as most are, that detail is sharper than blue light can be, and undoing blue's blur on
+    it makes coloured edges of it. So the detail is blurred first as the colour itself is: with x_g Wiener's
+    estimate of green, each colour is predicted from p = K_c x_g by residual interpolation [1]_, a line
+    y = a p + b in each window, and what is left at measured pixels is interpolated. No frequency of p is
+    stronger than in green itself: a blue that is thought to be sharper would get the mosaic's own pattern::
+
+        y_c = a p + b + interpolated( y_c - a p - b )
+
+    Parameters
+    ----------
+    y : Planes, shape (3, rows, cols)
+        The canvas, scaled to equal light.
+    K : ndarray, shape (3, rows, cols / 2 + 1)
+        Transfer functions.
+    noise, variance : ndarray, shape (3,)
+        Variances of noise and data.
+    sensors : sequence of Sensor
+        Which pixels each colour measured.
+    canvas : Canvas
+
+    References
+    ----------
+    .. [1] D. Kiku, Y. Monno, M. Tanaka, M. Okutomi, "Residual interpolation for color image demosaicking",
+       ICIP 2013, section 3.
+    """
+    shape = (y.shape[1], y.shape[2])
+    green = np.asarray(fft.rfft2(y[1]), dtype=np.complex64)
+    sharp = wiener_spectrum(y[1], K[1], float(noise[1]), float(variance[1]))
+    light = np.maximum(np.abs(green), np.float32(1e-12))
+    for c in (0, 2):
+        measured = sensors[c].measured
+        if measured is None:
+            continue
+        known = np.zeros(shape, dtype=np.float32)
+        known[canvas.data] = measured
+        led = K[c] * sharp
+        led /= np.maximum(np.abs(led) / light, np.float32(1.0))
+        p = np.asarray(fft.irfft2(led, shape), dtype=np.float32)
+        predicted = _lines(y[c], p, known)
+        left = known * (y[c] - predicted)
+        share = ndimage.convolve(known, BETWEEN, mode="wrap")
+        predicted += ndimage.convolve(left, BETWEEN, mode="wrap") / np.maximum(share, np.float32(1e-3))
+        np.copyto(y[c][canvas.data], predicted[canvas.data], where=~measured)
+
+
+def _lines(y: NDArray[np.float32], p: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A p + b of each window's least squares over known pixels, its slope pulled to that of one hue."""
+
+    def mean(plane: NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.asarray(ndimage.gaussian_filter(plane, _WINDOW, mode="wrap") / share, dtype=np.float32)
+
+    share = np.maximum(ndimage.gaussian_filter(known, _WINDOW, mode="wrap"), np.float32(1e-3))
+    mean_p, mean_y = mean(known * p), mean(known * y)
+    covariance = mean(known * p * y) - mean_p * mean_y
+    ridge = np.float32(_RIDGE) * mean_p * mean_p + np.float32(1e-9)
+    hue = np.clip(mean_y / np.maximum(mean_p, np.float32(1e-6)), 0.0, 8.0)
+    slope = (covariance + ridge * hue) / (mean(known * p * p) - mean_p * mean_p + ridge)
+    return np.asarray(mean_y + slope * (p - mean_p), dtype=np.float32)

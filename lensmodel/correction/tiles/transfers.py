@@ -1,0 +1,75 @@
+"""Transfer functions of a tile's kernels, and of how they change within it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.correction.blur import UniformBlur
+
+Transfers = tuple[NDArray[np.complex64], NDArray[np.complex64]]
+
+
+def transfers(
+    blurs: Sequence[UniformBlur],
+    shape: tuple[int, int],
+    reach: float,
+    loops: ModuleType | None,
+    *,
+    drifting: bool = True,
+) -> Transfers:
+    """Return K, `(channel, rows, cols)`, and its change per pixel, `(channel, 2, rows, cols)`.
+
+    The latter is empty where a kernel has none or `drifting` is false. Each step of a solver inverts K
+    alone and takes the change to the other side, as data. That converges only where the change is
+    smaller than K, so it is limited to half of K at `reach` pixels from the middle.
+    """
+    if loops is None or any(blur.offset != (0.0, 0.0) for blur in blurs):
+        steady = np.zeros((0, 2, 0, 0), dtype=np.complex64)
+        spectra = np.stack([blur.spectrum(shape) for blur in blurs])
+        return spectra, _rates(blurs, shape, reach) if drifting else steady
+    taps = _taps(blurs, drifting=drifting)
+    half = shape[1] // 2 + 1
+    K = np.empty((len(taps), shape[0], half), dtype=np.complex64)
+    rates = np.empty((len(taps) if taps.shape[1] > 1 else 0, 2, shape[0], half), dtype=np.complex64)
+    loops.spectra_of(taps, np.float32(reach), shape[1], K, rates)
+    return K, rates
+
+
+def _taps(blurs: Sequence[UniformBlur], *, drifting: bool) -> NDArray[np.float32]:
+    """Kernels and their changes per pixel down and across, `(channel, 1 or 3, k, k)`, centred alike."""
+    ways = [(blur.drift.down, blur.drift.across) for blur in blurs if blur.drift is not None]
+    drifting = drifting and len(ways) == len(blurs)
+    used = [blur.kernel for blur in blurs]
+    if drifting:
+        used += [end.kernel for pair in ways for way in pair for end in way[:2]]
+    side = max(kernel.shape[0] for kernel in used)
+    taps = np.zeros((len(blurs), 3 if drifting else 1, side, side), dtype=np.float32)
+
+    def place(channel: int, index: int, kernel: NDArray[np.float64], factor: float) -> None:
+        low = (side - kernel.shape[0]) // 2
+        taps[channel, index, low : side - low, low : side - low] += factor * kernel
+
+    for c, blur in enumerate(blurs):
+        place(c, 0, blur.kernel, 1.0)
+    if drifting:
+        for c, pair in enumerate(ways):
+            for index, (before, after, pixels) in enumerate(pair, start=1):
+                place(c, index, before.kernel, -1.0 / max(pixels, 1.0))
+                place(c, index, after.kernel, 1.0 / max(pixels, 1.0))
+    return taps
+
+
+def _rates(blurs: Sequence[UniformBlur], shape: tuple[int, int], reach: float) -> NDArray[np.complex64]:
+    found = []
+    for blur in blurs:
+        if blur.drift is None:
+            return np.zeros((0, 2, 0, 0), dtype=np.complex64)
+        rates = blur.drift.spectra(shape)
+        change = np.float32(reach) * np.abs(rates).sum(axis=0)
+        allowed = np.float32(0.5) * np.abs(blur.spectrum(shape))
+        found.append(rates * np.minimum(allowed / np.maximum(change, np.float32(1e-9)), np.float32(1.0)))
+    return np.stack(found).astype(np.complex64)

@@ -1,0 +1,272 @@
+"""Correct a whole photo: cells of one PSF each, faded into each other."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+
+import numpy as np
+
+from lensmodel.core.belief import Belief, UncertainField
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.geometry import Frame, zone_of
+from lensmodel.core.psf import PsfField
+from lensmodel.core.types import (
+    CHANNELS,
+    BayerPattern,
+    Channel,
+    FieldPosition,
+    NoiseModel,
+    Planes,
+    StepHook,
+    Zone,
+    ignore_step,
+)
+from lensmodel.correction.audit import AuditReport, pooled
+from lensmodel.correction.blur import crop_to_support
+from lensmodel.correction.cell import CorrectionJob, LateralShift, RestoredCell, restore_cell
+from lensmodel.correction.deconvolver import CoarseMethod, Deconvolver
+from lensmodel.correction.engine import compiled, keep_freed_memory
+from lensmodel.correction.expected_gain import ZoneReport, zone_reports
+from lensmodel.correction.limits.bounds import Bounds
+from lensmodel.correction.limits.chroma import StoredColour
+from lensmodel.correction.methods.catalogue import deconvolvers
+from lensmodel.correction.tiles.lattice import Cell, Roi, cells, usual_pitch
+
+PsfError = Callable[[FieldPosition, Channel], float] | float
+"""Relative L2 error that the PSF is expected to have, everywhere or by place and channel."""
+
+
+KERNEL_SIZE = 55
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corrected:
+    """A corrected photo.
+
+    Parameters
+    ----------
+    planes : Planes
+        The photo, or the part of it that was asked for.
+    zones : Mapping[Zone, ZoneReport]
+        What the correction is expected to have gained in each zone of the field.
+    audit : AuditReport
+        What was held back of it, why, and where most.
+    chroma_step : tuple of int
+        Rows and columns of pixels that share one value of chroma in the photo's file; where that is more than
+        one pixel, chroma was corrected no more finely.
+    """
+
+    planes: Planes
+    zones: dict[Zone, ZoneReport]
+    audit: AuditReport = field(default_factory=lambda: pooled(()))
+    chroma_step: tuple[int, int] = (1, 1)
+
+    @property
+    def nothing_to_correct(self) -> bool:
+        """Whether every pixel stayed as it was."""
+        return all(zone.left == zone.cells for zone in self.zones.values())
+
+    @property
+    def expected_gain_db(self) -> float:
+        """Gain expected over the whole picture, decibels: the mean of its zones, each by its cells.
+
+        A zone whose PSFs are too unsure to tell counts as 0.
+        """
+        cells = sum(zone.cells for zone in self.zones.values())
+        gained = sum(zone.cells * (zone.expected_gain_db or 0.0) for zone in self.zones.values())
+        return gained / cells if cells else 0.0
+
+
+def correct_planes(
+    planes: Planes,
+    field: PsfField | UncertainField,
+    frame: Frame,
+    *,
+    noise: Sequence[NoiseModel],
+    clip: Sequence[float] = (1.0, 1.0, 1.0),
+    method: str | Deconvolver = "standard",
+    strength: float = 1.0,
+    psf_error: PsfError | None = None,
+    lateral: LateralShift | None = None,
+    cfa: BayerPattern | None = None,
+    bounds: Bounds | None = None,
+    audited: bool = True,
+    stored: StoredColour | None = None,
+    roi: Roi | tuple[int, int, int, int] | None = None,
+    workers: int = 1,
+    pitch: int | None = None,
+    out: Planes | None = None,
+    on_step: StepHook = ignore_step,
+) -> Corrected:
+    """Remove the lens blur of a photo.
+
+    The frame is cut into cells that are fixed in the field. Each is restored with the PSF of its
+    centre and a halo of the PSF's own reach, and faded into its neighbours. Cells are added in a
+    fixed order, so the result does not depend on the number of workers to the last bit.
+
+    Parameters
+    ----------
+    planes : Planes, shape (3, height, width)
+        Linear light, saturation 1; may be memory-mapped.
+    field : PsfField or UncertainField
+        The lens.
+    frame : Frame
+        Size of the photo.
+    noise : sequence of NoiseModel
+        One per channel.
+    clip : sequence of float
+        Level per channel from which on a value is only a lower bound.
+    method : str or Deconvolver
+        A name in `deconvolvers`, or a method of your own.
+    strength : float
+        0 leaves the photo as it is, 1 applies what the noise allows.
+    psf_error : float, callable or None
+        Expected relative L2 error of the PSF: the more, the more of a point is mixed into it, and the less
+        is allowed beside edges. None takes what an `UncertainField` says, and 0 for any other.
+    lateral : LateralShift or None
+        Lateral colour to remove in the same step: it becomes part of the red and blue PSFs, so
+        nothing is interpolated. Leave it out where the planes were resampled before.
+    cfa : BayerPattern or None
+        The mosaic on which the planes were measured; what demosaicing filled in is then no datum, and
+        "standard" and "fast" demosaic and deblur in one. `noise` is that of the sensor then.
+    bounds : Bounds or None
+        What to allow beside edges and in flat areas; None lets `psf_error` decide.
+    audited : bool
+        Whether to hold back what fails `lensmodel.correction.audit`; without it a method's own
+        errors can be seen.
+    stored : StoredColour or None
+        How the photo's file stored chroma, if at less than full resolution.
+    roi : tuple of int or None
+        `(top, left, height, width)`: return only this part, with the same pixels as the whole.
+    workers : int
+        Threads.
+    pitch : int or None
+        Side of a cell in pixels; None chooses.
+    out : Planes or None
+        Where to write, for instance memory-mapped; zeroed first. None allocates.
+    on_step : StepHook
+        Called after each cell; may raise to stop.
+
+    Returns
+    -------
+    Corrected
+
+    Raises
+    ------
+    InvalidInputError
+        If shapes, strength, window or worker count make no sense.
+    UnknownMethodError
+        If `method` is in no registry.
+    """
+    if workers < 1:
+        raise InvalidInputError(f"workers must be at least 1, got {workers}")
+    solver = deconvolvers.create(method) if isinstance(method, str) else method
+    job = CorrectionJob(
+        planes,
+        _beliefs_of(field, psf_error),
+        lateral,
+        frame,
+        solver,
+        strength,
+        tuple(noise),
+        tuple(clip),
+        cfa,
+        bounds or Bounds(),
+        # Kernels do not change within cells that are larger than usual.
+        solver.cell_factor if isinstance(solver, CoarseMethod) and cfa is None else 1,
+        audited,
+        stored,
+    )
+    window = Roi.of(frame, roi)
+    keep_freed_memory()
+    out = _zeroed(out, (len(CHANNELS), window.height, window.width))
+    if pitch is None:
+        pitch = usual_pitch(frame, job.cell_factor)
+    wanted = [cell for cell in cells(frame, pitch) if cell.meets(window)]
+    forecasts, audits, left = [], [], Counter[Zone]()
+    for done, (cell, restored) in enumerate(_restored(job, wanted, workers), start=1):
+        _add(out, window, cell, restored.planes)
+        forecasts.append(restored.forecast)
+        left[restored.forecast.zone] += restored.left
+        if restored.audit is not None:
+            audits.append((zone_of(cell.position.r), (cell.top, cell.left), restored.audit))
+        on_step(done, len(wanted))
+    report = pooled(audits, pitch)
+    step = (1, 1) if stored is None else stored.step
+    return Corrected(out, zone_reports(forecasts, left, report), report, step)
+
+
+def _zeroed(out: Planes | None, shape: tuple[int, int, int]) -> Planes:
+    """What the caller gave to write to, or something new."""
+    if out is None:
+        return np.zeros(shape, dtype=np.float32)
+    if out.shape != shape or out.dtype != np.float32:
+        raise InvalidInputError(f"out must be float32 {shape}, got {out.dtype} {out.shape}")
+    out[:] = 0.0
+    return out
+
+
+def _beliefs_of(
+    field: PsfField | UncertainField, psf_error: PsfError | None
+) -> Callable[[FieldPosition, Channel], Belief]:
+    """What is thought of the PSF of one channel at one place.
+
+    Each serves its own cell and as a neighbour; three rows of cells of 100 megapixels fit.
+    """
+
+    @lru_cache(maxsize=640)
+    def belief(position: FieldPosition, channel: Channel) -> Belief:
+        if psf_error is None and isinstance(field, UncertainField):
+            known = field.belief_at(position, channel, KERNEL_SIZE)
+            return replace(known, kernel=crop_to_support(known.kernel))
+        error = psf_error(position, channel) if callable(psf_error) else psf_error or 0.0
+        return Belief.of_error(crop_to_support(field.kernel_at(position, channel, KERNEL_SIZE)), float(error))
+
+    return belief
+
+
+def _restored(
+    job: CorrectionJob, wanted: Sequence[Cell], workers: int
+) -> Iterator[tuple[Cell, RestoredCell]]:
+    """Restore cells in order, a few ahead of the one that is being added."""
+    if workers == 1:
+        for cell in wanted:
+            yield cell, restore_cell(job, cell)
+        return
+    with ThreadPoolExecutor(workers) as pool:
+        ahead: deque[tuple[Cell, Future[RestoredCell]]] = deque()
+        queue = iter(wanted)
+        try:
+            for cell in queue:
+                ahead.append((cell, pool.submit(restore_cell, job, cell)))
+                if len(ahead) > 2 * workers:
+                    first, future = ahead.popleft()
+                    yield first, future.result()
+            while ahead:
+                first, future = ahead.popleft()
+                yield first, future.result()
+        finally:
+            for _, future in ahead:
+                future.cancel()
+
+
+def _add(out: Planes, window: Roi, cell: Cell, restored: Planes) -> None:
+    """Add a cell with its weights to the part of it that was asked for."""
+    top, left = max(cell.top, window.top), max(cell.left, window.left)
+    bottom = min(cell.bottom, window.top + window.height)
+    right = min(cell.right, window.left + window.width)
+    rows, cols = slice(top - cell.top, bottom - cell.top), slice(left - cell.left, right - cell.left)
+    target = (
+        slice(None),
+        slice(top - window.top, bottom - window.top),
+        slice(left - window.left, right - window.left),
+    )
+    loops = compiled("auto")
+    if loops is None:
+        out[target] += np.outer(cell.rise[rows], cell.run[cols]) * restored[:, rows, cols]
+    else:
+        loops.add(np.asarray(out[target]), cell.rise[rows], cell.run[cols], restored[:, rows, cols])

@@ -1,0 +1,216 @@
+"""What every blind estimator takes and gives, and what it refuses."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.core.evidence import PatchEvidence
+from lensmodel.core.psf import second_moments
+from lensmodel.core.spectrum import repeats
+from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
+
+NO_BLUR_PX2 = 0.3
+"""Below this mean second moment a kernel cannot be told from the pixel and the scene's own softness."""
+
+_MIN_SIDE = 64
+_CONTRAST_IN_NOISE = 3.0
+_CLIPPED_SHARE = 0.02
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PsfEstimate:
+    """One estimated PSF and what speaks for it.
+
+    Parameters
+    ----------
+    kernel : Kernel, shape (size, size)
+    confidence : float
+        0..1; ranks estimates by their true error.
+    reliability : ndarray, shape (rings,)
+        Share of signal in the power of each ring of frequency, 0..1, low frequencies first.
+    predicted_error : float
+        Expected relative L2 distance to the true kernel.
+    diagnostics : mapping of str to float
+        What the estimator reports of itself.
+    seconds : float
+        CPU time.
+    evidence : tuple of PatchEvidence or None
+        One for each patch, None for one that took no part; empty where the method keeps none.
+    no_blur : bool
+        The kernel is too narrow to be told from none.
+    """
+
+    kernel: Kernel
+    confidence: float
+    reliability: NDArray[np.float64]
+    predicted_error: float
+    diagnostics: Mapping[str, float]
+    seconds: float
+    evidence: tuple[PatchEvidence | None, ...] = ()
+    no_blur: bool = False
+
+
+class PsfEstimator(Protocol):
+    """A blind estimator: patches of one field position in, one kernel out."""
+
+    name: str
+    version: int
+
+    def estimate(
+        self,
+        patches: Sequence[Plane],
+        noise: Sequence[NoiseModel],
+        *,
+        size: int = 31,
+        rng: np.random.Generator | None = None,
+        on_step: StepHook = ignore_step,
+    ) -> PsfEstimate:
+        """Estimate the kernel that all patches share.
+
+        Parameters
+        ----------
+        patches : sequence of Plane
+            Windows of 64 to 512 px of one colour plane, linear light.
+        noise : sequence of NoiseModel
+            One for each patch.
+        size : int
+            Odd side of the kernel, up to 55.
+        rng : numpy.random.Generator, optional
+            Source of chance where the method uses any.
+        on_step : StepHook
+            Progress; raising `CancelledError` there stops the work.
+
+        Raises
+        ------
+        NotEnoughEvidenceError
+            If no patch determines a kernel: flat, clipped, or noise only.
+        InvalidInputError
+            For values that no photo has.
+        """
+
+    def estimate_channel(
+        self,
+        patches: Sequence[Plane],
+        noise: Sequence[NoiseModel],
+        reference: PsfEstimate,
+        reference_patches: Sequence[Plane],
+        *,
+        size: int = 31,
+        rng: np.random.Generator | None = None,
+        on_step: StepHook = ignore_step,
+    ) -> PsfEstimate:
+        """Estimate another channel of the same patches, starting from the result of the first."""
+
+
+class StartingFrom(ABC):
+    """Both calls of `PsfEstimator` by one run, that for another channel starts from the reference kernel."""
+
+    __slots__ = ()
+
+    def estimate(
+        self,
+        patches: Sequence[Plane],
+        noise: Sequence[NoiseModel],
+        *,
+        size: int = 31,
+        rng: np.random.Generator | None = None,
+        on_step: StepHook = ignore_step,
+    ) -> PsfEstimate:
+        """Estimate the kernel that all patches share; see `PsfEstimator`."""
+        return self._run(patches, noise, size, None, on_step)
+
+    def estimate_channel(
+        self,
+        patches: Sequence[Plane],
+        noise: Sequence[NoiseModel],
+        reference: PsfEstimate,
+        reference_patches: Sequence[Plane],
+        *,
+        size: int = 31,
+        rng: np.random.Generator | None = None,
+        on_step: StepHook = ignore_step,
+    ) -> PsfEstimate:
+        """Estimate another channel: the finest level alone, from the reference kernel on."""
+        return self._run(patches, noise, size, reference.kernel, on_step)
+
+    @abstractmethod
+    def _run(
+        self,
+        patches: Sequence[Plane],
+        noise: Sequence[NoiseModel],
+        size: int,
+        start: Kernel | None,
+        on_step: StepHook,
+    ) -> PsfEstimate:
+        """Estimate from scratch, or on the finest level alone from a kernel to start with."""
+
+
+def usable(
+    patches: Sequence[Plane], noise: Sequence[NoiseModel], size: int
+) -> list[tuple[Plane, NoiseModel]]:
+    """Check patches at the door and keep those that carry signal.
+
+    Raises
+    ------
+    InvalidInputError
+        For an even size, a shape or values that no patch has.
+    NotEnoughEvidenceError
+        If none is left; the text says why.
+    """
+    if size % 2 == 0 or not 3 <= size <= 55:
+        raise InvalidInputError(f"kernel size must be odd and in 3..55, got {size}")
+    if len(patches) != len(noise) or not patches:
+        raise InvalidInputError(f"every patch needs a noise model, got {len(patches)} and {len(noise)}")
+    kept, reasons = [], []
+    for patch, model in zip(patches, noise, strict=True):
+        if patch.ndim != 2 or min(patch.shape) < _MIN_SIDE:
+            raise InvalidInputError(f"a patch must be a plane of at least {_MIN_SIDE} px, got {patch.shape}")
+        if not np.isfinite(patch).all():
+            raise InvalidInputError("a patch must be finite; mask or replace NaN and infinity first")
+        reason = _unfit(patch, model)
+        if reason is None:
+            kept.append((patch, model))
+        else:
+            reasons.append(reason)
+    if not kept:
+        raise NotEnoughEvidenceError(
+            f"no patch determines a kernel ({', '.join(sorted(set(reasons)))}); choose parts with fine detail"
+        )
+    return kept
+
+
+def placed(
+    evidence: Sequence[PatchEvidence | None],
+    kept: Sequence[tuple[Plane, NoiseModel]],
+    patches: Sequence[Plane],
+) -> tuple[PatchEvidence | None, ...]:
+    """Evidence of the patches that `usable` kept, at their places among all."""
+    own = {id(patch): one for (patch, _), one in zip(kept, evidence, strict=True)}
+    return tuple(own.get(id(patch)) for patch in patches)
+
+
+def _unfit(patch: Plane, model: NoiseModel) -> str | None:
+    sigma = model.sigma_at(float(patch.mean()))
+    if float(patch.std()) <= _CONTRAST_IN_NOISE * sigma or float(np.ptp(patch)) < 1e-6:
+        return "flat"
+    if float((patch >= 0.995).mean()) > _CLIPPED_SHARE:
+        return "clipped"
+    # White noise has as much power between neighbours as anywhere; a picture has far less.
+    steps = 0.5 * float(np.var(np.diff(patch, axis=0)) + np.var(np.diff(patch, axis=1)))
+    if steps > 1.4 * float(patch.var()):
+        return "noise"
+    if repeats(patch):
+        return "periodic"
+    return None
+
+
+def is_no_blur(kernel: Kernel) -> bool:
+    """Whether a kernel is too narrow to be told from none."""
+    return float(np.trace(second_moments(kernel))) / 2.0 < NO_BLUR_PX2

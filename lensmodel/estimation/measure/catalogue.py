@@ -1,0 +1,16 @@
+"""The ways of measuring, by name."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from lensmodel.core.registry import Registry
+from lensmodel.estimation.measure.edges import Edges
+from lensmodel.estimation.measure.measurer import Measurer
+from lensmodel.estimation.measure.pair import Pair
+from lensmodel.estimation.measure.points import Points
+from lensmodel.estimation.measure.target import Target
+
+methods: Final[Registry[Measurer]] = Registry(
+    "way of measuring", {"target": Target, "pair": Pair, "points": Points, "edges": Edges}
+)

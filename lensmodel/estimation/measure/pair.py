@@ -1,0 +1,296 @@
+"""PSFs from an aperture pair: the same scene from a tripod, wide open and well closed.
+
+The closed photo z is nearly sharp, and its own blur h is nearly known: diffraction and pixels. With the
+scene x,  z = h * x + n  and  y = k * x + n', so that x = z deconvolved by h is the sharp picture that the
+open photo y blurs, once it is laid under y to a part of a pixel. It keeps noise of its own, whose
+autocovariance is taken off where kernels are solved for.
+
+Closed lenses are not perfect. What they blur besides diffraction is missing in k, and `FLOOR` says how
+much that is as a rule.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.core.types import CHANNELS, Channel, StepHook, ignore_step
+from lensmodel.estimation.measure.measurer import MeasuredPsf, require_photos
+from lensmodel.estimation.measure.quiet import with_bounded_noise
+from lensmodel.estimation.measure.warp import Warp, match, matched
+from lensmodel.estimation.measure.windows import grid, measured_pixels, quadratic, window_psf
+from lensmodel.optics.diffraction import diffraction_otf
+from lensmodel.photo import LinearPhoto
+
+FLOOR: Final = 0.05
+"""Error that no window shows of itself; chosen: a lens at f/8 is that far from
+diffraction at pixels of 4.5 um."""
+
+USUAL_F_NUMBER: Final = 8.0
+"""Aperture of the closed photo where it does not say: the sharpest of most lenses."""
+
+_USUAL_PITCH_UM: Final = 4.5
+_CLEAR: Final = 8.0  # see `target`
+_SIDE: Final = 160
+_SPARE: Final = 24  # pixels around a window: deconvolution and interpolation spoil the rim
+_DAMPING: Final = 0.004  # of the squared transfer function: noise is not raised more than eightfold
+_STOPS_APART: Final = 2.0
+_SURE: Final = 0.3
+_COARSE: Final = 4
+_NOISE_GRID: Final = 128
+_SMOOTH_PX: Final = 6.0
+_FEWEST: Final = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """Non-blind PSFs of the first photo; the second is the same scene, closed by two stops or more.
+
+    Parameters
+    ----------
+    across, down : int
+        Cells of the frame, in each of which the window with most detail is taken.
+    side : int
+        Side of a window in pixels.
+    """
+
+    across: int = 8
+    down: int = 6
+    side: int = _SIDE
+
+    name: ClassVar[str] = "pair"
+    version: ClassVar[int] = 1
+    photos: ClassVar[int] = 2
+
+    def measure(
+        self,
+        photos: Sequence[LinearPhoto],
+        *,
+        size: int,
+        channels: Sequence[Channel] = CHANNELS,
+        on_step: StepHook = ignore_step,
+    ) -> list[MeasuredPsf]:
+        """Measure the PSF of the first photo; see `Measurer`."""
+        require_photos(self, photos)
+        _require_pair(*photos)
+        opened, closed = with_bounded_noise(list(photos))
+        warp = self.register(opened, closed)
+        corners = _detailed(opened, closed, self.side, self.across, self.down, size // 2 + _SPARE)
+        found = []
+        for done, corner in enumerate(corners, start=1):
+            for channel in channels:
+                one = self._window(opened, closed, warp, corner, size, channel)
+                if one is not None:
+                    found.append(one)
+            on_step(done, len(corners))
+        if not found:
+            raise NotEnoughEvidenceError(
+                "no part of the pair determines a PSF; photograph a scene with fine detail everywhere, flat "
+                "and in focus"
+            )
+        return found
+
+    def register(self, opened: LinearPhoto, closed: LinearPhoto) -> Warp:
+        """Lay the closed photo under the open one.
+
+        Raises
+        ------
+        NotEnoughEvidenceError
+            If they do not show the same scene.
+        """
+        one, other = (np.asarray(photo.planes[1]) for photo in (opened, closed))
+        coarse = match(_shrunk(one), _shrunk(other))
+        if coarse.clarity < _CLEAR:
+            raise NotEnoughEvidenceError(
+                "the two photos do not show the same scene; take them from a tripod, one after the other"
+            )
+        start = np.eye(3)
+        start[:2, 2] = -_COARSE * np.array(coarse.shift)
+        warp = Warp.plain(start, opened.frame)
+
+        def shown(bent: Warp, corner: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.floating]:
+            places = bent(
+                *np.meshgrid(
+                    *(at + np.arange(float(n)) for at, n in zip(corner, shape, strict=True)), indexing="ij"
+                )
+            )
+            return np.asarray(ndimage.map_coordinates(other, places, order=3, mode="mirror"))
+
+        half = self.side // 2
+        corners = grid(one.shape, self.side, one.shape[1] // half, one.shape[0] // half, 8)
+        for degree in (1, 1, 3):
+            warp, _ = matched(warp, shown, one, corners, self.side, least_clarity=_CLEAR, degree=degree)
+        return warp
+
+    def _window(
+        self,
+        opened: LinearPhoto,
+        closed: LinearPhoto,
+        warp: Warp,
+        corner: tuple[int, int],
+        size: int,
+        channel: Channel,
+    ) -> MeasuredPsf | None:
+        """PSF of one window, or None where it tells nothing."""
+        around = size // 2
+        scene = _Scene(closed, warp, corner, self.side, around, channel)
+        try:
+            light = _falloff(opened, scene, corner, self.side, around, channel)
+        except NotEnoughEvidenceError:
+            return None
+
+        def latent(shift: tuple[float, float], margin: int) -> NDArray[np.floating]:
+            cut = around - margin
+            whole = scene.moved(shift) * light
+            return whole[cut : whole.shape[0] - cut, cut : whole.shape[1] - cut]
+
+        try:
+            kernel, solved, _ = window_psf(
+                opened,
+                channel,
+                corner,
+                (self.side, self.side),
+                latent,
+                size,
+                latent_noise=scene.noise(size),
+            )
+        except NotEnoughEvidenceError:
+            return None
+        error = float(np.hypot(solved.error, FLOOR))
+        pixel = corner[0] + (self.side - 1) / 2.0, corner[1] + (self.side - 1) / 2.0
+        if error >= _SURE:
+            return None
+        return MeasuredPsf(kernel, opened.frame.position(*pixel), channel, error, pixel, self.side)
+
+
+def _require_pair(opened: LinearPhoto, closed: LinearPhoto) -> None:
+    if opened.frame != closed.frame:
+        raise InvalidInputError(
+            f"the photos of a pair must have one size, got {opened.frame.width} x {opened.frame.height} and "
+            f"{closed.frame.width} x {closed.frame.height}"
+        )
+    n, m = opened.info.metadata.aperture, closed.info.metadata.aperture
+    if n is not None and m is not None and 2.0 * np.log2(m / n) < _STOPS_APART:
+        raise InvalidInputError(
+            f"the second photo is at f/{m:g} and the first at f/{n:g}; close the lens by two stops or more "
+            "for the second, best to f/8"
+        )
+
+
+class _Scene:
+    """The sharp picture around one window, on the pixels of the open photo.
+
+    The cosine transform filters as if the picture were mirrored at its rim, which suits a transfer
+    function that is real and even.
+    """
+
+    def __init__(
+        self,
+        closed: LinearPhoto,
+        warp: Warp,
+        corner: tuple[int, int],
+        side: int,
+        around: int,
+        channel: Channel,
+    ) -> None:
+        self._warp = warp
+        self._rows = corner[0] - around + np.arange(side + 2 * around)
+        self._cols = corner[1] - around + np.arange(side + 2 * around)
+        known = closed.info.metadata
+        self._f_number = known.aperture or USUAL_F_NUMBER
+        self._pitch_um, self._channel = known.pixel_pitch_um or _USUAL_PITCH_UM, channel
+        index = CHANNELS.index(channel)
+        rows, cols = self._places((0.0, 0.0))
+        top, left = (max(int(at.min()) - _SPARE, 0) for at in (rows, cols))
+        bottom, right = int(rows.max()) + _SPARE + 1, int(cols.max()) + _SPARE + 1
+        region = np.asarray(closed.planes[index, top:bottom, left:right], dtype=np.float64)
+        self._corner = top, left
+        height, width = region.shape
+        filtered = fft.dctn(region, norm="ortho") * self._inverse(
+            np.arange(height)[:, None] / (2.0 * height), np.arange(width)[None, :] / (2.0 * width)
+        )
+        sharp = fft.idctn(filtered, norm="ortho")
+        self._spline = ndimage.spline_filter(sharp, order=5, mode="mirror")
+        self._variance = float(closed.noise[index].variance(np.array([region.mean()]))[0])
+
+    def moved(self, shift: tuple[float, float]) -> NDArray[np.float64]:
+        """Return the picture moved down and right by `shift` pixels."""
+        rows, cols = self._places(shift)
+        places = np.stack([rows - self._corner[0], cols - self._corner[1]])
+        seen = ndimage.map_coordinates(self._spline, places, order=5, prefilter=False, mode="mirror")
+        return np.asarray(seen, dtype=np.float64)
+
+    def noise(self, size: int) -> NDArray[np.float64]:
+        """Autocovariance of what noise the deconvolution leaves in it, shape (2 size - 1, 2 size - 1)."""
+        f = fft.fftfreq(_NOISE_GRID)
+        power = np.square(self._inverse(f[:, None], f[None, :]))
+        whole = fft.ifft2(power).real * self._variance
+        index = np.arange(-(size - 1), size)
+        return np.asarray(whole[np.ix_(index, index)])
+
+    def _places(self, shift: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return self._warp(*np.meshgrid(self._rows - shift[0], self._cols - shift[1], indexing="ij"))
+
+    def _inverse(self, rows: NDArray[np.float64], cols: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Wiener's inverse of the closed lens's blur."""
+        h = diffraction_otf(rows, cols, self._f_number, self._pitch_um, self._channel)
+        return np.asarray((1.0 + _DAMPING) * h / (h * h + _DAMPING))
+
+
+def _falloff(
+    opened: LinearPhoto, scene: _Scene, corner: tuple[int, int], side: int, around: int, channel: Channel
+) -> NDArray[np.float64]:
+    """How much darker or brighter the open photo is than the closed one: a quadratic in row and column."""
+    row, col = corner
+    t = (np.arange(-around, side + around) - (side - 1) / 2.0) / side
+    basis = quadratic(t[:, None], t[None, :])
+    # smoothed, the two differ by the light alone, however one of them is blurred
+    smooth = ndimage.gaussian_filter(scene.moved((0.0, 0.0)), _SMOOTH_PX)
+    inner = slice(around, around + side)
+    good = measured_pixels(opened, channel, row, col, (side, side))
+    plane = opened.planes[CHANNELS.index(channel), row : row + side, col : col + side]
+    if good.sum() < _FEWEST:
+        raise NotEnoughEvidenceError("nearly all pixels of a window are clipped; expose less")
+    columns = (basis[inner, inner] * smooth[inner, inner, None])[good]
+    terms, *_ = np.linalg.lstsq(columns, np.asarray(plane[good], dtype=np.float64), rcond=None)
+    light = basis @ terms
+    level = float(light[inner, inner].mean())
+    if not level > 0.0:
+        raise NotEnoughEvidenceError("a window of the open photo is black")
+    return np.asarray(np.maximum(light / level, 0.1))
+
+
+def _detailed(
+    opened: LinearPhoto, closed: LinearPhoto, side: int, across: int, down: int, margin: int
+) -> list[tuple[int, int]]:
+    """Corners of the windows with most fine detail, one in each cell of the frame."""
+    step = side // 4
+    plane = np.asarray(closed.planes[1])
+    fine = np.square(plane - ndimage.gaussian_filter(plane, 1.5))
+    clipped = (plane >= closed.clip[1]) | (np.asarray(opened.planes[1]) >= opened.clip[1])
+    fine[ndimage.maximum_filter(clipped, 5)] = 0.0
+    energy = ndimage.uniform_filter(np.minimum(fine, 20.0 * float(fine.mean())), side, mode="constant")
+    height, width = plane.shape
+    found = []
+    for i in range(down):
+        for j in range(across):
+            rows = np.arange(max(i * height // down - side // 4, margin), (i + 1) * height // down, step)
+            cols = np.arange(max(j * width // across - side // 4, margin), (j + 1) * width // across, step)
+            rows, cols = rows[rows + side + margin <= height], cols[cols + side + margin <= width]
+            if rows.size and cols.size:
+                here = energy[np.ix_(rows + side // 2, cols + side // 2)]
+                k, l = np.unravel_index(int(here.argmax()), here.shape)
+                found.append((int(rows[k]), int(cols[l])))
+    return list(dict.fromkeys(found))
+
+
+def _shrunk(plane: NDArray[np.floating]) -> NDArray[np.float64]:
+    rows, cols = (n // _COARSE for n in plane.shape)
+    part = np.asarray(plane[: rows * _COARSE, : cols * _COARSE], dtype=np.float64)
+    return part.reshape(rows, _COARSE, cols, _COARSE).mean(axis=(1, 3))

@@ -1,0 +1,217 @@
+"""PSFs from photos of points: stars, pinholes, sparks on a steel ball.
+
+A point at a place between pixels is, to whoever sees no finer than pixels, a sinc there. The kernel k of a
+cell of the field is what makes of all its points, each at its own phase, the pixels that were measured:
+
+    y_i(p) = f_i sum_u k(u) sinc(p - u - c_i) + b_i
+
+So points at many phases are stacked without interpolating a photo, and pixels of a mosaic that saw another
+colour are left out. Places c_i and fluxes f_i are refined between two solutions for k. A point with one
+saturated pixel is refused whole: its neighbours hold what ran over. Each pixel counts by its own noise, of
+the sky and of the light that the kernel before predicts there: of a point most pixels are dark, and their
+mean is the noise of none of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from lensmodel.core.errors import NotEnoughEvidenceError
+from lensmodel.core.psf import centred
+from lensmodel.core.types import CHANNELS, Channel, StepHook, ignore_step
+from lensmodel.estimation.measure.measurer import MeasuredPsf, require_photos
+from lensmodel.estimation.measure.point_detection import Light, find_lights, isolated, sky_of
+from lensmodel.estimation.measure.solve import Solved, solve
+from lensmodel.estimation.measure.windows import NEAR_CLIP, measured_pixels, photo_noise
+from lensmodel.photo import LinearPhoto
+
+FLOOR: Final = 0.1
+"""Error that no cell shows of itself (chosen): three times what lights behind one kernel are off by
+over a dark sky, 0.02 to 0.03, since a kernel that changes within a cell shows in none of its residuals."""
+
+_FEWEST: Final = 2
+"""Lights a cell must have: one alone may be a double star."""
+_MOST: Final = 12
+_ROUNDS: Final = 3
+_SURE: Final = 0.45
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """PSFs from isolated, unsaturated points of light.
+
+    Parameters
+    ----------
+    across, down : int
+        Cells of the frame; the points of a cell are stacked.
+    detector : str
+        See `detect.find_lights`.
+    """
+
+    across: int = 7
+    down: int = 5
+    detector: str = "auto"
+
+    name: ClassVar[str] = "points"
+    version: ClassVar[int] = 1
+    photos: ClassVar[int] = 1
+
+    def measure(
+        self,
+        photos: Sequence[LinearPhoto],
+        *,
+        size: int,
+        channels: Sequence[Channel] = CHANNELS,
+        on_step: StepHook = ignore_step,
+    ) -> list[MeasuredPsf]:
+        """Measure the PSF wherever there are points; see `Measurer`."""
+        require_photos(self, photos)
+        photo = photos[0]
+        plane = np.asarray(photo.planes[1], dtype=np.float64)
+        lights = isolated(find_lights(plane, self.detector), size)
+        usable = [light for light in lights if _whole(light, photo, size) and not _saturated(light, photo)]
+        cells: dict[tuple[int, int], list[Light]] = {}
+        for light in usable:
+            row = int(light.row * self.down / photo.frame.height)
+            col = int(light.col * self.across / photo.frame.width)
+            cells.setdefault((row, col), []).append(light)
+        good = [cell for cell in cells.values() if len(cell) >= _FEWEST]
+        if not good:
+            raise NotEnoughEvidenceError(
+                f"{len(lights)} isolated points of light, {len(usable)} of them unsaturated and whole, and "
+                f"no part of the frame with {_FEWEST}; expose less, or photograph more points"
+            )
+        skies = {
+            c: sky_of(np.asarray(photo.planes[CHANNELS.index(c)], dtype=np.float64))[0] for c in channels
+        }
+        found = []
+        for done, cell in enumerate(good, start=1):
+            for channel in channels:
+                one = _cell_psf(photo, channel, cell[:_MOST], size, skies[channel])
+                if one is not None:
+                    found.append(one)
+            on_step(done, len(good))
+        if not found:
+            raise NotEnoughEvidenceError("the points of light are too faint; expose longer")
+        return found
+
+
+def _whole(light: Light, photo: LinearPhoto, size: int) -> bool:
+    half = size // 2 + 1
+    return half <= light.row < photo.frame.height - half and half <= light.col < photo.frame.width - half
+
+
+def _saturated(light: Light, photo: LinearPhoto) -> bool:
+    row, col = round(light.row), round(light.col)
+    near = np.asarray(photo.planes[:, max(row - 3, 0) : row + 4, max(col - 3, 0) : col + 4])
+    return any(bool((plane >= NEAR_CLIP * clip).any()) for plane, clip in zip(near, photo.clip, strict=True))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stamp:
+    """One light: its window without sky, which pixels count, where it is in it, and the sky's level."""
+
+    observed: NDArray[np.float64]
+    measured: NDArray[np.bool_]
+    place: tuple[float, float]
+    flux: float
+    pixel: tuple[float, float]
+    sky: float
+
+    def latent(self, size: int) -> NDArray[np.float64]:
+        """The light as a sinc, on the window with a margin of half a kernel."""
+        side = self.observed.shape[0] + 2 * (size // 2)
+        t = np.arange(side) - size // 2
+        return self.flux * np.outer(np.sinc(t - self.place[0]), np.sinc(t - self.place[1]))
+
+
+def _cell_psf(
+    photo: LinearPhoto, channel: Channel, lights: Sequence[Light], size: int, sky: NDArray[np.float64]
+) -> MeasuredPsf | None:
+    stamps = [_stamp(photo, channel, light, size, sky) for light in lights]
+    stamps = [stamp for stamp in stamps if stamp.flux > 0.0 and stamp.measured.sum() > size]
+    if len(stamps) < _FEWEST:
+        return None
+    try:
+        solved = _stacked(photo, channel, stamps, size, None)
+        for _ in range(_ROUNDS - 1):
+            kernel = np.asarray(solved.kernel)
+            stamps = [_refined(stamp, kernel) for stamp in stamps]
+            solved = _stacked(photo, channel, stamps, size, kernel)
+    except NotEnoughEvidenceError:
+        return None
+    error = float(np.hypot(solved.error, FLOOR))
+    if error >= _SURE:
+        return None
+    votes = np.array([stamp.flux for stamp in stamps])
+    middle = np.average([stamp.pixel for stamp in stamps], axis=0, weights=votes)
+    pixel = float(middle[0]), float(middle[1])
+    return MeasuredPsf(centred(solved.kernel), photo.frame.position(*pixel), channel, error, pixel, size)
+
+
+def _stamp(photo: LinearPhoto, channel: Channel, light: Light, size: int, sky: NDArray[np.float64]) -> _Stamp:
+    half = size // 2
+    top, left = round(light.row) - half, round(light.col) - half
+    index = CHANNELS.index(channel)
+    box = slice(top, top + size), slice(left, left + size)
+    observed = np.asarray(photo.planes[index][box], dtype=np.float64) - sky[box]
+    measured = measured_pixels(photo, channel, top, left, (size, size))
+    flux = float(observed.sum())
+    place, level = (light.row - top, light.col - left), max(float(sky[box].mean()), 0.0)
+    return _Stamp(observed, measured, place, flux, (light.row, light.col), level)
+
+
+def _stacked(
+    photo: LinearPhoto,
+    channel: Channel,
+    stamps: Sequence[_Stamp],
+    size: int,
+    kernel: NDArray[np.float64] | None,
+) -> Solved:
+    """Solve for the kernel of all stamps at once: they stand below each other, apart by what pads them.
+
+    `kernel` is that of the round before, by which the noise of each pixel is known.
+    """
+    high = 2 * size - 1
+    shot, read = photo_noise(photo, channel)
+    latent = np.concatenate([stamp.latent(size) for stamp in stamps])
+    observed = np.zeros((latent.shape[0] - size + 1, size))
+    measured = np.zeros(observed.shape, dtype=bool)
+    variance = np.ones(observed.shape)
+    for number, stamp in enumerate(stamps):
+        rows = slice(number * high, number * high + size)
+        observed[rows], measured[rows] = stamp.observed, stamp.measured
+        if kernel is None:
+            light = np.full((size, size), max(stamp.flux, 0.0) / size**2)
+        else:
+            light = np.maximum(signal.fftconvolve(stamp.latent(size), kernel, mode="valid"), 0.0)
+        variance[rows] = shot * (stamp.sky + light) + read
+    return solve(observed, latent, measured, variance, size)
+
+
+def _refined(stamp: _Stamp, kernel: NDArray[np.float64]) -> _Stamp:
+    """Move and scale a light so that the kernel explains its pixels best: one Gauss-Newton step."""
+    size = kernel.shape[0]
+    step = 0.05
+
+    def seen(row: float, col: float) -> NDArray[np.float64]:
+        moved = replace(stamp, place=(stamp.place[0] + row, stamp.place[1] + col))
+        return np.asarray(signal.fftconvolve(moved.latent(size), kernel, mode="valid"))
+
+    here = seen(0.0, 0.0)
+    by_row = (seen(step, 0.0) - seen(-step, 0.0)) / (2 * step)
+    by_col = (seen(0.0, step) - seen(0.0, -step)) / (2 * step)
+    good = stamp.measured
+    basis = np.stack([here[good], by_row[good], by_col[good], np.ones(int(good.sum()))], axis=-1)
+    terms, *_ = np.linalg.lstsq(basis, stamp.observed[good], rcond=None)
+    if not terms[0] > 0.0:
+        return stamp
+    row, col = np.clip(terms[1:3] / terms[0], -0.5, 0.5)
+    place = stamp.place[0] + float(row), stamp.place[1] + float(col)
+    return replace(stamp, place=place, flux=stamp.flux * float(terms[0]))

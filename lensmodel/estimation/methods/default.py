@@ -1,0 +1,225 @@
+"""The default estimator: a Whittle Gaussian, patch recurrence, a wavefront, and a judge among them."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lensmodel.core.psf import as_kernel, distance, rms_width
+from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
+from lensmodel.estimation.estimator import PsfEstimate, is_no_blur, placed, usable
+from lensmodel.estimation.methods.patch_recurrence import PatchRecurrence
+from lensmodel.estimation.methods.whittle import Whittle
+from lensmodel.estimation.spectra.kernel_choice import Judgement
+from lensmodel.estimation.spectra.local_wavefront import AberrationFit
+from lensmodel.estimation.spectra.scene_spectra import SceneSpectra
+from lensmodel.estimation.steps.finish import signal_share
+from lensmodel.estimation.steps.recurrence import QUICK
+
+_POOLED_SUPPORT, _POOLED_ITERATIONS, _POOLED_SIDE = 21, 3, 160
+_STARTS, _STARTS_OF_CHANNEL = 10, 6
+_PIXEL_SIGMA = 0.29
+_PER_WIDTH = 40.0
+"""Cost of a kernel e times as wide: in doubt the narrower one, which does less harm."""
+
+_POOLED_ERROR = 0.7
+"""Relative error of a wavefront agreed on by n patches, times the root of n."""
+
+_AT_TYPICAL = -0.65
+"""Logarithm of the error where all agree on a usual scene, but wavefront and patch recurrence differ by 1."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cautious:
+    """What a Whittle Gaussian, patch recurrence and the spectra of the patches agree on.
+
+    A kernel that is too wide ruins a photo, one too narrow only helps less, and both of the first two
+    methods take the softness of a scene for blur, each in its own way. With few patches there are four
+    kernels: the Gaussian, that of patch recurrence, the mean of both, and a wavefront fitted to the
+    spectra, whole and local, and, with the weight `trust`, to the result of patch recurrence (see
+    `local_wavefront`). The likelihood of the spectra of whole patches and of small tiles (see
+    `kernel_choice`) chooses among them. Where the Gaussian is narrower than `trusted_px`, most lenses are as
+    sharp as it says: then the mean, or the Gaussian if patch recurrence ran more than `apart` times as
+    wide, stays unless another is likelier by `sure`. A sharp core with wide wings is.
+
+    From `pooled` patches on the slopes of the scenes average out, the wavefront is all but given by the
+    spectra, and patch recurrence only has to tell the phase. How far the wavefront is from
+    the kernel of patch recurrence is the best single predictor of the true error of few patches.
+    """
+
+    trusted_px: float = 0.95
+    apart: float = 2.2
+    sure: float = 60.0
+    pooled: int = 6
+    trust: float = 5.0
+
+    name = "default"
+    version = 11
+
+    def estimate(
+        self,
+        patches: Sequence[Plane],
+        noise: Sequence[NoiseModel],
+        *,
+        size: int = 31,
+        rng: np.random.Generator | None = None,
+        on_step: StepHook = ignore_step,
+    ) -> PsfEstimate:
+        """Estimate the kernel that all patches share; see `PsfEstimator`."""
+        began = time.process_time()
+        kept = usable(patches, noise, size)
+        if len(kept) >= self.pooled:
+            inner, models = [_middle(patch) for patch, _ in kept], [model for _, model in kept]
+            recurrence = PatchRecurrence(support=min(_POOLED_SUPPORT, size), iterations=_POOLED_ITERATIONS)
+            found = recurrence.estimate(inner, models, size=size, on_step=_half(on_step, 0))
+            found = replace(found, evidence=placed(found.evidence, kept, patches))
+            return self._agreed(kept, found, began, size, on_step)
+        gaussian = Whittle().estimate(patches, noise, size=size)
+        support = min(max(2 * round(3.0 * gaussian.diagnostics["width"] + 3.0) + 1, 15), 31, size)
+        recurrence = PatchRecurrence(support=support, search=QUICK)
+        found = recurrence.estimate(patches, noise, size=size, on_step=_half(on_step, 0))
+        return self._chosen(kept, gaussian, found, began, size, on_step, _STARTS)
+
+    def estimate_channel(
+        self,
+        patches: Sequence[Plane],
+        noise: Sequence[NoiseModel],
+        reference: PsfEstimate,
+        reference_patches: Sequence[Plane],
+        *,
+        size: int = 31,
+        rng: np.random.Generator | None = None,
+        on_step: StepHook = ignore_step,
+    ) -> PsfEstimate:
+        """Estimate another channel from the reference kernel on."""
+        began = time.process_time()
+        kept = usable(patches, noise, size)
+        if len(kept) >= self.pooled:
+            same_phase = replace(reference, evidence=(), reliability=signal_share(kept))
+            return self._agreed(kept, same_phase, began, size, on_step)
+        support = int(reference.diagnostics.get("support", 21.0))
+        recurrence = PatchRecurrence(support=support, iterations=3, search=QUICK)
+        found = recurrence.estimate_channel(
+            patches, noise, reference, reference_patches, size=size, on_step=_half(on_step, 0)
+        )
+        gaussian = Whittle().estimate(patches, noise, size=size)
+        return self._chosen(kept, gaussian, found, began, size, on_step, _STARTS_OF_CHANNEL)
+
+    def _agreed(
+        self,
+        kept: Sequence[tuple[Plane, NoiseModel]],
+        found: PsfEstimate,
+        began: float,
+        size: int,
+        on_step: StepHook,
+    ) -> PsfEstimate:
+        """Kernel of the wavefront that many patches agree on."""
+        fitted = AberrationFit().fit(SceneSpectra.of(kept), found.kernel, _half(on_step, 1))
+        kernel = fitted.kernel(size)
+        error = min(max(_POOLED_ERROR / math.sqrt(len(kept)), 0.05), 1.0)
+        more = {
+            "width": rms_width(kernel),
+            "disagreement": distance(found.kernel, kernel).mtf_rmse,
+            "cost": fitted.cost,
+        }
+        return _told(found, kernel, error, more, began)
+
+    def _chosen(
+        self,
+        kept: Sequence[tuple[Plane, NoiseModel]],
+        gaussian: PsfEstimate,
+        found: PsfEstimate,
+        began: float,
+        size: int,
+        on_step: StepHook,
+        starts: int,
+    ) -> PsfEstimate:
+        """Kernel of few patches, the one that their spectra speak for."""
+        disagreement = distance(found.kernel, gaussian.kernel).mtf_rmse
+        judgement = Judgement.of(kept)
+        fit = AberrationFit(
+            weight=self.trust, temper=judgement.temper, starts=starts, kept=max(starts // 5, 2)
+        )
+        fitted = fit.fit(judgement.whole, found.kernel, _half(on_step, 1), judgement.local)
+        options = {
+            "gaussian": gaussian.kernel,
+            "recurrence": found.kernel,
+            "mean": as_kernel(0.5 * (gaussian.kernel + found.kernel)),
+            "wavefront": fitted.kernel(size),
+        }
+        costs = {
+            name: judgement.cost(kernel) + _PER_WIDTH * math.log(max(rms_width(kernel), _PIXEL_SIGMA))
+            for name, kernel in options.items()
+        }
+        costs["wavefront"] += fitted.unusual
+        if rms_width(gaussian.kernel) <= self.trusted_px:
+            ran = rms_width(found.kernel) > self.apart * max(rms_width(gaussian.kernel), _PIXEL_SIGMA)
+            costs["gaussian" if ran else "mean"] -= self.sure
+        chosen = min(costs, key=lambda name: costs[name])
+        kernel = options[chosen]
+        on_step(1, 1)
+        apart = distance(found.kernel, options["wavefront"]).rel_l2
+        more = {
+            "gaussian_width": gaussian.diagnostics["width"],
+            "slope": gaussian.diagnostics["slope"],
+            "disagreement": disagreement,
+            "apart": apart,
+            "width": rms_width(kernel),
+            **{f"chose_{name}": float(name == chosen) for name in options},
+        }
+        error = predicted_error(
+            apart, disagreement, rms_width(gaussian.kernel), gaussian.diagnostics["slope"]
+        )
+        return _told(found, kernel, error, more, began)
+
+
+def _told(
+    found: PsfEstimate, kernel: Kernel, error: float, more: Mapping[str, float], began: float
+) -> PsfEstimate:
+    """Return the result of patch recurrence with another kernel, its expected error, and why."""
+    return replace(
+        found,
+        kernel=kernel,
+        confidence=1.0 / (1.0 + (error / 0.4) ** 2),
+        predicted_error=error,
+        diagnostics={**found.diagnostics, **more},
+        seconds=time.process_time() - began,
+        no_blur=is_no_blur(kernel),
+    )
+
+
+def _middle(patch: Plane) -> Plane:
+    """Cut the middle out: many patches together need not be large."""
+    top, left = (max(n - _POOLED_SIDE, 0) // 2 for n in patch.shape)
+    return patch[top : top + _POOLED_SIDE, left : left + _POOLED_SIDE]
+
+
+def _half(on_step: StepHook, which: int) -> StepHook:
+    """Report progress as the first or the second half of the work."""
+    return lambda done, total: on_step(done + which * total, 2 * total)
+
+
+def predicted_error(apart: float, disagreement: float, width: float, slope: float) -> float:
+    """Expected relative L2 error of the kernel.
+
+    The geometric mean of two log-linear fits to the development half: one to the benchmark's PSFs, which
+    sees the first argument only, one to whole fields of lenses, which sees the others.
+
+    Parameters
+    ----------
+    apart : float
+        Relative L2 distance of the kernel of patch recurrence from the fitted wavefront.
+    disagreement : float
+        Root mean square distance of the MTFs of the Gaussian and patch recurrence.
+    width : float
+        RMS width of the Gaussian in pixels.
+    slope : float
+        Slope of the scene's power spectrum that went with it; a steep one hides blur or is it.
+    """
+    by_kernels = 0.43 * math.log(max(apart, 1e-3)) + 1.1 * disagreement
+    by_scene = 0.33 * math.log(max(width, 0.2)) + 1.1 * (slope - 2.5)
+    return min(max(math.exp(_AT_TYPICAL + by_kernels + by_scene), 0.05), 1.0)

@@ -1,0 +1,252 @@
+"""What only a look at the window's own pixels tells: spectrum, periods, blocks, blobs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from lensmodel.core.spectrum import repeats
+from lensmodel.core.types import Plane
+from lensmodel.estimation.patches.blocks import CLIP_SHARE
+
+SECTORS: Final = 8
+BAND_EDGES: Final = (0.03, 0.1, 0.2, 0.35)
+BANDS: Final = len(BAND_EDGES) - 1
+
+EVIDENCE_EDGES: Final = (0.1, 0.2, 0.3, 0.4)
+"""Bands of the frequencies that blur takes away: below 0.1 cycles/pixel lenses leave nearly all, above 0.4
+demosaicing and compression leave little to see."""
+
+SLOPE_ORDER: Final = 2
+"""Order of the polynomial that is taken off first: vignetting, a sky, shading of a wall are no detail."""
+
+NON_UNIFORMITY: Final = 0.005
+"""Standard deviation of the gain of a sensor's pixels, relative: 0.3 to 1 percent is usual in data sheets by
+the standard EMVA 1288. Weaker structure is the sensor's and no noise model of light holds it."""
+
+DYNAMIC_RANGE: Final = 2.0**14.8
+"""Full level over the noise of darkness of the best camera sensors; noise said to be less was eaten by
+rounding or denoising."""
+
+_JPEG_BLOCK = 8
+_MAIN_LOBE_PX = 8
+_ON_THE_WAY = 24
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Details:
+    """Second look at some windows; every array has one entry a window along axis 0.
+
+    Parameters
+    ----------
+    information : ndarray of float64, shape (n, BANDS, SECTORS)
+        Natural logarithm of power over noise by radial band and angular sector.
+    period : ndarray of float64, shape (n,)
+        Highest separate peak of the autocorrelation, 1 for a perfect period.
+    blockiness : ndarray of float64, shape (n,)
+        Steps on an 8 px grid over steps off it; 1 where there is none.
+    blob : ndarray of int64, shape (n,)
+        Pixels of the largest connected clipped area.
+    kurtosis : ndarray of float64, shape (n,)
+        Of the horizontal and vertical differences; 3 for a Gaussian, more for isolated edges.
+    evidence : ndarray of float64, shape (n,)
+        Bits a frequency between 0.1 and 0.4 cycles/pixel, mean of log2(1 + S/N); 0 for noise.
+    """
+
+    information: NDArray[np.float64]
+    period: NDArray[np.float64]
+    blockiness: NDArray[np.float64]
+    blob: NDArray[np.int64]
+    kurtosis: NDArray[np.float64]
+    evidence: NDArray[np.float64]
+
+    def take(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> Details:
+        """Return the entries that `index` picks."""
+        return Details(*(getattr(self, name)[index] for name in self.__slots__))
+
+
+def look_at(
+    patch: Plane, sigma: float, clip: float, corner: tuple[int, int], coarse_sigma: float | None = None
+) -> Details:
+    """Look at one window.
+
+    Parameters
+    ----------
+    patch : Plane, shape (P, P)
+        The window's pixels.
+    sigma : float
+        Standard deviation of the noise at the window's mean level.
+    clip : float
+        Level of saturation.
+    corner : tuple of int
+        Top-left pixel in the photo: the JPEG grid starts at the photo's corner.
+    coarse_sigma : float, optional
+        Square root of the noise's power at 0.1 to 0.4 cycles/pixel, where it exceeds `sigma`: noise that
+        was demosaiced or denoised is coarser than white.
+    """
+    values = np.asarray(patch, dtype=np.float64)
+    power = _power(_detrended(values))
+    noise = max(sigma, coarse_sigma or 0.0) ** 2
+    noise += (NON_UNIFORMITY * values.mean()) ** 2 + (clip / DYNAMIC_RANGE) ** 2
+    return Details(
+        information=_information(power, sigma)[None],
+        period=np.array([1.0 if repeats(patch) else _period(power, sigma)]),
+        blockiness=np.array([_blockiness(values, corner)]),
+        blob=np.array([_largest_blob(values >= CLIP_SHARE * clip)], dtype=np.int64),
+        kurtosis=np.array([_kurtosis(values)]),
+        evidence=np.array([_evidence(power, noise)]),
+    )
+
+
+def joined(parts: list[Details]) -> Details:
+    """Put the entries of several together."""
+    return Details(*(np.concatenate([getattr(p, name) for p in parts]) for name in Details.__slots__))
+
+
+@lru_cache(maxsize=2)
+def _slopes(size: int) -> NDArray[np.float64]:
+    """Orthonormal polynomials up to `SLOPE_ORDER` over a window, `(size^2, count)`."""
+    t = np.linspace(-1.0, 1.0, size)
+    powers = [(i, j) for i in range(SLOPE_ORDER + 1) for j in range(SLOPE_ORDER + 1 - i)]
+    basis: NDArray[np.float64] = np.linalg.qr(
+        np.stack([np.outer(t**i, t**j).ravel() for i, j in powers], axis=1)
+    )[0]
+    return basis
+
+
+def _detrended(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    basis = _slopes(values.shape[0])
+    flat = values.ravel()
+    return (flat - basis @ (flat @ basis)).reshape(values.shape)
+
+
+@lru_cache(maxsize=4)
+def _grids(size: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.intp]]:
+    """Hann window, |f|² and the band-sector number of each frequency (-1 outside)."""
+    hann = np.hanning(size + 2)[1:-1]
+    window = np.outer(hann, hann)
+    fr, fc = fft.fftfreq(size)[:, None], fft.rfftfreq(size)[None, :]
+    radius = np.hypot(fr, fc)
+    band = np.searchsorted(BAND_EDGES, radius, side="right") - 1
+    sector = np.floor(np.arctan2(fr, fc) * (SECTORS / np.pi) + 0.5).astype(np.intp) % SECTORS
+    # Of the column fc = 0 the half spectrum holds both halves: one of them must not count.
+    inside = (band >= 0) & (band < BANDS) & ((fc > 0.0) | (fr > 0.0))
+    number = np.where(inside, band * SECTORS + sector, -1)
+    return window, (2.0 * np.pi * radius) ** 2, number
+
+
+def _power(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Periodogram under a Hann window, scaled so that white noise gives its variance."""
+    window, _, _ = _grids(values.shape[0])
+    return np.square(np.abs(fft.rfft2(values * window))) / float(np.square(window).sum())
+
+
+@lru_cache(maxsize=4)
+def _evidence_bins(size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Number of band and sector of each frequency (-1 outside), and how many frequencies each holds."""
+    fr, fc = fft.fftfreq(size)[:, None], fft.rfftfreq(size)[None, :]
+    bands = len(EVIDENCE_EDGES) - 1
+    band = np.searchsorted(EVIDENCE_EDGES, np.hypot(fr, fc), side="right") - 1
+    sector = np.floor(np.arctan2(fr, fc) * (SECTORS / np.pi) + 0.5).astype(np.intp) % SECTORS
+    inside = (band >= 0) & (band < bands) & ((fc > 0.0) | (fr > 0.0))
+    number = np.where(inside, band * SECTORS + sector, -1)
+    return number, np.bincount(number[inside], minlength=bands * SECTORS)
+
+
+def _evidence(power: NDArray[np.float64], noise: float) -> float:
+    """Bits a frequency: mean of log2(1 + max(P / N - 1, 0)) over the bands and sectors that blur empties.
+
+    It is the capacity of a channel with the scene as the signal: C. E. Shannon, "Communication in the
+    presence of noise", Proc. IRE 37, 1949. A frequency with signal below the noise says next to nothing
+    about what the lens did to it, one far above says it well.
+    """
+    number, count = _evidence_bins(power.shape[0])
+    inside = number >= 0
+    mean = np.bincount(number[inside], power[inside], count.size) / np.maximum(count, 1)
+    signal = np.maximum(mean / max(noise, 1e-30) - 1.0, 0.0)
+    return float(np.log2(1.0 + signal) @ count / count.sum())
+
+
+def _information(power: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
+    """Mean log of power over noise: at which frequencies and directions the window carries signal.
+
+    If the scene were known, the covariance of a least-squares kernel would be the noise over
+    this power, frequency by frequency.
+    """
+    _, _, number = _grids(power.shape[0])
+    inside = number >= 0
+    total = np.bincount(number[inside], power[inside], BANDS * SECTORS)
+    count = np.bincount(number[inside], minlength=BANDS * SECTORS)
+    mean = total / np.maximum(count, 1)
+    return np.log(np.maximum(mean / max(sigma * sigma, 1e-12), 1e-3)).reshape(BANDS, SECTORS)
+
+
+def _period(power: NDArray[np.float64], sigma: float) -> float:
+    """Highest separate peak of the autocorrelation of the gradients.
+
+    A fence or a facade repeats itself, and a blind estimate then cannot tell one repetition
+    from the next. A long straight edge has a ridge through the origin, not a separate peak: on
+    the way from the origin the correlation must fall to half the peak's height.
+    """
+    size = power.shape[0]
+    window, square_frequency, _ = _grids(size)
+    signal = np.maximum(power - sigma * sigma, 0.0) * square_frequency * np.exp(-2.0 * square_frequency)
+    correlation = fft.fftshift(fft.irfft2(signal, s=(size, size)))
+    taper = fft.fftshift(fft.irfft2(np.square(np.abs(fft.rfft2(window))), s=(size, size)))
+    middle = size // 2
+    if correlation[middle, middle] <= 0.0:
+        return 0.0
+    # The window's own autocorrelation takes weight from long lags; give it back up to a third.
+    correlation = correlation / correlation[middle, middle]
+    reach = size // 3
+    part = slice(middle - reach, middle + reach + 1)
+    correlation = correlation[part, part] / (taper[part, part] / taper[middle, middle])
+    lag = np.hypot(*np.ogrid[-reach : reach + 1, -reach : reach + 1])
+    peaks = (correlation == ndimage.maximum_filter(correlation, 3)) & (lag >= _MAIN_LOBE_PX)
+    heights = np.where(peaks, correlation, 0.0)
+    highest = 0.0
+    for at in np.argsort(heights.ravel())[::-1][:6]:
+        row, col = np.unravel_index(at, heights.shape)
+        height = float(heights[row, col])
+        t = np.linspace(0.0, 1.0, _ON_THE_WAY)
+        way = correlation[
+            np.rint(reach + (row - reach) * t).astype(int), np.rint(reach + (col - reach) * t).astype(int)
+        ]
+        if height > highest and float(way.min()) < 0.5 * height:
+            highest = height
+    return min(highest, 1.0)
+
+
+def _blockiness(values: NDArray[np.float64], corner: tuple[int, int]) -> float:
+    """Mean step across the lines of an 8 px grid over the mean step elsewhere.
+
+    The step at a line is the difference minus what its neighbours on either side predict.
+    """
+    ratios = []
+    for axis in (0, 1):
+        d = np.abs(np.diff(values, axis=axis))
+        d = d if axis == 0 else d.T
+        excess = np.abs(d[1:-1] - 0.5 * (d[:-2] + d[2:])).mean(axis=1)
+        # Entry i belongs to the line between pixels i + 1 and i + 2 of the window.
+        phase = (np.arange(excess.size) + 2 + corner[axis]) % _JPEG_BLOCK
+        by_phase = np.array([excess[phase == k].mean() for k in range(_JPEG_BLOCK)])
+        ratios.append(by_phase[0] / max(float(np.median(by_phase[1:])), 1e-12))
+    return float(np.mean(ratios))
+
+
+def _largest_blob(mask: NDArray[np.bool_]) -> int:
+    if not mask.any():
+        return 0
+    labels, _ = ndimage.label(mask)
+    return int(np.bincount(labels.ravel())[1:].max())
+
+
+def _kurtosis(values: NDArray[np.float64]) -> float:
+    d = np.concatenate([np.diff(values, axis=0).ravel(), np.diff(values, axis=1).ravel()])
+    square = float(np.mean(d**2))
+    return float(np.mean(d**4)) / max(square * square, 1e-30)

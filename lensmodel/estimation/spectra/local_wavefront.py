@@ -1,0 +1,239 @@
+"""One local wavefront fitted to the spectra of all patches of a position, and to a kernel found before.
+
+Power says how wide the blur is in every direction, the better the more patches share it, and nothing of
+its phase; a kernel found by other means knows the phase and has a width of its own bias. The eight
+numbers of a wavefront have to please both, so that this is least::
+
+    temper * sum t(residuals of log power)  -  parts * ln L(local spectra)
+        +  weight |k(g) - k_found|² / |k_found|²  +  |g / usual|²
+
+found by Levenberg-Marquardt from random wavefronts about as wide as the kernel. t is the log-likelihood of
+Student's t: scenes have stripes that no polynomial follows. L is that of `local_spectra`, where such spectra
+are given; its curvature in the normal equations is Fisher's information with the components of the tiles
+known. For the true wavefront the likelihood is best where the scene's prior holds
+(`tests/lensmodel/estimation/test_local_wavefront.py`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.psf import as_kernel, centred, resized, rms_width
+from lensmodel.core.types import Kernel, StepHook, ignore_step
+from lensmodel.estimation.spectra.local_spectra import LocalSpectra, log_local_power
+from lensmodel.estimation.spectra.scene_spectra import SceneSpectra, log_power
+from lensmodel.optics.local_pupil import COMA, TERMS, Pupil
+
+_USUAL_PX = np.array([3.0, 2.0, 2.0, 3.0, 1.5, 1.5, 3.0, 3.0])
+_TAILS = 6.0
+_STRIDE_PX = 1.0
+_ENOUGH = 0.05
+_TRIES = 4
+_SIDES: Final = (31, 47)
+_WIDE_PX = 2.8
+
+_USUAL_SHAPE = (0.4, 0.6, 0.6, 0.8, 0.6, 0.6)
+"""Spread of the terms of a random wavefront, in widths of the kernel found; no tilts."""
+
+_SEED = 0
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class AberrationFit:
+    """How to weigh spectra against the kernel found, and how long to search.
+
+    Parameters
+    ----------
+    weight : float
+        Of the kernel found.
+    temper : float
+        Share of the spectra's likelihood that counts: neighbouring bins err alike.
+    starts : int
+        Random wavefronts, each moved `approach` steps towards the kernel alone and `first` steps with
+        the spectra.
+    kept, rounds : int
+        So many of the best go on for at most `rounds` steps; only these see local spectra.
+    parts : float
+        Share of the likelihood of local spectra that counts.
+    """
+
+    weight: float = 20.0
+    temper: float = 0.25
+    starts: int = 24
+    approach: int = 2
+    first: int = 4
+    kept: int = 8
+    rounds: int = 12
+    parts: float = 0.02
+
+    def fit(
+        self,
+        spectra: SceneSpectra,
+        found: Kernel,
+        on_step: StepHook = ignore_step,
+        local: LocalSpectra | None = None,
+    ) -> LocalWavefront:
+        """Fit.
+
+        Parameters
+        ----------
+        spectra : SceneSpectra
+        found : Kernel
+            Centred.
+        on_step : StepHook
+            Progress; raising `CancelledError` there stops the work.
+        local : LocalSpectra, optional
+            Spectra of small tiles of the same patches.
+        """
+        wide = max(rms_width(found), 0.3)
+        pupil = Pupil.of(_SIDES[wide > _WIDE_PX])
+        aim = resized(found, pupil.size)
+        rng = np.random.default_rng(_SEED)
+        total = self.starts + self.kept + 1
+        fits = []
+        for done in range(self.starts):
+            start = np.zeros(TERMS)
+            start[: len(_USUAL_SHAPE)] = rng.standard_normal(len(_USUAL_SHAPE)) * _USUAL_SHAPE * wide
+            near = self._descend(pupil, aim, start, _Seen(None), self.approach)
+            fits.append(self._descend(pupil, aim, near.terms, _Seen(spectra), self.first))
+            on_step(done + 1, total)
+        seen = _Seen(spectra, local)
+        refined = []
+        for done, fit in enumerate(sorted(fits, key=_cost)[: self.kept]):
+            refined.append(self._descend(pupil, aim, fit.terms, seen, self.rounds))
+            on_step(self.starts + done + 1, total)
+        best = min(refined, key=_cost)
+        # The spectra of a kernel and of its turned copy are equal: only the kernel found tells.
+        turned = best.terms.copy()
+        turned[[*COMA, -2, -1]] *= -1.0
+        best = min(best, self._descend(pupil, aim, turned, seen, self.rounds // 2), key=_cost)
+        on_step(total, total)
+        return best
+
+    def _descend(self, pupil: Pupil, aim: Kernel, terms: Floats, seen: _Seen, rounds: int) -> LocalWavefront:
+        state = self._state(pupil, aim, terms, seen, None)
+        damping = 1e-2
+        for _ in range(rounds):
+            better = None
+            for _ in range(_TRIES):
+                lifted = state.normal + np.diag(damping * np.diag(state.normal))
+                step = np.linalg.solve(lifted, state.gradient)
+                step *= min(1.0, _STRIDE_PX / max(float(np.abs(step[:TERMS]).max()), 1e-9))
+                after = self._state(pupil, aim, state.terms + step[:TERMS], seen, state.levels + step[TERMS:])
+                if after.cost < state.cost:
+                    better = after
+                    break
+                damping *= 6.0
+            if better is None:
+                break
+            gain, state = state.cost - better.cost, better
+            damping /= 4.0
+            if gain < _ENOUGH:
+                break
+        return LocalWavefront(state.terms, state.kernel, state.cost)
+
+    def _state(self, pupil: Pupil, aim: Kernel, terms: Floats, seen: _Seen, levels: Floats | None) -> _State:
+        kernel, changes = pupil.kernel(terms)
+        off, flat = (kernel - aim).ravel(), changes.reshape(TERMS, -1)
+        weight = self.weight / float((aim**2).sum())
+        usual = terms / _USUAL_PX
+        state = _State(
+            terms,
+            np.zeros(0),
+            kernel,
+            float(usual @ usual) + weight * float(off @ off),
+            np.diag(1.0 / _USUAL_PX**2) + weight * (flat @ flat.T),
+            -usual / _USUAL_PX - weight * (flat @ off),
+        )
+        if seen.whole is not None:
+            count = len(seen.whole.seen)
+            state = self._with_whole(state, changes, seen.whole, None if levels is None else levels[:count])
+            if seen.local is not None:
+                state = self._with_local(
+                    state, changes, seen.local, None if levels is None else levels[count:]
+                )
+        return state
+
+    def _with_whole(
+        self, state: _State, changes: Floats, spectra: SceneSpectra, amplitudes: Floats | None
+    ) -> _State:
+        """Add what whole spectra say; the amplitudes of the scenes become unknowns."""
+        blur, by_terms = log_power(state.kernel, changes)
+        if amplitudes is None:
+            amplitudes = spectra.begin(blur)
+        left, change = spectra.residuals(blur, by_terms, amplitudes)
+        weighted = change * (self.temper * (_TAILS + 1.0) / (_TAILS + left**2))[:, None]
+        normal, gradient = change.T @ weighted, -(weighted.T @ left)
+        normal[:TERMS, :TERMS] += state.normal
+        gradient[:TERMS] += state.gradient
+        cost = state.cost + self.temper * (_TAILS + 1.0) * float(np.log1p(left**2 / _TAILS).sum())
+        return _State(state.terms, amplitudes, state.kernel, cost, normal, gradient)
+
+    def _with_local(
+        self, state: _State, changes: Floats, local: LocalSpectra, gains: Floats | None
+    ) -> _State:
+        """Add what local spectra say; the gains of the patches become unknowns."""
+        power, by_terms = log_local_power(state.kernel, changes)
+        if gains is None:
+            gains = local.gains(power)
+        known, cost = len(state.gradient), state.cost
+        every = known + len(gains)
+        normal, gradient = np.zeros((every, every)), np.zeros(every)
+        normal[:known, :known], gradient[:known] = state.normal, state.gradient
+        moved = np.column_stack([by_terms, np.ones(len(power))])
+        for i, gain in enumerate(gains):
+            value, slope, curvature = local.pull(i, power + gain)
+            at = np.append(np.arange(TERMS), known + i)
+            cost -= self.parts * value
+            normal[np.ix_(at, at)] += self.parts * (moved.T * curvature) @ moved
+            gradient[at] += self.parts * (moved.T @ slope)
+        levels = np.concatenate([state.levels, gains])
+        return _State(state.terms, levels, state.kernel, cost, normal, gradient)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocalWavefront:
+    """A wavefront, pixels of blur by term, with its kernel where the pupil puts it, and its cost."""
+
+    terms: Floats
+    light: Floats
+    cost: float
+
+    @property
+    def unusual(self) -> float:
+        """What speaks against a wavefront before anything is seen, |g / usual|²."""
+        return float(np.square(self.terms / _USUAL_PX).sum())
+
+    def kernel(self, size: int) -> Kernel:
+        """Kernel of odd side `size`, centred."""
+        return resized(centred(as_kernel(self.light)), size)
+
+
+def _cost(fit: LocalWavefront) -> float:
+    return fit.cost
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """Which spectra a descent looks at."""
+
+    whole: SceneSpectra | None
+    local: LocalSpectra | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _State:
+    """Where a descent is: the terms, the amplitudes and gains of the patches, and which way down."""
+
+    terms: Floats
+    levels: Floats
+    kernel: Floats
+    cost: float
+    normal: Floats
+    gradient: Floats

@@ -1,0 +1,93 @@
+"""From a raw kernel to an estimate: the last steps that several blind methods share."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lensmodel.core.errors import NotEnoughEvidenceError
+from lensmodel.core.psf import as_kernel, centred, resized, rms_width
+from lensmodel.core.spectrum import binned_spectrum
+from lensmodel.core.types import Kernel, NoiseModel, Plane
+from lensmodel.estimation.estimator import PsfEstimate, is_no_blur
+
+_EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=np.int_)
+_HALF_CONFIDENT = 0.4
+
+
+def cleaned(kernel: NDArray[np.float64], threshold: float, least_mass: float = 0.0) -> Kernel:
+    """Drop values below `threshold` times the peak and islands below `least_mass` of the sum.
+
+    Not centred. The largest island always stays.
+
+    Raises
+    ------
+    NotEnoughEvidenceError
+        If nothing positive is there.
+    """
+    kept = np.maximum(kernel, 0.0)
+    if not kept.max() > 0:
+        raise NotEnoughEvidenceError("the kernel vanished; the patches hold no detail beyond the noise")
+    kept = np.where(kept >= threshold * kept.max(), kept, 0.0)
+    if least_mass > 0.0:
+        label, count = ndimage.label(kept > 0, _EIGHT_NEIGHBOURS)
+        mass = np.bincount(label.ravel(), weights=kept.ravel(), minlength=count + 1)
+        mass[0] = 0.0
+        heavy = mass >= min(least_mass * float(mass.sum()), float(mass.max()))
+        heavy[0] = False
+        kept = np.where(heavy[label], kept, 0.0)
+    return as_kernel(kept)
+
+
+def signal_share(kept: Sequence[tuple[Plane, NoiseModel]]) -> NDArray[np.float64]:
+    """Share of signal in the power of each ring of frequency, mean over patches, `(rings,)`."""
+    shares = []
+    for patch, model in kept:
+        spectrum, floor = binned_spectrum(patch, model)
+        power = spectrum.mean(axis=1, dtype=np.float64)
+        shares.append(np.clip(1.0 - floor / np.maximum(power, 1e-30), 0.0, 1.0))
+    return np.asarray(np.mean(shares, axis=0), dtype=np.float64)
+
+
+def finished(
+    kernel: Kernel,
+    kept: Sequence[tuple[Plane, NoiseModel]],
+    *,
+    size: int,
+    error: float,
+    diagnostics: Mapping[str, float],
+    began: float,
+) -> PsfEstimate:
+    """Centre a kernel and say what speaks for it.
+
+    Parameters
+    ----------
+    kernel : Kernel
+        Of any odd side.
+    kept : sequence of (Plane, NoiseModel)
+        The patches that it came from.
+    size : int
+        Odd side of the answer.
+    error : float
+        Expected relative L2 distance to the true kernel; confidence is 1/2 at 0.4.
+    diagnostics : mapping of str to float
+        What else the method reports.
+    began : float
+        `time.process_time()` at its start.
+    """
+    final = resized(centred(kernel), size)
+    error = min(max(error, 0.0), 1.0) if math.isfinite(error) else 1.0
+    return PsfEstimate(
+        kernel=final,
+        confidence=1.0 / (1.0 + (error / _HALF_CONFIDENT) ** 2),
+        reliability=signal_share(kept),
+        predicted_error=error,
+        diagnostics={"width": rms_width(final), **diagnostics},
+        seconds=time.process_time() - began,
+        no_blur=is_no_blur(final),
+    )

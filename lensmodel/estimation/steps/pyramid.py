@@ -1,0 +1,307 @@
+"""Coarse to fine: the driver that the classic blind methods share.
+
+A wide kernel is a small one on a small copy of the patch. The methods start there, where few pixels
+decide, and hand kernel and latent image up to the next finer level. A method brings one function,
+its alternation on one level; the driver makes the levels, resamples and reports progress::
+
+    def solve(level: Level, kernel: Kernel, latents: Sequence[Image], tick: Tick) -> LevelResult:
+        for _ in range(level.iterations):
+            ...                      # image steps for level.views, one pooled kernel step
+            tick()                   # progress; lets a cancelled job stop
+        return LevelResult(kernel, latents)
+
+    found = coarse_to_fine(views, solve, Schedule(side=31, iterations=5), on_step=on_step)
+
+Everything here commutes with turns by 90 degrees and mirroring.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.psf import as_kernel, delta, resized
+from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
+
+Image: TypeAlias = NDArray[np.float64]
+Tick: TypeAlias = Callable[[], None]
+
+RATIO = math.sqrt(0.5)
+"""Size of a level over that of the next finer one, as in the public codes of these methods."""
+
+_SMALLEST_IMAGE = 24
+_REACH = 2  # of the cubic, in pixels of the coarser grid
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """One patch on one level.
+
+    Parameters
+    ----------
+    y : ndarray of float64, shape (H, W)
+        Observed, zero mean, its 1 to 99 percent range scaled to 1.
+    noise : float
+        Standard deviation of the noise of y, same units.
+    """
+
+    y: Image
+    noise: float
+
+    @classmethod
+    def of(cls, patch: Plane, model: NoiseModel) -> View:
+        """Scale a patch; an affine change of its values changes nothing."""
+        values = patch.astype(np.float64)
+        low, high = np.quantile(values, (0.01, 0.99))
+        span = max(float(high - low), 1e-9)
+        mean = float(values.mean())
+        return cls((values - mean) / span, model.sigma_at(mean) / span)
+
+    def at(self, shape: tuple[int, int]) -> View:
+        """Return the same patch on another grid; averaging makes its noise smaller."""
+        if shape == self.y.shape:
+            return self
+        return View(resample(self.y, shape), self.noise * noise_gain(_plain(self.y.shape), shape))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Level:
+    """One level of the pyramid.
+
+    Parameters
+    ----------
+    number : int
+        0 is the finest.
+    count : int
+        How many levels there are.
+    side : int
+        Odd side of the kernel on this level.
+    iterations : int
+        How many alternations the schedule gives it.
+    views : tuple of View
+        The patches, all of which share the kernel.
+    """
+
+    number: int
+    count: int
+    side: int
+    iterations: int
+    views: tuple[View, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LevelResult:
+    """Kernel and one latent image for each patch, on the grids of their level."""
+
+    kernel: Kernel
+    latents: tuple[Image, ...]
+
+
+class LevelSolver(Protocol):
+    """What a method does on one level, from what the coarser one found.
+
+    It must not change its arguments, and calls `tick` after each iteration.
+    """
+
+    def __call__(self, level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:
+        """Improve kernel `(side, side)` and latent images, each of the shape of its view."""
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """Levels and iterations.
+
+    Parameters
+    ----------
+    side : int
+        Odd side of the kernel on the finest level.
+    iterations : int
+        Alternations on each level.
+    coarsest : int
+        The coarsest level is the last whose kernel is not smaller than this, in pixels.
+    ratio : float
+        Size of a level over that of the next finer one, below 1.
+    """
+
+    side: int
+    iterations: int
+    coarsest: int = 5
+    ratio: float = RATIO
+
+    def __post_init__(self) -> None:
+        if self.side < 3 or self.side % 2 == 0 or self.coarsest < 3:
+            raise InvalidInputError(
+                f"kernel sides must be odd and at least 3, got {self.side} down to {self.coarsest}"
+            )
+        if self.iterations < 1 or not 0.3 <= self.ratio < 1.0:
+            raise InvalidInputError(
+                f"a schedule needs iterations >= 1 and a ratio in 0.3..1, got {self.iterations}, {self.ratio}"
+            )
+
+    def sides(self, image_side: int) -> tuple[int, ...]:
+        """Kernel sides by level, finest first; no level's image gets smaller than 24 px."""
+        found = [self.side]
+        while True:
+            factor = self.ratio ** len(found)
+            side = odd(self.side * factor)
+            if side < self.coarsest or image_side * factor < max(_SMALLEST_IMAGE, 3 * side):
+                return tuple(found)
+            found.append(side)
+
+
+def coarse_to_fine(
+    views: Sequence[View],
+    solve: LevelSolver,
+    schedule: Schedule,
+    *,
+    start: Kernel | None = None,
+    on_step: StepHook = ignore_step,
+) -> LevelResult:
+    """Run a method on every level, coarsest first.
+
+    Parameters
+    ----------
+    views : sequence of View
+        The patches at full size; they may differ in shape.
+    solve : LevelSolver
+        The method's alternation on one level.
+    schedule : Schedule
+        Levels and iterations.
+    start : Kernel, optional
+        First kernel, on the finest grid; a delta when None. It is shrunk to the coarsest level.
+    on_step : StepHook
+        Called after each iteration; raising `CancelledError` there stops the work.
+    """
+    if not views:
+        raise InvalidInputError("coarse to fine needs at least one patch")
+    sides = schedule.sides(min(min(view.y.shape) for view in views))
+    count = len(sides)
+    total = count * schedule.iterations
+    kernel = delta(sides[-1])
+    if start is not None:
+        kernel = rescaled(start, schedule.ratio ** (count - 1), sides[-1])
+    latents: tuple[Image, ...] = ()
+    for number in reversed(range(count)):
+        factor = schedule.ratio**number
+        small = tuple(view.at(level_shape(_plain(view.y.shape), factor)) for view in views)
+        if number == count - 1:
+            latents = tuple(view.y for view in small)
+        else:
+            kernel = rescaled(kernel, 1.0 / schedule.ratio, sides[number])
+            latents = tuple(resample(x, _plain(v.y.shape)) for x, v in zip(latents, small, strict=True))
+        before = (count - 1 - number) * schedule.iterations
+        ticks = _Ticks(before, before + schedule.iterations, total, on_step)
+        level = Level(number, count, sides[number], schedule.iterations, small)
+        result = solve(level, kernel, latents, ticks)
+        ticks.finish()
+        kernel, latents = resized(result.kernel, sides[number]), result.latents
+    return LevelResult(kernel, latents)
+
+
+@dataclass(slots=True)
+class _Ticks:
+    """Counts iterations of one level; a method that stops early leaps to the level's end."""
+
+    done: int
+    last: int
+    total: int
+    on_step: StepHook
+
+    def __call__(self) -> None:
+        if self.done < self.last:
+            self.done += 1
+        self.on_step(self.done, self.total)
+
+    def finish(self) -> None:
+        if self.done < self.last:
+            self.done = self.last
+            self.on_step(self.done, self.total)
+
+
+def odd(value: float) -> int:
+    """Nearest odd integer, at least 1."""
+    return max(2 * round((value - 1.0) / 2.0) + 1, 1)
+
+
+def level_shape(shape: tuple[int, int], factor: float) -> tuple[int, int]:
+    """Shape of an image scaled by `factor`."""
+    return max(round(shape[0] * factor), 1), max(round(shape[1] * factor), 1)
+
+
+def resample(image: Image, shape: tuple[int, int]) -> Image:
+    """Resize by Keys' cubic, stretched when the image shrinks so that nothing aliases.
+
+    The extent is kept: pixel i of n lies at (i + 1/2) / n. Beyond the border the image is mirrored.
+
+    References
+    ----------
+    .. [1] R. Keys, "Cubic convolution interpolation for digital image processing", IEEE TASSP 29,
+       1981.
+    """
+    if image.shape == shape:
+        return image
+    rows, cols = _weights(image.shape[0], shape[0]), _weights(image.shape[1], shape[1])
+    return np.asarray(rows @ image @ cols.T)
+
+
+def noise_gain(shape: tuple[int, int], target: tuple[int, int]) -> float:
+    """Root mean square by which `resample` scales the standard deviation of white noise."""
+    powers = [
+        float(np.square(_weights(have, want)).sum(axis=1).mean())
+        for have, want in zip(shape, target, strict=True)
+    ]
+    return math.sqrt(powers[0] * powers[1])
+
+
+def rescaled(kernel: Kernel, factor: float, side: int) -> Kernel:
+    """Kernel of the same blur on a grid finer by `factor`, cut or padded to the odd `side`.
+
+    The middle pixel stays the middle. Undershoot of the cubic is clipped.
+    """
+    if factor == 1.0:
+        return resized(kernel, side)
+    have = kernel.shape[0]
+    step = 1.0 / factor
+    places = (np.arange(side) - side // 2) * step + have // 2
+    stretch = max(step, 1.0)
+    weight = _cubic((places[:, None] - np.arange(have)[None, :]) / stretch)
+    weight /= stretch * factor  # so that the sum is kept, up to what the cut takes
+    scaled = np.maximum(weight @ kernel @ weight.T, 0.0)
+    return as_kernel(scaled) if scaled.sum() > 0 else delta(side)
+
+
+@lru_cache(maxsize=64)
+def _weights(have: int, want: int) -> Image:
+    """Matrix `(want, have)` of `resample` along one axis; rows sum to 1."""
+    ratio = have / want
+    stretch = max(ratio, 1.0)
+    places = (np.arange(want) + 0.5) * ratio - 0.5
+    reach = math.ceil(_REACH * stretch)
+    columns = np.floor(places).astype(np.intp)[:, None] + np.arange(-reach, reach + 1)
+    values = _cubic((places[:, None] - columns) / stretch)
+    values /= values.sum(axis=1, keepdims=True)
+    folded = np.mod(columns, 2 * have)
+    folded = np.where(folded < have, folded, 2 * have - 1 - folded)
+    weights = np.zeros((want, have))
+    np.add.at(weights, (np.arange(want)[:, None], folded), values)
+    weights.setflags(write=False)
+    return weights
+
+
+def _cubic(t: Image) -> Image:
+    """Keys' cubic with a = -1/2, zero beyond 2."""
+    t = np.abs(t)
+    near = (1.5 * t - 2.5) * t * t + 1.0
+    far = ((-0.5 * t + 2.5) * t - 4.0) * t + 2.0
+    return np.where(t <= 1.0, near, np.where(t < 2.0, far, 0.0))
+
+
+def _plain(shape: tuple[int, ...]) -> tuple[int, int]:
+    return shape[0], shape[1]

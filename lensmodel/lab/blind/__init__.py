@@ -1,0 +1,1 @@
+"""How near blind estimates come to the truth."""

@@ -1,0 +1,1 @@
+"""The whole chain: photos in, corrected photos out, against the truth."""

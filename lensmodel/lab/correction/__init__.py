@@ -1,0 +1,1 @@
+"""What corrections gain, cost and do wrong."""

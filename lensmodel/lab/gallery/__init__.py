@@ -1,0 +1,20 @@
+"""Pictures to look at: real and simulated ones, corrected by default and measured from outside."""
+
+from lensmodel.lab.gallery.page import PAGE, text, write_page
+from lensmodel.lab.gallery.pictures import Picture, chosen, real_pictures, simulated_pictures
+from lensmodel.lab.gallery.run import CACHE, Entry, hang
+from lensmodel.lab.gallery.work import Wishes
+
+__all__ = [
+    "CACHE",
+    "PAGE",
+    "Entry",
+    "Picture",
+    "Wishes",
+    "chosen",
+    "hang",
+    "real_pictures",
+    "simulated_pictures",
+    "text",
+    "write_page",
+]

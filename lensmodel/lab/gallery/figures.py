@@ -1,0 +1,399 @@
+"""What can be seen of a corrected picture beside its original, with no truth and none of the product's code.
+
+Everything is measured on pictures as shown: sRGB-encoded, because a fault counts by how it looks.
+Nothing here imports the library: what judges it must not share its errors.
+"""
+
+from __future__ import annotations
+
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+Shown: TypeAlias = NDArray[np.floating]
+"""A picture `(row, col, 3)`, sRGB-encoded, 0 to 1."""
+
+STANDS_OUT: Final = 0.06
+"""Fifteen of 255: chosen as what one sees at a glance on an even ground."""
+
+COLOURED: Final = 0.12
+"""Distance of chromaticity, see `chromaticity`: chosen, a colour cast that one names without comparison."""
+
+HUE_REACH: Final = 3
+"""Pixels around a place whose colours it may take: as far as lateral colour moves them."""
+
+TRACE: Final = 0.006
+"""Least curvature that a point of contrast 1 leaves when it is blurred, after a Gaussian of one pixel.
+
+Behind a Gaussian of s pixels it is 1 / (2 pi (1 + s^2)^2): .072 at s = .7, .027 at 1.2, .0064 at 2.
+"""
+
+BANDS: Final = {"coarse": (0.06, 0.15), "middle": (0.15, 0.3), "fine": (0.3, 0.5)}
+"""Cycles per pixel."""
+
+_FAR: Final = 2.0
+"""How many ranges beyond the range a dot lies.
+
+Chosen: with 1.5, correct sharpening of twigs and letters to half their width had up to 70 dots a megapixel.
+"""
+_HINT: Final = 0.1
+
+_LUMA: Final = np.array([0.299, 0.587, 0.114])
+_BLOCK: Final = 32
+_SPECTRUM_OF_GRAIN: Final = 8.0
+"""Power density of coarse over fine: white noise has 1, demosaiced noise 2 to 5, a scene (1/f^2) about 20."""
+_FLAT_SHARE: Final = 0.1
+_FLAT_BLOCKS: Final = 8
+_LEAST_GRAIN: Final = 1e-3
+"""Standard deviation below which a place holds rounding to eight bits and no grain."""
+
+_TEXTURE_BLOCK: Final = 16
+_TEXTURE: Final = (0.006, 0.05)
+"""Standard deviations of lightness that count as low contrast: one and a half to thirteen of 255, chosen."""
+_TEXTURE_PERCENTILE: Final = 5.0
+
+_EDGE_GRID: Final = 16
+_REACH: Final = 12
+_PLATEAU: Final = 7
+_STEP: Final = 0.2
+_EVEN: Final = 0.06
+"""Standard deviation of a plateau beside an edge, as a share of the step: chosen, half of the bar."""
+_HALO: Final = 5.0
+"""Percent of the step by which an original may leave its plateaus beside an edge that counts.
+
+Chosen: with 25 the truth itself "overshoots" by 26 percent in foliage, by lines and texture that blur hid;
+with 5 by 5.5. Edges that a camera gave halos are left out.
+"""
+_LEAST_EDGES: Final = 50
+"""Chosen: below it the 99th percentile is the worst edge."""
+
+
+def luma(picture: Shown) -> NDArray[np.float64]:
+    """Lightness of a picture, `(row, col)` (weights of ITU-R BT.601)."""
+    return np.asarray(picture, dtype=np.float64) @ _LUMA
+
+
+def chromaticity(picture: Shown) -> NDArray[np.float32]:
+    """Coordinates in the plane of colours without lightness, `(row, col, 2)`; the origin is grey.
+
+    c1 = (R - G) / sqrt 2, c2 = (R + G - 2 B) / sqrt 6: an orthonormal basis beside (1, 1, 1).
+    """
+    r, g, b = (np.asarray(picture[..., k], dtype=np.float32) for k in range(3))
+    return np.stack([(r - g) / np.float32(2**0.5), (r + g - 2 * b) / np.float32(6**0.5)], axis=-1)
+
+
+def dots(before: Shown, after: Shown) -> NDArray[np.bool_]:
+    """Pixels that stand alone where the original has no such value and nothing that could become one.
+
+    In a channel, a dot exceeds the range of the original's 5 x 5 pixels by twice that range and by
+    `STANDS_OUT` at least, and at most one of its own eight neighbours goes with it: what is sharpened
+    along an edge or a line has two. A true point that was blurred left a bump, see `TRACE`.
+
+    Parameters
+    ----------
+    before, after : Shown, shape (row, col, 3)
+
+    Returns
+    -------
+    ndarray of bool, shape (row, col)
+    """
+    found = np.zeros(before.shape[:2], dtype=bool)
+    for k in range(3):
+        old = np.asarray(before[..., k], dtype=np.float32)
+        new = np.asarray(after[..., k], dtype=np.float32)
+        for sign in (np.float32(1.0), np.float32(-1.0)):
+            found |= _dots(sign * old, sign * new)
+    return found
+
+
+def _dots(old: NDArray[np.float32], new: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Bright dots of a channel."""
+    found = np.zeros(old.shape, dtype=bool)
+    high = ndimage.maximum_filter(old, 5)
+    margin = np.maximum(_FAR * (high - ndimage.minimum_filter(old, 5)), STANDS_OUT)
+    rows, cols = np.nonzero(new > high + margin)
+    if rows.size == 0:
+        return found
+    padded = np.pad(new, 1, mode="reflect")
+    around = [
+        padded[rows + 1 + dr, cols + 1 + dc] for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (dr, dc) != (0, 0)
+    ]
+    alone = new[rows, cols] > np.sort(np.stack(around), axis=0)[-2] + STANDS_OUT
+    rows, cols = rows[alone], cols[alone]
+    down, across, mixed = _second_derivatives(old)
+    weakest = -((down + across) / 2.0 + np.hypot((down - across) / 2.0, mixed))
+    bump = ndimage.maximum_filter(weakest, 3)[rows, cols]
+    dot = bump < TRACE * (new - high)[rows, cols]
+    found[rows[dot], cols[dot]] = True
+    return found
+
+
+def hue_flips(before: Shown, after: Shown) -> NDArray[np.bool_]:
+    """Pixels whose hue the original has nowhere within `HUE_REACH` pixels, and no trace of it either.
+
+    With c the chromaticity of a pixel and o those around the same place of the original, it is a flip
+    where |c| exceeds the largest part of any o along c by `COLOURED` and by half of |c|: a colour may
+    get purer, up to twice, but not turn into another one. A small thing whose colour blur has washed out
+    left a tenth of it, and a ridge (`TRACE`); only where all around it has the opposite hue did it leave
+    nothing, and counts.
+
+    Parameters
+    ----------
+    before, after : Shown, shape (row, col, 3)
+
+    Returns
+    -------
+    ndarray of bool, shape (row, col)
+    """
+    old, new = chromaticity(before), chromaticity(after)
+    size = np.linalg.norm(new, axis=-1)
+    rows, cols = np.nonzero((size > COLOURED) & (np.linalg.norm(new - old, axis=-1) > COLOURED))
+    own = size[rows, cols]
+    most = _most_along(old, rows, cols, new[rows, cols] / np.maximum(own, COLOURED)[:, None], HUE_REACH)
+    flips = own - most > np.maximum(COLOURED, 0.5 * own)
+    found = np.zeros(before.shape[:2], dtype=bool)
+    rows, cols, own = rows[flips], cols[flips], own[flips]
+    if rows.size == 0:
+        return found
+    towards = new[rows, cols] / own[:, None]
+    bends = [
+        np.stack(pair, axis=-1)
+        for pair in zip(*(_second_derivatives(old[..., k]) for k in (0, 1)), strict=True)
+    ]
+    ridge = np.full(rows.size, -np.inf)
+    for dr, dc in np.ndindex(3, 3):
+        at = np.clip(rows + dr - 1, 0, old.shape[0] - 1), np.clip(cols + dc - 1, 0, old.shape[1] - 1)
+        down, across, mixed = ((bend[at] * towards).sum(axis=-1) for bend in bends)
+        np.maximum(ridge, np.hypot((down - across) / 2.0, mixed) - (down + across) / 2.0, out=ridge)
+    traced = (ridge >= TRACE * own) & (_most_along(old, rows, cols, towards, 1) >= _HINT * own)
+    found[rows[~traced], cols[~traced]] = True
+    return found
+
+
+def _most_along(
+    colours: NDArray[np.float32],
+    rows: NDArray[np.intp],
+    cols: NDArray[np.intp],
+    towards: NDArray[np.floating],
+    reach: int,
+) -> NDArray[np.float64]:
+    """Largest part along a direction that any chromaticity around a pixel has."""
+    padded = np.pad(colours, ((reach, reach), (reach, reach), (0, 0)), mode="reflect")
+    most = np.full(rows.size, -np.inf)
+    for dr, dc in np.ndindex(2 * reach + 1, 2 * reach + 1):
+        np.maximum(most, (padded[rows + dr, cols + dc] * towards).sum(axis=-1), out=most)
+    return most
+
+
+def _second_derivatives(plane: NDArray[np.floating]) -> tuple[NDArray[np.float32], ...]:
+    """Second derivatives of a plane by rows, by columns and mixed, after a Gaussian of one pixel."""
+    orders = ((2, 0), (0, 2), (1, 1))
+    return tuple(ndimage.gaussian_filter(plane.astype(np.float32), 1.0, order=order) for order in orders)
+
+
+def overshoots(before: Shown, after: Shown, truth: Shown | None = None) -> NDArray[np.float64]:
+    """Overshoot beside each clean edge of the original, in both pictures.
+
+    An edge is the steepest place of a square of 16 pixels where the original's lightness changes by a fifth
+    or more from one even plateau to another, each 7 to 12 pixels away, with nothing between. Its
+    profile is the mean of five lines across it; the overshoot is how far it leaves the plateaus 1 to 6 pixels
+    away, in percent of the step. Where the truth is known, edges beside which it has a line that blur hid
+    are left out as well: a perfect correction "overshoots" there.
+
+    Parameters
+    ----------
+    before, after : Shown, shape (row, col, 3)
+    truth : Shown, shape (row, col, 3), or None
+        What a perfect lens would have shown.
+
+    Returns
+    -------
+    ndarray, shape (n, 2)
+        Percent in the original and in the corrected picture.
+    """
+    old, new = luma(before), luma(after)
+    if min(old.shape) < 3 * _REACH:
+        return np.empty((0, 2))
+    slope = np.stack([ndimage.gaussian_filter(old, 1.5, order=order) for order in ((1, 0), (0, 1))])
+    rows, cols = _steepest(np.hypot(*slope))
+    direction = slope[:, rows, cols]
+    direction = direction / np.maximum(np.hypot(*direction), 1e-12)
+    pictures = [old, new] if truth is None else [old, new, luma(truth)]
+    profiles = [_profiles(picture, rows, cols, direction) for picture in pictures]
+    t = np.arange(-_REACH, _REACH + 1)
+    low_side, high_side = t <= -_PLATEAU, t >= _PLATEAU
+    original = profiles[0]
+    step = original[:, high_side].mean(axis=1) - original[:, low_side].mean(axis=1)
+    uneven = np.maximum(original[:, high_side].std(axis=1), original[:, low_side].std(axis=1))
+    clean = (step >= _STEP) & (uneven <= _EVEN * step)
+    beyond = []
+    for profile in profiles:
+        low, high = profile[:, low_side].mean(axis=1), profile[:, high_side].mean(axis=1)
+        above = profile[:, (t >= 1) & ~high_side].max(axis=1) - high
+        below = low - profile[:, (t <= -1) & ~low_side].min(axis=1)
+        beyond.append(np.maximum(np.maximum(above, below), 0.0) / np.maximum(high - low, 0.5 * step + 1e-12))
+    percent = 100.0 * np.stack(beyond, axis=1)
+    for own in (0, *range(2, len(pictures))):
+        clean &= percent[:, own] <= _HALO
+    return percent[clean, :2]
+
+
+def _steepest(slope: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Place of the steepest pixel of each square, where it is steep enough for a step to be there."""
+    inner = slope[_REACH + 2 : -_REACH - 2, _REACH + 2 : -_REACH - 2]
+    height, width = (n // _EDGE_GRID * _EDGE_GRID for n in inner.shape)
+    squares = inner[:height, :width].reshape(
+        height // _EDGE_GRID, _EDGE_GRID, width // _EDGE_GRID, _EDGE_GRID
+    )
+    flat = squares.transpose(0, 2, 1, 3).reshape(height // _EDGE_GRID, width // _EDGE_GRID, _EDGE_GRID**2)
+    at = flat.argmax(axis=-1)
+    down, across = np.nonzero(flat.max(axis=-1) > _STEP / (2 * _REACH))
+    best = at[down, across]
+    return (
+        down * _EDGE_GRID + best // _EDGE_GRID + _REACH + 2,
+        across * _EDGE_GRID + best % _EDGE_GRID + _REACH + 2,
+    )
+
+
+def _profiles(
+    picture: NDArray[np.float64],
+    rows: NDArray[np.intp],
+    cols: NDArray[np.intp],
+    direction: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Lightness across each edge from its dark to its light side, `(n, 2 reach + 1)`.
+
+    Linear between pixels: a spline through an edge as sharp as pixels allow leaves its plateaus by itself,
+    by 4 percent of the step.
+    """
+    t = np.arange(-_REACH, _REACH + 1)[None, :]
+    total = np.zeros((rows.size, t.size))
+    for along in range(-2, 3):
+        places = (
+            rows[:, None] + t * direction[0][:, None] - along * direction[1][:, None],
+            cols[:, None] + t * direction[1][:, None] + along * direction[0][:, None],
+        )
+        total += ndimage.map_coordinates(picture, places, order=1, mode="nearest")
+    return total / 5.0
+
+
+def grain(before: Shown, after: Shown) -> NDArray[np.float64]:
+    """Noise power of each even place in each band of frequency, in both pictures.
+
+    Squares of 32 pixels, less their plane: unclipped, with a spectrum of grain (`_SPECTRUM_OF_GRAIN`) in
+    the original, more of it than rounding. Which of them are the flattest `grain_ratio` decides.
+
+    Parameters
+    ----------
+    before, after : Shown, shape (row, col, 3)
+
+    Returns
+    -------
+    ndarray, shape (n, 1 + 2 * bands)
+        Variance in the original, then its power by band, then that of the corrected picture.
+    """
+    height, width = (n // _BLOCK for n in before.shape[:2])
+    found = []
+    for down in range(height):
+        for across in range(width):
+            window = (
+                slice(down * _BLOCK, (down + 1) * _BLOCK),
+                slice(across * _BLOCK, (across + 1) * _BLOCK),
+            )
+            old = np.asarray(before[window], dtype=np.float64)
+            if not (old.min() > 0.02 and old.max() < 0.98):
+                continue
+            old = _detrended(old)
+            variance = float(np.square(old).mean())
+            if variance < _LEAST_GRAIN**2:
+                continue
+            powers = _powers(old)
+            if powers[0] > _SPECTRUM_OF_GRAIN * powers[-1]:
+                continue
+            found.append([variance, *powers, *_powers(_detrended(np.asarray(after[window], np.float64)))])
+    return np.array(found).reshape(-1, 1 + 2 * len(BANDS))
+
+
+def grain_ratio(places: NDArray[np.float64]) -> dict[str, float] | None:
+    """Noise power of the corrected picture over the original's in each band; None where nothing is flat.
+
+    Parameters
+    ----------
+    places : ndarray, shape (n, 1 + 2 * bands)
+        From `grain`, of the whole picture; the tenth with the least variance counts.
+    """
+    count = max(round(_FLAT_SHARE * len(places)), _FLAT_BLOCKS)
+    if len(places) < count:
+        return None
+    flattest = places[np.argsort(places[:, 0])[:count], 1:]
+    old, new = np.median(flattest[:, : len(BANDS)], axis=0), np.median(flattest[:, len(BANDS) :], axis=0)
+    return {name: float(n / o) for name, n, o in zip(BANDS, new, old, strict=True)}
+
+
+def textures(before: Shown, after: Shown) -> NDArray[np.float64]:
+    """Local contrast of the corrected picture over the original's, where that is low.
+
+    Standard deviation of lightness in squares of 16 pixels, less their plane; of 1.5 to 13 of 255 in the
+    original. Lawns, slats and grain lie there: far below 1, they were painted over.
+
+    Parameters
+    ----------
+    before, after : Shown, shape (row, col, 3)
+
+    Returns
+    -------
+    ndarray, shape (n,)
+    """
+    contrasts = [_contrasts(luma(picture)) for picture in (before, after)]
+    low = (contrasts[0] >= _TEXTURE[0]) & (contrasts[0] <= _TEXTURE[1])
+    return np.asarray(contrasts[1][low] / contrasts[0][low])
+
+
+def texture_kept(ratios: NDArray[np.float64]) -> float | None:
+    """Fifth percentile of `textures` of a picture; None where it has none."""
+    return float(np.percentile(ratios, _TEXTURE_PERCENTILE)) if len(ratios) >= _LEAST_EDGES else None
+
+
+def _contrasts(plane: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Standard deviation of each square about its plane of best fit."""
+    side = _TEXTURE_BLOCK
+    down, across = (n // side for n in plane.shape)
+    squares = plane[: down * side, : across * side].reshape(down, side, across, side).transpose(0, 2, 1, 3)
+    squares = squares - squares.mean(axis=(2, 3), keepdims=True)
+    t = np.arange(side) - (side - 1) / 2.0
+    scale = float(np.square(t).sum()) * side
+    explained = (
+        np.square(np.einsum("abij,i->ab", squares, t)) + np.square(np.einsum("abij,j->ab", squares, t))
+    ) / scale
+    return np.sqrt(np.maximum(np.square(squares).sum(axis=(2, 3)) - explained, 0.0)) / side
+
+
+def percentile_of_edges(found: NDArray[np.float64]) -> tuple[float, float] | None:
+    """99th percentile of the overshoot, of the original and of the corrected picture; None for few edges."""
+    if len(found) < _LEAST_EDGES:
+        return None
+    old, new = np.percentile(found, 99.0, axis=0)
+    return float(old), float(new)
+
+
+def _detrended(block: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A square less its plane of best fit, channel by channel."""
+    t = np.arange(_BLOCK) - (_BLOCK - 1) / 2.0
+    scale = float(np.square(t).sum()) * _BLOCK
+    block = block - block.mean(axis=(0, 1))
+    down = np.einsum("ijk,i->k", block, t) / scale
+    across = np.einsum("ijk,j->k", block, t) / scale
+    return block - t[:, None, None] * down - t[None, :, None] * across
+
+
+def _powers(block: NDArray[np.float64]) -> list[float]:
+    """Mean power density of a square in each band, all channels together."""
+    spectrum = np.square(np.abs(np.fft.fft2(block * _WINDOW[:, :, None], axes=(0, 1)))).mean(axis=-1)
+    return [float(spectrum[mask].mean()) for mask in _MASKS]
+
+
+_WINDOW: Final = np.outer(np.hanning(_BLOCK), np.hanning(_BLOCK))
+_RADIUS: Final = np.hypot(np.fft.fftfreq(_BLOCK)[:, None], np.fft.fftfreq(_BLOCK)[None, :])
+_MASKS: Final = tuple((low <= _RADIUS) & (high > _RADIUS) for low, high in BANDS.values())

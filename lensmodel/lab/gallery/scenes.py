@@ -1,0 +1,273 @@
+"""Scenes for the simulated frames: what corrections fail on in public, drawn or from the demo photos.
+
+Each is `scene(rng, height, width) -> Planes` in linear light, white-balanced; values above 1 are brighter
+than white.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+from scipy import ndimage
+
+from lensmodel.core.types import Planes
+from lensmodel.simulate import demo_scene
+
+_OVER: Final = 3
+"""Drawings are made larger by this factor and averaged: sampled by area."""
+
+Colour = tuple[float, float, float]
+Mask = NDArray[np.float32]
+
+
+def lamps(rng: np.random.Generator, height: int, width: int) -> Planes:
+    """A street at dusk with lamps of 1 to 10 pixels, up to thirty times brighter than white."""
+    scene = 0.2 * _photo("city", height, width)
+    for _ in range(70):
+        radius = float(rng.choice([0.6, 0.9, 1.4, 2.2, 3.5, 6.0, 10.0]))
+        disc = _shape(height, width, "ellipse", _around(rng, height, width, radius, radius))
+        colour = rng.uniform(2.0, 30.0) * np.array(_LAMPS[int(rng.integers(len(_LAMPS)))])
+        scene = _over(scene, disc, (float(colour[0]), float(colour[1]), float(colour[2])))
+    return scene
+
+
+def red_cars(rng: np.random.Generator, height: int, width: int) -> Planes:
+    """Glossy red bodies in the sun: red far beyond white, green and blue well below."""
+    scene = 0.6 * _photo("colosseum", height, width)
+    length = width / 4.5
+    for row in (0.2, 0.47, 0.74):
+        for col in (0.04, 0.28, 0.52, 0.76):
+            top, left = height * row, width * (col + float(rng.uniform(-0.01, 0.01)))
+            scene = _car(scene, rng, top, left, length)
+    return scene
+
+
+def night(rng: np.random.Generator, height: int, width: int) -> Planes:
+    """A thirtieth of the light, a few windows and signs; meant for a high ISO."""
+    scene = 0.035 * _photo("city", height, width)
+    for _ in range(60):
+        half = rng.uniform(1.0, 7.0, 2)
+        window = _shape(height, width, "rectangle", _around(rng, height, width, half[0], half[1]))
+        level = float(rng.uniform(0.1, 1.6))
+        scene = _over(scene, window, (level, 0.75 * level, float(rng.uniform(0.2, 0.8)) * level))
+    return scene
+
+
+def snow(rng: np.random.Generator, height: int, width: int) -> Planes:
+    """Snow, bright and nearly flat, partly beyond white; dark twigs down to half a pixel."""
+    ground = _photo("lake", height, width).mean(axis=0)
+    level = (0.72 + 0.25 * ground / max(float(ground.max()), 1e-6)).astype(np.float32)
+    fall = np.linspace(0.9, 1.12, height, dtype=np.float32)[:, None]
+    scene = np.stack([level * fall * tint for tint in (0.98, 0.99, 1.02)]).astype(np.float32)
+    twigs = Image.new("L", (width * _OVER, height * _OVER), 0)
+    pen = ImageDraw.Draw(twigs)
+    for _ in range(26):
+        _branch(
+            pen,
+            rng,
+            (rng.uniform(0, width), float(height)),
+            -math.pi / 2 + rng.uniform(-0.5, 0.5),
+            rng.uniform(2.0, 6.0),
+        )
+    return _over(scene, _averaged(twigs), (0.045, 0.035, 0.028))
+
+
+def faces(rng: np.random.Generator, height: int, width: int) -> Planes:
+    """Faces before foliage: smooth shading, pores and freckles of low contrast, lashes and hair."""
+    scene = 0.5 * _photo("tea-gardens", height, width)
+    for k in range(6):
+        row, col = height * (0.28 + 0.46 * (k // 3)), width * (0.18 + 0.32 * (k % 3))
+        scene = _face(scene, rng, row, col, height / 6.5, _SKIN[k])
+    return scene
+
+
+def foliage(rng: np.random.Generator, height: int, width: int) -> Planes:
+    """Terraces of tea bushes, and before them leaves and stalks: detail everywhere, long edges nowhere."""
+    scene = _photo("tea-gardens", height, width)
+    sheet = Image.new("RGB", (width * _OVER, height * _OVER // 2))
+    pen = ImageDraw.Draw(sheet)
+    for _ in range(9000):
+        length, angle = float(rng.uniform(4.0, 26.0)) * _OVER, float(rng.uniform(0.0, math.tau))
+        at = rng.uniform((0.0, 0.0), sheet.size)
+        tip = at + length * np.array([math.cos(angle), math.sin(angle)])
+        side = 0.22 * length * np.array([-math.sin(angle), math.cos(angle)])
+        middle = (at + tip) / 2.0
+        green = int(rng.uniform(50, 190))
+        colour = (int(green * rng.uniform(0.4, 0.9)), green, int(green * rng.uniform(0.2, 0.5)))
+        pen.polygon([tuple(p) for p in (at, middle + side, tip, middle - side)], fill=colour)
+    rows = height // 2
+    leaves = np.asarray(sheet.resize((width, rows), Image.Resampling.BOX), dtype=np.float32) / 255.0
+    scene[:, height - rows :] = leaves.transpose(2, 0, 1) ** np.float32(2.2)
+    return scene
+
+
+def sky(rng: np.random.Generator, height: int, width: int) -> Planes:
+    """A lake under a cloudless sky that fills three fifths: a gradient, and nothing else."""
+    scene = _photo("lake", height, width)
+    ragged = ndimage.gaussian_filter1d(rng.normal(size=width), 20.0, mode="wrap")
+    horizon = height * (0.6 + 0.04 * ragged / np.abs(ragged).max())
+    rows = np.arange(height)[:, None]
+    above = np.clip(horizon[None, :] - rows + 0.5, 0.0, 1.0)
+    fall = rows / height
+    colours = (0.10 + 0.55 * fall, 0.22 + 0.55 * fall, 0.55 + 0.40 * fall)
+    planes = [above * c + (1.0 - above) * plane for c, plane in zip(colours, scene, strict=True)]
+    return np.stack(planes).astype(np.float32)
+
+
+_LAMPS: Final[tuple[Colour, ...]] = ((1.0, 0.85, 0.6), (1.0, 0.6, 0.25), (0.7, 0.9, 1.0), (1.0, 0.15, 0.1))
+_SKIN: Final[tuple[Colour, ...]] = (
+    (0.62, 0.36, 0.25),
+    (0.30, 0.16, 0.10),
+    (0.50, 0.28, 0.18),
+    (0.70, 0.45, 0.34),
+    (0.14, 0.07, 0.045),
+    (0.42, 0.24, 0.14),
+)
+"""Linear sRGB of light to dark skin in daylight, chosen."""
+
+
+def _photo(name: str, height: int, width: int) -> Planes:
+    """Middle of a demo photograph; repeated in mirror image where it is too small."""
+    scene = demo_scene(name)
+    short = [max(want - have, 0) for have, want in zip(scene.shape[1:], (height, width), strict=True)]
+    if any(short):
+        scene = np.pad(scene, ((0, 0), *((s // 2, s - s // 2) for s in short)), mode="symmetric")
+    top, left = (scene.shape[1] - height) // 2, (scene.shape[2] - width) // 2
+    return np.ascontiguousarray(scene[:, top : top + height, left : left + width])
+
+
+def _around(
+    rng: np.random.Generator, height: int, width: int, half_rows: float, half_cols: float
+) -> tuple[float, ...]:
+    """Box of a shape of the given half sides at a random place, as Pillow wants it."""
+    row, col = float(rng.uniform(8, height - 8)), float(rng.uniform(8, width - 8))
+    return col - half_cols, row - half_rows, col + half_cols, row + half_rows
+
+
+def _shape(height: int, width: int, kind: str, box: tuple[float, ...], **more: float) -> Mask:
+    """Coverage of a shape of Pillow's, 0 to 1."""
+    sheet = Image.new("L", (width * _OVER, height * _OVER), 0)
+    getattr(ImageDraw.Draw(sheet), kind)(tuple(_OVER * v for v in box), fill=255, **more)
+    return _averaged(sheet)
+
+
+def _averaged(sheet: Image.Image) -> Mask:
+    size = sheet.width // _OVER, sheet.height // _OVER
+    return np.asarray(sheet.resize(size, Image.Resampling.BOX), dtype=np.float32) / np.float32(255.0)
+
+
+def _over(scene: Planes, mask: Mask, colour: Colour | Planes) -> Planes:
+    """Lay a colour, or a picture, over a scene where the mask says."""
+    top = np.asarray(colour, dtype=np.float32)
+    if top.ndim == 1:
+        top = top[:, None, None]
+    return np.ascontiguousarray((1.0 - mask) * scene + mask * top, dtype=np.float32)
+
+
+def _car(scene: Planes, rng: np.random.Generator, top: float, left: float, length: float) -> Planes:
+    """One car from the side: body with a glossy gradient, glass, wheels, seams and a glint."""
+    size = scene.shape[1], scene.shape[2]
+    tall = 0.34 * length
+    body = np.maximum(
+        _shape(*size, "rounded_rectangle", (left, top + 0.4 * tall, left + length, top + tall), radius=24.0),
+        _shape(*size, "ellipse", (left + 0.18 * length, top, left + 0.8 * length, top + 1.1 * tall)),
+    )
+    gloss = np.clip((np.arange(size[0])[:, None] - top) / tall, 0.0, 1.0)
+    red = (float(rng.uniform(2.6, 4.2)) - 1.6 * gloss) * np.ones(size)
+    green = 0.05 + 0.05 * (1.0 - gloss) * np.ones(size)
+    scene = _over(scene, body, np.stack([red, green, 0.6 * green]).astype(np.float32))
+    glass = (left + 0.3 * length, top + 0.12 * tall, left + 0.68 * length, top + 0.38 * tall)
+    scene = _over(scene, _shape(*size, "rounded_rectangle", glass, radius=12.0), (0.03, 0.04, 0.06))
+    for at in (0.2, 0.78):
+        middle = left + at * length
+        wheel = (middle - 0.09 * length, top + 0.72 * tall, middle + 0.09 * length, top + 1.25 * tall)
+        scene = _over(scene, _shape(*size, "ellipse", wheel), (0.02, 0.02, 0.022))
+    for at in (0.34, 0.52, 0.66):
+        seam = (
+            left + at * length,
+            top + 0.42 * tall,
+            left + at * length + rng.uniform(0.4, 1.5),
+            top + 0.95 * tall,
+        )
+        scene = _over(scene, _shape(*size, "rectangle", seam), (0.25, 0.02, 0.02))
+    glint = (left + 0.1 * length, top + 0.47 * tall, left + 0.9 * length, top + 0.485 * tall)
+    return _over(scene, _shape(*size, "rectangle", glint), (6.0, 4.5, 4.0))
+
+
+def _branch(
+    pen: ImageDraw.ImageDraw,
+    rng: np.random.Generator,
+    at: tuple[float, float],
+    angle: float,
+    thickness: float,
+) -> None:
+    """Draw a twig and what grows from it, ever thinner down to half a pixel."""
+    x, y = at
+    for _ in range(int(rng.integers(5, 10))):
+        angle += float(rng.normal(0.0, 0.18))
+        length = float(rng.uniform(10.0, 28.0))
+        end = x + length * math.cos(angle), y + length * math.sin(angle)
+        pen.line(
+            (_OVER * x, _OVER * y, _OVER * end[0], _OVER * end[1]),
+            fill=255,
+            width=max(round(_OVER * thickness), 1),
+        )
+        x, y = end
+        if thickness > 0.5 and rng.random() < 0.55:
+            _branch(pen, rng, (x, y), angle + float(rng.choice([-0.7, 0.7])), 0.6 * thickness)
+        thickness = max(0.92 * thickness, 0.34)
+
+
+def _face(
+    scene: Planes, rng: np.random.Generator, row: float, col: float, radius: float, skin: Colour
+) -> Planes:
+    """One face with hair, eyes, mouth and a skin that has pores."""
+    size = scene.shape[1], scene.shape[2]
+    wide = 0.76 * radius
+    hair = (col - 1.15 * wide, row - 1.2 * radius, col + 1.15 * wide, row + 0.75 * radius)
+    scene = _over(scene, _shape(*size, "ellipse", hair), (0.03, 0.02, 0.015))
+    strands = Image.new("L", (size[1] * _OVER, size[0] * _OVER), 0)
+    pen = ImageDraw.Draw(strands)
+    for _ in range(160):
+        start = rng.uniform(-1.15, 1.15) * wide + col, row + rng.uniform(-1.25, 0.3) * radius
+        end = start[0] + rng.normal(0.0, 8.0), start[1] + rng.uniform(15.0, 50.0)
+        pen.line([_OVER * v for v in (*start, *end)], fill=200, width=1)
+    scene = _over(scene, _averaged(strands), (0.16, 0.10, 0.06))
+    rows = (np.arange(size[0])[:, None] - row) / radius
+    cols = (np.arange(size[1])[None, :] - col) / wide
+    shade = np.clip(1.08 - 0.35 * rows * rows - 0.45 * (cols + 0.3) ** 2, 0.25, None)
+    pores = ndimage.gaussian_filter(rng.normal(size=size), 0.9) * 0.06
+    freckles = ndimage.gaussian_filter((rng.random(size) < 0.004).astype(np.float64), 1.1) * 1.6
+    texture = shade * (1.0 + pores - freckles)
+    skin_plane = np.stack([np.clip(texture, 0.05, None) * c for c in skin]).astype(np.float32)
+    oval = _shape(*size, "ellipse", (col - wide, row - radius, col + wide, row + radius))
+    scene = _over(scene, oval, skin_plane)
+    for side in (-1.0, 1.0):
+        x, y = col + 0.38 * side * wide, row - 0.15 * radius
+        white = (x - 0.17 * wide, y - 0.055 * radius, x + 0.17 * wide, y + 0.055 * radius)
+        scene = _over(scene, _shape(*size, "ellipse", white), (0.75, 0.72, 0.7))
+        for share, colour in ((0.065, (0.10, 0.06, 0.03)), (0.03, (0.005, 0.005, 0.005))):
+            r = share * radius
+            scene = _over(scene, _shape(*size, "ellipse", (x - r, y - r, x + r, y + r)), colour)
+        glint = (x + 1.0, y - 2.5, x + 2.6, y - 0.9)
+        scene = _over(scene, _shape(*size, "ellipse", glint), (1.3, 1.3, 1.3))
+        lashes = Image.new("L", (size[1] * _OVER, size[0] * _OVER), 0)
+        pen = ImageDraw.Draw(lashes)
+        for t in np.linspace(-1.0, 1.0, 14):
+            foot = x + 0.17 * wide * t, y - 0.055 * radius * math.sqrt(max(1.0 - t * t, 0.0))
+            pen.line(
+                [_OVER * v for v in (*foot, foot[0] + 3.0 * t, foot[1] - 5.0)], fill=255, width=_OVER // 2
+            )
+        brow = (x - 0.22 * wide, y - 0.2 * radius, x + 0.22 * wide, y - 0.1 * radius)
+        pen.arc([_OVER * v for v in brow], 190, 350, fill=230, width=2 * _OVER)
+        scene = _over(scene, _averaged(lashes), (0.02, 0.015, 0.01))
+    mouth = (col - 0.33 * wide, row + 0.42 * radius, col + 0.33 * wide, row + 0.56 * radius)
+    scene = _over(
+        scene, _shape(*size, "ellipse", mouth), (0.9 * skin[0] + 0.05, 0.5 * skin[1], 0.55 * skin[2])
+    )
+    line = (col - 0.32 * wide, row + 0.487 * radius, col + 0.32 * wide, row + 0.487 * radius + 1.2)
+    return _over(scene, _shape(*size, "rectangle", line), (0.08, 0.02, 0.02))

@@ -1,0 +1,1 @@
+"""How well a model predicts the PSF where no sample was."""

@@ -1,0 +1,251 @@
+"""Programs that people use instead, run from outside: what they cost and what they gain.
+
+Nothing here links a program; each is called by its own command line where it is installed.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import struct
+import subprocess
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+from skimage import restoration
+
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.psf import gaussian
+from lensmodel.core.types import Planes
+from lensmodel.photo.dng import write_bayer_dng
+
+_LIMIT_S: Final = 1800
+_FULL: Final = 65535
+
+Command = Callable[[Path, Path, Path, float], list[str]]
+"""Words of a command, from the input, the output, a folder for settings and a setting."""
+
+
+@dataclass(frozen=True, slots=True)
+class Peer:
+    """A program with one setting that matters.
+
+    Parameters
+    ----------
+    name : str
+        For tables.
+    program : str
+        What must be on the path.
+    command : callable
+        The command line; a setting of 0 switches the sharpening off and leaves everything else.
+    settings : tuple of float
+        What to try when the best is chosen against the truth.
+    usual : float
+        The setting that is timed.
+    raw : bool
+        Whether it takes a mosaic in a DNG; else a 16-bit TIFF, sRGB-encoded.
+    """
+
+    name: str
+    program: str
+    command: Command
+    settings: tuple[float, ...]
+    usual: float
+    raw: bool = False
+
+    @property
+    def installed(self) -> bool:
+        """Whether the program is on the path."""
+        return shutil.which(self.program) is not None
+
+    def write_input(self, encoded: NDArray[np.float32], path: Path) -> None:
+        """Write a picture `(height, width, 3)`, 0 to 1, as this program takes it."""
+        numbers = np.round(np.clip(encoded, 0.0, 1.0) * _FULL).astype(np.uint16)
+        if not self.raw:
+            tifffile.imwrite(path, numbers, photometric="rgb")
+            return
+        rows, cols = numbers.shape[0] // 2 * 2, numbers.shape[1] // 2 * 2
+        mosaic = np.ascontiguousarray(numbers[:rows, :cols, 1])
+        mosaic[::2, ::2] = numbers[:rows:2, :cols:2, 0]
+        mosaic[1::2, 1::2] = numbers[1:rows:2, 1:cols:2, 2]
+        write_bayer_dng(path, mosaic, black=0, white=_FULL)
+
+    def run(self, source: Path, folder: Path, setting: float) -> tuple[Path, float]:
+        """Run the program on a file.
+
+        Returns
+        -------
+        Path
+            Its picture.
+        float
+            CPU seconds of the process, files included.
+
+        Raises
+        ------
+        InvalidInputError
+            If the program is missing, fails or writes nothing.
+        """
+        if not self.installed:
+            raise InvalidInputError(f"{self.program} is not installed; install it to compare with it")
+        target = folder / f"{self.program}-out.tif"
+        target.unlink(missing_ok=True)
+        words = self.command(source, target, folder, setting)
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        done = subprocess.run(
+            words,
+            capture_output=True,
+            check=False,
+            timeout=_LIMIT_S,
+            env=os.environ | {"HOME": str(folder), "OMP_NUM_THREADS": "2"},
+        )
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        if done.returncode != 0 or not target.exists():
+            said = done.stderr.decode(errors="replace")[-300:]
+            raise InvalidInputError(f"{self.program} failed with status {done.returncode}: {said}")
+        return target, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+    def net_seconds(self, source: Path, folder: Path) -> float:
+        """CPU seconds of the sharpening alone: a run with it less one without."""
+        with_it = self.run(source, folder, self.usual)[1]
+        return with_it - self.run(source, folder, 0.0)[1]
+
+
+def read_picture(path: Path) -> NDArray[np.float32]:
+    """Read a TIFF of a peer, `(height, width, 3)`, 0 to 1."""
+    found = tifffile.imread(path)[..., :3]
+    return np.clip(found.astype(np.float32) / np.float32(_FULL), 0.0, 1.0)
+
+
+def _gmic(source: Path, target: Path, folder: Path, setting: float) -> list[str]:
+    del folder
+    step = ["-deblur_richardsonlucy", f"1.2,{setting:.0f},1"] if setting else []
+    return ["gmic", str(source), *step, "-c", "0,65535", "-o", f"{target},uint16"]
+
+
+def _rawtherapee(section: str) -> Command:
+    def command(source: Path, target: Path, folder: Path, setting: float) -> list[str]:
+        profile = folder / "rawtherapee.pp3"
+        enabled = "true" if setting else "false"
+        profile.write_text(
+            "[Version]\nAppVersion=5.9\nVersion=346\n"
+            + section.format(enabled=enabled, radius=setting or 1.0),
+            encoding="utf-8",
+        )
+        words = ["rawtherapee-cli", "-Y", "-t", "-b16", "-o", str(target), "-p", str(profile)]
+        return [*words, "-c", str(source)]
+
+    return command
+
+
+_CAPTURE = """[PostDemosaicSharpening]
+Enabled={enabled}
+Contrast=0
+AutoContrast=false
+AutoRadius=false
+DeconvRadius={radius}
+DeconvRadiusOffset=0
+DeconvIterCheck=false
+DeconvIterations=20
+"""
+_LUCY = """[Sharpening]
+Enabled={enabled}
+Contrast=0
+Method=rld
+DeconvRadius={radius}
+DeconvAmount=100
+DeconvDamping=0
+DeconvIterations=10
+"""
+
+_HISTORY = """<?xml version="1.0" encoding="UTF-8"?>
+<x:xmpmeta xmlns:x="adobe:ns:meta/">
+<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+<rdf:Description rdf:about="" xmlns:darktable="http://darktable.sf.net/" darktable:xmp_version="4"
+ darktable:raw_params="0" darktable:auto_presets_applied="1" darktable:history_end="1"
+ darktable:iop_order_version="4"><darktable:history><rdf:Seq>
+<rdf:li darktable:num="0" darktable:operation="diffuse" darktable:enabled="{enabled}"
+ darktable:modversion="2" darktable:params="{params}" darktable:multi_name="" darktable:multi_priority="0"/>
+</rdf:Seq></darktable:history></rdf:Description></rdf:RDF></x:xmpmeta>
+"""
+
+
+def _darktable(source: Path, target: Path, folder: Path, setting: float) -> list[str]:
+    # The preset "lens deblur: medium" of version 4.2 has 16 iterations over 10 pixels.
+    params = struct.pack(
+        "<ifi11fi",
+        int(setting) or 16,
+        0.0,
+        10,
+        3.0,
+        1.0,
+        1.0,
+        0.0,
+        1.0,
+        0.0,
+        0.0,
+        -0.25,
+        0.125,
+        -0.5,
+        0.25,
+        0,
+    )
+    history = folder / "darktable.xmp"
+    history.write_text(_HISTORY.format(enabled=int(setting > 0), params=params.hex()), encoding="utf-8")
+    core = ["--core", "--configdir", str(folder / "darktable"), "--library", ":memory:"]
+    depth = ["--conf", "plugins/imageio/format/tiff/bpp=16"]
+    return [
+        "darktable-cli",
+        str(source),
+        str(history),
+        str(target),
+        "--apply-custom-presets",
+        "false",
+        *core,
+        *depth,
+    ]
+
+
+PEERS: Final[tuple[Peer, ...]] = (
+    Peer("G'MIC Richardson-Lucy", "gmic", _gmic, (2.0, 5.0, 10.0, 20.0), 20.0),
+    Peer("RawTherapee RL", "rawtherapee-cli", _rawtherapee(_LUCY), (0.5, 0.7, 1.0, 1.4), 1.0),
+    Peer("darktable lens deblur", "darktable-cli", _darktable, (1.0, 4.0, 8.0, 16.0), 16.0),
+    Peer(
+        "RawTherapee capture sharpening",
+        "rawtherapee-cli",
+        _rawtherapee(_CAPTURE),
+        (0.5, 0.8, 1.15, 1.6),
+        1.15,
+        raw=True,
+    ),
+)
+"""Each at the settings that are tried, and at the one that is timed."""
+
+
+def skimage_results(seen: Planes, widths: Sequence[float] = (0.7, 1.0, 1.5)) -> dict[str, list[Planes]]:
+    """Pictures of scikit-image's Richardson-Lucy and Wiener with one Gaussian, for several settings.
+
+    Parameters
+    ----------
+    seen : Planes, shape (3, height, width)
+        Linear light.
+    widths : sequence of float
+        Standard deviations of the Gaussian in pixels.
+    """
+    light = np.clip(seen, 1e-4, 1.0)
+    kernels = [gaussian(15, np.eye(2) * width**2).astype(np.float32) for width in widths]
+    lucy = restoration.richardson_lucy
+    wiener = restoration.wiener
+    return {
+        "scikit-image Richardson-Lucy": [_each(lucy, light, k, steps) for k in kernels for steps in (3, 10)],
+        "scikit-image Wiener": [_each(wiener, light, k, balance) for k in kernels for balance in (0.01, 0.1)],
+    }
+
+
+def _each(method: Callable[..., NDArray[np.floating]], light: Planes, *setting: object) -> Planes:
+    return np.stack([np.clip(method(plane, *setting), 0.0, 1.0) for plane in light]).astype(np.float32)

@@ -1,0 +1,23 @@
+"""The paper's figures and its Table 1, with our software, on lenses whose truth is known."""
+
+from lensmodel.lab.reproduce.cases import Case, Reproduction, Size, planned
+from lensmodel.lab.reproduce.pages.blind_curve import collected
+from lensmodel.lab.reproduce.pages.page import write_json, write_page
+from lensmodel.lab.reproduce.routes import Answer, DirectRoute, OpenRoute, Place, Route
+from lensmodel.lab.reproduce.run import run_reproduction
+
+__all__ = [
+    "Answer",
+    "Case",
+    "DirectRoute",
+    "OpenRoute",
+    "Place",
+    "Reproduction",
+    "Route",
+    "Size",
+    "collected",
+    "planned",
+    "run_reproduction",
+    "write_json",
+    "write_page",
+]

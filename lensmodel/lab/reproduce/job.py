@@ -1,0 +1,308 @@
+"""One case of a reproduction: take its photos, learn, correct, measure; keep every result."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from lensmodel.core.errors import LensModelError
+from lensmodel.core.psf import PsfField
+from lensmodel.core.types import Planes
+from lensmodel.lab.reproduce import measure, programs
+from lensmodel.lab.reproduce.cases import Case, Reproduction
+from lensmodel.lab.reproduce.measured import measured_field, photograph_target
+from lensmodel.lab.reproduce.progress import (
+    CORRECT,
+    LEARN,
+    MEASURE,
+    PROGRAM,
+    RIVAL,
+    SHOT,
+    Progress,
+    corrections,
+    is_measured,
+    methods_of,
+    programs_of,
+    rivals_of,
+    weight_of,
+)
+from lensmodel.lab.reproduce.routes import (
+    Answer,
+    OpenRoute,
+    PointField,
+    Remembered,
+    Route,
+    corrected_with,
+)
+from lensmodel.lab.reproduce.shots import Shots, take
+from lensmodel.lab.reproduce.store import Unit, read, stored
+from lensmodel.lab.rivals import rivals
+from lensmodel.photo import LinearPhoto, develop
+from lensmodel.report import photo_crops
+
+CROP_PX = 128
+CONTROL = "standard"
+"""Method whose denoising alone is the control."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One case; `truth` keeps the kernels that were asked for, which are slow to make."""
+
+    case: Case
+    truth: PsfField
+    plan: Reproduction
+    open_route: OpenRoute
+    folder: Path
+    shown: Path
+    progress: Progress
+    workers: int
+    rival_code: str
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Non-blind methods of this case."""
+        return methods_of(self.case, self.plan)
+
+    def run(self) -> Unit:
+        """Compute what is missing, and return all of it."""
+        case, learned = self.case, {n: self.folder / f"learned-{n}.json" for n in self.case.photos}
+        truth, work = self.folder / "truth.json", self.folder / "work"
+        measured = [self.folder / "measured.json"] if is_measured(case) else []
+        rival = {
+            name: self.folder / f"rival-{name}-{self.rival_code}.json" for name in rivals_of(case, self.plan)
+        }
+        version = programs.version()
+        program = {
+            name: self.folder / f"program-{programs.label_of(name)}-{version}.json"
+            for name in programs_of(case, self.plan)
+        }
+        files = (truth, *measured, *learned.values(), *rival.values(), *program.values())
+        if all(path.exists() for path in files):
+            self.progress.tell(f"{case.title}: stored", weight_of(case, self.plan), fresh=False)
+        else:
+            shots = self._shots(work / "photos")
+            self._truth(truth, shots)
+            for path in measured:
+                self._target(path, shots, work)
+            if all(path.exists() for path in learned.values()):
+                self.progress.tell(f"{case.title}: learned before", self._learning(), fresh=False)
+            else:
+                with self.open_route(case, work) as route:
+                    self._learned(route, shots, learned)
+            self._beside(rival, shots)
+            self._programs(program, shots)
+            shutil.rmtree(work)
+        return {
+            "name": case.name,
+            "title": case.title,
+            "kind": case.lens.model.split()[1].lower(),
+            "condition": case.condition,
+            "condition_title": case.conditions.title,
+            "settings": {key: value for key, value in asdict(case).items() if key != "layout"},
+            "stops": case.stops,
+            "frames": case.layout.words(),
+            "truth": read(truth),
+            "measured": read(measured[0]) if measured else None,
+            "learned": {str(n): read(path) for n, path in learned.items()},
+            "rivals": {name: read(path) for name, path in rival.items()},
+            "programs": {name: read(path) for name, path in program.items()},
+        }
+
+    def _learning(self) -> float:
+        return self.case.photos[-1] * LEARN + len(self.case.photos) * corrections(self.case, self.plan)
+
+    def _shots(self, folder: Path) -> Shots:
+        total = (self.case.photos[-1] + 2) * SHOT
+        told = 0.0
+
+        def on_step(done: int, count: int) -> None:
+            nonlocal told
+            share = total * done / count
+            self.progress.tell(f"{self.case.title}: photo {done} of {count} taken", share - told)
+            told = share
+
+        shots = take(self.case, self.plan.files(), folder, workers=self.workers, on_step=on_step)
+        self.progress.tell(f"{self.case.title}: photos are there", total - told, fresh=told > 0)
+        return shots
+
+    def _truth(self, path: Path, shots: Shots) -> None:
+        weight = corrections(self.case, self.plan) + 2 * CORRECT
+        _, fresh = stored(path, lambda: self._measured_truth(shots))
+        self.progress.tell(f"{self.case.title}: with the true PSF", weight, fresh=fresh)
+
+    def _target(self, path: Path, shots: Shots, work: Path) -> None:
+        weight = MEASURE + corrections(self.case, self.plan)
+        _, fresh = stored(path, lambda: self._measured_by_target(shots, work))
+        self.progress.tell(f"{self.case.title}: measured with a target", weight, fresh=fresh)
+
+    def _measured_by_target(self, shots: Shots, work: Path) -> Unit:
+        """What a photo of the printed target makes of the lens: the paper's non-blind calibration."""
+        page = work / "target.dng"
+        began = time.monotonic()
+        try:
+            photograph_target(self.case, page)
+            began = time.monotonic()
+            field = Remembered(measured_field(self.case, page))
+        except LensModelError as error:  # frames too small for a page: the row is left out
+            return {"refused": str(error), "psf": None, "methods": {}, "pictures": {}}
+        seconds = time.monotonic() - began
+        answers = [Answer(field.kernel_at(*place, measure.PSF_SIZE), np.nan) for place in measure.places()]
+        unit: Unit = {
+            "refused": "",
+            "learning_seconds": round(seconds, 1),
+            "psf": measure.psf_errors(answers, self.truth),
+            "methods": {},
+            "pictures": {},
+        }
+        chart = None if shots.chart is None else develop(shots.chart)
+        photo = develop(shots.held_out)
+        for method in self.methods:
+            unit["methods"][method], made = self._corrected(chart, photo, field, method, shots, "measured")
+            unit["pictures"] |= made
+        return unit
+
+    def _measured_truth(self, shots: Shots) -> Unit:
+        case = self.case
+        chart = None if shots.chart is None else develop(shots.chart)
+        photo = develop(shots.held_out)
+        unit: Unit = {
+            "before": measure.state(None if chart is None else chart.planes, photo.planes, shots, case),
+            "true": {},
+            "pictures": {
+                "before": self._picture("before", photo.planes),
+                "scene": self._picture("scene", self._as_photo(shots.truth())),
+            },
+        }
+        for method in self.methods:
+            unit["true"][method], name = self._corrected(chart, photo, self.truth, method, shots, "true")
+            unit["pictures"] |= name
+        unit["control"], _ = self._corrected(chart, photo, PointField(), CONTROL, shots, None)
+        return unit
+
+    def _corrected(
+        self,
+        chart: LinearPhoto | None,
+        photo: LinearPhoto,
+        field: PsfField,
+        method: str,
+        shots: Shots,
+        label: str | None,
+    ) -> tuple[Unit, dict[str, str]]:
+        """Correct and measure chart and photo with a field; the name of the picture, if it has a label."""
+        edges = None if chart is None else corrected_with(chart, field, method, workers=self.workers)
+        after = corrected_with(photo, field, method, workers=self.workers)
+        name = {} if label is None else {f"{label}-{method}": self._picture(f"{label}-{method}", after)}
+        before = None if chart is None else chart.planes
+        return measure.state(edges, after, shots, self.case, before=before), name
+
+    def _as_photo(self, planes: Planes) -> Planes:
+        """Planes of the sensor as the photo's file has them: white-balanced where it is not raw."""
+        if self.case.conditions.container == "dng":
+            return planes
+        return planes * np.asarray(self.case.camera.white_balance, dtype=np.float32)[:, None, None]
+
+    def _beside(self, targets: Mapping[str, Path], shots: Shots) -> None:
+        weight = RIVAL + corrections(self.case, self.plan)
+        for name, path in targets.items():
+            _, fresh = stored(path, partial(self._measured_rival, name, shots))
+            self.progress.tell(f"{self.case.title}: rival {name}", weight, fresh=fresh)
+
+    def _measured_rival(self, name: str, shots: Shots) -> Unit:
+        """What a rival makes of the first photo, corrected by our methods."""
+        began = time.monotonic()
+        try:
+            field = Remembered(rivals.create(name).field([develop(shots.learn[0])]))
+        except LensModelError as error:
+            before = read(self.folder / "truth.json")["before"]
+            unit: Unit = {"refused": str(error), "psf": None, "pictures": {}}
+            return {**unit, "methods": dict.fromkeys(self.methods, before)}
+        seconds = time.monotonic() - began
+        answers = [Answer(field.kernel_at(*place, measure.PSF_SIZE), np.nan) for place in measure.places()]
+        unit = {
+            "refused": "",
+            "learning_seconds": round(seconds, 1),
+            "psf": measure.psf_errors(answers, self.truth),
+            "methods": {},
+            "pictures": {},
+        }
+        chart = None if shots.chart is None else develop(shots.chart)
+        photo = develop(shots.held_out)
+        for method in self.methods:
+            unit["methods"][method], made = self._corrected(chart, photo, field, method, shots, name)
+            unit["pictures"] |= made
+        return unit
+
+    def _programs(self, targets: Mapping[str, Path], shots: Shots) -> None:
+        for name, path in targets.items():
+            _, fresh = stored(path, partial(self._measured_program, name, shots))
+            self.progress.tell(f"{self.case.title}: {name}", PROGRAM, fresh=fresh)
+
+    def _measured_program(self, name: str, shots: Shots) -> Unit:
+        """What a program of others makes of chart and photo, at its best setting."""
+        peer, gains = programs.named(name), self.case.camera.white_balance
+        photo = develop(shots.held_out).planes
+        setting, after = programs.best_setting(peer, photo, shots.truth(), gains)
+        chart = None if shots.chart is None else develop(shots.chart).planes
+        edges = None if chart is None else programs.corrected_by(peer, chart, setting, gains)
+        label = programs.label_of(name)
+        return {
+            "setting": setting,
+            "state": measure.state(edges, after, shots, self.case, before=chart),
+            "pictures": {label: self._picture(label, after)},
+        }
+
+    def _learned(self, route: Route, shots: Shots, targets: Mapping[int, Path]) -> None:
+        refused: list[str] = []
+        weight, seen = corrections(self.case, self.plan), 0
+        for n, path in targets.items():
+            began = time.monotonic()
+            for photo in shots.learn[seen:n]:
+                if reason := route.learn(photo):
+                    refused.append(f"{photo.stem}: {reason}")
+                self.progress.tell(f"{self.case.title}: learned from {photo.stem}", LEARN)
+            seconds = time.monotonic() - began
+            make = partial(self._measured, route, shots, n, tuple(refused), seconds)
+            _, fresh = stored(path, make)
+            self.progress.tell(f"{self.case.title}: measured after {n}", weight, fresh=fresh)
+            seen = n
+
+    def _measured(self, route: Route, shots: Shots, n: int, refused: Sequence[str], seconds: float) -> Unit:
+        case = self.case
+        unit: Unit = {
+            "photos": n,
+            "counted": n - len(refused),
+            "refused": list(refused),
+            "learning_seconds": round(seconds, 1),
+            "pictures": {},
+        }
+        if n == len(refused):
+            # no model: a user gets no correction, so the photos stay as they are
+            before = read(self.folder / "truth.json")["before"]
+            return {**unit, "psf": None, "methods": dict.fromkeys(self.methods, before)}
+        unit["methods"] = {}
+        chart = None if shots.chart is None else develop(shots.chart).planes
+        for method in self.methods:
+            after = route.corrected(shots.held_out, method)
+            edges = None if shots.chart is None else route.corrected(shots.chart, method)
+            unit["methods"][method] = measure.state(edges, after, shots, case, before=chart)
+            unit["pictures"][f"n{n}-{method}"] = self._picture(f"n{n}-{method}", after)
+        # not before: until a correction, or its own leisure, has fitted the model, a service answers in part
+        answers = route.answers(measure.places(), case.settings, measure.PSF_SIZE)
+        unit["psf"] = measure.psf_errors(answers, self.truth)
+        return unit
+
+    def _picture(self, label: str, planes: Planes) -> str:
+        name = f"{self.folder.name}-{label}.png"
+        raw = self.case.conditions.container == "dng"
+        gains = self.case.camera.white_balance if raw else (1.0, 1.0, 1.0)
+        crops = photo_crops.strip(photo_crops.as_shown(planes, gains), CROP_PX)
+        Image.fromarray(crops).save(self.shown / name, optimize=True)
+        return name

@@ -1,0 +1,158 @@
+"""Put the output of `lensmodel reproduce` into the documentation: the page, README's picture and its table.
+
+    python -m lensmodel.lab.reproduce.pages.publish reproduction figures.json --lenses 3 --seed 1002
+
+`reproduction` is the output folder of the run, `figures.json` what `--json` wrote. Written are
+`docs/results/reproduction.md` with its pictures (those of the first lenses only, crops as JPEG), the picture
+`docs/images/before-after.jpg` and the lines of README.md between its two markers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import shutil
+import textwrap
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from lensmodel.core.types import ZONES, Zone
+
+ROOT = Path(__file__).resolve().parents[4]
+PAGE, PICTURE = ROOT / "docs/results", ROOT / "docs/images/before-after.jpg"
+BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
+SHOWN: tuple[Zone, ...] = ("center", "corner")
+METHOD = "standard"
+_QUALITY = 90
+_LABEL_PX = 96
+
+
+def page(folder: Path, kept: set[str]) -> int:
+    """Copy the page with the pictures of the figures and of some cases; return how many pictures."""
+    shown = PAGE / "pictures"
+    shutil.rmtree(PAGE, ignore_errors=True)
+    shown.mkdir(parents=True)
+    blocks: list[str] = []
+    count = 0
+    for block in (folder / "reproduction.md").read_text(encoding="utf-8").rstrip().split("\n\n"):
+        found = re.fullmatch(r"!\[(.*)\]\(pictures/(.*)\)", block, re.DOTALL)
+        if not found:
+            blocks.append(block)
+            continue
+        words, name = found.groups()
+        own = re.match(r"\d{4}-", name)
+        if own and not any(name.startswith(f"{case}-") for case in kept):
+            blocks.pop()  # the line that tells what it would show
+            continue
+        source, count = folder / "pictures" / name, count + 1
+        if own:
+            name = f"{Path(name).stem}.jpg"
+            with Image.open(source) as opened:
+                opened.convert("RGB").save(shown / name, quality=_QUALITY, subsampling=0)
+        else:
+            shutil.copyfile(source, shown / name)
+        blocks.append(f"![{words}](pictures/{name})")
+    told = [
+        block
+        for block, after in zip(blocks, [*blocks[1:], "#"], strict=True)
+        if not (block.startswith("### ") and after.startswith("#"))
+    ]
+    (PAGE / "reproduction.md").write_text("\n\n".join(told) + "\n", encoding="utf-8")
+    return count
+
+
+def picture(folder: Path, case: Mapping[str, Any]) -> None:
+    """Lay the photo as it was, corrected after the most photos, and the scene below each other."""
+    most = max(case["learned"], key=int)
+    names = {
+        "as it was": case["truth"]["pictures"]["before"],
+        "corrected": case["learned"][most]["pictures"][f"n{most}-{METHOD}"],
+        "the scene": case["truth"]["pictures"]["scene"],
+    }
+    rows = []
+    for label, name in names.items():
+        with Image.open(folder / "pictures" / name) as opened:
+            row = Image.new("RGB", (opened.width + _LABEL_PX, opened.height + 6), "white")
+            row.paste(opened.convert("RGB"), (_LABEL_PX, 0))
+        ImageDraw.Draw(row).text((6, row.height // 2 - 8), label, fill="black", font_size=15)
+        rows.append(np.asarray(row))
+    Image.fromarray(np.concatenate(rows)).save(PICTURE, quality=_QUALITY, subsampling=0)
+
+
+def table(cases: list[Mapping[str, Any]]) -> str:
+    """Means over lenses of MTF50 and PSNR, and what PSNR gained where it gained least."""
+
+    def line(label: str, of: Callable[[Mapping[str, Any]], Mapping[str, Any]]) -> str:
+        cells = [f"{np.mean([of(case)['edges'][zone]['mtf50'] for case in cases]):.0f}" for zone in SHOWN] + [
+            f"{np.mean([of(case)['psnr'][zone] for case in cases]):.2f}" for zone in SHOWN
+        ]
+        gains = [
+            of(case)["psnr"][zone] - case["truth"]["before"]["psnr"][zone] for case in cases for zone in ZONES
+        ]
+        return f"| {label} | {' | '.join(cells)} | {min(gains):+.1f} |"
+
+    lines = [
+        "| | MTF50 center | corner | PSNR center | corner | least gain of a zone |",
+        "|---|---|---|---|---|---|",
+        line("the photo as it was", lambda case: case["truth"]["before"]),
+    ]
+    lines += [
+        line(f"{name}, at its best setting", lambda case, name=name: case["programs"][name]["state"])  # type: ignore[misc]
+        for name in cases[0]["programs"]
+    ]
+    for n in sorted(cases[0]["learned"], key=int):
+        photos = "one photo" if n == "1" else f"{n} photos"
+        lines.append(
+            line(
+                f"corrected, learned from {photos}",
+                lambda case, n=n: case["learned"][n]["methods"][METHOD],  # type: ignore[misc]
+            )
+        )
+    lines.append(line("corrected with the true PSF", lambda case: case["truth"]["true"][METHOD]))
+    return "\n".join(lines)
+
+
+def words(result: Mapping[str, Any]) -> str:
+    """Say what the table is of."""
+    cases, held = result["cases"], result["bars_held"]
+    seeds = sorted(case["settings"]["seed"] for case in cases)
+    said = (
+        f"MTF50 in line pairs per picture height, PSNR in dB: means over {len(cases)} simulated lenses, as "
+        "unlike each other as lenses are, and photographs that nothing was tuned on (lens seeds "
+        f"{seeds[0]} to {seeds[-1]}, raw files at base ISO). The last column is the worst zone of any lens. "
+        "`lensmodel reproduce` made it; of the bars that were set before measuring "
+        f"{held['held']} hold and {held['missed']} are missed: [all of it](docs/results/reproduction.md)."
+    )
+    return textwrap.fill(said, 110, break_long_words=False, break_on_hyphens=False)
+
+
+def main() -> None:
+    """Write page, picture and table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("figures", type=Path)
+    parser.add_argument("--lenses", type=int, default=3, help="so many lenses keep their pictures")
+    parser.add_argument("--seed", type=int, default=1000, help="of the lens whose crops README shows")
+    asked = parser.parse_args()
+    readme = ROOT / "README.md"
+    before, _, rest = readme.read_text(encoding="utf-8").partition(BEGIN)
+    _, found, after = rest.partition(END)
+    if not found:
+        parser.error(f"README.md has no lines {BEGIN} and {END}")
+    result = json.loads(asked.figures.read_text(encoding="utf-8"))
+    cases = result["cases"]
+    count = page(asked.folder, {case["name"] for case in cases[: asked.lenses]})
+    picture(asked.folder, next(case for case in cases if case["settings"]["seed"] == asked.seed))
+    readme.write_text(f"{before}{BEGIN}\n{table(cases)}\n\n{words(result)}\n{END}{after}", encoding="utf-8")
+    print(f"{count} pictures; {PAGE / 'reproduction.md'}, {PICTURE}, {readme}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,339 @@
+"""Tables from results: means over lenses, in the paper's order."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from typing import Any, Final
+
+from lensmodel.core.types import ZONES
+
+Result = Mapping[str, Any]
+
+SMALL_GAIN: Final = 0.05
+"""Where the true PSF raises MTF50 by a smaller share, the share of its gain says nothing."""
+
+EDGE_FIGURES: Final = (
+    "mtf50",
+    "tangential_mtf50",
+    "sagittal_mtf50",
+    "mtf_max",
+    "overshoot",
+    "mtf50_fair",
+)
+
+TOLERATED_DB: Final = 0.05
+
+MEASURABLE: Final = {"psnr": 0.2, "ssim": 0.002}
+"""Gains of the true PSF below these say nothing of a lens."""
+
+BEFORE: Final = "without correction"
+DENOISED: Final = "denoised only"
+MEASURED: Final = "measured with a target"
+TRUE: Final = "true PSF"
+
+
+def groups(result: Result) -> dict[str, Result]:
+    """Split the lenses by aperture and frame: means over different ones would compare nothing."""
+    found: dict[str, list[Result]] = {}
+    for case in result["cases"]:
+        settings = case["settings"]
+        stops = "wide open" if case["stops"] < 0.1 else f"{case['stops']:.0f} stops down"
+        label = f"{stops}, frames of {settings['width']} x {settings['height']}"
+        found.setdefault(label, []).append(case)
+    return {label: {**result, "cases": cases} for label, cases in found.items()}
+
+
+def counts(result: Result) -> list[int]:
+    """Numbers of photos that occur, ascending."""
+    return sorted({int(n) for case in result["cases"] for n in case["learned"]})
+
+
+def mean(values: Iterable[float | None]) -> float | None:
+    """Mean of those that are known; None where none is."""
+    known = [v for v in values if v is not None and math.isfinite(v)]
+    return sum(known) / len(known) if known else None
+
+
+def summary(result: Result) -> dict[str, Any]:
+    """Return everything that the tables show, as plain values.
+
+    Returns
+    -------
+    dict
+        `mtf`, `psnr`, `ssim`: rows of states by method, with the mean over the lenses that have it;
+        `share`: share of the true-PSF gain in MTF50; `halo`: overshoot beyond that of the true PSF;
+        `psnr_kept`, `ssim_kept`: share of its gain; `psnr_control`: gain by denoising alone;
+        `worse`: zones that fell; `psf`, `psf_all_channels`, `psf_rivals`; `predicted_right`.
+    """
+    methods = result["plan"]["methods"]
+    return {
+        "lenses": len(result["cases"]),
+        "mtf": {method: _mtf(result, method) for method in methods},
+        "share": {method: _by_count(result, partial(shares, method=method)) for method in methods},
+        "share_tangential": {
+            method: _by_count(result, partial(shares, method=method, edge="tangential_mtf50"))
+            for method in methods
+        },
+        "share_sagittal": {
+            method: _by_count(result, partial(shares, method=method, edge="sagittal_mtf50"))
+            for method in methods
+        },
+        "halo": {method: _by_count(result, partial(halo, method=method)) for method in methods},
+        "psnr": {method: _fidelity(result, method, "psnr") for method in methods},
+        "ssim": {method: _fidelity(result, method, "ssim") for method in methods},
+        "psnr_control": _zones(lambda z: mean(gain(c, c["truth"]["control"], z) for c in result["cases"])),
+        "psnr_kept": {method: _by_count(result, partial(kept, method=method)) for method in methods},
+        "ssim_kept": {
+            method: _by_count(result, partial(kept, method=method, of="ssim")) for method in methods
+        },
+        "worse": {method: worse(result, method) for method in methods},
+        "psf_rivals": {
+            name: _zones(
+                partial(_column_mean, [_rel_l2(c["rivals"][name]["psf"], "g") for c in _with(result, name)])
+            )
+            for name in result["plan"].get("rivals", {})
+        },
+        "psf": _by_count(result, partial(_psf, channel="g")),
+        "psf_all_channels": _by_count(result, _psf_mean),
+        "predicted_right": {
+            str(n): mean(_get(c["learned"][str(n)]["psf"], "predicted_right") for c in _having(result, n))
+            for n in counts(result)
+        },
+    }
+
+
+def shares(case: Result, n: int, method: str, edge: str = "mtf50") -> dict[str, float | None]:
+    """Share of the gain of the true PSF in MTF50 that one lens reaches; None where that gain is small."""
+    found: dict[str, float | None] = {}
+    for zone in ZONES:
+        before = _edge(case["truth"]["before"], zone, edge)
+        true = _edge(case["truth"]["true"][method], zone, edge)
+        after = _edge(case["learned"][str(n)]["methods"][method], zone, edge)
+        if before is None or true is None or after is None or true - before < SMALL_GAIN * before:
+            found[zone] = None
+        else:
+            found[zone] = (after - before) / (true - before)
+    return found
+
+
+def halo(case: Result, n: int, method: str) -> dict[str, float | None]:
+    """Overshoot of edges beyond that of the correction with the true PSF, percent of the step."""
+    found: dict[str, float | None] = {}
+    for zone in ZONES:
+        true = _edge(case["truth"]["true"][method], zone, "overshoot")
+        after = _edge(case["learned"][str(n)]["methods"][method], zone, "overshoot")
+        found[zone] = None if true is None or after is None else after - true
+    return found
+
+
+def kept(case: Result, n: int, method: str, of: str = "psnr") -> dict[str, float | None]:
+    """Share of the gain of the true PSF in PSNR or SSIM; None where that gain is small."""
+    found: dict[str, float | None] = {}
+    for zone in ZONES:
+        true = gain(case, case["truth"]["true"][method], zone, of)
+        after = gain(case, case["learned"][str(n)]["methods"][method], zone, of)
+        found[zone] = None if true is None or after is None or true < MEASURABLE[of] else after / true
+    return found
+
+
+def worse(result: Result, method: str) -> dict[str, dict[str, int]]:
+    """Count zones of lenses whose PSNR or SSIM fell.
+
+    Returns
+    -------
+    dict
+        By number of photos: `zones`; `worse` and `clearly_worse`, PSNR at all and by more than is
+        tolerated; `ssim_worse`; `unimproved`, PSNR or SSIM did not rise although the true PSF raises
+        PSNR measurably.
+    """
+    return {
+        str(n): counted(
+            [
+                (case, zone, case["learned"][str(n)]["methods"][method], case["truth"]["true"][method])
+                for case in _having(result, n)
+                for zone in ZONES
+            ]
+        )
+        for n in counts(result)
+    }
+
+
+def counted(rows: Iterable[tuple[Result, str, Result, Result]]) -> dict[str, int]:
+    """Count zones that fell, of rows `(case, zone, corrected, with the true PSF)`; see `worse`."""
+    found = dict.fromkeys(("zones", "worse", "clearly_worse", "ssim_worse", "unimproved"), 0)
+    for case, zone, after, true in rows:
+        psnr, ssim = gain(case, after, zone), gain(case, after, zone, "ssim")
+        possible = gain(case, true, zone)
+        if psnr is None or ssim is None or possible is None:
+            continue
+        found["zones"] += 1
+        found["worse"] += psnr < 0.0
+        found["clearly_worse"] += psnr < -TOLERATED_DB
+        found["ssim_worse"] += ssim < 0.0
+        found["unimproved"] += possible >= MEASURABLE["psnr"] and (psnr <= 0.0 or ssim <= 0.0)
+    return found
+
+
+def hard_rows(result: Result) -> list[dict[str, Any]]:
+    """One row a scene or path that hurts: gains in PSNR by zone, and zones that fell.
+
+    Returns
+    -------
+    list of dict
+        `condition`, `title`, `lenses`, `refused` (photos that were not learned from); `gain`,
+        `control`, `true`: mean gain in dB by zone of the correction learned from such a photo, of
+        denoising alone, and of the true PSF; `ssim`: mean gain in SSIM; `kept`; `share` of the true-PSF
+        gain in MTF50 where there was a chart; `psf`; `counts` of `counted`.
+    """
+    every: dict[str, list[Result]] = {}
+    for case in result.get("hard", ()):
+        every.setdefault(case["condition"], []).append(case)
+    return [_hard_row(name, cases) for name, cases in every.items()]
+
+
+def _hard_row(name: str, cases: Sequence[Result]) -> dict[str, Any]:
+    after = [(case, *case["learned"].values()) for case in cases]
+    method = next(iter(after[0][1]["methods"]))
+    done = [(case, unit["methods"][method]) for case, unit in after]
+    rows = [(c, z, state, c["truth"]["true"][method]) for c, state in done for z in ZONES]
+    return {
+        "condition": name,
+        "title": cases[0]["condition_title"],
+        "lenses": len(cases),
+        "refused": sum(len(unit["refused"]) for _, unit in after),
+        "gain": _zones(lambda z: mean(gain(c, state, z) for c, state in done)),
+        "ssim": _zones(lambda z: mean(gain(c, state, z, "ssim") for c, state in done)),
+        "control": _zones(lambda z: mean(gain(c, c["truth"]["control"], z) for c in cases)),
+        "true": _zones(lambda z: mean(gain(c, c["truth"]["true"][method], z) for c in cases)),
+        "kept": _zones(partial(_column_mean, [kept(c, 1, method) for c in cases])),
+        "share": _zones(partial(_column_mean, [shares(c, 1, method) for c in cases])),
+        "psf": _zones(partial(_column_mean, [_rel_l2(unit["psf"], "g") for _, unit in after])),
+        "counts": counted(rows),
+    }
+
+
+def states(case: Result, method: str) -> dict[str, Mapping[str, Any]]:
+    """Versions of a lens's photos by name, from untouched to the true PSF."""
+    learned = {
+        f"n = {n}": unit["methods"][method]
+        for n, unit in sorted(case["learned"].items(), key=lambda item: int(item[0]))
+    }
+    rival = {f"{name}, n = 1": unit["methods"][method] for name, unit in case["rivals"].items()}
+    return {
+        BEFORE: case["truth"]["before"],
+        DENOISED: case["truth"]["control"],
+        **{name: unit["state"] for name, unit in case.get("programs", {}).items()},
+        **rival,
+        **learned,
+        **_by_target(case, method),
+        TRUE: case["truth"]["true"][method],
+    }
+
+
+def _by_target(case: Result, method: str) -> dict[str, Mapping[str, Any]]:
+    """The state with PSFs measured on a target; empty where there was none or it could not be measured."""
+    methods = (case.get("measured") or {}).get("methods", {})
+    return {MEASURED: methods[method]} if method in methods else {}
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Write a Markdown table."""
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
+
+
+def number(value: float | None, digits: int = 0) -> str:
+    """Format a number; a dash where there is none."""
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _names(every: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Names of all states: untouched, denoised, rivals, photos ascending, measured, the true PSF."""
+    found = dict.fromkeys(name for one in every for name in one)
+
+    def place(name: str) -> tuple[int, int]:
+        fixed = {BEFORE: 0, DENOISED: 1, MEASURED: 4, TRUE: 5}
+        if name in fixed:
+            return fixed[name], 0
+        return (3, int(name[4:])) if name.startswith("n = ") else (2, 0)
+
+    return sorted(found, key=place)
+
+
+def _mtf(result: Result, method: str) -> list[dict[str, Any]]:
+    every = [states(case, method) for case in result["cases"]]
+    rows = []
+    for name in _names(every):
+        row: dict[str, Any] = {"state": name}
+        for zone in ZONES:
+            here = [one[name]["edges"].get(zone, {}) for one in every if name in one]
+            row[zone] = {field: mean(_get(edge, field) for edge in here) for field in EDGE_FIGURES}
+        rows.append(row)
+    return rows
+
+
+def _fidelity(result: Result, method: str, of: str) -> list[dict[str, Any]]:
+    every = [states(case, method) for case in result["cases"]]
+    return [
+        {
+            "state": name,
+            **{zone: mean(_get(one[name][of], zone) for one in every if name in one) for zone in ZONES},
+        }
+        for name in _names(every)
+    ]
+
+
+def _by_count(
+    result: Result, of: Callable[[Result, int], Mapping[str, float | None]]
+) -> dict[str, dict[str, float | None]]:
+    table: dict[str, dict[str, float | None]] = {}
+    for n in counts(result):
+        rows = [of(case, n) for case in _having(result, n)]
+        table[str(n)] = _zones(partial(_column_mean, rows))
+    return table
+
+
+def _column_mean(rows: Sequence[Mapping[str, float | None]], zone: str) -> float | None:
+    return mean(row.get(zone) for row in rows)
+
+
+def _zones(of: Callable[[str], float | None]) -> dict[str, float | None]:
+    return {zone: of(zone) for zone in ZONES}
+
+
+def _having(result: Result, n: int) -> list[Result]:
+    return [case for case in result["cases"] if str(n) in case["learned"]]
+
+
+def _with(result: Result, rival: str) -> list[Result]:
+    return [case for case in result["cases"] if rival in case["rivals"]]
+
+
+def _psf(case: Result, n: int, channel: str) -> dict[str, float | None]:
+    return _rel_l2(case["learned"][str(n)]["psf"], channel)
+
+
+def _rel_l2(found: Result | None, channel: str) -> dict[str, float | None]:
+    return {zone: None if found is None else found["rel_l2"][channel].get(zone) for zone in ZONES}
+
+
+def _psf_mean(case: Result, n: int) -> dict[str, float | None]:
+    every = [_psf(case, n, channel) for channel in ("r", "g", "b")]
+    return {zone: mean(one[zone] for one in every) for zone in ZONES}
+
+
+def _edge(state: Result, zone: str, name: str) -> float | None:
+    value: float | None = _get(state["edges"].get(zone, {}), name)
+    return value
+
+
+def gain(case: Result, state: Result, zone: str, of: str = "psnr") -> float | None:
+    """Gain in PSNR (dB) or SSIM over the photo as it was; None where the zone is not there."""
+    before, after = _get(case["truth"]["before"][of], zone), _get(state[of], zone)
+    return None if before is None or after is None else after - before
+
+
+def _get(row: Mapping[str, Any] | None, name: str) -> float | None:
+    return None if row is None else row.get(name)

@@ -1,0 +1,74 @@
+"""How far a reproduction is: what is done, of how much."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from lensmodel.lab.reproduce.cases import HARD_METHODS, Case, Reproduction
+from lensmodel.lab.reproduce.conditions import BASE
+
+
+class OnWork(Protocol):
+    """Hears of progress; weights are rough shares of the time."""
+
+    def __call__(self, words: str, done: float, total: float, *, fresh: bool) -> None:
+        """Say that `done` of `total` is over, and whether the last part was computed or found stored."""
+
+
+@dataclass(slots=True)
+class Progress:
+    """Adds up the weights of what is done and tells a listener."""
+
+    on_work: OnWork
+    total: float
+    done: float = 0.0
+
+    def tell(self, words: str, weight: float, *, fresh: bool = True) -> None:
+        """Say that one more piece of work is over."""
+        self.done += weight
+        self.on_work(words, self.done, self.total, fresh=fresh)
+
+
+SHOT: Final = 1.0
+LEARN: Final = 5.0
+CORRECT: Final = 1.0
+MEASURE: Final = 4.0
+RIVAL: Final = 4.0
+PROGRAM: Final = 4.0
+FIGURES: Final = 12.0
+"""Rough shares of the time."""
+
+
+def methods_of(case: Case, plan: Reproduction) -> tuple[str, ...]:
+    """Non-blind methods that a case is corrected by."""
+    return plan.methods if case.condition == BASE else HARD_METHODS
+
+
+def rivals_of(case: Case, plan: Reproduction) -> tuple[str, ...]:
+    """Rivals of a case; one of n = 10, 20 is a lens that another case has from its first photo on."""
+    return plan.rivals if case.condition == BASE and case.photos[0] <= 2 else ()
+
+
+def programs_of(case: Case, plan: Reproduction) -> tuple[str, ...]:
+    """Programs of others that correct what a case photographs; like the rivals, each lens once."""
+    return plan.programs if rivals_of(case, plan) else ()
+
+
+def is_measured(case: Case) -> bool:
+    """Whether the lens of a case is also measured with a target: once, from the first photo on."""
+    return case.condition == BASE and case.photos[0] <= 2
+
+
+def corrections(case: Case, plan: Reproduction) -> float:
+    """Weight of correcting and measuring chart and photo by every method."""
+    return (2 if case.conditions.with_chart else 1) * len(methods_of(case, plan)) * CORRECT
+
+
+def weight_of(case: Case, plan: Reproduction) -> float:
+    """Weight of a whole case."""
+    shots = (case.photos[-1] + 2) * SHOT
+    each = corrections(case, plan)
+    target = MEASURE + each if is_measured(case) else 0.0
+    rest = target + len(rivals_of(case, plan)) * (RIVAL + each) + len(programs_of(case, plan)) * PROGRAM
+    return shots + each + 2 * CORRECT + case.photos[-1] * LEARN + len(case.photos) * each + rest

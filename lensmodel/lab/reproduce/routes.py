@@ -1,0 +1,185 @@
+"""Ways from photo files to a lens model and to corrected photos: what is under test."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from dataclasses import field as dataclass_field
+from pathlib import Path
+from typing import Protocol, TypeAlias
+
+from lensmodel.core import psf
+from lensmodel.core.errors import LensModelError, NoSamplesError
+from lensmodel.core.psf import PsfField
+from lensmodel.core.types import Channel, FieldPosition, Kernel, LensSettings, Planes
+from lensmodel.correction import correct_planes
+from lensmodel.lab.reproduce.cases import Case
+from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
+from lensmodel.photo import LinearPhoto, develop
+from lensmodel.photo.lateral import LateralColour, resample
+from lensmodel.workflow import pipeline
+
+Place: TypeAlias = tuple[FieldPosition, Channel]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """A PSF as the route gives it.
+
+    Parameters
+    ----------
+    kernel : Kernel
+    predicted_error : float
+        Relative L2 that the model expects of it; NaN where it says nothing.
+    """
+
+    kernel: Kernel
+    predicted_error: float
+
+
+class Route(Protocol):
+    """One lens that learns from photos, answers for its PSF, and corrects photos."""
+
+    def learn(self, photo: Path) -> str:
+        """Learn from one more photo; return why it did not count, or nothing.
+
+        A photo that has been learned from before changes nothing.
+        """
+
+    def answers(self, places: Sequence[Place], settings: LensSettings, size: int) -> list[Answer]:
+        """Return the PSFs at some places.
+
+        Raises
+        ------
+        NoSamplesError
+            If no photo has counted yet.
+        """
+
+    def corrected(self, photo: Path, method: str) -> Planes:
+        """Correct a photo that takes no part in learning, with what is known now.
+
+        Returns
+        -------
+        Planes
+            In the camera's colours, linear, not white-balanced.
+        """
+
+
+OpenRoute: TypeAlias = Callable[[Case, Path], AbstractContextManager[Route]]
+"""Opens the route of a case; the folder keeps what was learned, should the run be stopped."""
+
+
+class DirectRoute:
+    """The library in this process, without the service.
+
+    Parameters
+    ----------
+    folder : Path
+        Where models are kept between runs.
+    estimator : str
+        Name in the registry of blind estimators.
+    workers : int or None
+        Processes; None takes all cores.
+    """
+
+    def __init__(self, folder: Path, estimator: str = "default", workers: int | None = None) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._folder, self._estimator, self._workers = folder, estimator, workers
+        self._seen: list[str] = []
+        self._model: LensModel | None = None
+
+    def learn(self, photo: Path) -> str:
+        """Learn from one more photo; see `Route`."""
+        name = pipeline.photo_id(photo)
+        if name in self._seen:
+            return ""
+        self._seen.append(name)
+        stored = self._folder / f"{name}.lensprofile"
+        refused = self._folder / f"{name}.json"
+        if refused.exists():
+            return str(json.loads(refused.read_text(encoding="utf-8")))
+        if stored.exists():
+            samples = load_profile(stored).model.samples
+        else:
+            try:
+                samples = tuple(
+                    pipeline.samples_of_photo(photo, estimator=self._estimator, workers=self._workers)
+                )
+            except LensModelError as error:
+                refused.write_text(json.dumps(str(error)), encoding="utf-8")
+                return str(error)
+            save_profile(stored, LensProfile(LensModel.fit(samples)))
+        model = LensModel.fit(samples) if self._model is None else self._model.added(samples)
+        self._model = model.warmed()
+        return ""
+
+    def answers(self, places: Sequence[Place], settings: LensSettings, size: int) -> list[Answer]:
+        """Return the PSFs at some places; see `Route`."""
+        model = self._known()
+        found = [model.query(place, settings.with_channel(channel), size) for place, channel in places]
+        return [Answer(answer.kernel, answer.predicted_error) for answer in found]
+
+    def corrected(self, photo: Path, method: str) -> Planes:
+        """Correct a photo; see `Route`."""
+        developed = develop(photo)
+        return pipeline.correct_photo(
+            developed,
+            self._known(),
+            pipeline.settings_of(developed),
+            method=method,
+            lateral=pipeline.lateral_of(developed),
+            workers=self._workers or os.cpu_count() or 1,
+        ).planes
+
+    def _known(self) -> LensModel:
+        if self._model is None:
+            raise NoSamplesError("no photo has counted yet: learn from one with fine detail in focus")
+        return self._model
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Remembered:
+    """A PSF field whose kernels are made once: several photos are corrected with it."""
+
+    field: PsfField
+    _known: dict[tuple[float, float, Channel, int], Kernel] = dataclass_field(default_factory=dict)
+
+    def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
+        """Return the kernel of a place; see `PsfField`."""
+        key = (position.r, position.phi, channel, size)
+        if key not in self._known:
+            self._known[key] = self.field.kernel_at(position, channel, size)
+        return self._known[key]
+
+
+@dataclass(frozen=True, slots=True)
+class PointField:
+    """A lens without any blur: what is left of a correction with it is denoising and demosaicing."""
+
+    def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
+        """Return a point."""
+        del position, channel
+        return psf.delta(size)
+
+
+def corrected_with(developed: LinearPhoto, field: PsfField, method: str, *, workers: int = 1) -> Planes:
+    """Correct a photo with a PSF field taken as right, as the routes do with theirs."""
+    planes, cfa = developed.planes, developed.cfa
+    lateral: LateralColour | None = pipeline.lateral_of(developed)
+    if method == "paper" and lateral is not None:
+        # the same way as `pipeline.correct_photo` goes, so that only the PSFs differ
+        planes, lateral, cfa = resample(planes, developed.frame, lateral), None, None
+    return correct_planes(
+        planes,
+        field,
+        developed.frame,
+        method=method,
+        noise=developed.correction_noise,
+        clip=developed.clip,
+        lateral=lateral,
+        cfa=cfa,
+        workers=workers,
+    ).planes

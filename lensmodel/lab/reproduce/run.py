@@ -1,0 +1,122 @@
+"""Run a reproduction case by case; whatever is stored already is not computed again.
+
+Stored for each case, one JSON file each, under a name that hashes all that it depends on::
+
+    <key>/truth.json                  as photographed, with the true PSF, denoised only
+    <key>/learned-<n>.json            after n photos
+    <key>/rival-<name>-<version>.json corrected with the PSFs of a rival, from the first photo
+    <key>/program-<name>-<version>.json  corrected by a program of others
+
+The folder `<key>/work` holds photos and models while a case is unfinished.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from lensmodel.lab.cases import photo_half
+from lensmodel.lab.reproduce import figures
+from lensmodel.lab.reproduce.cases import Reproduction, fingerprint, key_of
+from lensmodel.lab.reproduce.conditions import BASE
+from lensmodel.lab.reproduce.job import Job
+from lensmodel.lab.reproduce.progress import FIGURES, OnWork, Progress, weight_of
+from lensmodel.lab.reproduce.routes import OpenRoute
+from lensmodel.lab.reproduce.store import Unit, stored
+from lensmodel.lab.rivals import kee, rivals
+from lensmodel.lab.rivals.basis import STORED
+
+
+def run_reproduction(
+    plan: Reproduction,
+    open_route: OpenRoute,
+    folder: Path,
+    *,
+    route: str,
+    code: Sequence[Path] = (),
+    workers: int | None = None,
+    with_figures: bool = True,
+    on_work: OnWork,
+) -> dict[str, Any]:
+    """Run what is missing and return everything.
+
+    Parameters
+    ----------
+    plan : Reproduction
+    open_route : OpenRoute
+        What is under test.
+    folder : Path
+        Results go to `cache` and `pictures` in it.
+    route : str
+        Name of the route: part of the keys and of the report.
+    code : sequence of Path
+        Code of the route outside the library; a change of it makes stored results void.
+    workers : int or None
+        Processes that take photos; None means all cores.
+    with_figures : bool
+        Whether to draw Fig. 2 and Fig. 4 too.
+    on_work : OnWork
+        Called after each piece of work.
+
+    Returns
+    -------
+    dict
+        Plain values: `plan`, `route`, `code`, `scenes`, `cases`, `hard` (scenes and paths that
+        hurt), `figures`.
+    """
+    version = fingerprint(code)
+    cache, shown = folder / "cache", folder / "pictures"
+    shown.mkdir(parents=True, exist_ok=True)
+    keys = [key_of(case, plan, route, version) for case in plan.cases]
+    weights = sum(weight_of(case, plan) for case in plan.cases)
+    rival_code = rivals_version()
+    progress = Progress(on_work, weights + (FIGURES if with_figures else 0.0))
+    results = []
+    for case, key in zip(plan.cases, keys, strict=True):
+        job = Job(
+            case,
+            case.truth(),
+            plan,
+            open_route,
+            cache / key,
+            shown,
+            progress,
+            workers or os.cpu_count() or 1,
+            rival_code,
+        )
+        results.append(job.run())
+    drawn: Unit = {}
+    if with_figures:
+        path = cache / keys[0] / f"figures-{figures.version()}.json"
+        drawn, fresh = stored(path, lambda: figures.draw(plan, plan.cases[0], shown, workers=workers))
+        progress.tell("figures 2 and 4", FIGURES, fresh=fresh)
+    files = plan.files()
+    return {
+        "route": route,
+        "code": version,
+        "plan": {
+            "size": plan.size,
+            "estimator": plan.estimator,
+            "methods": list(plan.methods),
+            "rivals": {name: rivals.create(name).source for name in plan.rivals},
+            "programs": list(plan.programs),
+            "own_scenes": plan.scenes is None,
+        },
+        "scenes": [path.stem for path in files],
+        "developed_on": [path.stem for path in files if photo_half(path.stem) == "dev"],
+        "cases": [one for one in results if one["condition"] == BASE],
+        "hard": [one for one in results if one["condition"] != BASE],
+        "figures": drawn,
+    }
+
+
+def rivals_version() -> str:
+    """Hash of the rivals' code and basis: they are no part of what a case's key depends on."""
+    folder = Path(kee.__file__).parent
+    total = hashlib.sha256(STORED.read_bytes())
+    for path in sorted(folder.glob("*.py")):
+        total.update(path.read_bytes())
+    return total.hexdigest()[:8]

@@ -1,0 +1,48 @@
+"""Stored results: one JSON file each, whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from lensmodel.core.errors import InvalidInputError
+
+Unit: TypeAlias = dict[str, Any]
+"""What one file holds: plain values."""
+
+
+def stored(path: Path, make: Callable[[], Unit]) -> tuple[Unit, bool]:
+    """Return the unit of a file, or make it and write it; the file appears whole or not at all.
+
+    Returns
+    -------
+    unit : dict
+    fresh : bool
+        Whether it was made now.
+    """
+    if path.exists():
+        return read(path), False
+    unit = make()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile("w", dir=path.parent, suffix=".part", delete=False) as part:
+        json.dump(unit, part, indent=1, allow_nan=False)
+    Path(part.name).replace(path)
+    return unit, True
+
+
+def read(path: Path) -> Unit:
+    """Read a stored result.
+
+    Raises
+    ------
+    InvalidInputError
+        If the file is damaged.
+    """
+    try:
+        unit: Unit = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InvalidInputError(f"{path} is damaged; delete it and run again") from error
+    return unit

@@ -1,0 +1,79 @@
+"""What a rival method takes and gives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.psf import PsfField
+from lensmodel.core.types import FieldPosition, NoiseModel, Plane, Planes
+from lensmodel.photo import LinearPhoto
+from lensmodel.workflow import pipeline
+
+PATCHES = 48
+"""Patches looked at in one photo: twice those of a calibration, because rivals are cheap."""
+
+
+class Rival(Protocol):
+    """A blind method of somebody else: photos of one lens at one setting in, its PSF field out."""
+
+    name: str
+    source: str
+
+    def field(self, photos: Sequence[LinearPhoto]) -> PsfField:
+        """Estimate the PSF field, all channels.
+
+        Raises
+        ------
+        NotEnoughEvidenceError
+            If the photos do not determine it.
+        NoUsablePatchesError
+            If no part of a photo tells about its blur.
+        """
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """A window of a photo in all channels.
+
+    Parameters
+    ----------
+    planes : Planes, shape (3, side, side)
+    noise : tuple of NoiseModel
+        One per channel.
+    position : FieldPosition
+        Of its middle.
+    """
+
+    planes: Planes
+    noise: tuple[NoiseModel, ...]
+    position: FieldPosition
+
+    def plane(self, channel: int) -> Plane:
+        """One colour of it."""
+        return self.planes[channel]
+
+
+def windows_of(photos: Sequence[LinearPhoto]) -> list[Window]:
+    """Cut the windows that tell about the blur, chosen in green as a calibration does."""
+    found = []
+    for photo in photos:
+        for patch in pipeline.find_patches(photo, count=PATCHES).patches:
+            rows, cols = slice(patch.row, patch.row + patch.size), slice(patch.col, patch.col + patch.size)
+            planes = np.ascontiguousarray(photo.planes[:, rows, cols])
+            found.append(Window(planes, photo.noise, patch.position))
+    return found
+
+
+def powers(degree: int) -> list[tuple[int, int]]:
+    """Exponents of x and y of all terms of a polynomial in the plane, the constant first."""
+    return [(total - j, j) for total in range(degree + 1) for j in range(total + 1)]
+
+
+def polynomial(x: NDArray[np.float64], y: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
+    """Terms of `powers` at places, shape (..., terms)."""
+    return np.stack([x**i * y**j for i, j in powers(degree)], axis=-1)

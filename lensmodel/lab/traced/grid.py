@@ -1,0 +1,275 @@
+"""PSFs of a traced lens at nodes of the field, as a file, and the lens that answers between them."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.interpolate import CubicSpline
+
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.files import atomic
+from lensmodel.core.psf import as_kernel, centroid, resized
+from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensSettings
+
+FORMAT: Final = 1
+"""Raised when files of an older form can no longer be read."""
+
+_CENTRED_PX: Final = 5e-3
+
+
+@dataclass(frozen=True, eq=False)
+class GridField:
+    """The PSF field of a traced lens at one aperture: a `PsfField` that is smooth between its nodes.
+
+    Nodes stand on a square grid over the disc of the field, (right, up) in half diagonals; kernels
+    between are cubic splines through them, clipped at zero.
+
+    Parameters
+    ----------
+    axis : ndarray, shape (n,)
+        Ascending places of the nodes along both axes.
+    kernels : ndarray, shape (3, n, n, k, k), float16
+        Of channels r, g, b; rows of nodes run upwards, columns to the right. Each sums to 1 and has its
+        centre of mass on the middle pixel.
+    centers_px : ndarray, shape (3, n, n, 2), float32
+        Where they lie against green, (right, up): lateral colour.
+    light : ndarray, shape (n, n), float32
+        Transmission of the pupil over that in the centre.
+    facts : mapping
+        Design, source, copy, `f_number`, `focal_mm`, `pitch_um`, `half_diagonal_mm`.
+    """
+
+    axis: NDArray[np.float64]
+    kernels: NDArray[np.float16]
+    centers_px: NDArray[np.float32]
+    light: NDArray[np.float32]
+    facts: Mapping[str, Any]
+    _known: dict[tuple[float, float, Channel], Kernel] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        n = self.axis.size
+        shapes = (self.kernels.shape[:3], self.centers_px.shape, self.light.shape)
+        if shapes != ((3, n, n), (3, n, n, 2), (n, n)) or self.kernels.ndim != 5:
+            raise InvalidInputError(f"a grid of {n} nodes a side does not have the shapes {shapes}")
+
+    @property
+    def f_number(self) -> float:
+        """Aperture of these PSFs."""
+        return float(self.facts["f_number"])
+
+    @property
+    def pitch_um(self) -> float:
+        """Pixel pitch that they were made for."""
+        return float(self.facts["pitch_um"])
+
+    @property
+    def size(self) -> int:
+        """Side of the stored kernels."""
+        return int(self.kernels.shape[-1])
+
+    def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
+        """Return the kernel of odd side `size`; cut or padded from the stored side."""
+        h = (position.r * math.cos(position.phi), position.r * math.sin(position.phi))
+        return self.kernel_at_field(h, channel, size)
+
+    def kernel_at_field(self, h: tuple[float, float], channel: Channel, size: int) -> Kernel:
+        """Kernel at field vector `h` (right, up); beyond the nodes that of the nearest place."""
+        key = (h[0], h[1], channel)
+        if key not in self._known:
+            right, up = self._weights(h)
+            nodes = self._nodes[CHANNELS.index(channel)]
+            kernel = np.tensordot(right, np.tensordot(up, nodes, axes=(0, 0)), axes=(0, 0))
+            self._known[key] = _centred(as_kernel(np.maximum(kernel, 0.0)))
+        return resized(self._known[key], size)
+
+    def transmission(self, h: tuple[float, float]) -> float:
+        """Light at field vector `h` over that in the centre."""
+        right, up = self._weights(h)
+        return float(np.clip(up @ self.light.astype(np.float64) @ right, 0.0, 1.0))
+
+    @cached_property
+    def lateral(self) -> Mapping[Channel, tuple[float, float]]:
+        """Lateral colour against green: outwards c1 r + c3 r^3 pixels, fitted inside the frame."""
+        right, up = np.meshgrid(self.axis, self.axis)
+        r = np.hypot(right, up)
+        inside = (r > 0) & (r <= 1.0)
+        found: dict[Channel, tuple[float, float]] = {}
+        for channel, centers in zip(CHANNELS, self.centers_px.astype(np.float64), strict=True):
+            outwards = (centers[..., 0] * right + centers[..., 1] * up)[inside] / r[inside]
+            basis = np.stack([r[inside], r[inside] ** 3], axis=1)
+            c1, c3 = np.linalg.lstsq(basis, outwards, rcond=None)[0]
+            found[channel] = (float(c1), float(c3))
+        return found
+
+    @cached_property
+    def _nodes(self) -> NDArray[np.float32]:
+        return self.kernels.astype(np.float32)
+
+    @cached_property
+    def _basis(self) -> CubicSpline:
+        return CubicSpline(self.axis, np.eye(self.axis.size))
+
+    def _weights(self, h: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        inside = np.clip(np.asarray(h, dtype=np.float64), self.axis[0], self.axis[-1])
+        right, up = self._basis(inside)
+        return right, up
+
+    def write(self, path: str | Path) -> None:
+        """Write as npz, whole or not at all."""
+        with atomic(Path(path)) as stream:
+            np.savez_compressed(
+                stream,
+                format=np.array(FORMAT),
+                axis=self.axis,
+                kernels=self.kernels,
+                centers_px=self.centers_px,
+                light=self.light,
+                facts=np.array(json.dumps(dict(self.facts), sort_keys=True)),
+            )
+
+
+def read_grid(path: str | Path) -> GridField:
+    """Read a grid that `GridField.write` wrote.
+
+    Raises
+    ------
+    InvalidInputError
+        If the file has another form.
+    """
+    with np.load(path, allow_pickle=False) as stored:
+        if int(stored["format"]) != FORMAT:
+            raise InvalidInputError(f"{path} has grid format {stored['format']}, expected {FORMAT}")
+        return GridField(
+            stored["axis"],
+            stored["kernels"],
+            stored["centers_px"],
+            stored["light"],
+            json.loads(str(stored["facts"])),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class GridLens:
+    """A traced lens in front of a simulated camera, at the apertures that it has grids for.
+
+    Parameters
+    ----------
+    grids : tuple of GridField
+        Of one copy, by aperture, widest first.
+    maker, model, serial : str
+        As written into the metadata of its photos.
+    """
+
+    grids: tuple[GridField, ...]
+    maker: str = "Traced Optics"
+    model: str = ""
+    serial: str = "TRC0000001"
+
+    def __post_init__(self) -> None:
+        apertures = [grid.f_number for grid in self.grids]
+        if not apertures or apertures != sorted(apertures):
+            raise InvalidInputError(f"grids must be sorted from the widest aperture on, got {apertures}")
+        if not self.model:
+            facts = self.grids[0].facts
+            name = f"Traced {facts['design'].title()} {self.focal_mm[0]:.0f}mm f/{apertures[0]:g}"
+            object.__setattr__(self, "model", name)
+
+    @classmethod
+    def read(cls, *paths: str | Path) -> GridLens:
+        """Read the grids of one copy."""
+        return cls(tuple(sorted((read_grid(path) for path in paths), key=lambda grid: grid.f_number)))
+
+    @property
+    def focal_mm(self) -> tuple[float, ...]:
+        """The focal length, rounded to a tenth of a millimetre as lenses tell it."""
+        return (round(float(self.grids[0].facts["focal_mm"]), 1),)
+
+    def widest(self, focal_mm: float | None = None) -> float:
+        """Widest aperture."""
+        return self.grids[0].f_number
+
+    def f_number(self, settings: LensSettings) -> float:
+        """Working f-number of the settings; unknown means wide open."""
+        return self._grid(settings).f_number
+
+    def field(self, settings: LensSettings | None = None) -> GridField:
+        """The PSF of every place and channel at these settings."""
+        return self._grid(settings or LensSettings())
+
+    def kernel_at_field(
+        self,
+        h: tuple[float, float],
+        settings: LensSettings,
+        size: int,
+        *,
+        pitch_um: float,
+        defocus: float = 0.0,
+        offset: tuple[float, float] = (0.0, 0.0),
+    ) -> Kernel:
+        """Kernel at field vector `h`, its centre of mass at `offset` (row, col) pixels.
+
+        Raises
+        ------
+        InvalidInputError
+            If the pixel pitch is not that of the grid, or the photo is out of focus.
+        """
+        grid = self._grid(settings)
+        if defocus != 0.0 or abs(pitch_um / grid.pitch_um - 1.0) > 1e-3:
+            raise InvalidInputError(
+                f"this lens has kernels for a pitch of {grid.pitch_um:g} um in focus, "
+                f"got {pitch_um:g} um and a defocus of {defocus:g}"
+            )
+        kernel = grid.kernel_at_field(h, settings.channel, size)
+        return kernel if offset == (0.0, 0.0) else _moved(kernel, offset)
+
+    def transmission(self, h: tuple[float, float], settings: LensSettings) -> float:
+        """Light that the rims let through at field vector `h`, over that in the centre."""
+        return self._grid(settings).transmission(h)
+
+    def lateral_shift(self, r: float, channel: Channel, focal_mm: float | None = None) -> float:
+        """Displacement of a channel's image against green at radius `r`, outwards, in half diagonals."""
+        grid = self.grids[0]
+        c1, c3 = grid.lateral[channel]
+        half_diagonal_px = 1000.0 * float(grid.facts["half_diagonal_mm"]) / grid.pitch_um
+        return (c1 * r + c3 * r**3) / half_diagonal_px
+
+    def _grid(self, settings: LensSettings) -> GridField:
+        if settings.aperture is None:
+            return self.grids[0]
+        for grid in self.grids:
+            if abs(settings.aperture / grid.f_number - 1.0) < 0.02:
+                return grid
+        known = ", ".join(f"f/{grid.f_number:g}" for grid in self.grids)
+        raise InvalidInputError(f"this lens has PSFs for {known}, got f/{settings.aperture:g}")
+
+
+def _centred(kernel: Kernel) -> Kernel:
+    """Undo the shift that clipping the splines' undershoot made."""
+    for _ in range(4):
+        row, col = centroid(kernel)
+        if math.hypot(row, col) < _CENTRED_PX:
+            break
+        kernel = _moved(kernel, (-row, -col))
+    return kernel
+
+
+def _moved(kernel: Kernel, offset: tuple[float, float]) -> Kernel:
+    """Shift by the phase of the spectrum: what the pixel passes below its limit is moved exactly."""
+    size = kernel.shape[0]
+    grid = int(fft.next_fast_len(size + 2 * math.ceil(max(map(abs, offset)) + 4), real=True))
+    rows, cols = fft.fftfreq(grid), fft.rfftfreq(grid)
+    phase = np.exp(-2j * np.pi * (rows[:, None] * offset[0] + cols[None, :] * offset[1]))
+    padded = np.zeros((grid, grid))
+    start = (grid - size) // 2
+    padded[start : start + size, start : start + size] = kernel
+    moved = fft.irfft2(fft.rfft2(padded) * phase, s=(grid, grid))
+    return as_kernel(np.maximum(moved[start : start + size, start : start + size], 0.0))

@@ -1,0 +1,1 @@
+"""What made the data files that the library ships."""

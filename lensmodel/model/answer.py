@@ -1,0 +1,147 @@
+"""What one asks a lens model for and what it answers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.errors import InvalidInputError, UnknownMethodError
+from lensmodel.core.types import Kernel
+
+KERNELS: Final = "kernels"
+MIXED: Final = "mixed"
+LIKELIEST: Final = "likeliest"
+MODES: Final = (KERNELS, MIXED, "evidence", "wavefront", LIKELIEST)
+"""What can be made of the neighbours of a question; `modes` tells what they are."""
+
+NEEDING_EVIDENCE: Final = frozenset({"evidence", LIKELIEST})
+"""Modes that use the normal equations of patches."""
+
+MICROMETRE: Final = "micrometre"
+HALF_DIAGONAL: Final = "half-diagonal"
+UNITS: Final = (MICROMETRE, HALF_DIAGONAL)
+"""In what kernels of bodies with different pixels agree; see `pitch`."""
+
+
+@dataclass(frozen=True, slots=True)
+class ModelSettings:
+    """Choices of the regression; None means automatic.
+
+    Parameters
+    ----------
+    r, phi, stops : float or None
+        Bandwidths in half-diagonals, chord of the unit circle, and stops. Automatic: eq. (8), and
+        from three photos on the factors on it with the least leave-one-photo-out error.
+    method : str
+        Name in `smoothers`.
+    rotational : float or None
+        Strength of rotational symmetry: 0 none, 1 all angles count alike. None: by cross-validation.
+    mirror : float or None
+        Weight of each sample's mirror image about the meridional plane, 0..1. None: same.
+    robust : bool
+        Whether photos and samples that do not fit the others count less.
+    excluded : tuple of str
+        Photos whose samples do not vote; they stay listed.
+    mode : str
+        What is made of the neighbours, one of `MODES`: see `modes`.
+    unit : str
+        In what (u, v) are the same for all bodies, one of `UNITS`. By default micrometres on the sensor.
+    """
+
+    r: float | None = None
+    phi: float | None = None
+    stops: float | None = None
+    method: str = "combined"
+    rotational: float | None = None
+    mirror: float | None = None
+    robust: bool = True
+    excluded: tuple[str, ...] = ()
+    mode: str = KERNELS
+    unit: str = MICROMETRE
+
+    def __post_init__(self) -> None:
+        for name in ("r", "phi", "stops"):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise InvalidInputError(
+                    f"bandwidth {name} must be positive, or None for automatic, got {value}"
+                )
+        for name in ("rotational", "mirror"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 <= value <= 1.0:
+                raise InvalidInputError(f"{name} symmetry must lie in 0..1, or None, got {value}")
+        if self.mode not in MODES:
+            raise UnknownMethodError(f"no mode {self.mode!r} of the lens model; known: {', '.join(MODES)}")
+        if self.unit not in UNITS:
+            raise UnknownMethodError(f"no unit {self.unit!r} of the lens model; known: {', '.join(UNITS)}")
+        object.__setattr__(self, "excluded", tuple(str(name) for name in self.excluded))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PsfAnswer:
+    """A PSF with how much stands behind it.
+
+    Parameters
+    ----------
+    kernel : Kernel, shape (size, size)
+        In the image frame, centred, sum 1.
+    effective_samples : float
+        (sum w)^2 / sum w^2 of the weights; samples of one photo count together in `photos`.
+    photos : int
+        Photos among the samples that were used.
+    extrapolated : bool
+        True where no sample is near.
+    predicted_error : float
+        Expected relative L2, from the held-out errors of the neighbours and `shared_error`; at most 1.
+    shared_error : float
+        The part of it that all samples share, which no number of them makes smaller: what their estimators
+        expect beyond what their scatter shows. 0 where they expect nothing.
+    bandwidth : mapping of str to float
+        Bandwidths that were used.
+    beyond : tuple of str
+        Variables in which the question lies outside the samples.
+    nearest : float
+        Distance to the nearest sample, in bandwidths of eq. (8).
+    prior : str
+        Name of the prior that the model leans on where it has seen little; empty without one.
+    prior_share : float
+        Weight of the prior in the kernel, 0..1; 0 without a prior.
+    image_frame_share : float
+        Weight of the regression in the image frame, 0..1, by held-out errors near the place.
+    wavefront_share : float
+        Weight of the fitted wavefront with the rest of the samples, 0..1, likewise.
+    mode : str
+        Which of `MODES` answered.
+    scatter : callable
+        Computes `std`.
+    """
+
+    kernel: Kernel
+    effective_samples: float
+    photos: int
+    extrapolated: bool
+    predicted_error: float
+    bandwidth: Mapping[str, float]
+    shared_error: float = 0.0
+    beyond: tuple[str, ...] = ()
+    nearest: float = 0.0
+    prior: str = ""
+    prior_share: float = 0.0
+    image_frame_share: float = 0.0
+    wavefront_share: float = 0.0
+    mode: str = KERNELS
+    scatter: Callable[[], NDArray[np.float64]] | None = field(default=None, repr=False)
+
+    @property
+    def std(self) -> NDArray[np.float64] | None:
+        """Standard error of each pixel from the scatter of the samples, shape (size, size).
+
+        Computed when it is read: each neighbour is turned to the place alone. None where the model that made
+        the answer is not at hand.
+        """
+        return None if self.scatter is None else self.scatter()

@@ -1,0 +1,1 @@
+"""The PSF as a regression over samples: neighbours of a question, turned into its frame, and weighed."""

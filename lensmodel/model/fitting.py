@@ -1,0 +1,187 @@
+"""What is made of samples before the first question: kernels, widths, bandwidths, votes, experts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.errors import NoSamplesError
+from lensmodel.core.psf import PsfSample
+from lensmodel.core.types import LensSettings, StepHook, ignore_step
+from lensmodel.model import pitch as pitches
+from lensmodel.model import variables as va
+from lensmodel.model.answer import KERNELS, LIKELIEST, MICROMETRE, NEEDING_EVIDENCE, ModelSettings
+from lensmodel.model.field.cross_validation import Judgement, bandwidth, held_together, judge
+from lensmodel.model.field.index import SampleIndex
+from lensmodel.model.field.local_frame import LocalKernels
+from lensmodel.model.field.normal_equations import NormalEquations
+from lensmodel.model.field.smoothers import smoothers
+from lensmodel.model.field.transport import WidthField
+from lensmodel.model.wavefront.physical_mean import Physics
+from lensmodel.model.wavefront.zoom import End, ends_of, nearest
+
+_INCREMENT = 0.05
+_MOSTLY = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Roster:
+    """Numbers of photos by name, and the photo of each sample, shape (n,)."""
+
+    numbers: dict[str, int]
+    photo: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, samples: Sequence[PsfSample]) -> Roster:
+        """Number the photos in the order of their first samples."""
+        return cls({}, np.empty(0, dtype=np.intp)).extended(samples)
+
+    def extended(self, samples: Sequence[PsfSample]) -> Roster:
+        """Return it with more samples."""
+        numbers = dict(self.numbers)
+        own = [numbers.setdefault(s.photo, len(numbers)) for s in samples]
+        return Roster(numbers, np.concatenate([self.photo, np.array(own, dtype=np.intp)]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """A model's samples, prepared for questions.
+
+    Parameters
+    ----------
+    pixel : float or None
+        Pixel, in the unit of the settings, that all kernels are brought to; None where none is known.
+    size : int
+        How many samples it was fitted to; those added since keep what was fitted.
+    widths : WidthField
+    local : LocalKernels
+    index : SampleIndex
+        Points of the samples.
+    roster : Roster
+    judgement : Judgement
+    told : ndarray, shape (n,)
+        Squared errors that the estimators expect of their samples; 0 where they expect nothing.
+    rule, bandwidth : dict
+        Bandwidths of eq. (8), and those in use.
+    physical : Physics or None
+        None until `warmed`, or if it takes no part.
+    ends : tuple of End
+        Of a zoom: focal lengths that answer by a wavefront of their own.
+    statistics : NormalEquations or None
+        Those of the patches, where the mode may need them.
+    mode : str
+        Which mode answers: that of the settings, or the one that was found likeliest.
+    unit : str
+        That of the settings.
+    """
+
+    pixel: float | None
+    size: int
+    widths: WidthField
+    local: LocalKernels
+    index: SampleIndex
+    roster: Roster
+    judgement: Judgement
+    told: NDArray[np.float64]
+    rule: dict[str, float]
+    bandwidth: dict[str, float]
+    physical: Physics | None = None
+    statistics: NormalEquations | None = None
+    mode: str = KERNELS
+    unit: str = MICROMETRE
+    ends: tuple[End, ...] = ()
+
+    @classmethod
+    def of(cls, samples: Sequence[PsfSample], settings: ModelSettings) -> Fit:
+        """Fit everything but the wavefront, which `warmed` adds.
+
+        Raises
+        ------
+        NoSamplesError
+            If there are none, or none may vote.
+        UnknownMethodError
+            If `settings.method` is in no registry.
+        """
+        if not samples:
+            raise NoSamplesError("the lens has no PSF samples yet; calibrate it with a photo first")
+        base = _claimed(samples, settings)
+        if not (base > 0).any():
+            raise NoSamplesError(f"none of the {len(samples)} samples may vote; include a photo again")
+        smoother = smoothers.create(settings.method)
+        pixel = pitches.usual_pixel(samples, settings.unit)
+        common = pitches.at_pixel(samples, pixel, settings.unit)
+        index, roster = SampleIndex.of(va.points(common)), Roster.of(common)
+        where = index.points
+        widths = WidthField.fit(common, base) if smoother.transport else WidthField()
+        local = LocalKernels.of(common, where, widths)
+        judgement = judge(common, settings, local, where, base, blend=smoother.blend)
+        if smoother.transport and any(flag.sample is None for flag in judgement.flags):
+            # a spoilt photo has bent the widths too: fit them again without its voice
+            widths = WidthField.fit(common, judgement.votes)
+            local = local.rescaled(where, widths)
+            judgement = judge(common, settings, local, where, base, blend=smoother.blend)
+        rule = va.bandwidths(where)
+        used = bandwidth(rule, settings, judgement.choice)
+        return cls(
+            *(pixel, len(samples), widths, local, index, roster, judgement, told_errors(samples), rule, used),
+            statistics=statistics_of(common, settings),
+            mode=KERNELS if settings.mode == LIKELIEST else settings.mode,
+            unit=settings.unit,
+        )
+
+    def warmed(self, samples: Sequence[PsfSample], on_step: StepHook = ignore_step) -> Fit:
+        """Return it with the wavefront of its samples; the steps of each end of a zoom begin anew."""
+        groups = held_together(samples, self.roster.photo)
+        common, scale = pitches.at_pixel(samples, self.pixel, self.unit), va.scales(self.bandwidth)
+        votes = self.judgement.votes
+        physical = Physics.fit(common, votes, groups, scale, on_step)
+        ends = () if physical is None else ends_of(common, votes, groups, scale, physical, on_step)
+        return replace(self, physical=physical, ends=ends)
+
+    def physical_at(self, settings: LensSettings) -> Physics | None:
+        """The wavefront that has the larger say at settings."""
+        end, share = nearest(self.ends, settings)
+        return self.physical if end is None or share < _MOSTLY else end.physical
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of stored kernels."""
+        image = self.judgement.image
+        return self.local.nbytes + (0 if image is None else image.rest.nbytes)
+
+    def takes(self, samples: Sequence[PsfSample]) -> bool:
+        """Whether so few samples can join without fitting everything anew."""
+        total = len(self.roster.photo) + len(samples)
+        sides = [pitches.side_at(s, self.pixel, self.unit) for s in samples]
+        return total <= (1.0 + _INCREMENT) * self.size and max(sides) <= self.local.side
+
+    def extended(self, samples: Sequence[PsfSample], settings: ModelSettings) -> Fit:
+        """Return it with more samples; widths, bandwidths and the other experts stay as they were fitted."""
+        common = pitches.at_pixel(samples, self.pixel, self.unit)
+        where = va.points(common)
+        return replace(
+            self,
+            local=self.local.extended(common, where, self.widths),
+            index=self.index.extended(where),
+            roster=self.roster.extended(common),
+            judgement=self.judgement.extended(_claimed(samples, settings)),
+            told=np.concatenate([self.told, told_errors(samples)]),
+            statistics=None if self.statistics is None else self.statistics.extended(common),
+        )
+
+
+def statistics_of(samples: Sequence[PsfSample], settings: ModelSettings) -> NormalEquations | None:
+    """Normal equations of samples of one pitch, where the mode may ask for them."""
+    return NormalEquations.of(samples) if settings.mode in NEEDING_EVIDENCE else None
+
+
+def told_errors(samples: Sequence[PsfSample]) -> NDArray[np.float64]:
+    """Squared errors that the estimators expect, shape (n,)."""
+    return np.array([0.0 if s.error is None else min(s.error, 1.0) ** 2 for s in samples])
+
+
+def _claimed(samples: Sequence[PsfSample], settings: ModelSettings) -> NDArray[np.float64]:
+    return np.array([0.0 if s.photo in settings.excluded else s.weight for s in samples])

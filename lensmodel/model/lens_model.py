@@ -1,0 +1,398 @@
+"""The PSF of one lens as a continuous function of place and settings.
+
+Nadaraya-Watson regression in rotated local frames (paper, section 6.2, eq. 4-8). The weight of a
+sample factorises into one of place and settings, common to all its pixels, and one of (u, v). So
+the sum over all pixels of all samples is one of kernels::
+
+    f(u, v) = sum_i W_i C_i(u, v) / sum_i W_i
+
+with C_i the sample's kernel in its own radial frame. Departures from the paper: n in eq. (8) counts
+PSFs, not pixels; the smoothing over (u, v) is that of the spline, because a bandwidth of pixels
+would widen the PSF; kernels are scaled to the width of the place before averaging (`transport`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.geometry import zone_of
+from lensmodel.core.psf import PsfField, PsfSample
+from lensmodel.core.types import ZONES, FieldPosition, Kernel, LensSettings, StepHook, Zone, ignore_step
+from lensmodel.model import learned as memory
+from lensmodel.model import pitch as pitches
+from lensmodel.model import variables as va
+from lensmodel.model.answer import LIKELIEST, MICROMETRE, MIXED, MODES, ModelSettings, PsfAnswer
+from lensmodel.model.answering import AnsweringModel, ModelField
+from lensmodel.model.field.robust import Flag
+from lensmodel.model.fitting import Fit
+from lensmodel.model.modes import NEEDING_WAVEFRONT
+from lensmodel.model.predictor import Predictor
+from lensmodel.model.prior import Prior
+from lensmodel.model.trust.expected_error import Evidence, expected_error, with_prior
+from lensmodel.model.trust.misleading_photos import without_misleading
+from lensmodel.model.trust.support import standard_error, support
+from lensmodel.model.wavefront.likelihood import Predict, likeliest
+
+_LISTED = 1e-3  # share of the weight from which on a photo or a prior is named (chosen)
+
+
+class LensModel:
+    """PSF samples of one lens as a continuous function: a value, which `added` and the like keep."""
+
+    def __init__(
+        self,
+        samples: tuple[PsfSample, ...],
+        settings: ModelSettings,
+        fit: Fit,
+        *,
+        prior: Prior | None = None,
+    ) -> None:
+        self.samples = samples
+        self.settings = settings
+        self.prior = prior
+        self._fit = fit
+        self._predictor = Predictor(fit, settings.method, prior)
+
+    # --- building -------------------------------------------------------------------------------
+
+    @classmethod
+    def fit(
+        cls,
+        samples: Sequence[PsfSample],
+        settings: ModelSettings | None = None,
+        *,
+        prior: Prior | None = None,
+    ) -> LensModel:
+        """Build a model from samples.
+
+        Raises
+        ------
+        NoSamplesError
+            If there are none, or none may vote.
+        UnknownMethodError
+            If `settings.method` is in no registry.
+        """
+        settings, kept = settings or ModelSettings(), tuple(samples)
+        return cls(kept, settings, Fit.of(kept, settings), prior=prior)
+
+    def added(self, samples: Sequence[PsfSample]) -> LensModel:
+        """Return the model with more samples.
+
+        A handful is put in place without touching the others: bandwidths, widths and cross-validated
+        factors stay until the model has grown by a twentieth; then all is fitted anew, and wants to be
+        `warmed` again.
+        """
+        new = tuple(samples)
+        if not new:
+            return self
+        if not self._fit.takes(new):
+            return self.refitted((*self.samples, *new))
+        fit = self._fit.extended(new, self.settings)
+        return LensModel((*self.samples, *new), self.settings, fit, prior=self.prior)
+
+    def refitted(self, samples: Sequence[PsfSample]) -> LensModel:
+        """Return a model of other samples with the settings and prior of this one."""
+        return LensModel.fit(samples, self.settings, prior=self.prior)
+
+    @classmethod
+    def restored(
+        cls,
+        samples: Sequence[PsfSample],
+        learned: bytes,
+        settings: ModelSettings | None = None,
+        *,
+        prior: Prior | None = None,
+    ) -> LensModel:
+        """Build the model that `learned` was taken from, without fitting anything.
+
+        Raises
+        ------
+        InvalidInputError
+            If `learned` is damaged, or belongs to other samples, settings or another version.
+        """
+        settings, kept = settings or ModelSettings(), tuple(samples)
+        return cls(kept, settings, memory.load(learned, kept, settings), prior=prior)
+
+    def learned(self) -> bytes:
+        """What was learned from the samples, the wavefront included if `warm`; see `restored`."""
+        return memory.dump(self._fit, self.samples, self.settings)
+
+    @property
+    def warm(self) -> bool:
+        """Whether nothing is left for `warmed` to do."""
+        if self.prior is not None and not self.prior.warm:
+            return False
+        return self._fit.physical is not None or not self._wants_wavefront
+
+    @property
+    def _wants_wavefront(self) -> bool:
+        """Whether answers need a wavefront, or patches can judge it as a second opinion."""
+        if self.settings.mode in NEEDING_WAVEFRONT:
+            return True
+        heard = self.settings.mode == MIXED or any(s.spectrum is not None for s in self.samples)
+        return heard and self._predictor.smoother.physical
+
+    def warmed(self, on_step: StepHook = ignore_step) -> LensModel:
+        """Return the model with the wavefront fitted to its samples, if its method or mode has one.
+
+        That takes some seconds of CPU, and the answers are good without it, so it is not done behind
+        anybody's back: call it once when the samples are complete. The same samples give the same model.
+        A correction hears the wavefront as a second opinion (`witness`), whatever mode answers. Photos that
+        make the patches of the others less likely lose their votes here (`misleading`).
+        The mode "likeliest" is chosen here too, which takes up to three such fits more.
+        """
+        if self.warm:
+            return self
+        prior = None if self.prior is None else self.prior.warmed()
+        judged = without_misleading(self._fit, self.samples, self.settings)
+        fit = judged.warmed(self.samples, on_step)
+        if self.settings.mode == LIKELIEST:
+            voting = [s for s, vote in zip(self.samples, fit.judgement.votes, strict=True) if vote > 0]
+            fit = replace(fit, mode=likeliest(voting, self._by_mode))
+        return LensModel(self.samples, self.settings, fit, prior=prior)
+
+    def without_photo(self, photo: str) -> LensModel:
+        """Return the model without the samples of one photo."""
+        return self.refitted([s for s in self.samples if s.photo != photo])
+
+    def excluding(self, *photos: str) -> LensModel:
+        """Return the model in which these photos stay listed but do not vote."""
+        names = tuple(sorted({*self.settings.excluded, *photos}))
+        return LensModel.fit(self.samples, replace(self.settings, excluded=names), prior=self.prior)
+
+    def answering(self, *, mode: str | None = None, unit: str | None = None) -> LensModel:
+        """Return the model of the same samples in another mode or unit; None keeps what it has."""
+        chosen = replace(self.settings, mode=mode or self.settings.mode, unit=unit or self.settings.unit)
+        return self if chosen == self.settings else LensModel.fit(self.samples, chosen, prior=self.prior)
+
+    def opinion(self, mode: str) -> LensModel | None:
+        """Return the model of the same fit that answers in another mode; None without a wavefront for it."""
+        if mode in NEEDING_WAVEFRONT and self._fit.physical is None:
+            return None
+        return LensModel(self.samples, self.settings, replace(self._fit, mode=mode), prior=self.prior)
+
+    def including(self, *photos: str) -> LensModel:
+        """Return the model in which these photos vote again."""
+        names = tuple(name for name in self.settings.excluded if name not in photos)
+        return LensModel.fit(self.samples, replace(self.settings, excluded=names), prior=self.prior)
+
+    def with_prior(
+        self, source: PsfField | AnsweringModel | None, strength: float = 2.0, name: str = "other copies"
+    ) -> LensModel:
+        """Return the model that leans on a prior where it has seen little; None switches it off.
+
+        Parameters
+        ----------
+        source : LensModel or PsfField
+            Usually the model of other copies of the lens. A prior that it has itself does not count.
+        strength : float
+            Number of samples that the prior is worth.
+        name : str
+            What answers call it.
+        """
+        prior = None if source is None else Prior(source, strength, name)
+        return LensModel(self.samples, self.settings, self._fit, prior=prior)
+
+    def without_prior(self) -> LensModel:
+        """Return the model that leans on nothing but its own samples."""
+        return self if self.prior is None else self.with_prior(None)
+
+    # --- asking ---------------------------------------------------------------------------------
+
+    def query(
+        self,
+        position: FieldPosition,
+        settings: LensSettings,
+        size: int = 55,
+        *,
+        pitch_um: float | None = None,
+        half_diagonal_px: float | None = None,
+    ) -> PsfAnswer:
+        """Return the PSF at a place, with the evidence behind it.
+
+        Parameters
+        ----------
+        position : FieldPosition
+        settings : LensSettings
+            Unknown settings take no part.
+        size : int
+            Odd side in pixels.
+        pitch_um : float, optional
+            Size of a pixel of the body that asks, in micrometres; that of the samples if unknown.
+        half_diagonal_px : float, optional
+            Half the diagonal of its frame in pixels, which counts where the unit is the half-diagonal.
+        """
+        pixel = self._predictor.pixels.asked(pitch_um, half_diagonal_px)
+        inside = self._predictor.pixels.inner_size(size, pixel)
+        answers, mixture, prior_shares = self._predictor.ask([position], settings, inside)
+        fit = self._fit
+        rows, weight = answers.rows, np.maximum(answers.weights, 0.0)
+        weight /= weight.sum()
+        per_photo = np.bincount(fit.roster.photo[rows], weight)
+        nearest, beyond = support(fit.index.points[rows], va.point(position, settings), fit.rule)
+        evidence = Evidence(
+            scatter=float(weight @ fit.judgement.noise[rows]),
+            expected=float(weight @ fit.told[rows]),
+            independent=1.0 / float((per_photo**2).sum()),
+            nearest=nearest,
+            extrapolated=bool(beyond),
+            usual=float(np.mean(fit.judgement.errors**2)),
+        )
+        physical = fit.physical_at(settings)
+        alone = fit.mode in {MIXED, "wavefront"} and physical is not None and physical.agreed
+        error = expected_error(evidence, mixture, wavefront_alone=alone)
+        share = float(prior_shares[0])
+        if self.prior is not None and share > _LISTED:
+            error = with_prior(error, share, self.prior.error(position, settings))
+
+        def scatter() -> NDArray[np.float64]:
+            apart = fit.local.apart(rows, position.phi, np.array(fit.widths.at(position, settings)), inside)
+            return standard_error(self._predictor.pixels.resampled(apart, size, pixel), weight)
+
+        return PsfAnswer(
+            kernel=self._predictor.pixels.resampled(mixture.kernels, size, pixel)[0],
+            effective_samples=1.0 / float((weight**2).sum()),
+            photos=int(np.count_nonzero(per_photo > _LISTED)),
+            extrapolated=bool(beyond),
+            predicted_error=min(error, 1.0),
+            bandwidth=dict(fit.bandwidth),
+            shared_error=evidence.shared,
+            beyond=beyond,
+            nearest=nearest,
+            prior="" if self.prior is None else self.prior.name,
+            prior_share=share,
+            image_frame_share=float(mixture.shares[0, 1]),
+            wavefront_share=float(mixture.shares[0, 2]),
+            scatter=scatter,
+            mode=fit.mode,
+        )
+
+    def kernels(
+        self,
+        positions: Sequence[FieldPosition],
+        settings: LensSettings,
+        size: int = 55,
+        *,
+        pitch_um: float | None = None,
+        half_diagonal_px: float | None = None,
+    ) -> NDArray[np.float64]:
+        """Return the PSFs of many places at one setting, shape (n, size, size).
+
+        The same numbers as of `query`, several times faster: for grids and maps.
+        """
+        if not positions:
+            return np.empty((0, size, size))
+        pixel = self._predictor.pixels.asked(pitch_um, half_diagonal_px)
+        _, mixture, _ = self._predictor.ask(
+            positions, settings, self._predictor.pixels.inner_size(size, pixel)
+        )
+        return self._predictor.pixels.resampled(mixture.kernels, size, pixel)
+
+    def kernel_of(self, sample: PsfSample) -> Kernel:
+        """Return the PSF at the place and settings of a sample, in its pixels and of its size."""
+        found = self.kernels(
+            [sample.position],
+            sample.settings,
+            sample.kernel.shape[0],
+            pitch_um=sample.pixel_pitch_um,
+            half_diagonal_px=sample.half_diagonal_px,
+        )
+        return np.asarray(found[0])
+
+    def weights(
+        self, position: FieldPosition, settings: LensSettings
+    ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
+        """Weights of sum 1 that a question gives to samples.
+
+        Returns
+        -------
+        rows : ndarray of int, shape (m,)
+            Samples that take part.
+        gaps : ndarray, shape (m, 7)
+            Their distances in bandwidths, by variable.
+        weights : ndarray, shape (m,)
+            Those that hardly weigh anything are left out.
+        """
+        near = self._predictor.near([position], settings)
+        asked, scale = va.point(position, settings), va.scales(self._fit.bandwidth)
+        return near.rows, va.gaps(self._fit.index.points[near.rows], asked, scale), near.weights
+
+    def field(
+        self, settings: LensSettings, *, pitch_um: float | None = None, half_diagonal_px: float | None = None
+    ) -> ModelField:
+        """Return the PSF of every place and channel at these settings, for pixels of some size."""
+        return ModelField(self, settings, pitch_um, half_diagonal_px)
+
+    # --- what it is made of ---------------------------------------------------------------------
+
+    @property
+    def bandwidth(self) -> dict[str, float]:
+        """Bandwidths in use, by variable."""
+        return self._fit.bandwidth
+
+    @property
+    def pitch_um(self) -> float | None:
+        """Pixel pitch that answers are for unless another is asked for; None where no sample knows."""
+        fit = self._fit
+        return fit.pixel if fit.unit == MICROMETRE else pitches.usual_pixel(self.samples, MICROMETRE)
+
+    @property
+    def mode(self) -> str:
+        """Which of `MODES` answers: that of the settings, or the one that `warmed` found likeliest."""
+        return self._fit.mode
+
+    @property
+    def diffraction_known(self) -> bool:
+        """Whether the wavefront was fitted knowing aperture and pixels, so that it tells narrow blur."""
+        physical = self._fit.physical
+        return physical is not None and physical.agreed and physical.diffraction_known
+
+    @property
+    def votes(self) -> NDArray[np.float64]:
+        """Votes of the samples after robust weighting, shape (n,); 0 of photos that are excluded."""
+        return self._fit.judgement.votes
+
+    def flags(self) -> tuple[Flag, ...]:
+        """Photos and samples that count less than they claim, with reasons."""
+        return self._fit.judgement.flags
+
+    def coverage(self) -> dict[Zone, int]:
+        """Number of green samples in each zone."""
+        zones = [zone_of(s.position.r) for s in self.samples if s.settings.channel == "g"]
+        return {zone: zones.count(zone) for zone in ZONES}
+
+    def cross_validate(self) -> dict[Zone, float]:
+        """Median relative L2 of green samples against a model of the other photos, by zone.
+
+        Empty with fewer than two photos.
+        """
+        if len(self._fit.roster.numbers) < 2:
+            return {}
+        found: dict[Zone, list[float]] = {zone: [] for zone in ZONES}
+        for sample, error in zip(self.samples, self._fit.judgement.errors, strict=True):
+            if sample.settings.channel == "g" and sample.photo not in self.settings.excluded:
+                found[zone_of(sample.position.r)].append(float(error))
+        return {zone: float(np.median(values)) for zone, values in found.items() if values}
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of stored kernels, those of the samples included."""
+        return self._fit.nbytes + sum(s.kernel.nbytes for s in self.samples)
+
+    # --- inside ---------------------------------------------------------------------------------
+
+    def _by_mode(self, samples: Sequence[PsfSample]) -> dict[str, Predict]:
+        """Predictors by mode, learned from some of the samples."""
+        seen = tuple(samples)
+        fit = Fit.of(seen, self.settings).warmed(seen)
+        open_ = {"evidence": fit.statistics is not None, "wavefront": fit.physical is not None}
+
+        def told_by(mode: str) -> Predict:
+            model = LensModel(seen, self.settings, replace(fit, mode=mode))
+            return model.kernel_of
+
+        return {mode: told_by(mode) for mode in MODES if mode != LIKELIEST and open_.get(mode, True)}

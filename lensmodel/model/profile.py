@@ -1,0 +1,319 @@
+"""The portable lens profile: a zip of JSON and npy that opens anywhere and gives the same PSFs.
+
+Layout of a `.lensprofile`, format 1::
+
+    profile.json    format, lens, cameras, provenance, settings of the model, one entry for each sample
+    kernels.npy     (n, k, k) float32, sum 1, centred, in the order of the entries
+    spectra.npy     optional: what each patch says without a kernel, see `PatchSpectrum`
+    evidence/N.npz  optional: the normal equations of sample N, see `PatchEvidence`
+    learned.npz     optional: what the model has learned from them, see `learned`
+    family.lensprofile  optional: the profile of other copies that the model leans on, without one of its own
+
+Nothing in it can run code: no pickle, sizes bounded before arrays are made.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import math
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.errors import InvalidInputError, LensModelError
+from lensmodel.core.evidence import PatchEvidence
+from lensmodel.core.files import atomic
+from lensmodel.core.psf import PsfSample, resized
+from lensmodel.core.spectrum import RINGS, SECTORS, PatchSpectrum
+from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.model.answer import ModelSettings
+from lensmodel.model.lens_model import LensModel
+
+FORMAT = 1
+_MAX_BYTES = 1 << 30
+_MAX_SAMPLES = 200_000
+_MAX_SIDE = 255
+_INFINITY = "infinity"
+_LEARNED = "learned.npz"
+_SPECTRA = "spectra.npy"
+_EVIDENCE = "evidence/"
+_FAMILY = "family.lensprofile"
+
+log = logging.getLogger(__name__)
+_UNREADABLE = (
+    OSError,
+    ValueError,
+    KeyError,
+    EOFError,
+    MemoryError,  # an array header may claim any size
+    RecursionError,  # lists in lists in lists
+    RuntimeError,  # encrypted, or packed by a method that zipfile does not know
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A body that photos of a lens were taken with, as far as they say; the lens may be part of it."""
+
+    maker: str | None = None
+    model: str | None = None
+    serial: str | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LensProfile:
+    """A model with what is known of its lens and of the photos that it came from.
+
+    Parameters
+    ----------
+    model : LensModel
+    lens : dict
+        Texts: maker, model, serial, label; whatever is known.
+    photos : dict
+        File name of each photo by the id that samples carry.
+    cameras : tuple of Camera
+        What these were taken with, each once; empty where no photo says, and in older profiles.
+    """
+
+    model: LensModel
+    lens: dict[str, str] = field(default_factory=dict)
+    photos: dict[str, str] = field(default_factory=dict)
+    cameras: tuple[Camera, ...] = ()
+
+
+def save_profile(path: Path | str, profile: LensProfile) -> None:
+    """Write a profile; the file appears complete or not at all."""
+    with atomic(Path(path)) as file:
+        write_profile(file, profile)
+
+
+def write_profile(file: IO[bytes], profile: LensProfile) -> None:
+    """Write a profile to an open file.
+
+    Raises
+    ------
+    InvalidInputError
+        If it has more samples, or larger ones, than a profile holds.
+    """
+    samples, prior = profile.model.samples, profile.model.prior
+    side = max(sample.kernel.shape[0] for sample in samples)
+    if not _within_limits(len(samples), side):
+        raise InvalidInputError(
+            f"a profile holds {_MAX_SAMPLES} samples of side {_MAX_SIDE}, not {len(samples)} of side {side}"
+        )
+    stack = np.stack([resized(sample.kernel, side) for sample in samples]).astype(np.float32)
+    document = {
+        "format": FORMAT,
+        "units": {"r": "half-diagonal", "phi": "radian, counter-clockwise from the right", "kernel": "pixel"},
+        "lens": profile.lens,
+        "photos": profile.photos,
+        "cameras": [_named(asdict(camera)) for camera in profile.cameras],
+        "model": asdict(profile.model.settings),
+        "samples": [_entry(sample) for sample in samples],
+    }
+    if prior is not None and isinstance(prior.source, LensModel):
+        document["family"] = {"name": prior.name, "strength": prior.strength}
+    arrays = io.BytesIO()
+    np.save(arrays, stack, allow_pickle=False)
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("profile.json", json.dumps(document, allow_nan=False))
+        archive.writestr("kernels.npy", arrays.getvalue())
+        if any(sample.spectrum is not None for sample in samples):
+            archive.writestr(_SPECTRA, _spectra(samples))
+        for i, sample in enumerate(samples):
+            if sample.evidence is not None:
+                archive.writestr(f"{_EVIDENCE}{i}.npz", sample.evidence.to_bytes())
+        archive.writestr(_LEARNED, profile.model.learned(), zipfile.ZIP_STORED)
+        if prior is not None and isinstance(prior.source, LensModel):
+            family = io.BytesIO()
+            write_profile(family, LensProfile(prior.source))
+            archive.writestr(_FAMILY, family.getvalue(), zipfile.ZIP_STORED)
+        if _unpacked(archive) > _MAX_BYTES:
+            raise InvalidInputError(f"a profile holds {_MAX_BYTES >> 20} MiB at most; save fewer samples")
+
+
+def _within_limits(count: int, side: int) -> bool:
+    return 0 < count <= _MAX_SAMPLES and side <= _MAX_SIDE
+
+
+def _unpacked(archive: zipfile.ZipFile) -> int:
+    return sum(entry.file_size for entry in archive.infolist())
+
+
+def load_profile(path: Path | str) -> LensProfile:
+    """Open a profile.
+
+    Raises
+    ------
+    InvalidInputError
+        If the file is no profile, or one of a newer format; the text says which.
+    """
+    return _read(path, Path(path).name)
+
+
+def read_profile(file: IO[bytes], name: str) -> LensProfile:
+    """Open a profile that lies in an open file; `name` is what errors call it.
+
+    Raises
+    ------
+    InvalidInputError
+        As `load_profile`.
+    """
+    return _read(file, name)
+
+
+def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> LensProfile:
+    """Open a profile; `alone` passes over the family, which has none of its own."""
+    try:
+        with zipfile.ZipFile(source) as archive:
+            names = set(archive.namelist())
+            if _unpacked(archive) > _MAX_BYTES:
+                raise InvalidInputError(
+                    f"{name} unpacks to more than {_MAX_BYTES >> 20} MiB; it is no lens profile"
+                )
+            document = json.loads(archive.read("profile.json"))
+            stack = np.load(io.BytesIO(archive.read("kernels.npy")), allow_pickle=False)
+            spectra = archive.read(_SPECTRA) if _SPECTRA in names else None
+            evidence = {name: archive.read(name) for name in names if name.startswith(_EVIDENCE)}
+            learned = archive.read(_LEARNED) if _LEARNED in names else None
+            family = archive.read(_FAMILY) if _FAMILY in names and not alone else None
+    except FileNotFoundError:
+        raise
+    except _UNREADABLE as error:
+        raise InvalidInputError(f"{name} is no lens profile; make one with `lensmodel calibrate`") from error
+    try:
+        if document["format"] != FORMAT:
+            raise InvalidInputError(
+                f"{name} has profile format {document['format']}, this program reads {FORMAT}; "
+                "update the program"
+            )
+        entries = document["samples"]
+        fits = (
+            stack.ndim == 3
+            and len(entries) == stack.shape[0]
+            and _within_limits(len(entries), stack.shape[1])
+        )
+        if not fits or stack.dtype != np.float32:
+            raise InvalidInputError(
+                f"{name} holds {len(entries)} samples but kernels of shape {stack.shape}; "
+                f"one is needed for each, of side {_MAX_SIDE} at most"
+            )
+        samples = _samples(entries, stack, spectra, evidence)
+        model = _model(samples, _settings(document["model"]), learned)
+        if family is not None:
+            other = _read(io.BytesIO(family), f"the family in {name}", alone=True)
+            told = document["family"]
+            model = model.with_prior(other.model, float(told["strength"]), str(told["name"])[:200])
+        cameras = tuple(_camera(_texts(camera)) for camera in document.get("cameras", []))
+        return LensProfile(model, _texts(document["lens"]), _texts(document["photos"]), cameras)
+    except LensModelError:
+        raise
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        raise InvalidInputError(f"{name} is damaged: {error}") from error
+
+
+def _entry(sample: PsfSample) -> dict[str, Any]:
+    settings = asdict(sample.settings)
+    if settings["focus_m"] is not None and math.isinf(settings["focus_m"]):
+        settings["focus_m"] = _INFINITY
+    return {
+        "r": sample.position.r,
+        "phi": sample.position.phi,
+        "settings": settings,
+        "weight": sample.weight,
+        "photo": sample.photo,
+        "pixel_pitch_um": sample.pixel_pitch_um,
+        "half_diagonal_px": sample.half_diagonal_px,
+        "estimator": sample.estimator,
+        "error": sample.error,
+    }
+
+
+def _spectra(samples: Sequence[PsfSample]) -> bytes:
+    """One row for each sample, NaN where it has no spectrum."""
+    missing = np.full(RINGS * SECTORS + 3, np.nan, dtype="<f4").tobytes()
+    rows = b"".join(missing if s.spectrum is None else s.spectrum.to_bytes() for s in samples)
+    buffer = io.BytesIO()
+    np.save(buffer, np.frombuffer(rows, dtype="<f4").reshape(len(samples), -1), allow_pickle=False)
+    return buffer.getvalue()
+
+
+def _opened(data: bytes | None, count: int) -> list[PatchSpectrum | None]:
+    if data is None:
+        return [None] * count
+    rows = np.load(io.BytesIO(data), allow_pickle=False)
+    if rows.shape != (count, RINGS * SECTORS + 3) or rows.dtype != np.float32:
+        raise ValueError(f"spectra of shape {rows.shape} for {count} samples")
+    return [None if np.isnan(row).all() else PatchSpectrum.from_bytes(row.tobytes()) for row in rows]
+
+
+def _samples(
+    entries: Sequence[dict[str, Any]],
+    stack: NDArray[np.float32],
+    spectra: bytes | None,
+    evidence: Mapping[str, bytes],
+) -> list[PsfSample]:
+    found = []
+    seen = _opened(spectra, len(entries))
+    for i, (entry, kernel, spectrum) in enumerate(zip(entries, stack, seen, strict=True)):
+        sample, data = _sample(entry, kernel, spectrum), evidence.get(f"{_EVIDENCE}{i}.npz")
+        found.append(sample if data is None else replace(sample, evidence=PatchEvidence.from_bytes(data)))
+    return found
+
+
+def _sample(
+    entry: dict[str, Any],
+    kernel: Any,  # noqa: ANN401 - one row of an array of any shape
+    spectrum: PatchSpectrum | None,
+) -> PsfSample:
+    settings = dict(entry["settings"])
+    if settings.get("focus_m") == _INFINITY:
+        settings["focus_m"] = math.inf
+    return PsfSample(
+        kernel=kernel,
+        position=FieldPosition(float(entry["r"]), float(entry["phi"])),
+        settings=LensSettings(**settings),
+        weight=float(entry["weight"]),
+        photo=str(entry["photo"]),
+        spectrum=spectrum,
+        pixel_pitch_um=entry["pixel_pitch_um"],
+        estimator=str(entry["estimator"]),
+        error=entry.get("error"),
+        half_diagonal_px=entry.get("half_diagonal_px"),
+    )
+
+
+def _model(samples: list[PsfSample], settings: ModelSettings, learned: bytes | None) -> LensModel:
+    if learned is not None:
+        try:
+            return LensModel.restored(samples, learned, settings)
+        except InvalidInputError as error:
+            log.info("the profile's model is fitted anew: %s", error)
+    return LensModel.fit(samples, settings)
+
+
+def _settings(values: dict[str, Any]) -> ModelSettings:
+    # written until 0.2; it changed how finely kernels were kept, and no answer
+    return ModelSettings(**{key: value for key, value in values.items() if key != "oversampling"})
+
+
+def _named(values: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in values.items() if value is not None}
+
+
+def _camera(texts: dict[str, str]) -> Camera:
+    return Camera(texts.get("maker"), texts.get("model"), texts.get("serial"))
+
+
+def _texts(values: dict[str, Any]) -> dict[str, str]:
+    return {str(key)[:200]: str(value)[:200] for key, value in values.items()}

@@ -1,0 +1,314 @@
+"""One wavefront fitted to the spectra of all patches of all photos of a lens.
+
+Finished kernels keep the error that each patch made on its own: the scene's slope taken for blur. Here
+the scene of each patch, and what a photo's patches share, stay unknown beside the few numbers of the
+lens, and all of them are estimated at once (P. Whittle's idea, with log spectra in bins and Student's t
+against outliers), so that photos add up::
+
+    minimise  sum_patches rho(chi^2)  +  |priors|^2,
+    chi^2 = sum_bins t(r' V^-1 r),
+    r = ln S - ln(exp(s(z) + b + d |OTF(theta)|^4) (|OTF(theta)|^2 + exp(w)) + n)
+
+by Levenberg-Marquardt, the unknowns z and w of a patch eliminated from the normal equations (Schur). Power
+knows nothing of the phase: a wavefront and its negative, which turns the kernels by 180 degrees, have
+equal spectra. Which of the two it is has to come from elsewhere (`refine`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.spectrum import SECTORS
+from lensmodel.core.types import WAVELENGTH_NM, FieldPosition, LensSettings, StepHook, ignore_step
+from lensmodel.model.wavefront.aberration_prior import unlikeliness
+from lensmodel.model.wavefront.scene_spectrum import BIAS, PHOTO_SPREAD, SHAPES, WITH_POWER, SceneView
+from lensmodel.optics.transfer import BINS, BORROWED_RINGS, Transfer
+from lensmodel.optics.wavefront import NAMES, Wavefront, design, stopped
+
+Floats = NDArray[np.float64]
+
+_RINGS = BINS // SECTORS
+_LENS = len(NAMES) + 2  # and the cat's eye
+SYMMETRIC: Final = np.array(
+    [name in {"spherical", "coma", "focus", "field curvature", "astigmatism"} for name in NAMES] + [False] * 2
+)
+"""Which unknowns a centred lens of third order has in one colour."""
+
+_HELD = 1e12
+_TEMPER = 0.1
+"""Share of the likelihood that counts: neighbouring bins and patches of one motif err alike."""
+
+_FLOOR_RANGE = (-12.0, -1.0)  # of its logarithm
+_LARGEST_RESIDUAL = 3.0
+_TAILS = 6.0  # degrees of freedom of Student's t of a bin
+_PATCH_TAILS = 3.0  # of a patch, in units of its bins
+_SCENE_ROUNDS, _SCENE_ROUNDS_AGAIN = 3, 2
+_TRIES = 5
+_STRIDE_PX = 1.5
+_ENOUGH = 0.2
+_SMALLEST_EYE, _FARTHEST_EYE = 0.5, 1.0  # the two circles of the pupil have to overlap all over the field
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatchView:
+    """One patch: where, how the lens was set, of which photo, and its spectra."""
+
+    position: FieldPosition
+    settings: LensSettings
+    photo: str
+    scene: SceneView
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PooledFit:
+    """A fitted lens.
+
+    Parameters
+    ----------
+    front : Wavefront
+    cost : float
+        What was minimised; fits to the same patches compare by it.
+    covariance : ndarray, shape (21, 21)
+        Of the 19 terms and the cat's eye, by the curvature of the cost.
+    trust : ndarray, shape (n,)
+        Weight of each patch, 1 where it fits; near 0 for one that was blurred by something else.
+    """
+
+    front: Wavefront
+    cost: float
+    covariance: Floats
+    trust: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _State:
+    cost: float
+    normal: Floats
+    gradient: Floats
+    scenes: list[Floats]
+    trust: Floats
+
+
+def fit_spectra(
+    patches: Sequence[PatchView],
+    begin: Wavefront,
+    *,
+    rounds: int = 15,
+    symmetric: bool = False,
+    coarse: bool = False,
+    on_step: StepHook = ignore_step,
+) -> PooledFit:
+    """Fit a lens to patches, beginning with a wavefront.
+
+    Parameters
+    ----------
+    patches : sequence of PatchView
+    begin : Wavefront
+        `log_q`, `f_number` and `size` stay as they are here.
+    rounds : int
+        Steps at most.
+    symmetric : bool
+        Whether only the terms of a perfectly centred lens may change: few unknowns have few minima.
+    coarse : bool
+        Whether a coarse pupil does; such costs compare only among each other.
+    """
+    photos = sorted({patch.photo for patch in patches})
+    problem = _Problem(tuple(patches), {name: i for i, name in enumerate(photos)}, begin, coarse)
+    lens = np.concatenate([begin.terms, open_eye(np.asarray(begin.eye))])
+    shared = np.zeros((len(photos), len(PHOTO_SPREAD)))
+    state = problem.state(lens, shared, None)
+    held = np.zeros(_LENS + shared.size)
+    held[:_LENS] = np.where(SYMMETRIC, 0.0, _HELD) if symmetric else 0.0
+    damping = 1e-2
+    for done in range(rounds):
+        better: tuple[Floats, Floats, _State] | None = None
+        for _ in range(_TRIES):
+            step = np.linalg.solve(
+                state.normal + np.diag(damping * np.diag(state.normal) + held), state.gradient
+            )
+            step = step * min(1.0, _STRIDE_PX / max(float(np.abs(step[: len(NAMES)]).max()), 1e-9))
+            moved = lens + step[:_LENS]
+            moved[-2:] = open_eye(moved[-2:])
+            moved_shared = shared + step[_LENS:].reshape(shared.shape)
+            after = problem.state(moved, moved_shared, state.scenes)
+            if after.cost < state.cost:
+                better = moved, moved_shared, after
+                break
+            damping *= 6.0
+        if better is None:
+            break
+        gain = state.cost - better[2].cost
+        lens, shared, state = better
+        damping /= 4.0
+        on_step(done + 1, rounds)
+        if gain < _ENOUGH:
+            break
+    on_step(rounds, rounds)
+    covariance = np.asarray(np.linalg.inv(state.normal), dtype=np.float64)[:_LENS, :_LENS]
+    return PooledFit(problem.front(lens), state.cost, covariance, state.trust)
+
+
+def open_eye(eye: Floats) -> tuple[float, float]:
+    """Nearest cat's eye, radius and shift, that leaves light everywhere in the field."""
+    return max(float(eye[0]), _SMALLEST_EYE), float(np.clip(eye[1], -_FARTHEST_EYE, _FARTHEST_EYE))
+
+
+def fit_scene(view: SceneView, power: Floats) -> tuple[Floats, Floats, Floats]:
+    """Fit the scene of one patch behind a lens that is known.
+
+    Parameters
+    ----------
+    view : SceneView
+    power : ndarray, shape (BINS, c)
+        |OTF|^2.
+
+    Returns
+    -------
+    unknowns : ndarray, shape (z,)
+    residual, signal : ndarray, shape (BINS, c)
+        What is left of the log power, and the share of the scene in the power.
+    """
+    fitted = _Scene.fitted(view, power, BIAS[:, None], None)
+    return fitted.z, fitted.residual, fitted.signal
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Problem:
+    patches: tuple[PatchView, ...]
+    photos: dict[str, int]
+    begin: Wavefront
+    coarse: bool
+
+    def front(self, lens: Floats) -> Wavefront:
+        """Wavefront of the unknowns."""
+        eye = (float(lens[-2]), float(lens[-1]))
+        return replace(self.begin, terms=lens[: len(NAMES)].copy(), eye=eye)
+
+    def state(self, lens: Floats, shared: Floats, scenes: list[Floats] | None) -> _State:
+        """Cost with its normal equations; `scenes` are the patches' unknowns to begin with."""
+        count = _LENS + shared.size
+        normal, gradient = np.zeros((count, count)), np.zeros(count)
+        cost, found, trust = 0.0, [], []
+        for i, patch in enumerate(self.patches):
+            at = _LENS + len(PHOTO_SPREAD) * self.photos[patch.photo]
+            seen, by_lens = self._lens(lens, patch)
+            # its change with the lens is no part of the derivatives: lenses far too sharp would gain by it
+            rest = (BIAS + SHAPES[:, 1:3] @ shared[self.photos[patch.photo]])[:, None]
+            rest = rest + WITH_POWER[:, None] * seen**2
+            z = None if scenes is None else scenes[i]
+            fitted = _Scene.fitted(patch.scene, seen, rest, z)
+            nu = _PATCH_TAILS * BINS * len(patch.scene.channels)
+            cost += _TEMPER * nu * math.log1p(fitted.cost / nu)
+            trusted = 1.0 / (1.0 + fitted.cost / nu)
+            weight = _TEMPER * trusted
+            own_normal, own_gradient, own_count = fitted.reduced(by_lens)
+            places = [*range(_LENS), *range(at, at + own_count - _LENS)]
+            normal[np.ix_(places, places)] += weight * own_normal
+            gradient[places] += weight * own_gradient
+            found.append(fitted.z)
+            trust.append(trusted)
+        unusual, curvature, pull = unlikeliness(lens)
+        vote = np.tile(1.0 / PHOTO_SPREAD**2, len(self.photos))
+        cost += unusual + float(vote @ shared.ravel() ** 2)
+        normal[:_LENS, :_LENS] += curvature
+        normal[range(_LENS, count), range(_LENS, count)] += vote
+        gradient -= np.concatenate([pull, vote * shared.ravel()])
+        return _State(cost, normal, gradient, found, np.array(trust))
+
+    def _lens(self, lens: Floats, patch: PatchView) -> tuple[Floats, Floats]:
+        """Return |OTF|^2 in the bins, shape (BINS, c), and the derivatives of its logarithm (BINS, c, 21)."""
+        x = patch.position.r * math.cos(patch.position.phi)
+        y = patch.position.r * math.sin(patch.position.phi)
+        values, derivatives = [], []
+        for channel in patch.scene.channels:
+            settings = patch.settings.with_channel(channel)
+            stop = self.begin.stop(settings)
+            q = math.exp(self.begin.log_q) * WAVELENGTH_NM[channel] / WAVELENGTH_NM["g"] / stop
+            linear = stopped(design(patch.position, settings), stop)
+            radius, move = lens[-2] / stop, lens[-1] / stop
+            transfer = Transfer.of(
+                q, _RINGS if channel == "g" else _RINGS - BORROWED_RINGS, coarse=self.coarse
+            )
+            value, by_blur, by_eye = transfer.log_power(
+                linear @ lens[: len(NAMES)], radius, (move * x, move * y)
+            )
+            values.append(np.exp(value))
+            by_move = by_eye[:, 1] * x + by_eye[:, 2] * y
+            derivatives.append(np.column_stack([by_blur @ linear, by_eye[:, 0] / stop, by_move / stop]))
+        return np.stack(values, axis=1), np.stack(derivatives, axis=1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scene:
+    """The scene of a patch fitted for one lens, and the linearised residuals about it."""
+
+    z: Floats
+    cost: float
+    residual: Floats  # (BINS, c)
+    signal: Floats  # (BINS, c): derivative of the log power by that of the scene
+    kept: Floats  # (BINS, c): derivative of ln(|OTF|^2 + floor) by that of |OTF|^2
+    precision: Floats  # (BINS, c, c), outliers weighted down
+    weighted: Floats  # (BINS, c): precision times residual
+    by_scene: Floats  # (BINS, c, z)
+    normal: Floats
+    gradient: Floats
+
+    @classmethod
+    def fitted(cls, view: SceneView, power: Floats, rest: Floats, begin: Floats | None) -> _Scene:
+        """Solve for the patch's own unknowns by Gauss-Newton."""
+        rounds = _SCENE_ROUNDS_AGAIN
+        if begin is None:
+            rounds = _SCENE_ROUNDS
+            z = view.usual.copy()
+            left = view.log_power - np.log(power + math.exp(z[-1])) - rest - view.shapes @ z
+            z[SHAPES.shape[1] : -1 : 3] += np.median(left, axis=0)
+        else:
+            z = begin
+        state = cls._about(view, power, rest, z)
+        for _ in range(rounds):
+            z = z + np.clip(np.linalg.solve(state.normal, state.gradient), -3.0, 3.0)
+            z[-1] = np.clip(z[-1], *_FLOOR_RANGE)
+            state = cls._about(view, power, rest, z)
+        return state
+
+    @classmethod
+    def _about(cls, view: SceneView, power: Floats, rest: Floats, z: Floats) -> _Scene:
+        floor = math.exp(z[-1])
+        passed = power + floor
+        scene = np.exp(np.clip(view.shapes @ z + np.log(passed) + rest, -60.0, 60.0))
+        signal = scene / (scene + view.noise)
+        residual = np.clip(view.log_power - np.log(scene + view.noise), -_LARGEST_RESIDUAL, _LARGEST_RESIDUAL)
+        count = residual.shape[1]
+        distance = np.einsum("bi,bij,bj->b", residual, view.precision, residual)
+        precision = view.precision * ((_TAILS + count) / (_TAILS + distance))[:, None, None]
+        off = z - view.usual
+        cost = float((_TAILS + count) * np.log1p(distance / _TAILS).sum() + view.vote @ off**2)
+        by_scene = view.shapes * signal[:, :, None]
+        by_scene[:, :, -1] = floor / passed * signal
+        unknowns = by_scene.shape[2]
+        flat = by_scene.reshape(-1, unknowns)
+        weighted = np.einsum("bij,bj->bi", precision, residual)
+        normal = np.einsum("bij,bjz->biz", precision, by_scene).reshape(-1, unknowns).T @ flat
+        normal += np.diag(view.vote)
+        gradient = flat.T @ weighted.ravel() - view.vote * off
+        kept = power / passed
+        return cls(z, cost, residual, signal, kept, precision, weighted, by_scene, normal, gradient)
+
+    def reduced(self, by_lens: Floats) -> tuple[Floats, Floats, int]:
+        """Normal equations of the lens and of the photo's share, the scene eliminated."""
+        shared = np.broadcast_to(SHAPES[:, None, 1:3], (*self.signal.shape, len(PHOTO_SPREAD)))
+        columns = np.concatenate([by_lens * self.kept[:, :, None], shared], axis=2) * self.signal[:, :, None]
+        count = columns.shape[2]
+        flat = columns.reshape(-1, count)
+        voted = np.einsum("bij,bjn->bin", self.precision, columns).reshape(-1, count)
+        mixed = self.by_scene.reshape(flat.shape[0], -1).T @ voted
+        solved = np.linalg.solve(self.normal, np.column_stack([mixed, self.gradient]))
+        normal = flat.T @ voted - mixed.T @ solved[:, :-1]
+        gradient = flat.T @ self.weighted.ravel() - mixed.T @ solved[:, -1]
+        return normal, gradient, count

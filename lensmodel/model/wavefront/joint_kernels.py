@@ -1,0 +1,301 @@
+"""The kernels of all samples of a lens, solved together from their spectra.
+
+A wavefront is fitted to the spectra of all patches (`fit`), beginning with fits to the samples' own kernels
+and to their moments; the side of the tails is decided by the patches' vote (`PatchSpectrum.tail`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.psf import PsfSample, distance, rms_width
+from lensmodel.core.types import WAVELENGTH_NM, Channel, FieldPosition, Kernel, StepHook, ignore_step
+from lensmodel.model.wavefront.aberration_prior import BALANCE
+from lensmodel.model.wavefront.from_kernels import USUAL_PITCH_UM, fit_wavefront, side_of_light, spread
+from lensmodel.model.wavefront.from_spectra import (
+    SYMMETRIC,
+    PatchView,
+    PooledFit,
+    fit_spectra,
+    open_eye,
+)
+from lensmodel.model.wavefront.least_squares import PRIOR_PX, USUAL_EYE
+from lensmodel.model.wavefront.scene_spectrum import SceneView
+from lensmodel.model.wavefront.starts import starts
+from lensmodel.optics.wavefront import NAMES, Wavefront, design, stopped
+
+MIN_PLACES: Final = 8
+"""Fewer patches with a spectrum are not solved together."""
+
+_COMA = slice(2, 6)  # the odd terms
+_COARSE_PLACES, _MEDIUM_PLACES, _FINE_PLACES = 24, 36, 48
+_COARSE_ROUNDS, _MEDIUM_ROUNDS, _FINE_ROUNDS = 7, 6, 16
+_STARTS, _KEPT, _REFINED = 6, 12, 4
+_FIRST, _RANDOM = 16, 24
+_SAME_PX = 0.4
+_USUAL_SHAPE: Final = {
+    "spherical": 1.2,
+    "coma": 1.5,
+    "field curvature": 1.3,
+    "astigmatism": 1.3,
+}
+"""Spread of the terms of a random wavefront, in widths of the samples' kernels."""
+
+_FOCUS_SPREAD = 0.5  # about `BALANCE`
+
+_TAIL_SIDE = 31
+_ERROR_PLACES, _DRAWS, _SEED = 14, 6, 0
+_DRAWN, _LEAST_DRAWN = 0.7, 0.3
+"""Share of the scatter of draws that is told of one photo, and the least of what n photos leave of it. The
+corners of a single photo may be soft by themselves; what several agree on is nearer to the truth."""
+
+_LEAST_ERROR, _RISE = 0.07, 1.5
+"""What more patches do not mend, at r = 0, and how it grows: as exp(1.5 r).
+
+The figures were chosen on 21 fits of simulated lenses of development seeds (0 to 30, one photo to five):
+with them 44 % of the places are told within a factor of 1.5, 43 % with each lens left out in turn, and no
+rule of width, radius, number of photos and covariance that was tried told more than 46 %.
+`python -m lensmodel.lab.model.pooled_evidence` prints how often they do.
+"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pooled:
+    """A lens that all patches agree on.
+
+    Parameters
+    ----------
+    fit : PooledFit
+    tails : float
+        Vote of the patches for the side of the tails, in standard deviations; its sign was obeyed.
+    trust : dict
+        Median weight of each photo's patches; near 0 where something other than the lens blurred.
+    diffraction_known : bool
+        Whether samples name aperture and pixel pitch.
+    """
+
+    fit: PooledFit
+    tails: float
+    trust: dict[str, float]
+    diffraction_known: bool
+
+    @property
+    def front(self) -> Wavefront:
+        """The wavefront."""
+        return self.fit.front
+
+    def kernel(self, sample: PsfSample, size: int) -> Kernel:
+        """Kernel at the place and settings of a sample."""
+        return self.front.kernel(sample.position, sample.settings, size)
+
+    def errors(self, samples: Sequence[PsfSample]) -> NDArray[np.float64]:
+        """Expected relative L2 of the kernels at samples, shape (n,).
+
+        hypot(0.7 c d, 0.07 exp(1.5 r)), with d the scatter of draws from the fit's covariance and c one over
+        the number of photos, 0.3 at least.
+        """
+        few = spread(samples, _ERROR_PLACES)
+        rng = np.random.default_rng(_SEED)
+        lens = np.concatenate([self.front.terms, self.front.eye])
+        values, vectors = np.linalg.eigh(self.fit.covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        found = np.zeros(len(few))
+        right = [self.front.kernel(s.position, s.settings, _TAIL_SIDE) for s in few]
+        for _ in range(_DRAWS):
+            drawn = lens + root @ rng.standard_normal(len(lens))
+            other = replace(self.front, terms=drawn[:-2], eye=open_eye(drawn[-2:]))
+            found += [
+                distance(other.kernel(s.position, s.settings, _TAIL_SIDE), k).rel_l2 ** 2
+                for s, k in zip(few, right, strict=True)
+            ]
+        here = np.array([_vector(s) for s in samples])
+        there = np.array([_vector(s) for s in few])
+        apart = ((here[:, None] - there[None]) ** 2).sum(axis=-1)
+        weight = np.exp(-0.5 * apart / 0.15**2) + 1e-9
+        drawn_here = weight @ np.sqrt(found / _DRAWS) / weight.sum(axis=1)
+        least = _LEAST_ERROR * np.exp([_RISE * s.position.r for s in samples])
+        share = _DRAWN * max(1.0 / max(len({s.photo for s in samples}), 1), _LEAST_DRAWN)
+        return np.hypot(share * drawn_here, least)
+
+
+def pool(samples: Sequence[PsfSample], on_step: StepHook = ignore_step) -> Pooled | None:
+    """Solve all samples of one focal length together.
+
+    Parameters
+    ----------
+    samples : sequence of PsfSample
+        Those without a spectrum only help to begin.
+
+    Returns
+    -------
+    Pooled or None
+        None with fewer than `MIN_PLACES` patches that have a spectrum.
+    """
+    seen = [s for s in samples if s.spectrum is not None and s.weight > 0]
+    places = _places(seen)
+    if len(places) < MIN_PLACES:
+        return None
+    heads = [group.get("g", next(iter(group.values()))) for group in places]
+    first = fit_wavefront(spread(samples, _FIRST))
+    if first is None:
+        return None
+    widest = min((s.settings.aperture for s in seen if s.settings.aperture is not None), default=None)
+    pitches = [s.pixel_pitch_um for s in seen if s.pixel_pitch_um is not None]
+    first = replace(first, size=max(side_of_light(s.kernel) for s in heads))
+    if widest is not None:
+        pitch = float(np.median(pitches)) if pitches else USUAL_PITCH_UM
+        first = replace(first, f_number=widest, log_q=_log_q(widest, pitch))
+    begins = [first]
+    centred = np.where(SYMMETRIC[: len(PRIOR_PX)], PRIOR_PX, 0.0)
+    designs = np.stack([stopped(design(s.position, s.settings), first.stop(s.settings)) for s in heads])
+    begins += [
+        replace(first, terms=terms * (centred > 0), eye=USUAL_EYE)
+        for terms in starts(heads, designs, np.maximum(centred, 1e-3), math.exp(first.log_q), _STARTS)
+    ]
+    begins += _random_fronts(first, float(np.median([rms_width(s.kernel) for s in heads])))
+    at = {id(head): group for head, group in zip(heads, places, strict=True)}
+    chosen = [at[id(s)] for s in spread(heads, _FINE_PLACES)]
+    votes = [(_tail_vote(fit.front, heads), fit) for fit in _searched(chosen, begins, on_step)]
+    # a vote of z standard deviations is a likelihood too: z^2 beside a cost of chi^2
+    tails, best = min(votes, key=lambda vote: vote[1].cost - vote[0] ** 2)
+    if tails < 0:
+        best = replace(best, front=_negative(best.front))
+    trust: dict[str, list[float]] = {}
+    for group, value in zip(chosen, best.trust, strict=True):
+        trust.setdefault(next(iter(group.values())).photo, []).append(float(value))
+    known = widest is not None and bool(pitches)
+    return Pooled(best, tails, {photo: float(np.median(values)) for photo, values in trust.items()}, known)
+
+
+def _searched(
+    chosen: Sequence[dict[Channel, PsfSample]], begins: Sequence[Wavefront], on_step: StepHook
+) -> list[PooledFit]:
+    """Fit from many starts: all of them coarsely and centred, the best in green, the best of those in full.
+
+    Where the pupil is round, a wavefront whose coma is negated has the same spectra as before. Only the
+    cat's eye tells the two apart, so that both are tried.
+    """
+    green = [_view({"g": group["g"]}) for group in chosen if "g" in group]
+    total = len(begins) * _COARSE_ROUNDS + 2 * _KEPT * _MEDIUM_ROUNDS + _REFINED * _FINE_ROUNDS
+    done = 0
+    fits = []
+    for begin in begins:
+        fits.append(
+            fit_spectra(green[:_COARSE_PLACES], begin, rounds=_COARSE_ROUNDS, symmetric=True, coarse=True)
+        )
+        on_step(done := done + _COARSE_ROUNDS, total)
+    medium = []
+    for fit in _different(fits)[:_KEPT]:
+        for front in (fit.front, _mirrored(fit.front)):
+            medium.append(fit_spectra(green[:_MEDIUM_PLACES], front, rounds=_MEDIUM_ROUNDS))
+            on_step(done := done + _MEDIUM_ROUNDS, total)
+    fine, refined = [_view(group) for group in chosen], []
+    for fit in _different(medium)[:_REFINED]:
+        refined.append(fit_spectra(fine, fit.front, rounds=_FINE_ROUNDS))
+        on_step(done := done + _FINE_ROUNDS, total)
+    on_step(total, total)
+    return refined
+
+
+def _random_fronts(first: Wavefront, width: float) -> list[Wavefront]:
+    """Draw centred lenses that blur about as much as the samples.
+
+    Kernels that were estimated one by one have the widths of the lens, not always its character: where
+    spherical aberration is balanced by focus, their moments lead elsewhere.
+    """
+    rng, found = np.random.default_rng(_SEED), []
+    for _ in range(_RANDOM):
+        terms = np.zeros(len(NAMES))
+        for name, usual in _USUAL_SHAPE.items():
+            terms[NAMES.index(name)] = rng.normal(0.0, usual)
+        balance = BALANCE * terms[NAMES.index("spherical")]
+        terms[NAMES.index("focus")] = balance + rng.normal(0.0, _FOCUS_SPREAD)
+        found.append(replace(first, terms=width * terms, eye=USUAL_EYE))
+    return found
+
+
+def _negative(front: Wavefront) -> Wavefront:
+    """Return the wavefront of the kernels turned by 180 degrees."""
+    return replace(front, terms=-front.terms)
+
+
+def _mirrored(front: Wavefront) -> Wavefront:
+    """Negate the coma."""
+    terms = front.terms.copy()
+    terms[_COMA] *= -1.0
+    return replace(front, terms=terms)
+
+
+def _log_q(aperture: float, pitch_um: float) -> float:
+    """Logarithm of wavelength x f-number / pixel pitch, the width of diffraction, in green.
+
+    It stays fixed: the pixels of a power spectrum follow it little, and kernels that were estimated one by
+    one, to which it might be fitted, are too wide where blur is narrow.
+    """
+    return math.log(WAVELENGTH_NM["g"] / 1000.0 * aperture / pitch_um)
+
+
+def _cost(fit: PooledFit) -> float:
+    return fit.cost
+
+
+def _different(fits: Sequence[PooledFit]) -> list[PooledFit]:
+    """Fits that ended in different minima, the best first; a wavefront and its negative count as one.
+
+    Their costs say nothing of that: unlike lenses can be about as likely.
+    """
+    kept: list[PooledFit] = []
+    for fit in sorted(fits, key=_cost):
+        if all(_apart(fit.front.terms, other.front.terms) > _SAME_PX for other in kept):
+            kept.append(fit)
+    return kept
+
+
+def _apart(terms: NDArray[np.float64], others: NDArray[np.float64]) -> float:
+    return float(min(np.abs(terms - others).max(), np.abs(terms + others).max()))
+
+
+def _places(samples: Sequence[PsfSample]) -> list[dict[Channel, PsfSample]]:
+    """Samples of one patch in its channels."""
+    found: dict[tuple[str, float, float], dict[Channel, PsfSample]] = {}
+    for sample in samples:
+        key = (sample.photo, sample.position.r, sample.position.phi)
+        found.setdefault(key, {})[sample.settings.channel] = sample
+    return list(found.values())
+
+
+def _view(group: dict[Channel, PsfSample]) -> PatchView:
+    head = next(iter(group.values()))
+    spectra = {c: group[c].spectrum for c in ("g", "r", "b") if c in group}
+    scene = SceneView.of({c: s for c, s in spectra.items() if s is not None})
+    return PatchView(head.position, head.settings, head.photo, scene)
+
+
+def _tail_vote(front: Wavefront, samples: Sequence[PsfSample]) -> float:
+    """How much the patches' tails agree with those of a wavefront, in standard deviations."""
+    votes = []
+    for sample in samples:
+        if sample.spectrum is not None:
+            x, y = _third_moment(front.kernel(sample.position, sample.settings, _TAIL_SIDE))
+            votes.append(x * sample.spectrum.tail[0] + y * sample.spectrum.tail[1])
+    total, scatter = float(np.sum(votes)), float(np.sqrt(np.sum(np.square(votes))))
+    return total / scatter if scatter > 0 else 0.0
+
+
+def _third_moment(kernel: Kernel) -> tuple[float, float]:
+    """Vector sum k x |x|^2 over the cube of the width, (right, up)."""
+    middle = kernel.shape[0] // 2
+    row, col = np.mgrid[-middle : middle + 1, -middle : middle + 1]
+    weight = kernel * (row**2 + col**2) / max(rms_width(kernel), 0.1) ** 3
+    return float((weight * col).sum()), float(-(weight * row).sum())
+
+
+def _vector(sample: PsfSample) -> tuple[float, float]:
+    place: FieldPosition = sample.position
+    return place.r * math.cos(place.phi), place.r * math.sin(place.phi)

@@ -1,0 +1,176 @@
+"""Least squares of a wavefront against samples: Levenberg-Marquardt with exact derivatives.
+
+Each sample may move by a fraction of a pixel: its tilts are eliminated before the step. Starts come
+from the moments of the samples (`starts`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lensmodel.core.psf import PsfSample, resized
+from lensmodel.optics.wavefront import NAMES, Wavefront, design, stopped
+
+PRIOR_PX: Final = np.array(
+    [4.0, 0.5, 4.0, 1.0, 1.0, 0.5, 4.0, 1.0, 1.0, 4.0, 0.5, 1.0, 1.0, 4.0, 1.0, 1.0, 1.0, 1.0, 0.5]
+)
+"""Usual size of each linear unknown, in pixels."""
+
+USUAL_EYE: Final = (1.15, 0.25)
+SLOPE_PX: Final = 0.6 * PRIOR_PX
+"""Usual change of each linear unknown by octave of focal length."""
+
+_SHAPE_PRIOR: Final = np.array([0.15, 0.3])  # of the cat's eye: radius and shift per unit of field
+_NOISE = 0.1  # relative L2 that a good sample has against the best wavefront
+_HUBER = 0.35
+_ENOUGH = 2e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """Least squares of a wavefront against samples, both blurred alike."""
+
+    samples: tuple[PsfSample, ...]
+    size: int
+    log_q: float
+    vague: float  # standard deviation of log q about `log_q`
+    blur_px: float
+
+    def solve(self, begin: Wavefront, rounds: int) -> tuple[Wavefront, float, NDArray[np.float64]]:
+        """Levenberg-Marquardt; returns the wavefront, its cost and each sample's relative L2."""
+        wanted = [self._soft(resized(s.kernel, self.size)) for s in self.samples]
+        norms = np.array([np.linalg.norm(w) for w in wanted])
+        votes = np.array([s.weight for s in self.samples])
+        designs = [design(s.position, s.settings) for s in self.samples]
+        now, tilts = begin, self._tilts(begin)
+        damping = 1e-2
+        state = self._linearised(now, tilts, designs, wanted, norms, votes)
+        for _ in range(rounds):
+            cost, normal, gradient, _, locals_ = state
+            improved = False
+            for _ in range(4):
+                step = np.asarray(
+                    -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient), dtype=np.float64
+                )
+                moved = _moved(now, step)
+                tilts_ = tilts + np.stack([-(a + b @ step) for a, b in locals_])
+                after = self._linearised(moved, tilts_, designs, wanted, norms, votes)
+                if after[0] < cost:
+                    improved = True
+                    break
+                damping *= 8.0
+            if not improved:
+                break
+            gain = cost - after[0]
+            now, tilts, state, damping = moved, tilts_, after, damping / 5.0
+            if gain < _ENOUGH * cost:
+                break
+        return now, state[0], state[3]
+
+    def _soft(self, kernel: NDArray[np.float64]) -> NDArray[np.float64]:
+        if self.blur_px == 0.0:
+            return np.asarray(kernel)
+        return np.asarray(
+            ndimage.gaussian_filter(kernel, self.blur_px, axes=(-2, -1), mode="constant", truncate=3.0)
+        )
+
+    def _tilts(self, front: Wavefront) -> NDArray[np.float64]:
+        found = []
+        for s in self.samples:
+            grid = front.grid(s.settings)
+            amplitude = front.amplitude(grid, s.position, s.settings, front.eye)
+            found.append(-np.array(grid.centre(front.blur(s.position, s.settings), amplitude)))
+        return np.array(found)
+
+    def _linearised(
+        self,
+        front: Wavefront,
+        tilts: NDArray[np.float64],
+        designs: Sequence[NDArray[np.float64]],
+        wanted: Sequence[NDArray[np.float64]],
+        norms: NDArray[np.float64],
+        votes: NDArray[np.float64],
+    ) -> tuple[
+        float,
+        NDArray[np.float64],
+        NDArray[np.float64],
+        NDArray[np.float64],
+        list[tuple[NDArray[np.float64], NDArray[np.float64]]],
+    ]:
+        """Cost, normal matrix, gradient, relative L2 of each sample, and how tilts follow a step."""
+        slopes = np.empty(0) if front.slopes is None else front.slopes
+        count = len(NAMES) + 3 + slopes.size  # log q and the cat's eye
+        precision = np.concatenate(
+            [PRIOR_PX**-2.0, [self.vague**-2.0], _SHAPE_PRIOR**-2.0, SLOPE_PX[: slopes.size] ** -2.0]
+        )
+        apart = np.concatenate(
+            [front.terms, [front.log_q - self.log_q], np.subtract(front.eye, USUAL_EYE), slopes]
+        )
+        normal, gradient = np.diag(precision), precision * apart
+        cost = float(precision @ apart**2)
+        errors, locals_ = np.zeros(len(self.samples)), []
+        for i, s in enumerate(self.samples):
+            light, columns, moves = self._columns(front, s, tilts[i], designs[i])
+            miss = (light - wanted[i].ravel()) / norms[i]
+            columns, moves = columns / norms[i], moves / norms[i]
+            within = np.linalg.inv(moves @ moves.T + 1e-9 * np.eye(2)) @ moves
+            own, follows = within @ miss, within @ columns.T
+            free = miss - own @ moves
+            errors[i] = np.linalg.norm(free)
+            # Huber: beyond _HUBER the cost grows linearly
+            trust = votes[i] * min(1.0, _HUBER / max(errors[i], 1e-12)) / _NOISE**2
+            clean = columns - follows.T @ moves
+            normal += trust * (clean @ clean.T)
+            gradient += trust * (clean @ free)
+            flat = errors[i] ** 2 if errors[i] <= _HUBER else _HUBER * (2 * errors[i] - _HUBER)
+            cost += votes[i] * flat / _NOISE**2
+            locals_.append((own, follows))
+        assert normal.shape == (count, count)
+        return cost, normal, gradient, errors, locals_
+
+    def _columns(
+        self,
+        front: Wavefront,
+        sample: PsfSample,
+        tilt: NDArray[np.float64],
+        linear: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Kernel of sum 1, its derivatives by the unknowns (count, k^2) and by the tilts (2, k^2)."""
+        settings, position = sample.settings, sample.position
+        grid = front.grid(settings)
+        radius, shift = front.eye
+        amplitude = front.amplitude(grid, position, settings, front.eye)
+        wider = front.amplitude(grid, position, settings, (radius + 0.02, shift)) - amplitude
+        further = front.amplitude(grid, position, settings, (radius, shift + 0.02)) - amplitude
+        g = front.blur(position, settings)
+        g[6:] = tilt
+        light, found = grid.with_derivatives(g, amplitude, (wider / 0.02, further / 0.02))
+        softer = replace(front, log_q=front.log_q + 0.05).grid(settings)
+        broad = softer.light(g, front.amplitude(softer, position, settings, front.eye))
+        by_q = (broad / broad.sum() * light.sum() - light) / 0.05
+        stack = self._soft(np.concatenate([found, by_q[None], light[None]]))
+        flat = stack.reshape(len(stack), -1)
+        total = light.sum()
+        sums = np.concatenate([found.sum(axis=(1, 2)), [by_q.sum()]])
+        kernel = flat[-1] / total
+        normalised = flat[:-1] / total - np.outer(sums / total, kernel)
+        terms = stopped(linear, front.stop(settings)).T @ normalised[:6]
+        columns = [terms, normalised[[10, 8, 9]]]
+        if front.slopes is not None:
+            columns.append(terms * front.octaves(settings))
+        return kernel, np.concatenate(columns), normalised[6:8]
+
+
+def _moved(front: Wavefront, step: NDArray[np.float64]) -> Wavefront:
+    n = len(NAMES)
+    q = float(np.clip(front.log_q + step[n], math.log(0.1), math.log(12.0)))
+    eye = (max(front.eye[0] + float(step[n + 1]), 0.4), front.eye[1] + float(step[n + 2]))
+    slopes = None if front.slopes is None else front.slopes + step[n + 3 :]
+    return replace(front, terms=front.terms + step[:n], log_q=q, eye=eye, slopes=slopes)

@@ -1,0 +1,188 @@
+"""Headers of TIFF, DNG and RAW files. Source: "TIFF Revision 6.0", Aldus, 1992."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Final
+
+from lensmodel.core.errors import (
+    ImageTooLargeError,
+    NotAnImageError,
+    TruncatedImageError,
+    UnsupportedFormatError,
+)
+from lensmodel.photo.headers.ciff import read_ciff
+from lensmodel.photo.headers.header import MAX_BLOCK_BYTES, Header, check_size
+from lensmodel.photo.headers.ifd import MAX_DIRECTORIES, Buffer, Directory, TiffReader
+from lensmodel.photo.headers.jpeg import read_jpeg
+from lensmodel.photo.values import Limits
+
+_DNG_VERSION: Final = 0xC612
+
+_RAW_PHOTOMETRIC: Final = {32803, 34892}
+"""Colour filter array and linear RAW."""
+
+_LOSSY: Final = 34892
+"""Compression of a DNG by baseline JPEG, eight bits a sample: DNG 1.4, "Compression"."""
+
+_RAW_COMPRESSION: Final = {32767, 32769, 32770, 34713, 65000, 65535}
+"""Of Sony, Epson, Samsung, Nikon, Kodak and Pentax."""
+
+
+def read_tiff(buffer: Buffer, limits: Limits) -> Header:
+    """Read the directories; tells TIFF from DNG and from RAW files that look like TIFF.
+
+    Raises
+    ------
+    TruncatedImageError, NotAnImageError, UnsupportedFormatError
+        If the file ends early, holds no picture, or too many.
+    ImageTooLargeError
+        See `check_size`.
+    """
+    reader = TiffReader.open(buffer)
+    if reader is None:
+        raise TruncatedImageError("the TIFF ends inside its header; the upload was cut off")
+    directories = list(reader.chain())
+    if not directories:
+        raise TruncatedImageError("the TIFF has no readable directory; the upload was cut off")
+    first = directories[0]
+    header = Header("tiff", tiff=(reader,), xmp=_block(first, 700), icc=_block(first, 34675))
+    if _DNG_VERSION in first:
+        largest = _largest(reader, directories)
+        header = _sized(replace(header, kind="dng"), largest)
+        if header.compression == _LOSSY:
+            header = replace(header, coarseness=_coarseness(buffer, largest, limits))
+    elif _looks_raw(reader, directories):
+        header = _sized(replace(header, kind="raw"), _largest(reader, directories))
+    else:
+        header = _sized(header, first)
+    check_size(header.width, header.height, len(buffer), limits)
+    if header.kind != "tiff":
+        return header
+    if len(directories) >= MAX_DIRECTORIES:
+        raise UnsupportedFormatError(f"the TIFF has more than {MAX_DIRECTORIES - 1} pictures; give one photo")
+    _check_strips(first, len(buffer))
+    return header
+
+
+def _block(directory: Directory, tag: int) -> bytes | None:
+    entry = directory.get(tag)
+    return None if entry is None else entry.raw()[:MAX_BLOCK_BYTES] or None
+
+
+def _value(directory: Directory, tag: int, default: int) -> int:
+    entry = directory.get(tag)
+    values = () if entry is None else entry.integers(1)
+    return values[0] if values else default
+
+
+def _sized(header: Header, directory: Directory) -> Header:
+    return replace(
+        header,
+        width=_value(directory, 256, 0),
+        height=_value(directory, 257, 0),
+        channels=_value(directory, 277, 1),
+        bits=_value(directory, 258, 1),
+        compression=_value(directory, 259, 1),
+    )
+
+
+def _with_children(reader: TiffReader, directories: Sequence[Directory]) -> Iterator[Directory]:
+    for directory in directories[:MAX_DIRECTORIES]:
+        yield directory
+        children = directory.get(330)
+        for offset in () if children is None else children.integers(16):
+            yield reader.directory(offset)[0]
+
+
+def _looks_raw(reader: TiffReader, directories: Sequence[Directory]) -> bool:
+    return any(
+        _value(d, 262, 0) in _RAW_PHOTOMETRIC or _value(d, 259, 0) in _RAW_COMPRESSION
+        for d in _with_children(reader, directories)
+    )
+
+
+def _largest(reader: TiffReader, directories: Sequence[Directory]) -> Directory:
+    return max(_with_children(reader, directories), key=lambda d: _value(d, 256, 0) * _value(d, 257, 0))
+
+
+def _coarseness(buffer: Buffer, directory: Directory, limits: Limits) -> float:
+    """Step of the quantised coefficients of a DNG by its first JPEG tile, which speaks for all; 0 unknown."""
+    offsets, counts = (directory.get(tag) or directory.get(other) for tag, other in ((324, 273), (325, 279)))
+    if offsets is None or counts is None:
+        return 0.0
+    at, size = offsets.integers(1), counts.integers(1)
+    if not at or not size:
+        return 0.0
+    with contextlib.suppress(NotAnImageError, TruncatedImageError, ImageTooLargeError):
+        return read_jpeg(bytes(buffer[at[0] : at[0] + min(size[0], MAX_BLOCK_BYTES)]), limits).coarseness
+    return 0.0
+
+
+def _check_strips(directory: Directory, file_bytes: int) -> None:
+    """Refuse a picture whose strips or tiles do not lie in the file.
+
+    Raises
+    ------
+    NotAnImageError, TruncatedImageError, UnsupportedFormatError
+        If there is no picture, it ends early, or its tables are absurd.
+    """
+    width, height = _value(directory, 256, 0), _value(directory, 257, 0)
+    if width <= 0 or height <= 0:
+        raise NotAnImageError(f"the TIFF gives no size ({width} x {height}); it holds no picture")
+    offsets = directory.get(273) or directory.get(324)
+    counts = directory.get(279) or directory.get(325)
+    if offsets is None or counts is None:
+        raise NotAnImageError("the TIFF has no strips or tiles; it holds no picture")
+    if offsets.count != counts.count:
+        raise NotAnImageError(f"the TIFF lists {offsets.count} strips but {counts.count} lengths")
+    starts, lengths = offsets.integers(), counts.integers()
+    if not starts or len(starts) != len(lengths):
+        raise TruncatedImageError("the TIFF's strip table lies outside the file; the upload was cut off")
+    if any(a + n > file_bytes for a, n in zip(starts, lengths, strict=True)):
+        raise TruncatedImageError("the TIFF's pixel data go beyond the file's end; the upload was cut off")
+    stored = width * height * _value(directory, 277, 1) * max(_value(directory, 258, 1), 1) / 8
+    if _value(directory, 259, 1) == 1 and _value(directory, 262, 1) != 6 and sum(lengths) < 0.999 * stored:
+        raise TruncatedImageError(
+            f"the TIFF holds {sum(lengths)} bytes of pixels where {stored:.0f} are needed"
+        )
+
+
+def read_raw(buffer: Buffer, limits: Limits) -> Header:
+    """Find the TIFF structures of RAW files that are not plain TIFF; LibRaw tells their size."""
+    head = bytes(buffer[:12])
+    if head[4:12] == b"ftypcrx ":
+        return Header("raw", tiff=tuple(_canon_boxes(buffer)))
+    if (ciff := read_ciff(buffer)) is not None:
+        return Header("raw", ciff=ciff)
+    if head.startswith(b"FUJIFILMCCD"):
+        return _fujifilm(buffer, limits)
+    reader = TiffReader.open(buffer)
+    if reader is None:
+        return Header("raw")
+    header, directories = Header("raw", tiff=(reader,)), list(reader.chain())
+    if directories:
+        header = _sized(replace(header, xmp=_block(directories[0], 700)), _largest(reader, directories))
+    check_size(header.width, header.height, len(buffer), limits)
+    return header
+
+
+def _fujifilm(buffer: Buffer, limits: Limits) -> Header:
+    """Read what the JPEG in a RAF says."""
+    at = int.from_bytes(bytes(buffer[84:88]), "big")
+    if bytes(buffer[at : at + 3]) == b"\xff\xd8\xff":
+        with contextlib.suppress(NotAnImageError, TruncatedImageError):
+            preview = read_jpeg(bytes(buffer[at : at + MAX_BLOCK_BYTES]), limits)
+            return Header("raw", tiff=preview.tiff, xmp=preview.xmp)
+    return Header("raw")
+
+
+def _canon_boxes(buffer: Buffer) -> Iterator[TiffReader]:
+    """Yield the TIFF structures CMT1 (camera) and CMT2 (EXIF) of a CR3."""
+    head = bytes(buffer[: 1 << 16])
+    for name in (b"CMT1", b"CMT2"):
+        at = head.find(name)
+        if at > 0 and (reader := TiffReader.open(buffer, at + 4)):
+            yield reader

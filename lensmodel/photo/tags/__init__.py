@@ -1,0 +1,1 @@
+"""What a photo file says about camera, lens, exposure and place."""

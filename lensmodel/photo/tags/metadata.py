@@ -1,0 +1,263 @@
+"""What the file says about camera, lens and exposure, from EXIF, maker note and XMP.
+
+CRW files, which are older than all three, say it in a heap of their own (`ciff`).
+
+The order of trust is EXIF, maker note, XMP. A serial that the camera fills in without knowing
+one is no serial, and an f-number or focal length of zero is unknown: manual lenses say so.
+
+Source: CIPA DC-008-2023 (Exif 3.0), section 4.6.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Final
+
+from lensmodel.photo.headers.ciff import CiffShot
+from lensmodel.photo.headers.header import Header
+from lensmodel.photo.headers.ifd import Directory, Entry
+from lensmodel.photo.headers.opening import opened_header
+from lensmodel.photo.tags.makernote import MakerNote, read_maker_note
+from lensmodel.photo.tags.xmp import read_xmp
+from lensmodel.photo.values import LensIdentity, Limits, PhotoMetadata, SerialSource
+
+_PLACEHOLDER: Final = re.compile(
+    r"[0.\-_ x?]*|(.)\1{5,}|none|no lens|n/?a|unknown|null|manual", re.IGNORECASE
+)
+_SENSOR_WIDTHS_MM: Final = (
+    (12.8, 13.4),
+    (17.2, 18.1),
+    (22.0, 24.1),
+    (27.5, 29.0),
+    (35.4, 36.4),
+    (43.0, 54.1),
+)
+"""One inch, Four Thirds, APS-C, APS-H, 24 x 36 and medium format."""
+
+_LARGEST_SENSOR_MM: Final = max(high for _, high in _SENSOR_WIDTHS_MM)
+_FILM_DIAGONAL_MM: Final = math.hypot(36.0, 24.0)
+_CROP_FACTORS: Final = (0.5, 15.0)  # from medium format to the smallest phones
+_PITCHES_UM: Final = (0.3, 60.0)
+_APERTURES: Final = (0.5, 128.0)
+_FOCALS_MM: Final = (0.1, 20000.0)
+_SPEEDS: Final = (1.0, 1e7)
+_EXPOSURES_S: Final = (1e-7, 1e6)
+
+
+def read_metadata(path: Path | str) -> PhotoMetadata:
+    """Read what a photo file says, without decoding it.
+
+    Unreadable metadata are unknown metadata; only a file that is no photo raises.
+
+    Raises
+    ------
+    NotAnImageError, UnsupportedFormatError, TruncatedImageError
+        If the file's header cannot be read.
+    """
+    with opened_header(Path(path), Limits()) as header:
+        return metadata_of(header)
+
+
+def is_placeholder(serial: str) -> bool:
+    """Tell whether a serial is only what a camera writes when it knows none."""
+    return _PLACEHOLDER.fullmatch(serial.strip()) is not None
+
+
+def metadata_of(header: Header) -> PhotoMetadata:
+    """Put together what a parsed header holds; see `read_metadata`."""
+    if header.ciff is not None:
+        return _of_ciff(header.ciff)
+    exif = _Exif.of(header)
+    xmp = read_xmp(header.xmp)
+    note = (
+        read_maker_note(exif.text(0x010F) or "", exif.tags.get(0x927C), header.tiff[exif.block])
+        if header.tiff
+        else MakerNote()
+    )
+    return PhotoMetadata(
+        camera_maker=exif.text(0x010F) or xmp.get("tiff:Make"),
+        camera_model=exif.text(0x0110) or xmp.get("tiff:Model"),
+        body_serial=_body_serial(exif, note, xmp),
+        lens=_lens(exif, note, xmp),
+        aperture=_first_within(*_APERTURES, exif.aperture(), _quotient(xmp.get("exif:FNumber"))),
+        focal_mm=_first_within(*_FOCALS_MM, exif.number(0x920A), _quotient(xmp.get("exif:FocalLength"))),
+        focus_m=_focus(exif, note, xmp),
+        iso=_first_within(*_SPEEDS, exif.iso(), note.iso, _quotient(xmp.get("exif:ISOSpeedRatings"))),
+        exposure_s=_first_within(*_EXPOSURES_S, exif.number(0x829A), _quotient(xmp.get("exif:ExposureTime"))),
+        taken_at=exif.taken_at(),
+        orientation=exif.orientation(),
+        pixel_pitch_um=exif.pixel_pitch_um(header),
+    )
+
+
+def _of_ciff(shot: CiffShot) -> PhotoMetadata:
+    serial = shot.body_serial
+    return PhotoMetadata(
+        camera_maker=shot.maker,
+        camera_model=shot.model,
+        body_serial=None if serial is None or is_placeholder(serial) else serial,
+        lens=LensIdentity(model=shot.lens_model),
+        aperture=_first_within(*_APERTURES, shot.aperture),
+        focal_mm=_first_within(*_FOCALS_MM, shot.focal_mm),
+        focus_m=shot.focus_m,
+        iso=_first_within(*_SPEEDS, shot.iso),
+        exposure_s=_first_within(*_EXPOSURES_S, shot.exposure_s),
+        taken_at=shot.taken_at,
+        orientation=shot.orientation,
+        pixel_pitch_um=_first_within(*_PITCHES_UM, shot.pitch_um),
+    )
+
+
+def baseline_exposure_of(header: Header) -> float | None:
+    """Stops by which a DNG asks to be brightened (tag 50730), None where it does not say or is absurd."""
+    return _first_within(-10.0, 10.0, _Exif.of(header).number(0xC62A))
+
+
+@dataclass(frozen=True, slots=True)
+class _Exif:
+    """The tags of IFD0 and the EXIF directory together; the latter win."""
+
+    tags: Directory
+    block: int = 0
+
+    @classmethod
+    def of(cls, header: Header) -> _Exif:
+        tags: dict[int, Entry] = {}
+        block = 0
+        for index, reader in enumerate(header.tiff):
+            main, _ = reader.directory(reader.first)
+            found = {**main, **reader.below(main.get(0x8769))}
+            if 0x927C in found:
+                block = index
+            tags = {**found, **tags}
+        return cls(tags, block)
+
+    def text(self, tag: int) -> str | None:
+        entry = self.tags.get(tag)
+        return None if entry is None else entry.text() or None
+
+    def number(self, tag: int) -> float | None:
+        entry = self.tags.get(tag)
+        return None if entry is None else entry.number()
+
+    def aperture(self) -> float | None:
+        """FNumber, else the APEX value A_v of tag 0x9202: N = 2^(A_v / 2)."""
+        direct, apex = self.number(0x829D), self.number(0x9202)
+        if direct or apex is None or not 0 < apex < 14:
+            return direct
+        return round(2.0 ** (apex / 2.0), 1)
+
+    def iso(self) -> float | None:
+        speed = self.number(0x8827)
+        # The tag has 16 bits; above them cameras say 65535 and use the newer ones.
+        return speed if speed and speed < 65535 else self.number(0x8832) or self.number(0x8831) or speed
+
+    def orientation(self) -> int:
+        value = self.number(0x0112)
+        return int(value) if value is not None and 1 <= value <= 8 else 1
+
+    def taken_at(self) -> datetime | None:
+        for tag in (0x9003, 0x9004, 0x0132):
+            try:
+                return datetime.strptime((self.text(tag) or "")[:19], "%Y:%m:%d %H:%M:%S")  # noqa: DTZ007  the camera's clock has no zone
+            except ValueError:
+                continue
+        return None
+
+    def pixel_pitch_um(self, header: Header) -> float | None:
+        """Pitch from the focal plane resolution, else from the focal length for 35 mm film.
+
+        Programs that scale a photo down rarely correct the former; then width times pitch is the
+        width of no common sensor, and it says nothing. A mosaic was never scaled, only cut.
+
+        Source: CIPA DC-008-2023, tags FocalPlaneXResolution and FocalLengthIn35mmFilm.
+        """
+        pitch = _first_within(*_PITCHES_UM, self._focal_plane_pitch_um())
+        if pitch is not None:
+            width_mm = max(header.width, header.height) * pitch / 1000.0
+            mosaic = header.kind == "raw" or (header.kind == "dng" and header.channels == 1)
+            if mosaic and width_mm <= _LARGEST_SENSOR_MM:
+                return pitch
+            if any(low <= width_mm <= high for low, high in _SENSOR_WIDTHS_MM):
+                return pitch
+        return self._film_pitch_um(math.hypot(header.width, header.height))
+
+    def _focal_plane_pitch_um(self) -> float | None:
+        per_unit, unit = self.number(0xA20E), self.number(0xA210) or 2.0
+        unit_um = {2.0: 25400.0, 3.0: 10000.0, 4.0: 1000.0, 5.0: 1.0}.get(unit)
+        return None if not per_unit or per_unit <= 0 or unit_um is None else unit_um / per_unit
+
+    def _film_pitch_um(self, diagonal_px: float) -> float | None:
+        """Pitch of a frame whose diagonal is that of 35 mm film over the crop factor."""
+        focal, film = self.number(0x920A), self.number(0xA405)
+        if not focal or not film or focal <= 0 or film <= 0 or diagonal_px <= 0:
+            return None
+        crop = _first_within(*_CROP_FACTORS, film / focal)
+        if crop is None:
+            return None
+        return _first_within(*_PITCHES_UM, 1000.0 * _FILM_DIAGONAL_MM / crop / diagonal_px)
+
+
+def _lens(exif: _Exif, note: MakerNote, xmp: Mapping[str, str]) -> LensIdentity:
+    model = exif.text(0xA434) or note.lens_model or xmp.get("aux:Lens") or xmp.get("exifEX:LensModel")
+    maker = exif.text(0xA433) or xmp.get("exifEX:LensMake")
+    serial, source = _serial(exif, note, xmp)
+    return LensIdentity(maker, model, serial, source)
+
+
+def _serial(exif: _Exif, note: MakerNote, xmp: Mapping[str, str]) -> tuple[str | None, SerialSource]:
+    declared = exif.text(0xA435)
+    if declared and not is_placeholder(declared):
+        return declared, "exif"
+    # A camera that fills the EXIF tag with zeros has looked and found no serial; what its maker
+    # note holds beside it (seen: 1c00000000) is no serial either.
+    if not declared and note.lens_serial and not is_placeholder(note.lens_serial):
+        return note.lens_serial, "makernote"
+    for name in ("aux:LensSerialNumber", "exifEX:LensSerialNumber"):
+        value = xmp.get(name, "")
+        if not is_placeholder(value):
+            return value, "xmp"
+    return None, "none"
+
+
+def _body_serial(exif: _Exif, note: MakerNote, xmp: Mapping[str, str]) -> str | None:
+    candidates = (
+        exif.text(0xA431),
+        exif.text(0xC62F),
+        note.body_serial,
+        xmp.get("aux:SerialNumber"),
+        xmp.get("exifEX:BodySerialNumber"),
+    )
+    return next((c for c in candidates if c and not is_placeholder(c)), None)
+
+
+def _focus(exif: _Exif, note: MakerNote, xmp: Mapping[str, str]) -> float | None:
+    # 0xffffffff is EXIF's word for infinity; as a plain number it also stands in XMP.
+    subject = exif.tags.get(0x9206)
+    values = [
+        math.inf if subject is not None and subject.raw()[:4] == b"\xff\xff\xff\xff" else exif.number(0x9206),
+        note.focus_m,
+        _quotient(xmp.get("aux:ApproximateFocusDistance")),
+    ]
+    plain = [math.inf if v is not None and v >= 4294967295 else v for v in values]
+    return next((v for v in plain if v is not None and v > 0), None)
+
+
+def _quotient(text: str | None) -> float | None:
+    """Value of an XMP rational such as "71/10"."""
+    if text is None:
+        return None
+    over, _, under = text.partition("/")
+    try:
+        return float(over) / float(under or 1)  # a Fraction would write 1e1000000000 out
+    except (ValueError, ZeroDivisionError):
+        return None
+
+
+def _first_within(low: float, high: float, *candidates: float | None) -> float | None:
+    return next((c for c in candidates if c is not None and low <= c <= high), None)

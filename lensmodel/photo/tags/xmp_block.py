@@ -1,0 +1,142 @@
+"""XMP: camera and lens, and what was done to a photo, within its file or in a sidecar beside it.
+
+Sources: ISO 16684-1:2019, sections 7 and 8 (packet, `dc`, `xmp`, `xmpMM`); Adobe, "XMP Specification Part 2",
+2016 (`aux`); CIPA DC-010-2024 (`exif`, `exifEX`, `tiff`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final
+from xml.etree import ElementTree as ET
+
+from lensmodel.core.files import atomic
+from lensmodel.photo.tags.exif_block import SOFTWARE
+from lensmodel.photo.values import PhotoMetadata
+
+OWN: Final = "urn:x-lensmodel:correction/1/"
+"""Namespace of the properties that no standard has."""
+
+_SPACES: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "x": "adobe:ns:meta/",
+        "xml": "http://www.w3.org/XML/1998/namespace",
+        "rdf": "http://www.w3.org/1999/02/22-rdf-syntax-ns#",
+        "dc": "http://purl.org/dc/elements/1.1/",
+        "xmp": "http://ns.adobe.com/xap/1.0/",
+        "xmpMM": "http://ns.adobe.com/xap/1.0/mm/",
+        "stRef": "http://ns.adobe.com/xap/1.0/sType/ResourceRef#",
+        "stEvt": "http://ns.adobe.com/xap/1.0/sType/ResourceEvent#",
+        "tiff": "http://ns.adobe.com/tiff/1.0/",
+        "exif": "http://ns.adobe.com/exif/1.0/",
+        "exifEX": "http://cipa.jp/exif/1.0/",
+        "aux": "http://ns.adobe.com/exif/1.0/aux/",
+        "lensmodel": OWN,
+    }
+)
+for _prefix, _uri in _SPACES.items():
+    ET.register_namespace(_prefix, _uri)  # else they are written as ns0, ns1: legal, and unreadable
+
+_PACKET: Final = '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>\n{}\n<?xpacket end="{}"?>'
+_CHARACTERS: Final = str.maketrans(dict.fromkeys((*range(9), 11, 12, *range(14, 32), 0xFFFE, 0xFFFF), " "))
+"""What XML has no way to write; cameras put it into names."""
+
+
+def sidecar_path(photo: Path) -> Path:
+    """Name the sidecar of a photo: its own name, ending in `.xmp`."""
+    return photo.with_suffix(".xmp")
+
+
+def write_sidecar(
+    path: Path, metadata: PhotoMetadata, *, source: str, description: str, done: Mapping[str, str]
+) -> None:
+    """Write a packet as a file of its own, complete or not at all; an existing one is replaced.
+
+    Parameters
+    ----------
+    path : Path
+        Where to.
+    metadata, source, description, done
+        As of `xmp_packet`.
+    """
+    with atomic(path) as file:
+        file.write(xmp_packet(metadata, description, source=source, done=done, writable=True))
+
+
+def xmp_packet(
+    metadata: PhotoMetadata,
+    description: str,
+    lens: str = "",
+    *,
+    source: str = "",
+    done: Mapping[str, str] = MappingProxyType({}),
+    writable: bool = False,
+) -> bytes:
+    """Return a packet, UTF-8; serial numbers, places (GPS) and maker notes stay out.
+
+    Parameters
+    ----------
+    metadata : PhotoMetadata
+        Of the photo that was changed.
+    description : str
+        What was done to it; it becomes the description and one event of the history.
+    lens : str
+        What its owner calls the lens; by default what the photo says.
+    source : str
+        Name of the photo's file, without a folder; "" leaves it out.
+    done : mapping of str to str
+        Further properties in the namespace `OWN`, such as the method and the expected gain.
+    writable : bool
+        Whether other programs may change the packet in place, as they may a sidecar.
+    """
+    root = ET.Element(_name("x:xmpmeta"), {_name("x:xmptk"): SOFTWARE})
+    whole = ET.SubElement(ET.SubElement(root, _name("rdf:RDF")), _name("rdf:Description"))
+    whole.set(_name("rdf:about"), "")
+    for key, value in _taken(metadata, lens).items():
+        whole.set(_name(key), _plain(value))
+    for key, value in done.items():
+        whole.set(f"{{{OWN}}}{key}", _plain(value))
+    if description:
+        words = ET.SubElement(ET.SubElement(whole, _name("dc:description")), _name("rdf:Alt"))
+        text = ET.SubElement(words, _name("rdf:li"), {_name("xml:lang"): "x-default"})
+        text.text = _plain(description)
+        steps = ET.SubElement(ET.SubElement(whole, _name("xmpMM:History")), _name("rdf:Seq"))
+        step = ET.SubElement(steps, _name("rdf:li"))
+        step.set(_name("stEvt:action"), "filtered")
+        step.set(_name("stEvt:softwareAgent"), SOFTWARE)
+        step.set(_name("stEvt:parameters"), _plain(description))
+    if source:
+        ET.SubElement(whole, _name("xmpMM:DerivedFrom")).set(_name("stRef:filePath"), _plain(source))
+    ET.indent(root, " ")
+    return _PACKET.format(ET.tostring(root, encoding="unicode"), "w" if writable else "r").encode()
+
+
+def _taken(metadata: PhotoMetadata, lens: str) -> dict[str, str]:
+    named = lens or metadata.lens.model
+    found = {
+        "xmp:CreatorTool": SOFTWARE,
+        "tiff:Make": metadata.camera_maker,
+        "tiff:Model": metadata.camera_model,
+        "exifEX:LensMake": metadata.lens.maker,
+        "exifEX:LensModel": metadata.lens.model or named,
+        "aux:Lens": named,
+        "exif:FNumber": _rational(metadata.aperture),
+        "exif:FocalLength": _rational(metadata.focal_mm),
+        "exif:DateTimeOriginal": None if metadata.taken_at is None else metadata.taken_at.isoformat(),
+    }
+    return {name: value for name, value in found.items() if value}
+
+
+def _rational(value: float | None) -> str | None:
+    return None if value is None else f"{round(value * 1000)}/1000"
+
+
+def _plain(text: str) -> str:
+    return text.translate(_CHARACTERS)
+
+
+def _name(qualified: str) -> str:
+    prefix, _, local = qualified.partition(":")
+    return f"{{{_SPACES[prefix]}}}{local}"

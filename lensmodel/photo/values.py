@@ -1,0 +1,265 @@
+"""The values that travel: what a photo file is, what it says, and its pixels in linear light."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from datetime import datetime
+from typing import Final, Literal, TypeAlias
+
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.geometry import Frame
+from lensmodel.core.types import BayerPattern, NoiseModel, Planes
+
+FileKind: TypeAlias = Literal["raw", "dng", "tiff", "png", "jpeg"]
+SerialSource: TypeAlias = Literal["exif", "makernote", "xmp", "user", "none"]
+Transfer: TypeAlias = Literal["srgb", "linear", "icc"]
+OutputFormat: TypeAlias = Literal["tiff16", "png16", "png8", "jpeg", "dng"]
+ColorSpace: TypeAlias = Literal["same", "srgb", "camera-linear"]
+PlaneNoise: TypeAlias = tuple[NoiseModel, NoiseModel, NoiseModel]
+Matrix3: TypeAlias = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+
+_PROCESSED: Final = 16.0
+"""How much more noise variance a photo without its mosaic has than its flat places show."""
+_USUAL_GRAIN, _COARSEST = 14.0, 4.0
+"""How coarse grain may be, by `noise.graininess`, before more of it counts, and how much more at most.
+
+Demosaicing leaves 6 to 9; texture in places that are none too flat looks coarse as well.
+"""
+_DEMOSAICED: Final = (3.7, 1.9, 3.7)
+"""Noise power of demosaiced planes at low frequencies over that of the sensor: see `raw._NOISE_MIX`."""
+_COARSEST_POWER: Final = 64.0
+"""Largest `noise.graininess` that is believed: cameras that denoise reach about 60, texture far more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """How large a photo may be; checked on the header, before anything is decoded.
+
+    Parameters
+    ----------
+    max_megapixels : float
+        Width times height, in millions.
+    max_bytes : int
+        Size of the file.
+    """
+
+    max_megapixels: float = 160.0
+    max_bytes: int = 2 << 30
+
+    def __post_init__(self) -> None:
+        if not (self.max_megapixels > 0 and self.max_bytes > 0):
+            raise InvalidInputError(f"limits must be positive, got {self}")
+
+
+@dataclass(frozen=True, slots=True)
+class LensIdentity:
+    """Which lens it was, as far as the file says.
+
+    A serial is never blank and never a placeholder such as "0000000000": then it is `None`
+    and `serial_source` is "none".
+    """
+
+    maker: str | None = None
+    model: str | None = None
+    serial: str | None = None
+    serial_source: SerialSource = "none"
+
+    def __post_init__(self) -> None:
+        if (self.serial is None) != (self.serial_source == "none"):
+            raise InvalidInputError(
+                f"a lens serial and its source belong together, got a source of {self.serial_source!r}"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoMetadata:
+    """What the file says about camera, lens and exposure; `None` is unknown, never zero.
+
+    Parameters
+    ----------
+    aperture : float or None
+        f-number.
+    focal_mm : float or None
+        Focal length in mm, not its 35 mm equivalent.
+    focus_m : float or None
+        Focus distance in metres.
+    exposure_s : float or None
+        Exposure time in seconds.
+    taken_at : datetime or None
+        Local time of the camera, without a zone.
+    orientation : int
+        EXIF orientation 1 to 8; the planes are always in sensor orientation, whatever it says.
+    pixel_pitch_um : float or None
+        Pitch of the pixels of this file in micrometres.
+    """
+
+    camera_maker: str | None = None
+    camera_model: str | None = None
+    body_serial: str | None = None
+    lens: LensIdentity = LensIdentity()
+    aperture: float | None = None
+    focal_mm: float | None = None
+    focus_m: float | None = None
+    iso: float | None = None
+    exposure_s: float | None = None
+    taken_at: datetime | None = None
+    orientation: int = 1
+    pixel_pitch_um: float | None = None
+
+    def without_serials(self) -> PhotoMetadata:
+        """Return the same without the serials of body and lens, which are personal data."""
+        return replace(self, body_serial=None, lens=replace(self.lens, serial=None, serial_source="none"))
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoInfo:
+    """What can be told of a photo without decoding it.
+
+    Parameters
+    ----------
+    kind : {"raw", "dng", "tiff", "png", "jpeg"}
+        The kind of file by its content.
+    width, height : int
+        Size as developed, in sensor orientation.
+    metadata : PhotoMetadata
+        What the file says.
+    """
+
+    kind: FileKind
+    width: int
+    height: int
+    metadata: PhotoMetadata = PhotoMetadata()
+
+
+@dataclass(frozen=True, slots=True)
+class Encoding:
+    """How linear planes become a file like the one that they came from.
+
+    Parameters
+    ----------
+    bit_depth : int
+        Bits of one sample of the input: 8, 14, 16, 32, ...
+    transfer : {"srgb", "linear", "icc"}
+        Curve between the file's numbers and linear light; "icc" = the curves of `icc`.
+    icc : bytes or None
+        The input's ICC profile.
+    metadata : PhotoMetadata
+        What is written into the output: without serials, GPS and maker notes.
+    white_balance : tuple of float
+        Multipliers of r, g, b that make grey grey; green is 1. All 1 except for RAW.
+    to_srgb : 3 x 3 tuple or None
+        White-balanced planes to linear sRGB, row by row; `None` where the primaries are those
+        of `icc`, or of sRGB.
+    xyz_to_camera : 3 x 3 tuple or None
+        CIE XYZ (D65) to camera RGB, for DNG output.
+    baseline_exposure : float or None
+        Stops by which a DNG asks raw converters to brighten it; `None` where the file does not say.
+    """
+
+    bit_depth: int = 8
+    transfer: Transfer = "srgb"
+    icc: bytes | None = None
+    metadata: PhotoMetadata = PhotoMetadata()
+    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    to_srgb: Matrix3 | None = None
+    xyz_to_camera: Matrix3 | None = None
+    baseline_exposure: float | None = None
+
+    @property
+    def orientation(self) -> int:
+        """EXIF orientation, 1 to 8, by which the picture stands upright."""
+        return self.metadata.orientation
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearPhoto:
+    """A developed photo: linear light in sensor orientation.
+
+    Parameters
+    ----------
+    planes : ndarray of float32, shape (3, height, width)
+        Black 0, saturation 1, not white balanced; RAW stays in the camera's own colours.
+    frame : Frame
+        Size of the planes.
+    noise : tuple of NoiseModel
+        Variance of the pixels of each plane.
+    clip : tuple of float
+        Level of each plane at which the sensor, or the file, clips.
+    info : PhotoInfo
+        What the file says.
+    encoding : Encoding
+        The way back to a file.
+    pipeline : str
+        How the planes were made; samples of different pipelines must not be mixed.
+    white_balance : tuple of float
+        Multipliers of the camera's own white balance, green 1.
+    sensor_noise : tuple of NoiseModel or None
+        Noise of the sensor itself, measured on the mosaic: white, unlike that of demosaiced
+        planes, whose pixels share their neighbours' noise. `None` where there is no mosaic.
+    coding_noise : NoiseModel or None
+        What lossy compression adds where there is detail; `None` where there was none.
+    chroma_step : tuple of int
+        Rows and columns of pixels that share one value of chroma: (2, 2) in most JPEGs.
+    grain : tuple of float
+        How much coarser than white the noise of each plane is: see `noise.graininess`.
+    cfa : BayerPattern or None
+        Which pixels of each plane were measured, and not filled in by demosaicing. `None` where
+        the planes are no longer on the sensor's grid, or there was no Bayer mosaic.
+    """
+
+    planes: Planes
+    frame: Frame
+    noise: PlaneNoise
+    clip: tuple[float, float, float]
+    info: PhotoInfo
+    encoding: Encoding
+    pipeline: str
+    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    sensor_noise: PlaneNoise | None = None
+    coding_noise: NoiseModel | None = None
+    cfa: BayerPattern | None = None
+    grain: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    chroma_step: tuple[int, int] = (1, 1)
+
+    @property
+    def lossy(self) -> bool:
+        """Whether compression made errors of its own, and perhaps a camera sharpened: JPEG and lossy DNG."""
+        return self.info.kind == "jpeg" or self.coding_noise is not None
+
+    @property
+    def coarse_noise(self) -> PlaneNoise:
+        """Noise power of each plane at 0.1 to 0.4 cycles/pixel, above which detail tells of the lens.
+
+        Flat places of a photo that was denoised show little noise from pixel to pixel and all of it in
+        coarser grain; what compression adds is seen only where there is detail.
+        """
+        if self.sensor_noise is not None:
+            factors, base = _DEMOSAICED, self.sensor_noise
+        else:
+            red, green, blue = (min(max(grain, 1.0), _COARSEST_POWER) for grain in self.grain)
+            factors, base = (red, green, blue), self.noise
+        coded = self.coding_noise or NoiseModel(0.0, 0.0)
+        r, g, b = (
+            NoiseModel(max(factor * n.shot, coded.shot), max(factor * n.read, coded.read))
+            for n, factor in zip(base, factors, strict=True)
+        )
+        return r, g, b
+
+    @property
+    def correction_noise(self) -> PlaneNoise:
+        """Noise as a correction must count it, as if it were white.
+
+        That of the sensor where it is known. Demosaicing, denoising and compression leave less of it in
+        a pixel than there is in a patch, and make errors of their own where there is detail. Where a
+        camera's denoising took the fine grain and left the coarse one, that counts, or a correction that
+        was told of the fine one alone would take it for a scene and sharpen it.
+        """
+        if self.sensor_noise is not None:
+            return self.sensor_noise
+        coded = self.coding_noise or NoiseModel(0.0, 0.0)
+        factors = [_PROCESSED * min(max(grain / _USUAL_GRAIN, 1.0), _COARSEST) for grain in self.grain]
+        r, g, b = (
+            NoiseModel(max(factor * n.shot, coded.shot), max(factor * n.read, coded.read))
+            for n, factor in zip(self.noise, factors, strict=True)
+        )
+        return r, g, b

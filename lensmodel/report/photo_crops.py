@@ -1,0 +1,49 @@
+"""Pictures for reports: sRGB as shown, and 1:1 crops of the center and the corners."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.types import Kernel, Planes
+
+Picture = NDArray[np.uint8]
+"""`(row, col, 3)` sRGB, as shown."""
+
+_EDGE = 4
+
+
+def as_shown(planes: Planes, gain: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Picture:
+    """Encode linear planes `(3, row, col)` to 8-bit sRGB, each channel times its gain."""
+    linear = np.clip(planes * np.asarray(gain, dtype=np.float32)[:, None, None], 0.0, 1.0)
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.ascontiguousarray(np.moveaxis(np.rint(encoded * 255), 0, -1).astype(np.uint8))
+
+
+def crop_boxes(height: int, width: int, side: int) -> dict[str, tuple[int, int]]:
+    """Top-left pixels of five crops: the center and the four corners, clear of the border."""
+    bottom, right = height - side - _EDGE, width - side - _EDGE
+    return {
+        "center": ((height - side) // 2, (width - side) // 2),
+        "upper left": (_EDGE, _EDGE),
+        "upper right": (_EDGE, right),
+        "lower left": (bottom, _EDGE),
+        "lower right": (bottom, right),
+    }
+
+
+def strip(picture: Picture, side: int, gap: int = 6) -> Picture:
+    """Put the five crops of `crop_boxes` side by side on white, `(side, 5 side + 4 gap, 3)`."""
+    side = min(side, picture.shape[0] // 2, picture.shape[1] // 2)
+    boxes = crop_boxes(picture.shape[0], picture.shape[1], side)
+    sheet = np.full((side, len(boxes) * (side + gap) - gap, 3), 255, dtype=np.uint8)
+    for i, (row, col) in enumerate(boxes.values()):
+        left = i * (side + gap)
+        sheet[:, left : left + side] = picture[row : row + side, col : col + side]
+    return sheet
+
+
+def kernel_tile(kernel: Kernel, zoom: int = 3, gamma: float = 0.5) -> NDArray[np.uint8]:
+    """Draw a kernel, its peak white, each pixel `zoom` times; the paper's figures use gamma 0.5."""
+    shown = np.rint((kernel / kernel.max()) ** gamma * 255).astype(np.uint8)
+    return np.kron(shown, np.ones((zoom, zoom), dtype=np.uint8))

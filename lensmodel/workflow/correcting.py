@@ -1,0 +1,180 @@
+"""Step 3: a photo without the blur of its lens."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from pathlib import Path
+
+from lensmodel import correction, photo, quality
+from lensmodel.core.types import (
+    LensSettings,
+    StepHook,
+    ignore_step,
+)
+from lensmodel.model import LensModel, WitnessedField
+from lensmodel.photo import LinearPhoto
+from lensmodel.photo.lateral import LateralColour, estimate_lateral, resample
+from lensmodel.photo.tags.xmp_block import sidecar_path, write_sidecar
+from lensmodel.workflow.developed import settings_of
+from lensmodel.workflow.estimating import witnesses_of
+
+log = logging.getLogger(__name__)
+
+
+def lateral_of(developed: LinearPhoto) -> LateralColour:
+    """Estimate the lateral colour of a photo from its own edges."""
+    return estimate_lateral(developed.planes, developed.frame, clip=developed.clip)
+
+
+def correct_photo(
+    developed: LinearPhoto,
+    model: LensModel,
+    settings: LensSettings,
+    *,
+    method: str | correction.Deconvolver = "standard",
+    strength: float = 1.0,
+    bounds: correction.Bounds | None = None,
+    lateral: LateralColour | None = None,
+    roi: tuple[int, int, int, int] | None = None,
+    workers: int = 1,
+    on_step: StepHook = ignore_step,
+) -> correction.Corrected:
+    """Remove the blur of the lens from a developed photo.
+
+    What is thought of each PSF, its mean and its uncertainty, comes from two opinions of the model and from
+    the patches of the lens and of this photo (`lensmodel.model.trust.witness`); the less sure, the gentler.
+
+    Parameters
+    ----------
+    bounds : Bounds, optional
+        What to allow beside edges and in flat areas.
+    roi : tuple of int, optional
+        `(row, col, height, width)` in sensor orientation; only that part is corrected.
+
+    Returns
+    -------
+    Corrected
+        Of a chart, with what was measured on its edges (`find_edges`) in each zone.
+    """
+    field = WitnessedField.of(
+        model.warmed(),
+        settings,
+        witnesses_of(developed, settings),
+        pitch_um=developed.info.metadata.pixel_pitch_um,
+        half_diagonal_px=developed.frame.half_diagonal,
+    )
+    planes, cfa = developed.planes, developed.cfa
+    solver = correction.deconvolvers.resolve(method)
+    if isinstance(solver, correction.WarpableMethod) and solver.warped and lateral is not None:
+        planes, lateral, cfa = resample(planes, developed.frame, lateral), None, None
+    corrected = correction.correct_planes(
+        planes,
+        field,
+        developed.frame,
+        method=solver,
+        strength=strength,
+        noise=developed.correction_noise,
+        clip=developed.clip,
+        lateral=lateral,
+        cfa=cfa,
+        bounds=bounds,
+        stored=correction.StoredColour.of_photo(developed),
+        roi=roi,
+        workers=workers,
+        on_step=on_step,
+    )
+    return _with_measured_gain(corrected, developed, roi)
+
+
+def _with_measured_gain(
+    corrected: correction.Corrected, developed: LinearPhoto, roi: tuple[int, int, int, int] | None
+) -> correction.Corrected:
+    """Say what the correction did to the edges of a chart, where the photo shows one."""
+    top, left, height, width = roi or (0, 0, developed.frame.height, developed.frame.width)
+    gains = quality.edge_gains(
+        developed.planes[1, top : top + height, left : left + width],
+        corrected.planes[1],
+        developed.frame,
+        origin=(top, left),
+        noise=developed.noise[1],
+        clip=developed.clip[1],
+    )
+    zones = {
+        zone: dataclasses.replace(report, measured=gains.get(zone))
+        for zone, report in corrected.zones.items()
+    }
+    return dataclasses.replace(corrected, zones=zones)
+
+
+def correct(
+    source: Path | LinearPhoto,
+    model: LensModel,
+    output: Path | None,
+    *,
+    settings: LensSettings | None = None,
+    method: str | correction.Deconvolver = "standard",
+    strength: float = 1.0,
+    bounds: correction.Bounds | None = None,
+    file_format: photo.OutputFormat = "tiff16",
+    color_space: photo.ColorSpace = "same",
+    quality: int = 95,
+    least_gain_db: float | None = None,
+    sidecar: bool = False,
+    lens: str = "",
+    workers: int = 1,
+    on_step: StepHook = ignore_step,
+) -> correction.Corrected:
+    """Correct one photo and write the result, if it is to be written, in the encoding of the input.
+
+    The file appears complete or not at all. It says in a tag what was done; `lens` goes into that. With
+    `least_gain_db` there is none where less is expected to be gained. With `sidecar` an XMP file beside it
+    tells what was done.
+    """
+    developed = source if isinstance(source, LinearPhoto) else photo.develop(source)
+    chosen = settings_of(developed, settings)
+    corrected = correct_photo(
+        developed,
+        model,
+        chosen,
+        method=method,
+        strength=strength,
+        bounds=bounds,
+        lateral=lateral_of(developed),
+        workers=workers,
+        on_step=on_step,
+    )
+    too_little = least_gain_db is not None and corrected.expected_gain_db < least_gain_db
+    if output is None or too_little:
+        return corrected
+    encoding, name = developed.encoding, method if isinstance(method, str) else type(method).__name__
+    metadata, name_of_source = developed.info.metadata, source.name if isinstance(source, Path) else ""
+    del developed  # its planes are as large as the result: at 100 megapixels, 1.1 GiB
+    description = (
+        f"lens blur corrected by lensmodel: {lens + ', ' if lens else ''}"
+        f"method {name}, strength {strength:g}{'' if bounds is None else bounds.described}"
+    )
+    photo.write_image(
+        output,
+        corrected.planes,
+        encoding,
+        format=file_format,
+        color_space=color_space,
+        quality=quality,
+        description=description,
+    )
+    if sidecar:
+        write_sidecar(
+            sidecar_path(output),
+            metadata,
+            source=name_of_source,
+            description=description,
+            done={
+                "Method": name,
+                "Strength": f"{strength:g}",
+                "Profile": lens,
+                "ExpectedGainDb": f"{corrected.expected_gain_db:.2f}",
+                "NothingToCorrect": str(corrected.nothing_to_correct).lower(),
+            },
+        )
+    return corrected

@@ -1,0 +1,70 @@
+"""A developed photo as the steps share it: on disk, by its settings, by its name."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+
+from lensmodel.core import codec
+from lensmodel.core.errors import (
+    InvalidInputError,
+)
+from lensmodel.core.files import atomic
+from lensmodel.core.types import (
+    LensSettings,
+)
+from lensmodel.photo import LinearPhoto
+
+
+def save_developed(developed: LinearPhoto, folder: Path) -> None:
+    """Keep a developed photo so that other processes can map it: planes.npy and photo.json.
+
+    The planes are written last: a folder that has them is complete.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    fields = {
+        f.name: getattr(developed, f.name) for f in dataclasses.fields(LinearPhoto) if f.name != "planes"
+    }
+    (folder / "photo.json").write_text(json.dumps(codec.to_json(fields)), encoding="utf-8")
+    with atomic(folder / "planes.npy") as file:
+        np.save(file, developed.planes, allow_pickle=False)
+
+
+def load_developed(folder: Path) -> LinearPhoto:
+    """Open what `save_developed` kept; the planes are memory-mapped, read-only.
+
+    Raises
+    ------
+    InvalidInputError
+        If the folder holds no complete developed photo.
+    """
+    try:
+        planes = np.load(folder / "planes.npy", mmap_mode="r", allow_pickle=False)
+        stored = json.loads((folder / "photo.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InvalidInputError(f"{folder} holds no developed photo; develop it again") from error
+    return codec.from_json(LinearPhoto, {**stored, "planes": planes})
+
+
+def settings_of(developed: LinearPhoto, given: LensSettings | None = None) -> LensSettings:
+    """Settings of the lens as the photo's metadata say; the caller's values fill what they leave open.
+
+    The one rule of precedence, of the library and of the command: a value that is given for a folder of
+    photos is meant for those among them that do not say their own.
+    """
+    known, given = developed.info.metadata, given or LensSettings()
+    return LensSettings(
+        aperture=given.aperture if known.aperture is None else known.aperture,
+        focal_mm=given.focal_mm if known.focal_mm is None else known.focal_mm,
+        focus_m=given.focus_m if known.focus_m is None else known.focus_m,
+    )
+
+
+def photo_id(path: Path) -> str:
+    """Name a photo by its content: the first 16 hex digits of its SHA-256."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:16]

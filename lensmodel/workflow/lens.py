@@ -1,0 +1,400 @@
+"""A lens as one value: what it was calibrated from, what it answers, and the file that keeps it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.psf import PsfSample, centred
+from lensmodel.core.types import Channel, FieldPosition, LensSettings
+from lensmodel.model import (
+    LensModel,
+    LensProfile,
+    ModelSettings,
+    PsfAnswer,
+    load_profile,
+    save_profile,
+)
+from lensmodel.quality import mtf50_from_kernel, mtf_from_kernel
+from lensmodel.workflow.identity import Identity
+
+DEFAULT_SIZE = 55
+"""Side of a kernel in pixels (chosen): what a correction uses, so that the same numbers are seen."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lens:
+    """One copy of a lens: its PSF at every place of the picture, aperture and color.
+
+    The PSF is the function f(u, v, r, phi, settings) of M. Hirsch and B. Schölkopf, "Self-Calibration of
+    Optical Lenses", ICCV 2015, section 6. Places are field positions: `r` is the distance to the center over
+    the half diagonal (0 center, 1 corner), `phi` the angle in radians, counter-clockwise from the right, in
+    sensor orientation. Kernels are float64, of odd side, not negative, of sum 1, on the pixel grid of the
+    sensor that the lens was calibrated on.
+
+    Lenses are values: nothing changes one. Make them with `calibrate`, `Lens.from_kernels` or `Lens.load`.
+
+    Parameters
+    ----------
+    profile : LensProfile
+        The model, with what is known of lens, cameras and photos.
+    """
+
+    profile: LensProfile
+
+    @classmethod
+    def from_kernels(
+        cls,
+        kernels: ArrayLike,
+        r: ArrayLike,
+        phi: ArrayLike,
+        *,
+        aperture: ArrayLike | None = None,
+        channel: Channel | Sequence[Channel] = "g",
+        weight: ArrayLike = 1.0,
+        photo: str | Sequence[str] = "",
+        pixel_pitch_um: float | None = None,
+        model: ModelSettings | None = None,
+    ) -> Lens:
+        """Make a PSF field of kernels that were measured in any way, at n places.
+
+        Parameters
+        ----------
+        kernels : array_like, shape (n, k, k)
+            k odd; not negative. Each is normalized, and its center of mass moved to the middle pixel.
+        r, phi : array_like, shape (n,)
+            Field positions: half diagonals 0..1, and radians.
+        aperture : array_like, shape (n,) or (), optional
+            f-number of each, or of all; None where it is unknown.
+        channel : {"r", "g", "b"} or sequence of them
+            Color of each, or of all.
+        weight : array_like, shape (n,) or ()
+            Confidence 0..1, which scales the vote of a kernel.
+        photo : str or sequence of str
+            What each was measured on: kernels of one photo share its faults.
+        pixel_pitch_um : float, optional
+            Pixels of the kernels in micrometres, so that sensors with other pixels may ask.
+        model : ModelSettings, optional
+            Choices of the regression.
+
+        Returns
+        -------
+        Lens
+
+        Raises
+        ------
+        InvalidInputError
+            If shapes do not fit, or a value is out of its range.
+        NoSamplesError
+            If there is no kernel, or none has a weight.
+        """
+        stack = np.asarray(kernels, dtype=np.float64)
+        if stack.ndim != 3:
+            raise InvalidInputError(f"kernels must have the shape (n, k, k), got {stack.shape}")
+        n = len(stack)
+        places = zip(_each(r, n, "r"), _each(phi, n, "phi"), strict=True)
+        apertures = [None] * n if aperture is None else _each(aperture, n, "aperture")
+        samples = [
+            PsfSample(
+                centred(kernel),
+                FieldPosition(*place),
+                LensSettings(f_number, channel=colour),
+                weight=vote,
+                photo=name,
+                pixel_pitch_um=pixel_pitch_um,
+                estimator="given",
+            )
+            for kernel, place, f_number, colour, vote, name in zip(
+                stack,
+                places,
+                apertures,
+                _named(channel, n, "channel"),
+                _each(weight, n, "weight"),
+                _named(photo, n, "photo"),
+                strict=True,
+            )
+        ]
+        return cls(LensProfile(LensModel.fit(samples, model).warmed()))
+
+    @classmethod
+    def grown(
+        cls,
+        lens: Lens | None,
+        model: LensModel,
+        photos: Mapping[str, str],
+        seen: Iterable[Identity],
+        *,
+        any_lens: bool = False,
+    ) -> Lens:
+        """Return a lens whose model has learned from more photos.
+
+        Parameters
+        ----------
+        lens : Lens or None
+            What was known before.
+        model : LensModel
+            What is known now.
+        photos : mapping of str to str
+            File names of the new photos, by their ids.
+        seen : iterable of Identity
+            What the new photos say of lens and camera.
+        any_lens : bool
+            The photos may be of other lenses, so they do not name this one.
+        """
+        known = None if lens is None else lens.profile
+        names = {} if known is None else dict(known.lens)
+        cameras = [] if known is None else list(known.cameras)
+        for one in seen:
+            if known is None or not any_lens:
+                names = {**one.lens, **names}
+            if one.camera is not None and one.camera not in cameras:
+                cameras.append(one.camera)
+        earlier = {} if known is None else known.photos
+        return cls(LensProfile(model, names, {**earlier, **photos}, tuple(cameras)))
+
+    @classmethod
+    def load(cls, path: Path | str) -> Lens:
+        """Open a lens profile.
+
+        Raises
+        ------
+        InvalidInputError
+            If the file is no profile, or one of a newer format.
+        FileNotFoundError
+            If there is none.
+        """
+        return cls(load_profile(path))
+
+    def save(self, path: Path | str) -> None:
+        """Write the lens to a file, by custom `*.lensprofile`; it appears complete or not at all.
+
+        A file of that name is replaced. The format is plain JSON and npy in a zip: no pickle, no code.
+        """
+        save_profile(path, self.profile)
+
+    def warmed(self) -> Lens:
+        """Return the lens with all fitted that takes long and is fitted once; `calibrate` did so."""
+        return (
+            self
+            if self.model.warm
+            else replace(self, profile=replace(self.profile, model=self.model.warmed()))
+        )
+
+    def psf(
+        self,
+        r: float,
+        phi: float = 0.0,
+        *,
+        aperture: float | None = None,
+        focal_mm: float | None = None,
+        focus_m: float | None = None,
+        channel: Channel = "g",
+        size: int = DEFAULT_SIZE,
+    ) -> PsfAnswer:
+        """Return the PSF at one place, with how much stands behind it.
+
+        Parameters
+        ----------
+        r, phi : float
+            Field position: half diagonals 0..1, and radians.
+        aperture : float, optional
+            f-number; None takes all apertures of the samples together. The same goes for `focal_mm` in mm and
+            `focus_m` in metres.
+        channel : {"r", "g", "b"}
+            Color.
+        size : int
+            Odd side of the kernel in pixels.
+
+        Returns
+        -------
+        PsfAnswer
+            `.kernel` is the array, shape (size, size), float64; `.predicted_error` its expected relative L2
+            error; `.photos` and `.effective_samples` what it was made of.
+
+        Raises
+        ------
+        InvalidInputError
+            If a value is out of its range.
+        """
+        settings = LensSettings(aperture, focal_mm, focus_m, channel)
+        return self.model.query(FieldPosition(r, phi), settings, size)
+
+    def kernels(
+        self,
+        r: ArrayLike,
+        phi: ArrayLike,
+        *,
+        aperture: float | None = None,
+        channel: Channel = "g",
+        size: int = DEFAULT_SIZE,
+    ) -> NDArray[np.float64]:
+        """Return the kernels of many places at once, faster than `psf` for each.
+
+        Parameters
+        ----------
+        r, phi : array_like
+            Field positions, of shapes that broadcast to one shape S.
+        aperture, channel, size
+            As of `psf`.
+
+        Returns
+        -------
+        ndarray of float64, shape (*S, size, size)
+
+        Raises
+        ------
+        InvalidInputError
+            If a value is out of its range.
+        """
+        radii, angles = np.broadcast_arrays(
+            np.asarray(r, dtype=np.float64), np.asarray(phi, dtype=np.float64)
+        )
+        places = [
+            FieldPosition(float(a), float(b)) for a, b in zip(radii.ravel(), angles.ravel(), strict=True)
+        ]
+        found = self.model.kernels(places, LensSettings(aperture, channel=channel), size)
+        return found.reshape(*radii.shape, size, size)
+
+    def mtf(
+        self,
+        r: ArrayLike,
+        phi: ArrayLike,
+        frequencies: ArrayLike,
+        *,
+        aperture: float | None = None,
+        channel: Channel = "g",
+    ) -> NDArray[np.float64]:
+        """Return the contrast that the lens leaves of fine lines (`mtf_from_kernel` gives the equation).
+
+        Parameters
+        ----------
+        r, phi : array_like
+            Field positions, of shapes that broadcast to one shape S.
+        frequencies : array_like, shape (n,)
+            Cycles/pixel.
+        aperture, channel
+            As of `psf`.
+
+        Returns
+        -------
+        ndarray of float64, shape (2, *S, n)
+            Tangential (contrast along the radius), then sagittal; 1 at frequency 0.
+
+        Raises
+        ------
+        InvalidInputError
+            If a value is out of its range.
+        """
+        wanted = np.atleast_1d(np.asarray(frequencies, dtype=np.float64))
+        kernels = self.kernels(r, phi, aperture=aperture, channel=channel)
+        angles = np.broadcast_to(np.asarray(phi, dtype=np.float64), kernels.shape[:-2])
+        out = np.empty((2, *angles.shape, len(wanted)))
+        for index in np.ndindex(angles.shape):
+            for row, turn in enumerate((0.0, np.pi / 2.0)):
+                out[(row, *index)] = mtf_from_kernel(kernels[index], float(angles[index]) + turn, wanted)
+        return out
+
+    def mtf50_map(
+        self,
+        rows: int = 20,
+        cols: int = 30,
+        *,
+        aspect: float = 1.5,
+        aperture: float | None = None,
+        channel: Channel = "g",
+    ) -> NDArray[np.float64]:
+        """Return where contrast falls to one half, over the picture.
+
+        Parameters
+        ----------
+        rows, cols : int
+            Equal cells of the picture; each value is that of its cell's center.
+        aspect : float
+            Width over height of the picture.
+        aperture, channel
+            As of `psf`.
+
+        Returns
+        -------
+        ndarray of float64, shape (2, rows, cols)
+            Tangential and sagittal MTF50 in cycles/pixel; row 0 is the top in sensor orientation.
+
+        Raises
+        ------
+        InvalidInputError
+            If there are no cells, or a value is out of its range.
+        """
+        r, phi = field_grid(rows, cols, aspect=aspect)
+        kernels = self.kernels(r, phi, aperture=aperture, channel=channel)
+        out = np.empty((2, rows, cols))
+        for index in np.ndindex(rows, cols):
+            for along, turn in enumerate((0.0, np.pi / 2.0)):
+                out[(along, *index)] = mtf50_from_kernel(kernels[index], float(phi[index]) + turn)
+        return out
+
+    @property
+    def model(self) -> LensModel:
+        """The function behind the answers."""
+        return self.profile.model
+
+    @property
+    def samples(self) -> tuple[PsfSample, ...]:
+        """The local PSF estimates that the lens was made of."""
+        return self.model.samples
+
+    @property
+    def description(self) -> str:
+        """Which lens, and how many photos it was learned from."""
+        words = [self.profile.lens[key] for key in ("maker", "model") if self.profile.lens.get(key)]
+        count = len(self.profile.photos)
+        return f"{' '.join(words) or 'unknown lens'}, profile of {count} photo{'' if count == 1 else 's'}"
+
+
+def field_grid(
+    rows: int, cols: int, *, aspect: float = 1.5
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the field positions of the centers of equal cells of a picture.
+
+    Parameters
+    ----------
+    rows, cols : int
+        Number of cells.
+    aspect : float
+        Width over height of the picture.
+
+    Returns
+    -------
+    r, phi : ndarray of float64, shape (rows, cols)
+        Half diagonals, and radians; row 0 is the top in sensor orientation.
+
+    Raises
+    ------
+    InvalidInputError
+        If there are no cells, or the aspect is not positive.
+    """
+    if rows < 1 or cols < 1 or not aspect > 0.0:
+        raise InvalidInputError(f"a grid needs cells and an aspect, got {rows} x {cols}, aspect {aspect}")
+    half = np.hypot(aspect, 1.0)
+    up = (1.0 - (2.0 * np.arange(rows) + 1.0) / rows)[:, None] / half
+    right = ((2.0 * np.arange(cols) + 1.0) / cols - 1.0)[None, :] * aspect / half
+    return np.hypot(up, right), np.arctan2(up + 0.0 * right, right + 0.0 * up)
+
+
+def _each(values: ArrayLike, n: int, name: str) -> list[float]:
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape not in {(), (n,)}:
+        raise InvalidInputError(f"{name} must be one number or {n}, one for each kernel, got {array.shape}")
+    return [float(value) for value in np.broadcast_to(array, (n,))]
+
+
+def _named(values: str | Sequence[str], n: int, name: str) -> list[Any]:
+    found = [values] * n if isinstance(values, str) else list(values)
+    if len(found) != n:
+        raise InvalidInputError(f"{name} must be one or {n}, one for each kernel, got {len(found)}")
+    return found

@@ -1,0 +1,54 @@
+"""From photos to a lens model, and from a model to corrected photos: the only glue.
+
+    develop -> find_patches -> estimate_cell (many, independent) -> LensModel.fit
+    develop -> correct_photo -> write
+
+Each step is a plain function on values, so that a script, the command line and the workers of
+the service run the same code. The steps in the middle are independent of each other and may
+run in as many processes as there are. Here they are under one name.
+"""
+
+from lensmodel.workflow.calibrating import (
+    CalibrationEvent,
+    EventHook,
+    calibrate,
+    ignore_event,
+    samples_of_bytes,
+    samples_of_photo,
+)
+from lensmodel.workflow.correcting import correct, correct_photo, lateral_of
+from lensmodel.workflow.developed import load_developed, photo_id, save_developed, settings_of
+from lensmodel.workflow.estimating import (
+    DEFAULT_KERNEL_SIZE,
+    DEFAULT_PATCHES,
+    CellSample,
+    cells,
+    estimate_cell,
+    find_patches,
+    require_spread,
+    witnesses_of,
+)
+
+__all__ = [
+    "DEFAULT_KERNEL_SIZE",
+    "DEFAULT_PATCHES",
+    "CalibrationEvent",
+    "CellSample",
+    "EventHook",
+    "calibrate",
+    "cells",
+    "correct",
+    "correct_photo",
+    "estimate_cell",
+    "find_patches",
+    "ignore_event",
+    "lateral_of",
+    "load_developed",
+    "photo_id",
+    "require_spread",
+    "samples_of_bytes",
+    "samples_of_photo",
+    "save_developed",
+    "settings_of",
+    "witnesses_of",
+]

@@ -1,0 +1,362 @@
+"""What an owner takes away, and what is left when he goes; the same request sent twice."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import zipfile
+from datetime import timedelta
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from sqlalchemy import func, select, update
+from starlette.testclient import TestClient
+
+from app.blobs.erasure import erase
+from app.store import Store
+from app.store.access.access_tables import IdempotencyRow, KeyRow
+from app.store.access.owners import now
+from app.store.tables import (
+    CorrectionRow,
+    EventRow,
+    GarbageRow,
+    LensRow,
+    OwnerRow,
+    PatchRow,
+    PhotoRow,
+    SampleRow,
+)
+
+JPEG = b"\xff\xd8\xff" + bytes(200)
+
+
+def count(store: Store, table: type[Any]) -> int:
+    with store.database.reading() as session:
+        return session.scalar(select(func.count()).select_from(table)) or 0
+
+
+def storage_of(client: TestClient) -> Any:
+    return client.app.state.services.storage  # type: ignore[attr-defined]  # the TestClient knows no type of it
+
+
+def lines(archive: zipfile.ZipFile, name: str) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in archive.read(name).decode().splitlines()]
+
+
+# --- once -----------------------------------------------------------------------------------------
+
+
+def test_the_same_request_with_the_same_key_is_done_once(
+    client: TestClient, store: Store, steps: Any
+) -> None:
+    photo = steps.counted()
+    key = {"Idempotency-Key": "a-1"}
+    wish = {"photo_id": photo.public_id, "method": "fast"}
+
+    first = client.post("/v1/corrections", json=wish, headers=key)
+    client.delete(f"/v1/corrections/{first.json()['id']}")
+    again = client.post("/v1/corrections", json=wish, headers=key)
+
+    assert (first.status_code, again.status_code) == (202, 202)
+    assert first.json() == again.json()
+    assert again.headers["Idempotency-Replayed"] == "true"
+    assert again.headers["Location"] == first.headers["Location"]
+    assert count(store, CorrectionRow) == 0  # not made again
+
+
+def test_a_key_belongs_to_one_request(client: TestClient, steps: Any) -> None:
+    photo = steps.counted()
+    key = {"Idempotency-Key": "a-1"}
+    wish = {"photo_id": photo.public_id, "method": "fast"}
+    client.post("/v1/corrections", json=wish, headers=key)
+
+    other_body = client.post("/v1/corrections", json={**wish, "strength": 0.5}, headers=key)
+    other_path = client.post("/v1/jobs/retry", headers=key)
+    malformed = client.post("/v1/jobs/retry", headers={"Idempotency-Key": "with blank"})
+
+    assert [a.status_code for a in (other_body, other_path, malformed)] == [422, 422, 422]
+    assert "another request" in other_body.json()["detail"]
+
+
+def test_an_upload_that_is_sent_again_leaves_one_photo_and_one_file(client: TestClient, store: Store) -> None:
+    key = {"Idempotency-Key": "up-1"}
+
+    first = client.post("/v1/photos?filename=a.jpg", content=JPEG, headers=key)
+    again = client.post("/v1/photos?filename=a.jpg", content=JPEG, headers=key)
+    other = client.post("/v1/photos?filename=a.jpg", content=JPEG + b"x", headers=key)
+
+    assert (first.status_code, again.status_code, other.status_code) == (202, 202, 422)
+    assert first.json() == again.json()
+    assert count(store, PhotoRow) == 1
+    kept = [path.parent.name for path in storage_of(client).folder.glob("photos/*/original")]
+    assert kept == [first.json()["id"]]
+
+
+def test_a_request_that_was_refused_may_be_sent_again(client: TestClient, store: Store, steps: Any) -> None:
+    photo = steps.receive()
+    steps.inspect(photo)
+    key = {"Idempotency-Key": "a-1"}
+    wish = {"photo_id": photo.public_id, "method": "fast"}
+
+    early = client.post("/v1/corrections", json=wish, headers=key)
+    steps.plan(photo)
+    steps.estimate(photo)
+    assert store.photos.finish(photo.public_id, photo.epoch) is not None
+    later = client.post("/v1/corrections", json=wish, headers=key)
+
+    assert (early.status_code, later.status_code) == (409, 202)
+
+
+def test_a_request_that_is_being_answered_is_not_begun_again_before_it_is_lost(store: Store) -> None:
+    answers = store.idempotency
+    store.keys.create("other", ["write"])
+    assert answers.begin("local", "k", "h") is None
+
+    with pytest.raises(Exception, match="is being answered"):
+        answers.begin("local", "k", "h")
+    with store.database.writing() as session:
+        session.execute(update(IdempotencyRow).values(created_at=now() - timedelta(minutes=2)))
+    assert answers.begin("local", "k", "h") is None
+    assert answers.begin("other", "k", "another") is None
+
+
+def test_an_answer_goes_with_the_photo_that_it_speaks_of_or_after_a_day(
+    client: TestClient, store: Store
+) -> None:
+    sent = client.post("/v1/photos", content=JPEG, headers={"Idempotency-Key": "one"})
+    client.post("/v1/jobs/retry", headers={"Idempotency-Key": "two"})
+
+    client.delete(f"/v1/photos/{sent.json()['id']}")
+    after_photo = count(store, IdempotencyRow)
+    with store.database.writing() as session:
+        session.execute(update(IdempotencyRow).values(created_at=now() - timedelta(hours=25)))
+    store.idempotency.tidy()
+
+    assert (after_photo, count(store, IdempotencyRow)) == (1, 0)
+
+
+# --- taking it away -------------------------------------------------------------------------------
+
+
+def test_the_export_holds_every_row_and_file_of_the_owner_and_nothing_else(
+    client: TestClient, store: Store, steps: Any
+) -> None:
+    photo = steps.counted()
+    storage_of(client).put(photo.blob_key, b"mine")
+    steps.owner = "other"
+    foreign = steps.counted()
+
+    answer = client.get("/v1/account/export")
+
+    assert answer.headers["Content-Type"] == "application/zip"
+    assert client.head("/v1/account/export").status_code == 200
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+        assert archive.testzip() is None
+        assert archive.read(f"originals/{photo.public_id}/{photo.filename}") == b"mine"
+        assert [row["public_id"] for row in lines(archive, "photos.jsonl")] == [photo.public_id]
+        assert [row["serial"] for row in lines(archive, "lenses.jsonl")] == ["123"]
+        samples = lines(archive, "samples.jsonl")
+        assert len(samples) == 6
+        kernel = np.frombuffer(base64.b64decode(samples[0]["psf"]), dtype="<f4")
+        assert kernel.size == samples[0]["size"] ** 2
+        assert kernel.sum() == pytest.approx(1.0, abs=1e-4)
+        assert len(lines(archive, "patches.jsonl")) == 2
+        assert [row["kind"] for row in lines(archive, "calibrations.jsonl")] == ["photo_added"]
+    assert foreign.public_id.encode() not in answer.content
+
+
+def test_files_that_are_gone_while_the_export_is_written_are_named(client: TestClient, steps: Any) -> None:
+    photo = steps.counted()
+
+    answer = client.get("/v1/account/export")
+
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+        assert archive.read("missing.txt").decode() == f"originals/{photo.public_id}/{photo.filename}\n"
+
+
+# --- erasing it -----------------------------------------------------------------------------------
+
+
+def test_an_erased_account_leaves_no_row_and_no_file(client: TestClient, store: Store, steps: Any) -> None:
+    steps.owner = "other"
+    foreign = steps.counted()
+    steps.owner = "local"
+    photo, gone = steps.counted(), steps.counted()
+    storage_of(client).put(photo.blob_key, b"mine")
+    store.photos.delete(gone.public_id, "local")
+    client.post("/v1/corrections", json={"photo_id": photo.public_id, "method": "fast"})
+
+    answer = client.delete("/v1/account")
+
+    assert answer.status_code == 204
+    assert [count(store, t) for t in (OwnerRow, PhotoRow, LensRow, EventRow)] == [1, 1, 1, 1]
+    assert [count(store, t) for t in (CorrectionRow, KeyRow, IdempotencyRow)] == [0, 0, 0]
+    assert (count(store, PatchRow), count(store, SampleRow)) == (3, 6) or count(store, SampleRow) == 6
+    assert store.photos.get(foreign.public_id, "other") is not None
+    assert not (storage_of(client).folder / photo.blob_key).exists()
+    assert client.get("/v1/photos").json()["items"] == []
+
+
+def test_an_erasure_that_was_killed_is_carried_through_by_a_worker(
+    client: TestClient, store: Store, steps: Any
+) -> None:
+    photo = steps.counted()
+    store.keys.create("local", ["write"])
+    key = store.accounts.begin_erasing("local")  # and then the API is killed
+
+    assert not store.keys.any_valid()
+    assert store.photos.get(photo.public_id, "local") is None
+    assert store.accounts.to_erase() == [key]
+    for owner_key in store.accounts.to_erase():
+        erase(store.accounts, storage_of(client), owner_key)
+    assert store.accounts.to_erase() == []
+    assert [count(store, t) for t in (OwnerRow, PhotoRow, LensRow, SampleRow, KeyRow)] == [0] * 5
+
+
+def test_an_upload_that_outlasts_its_owner_makes_no_new_one(store: Store) -> None:
+    with pytest.raises(Exception, match="erased"):
+        store.photos.receive(
+            "anna",
+            public_id="a1",
+            sha256="0" * 64,
+            filename="a.jpg",
+            kind="jpeg",
+            byte_size=1,
+            blob_key="photos/a1/original",
+            calibrate=True,
+            given={},
+            may_be_new=False,
+        )
+    assert count(store, OwnerRow) == 0
+
+
+def test_a_deleted_photo_is_an_empty_row_and_after_a_day_none(store: Store, steps: Any) -> None:
+    photo = steps.counted()
+    store.photos.delete(photo.public_id, "local")
+
+    with store.database.reading() as session:
+        row = session.scalars(select(PhotoRow)).one()
+    said = {name: value for name, value in vars(row).items() if value not in (None, "", {}, 0)}
+    assert set(said) <= {
+        *("_sa_instance_state", "id", "public_id", "owner_id", "blob_key", "kind", "byte_size", "calibrate"),
+        *("epoch", "state", "received_at", "stage_at", "finished_at", "counted_at", "deleted_at"),
+        *("patches_total", "patches_done", "patches_rejected"),
+    }
+    store.accounts.purge()
+    assert count(store, PhotoRow) == 1
+    with store.database.writing() as session:
+        for table in (PhotoRow, LensRow):
+            session.execute(update(table).values(deleted_at=now() - timedelta(days=2)))
+    store.accounts.purge()
+    assert (count(store, PhotoRow), count(store, LensRow)) == (0, 0)
+
+
+# --- files of photos ------------------------------------------------------------------------------
+
+
+def ended(store: Store, photo: PhotoRow, ago: timedelta) -> None:
+    with store.database.writing() as session:
+        mine = update(PhotoRow).where(PhotoRow.id == photo.id)
+        session.execute(mine.values(finished_at=now() - ago))
+
+
+def test_files_stay_as_long_as_the_setting_says(store: Store, steps: Any) -> None:
+    counted, running, corrected, stored = steps.counted(), steps.receive(), steps.counted(), steps.receive()
+    steps.inspect(running)
+    store.photos.set_state(stored.public_id, ("received",), "stored")
+    lens = store.photos.lens_of(corrected)
+    assert lens is not None
+    row, _ = store.corrections.create(corrected, lens, 1, {"method": "fast"})
+    for photo in (counted, corrected, stored):
+        ended(store, photo, timedelta(hours=2))
+
+    def unneeded(policy: str) -> set[str]:
+        return set(store.photos.unneeded(policy))
+
+    assert unneeded("always") == set()
+    assert unneeded("corrections") == {counted.public_id}
+    assert unneeded("never") == {counted.public_id}  # the others are to be corrected
+    store.corrections.cancel(row.public_id, "local")
+    ended(store, stored, timedelta(hours=25))
+    assert unneeded("corrections") == {counted.public_id}
+    assert unneeded("never") == {counted.public_id, corrected.public_id, stored.public_id}
+    ended(store, counted, timedelta(minutes=1))
+    assert unneeded("corrections") == set()
+
+
+def test_a_file_that_was_given_up_comes_back_with_the_same_bytes(client: TestClient, store: Store) -> None:
+    sent = client.post("/v1/photos?filename=a.jpg", content=JPEG).json()
+    store.photos.set_state(sent["id"], ("received",), "counted", finished_at=now())
+    with store.database.writing() as session:
+        session.execute(update(PhotoRow).values(width=10, height=10))
+    before = store.photos.get(sent["id"])
+    assert before is not None
+
+    assert store.photos.give_up_file(sent["id"], ("preview.jpg",))
+    assert not store.photos.give_up_file(sent["id"], ("preview.jpg",))
+    folder = f"photos/{sent['id']}/"
+    garbage = set(store.workers.garbage())
+    refused = client.post("/v1/corrections", json={"photo_id": sent["id"]})
+    storage_of(client).remove(before.blob_key)
+    storage_of(client).remove(before.blob_key)  # again, and nothing happens
+    again = client.post("/v1/photos?filename=a.jpg", content=JPEG)
+    after = store.photos.get(sent["id"])
+
+    assert {f"{folder}original", f"{folder}preview.jpg"} <= garbage
+    assert refused.status_code == 409
+    assert "send the same file again" in refused.json()["detail"]
+    assert (again.status_code, again.json()["id"]) == (200, sent["id"])
+    assert after is not None
+    assert after.file_gone_at is None
+    assert after.blob_key != before.blob_key  # what deletes the old one cannot delete this
+    assert storage_of(client).get(after.blob_key) == JPEG
+    assert count(store, PhotoRow) == 1
+
+
+def test_a_photo_whose_file_is_gone_takes_no_room(client: TestClient, store: Store) -> None:
+    sent = client.post("/v1/photos?filename=a.jpg", content=JPEG).json()
+    store.photos.set_state(sent["id"], ("received",), "counted", finished_at=now())
+    before = client.get("/v1/account").json()["stored_bytes"]
+    store.photos.give_up_file(sent["id"], ())
+
+    assert (before, client.get("/v1/account").json()["stored_bytes"]) == (len(JPEG), 0)
+    assert store.photos.load_of("local") == (0, 0, 1)
+
+
+def test_where_a_photo_was_taken_is_gone_from_the_stored_file_at_once(
+    client: TestClient, store: Store
+) -> None:
+    picture = Image.fromarray(np.arange(64 * 48, dtype=np.uint8).reshape(48, 64))
+    exif = Image.Exif()
+    exif.get_ifd(0x8825).update({1: "N", 2: (47.0, 13.0, 14.159), 3: "E", 4: (11.0, 22.0, 33.0)})
+    out = io.BytesIO()
+    picture.save(out, "jpeg", exif=exif)
+    assert Image.open(out).getexif().get_ifd(0x8825)
+
+    sent = client.post("/v1/photos?filename=a.jpg", content=out.getvalue())
+    row = store.photos.get(sent.json()["id"])
+
+    assert sent.status_code == 202
+    assert row is not None
+    assert row.location == "removed"
+    kept = storage_of(client).get(row.blob_key)
+    assert len(kept) == len(out.getvalue())
+    read = Image.open(io.BytesIO(kept))
+    assert not read.getexif().get_ifd(0x8825)
+    assert np.array_equal(np.asarray(read), np.asarray(Image.open(out)))
+    again = client.post("/v1/photos?filename=a.jpg", content=out.getvalue())
+    assert (again.status_code, again.json()["id"]) == (200, sent.json()["id"])  # by the hash of what was sent
+
+
+def test_garbage_of_an_erased_owner_is_deleted_once_more_later(store: Store, steps: Any) -> None:
+    photo = steps.counted()
+    key = store.accounts.begin_erasing("local")
+    assert key is not None
+    prefixes = store.accounts.erase_some(key)
+
+    assert prefixes == [f"photos/{photo.public_id}/"]
+    with store.database.reading() as session:
+        assert f"photos/{photo.public_id}/" in set(session.scalars(select(GarbageRow.prefix)))

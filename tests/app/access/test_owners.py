@@ -1,0 +1,412 @@
+"""Owners and their keys: who is let in, and that nobody sees what is another's."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from datetime import timedelta
+from typing import Any
+
+import pytest
+from fastapi.routing import APIRoute
+from sqlalchemy import select, update
+from starlette.testclient import TestClient
+
+from app.access import keys, rate_limits
+from app.main import create_app
+from app.pages import lens_pages, photo_pages, picture_routes, signing
+from app.pages import routes as page_routes
+from app.runtime.settings import Settings
+from app.store import Store
+from app.store.access.access_tables import KeyRow, SessionRow
+from app.store.access.owners import now
+from app.store.corrections import Result
+from app.store.upkeep.migrate import upgrade
+
+METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")
+OPEN = {"/healthz", "/readyz", "/sign-in", "/v1/session"}
+NEEDED = {
+    "psf": {"r": 0.5},
+    "psf.{suffix}": {"r": 0.5},
+    "crop.png": {"row": 0.5, "col": 0.5},
+}
+
+
+@pytest.fixture
+def guarded(settings: Settings, store: Store) -> Iterator[TestClient]:
+    """Speak with a service that asks for keys."""
+    closed = settings.model_copy(update={"auth": "keys"})
+    with TestClient(create_app(closed), raise_server_exceptions=False) as opened:
+        yield opened
+
+
+def key_of(store: Store, owner: str, scope: keys.Scope = "admin", **options: Any) -> dict[str, str]:
+    return {"Authorization": f"Bearer {store.keys.create(owner, [scope], **options).text}"}
+
+
+def furnish(store: Store, steps: Any, storage: Any, owner: str) -> dict[str, str]:
+    """Give an owner a counted photo, its lens and a finished correction; return their ids."""
+    steps.owner = owner
+    photo = steps.counted()
+    storage.put(photo.blob_key, b"the original of " + owner.encode())
+    lens = store.photos.lens_of(photo)
+    assert lens is not None
+    params = {"method": "fast", "strength": 1.0, "output": {"format": "dng"}, "roi": None}
+    row, _ = store.corrections.create(photo, lens, 1, params)
+    store.corrections.start(row.public_id)
+    key = f"corrections/{row.public_id}/result.dng"
+    storage.put(key, b"result")
+    assert store.corrections.finish(
+        row.public_id, Result(key, "tag", "image/x-adobe-dng", 6, "p-corrected.dng"), {}
+    )
+    return {
+        "photo_id": photo.public_id,
+        "lens_id": lens.public_id,
+        "job_id": photo.public_id,
+        "correction_id": row.public_id,
+    }
+
+
+def body_of(path: str, method: str, ids: dict[str, str]) -> dict[str, Any]:
+    """Return what a right request has besides its address: nothing else may be what is refused."""
+    if method == "PATCH":
+        return {"json": {"label": "mine"} if path.startswith("/v1/lenses") else {"aperture": 2.8}}
+    if method != "POST":
+        return {}
+    bodies: dict[str, dict[str, Any]] = {
+        "/ui/photos/{photo_id}/preview": {"json": {"x": 0, "y": 0, "width": 64, "height": 64}},
+        "/v1/corrections": {"json": {"photo_id": ids["photo_id"]}},
+        "/v1/photos": {
+            "content": b"\xff\xd8\xff" + bytes(64),
+            "params": {"lens_id": ids.get("lens_id", "x")},
+        },
+        "/v1/session": {"json": {"key": "x"}},
+    }
+    return bodies.get(path, {})
+
+
+PARTS = {
+    "suffix": "json",
+    "form": "html",
+    "which": "after",
+    "name": "before",
+    "half": "0",
+    "col": "0",
+    "row": "0",
+}
+"""Parts of paths that name nobody's thing."""
+
+
+def requests(client: TestClient, ids: dict[str, str]) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Yield every path with every method: those of the OpenAPI document, and the pages that are not in it."""
+    app: Any = client.app
+    described = set(app.openapi()["paths"])
+    rooms = (page_routes, photo_pages, lens_pages, picture_routes, signing)  # a stream of events has no end
+    hidden = [route for room in rooms for route in room.router.routes]
+    pages = {route.path for route in hidden if isinstance(route, APIRoute)}
+    for path in sorted(described | pages):
+        name = path.rpartition("/")[2]
+        for method in METHODS:
+            if method == "DELETE" and path == "/v1/account":
+                continue  # of the one who asks; it would end the walk
+            options = body_of(path, method, ids)
+            params = {**options.pop("params", {}), **NEEDED.get(name, {})}
+            if name == "crop.png":
+                params["correction"] = ids["correction_id"]
+            yield (
+                method,
+                re.sub(r"\{(\w+)\}", lambda found: ids.get(found[1]) or PARTS[found[1]], path),
+                {**options, "params": params},
+            )
+
+
+def test_a_second_owner_finds_nothing_of_the_first_on_any_route(
+    guarded: TestClient, store: Store, steps: Any
+) -> None:
+    storage = guarded.app.state.services.storage  # type: ignore[attr-defined]  # the TestClient knows no type of it
+    ids = furnish(store, steps, storage, "anna")
+    anna, ben = key_of(store, "anna"), key_of(store, "ben")
+    secrets = {*ids.values(), "anna", "p1.dng", "EF24mm"}
+    walked = list(requests(guarded, ids))
+
+    for method, address, options in walked:
+        answer = guarded.request(method, address, headers=ben, **options)
+
+        named = any(value in address for value in ids.values())
+        if named:
+            assert answer.status_code in {404, 405}, (method, address, answer.text)
+        told = {word for word in secrets if word in answer.text}
+        asked = {word for word in ids.values() if word in address or word in str(options)}
+        assert told <= asked, (method, address, answer.text)
+    assert len({address for _, address, _ in walked}) >= 40
+    assert sum(any(value in address for value in ids.values()) for _, address, _ in walked) >= 100
+
+    statuses = {
+        address: guarded.get(address, headers=anna, **options).status_code
+        for method, address, options in walked
+        if method == "GET"
+        and any(value in address for value in ids.values())
+        # events do not end, and the model takes its time: other routes show that the ids are real
+        and not re.search(r"/(events|psf|psf\.json|field\.png)$", address)
+    }
+    assert len(statuses) >= 12
+    assert not {address for address, status in statuses.items() if status in {401, 403}}
+    missing = {address for address, status in statuses.items() if status == 404}
+    assert missing <= {f"/ui/photos/{ids['photo_id']}/{name}" for name in ("preview.jpg", "r-map.png")}
+
+
+def test_ids_in_bodies_and_queries_of_another_owner_are_unknown_too(
+    guarded: TestClient, store: Store, steps: Any
+) -> None:
+    storage = guarded.app.state.services.storage  # type: ignore[attr-defined]  # as above
+    theirs, mine = furnish(store, steps, storage, "anna"), furnish(store, steps, storage, "ben")
+    ben = key_of(store, "ben")
+    foreign_lens = {"photo_id": mine["photo_id"], "lens_id": theirs["lens_id"]}
+
+    def refused(method: str, path: str, **options: Any) -> int:
+        return guarded.request(method, path, headers=ben, **options).status_code
+
+    assert refused("POST", "/v1/corrections", json={"photo_id": theirs["photo_id"]}) == 404
+    assert refused("POST", "/v1/corrections", json=foreign_lens) == 404
+    assert refused("PATCH", f"/v1/photos/{mine['photo_id']}", json={"lens_id": theirs["lens_id"]}) == 404
+    assert refused("GET", f"/v1/corrections?photo_id={theirs['photo_id']}") == 404
+    listed = guarded.get(f"/v1/photos?lens_id={theirs['lens_id']}", headers=ben).json()
+    assert listed["items"] == []
+    crop = f"/ui/corrections/{theirs['correction_id']}/crop.png?row=0.5&col=0.5"
+    assert refused("GET", crop) == 404
+
+
+def test_the_same_bytes_of_two_owners_are_two_photos_and_one_goes_without_the_other(
+    guarded: TestClient, store: Store
+) -> None:
+    jpeg = b"\xff\xd8\xff" + bytes(200)
+    anna, ben = key_of(store, "anna"), key_of(store, "ben")
+
+    first = guarded.post("/v1/photos?filename=a.jpg", content=jpeg, headers=anna)
+    second = guarded.post("/v1/photos?filename=b.jpg", content=jpeg, headers=ben)
+    guarded.delete(f"/v1/photos/{first.json()['id']}", headers=anna)
+
+    assert (first.status_code, second.status_code) == (202, 202)  # 200 would say that somebody has it
+    storage = guarded.app.state.services.storage  # type: ignore[attr-defined]  # as above
+    left = store.photos.get(second.json()["id"])
+    assert left is not None
+    assert storage.get(left.blob_key) == jpeg
+    assert guarded.get(f"/v1/photos/{second.json()['id']}", headers=ben).status_code == 200
+
+
+def test_every_route_but_probes_and_the_sign_in_wants_to_know_who_asks(
+    guarded: TestClient, store: Store, steps: Any
+) -> None:
+    ids = dict.fromkeys(("photo_id", "lens_id", "job_id", "correction_id"), "x")
+    allowed: dict[str, set[str]] = {}
+    for method, address, options in requests(guarded, ids):
+        answer = guarded.request(method, address, follow_redirects=False, **options)
+        if answer.status_code not in {401, 405}:
+            allowed.setdefault(address, set()).add(method)
+
+    assert set(allowed) == OPEN
+    assert allowed["/v1/session"] == {"DELETE"}
+    assert guarded.get("/v1/photos").headers["WWW-Authenticate"] == "Bearer"
+
+
+def test_a_person_who_is_not_signed_in_is_sent_to_the_page_for_it(guarded: TestClient) -> None:
+    answer = guarded.get("/photos/abc", headers={"Accept": "text/html"}, follow_redirects=False)
+
+    assert (answer.status_code, answer.headers["Location"]) == (303, "/sign-in?next=/photos/abc")
+    page = guarded.get("/sign-in", headers={"Accept": "text/html"})
+    assert page.status_code == 200
+    assert 'type="password"' in page.text
+    assert guarded.get("/static/session.js").status_code == 200
+
+
+def test_a_browser_signs_in_with_a_cookie_that_no_script_and_no_other_site_gets(
+    guarded: TestClient, store: Store
+) -> None:
+    text = key_of(store, "anna")["Authorization"].removeprefix("Bearer ")
+    at_home = {"Host": "127.0.0.1:8000"}
+    outside = {"Host": "192.0.2.7"}
+
+    wrong = guarded.post("/v1/session", json={"key": text[:-1] + ("A" if text[-1] != "A" else "B")})
+    far = guarded.post("/v1/session", json={"key": text}, headers=outside)
+    near = guarded.post("/v1/session", json={"key": text}, headers=at_home)
+
+    assert wrong.status_code == 401
+    assert "set-cookie" not in wrong.headers
+    cookie = near.headers["Set-Cookie"]
+    assert "HttpOnly" in cookie
+    assert "samesite=strict" in cookie.lower()
+    assert "Secure" not in cookie
+    assert "Secure" in far.headers["Set-Cookie"]
+    token = re.search(r"lens_session=([^;]+)", cookie)[1]  # type: ignore[index]  # it is there, see above
+    shown = {"Cookie": f"lens_session={token}", **at_home}
+    guarded.cookies.clear()
+    assert guarded.get("/v1/session", headers=shown).json() == {
+        "owner": "anna",
+        "scopes": ["admin"],
+        "needed": True,
+    }
+    with store.database.reading() as session:
+        assert token not in {row.token_hash for row in session.scalars(select(SessionRow))}
+    assert guarded.delete("/v1/session", headers=shown).status_code == 204
+    assert guarded.get("/v1/session", headers=shown).status_code == 401
+
+
+def test_another_site_cannot_sign_a_browser_in(guarded: TestClient, store: Store) -> None:
+    text = key_of(store, "anna")["Authorization"].removeprefix("Bearer ")
+
+    answer = guarded.post("/v1/session", json={"key": text}, headers={"Origin": "https://evil.example"})
+
+    assert answer.status_code == 403
+
+
+def test_keys_end_by_revoking_expiry_and_rotation(
+    guarded: TestClient, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("app.access.authentication.FRESH_S", 0.0)  # each request looks
+    made = store.keys.create("anna", ["read"], lasts=timedelta(days=1))
+
+    def status(key: str) -> int:
+        return guarded.get("/v1/photos", headers={"Authorization": f"Bearer {key}"}).status_code
+
+    assert status(made.text) == 200
+    renewed = store.keys.rotate(made.prefix, keep=timedelta(hours=1))
+    assert renewed is not None
+    assert (status(made.text), status(renewed.text)) == (200, 200)
+    with store.database.writing() as session:
+        old = update(KeyRow).where(KeyRow.prefix == made.prefix)
+        session.execute(old.values(expires_at=now() - timedelta(seconds=1)))
+    assert (status(made.text), status(renewed.text)) == (401, 200)
+    assert store.keys.revoke(renewed.prefix)
+    assert status(renewed.text) == 401
+    assert store.keys.rotate(renewed.prefix, keep=timedelta(0)) is None
+
+
+def test_what_a_key_consists_of_is_kept_nowhere(store: Store) -> None:
+    made = store.keys.create("anna", ["read"])
+
+    with store.database.reading() as session:
+        row = session.scalars(select(KeyRow)).one()
+    assert made.text.rpartition("_")[2] not in str(vars(row))
+    assert row.key_hash.startswith("$argon2id$v=19$m=19456,t=2,p=1$")
+    assert keys.matches(made.text, row.key_hash)
+    assert not keys.matches(made.text[:-1], row.key_hash)
+
+
+@pytest.mark.parametrize(
+    ("scope", "asks", "changes", "erases"),
+    [("read", 200, 403, 403), ("write", 200, 404, 403), ("admin", 200, 404, 204)],
+)
+def test_scopes_allow_what_they_say(
+    guarded: TestClient, store: Store, scope: keys.Scope, asks: int, changes: int, erases: int
+) -> None:
+    key = key_of(store, "anna", scope)
+
+    assert guarded.get("/v1/lenses", headers=key).status_code == asks
+    assert guarded.post("/v1/jobs/abc/cancel", headers=key).status_code == changes
+    assert guarded.delete("/v1/account", headers=key).status_code == erases
+
+
+def test_loopback_asks_nobody_until_there_is_a_key(
+    client: TestClient, store: Store, steps: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("app.access.authentication.FRESH_S", 0.0)
+    photo = steps.receive()
+
+    before = client.get("/v1/session").json()
+    key = key_of(store, "local")
+
+    assert before == {"owner": "local", "scopes": ["read", "write", "admin"], "needed": False}
+    assert client.get("/v1/photos").status_code == 401
+    listed = client.get("/v1/photos", headers=key).json()["items"]
+    assert [item["id"] for item in listed] == [photo.public_id]
+
+
+def test_a_stream_of_events_ends_with_the_key(
+    guarded: TestClient, store: Store, steps: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("app.access.authentication.FRESH_S", 0.0)
+    monkeypatch.setattr("app.routes.jobs.LOOK_AGAIN_S", 0.1)
+    steps.owner = "anna"
+    photo = steps.receive()
+    made = store.keys.create("anna", ["read"])
+    gate = guarded.app.state.services.gate  # type: ignore[attr-defined]  # as above
+    really = gate.is_still
+    asked: list[bool] = []
+
+    def revoked_meanwhile(who: Any) -> bool:
+        if asked:
+            store.keys.revoke(made.prefix)
+        asked.append(really(who))
+        return asked[-1]
+
+    monkeypatch.setattr(gate, "is_still", revoked_meanwhile)
+    # the photo never ends: only the key's end can end this
+    answer = guarded.get(
+        f"/v1/jobs/{photo.public_id}/events", headers={"Authorization": f"Bearer {made.text}"}
+    )
+
+    assert asked == [True, False]
+    events = [line for line in answer.text.splitlines() if line.startswith("data:")]
+    assert [json.loads(event[5:])["id"] for event in events] == [photo.public_id]
+
+
+def test_more_requests_than_there_may_be_are_told_when_to_come_again(
+    settings: Settings, store: Store
+) -> None:
+    slow = settings.model_copy(update={"auth": "keys", "requests_per_minute": 12})
+    anna, ben = key_of(store, "anna"), key_of(store, "ben")
+    with TestClient(create_app(slow)) as client:
+        answers = [client.get("/v1/lenses", headers=anna) for _ in range(3)]
+        other = client.get("/v1/lenses", headers=ben)
+
+    assert [answer.status_code for answer in answers] == [200, 200, 429]
+    assert 1 <= int(answers[2].headers["Retry-After"]) <= 6
+    assert answers[2].json()["code"] == "quota_exceeded"
+    assert other.status_code == 200
+
+
+def test_a_bucket_fills_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: clock[0])
+    bucket = rate_limits.Rates(60)
+    taken = [bucket.wait_of("anna") for _ in range(11)]
+
+    assert taken == [0.0] * 10 + [1.0]
+    clock[0] += 1.0
+    assert (bucket.wait_of("anna"), bucket.wait_of("anna")) == (0.0, 1.0)
+    assert rate_limits.Rates(0).wait_of("anna") == 0.0
+
+
+def test_quotas_of_an_owner_go_before_the_settings(guarded: TestClient, store: Store) -> None:
+    anna, ben = key_of(store, "anna", quota_photos=1), key_of(store, "ben", quota_bytes=100)
+
+    def send(key: dict[str, str], number: int) -> Any:
+        return guarded.post("/v1/photos", content=b"\xff\xd8\xff" + bytes([number] * 200), headers=key)
+
+    by_anna = [send(anna, number) for number in range(2)]
+    by_ben = [send(ben, number) for number in range(2)]
+
+    assert [answer.status_code for answer in (*by_anna, *by_ben)] == [202, 429, 202, 429]
+    assert by_anna[1].headers["Retry-After"] == by_ben[1].headers["Retry-After"] == "3600"
+    account = guarded.get("/v1/account", headers=anna).json()
+    assert (account["photos"], account["max_photos"], account["stored_bytes"]) == (1, 1, 203)
+
+
+@pytest.mark.parametrize("open_to", [{"host": "0.0.0.0"}, {"public": True, "allowed_hosts": "localhost"}])
+def test_what_others_can_reach_does_not_start_without_a_key(
+    settings: Settings, store: Store, open_to: dict[str, Any]
+) -> None:
+    from app.commands.console.failure import UsageError  # noqa: PLC0415 - same
+    from app.runtime import supervisor  # noqa: PLC0415 - few tests need it
+
+    open_settings = Settings(**{**settings.model_dump(), **open_to})
+    upgrade(store.database)
+
+    with pytest.raises(UsageError, match="lensmodel keys create"):
+        supervisor._prepare(open_settings)
+    made = store.keys.create("anna", ["write"])
+    supervisor._prepare(open_settings)
+    store.keys.revoke(made.prefix)
+    with pytest.raises(UsageError, match="no valid key"):
+        supervisor._prepare(open_settings)

@@ -1,0 +1,697 @@
+"""The command line as a person types it: real processes, real files."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import pty
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rawpy
+import tifffile
+from PIL import ExifTags, Image
+from scipy import ndimage
+from typer.testing import CliRunner
+
+from app.cli import app, main
+from app.commands.console.progress_lines import EVERY_S, ProgressLines
+from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
+from lensmodel.workflow import pipeline
+
+HERE = Path(__file__).parents[1]
+sys.path.insert(0, str(HERE))
+from deadline import Deadline, stretched  # noqa: E402 - beside these files
+from running import scene, write_photo  # noqa: E402 - same
+
+sys.path.remove(str(HERE))
+
+PROFILE = "my-24mm.lensprofile"
+PATIENCE_S = 240.0
+ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith("LENS_")}
+
+
+def command(*words: str | Path) -> list[str]:
+    return [sys.executable, "-m", "app.cli", *map(str, words)]
+
+
+def lensmodel(*words: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    found = {**ENVIRONMENT, "PYTHONPATH": str(HERE.parents[1])}
+    return subprocess.run(
+        command(*words),
+        cwd=cwd,
+        env=found,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=stretched(PATIENCE_S),
+    )
+
+
+Here = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture
+def here(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Iterator[Here]:
+    """Run `main` in this process, in that folder: saves two seconds of imports where nothing is lost."""
+    root = logging.getLogger()
+    handlers, level = list(root.handlers), root.level
+    signals = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    monkeypatch.chdir(folder)
+    # a command that is quick says nothing of its progress, and a busy machine makes none slow
+    monkeypatch.setitem(ProgressLines.__init__.__kwdefaults__, "every_s", stretched(EVERY_S))
+
+    def run(*words: str | Path) -> subprocess.CompletedProcess[str]:
+        capsys.readouterr()
+        monkeypatch.setattr(sys, "argv", ["lensmodel", *map(str, words)])
+        try:
+            main()
+            status = 0
+        except SystemExit as end:
+            status = int(end.code or 0)
+        said = capsys.readouterr()
+        return subprocess.CompletedProcess(words, status, said.out, said.err)
+
+    yield run
+    root.handlers[:], root.level = handlers, level
+    for number, handler in signals.items():
+        signal.signal(number, handler)
+
+
+def start(*words: str | Path, cwd: Path) -> subprocess.Popen[str]:
+    """Start a command as a terminal does, in a process group of its own."""
+    return subprocess.Popen(
+        command(*words),
+        cwd=cwd,
+        env={**ENVIRONMENT, "PYTHONPATH": str(HERE.parents[1])},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def wait_for(fact: Callable[[], object]) -> None:
+    deadline = Deadline(PATIENCE_S)
+    while not fact():
+        assert not deadline.passed()
+        time.sleep(0.02)
+
+
+def one_sentence(text: str) -> str:
+    """Check that standard error is one plain line, and return it."""
+    lines = text.strip().splitlines()
+    assert len(lines) == 1, text
+    assert "Traceback" not in text
+    assert lines[0].startswith("lensmodel: ")
+    return lines[0]
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A profile of a known blur, and photos of that lens and of another."""
+    folder = tmp_path_factory.mktemp("made")
+    write_photo(folder / "a.dng", 1)
+    write_photo(folder / "b.dng", 2)
+    write_photo(folder / "other.dng", 3, serial="L-43")
+    samples = [
+        PsfSample(gaussian(15, np.eye(2) * 1.7), FieldPosition(r, phi), LensSettings(2.8, 35.0), photo="x")
+        for r in (0.1, 0.5, 0.9)
+        for phi in (-2.0, 0.5, 2.5)
+    ]
+    lens = {"maker": "Test Optics", "model": "Test 35mm f/1.8", "serial": "L-42"}
+    save_profile(folder / PROFILE, LensProfile(LensModel.fit(samples), lens, {"0123456789abcdef": "x.dng"}))
+    return folder
+
+
+@pytest.fixture
+def folder(made: Path, tmp_path: Path) -> Iterator[Path]:
+    """A working folder with a profile and one photo, and nothing left behind in it."""
+    shutil.copy(made / PROFILE, tmp_path)
+    shutil.copy(made / "a.dng", tmp_path / "one.dng")
+    yield tmp_path
+    assert not [path for path in tmp_path.rglob("*") if ".part" in path.name]
+
+
+def _picture() -> np.ndarray[Any, np.dtype[np.uint8]]:
+    rng = np.random.default_rng(0)
+    blocks = np.kron(rng.integers(20, 200, (80, 100, 3)), np.ones((4, 4, 1)))
+    smooth = (blocks + np.roll(blocks, 1, 0) + np.roll(blocks, 1, 1) + np.roll(blocks, (1, 1), (0, 1))) / 4
+    return np.clip(smooth + rng.normal(0, 2, smooth.shape), 0, 255).astype(np.uint8)
+
+
+@pytest.fixture
+def few_patches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Learn from three patches of a photo: too few for a wavefront, whose fit takes longer than the rest."""
+    few = partial(pipeline.samples_of_photo, count=3)
+    monkeypatch.setattr("lensmodel.workflow.pipeline.samples_of_photo", few)
+
+
+# --- results -----------------------------------------------------------------------------------
+
+
+def test_calibrate_learns_once_from_each_photo_and_says_so_in_json(
+    folder: Path, here: Here, few_patches: None
+) -> None:
+    words = ("calibrate", "one.dng", "--profile", "new/lens.lensprofile", "--estimator", "whittle", "--json")
+    first = here(*words, "--workers", "1")
+    again = here(*words)
+
+    said, then = json.loads(first.stdout), json.loads(again.stdout)
+    assert first.returncode == again.returncode == 0
+    assert [result["state"] for result in said["results"]] == ["counted"]
+    assert [result["state"] for result in then["results"]] == ["known"]
+    assert said["samples"] == then["samples"] > 0
+    assert load_profile(folder / "new/lens.lensprofile").lens["serial"] == "L-42"
+
+
+@pytest.mark.slow
+def test_calibrate_force_begins_anew(folder: Path) -> None:
+    done = lensmodel("calibrate", "one.dng", "-p", PROFILE, "--estimator", "whittle", "--force", cwd=folder)
+
+    assert done.returncode == 0, done.stderr
+    assert list(load_profile(folder / PROFILE).photos.values()) == ["one.dng"]
+
+
+def test_correct_leaves_what_is_there_alone_unless_forced(folder: Path, here: Here) -> None:
+    (folder / "out").mkdir()
+    target = folder / "out" / "one-corrected.tif"
+    target.write_bytes(b"mine")
+    words = ("correct", "one.dng", "--profile", PROFILE, "-o", "out", "--method", "fast")
+    kept = here(*words)
+    was = target.read_bytes()
+    forced = here(*words, "--force", "-q")
+
+    assert kept.returncode == forced.returncode == 0
+    assert was == b"mine"
+    assert "--force" in one_sentence(kept.stderr)
+    assert target.stat().st_size > 10000
+    assert forced.stdout == forced.stderr == ""
+
+
+def test_photographer_bounds_halos_and_takes_the_grain_away(folder: Path, here: Here) -> None:
+    words = ("correct", "one.dng", "-p", PROFILE, "--method", "fast")
+    here(*words, "-o", "plain", "--strength", "0")
+    here(*words, "-o", "free", "--halo", "inf")
+    done = here(*words, "-o", "bound", "--halo", "0", "--denoise", "1")
+
+    assert done.returncode == 0, done.stderr
+    with tifffile.TiffFile(folder / "bound/one-corrected.tif") as file:
+        assert "method fast, strength 1, halo 0, denoised 1" in file.pages[0].description
+        assert "profile of 1 photo," in file.pages[0].description
+    plain, free, bound = (
+        tifffile.imread(folder / name / "one-corrected.tif").astype(float)
+        for name in ("plain", "free", "bound")
+    )
+    low, high = (f(plain, (5, 5, 1)) for f in (ndimage.minimum_filter, ndimage.maximum_filter))
+    assert np.mean((free < low - 50) | (free > high + 50)) > 0.01
+    assert np.mean((bound < low - 50) | (bound > high + 50)) < 0.001
+
+
+def test_corrected_dng_opens_as_raw(folder: Path, here: Here) -> None:
+    done = here("correct", "one.dng", "-p", PROFILE, "-o", "out", "--format", "dng", "--method", "fast")
+
+    assert done.stdout.splitlines() == [str(Path("out/one-corrected.dng"))]
+    with rawpy.imread(str(folder / "out/one-corrected.dng")) as raw:
+        assert raw.sizes.width > 400
+
+
+def test_folders_pass_over_corrected_photos_and_what_was_made_of_a_raw_file(folder: Path, here: Here) -> None:
+    for name in ("one.jpg", "one.tif"):
+        Image.fromarray(_picture()).save(folder / name)
+    Image.fromarray(_picture()).save(folder / "one-corrected.tif")
+    done = here("correct", ".", "-p", PROFILE, "-o", "out", "--method", "fast", "--json")
+
+    assert [result["photo"] for result in json.loads(done.stdout)["results"]] == ["one.dng"]
+
+
+def test_one_bad_photo_does_not_stop_the_others(folder: Path, here: Here) -> None:
+    (folder / "a-note.dng").write_text("this is text")
+    done = here("correct", ".", "-p", PROFILE, "-o", "out", "--method", "fast", "--json")
+
+    assert done.returncode == 1
+    states = [result["state"] for result in json.loads(done.stdout)["results"]]
+    assert states == ["failed", "corrected"]
+    assert "give RAW, DNG, TIFF, PNG or JPEG" in one_sentence(done.stderr)
+
+
+@pytest.mark.parametrize("suffix", ["npy", "json", "tif", "png"])
+def test_psf_writes_files_that_open(folder: Path, suffix: str) -> None:
+    target = folder / f"corner.{suffix}"
+    result = CliRunner().invoke(app, ["psf", str(folder / PROFILE), "--size", "15", "-o", str(target)])
+
+    assert result.exit_code == 0, result.output
+    match suffix:
+        case "npy":
+            shape = np.load(target).shape
+        case "json":
+            shape = tuple(json.loads(target.read_text())["psf"]["shape"])
+        case _:
+            with Image.open(target) as picture:
+                shape = picture.size
+    assert shape == (15, 15)
+
+
+def test_two_runs_on_one_profile_drop_nothing_of_each_other(
+    folder: Path, made: Path, here: Here, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def estimated(path: Path, **options: Any) -> list[PsfSample]:
+        known = load_profile(folder / PROFILE)  # the other run saves while this one estimates
+        save_profile(folder / PROFILE, replace(known, photos={**known.photos, "fedcba9876543210": "y.dng"}))
+        return [PsfSample(gaussian(15, np.eye(2)), FieldPosition(0.5, 0.0), LensSettings(2.8), photo="z")]
+
+    monkeypatch.setattr("lensmodel.workflow.pipeline.samples_of_photo", estimated)
+    done = here("calibrate", "one.dng", "-p", PROFILE)
+
+    assert done.returncode == 0, done.stderr
+    assert sorted(load_profile(folder / PROFILE).photos.values()) == ["one.dng", "x.dng", "y.dng"]
+
+
+def test_a_photo_that_does_not_count_leaves_no_trace(folder: Path, here: Here) -> None:
+    Image.fromarray(_picture()).save(folder / "scan.png")
+    done = here("calibrate", "scan.png", "-p", "no/such/lens.lensprofile")
+
+    assert done.returncode == 1
+    assert done.stderr.startswith("lensmodel: scan.png: it does not say its aperture")
+    assert not (folder / "no").exists()
+
+
+@pytest.mark.parametrize("consent", ["--any-lens", "--force"])
+@pytest.mark.slow
+def test_a_photo_of_another_lens_is_corrected_on_demand_and_said_to_be_one(
+    folder: Path, here: Here, made: Path, consent: str
+) -> None:
+    shutil.copy(made / "other.dng", folder)
+    done = here("correct", "other.dng", "-p", PROFILE, "-o", "out", consent, "--method", "wiener")
+
+    assert done.returncode == 0, done.stderr
+    assert "another lens, serial L-43" in done.stderr
+    assert (folder / "out/other-corrected.tif").exists()
+
+
+# --- refusals ----------------------------------------------------------------------------------
+
+REFUSED = {
+    "missing photo": (["calibrate", "gone.dng", "-p", "new"], 2, "no photo called gone.dng"),
+    "empty folder": (["calibrate", "empty", "-p", "new"], 2, "no photo in the folder empty"),
+    "no image": (["correct", "text.dng", "-p", PROFILE, "-o", "out"], 1, "belong to no photo format"),
+    "other lens": (["correct", "other.dng", "-p", PROFILE, "-o", "out"], 1, "serial L-43.*L-42.*--any-lens"),
+    "add other lens": (["calibrate", "other.dng", "-p", PROFILE], 1, "serial L-43.*profile of its own"),
+    "no profile": (["correct", "one.dng", "-p", "gone", "-o", "out"], 2, "no lens profile at gone; make it"),
+    "bad profile": (["correct", "one.dng", "-p", "bad", "-o", "out"], 1, "bad is no lens profile"),
+    "bad profile to add to": (["calibrate", "one.dng", "-p", "bad"], 1, "bad is no lens profile.*--force"),
+    "profile is a photo": (
+        ["calibrate", "one.dng", "-p", "sub/one.dng", "--force"],
+        2,
+        "one.dng is a photo; name a new file after --profile",
+    ),
+    "profile is the photo": (["calibrate", "there.npy", "-p", "there.npy", "--force"], 2, "npy is a photo"),
+    "no profile to add to": (
+        ["calibrate", "one.dng", "-p", "there.npy"],
+        1,
+        "no lens profile.*new file after",
+    ),
+    "family and none": (
+        ["calibrate", "one.dng", "-p", "n", "--family", PROFILE, "--no-family"],
+        2,
+        "exclude",
+    ),
+    "family of itself": (
+        ["calibrate", "one.dng", "-p", PROFILE, "--family", PROFILE],
+        2,
+        "the profile itself",
+    ),
+    "profile is a folder": (["calibrate", "one.dng", "-p", "empty"], 2, "empty is a folder"),
+    "output is a file": (["correct", "one.dng", "-p", PROFILE, "-o", "bad"], 2, "bad is a file"),
+    "negative halo": (["correct", "one.dng", "-p", PROFILE, "-o", "o", "--halo", "-1"], 2, "must not be neg"),
+    "halo that is none": (
+        ["correct", "one.dng", "-p", PROFILE, "-o", "o", "--halo", "nan"],
+        2,
+        "halo must not be negative.*nan",
+    ),
+    "nearly a format": (
+        ["correct", "one.dng", "-p", PROFILE, "-o", "o", "--format", "tiff"],
+        2,
+        "must be tiff16, .* or dng, got 'tiff'; did you mean tiff16",
+    ),
+    "unknown method": (["correct", "one.dng", "-p", PROFILE, "-o", "o", "--method", "x"], 2, "known: .*fast"),
+    "unknown estimator": (["calibrate", "one.dng", "-p", "new", "--estimator", "x"], 2, "known: .*whittle"),
+    "aperture": (["calibrate", "one.dng", "-p", "new", "--aperture", "-2"], 2, "-2"),
+    "same name twice": (["correct", "one.dng", "sub/one.dng", "-p", PROFILE, "-o", "o"], 2, "would both"),
+    "even size": (["psf", PROFILE, "--size", "20"], 2, "must be odd, got 20"),
+    "psf file there": (["psf", PROFILE, "-o", "there.npy"], 2, "there.npy is there already; --force"),
+    "degrees": (["psf", PROFILE, "--phi", "90"], 2, "--phi is in radians; 90 degrees are 1.571"),
+    "aperture in words": (["psf", PROFILE, "--aperture", "wide"], 2, "such as 2.8 or f/2.8, got 'wide'"),
+    "psf format": (["psf", PROFILE, "-o", "psf.xyz"], 2, "psf.xyz"),
+    "quick and full": (["reproduce", "--quick", "--full"], 2, "exclude each other"),
+    "noise in words": (["bench", "blind", "--noise", "much"], 2, "numbers such as 0.01,0.003, got 'much'"),
+    "photo to time": (["bench", "correct", "--photo", "gone.jpg"], 2, "no photo called gone.jpg"),
+    "photos to blur": (["bench", "blind", "--photos", "empty", "-o", "o"], 2, "empty holds no PNG, JPEG"),
+    "no such picture": (["bench", "gallery", "--only", "rose", "-o", "o"], 2, "no picture is called 'rose'"),
+    "unknown half": (["bench", "blind", "--half", "x"], 2, "half must be one of .*got 'x'"),
+    "report there": (["report", PROFILE, "-o", "reported"], 2, "mtf.csv is there already; --force"),
+    "export format": (["export", PROFILE, "-o", "new.bmp", "--format", "bmp"], 2, "known: csv, fits, json"),
+    "export by no format": (["export", PROFILE, "-o", "new.bmp"], 2, "ends in .csv, .fits, .json"),
+    "export by two formats": (
+        ["export", PROFILE, "-o", "new.fits", "--format", "tiff"],
+        2,
+        "fits does, .* tiff",
+    ),
+    "half a place": (["export", PROFILE, "-o", "new.csv", "--phi", "1"], 2, "--phi needs --r"),
+    "report of nothing": (["report", "gone"], 2, "no lens profile at gone; make it"),
+    "demo into a file": (["demo", "-o", "bad"], 2, "bad is a file"),
+    "demo by no estimator": (["demo", "--estimator", "x"], 2, "no estimator 'x'; known: .*default"),
+    "bench json there": (["bench", "model", "--json", "there.npy"], 2, "there.npy is there already; --force"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refusal_is_one_sentence_with_the_value_and_a_remedy(
+    case: str, folder: Path, made: Path, here: Here
+) -> None:
+    words, status, expected = REFUSED[case]
+    (folder / "empty").mkdir()
+    (folder / "sub").mkdir()
+    shutil.copy(made / "other.dng", folder)
+    shutil.copy(made / "other.dng", folder / "sub" / "one.dng")
+    (folder / "text.dng").write_text("no picture at all")
+    (folder / "bad").write_bytes((folder / PROFILE).read_bytes()[:-200])
+    (folder / "there.npy").write_bytes(b"mine")
+    (folder / "reported").mkdir()
+    (folder / "reported" / "mtf.csv").write_bytes(b"mine")
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+    done = here(*words)
+
+    assert done.returncode == status, done.stderr
+    assert re.search(expected, one_sentence(done.stderr)), done.stderr
+    assert done.stdout == ""
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_the_readme_says_the_same_of_the_exit_status(here: Here) -> None:
+    codes = "0 done, 1 something failed, 2 called wrongly, 130 stopped by Ctrl-C, 143 by SIGTERM"
+    readme = (HERE.parents[1] / "README.md").read_text(encoding="utf-8")
+
+    for text in (readme, here("--help").stdout):
+        assert codes in " ".join(text.split())
+
+
+def test_unknown_options_and_settings_are_wrong_usage(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    option = lensmodel("calibrate", "one.dng", "--profil", "x", cwd=folder)
+    monkeypatch.setitem(ENVIRONMENT, "LENS_PROT", "9000")
+    setting = lensmodel("serve", cwd=folder)
+
+    assert option.returncode == setting.returncode == 2
+    assert "did you mean LENS_PORT" in one_sentence(setting.stderr)
+
+
+def test_the_settings_are_told_with_what_they_mean_and_without_passwords(
+    here: Here, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("DATABASE", "JOBS"):
+        monkeypatch.setenv(f"LENS_{name}_URL", "postgresql+psycopg://lens:a[b@c/d@db:5432/lens")
+    monkeypatch.setenv("LENS_STORAGE_URL", "s3://lensmodel")
+    lines = here("config").stdout.splitlines()
+
+    assert "LENS_DATABASE_URL=postgresql+psycopg://lens:********@db:5432/lens" in lines
+    assert lines[lines.index("LENS_PORT=8000") - 1] == "# Port to listen on; 0 takes any free one."
+    assert not [line for line in lines if "a[b" in line or "None" in line]
+
+
+@pytest.mark.parametrize("part", ["serve", "api"])
+def test_a_taken_port_is_told_as_such(part: str, here: Here) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        done = here(part, "--port", str(taken.getsockname()[1]), "--data", "data")
+
+    assert done.returncode == 1
+    assert re.search("cannot listen on 127.0.0.1:.* give another --port", done.stderr.splitlines()[-1])
+
+
+def test_the_api_alone_logs_as_much_as_its_setting_says(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LENS_LOG_LEVEL", "info")
+    monkeypatch.setattr("uvicorn.Server.run", lambda *_, **__: logging.getLogger("app").info("GET /readyz"))
+
+    assert "INFO api app: GET /readyz" in here("api", "--port", "0", "--data", "data").stderr
+
+
+# --- what is there already ---------------------------------------------------------------------
+
+
+@pytest.fixture
+def shown_off(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Put a demo in place of the real one that writes two files at once, and counts its runs."""
+    runs: list[int] = []
+
+    def run(output: Path, tell: Callable[[str, float | None], None], *, estimator: str) -> bool:
+        assert estimator == "default"
+        runs.append(len(runs))
+        tell("working", 83.4)
+        tell("done", None)
+        output.mkdir(parents=True, exist_ok=True)
+        for name in ("report.md", "report.json"):
+            (output / name).write_text(f'{{"run": {len(runs)}}}', encoding="utf-8")
+        return True
+
+    monkeypatch.setattr("app.demo.run.run", run)
+    return runs
+
+
+def test_demo_renews_what_an_earlier_demo_left(folder: Path, here: Here, shown_off: list[int]) -> None:
+    first, second = here("demo", "-o", "out"), here("demo", "-o", "out", "--json")
+
+    assert first.returncode == second.returncode == 0
+    assert json.loads(second.stdout) == {"run": 2}
+    assert first.stderr.splitlines() == ["[ 0:00, ETA 1:23] working", "[ 0:00] done"]
+    assert len(shown_off) == 2
+
+
+@pytest.mark.parametrize("touched", ["report.md", "mine.txt"])
+def test_demo_replaces_nothing_that_is_not_its_own_unless_forced(
+    touched: str, folder: Path, here: Here, shown_off: list[int]
+) -> None:
+    if touched == "report.md":
+        here("demo", "-o", "out")
+    (folder / "out").mkdir(exist_ok=True)
+    (folder / "out" / touched).write_text("my notes", encoding="utf-8")
+    begun = len(shown_off)
+
+    refused = here("demo", "-o", "out")
+    runs, kept = len(shown_off), (folder / "out" / touched).read_text(encoding="utf-8")
+    forced = here("demo", "-o", "out", "--force")
+
+    assert refused.returncode == 2
+    assert re.search(f"{touched} is not as a demo left it; .*--force", one_sentence(refused.stderr))
+    assert (runs, kept) == (begun, "my notes")
+    assert forced.returncode == 0
+    assert "my notes" in kept
+    assert (folder / "out" / "mine.txt").exists() == (touched == "mine.txt")
+
+
+def test_a_file_of_mine_stays_mine_after_a_forced_demo(
+    folder: Path, here: Here, shown_off: list[int]
+) -> None:
+    (folder / "out").mkdir()
+    (folder / "out" / "mine.txt").write_text("my notes", encoding="utf-8")
+    here("demo", "-o", "out", "--force")
+
+    assert here("demo", "-o", "out").returncode == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "finished"),
+    [
+        (("bench", "blind", "-o", "out"), "out/blind.md"),
+        (("reproduce", "--quick", "-o", "out"), "out/reproduction.md"),
+        (("reproduce", "--json", "out/figures.json"), "out/figures.json"),
+    ],
+)
+def test_a_finished_report_is_refused_before_any_work(
+    words: tuple[str, ...], finished: str, folder: Path, here: Here
+) -> None:
+    (folder / "out").mkdir()
+    (folder / finished).write_text("finished", encoding="utf-8")
+
+    done = here(*words)
+
+    assert done.returncode == 2
+    assert f"{finished} is there already; --force replaces it" in one_sentence(done.stderr)
+    assert [path.name for path in (folder / "out").iterdir()] == [Path(finished).name]
+
+
+@pytest.mark.slow
+def test_aperture_of_the_command_line_is_for_photos_that_do_not_say_their_own(
+    folder: Path, here: Here
+) -> None:
+    Image.fromarray(_picture()).save(folder / "scan.tif")
+    words = ("calibrate", "one.dng", "scan.tif", "-p", "new", "--any-lens", "--estimator", "whittle")
+    done = here(*words, "--aperture", "8", "--workers", "1")
+
+    assert done.returncode == 0, done.stderr
+    seen = {sample.settings.aperture for sample in load_profile(folder / "new").model.samples}
+    assert seen == {2.8, 8.0}
+
+
+@pytest.mark.slow
+def test_a_new_copy_starts_from_another_and_can_leave_it(folder: Path, here: Here) -> None:
+    words = ("calibrate", "one.dng", "-p", "new", "--estimator", "whittle", "--workers", "1")
+    done = here(*words, "--family", PROFILE)
+
+    assert done.returncode == 0, done.stderr
+    asked = json.loads(here("psf", "new", "--r", "0.95", "--phi", "1", "--json").stdout)
+    assert asked["support"]["prior"]
+    assert asked["support"]["prior_share"] > 0
+
+    assert here(*words, "--no-family").returncode == 0
+    assert load_profile(folder / "new").model.prior is None
+
+
+def test_a_profile_keeps_the_mode_and_the_unit_that_it_was_told(
+    folder: Path, here: Here, few_patches: None
+) -> None:
+    words = ("calibrate", "one.dng", "-p", PROFILE, "--estimator", "whittle", "--workers", "1", "--json")
+    told = json.loads(here(*words, "--any-lens", "--mode", "kernels", "--unit", "half-diagonal").stdout)
+
+    kept = load_profile(folder / PROFILE).model
+    assert (kept.settings.mode, kept.settings.unit) == ("kernels", "half-diagonal")
+    assert told["mode"] == kept.mode == "kernels"
+    again = json.loads(here(*words, "--any-lens").stdout)
+    assert again["results"][0]["state"] == "known"
+    assert again["mode"] == told["mode"]
+    assert here(*words, "--mode", "guess").returncode == 2
+
+
+def test_a_photo_that_says_little_is_corrected_with_a_word_of_warning(folder: Path, here: Here) -> None:
+    Image.fromarray(_picture()).save(folder / "scan.tif")
+    done = here("correct", "scan.tif", "-p", PROFILE, "-o", "out", "--method", "fast")
+
+    assert done.returncode == 0
+    assert re.search("does not name its lens.*\n.*does not say its aperture", done.stderr)
+
+
+# --- interrupting ------------------------------------------------------------------------------
+
+
+def write_jpeg(path: Path, seed: int) -> None:
+    """Write a photo of such a lens as its camera would: nothing is learned of it in the end, all at once."""
+    light = ndimage.gaussian_filter(scene(seed), 1.3)
+    picture = np.rint(255.0 * light ** (1.0 / 2.2)).astype(np.uint8)
+    exif = Image.Exif()
+    exif.get_ifd(ExifTags.IFD.Exif).update({ExifTags.Base.FNumber: 2.8, ExifTags.Base.LensModel: "Test 35mm"})
+    Image.fromarray(np.dstack([picture] * 3)).save(path, quality=95, exif=exif)
+
+
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)], ids=str
+)
+def test_stopped_calibration_keeps_finished_photos_and_goes_on(
+    number: signal.Signals, folder: Path, here: Here
+) -> None:
+    for seed, name in enumerate(("one.jpg", "two.jpg")):
+        write_jpeg(folder / name, seed)
+    profile = folder / "new.lensprofile"
+    words = ("calibrate", "one.jpg", "two.jpg", "-p", "new.lensprofile", "--estimator", "whittle", "--json")
+    process = start(*words, "-q", cwd=folder)  # on a slow machine it would tell how far it is
+    wait_for(profile.exists)
+    os.killpg(process.pid, number)  # the whole group, as a terminal does
+    said, errors = process.communicate(timeout=stretched(20))
+
+    assert process.returncode == 128 + number
+    assert said == ""
+    assert "finished files are kept" in one_sentence(errors)
+    assert list(load_profile(profile).photos.values()) == ["one.jpg"]
+    again = json.loads(here(*words, "--workers", "1").stdout)
+    assert [result["state"] for result in again["results"]] == ["known", "counted"]
+
+
+def test_stopped_correction_leaves_whole_files_only_and_goes_on(folder: Path, made: Path) -> None:
+    shutil.copy(made / "b.dng", folder / "two.dng")
+    words = ("correct", "one.dng", "two.dng", "-p", PROFILE, "-o", "out", "--method", "paper")
+    process = start(*words, cwd=folder)
+    first = folder / "out" / "one-corrected.tif"
+    wait_for(first.exists)
+    os.killpg(process.pid, signal.SIGINT)
+    process.communicate(timeout=stretched(20))
+    stamp = first.stat().st_mtime_ns
+
+    assert process.returncode == 130
+    assert [path.name for path in (folder / "out").iterdir()] == ["one-corrected.tif"]
+    again = lensmodel(*words, cwd=folder)
+    assert again.stdout.splitlines() == [str(Path("out/two-corrected.tif"))]
+    assert first.stat().st_mtime_ns == stamp
+
+
+# --- progress ----------------------------------------------------------------------------------
+
+
+def on_a_terminal(folder: Path, *words: str) -> tuple[str, str]:
+    """Run a command whose standard error is a terminal; return what each of the two outputs got."""
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(
+        command(*words),
+        cwd=folder,
+        env={**ENVIRONMENT, "PYTHONPATH": str(HERE.parents[1]), "TERM": "xterm", "COLUMNS": "120"},
+        stdout=subprocess.PIPE,
+        stderr=theirs,
+        text=True,
+    )
+    os.close(theirs)
+    seen = b""
+    while chunk := _read(ours):
+        seen += chunk
+    os.close(ours)
+    said, _ = process.communicate(timeout=stretched(PATIENCE_S))
+    return said, seen.decode()
+
+
+def test_progress_with_time_left_is_on_a_terminal_and_results_are_in_the_pipe(folder: Path) -> None:
+    said, seen = on_a_terminal(folder, "correct", "one.dng", "-p", PROFILE, "-o", "out", "--method", "fast")
+
+    assert said.splitlines() == [str(Path("out/one-corrected.tif"))]
+    assert "ETA" in seen
+    assert "one.dng" in seen
+
+
+def test_a_benchmark_of_the_lens_model_says_how_far_it_is(folder: Path) -> None:
+    said, seen = on_a_terminal(
+        folder, "bench", "model", "--seeds", "1000:1003", "--photos", "1", "--methods", "eff-linear"
+    )
+
+    assert said.startswith("| method |")
+    assert "ETA" in seen
+    assert "3/3" in seen
+
+
+def test_a_question_to_the_lens_says_that_it_is_being_answered(folder: Path) -> None:
+    said, seen = on_a_terminal(folder, "psf", PROFILE)
+
+    assert said.startswith("center, r 0")
+    assert "asking the lens" in seen
+
+
+def _read(terminal: int) -> bytes:
+    try:
+        return os.read(terminal, 4096)
+    except OSError:  # Linux says so when the other side is closed
+        return b""
+
+
+def test_without_a_terminal_standard_error_stays_empty(folder: Path) -> None:
+    done = lensmodel("correct", "one.dng", "-p", PROFILE, "-o", "out", "--method", "fast", cwd=folder)
+
+    assert done.stderr == ""

@@ -1,0 +1,153 @@
+"""Calibration by executors of any kind, a Dask cluster of two processes among them."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import threading
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from app.cli import app
+from lensmodel.core import parallel
+from lensmodel.core.psf import PsfSample
+from lensmodel.model import load_profile
+from lensmodel.workflow import pipeline
+
+HERE = Path(__file__).parents[1]
+sys.path.insert(0, str(HERE))
+from running import write_photo  # noqa: E402 - beside this file
+
+sys.path.remove(str(HERE))
+
+
+def test_the_calling_thread_is_an_executor_that_hands_on_errors() -> None:
+    executor = parallel.Here()
+
+    assert executor.submit(threading.get_ident).result() == threading.get_ident()
+    with pytest.raises(ZeroDivisionError):
+        executor.submit(lambda: 1 // 0).result()
+
+
+class Counting(ThreadPoolExecutor):
+    """Notes how many calls are submitted and not yet taken."""
+
+    def __init__(self) -> None:
+        super().__init__(2)
+        self.submitted = 0
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        self.submitted += 1
+        return super().submit(fn, *args, **kwargs)
+
+
+def test_items_come_in_order_and_few_are_submitted_ahead() -> None:
+    with Counting() as executor:
+        seen = []
+        for taken, (item, future) in enumerate(
+            parallel.in_order(executor, pow, range(20), lambda k: (k, 2) if k % 3 else None, ahead=4), start=1
+        ):
+            assert executor.submitted <= taken + 4
+            seen.append((item, None if future is None else future.result()))
+
+    assert seen == [(k, k**2 if k % 3 else None) for k in range(20)]
+
+
+def test_what_is_not_taken_any_more_is_cancelled() -> None:
+    gate = threading.Event()
+    with ThreadPoolExecutor(1) as executor:
+        jobs = parallel.in_order(executor, gate.wait, range(9), lambda _: (5.0,), ahead=8)
+        first = next(jobs)[1]
+        jobs.close()  # type: ignore[attr-defined]  # a generator
+        gate.set()
+        assert first is not None
+        assert first.result()
+        assert executor._work_queue.qsize() == 0 or all(
+            item is None or item.future.cancelled() for item in executor._work_queue.queue
+        )
+
+
+@pytest.fixture(scope="module")
+def photo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_photo(tmp_path_factory.mktemp("photos") / "one.dng", 1)
+
+
+def stacked(samples: list[PsfSample]) -> np.ndarray:
+    return np.stack([sample.kernel for sample in samples])
+
+
+def test_a_photo_gives_the_same_samples_wherever_it_is_estimated(photo: Path) -> None:
+    here = pipeline.samples_of_photo(photo, estimator="whittle", count=4, executor=parallel.Here())
+    with ThreadPoolExecutor(2) as threads:
+        beside = pipeline.samples_of_photo(photo, estimator="whittle", count=4, executor=threads)
+    sent = pipeline.samples_of_bytes(photo.name, photo.read_bytes(), None, "whittle", 4)
+
+    np.testing.assert_array_equal(stacked(beside), stacked(here))
+    np.testing.assert_array_equal(stacked(sent), stacked(here))
+    assert [sample.photo for sample in sent] == [sample.photo for sample in here]
+
+
+def test_whole_photos_are_calibrated_by_an_executor(photo: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.dng"
+    broken.write_bytes(photo.read_bytes()[:2000])
+    events: list[pipeline.CalibrationEvent] = []
+
+    with ThreadPoolExecutor(2) as threads:
+        model = pipeline.calibrate(
+            [photo, broken, photo], estimator="whittle", count=4, executor=threads, on_event=events.append
+        )
+
+    assert [event.stage for event in events] == ["counted", "skipped", "skipped"]
+    assert {sample.photo for sample in model.samples} == {pipeline.photo_id(photo)}
+
+
+@pytest.mark.slow
+def test_a_cluster_of_two_processes_calibrates_the_same_profile(tmp_path: Path) -> None:
+    if importlib.util.find_spec("distributed") is None:
+        pytest.skip("Dask is not installed: pip install 'lensmodel[cluster]'")
+    from distributed import LocalCluster  # noqa: PLC0415 - an extra
+
+    for k in range(4):
+        write_photo(tmp_path / f"{k}.dng", k)
+    common = [str(tmp_path / f"{k}.dng") for k in range(4)] + ["--estimator", "whittle", "--quiet"]
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, protocol="tcp"
+    ) as cluster:
+        address = cluster.scheduler_address
+        far = CliRunner().invoke(
+            app,
+            ["calibrate", *common, "--profile", str(tmp_path / "far.lensprofile"), "--scheduler", address],
+        )
+        nodes = cluster.scheduler_info["workers"]
+        assert len(nodes) == 2
+    near = CliRunner().invoke(app, ["calibrate", *common, "--profile", str(tmp_path / "near.lensprofile")])
+
+    assert (far.exit_code, near.exit_code) == (0, 0), far.output + near.output
+    one, other = (load_profile(tmp_path / f"{name}.lensprofile").model for name in ("far", "near"))
+    np.testing.assert_array_equal(stacked(list(one.samples)), stacked(list(other.samples)))
+
+
+def test_a_cluster_that_does_not_answer_is_said(
+    photo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("app.commands.cluster.CONNECT_S", 0.5)
+
+    result = CliRunner().invoke(
+        app,
+        [
+            "calibrate",
+            str(photo),
+            "--profile",
+            str(tmp_path / "x.lensprofile"),
+            "--scheduler",
+            "tcp://127.0.0.1:9",
+        ],
+    )
+
+    assert "no cluster answers there" in str(result.exception)

@@ -1,0 +1,70 @@
+"""What commands say: numbers in words, tables, progress without a terminal, completion of the shell."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from app.commands.console.progress_lines import ProgressLines, clock
+from app.commands.console.table import aligned
+from app.words import mtf50_words
+
+
+@pytest.mark.parametrize(
+    ("frequency", "words"),
+    [(0.3104, "0.310"), (0.4999, "0.500"), (0.5, "at least 0.5"), (1.0, "at least 0.5")],
+)
+def test_an_mtf50_beyond_what_pixels_show_is_a_lower_bound(frequency: float, words: str) -> None:
+    assert mtf50_words(frequency) == words
+
+
+def test_columns_are_in_line_and_numbers_to_the_right() -> None:
+    text = aligned(["lens", "photos"], [["a", "7"], ["longer name", "12"]], numbers={1})
+
+    assert text.splitlines() == [
+        "lens         photos",
+        "-----------  ------",
+        "a                 7",
+        "longer name      12",
+    ]
+
+
+def test_without_a_terminal_progress_is_told_in_lines() -> None:
+    said: list[str] = []
+    with ProgressLines(said.append, every_s=0.0) as lines:
+        task = lines.add_task("learning from a.dng", total=4)
+        lines.update(task, completed=1)
+
+    assert said == ["[0:00]  25 % learning from a.dng, about 0:00 left"]
+
+
+def test_quick_work_says_nothing() -> None:
+    said: list[str] = []
+    with ProgressLines(said.append) as lines:
+        lines.update(lines.add_task("a", total=1), completed=1)
+
+    assert said == []
+
+
+@pytest.mark.parametrize(("seconds", "words"), [(7.9, "0:07"), (247, "4:07"), (3847, "1:04:07")])
+def test_times_are_those_of_a_clock(seconds: float, words: str) -> None:
+    assert clock(seconds) == words
+
+
+def test_one_command_installs_the_completion_of_a_shell(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "lensmodel", "--install-completion", "bash"],
+        env={**os.environ, "HOME": str(tmp_path), "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+    assert done.returncode == 0, done.stderr
+    (script,) = (tmp_path / ".bash_completions").iterdir()
+    assert script.name == "lensmodel.sh"
+    assert "_LENSMODEL_COMPLETE" in script.read_text()

@@ -1,0 +1,245 @@
+"""What `--help` teaches: each command by example, and each example does what it says."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+from PIL import Image
+from sqlalchemy import update
+from typer.core import TyperCommand, TyperGroup
+
+from app.blobs.storage import Storage
+from app.cli import app
+from app.runtime.backup import backup
+from app.runtime.settings import Settings
+from app.store import Store
+from app.store.access.access_tables import KeyRow
+from app.store.access.keys import KeyStore
+from app.store.database import Database
+from app.store.upkeep.migrate import upgrade
+from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.model import LensModel, LensProfile, save_profile
+
+HERE = Path(__file__).parents[1]
+sys.path.insert(0, str(HERE))
+from deadline import stretched  # noqa: E402 - beside these files
+from running import scene, write_photo  # noqa: E402 - same
+
+sys.path.remove(str(HERE))
+
+PATIENCE_S = 240.0
+LONG_S = 3600.0
+ROOT = typer.main.get_command(app)
+
+
+def commands(group: Any, names: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+    """Walk over all commands that `--help` shows."""
+    assert isinstance(group, TyperGroup)
+    for name, command in group.commands.items():
+        assert isinstance(command, TyperCommand | TyperGroup)
+        if not command.hidden:
+            yield " ".join((*names, name)), command
+        if isinstance(command, TyperGroup):
+            yield from commands(command, (*names, name))
+
+
+def examples_of(command: Any) -> list[str]:
+    return re.findall(r"^\s*lensmodel (.+?)\s*$", command.help or "", re.MULTILINE)
+
+
+COMMANDS = dict(commands(ROOT))
+EXAMPLES = {line: name for name, command in COMMANDS.items() for line in examples_of(command)}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_each_command_teaches_by_examples_of_its_own_and_says_its_exit_status(name: str) -> None:
+    lines = examples_of(COMMANDS[name])
+
+    assert lines
+    assert all(f"{line} ".startswith(f"{name} ") for line in lines)
+    assert re.search(r"Exit status: 0 .+, 2 ", COMMANDS[name].help or "")
+
+
+@pytest.mark.parametrize("line", EXAMPLES)
+def test_each_example_is_understood_by_its_command(line: str) -> None:
+    name = max((name for name in COMMANDS if f"{line} ".startswith(f"{name} ")), key=len)
+    words = shlex.split(line.removeprefix(name))
+
+    with contextlib.suppress(typer.Exit):  # `--help` ends the reading
+        assert COMMANDS[name].make_context(name, words).params
+
+
+def test_an_option_that_does_not_exist_would_be_noticed() -> None:
+    with pytest.raises(typer.TyperException, match="outputs"):
+        COMMANDS["demo"].make_context("demo", ["--outputs", "x"])
+
+
+# --- each example, in a process of its own -----------------------------------------------------
+
+SHORTER = {
+    "calibrate": ["--estimator", "whittle"],
+    "reproduce": ["--quick", "--direct", "--estimator", "whittle"],
+}
+"""What is added so that an example takes minutes at most; the estimators have tests of their own."""
+
+KEPT = {
+    "reproduce": Path("reproduction", "cache"),
+    "bench": Path("bench-output", "cache"),
+    "bench blind": Path("bench-output", "cache"),
+}
+"""Where a command keeps finished pieces of work, which its next example need not do again."""
+
+QUICK = {
+    "correct one.dng --profile my-24mm.lensprofile -o linear --format dng --method fast --json",
+    "calibrate scan.tif --aperture 2.8 --profile old-lens.lensprofile",
+    "psf my-24mm.lensprofile --r 0.9 --channel b --output corner.npy",
+    "report my-24mm.lensprofile --aperture 2 -o my-24mm-report",
+    "check scan.tif scan-sharpened.tif --profile my-24mm.lensprofile --map faults.png",
+    "export my-24mm.lensprofile --format json --r 0.9 --phi 0.6 -o corner-for-art.json",
+    "config --json",
+    "doctor --deep --json",
+    "backup my-backup",
+    "restore my-backup --data restored",
+    "migrate --to sqlite:///elsewhere.db",
+    "serve",
+}
+"""One of each command that does not take minutes; the others are run among the slow tests."""
+
+
+def marked(lines: Iterable[str]) -> list[Any]:
+    return [pytest.param(k, id=k, marks=[] if k in QUICK else [pytest.mark.slow]) for k in lines]
+
+
+def test_the_quick_examples_are_examples() -> None:
+    assert set(EXAMPLES) >= QUICK
+
+
+@pytest.fixture(scope="session")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with all that the examples speak of."""
+    folder = tmp_path_factory.mktemp("prepared")
+    (folder / "holiday").mkdir()
+    (folder / "sharp").mkdir()
+    write_photo(folder / "holiday" / "first.dng", 2)
+    for name, seed in (("one", 1), ("one-more", 3), ("mine", 4)):
+        write_photo(folder / f"{name}.dng", seed)
+    for k in range(4):
+        picture = np.rint(255.0 * scene(10 + k)).astype(np.uint8)
+        Image.fromarray(np.dstack([picture] * 3)).save(folder / "sharp" / f"{k}.png")
+    shutil.copy(folder / "sharp" / "0.png", folder / "scan.png")
+    with Image.open(folder / "scan.png") as scan:
+        scan.save(folder / "scan.tif")
+    shutil.copy(folder / "scan.tif", folder / "scan-sharpened.tif")
+    (folder / "linear").mkdir()
+    shutil.copy(folder / "one.dng", folder / "linear" / "one-corrected.dng")
+    kernels = np.stack([gaussian(31, np.eye(2) * (0.8 + 0.3 * k)) for k in range(4)])
+    np.savez(folder / "mine.npz", psf=kernels)
+    places = [FieldPosition(r, phi) for r in (0.1, 0.3, 0.5, 0.7, 0.9) for phi in (-2.4, -0.8, 0.8, 2.4)]
+    stars = np.stack([gaussian(15, np.eye(2) * (1.0 + place.r)) for place in places])
+    np.savez(
+        folder / "stars.npz", psf=stars, r=[place.r for place in places], phi=[place.phi for place in places]
+    )
+    samples = [
+        PsfSample(gaussian(15, np.eye(2) * 1.7), FieldPosition(r, phi), LensSettings(2.8, 35.0), photo="x")
+        for r in (0.1, 0.5, 0.9)
+        for phi in (-2.0, 0.5, 2.5)
+    ]
+    lens = {"maker": "Test Optics", "model": "Test 35mm f/1.8", "serial": "L-42"}
+    known = LensProfile(LensModel.fit(samples), lens, {"0123456789abcdef": "x.dng"})
+    save_profile(folder / "my-24mm.lensprofile", known)
+    database = Database(f"sqlite:///{folder / 'lensmodel-data' / 'app.db'}")
+    upgrade(database)
+    KeyStore(database).create("anna", ["write"])
+    with database.writing() as session:
+        session.execute(update(KeyRow).values(prefix="abcd2345"))
+    database.close()
+    settings = Settings(data_dir=folder / "lensmodel-data")
+    with contextlib.closing(Store(settings)) as store:
+        upgrade(store.database)
+        backup(store.database, Storage(settings.storage), folder / "my-backup")
+    return folder
+
+
+@pytest.fixture
+def folder(prepared: Path, tmp_path: Path) -> Path:
+    shutil.copytree(prepared, tmp_path / "work")
+    return tmp_path / "work"
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder for what examples leave to one another, see `KEPT`."""
+    return tmp_path_factory.mktemp("finished")
+
+
+def environment(folder: Path) -> dict[str, str]:
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("LENS_", "LENSMODEL_"))}
+    return {**kept, "PYTHONPATH": str(HERE.parents[1]), "HOME": str(folder)}
+
+
+@pytest.mark.parametrize(  # what needs a running service is walked in test_remote.py
+    "line", marked(k for k in EXAMPLES if EXAMPLES[k] != "serve" and "--server" not in k)
+)
+def test_example_runs(line: str, folder: Path, finished: Path) -> None:
+    words = [*shlex.split(line), *SHORTER.get(EXAMPLES[line], [])]
+    if "auto" in words:
+        words += ["--estimator", "whittle", "--learn-from", "1"]
+    kept = KEPT.get(EXAMPLES[line])
+    if kept is not None and (finished / kept).is_dir():
+        shutil.copytree(finished / kept, folder / kept)
+    done = subprocess.run(
+        [sys.executable, "-m", "app.cli", *words],
+        cwd=folder,
+        env=environment(folder),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=LONG_S,
+    )
+
+    assert done.returncode == 0, done.stderr
+    assert done.stdout
+    if kept is not None and (folder / kept).is_dir():
+        shutil.copytree(folder / kept, finished / kept, dirs_exist_ok=True)
+    for flag in ("-o", "--output", "--profile", "--json"):
+        for at in (
+            k for k, word in enumerate(words[:-1]) if word == flag and not words[k + 1].startswith("-")
+        ):
+            assert (folder / words[at + 1]).exists(), flag
+    if "--json" in words and (words[-1] == "--json"):
+        json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("line", marked(k for k in EXAMPLES if EXAMPLES[k] == "serve"))
+def test_example_serves_until_it_is_told_to_stop(line: str, folder: Path) -> None:
+    words = [word.replace("~", str(folder)) for word in shlex.split(line)]
+    with subprocess.Popen(
+        [sys.executable, "-m", "app.cli", *words, *([] if "--port" in words else ["--port", "0"])],
+        cwd=folder,
+        env=environment(folder),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        said = process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        status = process.wait(stretched(PATIENCE_S))
+
+    assert said.startswith("lensmodel is ready: http://127.0.0.1:")
+    assert status == 0

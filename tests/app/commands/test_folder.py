@@ -1,0 +1,244 @@
+"""`lensmodel correct FOLDER --lens auto`: from a folder of mixed photos to corrected ones and a table."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import json
+import logging
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.cli import main
+from app.commands.grouping import Shot, groups
+from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
+from lensmodel.model.profile import Camera
+from lensmodel.photo.tags.xmp import read_xmp
+from lensmodel.photo.values import LensIdentity, PhotoMetadata
+from lensmodel.workflow.pipeline import photo_id
+
+HERE = Path(__file__).parents[1]
+sys.path.insert(0, str(HERE))
+from running import write_photo  # noqa: E402 - beside this file
+
+sys.path.remove(str(HERE))
+
+AUTO = (
+    "correct",
+    "holiday",
+    "--lens",
+    "auto",
+    "--profiles",
+    "lenses",
+    "--estimator",
+    "whittle",
+    "--method",
+    "fast",
+)
+
+
+def lensmodel(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """Run the command in this process, which saves seconds of imports a run."""
+    root, out, err, status = logging.getLogger(), io.StringIO(), io.StringIO(), 0
+    handlers, level = list(root.handlers), root.level
+    signals = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with (
+            pytest.MonkeyPatch.context() as patched,
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(err),
+        ):
+            patched.chdir(cwd)
+            patched.setattr(sys, "argv", ["lensmodel", *words])
+            main()
+    except SystemExit as end:
+        status = int(end.code or 0)
+    finally:
+        root.handlers[:], root.level = handlers, level
+        for number, handler in signals.items():
+            signal.signal(number, handler)
+    return subprocess.CompletedProcess(words, status, out.getvalue(), err.getvalue())
+
+
+@pytest.fixture(scope="module")
+def card(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder as it comes from a card: two lenses, one of them known, and a file that is no photo."""
+    here = tmp_path_factory.mktemp("card")
+    photos = here / "holiday"
+    photos.mkdir()
+    write_photo(photos / "a.dng", 1)
+    write_photo(photos / "b.dng", 2)
+    write_photo(photos / "c.dng", 3, serial="L-43", sigma=20.0)  # nothing to be learned from
+    (photos / "broken.dng").write_bytes(b"no photo")
+    samples = [
+        PsfSample(gaussian(15, np.eye(2) * 1.7), FieldPosition(r, phi), LensSettings(2.8, 35.0), photo="x")
+        for r in (0.1, 0.5, 0.9)
+        for phi in (-2.0, 0.5, 2.5)
+    ]
+    names = {"maker": "Test Optics", "model": "Test 35mm f/1.8", "serial": "L-42"}
+    known = {photo_id(photos / name): name for name in ("a.dng", "b.dng")}
+    camera = Camera("Test", "T-1", None)
+    lenses = here / "lenses"
+    lenses.mkdir()
+    group = groups([Shot.of(photos / "a.dng")])[0]
+    profile = LensProfile(LensModel.fit(samples).warmed(), names, known, (camera,))
+    save_profile(lenses / f"{group.name}.lensprofile", profile)
+    return here
+
+
+@pytest.fixture(scope="module")
+def journey(card: Path) -> Path:
+    """The same folder after the command ran once."""
+    (card / "before.json").write_text(json.dumps(_sums(card / "holiday")))
+    done = lensmodel(*AUTO, "--sidecar", cwd=card)
+    (card / "said.txt").write_text(done.stdout)
+    (card / "errors.txt").write_text(done.stderr)
+    assert done.returncode == 1, done.stderr  # for the file that is no photo
+    return card
+
+
+def _sums(folder: Path) -> dict[str, str]:
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.glob("*.dng")}
+
+
+def test_each_lens_has_a_line_in_the_table(journey: Path) -> None:
+    head, _, *lines = (journey / "said.txt").read_text().splitlines()
+
+    assert head.split()[:2] == ["camera", "lens"]
+    assert [line.split("#")[1].split()[0] for line in lines] == ["L-42", "L-43"]
+    figures = [line.split("mm")[-1].split() for line in lines]
+    assert [row[:5] for row in figures] == [["2", "2", "2", "0", "0"], ["1", "0", "0", "1", "0"]]
+
+
+def test_what_cannot_be_read_is_named_and_the_rest_goes_on(journey: Path) -> None:
+    errors = (journey / "errors.txt").read_text().splitlines()
+
+    assert any("broken.dng" in line for line in errors)
+    assert any("#L-43" in line and "no photo tells enough" in line for line in errors)
+
+
+def test_corrected_photos_and_sidecars_are_beside_the_originals(journey: Path) -> None:
+    out = journey / "holiday" / "corrected"
+
+    assert sorted(path.name for path in out.glob("*.tif")) == ["a-corrected.tif", "b-corrected.tif"]
+    said = (out / "a-corrected.xmp").read_text()
+    assert 'exifEX:LensModel="Test 35mm f/1.8"' in said
+    assert 'stRef:filePath="a.dng"' in said
+    assert "L-42" not in said
+    assert read_xmp(said.encode())["exif:FNumber"] == "2800/1000"
+
+
+def test_the_photos_themselves_stay_as_they_are(journey: Path) -> None:
+    assert _sums(journey / "holiday") == json.loads((journey / "before.json").read_text())
+
+
+def test_the_same_command_again_does_nothing_twice(journey: Path) -> None:
+    stamps = {path: path.stat().st_mtime_ns for path in journey.rglob("*.*") if path.suffix != ".json"}
+
+    done = lensmodel(*AUTO, "--json", cwd=journey)
+
+    assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
+    found = json.loads(done.stdout)
+    assert [group["corrected_before"] for group in found["groups"]] == [2, 0]
+    assert [group["left"] for group in found["groups"]] == [0, 1]
+    assert sorted(result["state"] for result in found["results"]) == ["failed", "kept", "kept", "left"]
+
+
+def test_quiet_says_nothing_but_errors_and_verbose_tells_of_each_photo(journey: Path) -> None:
+    quiet = lensmodel(*AUTO, "-q", cwd=journey)
+    verbose = lensmodel(*AUTO, "-v", cwd=journey)
+
+    assert quiet.stdout == ""
+    assert len(quiet.stderr.splitlines()) == 1
+    assert "a-corrected.tif is there already" in verbose.stderr
+
+
+def test_a_profile_and_auto_exclude_each_other(card: Path) -> None:
+    both = lensmodel("correct", "holiday", "--lens", "auto", "-p", "x.lensprofile", cwd=card)
+    none = lensmodel("correct", "holiday", cwd=card)
+
+    assert (both.returncode, none.returncode) == (2, 2)
+    assert "--lens auto" in none.stderr
+
+
+@pytest.mark.slow
+def test_a_folder_of_an_unknown_lens_is_learned_and_corrected(tmp_path: Path) -> None:
+    (tmp_path / "holiday").mkdir()
+    write_photo(tmp_path / "holiday" / "a.dng", 1)
+    write_photo(tmp_path / "holiday" / "b.dng", 2)
+
+    done = lensmodel(*AUTO, "--learn-from", "1", "--json", cwd=tmp_path)
+
+    (group,) = json.loads(done.stdout)["groups"]
+    assert group["learned_from"] == 1
+    assert group["corrected"] + group["left"] == 2
+    assert load_profile(tmp_path / Path(group["profile"])).model.warm
+
+
+# --- sorting -----------------------------------------------------------------------------------
+
+ZOOM = PhotoMetadata(
+    camera_model="T-1", lens=LensIdentity("Test", "24-70mm", "7", "exif"), focal_mm=24.0, aperture=2.8
+)
+
+
+def shots(*metadata: PhotoMetadata) -> list[Shot]:
+    return [Shot(Path(f"{i}.dng"), said) for i, said in enumerate(metadata)]
+
+
+def at(focal: float | None) -> PhotoMetadata:
+    return replace(ZOOM, focal_mm=focal)
+
+
+def test_focal_lengths_of_a_zoom_are_groups_of_one_profile() -> None:
+    found = groups(shots(at(24.0), at(26.0), at(70.0), at(None)))
+
+    assert [group.focal for group in found] == ["unknown", "24-26 mm", "70 mm"]
+    assert len({group.name for group in found}) == 1
+
+
+def test_photos_that_name_no_lens_are_of_as_many_lenses_as_focal_lengths() -> None:
+    unnamed = replace(ZOOM, lens=LensIdentity())
+
+    found = groups(shots(unnamed, replace(unnamed, focal_mm=50.0)))
+
+    assert len({group.name for group in found}) == 2
+
+
+def test_two_bodies_and_two_copies_are_kept_apart() -> None:
+    copy = replace(ZOOM, lens=LensIdentity("Test", "24-70mm", "8", "exif"))
+    body = replace(ZOOM, body_serial="1")
+
+    assert len(groups(shots(ZOOM, copy, body, ZOOM))) == 3
+
+
+def test_copies_whose_serials_end_alike_have_profiles_of_their_own() -> None:
+    one = replace(ZOOM, lens=LensIdentity("Test", "24-70mm", "111234", "exif"))
+    other = replace(ZOOM, lens=LensIdentity("Test", "24-70mm", "991234", "exif"))
+
+    assert len({group.name for group in groups(shots(one, other))}) == 2
+
+
+def test_a_name_of_a_lens_is_never_a_path() -> None:
+    evil = replace(ZOOM, camera_model="../../etc", lens=LensIdentity("x", "a/b\\c", None, "none"))
+
+    (group,) = groups(shots(evil))
+
+    assert not set("/\\") & set(group.name)
+    assert not group.name.startswith(".")
+
+
+def test_every_aperture_is_learned_from_before_any_is_twice() -> None:
+    apertures = [2.8, 2.8, 2.8, 8.0, 4.0]
+    (group,) = groups(shots(*(replace(ZOOM, aperture=float(n)) for n in np.array(apertures))))
+
+    assert [shot.metadata.aperture for shot in group.to_learn_from()] == [2.8, 4.0, 8.0, 2.8, 2.8]

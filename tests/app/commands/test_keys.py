@@ -1,0 +1,64 @@
+"""`lensmodel keys`, and the client that sends one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import httpx2
+import pytest
+from typer.testing import CliRunner
+
+from app.cli import app
+from app.client import Client
+from app.commands.console.failure import UsageError
+from lensmodel.core.errors import InvalidInputError
+
+RUNNER = CliRunner()
+
+
+def run(folder: Path, *words: str) -> tuple[str, str]:
+    done = RUNNER.invoke(app, ["keys", *words, "--data", str(folder)], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return done.stdout, done.stderr
+
+
+def test_a_key_is_made_listed_renewed_and_ended(tmp_path: Path) -> None:
+    text, hint = run(tmp_path, "create", "--owner", "anna", "--scope", "read", "--label", "notebook")
+    assert text.startswith("lpk_")
+    assert text.count("\n") == 1  # it can be passed on as it is
+    assert "Shown once" in hint
+
+    [key] = json.loads(run(tmp_path, "list", "--json")[0])
+    assert (key["owner"], key["scope"], key["label"], key["state"]) == ("anna", "read", "notebook", "valid")
+    assert text.strip().rpartition("_")[2] not in str(key)
+    renewed, _ = run(tmp_path, "rotate", text.strip(), "--keep", "0h")
+    run(tmp_path, "revoke", renewed[4:12])
+
+    states = [key["state"] for key in json.loads(run(tmp_path, "list", "--owner", "anna", "--json")[0])]
+    assert states == ["revoked", "revoked"]
+    assert "owner anna" in run(tmp_path, "list")[0]
+
+
+def test_what_cannot_be_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="such as 90d; got '3 months'"):
+        run(tmp_path, "create", "--expires", "3 months")
+    with pytest.raises(UsageError, match="owner's name"):
+        run(tmp_path, "create", "--owner", " ")
+    with pytest.raises(InvalidInputError, match="no valid key begins with abcd2345"):
+        run(tmp_path, "rotate", "abcd2345")
+
+
+def test_the_client_sends_its_key_or_that_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    def sent(client: Client) -> str | None:
+        with client:
+            header: str | None = client._http.headers.get("Authorization")
+        return header
+
+    monkeypatch.delenv("LENS_API_KEY", raising=False)
+    assert sent(Client()) is None
+    assert sent(Client(key="lpk_a")) == "Bearer lpk_a"
+    monkeypatch.setenv("LENS_API_KEY", "lpk_b")
+    assert sent(Client()) == "Bearer lpk_b"
+    assert sent(Client(key="")) is None
+    assert sent(Client(http=httpx2.Client())) is None

@@ -1,0 +1,129 @@
+"""`lensmodel report` and `lensmodel export` on a profile, as a person types them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+import tifffile
+from typer.testing import CliRunner
+
+from app.cli import app
+from app.commands.console.failure import UsageError
+from lensmodel.core.codec import from_json
+from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
+from lensmodel.report import Advice, LensReport
+
+NAME = "my-24mm.lensprofile"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a profile of two apertures, and the command run in it."""
+    samples = []
+    for photo, aperture in (("a", 2.0), ("b", 2.0), ("c", 5.6)):
+        for r in (0.1, 0.35, 0.6, 0.85):
+            for k in range(5):
+                place = FieldPosition(r, 2.0 * math.pi * k / 5 + r)
+                kernel = gaussian(15, np.eye(2) * (0.5 + 1.5 * r + 2.0 / aperture))
+                samples.append(PsfSample(kernel, place, LensSettings(aperture=aperture), photo=photo))
+    save_profile(tmp_path / NAME, LensProfile(LensModel.fit(samples)))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(*words: str) -> str:
+    result = CliRunner().invoke(app, [*words], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def test_the_report_speaks_of_sharpness_centring_aperture_and_the_next_photo(folder: Path) -> None:
+    text = run("report", NAME)
+
+    assert text.startswith("3 photos, 60 samples; f/2, channel g\n")
+    for words in ("MTF50 lies between", "centred", "sharpest at f/5.6", "something with fine detail"):
+        assert words in text
+
+
+def test_the_report_as_json_reads_back(folder: Path) -> None:
+    stored = json.loads(run("report", NAME, "--json", "--aperture", "5.6"))
+
+    report, advice = from_json(LensReport, stored["report"]), from_json(Advice, stored["advice"])
+    assert report.settings.aperture == 5.6
+    assert advice.wishes
+
+
+def test_the_report_folder_holds_numbers_and_pictures_that_agree(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lensmodel.report.bootstrap.DRAWS", 2)
+    run("report", NAME, "-o", "out", "--against", NAME)
+
+    names = {p.name for p in (folder / "out").iterdir()}
+    tests = {f"lens-test.{ending}" for ending in ("html", "pdf", "csv", "json")}
+    both = {"comparison.html", "comparison.pdf"}
+    assert names == {
+        *("report.json", "mtf.csv", "mtf-map.svg", "mtf-curves.svg", "apertures.svg"),
+        *tests,
+        *both,
+    }
+    page = (folder / "out" / "lens-test.html").read_text(encoding="utf-8")
+    assert "At f/2 this copy is" in page
+    assert "alike in the center" in (folder / "out" / "comparison.html").read_text(encoding="utf-8")
+    stored = json.loads((folder / "out" / "report.json").read_text(encoding="utf-8"))
+    with (folder / "out" / "mtf.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["mtf50_sagittal"]) for row in rows] == pytest.approx(
+        [point["sagittal"] for point in stored["report"]["field"]], abs=1e-6
+    )
+    for name in names:
+        if name.endswith(".svg"):
+            ET.fromstring((folder / "out" / name).read_text(encoding="utf-8"))
+
+
+def test_files_that_are_there_are_kept_without_force(folder: Path) -> None:
+    (folder / "out").mkdir()
+    for name in ("out/report.json", "psf.tif"):
+        (folder / name).write_text("mine", encoding="utf-8")
+
+    for words in (("report", NAME, "-o", "out"), ("export", NAME, "-o", "psf.tif")):
+        with pytest.raises(UsageError, match="--force replaces it"):
+            run(*words)
+    assert {p.name for p in (folder / "out").iterdir()} == {"report.json"}
+    assert (folder / "psf.tif").read_text(encoding="utf-8") == "mine"
+
+    run("export", NAME, "-o", "psf.tif", "--force")
+    assert tifffile.imread(folder / "psf.tif").shape == (35, 31, 31)
+
+
+def test_an_exported_stack_holds_the_answers_of_the_profile(folder: Path) -> None:
+    run("export", NAME, "-o", "psf.tif", "--rows", "2", "--cols", "3", "--size", "15", "--aperture", "2")
+
+    pages = tifffile.imread(folder / "psf.tif")
+    model = load_profile(folder / NAME).model
+    width, height = 1.5 / math.hypot(1.5, 1.0), 1.0 / math.hypot(1.5, 1.0)
+    x, y = -2.0 / 3.0 * width, 0.5 * height
+    first = model.query(FieldPosition(math.hypot(x, y), math.atan2(y, x)), LensSettings(aperture=2.0), 15)
+    assert pages.shape == (6, 15, 15)
+    assert pages[0] == pytest.approx(first.kernel, abs=1e-7)
+
+
+def test_a_comparison_needs_a_folder(folder: Path) -> None:
+    with pytest.raises(UsageError, match="--against needs --output"):
+        run("report", NAME, "--against", NAME)
+
+
+def test_unknown_formats_and_channels_are_refused_and_nothing_is_written(folder: Path) -> None:
+    with pytest.raises(UsageError, match="csv, fits, json"):
+        run("export", NAME, "--format", "bmp", "-o", "psf.bmp")
+    with pytest.raises(UsageError, match="r, g or b"):
+        run("export", NAME, "--channel", "x", "-o", "psf.tif")
+    assert [p.name for p in folder.iterdir()] == [NAME]

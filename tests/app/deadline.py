@@ -1,0 +1,30 @@
+"""Deadlines in seconds of an idle machine: they last longer where others use its processors too."""
+
+from __future__ import annotations
+
+import os
+import time
+
+
+def slowness() -> float:
+    """How many processes share a processor, over the last minute; 1 on an idle machine."""
+    return max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+
+
+def stretched(seconds: float) -> float:
+    """Return as many seconds as the machine, busy as it is now, takes for those of an idle one."""
+    return seconds * slowness()
+
+
+class Deadline:
+    """Some seconds of an idle machine from now, counted slower while it is busy."""
+
+    def __init__(self, seconds: float) -> None:
+        self._left, self._asked = seconds, time.monotonic()
+
+    def passed(self) -> bool:
+        """Say whether they are over; to be asked again and again."""
+        now = time.monotonic()
+        self._left -= (now - self._asked) / slowness()
+        self._asked = now
+        return self._left <= 0.0

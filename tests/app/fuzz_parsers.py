@@ -1,0 +1,208 @@
+"""Feed damaged files to all that reads what strangers send; keep each that is not refused in words.
+
+    python tests/app/fuzz_parsers.py [--minutes 10] [--seed 0] [--keep FOLDER]
+
+Each reader gets a valid file of its kind with random damage: bytes set, inserted, removed, doubled, numbers
+of the header made huge, the end cut off. It may read it, or refuse it with an error of the library; any other
+exception, and more than ten seconds, is a fault, and its file is kept. Damage that reached a new line of our
+own modules is built upon (coverage by `sys.settrace`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType
+
+import numpy as np
+from PIL import Image
+from python_multipart.exceptions import FormParserError
+
+from app.http.upload import _Form
+from lensmodel import photo
+from lensmodel.core.errors import LensModelError
+from lensmodel.core.evidence import PatchEvidence
+from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.spectrum import PatchSpectrum
+from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
+from lensmodel.photo.dng import ShotInfo, write_bayer_dng
+
+SLOW_S = 10.0
+POOL = 400
+"""Files kept for each reader (chosen): what reached a new line, the newest first to go."""
+
+Reader = Callable[[Path], object]
+
+
+def _multipart(path: Path) -> object:
+    form = _Form()
+    parser = form.parser(b"lens")
+    try:
+        parser.write(path.read_bytes())
+        parser.finalize()
+    except FormParserError as error:
+        raise LensModelError(str(error)) from error
+    return form.fields
+
+
+READERS: dict[str, tuple[str, Reader]] = {
+    "inspect dng": ("a.dng", photo.inspect),
+    "inspect tiff": ("a.tif", photo.inspect),
+    "inspect jpeg": ("a.jpg", photo.inspect),
+    "inspect png": ("a.png", photo.inspect),
+    "sniff": ("a.dng", lambda path: photo.sniff(path.read_bytes()[: photo.HEAD_BYTES])),
+    "profile": ("a.lensprofile", load_profile),
+    "spectrum": ("spectrum", lambda path: PatchSpectrum.from_bytes(path.read_bytes())),
+    "statistics": ("spectrum", lambda path: PatchEvidence.from_bytes(path.read_bytes())),
+    "multipart": ("multipart", _multipart),
+}
+
+
+def write_seeds(folder: Path) -> None:
+    """Write a small valid file of each kind."""
+    rng = np.random.default_rng(0)
+    mosaic = rng.integers(512, 9000, (96, 128), dtype=np.uint16)
+    shot = ShotInfo(
+        camera_maker="Test",
+        camera_model="T-1",
+        lens_maker="Test",
+        lens_model="50mm",
+        lens_serial="1",
+        aperture=2.0,
+    )
+    write_bayer_dng(folder / "a.dng", mosaic, black=512, white=15512, shot=shot)
+    picture = Image.fromarray(rng.integers(0, 255, (48, 64, 3), dtype=np.uint8))
+    exif = Image.Exif()
+    exif[0x010F], exif[0x829D] = "Test", 2.8
+    for name in ("a.tif", "a.jpg", "a.png"):
+        picture.save(folder / name, exif=exif)
+    samples = [
+        PsfSample(gaussian(15, np.eye(2)), FieldPosition(r, 0.3), LensSettings(2.8, 35.0), photo="x")
+        for r in (0.1, 0.5, 0.9)
+    ]
+    save_profile(
+        folder / "a.lensprofile", LensProfile(LensModel.fit(samples), {"model": "x"}, {"0" * 16: "x.dng"})
+    )
+    (folder / "spectrum").write_bytes(rng.bytes(256))
+    (folder / "multipart").write_bytes(
+        b'--lens\r\nContent-Disposition: form-data; name="aperture"\r\n\r\n2.8\r\n'
+        b'--lens\r\nContent-Disposition: form-data; name="file"; filename="a.dng"\r\n\r\nII*\0\r\n'
+        b"--lens--\r\n"
+    )
+
+
+def damaged(data: bytes, others: list[bytes], rng: random.Random) -> bytes:
+    """Return a file with one to eight kinds of damage."""
+    out = bytearray(data)
+    for _ in range(rng.randint(1, 8)):
+        at = rng.randrange(max(len(out), 1))
+        kind = rng.randrange(7)
+        if kind == 0 and out:
+            out[at] = rng.randrange(256)
+        elif kind == 1:
+            out[at:at] = rng.randbytes(rng.randint(1, 16))
+        elif kind == 2:
+            del out[at : at + rng.randint(1, 64)]
+        elif kind == 3:
+            out[at : at + 4] = rng.choice((b"\xff" * 4, b"\0" * 4, b"\x7f\xff\xff\xff", b"\0\0\0\x80"))
+        elif kind == 4:
+            out += out[at : at + 512]
+        elif kind == 5:
+            del out[rng.randrange(len(out) + 1) :]
+        else:
+            other = rng.choice(others)
+            cut = rng.randrange(max(len(other), 1))
+            out[at : at + 32] = other[cut : cut + 32]
+    return bytes(out)
+
+
+class Lines:
+    """Notes which lines of our own code ran."""
+
+    def __init__(self) -> None:
+        self.known: set[tuple[str, int]] = set()
+        self.fresh = False
+
+    def trace(self, frame: FrameType, event: str, argument: object) -> Callable[..., object] | None:
+        """Follow calls into our own modules."""
+        del argument
+        name = frame.f_code.co_filename
+        if "lensmodel" not in name and "/app/" not in name:
+            return None
+        if event == "line":
+            place = (name, frame.f_lineno)
+            if place not in self.known:
+                self.known.add(place)
+                self.fresh = True
+        return self.trace
+
+
+def rounds(minutes: float, seed: int, keep: Path) -> Iterator[tuple[str, Path, str]]:
+    """Feed for some minutes; give each fault as reader, file and reason; print a summary at the end."""
+    rng = random.Random(seed)
+    lines, done = Lines(), Counter[str]()
+    with tempfile.TemporaryDirectory() as scratch:
+        seeds = Path(scratch)
+        write_seeds(seeds)
+        pools = {name: [(seeds / file).read_bytes()] for name, (file, _) in READERS.items()}
+        every = [pool[0] for pool in pools.values()]
+        end = time.monotonic() + 60.0 * minutes
+        names = list(READERS)
+        while time.monotonic() < end:
+            name = names[sum(done.values()) % len(names)]
+            file, reader = READERS[name]
+            data = damaged(rng.choice(pools[name]), every, rng)
+            path = seeds / f"try-{file}"
+            path.write_bytes(data)
+            began, reason = time.monotonic(), ""
+            lines.fresh = False
+            sys.settrace(lines.trace)
+            try:
+                reader(path)
+            except LensModelError:
+                pass
+            except Exception:  # noqa: BLE001 - whatever else it is, is what we look for
+                reason = traceback.format_exc()
+            finally:
+                sys.settrace(None)
+            if time.monotonic() - began > SLOW_S:
+                reason = f"took {time.monotonic() - began:.0f} s"
+            done[name] += 1
+            if lines.fresh:
+                pools[name] = [pools[name][0], *pools[name][1:][-POOL:], data]
+            if reason:
+                kept = keep / f"{name.replace(' ', '-')}-{done[name]}"
+                keep.mkdir(parents=True, exist_ok=True)
+                kept.write_bytes(data)
+                yield name, kept, reason
+    print(json.dumps({"files": dict(done), "lines of our code reached": len(lines.known)}))
+
+
+def main() -> int:
+    """Run for the time that was asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--keep", type=Path, default=Path("bench-output/fuzz"))
+    wishes = parser.parse_args()
+    faults = Counter[str]()
+    for name, path, reason in rounds(wishes.minutes, wishes.seed, wishes.keep):
+        last = reason.strip().splitlines()[-1]
+        if not faults[f"{name}: {last}"]:
+            print(f"FAULT {name}: {path}\n{reason}")
+        faults[f"{name}: {last}"] += 1
+    print(f"{sum(faults.values())} faults of {len(faults)} kinds")
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

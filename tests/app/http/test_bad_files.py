@@ -1,0 +1,150 @@
+"""Broken and hostile files against the running service: a clear answer each, and it goes on working."""
+
+from __future__ import annotations
+
+import struct
+import sys
+import time
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+HERE = Path(__file__).parents[1]
+sys.path.insert(0, str(HERE))
+from deadline import Deadline  # noqa: E402 - beside these files
+from running import PATIENCE_S, Service, running, write_photo  # noqa: E402 - beside this file
+
+sys.path.remove(str(HERE))
+
+KNOWN_CODES = {
+    "malformed_upload",
+    "not_an_image",
+    "truncated_image",
+    "unsupported_format",
+    "image_too_large",
+    "decompression_bomb",
+    "raw_decode_failed",
+    "metadata_missing",
+    "no_usable_patches",
+    "memory_limit",
+    "time_limit",
+}
+TOLD = {"lens_serial": "L-1", "lens_model": "Test lens", "aperture": "4"}
+"""What the owner says, so that a file is taken as far as its pixels allow."""
+
+ENDED = {"counted", "stored", "failed", "cancelled"}
+
+
+def png(width: int, height: int, data: bytes = b"") -> bytes:
+    def chunk(name: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(data))
+        + chunk(b"IEND", b"")
+    )
+
+
+def tiff(entries: list[tuple[int, int, int, int]], following: int = 0) -> bytes:
+    fields = b"".join(struct.pack("<HHII", *entry) for entry in entries)
+    return b"II*\0" + struct.pack("<IH", 8, len(entries)) + fields + struct.pack("<I", following)
+
+
+OWN = {
+    "empty.dng": b"",
+    "text.jpg": b"this is no picture at all\n" * 40,
+    "zip.nef": b"PK\x03\x04" + bytes(100),
+    "svg.png": b'<svg xmlns="http://www.w3.org/2000/svg"><script>alert(1)</script></svg>',
+    "half_a_header.png": png(100, 100)[:20],
+    "bomb.png": png(60000, 60000),
+    "tall.png": png(1, 2**31 - 1),
+    "no_pixels.png": png(200, 200),
+    "grey.png": png(300, 300, (b"\0" + b"\x80" * 900) * 300),
+    "only_a_start.jpg": b"\xff\xd8\xff\xe0\x00\x10JFIF\0" + bytes(9),
+    "no_frame.jpg": b"\xff\xd8\xff\xd9",
+    "directory_of_itself.tif": tiff([(256, 4, 1, 100), (257, 4, 1, 100)], following=8),
+    "huge.tif": tiff([(256, 4, 1, 2**31), (257, 4, 1, 2**31), (273, 4, 1, 8)]),
+    "outside.tif": tiff([(256, 4, 1, 64), (257, 4, 1, 64), (273, 4, 1, 2**31), (279, 4, 1, 12288)]),
+    "many_entries.tif": b"II*\0" + struct.pack("<IH", 8, 65535) + bytes(64),
+    "beyond_the_end.tif": b"II*\0" + struct.pack("<I", 2**31),
+}
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    limits = {"LENS_INSPECT_SECONDS": "30", "LENS_WORKER_MEMORY_MB": "3000", "LENS_MAX_MEGAPIXELS": "50"}
+    with running(tmp_path_factory.mktemp("bad") / "data", **limits) as made:
+        yield made
+
+
+def send_all(service: Service, files: dict[str, bytes]) -> dict[str, dict[str, Any]]:
+    """Send all files, wait until each has its answer; return the answers by name."""
+    answers, waiting = {}, {}
+    for name, content in files.items():
+        answer = service.http.post("/v1/photos", files={"file": (name, content)}, data=TOLD)
+        assert answer.status_code in {200, 202, 400, 413, 415, 422}, f"{name}: {answer.text}"
+        if answer.status_code < 300:
+            waiting[name] = answer.json()["id"]
+        else:
+            answers[name] = answer.json()
+    deadline = Deadline(PATIENCE_S * 2)
+    while waiting:
+        for name, photo_id in list(waiting.items()):
+            photo = service.get(f"/v1/photos/{photo_id}")
+            if photo["state"] in ENDED:
+                answers[name] = photo["error"] or {"code": photo["state"], "detail": "done"}
+                del waiting[name]
+        assert not deadline.passed(), f"stuck: {waiting}\n{service.log.read_text()[-3000:]}"
+        time.sleep(0.1)
+    return answers
+
+
+@pytest.fixture(scope="module")
+def answers(service: Service) -> dict[str, dict[str, Any]]:
+    return send_all(service, OWN)
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_a_bad_file_is_refused_with_a_code_and_a_sentence(
+    name: str, answers: dict[str, dict[str, Any]]
+) -> None:
+    problem = answers[name]
+
+    assert problem["code"] in KNOWN_CODES, problem
+    assert len(problem["detail"]) > 15
+    assert "Traceback" not in problem["detail"]
+
+
+@pytest.mark.parametrize("name", ["bomb.png", "tall.png", "huge.tif"])
+def test_a_bomb_is_refused_by_its_header(name: str, answers: dict[str, dict[str, Any]]) -> None:
+    assert answers[name]["code"] in {"decompression_bomb", "image_too_large"}
+
+
+def test_a_good_photo_still_goes_through_afterwards_in_the_same_worker(
+    service: Service, answers: dict[str, dict[str, Any]], tmp_path: Path
+) -> None:
+    photo = service.calibrated(write_photo(tmp_path / "good.dng", 77))
+
+    assert photo["state"] == "counted"
+    assert "started again" not in service.log.read_text()
+
+
+@pytest.mark.tools
+def test_each_file_of_the_collection_is_refused_or_processed_and_none_is_stuck(
+    service: Service, shared_data: Path
+) -> None:
+    files = {path.name: path.read_bytes() for path in sorted((shared_data / "bad").iterdir())}
+    assert len(files) > 40
+
+    answers = send_all(service, files)
+
+    codes = {name: answer["code"] for name, answer in answers.items()}
+    assert codes.keys() == files.keys()
+    assert {name: code for name, code in codes.items() if code not in KNOWN_CODES | {"counted"}} == {}
+    assert "started again" not in service.log.read_text()

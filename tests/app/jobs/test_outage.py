@@ -1,0 +1,395 @@
+"""A database, a storage or a disk that is away for a while costs time and no photo."""
+
+from __future__ import annotations
+
+import errno
+import os
+import random
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import psycopg
+import pytest
+from obstore import exceptions as stored
+from sqlalchemy import exc, func, select
+from starlette.testclient import TestClient
+
+from app.blobs.storage import Storage
+from app.jobs.worker import Worker
+from app.runtime.outage import Patience, is_outage
+from app.runtime.settings import Settings
+from app.runtime.supervisor import environment
+from app.store import LensName, Store
+from app.store.ids import new_id
+from app.store.tables import EventRow, PhotoRow, SampleRow
+from app.store.upkeep.migrate import upgrade
+
+HERE = Path(__file__).parents[1]
+sys.path.insert(0, str(HERE))
+from deadline import Deadline  # noqa: E402 - beside these files
+from servers import postgres  # noqa: E402 - same
+
+sys.path.remove(str(HERE))
+
+CELLS = 8
+PATIENCE_S = 180.0
+"""Of an idle machine, see `deadline`."""
+
+
+def sqlite_error(code: int) -> exc.OperationalError:
+    error = sqlite3.OperationalError("said by SQLite")
+    error.sqlite_errorcode = code
+    return exc.OperationalError("SELECT", {}, error)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        exc.OperationalError("SELECT", {}, psycopg.OperationalError("the connection is closed")),
+        exc.InterfaceError("SELECT", {}, psycopg.InterfaceError("the connection is lost")),
+        exc.TimeoutError("no connection within 30 s"),
+        sqlite_error(sqlite3.SQLITE_BUSY),
+        sqlite_error(sqlite3.SQLITE_FULL),
+        stored.GenericError("error sending request"),
+        stored.PermissionDeniedError("credentials are being changed"),
+        OSError(errno.ENOSPC, "no space"),
+        ConnectionRefusedError(),
+        MemoryError(),
+    ],
+)
+def test_errors_of_the_machinery_are_known(error: Exception) -> None:
+    assert is_outage(error)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ValueError("of ours"),
+        KeyError("of ours"),
+        FileNotFoundError(errno.ENOENT, "gone"),
+        stored.InvalidPathError("of ours"),
+        exc.IntegrityError("INSERT", {}, Exception("of ours")),
+        sqlite_error(sqlite3.SQLITE_ERROR),
+    ],
+)
+def test_errors_of_ours_are_no_outage(error: Exception) -> None:
+    assert not is_outage(error)
+
+
+def test_pauses_grow_from_a_second_to_a_minute_until_hours_have_passed() -> None:
+    now = 0.0
+    patience = Patience(3600.0, clock=lambda: now, rng=random.Random(3))
+    pauses = []
+    while (pause := patience.pause_after(ConnectionResetError())) is not None:
+        pauses.append(pause)
+        now += pause
+
+    assert 1.0 <= min(pauses) < 2.0
+    assert 45.0 < max(pauses) <= 60.0
+    assert pauses[0] <= 2.0
+    assert len({round(pause, 3) for pause in pauses}) == len(pauses)  # never in step with others
+    assert 3600.0 < now <= 3660.0
+
+
+def test_what_nobody_foresaw_is_tried_three_times() -> None:
+    patience = Patience(3600.0)
+
+    assert [patience.pause_after(KeyError()) for _ in range(3)] == [1.0, 2.0, None]
+
+
+class Away:
+    """A job that fails so often before it succeeds."""
+
+    def __init__(self, error: Exception, times: int) -> None:
+        self.error, self.left, self.runs = error, times, 0
+        self.__name__ = "job"
+
+    def __call__(self, *arguments: object) -> None:
+        self.runs += 1
+        if self.left:
+            self.left -= 1
+            raise self.error
+
+
+@pytest.fixture
+def worker(settings: Settings, store: Store, monkeypatch: pytest.MonkeyPatch) -> Worker:
+    made = Worker(settings)
+    monkeypatch.setattr(made, "_rest", lambda _: None)
+    return made
+
+
+def test_a_job_outlasts_an_outage(worker: Worker, store: Store, steps: Any) -> None:
+    photo = steps.receive()
+    job = Away(exc.OperationalError("SELECT", {}, psycopg.OperationalError("away")), times=9)
+
+    worker._safe(job, worker._photo_broke)(photo.public_id, 1)
+
+    assert job.runs == 10
+    assert steps.fresh(photo).state == "received"
+
+
+def test_a_job_that_waited_in_vain_ends_as_such(
+    worker: Worker, store: Store, steps: Any, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker, "_settings", settings.model_copy(update={"outage_hours": 0.0}))
+    photo = steps.receive()
+    steps.inspect(photo)
+
+    worker._safe(Away(OSError(errno.ENOSPC, "full"), times=10**6), worker._cell_broke)(photo.public_id, 1, 0)
+
+    failed = steps.fresh(photo)
+    assert (failed.state, failed.error_code) == ("failed", "outage")
+
+
+def test_a_bug_ends_the_job_after_three_tries(worker: Worker, steps: Any) -> None:
+    photo, job = steps.receive(), Away(KeyError("a bug"), times=10)
+
+    worker._safe(job, worker._photo_broke)(photo.public_id, 1)
+
+    assert (steps.fresh(photo).error_code, job.runs) == ("internal_error", 3)
+
+
+def test_a_worker_keeps_its_lease_while_its_engine_starts(
+    worker: Worker, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Slow:
+        """As on a machine that is busy: the tables of the jobs take longer than a lease."""
+
+        def start(self, handlers: object) -> None:
+            del handlers
+            first = store.workers.all()[0].heartbeat_at
+            end = time.monotonic() + PATIENCE_S
+            while store.workers.all()[0].heartbeat_at == first and time.monotonic() < end:
+                time.sleep(0.02)
+            beats.append(store.workers.all()[0].heartbeat_at > first)
+            worker.stop()
+
+    beats: list[bool] = []
+    monkeypatch.setattr(worker, "_engine", Slow())
+    monkeypatch.setattr(worker, "_settings", worker._settings.model_copy(update={"lease_seconds": 1.0}))
+    monkeypatch.setattr(worker, "_leave", lambda: None)
+    monkeypatch.setattr(worker, "_bury_the_gone", lambda _: None)
+
+    worker.run()
+
+    assert beats == [True]
+
+
+def failed_photo(store: Store, steps: Any, code: str = "outage") -> PhotoRow:
+    photo: PhotoRow = steps.receive()
+    steps.inspect(photo)
+    assert store.photos.fail(photo.public_id, 1, code, "for a test")
+    return photo
+
+
+def failed_correction(store: Store, steps: Any, strength: float = 1.0) -> str:
+    photo = steps.counted()
+    lens = store.photos.lens_of(photo)
+    assert lens is not None
+    params = {"method": "fast", "strength": strength, "output": {"format": "png8"}, "roi": None}
+    correction, _ = store.corrections.create(photo, lens, lens.version, params)
+    assert store.corrections.start(correction.public_id)
+    assert store.corrections.fail(correction.public_id, "outage", "for a test")
+    return correction.public_id
+
+
+def test_a_failed_photo_is_retried_by_one_call(client: TestClient, store: Store, steps: Any) -> None:
+    photo = failed_photo(store, steps)
+
+    answer = client.post(f"/v1/jobs/{photo.public_id}/retry")
+
+    assert (answer.status_code, answer.json()["state"], answer.json()["error"]) == (202, "queued", None)
+    assert store.photos.to_do() == [(photo.public_id, 2, "local")]
+    again = client.post(f"/v1/jobs/{photo.public_id}/retry")
+    assert (again.status_code, again.json()["code"]) == (409, "conflict")
+
+
+def test_a_failed_correction_is_retried_as_another_job_of_the_engine(
+    client: TestClient, store: Store, steps: Any
+) -> None:
+    correction = failed_correction(store, steps)
+
+    answer = client.post(f"/v1/jobs/{correction}/retry")
+
+    assert (answer.status_code, answer.json()["state"]) == (202, "queued")
+    assert store.corrections.to_do() == [(correction, 2, "local")]
+    assert not store.corrections.fail(correction, "outage", "said late by the first try", epoch=1)
+    assert store.corrections.start(correction, epoch=2)
+
+
+def test_a_retry_gives_way_to_the_same_wish_made_again(client: TestClient, store: Store, steps: Any) -> None:
+    correction = failed_correction(store, steps)
+    plan = store.corrections.plan(correction)
+    assert plan is not None
+    store.corrections.create(plan.photo, plan.lens, plan.correction.lens_version, plan.correction.params)
+
+    assert client.post(f"/v1/jobs/{correction}/retry").status_code == 409
+
+
+def test_an_unknown_job_cannot_be_retried(client: TestClient) -> None:
+    assert client.post("/v1/jobs/nothing/retry").status_code == 404
+
+
+def test_all_that_an_outage_ended_is_retried_by_one_call(
+    client: TestClient, store: Store, steps: Any
+) -> None:
+    photos = [failed_photo(store, steps) for _ in range(3)]
+    other = failed_photo(store, steps, "no_usable_patches")
+    correction = failed_correction(store, steps)
+
+    answers = [client.post("/v1/jobs/retry", params={"limit": 2}).json() for _ in range(3)]
+
+    assert answers == [{"retried": 2}, {"retried": 2}, {"retried": 0}]
+    assert {row[0] for row in store.photos.to_do()} == {photo.public_id for photo in photos}
+    assert [row[0] for row in store.corrections.to_do()] == [correction]
+    assert steps.fresh(other).state == "failed"
+
+
+# --- real workers -----------------------------------------------------------------------------
+
+
+@contextmanager
+def hired(settings: Settings) -> Iterator[subprocess.Popen[bytes]]:
+    path = os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")])
+    with (settings.data_dir / "workers.log").open("a") as log:
+        process = subprocess.Popen(
+            [sys.executable, str(HERE / "quick_worker.py")],
+            env=os.environ | environment(settings) | {"PYTHONPATH": path},
+            stderr=log,
+        )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def until(condition: Callable[[], object], log: Path) -> None:
+    deadline = Deadline(PATIENCE_S)
+    while not condition():
+        assert not deadline.passed(), log.read_text()[-4000:]
+        time.sleep(0.1)
+
+
+def send(store: Store, storage: Storage, count: int) -> list[str]:
+    ids = []
+    for number in range(count):
+        public_id = new_id()
+        storage.put(f"photos/{public_id}/original", b"a photo")
+        store.photos.receive(
+            "local",
+            public_id=public_id,
+            sha256=f"{number:064x}",
+            filename="p.dng",
+            kind="dng",
+            byte_size=7,
+            blob_key=f"photos/{public_id}/original",
+            calibrate=True,
+            given={},
+        )
+        ids.append(public_id)
+    return ids
+
+
+def states(store: Store) -> set[str]:
+    with store.database.reading() as session:
+        return set(session.scalars(select(PhotoRow.state)))
+
+
+def check_counted_once(store: Store, photos: int) -> None:
+    with store.database.reading() as session:
+        samples = session.scalar(select(func.count()).select_from(SampleRow))
+        events = session.scalar(select(func.count()).where(EventRow.kind == "photo_added"))
+    assert states(store) == {"counted"}
+    assert (samples, events) == (photos * CELLS * 3, photos)
+
+
+def test_photos_outlast_a_storage_that_is_away(settings: Settings, store: Store, tmp_path: Path) -> None:
+    settings = settings.model_copy(update={"worker_slots": 2, "sweep_seconds": 0.1})
+    storage = Storage(settings.storage)
+    assert storage.folder is not None
+    aside = storage.folder.with_name("aside")
+    log = settings.data_dir / "workers.log"
+    with hired(settings):
+        until(lambda: store.workers.live(60.0), log)
+        storage.folder.rename(aside)
+        send(store, Storage(f"file://{aside}"), 3)
+        until(lambda: log.read_text().count("is away") >= 6, log)
+        seen = states(store)
+        aside.rename(storage.folder)
+        until(lambda: states(store) == {"counted"}, log)
+
+    assert "failed" not in seen
+    check_counted_once(store, 3)
+
+
+def test_workers_that_start_while_the_storage_is_away_wait_for_it(settings: Settings, store: Store) -> None:
+    settings = settings.model_copy(update={"worker_slots": 2, "sweep_seconds": 0.1})
+    storage = Storage(settings.storage)
+    assert storage.folder is not None
+    send(store, storage, 2)
+    aside = storage.folder.with_name("aside")
+    storage.folder.rename(aside)
+    storage.folder.mkdir()  # as where nothing is mounted
+    log = settings.data_dir / "workers.log"
+    with hired(settings):
+        until(lambda: log.read_text().count("is away") >= 2, log)
+        seen, left = states(store), list(storage.folder.iterdir())
+        storage.folder.rmdir()
+        aside.rename(storage.folder)
+        until(lambda: states(store) == {"counted"}, log)
+
+    assert "failed" not in seen
+    assert left == []
+    check_counted_once(store, 2)
+
+
+@pytest.mark.tools
+@pytest.mark.slow
+def test_photos_outlast_a_database_that_is_away(tmp_path: Path) -> None:
+    with postgres() as server:
+        settings = Settings(
+            data_dir=tmp_path / "data",
+            database_url=server.url("app"),
+            jobs_url=server.url("jobs"),
+            shared_filesystem=True,
+            worker_slots=2,
+            sweep_seconds=0.1,
+            min_free_mb=0,
+        )
+        settings.data_dir.mkdir()
+        store = Store(settings)
+        upgrade(store.database)
+        send(store, Storage(settings.storage), 6)
+        log = settings.data_dir / "workers.log"
+
+        with hired(settings) as worker:
+            until(lambda: "estimating" in states(store), log)
+            server.stop()
+            time.sleep(9.0)  # long enough for three quick tries
+            server.start()
+            until(lambda: states(store) == {"counted"}, log)
+            survived = worker.poll() is None
+
+        check_counted_once(store, 6)
+        assert survived
+        store.close()
+
+
+def test_a_lens_named_by_hand_keeps_its_name_after_a_retry(
+    client: TestClient, store: Store, steps: Any
+) -> None:
+    photo = failed_photo(store, steps)
+    assert store.photos.change(photo.public_id, "local", {}, lens=LensName(None, None, None, label="mine"))
+    lens_id = steps.fresh(photo).given["lens_id"]
+    store.photos.fail(photo.public_id, 2, "outage", "again")
+
+    client.post(f"/v1/jobs/{photo.public_id}/retry")
+
+    assert steps.fresh(photo).given["lens_id"] == lens_id

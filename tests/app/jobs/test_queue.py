@@ -1,0 +1,218 @@
+"""The contract that the job engine must keep: it pins what we rely on in the library behind it."""
+
+from __future__ import annotations
+
+import sqlite3
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from app.jobs.queue import MAX_STARTS, DbosEngine, Handler, Job, Kind
+
+HERE = Path(__file__).parents[1]
+sys.path.insert(0, str(HERE))
+from deadline import Deadline, stretched  # noqa: E402 - beside these files
+
+sys.path.remove(str(HERE))
+
+DEAD = "a-worker-that-died"
+
+
+class Ran:
+    """Handlers that note what ran."""
+
+    def __init__(self) -> None:
+        self.jobs: list[tuple[str, ...]] = []
+        self.handlers: dict[Kind, Handler] = {
+            kind: self._handler(kind) for kind in ("photo", "cell", "correction", "measure")
+        }
+
+    def _handler(self, kind: str) -> Handler:
+        def run(*arguments: str | int) -> None:
+            self.jobs.append((kind, *map(str, arguments)))
+
+        return run
+
+
+@pytest.fixture
+def url(tmp_path: Path) -> str:
+    return f"sqlite:///{tmp_path / 'jobs.db'}"
+
+
+@pytest.fixture
+def ran() -> Ran:
+    return Ran()
+
+
+@pytest.fixture
+def engine(url: str, ran: Ran) -> Iterator[DbosEngine]:
+    made = DbosEngine(url, "this-process", slots=2)
+    made.start(ran.handlers)
+    yield made
+    made.stop()
+
+
+def until(condition: Callable[[], object], within_s: float = 20.0) -> None:
+    deadline = Deadline(within_s)
+    while not condition():
+        assert not deadline.passed(), "it never happened"
+        time.sleep(0.02)
+
+
+def test_a_job_runs_once_however_often_it_is_asked_for(engine: DbosEngine, ran: Ran) -> None:
+    job = Job("photo", ("p1", 1))
+    for _ in range(3):
+        engine.enqueue(job)
+    until(lambda: engine.status(job) == "done")
+    engine._asked.clear()  # another process would not know that it was asked for
+    engine.enqueue(job)
+    engine.enqueue(Job("photo", ("p1", 2)))
+
+    until(lambda: len(ran.jobs) == 2)
+
+    assert ran.jobs == [("photo", "p1", "1"), ("photo", "p1", "2")]
+
+
+def test_a_job_may_ask_for_others_and_does_not_own_them(url: str) -> None:
+    seen: list[str] = []
+    engine = DbosEngine(url, "this-process", slots=2)
+
+    def photo(photo_id: str) -> None:
+        engine.enqueue(Job("cell", (photo_id, 0)))
+        engine.enqueue(Job("cell", (photo_id, 1)))
+
+    engine.start({"photo": photo, "cell": lambda photo_id, cell: seen.append(f"{photo_id}{cell}")})
+    try:
+        engine.enqueue(Job("photo", ("p",)))
+        until(lambda: len(seen) == 2)
+    finally:
+        engine.stop()
+
+    assert sorted(seen) == ["p0", "p1"]
+
+
+def test_a_failing_job_ends_and_is_not_repeated(url: str) -> None:
+    calls = []
+
+    def photo(photo_id: str) -> None:
+        calls.append(photo_id)
+        raise RuntimeError("deliberate")
+
+    engine = DbosEngine(url, "this-process", slots=2)
+    engine.start({"photo": photo})
+    try:
+        engine.enqueue(Job("photo", ("p",)))
+        until(lambda: engine.status(Job("photo", ("p",))) == "done")
+    finally:
+        engine.stop()
+
+    assert calls == ["p"]
+
+
+def test_a_job_that_nobody_asked_for_is_unknown(engine: DbosEngine) -> None:
+    assert engine.status(Job("photo", ("never", 1))) == "unknown"
+
+
+def test_patches_run_side_by_side_one_more_than_there_are_slots(url: str) -> None:
+    together = threading.Barrier(3, timeout=stretched(20))
+    engine = DbosEngine(url, "this-process", slots=2)
+
+    def cell(*_: object) -> None:
+        together.wait()
+
+    engine.start({"cell": cell})
+    try:
+        jobs = [Job("cell", (number,)) for number in range(3)]
+        for job in jobs:
+            engine.enqueue(job)
+        until(lambda: all(engine.status(job) == "done" for job in jobs))
+    finally:
+        engine.stop()
+
+    assert not together.broken
+
+
+def test_the_engines_file_is_in_wal_mode(engine: DbosEngine, tmp_path: Path) -> None:
+    with closing(sqlite3.connect(tmp_path / "jobs.db")) as connection:
+        assert connection.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+
+
+def test_forgotten_jobs_leave_no_row(engine: DbosEngine) -> None:
+    job = Job("measure", ("lens", 3))
+    engine.enqueue(job)
+    until(lambda: engine.status(job) == "done")
+
+    assert engine.forget(datetime.now(UTC) - timedelta(hours=1)) == 0
+    assert engine.forget(datetime.now(UTC) + timedelta(hours=1)) == 1
+    assert engine.status(job) == "unknown"
+
+
+def die_in_a_job(url: str, executor_id: str = DEAD) -> None:
+    script = textwrap.dedent(
+        f"""
+        import os, time
+        from app.jobs.queue import DbosEngine, Job
+        engine = DbosEngine({url!r}, {executor_id!r}, slots=1)
+        engine.start({{"cell": lambda *arguments: os.kill(os.getpid(), 9)}})
+        engine.enqueue(Job("cell", ("p", 1)))
+        time.sleep(30)
+        """
+    )
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == -9
+
+
+def test_jobs_of_a_killed_worker_are_taken_over_only_when_somebody_says_so(url: str, ran: Ran) -> None:
+    die_in_a_job(url)
+    job = Job("cell", ("p", 1))
+    engine = DbosEngine(url, "this-process", slots=2)
+    engine.start(ran.handlers)
+    try:
+        time.sleep(0.5)
+        held_before = (engine.status(job), list(ran.jobs))
+        left = engine.take_over(DEAD)
+        until(lambda: ran.jobs == [("cell", "p", "1")])
+        until(lambda: engine.status(job) == "done")
+    finally:
+        engine.stop()
+
+    assert held_before == ("waiting", [])
+    assert left == 0
+
+
+@pytest.mark.slow
+def test_a_job_that_kills_every_worker_is_given_up(url: str, ran: Ran) -> None:
+    previous = DEAD
+    die_in_a_job(url)
+    for number in range(MAX_STARTS["cell"] + 1):
+        script = textwrap.dedent(
+            f"""
+            import os, time
+            from app.jobs.queue import DbosEngine, Job
+            engine = DbosEngine({url!r}, "worker-{number}", slots=1)
+            engine.start({{"cell": lambda *arguments: os.kill(os.getpid(), 9)}})
+            engine.take_over({previous!r})
+            time.sleep(3)
+            os._exit(0)
+            """
+        )
+        previous = f"worker-{number}"
+        if subprocess.run([sys.executable, "-c", script], check=False).returncode == 0:
+            break
+    engine = DbosEngine(url, "this-process", slots=2)
+    engine.start(ran.handlers)
+    try:
+        status = engine.status(Job("cell", ("p", 1)))
+    finally:
+        engine.stop()
+
+    assert number == MAX_STARTS["cell"]
+    assert status == "lost"
+    assert ran.jobs == []

@@ -1,0 +1,713 @@
+"""The way of photos and corrections through the states, with children that do as they are told."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app.blobs.storage import Storage
+from app.http import views
+from app.jobs.context import JobFailedError, NotWantedError, Workbench
+from app.jobs.correction_work import CorrectionWork
+from app.jobs.photo_work import PhotoWork
+from app.jobs.queue import Handler, Job, Kind, Status
+from app.jobs.task_files import KERNELS, LEARNED, PREVIEW, SAMPLES
+from app.runtime.settings import Settings
+from app.sandbox.child import Progress
+from app.sandbox.runner import Budget, Limits, Outcome
+from app.store import Store
+from app.store.tables import PhotoRow
+from app.store.versions import learned_key
+from lensmodel.core.psf import gaussian
+from lensmodel.core.types import ignore_step
+
+Answer = Callable[[dict[str, Any], Path], Outcome]
+LENS = {"maker": "Canon", "model": "EF24mm f/1.4L", "serial": "123", "serial_source": "exif"}
+INFO = {
+    "kind": "dng",
+    "width": 600,
+    "height": 450,
+    "metadata": {
+        "camera_maker": "Canon",
+        "camera_model": "5D",
+        "lens": LENS,
+        "aperture": 2.8,
+        "focal_mm": 24.0,
+        "focus_m": -1.0,
+        "iso": 100.0,
+        "exposure_s": 0.01,
+        "taken_at": "2024-05-01T12:00:00",
+        "orientation": 1,
+        "pixel_pitch_um": 6.0,
+    },
+}
+
+
+def patch(cell: int) -> dict[str, Any]:
+    place = {"r": 0.1 + 0.2 * cell, "phi": 0.5}
+    return {"row": 0, "col": 100 * cell, "size": 64, "position": place, "score": 0.5, "cell": cell}
+
+
+def ok(value: object) -> Answer:
+    return lambda *_: Outcome("ok", value=value)
+
+
+def refused(code: str, detail: str = "no") -> Answer:
+    return lambda *_: Outcome("error", code=code, detail=detail)
+
+
+def ended(outcome: Outcome) -> Answer:
+    return lambda *_: outcome
+
+
+CRASHED = Outcome("crashed", code="crashed", detail="the process that did the work died: signal 11")
+MEMORY = Outcome("memory_limit", code="memory_limit", detail="too little")
+
+
+def develop(arguments: dict[str, Any], folder: Path) -> Outcome:
+    np.save(folder / "planes.npy", np.zeros((3, 4, 4), np.float32))
+    return Outcome("ok", value={})
+
+
+def estimate(arguments: dict[str, Any], folder: Path) -> Outcome:
+    listed = [
+        {
+            "idx": number,
+            "channel": channel,
+            "weight": 0.5,
+            "estimator": "whittle/1",
+            "predicted_error": 0.1,
+            "diagnostics": {},
+            "evidence": None,
+            "spectrum": None,
+        }
+        for number in arguments["numbers"]
+        for channel in ("r", "g", "b")
+    ]
+    np.save(folder / KERNELS, np.stack([gaussian(15, np.eye(2))] * len(listed)))
+    return Outcome("ok", value=listed)
+
+
+class Scripted:
+    """A sandbox without children: each task answers from a list, the last answer for ever."""
+
+    def __init__(self, scratch: Path) -> None:
+        self.scratch = scratch
+        self.budget = Budget(2, 2048)
+        self.stopping = False
+        self.limits: list[Limits] = []
+        self.ran: list[str] = []
+        self.seen: dict[str, dict[str, Any]] = {}
+        self.files: set[str] = set()
+        self.answers: dict[str, list[Answer]] = {
+            "inspect": [ok(INFO)],
+            "glance": [refused("unsupported_format")],  # a photo without a small picture goes on
+            "report": [refused("no_samples")],  # and so does a lens without a report
+            "develop": [develop],
+            "select": [ok({"patches": [patch(0), patch(1)], "rejected": [], "lateral": None})],
+            "estimate": [estimate],
+        }
+
+    @contextmanager
+    def folder(self) -> Iterator[Path]:
+        self.scratch.mkdir(parents=True, exist_ok=True)
+        path = self.scratch / f"t{len(list(self.scratch.iterdir()))}"
+        path.mkdir()
+        yield path
+
+    def run(
+        self,
+        task: str,
+        arguments: Mapping[str, Any],
+        *,
+        folder: Path,
+        limits: Limits,
+        reads: Sequence[Path],
+        wanted: Callable[[], bool],
+        compiles: bool = False,
+        on_progress: Progress = ignore_step,
+    ) -> Outcome:
+        self.ran.append(task)
+        self.limits.append(limits)
+        self.seen[task] = dict(arguments)
+        self.files = {path.name for path in folder.iterdir()}
+        if not wanted():
+            return Outcome("cancelled")
+        answers = self.answers[task]
+        return (answers.pop(0) if len(answers) > 1 else answers[0])(dict(arguments), folder)
+
+
+class AtOnce:
+    """An engine that runs each job when it is asked for, once."""
+
+    def __init__(self) -> None:
+        self.handlers: Mapping[Kind, Handler] = {}
+        self.asked: list[str] = []
+        self.lost: set[str] = set()
+
+    def start(self, handlers: Mapping[Kind, Handler]) -> None:
+        self.handlers = handlers
+
+    def enqueue(self, job: Job) -> None:
+        if job.id not in self.asked:
+            self.asked.append(job.id)
+            if job.id not in self.lost:
+                self.handlers[job.kind](*job.arguments)
+
+    def status(self, job: Job) -> Status:
+        return "lost" if job.id in self.lost else "done"
+
+    def take_over(self, executor_id: str) -> int:
+        return 0
+
+    def holders(self) -> set[str]:
+        return set()
+
+    def forget(self, before: datetime) -> int:
+        return 0
+
+    def stop(self) -> None:
+        self.handlers = {}
+
+
+@pytest.fixture
+def sandbox(tmp_path: Path) -> Scripted:
+    return Scripted(tmp_path / "scratch")
+
+
+@pytest.fixture
+def bench(settings: Settings, store: Store, sandbox: Scripted, monkeypatch: pytest.MonkeyPatch) -> Workbench:
+    monkeypatch.setattr("app.jobs.context.BACKOFF_S", 0.001)
+    monkeypatch.setattr("app.jobs.photo_work.LOOK_AFTER_S", 0.0)
+    monkeypatch.setattr("app.jobs.photo_work.WAIT_S", 0.001)
+    return Workbench(settings, store, Storage(settings.storage), sandbox)  # type: ignore[arg-type]  # scripted
+
+
+@pytest.fixture
+def engine() -> AtOnce:
+    return AtOnce()
+
+
+@pytest.fixture
+def work(bench: Workbench, engine: AtOnce) -> PhotoWork:
+    made = PhotoWork(bench, engine)
+    engine.start({"cell": made.cell})
+    return made
+
+
+@pytest.fixture
+def photo(bench: Workbench, steps: Any) -> PhotoRow:
+    return received(bench, steps)
+
+
+def received(bench: Workbench, steps: Any, **options: Any) -> PhotoRow:
+    photo: PhotoRow = steps.receive(**options)
+    bench.storage.put(photo.blob_key, b"the file")
+    return photo
+
+
+def changed(photo: PhotoRow, **metadata: Any) -> Answer:
+    return ok(INFO | {"metadata": INFO["metadata"] | metadata})  # type: ignore[operator]  # both are dicts
+
+
+def test_a_photo_goes_all_the_way(work: PhotoWork, bench: Workbench, photo: PhotoRow, steps: Any) -> None:
+    work.photo(photo.public_id, 1)
+
+    done = steps.fresh(photo)
+    lens = bench.store.photos.lens_of(done)
+    assert (done.state, done.patches_done, done.width, done.aperture) == ("counted", 2, 600, 2.8)
+    assert lens is not None
+    assert (lens.version, lens.sample_count, lens.serial) == (1, 6, "123")
+
+
+def measured(arguments: dict[str, Any], folder: Path) -> Outcome:
+    np.save(folder / KERNELS, np.stack([gaussian(15, np.eye(2))] * 2))
+    entry = {"idx": 0, "row": 9, "col": 9, "side": 144, "r": 0.2, "phi": 0.1, "error": 0.04}
+    estimator = f"measured-{arguments['kind']}/1"
+    return Outcome("ok", value=[entry | {"channel": c, "estimator": estimator} for c in "gr"])
+
+
+def test_a_photo_of_the_target_counts_with_what_was_measured_and_no_blind_estimate(
+    work: PhotoWork, bench: Workbench, sandbox: Scripted, steps: Any
+) -> None:
+    sandbox.answers["measure-lens"] = [measured]
+    photo = received(bench, steps, kind="target")
+    work.photo(photo.public_id, 1)
+
+    assert (steps.fresh(photo).state, "estimate" in sandbox.ran) == ("counted", False)
+    _, samples = bench.store.samples.of_lens(steps.lens_id(photo))
+    assert [(s.sample.estimator, s.sample.error) for s in samples] == [("measured-target/1", 0.04)] * 2
+
+
+def test_the_open_photo_of_a_pair_is_measured_beside_the_closed_one(
+    work: PhotoWork, bench: Workbench, sandbox: Scripted, steps: Any
+) -> None:
+    sandbox.answers["measure-lens"] = [measured]
+    closed = received(bench, steps, calibrate=False)
+    work.photo(closed.public_id, 1)
+    opened = received(bench, steps, kind="pair", reference_id=closed.public_id)
+    work.photo(opened.public_id, 1)
+
+    assert steps.fresh(opened).state == "counted"
+    names = [Path(folder).name for folder in sandbox.seen["measure-lens"]["developed"]]
+    assert names == [opened.public_id, closed.public_id]
+
+
+def test_a_pair_whose_closed_photo_is_gone_says_so(work: PhotoWork, bench: Workbench, steps: Any) -> None:
+    photo = received(bench, steps, kind="pair", reference_id="gone")
+    work.photo(photo.public_id, 1)
+
+    row = steps.fresh(photo)
+    assert (row.state, row.error_code) == ("failed", "unknown_photo")
+
+
+def test_a_photo_focused_at_infinity_says_so_to_the_model(
+    work: PhotoWork, bench: Workbench, photo: PhotoRow, steps: Any
+) -> None:
+    work.photo(photo.public_id, 1)
+
+    _, samples = bench.store.samples.of_lens(steps.lens_id(photo))
+    assert {stored.sample.settings.focus_m for stored in samples} == {math.inf}
+    assert views.photo_out(steps.fresh(photo), None).focus_distance_m is None
+
+
+def test_a_developed_photo_leaves_its_pictures_with_the_blobs(
+    work: PhotoWork, bench: Workbench, photo: PhotoRow, sandbox: Scripted
+) -> None:
+    def with_preview(arguments: dict[str, Any], folder: Path) -> Outcome:
+        (folder / PREVIEW).write_bytes(b"a small picture")
+        return develop(arguments, folder)
+
+    sandbox.answers["develop"] = [with_preview]
+    work.photo(photo.public_id, 1)
+
+    assert bench.storage.get(f"photos/{photo.public_id}/{PREVIEW}") == b"a small picture"
+
+
+def test_running_a_finished_photo_again_changes_nothing(
+    work: PhotoWork, bench: Workbench, photo: PhotoRow, sandbox: Scripted, steps: Any
+) -> None:
+    work.photo(photo.public_id, 1)
+    ran = list(sandbox.ran)
+
+    work.photo(photo.public_id, 1)
+
+    lens = bench.store.photos.lens_of(steps.fresh(photo))
+    assert lens is not None
+    assert lens.version == 1
+    assert sandbox.ran == ran
+
+
+@pytest.mark.parametrize("dies_in", ["inspect", "develop", "select", "estimate"])
+def test_a_photo_whose_worker_died_is_finished_without_repeating_what_is_done(
+    work: PhotoWork, photo: PhotoRow, sandbox: Scripted, steps: Any, dies_in: str
+) -> None:
+    class DiedError(BaseException):
+        """Stands for the death of the process."""
+
+    def die(arguments: dict[str, Any], folder: Path) -> Outcome:
+        raise DiedError
+
+    sandbox.answers[dies_in].insert(0, die)
+    with pytest.raises(DiedError):
+        work.photo(photo.public_id, 1)
+    work._engine.asked.clear()  # type: ignore[attr-defined]  # the engine takes the job up again
+    work.photo(photo.public_id, 1)
+
+    done = steps.fresh(photo)
+    lens = steps.store.photos.lens_of(done)
+    assert (done.state, done.attempt) == ("counted", 2)
+    assert lens is not None
+    assert (lens.version, lens.sample_count) == (1, 6)
+    before = ["inspect", "develop", "select"]
+    assert [sandbox.ran.count(task) for task in before] == [2 if task == dies_in else 1 for task in before]
+
+
+def test_a_photo_without_serial_waits_for_its_owner(
+    work: PhotoWork, photo: PhotoRow, sandbox: Scripted, steps: Any
+) -> None:
+    sandbox.answers["inspect"] = [changed(photo, lens=LENS | {"serial": None, "serial_source": "none"})]
+
+    work.photo(photo.public_id, 1)
+
+    waiting = steps.fresh(photo)
+    assert (waiting.state, waiting.error_code) == ("needs_lens", "metadata_missing")
+    assert "lens_id" in waiting.error_detail
+    assert sandbox.ran == ["inspect", "glance"]
+
+
+def test_a_photo_without_aperture_waits_and_says_so(
+    work: PhotoWork, photo: PhotoRow, sandbox: Scripted, steps: Any
+) -> None:
+    sandbox.answers["inspect"] = [changed(photo, aperture=None)]
+
+    work.photo(photo.public_id, 1)
+
+    waiting = steps.fresh(photo)
+    assert waiting.state == "needs_lens"
+    assert "aperture" in waiting.error_detail
+
+
+def test_a_photo_to_be_stored_only_is_not_developed(
+    work: PhotoWork, bench: Workbench, sandbox: Scripted, steps: Any
+) -> None:
+    photo = received(bench, steps, calibrate=False)
+
+    work.photo(photo.public_id, 1)
+
+    assert steps.fresh(photo).state == "stored"
+    assert sandbox.ran == ["inspect", "glance"]
+
+
+@pytest.mark.parametrize(
+    "refusal",
+    [("inspect", "decompression_bomb"), ("develop", "raw_decode_failed"), ("select", "no_usable_patches")],
+)
+def test_a_refusal_of_the_library_ends_the_photo_without_another_try(
+    work: PhotoWork, photo: PhotoRow, sandbox: Scripted, steps: Any, refusal: tuple[str, str]
+) -> None:
+    task, code = refusal
+    sandbox.answers[task] = [refused(code, "the value and the remedy")]
+
+    work.photo(photo.public_id, 1)
+
+    failed = steps.fresh(photo)
+    assert (failed.state, failed.error_code, failed.error_detail) == (
+        "failed",
+        code,
+        "the value and the remedy",
+    )
+    assert sandbox.ran.count(task) == 1
+
+
+def test_a_photo_too_small_for_patches_is_told_so(
+    work: PhotoWork, photo: PhotoRow, sandbox: Scripted, steps: Any
+) -> None:
+    sandbox.answers["select"] = [refused("invalid_parameter", "patches need at least 64 px")]
+
+    work.photo(photo.public_id, 1)
+
+    failed = steps.fresh(photo)
+    assert failed.error_code == "no_usable_patches"
+    assert "600x450" in failed.error_detail
+
+
+def test_cells_without_evidence_are_rejected_and_the_others_count(
+    work: PhotoWork, bench: Workbench, photo: PhotoRow, sandbox: Scripted, steps: Any
+) -> None:
+    sandbox.answers["estimate"] = [refused("no_samples"), estimate]
+
+    work.photo(photo.public_id, 1)
+
+    rows = bench.store.patches.all_of(photo.public_id)
+    assert steps.fresh(photo).state == "counted"
+    assert [(row.state, row.reason) for row in rows] == [("rejected", "not-enough-evidence"), ("done", None)]
+
+
+def test_a_photo_of_which_no_cell_helps_fails_with_what_to_do(
+    work: PhotoWork, photo: PhotoRow, sandbox: Scripted, steps: Any
+) -> None:
+    sandbox.answers["estimate"] = [refused("no_samples")]
+
+    work.photo(photo.public_id, 1)
+
+    failed = steps.fresh(photo)
+    assert (failed.state, failed.error_code) == ("failed", "no_usable_patches")
+    assert "0 of 2 patches" in failed.error_detail
+
+
+def test_a_photo_whose_cells_all_time_out_says_so(
+    work: PhotoWork, photo: PhotoRow, sandbox: Scripted, steps: Any
+) -> None:
+    sandbox.answers["estimate"] = [ended(Outcome("time_limit", code="time_limit", detail="too slow"))]
+
+    work.photo(photo.public_id, 1)
+
+    assert steps.fresh(photo).error_code == "time_limit"
+
+
+def test_a_cell_that_the_engine_gave_up_does_not_keep_the_photo_waiting(
+    work: PhotoWork, bench: Workbench, engine: AtOnce, photo: PhotoRow, steps: Any
+) -> None:
+    engine.lost.add(f"cell/{photo.public_id}/1/0")
+
+    work.photo(photo.public_id, 1)
+
+    rows = bench.store.patches.all_of(photo.public_id)
+    assert steps.fresh(photo).state == "counted"
+    assert [(row.state, row.reason) for row in rows] == [("failed", "crashed_repeatedly"), ("done", None)]
+
+
+@pytest.mark.parametrize("task", ["inspect", "develop", "select", "estimate"])
+def test_cancelling_in_the_middle_of_a_task_ends_the_photo_and_nothing_counts(
+    work: PhotoWork, photo: PhotoRow, sandbox: Scripted, steps: Any, task: str
+) -> None:
+    def cancel(arguments: dict[str, Any], folder: Path) -> Outcome:
+        assert steps.store.photos.cancel(photo.public_id)
+        return Outcome("cancelled")
+
+    sandbox.answers[task].insert(0, cancel)
+
+    work.photo(photo.public_id, 1)
+
+    assert steps.fresh(photo).state == "cancelled"
+    lens = steps.store.photos.lens_of(steps.fresh(photo))
+    assert lens is None or (lens.version, lens.sample_count) == (0, 0)
+
+
+def test_work_of_an_old_epoch_changes_nothing(
+    work: PhotoWork, bench: Workbench, photo: PhotoRow, sandbox: Scripted, steps: Any
+) -> None:
+    def restart(arguments: dict[str, Any], folder: Path) -> Outcome:
+        bench.store.photos.change(photo.public_id, "local", {"aperture": 4.0})
+        return ok({"patches": [patch(0)], "rejected": [], "lateral": None})(arguments, folder)
+
+    sandbox.answers["select"].insert(0, restart)
+    work.photo(photo.public_id, 1)
+    after_old = steps.fresh(photo)
+    work.photo(photo.public_id, 2)
+
+    done = steps.fresh(photo)
+    assert (after_old.state, after_old.epoch) == ("received", 2)
+    assert (done.state, done.aperture, done.patches_total) == ("counted", 4.0, 2)
+
+
+def test_a_lost_file_is_told_of(work: PhotoWork, bench: Workbench, photo: PhotoRow, steps: Any) -> None:
+    bench.storage.delete(f"photos/{photo.public_id}/")
+
+    work.photo(photo.public_id, 1)
+
+    assert (steps.fresh(photo).state, steps.fresh(photo).error_code) == ("failed", "unknown_photo")
+
+
+def attempt(bench: Workbench, wanted: Callable[[], bool] = lambda: True) -> Any:
+    with bench.sandbox.folder() as folder:
+        return bench.attempt("task", {}, folder=folder, limits=Limits(500, 10), wanted=wanted)
+
+
+def test_a_crash_is_tried_again(bench: Workbench, sandbox: Scripted) -> None:
+    sandbox.answers["task"] = [ended(CRASHED), ended(CRASHED), ok(7)]
+
+    assert attempt(bench) == 7
+
+
+def test_the_third_crash_is_the_last(bench: Workbench, sandbox: Scripted) -> None:
+    sandbox.answers["task"] = [ended(CRASHED)]
+
+    with pytest.raises(JobFailedError, match="signal 11; tried 3 times") as caught:
+        attempt(bench)
+
+    assert caught.value.code == "crashed_repeatedly"
+    assert sandbox.ran == ["task"] * 3
+
+
+def test_an_unforeseen_exception_is_not_tried_again(bench: Workbench, sandbox: Scripted) -> None:
+    sandbox.answers["task"] = [ended(Outcome("crashed", code="internal_error", detail="a KeyError"))]
+
+    with pytest.raises(JobFailedError, match="a KeyError"):
+        attempt(bench)
+
+    assert sandbox.ran == ["task"]
+
+
+def test_too_little_memory_is_doubled_once_within_the_budget(bench: Workbench, sandbox: Scripted) -> None:
+    sandbox.answers["task"] = [ended(MEMORY)]
+
+    with pytest.raises(JobFailedError, match="too little"):
+        attempt(bench)
+
+    assert [limits.memory_mb for limits in sandbox.limits] == [500, 1000]
+
+
+def test_nobody_waits_between_crashes_for_what_nobody_wants(bench: Workbench, sandbox: Scripted) -> None:
+    asked = iter([True, False, False])
+    sandbox.answers["task"] = [ended(CRASHED)]
+
+    with pytest.raises(NotWantedError):
+        attempt(bench, lambda: next(asked))
+
+
+@pytest.fixture
+def counted(bench: Workbench, steps: Any) -> PhotoRow:
+    photo: PhotoRow = steps.counted()
+    bench.storage.put(photo.blob_key, b"the file")
+    return photo
+
+
+def ask(bench: Workbench, photo: PhotoRow, steps: Any, version: int = 1, **params: Any) -> str:
+    lens = bench.store.lenses.get(steps.lens_id(photo))
+    assert lens is not None
+    output = {"format": "jpeg", "color_space": "srgb", "quality": 90}
+    wish = {"method": "standard", "strength": 1.0, "output": output, "roi": None, **params}
+    return bench.store.corrections.create(photo, lens, version, wish)[0].public_id
+
+
+def write_result(arguments: dict[str, Any], folder: Path) -> Outcome:
+    (folder / "result.jpg").write_bytes(b"a picture")
+    return Outcome(
+        "ok", value={"file": "result.jpg", "report": {"zones": {"center": {"expected_gain_db": 3.0}}}}
+    )
+
+
+def test_a_correction_ends_with_a_file(
+    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+) -> None:
+    sandbox.answers["correct"] = [write_result]
+    key = ask(bench, counted, steps)
+
+    CorrectionWork(bench).correction(key)
+
+    row = bench.store.corrections.get(key)
+    assert row is not None
+    assert (row.state, row.result_media_type, row.result_bytes) == ("succeeded", "image/jpeg", 9)
+    assert row.report == {"zones": {"center": {"expected_gain_db": 3.0}}}
+    assert bench.storage.get(row.result_key or "") == b"a picture"
+    assert sandbox.files >= {KERNELS, SAMPLES}
+
+
+def test_what_a_correction_learned_of_the_newest_version_is_kept(
+    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+) -> None:
+    def learn(arguments: dict[str, Any], folder: Path) -> Outcome:
+        assert not (folder / LEARNED).exists()
+        (folder / LEARNED).write_bytes(b"fitted")
+        return write_result(arguments, folder)
+
+    def find(arguments: dict[str, Any], folder: Path) -> Outcome:
+        assert (folder / LEARNED).read_bytes() == b"fitted"
+        return write_result(arguments, folder)
+
+    lens_id = steps.lens_id(counted)
+    state, _ = bench.store.samples.of_lens(lens_id)
+    sandbox.answers["correct"] = [learn, find]
+    for strength in (1.0, 0.5):
+        CorrectionWork(bench).correction(ask(bench, counted, steps, strength=strength))
+
+    assert bench.storage.get(learned_key(lens_id, 1, state.rebuild_epoch)) == b"fitted"
+
+
+def test_what_a_correction_learned_of_an_earlier_version_is_not_kept(
+    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+) -> None:
+    def learn(arguments: dict[str, Any], folder: Path) -> Outcome:
+        (folder / LEARNED).write_bytes(b"fitted")
+        return write_result(arguments, folder)
+
+    lens_id = steps.lens_id(counted)
+    state, _ = bench.store.samples.of_lens(lens_id)
+    steps.counted()
+    sandbox.answers["correct"] = [learn]
+    CorrectionWork(bench).correction(ask(bench, counted, steps, version=1))
+
+    assert bench.store.samples.of_lens(lens_id)[0].version == 2
+    with pytest.raises(FileNotFoundError):
+        bench.storage.get(learned_key(lens_id, 1, state.rebuild_epoch))
+
+
+def test_a_photographers_bounds_reach_the_correction_and_its_tag(
+    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+) -> None:
+    told: list[dict[str, Any]] = []
+
+    def keep(arguments: dict[str, Any], folder: Path) -> Outcome:
+        told.append(arguments)
+        return write_result(arguments, folder)
+
+    sandbox.answers["correct"] = [keep, keep]
+    for bounds in ({}, {"halo": 0.2, "denoise": 0.5}):
+        CorrectionWork(bench).correction(ask(bench, counted, steps, **bounds))
+
+    assert [one["bounds"] for one in told] == [{}, {"halo": 0.2, "denoise": 0.5}]
+    assert told[0]["description"].endswith("strength 1")
+    assert told[1]["description"].endswith("strength 1, halo 0.2, denoised 0.5")
+
+
+def test_a_correction_with_a_version_without_samples_fails(
+    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+) -> None:
+    key = ask(bench, counted, steps)
+    bench.store.photos.change(counted.public_id, "local", {}, excluded=True)
+
+    CorrectionWork(bench).correction(key)
+
+    row = bench.store.corrections.get(key)
+    assert row is not None
+    assert (row.state, row.error_code) == ("failed", "no_samples")
+
+
+def test_a_cancelled_correction_stays_cancelled(
+    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+) -> None:
+    key = ask(bench, counted, steps)
+
+    def cancel(arguments: dict[str, Any], folder: Path) -> Outcome:
+        bench.store.corrections.cancel(key)
+        return write_result(arguments, folder)
+
+    sandbox.answers["correct"] = [cancel]
+    CorrectionWork(bench).correction(key)
+
+    row = bench.store.corrections.get(key)
+    assert row is not None
+    assert (row.state, row.result_key) == ("cancelled", None)
+
+
+def test_a_correction_cancelled_while_its_file_was_stored_leaves_no_file(
+    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    key, put_file = ask(bench, counted, steps), bench.storage.put_file
+
+    def cancelled_meanwhile(blob: str, path: Path) -> None:
+        put_file(blob, path)
+        bench.store.corrections.cancel(key)
+
+    monkeypatch.setattr(bench.storage, "put_file", cancelled_meanwhile)
+    sandbox.answers["correct"] = [write_result]
+    CorrectionWork(bench).correction(key)
+
+    with pytest.raises(FileNotFoundError):
+        bench.storage.info(f"corrections/{key}/result.tif")
+
+
+def test_a_child_cannot_hand_in_a_file_from_elsewhere(
+    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+) -> None:
+    value = {"file": "../../../app.db", "report": {"zones": {}}}
+    sandbox.answers["correct"] = [ok(value)]
+    key = ask(bench, counted, steps)
+
+    CorrectionWork(bench).correction(key)
+
+    row = bench.store.corrections.get(key)
+    assert row is not None
+    assert (row.state, row.error_code) == ("failed", "internal_error")
+
+
+def test_a_version_is_measured_once_and_its_history_says_so(
+    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+) -> None:
+    sandbox.answers["measure"] = [ok({"error": {"mid": 0.2}, "coverage": {"mid": 4}})]
+    lens_id = steps.lens_id(counted)
+    before = bench.store.lenses.unmeasured()
+
+    CorrectionWork(bench).measure(lens_id, 1)
+
+    assert before == [(lens_id, 1)]
+    assert bench.store.lenses.unmeasured() == []
+
+
+def test_a_version_that_cannot_be_measured_is_not_tried_for_ever(
+    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+) -> None:
+    sandbox.answers["measure"] = [refused("no_samples")]
+
+    CorrectionWork(bench).measure(steps.lens_id(counted), 1)
+
+    assert bench.store.lenses.unmeasured() == []

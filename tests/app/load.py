@@ -1,0 +1,187 @@
+"""Use a service in every way at once for an hour, and look whether anything grows that must not.
+
+    python tests/app/load.py [--minutes 60] [--photos 40] [--kill-every 60] [--seed 0]
+
+A service of its own (SQLite, a folder, workers whose estimates are made up) gets uploads, PSF queries,
+corrections, cancels, exclusions and deletions from several threads, while its API and worker processes are
+killed now and then. The number of photos is kept level, so that memory, open files, files on disk and rows
+must level off too: they are printed every tenth of the time. At the end everything must settle, and
+`lensmodel doctor` must find nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import signal
+import statistics
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter, deque
+from pathlib import Path
+from typing import Any
+
+import httpx2
+from running import LIGHT, Service, running, write_photo
+
+from app.blobs.storage import Storage
+from app.runtime.doctor import examine
+from app.runtime.settings import Settings
+from app.store import Store
+
+SCENES = 6
+PATIENCE_S = 600.0
+COLUMNS = (
+    "minute",
+    "answers",
+    "rss_mb",
+    "open_files",
+    "files",
+    "photos",
+    "samples",
+    "psf_p50_ms",
+    "psf_p99_ms",
+)
+
+
+class Load:
+    """What the threads share."""
+
+    def __init__(self, service: Service, photos: list[bytes], level: int, seed: int) -> None:
+        self.service, self.photos, self.level = service, photos, level
+        self.rng = random.Random(seed)
+        self.stop = threading.Event()
+        self.answers: Counter[str] = Counter()
+        self.faults: list[str] = []
+        self.psf_ms: deque[float] = deque(maxlen=2000)
+        self.known: deque[str] = deque()
+
+    def run(self, deed: Any, pause_s: float) -> None:
+        """Do one thing again and again until the end."""
+        with httpx2.Client(base_url=self.service.http.base_url, timeout=60.0) as http:
+            while not self.stop.is_set():
+                with contextlib.suppress(
+                    httpx2.HTTPError, IndexError
+                ):  # killed under us; or nothing there yet
+                    deed(http)
+                self.stop.wait(self.rng.uniform(0.5, 1.5) * pause_s)
+
+    def ask(self, http: httpx2.Client, method: str, path: str, **options: Any) -> httpx2.Response:
+        """Ask, and note what was answered."""
+        answer = http.request(method, path, **options)
+        self.answers[f"{method} {answer.status_code}"] += 1
+        if answer.status_code == 500:
+            self.faults.append(f"{method} {path}: {answer.text[:300]}")
+        return answer
+
+    def upload(self, http: httpx2.Client) -> None:
+        """Send a photo; delete the oldest where there are enough."""
+        data = self.rng.choice(self.photos) + os.urandom(8)  # other bytes, same picture
+        answer = self.ask(http, "POST", "/v1/photos", files={"file": ("p.dng", data)})
+        if answer.status_code == 202:
+            self.known.append(answer.json()["id"])
+        if len(self.known) > self.level:
+            self.ask(http, "DELETE", f"/v1/photos/{self.known.popleft()}")
+
+    def query(self, http: httpx2.Client) -> None:
+        """Ask for the PSF of a lens at a random place."""
+        for lens in self.ask(http, "GET", "/v1/lenses").json()["items"][:2]:
+            place = {"r": self.rng.random(), "phi": self.rng.uniform(-3, 3), "aperture": 2.8}
+            began = time.perf_counter()
+            answer = self.ask(http, "GET", f"/v1/lenses/{lens['id']}/psf", params=place)
+            if answer.status_code == 200:
+                self.psf_ms.append(1000 * (time.perf_counter() - began))
+
+    def change(self, http: httpx2.Client) -> None:
+        """Cancel, retry, exclude or include some photo."""
+        photo = self.rng.choice(list(self.known))
+        deed = self.rng.randrange(4)
+        if deed == 0:
+            self.ask(http, "POST", f"/v1/jobs/{photo}/cancel")
+        elif deed == 1:
+            self.ask(http, "POST", f"/v1/jobs/{photo}/retry")
+        else:
+            self.ask(http, "PATCH", f"/v1/photos/{photo}", json={"excluded": deed == 2})
+
+    def correct(self, http: httpx2.Client) -> None:
+        """Ask for the correction of some photo."""
+        body = {"photo_id": self.rng.choice(list(self.known)), "method": "fast"}
+        self.ask(http, "POST", "/v1/corrections", json=body)
+
+    def kill(self) -> None:
+        """Kill the API or the worker; the supervisor starts it again."""
+        name = self.rng.choice(["api_pid", "worker_pid"])
+        with contextlib.suppress(OSError, ValueError, TypeError):  # between two lives
+            os.kill(self.service.info()[name], signal.SIGKILL)
+            self.answers[f"killed {name.removesuffix('_pid')}"] += 1
+
+
+def measured(load: Load, store: Store, minute: float) -> dict[str, Any]:
+    """Return one row of the table."""
+    memory, handles = 0, 0
+    for pid in load.service.info().values():
+        with contextlib.suppress(OSError, ValueError, StopIteration):
+            status = Path(f"/proc/{int(pid)}/status").read_text().splitlines()
+            memory += int(next(line for line in status if line.startswith("VmRSS")).split()[1])
+            handles += len(list(Path(f"/proc/{int(pid)}/fd").iterdir()))
+    times = sorted(load.psf_ms) or [0.0]
+    load.psf_ms.clear()
+    rows = store.operation.load().rows
+    numbers = (
+        *(round(minute, 1), sum(load.answers.values()), memory // 1024, handles),
+        *(sum(1 for _ in load.service.data.rglob("*")), rows["photo"], rows["sample"]),
+        *(round(statistics.median(times), 1), round(times[int(0.99 * (len(times) - 1))], 1)),
+    )
+    return dict(zip(COLUMNS, numbers, strict=True))
+
+
+def main() -> int:
+    """Run for the time that was asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--photos", type=int, default=40)
+    parser.add_argument("--kill-every", type=float, default=60.0, metavar="SECONDS")
+    parser.add_argument("--seed", type=int, default=0)
+    wishes = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        scenes = [write_photo(Path(folder) / f"{k}.dng", k).read_bytes() for k in range(SCENES)]
+        with running(Path(folder) / "data", LIGHT) as service:
+            settings = Settings(data_dir=service.data, min_free_mb=0)
+            store = Store(settings)
+            load = Load(service, scenes, wishes.photos, wishes.seed)
+            deeds = [(load.upload, 12.0), (load.query, 0.1), (load.change, 4.0), (load.correct, 10.0)]
+            threads = [threading.Thread(target=load.run, args=deed) for deed in deeds]
+            for thread in threads:
+                thread.start()
+            began, killed, table = time.monotonic(), time.monotonic(), []
+            print(" ".join(f"{name:>10}" for name in COLUMNS), flush=True)
+            while time.monotonic() - began < 60 * wishes.minutes:
+                time.sleep(1.0)
+                if time.monotonic() - killed > wishes.kill_every:
+                    killed = time.monotonic()
+                    load.kill()
+                if time.monotonic() - began > len(table) * 6 * wishes.minutes:
+                    table.append(measured(load, store, (time.monotonic() - began) / 60))
+                    print(" ".join(f"{value:>10}" for value in table[-1].values()), flush=True)
+            load.stop.set()
+            for thread in threads:
+                thread.join()
+            end = time.monotonic() + PATIENCE_S
+            while any(store.operation.load().jobs.values()) and time.monotonic() < end:
+                time.sleep(1.0)
+            unsettled = sum(store.operation.load().jobs.values())
+            findings = examine(settings, store, Storage(settings.storage)).findings
+            store.close()
+    print(json.dumps({"answers": dict(load.answers), "unfinished": unsettled, "faults": load.faults[:5]}))
+    print("\n".join(f"{finding.check}: {finding.subject}: {finding.says}" for finding in findings))
+    print(f"{len(load.faults)} answers of 500, {unsettled} jobs left, {len(findings)} findings")
+    return 1 if load.faults or unsettled or findings else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

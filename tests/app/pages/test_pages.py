@@ -1,0 +1,576 @@
+"""The pages in a real browser: what a photographer does, with pointer, touch and keyboard."""
+
+from __future__ import annotations
+
+import base64
+import os
+import re
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe  # type: ignore[import-untyped]  # has no types
+from playwright.sync_api import (
+    Browser,
+    ConsoleMessage,
+    Page,
+    Request,
+    Route,
+    expect,
+    sync_playwright,
+)
+
+HERE = Path(__file__).parents[1]
+sys.path.insert(0, str(HERE))
+from deadline import stretched  # noqa: E402 - beside these files
+from running import Service, running, write_photo  # noqa: E402 - beside this file
+
+sys.path.remove(str(HERE))
+
+PATIENCE_MS = 60_000.0
+FLAGS = [
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+WIDTHS = (360, 390, 768, 1280, 2560)
+RULES = {"runOnly": {"type": "tag", "values": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"]}}
+DROP = """([name, data]) => {
+  const bytes = Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0));
+  const carried = new DataTransfer();
+  carried.items.add(new File([bytes], name));
+  for (const kind of ["dragenter", "dragover", "drop"]) {
+    const event = new DragEvent(kind, { bubbles: true, cancelable: true, dataTransfer: carried });
+    document.querySelector("main").dispatchEvent(event);
+  }
+}"""
+RECORD = """() => {
+  window.states = new Set();
+  const note = () => document.querySelectorAll("#photos .state").forEach((e) => states.add(e.textContent));
+  new MutationObserver(note).observe(
+    document.querySelector("#photos"), { childList: true, subtree: true, characterData: true });
+}"""
+STOP = """() => {
+  const at = document.activeElement;
+  const style = getComputedStyle(at.type === "file" ? at.labels[0] : at);
+  window.stops ??= new Map();
+  if (!stops.has(at)) stops.set(at, stops.size);
+  const width = style.outlineStyle === "none" ? 0 : parseFloat(style.outlineWidth);
+  return [`${stops.get(at)} ${at.outerHTML.slice(0, 80)}`, width];
+}"""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        reason = "there is no `chromium` on this machine to open the pages with"
+        if os.environ.get("LENSMODEL_REQUIRE_BROWSER"):
+            pytest.fail(reason)
+        pytest.skip(reason)
+    expect.set_options(timeout=stretched(PATIENCE_MS))
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture(scope="module")
+def service(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    with running(tmp_path_factory.mktemp("pages") / "data") as made:
+        yield made
+
+
+class Visitor:
+    """A page that notes each complaint of the browser and each request to another host."""
+
+    def __init__(self, page: Page, home: str) -> None:
+        self.page, self.host = page, urlsplit(home).netloc
+        self.complaints: list[str] = []
+        self.strangers: list[str] = []
+        self.asked: list[str] = []
+        page.on("console", self._listen)
+        page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        page.on("request", self._watch)
+
+    def _listen(self, message: ConsoleMessage) -> None:
+        if message.type in {"error", "warning"}:
+            self.complaints.append(f"{message.text} ({message.location.get('url')})")
+
+    def _watch(self, request: Request) -> None:
+        self.asked.append(request.url)
+        parts = urlsplit(request.url)
+        if parts.scheme not in {"data", "blob"} and parts.netloc != self.host:
+            self.strangers.append(request.url)
+
+
+@pytest.fixture
+def visitor(browser: Browser, service: Service) -> Iterator[Visitor]:
+    context = browser.new_context(
+        base_url=service.info()["url"], viewport={"width": 1280, "height": 900}, has_touch=True
+    )
+    context.set_default_timeout(stretched(PATIENCE_MS))
+    made = Visitor(context.new_page(), service.info()["url"])
+    yield made
+    context.close()
+    assert made.strangers == []
+    assert made.complaints == []
+
+
+@pytest.fixture
+def page(visitor: Visitor) -> Page:
+    return visitor.page
+
+
+@pytest.fixture(scope="module")
+def learned(service: Service, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """A photo of a lens that has learned from two, at two apertures."""
+    folder = tmp_path_factory.mktemp("photos")
+    sent = [
+        service.upload(write_photo(folder / f"wall-{k}.dng", 20 + k, serial="P-77", aperture=aperture))
+        for k, aperture in enumerate((2.8, 5.6))
+    ]
+    for photo in sent:
+        assert service.job(photo["id"])["state"] == "succeeded"
+    found: dict[str, Any] = service.get(f"/v1/photos/{sent[0]['id']}")
+    return found
+
+
+@pytest.fixture(scope="module")
+def correction(service: Service, learned: dict[str, Any]) -> dict[str, Any]:
+    wish = {"photo_id": learned["id"], "method": "fast", "output": {"format": "png16"}}
+    made: dict[str, Any] = service.http.post("/v1/corrections", json=wish).json()
+    assert service.job(made["id"])["state"] == "succeeded"
+    return made
+
+
+def address_of(kind: str, learned: dict[str, Any], correction: dict[str, Any]) -> str:
+    return {
+        "home": "/",
+        "lens": f"/lenses/{learned['lens_id']}",
+        "photo": f"/photos/{learned['id']}",
+        "correction": f"/corrections/{correction['id']}",
+    }[kind]
+
+
+def faults(page: Page) -> list[str]:
+    found = Axe().run(page, options=RULES).response["violations"]
+    return [f"{fault['id']}: {node['html'][:160]}" for fault in found for node in fault["nodes"]]
+
+
+def overhang(page: Page) -> int:
+    found: int = page.evaluate("document.documentElement.scrollWidth - innerWidth")
+    return found
+
+
+def test_an_empty_service_says_how_to_begin(page: Page) -> None:
+    page.goto("/")
+
+    expect(page.locator("#photos .empty")).to_contain_text("No photo yet")
+    expect(page.locator("#lenses .empty")).to_contain_text("No lens yet")
+    expect(page.locator(".steps li")).to_have_count(3)
+    assert faults(page) == []
+
+
+def test_photos_chosen_and_dropped_are_learned_from_while_the_page_watches(
+    visitor: Visitor, page: Page, tmp_path: Path
+) -> None:
+    chosen = write_photo(tmp_path / "chosen.dng", 1, serial="C-1")
+    dropped = write_photo(tmp_path / "dropped.dng", 2, serial="C-1")
+    page.goto("/")
+    page.evaluate(RECORD)
+
+    page.set_input_files("#files", chosen)
+    page.evaluate(DROP, [dropped.name, base64.b64encode(dropped.read_bytes()).decode()])
+    for name in ("chosen.dng", "dropped.dng"):
+        row = page.locator(".row", has_text=name)
+        expect(row.locator(".state")).to_contain_text("Learned from")
+        expect(row.locator("img")).not_to_have_js_property("naturalWidth", 0)
+    expect(page.locator("#lenses .card")).to_have_count(1)
+
+    states = page.evaluate("[...window.states]")  # gone if the page had been loaded again
+    assert len(states) > 1
+    # one stream told all of it: nothing was asked for again and again
+    assert sum("/ui/events" in url for url in visitor.asked) == 1
+    assert not [url for url in visitor.asked if url.endswith(("/ui/photos", "/ui/lenses"))]
+    assert not visitor.complaints
+
+
+def test_every_raw_ending_can_be_picked(page: Page) -> None:
+    page.goto("/")
+    endings = set(str(page.locator("#files").get_attribute("accept")).split(","))
+    assert {".cr3", ".iiq", ".3fr", ".x3f", ".rw2", ".nef", ".dng", ".tif", ".png", ".jpg"} <= endings
+
+
+def test_a_file_that_is_no_photo_is_refused_in_a_plain_sentence(visitor: Visitor, page: Page) -> None:
+    page.goto("/")
+
+    page.evaluate(DROP, ["holiday.nef", base64.b64encode(b"not a photo" * 50).decode()])
+    refusal = page.locator("#uploads li")
+    expect(refusal.locator(".error")).to_contain_text("This is not a photo that can be read.")
+    expect(page.locator("#announce")).to_have_text("0 of 1 photos sent, 1 refused.")
+    refusal.get_by_role("button", name="Dismiss").click()
+    expect(refusal).to_have_count(0)
+
+    assert all("415" in complaint for complaint in visitor.complaints)
+    visitor.complaints.clear()
+
+
+def test_photos_that_wait_are_named_together_by_their_pictures(
+    page: Page, service: Service, learned: dict[str, Any], tmp_path: Path
+) -> None:
+    sent = [service.upload(write_photo(tmp_path / f"nameless-{k}.dng", 31 + k, serial="")) for k in range(2)]
+    for photo in sent:
+        service.job(photo["id"], until=lambda job: job["state"] == "waiting")
+    page.goto("/")
+    group = page.locator("[data-group]")
+    expect(group).to_have_count(1)
+    expect(group.locator("legend")).to_contain_text("Test T-1, Test 35mm f/1.8, 35 mm: 2 photos")
+    expect(group.locator("img").first).not_to_have_js_property("naturalWidth", 0)
+    assert faults(page) == []
+
+    group.get_by_role("button", name="Go on with these").click()
+    expect(group.locator(".alert")).to_have_text("Choose a lens, or give a new one a name.")
+    group.get_by_label("Or a new one, called").fill("Grandfather's 35 mm")
+    group.get_by_role("button", name="Go on with these").click()
+
+    expect(page.locator("[data-group]")).to_have_count(0)
+    card = page.locator("#lenses .card", has_text="Grandfather's 35 mm")
+    expect(card).to_contain_text("2 photos")
+    lenses = {service.get(f"/v1/photos/{photo['id']}")["lens_id"] for photo in sent}
+    assert len(lenses) == 1
+
+
+def test_a_damaged_file_leaves_no_empty_lens(page: Page, service: Service, tmp_path: Path) -> None:
+    whole = write_photo(tmp_path / "whole.dng", 41, serial="")
+    (tmp_path / "cut.dng").write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    photo = service.upload(tmp_path / "cut.dng", lens_serial="D-1", lens_model="Damaged 50 mm")
+    assert service.job(photo["id"])["state"] == "failed"
+
+    page.goto("/")
+    expect(page.locator("#photos .row", has_text="cut.dng")).to_contain_text("the file ends too early")
+    expect(page.locator("#lenses .card", has_text="Damaged")).to_have_count(0)
+
+
+def test_a_lens_shows_its_blur_at_any_place_aperture_and_colour(page: Page, learned: dict[str, Any]) -> None:
+    page.goto(f"/lenses/{learned['lens_id']}")
+    expect(page.locator("#lens-state [data-settled]")).to_be_attached()
+    field, words, drawn = page.locator("#field"), page.locator("#psf-words"), page.locator("#psf")
+    picture = "canvas => canvas.toDataURL()"
+    expect(words).to_contain_text("of the way to the corner")
+    expect(page.locator("#field img")).not_to_have_js_property("naturalWidth", 0)
+    begun = drawn.evaluate(picture)
+
+    box = field.bounding_box()
+    assert box is not None
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    expect(words).to_contain_text("In the center")
+    assert drawn.evaluate(picture) != begun
+    field.press("ArrowRight")
+    expect(words).to_contain_text("10 % of the way to the corner")
+    with page.expect_response(lambda answer: "aperture=5.6" in answer.url and "psf.json" in answer.url):
+        page.locator("#field-controls [name=aperture]").select_option("5.6")
+    assert page.locator("#field-controls [name=aperture] option").all_inner_texts() == ["f/2.8", "f/5.6"]
+    with page.expect_response(lambda answer: "view=" in answer.url and "0.5" in answer.url) as closer:
+        page.locator("#field-controls").get_by_role("button", name="Larger").click()
+    assert closer.value.ok
+    with page.expect_response(lambda answer: "channel=b" in answer.url and "field.png" in answer.url) as told:
+        page.get_by_label("Colour").select_option("b")
+
+    assert told.value.ok
+    expect(page.locator("#psf-numbers")).to_contain_text("pixels wide")
+    expect(page.locator("#psf-npy")).to_have_attribute("href", re.compile("channel=b"))
+
+
+def test_a_lens_shows_what_it_has_seen_and_how_it_learned(page: Page, learned: dict[str, Any]) -> None:
+    def newest_alone(route: Route) -> None:
+        # two photos done at the same moment make two measured versions, whose curve replaces the words
+        answer = route.fetch()
+        route.fulfill(response=answer, json={"items": answer.json()["items"][-1:], "next": None})
+
+    page.route("**/calibrations", newest_alone)
+    page.goto(f"/lenses/{learned['lens_id']}")
+
+    expect(page.locator("#lens-state [data-settled]")).to_be_attached()
+    page.get_by_label("Show where photos had detail").check()
+    expect(page.locator("#coverage")).to_be_visible()
+    assert page.locator("#coverage ellipse").count() >= learned["patches"]["done"]
+    expect(page.locator("#history")).to_contain_text("photos")
+    page.get_by_text("All versions").click()
+    versions = page.get_by_role("region", name="Calibration history")
+    expect(versions.locator("tbody tr").first).to_be_visible()
+    expect(page.locator("section[aria-labelledby=coverage-title] .zones li")).to_have_count(3)
+
+
+def test_two_measured_versions_make_a_curve(page: Page, learned: dict[str, Any]) -> None:
+    errors = [{}, {"center": 0.2, "mid": 0.3, "corner": 0.4}, {"center": 0.1, "mid": 0.2, "corner": 0.3}]
+    items = [{"version": k, "error": error} for k, error in enumerate(errors, start=1)]
+    page.route("**/calibrations", lambda route: route.fulfill(json={"items": items, "next": None}))
+    page.goto(f"/lenses/{learned['lens_id']}")
+
+    expect(page.locator("#history canvas")).to_be_visible()
+    expect(page.locator("#history .u-legend")).to_contain_text("Corners")
+
+
+def test_a_photo_shows_where_it_learned_and_why_not_elsewhere(page: Page, learned: dict[str, Any]) -> None:
+    page.goto(f"/photos/{learned['id']}")
+    page.get_by_text("Where it was learned from").click()  # the correction comes first
+    used, left = page.locator(".overlay rect.done"), page.locator(".overlay rect.rejected")
+    expect(used).to_have_count(learned["patches"]["done"])
+    assert left.count() == learned["patches"]["rejected"] > 0
+    expect(page.locator(".overlay > img").first).to_have_js_property("complete", value=True)
+
+    used.last.dispatch_event("click")
+    expect(page.locator("#told")).to_contain_text("Used (")
+    reason = page.locator(".reasons button").first
+    reason.click()
+    lit = page.locator(".overlay rect.lit")
+    expect(lit).to_have_count(int(reason.locator("b").inner_text()))
+    page.get_by_label("Show where edges are sharp enough to tell").check()
+    expect(page.locator("#rmap")).not_to_have_js_property("naturalWidth", 0)
+    expect(page.locator("#rmap")).to_be_visible()
+
+
+def test_a_button_waits_until_the_scripts_of_the_page_are_there(page: Page, learned: dict[str, Any]) -> None:
+    page.route("**/static/app.js*", lambda route: route.fulfill(body="", content_type="text/javascript"))
+    page.goto(f"/photos/{learned['id']}")
+
+    expect(page.get_by_role("button", name="Correct this photo")).to_be_disabled()
+    expect(page.get_by_role("button", name="Delete photo")).to_be_disabled()
+
+
+def shown(page: Page) -> str:
+    """What the view shows now, as a picture."""
+    page.wait_for_timeout(250)  # the next frame is drawn
+    found: str = page.locator("#viewer canvas").evaluate("canvas => canvas.toDataURL()")
+    return found
+
+
+def test_sliders_show_their_effect_on_the_part_that_is_seen(page: Page, learned: dict[str, Any]) -> None:
+    page.goto(f"/photos/{learned['id']}")
+    page.get_by_role("button", name="lower right").click()
+    expect(page.locator("#preview-words")).to_contain_text("This is what you get")
+    expect(page.locator("#viewer")).to_have_attribute("data-shown", "split")
+    page.get_by_role("button", name="After", exact=True).click()
+    full = shown(page)
+
+    page.get_by_label("Strength").fill("0")
+    none = shown(page)
+    assert none != full
+    page.get_by_label("Strength").fill("1")
+    assert shown(page) == full
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.get_by_label("Strength").fill("0.5")
+    assert shown(page) not in {none, full}
+    assert asked == []  # mixed here, from layers that are there
+    assert page.locator(".rows a[href^='/corrections/']").count() == 0
+
+
+def test_a_photo_is_corrected_and_compared(page: Page, learned: dict[str, Any], tmp_path: Path) -> None:
+    page.goto(f"/photos/{learned['id']}")
+    page.get_by_label("File").select_option("jpeg")
+    page.get_by_role("button", name="Correct this photo").click()
+    page.wait_for_url("**/corrections/*")
+    expect(page.locator("#correction-state")).to_contain_text("Done")
+    viewer, hold = page.locator("#viewer"), page.get_by_role("button", name="Hold to see before")
+    expect(viewer).to_have_attribute("data-shown", "split")
+
+    page.get_by_role("button", name="lower right").click()
+    expect(page.get_by_role("button", name="lower right")).to_have_attribute("aria-pressed", "true")
+    expect(page.locator(".zoom-words")).to_have_text("100 %")
+    page.wait_for_load_state("networkidle")
+    seen = {}
+    for name in ("Before", "After", "Side by side", "Split"):
+        page.get_by_role("button", name=name, exact=True).click()
+        seen[name] = shown(page)
+    assert len(set(seen.values())) == 4
+    page.get_by_role("button", name="After", exact=True).click()
+    page.keyboard.down("b")
+    expect(viewer).to_have_attribute("data-shown", "before")
+    assert shown(page) == seen["Before"]
+    page.keyboard.up("b")
+    expect(viewer).to_have_attribute("data-shown", "after")
+    hold.hover()
+    page.mouse.down()
+    expect(viewer).to_have_attribute("data-shown", "before")
+    page.mouse.up()
+    expect(viewer).to_have_attribute("data-shown", "after")
+
+    page.get_by_role("button", name="Split", exact=True).click()
+    handle = page.locator(".handle")
+    handle.focus()
+    page.keyboard.press("ArrowRight")
+    expect(handle).to_have_attribute("aria-valuenow", "52")
+    stage = page.locator(".stage")
+    box = stage.bounding_box()
+    assert box is not None
+    place = shown(page)
+    page.mouse.move(box["x"] + 60, box["y"] + 60)
+    page.mouse.wheel(0, -240)
+    expect(page.locator(".zoom-words")).not_to_have_text("100 %")
+    page.mouse.down()
+    page.mouse.move(box["x"] + 160, box["y"] + 100, steps=4)
+    page.mouse.up()
+    assert shown(page) != place
+    expect(page).to_have_url(re.compile("#at="))
+    page.get_by_role("button", name="Whole window").click()
+    assert viewer.bounding_box() == {"x": 0, "y": 0, "width": 1280, "height": 900}
+    page.keyboard.press("Escape")
+    page.get_by_role("button", name="Whole photo").click()
+
+    expect(page.locator(".mosaic button")).to_have_count(9)
+    expect(page.locator("section[aria-labelledby=gain] .zones")).to_contain_text("Corners")
+    expect(page.locator("section[aria-labelledby=audit]")).to_contain_text("held back")
+    with page.expect_download() as got:
+        page.get_by_role("link", name="Download the").click()
+    got.value.save_as(tmp_path / "saved")
+    assert got.value.suggested_filename == "wall-0-corrected.jpg"
+    saved = (tmp_path / "saved").read_bytes()
+    assert saved[:2] == b"\xff\xd8"
+    assert b"lens blur corrected by lensmodel: Test Optics Test 35mm" in saved
+    assert b"xpacket" in saved
+
+
+def test_fingers_zoom_and_move_the_view(page: Page, correction: dict[str, Any]) -> None:
+    page.goto(f"/corrections/{correction['id']}")
+    stage = page.locator(".stage")
+    expect(page.locator(".zoom-words")).not_to_have_text("")
+    stage.scroll_into_view_if_needed()
+    box = stage.bounding_box()
+    assert box is not None
+    first = page.locator(".zoom-words").inner_text()
+    middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    touch = page.context.new_cdp_session(page)
+    for half in (60, 100, 180):  # beside the handle of the split
+        points = [{"x": middle[0] + sign * half, "y": middle[1], "id": k} for k, sign in enumerate((-1, 1))]
+        kind = "touchStart" if half == 60 else "touchMove"
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    expect(page.locator(".zoom-words")).not_to_have_text(first)
+
+
+def test_a_lens_has_charts_a_verdict_and_a_report(page: Page, learned: dict[str, Any]) -> None:
+    page.goto(f"/lenses/{learned['lens_id']}")
+    expect(page.locator("#lens-state [data-settled]")).to_be_attached()
+    expect(page.locator("#charts svg").first).to_be_visible()
+    expect(page.locator(".verdict")).to_contain_text("this copy is")
+    expect(page.locator("section[aria-labelledby=centring-title]")).to_contain_text(
+        re.compile("Yes|No|Undecided")
+    )
+    controls = page.locator("#chart-controls")
+    with page.expect_response(lambda answer: "/charts?" in answer.url and "lp%2Fmm" not in answer.url) as got:
+        controls.locator("[name=aperture]").select_option("5.6")
+    assert got.value.ok
+    expect(page.locator("#charts")).to_contain_text("f/5.6")
+    controls.locator("[name=against]").select_option("at 2.8")
+    expect(page.locator("#charts .lead")).to_contain_text("Beside f/5.6, f/2.8 is")
+    with page.expect_download() as saved:
+        page.get_by_role("link", name="As CSV").click()
+    assert saved.value.suggested_filename.endswith(".csv")
+    pdf = page.request.get(f"/v1/lenses/{learned['lens_id']}/report.pdf")
+    assert pdf.body()[:5] == b"%PDF-"
+
+
+def test_a_lens_is_renamed_merged_and_its_profile_taken_along(
+    page: Page, service: Service, tmp_path: Path
+) -> None:
+    made = [
+        service.calibrated(write_photo(tmp_path / f"m{k}.dng", 61 + k, serial=f"M-{k}"))["lens_id"]
+        for k in range(2)
+    ]
+    page.goto(f"/lenses/{made[0]}")
+    with page.expect_download() as got:
+        page.get_by_role("link", name="Download the profile").click()
+    got.value.save_as(tmp_path / "one.lensprofile")
+    page.get_by_label("Name", exact=True).fill("My first")
+    page.get_by_role("button", name="Rename").click()
+    expect(page.locator("h1")).to_have_text("My first")
+
+    page.on("dialog", lambda dialog: dialog.accept())
+    page.get_by_label("The same copy as").select_option(made[1])
+    page.get_by_role("button", name="Merge into it").click()
+    page.wait_for_url(f"**/lenses/{made[1]}")
+    expect(page.locator(".facts").first).to_contain_text("2 photos")
+    assert service.http.get(f"/v1/lenses/{made[0]}").status_code == 404
+
+    before = service.get(f"/v1/lenses/{made[1]}")
+    page.get_by_label("Add what a profile knows").set_input_files(tmp_path / "one.lensprofile")
+    page.get_by_role("button", name="Add", exact=True).click()
+    expect(page.locator(".facts").first).to_contain_text("3 photos")
+    assert service.get(f"/v1/lenses/{made[1]}")["samples"] > before["samples"]
+    page.get_by_text("All versions").click()
+    page.get_by_role("button", name=f"Go back to {before['version']}").click()
+    expect(page.locator(".facts").first).to_contain_text("2 photos")
+    page.get_by_role("button", name="Delete lens").click()
+    page.wait_for_url("**/")
+
+
+def test_a_page_says_when_the_service_is_away(visitor: Visitor, page: Page) -> None:
+    page.goto("/")
+    expect(page.locator("#away")).to_be_hidden()
+    page.context.set_offline(True)
+    page.evaluate("dispatchEvent(new Event('offline'))")
+    expect(page.locator("#away")).to_be_visible()
+    page.context.set_offline(False)
+    expect(page.locator("#away")).to_be_hidden()
+    visitor.complaints.clear()  # the browser notes that it is offline
+
+
+def test_an_address_without_anything_is_a_page_for_people_and_json_for_programs(
+    visitor: Visitor, page: Page, service: Service
+) -> None:
+    for address in ("/photos/gone", "/lenses/gone", "/corrections/gone", "/nowhere"):
+        answer = page.goto(address)
+        assert answer is not None
+        assert answer.status == 404
+        expect(page.locator("h1")).to_have_text("Not here")
+    assert service.http.get("/photos/gone").json()["code"] == "unknown_photo"
+    assert service.http.get("/v1/photos/gone", headers={"Accept": "text/html"}).json()["status"] == 404
+
+    assert faults(page) == []
+    visitor.complaints.clear()  # the browser notes each 404
+
+
+@pytest.mark.parametrize("kind", ["home", "lens", "photo", "correction"])
+def test_a_page_is_accessible_fits_each_screen_and_shows_the_focus(
+    page: Page, learned: dict[str, Any], correction: dict[str, Any], kind: str
+) -> None:
+    page.goto(address_of(kind, learned, correction))
+    page.wait_for_load_state("load")
+    for scheme in ("light", "dark"):
+        page.emulate_media(color_scheme=scheme, reduced_motion="reduce")
+        assert faults(page) == [], scheme
+    for width in WIDTHS:
+        page.set_viewport_size({"width": width, "height": 800})
+        assert overhang(page) <= 0, width
+
+    page.set_viewport_size({"width": 1280, "height": 900})
+    check_each_stop_of_the_keyboard_is_seen(page)
+
+
+def check_each_stop_of_the_keyboard_is_seen(page: Page) -> None:
+    wanted = page.evaluate(
+        "[...document.querySelectorAll('a[href], button:not(:disabled), input, select, summary, "
+        '[tabindex="0"]\')].filter((e) => e.checkVisibility() && e.tabIndex >= 0).length'
+    )
+    seen = set()
+    page.keyboard.press("Tab")
+    expect(page.locator(".skip")).to_be_focused()
+    expect(page.locator(".skip")).to_be_in_viewport()
+    for _ in range(wanted):
+        name, outline = page.evaluate(STOP)
+        assert outline >= 2, name
+        seen.add(name)
+        page.keyboard.press("Tab")
+
+    assert len(seen) == wanted

@@ -1,0 +1,242 @@
+"""Pages and their pictures as they are served, without a browser."""
+
+from __future__ import annotations
+
+import io
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image
+from starlette.testclient import TestClient
+
+from app.blobs.previews import upright
+from app.blobs.storage import Storage
+from app.jobs import tasks
+from app.jobs.body_keys import body_key
+from app.jobs.task_files import AFTER, BEFORE, GLANCE, PREVIEW, R_MAP
+from app.pages.groups import grouped
+from app.pages.pictures import in_sensor, upright_point
+from app.runtime.settings import Settings
+from app.schemas import Region
+from app.store import LensName, Store
+from app.store.corrections import Result
+from app.store.photo_steps import folder_of
+from lensmodel.core.types import ignore_step
+from lensmodel.photo.dng import write_bayer_dng
+
+Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
+
+
+def opened(client: TestClient, path: str) -> Image.Image:
+    answer = client.get(path)
+    assert answer.status_code == 200, answer.text
+    return Image.open(io.BytesIO(answer.content))
+
+
+def test_a_preview_and_an_r_map_come_from_the_blobs_upright_in_any_size(
+    client: TestClient, steps: Steps, settings: Settings, tmp_path: Path
+) -> None:
+    scene = np.random.default_rng(1).integers(0, 255, (90, 120, 3), dtype=np.uint8)
+    exif = Image.Exif()
+    exif[0x0112] = 6  # the camera was held upright
+    Image.fromarray(scene).save(tmp_path / "p.jpg", exif=exif, quality=95)
+    tasks.develop({"path": str(tmp_path / "p.jpg"), "max_megapixels": 1.0}, tmp_path, ignore_step)
+    photo = steps.counted()
+    for name in (PREVIEW, R_MAP):
+        Storage(settings.storage).put_file(f"{folder_of(photo)}{name}", tmp_path / name)
+
+    for name in (PREVIEW, R_MAP):
+        assert opened(client, f"/ui/photos/{photo.public_id}/{name}").size == (90, 120)
+        assert opened(client, f"/ui/photos/{photo.public_id}/{name}?size=40").size == (30, 40)
+
+
+def test_no_photo_is_too_long_for_a_preview(tmp_path: Path) -> None:
+    Image.new("RGB", (30000, 16), "gray").save(tmp_path / "p.png")
+
+    tasks.develop({"path": str(tmp_path / "p.png"), "max_megapixels": 1.0}, tmp_path, ignore_step)
+
+    assert {PREVIEW, R_MAP} <= {path.name for path in tmp_path.iterdir()}
+
+
+def a_picture() -> NDArray[np.uint8]:
+    """A picture of 1300 x 700 with a white corner."""
+    scene = np.full((700, 1300, 3), 40, dtype=np.uint8)
+    scene[:20, :20] = 255
+    return scene
+
+
+def encoded(scene: NDArray[np.uint8]) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(scene).save(file, "JPEG", quality=95, subsampling=0)
+    return file.getvalue()
+
+
+@pytest.fixture
+def corrected(client: TestClient, steps: Steps, store: Store, settings: Settings) -> dict[str, Any]:
+    """A correction to a DNG that has changed nothing."""
+    wish = {"photo_id": steps.counted().public_id, "output": {"format": "dng"}}
+    made: dict[str, Any] = client.post("/v1/corrections", json=wish).json()
+    blobs, folder = Storage(settings.storage), f"corrections/{made['id']}/"
+    blobs.put(f"{folder}result.dng", b"a file that the pages never open")
+    for name in (BEFORE, AFTER):
+        blobs.put(f"{folder}{name}", encoded(a_picture()))
+    store.corrections.start(made["id"])
+    audit = {
+        "zones": {"center": {"tiles": 4, "tiles_held": 1, "held_back": 0.1, "checks": {"grain": 0.1}}},
+        "worst": [
+            {"check": "grain", "row": 10, "col": 90, "zone": "center", "severity": 2.0, "held_back": 0.4}
+        ],
+        "tiles": [{"row": 0, "col": 64, "held_back": 0.4}],
+        "tile_side": 64,
+    }
+    result = Result(f"{folder}result.dng", "etag", "image/x-adobe-dng", 1, "p.dng")
+    report = {"zones": {}, "nothing_to_correct": True, "audit": audit}
+    assert store.corrections.finish(made["id"], result, report)
+    return made
+
+
+def test_tiles_before_and_after_show_one_place_and_are_decoded_once(
+    client: TestClient, corrected: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    storage = client.app.state.services.storage  # type: ignore[attr-defined] # Starlette's own attribute
+    read, get = list[str](), storage.get
+    monkeypatch.setattr(storage, "get", lambda key: read.append(key) or get(key))
+    base = f"/ui/corrections/{corrected['id']}/tiles"
+    paths = [f"{base}/{side}/0/0_0.jpg" for side in ("before", "after")]
+
+    with ThreadPoolExecutor(4) as pool:
+        tiles = list(pool.map(lambda path: opened(client, path), paths * 4))
+
+    assert len(read) == 2
+    shown = [np.asarray(tile).astype(float) for tile in tiles]
+    assert all(np.abs(tile - shown[0]).max() < 8 for tile in shown)
+    assert shown[0].shape == (512, 512, 3)
+    assert shown[0][5, 5].min() > 245
+    assert opened(client, f"{base}/after/0/2_1.jpg").size == (1300 - 1024, 700 - 512)
+    assert opened(client, f"{base}/after/1/1_0.jpg").size == (650 - 512, 350)
+    assert opened(client, f"{base}/after/whole.jpg").size == (1300, 700)
+    assert client.get(f"{base}/after/0/9_9.jpg").status_code == 404
+
+
+def test_a_corrected_dng_is_looked_at_and_its_audit_told(
+    client: TestClient, corrected: dict[str, Any]
+) -> None:
+    page = client.get(f"/corrections/{corrected['id']}").text
+
+    assert 'id="viewer"' in page
+    assert "Nothing to correct here." in page
+    assert "10% of the correction was held back over the whole photo." in page
+    assert "grain beyond that of the photo: 10.0%" in page
+    assert '{"held": 0.4, "x": 64, "y": 0}' in page
+    assert "open it in your RAW developer" in page
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_part_of_the_upright_photo_is_found_on_the_sensor(orientation: int) -> None:
+    sensor = np.arange(30 * 50).reshape(30, 50)
+    turned = upright(sensor, orientation)
+    part = Region(x=7, y=11, width=9, height=5)
+
+    found = in_sensor(part, 30, 50, orientation)
+
+    crop = sensor[found.y : found.y + found.height, found.x : found.x + found.width]
+    wanted = turned[part.y : part.y + part.height, part.x : part.x + part.width]
+    assert sorted(crop.ravel()) == sorted(wanted.ravel())
+    row, col = upright_point(found.y, found.x, 30, 50, orientation)
+    assert turned[row, col] == sensor[found.y, found.x]
+
+
+def test_a_photo_is_glanced_at_before_it_is_developed(
+    client: TestClient, steps: Steps, settings: Settings, tmp_path: Path
+) -> None:
+    photo = steps.receive()
+    address = f"/ui/photos/{photo.public_id}/glance.jpg"
+    assert client.get(address).headers["content-type"] == "image/svg+xml"  # nothing to see yet
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(a_picture()).save(tmp_path / "p.jpg", exif=exif)
+    arguments = {"path": str(tmp_path / "p.jpg"), "kind": "jpeg", "orientation": 6}
+    tasks.glance(arguments, tmp_path, ignore_step)
+    Storage(settings.storage).put_file(f"{folder_of(photo)}{GLANCE}", tmp_path / GLANCE)
+
+    assert opened(client, address).size == (258, 480)
+
+
+@pytest.mark.parametrize("kind", ["tiff", "png", "dng"])
+def test_every_kind_of_photo_has_a_glance(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / f"p.{kind}"
+    if kind == "tiff":
+        tifffile.imwrite(path, a_picture().astype(np.uint16) * 257)
+    elif kind == "png":
+        Image.fromarray(a_picture()).save(path)
+    else:
+        write_bayer_dng(path, np.full((64, 96), 3000, np.uint16), black=512, white=15512)
+
+    tasks.glance({"path": str(path), "kind": kind, "orientation": 1}, tmp_path, ignore_step)
+
+    with Image.open(tmp_path / GLANCE) as picture:
+        assert picture.width > picture.height > 16
+
+
+def test_waiting_photos_are_grouped_by_body_and_focal_length(steps: Steps, store: Store) -> None:
+    for body, focal in (("A", 35.0), ("A", 35.0), ("B", 35.0), ("A", 50.0)):
+        photo = steps.receive()
+        store.photos.set_state(photo.public_id, ("received",), "inspecting")
+        store.photos.record_inspection(
+            photo.public_id,
+            width=60,
+            height=40,
+            identity=LensName(None, None, None, "none"),
+            aperture=None,
+            focal_mm=focal,
+            focus_m=None,
+            pixel_pitch_um=None,
+            camera_maker="Kamera",
+            camera_model="Kamera One",
+            body_key=body_key("Kamera", "Kamera One", body),
+        )
+        store.photos.set_state(photo.public_id, ("inspecting",), "needs_lens")
+
+    groups = grouped(store.photos.page("local", before=None, limit=9, state="needs_lens"))
+
+    assert sorted((g.camera, g.focal_mm, len(g.photos)) for g in groups) == [
+        ("Kamera One", 35.0, 1),
+        ("Kamera One", 35.0, 2),
+        ("Kamera One", 50.0, 1),
+    ]
+    assert {g.body for g in groups} == {1, 2}
+    assert all(g.needs_aperture for g in groups)
+
+
+def test_a_photo_that_lacks_only_its_aperture_is_asked_for_nothing_else(
+    client: TestClient, steps: Steps, store: Store
+) -> None:
+    photo = steps.receive()
+    steps.inspect(photo, aperture=None)
+    store.photos.set_state(photo.public_id, ("inspecting",), "needs_lens")
+
+    page = client.get(f"/photos/{photo.public_id}").text
+
+    assert 'name="aperture"' in page
+    assert 'name="label"' not in page
+    assert "aperture was it?" in page
+
+
+def test_a_lens_page_shows_the_newest_of_many_versions(
+    client: TestClient, steps: Steps, store: Store
+) -> None:
+    photo = steps.counted()
+    lens_id = steps.lens_id(photo)
+    for _ in range(201):
+        store.photos.change(photo.public_id, "local", {"aperture": 2.0})
+    store.lenses.record_metrics(lens_id, 202, {"error": {}, "coverage": {"corner": 77}})
+
+    page = client.get(f"/lenses/{lens_id}").text
+
+    assert "<td>202</td>" in page
+    assert "77 places" in page

@@ -1,0 +1,322 @@
+"""Corrections over HTTP: asked for once, fetched whole or in parts."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from app.blobs.storage import Storage
+from app.routes.corrections import byte_range
+from app.runtime.settings import Settings
+from app.store import Store
+from app.store.corrections import Result
+
+Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
+FILE = bytes(range(256)) * 40
+
+
+def post(client: TestClient, **wish: Any) -> Any:
+    return client.post("/v1/corrections", json=wish)
+
+
+def finish(store: Store, settings: Settings, correction_id: str) -> None:
+    key = f"corrections/{correction_id}/result"
+    Storage(settings.storage).put(key, FILE)
+    etag = hashlib.sha256(FILE).hexdigest()
+    store.corrections.start(correction_id)
+    result = Result(key, etag, "image/tiff", len(FILE), "Größe p1-corrected.tif")
+    report = {"zones": {"corner": {"expected_gain_db": 2.0}}}
+    assert store.corrections.finish(correction_id, result, report)
+
+
+@pytest.fixture
+def finished(client: TestClient, steps: Steps, store: Store, settings: Settings) -> str:
+    correction_id: str = post(client, photo_id=steps.counted().public_id).json()["id"]
+    finish(store, settings, correction_id)
+    return correction_id
+
+
+def test_a_correction_is_queued_with_the_newest_version(client: TestClient, steps: Steps) -> None:
+    steps.counted()
+    photo = steps.counted()
+
+    answer = post(client, photo_id=photo.public_id)
+
+    assert answer.status_code == 202
+    made = answer.json()
+    assert (made["state"], made["lens_version"], made["method"]) == ("queued", 2, "standard")
+    assert made["lens_id"] == steps.lens_id(photo)
+    assert answer.headers["location"] == made["links"]["self"] == f"/v1/corrections/{made['id']}"
+    job = client.get(made["links"]["job"]).json()
+    assert (job["kind"], job["state"], job["links"]["correction"]) == (
+        "correction",
+        "queued",
+        made["links"]["self"],
+    )
+
+
+def test_the_same_wish_is_the_same_correction(
+    client: TestClient, steps: Steps, store: Store, settings: Settings
+) -> None:
+    photo = steps.counted()
+    first = post(client, photo_id=photo.public_id, strength=0.5)
+    again = post(client, photo_id=photo.public_id, strength=0.5)
+    assert (again.status_code, again.json()["id"]) == (202, first.json()["id"])
+
+    finish(store, settings, first.json()["id"])
+
+    third = post(client, photo_id=photo.public_id, strength=0.5)
+    assert (third.status_code, third.json()["id"]) == (200, first.json()["id"])
+    assert third.json()["report"] == {"zones": {"corner": {"expected_gain_db": 2.0}}}
+    other = post(client, photo_id=photo.public_id, strength=0.6)
+    assert other.json()["id"] != first.json()["id"]
+
+
+def test_bounds_make_another_correction_and_none_the_same_as_before_there_were_any(
+    client: TestClient, steps: Steps, store: Store
+) -> None:
+    photo = steps.counted()
+    plain = post(client, photo_id=photo.public_id).json()["id"]
+    unbound = post(client, photo_id=photo.public_id, halo=None, denoise=0.0).json()["id"]
+    bound = post(client, photo_id=photo.public_id, halo=0.2, denoise=0.5).json()["id"]
+
+    assert unbound == plain != bound
+    rows = [store.corrections.get(key) for key in (plain, bound)]
+    assert [[row.params.get(name) for name in ("halo", "denoise")] for row in rows if row] == [
+        [None, None],
+        [0.2, 0.5],
+    ]
+
+
+def test_a_new_photo_of_the_lens_makes_another_correction(client: TestClient, steps: Steps) -> None:
+    photo = steps.counted()
+    first = post(client, photo_id=photo.public_id).json()
+    steps.counted()
+
+    assert post(client, photo_id=photo.public_id).json()["id"] != first["id"]
+    assert post(client, photo_id=photo.public_id, lens_version=1).json()["id"] == first["id"]
+
+
+def test_a_stored_photo_finds_the_lens_that_was_calibrated_later(client: TestClient, steps: Steps) -> None:
+    photo = steps.receive(calibrate=False)
+    steps.inspect(photo)
+    lens_id = steps.lens_id(steps.counted())
+
+    answer = post(client, photo_id=photo.public_id)
+
+    assert (answer.status_code, answer.json()["lens_id"]) == (202, lens_id)
+
+
+def test_a_photo_not_yet_read_asks_for_patience(client: TestClient, steps: Steps) -> None:
+    lens_id = steps.lens_id(steps.counted())
+    photo = steps.receive(calibrate=False)
+
+    without = post(client, photo_id=photo.public_id)
+    named = post(client, photo_id=photo.public_id, lens_id=lens_id)
+
+    for answer in (without, named):
+        assert (answer.status_code, answer.json()["code"]) == (409, "not_ready")
+        assert "retry-after" in answer.headers
+
+
+def test_a_photo_with_other_settings_is_corrected_anew(
+    client: TestClient, steps: Steps, store: Store, settings: Settings
+) -> None:
+    lens_id = steps.lens_id(steps.counted())
+    photo = steps.receive(calibrate=False)
+    steps.inspect(photo)
+    store.photos.set_state(photo.public_id, ("inspecting",), "stored")
+    first = post(client, photo_id=photo.public_id, lens_id=lens_id).json()["id"]
+    finish(store, settings, first)
+
+    client.patch(f"/v1/photos/{photo.public_id}", json={"aperture": 8.0})
+    again = post(client, photo_id=photo.public_id, lens_id=lens_id)
+
+    assert (again.status_code, again.json()["id"] != first) == (202, True)
+    row = store.corrections.get(again.json()["id"])
+    assert row is not None
+    assert row.params["settings"]["aperture"] == 8.0
+
+
+def test_a_photo_without_a_lens_must_be_told_one(client: TestClient, steps: Steps) -> None:
+    photo = steps.receive(calibrate=False)
+    steps.inspect(photo, serial=None)
+
+    answer = post(client, photo_id=photo.public_id)
+
+    assert (answer.status_code, answer.json()["code"]) == (422, "metadata_missing")
+    assert "lens_id" in answer.json()["detail"]
+
+
+def test_a_lens_without_samples_cannot_correct(client: TestClient, steps: Steps) -> None:
+    photo = steps.receive()
+    steps.inspect(photo)
+
+    answer = post(client, photo_id=photo.public_id)
+
+    assert (answer.status_code, answer.json()["code"]) == (409, "no_samples")
+
+
+@pytest.mark.parametrize(
+    ("wish", "status", "code"),
+    [
+        ({"method": "magic"}, 422, "invalid_parameter"),
+        ({"method": ""}, 422, "invalid_parameter"),
+        ({"strength": 1.5}, 422, "invalid_parameter"),
+        ({"strength": "NaN"}, 422, "invalid_parameter"),
+        ({"halo": -0.1}, 422, "invalid_parameter"),
+        ({"halo": "NaN"}, 422, "invalid_parameter"),
+        ({"denoise": 1.5}, 422, "invalid_parameter"),
+        ({"output": {"format": "bmp"}}, 422, "invalid_parameter"),
+        ({"output": {"quality": 0}}, 422, "invalid_parameter"),
+        ({"output": {"color_space": "adobe"}}, 422, "invalid_parameter"),
+        ({"roi": {"x": 0, "y": 0, "width": 6001, "height": 10}}, 422, "invalid_parameter"),
+        ({"roi": {"x": -1, "y": 0, "width": 10, "height": 10}}, 422, "invalid_parameter"),
+        ({"roi": {"x": 0, "y": 0, "width": 0, "height": 10}}, 422, "invalid_parameter"),
+        ({"lens_id": "nothing"}, 404, "unknown_lens"),
+        ({"lens_version": 7}, 409, "conflict"),
+        ({"lens_version": 0}, 422, "invalid_parameter"),
+        ({"iterations": 5}, 422, "invalid_parameter"),
+        ({"photo_id": "nothing"}, 404, "unknown_photo"),
+        ({"photo_id": 7}, 422, "invalid_parameter"),
+        ({"photo_id": "../../x"}, 422, "invalid_parameter"),
+    ],
+)
+def test_a_wish_that_cannot_be_is_refused(
+    client: TestClient, steps: Steps, wish: dict[str, Any], status: int, code: str
+) -> None:
+    answer = post(client, **({"photo_id": steps.counted().public_id} | wish))
+
+    assert (answer.status_code, answer.json()["code"]) == (status, code)
+    assert answer.json()["detail"]
+
+
+def test_an_unknown_method_lists_the_known_ones(client: TestClient, steps: Steps) -> None:
+    answer = post(client, photo_id=steps.counted().public_id, method="magic")
+
+    assert "magic" in answer.json()["detail"]
+    assert "standard" in answer.json()["detail"]
+
+
+def test_the_result_waits_for_the_work(client: TestClient, steps: Steps, store: Store) -> None:
+    made = post(client, photo_id=steps.counted().public_id).json()
+    store.corrections.start(made["id"])
+    store.corrections.progress(made["id"], 3, 8)
+
+    early = client.get(f"/v1/corrections/{made['id']}/result")
+    job = client.get(made["links"]["job"]).json()
+
+    assert (early.status_code, early.json()["code"]) == (409, "not_ready")
+    assert made["links"]["result"] is None
+    assert (job["stage"], job["progress"]) == ("correcting", {"done": 3, "total": 8, "unit": "tiles"})
+    assert job["links"]["result"] is None
+
+
+def test_a_failed_correction_says_why_and_can_be_asked_for_again(
+    client: TestClient, steps: Steps, store: Store
+) -> None:
+    photo = steps.counted()
+    made = post(client, photo_id=photo.public_id).json()
+    store.corrections.fail(made["id"], "memory_limit", "needs 9 GiB, may have 4: correct a region")
+
+    shown = client.get(made["links"]["self"]).json()
+
+    assert (shown["state"], shown["error"]["code"]) == ("failed", "memory_limit")
+    assert client.get(f"/v1/corrections/{made['id']}/result").status_code == 409
+    assert post(client, photo_id=photo.public_id).json()["id"] != made["id"]
+
+
+def test_the_result_is_the_file_that_was_made(client: TestClient, finished: str) -> None:
+    shown = client.get(f"/v1/corrections/{finished}").json()
+
+    answer = client.get(shown["links"]["result"])
+
+    assert answer.status_code == 200
+    assert answer.content == FILE
+    assert answer.headers["content-type"] == "image/tiff"
+    assert answer.headers["etag"] == f'"{hashlib.sha256(FILE).hexdigest()}"'
+    assert answer.headers["content-length"] == str(len(FILE))
+    assert answer.headers["content-disposition"] == (
+        "attachment; filename=\"Gr__e_p1-corrected.tif\"; filename*=UTF-8''Gr%C3%B6%C3%9Fe%20p1-corrected.tif"
+    )
+
+
+def test_parts_of_the_result_join_to_the_whole(client: TestClient, finished: str) -> None:
+    path = f"/v1/corrections/{finished}/result"
+
+    first = client.get(path, headers={"Range": "bytes=0-99"})
+    rest = client.get(path, headers={"Range": "bytes=100-", "If-Range": first.headers["etag"]})
+    changed = client.get(path, headers={"Range": "bytes=100-", "If-Range": '"other"'})
+
+    assert (first.status_code, first.headers["content-range"]) == (206, f"bytes 0-99/{len(FILE)}")
+    assert first.content + rest.content == FILE
+    assert (changed.status_code, changed.content) == (200, FILE)
+
+
+def test_an_unchanged_result_is_not_sent_again(client: TestClient, finished: str) -> None:
+    path = f"/v1/corrections/{finished}/result"
+    tag = client.get(path).headers["etag"]
+
+    assert client.get(path, headers={"If-None-Match": tag}).status_code == 304
+    assert client.get(path, headers={"If-None-Match": "*"}).status_code == 304
+    only_head = client.head(path)
+    assert (only_head.content, only_head.headers["content-length"]) == (
+        b"",
+        str(len(client.get(path).content)),
+    )
+
+
+def test_a_range_beyond_the_end_is_not_satisfiable(client: TestClient, finished: str) -> None:
+    answer = client.get(f"/v1/corrections/{finished}/result", headers={"Range": "bytes=99999-"})
+
+    assert answer.status_code == 416
+    assert answer.headers["content-range"] == f"bytes */{len(FILE)}"
+
+
+@pytest.mark.parametrize(
+    ("header", "part"),
+    [
+        (None, (0, 1000)),
+        ("bytes=0-0", (0, 1)),
+        ("bytes=10-19", (10, 20)),
+        ("bytes=990-2000", (990, 1000)),
+        ("bytes=-10", (990, 1000)),
+        ("bytes=-5000", (0, 1000)),
+        ("bytes=500-", (500, 1000)),
+        ("bytes=20-10", (0, 1000)),
+        ("bytes=0-1,5-6", (0, 1000)),
+        ("bytes=-", (0, 1000)),
+        ("lines=1-2", (0, 1000)),
+        ("bytes=0-" + "9" * 5000, (0, 1000)),
+        ("nonsense", (0, 1000)),
+    ],
+)
+def test_a_range_is_read_as_the_standard_says(header: str | None, part: tuple[int, int]) -> None:
+    assert byte_range(header, 1000) == part
+
+
+def test_corrections_are_listed_by_photo_and_deleted_with_their_file(
+    client: TestClient, finished: str, steps: Steps, settings: Settings
+) -> None:
+    other = post(client, photo_id=steps.counted().public_id).json()
+    photo_id = client.get(f"/v1/corrections/{finished}").json()["photo_id"]
+    assert [c["id"] for c in client.get("/v1/corrections").json()["items"]] == [other["id"], finished]
+    assert [c["id"] for c in client.get(f"/v1/corrections?photo_id={photo_id}").json()["items"]] == [finished]
+
+    assert client.delete(f"/v1/corrections/{finished}").status_code == 204
+
+    assert client.get(f"/v1/corrections/{finished}").status_code == 404
+    assert not (settings.data_dir / "blobs" / "corrections" / finished).exists()
+    assert client.delete(f"/v1/corrections/{finished}").status_code == 404
+
+
+def test_a_running_correction_is_cancelled_once(client: TestClient, steps: Steps, store: Store) -> None:
+    made = post(client, photo_id=steps.counted().public_id).json()
+    store.corrections.start(made["id"])
+
+    assert client.post(f"/v1/jobs/{made['id']}/cancel").json()["state"] == "cancelled"
+    assert client.post(f"/v1/jobs/{made['id']}/cancel").status_code == 409
+    assert client.get(made["links"]["self"]).json()["error"]["code"] == "cancelled"

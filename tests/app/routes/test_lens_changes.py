@@ -1,0 +1,156 @@
+"""Lenses renamed, merged, set back; their profiles and reports over HTTP."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from app.blobs.storage import Storage
+from app.runtime.settings import Settings
+from app.store import LensName, Store
+from app.store.versions import report_key
+from lensmodel.core.codec import to_json
+from lensmodel.model import LensModel
+from lensmodel.report.lens_test import lens_test
+
+Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
+
+
+def test_several_photos_are_named_at_once(client: TestClient, steps: Steps, store: Store) -> None:
+    photos = [steps.receive() for _ in range(3)]
+    for photo in photos:
+        steps.inspect(photo, serial=None)
+        store.photos.set_state(photo.public_id, ("inspecting",), "needs_lens")
+    keys = [photo.public_id for photo in photos]
+
+    named = client.patch(
+        "/v1/photos", json={"photo_ids": keys, "new_lens": {"label": "Mine"}, "aperture": 2.0}
+    )
+
+    assert named.status_code == 200, named.text
+    rows = [steps.fresh(photo) for photo in photos]
+    assert len({row.given["lens_id"] for row in rows}) == 1
+    assert {row.given["aperture"] for row in rows} == {2.0}
+    assert {row.state for row in rows} == {"received"}
+    both = {"photo_ids": keys, "new_lens": {"label": "Mine"}, "lens_id": "x"}
+    assert client.patch("/v1/photos", json=both).status_code == 422
+    assert client.patch("/v1/photos", json={"photo_ids": keys}).status_code == 422
+    assert client.patch("/v1/photos", json={"photo_ids": ["gone"], "lens_id": "x"}).status_code == 404
+
+
+def test_a_lens_is_renamed_and_named_after_its_model_again(client: TestClient, steps: Steps) -> None:
+    lens = steps.lens_id(steps.counted())
+
+    assert client.patch(f"/v1/lenses/{lens}", json={"label": "Old one"}).json()["label"] == "Old one"
+    assert client.patch(f"/v1/lenses/{lens}", json={"label": None}).json()["label"] is None
+    assert client.patch(f"/v1/lenses/{lens}", json={}).status_code == 422
+
+
+def test_merged_lenses_are_one(client: TestClient, steps: Steps, store: Store) -> None:
+    one, two = (steps.counted(serial=serial) for serial in ("1", "2"))
+    first, second = steps.lens_id(one), steps.lens_id(two)
+
+    merged = client.patch(f"/v1/lenses/{first}", json={"merge_into": second}).json()
+
+    assert (merged["id"], merged["photos"], merged["samples"]) == (second, 2, 12)
+    assert client.get(f"/v1/lenses/{first}").status_code == 404
+    assert steps.lens_id(one) == second
+    assert client.patch(f"/v1/lenses/{second}", json={"merge_into": second}).status_code == 422
+    busy = steps.receive()
+    steps.inspect(busy, serial="3")
+    third = steps.lens_id(busy)
+    refused = client.patch(f"/v1/lenses/{third}", json={"merge_into": second})
+    assert (refused.status_code, refused.json()["code"]) == (409, "conflict")
+
+
+def test_going_back_leaves_out_what_joined_later(client: TestClient, steps: Steps) -> None:
+    photos = [steps.counted() for _ in range(3)]
+    lens = steps.lens_id(photos[0])
+
+    back = client.patch(f"/v1/lenses/{lens}", json={"back_to": 1}).json()
+
+    assert (back["photos"], back["version"]) == (1, 5)
+    assert [steps.fresh(photo).state for photo in photos] == ["counted", "excluded", "excluded"]
+    assert client.patch(f"/v1/lenses/{lens}", json={"back_to": 5}).status_code == 422
+    again = client.patch(f"/v1/photos/{photos[1].public_id}", json={"excluded": False})
+    assert again.json()["state"] == "counted"
+
+
+def test_a_profile_goes_out_and_comes_back(client: TestClient, steps: Steps, store: Store) -> None:
+    lens = steps.lens_id(steps.counted(patches=4))
+    other = steps.named(LensName(None, None, None, label="Another"))
+    sent = client.get(f"/v1/lenses/{lens}/profile")
+    assert sent.headers["content-disposition"].endswith('.lensprofile"')
+
+    taken = client.put(f"/v1/lenses/{other}/profile", content=sent.content)
+    again = client.put(f"/v1/lenses/{other}/profile", content=sent.content)
+
+    assert taken.status_code == 200, taken.text
+    assert (taken.json()["photos"], taken.json()["samples"]) == (1, 12)
+    assert again.json() == taken.json()
+    question = {"r": 0.5, "phi": 0.4, "aperture": 1.4, "family": False}
+    kernels = [
+        client.get(f"/v1/lenses/{key}/psf.json", params=question).json()["psf"] for key in (lens, other)
+    ]
+    assert kernels[0] == kernels[1]
+    photo = client.get("/v1/photos", params={"lens_id": other}).json()["items"][0]
+    refused = client.post("/v1/corrections", json={"photo_id": photo["id"]})
+    assert refused.status_code == 409
+    bad = client.put(f"/v1/lenses/{other}/profile", content=b"no profile")
+    assert (bad.status_code, bad.json()["code"]) == (400, "malformed_upload")
+    assert client.put("/v1/lenses/gone/profile", content=sent.content).status_code == 404
+
+
+@pytest.fixture
+def reported(client: TestClient, steps: Steps, store: Store, settings: Settings) -> str:
+    """A lens whose newest version has its report."""
+    lens_id: str = steps.lens_id(steps.counted(patches=6))
+    _, stored = store.samples.of_lens(lens_id)
+    test = lens_test(
+        LensModel.fit([one.sample for one in stored]), "A lens", draws=0, rows=5, size=15, channels=("g",)
+    )
+    lens = store.lenses.get(lens_id)
+    assert lens is not None
+    key = report_key(lens_id, lens.version, lens.rebuild_epoch)
+    Storage(settings.storage).put(key, json.dumps(to_json(test)).encode())
+    return lens_id
+
+
+@pytest.mark.parametrize(
+    ("form", "begins"),
+    [("json", b"{"), ("csv", b"quantity,"), ("html", b"<!doctype html>"), ("pdf", b"%PDF-")],
+)
+def test_a_report_comes_in_each_form(client: TestClient, reported: str, form: str, begins: bytes) -> None:
+    address = f"/v1/lenses/{reported}/report.{form}"
+    answer = client.get(address)
+
+    assert answer.status_code == 200, answer.text
+    assert answer.content.startswith(begins)
+    assert client.get(address, headers={"If-None-Match": answer.headers["etag"]}).status_code == 304
+    compared = client.get(address, params={"against": reported, "aperture": 1.4})
+    assert compared.status_code == 200
+    assert compared.content != answer.content
+
+
+def test_a_report_that_is_not_made_yet_says_so(client: TestClient, steps: Steps) -> None:
+    lens = steps.lens_id(steps.counted())
+    answer = client.get(f"/v1/lenses/{lens}/report.json")
+
+    assert (answer.status_code, answer.json()["code"]) == (409, "not_ready")
+    assert client.get("/v1/lenses/gone/report.json").status_code == 404
+
+
+def test_the_page_of_a_lens_shows_its_test(client: TestClient, reported: str) -> None:
+    page = client.get(f"/lenses/{reported}").text
+
+    assert "this copy is" in page
+    assert "<title>MTF50 in cycles/pixel</title>" in page
+    charts = client.get(f"/ui/lenses/{reported}/charts", params={"unit": "lp/mm", "aperture": "1.4"})
+    assert "MTF50 in line pairs per mm" in charts.text
+    for wrong in ({"aperture": ".."}, {"aperture": "x"}, {"against": "at x"}, {"against": "at -1"}):
+        answer = client.get(f"/ui/lenses/{reported}/charts", params=wrong)
+        assert answer.status_code == 422, (wrong, answer.text)
+    assert "PATCH" not in page

@@ -1,0 +1,354 @@
+"""Lenses and their PSFs over HTTP: always current, in every format, cheap to ask again."""
+
+from __future__ import annotations
+
+import io
+import math
+import statistics
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+from starlette.testclient import TestClient
+
+from app.http.model_cache import ModelCache
+from app.routes.psf import accepted
+from app.store import Store
+from app.store.versions import learned_key
+from lensmodel.core.psf import centroid
+from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.model import LensModel
+
+Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
+
+
+@pytest.fixture
+def lens(steps: Steps) -> str:
+    """Return the path of a lens with one counted photo of six patches."""
+    return f"/v1/lenses/{steps.lens_id(steps.counted(patches=6))}"
+
+
+def ask(client: TestClient, lens: str, **query: float | str) -> dict[str, Any]:
+    answer = client.get(f"{lens}/psf", params={"r": 0.9, "phi": 0.59, "aperture": 1.4, **query})
+    assert answer.status_code == 200, answer.text
+    return dict(answer.json())
+
+
+def test_a_lens_tells_who_it_is_and_what_it_knows(client: TestClient, lens: str) -> None:
+    shown = client.get(lens).json()
+
+    assert (shown["maker"], shown["model"], shown["serial"]) == ("Canon", "EF24mm f/1.4L", "123")
+    assert (shown["serial_source"], shown["version"], shown["photos"], shown["samples"]) == ("exif", 1, 1, 18)
+    assert (shown["apertures"], shown["focal_lengths_mm"]) == ([1.4], [24.0])
+    assert client.get(shown["links"]["photos"]).json()["items"][0]["lens_id"] == shown["id"]
+    assert shown["id"] in lens
+    assert "123" not in str(shown["links"]).replace(shown["id"], "")
+
+
+def test_lenses_are_found_by_model_and_serial(client: TestClient, steps: Steps) -> None:
+    steps.counted(serial="1")
+    second = steps.lens_id(steps.counted(serial="2"))
+
+    assert len(client.get("/v1/lenses?model=ef24MM f/1.4l").json()["items"]) == 2
+    found = client.get("/v1/lenses?model=EF24mm f/1.4L&serial=2").json()["items"]
+    assert [lens["id"] for lens in found] == [second]
+    assert client.get("/v1/lenses?serial=3").json()["items"] == []
+
+
+def test_a_blank_filter_asks_for_all_lenses(client: TestClient, lens: str) -> None:
+    found = client.get("/v1/lenses?model=&serial=").json()["items"]
+
+    assert [f"/v1/lenses/{one['id']}" for one in found] == [lens]
+
+
+def test_a_psf_is_a_normalised_centred_kernel(client: TestClient, lens: str) -> None:
+    answer = ask(client, lens)
+
+    kernel = np.array(answer["psf"]["data"])
+    assert kernel.shape == (55, 55)
+    assert answer["psf"]["shape"] == [55, 55]
+    assert kernel.min() >= 0
+    assert kernel.sum() == pytest.approx(1, abs=1e-6)
+    assert np.abs(centroid(kernel)).max() < 0.05
+    assert answer["version"] == 1
+    assert answer["query"] | {"focal_length_mm": None, "focus_distance_m": None} == {
+        "r": 0.9,
+        "phi": 0.59,
+        "aperture": 1.4,
+        "channel": "g",
+        "size": 55,
+        "focal_length_mm": None,
+        "focus_distance_m": None,
+    }
+    assert answer["support"]["photos"] == 1
+    assert answer["support"]["effective_samples"] > 0
+    assert set(answer["bandwidth"]) >= {"r", "phi"}
+    assert answer["units"] == {"r": "half-diagonal", "phi": "radian", "pixel_pitch_um": 6.0}
+
+
+def test_all_formats_hold_the_same_kernel(client: TestClient, lens: str) -> None:
+    query = {"r": 0.5, "phi": 2.2, "aperture": 1.4, "size": 21}
+    data = np.array(client.get(f"{lens}/psf.json", params=query).json()["psf"]["data"])
+
+    npy = np.load(io.BytesIO(client.get(f"{lens}/psf.npy", params=query).content), allow_pickle=False)
+    tiff = client.get(f"{lens}/psf.tiff", params=query)
+    png = client.get(f"{lens}/psf.png", params=query)
+
+    assert npy.dtype == np.float32
+    np.testing.assert_allclose(npy, data, atol=1e-7)
+    with tifffile.TiffFile(io.BytesIO(tiff.content)) as file:
+        np.testing.assert_array_equal(file.asarray(), npy)
+        assert '"version":1' in file.pages.first.tags["ImageDescription"].value
+    picture = np.asarray(Image.open(io.BytesIO(png.content)), dtype=np.float64)
+    peak = float(png.headers["x-psf-scale"].partition(";")[0].removeprefix("max="))
+    np.testing.assert_allclose(picture / 65535 * peak, data, atol=peak / 65535)
+    assert [r.headers["content-type"] for r in (tiff, png)] == ["image/tiff", "image/png"]
+
+
+@pytest.mark.parametrize(
+    ("accept", "form"),
+    [
+        ("*/*", "json"),
+        ("application/json", "json"),
+        ("image/png", "png"),
+        ("image/tiff;q=0.5, image/png;q=0.2", "tiff"),
+        ("text/html, image/*;q=0.8", "png"),
+        ("application/x-npy", "npy"),
+        ("application/json;q=0, image/png", "png"),
+    ],
+)
+def test_the_format_follows_what_the_caller_likes_best(accept: str, form: str) -> None:
+    assert accepted(accept) == form
+
+
+def test_a_format_that_nobody_offers_is_not_acceptable(client: TestClient, lens: str) -> None:
+    answer = client.get(f"{lens}/psf?r=0.5", headers={"Accept": "video/mp4"})
+
+    assert (answer.status_code, answer.json()["code"]) == (406, "not_acceptable")
+
+
+def test_an_unchanged_psf_is_not_sent_again_and_a_changed_one_is(
+    client: TestClient, steps: Steps, lens: str
+) -> None:
+    path = f"{lens}/psf?r=0.9&phi=0.59&aperture=1.4"
+    first = client.get(path)
+    tag = {"If-None-Match": first.headers["etag"]}
+    again = client.get(path, headers=tag)
+    assert (again.status_code, again.content) == (304, b"")
+    assert client.get(f"{path}&channel=r", headers=tag).status_code == 200
+
+    steps.counted(patches=6, width=4.0)
+
+    changed = client.get(path, headers=tag)
+    assert changed.status_code == 200
+    assert changed.headers["etag"] != first.headers["etag"]
+
+
+def test_a_new_photo_is_in_the_very_next_answer(client: TestClient, steps: Steps, lens: str) -> None:
+    before = ask(client, lens)
+
+    steps.counted(patches=6, width=4.0)
+
+    after = ask(client, lens)
+    assert (before["version"], after["version"]) == (1, 2)
+    assert np.max(after["psf"]["data"]) < np.max(before["psf"]["data"])
+    assert after["support"]["photos"] == 2
+
+
+def test_adding_photos_one_by_one_gives_the_model_of_all_at_once(
+    client: TestClient, steps: Steps, store: Store, lens: str
+) -> None:
+    ask(client, lens)
+    steps.counted(patches=6, width=4.0)
+    grown = ask(client, lens)["psf"]["data"]
+
+    anew = ModelCache(store, max_bytes=1).get(lens.rpartition("/")[2])
+
+    assert anew.state.version == 2
+    answer = anew.model.query(FieldPosition(0.9, 0.59), LensSettings(1.4), size=55)
+    np.testing.assert_allclose(grown, answer.kernel, atol=1e-6)
+
+
+def test_an_earlier_version_stays_available_until_photos_are_removed(
+    client: TestClient, steps: Steps, lens: str
+) -> None:
+    first = ask(client, lens)
+    second = steps.counted(patches=6, width=4.0)
+
+    pinned = ask(client, lens, version=1)
+    assert pinned["version"] == 1
+    np.testing.assert_allclose(pinned["psf"]["data"], first["psf"]["data"], atol=1e-9)
+
+    client.patch(f"/v1/photos/{second.public_id}", json={"excluded": True})
+    gone = client.get(f"{lens}/psf?r=0.5&version=1")
+    assert (gone.status_code, gone.json()["code"]) == (409, "conflict")
+    assert ask(client, lens)["support"]["photos"] == 1
+
+
+def test_a_version_of_the_future_is_refused(client: TestClient, lens: str) -> None:
+    answer = client.get(f"{lens}/psf?r=0.5&version=99")
+
+    assert (answer.status_code, answer.json()["code"]) == (409, "conflict")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("r", "-0.01"),
+        ("r", "1.01"),
+        ("r", "nan"),
+        ("r", "inf"),
+        ("r", ""),
+        ("phi", "nan"),
+        ("phi", "1e300"),
+        ("aperture", "0.49"),
+        ("aperture", "128.5"),
+        ("aperture", "nan"),
+        ("channel", "x"),
+        ("size", "0"),
+        ("size", "1"),
+        ("size", "54"),
+        ("size", "257"),
+        ("size", "5.5"),
+        ("focal_length_mm", "0"),
+        ("focus_distance_m", "-2"),
+        ("version", "0"),
+        ("strict", "maybe"),
+        ("wavelength", "540"),
+    ],
+)
+def test_a_bad_question_is_answered_with_the_offending_value(
+    client: TestClient, lens: str, name: str, value: str
+) -> None:
+    answer = client.get(f"{lens}/psf", params={"r": "0.5"} | {name: value})
+
+    assert answer.status_code == 422
+    problem = answer.json()
+    assert problem["code"] == "invalid_parameter"
+    assert name in problem["errors"][0]["field"]
+    assert name in problem["detail"]
+
+
+def test_phi_is_an_angle_and_comes_round(client: TestClient, lens: str) -> None:
+    there = ask(client, lens, phi=0.59)
+    round_once = ask(client, lens, phi=0.59 + 2 * math.pi)
+
+    assert round_once["query"]["phi"] == pytest.approx(0.59)
+    np.testing.assert_allclose(round_once["psf"]["data"], there["psf"]["data"], atol=1e-9)
+
+
+def test_the_place_is_needed(client: TestClient, lens: str) -> None:
+    answer = client.get(f"{lens}/psf")
+
+    assert answer.status_code == 422
+    assert "r" in answer.json()["errors"][0]["field"]
+
+
+def test_a_lens_without_samples_says_what_to_do(client: TestClient, steps: Steps) -> None:
+    photo = steps.receive()
+    steps.inspect(photo)
+    lens = f"/v1/lenses/{steps.lens_id(photo)}"
+
+    for path in ("psf?r=0.5", "psf.png?r=0.5", "field.png", "lateral-colour"):
+        answer = client.get(f"{lens}/{path}")
+        assert (answer.status_code, answer.json()["code"]) == (409, "no_samples"), path
+        assert "upload" in answer.json()["detail"]
+
+
+def test_a_strict_question_outside_the_samples_is_refused(client: TestClient, lens: str) -> None:
+    query = {"r": 0.9, "phi": 0.59, "aperture": 128}
+
+    lenient = ask(client, lens, **query)
+    strict = client.get(f"{lens}/psf", params=query | {"strict": True})
+
+    assert lenient["support"]["extrapolated"]
+    assert (strict.status_code, strict.json()["code"]) == (422, "outside_support")
+
+
+def test_the_field_map_has_a_kernel_for_each_cell(client: TestClient, lens: str) -> None:
+    answer = client.get(f"{lens}/field.png?aperture=1.4&grid=4x3&size=15")
+
+    picture = np.asarray(Image.open(io.BytesIO(answer.content)))
+    assert picture.shape == (3 * 17 + 2, 4 * 17 + 2)
+    assert sum(bool(picture[2 + 17 * k : 17 + 17 * k].max() == 255) for k in range(3)) == 3
+    tag = answer.headers["etag"]
+    same = client.get(f"{lens}/field.png?aperture=1.4&grid=4x3&size=15", headers={"If-None-Match": tag})
+    assert same.status_code == 304
+
+
+@pytest.mark.parametrize("grid", ["0x3", "26x1", "axb", "9", "-1x2"])
+def test_a_bad_grid_is_refused(client: TestClient, lens: str, grid: str) -> None:
+    answer = client.get(f"{lens}/field.png?grid={grid}")
+
+    assert (answer.status_code, answer.json()["code"]) == (422, "invalid_parameter")
+
+
+def test_the_history_has_one_item_for_each_version(client: TestClient, steps: Steps, store: Store) -> None:
+    first, second = steps.counted(), steps.counted()
+    lens_id = steps.lens_id(first)
+    store.lenses.record_metrics(lens_id, 2, {"error": {"corner": 0.21}, "coverage": {"corner": 4}})
+
+    items = client.get(f"/v1/lenses/{lens_id}/calibrations").json()["items"]
+
+    assert [item["version"] for item in items] == [1, 2]
+    assert [item["photo_id"] for item in items] == [first.public_id, second.public_id]
+    assert [item["samples"] for item in items] == [6, 12]
+    assert (items[0]["error"], items[1]["error"]) == (None, {"corner": 0.21})
+    assert items[1]["coverage"] == {"corner": 4}
+    page = client.get(f"/v1/lenses/{lens_id}/calibrations?limit=1").json()
+    assert client.get(page["next"]).json()["items"][0]["version"] == 2
+
+
+def test_lateral_colour_is_the_middle_of_what_the_photos_show(
+    client: TestClient, steps: Steps, store: Store
+) -> None:
+    photos = [steps.counted() for _ in range(4)]
+    for photo, shift in zip(photos, (1e-4, 9e-4, 2e-4, 0.0), strict=True):
+        points = 50 if shift else 0  # the last could not tell
+        red, blue = [0.0, 0.0, shift, 1.0], [0.0, 0.0, -shift, 1.0]
+        lateral = {"red": red, "blue": blue, "red_points": points, "blue_points": points}
+        store.photos.record_lateral(photo.public_id, lateral)
+
+    shown = client.get(f"/v1/lenses/{steps.lens_id(photos[0])}/lateral-colour").json()
+
+    assert shown["red"] == [0.0, 0.0, 2e-4, 1.0]
+    assert shown["blue"] == [0.0, 0.0, -2e-4, 1.0]
+    assert shown["photos"] == 3
+
+
+def test_a_warm_psf_costs_milliseconds(client: TestClient, lens: str) -> None:
+    services = client.app.state.services  # type: ignore[attr-defined] # Starlette's own attribute
+    ask(client, lens)
+    lens_id = lens.rpartition("/")[2]
+    seconds = []
+    for _ in range(50):
+        began = time.process_time()
+        services.models.get(lens_id)
+        seconds.append(time.process_time() - began)
+
+    assert statistics.median(seconds) < 0.005  # processor time: other work on the machine does not count
+
+
+def test_what_a_worker_learned_of_a_version_is_served_from_the_next_request_on(
+    client: TestClient, store: Store, lens: str
+) -> None:
+    services = client.app.state.services  # type: ignore[attr-defined] # Starlette's own attribute
+    lens_id = lens.rpartition("/")[2]
+    first = client.get(f"{lens}/psf", params={"r": 0.9, "phi": 0.6, "aperture": 1.4})
+    state, samples = store.samples.of_lens(lens_id)
+    model = LensModel.fit([stored.sample for stored in samples]).warmed()
+    key = learned_key(lens_id, state.version, state.rebuild_epoch)
+    services.storage.put(key, model.learned())
+
+    second = client.get(f"{lens}/psf", params={"r": 0.9, "phi": 0.6, "aperture": 1.4})
+
+    assert "-p-" in first.headers["etag"]
+    assert "-l-" in second.headers["etag"]
+    assert ModelCache(store, 1, services.storage).get(lens_id).learned
+    services.storage.put(key, b"torn")
+    torn = ModelCache(store, 1, services.storage).get(lens_id)
+    assert not torn.learned
+    assert torn.model.query(FieldPosition(0.9, 0.6), LensSettings(1.4), 21).kernel.sum() == pytest.approx(1.0)

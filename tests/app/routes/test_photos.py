@@ -1,0 +1,402 @@
+"""Photos and their jobs over HTTP: what the owner sees, changes, cancels and deletes."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from app.http.dependencies import Call
+from app.routes import jobs
+from app.runtime.settings import Settings
+from app.schemas import JobOut
+from app.store import Store
+
+Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
+TIFF = b"II*\x00" + bytes(9000)
+
+
+def get(client: TestClient, path: str) -> dict[str, Any]:
+    answer = client.get(path)
+    assert answer.status_code == 200, answer.text
+    return dict(answer.json())
+
+
+@pytest.fixture
+def after_first_read(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[], object]], None]:
+    """Let a change happen when the watching request has read the job once, however busy the machine is."""
+
+    def arrange(change: Callable[[], object]) -> None:
+        find, pending = jobs.find_job, [change]
+
+        def find_then_change(call: Call, job_id: str) -> JobOut:
+            job = find(call, job_id)
+            if pending:
+                pending.pop()()
+            return job
+
+        monkeypatch.setattr(jobs, "find_job", find_then_change)
+
+    return arrange
+
+
+def test_a_counted_photo_shows_its_lens_and_patches(client: TestClient, steps: Steps) -> None:
+    photo = steps.counted()
+
+    shown = get(client, f"/v1/photos/{photo.public_id}")
+
+    assert shown["state"] == "counted"
+    assert shown["patches"] == {"total": 2, "done": 2, "rejected": 1}
+    assert shown["lens_id"] == steps.lens_id(photo)
+    assert shown["links"]["lens"] == f"/v1/lenses/{shown['lens_id']}"
+    assert (shown["width"], shown["focal_length_mm"], shown["pixel_pitch_um"]) == (6000, 24.0, 6.0)
+    patches = get(client, f"/v1/photos/{photo.public_id}/patches")["items"]
+    assert [patch["state"] for patch in patches] == ["done", "done", "rejected"]
+    assert patches[2]["reason"] == "flat"
+
+
+def test_no_answer_about_a_photo_holds_the_serial(client: TestClient, steps: Steps) -> None:
+    photo = steps.receive()
+    steps.inspect(photo, serial="SECRET-77")
+
+    assert "SECRET-77" not in client.get(f"/v1/photos/{photo.public_id}").text
+    assert "SECRET-77" not in client.get(f"/v1/jobs/{photo.public_id}").text
+
+
+def test_pages_join_without_gap_or_overlap(client: TestClient, steps: Steps) -> None:
+    sent = [steps.receive().public_id for _ in range(7)]
+    seen: list[str] = []
+    link: str | None = "/v1/photos?limit=3"
+
+    while link is not None:
+        answer = client.get(link)
+        page = answer.json()
+        seen += [photo["id"] for photo in page["items"]]
+        link = page["next"]
+        assert ("link" in answer.headers) == (link is not None)
+
+    assert seen == sent[::-1]
+
+
+def test_photos_are_listed_by_lens_and_state(client: TestClient, steps: Steps) -> None:
+    counted, other = steps.counted(serial="1"), steps.counted(serial="2")
+    steps.receive()
+
+    by_lens = get(client, f"/v1/photos?lens_id={steps.lens_id(counted)}")["items"]
+    by_state = get(client, "/v1/photos?state=counted")["items"]
+
+    assert [photo["id"] for photo in by_lens] == [counted.public_id]
+    assert [photo["id"] for photo in by_state] == [other.public_id, counted.public_id]
+
+
+@pytest.mark.parametrize("query", ["limit=0", "limit=201", "limit=x", "state=lost", f"cursor={'x' * 50}"])
+def test_a_bad_page_is_refused(client: TestClient, query: str) -> None:
+    answer = client.get(f"/v1/photos?{query}")
+
+    assert (answer.status_code, answer.json()["code"]) == (422, "invalid_parameter")
+
+
+@pytest.mark.parametrize("bad", ["nothing", "..", "%2e%2e%2fetc", "a' OR 1=1 --", "💥", "x" * 3000, "%00"])
+@pytest.mark.parametrize("kind", ["photos", "jobs", "lenses", "corrections"])
+def test_an_unknown_id_is_a_plain_404(client: TestClient, kind: str, bad: str) -> None:
+    answer = client.get(f"/v1/{kind}/{bad}")
+
+    assert answer.status_code == 404
+    assert answer.json()["code"] in {
+        f"unknown_{kind.removesuffix('es').removesuffix('s')}",
+        "unknown_lens",
+        "not_found",
+    }
+
+
+def test_a_photo_of_somebody_else_does_not_exist(client: TestClient, steps: Steps) -> None:
+    steps.owner = "stranger"
+    photo = steps.counted()
+    lens_id = steps.lens_id(photo)
+
+    for path in (
+        f"photos/{photo.public_id}",
+        f"photos/{photo.public_id}/patches",
+        f"jobs/{photo.public_id}",
+        f"jobs/{photo.public_id}/events",
+        f"lenses/{lens_id}",
+        f"lenses/{lens_id}/psf?r=0.5",
+        f"lenses/{lens_id}/field.png",
+        f"lenses/{lens_id}/calibrations",
+        f"lenses/{lens_id}/lateral-colour",
+    ):
+        assert client.get(f"/v1/{path}").status_code == 404, path
+    assert client.delete(f"/v1/photos/{photo.public_id}").status_code == 404
+    assert client.patch(f"/v1/photos/{photo.public_id}", json={"excluded": True}).status_code == 404
+    assert client.post(f"/v1/jobs/{photo.public_id}/cancel").status_code == 404
+    assert client.post("/v1/corrections", json={"photo_id": photo.public_id}).status_code == 404
+    assert get(client, "/v1/photos")["items"] == []
+    assert get(client, "/v1/lenses")["items"] == []
+
+
+def test_excluding_a_photo_takes_it_out_of_the_lens_and_back(client: TestClient, steps: Steps) -> None:
+    photo = steps.counted()
+    lens = f"/v1/lenses/{steps.lens_id(photo)}"
+
+    out = client.patch(f"/v1/photos/{photo.public_id}", json={"excluded": True})
+    assert out.json()["state"] == "excluded"
+    assert (get(client, lens)["samples"], get(client, lens)["version"]) == (0, 2)
+
+    again = client.patch(f"/v1/photos/{photo.public_id}", json={"excluded": True})
+    assert again.status_code == 200
+    assert get(client, lens)["version"] == 2
+
+    back = client.patch(f"/v1/photos/{photo.public_id}", json={"excluded": False})
+    assert back.json()["state"] == "counted"
+    assert (get(client, lens)["samples"], get(client, lens)["version"]) == (6, 3)
+
+
+def test_a_photo_that_does_not_count_cannot_be_excluded(client: TestClient, steps: Steps) -> None:
+    answer = client.patch(f"/v1/photos/{steps.receive().public_id}", json={"excluded": True})
+
+    assert (answer.status_code, answer.json()["code"]) == (409, "conflict")
+
+
+def waiting(store: Store, steps: Steps) -> Any:
+    photo = steps.receive()
+    steps.inspect(photo, serial=None)
+    store.photos.set_state(photo.public_id, ("inspecting",), "needs_lens")
+    return photo
+
+
+def test_a_photo_without_a_lens_waits_and_names_candidates(
+    client: TestClient, steps: Steps, store: Store
+) -> None:
+    known = steps.lens_id(steps.counted())
+    photo = waiting(store, steps)
+
+    job = get(client, f"/v1/jobs/{photo.public_id}")
+
+    assert (job["state"], job["error"]["code"]) == ("waiting", "metadata_missing")
+    assert job["error"]["candidates"] == [known]
+    assert get(client, f"/v1/photos/{photo.public_id}")["error"]["candidates"] == [known]
+
+
+@pytest.mark.parametrize("way", ["lens_id", "lens_serial", "new_lens"])
+def test_naming_the_lens_starts_a_waiting_photo_again(
+    client: TestClient, steps: Steps, store: Store, way: str
+) -> None:
+    known = steps.lens_id(steps.counted(serial="123"))
+    photo = waiting(store, steps)
+    body = {"lens_id": known, "lens_serial": "123", "new_lens": {"label": "the scratched one"}}[way]
+
+    answer = client.patch(f"/v1/photos/{photo.public_id}", json={way: body})
+
+    assert answer.json()["state"] == "received"
+    again = steps.fresh(photo)
+    assert again.epoch == 2
+    steps.inspect(again, serial=None)
+    assert (steps.lens_id(photo) == known) == (way != "new_lens")
+
+
+def test_a_change_happens_wholly_or_not_at_all(client: TestClient, steps: Steps, store: Store) -> None:
+    photo = steps.receive()
+    store.photos.fail(photo.public_id, 1, "no_usable_patches", "all is sky")
+    change = {"aperture": 2.0, "new_lens": {"label": "mine"}, "excluded": True}
+
+    answer = client.patch(f"/v1/photos/{photo.public_id}", json=change)
+
+    assert (answer.status_code, answer.json()["code"]) == (409, "conflict")
+    assert get(client, "/v1/lenses")["items"] == []
+    assert (steps.fresh(photo).state, steps.fresh(photo).epoch) == ("failed", 1)
+
+
+def test_a_counted_photo_moves_to_the_lens_that_the_owner_names(client: TestClient, steps: Steps) -> None:
+    mine, other = steps.counted(serial="1"), steps.counted(serial="2")
+
+    answer = client.patch(f"/v1/photos/{mine.public_id}", json={"lens_id": steps.lens_id(other)})
+
+    assert answer.json()["lens_id"] == steps.lens_id(other)
+    assert get(client, answer.json()["links"]["lens"])["photos"] == 2
+
+
+def test_a_corrected_aperture_renews_the_lens(client: TestClient, steps: Steps) -> None:
+    photo = steps.counted()
+
+    answer = client.patch(f"/v1/photos/{photo.public_id}", json={"aperture": 2.0})
+
+    assert answer.json()["aperture"] == 2.0
+    lens = get(client, answer.json()["links"]["lens"])
+    assert (lens["version"], lens["apertures"]) == (2, [2.0])
+
+
+@pytest.mark.parametrize(
+    ("body", "status"),
+    [
+        ({}, 422),
+        ({"aperture": 0.1}, 422),
+        ({"aperture": "wide"}, 422),
+        ({"colour": "red"}, 422),
+        ({"lens_id": "a", "lens_serial": "b"}, 422),
+        ({"lens_model": "EF"}, 422),
+        ({"lens_id": "nothing"}, 404),
+        ({"new_lens": {"label": ""}}, 422),
+        ({"lens_serial": "\x07"}, 422),
+        ([], 422),
+    ],
+)
+def test_a_change_that_makes_no_sense_is_refused(
+    client: TestClient, steps: Steps, body: object, status: int
+) -> None:
+    photo = steps.counted()
+
+    answer = client.patch(f"/v1/photos/{photo.public_id}", json=body)
+
+    assert answer.status_code == status
+    assert answer.json()["detail"]
+
+
+@pytest.mark.parametrize("body", [b"{", b"", b"\xff\xfe", b'{"aperture": NaN}', b"[" * 5000])
+def test_bad_json_is_a_problem_and_not_a_crash(client: TestClient, steps: Steps, body: bytes) -> None:
+    photo = steps.counted()
+
+    answer = client.patch(
+        f"/v1/photos/{photo.public_id}", content=body, headers={"Content-Type": "application/json"}
+    )
+
+    assert answer.status_code in {400, 422}
+    assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_deleting_a_photo_deletes_file_samples_and_job(client: TestClient, settings: Settings) -> None:
+    photo = client.post("/v1/photos", content=TIFF).json()
+
+    assert client.delete(f"/v1/photos/{photo['id']}").status_code == 204
+
+    assert client.get(f"/v1/photos/{photo['id']}").status_code == 404
+    assert client.get(f"/v1/jobs/{photo['id']}").status_code == 404
+    assert client.delete(f"/v1/photos/{photo['id']}").status_code == 404
+    assert list((settings.data_dir / "blobs" / "photos").iterdir()) == []
+    assert client.post("/v1/photos", content=TIFF).status_code == 202
+
+
+def test_a_job_tells_how_far_it_is(client: TestClient, steps: Steps) -> None:
+    photo = steps.receive()
+    assert get(client, f"/v1/jobs/{photo.public_id}")["state"] == "queued"
+    steps.inspect(photo)
+    steps.plan(photo)
+    steps.estimate(photo, (0,))
+
+    job = get(client, f"/v1/jobs/{photo.public_id}")
+
+    assert (job["id"], job["kind"], job["state"], job["stage"]) == (
+        photo.public_id,
+        "photo",
+        "running",
+        "estimating",
+    )
+    assert job["progress"] == {"done": 1, "total": 2, "unit": "patches"}
+    assert job["eta_seconds"] >= 0
+    assert job["links"]["photo"] == f"/v1/photos/{photo.public_id}"
+
+
+def test_a_failed_job_says_why(client: TestClient, steps: Steps, store: Store) -> None:
+    photo = steps.receive()
+    store.photos.fail(photo.public_id, 1, "no_usable_patches", "all is sky: photograph something with detail")
+
+    job = get(client, f"/v1/jobs/{photo.public_id}")
+
+    assert job["state"] == "failed"
+    assert job["error"]["code"] == "no_usable_patches"
+    assert job["error"]["status"] == 422
+    assert "detail" in job["error"]["detail"]
+    assert job["finished_at"] is not None
+
+
+def test_a_waiting_request_answers_at_the_change(
+    client: TestClient, steps: Steps, store: Store, after_first_read: Callable[[Callable[[], object]], None]
+) -> None:
+    photo = steps.receive()
+    after_first_read(lambda: store.photos.set_state(photo.public_id, ("received",), "inspecting"))
+    began = time.monotonic()
+
+    job = get(client, f"/v1/jobs/{photo.public_id}?wait=10")
+
+    assert job["stage"] == "inspecting"
+    assert time.monotonic() - began < 8.0  # it did not wait to the end
+
+
+def test_a_finished_job_does_not_make_anybody_wait(
+    client: TestClient, steps: Steps, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photo = steps.counted()
+    find, reads = jobs.find_job, list[str]()
+
+    def find_and_note(call: Call, job_id: str) -> JobOut:
+        reads.append(job_id)
+        return find(call, job_id)
+
+    @contextmanager
+    def nobody_waits(job_id: str) -> Iterator[Callable[[float], Awaitable[None]]]:
+        async def changed(seconds: float) -> None:
+            pytest.fail(f"the request waited {seconds} s for finished job {job_id}")
+
+        yield changed
+
+    monkeypatch.setattr(jobs, "find_job", find_and_note)
+    watch = client.app.state.services.watch  # type: ignore[attr-defined]  # an application of ours
+    monkeypatch.setattr(watch, "of", nobody_waits)
+
+    assert get(client, f"/v1/jobs/{photo.public_id}?wait=20")["state"] == "succeeded"
+
+    assert reads == [photo.public_id]
+
+
+def test_an_unchanged_job_is_not_sent_twice(client: TestClient, steps: Steps) -> None:
+    path = f"/v1/jobs/{steps.counted().public_id}"
+    tag = client.get(path).headers["etag"]
+
+    assert client.get(path, headers={"If-None-Match": tag}).status_code == 304
+
+
+@pytest.mark.parametrize("wait", ["-1", "21", "nan", "soon"])
+def test_a_bad_wait_is_refused(client: TestClient, steps: Steps, wait: str) -> None:
+    assert client.get(f"/v1/jobs/{steps.receive().public_id}?wait={wait}").status_code == 422
+
+
+def test_cancelling_ends_a_job_once(client: TestClient, steps: Steps) -> None:
+    photo = steps.receive()
+
+    first = client.post(f"/v1/jobs/{photo.public_id}/cancel")
+    second = client.post(f"/v1/jobs/{photo.public_id}/cancel")
+
+    assert (first.status_code, first.json()["state"]) == (202, "cancelled")
+    assert (second.status_code, second.json()["code"]) == (409, "conflict")
+
+
+def test_events_send_each_state_until_the_end(
+    client: TestClient, steps: Steps, store: Store, after_first_read: Callable[[Callable[[], object]], None]
+) -> None:
+    photo = steps.receive()
+    after_first_read(lambda: store.photos.cancel(photo.public_id))
+
+    text = client.get(f"/v1/jobs/{photo.public_id}/events").text
+
+    events = [
+        json.loads(line.removeprefix("data: ")) for line in text.splitlines() if line.startswith("data: ")
+    ]
+    assert [event["state"] for event in events] == ["queued", "cancelled"]
+
+
+def test_jobs_of_photos_and_corrections_share_a_list(client: TestClient, steps: Steps, store: Store) -> None:
+    photo = steps.counted()
+    lens = store.photos.lens_of(photo)
+    assert lens is not None
+    params = {"method": "standard", "strength": 1.0, "output": {}, "roi": None}
+    store.corrections.create(photo, lens, 1, params)
+
+    first = get(client, "/v1/jobs?limit=1")
+    second = get(client, first["next"])
+
+    assert [job["kind"] for job in first["items"] + second["items"]] == ["correction", "photo"]
+    assert second["next"] is None

@@ -1,0 +1,195 @@
+"""The examination of an installation: sound ones pass, each kind of damage is found, some of it mended."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import delete, update
+from typer.testing import CliRunner
+
+from app.blobs.storage import Storage
+from app.cli import app
+from app.runtime.doctor import Report, examine
+from app.runtime.settings import Settings
+from app.store import Store
+from app.store.access.owners import now
+from app.store.tables import EventRow, LensRow, PatchRow, PhotoRow, SampleRow
+from app.store.upkeep.invariants import INVARIANTS
+
+
+@pytest.fixture
+def sound(settings: Settings, store: Store, steps: Any) -> list[PhotoRow]:
+    """Make an installation with photos in all kinds of states, all as it must be."""
+    counted = [steps.counted(), steps.counted(width=1.2)]
+    excluded, deleted, failed = steps.counted(), steps.counted(), steps.receive()
+    assert store.photos.change(excluded.public_id, "local", {}, excluded=True)
+    assert store.photos.change(excluded.public_id, "local", {}, excluded=False)
+    assert store.photos.change(excluded.public_id, "local", {}, excluded=True)
+    store.photos.delete(deleted.public_id, "local")
+    store.photos.fail(failed.public_id, 1, "no_usable_patches", "too dark")
+    storage = Storage(settings.storage)
+    for photo in (*counted, excluded, failed):
+        storage.put(photo.blob_key, b"x" * photo.byte_size)
+    return counted
+
+
+@pytest.fixture
+def examined(settings: Settings, store: Store) -> Callable[..., Report]:
+    def run(**options: bool) -> Report:
+        return examine(settings, store, Storage(settings.storage), **options)
+
+    return run
+
+
+def test_a_sound_installation_passes_every_check(
+    sound: list[PhotoRow], examined: Callable[..., Report]
+) -> None:
+    report = examined()
+
+    assert report.findings == ()
+    assert len(report.checks) == len(INVARIANTS) + 2
+
+
+def test_an_empty_installation_is_sound(store: Store, examined: Callable[..., Report]) -> None:
+    assert examined(deep=True).findings == ()
+
+
+DAMAGES: dict[str, tuple[str, Any]] = {
+    "a version without its event": (
+        "versions",
+        lambda photo: delete(EventRow).where(EventRow.photo_public_id == photo.public_id),
+    ),
+    "a wrong number of samples": (
+        "totals",
+        lambda photo: update(LensRow).where(LensRow.id == photo.lens_id).values(sample_count=999),
+    ),
+    "a sample that does not count": (
+        "votes",
+        lambda photo: update(SampleRow).where(SampleRow.photo_id == photo.id).values(lens_id=None),
+    ),
+    "a sample of no version": (
+        "votes",
+        lambda photo: update(SampleRow).where(SampleRow.photo_id == photo.id).values(version_added=999),
+    ),
+    "a done patch without samples": (
+        "samples",
+        lambda photo: delete(SampleRow).where(SampleRow.photo_id == photo.id),
+    ),
+    "a wrong number of patches": (
+        "progress",
+        lambda photo: update(PhotoRow).where(PhotoRow.id == photo.id).values(patches_done=77),
+    ),
+    "an unfinished patch of a counted photo": (
+        "samples",
+        lambda photo: update(PatchRow).where(PatchRow.photo_id == photo.id).values(state="pending"),
+    ),
+    "a counted photo without a lens": (
+        "endings",
+        lambda photo: update(PhotoRow).where(PhotoRow.id == photo.id).values(lens_id=None),
+    ),
+    "a deleted photo with its name": (
+        "forgotten photos",
+        lambda photo: update(PhotoRow).where(PhotoRow.id == photo.id).values(deleted_at=now()),
+    ),
+    "a deleted lens with its serial": (
+        "forgotten lenses",
+        lambda photo: update(LensRow).where(LensRow.id == photo.lens_id).values(deleted_at=now()),
+    ),
+}
+MENDED = {"totals", "votes", "progress"}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_damage_to_the_tables_is_found_and_what_can_be_is_mended(
+    name: str, sound: list[PhotoRow], store: Store, examined: Callable[..., Report]
+) -> None:
+    check, damage = DAMAGES[name]
+    with store.database.writing() as session:
+        session.execute(damage(sound[0]))
+
+    assert check in {finding.check for finding in examined().open}
+    if check in MENDED:
+        assert {finding.check for finding in examined(repair=True).findings if finding.mended} >= {check}
+        assert examined().findings == ()
+
+
+def test_a_sample_of_an_excluded_photo_is_taken_out_and_the_model_learns_anew(
+    sound: list[PhotoRow], store: Store, steps: Any, examined: Callable[..., Report]
+) -> None:
+    lens_id = steps.lens_id(sound[0])
+    before = store.samples.of_lens(lens_id)
+    with store.database.writing() as session:  # as if the samples had stayed when it was excluded
+        session.execute(update(PhotoRow).where(PhotoRow.id == sound[0].id).values(state="excluded"))
+
+    assert "votes" in {finding.check for finding in examined(repair=True).findings}
+
+    state, samples = store.samples.of_lens(lens_id)
+    assert state.rebuild_epoch > before[0].rebuild_epoch
+    assert {stored.sample.photo for stored in samples} == {sound[1].public_id}
+    assert examined().findings == ()
+
+
+def test_a_missing_or_torn_photo_is_found(
+    sound: list[PhotoRow], settings: Settings, examined: Callable[..., Report]
+) -> None:
+    storage = Storage(settings.storage)
+    storage.delete(f"photos/{sound[0].public_id}/")
+    storage.put(sound[1].blob_key, b"torn")
+
+    says = {finding.subject: finding.says for finding in examined().open}
+
+    assert says == {
+        sound[0].public_id: "the file of the photo is missing",
+        sound[1].public_id: "the file of the photo is 4 bytes instead of 1000",
+    }
+
+
+def test_blobs_that_nobody_names_are_given_up_for_deletion(
+    sound: list[PhotoRow], settings: Settings, store: Store, examined: Callable[..., Report]
+) -> None:
+    Storage(settings.storage).put("photos/NOBODY/original", b"x")
+    assert [finding.subject for finding in examined().open] == ["photos/NOBODY/"]
+
+    examined(repair=True)
+
+    assert examined().findings == ()
+    assert "photos/NOBODY/" in store.workers.garbage(at=now() + timedelta(hours=1))
+
+
+def test_changed_bytes_are_found_when_all_is_read(
+    sound: list[PhotoRow], store: Store, examined: Callable[..., Report]
+) -> None:
+    with store.database.writing() as session:
+        session.execute(update(SampleRow).where(SampleRow.photo_id == sound[0].id).values(psf=b"\0" * 900))
+
+    assert examined().findings == ()
+    checks = {finding.check for finding in examined(deep=True).open}
+    assert checks == {"kernels", "photos"}  # the made-up files have made-up hashes
+
+
+def test_work_that_nobody_does_is_found(
+    steps: Any, examined: Callable[..., Report], settings: Settings
+) -> None:
+    photo = steps.receive()
+    Storage(settings.storage).put(photo.blob_key, b"x" * photo.byte_size)
+
+    assert [finding.check for finding in examined().open] == ["work"]
+
+
+def test_the_command_tells_and_ends_with_the_state_of_things(
+    sound: list[PhotoRow], settings: Settings, tmp_path: Path
+) -> None:
+    well = CliRunner().invoke(app, ["doctor", "--data", str(settings.data_dir)])
+    Storage(settings.storage).put("photos/NOBODY/original", b"x")
+    ill = CliRunner().invoke(app, ["doctor", "--data", str(settings.data_dir), "--json"])
+    nothing = CliRunner().invoke(app, ["doctor", "--data", str(tmp_path / "nothing")])
+
+    assert (well.exit_code, ill.exit_code) == (0, 1), well.output + ill.output
+    assert "0 findings" in well.output
+    assert "no row names these blobs" in ill.output
+    assert nothing.exit_code != 0
+    assert not (tmp_path / "nothing").exists()

@@ -1,0 +1,128 @@
+"""Log lines for collectors: one JSON object a line, which says what it is about."""
+
+from __future__ import annotations
+
+import contextvars
+import io
+import json
+import logging
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import pytest
+from starlette.testclient import TestClient
+
+from app.jobs.job_log import accounted
+from app.runtime import logs
+from app.runtime.settings import Settings
+from app.store import Store
+
+HERE = Path(__file__).parents[1]
+sys.path.insert(0, str(HERE))
+from running import served  # noqa: E402 - beside this file
+
+sys.path.remove(str(HERE))
+
+
+@pytest.fixture
+def lines() -> Iterator[io.StringIO]:
+    """Let every record of the service be written as JSON into a text."""
+    written = io.StringIO()
+    handler = logging.StreamHandler(written)
+    handler.setFormatter(logs.as_json("test"))
+    root, log = logging.getLogger(), logging.getLogger("app")
+    before = log.level
+    root.addHandler(handler)
+    log.setLevel(logging.INFO)
+    yield written
+    root.removeHandler(handler)
+    log.setLevel(before)
+
+
+def read(lines: io.StringIO) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in lines.getvalue().splitlines()]
+
+
+def test_a_record_is_one_object_on_one_line_whatever_it_holds(lines: io.StringIO) -> None:
+    try:
+        int("12\n\x1b[2J")
+    except ValueError:
+        logging.getLogger("app.some").exception("two\nlines of %s", "a \x1b[31mstranger\u2028")
+
+    (record,) = read(lines)
+
+    assert record["message"] == "two\nlines of a \x1b[31mstranger\u2028"
+    assert (record["level"], record["logger"], record["part"]) == ("error", "app.some", "test")
+    assert "ValueError" in record["exception"]
+    assert "\x1b" not in lines.getvalue()
+    assert record["time"].endswith("Z")
+
+
+def test_a_line_of_a_job_names_the_job_and_its_photo(lines: io.StringIO) -> None:
+    with accounted("cell", ("PHOTO", 1, 4)):
+        logging.getLogger("app.jobs").info("at work")
+    logging.getLogger("app.jobs").info("at rest")
+
+    during, after = read(lines)
+
+    assert (during["job_id"], during["photo_id"]) == ("cell/PHOTO/1/4", "PHOTO")
+    assert "job_id" not in after
+
+
+def test_lines_for_people_name_them_too() -> None:
+    record = logging.LogRecord("app", logging.INFO, "", 0, "at work\nforged", (), None)
+
+    def written() -> str:
+        with accounted("photo", ("PHOTO", 1)):
+            return logs.OneRecord("%(message)s").format(record)
+
+    assert contextvars.Context().run(written) == (
+        f"at work job_id=photo/PHOTO/1 photo_id=PHOTO{logs.CONTINUED}forged"
+    )
+
+
+def test_the_line_of_a_request_says_what_was_asked_and_answered(
+    client: TestClient, lines: io.StringIO
+) -> None:
+    client.get("/v1/photos/PHOTO", headers={"X-Request-ID": "asked-1"})
+
+    record = next(record for record in read(lines) if record["logger"] == "app.access")
+
+    assert {name: record[name] for name in ("request_id", "method", "path", "status", "photo_id")} == {
+        "request_id": "asked-1",
+        "method": "GET",
+        "path": "/v1/photos/PHOTO",
+        "status": 404,
+        "photo_id": "PHOTO",
+    }
+    assert record["ms"] >= 0
+
+
+def test_a_line_from_within_a_request_has_its_id(
+    client: TestClient, lines: io.StringIO, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise RuntimeError("unforeseen")
+
+    monkeypatch.setattr("app.store.lenses.LensStore.page", broken)
+    answer = client.get("/v1/lenses", headers={"X-Request-ID": "asked-2"})
+    assert answer.status_code == 500
+
+    said = [record for record in read(lines) if record["logger"] == "app.http.errors"]
+
+    assert [record["request_id"] for record in said] == ["asked-2"]
+
+
+def test_a_connection_that_is_kept_gives_nothing_of_one_request_to_the_next(
+    settings: Settings, store: Store, lines: io.StringIO
+) -> None:
+    with served(settings) as port, httpx2.Client(base_url=f"http://127.0.0.1:{port}") as http:
+        sent = http.post("/v1/photos", content=b"\xff\xd8\xff" + bytes(500_000))  # reading it pauses
+        http.get("/v1/formats")
+
+    assert sent.status_code == 202
+    said = {record["path"]: record for record in read(lines) if record["logger"] == "app.access"}
+    assert "photo_id" not in said["/v1/formats"]

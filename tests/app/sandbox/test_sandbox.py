@@ -1,0 +1,400 @@
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import textwrap
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app.sandbox import confine
+from app.sandbox.child import NICENESS
+from app.sandbox.runner import Budget, Limits, Outcome, Sandbox
+
+HERE = Path(__file__).parents[1]
+sys.path.insert(0, str(HERE))
+from deadline import Deadline, stretched  # noqa: E402 - beside these files
+
+sys.path.remove(str(HERE))
+
+LIMITS = Limits(memory_mb=512, wall_s=stretched(30))
+Run = Callable[..., Outcome]
+
+
+@pytest.fixture
+def sandbox(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Sandbox]:
+    monkeypatch.syspath_prepend(str(HERE))
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    made = Sandbox(
+        tmp_path / "scratch",
+        Budget(2, 2048),
+        module="hostile_tasks",
+        preload=["numpy", "app.sandbox.child"],
+        cache=tmp_path / "shared",
+    )
+    yield made
+    made.stop()
+
+
+@pytest.fixture
+def run(sandbox: Sandbox) -> Run:
+    def run(task: str, *, limits: Limits = LIMITS, **options: Any) -> Outcome:
+        arguments = options.pop("arguments", {})
+        with sandbox.folder() as folder:
+            return sandbox.run(task, arguments, folder=folder, limits=limits, **options)
+
+    return run
+
+
+def gone(pid: int, within_s: float = 5.0) -> bool:
+    deadline = Deadline(within_s)
+    while not deadline.passed():
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return True
+        if "\nState:\tZ" in Path(f"/proc/{pid}/status").read_text():
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def read_pid(path: Path) -> int:
+    deadline = Deadline(20)
+    while not deadline.passed():
+        if path.exists() and path.read_text():
+            return int(path.read_text())
+        time.sleep(0.02)
+    raise AssertionError("the child never said its pid")
+
+
+def test_a_task_hands_over_json_and_files(sandbox: Sandbox) -> None:
+    seen: list[tuple[int, int]] = []
+    with sandbox.folder() as folder:
+        outcome = sandbox.run(
+            "add",
+            {"a": [1, 2], "b": [10, 20]},
+            folder=folder,
+            limits=LIMITS,
+            on_progress=lambda done, total: seen.append((done, total)),
+        )
+
+        assert outcome.ending == "ok"
+        assert np.load(folder / "sum.npy", allow_pickle=False).tolist() == [11, 22]
+        assert outcome.value["folder"] == str(folder)
+    assert seen[-1] == (2, 2)
+    assert not folder.exists()
+
+
+def test_a_task_sees_nothing_of_the_services_environment(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LENS_DATABASE_URL", "postgresql://user:secret@host/db")
+
+    outcome = run("add", arguments={"a": 1, "b": 2})
+
+    seen = outcome.value["environment"]
+    assert "secret" not in str(seen)
+    assert seen["OMP_NUM_THREADS"] == "1"
+    assert seen["TMPDIR"] == seen["HOME"] == outcome.value["folder"]
+
+
+def test_a_task_gives_way_to_whoever_waits_for_an_answer(run: Run) -> None:
+    seen = run("weight").value
+
+    assert seen["nice"] == os.getpriority(os.PRIO_PROCESS, 0) + NICENESS
+    assert not seen["session"] or seen["session"].rstrip().endswith(f"nice {NICENESS}")
+
+
+def test_a_task_is_as_urgent_as_the_worker_where_the_operator_says_so(run: Run, sandbox: Sandbox) -> None:
+    sandbox._niceness = 0
+
+    seen = run("weight").value
+
+    assert seen["nice"] == os.getpriority(os.PRIO_PROCESS, 0)
+    assert not seen["session"] or seen["session"].rstrip().endswith("nice 0")
+
+
+def test_a_refusal_arrives_with_code_and_text(run: Run) -> None:
+    outcome = run("refuse")
+
+    assert (outcome.ending, outcome.code) == ("error", "no_usable_patches")
+    assert outcome.detail == "nothing sharp in this photo; use another one"
+
+
+def test_a_memory_bomb_ends_in_memory_limit_and_the_parent_lives(run: Run) -> None:
+    assert run("swell", arguments={"mb": 4096}).ending == "memory_limit"
+    assert run("swell", arguments={"mb": 64}).ending == "ok"
+
+
+def test_a_file_beyond_the_limit_is_refused(run: Run) -> None:
+    limits = Limits(memory_mb=512, wall_s=30, file_mb=4)
+
+    assert run("write", limits=limits, arguments={"mb": 8}).ending == "memory_limit"
+
+
+def test_open_files_are_limited(run: Run) -> None:
+    assert 16 < run("open_files", limits=Limits(512, 30, open_files=64)).value < 64
+
+
+def test_a_busy_loop_is_killed_at_the_wall_limit(run: Run) -> None:
+    start = time.monotonic()
+
+    outcome = run("spin", limits=Limits(memory_mb=512, wall_s=0.6))
+
+    assert outcome.code == "time_limit"
+    assert "0.6 s" in outcome.detail
+    assert time.monotonic() - start < stretched(10)
+
+
+def test_a_busy_loop_is_killed_at_the_processor_limit(run: Run) -> None:
+    outcome = run("spin", limits=Limits(memory_mb=512, wall_s=stretched(30), cpu_s=1))
+
+    assert outcome.ending == "time_limit"
+    assert "1 s of processor time" in outcome.detail
+
+
+def test_a_crashed_child_is_reported_with_its_signal(run: Run) -> None:
+    outcome = run("crash")
+
+    assert outcome.ending == "crashed"
+    assert "SIGSEGV" in outcome.detail
+
+
+@pytest.mark.parametrize(("task", "word"), [("die", "SIGKILL"), ("fill_the_disk", "no room")])
+def test_what_the_machine_did_to_a_child_is_no_fault_of_the_task(run: Run, task: str, word: str) -> None:
+    outcome = run(task)
+
+    assert outcome.ending == "outage"
+    assert word in outcome.detail
+
+
+def test_an_unforeseen_exception_names_its_type_but_shows_no_internals(run: Run) -> None:
+    outcome = run("blunder")
+
+    assert (outcome.ending, outcome.code) == ("crashed", "internal_error")
+    assert "KeyError" in outcome.detail
+    assert "nobody thought" not in outcome.detail
+
+
+def test_a_flood_of_text_is_cut(run: Run) -> None:
+    outcome = run("shout")
+
+    assert outcome.code == "no_usable_patches"
+    assert len(outcome.detail) < 10_000
+
+
+def test_cancelling_kills_the_child(run: Run, tmp_path: Path) -> None:
+    pid_file = tmp_path / "shared" / "pid"
+    start = time.monotonic()
+
+    arguments = {"pid_file": str(pid_file)}
+
+    outcome = run("sleep", arguments=arguments, compiles=True, wanted=lambda: not pid_file.exists())
+
+    assert outcome.ending == "cancelled"
+    assert time.monotonic() - start < 20
+    assert gone(read_pid(pid_file))
+
+
+def test_cancelling_kills_what_the_child_started_too(sandbox: Sandbox, tmp_path: Path) -> None:
+    sandbox._confined = False  # as where the kernel cannot keep it from starting programs
+    pid_file = tmp_path / "shared" / "pid"
+    arguments = {"pid_file": str(pid_file)}
+
+    with sandbox.folder() as folder:
+        outcome = sandbox.run(
+            "spawn", arguments, folder=folder, limits=LIMITS, wanted=lambda: not pid_file.exists()
+        )
+
+    assert outcome.ending == "cancelled"
+    assert gone(read_pid(pid_file))
+
+
+def test_stopping_the_sandbox_ends_all_tasks(sandbox: Sandbox, run: Run, tmp_path: Path) -> None:
+    pid_file = tmp_path / "shared" / "pid"
+
+    def stop_once_it_runs() -> None:
+        read_pid(pid_file)
+        sandbox.stop()
+
+    threading.Thread(target=stop_once_it_runs).start()
+
+    assert run("sleep", arguments={"pid_file": str(pid_file)}, compiles=True).ending == "cancelled"
+    assert run("add", arguments={"a": 1, "b": 1}).ending == "cancelled"
+
+
+def test_a_child_dies_with_its_killed_parent(tmp_path: Path) -> None:
+    pid_file = tmp_path / "shared" / "pid"
+    script = textwrap.dedent(
+        f"""
+        import sys
+        from pathlib import Path
+        sys.path.insert(0, {str(HERE)!r})
+        from app.sandbox.runner import Budget, Limits, Sandbox
+        if __name__ == "__main__":
+            scratch, shared = Path({str(tmp_path / "scratch")!r}), Path({str(pid_file.parent)!r})
+            box = Sandbox(scratch, Budget(1, 1024), module="hostile_tasks", preload=[], cache=shared)
+            with box.folder() as folder:
+                box.run(
+                    "sleep",
+                    {{"pid_file": {str(pid_file)!r}}},
+                    folder=folder,
+                    limits=Limits(512, 60),
+                    compiles=True,
+                )
+        """
+    )
+    (tmp_path / "parent.py").write_text(script)
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    parent = subprocess.Popen([sys.executable, str(tmp_path / "parent.py")], env=environment)
+    child_pid = read_pid(pid_file)
+
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+
+    assert gone(child_pid, within_s=2.0)
+
+
+def test_the_fork_server_listens_where_files_may_be_made(tmp_path: Path) -> None:
+    """In a container whose root is read-only there is nothing but TMPDIR."""
+    script = f"""if True:
+        from multiprocessing import forkserver
+        from pathlib import Path
+        from app.sandbox.runner import Budget, Sandbox
+        if __name__ == "__main__":
+            Sandbox(Path({str(tmp_path)!r}), Budget(1, 64), preload=[])
+            print(forkserver._forkserver._forkserver_address)
+    """
+    with tempfile.TemporaryDirectory() as folder:  # short: the address of a socket must be
+        environment = os.environ | {"TMPDIR": folder}
+        command = [sys.executable, "-c", script]
+        address = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout
+
+        assert Path(address.strip()).is_relative_to(folder)
+
+
+PROBE = """
+import json, os, sys
+from pathlib import Path
+sys.path.insert(0, {here!r})
+from app.sandbox import confine
+from app.sandbox.runner import Budget, Limits, Sandbox
+if __name__ == "__main__":
+    data = Path({data!r})
+    confine.hide_memory()
+    box = Sandbox(data / "scratch", Budget(1, 1024), module="hostile_tasks", preload=["numpy"],
+                  cache=data / "cache")
+    arguments = {{"parent": os.getpid(), "database": str(data / "app.db"), "cache": str(data / "cache"),
+                  "other": str(data / "blobs" / "other"), "own": str(data / "blobs" / "own"), "port": {port}}}
+    with box.folder() as folder:
+        outcome = box.run("probe", arguments, folder=folder, limits=Limits(1024, 300),
+                          reads=[data / "blobs" / "own"])
+    print(json.dumps([outcome.ending, outcome.detail, outcome.value]))
+"""
+
+
+@pytest.fixture
+def probed(tmp_path: Path) -> dict[str, str]:
+    """What a task that a hostile file took over can do, in a service with secrets."""
+    missing = [name for name, is_so in confine.available().items() if not is_so]
+    if missing:
+        pytest.skip(f"this kernel, or this container, has no {', '.join(missing)}")
+    data = tmp_path / "data"
+    (data / "blobs").mkdir(parents=True)
+    (data / "app.db").write_text("rows of all owners")
+    (data / "blobs" / "other").write_text("a photo of another owner")
+    (data / "blobs" / "own").write_text("the photo of this task")
+    secrets = {
+        "LENS_DATABASE_URL": "postgresql://lens:secret@db/lens",
+        "AWS_SECRET_ACCESS_KEY": "secret",
+    }
+    with closing(socket.create_server(("127.0.0.1", 0))) as listener:
+        script = tmp_path / "service.py"
+        script.write_text(
+            PROBE.format(here=str(HERE), data=str(data), port=listener.getsockname()[1]), encoding="utf-8"
+        )
+        environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+        said = subprocess.run(
+            [sys.executable, str(script)],
+            env=environment | secrets,
+            check=True,
+            stdout=subprocess.PIPE,
+            text=True,
+            timeout=stretched(400),
+        ).stdout
+    ending, detail, found = json.loads(said)
+    assert ending == "ok", detail
+    assert (data / "app.db").read_text() == "rows of all owners"
+    assert (data / "blobs" / "other").exists()
+    return dict(found)
+
+
+def test_a_task_that_was_taken_over_can_do_nothing_but_its_work(probed: dict[str, str]) -> None:
+    allowed = {"own environment", "own photo", "own folder", "thread", "import"}
+
+    assert {name for name, said in probed.items() if said.startswith("done")} == allowed
+    assert "secret" not in probed["own environment"]
+    assert "LENS_" not in probed["own environment"]
+
+
+def test_the_budget_lets_no_more_children_run_than_there_are_slots() -> None:
+    budget, inside, most = Budget(2, 100), 0, 0
+    lock = threading.Lock()
+
+    def work() -> None:
+        nonlocal inside, most
+        with budget.share(10, lambda: True):
+            with lock:
+                inside += 1
+                most = max(most, inside)
+            time.sleep(0.01)
+            with lock:
+                inside -= 1
+
+    threads = [threading.Thread(target=work) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+    assert most == 2
+
+
+def test_a_task_that_needs_all_memory_runs_alone_and_is_not_starved() -> None:
+    budget = Budget(4, 100)
+    order: list[str] = []
+    with budget.share(60, lambda: True):
+        large = threading.Thread(target=_enter, args=(budget, 1000, "large", order))
+        large.start()
+        while not budget._queue:
+            time.sleep(0.001)
+        small = threading.Thread(target=_enter, args=(budget, 10, "small", order))
+        small.start()
+        small.join(0.05)
+
+        assert order == []
+    large.join()
+    small.join()
+
+    assert order == ["large", "small"]
+
+
+def test_waiting_for_the_budget_ends_with_the_interest_in_it() -> None:
+    budget = Budget(1, 100)
+    with budget.share(10, lambda: True), budget.share(10, lambda: False) as entered:
+        assert not entered
+
+
+def _enter(budget: Budget, memory_mb: int, name: str, order: list[str]) -> None:
+    with budget.share(memory_mb, lambda: True):
+        order.append(name)

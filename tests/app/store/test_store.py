@@ -1,0 +1,447 @@
+"""The tables keep every promise however often, and in whatever order, steps are repeated."""
+
+from __future__ import annotations
+
+import threading
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import numpy as np
+import pytest
+from sqlalchemy import Text, cast, func, select, text
+from sqlalchemy.exc import DBAPIError
+
+from app.runtime.settings import Settings
+from app.store import NewPatch, Store
+from app.store.corrections import Result
+from app.store.database import Database
+from app.store.tables import Base, PatchRow, PhotoRow
+from app.store.upkeep.migrate import current, downgrade, head, is_current, upgrade
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.psf import gaussian
+
+OWNER = "local"
+Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
+
+
+def test_finishing_a_photo_counts_it_once_however_often_it_is_tried(store: Store, steps: Steps) -> None:
+    photo = steps.counted()
+
+    assert store.photos.finish(photo.public_id, photo.epoch) is None
+
+    lens = store.photos.lens_of(photo)
+    assert lens is not None
+    assert (lens.version, lens.photo_count, lens.sample_count) == (1, 1, 6)
+    assert len(store.lenses.history(lens)) == 1
+
+
+def test_a_repeated_cell_stores_no_sample_twice(store: Store, steps: Steps) -> None:
+    photo = steps.receive()
+    steps.inspect(photo)
+    steps.plan(photo)
+
+    assert steps.estimate(photo, (0,)) == 3
+    assert steps.estimate(photo, (0,)) == 0
+    assert steps.estimate(photo, (0, 1)) == 3
+    again = steps.fresh(photo)
+    assert (again.patches_total, again.patches_done, again.patches_rejected) == (2, 2, 1)
+
+
+def test_cells_empty_as_their_patches_finish_or_fail(store: Store, steps: Steps) -> None:
+    photo = steps.receive()
+    steps.inspect(photo)
+    steps.plan(photo, count=4)
+    assert store.patches.cells(photo.public_id, 1) == [0, 1]
+
+    steps.estimate(photo, (0, 2))
+    assert store.patches.cells(photo.public_id, 1) == [1]
+    store.patches.fail(photo.public_id, 1, [1, 3], "time_limit")
+
+    assert store.patches.cells(photo.public_id, 1) == []
+
+
+def test_planning_twice_adds_nothing(store: Store, steps: Steps) -> None:
+    photo = steps.receive()
+    steps.inspect(photo)
+    steps.plan(photo)
+
+    store.patches.add(photo.public_id, 1, [NewPatch(0, 5, 5, 64, 0.5, 0.0)])
+
+    assert len(store.patches.listed(photo.public_id)) == 3
+    assert store.patches.all_of(photo.public_id)[0].row == 100
+
+
+def test_rejected_windows_are_a_map_and_no_rows(store: Store, steps: Steps) -> None:
+    photo = steps.receive()
+    steps.inspect(photo)
+    store.photos.set_state(photo.public_id, ("inspecting",), "selecting")
+    reasons = ("flat", "out-of-focus", "clipped")
+    rejected = [
+        NewPatch(k + 1, 16 * k, 8 * k, 64, 0.12345678, -2.5, rejected=reasons[k % 3]) for k in range(2000)
+    ]
+
+    count = store.patches.add(photo.public_id, 1, [NewPatch(0, 5, 5, 64, 0.5, 0.0, cell=0), *rejected])
+
+    listed = store.patches.listed(photo.public_id)
+    with store.database.reading() as session:
+        stored = session.scalar(select(func.count()).select_from(PatchRow))
+        size = session.scalar(select(func.length(cast(PhotoRow.windows, Text))))
+    again = steps.fresh(photo)
+    assert (count, stored, len(listed)) == (1, 1, 2001)
+    assert (again.patches_total, again.patches_rejected) == (1, 2000)
+    assert [row.idx for row in listed] == list(range(2001))
+    last = listed[-1]
+    assert (last.row, last.col, last.size, last.r, last.phi) == (31984, 15992, 64, 0.1235, -2.5)
+    assert (last.state, last.reason) == ("rejected", reasons[1999 % 3])
+    assert size is not None
+    assert size < 100_000
+    store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
+    assert store.patches.listed(photo.public_id) == []
+
+
+def test_cancel_and_finish_exclude_each_other(store: Store, steps: Steps) -> None:
+    photo = steps.receive()
+    steps.inspect(photo)
+    steps.plan(photo)
+    steps.estimate(photo)
+
+    lens = steps.lens_id(steps.counted())
+    assert store.photos.cancel(photo.public_id)
+    assert store.photos.finish(photo.public_id, 1) is None
+    assert not store.photos.cancel(photo.public_id)
+    assert len(store.samples.of_lens(lens)[1]) == 6  # of the other photo alone
+
+
+def test_work_of_an_old_epoch_changes_nothing(store: Store, steps: Steps) -> None:
+    photo = steps.receive()
+    steps.inspect(photo)
+    steps.plan(photo)
+    store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
+
+    assert steps.estimate(photo) == 0
+    assert not store.photos.is_live(photo.public_id, 1)
+    assert store.photos.is_live(photo.public_id, 2)
+    assert not store.photos.fail(photo.public_id, 1, "time_limit", "late")
+    assert steps.fresh(photo).state == "received"
+
+
+def test_a_counted_photo_never_starts_anew(store: Store, steps: Steps) -> None:
+    photo = steps.counted()
+    lens = steps.lens_id(photo)
+
+    assert store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
+
+    after = steps.fresh(photo)
+    state, samples = store.samples.of_lens(lens)
+    assert (after.state, after.epoch) == ("counted", photo.epoch)
+    assert (state.rebuild_epoch, len(samples)) == (1, 6)  # models in memory are told to forget the old ones
+
+
+def test_a_photo_that_waits_for_its_lens_does_not_fail_for_the_end_of_its_job(
+    store: Store, steps: Steps
+) -> None:
+    photo = steps.receive()
+    steps.inspect(photo, serial=None)
+    store.photos.set_state(photo.public_id, ("inspecting",), "needs_lens")
+
+    assert not store.photos.fail(photo.public_id, 1, "internal_error", "its job is done")
+
+
+def test_a_photo_taken_up_again_keeps_the_time_since_its_stage_began(store: Store, steps: Steps) -> None:
+    photo = steps.receive()
+    steps.inspect(photo)
+    steps.plan(photo)
+    since = steps.fresh(photo).stage_at
+
+    store.photos.set_state(photo.public_id, ("estimating",), "estimating")
+
+    assert steps.fresh(photo).stage_at == since
+
+
+def test_a_failed_photo_starts_anew_when_it_is_sent_again(store: Store, steps: Steps) -> None:
+    photo = steps.receive()
+    store.photos.fail(photo.public_id, 1, "no_usable_patches", "flat")
+
+    again = store.photos.receive(
+        OWNER,
+        public_id="other",
+        sha256=photo.sha256,
+        filename="x",
+        kind="dng",
+        byte_size=1,
+        blob_key="y",
+        calibrate=True,
+        given={},
+    )
+
+    assert again.fresh
+    assert (again.photo.public_id, again.photo.epoch, again.photo.state) == (photo.public_id, 2, "received")
+    assert again.photo.error_code is None
+
+
+def test_photos_of_one_copy_share_a_lens_whatever_the_spelling(store: Store, steps: Steps) -> None:
+    first, second = steps.receive(), steps.receive(lens_maker="CANON", lens_model="ef24mm F/1.4l ")
+    steps.inspect(first)
+    steps.inspect(second)
+
+    assert steps.lens_id(first) == steps.lens_id(second)
+
+
+def test_another_serial_is_another_lens(store: Store, steps: Steps) -> None:
+    first, second = steps.receive(), steps.receive()
+    steps.inspect(first, serial="123")
+    steps.inspect(second, serial="124")
+
+    assert steps.lens_id(first) != steps.lens_id(second)
+
+
+def test_without_a_serial_no_lens_is_guessed(store: Store, steps: Steps) -> None:
+    photo = steps.receive()
+    steps.inspect(photo, serial=None)
+
+    assert steps.fresh(photo).lens_id is None
+    assert store.photos.assign_lens(photo.public_id, single_copy=True) is not None
+
+
+def test_what_the_owner_gave_goes_before_the_file(store: Store, steps: Steps) -> None:
+    photo = steps.receive(aperture=2.8, lens_serial="mine")
+    steps.inspect(photo, serial="123", aperture=1.4)
+
+    again = steps.fresh(photo)
+    assert (again.aperture, again.lens_serial, again.lens_serial_source) == (2.8, "mine", "user")
+
+
+def test_a_stored_photo_makes_no_lens_but_joins_one(store: Store, steps: Steps) -> None:
+    photo = steps.receive(calibrate=False)
+    steps.inspect(photo)
+    assert steps.fresh(photo).lens_id is None
+
+    steps.counted()
+    store.photos.assign_lens(photo.public_id)
+
+    assert steps.fresh(photo).lens_id is not None
+
+
+def test_samples_come_back_as_they_were_written(store: Store, steps: Steps) -> None:
+    photo = steps.counted()
+
+    state, samples = store.samples.of_lens(steps.lens_id(photo))
+
+    assert (state.version, state.rebuild_epoch, len(samples)) == (1, 0, 6)
+    sample = samples[0].sample
+    assert sample.settings.aperture == 1.4
+    assert sample.photo == photo.public_id
+    np.testing.assert_allclose(sample.kernel, gaussian(15, np.eye(2)), atol=1e-7)
+
+
+def test_only_samples_of_later_versions_are_read_on(store: Store, steps: Steps) -> None:
+    first, second = steps.counted(), steps.counted()
+
+    state, samples = store.samples.of_lens(steps.lens_id(first), after_version=1)
+
+    assert state.version == 2
+    assert {stored.sample.photo for stored in samples} == {second.public_id}
+
+
+def test_excluding_takes_the_samples_out_and_including_brings_them_back(store: Store, steps: Steps) -> None:
+    photo = steps.counted()
+    lens = steps.lens_id(photo)
+
+    assert store.photos.change(photo.public_id, OWNER, {}, excluded=True)
+    assert store.samples.of_lens(lens)[1] == []
+    assert store.photos.change(photo.public_id, OWNER, {}, excluded=True)  # again: no version of its own
+    assert store.photos.change(photo.public_id, OWNER, {}, excluded=False)
+
+    state, samples = store.samples.of_lens(lens)
+    assert (state.version, state.rebuild_epoch, len(samples)) == (3, 2, 6)
+
+
+def test_deleting_a_photo_forgets_its_samples_and_names_its_blobs(store: Store, steps: Steps) -> None:
+    other, photo = steps.counted(), steps.counted()
+    lens = steps.lens_id(photo)
+
+    assert store.photos.delete(photo.public_id, OWNER) == f"photos/{photo.public_id}/"
+
+    assert store.photos.get(photo.public_id) is None
+    assert {stored.sample.photo for stored in store.samples.of_lens(lens)[1]} == {other.public_id}
+    assert store.workers.garbage() == []  # a worker may still write: once more in a while
+    late = datetime.now(UTC) + timedelta(hours=1)
+    models = {f"models/{lens}/{version}-0/" for version in (1, 2)}
+    assert set(store.workers.garbage(at=late)) == {f"photos/{photo.public_id}/"} | models
+    found = store.lenses.get(lens)
+    assert found is not None
+    assert [event.kind for event in store.lenses.history(found)] == [
+        *("photo_added", "photo_added", "photo_removed")
+    ]
+
+
+def test_the_same_bytes_may_come_again_after_deletion(store: Store, steps: Steps) -> None:
+    photo = steps.receive()
+    store.photos.delete(photo.public_id, OWNER)
+
+    assert steps.receive_again(photo).public_id != photo.public_id
+
+
+def test_a_photo_moved_to_another_lens_renews_both(store: Store, steps: Steps) -> None:
+    mine, other = steps.counted(serial="123"), steps.counted(serial="124")
+    old, new = steps.lens_id(mine), steps.lens_id(other)
+
+    assert store.photos.change(mine.public_id, OWNER, {}, lens=new)
+
+    assert store.samples.of_lens(old)[1] == []
+    assert len(store.samples.of_lens(new)[1]) == 12
+
+
+def test_a_corrected_aperture_reaches_the_samples_and_the_version(store: Store, steps: Steps) -> None:
+    photo = steps.counted()
+
+    store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
+
+    state, samples = store.samples.of_lens(steps.lens_id(photo))
+    assert state.version == 2
+    assert {stored.sample.settings.aperture for stored in samples} == {2.0}
+
+
+def test_the_same_correction_is_made_once_and_a_failed_one_again(store: Store, steps: Steps) -> None:
+    photo = steps.counted()
+    lens = store.photos.lens_of(photo)
+    assert lens is not None
+
+    first, made = store.corrections.create(photo, lens, 1, {"method": "fast"})
+    second, made_again = store.corrections.create(photo, lens, 1, {"method": "fast"})
+    assert (made, made_again, first.public_id) == (True, False, second.public_id)
+
+    assert store.corrections.fail(first.public_id, "time_limit", "too slow")
+    third, made = store.corrections.create(photo, lens, 1, {"method": "fast"})
+    assert made
+    assert third.public_id != first.public_id
+
+
+def test_a_cancelled_correction_cannot_finish(store: Store, steps: Steps) -> None:
+    photo = steps.counted()
+    lens = store.photos.lens_of(photo)
+    assert lens is not None
+    row, _ = store.corrections.create(photo, lens, 1, {})
+    assert store.corrections.start(row.public_id)
+    store.corrections.progress(row.public_id, 1, 2)
+
+    assert store.corrections.cancel(row.public_id, OWNER)
+
+    assert not store.corrections.finish(row.public_id, Result("k", "e", "image/tiff", 1, "n"), {})
+    assert not store.corrections.start(row.public_id)
+    assert not store.corrections.is_live(row.public_id)
+
+
+def test_another_owner_sees_nothing(store: Store, steps: Steps) -> None:
+    photo = steps.counted()
+    lens = steps.lens_id(photo)
+
+    assert store.photos.get(photo.public_id, "stranger") is None
+    assert store.lenses.get(lens, "stranger") is None
+    assert store.photos.page("stranger", before=None, limit=10) == []
+    assert not store.photos.cancel(photo.public_id, "stranger")
+    assert store.photos.delete(photo.public_id, "stranger") is None
+
+
+def test_a_worker_declared_dead_cannot_beat_again(store: Store, steps: Steps) -> None:
+    store.workers.register("w", host="h", pid=1, pid_started=0.0)
+    assert store.workers.beat("w")
+    assert [row.id for row in store.workers.live(10)] == ["w"]
+
+    assert store.workers.bury_stale(0.0) == ["w"]
+
+    assert not store.workers.beat("w")
+    assert store.workers.live(10) == []
+    store.workers.forget("w")
+    assert store.workers.all() == []
+
+
+def test_no_update_is_lost_when_many_threads_raise_the_version(store: Store, steps: Steps) -> None:
+    photo = steps.counted()
+    lens = steps.lens_id(photo)
+
+    def toggle() -> None:
+        for _ in range(5):
+            store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
+
+    threads = [threading.Thread(target=toggle) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+    state = store.samples.state_of(lens)
+    assert state is not None
+    assert state.version == 21
+
+
+def test_an_error_of_the_database_names_no_serial(store: Store) -> None:
+    with pytest.raises(DBAPIError) as caught, store.database.writing() as session:
+        session.execute(text("SELECT 1 FROM nowhere WHERE serial = :serial"), {"serial": "SECRET-77"})
+
+    assert "SECRET-77" not in str(caught.value)
+
+
+def test_the_reader_cannot_write(store: Store, steps: Steps) -> None:
+    with pytest.raises(Exception, match=r"read-?only"), store.database.reading() as session:
+        session.execute(text("DELETE FROM owner"))
+
+
+def test_migrations_go_up_and_down_and_match_the_tables(settings: Settings) -> None:
+    from alembic.autogenerate import compare_metadata  # noqa: PLC0415 - only this test compares
+    from alembic.migration import MigrationContext  # noqa: PLC0415
+
+    database = Database(settings.database)
+    downgrade(database, "base")
+    assert upgrade(database)
+    assert is_current(database)
+    assert not upgrade(database)
+    with database.writer.connect() as connection:
+        assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
+
+    downgrade(database, "base")
+    assert current(database) is None
+    assert upgrade(database)
+    assert current(database) == head()
+    database.close()
+
+
+def test_an_unknown_setting_is_refused_with_the_likely_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LENS_WORKER_SLOT", "3")
+
+    with pytest.raises(ValueError, match="did you mean LENS_WORKER_SLOTS"):
+        Settings()
+
+
+def test_a_port_open_to_the_world_asks_for_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not Settings().needs_keys
+    monkeypatch.setenv("LENS_API_KEY", "what clients send is no setting")
+    monkeypatch.setenv("LENS_HOST", "0.0.0.0")
+
+    assert Settings().needs_keys
+    with pytest.raises(ValueError, match="LENS_AUTH=none lets everybody in"):
+        Settings(auth="none")
+
+
+def test_an_unknown_estimator_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(ValueError, match=r"no estimator 'nothing'; known: .*whittle"):
+        Settings(estimator="nothing")
+    assert Settings(estimator="whittle").estimator == "whittle"
+
+
+def test_a_database_server_needs_shared_storage() -> None:
+    with pytest.raises(ValueError, match="s3://"):
+        Settings(database_url="postgresql+psycopg://db/lens")
+
+
+def test_a_database_server_needs_jobs_that_all_machines_see() -> None:
+    with pytest.raises(ValueError, match="LENS_JOBS_URL"):
+        Settings(database_url="postgresql+psycopg://db/lens", storage_url="s3://lensmodel")
+
+
+def test_a_database_of_a_newer_program_is_refused(store: Store) -> None:
+    with store.database.writer.begin() as connection:
+        connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
+
+    with pytest.raises(InvalidInputError, match="newer program, schema 9999"):
+        upgrade(store.database)

@@ -1,0 +1,170 @@
+"""Methods of one's own, brought by an installed package: library, command and service know their names."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lensmodel
+from lensmodel.core import registry
+from lensmodel.core.errors import UnknownMethodError
+from lensmodel.core.registry import Registry
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+from running import Service, write_photo  # noqa: E402 - beside this file
+
+sys.path.remove(str(HERE))
+
+MODULE = '''
+from dataclasses import dataclass
+
+import lensmodel
+
+
+@dataclass(frozen=True)
+class Careful:
+    """The estimator "whittle", trusted half as much."""
+
+    name: str = "careful"
+    version: int = 1
+
+    def estimate(self, patches, noise, **options):
+        found = lensmodel.estimators.create("whittle").estimate(patches, noise, **options)
+        return type(found)(
+            found.kernel, found.confidence / 2, found.reliability, found.predicted_error, {}, found.seconds
+        )
+
+    def estimate_channel(self, patches, noise, reference, reference_patches, **options):
+        return self.estimate(patches, noise, **options)
+
+
+class Everywhere:
+    """Takes every window for as good as any other."""
+
+    def score(self, windows, looked):
+        return looked.information.mean(axis=(1, 2)) * 0.0 + 0.5
+
+
+@dataclass(frozen=True)
+class Adjoint:
+    """Blurs once more: of no use, and easily told from a method that deblurs."""
+
+    def deconvolve(self, blurred, blur, *, sensor, on_step=None):
+        return lensmodel.Restored(blur.frame(blur.adjoint(blurred)), 1)
+'''
+
+POINTS = """[lensmodel.estimators]
+careful = own_methods:Careful
+broken = own_methods:Missing
+[lensmodel.selectors]
+everywhere = own_methods:Everywhere
+[lensmodel.deconvolvers]
+adjoint = own_methods:Adjoint
+"""
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    """A package as an installer leaves it."""
+    folder = tmp_path / "site"
+    about = folder / "own_methods-1.0.dist-info"
+    about.mkdir(parents=True)
+    (folder / "own_methods.py").write_text(MODULE, encoding="utf-8")
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: own-methods\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(POINTS)
+    return folder
+
+
+@pytest.fixture
+def installed(package: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    monkeypatch.syspath_prepend(str(package))
+    registry._entry_points.cache_clear()
+    yield package
+    registry._entry_points.cache_clear()
+    sys.modules.pop("own_methods", None)
+
+
+def test_methods_of_a_package_are_known_by_their_names(installed: Path) -> None:
+    assert "careful" in lensmodel.estimators
+    assert "everywhere" in list(lensmodel.selectors)
+    assert lensmodel.estimators.create("careful").name == "careful"
+
+
+def test_a_method_of_a_package_corrects(installed: Path) -> None:
+    spots = np.ones((4, 5, 5))
+    lens = lensmodel.Lens.from_kernels(spots, [0.1, 0.5, 0.9, 0.5], [0.0, 1.0, 2.0, -2.0], aperture=2.0)
+    planes = np.random.default_rng(1).random((3, 64, 64), dtype=np.float32)
+
+    corrected = lensmodel.correct(planes, lens, aperture=2.0, method="adjoint", workers=1)
+
+    assert corrected.planes.shape == planes.shape
+
+
+def test_a_package_that_cannot_be_loaded_is_named(installed: Path) -> None:
+    lensmodel.estimators.load_installed()  # says so in the log, and goes on
+
+    with pytest.raises(UnknownMethodError, match=r"broken.*own-methods cannot be loaded"):
+        lensmodel.estimators.create("broken")
+
+
+def test_a_package_replaces_nothing(installed: Path) -> None:
+    taken: Registry[object] = Registry("estimator", {"careful": dict}, "lensmodel.estimators")
+
+    assert taken.create("careful") == {}
+    assert list(taken) == ["broken", "careful"]
+
+
+def _environment(package: Path) -> dict[str, str]:
+    paths = [str(package), str(HERE.parents[1])]
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("LENS_")}
+    return {**kept, "PYTHONPATH": os.pathsep.join(paths)}
+
+
+@pytest.mark.slow
+def test_the_command_learns_by_methods_of_a_package(package: Path, tmp_path: Path) -> None:
+    write_photo(tmp_path / "a.dng", 1)
+
+    done = subprocess.run(
+        [
+            *(sys.executable, "-m", "lensmodel", "calibrate", "a.dng", "-p", "a.lensprofile", "--json"),
+            *("--estimator", "careful", "--selector", "everywhere"),
+        ],
+        cwd=tmp_path,
+        env=_environment(package),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["samples"] > 0
+    assert lensmodel.Lens.load(tmp_path / "a.lensprofile").model.samples[0].estimator == "careful/1"
+
+
+@pytest.mark.slow
+def test_the_service_works_by_methods_of_a_package(package: Path, tmp_path: Path) -> None:
+    path = os.environ.get("PYTHONPATH", "")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("PYTHONPATH", os.pathsep.join([str(package), path]))
+        service = Service(tmp_path / "data", LENS_ESTIMATOR="careful", LENS_SELECTOR="everywhere")
+        service.start()
+    try:
+        formats = service.get("/v1/formats")
+        assert {"careful"} <= set(formats["estimators"])
+        assert {"everywhere"} <= set(formats["selectors"])
+        photo = service.upload(write_photo(tmp_path / "a.dng", 1))
+        assert service.job(photo["id"])["state"] == "succeeded"
+        answer = service.http.post("/v1/corrections", json={"photo_id": photo["id"], "method": "adjoint"})
+        assert service.job(answer.json()["id"])["state"] == "succeeded"
+        refused = service.http.post("/v1/corrections", json={"photo_id": photo["id"], "method": "none"})
+        assert "adjoint" in refused.json()["detail"]
+    finally:
+        service.close()

@@ -1,0 +1,267 @@
+"""Random deaths and outages under work, and then: everything counted exactly once, nothing lost.
+
+    python tests/app/torture.py --seeds 20              # SQLite and a folder
+    python tests/app/torture.py --seeds 20 --servers    # PostgreSQL and S3 (moto)
+
+Three workers estimate the photos of two owners while, as the seed says, workers are killed (alone, or with
+their children), the database server crashes, and the storage goes away. What must hold afterwards is what
+`lensmodel doctor` checks, and the exact numbers of photos, samples and versions.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from sqlalchemy import func, select
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+
+from deadline import stretched  # noqa: E402 - beside this file
+from servers import Postgres, moto, postgres  # noqa: E402
+
+from app.blobs.storage import Storage  # noqa: E402
+from app.runtime.doctor import examine  # noqa: E402
+from app.runtime.settings import Settings  # noqa: E402
+from app.runtime.supervisor import environment  # noqa: E402
+from app.store import Store  # noqa: E402
+from app.store.ids import new_id  # noqa: E402
+from app.store.tables import LensRow, OwnerRow, PhotoRow, SampleRow  # noqa: E402
+from app.store.upkeep.migrate import upgrade  # noqa: E402
+
+OWNERS = ("one", "two")
+CELLS, CHANNELS = 8, 3
+PHOTO = b"a photo"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How hard it gets."""
+
+    photos: int = 8
+    workers: int = 3
+    kills: int = 20
+    outages: int = 3
+    patience_s: float = 300.0
+
+
+class Crew:
+    """Worker processes of one installation."""
+
+    def __init__(self, settings: Settings, extra: dict[str, str]) -> None:
+        self.log = settings.data_dir / "workers.log"
+        path = os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")])
+        self._environment = os.environ | environment(settings) | {"PYTHONPATH": path} | extra
+        self.processes: list[subprocess.Popen[bytes]] = []
+
+    def hire(self) -> None:
+        with self.log.open("a") as log:
+            self.processes.append(
+                subprocess.Popen(
+                    [sys.executable, str(HERE / "quick_worker.py")],
+                    env=self._environment,
+                    stderr=log,
+                    start_new_session=True,
+                )
+            )
+
+    def bury(self, process: subprocess.Popen[bytes], *, group: bool) -> None:
+        if group:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+        process.kill()
+        process.wait()
+        self.processes.remove(process)
+
+    def replace_the_dead(self) -> None:
+        """Hire for those that ended themselves: fenced, or without their database for a lease."""
+        for process in [p for p in self.processes if p.poll() is not None]:
+            self.processes.remove(process)
+            self.hire()
+
+    def close(self) -> None:
+        for process in self.processes:
+            process.kill()
+            process.wait()
+
+
+@contextlib.contextmanager
+def folder_away(settings: Settings) -> Iterator[None]:
+    folder = Storage(settings.storage).folder
+    assert folder is not None
+    aside = folder.with_name("aside")
+    folder.rename(aside)
+    try:
+        yield
+    finally:
+        aside.rename(folder)
+
+
+@contextlib.contextmanager
+def crashed(server: Postgres) -> Iterator[None]:
+    server.stop()
+    try:
+        yield
+    finally:
+        server.start()
+
+
+@contextlib.contextmanager
+def installation(
+    folder: Path, *, servers: bool
+) -> Iterator[tuple[Settings, dict[str, str], list[Callable[[], contextlib.AbstractContextManager[None]]]]]:
+    """Give settings, what the environment of workers holds besides, and the outages that there can be."""
+    common = {"data_dir": folder / "data", "lease_seconds": 4.0, "sweep_seconds": 0.1, "worker_slots": 2}
+    if not servers:
+        settings = Settings(**common, min_free_mb=0)  # type: ignore[arg-type]  # checked by pydantic
+        yield settings, {}, [lambda: folder_away(settings)]
+        return
+    with postgres() as server, moto("torture") as store, in_environment(store.environment):
+        settings = Settings(
+            **common,  # type: ignore[arg-type]  # checked by pydantic
+            min_free_mb=0,
+            database_url=server.url("app"),
+            jobs_url=server.url("jobs"),
+            storage_url="s3://torture",
+            storage_seconds=3.0,
+        )
+        yield settings, store.environment, [lambda: crashed(server), store.hanging]
+
+
+@contextlib.contextmanager
+def in_environment(values: dict[str, str]) -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def send(store: Store, storage: Storage, number: int) -> None:
+    public_id = new_id()
+    storage.put(f"photos/{public_id}/original", PHOTO)
+    store.photos.receive(
+        OWNERS[number % len(OWNERS)],
+        public_id=public_id,
+        sha256=f"{number:064x}",
+        filename="p.dng",
+        kind="dng",
+        byte_size=len(PHOTO),
+        blob_key=f"photos/{public_id}/original",
+        calibrate=True,
+        given={},
+    )
+
+
+def states(store: Store) -> list[str]:
+    with store.database.reading() as session:
+        return list(session.scalars(select(PhotoRow.state)))
+
+
+def said(store: Store) -> list[str]:
+    """Return how photos are, with the reasons of those that ended."""
+    with store.database.reading() as session:
+        rows = session.execute(select(PhotoRow.state, PhotoRow.error_code, PhotoRow.error_detail))
+        return [" ".join(filter(None, row)) for row in rows]
+
+
+def torture(folder: Path, seed: int, *, servers: bool, plan: Plan | None = None) -> str:
+    """Do it once; return what happened in one line.
+
+    Raises
+    ------
+    AssertionError
+        If anything was lost, counted twice, or seen by another owner.
+    """
+    plan, chance, began = plan or Plan(), random.Random(seed), time.monotonic()
+    with installation(folder, servers=servers) as (settings, extra, outages):
+        settings.data_dir.mkdir(parents=True)
+        store, storage = Store(settings), Storage(settings.storage)
+        upgrade(store.database)
+        crew = Crew(settings, extra)
+        try:
+            for number in range(plan.photos):
+                send(store, storage, number)
+            for _ in range(plan.workers):
+                crew.hire()
+            deeds = ["kill"] * plan.kills + ["outage"] * plan.outages
+            chance.shuffle(deeds)
+            for deed in deeds:
+                time.sleep(chance.uniform(0.2, 1.5))
+                if deed == "kill":
+                    crew.bury(chance.choice(crew.processes), group=chance.random() < 0.5)
+                    crew.hire()
+                else:
+                    with chance.choice(outages)():
+                        time.sleep(chance.uniform(1.0, 5.0))
+                crew.replace_the_dead()
+            end = time.monotonic() + stretched(plan.patience_s)
+            while (now := set(states(store))) != {"counted"}:
+                crew.replace_the_dead()
+                assert not now & {"failed", "cancelled", "needs_lens"}, said(store)
+                assert time.monotonic() < end, f"{states(store)}\n{crew.log.read_text()[-4000:]}"
+                time.sleep(0.2)
+            check(settings, store, storage, plan)
+        finally:
+            crew.close()
+            store.close()
+    return (
+        f"seed {seed}: {plan.photos} of {plan.photos} photos counted once, "
+        f"{plan.photos * CELLS * CHANNELS} samples, {plan.kills} kills, {plan.outages} outages, "
+        f"{time.monotonic() - began:.0f} s"
+    )
+
+
+def check(settings: Settings, store: Store, storage: Storage, plan: Plan) -> None:
+    findings = examine(settings, store, storage, deep=False).findings
+    assert not [finding for finding in findings if finding.check != "work"], findings
+    with store.database.reading() as session:
+        samples = session.scalar(select(func.count()).select_from(SampleRow))
+        lenses = session.execute(
+            select(OwnerRow.name, LensRow.version, LensRow.photo_count, LensRow.sample_count)
+            .join(LensRow, LensRow.owner_id == OwnerRow.id)
+            .order_by(OwnerRow.name)
+        ).all()
+    each = plan.photos // len(OWNERS)
+    assert samples == plan.photos * CELLS * CHANNELS
+    assert [tuple(lens) for lens in lenses] == [
+        (owner, each, each, each * CELLS * CHANNELS) for owner in OWNERS
+    ]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--servers", action="store_true", help="PostgreSQL and S3 instead of files")
+    wishes = parser.parse_args()
+    failed = 0
+    for seed in range(wishes.first, wishes.first + wishes.seeds):
+        with tempfile.TemporaryDirectory(prefix="lensmodel-torture-") as folder:
+            try:
+                print(torture(Path(folder), seed, servers=wishes.servers), flush=True)  # noqa: T201
+            except AssertionError as error:
+                failed += 1
+                print(f"seed {seed}: FAILED: {error}", flush=True)  # noqa: T201
+    print(f"{wishes.seeds - failed} of {wishes.seeds} seeds passed")  # noqa: T201
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

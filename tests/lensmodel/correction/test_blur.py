@@ -1,0 +1,217 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy import signal
+
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.psf import as_kernel, delta, gaussian
+from lensmodel.correction.blur import (
+    Drift,
+    EfficientFilterFlow,
+    UniformBlur,
+    bartlett_hann,
+    crop_to_support,
+    partition,
+    support_radius,
+)
+
+
+def kernels(side: int = 7) -> st.SearchStrategy[np.ndarray]:
+    values = hnp.arrays(np.float64, (side, side), elements=st.floats(0.0, 1.0, width=32))
+    return values.filter(lambda a: a.sum() > 0.1).map(as_kernel)
+
+
+@given(kernel=kernels(), seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=25, deadline=None)
+def test_adjoint_is_the_transpose_of_forward(kernel: np.ndarray, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    blur = UniformBlur(kernel)
+    blurred = rng.random((24, 31), dtype=np.float32)
+    latent = rng.random(blur.adjoint(blurred).shape, dtype=np.float32)
+
+    left, right = np.vdot(blur.forward(latent), blurred), np.vdot(latent, blur.adjoint(blurred))
+
+    assert left == pytest.approx(right, rel=1e-5)
+
+
+def test_adjoint_is_the_transpose_of_forward_with_a_shift() -> None:
+    rng = np.random.default_rng(3)
+    blur = UniformBlur(gaussian(9, np.eye(2)), offset=(0.4, -1.3))
+    blurred = rng.standard_normal((24, 31), dtype=np.float32)
+    latent = rng.standard_normal(blur.adjoint(blurred).shape, dtype=np.float32)
+
+    left, right = np.vdot(blur.forward(latent), blurred), np.vdot(latent, blur.adjoint(blurred))
+
+    assert left == pytest.approx(right, abs=1e-4 * float(np.linalg.norm(latent)))
+
+
+@given(kernel=kernels(), seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=25, deadline=None)
+def test_forward_is_the_convolution_where_all_light_is_known(kernel: np.ndarray, seed: int) -> None:
+    latent = np.random.default_rng(seed).random((22, 27), dtype=np.float32)
+
+    expected = signal.convolve2d(latent, kernel, mode="valid")
+
+    np.testing.assert_allclose(UniformBlur(kernel).forward(latent), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("offset", [(0.0, 0.0), (0.4, -1.3)])
+def test_blur_of_a_constant_is_the_constant(offset: tuple[float, float]) -> None:
+    blur = UniformBlur(gaussian(9, np.eye(2)), offset=offset)
+    latent = np.full(blur.adjoint(np.ones((24, 31), dtype=np.float32)).shape, 0.7, dtype=np.float32)
+
+    np.testing.assert_allclose(blur.forward(latent), 0.7, rtol=1e-4)
+
+
+def test_blur_moves_a_point_to_where_the_kernel_says() -> None:
+    kernel, point = np.zeros((5, 5)), np.zeros((9, 9), dtype=np.float32)
+    kernel[2, 4] = point[4, 4] = 1.0  # two columns to the right of the middle
+
+    blurred = UniformBlur(kernel).forward(point)
+
+    assert np.unravel_index(blurred.argmax(), blurred.shape) == (2, 4)
+
+
+def test_offset_moves_a_point_by_whole_pixels() -> None:
+    point = np.zeros((21, 21), dtype=np.float32)
+    point[10, 10] = 1.0
+
+    blur = UniformBlur(delta(5), offset=(-1.0, 2.0))
+    blurred = blur.forward(point)
+
+    row, col = np.unravel_index(blurred.argmax(), blurred.shape)
+    assert (row + blur.reach - 10, col + blur.reach - 10) == (-1, 2)
+
+
+def test_delta_changes_nothing() -> None:
+    latent = np.random.default_rng(1).random((20, 21), dtype=np.float32)
+    blur = UniformBlur(delta(5))
+
+    np.testing.assert_allclose(blur.forward(latent), blur.frame(latent), atol=1e-6)
+
+
+def test_forward_refuses_a_latent_plane_without_a_frame() -> None:
+    with pytest.raises(InvalidInputError, match="leaves no frame"):
+        UniformBlur(delta(9)).forward(np.ones((8, 40), dtype=np.float32))
+
+
+@given(half=st.integers(1, 300))
+@settings(deadline=None)
+def test_bartlett_hann_tiles_exactly_at_half_overlap(half: int) -> None:
+    window = bartlett_hann(2 * half)
+
+    np.testing.assert_allclose(window + np.roll(window, half), 1.0, atol=1e-12)
+
+
+def test_bartlett_hann_refuses_odd_lengths() -> None:
+    with pytest.raises(InvalidInputError, match="even length"):
+        bartlett_hann(7)
+
+
+@given(extent=st.integers(1, 400), parts=st.integers(1, 12))
+@settings(deadline=None)
+def test_partition_sums_to_one_everywhere(extent: int, parts: int) -> None:
+    parts = min(parts, extent)
+    total = np.zeros(extent)
+    for start, window in partition(extent, parts):
+        total[start : start + len(window)] += window
+
+    np.testing.assert_allclose(total, 1.0, atol=1e-12)
+
+
+def _grid() -> tuple[tuple[np.ndarray, ...], ...]:
+    return tuple(
+        tuple(np.roll(gaussian(9, [[0.5 + i, 0.2], [0.2, 0.5 + j]]), 1, axis=j % 2) for j in range(4))
+        for i in range(3)
+    )
+
+
+def test_filter_flow_adjoint_is_the_transpose_of_forward() -> None:
+    flow, rng = EfficientFilterFlow(60, 77, _grid()), np.random.default_rng(2)
+    latent = rng.standard_normal(flow.latent_shape, dtype=np.float32)
+    blurred = rng.standard_normal((60, 77), dtype=np.float32)
+
+    difference = np.vdot(flow.forward(latent), blurred) - np.vdot(latent, flow.adjoint(blurred))
+
+    assert abs(difference) <= 1e-5 * np.linalg.norm(flow.forward(latent)) * np.linalg.norm(blurred)
+
+
+def test_filter_flow_of_one_kernel_is_the_uniform_blur() -> None:
+    kernel = _grid()[1][1]
+    flow = EfficientFilterFlow(60, 77, ((kernel,) * 4,) * 3)
+    latent = np.random.default_rng(4).random(flow.latent_shape, dtype=np.float32)
+
+    np.testing.assert_allclose(flow.forward(latent), UniformBlur(kernel).forward(latent), atol=2e-6)
+
+
+def test_filter_flow_keeps_the_light_of_every_point_inside() -> None:
+    flow = EfficientFilterFlow(60, 77, _grid())
+
+    arriving = flow.adjoint(np.ones((60, 77), dtype=np.float32))
+
+    np.testing.assert_allclose(arriving[9:-9, 9:-9], 1.0, atol=1e-5)
+
+
+def test_filter_flow_spreads_a_point_with_the_kernel_of_its_window() -> None:
+    grid = _grid()
+    flow = EfficientFilterFlow(60, 80, grid)
+    latent = np.zeros(flow.latent_shape, dtype=np.float32)
+    latent[flow.reach + 10, flow.reach + 30] = 1.0  # next to the centre of window (0, 1) at (9.5, 29.5)
+
+    spread = flow.forward(latent)[6:15, 26:35]
+
+    assert np.corrcoef(spread.ravel(), grid[0][1].ravel())[0, 1] > 0.999
+
+
+def test_filter_flow_refuses_a_ragged_grid() -> None:
+    with pytest.raises(InvalidInputError, match="full grid"):
+        EfficientFilterFlow(60, 77, ((delta(3), delta(3)), (delta(3),)))
+
+
+def test_support_radius_holds_the_energy_asked_for() -> None:
+    kernel = gaussian(41, np.eye(2) * 4.0)
+    radius = support_radius(kernel)
+    held = kernel[20 - radius : 21 + radius, 20 - radius : 21 + radius].sum()
+    less = kernel[21 - radius : 20 + radius, 21 - radius : 20 + radius].sum()
+
+    assert less < 0.999 <= held
+    assert crop_to_support(kernel).shape == (2 * radius + 1, 2 * radius + 1)
+
+
+def test_drift_is_the_change_of_the_transfer_function_per_pixel() -> None:
+    narrow, wide = UniformBlur(gaussian(5, np.eye(2))), UniformBlur(gaussian(9, 2.0 * np.eye(2)))
+    shifted = UniformBlur(narrow.kernel, (0.5, -0.25))
+
+    down, across = Drift((narrow, wide, 40.0), (narrow, shifted, 20.0), (0.0, 0.0)).spectra((32, 30))
+
+    np.testing.assert_allclose(down, (wide.transfer((32, 30)) - narrow.transfer((32, 30))) / 40.0, atol=1e-7)
+    np.testing.assert_allclose(
+        across, (shifted.transfer((32, 30)) - narrow.transfer((32, 30))) / 20.0, atol=1e-7
+    )
+
+
+@pytest.mark.parametrize("shift", [0.28, 0.5, 0.72, 1.3, -0.4])
+def test_shifted_point_stays_where_it_is_put(shift: float) -> None:
+    """A sinc would cross the picture; undone, it draws nets of dots."""
+    blur = UniformBlur(delta(1), (0.0, shift))
+    point = np.zeros((33, 64), dtype=np.float32)
+    point[16, 32] = 1.0
+    spread = np.fft.irfft2(np.fft.rfft2(point) * blur.transfer(point.shape), point.shape)
+
+    at = 32 + shift
+    far = np.abs(np.arange(64) - at) >= 2.0
+    assert np.abs(spread[:, far]).max() < 1e-6
+    assert spread.sum() == pytest.approx(1.0)
+    assert (spread[16] * np.arange(64)).sum() == pytest.approx(at, abs=1e-5)
+
+
+def test_shift_by_whole_pixels_changes_nothing_else() -> None:
+    rng = np.random.default_rng(5)
+    picture = rng.random((16, 20))
+    moved = np.fft.irfft2(
+        np.fft.rfft2(picture) * UniformBlur(delta(1), (2.0, -3.0)).transfer((16, 20)), (16, 20)
+    )
+
+    np.testing.assert_allclose(moved, np.roll(picture, (2, -3), (0, 1)), atol=1e-9)

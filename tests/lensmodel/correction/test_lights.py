@@ -1,0 +1,234 @@
+"""Light beyond saturation: where it is looked for, and the compiled products it is found with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from lensmodel.core.geometry import Frame
+from lensmodel.core.psf import as_kernel, gaussian
+from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, NoiseModel
+from lensmodel.correction import correct_planes
+from lensmodel.correction.blur import UniformBlur
+from lensmodel.correction.blur.compiled_uniform import CompiledBlur
+from lensmodel.correction.deconvolver import Sensor
+from lensmodel.correction.engine import compiled
+from lensmodel.correction.lights.clipped import Region, regions
+from lensmodel.correction.lights.saturation import Lights, compact
+
+REACH = 4
+KERNEL = gaussian(2 * REACH + 1, np.eye(2) * 1.2)
+
+
+def lamps(*places: tuple[int, int], shape: tuple[int, int] = (160, 200), radius: float = 3.0) -> np.ndarray:
+    """Light of lamps of 8 times saturation over a dim slope, wider than `shape` by the reach."""
+    rows, cols = np.mgrid[: shape[0] + 2 * REACH, : shape[1] + 2 * REACH]
+    light = 0.1 + 0.1 * rows / shape[0]
+    for row, col in places:
+        light[np.hypot(rows - row - REACH, cols - col - REACH) < radius] = 8.0
+    return light.astype(np.float32)
+
+
+def answered(found: list[Region], shape: tuple[int, int]) -> np.ndarray:
+    """How many regions answer for each pixel."""
+    count = np.zeros(shape, dtype=int)
+    for region in found:
+        count[region.seen][region.answers] += 1
+    return count
+
+
+def owned(found: list[Region], shape: tuple[int, int]) -> np.ndarray:
+    """How many regions own the light of each pixel of the latent plane."""
+    count = np.zeros((shape[0] + 2 * REACH, shape[1] + 2 * REACH), dtype=int)
+    for region in found:
+        wide = tuple(slice(part.start, part.stop + 2 * REACH) for part in region.seen)
+        count[wide][region.own] += 1
+    return count
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_clipped_pixels_near_measured_ones_have_one_region_that_answers(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    field = ndimage.gaussian_filter(rng.standard_normal((170, 210)), (2, 4, 8, 16)[seed])
+    clipped = field > np.quantile(field, (0.995, 0.97, 0.8, 0.5)[seed])
+    found = regions(clipped, REACH)
+
+    count = answered(found, clipped.shape)
+    near = ndimage.maximum_filter(~clipped, 4 * REACH + 1)
+    assert count.max() == 1
+    assert (count[clipped & near] == 1).all()
+    assert owned(found, clipped.shape).max() == 1
+
+
+def test_lamps_far_apart_are_regions_of_their_own_and_cost_less() -> None:
+    clipped = np.zeros((400, 400), dtype=bool)
+    clipped[20:24, 30:33] = clipped[350:360, 340:350] = True
+
+    found = regions(clipped, REACH)
+
+    assert len(found) == 2
+    pixels = sum((r.seen[0].stop - r.seen[0].start) * (r.seen[1].stop - r.seen[1].start) for r in found)
+    assert pixels < 0.05 * clipped.size
+
+
+def test_the_inside_of_a_blown_area_is_left_alone() -> None:
+    clipped = np.zeros((300, 300), dtype=bool)
+    clipped[:, 100:] = True
+
+    count = answered(regions(clipped, REACH), clipped.shape)
+
+    assert count[:, 100 : 100 + 2 * REACH].all()
+    assert not count[:, 140:].any()
+
+
+@pytest.mark.parametrize("value", [False, True])
+def test_nothing_is_to_be_found_where_nothing_or_everything_is_clipped(value: bool) -> None:
+    assert regions(np.full((40, 50), value), REACH) == []
+
+
+def test_lamps_far_apart_shine_as_each_does_alone() -> None:
+    blur, sensor = UniformBlur(KERNEL), Sensor(NoiseModel(1e-5, 1e-6), 1.0)
+    both = np.minimum(blur.forward(lamps((40, 50), (120, 150))), 1.0)
+    one = np.minimum(blur.forward(lamps((40, 50))), 1.0)
+
+    found, alone = (Lights.of(plane[None], [blur], [sensor], 20, "auto") for plane in (both, one))
+
+    assert found is not None
+    assert alone is not None
+    here = (0, slice(0, 80), slice(0, 100))
+    np.testing.assert_allclose(found.beyond[here], alone.beyond[here], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(found.rest[here], alone.rest[here], atol=1e-5)
+
+
+def test_a_lamp_that_is_cut_by_two_regions_shines_like_a_whole_one() -> None:
+    """A long lamp is cut in the middle; its light there is that of its other parts."""
+    blur, sensor = UniformBlur(KERNEL), Sensor(NoiseModel(1e-5, 1e-6), 1.0)
+    light = lamps(shape=(60, 900))
+    light[30 + REACH : 36 + REACH, 40:860] = 3.0
+    seen = np.minimum(blur.forward(light), 1.0)
+
+    found = Lights.of(seen[None], [blur], [sensor], 20, "auto")
+
+    assert found is not None
+    along = found.beyond[0, 28:40].sum(axis=0)[100:800]
+    assert np.ptp(along) < 0.02 * along.mean()
+
+
+@pytest.mark.parametrize("shape", [(30, 41), (5, 60), (3, 3)])
+def test_covered_light_is_the_adjoint_of_a_frame_of_ones(shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(1)
+    kernel = rng.random((7, 7)) ** 3
+    for blur in (UniformBlur(kernel / kernel.sum()), UniformBlur(kernel / kernel.sum(), (0.3, -0.6))):
+        expected = blur.adjoint(np.ones(shape, dtype=np.float32))
+        np.testing.assert_allclose(blur.covered(shape), expected, atol=2e-6)
+
+
+@pytest.mark.parametrize("offset", [(0.0, 0.0), (0.4, -1.2)])
+def test_compiled_blur_gives_the_products_of_scipy(offset: tuple[float, float]) -> None:
+    pytest.importorskip("numba")
+    pytest.importorskip("rocket_fft")
+    rng = np.random.default_rng(2)
+    kernel = rng.random((9, 9)) ** 3
+    slow = UniformBlur(kernel / kernel.sum(), offset)
+    quick = CompiledBlur.of(slow, compiled("auto"))
+    latent = rng.random((60, 77), dtype=np.float32)
+    blurred = slow.forward(latent)
+
+    np.testing.assert_allclose(quick.forward(latent), blurred, atol=2e-6)
+    np.testing.assert_allclose(quick.adjoint(blurred), slow.adjoint(blurred), atol=2e-6)
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.3, -0.4)])
+def test_lights_behind_next_to_no_blur_do_not_run_away(shift: tuple[float, float]) -> None:
+    # eight bits just below clipping, as a JPEG of a white wall has them, and lateral colour
+    levels = np.array([0.973, 0.982, 0.991, 1.0], dtype=np.float32)
+    tile = levels[np.random.default_rng(0).integers(0, 4, (1, 12, 12))].repeat(8, 1).repeat(8, 2)
+    sensor = Sensor(NoiseModel(shot=6e-6, read=2e-7), clip=1.0)
+
+    found = Lights.of(tile, [UniformBlur(np.ones((1, 1)), shift)], [sensor], 20, "auto")
+
+    assert found is not None
+    assert np.abs(found.rest).max() < 4.0
+    assert found.beyond.max() < 4.0
+
+
+@dataclass(frozen=True)
+class Lens:
+    """One kernel, and red and blue images that are larger and smaller than the green one."""
+
+    kernel: np.ndarray
+    shift: float
+
+    def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
+        return as_kernel(np.pad(self.kernel, (size - self.kernel.shape[0]) // 2))
+
+    def displacement(self, r: float, channel: Channel) -> float:
+        return {"r": self.shift, "g": 0.0, "b": -self.shift}[channel] * r
+
+
+def surface(clipped: int) -> np.ndarray:
+    """A lacquered surface in the sun, grooved, with a bright label, of which `clipped` colours saturate."""
+    rows, cols = np.mgrid[:160, :200].astype(np.float64)
+    rng = np.random.default_rng(7)
+    grooves = 1.0 + 0.25 * (np.sin(rows / 1.9) > 0.4) + 0.05 * rng.standard_normal(rows.shape)
+    label = (abs(cols - 120) < 22) & (abs(rows - 80) < 60) & ~((rows % 16 < 4) & (cols % 12 < 8))
+    colour = np.array([1.1, 1.1 if clipped > 1 else 0.4, 1.1 if clipped > 2 else 0.25])
+    light = colour[:, None, None] * (0.72 + 0.25 * (cols < 60)) * grooves
+    return np.where(label, 1.15 * colour[:, None, None], light).astype(np.float32)
+
+
+@pytest.mark.parametrize("method", ["standard", "fast", "paper"])
+@pytest.mark.parametrize("clipped", [1, 2, 3])
+@pytest.mark.parametrize(
+    ("width", "shift"), [(0.05, 1.0001), (0.5, 0.0), (0.5, 1.0001), (1.5, 0.3), (1.5, 3.0), (4.0, 1.0001)]
+)
+def test_clipped_surfaces_beside_lateral_colour_show_no_dots(
+    method: str, clipped: int, width: float, shift: float
+) -> None:
+    scene, frame = surface(clipped), Frame(120, 160)
+    lens = Lens(gaussian(19, np.eye(2) * width**2), shift)
+    rows, cols = np.indices((frame.height, frame.width), dtype=np.float64)
+    row, col = frame.center
+    truth, light = scene[:, 20:-20, 20:-20], []
+    for plane, channel in zip(scene.astype(np.float64), CHANNELS, strict=True):
+        soft = ndimage.convolve(plane, lens.kernel)
+        size = 1.0 + lens.displacement(1.0, channel) / frame.half_diagonal
+        where = [(rows - row) / size + row + 20, (cols - col) / size + col + 20]
+        light.append(ndimage.map_coordinates(soft, where, order=3))
+    noise = NoiseModel(2e-5, 1e-6)
+    seen = np.stack(light) + np.random.default_rng(8).standard_normal(truth.shape) * 4e-3
+    photo = np.minimum(seen, 1.0).astype(np.float32)
+
+    made = correct_planes(
+        photo,
+        lens,
+        frame,
+        noise=[noise] * 3,
+        method=method,
+        lateral=lens if shift > 0.0 else None,
+        clip=(0.995, 0.995, 0.995),
+    ).planes
+
+    lost = ndimage.binary_dilation((photo >= 0.995).any(axis=0), iterations=2)
+    window = (1, 9, 9)  # a dot is out of range of all that the blur reaches
+    low, high = ndimage.minimum_filter(photo, window), ndimage.maximum_filter(photo, window)
+    shown, wanted = np.minimum(made, 1.0), np.minimum(truth, 1.0)
+    dots = (shown < low - 0.05) | (shown > high + 0.05)
+    assert dots[:, lost].mean() < 0.001
+    assert np.sqrt(np.mean((shown - wanted) ** 2)) < 1.02 * np.sqrt(np.mean((photo - wanted) ** 2))
+
+
+def test_clipped_areas_that_demosaicing_has_perforated_are_broad_all_the_same() -> None:
+    clipped = np.zeros((60, 60), dtype=bool)
+    clipped[10:50, 10:50] = True
+    clipped[11:49:2, 11:49:2] = False  # filled in, hardly below saturation
+
+    assert not compact(clipped, reach=8).any()
+
+    clipped[:] = False
+    clipped[20:26, 20:26] = True
+    clipped[22, 23] = False
+    assert compact(clipped, reach=8).sum() == 35

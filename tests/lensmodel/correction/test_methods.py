@@ -1,0 +1,393 @@
+"""Contract of every deconvolution method, and what each one promises by itself."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+from skimage import restoration
+
+from lensmodel.core.errors import InvalidInputError, UnknownMethodError
+from lensmodel.core.geometry import Frame
+from lensmodel.core.psf import delta, gaussian
+from lensmodel.core.types import NoiseModel
+from lensmodel.correction import (
+    Deconvolver,
+    DirectFilter,
+    RichardsonLucy,
+    SaturationAwareRichardsonLucy,
+    Sensor,
+    SparseGradient,
+    correct_planes,
+    deconvolvers,
+    restore_planes,
+)
+from lensmodel.correction.blur import Drift, EfficientFilterFlow, UniformBlur
+from lensmodel.correction.engine import Engine
+from lensmodel.correction.lights.saturation import Lights
+from lensmodel.correction.methods.shrinkage import Shrinkage
+from lensmodel.lab.correction.quality import Constant
+
+CLEAN = Sensor(NoiseModel(1e-7, 1e-8))
+METHODS = list(deconvolvers)
+
+
+def scene(rows: int = 96, cols: int = 110, seed: int = 0) -> np.ndarray:
+    """Return overlapping squares of random light: edges of all sizes, as photographs have."""
+    rng = np.random.default_rng(seed)
+    plane = np.full((rows, cols), 0.3, dtype=np.float32)
+    for _ in range(150):
+        side = int(min(4 + rng.pareto(1.2) * 4, 40))
+        top, left = int(rng.integers(-side, rows)), int(rng.integers(-side, cols))
+        plane[max(top, 0) : max(top + side, 0), max(left, 0) : max(left + side, 0)] = rng.uniform(0.05, 0.8)
+    return plane
+
+
+def rmse(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.sqrt(np.mean((a - b) ** 2)))
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_method_keeps_a_constant(name: str) -> None:
+    flat = np.full((60, 64), 0.4, dtype=np.float32)
+
+    restored = deconvolvers.create(name).deconvolve(flat, UniformBlur(gaussian(9, np.eye(2))), sensor=CLEAN)
+
+    np.testing.assert_allclose(restored.plane, 0.4, atol=2e-3)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_method_changes_nothing_without_blur_and_noise(name: str) -> None:
+    plane = scene()
+
+    restored = deconvolvers.create(name).deconvolve(plane, UniformBlur(delta(5)), sensor=CLEAN)
+
+    assert rmse(restored.plane, plane) < 1e-3
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_method_brings_a_scene_blurred_without_noise_nearer_to_the_truth(name: str) -> None:
+    sharp, kernel = scene(), gaussian(11, np.eye(2) * 1.2)
+    blur = UniformBlur(kernel)
+    blurred = blur.forward(sharp)
+    truth = blur.frame(sharp)
+
+    restored = deconvolvers.create(name).deconvolve(blurred, blur, sensor=CLEAN)
+
+    slow = name in {"richardson-lucy", "paper", "whyte"}  # multiplicative steps creep, MAP solves
+    assert rmse(restored.plane, truth) < (0.9 if slow else 0.6) * rmse(blurred, truth)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_method_answers_float32_of_the_frame_and_counts_its_steps(name: str) -> None:
+    blurred, seen = scene(40, 50), []
+
+    restored = deconvolvers.create(name).deconvolve(
+        blurred,
+        UniformBlur(gaussian(7, np.eye(2))),
+        sensor=CLEAN,
+        on_step=lambda done, total: seen.append((done, total)),
+    )
+
+    assert restored.plane.shape == blurred.shape
+    assert restored.plane.dtype == np.float32
+    assert seen[-1] == (restored.steps, restored.steps)
+    assert seen == sorted(seen)
+
+
+@pytest.mark.parametrize("method", [SparseGradient, SaturationAwareRichardsonLucy, DirectFilter])
+@pytest.mark.parametrize("clip", [np.inf, 0.75])
+def test_compiled_loops_give_the_numbers_of_numpy(method: type, clip: float) -> None:
+    pytest.importorskip("numba")
+    pytest.importorskip("rocket_fft")
+    rng = np.random.default_rng(4)
+    blurs = [UniformBlur(gaussian(9, np.eye(2) * width)) for width in (0.8, 1.0, 1.3)]
+    sharp = scene(90, 101)
+    blurred = np.stack([np.minimum(blur.forward(sharp)[:80, :90], clip) for blur in blurs])
+    blurred += (0.003 * rng.standard_normal(blurred.shape)).astype(np.float32)
+    sensors = [Sensor(NoiseModel(1e-5, 1e-6), clip)] * 3
+
+    slow = restore_planes(method(engine="numpy"), blurred, blurs, sensors)
+    quick = restore_planes(method(engine="auto"), blurred, blurs, sensors)
+
+    # A gradient at the edge of its threshold may fall either way, so single pixels may differ.
+    assert rmse(slow, quick) < 2e-5
+    assert np.abs(slow - quick).max() < 2e-3
+
+
+def test_compiled_loops_find_the_same_light_beyond_saturation_as_numpy() -> None:
+    pytest.importorskip("numba")
+    pytest.importorskip("rocket_fft")
+    blurs = [UniformBlur(gaussian(9, np.eye(2) * width)) for width in (0.8, 1.0, 1.3)]
+    sharp = scene(90, 101)
+    tile = np.stack([np.minimum(blur.forward(sharp)[:80, :90], 0.7) for blur in blurs])
+
+    slow, quick = (
+        Lights.of(tile, blurs, [Sensor(NoiseModel(1e-5, 1e-6), 0.7)] * 3, 20, engine)
+        for engine in ("numpy", "auto")
+    )
+
+    assert slow is not None
+    assert quick is not None
+    np.testing.assert_allclose(slow.rest, quick.rest, atol=1e-5)
+    np.testing.assert_allclose(slow.beyond, quick.beyond, atol=1e-4)
+
+
+def test_light_beyond_saturation_and_the_rest_make_up_the_photo_where_it_was_not_clipped() -> None:
+    blurs = [UniformBlur(gaussian(9, np.eye(2) * width)) for width in (0.8, 1.0, 1.3)]
+    sharp = scene(90, 101)
+    tile = np.stack([np.minimum(blur.forward(sharp)[:80, :90], 0.7) for blur in blurs])
+
+    lights = Lights.of(tile, blurs, [Sensor(CLEAN.noise, 0.7)] * 3, 20, "auto")
+
+    assert lights is not None
+    np.testing.assert_allclose((lights.rest + lights.glow)[tile < 0.7], tile[tile < 0.7], atol=1e-6)
+    assert Lights.of(tile, blurs, [CLEAN] * 3, 20, "auto") is None
+
+
+def test_automatic_strength_is_near_the_best_where_noise_is_strong_and_the_kernel_wide() -> None:
+    rng, noise = np.random.default_rng(7), NoiseModel(1 / 2500, 0.003**2)
+    blur, sharp = UniformBlur(gaussian(21, np.eye(2) * 2.5**2)), scene(170, 180, seed=2)
+    seen = blur.forward(sharp)
+    seen = (seen + np.sqrt(noise.variance(seen)) * rng.standard_normal(seen.shape)).astype(np.float32)
+
+    def decibels(factor: float) -> float:
+        method = SparseGradient(weight=factor * SparseGradient().weight)
+        made = method.deconvolve(seen, blur, sensor=Sensor(noise, np.inf)).plane
+        return -20 * np.log10(rmse(made[8:-8, 8:-8], blur.frame(sharp)[8:-8, 8:-8]))
+
+    assert decibels(1.0) > max(decibels(factor) for factor in (0.35, 0.5, 0.7, 1.4, 2.0)) - 0.1
+
+
+def clipped_lamps(width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, UniformBlur, NoiseModel]:
+    """Lamps of 1.5 to 25 times saturation: photo, truth, unclipped pixels nearby, blur and noise."""
+    rng = np.random.default_rng(3)
+    sharp = scene(170, 180, seed=2) * 0.6
+    rows, cols = np.mgrid[:170, :180]
+    for light in (1.5, 3.0, 6.0, 12.0, 25.0):
+        row, col = rng.uniform(30, 140, 2)
+        sharp[np.hypot(rows - row, cols - col) < rng.uniform(1.0, 5.0)] = light
+    blur = UniformBlur(gaussian(17, np.eye(2) * width**2))
+    truth, noise = blur.frame(sharp), NoiseModel(2e-5, 1e-6)
+    seen = blur.forward(sharp)
+    seen += np.sqrt(noise.variance(seen)) * rng.standard_normal(seen.shape)
+    photo = np.minimum(seen, 1.0).astype(np.float32)
+    near = ndimage.binary_dilation(photo >= 1.0, iterations=16) & (photo < 1.0) & (truth < 1.0)
+    return photo, truth, near, blur, noise
+
+
+def error_and_ring(made: np.ndarray, truth: np.ndarray, near: np.ndarray) -> tuple[float, float]:
+    """RMS error near lamps, and by how much the darkest pixels fall below the darkest truth around."""
+    darkest = ndimage.minimum_filter(truth, 5)
+    return rmse(made[near], truth[near]), float(np.quantile((darkest - made)[near], 0.99))
+
+
+@pytest.mark.parametrize("name", ["standard", "fast"])
+def test_method_beats_richardson_lucy_around_lamps_that_the_lens_spread(name: str) -> None:
+    photo, truth, near, blur, noise = clipped_lamps(2.0)
+    sensor = Sensor(noise, clip=1.0)
+
+    def errors(method: Deconvolver) -> tuple[float, float]:
+        return error_and_ring(method.deconvolve(photo, blur, sensor=sensor).plane, truth, near)
+
+    error, ring = errors(deconvolvers.create(name))
+    rivals = [errors(SaturationAwareRichardsonLucy(steps)) for steps in (8, 15, 25)]
+
+    assert error < min(rival[0] for rival in rivals)
+    assert ring < rivals[1][1]
+
+
+@pytest.mark.parametrize("width", [0.6, 2.0])
+@pytest.mark.parametrize("name", ["standard", "fast"])
+def test_correction_rings_less_than_half_of_richardson_lucy_around_lamps(name: str, width: float) -> None:
+    photo, truth, near, blur, noise = clipped_lamps(width)
+    sensor = Sensor(noise, clip=1.0)
+    made = correct_planes(
+        np.stack([photo] * 3), Constant(blur.kernel), Frame(*photo.shape), noise=[noise] * 3, method=name
+    ).planes[1]
+    rival = SaturationAwareRichardsonLucy(15).deconvolve(photo, blur, sensor=sensor).plane
+
+    error, ring = error_and_ring(made, truth, near)
+
+    assert ring < 0.5 * error_and_ring(rival, truth, near)[1]
+    assert error < 0.85 * rmse(photo[near], truth[near])
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_method_is_repeatable_and_leaves_its_input_alone(name: str) -> None:
+    blurred = scene(40, 50)
+    before = blurred.copy()
+    blur = UniformBlur(gaussian(7, np.eye(2)))
+
+    first = deconvolvers.create(name).deconvolve(blurred, blur, sensor=CLEAN).plane
+    second = deconvolvers.create(name).deconvolve(blurred, blur, sensor=CLEAN).plane
+
+    np.testing.assert_array_equal(first, second)
+    np.testing.assert_array_equal(blurred, before)
+
+
+@pytest.mark.parametrize("name", ["standard", "fast", "wiener", "krishnan-fergus"])
+def test_method_of_one_kernel_says_what_to_use_for_a_field(name: str) -> None:
+    flow = EfficientFilterFlow(40, 40, ((delta(3),),))
+
+    with pytest.raises(InvalidInputError, match="correct_planes"):
+        deconvolvers.create(name).deconvolve(scene(40, 40), flow, sensor=CLEAN)
+
+
+def test_unknown_method_lists_the_known_ones() -> None:
+    with pytest.raises(UnknownMethodError, match="standard"):
+        deconvolvers.create("sharpen")
+
+
+@pytest.mark.parametrize("method", [RichardsonLucy, SaturationAwareRichardsonLucy])
+def test_richardson_lucy_refuses_a_step_count_out_of_range(method: type) -> None:
+    with pytest.raises(InvalidInputError, match="iterations"):
+        method(iterations=0)
+
+
+def test_richardson_lucy_raises_the_likelihood_with_every_step() -> None:
+    rng = np.random.default_rng(5)
+    blur = UniformBlur(gaussian(9, np.eye(2) * 2))
+    light = np.maximum(blur.forward(scene()), 0.01)
+    counts = (rng.poisson(light * 500) / 500).astype(np.float32)
+    sensor = Sensor(NoiseModel(1 / 500, 0.0))
+    scores = []
+    for steps in (1, 2, 4, 8, 16):
+        plane = RichardsonLucy(steps).deconvolve(counts, blur, sensor=sensor).plane
+        # The frame of the estimate is all that is returned; inside it the prediction is complete.
+        predicted = np.maximum(blur.forward(plane), 1e-6)
+        seen = blur.frame(counts)
+        scores.append(float((seen * np.log(predicted) - predicted).sum(dtype=np.float64)))
+
+    assert np.all(np.diff(scores) > 0)
+
+
+def test_richardson_lucy_equals_scikit_image_inside_at_equal_start() -> None:
+    sharp, kernel = scene(150, 150), gaussian(7, np.eye(2))
+    blur = UniformBlur(kernel)
+    blurred = np.maximum(blur.forward(sharp), 1e-3)
+    ours = RichardsonLucy(6).deconvolve(blurred, blur, sensor=Sensor(NoiseModel(1e-4, 0.0))).plane
+    # scikit-image starts from a constant; ours from one back-projection, which is its first step
+    # up to the constant: x1 = 0.5 k~ * (y / 0.5) = k~ * y.
+    theirs = restoration.richardson_lucy(blurred.astype(np.float64), kernel, num_iter=7, clip=False)
+
+    np.testing.assert_allclose(ours[30:-30, 30:-30], theirs[30:-30, 30:-30], atol=1e-4)
+
+
+def test_acceleration_is_worth_three_times_the_steps() -> None:
+    sharp, kernel = scene(128, 128), gaussian(15, np.eye(2) * 4)
+    blur = UniformBlur(kernel)
+    blurred = blur.forward(sharp)
+    truth = blur.frame(sharp)
+
+    fast = SaturationAwareRichardsonLucy(20).deconvolve(blurred, blur, sensor=CLEAN).plane
+    slow = SaturationAwareRichardsonLucy(60, accelerated=False).deconvolve(blurred, blur, sensor=CLEAN).plane
+
+    assert rmse(fast, truth) <= rmse(slow, truth)
+
+
+def test_clipped_lights_do_not_ring_into_their_neighbours() -> None:
+    rng = np.random.default_rng(8)
+    background = 0.2 + 0.05 * ndimage.gaussian_filter(rng.standard_normal((140, 140)), 1.5).astype(np.float32)
+    lights = background.copy()
+    rows, cols = np.mgrid[:140, :140]
+    for row, col, value in ((50, 60, 10.0), (95, 88, 20.0)):
+        lights[np.hypot(rows - row, cols - col) < 4] = value
+    kernel = gaussian(17, np.eye(2) * 4)
+    blur = UniformBlur(kernel)
+    noise = (rng.standard_normal((124, 124)) * 1e-3).astype(np.float32)
+    sensor = Sensor(NoiseModel(1e-6, 1e-6), clip=1.0)
+    photo = np.minimum(blur.forward(lights), 1.0) + noise
+    quiet = blur.forward(background) + noise
+    method = SaturationAwareRichardsonLucy(25)
+    truth = blur.frame(lights)
+    near = ndimage.binary_dilation(truth > 1.0, iterations=16)
+
+    with_lights = method.deconvolve(photo.astype(np.float32), blur, sensor=sensor).plane
+    without = method.deconvolve(quiet.astype(np.float32), blur, sensor=sensor).plane
+
+    far = ~near
+    assert rmse(with_lights[far], truth[far]) <= 1.1 * rmse(without[far], truth[far])
+
+
+@pytest.mark.parametrize("light", [1.5, 4.0, 20.0])
+def test_standard_method_does_not_ring_around_clipped_lights(light: float) -> None:
+    rng = np.random.default_rng(8)
+    sharp = scene(140, 140) * 0.5
+    rows, cols = np.mgrid[:140, :140]
+    for row, col in ((50, 60), (95, 88)):
+        sharp[np.hypot(rows - row, cols - col) < 5] = light
+    blur = UniformBlur(gaussian(17, np.eye(2) * 4))
+    truth = blur.frame(sharp)
+    photo = np.minimum(blur.forward(sharp), 1.0) + 1e-3 * rng.standard_normal((124, 124))
+    photo = photo.astype(np.float32)
+    dark = ~ndimage.binary_dilation(truth > 1.0, iterations=3)
+    far = ~ndimage.binary_dilation(photo > 0.98, iterations=8)
+    noise = NoiseModel(1e-5, 1e-6)
+
+    told = SparseGradient().deconvolve(photo, blur, sensor=Sensor(noise, clip=0.98)).plane
+    untold = SparseGradient().deconvolve(photo, blur, sensor=Sensor(noise)).plane
+
+    assert rmse(told[dark], truth[dark]) < rmse(photo[dark], truth[dark])
+    assert rmse(told[far], truth[far]) < 0.85 * rmse(photo[far], truth[far])
+    assert rmse(told[dark], truth[dark]) < rmse(untold[dark], truth[dark])
+
+
+@pytest.mark.parametrize("alpha", [0.5, 2 / 3, 0.8, 1.0])
+@pytest.mark.parametrize("threshold", [1e-4, 0.01, 1.0])
+def test_shrinkage_finds_the_minimum(alpha: float, threshold: float) -> None:
+    prox = Shrinkage.of(alpha)
+    v = np.linspace(-4.0, 4.0, 41).astype(np.float32)
+    grid = np.linspace(-4.2, 4.2, 20001)
+
+    found = prox(v, prox.scale(threshold))
+
+    def energy(w: np.ndarray) -> np.ndarray:
+        return threshold * np.abs(w) ** alpha + (w - v[:, None]) ** 2 / 2
+
+    best = energy(np.tile(grid, (v.size, 1))).min(axis=1)
+    assert np.all(energy(found[:, None].astype(np.float64))[:, 0] <= best + 2e-3 * threshold + 1e-5)
+
+
+@pytest.mark.parametrize("surrounded", [False, True])
+def test_compiled_loops_give_the_numbers_of_numpy_where_the_kernel_drifts(surrounded: bool) -> None:
+    pytest.importorskip("numba")
+    pytest.importorskip("rocket_fft")
+    narrow, wide = (UniformBlur(gaussian(9, np.eye(2) * width)) for width in (0.8, 1.2))
+    blur = UniformBlur(
+        gaussian(9, np.eye(2)), drift=Drift((narrow, wide, 80.0), (wide, narrow, 90.0), (40.0, 45.0))
+    )
+    blurred = np.stack([blur.forward(scene(90, 101))[:80, :90]] * 3)
+    sensors = [Sensor(NoiseModel(1e-5, 1e-6), surrounded=surrounded)] * 3
+
+    slow = restore_planes(SparseGradient(engine="numpy"), blurred, [blur] * 3, sensors)
+    quick = restore_planes(SparseGradient(engine="auto"), blurred, [blur] * 3, sensors)
+    steady = restore_planes(SparseGradient(), blurred, [UniformBlur(blur.kernel)] * 3, sensors)
+
+    assert rmse(slow, quick) < 2e-5
+    assert rmse(slow, steady) > 1e-3
+
+
+def test_data_with_their_surroundings_give_the_same_picture_inside() -> None:
+    blur = UniformBlur(gaussian(9, np.eye(2)))
+    blurred = np.stack([blur.forward(scene(110, 120))] * 3)
+    noise = NoiseModel(1e-5, 1e-6)
+
+    alone = restore_planes(SparseGradient(), blurred, [blur] * 3, [Sensor(noise)] * 3)
+    inside = restore_planes(SparseGradient(), blurred, [blur] * 3, [Sensor(noise, surrounded=True)] * 3)
+
+    assert rmse(alone[:, 16:-16, 16:-16], inside[:, 16:-16, 16:-16]) < 2e-3
+
+
+@pytest.mark.parametrize("engine", ["numpy", "auto"])
+def test_a_frame_behind_a_point_moved_by_a_part_of_a_pixel_does_not_run_away(engine: Engine) -> None:
+    # lateral colour of a file whose blur is not known: its transfer function rings, and is no kernel's
+    rng = np.random.default_rng(2)
+    tile = np.ascontiguousarray(np.repeat(rng.uniform(0.05, 0.9, (3, 16, 4)), 16, axis=2), dtype=np.float32)
+    tile = tile.repeat(4, axis=1)
+    shifts = ((0.3, -0.4), (0.0, 0.0), (-0.3, 0.4))
+    blurs = [UniformBlur(np.ones((1, 1)), shift) for shift in shifts]
+
+    restored = SparseGradient(engine=engine).deconvolve_planes(
+        tile, blurs, [Sensor(NoiseModel.white(0.002))] * 3
+    )
+
+    assert np.abs(restored).max() < 100.0  # steps of the tile ring; without a bound nothing is a number

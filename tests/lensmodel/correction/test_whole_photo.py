@@ -1,0 +1,537 @@
+"""A whole photo: cells, borders, windows, workers, uncertainty."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from lensmodel.core.belief import Belief
+from lensmodel.core.errors import CancelledError, InvalidInputError
+from lensmodel.core.geometry import Frame
+from lensmodel.core.psf import gaussian
+from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, NoiseModel, Planes
+from lensmodel.correction import Bounds, Corrected, Roi, correct_planes
+from lensmodel.correction.blur import EfficientFilterFlow
+from lensmodel.correction.deconvolver import Sensor
+from lensmodel.correction.engine import compiled
+from lensmodel.correction.expected_gain import plan
+from lensmodel.correction.limits.bounds import allowance, limited
+from lensmodel.correction.tiles.lattice import cells
+
+FRAME = Frame(200, 260)
+BASE = (NoiseModel(1 / 50_000, 1e-6),) * 3
+HIGH = (NoiseModel(1 / 2_500, 9e-6),) * 3
+DARK = (NoiseModel(1 / 40, 1e-3),) * 3
+
+
+@dataclass(frozen=True)
+class Soft:
+    """A lens whose blur grows from the centre to the corner."""
+
+    centre: float = 0.9
+    corner: float = 1.7
+
+    def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
+        width = self.centre + (self.corner - self.centre) * position.r**2
+        return gaussian(size, np.eye(2) * width**2)
+
+
+def scene(seed: int = 0) -> Planes:
+    rng = np.random.default_rng(seed)
+    rows, cols = FRAME.height + 60, FRAME.width + 60
+    planes = np.full((3, rows, cols), 0.3, dtype=np.float32)
+    for _ in range(700):
+        side = int(min(4 + rng.pareto(1.2) * 4, 60))
+        top, left = int(rng.integers(-side, rows)), int(rng.integers(-side, cols))
+        colour = rng.uniform(0.03, 0.7) * rng.uniform(0.7, 1.0, 3)
+        planes[:, max(top, 0) : max(top + side, 0), max(left, 0) : max(left + side, 0)] = colour[
+            :, None, None
+        ]
+    return planes
+
+
+def photo(lens: Soft, noise: tuple[NoiseModel, ...], seed: int = 1) -> tuple[Planes, Planes]:
+    """Return what a camera sees and the sharp frame; light from outside the frame is in it."""
+    rng, sharp = np.random.default_rng(seed), scene()
+    seen = []
+    for plane, channel, model in zip(sharp, CHANNELS, noise, strict=True):
+        flow = EfficientFilterFlow.of_field(lens, FRAME, channel, pitch=64, size=17)
+        cut = 30 - flow.reach
+        light = flow.forward(np.ascontiguousarray(plane[cut:-cut, cut:-cut]))
+        seen.append(light + rng.standard_normal(light.shape) * np.sqrt(model.variance(light)))
+    return np.stack(seen).astype(np.float32), sharp[:, 30:-30, 30:-30]
+
+
+def rmse(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.sqrt(np.mean((a.astype(np.float64) - b) ** 2)))
+
+
+def test_cells_sum_to_one_at_every_pixel() -> None:
+    total = np.zeros((FRAME.height, FRAME.width))
+    for cell in cells(FRAME):
+        total[cell.top : cell.bottom, cell.left : cell.right] += np.outer(cell.rise, cell.run)
+
+    np.testing.assert_allclose(total, 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("method", ["fast", "standard", "paper"])
+def test_correction_of_a_constant_is_the_constant_up_to_the_border(method: str) -> None:
+    flat = np.empty((3, FRAME.height, FRAME.width), dtype=np.float32)
+    flat[:] = np.array([0.2, 0.4, 0.3], dtype=np.float32)[:, None, None]
+
+    found = correct_planes(flat, Soft(), FRAME, noise=BASE, method=method).planes
+
+    np.testing.assert_allclose(found, flat, rtol=2e-3)
+
+
+def test_cells_of_a_large_frame_stay_within_their_bounds() -> None:
+    sides = [cell.bottom - cell.top for cell in cells(Frame(4000, 6000))]
+
+    assert max(sides) <= 240
+    assert min(sides) >= 150
+
+
+@pytest.mark.parametrize("method", ["standard", "fast"])
+@pytest.mark.parametrize("noise", [BASE, HIGH])
+def test_correction_brings_the_photo_nearer_to_the_scene(method: str, noise: tuple[NoiseModel, ...]) -> None:
+    seen, sharp = photo(Soft(), noise)
+
+    restored = correct_planes(seen, Soft(), FRAME, noise=noise, method=method).planes
+
+    share = {"standard": 0.75, "fast": 0.9}[method]  # one linear pass removes less
+    assert rmse(restored, sharp) < share * rmse(seen, sharp)
+
+
+@pytest.mark.parametrize("method", ["standard", "fast"])
+def test_correction_is_never_worse_than_the_photo_at_extreme_noise(method: str) -> None:
+    seen, sharp = photo(Soft(), DARK)
+
+    restored = correct_planes(seen, Soft(), FRAME, noise=DARK, method=method).planes
+
+    assert rmse(restored, sharp) < rmse(seen, sharp)
+
+
+def test_correction_is_the_same_for_any_number_of_workers() -> None:
+    seen, _ = photo(Soft(), BASE)
+
+    one = correct_planes(seen, Soft(), FRAME, noise=BASE, workers=1).planes
+    three = correct_planes(seen, Soft(), FRAME, noise=BASE, workers=3).planes
+
+    np.testing.assert_array_equal(one, three)
+
+
+def test_correction_of_a_window_shows_the_pixels_of_the_whole() -> None:
+    seen, _ = photo(Soft(), BASE)
+    roi = (37, 101, 64, 90)
+
+    whole = correct_planes(seen, Soft(), FRAME, noise=BASE).planes
+    part = correct_planes(seen, Soft(), FRAME, noise=BASE, roi=roi).planes
+
+    np.testing.assert_array_equal(part, whole[:, 37:101, 101:191])
+
+
+def test_correction_reads_and_writes_memory_mapped_planes(tmp_path: Path) -> None:
+    seen, _ = photo(Soft(), BASE)
+    np.save(tmp_path / "in.npy", seen)
+    mapped = np.load(tmp_path / "in.npy", mmap_mode="r")
+    out = np.lib.format.open_memmap(tmp_path / "out.npy", mode="w+", dtype=np.float32, shape=seen.shape)
+
+    correct_planes(mapped, Soft(), FRAME, noise=BASE, method="fast", out=out)
+    out.flush()
+
+    expected = correct_planes(seen, Soft(), FRAME, noise=BASE, method="fast").planes
+    np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), expected)
+
+
+def test_border_is_restored_like_the_inside_from_the_fourth_pixel_on() -> None:
+    lens = Soft(1.2, 1.2)
+    seen, sharp = photo(lens, BASE)
+
+    restored = correct_planes(seen, lens, FRAME, noise=BASE).planes
+
+    depth = np.minimum.outer(
+        np.minimum(np.arange(FRAME.height), np.arange(FRAME.height)[::-1]),
+        np.minimum(np.arange(FRAME.width), np.arange(FRAME.width)[::-1]),
+    )
+    # The outermost pixels share their light with a scene that nobody saw; they still must gain.
+    left = {
+        name: rmse(restored[:, where], sharp[:, where]) / rmse(seen[:, where], sharp[:, where])
+        for name, where in {
+            "edge": depth < 3,
+            "rim": (depth >= 4) & (depth < 14),
+            "inside": depth >= 14,
+        }.items()
+    }
+    assert left["edge"] < 0.85
+    assert left["rim"] < 1.25 * left["inside"]
+
+
+@pytest.mark.parametrize(("method", "bound"), [("fast", 1.06), ("standard", 1.15)])
+def test_light_from_beyond_the_frame_leaves_no_ripples_at_the_border_of_a_soft_lens(
+    method: str, bound: float
+) -> None:
+    lens = Soft(2.5, 2.5)
+    seen, sharp = photo(lens, BASE)
+
+    restored = correct_planes(seen, lens, FRAME, noise=BASE, method=method).planes
+
+    inside = np.zeros((FRAME.height, FRAME.width), dtype=np.bool_)
+    inside[16:-16, 16:-16] = True
+    border, middle = (
+        rmse(restored[:, where], sharp[:, where]) / rmse(seen[:, where], sharp[:, where])
+        for where in (~inside, inside)
+    )
+    assert border < bound * middle
+
+
+def test_result_hardly_depends_on_the_size_of_the_cells() -> None:
+    lens = Soft(1.0, 1.0)
+    seen, _ = photo(lens, BASE)
+
+    small = correct_planes(seen, lens, FRAME, noise=BASE, method="paper", pitch=90).planes
+    large = correct_planes(seen, lens, FRAME, noise=BASE, method="paper", pitch=200).planes
+
+    assert np.abs(small - large)[:, 8:-8, 8:-8].max() < 1e-3
+
+
+@pytest.mark.parametrize("noise", [BASE, HIGH])
+def test_smooth_scene_under_a_wide_blur_does_not_gain_noise(noise: tuple[NoiseModel, ...]) -> None:
+    rows, cols = np.indices((FRAME.height, FRAME.width))
+    sharp = np.stack([0.3 + 0.2 * np.sin(rows / 60.0 + c) * np.cos(cols / 70.0) for c in range(3)])
+    rng = np.random.default_rng(3)
+    seen = sharp + rng.standard_normal(sharp.shape) * np.sqrt(noise[0].variance(sharp))
+    seen = seen.astype(np.float32)
+
+    restored = correct_planes(seen, Soft(3.0, 3.0), FRAME, noise=noise).planes
+
+    assert rmse(restored, sharp) < rmse(seen, sharp)
+
+
+def test_strength_zero_returns_the_photo() -> None:
+    seen, _ = photo(Soft(), BASE)
+
+    restored = correct_planes(seen, Soft(), FRAME, noise=BASE, strength=0.0).planes
+
+    np.testing.assert_allclose(restored, seen, atol=1e-6)
+
+
+def test_strength_half_lies_half_way() -> None:
+    seen, _ = photo(Soft(), BASE)
+
+    half = correct_planes(seen, Soft(), FRAME, noise=BASE, method="fast", strength=0.5).planes
+    full = correct_planes(seen, Soft(), FRAME, noise=BASE, method="fast").planes
+
+    np.testing.assert_allclose(half, (seen + full) / 2, atol=1e-5)
+
+
+def test_wrong_kernel_with_its_error_stated_does_less_harm() -> None:
+    seen, sharp = photo(Soft(0.7, 1.0), BASE)
+    wrong = Soft(1.3, 1.8)
+
+    trusting = correct_planes(seen, wrong, FRAME, noise=BASE).planes
+    careful = correct_planes(seen, wrong, FRAME, noise=BASE, psf_error=0.6).planes
+
+    assert rmse(careful, sharp) < rmse(trusting, sharp)
+
+
+def test_without_the_audit_nothing_of_a_wrong_kernel_is_held_back() -> None:
+    seen, _ = photo(Soft(), BASE)
+    wide = Soft(2.2, 3.0)
+
+    held = correct_planes(seen, wide, FRAME, noise=BASE)
+    bare = correct_planes(seen, wide, FRAME, noise=BASE, audited=False)
+
+    assert held.audit.held_back > 0.1
+    assert bare.audit.zones == {}
+    assert rmse(bare.planes, seen) > 1.1 * rmse(held.planes, seen)
+
+
+def test_result_stays_within_the_range_of_the_photo_where_no_halo_is_allowed() -> None:
+    seen, _ = photo(Soft(), BASE)
+    low, high = (f(seen, (1, 5, 5), mode="nearest") for f in (ndimage.minimum_filter, ndimage.maximum_filter))
+
+    held = correct_planes(seen, Soft(), FRAME, noise=BASE, bounds=Bounds(halo=0.0)).planes
+    free = correct_planes(seen, Soft(), FRAME, noise=BASE).planes
+
+    assert np.all(held >= low - 1e-6)
+    assert np.all(held <= high + 1e-6)
+    assert np.mean((free < low) | (free > high)) > 0.02
+
+
+def test_kernels_that_are_off_leave_no_dark_lines_beside_edges() -> None:
+    seen, sharp = photo(Soft(0.7, 1.0), BASE)
+    darkest = ndimage.minimum_filter(sharp, (1, 5, 5))
+
+    def line(bounds: Bounds) -> float:
+        made = correct_planes(seen, Soft(1.3, 1.8), FRAME, noise=BASE, psf_error=0.6, bounds=bounds).planes
+        return float(np.quantile(darkest - made, 0.999))
+
+    assert line(Bounds()) < 0.5 * line(Bounds(halo=np.inf))
+
+
+def test_range_is_wider_the_surer_the_kernel() -> None:
+    shares = [allowance(error) for error in (0.0, 0.1, 0.16, 0.5)]
+
+    assert shares[0] == np.inf
+    assert shares == sorted(shares, reverse=True)
+    assert shares[2] == pytest.approx(1.0)
+
+
+def test_compiled_limiter_gives_the_numbers_of_scipy() -> None:
+    pytest.importorskip("numba")
+    pytest.importorskip("rocket_fft")
+    rng = np.random.default_rng(0)
+    seen, made = rng.random((3, 44, 54), dtype=np.float32), rng.random((3, 40, 50), dtype=np.float32)
+    made = 3 * made - 1
+
+    quick = limited(seen, made, (0.1, 0.5, np.inf), compiled("auto"))
+
+    np.testing.assert_allclose(quick, limited(seen, made, (0.1, 0.5, np.inf)), atol=1e-6)
+    np.testing.assert_array_equal(quick[2], made[2])
+
+
+@pytest.mark.parametrize("mosaic", [False, True])
+def test_flat_areas_keep_their_grain_unless_it_is_to_be_taken_away(mosaic: bool) -> None:
+    rng = np.random.default_rng(1)
+    level = np.array([0.3, 0.4, 0.2])[:, None, None] * np.ones((1, FRAME.height, FRAME.width))
+    level[:, :, :40:8] *= 0.4  # something to correct beside the flat area, within each of its cells
+    level[:, :, 120:160:8] *= 0.4
+    level[:, :, 232::8] *= 0.4
+    seen = level + rng.standard_normal((3, FRAME.height, FRAME.width)) * np.sqrt(HIGH[0].variance(level))
+    seen = seen.astype(np.float32)
+    cfa = ((0, 1), (1, 2)) if mosaic else None
+    if mosaic:  # what was not measured is the mean of neighbours, as demosaicing makes it
+        sites = np.tile(cfa, (FRAME.height // 2, FRAME.width // 2))
+        for c in range(3):
+            known = (sites == c).astype(np.float32)
+            share = [[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]]
+            filled = ndimage.convolve(known * seen[c], share) / ndimage.convolve(known, share)
+            seen[c] = np.where(known > 0, seen[c], filled)
+
+    def grain(denoise: float) -> float:
+        made = correct_planes(seen, Soft(), FRAME, noise=HIGH, cfa=cfa, bounds=Bounds(denoise=denoise)).planes
+        flat = np.r_[54:106, 174:218]  # out of the blur's reach
+        inside = made[1, 20:-20, flat], seen[1, 20:-20, flat]
+        return float(inside[0].var() / inside[1].var())
+
+    assert 0.7 < grain(0.0) < 1.0
+    assert grain(1.0) < 0.3
+
+
+def test_forecast_of_a_blur_turns_with_it() -> None:
+    plane = np.random.default_rng(0).random((3, 72, 72), dtype=np.float32)
+    cell, sensors = next(iter(cells(FRAME, 64))), [Sensor(NoiseModel.white(0.01))] * 3
+
+    lying, standing = (
+        plan(cell, plane, [Belief.of_error(gaussian(15, np.diag(width)), 0.2)] * 3, [(0.0, 0.0)] * 3, sensors)
+        for width in ((0.1, 6.0), (6.0, 0.1))
+    )
+
+    assert lying.forecast.before == pytest.approx(standing.forecast.before, rel=1e-5)
+    assert lying.forecast.after == pytest.approx(standing.forecast.after, rel=1e-5)
+    assert lying.shares == standing.shares
+
+
+def test_less_of_a_kernel_is_used_the_less_sure_it_is() -> None:
+    plane = np.random.default_rng(0).random((3, 72, 72), dtype=np.float32)
+    cell, sensors = next(iter(cells(FRAME, 64))), [Sensor(NoiseModel.white(0.003))] * 3
+    kernel = gaussian(15, 1.4**2 * np.eye(2))
+
+    plans = [
+        plan(cell, plane, [Belief.of_error(kernel, error)] * 3, [(0.0, 0.0)] * 3, sensors)
+        for error in (0.0, 0.3, 0.6, 1.0)
+    ]
+
+    shares, gains = [p.shares[1] for p in plans], [p.forecast.gain_db for p in plans]
+    assert shares[0] == 1.0
+    assert shares == sorted(shares, reverse=True)
+    assert shares[-1] < 0.7
+    assert gains == sorted(gains, reverse=True)
+
+
+def test_zone_report_expects_less_gain_from_a_noisier_photo() -> None:
+    seen, _ = photo(Soft(), BASE)
+
+    clean, noisy = (
+        correct_planes(seen, Soft(), FRAME, noise=noise, method="fast", psf_error=0.1, pitch=40).zones
+        for noise in (BASE, HIGH)
+    )
+
+    assert set(clean) == {"center", "mid", "corner"}
+    for zone, report in clean.items():
+        assert report.expected_gain_db > noisy[zone].expected_gain_db > 0
+        assert report.psf_error == pytest.approx(0.1)
+
+
+def test_steps_count_the_cells_and_can_cancel() -> None:
+    seen, _ = photo(Soft(), BASE)
+
+    def stop(done: int, total: int) -> None:
+        assert total == len(cells(FRAME))
+        if done == 2:
+            raise CancelledError("enough")
+
+    with pytest.raises(CancelledError):
+        correct_planes(seen, Soft(), FRAME, noise=BASE, method="fast", workers=2, on_step=stop)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"strength": 1.5}, "strength"),
+        ({"workers": 0}, "workers"),
+        ({"roi": (0, 0, 300, 10)}, "does not lie"),
+        ({"noise": BASE[:2]}, "one entry per channel"),
+        ({"psf_error": -0.1}, "psf_error"),
+        ({"out": np.zeros((3, 5, 5), dtype=np.float32)}, "out must be"),
+    ],
+)
+def test_correction_refuses_what_makes_no_sense(change: dict, text: str) -> None:
+    seen = np.full((3, FRAME.height, FRAME.width), 0.2, dtype=np.float32)
+
+    with pytest.raises(InvalidInputError, match=text):
+        correct_planes(seen, Soft(), FRAME, **({"noise": BASE} | change))
+
+
+@pytest.mark.parametrize("change", [{"halo": -0.1}, {"denoise": 1.5}])
+def test_bounds_refuse_what_makes_no_sense(change: dict) -> None:
+    with pytest.raises(InvalidInputError, match=next(iter(change))):
+        Bounds(**change)
+
+
+def test_correction_refuses_planes_of_another_frame() -> None:
+    with pytest.raises(InvalidInputError, match="as the frame says"):
+        correct_planes(np.zeros((3, 10, 10), dtype=np.float32), Soft(), FRAME, noise=BASE)
+
+
+def test_lateral_colour_is_removed_in_the_same_step() -> None:
+    @dataclass(frozen=True)
+    class Shift:
+        def displacement(self, r: float, channel: Channel) -> float:
+            return {"r": 1.5, "g": 0.0, "b": -1.5}[channel] * r
+
+    lens, lateral = Soft(1.0, 1.0), Shift()
+    sharp = scene()
+    rows, cols = np.indices((FRAME.height, FRAME.width), dtype=np.float64)
+    row_c, col_c = FRAME.center
+    seen = []
+    for plane, channel in zip(sharp, CHANNELS, strict=True):
+        soft = ndimage.gaussian_filter(plane.astype(np.float64), 1.0)
+        pixels = lateral.displacement(1.0, channel) / FRAME.half_diagonal
+        # A point at p lands at p (1 + pixels): the pixel p shows what lies at p / (1 + pixels).
+        where = [
+            (rows - row_c) / (1 + pixels) + row_c + 30,
+            (cols - col_c) / (1 + pixels) + col_c + 30,
+        ]
+        seen.append(ndimage.map_coordinates(soft, where, order=3))
+    photo_planes = np.stack(seen).astype(np.float32)
+    truth = sharp[:, 30:-30, 30:-30]
+
+    plain = correct_planes(photo_planes, lens, FRAME, noise=BASE)
+    aligned = correct_planes(photo_planes, lens, FRAME, noise=BASE, lateral=lateral)
+
+    assert isinstance(aligned, Corrected)
+    assert rmse(aligned.planes, truth) < 0.7 * rmse(plain.planes, truth)
+
+
+def test_roi_accepts_its_own_kind() -> None:
+    assert Roi.of(FRAME, Roi(1, 2, 3, 4)) == Roi.of(FRAME, (1, 2, 3, 4))
+
+
+def test_mosaic_is_restored_better_than_what_demosaicing_made_of_it() -> None:
+    lens = Soft(1.0, 1.0)
+    seen, sharp = photo(lens, BASE)
+    cfa = ((0, 1), (1, 2))
+    pattern = np.tile(np.asarray(cfa), (FRAME.height // 2 + 1, FRAME.width // 2 + 1))
+    pattern = pattern[: FRAME.height, : FRAME.width]
+    sites = np.stack([pattern == c for c in range(3)])
+    weights = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]]) / 4.0
+    filled = np.stack(
+        [
+            ndimage.convolve(plane * site, weights) / ndimage.convolve(site.astype(float), weights)
+            for plane, site in zip(seen, sites, strict=True)
+        ]
+    )
+    planes = np.where(sites, seen, filled).astype(np.float32)
+
+    joint = correct_planes(planes, lens, FRAME, noise=BASE, cfa=cfa).planes
+    apart = correct_planes(planes, lens, FRAME, noise=BASE).planes
+
+    assert rmse(joint, sharp) < 0.9 * rmse(apart, sharp)
+    assert rmse(joint, sharp) < 0.8 * rmse(planes, sharp)
+
+
+def test_cells_of_a_mosaic_know_where_they_begin() -> None:
+    seen, _ = photo(Soft(1.0, 1.0), BASE)
+    roi = (31, 17, 60, 70)
+
+    whole = correct_planes(seen, Soft(1.0, 1.0), FRAME, noise=BASE, cfa=((1, 0), (2, 1))).planes
+    part = correct_planes(seen, Soft(1.0, 1.0), FRAME, noise=BASE, cfa=((1, 0), (2, 1)), roi=roi).planes
+
+    np.testing.assert_array_equal(part, whole[:, 31:91, 17:87])
+
+
+def test_cells_follow_a_kernel_that_changes_within_them() -> None:
+    lens = Soft(0.7, 2.2)
+    seen, sharp = photo(lens, BASE)
+
+    class Steps:
+        """The same lens, but with one kernel in each cell: those of its neighbours are its own."""
+
+        def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
+            nearest = min(places, key=lambda place: abs(place.r - position.r) + abs(place.phi - position.phi))
+            return lens.kernel_at(nearest, channel, size)
+
+    # A window in one cell, whose neighbours Steps hides by answering for that cell alone.
+    roi = (0, 0, 80, 100)
+    places = [cells(FRAME, 100)[0].position]
+    following = correct_planes(seen, lens, FRAME, noise=BASE, pitch=100, roi=roi).planes
+    fixed = correct_planes(seen, Steps(), FRAME, noise=BASE, pitch=100, roi=roi).planes
+
+    truth = sharp[:, :80, :100]
+    assert rmse(following, truth) < rmse(fixed, truth)
+
+
+def test_one_pass_takes_larger_cells_but_not_on_a_mosaic() -> None:
+    frame = Frame(16, 6000)
+    seen = np.full((3, frame.height, frame.width), 0.3, dtype=np.float32)
+    roi = (0, 0, 16, 900)
+    counts = []
+    for cfa in (None, ((0, 1), (1, 2))):
+        steps: list[int] = []
+        correct_planes(
+            seen,
+            Soft(),
+            frame,
+            noise=BASE,
+            method="fast",
+            roi=roi,
+            cfa=cfa,
+            on_step=lambda _, total, steps=steps: steps.append(total),
+        )
+        counts.append(steps[-1])
+
+    assert counts == [3, 6]
+
+
+def test_a_cell_of_which_next_to_nothing_is_left_to_correct_stays_as_it_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(0)
+    seen = ndimage.gaussian_filter(rng.random((3, FRAME.height, FRAME.width)), (0, 1.5, 1.5)).astype(
+        np.float32
+    )
+
+    def hardly(method: object, tile: np.ndarray, *rest: object) -> np.ndarray:
+        del method, rest
+        return tile + np.float32(1e-4) * rng.standard_normal(tile.shape, dtype=np.float32)
+
+    monkeypatch.setattr("lensmodel.correction.cell.restore_planes", hardly)
+
+    made = correct_planes(seen, Soft(), FRAME, noise=BASE, bounds=Bounds(texture=0.0))
+
+    np.testing.assert_allclose(made.planes, seen, rtol=1e-6)  # faded cells add up to rounding
+    assert made.nothing_to_correct
+    assert all(zone.expected_gain_db == 0.0 for zone in made.zones.values())

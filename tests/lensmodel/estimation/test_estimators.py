@@ -1,0 +1,217 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from lensmodel import estimation
+from lensmodel.core.errors import CancelledError, InvalidInputError, LensModelError, NotEnoughEvidenceError
+from lensmodel.core.evidence import nonnegative_least_squares
+from lensmodel.core.psf import centroid, delta, distance, gaussian, rms_width
+from lensmodel.core.types import NoiseModel, Plane
+from lensmodel.estimation.methods.patch_recurrence import normal_equations
+from lensmodel.estimation.steps.recurrence import blend, recur
+from lensmodel.simulate import dead_leaves, demo_scene, edge_area
+
+SIGMA = 0.01
+NAMES = sorted(estimation.estimators)
+
+
+def patch(kernel: np.ndarray, *, sigma: float = SIGMA, seed: int = 0, side: int = 96) -> Plane:
+    margin = kernel.shape[0] - 1
+    rng = np.random.default_rng(seed)
+    scene = dead_leaves(side + margin, side + margin, rng, largest=40.0)[1]
+    y = signal.fftconvolve(scene, kernel, mode="valid")
+    return (y + rng.normal(0, sigma, y.shape)).astype(np.float32)
+
+
+def photo_patch(kernel: np.ndarray, row: int, col: int, side: int = 160) -> Plane:
+    margin = kernel.shape[0] - 1
+    scene = demo_scene("city")[1][row : row + side + margin, col : col + side + margin]
+    y = signal.fftconvolve(scene, kernel, mode="valid")
+    return (y + np.random.default_rng(row).normal(0, SIGMA, y.shape)).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_estimator_keeps_the_contract(name: str) -> None:
+    method = estimation.estimators.create(name)
+    seen: list[tuple[int, int]] = []
+
+    found = method.estimate(
+        [patch(gaussian(15, 1.5 * np.eye(2)))],
+        [NoiseModel.white(SIGMA)],
+        size=21,
+        on_step=lambda done, total: seen.append((done, total)),
+    )
+
+    assert found.kernel.shape == (21, 21)
+    assert found.kernel.min() >= 0
+    assert found.kernel.sum() == pytest.approx(1.0)
+    assert max(map(abs, centroid(found.kernel))) < 0.02
+    assert 0.0 <= found.confidence <= 1.0
+    assert seen[-1][0] == seen[-1][1]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_estimates_repeat_to_the_bit(name: str) -> None:
+    y, noise = patch(gaussian(15, np.eye(2))), NoiseModel.white(SIGMA)
+    first, second = (estimation.estimators.create(name).estimate([y], [noise], size=15) for _ in range(2))
+
+    assert np.array_equal(first.kernel, second.kernel)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("kind", ["flat", "noise", "clipped", "stripes"])
+def test_nothing_is_made_of_patches_that_say_nothing(name: str, kind: str) -> None:
+    rng = np.random.default_rng(1)
+    y = {
+        "flat": np.full((96, 96), 0.5),
+        "noise": 0.5 + rng.normal(0, 0.1, (96, 96)),
+        "clipped": np.where(rng.random((96, 96)) > 0.5, 1.0, 0.1),
+        "stripes": np.broadcast_to(0.5 + 0.4 * np.sin(np.arange(96) * 2 * np.pi / 8), (96, 96)),
+    }[kind].astype(np.float32)
+
+    with pytest.raises(NotEnoughEvidenceError):
+        estimation.estimators.create(name).estimate([y], [NoiseModel.white(SIGMA)])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_impossible_input_is_refused_by_name(name: str) -> None:
+    method, noise = estimation.estimators.create(name), NoiseModel.white(SIGMA)
+    y = patch(gaussian(15, np.eye(2)))
+    broken = y.copy()
+    broken[3, 4] = np.nan
+
+    for wrong, size in ((y[:20, :20], 15), (broken, 15), (y, 16), (y, 99)):
+        with pytest.raises(InvalidInputError):
+            method.estimate([wrong], [noise], size=size)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_cancelling_stops_the_work(name: str) -> None:
+    def stop(done: int, total: int) -> None:
+        raise CancelledError(f"stopped at {done} of {total}")
+
+    with pytest.raises(LensModelError, match="stopped"):
+        estimation.estimators.create(name).estimate(
+            [patch(gaussian(15, np.eye(2)))], [NoiseModel.white(SIGMA)], on_step=stop
+        )
+
+
+def test_a_wider_blur_gives_a_wider_kernel() -> None:
+    widths = [
+        rms_width(
+            estimation.estimators.create("default")
+            .estimate([photo_patch(gaussian(21, s * s * np.eye(2)), 300, 500)], [NoiseModel.white(SIGMA)])
+            .kernel
+        )
+        for s in (0.8, 1.6, 2.6)
+    ]
+
+    assert widths == sorted(widths)
+
+
+def test_default_comes_nearer_to_the_truth_than_no_kernel_at_all() -> None:
+    truth = gaussian(21, [[2.6, 1.0], [1.0, 1.4]])
+    patches = [photo_patch(truth, row, col) for row, col in ((300, 500), (420, 700))]
+
+    found = estimation.estimators.create("default").estimate(patches, [NoiseModel.white(SIGMA)] * 2, size=21)
+
+    nothing = distance(delta(21), truth).rel_l2
+    assert distance(found.kernel, truth).rel_l2 < 0.4 * nothing
+
+
+def test_kernel_step_recovers_the_kernel_where_the_scene_is_known() -> None:
+    truth = gaussian(9, [[1.5, 0.5], [0.5, 1.0]])
+    rng = np.random.default_rng(0)
+    scene = dead_leaves(160, 160, rng)[1].astype(np.float64)
+    y = signal.fftconvolve(scene, truth, mode="same") + rng.normal(0, SIGMA, scene.shape)
+    response = np.zeros((40, 40))  # this scene took nothing from y
+
+    a, b, n = normal_equations(scene, y, 9, SIGMA, response)
+    k = nonnegative_least_squares(a, b, np.asarray(delta(9)).ravel()).reshape(9, 9)
+
+    assert n == (160 - 2 * 3 - 8) ** 2
+    assert distance(k, truth).rel_l2 < 0.08  # the noise alone costs 0.057
+
+
+def test_noise_correction_leaves_nothing_of_pure_noise() -> None:
+    rng = np.random.default_rng(0)
+    y = rng.normal(0, 0.1, (220, 220))
+    x, response = blend(y, gaussian(9, 0.8 * np.eye(2)), np.zeros_like(y), 0.2)
+
+    raw_a, raw_b, _ = normal_equations(x, y, 9, 0.0, response)
+    a, b, _ = normal_equations(x, y, 9, 0.1, response)
+
+    assert np.abs(a).max() < 0.06 * np.abs(raw_a).max()
+    assert np.abs(b).max() < 0.06 * np.abs(raw_b).max()
+
+
+def test_image_step_with_the_true_kernel_and_scene_returns_the_scene() -> None:
+    rng = np.random.default_rng(0)
+    scene = dead_leaves(120, 120, rng)[1].astype(np.float64)
+    kernel = gaussian(9, np.eye(2))
+    y = signal.fftconvolve(scene, kernel, mode="same")
+
+    x, _ = blend(y, kernel, scene, 0.3)
+
+    assert np.abs(x - scene)[12:-12, 12:-12].max() < 1e-3
+
+
+def test_a_sharp_step_recurs_as_itself() -> None:
+    rows, cols = np.arange(-32, 32)[:, None], np.arange(-32, 32)[None, :]
+    step = edge_area(rows, cols, 0.3)
+
+    z = recur(step, 0.001, 0.03)
+
+    assert np.sqrt(np.mean((z - step)[8:-8, 8:-8] ** 2)) < 0.03
+
+
+def test_turning_the_patch_turns_the_kernel() -> None:
+    y, noise = patch(gaussian(15, [[2.0, 0.8], [0.8, 1.0]])), NoiseModel.white(SIGMA)
+    method = estimation.PatchRecurrence(levels=2, iterations=2, support=15)
+    upright = method.estimate([y], [noise], size=15).kernel
+    turned = method.estimate([np.ascontiguousarray(np.rot90(y))], [noise], size=15).kernel
+
+    assert distance(np.rot90(upright).copy(), turned).rel_l2 < 0.15
+
+
+def test_more_evidence_comes_with_the_estimate() -> None:
+    patches = [patch(gaussian(15, np.eye(2)), seed=s) for s in (0, 1)]
+
+    found = estimation.estimators.create("default").estimate(patches, [NoiseModel.white(SIGMA)] * 2)
+
+    assert len(found.evidence) == 2
+    assert all(len(e.to_bytes()) < 200_000 for e in found.evidence)
+
+
+def test_whittle_gradient_is_the_derivative_of_its_cost() -> None:
+    from lensmodel.estimation.methods import whittle  # noqa: PLC0415 - looks inside
+
+    band = whittle._Band.of(64)
+    spectra = [whittle._periodogram(patch(gaussian(15, np.eye(2))), NoiseModel.white(SIGMA), band)]
+    p = np.array([1.1, 0.2, 0.9, -3.0, 2.0, 0.1, -0.2])
+    _, gradient = whittle._cost(p, spectra, band)
+    steps = 1e-6 * np.eye(p.size)
+    numeric = [
+        (whittle._cost(p + s, spectra, band)[0] - whittle._cost(p - s, spectra, band)[0]) / 2e-6
+        for s in steps
+    ]
+
+    assert np.allclose(gradient, numeric, rtol=1e-4, atol=1e-6)
+
+
+def test_the_generating_width_scores_best_on_a_spectrum_of_its_own_kind() -> None:
+    from lensmodel.estimation.methods import whittle  # noqa: PLC0415 - looks inside
+
+    band = whittle._Band.of(64)
+    truth = np.array([1.3, 0.0, 0.8, -4.0, 2.1, 0.0, 0.0])
+    shape = np.exp(truth[3] - truth[4] * np.log(band.modulus / 0.1))
+    power = shape * np.exp(-4 * np.pi**2 * (truth[0] ** 2 * band.row**2 + truth[2] ** 2 * band.col**2)) + 1e-6
+    spectra = [whittle._Spectrum(power, 1e-6)]
+    best = whittle._cost(truth, spectra, band)[0]
+
+    for factor in (0.8, 0.9, 1.1, 1.25):
+        other = truth.copy()
+        other[[0, 2]] *= factor
+        assert whittle._cost(other, spectra, band)[0] > best

@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from lensmodel.core.geometry import Frame
+from lensmodel.core.types import NoiseModel, Plane, ignore_step
+from lensmodel.estimation.patches import select
+from lensmodel.estimation.patches.blocks import measure_blocks
+from lensmodel.estimation.patches.details import Details, joined, look_at
+from lensmodel.estimation.patches.good_regions import FEATURES, GoodRegionsSelector, TreeEnsemble, features_of
+from lensmodel.estimation.patches.windows import Windows, windows_of
+
+SIGMA = 0.004
+NOISE = NoiseModel.white(SIGMA)
+
+
+def plane_of(seed: int, height: int = 320, width: int = 384) -> Plane:
+    """Overlapping rectangles, slightly blurred, with noise."""
+    rng = np.random.default_rng(seed)
+    plane = np.full((height, width), 0.4, dtype=np.float32)
+    for _ in range(220):
+        row, col = int(rng.integers(height)), int(rng.integers(width))
+        tall, wide = rng.integers(4, 60, size=2)
+        plane[row : row + tall, col : col + wide] = rng.uniform(0.1, 0.8)
+    blurred = ndimage.gaussian_filter(plane, 0.9)
+    return (blurred + rng.normal(0.0, SIGMA, plane.shape)).astype(np.float32)
+
+
+def looked_at(plane: Plane) -> tuple[Windows, Details]:
+    blocks = measure_blocks(plane, NOISE, 32, 1.0, ignore_step)
+    windows = windows_of(blocks, Frame(*plane.shape), NOISE)
+    size = windows.size
+    corners = list(zip(windows.rows.tolist(), windows.cols.tolist(), strict=True))
+    return windows, joined(
+        [look_at(plane[r : r + size, c : c + size], SIGMA, 1.0, (r, c)) for r, c in corners]
+    )
+
+
+@pytest.fixture(scope="module")
+def windows_and_details() -> tuple[Windows, Details]:
+    return looked_at(plane_of(0))
+
+
+def test_features_have_the_named_columns_and_are_finite_even_on_a_flat_plane(
+    windows_and_details: tuple[Windows, Details],
+) -> None:
+    flat = looked_at(np.full((256, 256), 0.5, dtype=np.float32))
+
+    for windows, details in (windows_and_details, flat):
+        features = features_of(windows, details)
+        assert features.shape == (len(windows), len(FEATURES))
+        assert np.isfinite(features).all()
+
+
+def test_features_hardly_change_when_the_plane_is_turned(
+    windows_and_details: tuple[Windows, Details],
+) -> None:
+    plane = plane_of(0)[:320, :320].copy()
+    straight = features_of(*looked_at(plane))
+    turned = features_of(*looked_at(np.rot90(plane).copy()))
+    spread = features_of(*windows_and_details).std(axis=0)
+    order = np.rot90(np.arange(49).reshape(7, 7)).ravel()
+    loose = [i for i, name in enumerate(FEATURES) if name in {"blockiness", "period"}]
+    difference = np.delete(np.abs(turned - straight[order]), loose, axis=1)
+
+    assert np.all(difference.max(axis=0) <= 0.2 * np.delete(spread, loose) + 0.03)
+
+
+def test_trees_are_evaluated_as_written_down() -> None:
+    # x0 <= 1 ? (x1 <= 0 ? 1 : 2) : 4, and a second tree that is a leaf.
+    ensemble = TreeEnsemble(
+        start=10.0,
+        feature=np.array([[0, 1, -1, -1, -1], [-1, -1, -1, -1, -1]], np.int16),
+        threshold=np.array([[1, 0, 0, 0, 0], [0, 0, 0, 0, 0]], np.float32),
+        left=np.array([[1, 3, 2, 3, 4], [0, 0, 0, 0, 0]], np.int16),
+        right=np.array([[2, 4, 2, 3, 4], [0, 0, 0, 0, 0]], np.int16),
+        value=np.array([[0, 0, 4, 1, 2], [0.5, 0, 0, 0, 0]], np.float32),
+    )
+    rows = np.array([[0.0, -1.0], [1.0, 1.0], [1.5, 0.0]])
+
+    np.testing.assert_allclose(ensemble.predict(rows), [11.5, 12.5, 14.5])
+
+
+def test_trees_survive_writing_and_reading(tmp_path: Path) -> None:
+    ensemble = TreeEnsemble.load()
+    ensemble.save(tmp_path / "again.npz")
+    again = TreeEnsemble.load(tmp_path / "again.npz")
+    rows = np.random.default_rng(0).normal(size=(20, len(FEATURES)))
+
+    np.testing.assert_array_equal(again.predict(rows), ensemble.predict(rows))
+
+
+def test_score_falls_as_the_predicted_error_grows(windows_and_details: tuple[Windows, Details]) -> None:
+    windows, details = windows_and_details
+    score = GoodRegionsSelector().score(windows, details)
+    predicted = TreeEnsemble.load().predict(features_of(windows, details))
+
+    assert np.all((score > 0.0) & (score < 1.0))
+    assert np.all(np.diff(score[np.argsort(predicted)]) <= 0.0)
+
+
+def test_a_window_with_detail_scores_above_the_same_window_in_heavy_noise() -> None:
+    windows, details = looked_at(plane_of(3))
+    noisy = dataclasses.replace(details, information=details.information - np.log(100.0))
+    loud = dataclasses.replace(
+        windows,
+        directions=windows.directions / 100.0,
+        eigenvalues=windows.eigenvalues / 100.0,
+        contrast=windows.contrast / 100.0,
+        sigma=windows.sigma * 10.0,
+    )
+    selector = GoodRegionsSelector()
+
+    assert selector.score(windows, details).mean() > selector.score(loud, noisy).mean()
+
+
+def test_good_regions_can_be_asked_for_by_name() -> None:
+    plane = plane_of(5, 600, 800)
+    patches = select(plane, NOISE, Frame(*plane.shape), count=12, selector="good-regions").patches
+
+    assert len(patches) == 12
+    assert len({p.score for p in patches}) > 1

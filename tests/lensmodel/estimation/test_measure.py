@@ -1,0 +1,337 @@
+"""PSFs measured on photos made for it: small frames, one kernel all over, so that the truth is plain."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from scipy import signal
+
+from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.core.geometry import Frame
+from lensmodel.core.psf import centred, distance, gaussian, resized
+from lensmodel.core.types import Kernel, LensSettings, NoiseModel
+from lensmodel.estimation import measure
+from lensmodel.estimation.measure.edges import Edges, constrained
+from lensmodel.estimation.measure.page import TargetPage
+from lensmodel.estimation.measure.pair import Pair
+from lensmodel.estimation.measure.point_detection import find_lights, isolated
+from lensmodel.estimation.measure.points import Points
+from lensmodel.estimation.measure.solve import solve
+from lensmodel.estimation.measure.target import PlacedPage, Target
+from lensmodel.estimation.measure.warp import homography_of, match
+from lensmodel.lab.measured import scenes
+from lensmodel.model import LensModel
+from lensmodel.optics.diffraction import diffraction_kernel
+from lensmodel.photo import LinearPhoto
+from lensmodel.photo.values import Encoding, PhotoInfo, PhotoMetadata
+from lensmodel.quality.edge import slanted_edge
+from lensmodel.workflow.joining import joined
+from lensmodel.workflow.measuring import samples_of_developed
+
+SHAPE = (360, 540)
+NOISE = NoiseModel(1 / 40000, (4 / 40000) ** 2)
+
+
+def lopsided() -> Kernel:
+    """A core with a flare to the lower right: flips and turns of it are told apart."""
+    core = gaussian(21, np.array([[1.0, 0.35], [0.35, 0.6]]))
+    flare = np.roll(gaussian(21, np.array([[3.0, 1.0], [1.0, 2.0]])), (2, 1), (0, 1))
+    return centred(0.75 * core + 0.25 * flare)
+
+
+def photo_of(
+    scene: NDArray[np.floating], kernel: Kernel, seed: int = 0, aperture: float | None = 2.0
+) -> LinearPhoto:
+    """One Bayer photo of a scene with its margin."""
+    rng = np.random.default_rng(seed)
+    blurred = signal.fftconvolve(scene, kernel, mode="same")[
+        scenes.MARGIN : -scenes.MARGIN, scenes.MARGIN : -scenes.MARGIN
+    ]
+    noisy = blurred + rng.standard_normal(blurred.shape) * np.sqrt(NOISE.variance(blurred))
+    plane = np.clip(noisy, 0.0, 1.0).astype(np.float32)
+    height, width = plane.shape
+    metadata = PhotoMetadata(aperture=aperture, focal_mm=50.0, pixel_pitch_um=4.5)
+    return LinearPhoto(
+        planes=np.stack([plane] * 3),
+        frame=Frame(height, width),
+        noise=(NOISE,) * 3,
+        clip=(1.0, 1.0, 1.0),
+        info=PhotoInfo("dng", width, height, metadata),
+        encoding=Encoding(),
+        pipeline="test",
+        sensor_noise=(NOISE,) * 3,
+        cfa=((0, 1), (1, 2)),
+    )
+
+
+# --- the solver ---------------------------------------------------------------------------------
+
+
+def test_the_solver_finds_a_kernel_from_half_of_the_pixels() -> None:
+    rng = np.random.default_rng(0)
+    kernel = lopsided()
+    latent = rng.uniform(0.2, 0.8, (96, 96))
+    observed = signal.fftconvolve(latent, kernel, mode="valid") + rng.normal(0, 2e-3, (76, 76))
+    measured = np.indices(observed.shape).sum(axis=0) % 2 == 0
+    solved = solve(observed + 0.1, latent, measured, np.full(observed.shape, 4e-6), 21)
+    seen = distance(solved.kernel, kernel).rel_l2
+    assert seen < 0.05
+    assert 0.5 < solved.error / seen < 2.0
+    assert solved.light == pytest.approx(1.0, abs=0.02)
+    assert solved.offset == pytest.approx(0.1, abs=0.01)
+    assert np.hypot(*solved.shift) < 0.05
+
+
+def test_noise_of_the_latent_picture_is_taken_off() -> None:
+    rng = np.random.default_rng(1)
+    kernel = gaussian(15, np.eye(2) * 0.6)
+    latent = 0.5 + 0.05 * rng.standard_normal((140, 140))
+    observed = signal.fftconvolve(latent, kernel, mode="valid") + rng.normal(0, 1e-3, (126, 126))
+    seen = latent + rng.normal(0, 0.02, latent.shape)
+    every, variance = np.ones(observed.shape, dtype=bool), np.full(observed.shape, 1e-6)
+    covariance = np.zeros((29, 29))
+    covariance[14, 14] = 0.02**2
+    plain = solve(observed, seen, every, variance, 15)
+    without = solve(observed, seen, every, variance, 15, covariance)
+    assert plain.light < 0.9  # noise that blur did not reach dilutes the picture
+    assert 1.0 < without.light < 1.15  # what k >= 0 cuts off of the noise is too much by a tenth here
+
+
+@pytest.mark.parametrize("size", [14, 1])
+def test_the_solver_refuses_shapes_that_do_not_fit(size: int) -> None:
+    plane = np.ones((40, 40))
+    with pytest.raises(InvalidInputError):
+        solve(plane, np.ones((54, 54)), plane > 0, plane, size)
+
+
+def test_too_few_pixels_determine_no_kernel() -> None:
+    plane = np.ones((20, 20))
+    with pytest.raises(NotEnoughEvidenceError, match="400 pixels count, 441"):
+        solve(plane, np.ones((40, 40)), plane > 0, plane, 21)
+
+
+# --- the page -----------------------------------------------------------------------------------
+
+
+def test_a_page_is_the_same_each_time_and_differs_from_the_others() -> None:
+    one, again, other = (TargetPage(detail).samples for detail in (300, 300, 301))
+    assert np.array_equal(one, again)
+    assert not np.array_equal(one, other[: one.shape[0], : one.shape[1]])
+
+
+def test_the_page_passes_through_its_samples() -> None:
+    page = TargetPage(300)
+    rows, cols = np.meshgrid(np.arange(80, 110), np.arange(120, 160), indexing="ij")
+    seen = page.at(rows.astype(float), cols.astype(float))
+    # what ink and paper cut off moves a few of them a little
+    assert np.median(np.abs(seen - page.samples[80:110, 120:160])) < 0.02
+
+
+@pytest.mark.parametrize("suffix", ["png", "pdf", "svg"])
+def test_a_target_is_written_to_print(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"target.{suffix}"
+    page = TargetPage(300)
+    measure.print_target(path, page, paper="a4")
+    data = path.read_bytes()
+    if suffix == "png":
+        with Image.open(path) as picture:
+            assert picture.size == page.raster.shape[::-1]
+            assert picture.info["dpi"][0] == pytest.approx(600 / (297 / 25.4), rel=0.01)
+    elif suffix == "pdf":
+        assert data.startswith(b"%PDF-1.4")
+        assert b"/MediaBox [0 0 841.890 595.276]" in data
+        start = int(data.split(b"startxref\n")[1].split(b"\n")[0])
+        assert data[start : start + 4] == b"xref"
+    else:
+        assert b'width="297.0mm"' in data
+
+
+def test_a_target_of_an_unknown_kind_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match="pdf"):
+        measure.print_target(tmp_path / "target.gif", TargetPage(300))
+    with pytest.raises(InvalidInputError, match="a2, a3, a4"):
+        measure.print_target(tmp_path / "target.png", TargetPage(300), paper="letter")
+
+
+# --- registration -------------------------------------------------------------------------------
+
+
+def test_a_homography_is_found_from_four_corners() -> None:
+    truth = np.array([[1.1, 0.02, 5.0], [-0.03, 0.9, -7.0], [1e-5, 2e-5, 1.0]])
+    points = np.array([[0.0, 0.0], [0.0, 500.0], [300.0, 500.0], [300.0, 0.0]])
+    raised = np.column_stack([points, np.ones(4)]) @ truth.T
+    assert homography_of(points, raised[:, :2] / raised[:, 2:]) == pytest.approx(truth, abs=1e-6)
+
+
+@pytest.mark.parametrize("shift", [(3, -5), (0, 11)])
+def test_a_match_says_how_far_the_photo_lies_beyond(shift: tuple[int, int]) -> None:
+    plane = np.random.default_rng(0).standard_normal((128, 128))
+    seen = match(np.roll(plane, shift, (0, 1)), plane)
+    assert seen.shift == pytest.approx(shift, abs=0.1)
+
+
+# --- the ways -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def target_photo() -> LinearPhoto:
+    scene = 0.8 * scenes.target_scene(TargetPage(500), SHAPE, scenes.Setup(fill=0.97))[1]
+    return photo_of(scene, lopsided())
+
+
+def test_a_target_is_found_and_gives_the_kernel_as_it_is(
+    target_photo: LinearPhoto, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    placed: list[PlacedPage] = []
+    find = Target.find
+
+    def noted(self: Target, photo: LinearPhoto) -> PlacedPage:
+        placed.append(find(self, photo))
+        return placed[-1]
+
+    monkeypatch.setattr(Target, "find", noted)  # to find a page takes longer than all the rest
+    method = Target(across=2, down=1, details=(400, 500))
+    found = method.measure([target_photo], size=21, channels=("g",))
+    assert [page.page.detail for page in placed] == [500]
+    assert found
+    for one in found:
+        seen = distance(one.kernel, lopsided()).rel_l2
+        assert seen < 0.06
+        assert 0.5 < one.error / seen < 2.5
+        assert distance(np.rot90(one.kernel, 2), lopsided()).rel_l2 > 3 * seen
+
+
+def test_a_photo_without_a_target_is_refused() -> None:
+    grey = np.full((SHAPE[0] + 2 * scenes.MARGIN, SHAPE[1] + 2 * scenes.MARGIN), 0.4)
+    with pytest.raises(NotEnoughEvidenceError, match="corner discs"):
+        Target(details=(500,)).measure([photo_of(grey, lopsided())], size=21)
+
+
+def test_points_between_pixels_are_stacked_and_saturated_ones_refused() -> None:
+    scene = scenes.light_scene(60, SHAPE, np.random.default_rng(3))[1]
+    photo = photo_of(scene, lopsided())
+    found = Points(across=2, down=2, detector="own").measure([photo], size=21, channels=("g",))
+    errors = [distance(one.kernel, lopsided()).rel_l2 for one in found]
+    assert len(found) == 4
+    assert max(errors) < 0.06
+    lit = Points(across=2, down=2, detector="own").measure(
+        [photo_of(scene + 0.27, lopsided())], size=21, channels=("g",)
+    )
+    assert (
+        max(distance(one.kernel, lopsided()).rel_l2 for one in lit) < 0.15
+    )  # 100 times the light of the sky
+    assert min(one.error for one in lit) > max(one.error for one in found)
+    bright = photo_of(40.0 * scene, lopsided())
+    with pytest.raises(NotEnoughEvidenceError, match="expose less"):
+        Points(detector="own").measure([bright], size=21)
+
+
+def test_lights_beside_others_are_left_out() -> None:
+    plane = np.zeros((120, 160))
+    for row, col in ((40, 40), (40, 48), (80, 120)):
+        plane[row - 8 : row + 9, col - 8 : col + 9] += gaussian(17, np.eye(2))
+    plane += np.random.default_rng(0).normal(0, 1e-4, plane.shape)
+    lights = find_lights(plane, "own")
+    assert len(lights) == 3
+    assert [(round(one.row), round(one.col)) for one in isolated(lights, 21)] == [(80, 120)]
+
+
+def test_an_unknown_detector_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match="auto, sep, photutils, own"):
+        find_lights(np.zeros((64, 64)), "eyes")
+
+
+def test_a_pair_gives_the_kernel_of_the_open_photo() -> None:
+    rng = np.random.default_rng(5)
+    height, width = (n + 2 * scenes.MARGIN for n in SHAPE)
+    scene = np.clip(0.4 + 0.12 * rng.standard_normal((height, width)), 0.05, 0.9)
+    scene = signal.fftconvolve(scene, gaussian(9, np.eye(2) * 0.2), mode="same")
+    sharp = diffraction_kernel(21, 8.0, 4.5, "g")
+    moved = scenes.moved_scene(np.stack([scene] * 3).astype(np.float32), (0.4, -0.7), 0.05)[1]
+    opened, closed = photo_of(scene, lopsided()), photo_of(moved, sharp, 1, 8.0)
+    found = Pair(across=2, down=1, side=128).measure([opened, closed], size=21, channels=("g",))
+    assert found
+    assert np.median([distance(one.kernel, lopsided()).rel_l2 for one in found]) < 0.08
+
+
+def test_a_pair_is_not_misled_by_detail_that_passed_for_noise() -> None:
+    rng = np.random.default_rng(5)
+    height, width = (n + 2 * scenes.MARGIN for n in SHAPE)
+    contrast = np.clip(np.linspace(-0.06, 0.3, width), 0.0, 0.12)  # the left of the frame is quiet
+    scene = np.clip(0.4 + contrast * rng.standard_normal((height, width)), 0.05, 0.9)
+    scene = signal.fftconvolve(scene, gaussian(9, np.eye(2) * 0.2), mode="same")
+    sharp = diffraction_kernel(21, 8.0, 4.5, "g")
+    said = (NoiseModel(100 * NOISE.shot, 100 * NOISE.read),) * 3  # as where no place of a photo is flat
+    pair = [
+        replace(photo, noise=said, sensor_noise=said)
+        for photo in (photo_of(scene, lopsided()), photo_of(scene, sharp, 1, 8.0))
+    ]
+    found = Pair(across=2, down=1, side=128).measure(pair, size=21, channels=("g",))
+    assert np.median([distance(one.kernel, lopsided()).rel_l2 for one in found]) < 0.1
+
+
+def test_a_pair_of_one_aperture_is_refused() -> None:
+    grey = np.full((SHAPE[0] + 2 * scenes.MARGIN, SHAPE[1] + 2 * scenes.MARGIN), 0.4)
+    photo = photo_of(grey, lopsided())
+    with pytest.raises(InvalidInputError, match="two stops"):
+        Pair().measure([photo, photo], size=21)
+    with pytest.raises(InvalidInputError, match="takes 2 photos"):
+        Pair().measure([photo], size=21)
+
+
+def test_edges_anywhere_give_a_constraint_with_both_widths() -> None:
+    kernel = gaussian(21, np.array([[3.0, 0.0], [0.0, 0.8]]))
+    photo = photo_of(scenes.board_scene(110.0, SHAPE, scenes.Setup(distortion=0.0))[1], kernel)
+    found = Edges().measure([photo], size=21, channels=("g",))
+    assert found
+    seen = np.median([distance(one.kernel, kernel).rel_l2 for one in found])
+    assert seen < 0.2
+    assert all(distance(one.kernel, kernel.T).rel_l2 > 0.3 for one in found)
+
+
+def test_edges_of_one_direction_are_no_constraint() -> None:
+    rows, cols = np.indices((80, 80)) - 39.5
+    edge = 0.2 + 0.5 / (1.0 + np.exp(-(cols - rows * math.tan(math.radians(5.0)))))
+    response = slanted_edge(edge)
+    with pytest.raises(InvalidInputError, match="two directions"):
+        constrained([response, response], 21)
+
+
+# --- samples and models -------------------------------------------------------------------------
+
+
+def test_measured_samples_join_or_replace_blind_ones(target_photo: LinearPhoto) -> None:
+    place = measure.MeasuredPsf(
+        lopsided(), target_photo.frame.position(100, 100), "g", 0.04, (100.0, 100.0), 144
+    )
+    method = measure.methods.create("target")
+    blind = [
+        sample
+        for f_number, photo in ((2.0, "old"), (5.6, "other"))
+        for sample in measure.samples_of(
+            [place], method, target_photo, photo_id=photo, settings=LensSettings(aperture=f_number)
+        )
+    ]
+    blind = [type(s)(**{**{f: getattr(s, f) for f in s.__slots__}, "estimator": "blind/1"}) for s in blind]
+    samples = measure.samples_of(
+        [place], method, target_photo, photo_id="new", settings=LensSettings(aperture=2.0)
+    )
+    assert samples[0].estimator == "measured-target/1"
+    assert measure.is_measured(samples[0])
+    model = LensModel.fit(blind)
+    assert [s.photo for s in joined(model, samples).samples] == ["old", "other", "new"]
+    assert [s.photo for s in joined(model, samples, replace=True).samples] == ["other", "new"]
+    assert joined(None, samples).samples == tuple(samples)
+    assert resized(samples[0].kernel, 21).shape == (21, 21)
+
+
+def test_a_measurement_needs_an_aperture(target_photo: LinearPhoto) -> None:
+    grey = np.full((SHAPE[0] + 2 * scenes.MARGIN, SHAPE[1] + 2 * scenes.MARGIN), 0.4)
+    with pytest.raises(Exception, match="aperture"):
+        samples_of_developed("target", [photo_of(grey, lopsided(), aperture=None)], photo_id="x")

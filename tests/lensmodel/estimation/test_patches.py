@@ -1,0 +1,482 @@
+from __future__ import annotations
+
+import math
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from lensmodel.core.errors import InvalidInputError, NoUsablePatchesError, UnknownMethodError
+from lensmodel.core.geometry import Frame
+from lensmodel.core.types import FieldPosition, NoiseModel, Plane, ignore_step
+from lensmodel.estimation.patches import (
+    REASONS,
+    Patch,
+    Selection,
+    blocks,
+    r_map,
+    require_enough,
+    select,
+    selectors,
+)
+from lensmodel.estimation.patches.details import look_at
+from lensmodel.estimation.patches.enough import part_of
+from lensmodel.estimation.patches.select import EVIDENCE_FLOOR
+from lensmodel.estimation.patches.windows import windows_of
+
+NOISE = NoiseModel.white(0.003)
+
+
+def dead_leaves(height: int, width: int, seed: int = 0) -> Plane:
+    """Discs of many sizes that hide each other: sharp edges in every direction."""
+    rng = np.random.default_rng(seed)
+    plane = np.full((height, width), 0.4, dtype=np.float32)
+    rows, cols = np.mgrid[:height, :width]
+    for _ in range(height * width // 600):
+        radius = 4.0 * (1.0 - rng.random()) ** -0.7
+        if radius > 120.0:
+            continue
+        row, col = rng.random(2) * (height, width)
+        r0, r1 = max(int(row - radius - 1), 0), int(row + radius + 2)
+        c0, c1 = max(int(col - radius - 1), 0), int(col + radius + 2)
+        inside = np.hypot(rows[r0:r1, c0:c1] - row, cols[r0:r1, c0:c1] - col) <= radius
+        plane[r0:r1, c0:c1][inside] = rng.uniform(0.08, 0.8)
+    return plane
+
+
+def photo_of(scene: Plane, seed: int = 1, blur_px: float = 0.8) -> Plane:
+    rng = np.random.default_rng(seed)
+    blurred = ndimage.gaussian_filter(scene, blur_px)
+    return (blurred + rng.normal(0.0, 0.003, scene.shape)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Plane:
+    return dead_leaves(1000, 1500)
+
+
+@pytest.fixture(scope="module")
+def photo(scene: Plane) -> Plane:
+    return photo_of(scene)
+
+
+@pytest.fixture(scope="module")
+def selection(photo: Plane) -> Selection:
+    return select(photo, NOISE, Frame(*photo.shape), count=36)
+
+
+@pytest.fixture(scope="module")
+def part(photo: Plane) -> Plane:
+    """A third of the photo, for what does not hang on its size."""
+    return photo[:600, :800].copy()
+
+
+@pytest.fixture(scope="module")
+def part_selection(part: Plane) -> Selection:
+    return chosen(part, count=24)
+
+
+def chosen(plane: Plane, **options: int) -> Selection:
+    return select(plane, NOISE, Frame(*plane.shape), **options)
+
+
+def overlap(patch: Patch, mask: np.ndarray) -> float:
+    return float(mask[patch.row : patch.row + patch.size, patch.col : patch.col + patch.size].mean())
+
+
+# ---- the r-map
+
+
+def test_r_is_high_at_a_step_and_low_on_stripes_narrower_than_the_window() -> None:
+    step, stripes = np.zeros((2, 101, 101), dtype=np.float32)
+    step[:, 50:] = 1.0
+    stripes[:, (np.arange(101) // 3) % 2 == 0] = 1.0
+
+    assert r_map(step)[50, 50] > 0.9
+    assert r_map(stripes)[50, 50] < 0.1
+
+
+def test_r_of_a_step_is_what_the_formula_says() -> None:
+    step = np.zeros((121, 121), dtype=np.float32)
+    step[:, 60:] = 1.0
+
+    # Within the window every row adds the whole step of 1, all in one direction.
+    assert r_map(step, 25)[60, 60] == pytest.approx(25.0 / (25.0 + 0.5), rel=1e-3)
+
+
+def test_r_of_a_flat_plane_is_zero() -> None:
+    assert r_map(np.full((60, 60), 0.5, dtype=np.float32)).max() < 1e-4
+
+
+@given(st.integers(1, 3))
+def test_r_map_turns_with_the_plane(turns: int) -> None:
+    plane = dead_leaves(90, 90, seed=7)
+
+    np.testing.assert_allclose(r_map(np.rot90(plane, turns).copy()), np.rot90(r_map(plane), turns), atol=2e-4)
+
+
+def test_r_map_refuses_an_even_window() -> None:
+    with pytest.raises(InvalidInputError, match="odd"):
+        r_map(np.zeros((50, 50), dtype=np.float32), 24)
+
+
+# ---- what is chosen
+
+
+def test_a_photo_of_1500_by_1000_gives_two_to_four_patches_a_cell(selection: Selection) -> None:
+    cells = Counter(patch.cell for patch in selection.patches)
+
+    assert len(selection.patches) == 36
+    assert {patch.size for patch in selection.patches} == {192}
+    assert set(cells.values()) <= {2, 3, 4}
+
+
+def test_cells_are_numbered_without_gaps(selection: Selection) -> None:
+    numbers = [patch.cell for patch in selection.patches]
+
+    assert numbers == sorted(numbers)
+    assert set(numbers) == set(range(max(numbers) + 1))
+
+
+def test_patches_of_a_cell_lie_together(selection: Selection) -> None:
+    for patch in selection.patches:
+        first = next(p for p in selection.patches if p.cell == patch.cell)
+        turn = (patch.position.phi - first.position.phi + math.pi) % (2 * math.pi) - math.pi
+        apart = max(abs(patch.row - first.row), abs(patch.col - first.col))
+        assert abs(patch.position.r - first.position.r) <= 0.12
+        assert apart < patch.size or abs(turn) <= math.radians(24.0)
+
+
+def test_patches_overlap_by_half_at_most(selection: Selection) -> None:
+    for i, a in enumerate(selection.patches):
+        for b in selection.patches[i + 1 :]:
+            assert max(abs(a.row - b.row), abs(a.col - b.col)) >= a.size / 2
+
+
+def test_every_corner_gets_its_share(selection: Selection) -> None:
+    outer = [p.position.phi for p in selection.patches if p.position.r > 0.55]
+    quadrants = Counter(int(phi // (math.pi / 2)) for phi in outer)
+
+    assert min(quadrants[q] for q in (-2, -1, 0, 1)) >= 2
+
+
+def test_position_is_that_of_the_centre_of_the_patch(selection: Selection) -> None:
+    patch = selection.patches[0]
+    expected = Frame(1000, 1500).position(patch.row + (patch.size - 1) / 2, patch.col + (patch.size - 1) / 2)
+
+    assert patch.position.r == pytest.approx(expected.r)
+    assert patch.position.phi == pytest.approx(expected.phi)
+
+
+def test_selection_is_the_same_each_time(part: Plane, part_selection: Selection) -> None:
+    assert chosen(part, count=24).patches == part_selection.patches
+
+
+def test_a_small_photo_gets_smaller_patches() -> None:
+    small = photo_of(dead_leaves(320, 400))
+    patches = chosen(small, count=12).patches
+
+    assert len(patches) >= 8
+    assert {p.size for p in patches} == {128}
+
+
+def test_a_memory_mapped_plane_gives_the_same(tmp_path: Path, part: Plane, part_selection: Selection) -> None:
+    np.save(tmp_path / "plane.npy", part)
+
+    mapped = np.load(tmp_path / "plane.npy", mmap_mode="r")
+
+    assert chosen(mapped, count=24).patches == part_selection.patches
+
+
+def test_scores_lie_in_zero_to_one_and_jpeg_counts_for_less(part: Plane, selection: Selection) -> None:
+    jpeg = select(part, NOISE, Frame(*part.shape), count=24, jpeg=True)
+
+    assert all(0.0 < p.score <= 1.0 for p in selection.patches)
+    assert max(p.score for p in jpeg.patches) <= 0.3
+
+
+def test_a_window_with_edges_scores_above_one_with_faint_texture(scene: Plane) -> None:
+    faint = scene.copy()
+    faint[:, :750] = 0.4 + 0.15 * (faint[:, :750] - 0.4)
+    patches = chosen(photo_of(faint), count=24).patches
+    left = [p.score for p in patches if p.col + p.size <= 750]
+    right = [p.score for p in patches if p.col >= 750]
+
+    assert np.mean(right) > np.mean(left) + 0.1
+
+
+def test_progress_is_reported_to_the_end(part: Plane) -> None:
+    steps: list[tuple[int, int]] = []
+    select(part, NOISE, Frame(*part.shape), on_step=lambda done, total: steps.append((done, total)))
+
+    assert steps[-1][0] == steps[-1][1]
+    assert [done for done, _ in steps] == sorted(done for done, _ in steps)
+
+
+# ---- what is rejected
+
+
+def test_strips_leave_no_trace_in_the_sums(photo: Plane, monkeypatch: pytest.MonkeyPatch) -> None:
+    def measured(pixels: int) -> blocks.Blocks:
+        monkeypatch.setattr(blocks, "_STRIP_PIXELS", pixels)
+        return blocks.measure_blocks(photo[:300, :400], NOISE, 32, 1.0, ignore_step)
+
+    whole, cut = measured(10**9), measured(32 * 400)
+
+    assert whole.widths.sum() > 1000
+    for name in ("energy", "tensor", "level", "widths", "width_sums", "histogram"):
+        np.testing.assert_allclose(getattr(cut, name), getattr(whole, name), rtol=1e-5)
+
+
+def test_every_window_is_chosen_or_has_a_reason(selection: Selection) -> None:
+    assert {r.reason for r in selection.rejected} <= set(REASONS)
+    assert sum(selection.counts.values()) == len(selection.rejected)
+    places = [(r.row, r.col) for r in selection.rejected] + [(p.row, p.col) for p in selection.patches]
+    assert len(places) == len(set(places)) == 17 * 28
+
+
+def test_clipped_flat_and_dark_parts_are_rejected_with_their_reason(scene: Plane) -> None:
+    spoilt = scene.copy()
+    spoilt[:300, :400] = np.where(spoilt[:300, :400] > 0.5, 1.2, spoilt[:300, :400])
+    spoilt[-300:, -400:] = 0.5
+    plane = photo_of(spoilt)
+    plane[:300, -400:] *= 0.01
+    result = chosen(np.minimum(plane, 1.0))
+    reason = {(r.row < 100, r.col < 100): r.reason for r in result.rejected if _in_a_corner(r.row, r.col)}
+
+    assert reason[True, True] == "clipped"
+    assert reason[False, False] == "flat"
+    assert reason[True, False] == "dark"
+
+
+def _in_a_corner(row: int, col: int) -> bool:
+    return (row < 100 or row > 700) and (col < 100 or col > 1200)
+
+
+def test_edges_of_one_direction_only_are_rejected() -> None:
+    stripes = np.repeat(np.cumsum(np.random.default_rng(3).normal(0, 1, 100)), 12)[None, :].repeat(600, 0)
+    plane = photo_of((0.5 + 0.3 * np.tanh(stripes / 3)).astype(np.float32))
+
+    with pytest.raises(NoUsablePatchesError, match="one-directional"):
+        chosen(plane)
+
+
+def test_a_grid_that_repeats_is_rejected_as_periodic() -> None:
+    rows, cols = np.mgrid[:600, :800]
+    tile = ((rows % 24 < 12) ^ (cols % 30 < 11)).astype(np.float32) * 0.5 + 0.2
+
+    with pytest.raises(NoUsablePatchesError, match="periodic"):
+        chosen(photo_of(tile))
+
+
+def test_steps_on_the_grid_of_jpeg_blocks_are_rejected(scene: Plane) -> None:
+    coarse = scene[:600, :800].reshape(75, 8, 100, 8).mean(axis=(1, 3)).repeat(8, 0).repeat(8, 1)
+
+    with pytest.raises(NoUsablePatchesError, match="jpeg-blocks"):
+        chosen((coarse + photo_of(scene)[:600, :800] * 0.05).astype(np.float32))
+
+
+def test_windows_with_missing_pixels_are_rejected_as_border(part: Plane) -> None:
+    plane = part.copy()
+    plane[:, :40] = np.nan
+    result = chosen(plane)
+
+    assert all(p.col >= 40 for p in result.patches)
+    assert {r.reason for r in result.rejected if r.col < 40} == {"border"}
+
+
+def test_a_defocused_part_is_left_out_and_the_rest_kept(scene: Plane, photo: Plane) -> None:
+    t = np.hypot(*np.ogrid[-4:5, -4:5])
+    disc = (np.clip(3.0 + 0.5 - t, 0.0, 1.0)).astype(np.float32)
+    out_of_focus = np.zeros(scene.shape, dtype=bool)
+    out_of_focus[:, 900:] = True
+    blurred = ndimage.convolve(scene, disc / disc.sum())
+    result = chosen(photo_of(np.where(out_of_focus, blurred, scene)))
+    sharp = chosen(photo)
+
+    defocused = [p for p in result.patches if overlap(p, out_of_focus) > 0.5]
+    in_focus = [p for p in sharp.patches if overlap(p, out_of_focus) == 0.0]
+    assert len(defocused) < 0.05 * len(result.patches)
+    assert len(result.patches) - len(defocused) > 0.5 * len(in_focus)
+
+
+def test_the_soft_side_of_a_decentred_lens_is_not_taken_for_defocus(scene: Plane) -> None:
+    rows, cols = np.mgrid[-500:500, -750:750] / 901.0
+    sigma = 0.6 + 1.5 * (rows**2 + (cols + 0.25) ** 2)
+    steps = np.array([0.5, 0.8, 1.2, 1.7, 2.4])
+    blurred = np.stack([ndimage.gaussian_filter(scene, step) for step in steps])
+    at = np.clip(np.interp(sigma, steps, np.arange(5)), 0, 3.999)
+    low = at.astype(int)
+    r, c = np.indices(scene.shape)
+    soft = blurred[low, r, c] * (1 - (at - low)) + blurred[low + 1, r, c] * (at - low)
+    result = chosen(photo_of(soft.astype(np.float32), blur_px=0.01))
+
+    assert result.counts.get("defocus", 0) < 0.05 * 17 * 28
+    assert sum(p.position.r > 0.6 and abs(p.position.phi) < 0.8 for p in result.patches) >= 3
+
+
+def test_camera_shake_is_warned_of_and_blur_that_turns_with_the_field_is_not(
+    scene: Plane, selection: Selection
+) -> None:
+    shaken = ndimage.uniform_filter1d(scene, 9, axis=0)
+    rows, cols = np.mgrid[-500:500, -750:750]
+    frame_r = np.hypot(rows, cols) / 901
+    along = np.stack([cols, rows]) / np.maximum(np.hypot(rows, cols), 1)
+    radial = np.mean(
+        [
+            ndimage.map_coordinates(
+                scene, [rows + 500 + t * along[1] * frame_r, cols + 750 + t * along[0] * frame_r], order=1
+            )
+            for t in np.linspace(-4, 4, 9)
+        ],
+        axis=0,
+    )
+
+    (warning,) = chosen(photo_of(shaken)).warnings
+    assert warning.startswith("motion")
+    assert abs(int(warning.split("(")[1].split()[0])) > 80  # vertical
+    assert selection.warnings == ()
+    assert chosen(photo_of(radial.astype(np.float32))).warnings == ()
+
+
+def test_noise_alone_is_refused_with_a_remedy() -> None:
+    noise = np.random.default_rng(5).normal(0.4, 0.003, (400, 500)).astype(np.float32)
+
+    with pytest.raises(NoUsablePatchesError, match="more fine detail"):
+        chosen(noise)
+
+
+def test_a_tiny_photo_is_refused_with_its_size() -> None:
+    with pytest.raises(NoUsablePatchesError, match="50 x 40"):
+        chosen(np.zeros((40, 50), dtype=np.float32))
+
+
+def test_wrong_arguments_are_named(photo: Plane) -> None:
+    with pytest.raises(InvalidInputError, match="frame"):
+        select(photo, NOISE, Frame(10, 10))
+    with pytest.raises(InvalidInputError, match="count"):
+        chosen(photo, count=0)
+    with pytest.raises(InvalidInputError, match="64 px"):
+        chosen(photo, size=32)
+    with pytest.raises(UnknownMethodError, match="r-map"):
+        select(photo, NOISE, Frame(*photo.shape), selector="best")
+
+
+# ---- parts
+
+
+def test_every_selector_scores_within_zero_and_one(part: Plane) -> None:
+    for name in selectors:
+        patches = select(part, NOISE, Frame(*part.shape), count=12, selector=name).patches
+        assert len(patches) == 12
+        assert all(0.0 <= p.score <= 1.0 for p in patches)
+
+
+# ---- evidence
+
+
+def vignetted_sky(height: int, width: int, sigma: float, grain_px: float = 0.0) -> Plane:
+    """Bright sky that falls off towards the corners, with noise; coarse where a camera denoised it."""
+    y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
+    noise = np.random.default_rng(3).normal(0.0, 1.0, (height, width))
+    if grain_px:
+        noise = ndimage.gaussian_filter(noise, grain_px)
+    return (0.6 * (1.0 - 0.3 * (x * x + y * y)) + 0.05 * y + sigma * noise / noise.std()).astype(np.float32)
+
+
+def test_a_slope_is_no_contrast() -> None:
+    sky = vignetted_sky(512, 768, 0.003)
+    found = windows_of(blocks.measure_blocks(sky, NOISE, 48, 1.0, ignore_step), Frame(512, 768), NOISE)
+
+    assert np.square(sky.std() / 0.003) > 100.0
+    assert found.contrast.max() < 4.0
+
+
+def test_detail_counts_the_same_on_a_slope(photo: Plane) -> None:
+    slope = np.linspace(0.0, 0.2, photo.shape[1], dtype=np.float32)
+    plain, sloping = (
+        windows_of(blocks.measure_blocks(plane, NOISE, 48, 2.0, ignore_step), Frame(*plane.shape), NOISE)
+        for plane in (photo, photo + slope)
+    )
+
+    np.testing.assert_allclose(sloping.contrast, plain.contrast, rtol=0.15)
+
+
+@pytest.mark.parametrize("sigma", [0.002, 0.01])
+def test_noise_is_no_evidence_and_a_slope_none_either(sigma: float) -> None:
+    sky = vignetted_sky(192, 192, sigma)
+
+    assert look_at(sky, sigma, 1.0, (0, 0)).evidence[0] < 0.05
+
+
+def test_evidence_is_the_capacity_of_white_signal() -> None:
+    rng = np.random.default_rng(0)
+    white = 0.001 + 0.04 * rng.normal(size=(192, 192))  # so dark that the gain of pixels plays no part
+
+    # P / N = 4: log2(1 + 3) bits at every frequency
+    assert look_at(white, 0.02, 1.0, (0, 0)).evidence[0] == pytest.approx(2.0, abs=0.05)
+
+
+def test_a_soft_corner_is_evidence_by_its_lowest_frequencies(scene: Plane) -> None:
+    soft = photo_of(scene, blur_px=2.5)[200:392, 200:392]
+
+    assert look_at(soft, 0.003, 1.0, (0, 0)).evidence[0] > 0.5
+
+
+def test_structure_below_the_uniformity_of_sensors_is_no_evidence(scene: Plane) -> None:
+    faint = 0.5 + 0.004 * (scene[:192, :192] - scene[:192, :192].mean())
+
+    assert look_at(faint, 1e-6, 1.0, (0, 0)).evidence[0] < EVIDENCE_FLOOR
+
+
+def test_patches_avoid_a_sky_whose_noise_the_camera_smoothed(scene: Plane) -> None:
+    plane = photo_of(scene)
+    plane[:500] = vignetted_sky(500, 1500, 0.004, grain_px=2.0)
+    single = NoiseModel.white(0.0006)  # from pixel to pixel it is as low as that
+    coarse = NoiseModel.white(0.02)
+
+    careless = select(plane, single, Frame(*plane.shape), count=36)
+    careful = select(plane, single, Frame(*plane.shape), count=36, coarse_noise=coarse)
+
+    assert any(patch.row + patch.size < 480 for patch in careless.patches)
+    assert all(patch.row + patch.size > 480 for patch in careful.patches)
+
+
+def placed(*places: tuple[int, int], size: int = 100) -> list[Patch]:
+    frame = Frame(1000, 1500)
+    return [
+        Patch(row, col, size, frame.position(row + size / 2, col + size / 2), 0.5, k)
+        for k, (row, col) in enumerate(places)
+    ]
+
+
+def test_six_patches_apart_in_three_parts_are_enough() -> None:
+    require_enough(placed((450, 700), (450, 800), (100, 100), (100, 300), (800, 1300), (700, 1200)))
+
+
+def test_patches_that_share_pixels_count_once() -> None:
+    shifted = placed(*((450 + 50 * (k % 2), 200 + 50 * k) for k in range(10)))
+
+    with pytest.raises(NoUsablePatchesError, match="counts from 6 on"):
+        require_enough(shifted)
+
+
+def test_patches_of_one_quarter_are_not_spread() -> None:
+    with pytest.raises(NoUsablePatchesError, match="only 1 of 9 parts"):
+        require_enough(placed(*((120 + 110 * i, 220 + 110 * j) for i in range(2) for j in range(3))))
+
+
+def test_every_part_of_the_picture_has_a_number_of_its_own() -> None:
+    turn = math.pi / 2
+    places = [
+        FieldPosition(0.1, 1.0),
+        *(FieldPosition(r, 0.5 + k * turn) for r in (0.5, 0.9) for k in range(4)),
+    ]
+
+    assert sorted(part_of(FieldPosition(p.r, math.remainder(p.phi, math.tau))) for p in places) == list(
+        range(9)
+    )

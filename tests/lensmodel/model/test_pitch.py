@@ -1,0 +1,161 @@
+"""One lens seen by bodies whose pixels differ in size."""
+
+from __future__ import annotations
+
+import math
+import tracemalloc
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lensmodel.core.errors import InvalidInputError, UnknownMethodError
+from lensmodel.core.psf import PsfSample, distance, gaussian
+from lensmodel.core.types import FieldPosition, Kernel, LensSettings
+from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
+from lensmodel.model.pitch import rescaled
+
+FINE_UM, COARSE_UM = 4.0, 6.0
+SETTINGS = LensSettings(aperture=2.0)
+
+
+def seen(place: FieldPosition, pitch_um: float, size: int = 25) -> Kernel:
+    """Blur of 6 to 10 micrometres, wide along v, as pixels of a pitch show it."""
+    c, s = math.cos(place.phi), math.sin(place.phi)
+    u, v = np.array([-s, c]), np.array([-c, -s])  # (row, col)
+    along, across = (6.0 + 2.0 * place.r**2) / pitch_um, (6.0 + 4.0 * place.r**2) / pitch_um
+    return gaussian(size, along**2 * np.outer(u, u) + across**2 * np.outer(v, v))
+
+
+def photo(name: str, seed: int, pitch_um: float) -> list[PsfSample]:
+    rng = np.random.default_rng(seed)
+    places = [FieldPosition(float(r), float(a)) for r, a in rng.uniform((0.05, -3.1), (0.95, 3.1), (24, 2))]
+    return [PsfSample(seen(p, pitch_um), p, SETTINGS, photo=name, pixel_pitch_um=pitch_um) for p in places]
+
+
+@pytest.fixture(scope="module")
+def both() -> list[PsfSample]:
+    fine = [s for i in range(2) for s in photo(f"fine{i}", i, FINE_UM)]
+    return [*fine, *photo("coarse", 9, COARSE_UM)]
+
+
+ASKED = [FieldPosition(r, a) for r in (0.2, 0.5, 0.8) for a in (-2.0, 0.4, 1.7)]
+
+
+def mean_error(model: LensModel, pitch_um: float | None, truth_um: float) -> float:
+    answers = [model.query(p, SETTINGS, 21, pitch_um=pitch_um).kernel for p in ASKED]
+    return float(
+        np.mean([distance(k, seen(p, truth_um, 21)).rel_l2 for k, p in zip(answers, ASKED, strict=True)])
+    )
+
+
+@pytest.mark.parametrize(("before", "after"), [(FINE_UM, COARSE_UM), (COARSE_UM, FINE_UM)])
+def test_kernel_of_one_pitch_becomes_that_of_another(before: float, after: float) -> None:
+    place = FieldPosition(0.7, 0.4)
+    found = rescaled(seen(place, before, 31), before, after, 25)
+
+    assert distance(found, seen(place, after, 25)).rel_l2 < 0.01
+
+
+def test_kernel_in_huge_pixels_is_a_point_and_takes_little_memory() -> None:
+    tracemalloc.start()
+    found = rescaled(gaussian(9, 4.0 * np.eye(2)), 1.0, 60.0, 55)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+
+    assert found[27, 27] > 0.9
+    assert peak < 32 << 20
+
+
+def test_pixels_that_are_absurdly_wide_are_refused() -> None:
+    with pytest.raises(InvalidInputError, match="smaller pixels"):
+        rescaled(gaussian(9, np.eye(2)), 1e-6, 100.0, 55)
+
+
+def test_two_bodies_share_one_lens(both: list[PsfSample]) -> None:
+    model = LensModel.fit(both)
+
+    assert model.pitch_um == FINE_UM
+    assert mean_error(model, None, FINE_UM) < 0.03
+    assert mean_error(model, FINE_UM, FINE_UM) < 0.03
+    assert mean_error(model, COARSE_UM, COARSE_UM) < 0.03
+
+
+def test_pitch_that_is_not_known_is_that_of_the_others(both: list[PsfSample]) -> None:
+    silent = [replace(s, pixel_pitch_um=None) if s.photo == "fine1" else s for s in both]
+
+    assert mean_error(LensModel.fit(silent), None, FINE_UM) < 0.03
+
+
+def test_photos_of_another_pitch_that_say_nothing_of_it_spoil_the_model(both: list[PsfSample]) -> None:
+    silent = LensModel.fit([replace(s, pixel_pitch_um=None) for s in both])
+
+    assert mean_error(silent, None, FINE_UM) > 2.0 * mean_error(LensModel.fit(both), None, FINE_UM)
+
+
+def test_a_photo_of_another_body_joins_by_its_pitch(both: list[PsfSample]) -> None:
+    few = photo("more", 5, COARSE_UM)[:2]
+    model = LensModel.fit(both).added(few)
+
+    assert len(model.samples) == len(both) + 2
+    assert mean_error(model, None, FINE_UM) < 0.03
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan])
+def test_impossible_pitches_are_refused(both: list[PsfSample], bad: float) -> None:
+    with pytest.raises(InvalidInputError, match="pitch"):
+        LensModel.fit(both).query(ASKED[0], SETTINGS, 21, pitch_um=bad)
+
+
+class TestHalfDiagonals:
+    """Pictures of one sensor in two sizes: nobody knows a pitch, everybody his frame."""
+
+    LARGE_PX, SMALL_PX = 2400.0, 1600.0
+    UNIT = ModelSettings(unit="half-diagonal")
+
+    def samples(self) -> list[PsfSample]:
+        large = [s for i in range(2) for s in photo(f"large{i}", i, FINE_UM)]
+        sizes = [(large, self.LARGE_PX), (photo("small", 9, COARSE_UM), self.SMALL_PX)]
+        return [
+            replace(s, pixel_pitch_um=None, half_diagonal_px=half) for group, half in sizes for s in group
+        ]
+
+    def error(self, model: LensModel, half_diagonal_px: float, truth_um: float) -> float:
+        asked = [
+            (model.query(p, SETTINGS, 21, half_diagonal_px=half_diagonal_px).kernel, seen(p, truth_um, 21))
+            for p in ASKED
+        ]
+        return float(np.mean([distance(kernel, truth).rel_l2 for kernel, truth in asked]))
+
+    def test_share_one_lens(self) -> None:
+        model = LensModel.fit(self.samples(), self.UNIT)
+
+        assert self.error(model, self.LARGE_PX, FINE_UM) < 0.05
+        assert self.error(model, self.SMALL_PX, COARSE_UM) < 0.05
+
+    def test_are_mixed_up_in_micrometres_that_nobody_knows(self) -> None:
+        model = LensModel.fit(self.samples())
+
+        assert self.error(model, self.SMALL_PX, COARSE_UM) > 0.15
+
+    def test_travel_with_the_profile(self, tmp_path: Path) -> None:
+        model = LensModel.fit(self.samples(), self.UNIT)
+        save_profile(tmp_path / "a.lensprofile", LensProfile(model))
+
+        back = load_profile(tmp_path / "a.lensprofile").model
+
+        assert self.error(back, self.SMALL_PX, COARSE_UM) < 0.05
+
+    @pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
+    def test_impossible_ones_are_refused(self, bad: float) -> None:
+        with pytest.raises(InvalidInputError, match="half diagonal"):
+            replace(photo("a", 0, FINE_UM)[0], half_diagonal_px=bad)
+
+    def test_a_sample_of_impossible_pixels_is_refused(self) -> None:
+        with pytest.raises(InvalidInputError, match="pixel pitch"):
+            replace(photo("a", 0, FINE_UM)[0], pixel_pitch_um=0.0)
+
+    def test_unknown_units_are_refused(self) -> None:
+        with pytest.raises(UnknownMethodError, match="micrometre"):
+            ModelSettings(unit="inch")

@@ -1,0 +1,466 @@
+"""What the regression says of itself: reference sums, outliers, errors, priors, profiles."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import math
+import zipfile
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.psf import PsfSample, distance, gaussian
+from lensmodel.core.types import FieldPosition, Kernel, LensSettings
+from lensmodel.model import (
+    LensModel,
+    LensProfile,
+    ModelSettings,
+    PaperModel,
+    Prior,
+    all_pairs,
+    factorised,
+    load_profile,
+    save_profile,
+)
+
+SIZE = 21
+GREEN = LensSettings(aperture=2.0)
+WIDTHS = {
+    "r": 0.1,
+    "phi": 0.5,
+    "aperture_stops": 0.5,
+    "wavelength_nm": 20.0,
+    "focal_octaves": 0.25,
+    "focus_dioptres": 0.5,
+}
+
+
+def truth(position: FieldPosition, size: int = SIZE) -> Kernel:
+    c, s = math.cos(position.phi), math.sin(position.phi)
+    u, v = np.array([-s, c]), np.array([-c, -s])
+    along, across = 0.8 + 1.0 * position.r**2, 1.0 + 1.4 * position.r**2
+    return gaussian(size, along**2 * np.outer(u, u) + across**2 * np.outer(v, v))
+
+
+def places(count: int, seed: int) -> list[FieldPosition]:
+    rng = np.random.default_rng(seed)
+    r = np.sqrt(rng.uniform(0.0, 0.9, count))
+    angles = rng.uniform(-math.pi, math.pi, count)
+    return [FieldPosition(float(a), float(p)) for a, p in zip(r, angles, strict=True)]
+
+
+def photo(name: str, seed: int, *, noise: float = 0.0, blur: float = 0.0, count: int = 16) -> list[PsfSample]:
+    """Samples of one photo; `blur` adds variance along the rows, `noise` is relative at the peak."""
+    rng = np.random.default_rng([seed, 1])
+    found = []
+    for where in places(count, seed):
+        kernel = np.array(truth(where))
+        if blur:
+            shake = np.array(gaussian(SIZE, [[blur, 0.0], [0.0, 1e-3]]))
+            kernel = np.fft.ifft2(np.fft.fft2(kernel) * np.fft.fft2(np.fft.ifftshift(shake))).real
+        kernel = np.maximum(kernel, 0.0)
+        # noise that leaves the empty surroundings empty: clipped there, it would be a bias, not noise
+        kernel = np.maximum(
+            kernel + rng.normal(0.0, noise, kernel.shape) * np.sqrt(kernel * kernel.max()), 0.0
+        )
+        found.append(PsfSample(kernel, where, GREEN, photo=name))
+    return found
+
+
+def merged(photos: list[list[PsfSample]]) -> list[PsfSample]:
+    return list(chain.from_iterable(photos))
+
+
+def error(model: LensModel, seed: int = 99) -> float:
+    return float(
+        np.mean([distance(model.query(p, GREEN, SIZE).kernel, truth(p)).rel_l2 for p in places(12, seed)])
+    )
+
+
+@pytest.fixture(scope="module")
+def good() -> list[list[PsfSample]]:
+    return [photo(f"p{i}", i, noise=0.01) for i in range(9)]
+
+
+def test_factorised_sum_equals_the_sum_over_all_pairs() -> None:
+    rng = np.random.default_rng(0)
+    samples = [
+        PsfSample(rng.random((9, 9)), p, GREEN, weight=float(w))
+        for p, w in zip(places(5, 4), rng.random(5), strict=True)
+    ]
+    for where in places(3, 8):
+        flat = all_pairs(samples, where, GREEN, 9, pixel=0.6, widths=WIDTHS)
+        fast = factorised(samples, where, GREEN, 9, pixel=0.6, widths=WIDTHS)
+        assert np.abs(flat - fast).max() <= 1e-12 * flat.max()
+
+
+def test_canonical_path_is_within_two_hundredths_of_the_exact_sum() -> None:
+    samples = photo("a", 0)
+    fixed = ModelSettings(r=0.1, phi=0.5, stops=0.5, method="nadaraya-watson", robust=False)
+    model = LensModel.fit(samples, fixed)
+    for where in places(4, 5):
+        exact = factorised(samples, where, GREEN, SIZE, pixel=0.3, widths=WIDTHS)
+        exact /= exact.sum()
+        fast = model.query(where, GREEN, SIZE).kernel
+        # the exact sum smooths by h_u^2 = 0.09 px^2 and by the pixel grid; the spline does not
+        assert np.abs(fast - exact).max() <= 0.08 * exact.max()
+
+
+def test_bandwidth_of_the_paper_taken_literally_widens_the_psf() -> None:
+    samples = [s for i in range(3) for s in photo(f"p{i}", i)]
+    where = FieldPosition(0.5, 0.4)
+    literal = PaperModel.fit(samples).kernel_at_settings(where, GREEN, SIZE)
+    ours = LensModel.fit(samples).query(where, GREEN, SIZE).kernel
+
+    assert distance(literal, truth(where)).rel_l2 > 3 * distance(ours, truth(where)).rel_l2
+
+
+def test_bandwidths_are_those_of_green_in_whatever_order_channels_come(good: list[list[PsfSample]]) -> None:
+    green = merged(good[:3])
+    noisy = merged([photo(f"p{i}", i, noise=0.5) for i in range(3)])
+    blue = [replace(s, settings=s.settings.with_channel("b")) for s in noisy]
+    plain = ModelSettings(method="nadaraya-watson", robust=False)
+    of_green = LensModel.fit(green, plain).bandwidth
+
+    for samples in ([*green, *blue], [*blue, *green]):
+        assert LensModel.fit(samples, plain).bandwidth == of_green
+
+
+class TestOutliers:
+    def test_shaken_photo_is_flagged_with_a_reason(self, good: list[list[PsfSample]]) -> None:
+        model = LensModel.fit([*merged(good), *photo("shaken", 50, blur=16.0)])
+
+        flagged = [flag for flag in model.flags() if flag.sample is None]
+
+        assert [flag.photo for flag in flagged] == ["shaken"]
+        assert "motion" in flagged[0].reason
+        assert flagged[0].factor < 0.5
+
+    def test_good_photos_are_not_flagged(self, good: list[list[PsfSample]]) -> None:
+        assert not [flag for flag in LensModel.fit(merged(good)).flags() if flag.sample is None]
+
+    def test_one_bad_photo_moves_the_field_by_less_than_a_tenth_of_a_plain_mean(
+        self, good: list[list[PsfSample]]
+    ) -> None:
+        clean, bad = merged(good), photo("shaken", 50, blur=16.0)
+        fixed = {"r": 0.12, "phi": 0.5, "mirror": 0.0, "method": "nadaraya-watson"}
+
+        def moved(robust: bool) -> float:
+            settings = ModelSettings(robust=robust, **fixed)  # type: ignore[arg-type] # values of one dict
+            before, after = LensModel.fit(clean, settings), LensModel.fit([*clean, *bad], settings)
+            return float(
+                np.mean(
+                    [
+                        np.linalg.norm(
+                            before.query(p, GREEN, SIZE).kernel - after.query(p, GREEN, SIZE).kernel
+                        )
+                        for p in places(15, 77)
+                    ]
+                )
+            )
+
+        assert moved(robust=True) < 0.1 * moved(robust=False)
+
+    def test_flagged_samples_stay_in_the_model(self, good: list[list[PsfSample]]) -> None:
+        samples = [*merged(good), *photo("shaken", 50, blur=16.0)]
+
+        assert len(LensModel.fit(samples).samples) == len(samples)
+
+    def test_excluded_photo_does_not_vote_until_included_again(self, good: list[list[PsfSample]]) -> None:
+        model = LensModel.fit(merged(good[:3]))
+        without = model.excluding("p1")
+        where = FieldPosition(0.5, 0.5)
+
+        left = {without.samples[i].photo for i in without.weights(where, GREEN)[0]}
+
+        assert "p1" not in left
+        assert len(without.samples) == len(model.samples)
+        again = without.including("p1").query(where, GREEN, SIZE).kernel
+        assert np.array_equal(again, model.query(where, GREEN, SIZE).kernel)
+
+
+class TestHonesty:
+    def test_error_falls_with_the_number_of_photos(self) -> None:
+        noisy = [photo(f"p{i}", i, noise=0.3) for i in range(10)]
+
+        assert error(LensModel.fit(merged(noisy))) < 0.75 * error(LensModel.fit(noisy[0]))
+
+    def test_predicted_error_is_of_the_size_of_the_true_one(self) -> None:
+        model = LensModel.fit(merged([photo(f"p{i}", i, noise=0.2) for i in range(6)]))
+        ratios = []
+        for where in places(20, 31):
+            answer = model.query(where, GREEN, SIZE)
+            ratios.append(answer.predicted_error / distance(answer.kernel, truth(where)).rel_l2)
+
+        assert 0.5 < float(np.median(ratios)) < 4.0
+
+    def test_standard_error_covers_the_truth_of_noisy_samples(self) -> None:
+        same = np.array(gaussian(SIZE, np.eye(2) * 2.0))
+        rng = np.random.default_rng(5)
+        samples = [
+            PsfSample(
+                np.maximum(same * (1.0 + rng.normal(0, 0.3, same.shape)), 0), p, GREEN, photo=str(i % 6)
+            )
+            for i, p in enumerate(places(90, 3))
+        ]
+        model = LensModel.fit(samples, ModelSettings(method="nadaraya-watson", r=0.3, phi=1.0))
+        answer = model.query(FieldPosition(0.5, 0.0), GREEN, SIZE)
+        assert answer.std is not None
+        core = same > 0.1 * same.max()
+
+        assert answer.std.shape == (SIZE, SIZE)
+        assert 0.3 < float(np.abs(answer.kernel - same)[core].mean() / answer.std[core].mean()) < 2.5
+
+    def test_corner_without_samples_is_called_extrapolated(self) -> None:
+        inner = [s for i in range(3) for s in photo(f"p{i}", i) if s.position.r < 0.5]
+        model = LensModel.fit(inner)
+
+        assert "r" in model.query(FieldPosition(1.0, 0.2), GREEN, SIZE).beyond
+        assert not model.query(FieldPosition(0.3, 0.2), GREEN, SIZE).extrapolated
+
+    def test_cross_validation_knows_zones_and_needs_two_photos(self, good: list[list[PsfSample]]) -> None:
+        assert LensModel.fit(good[0]).cross_validate() == {}
+        assert set(LensModel.fit(merged(good[:3])).cross_validate()) <= {"center", "mid", "corner"}
+
+
+class TestSharedError:
+    def told(self, photos: int, noise: float, expected: float | None) -> LensModel:
+        samples = merged([photo(f"p{i}", i, noise=noise) for i in range(photos)])
+        return LensModel.fit([replace(s, error=expected) for s in samples])
+
+    def test_what_estimators_expect_does_not_fall_with_the_number_of_photos(self) -> None:
+        where = FieldPosition(0.5, 0.3)
+        few, many = (self.told(n, 0.1, 0.3).query(where, GREEN, SIZE) for n in (2, 8))
+
+        assert many.predicted_error >= many.shared_error > 0.2
+        assert many.shared_error == pytest.approx(few.shared_error, rel=0.1)
+
+    def test_what_scatters_is_not_shared(self) -> None:
+        where = FieldPosition(0.5, 0.3)
+        quiet, noisy = (self.told(6, noise, 0.3).query(where, GREEN, SIZE) for noise in (0.02, 0.5))
+
+        assert noisy.shared_error < quiet.shared_error
+        assert quiet.shared_error == pytest.approx(0.3, abs=0.02)
+
+    def test_estimators_that_expect_nothing_share_nothing(self) -> None:
+        assert self.told(3, 0.1, None).query(FieldPosition(0.5, 0.3), GREEN, SIZE).shared_error == 0.0
+
+    @pytest.mark.parametrize("bad", [-0.1, math.nan, math.inf])
+    def test_impossible_expectations_are_refused(self, bad: float) -> None:
+        with pytest.raises(InvalidInputError, match="expected error"):
+            self.told(1, 0.1, bad)
+
+
+class TestPrior:
+    def test_prior_fills_what_was_never_seen_and_fades_with_evidence(self) -> None:
+        others = LensModel.fit(merged([photo(f"o{i}", i) for i in range(5)]))
+        here = LensModel.fit([s for s in photo("a", 20) if s.position.r < 0.5]).with_prior(others)
+
+        outside = here.query(FieldPosition(0.95, 1.0), GREEN, SIZE)
+        alone = here.with_prior(None).query(FieldPosition(0.95, 1.0), GREEN, SIZE)
+
+        assert outside.prior_share > 0.9
+        assert alone.prior_share == 0.0
+        assert distance(outside.kernel, truth(FieldPosition(0.95, 1.0))).rel_l2 < (
+            distance(alone.kernel, truth(FieldPosition(0.95, 1.0))).rel_l2
+        )
+
+    def test_prior_gives_way_as_photos_come_in(self) -> None:
+        others, where = LensModel.fit(merged([photo(f"o{i}", i) for i in range(3)])), FieldPosition(0.5, 0.4)
+        shares = []
+        for count in (1, 4, 12):
+            samples = merged([photo(f"a{i}", 20 + i) for i in range(count)])
+            answer = LensModel.fit(samples, prior=Prior(others, 2.0, "copy L-2")).query(where, GREEN, SIZE)
+            shares.append(answer.prior_share)
+            assert answer.prior == "copy L-2"
+
+        assert shares[0] > shares[1] > shares[2]
+
+    def test_prior_of_the_prior_does_not_count(self) -> None:
+        first, second, third = (LensModel.fit(photo(f"a{i}", i)) for i in range(3))
+        chain_ = first.with_prior(second.with_prior(third))
+
+        assert chain_.prior is not None
+        assert isinstance(chain_.prior.source, LensModel)
+        assert chain_.prior.source.prior is None
+
+    def test_prior_travels_with_the_profile(self, tmp_path: Path) -> None:
+        here = LensModel.fit(photo("a", 20)).with_prior(LensModel.fit(photo("o", 1)), 3.0, "copy L-2")
+        save_profile(tmp_path / "a.lensprofile", LensProfile(here))
+        where = FieldPosition(0.95, 1.0)
+
+        again = load_profile(tmp_path / "a.lensprofile").model.query(where, GREEN, SIZE)
+
+        assert again.prior == "copy L-2"
+        assert again.prior_share > 0
+        assert np.abs(again.kernel - here.query(where, GREEN, SIZE).kernel).max() <= 1e-6
+
+    def test_strength_must_be_positive(self) -> None:
+        model = LensModel.fit(photo("a", 0))
+        with pytest.raises(InvalidInputError, match="positive"):
+            model.with_prior(model, 0.0)
+
+
+class TestProfile:
+    def profile(self) -> LensProfile:
+        samples = merged([photo(f"p{i}", i, noise=0.02) for i in range(3)])
+        settings = ModelSettings(excluded=("p1",), phi=0.4)
+        return LensProfile(LensModel.fit(samples, settings), {"serial": "1"}, {"p0": "a.dng"})
+
+    def test_comes_back_with_the_same_answers(self, tmp_path: Path) -> None:
+        before = self.profile()
+        save_profile(tmp_path / "a.lensprofile", before)
+        after = load_profile(tmp_path / "a.lensprofile")
+
+        assert after.lens == before.lens
+        assert after.photos == before.photos
+        assert after.model.settings == before.model.settings
+        for where in places(5, 1):
+            a, b = before.model.query(where, GREEN, SIZE), after.model.query(where, GREEN, SIZE)
+            assert np.abs(a.kernel - b.kernel).max() <= 1e-6
+            assert a.predicted_error == pytest.approx(b.predicted_error, rel=1e-4)
+
+    @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 nonsense", b"\x80\x04pickle"])
+    def test_other_bytes_are_refused(self, content: bytes, tmp_path: Path) -> None:
+        (tmp_path / "a.lensprofile").write_bytes(content)
+
+        with pytest.raises(InvalidInputError, match="no lens profile"):
+            load_profile(tmp_path / "a.lensprofile")
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            {"format": 99},
+            {"model": {"method": "magic"}},
+            {"model": {"unknown": 1}},
+            {"samples": []},
+            {"lens": 7},
+            {"samples": [{"r": "far"}] * 48},
+            {"samples": [{"r": 10**400}] * 48},
+        ],
+    )
+    def test_tampered_document_is_refused(self, change: dict[str, object], tmp_path: Path) -> None:
+        path = tmp_path / "a.lensprofile"
+        save_profile(path, self.profile())
+        with zipfile.ZipFile(path) as archive:
+            parts = {name: archive.read(name) for name in archive.namelist()}
+        parts["profile.json"] = json.dumps({**json.loads(parts["profile.json"]), **change}).encode()
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, data in parts.items():
+                archive.writestr(name, data)
+
+        with pytest.raises(InvalidInputError):
+            load_profile(path)
+
+    def test_what_could_not_be_opened_is_not_written(self, tmp_path: Path) -> None:
+        kernel = np.zeros((257, 257))
+        kernel[128, 128] = 1.0
+        model = LensModel.fit([PsfSample(kernel, FieldPosition(0.1, 0.0))])
+
+        with pytest.raises(InvalidInputError, match="side 255"):
+            save_profile(tmp_path / "a.lensprofile", LensProfile(model))
+        assert not list(tmp_path.iterdir())
+
+    def test_every_truncation_and_flipped_byte_is_refused_or_harmless(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.lensprofile"
+        save_profile(path, LensProfile(LensModel.fit(photo("a", 0, count=3))))
+        whole, rng = path.read_bytes(), np.random.default_rng(0)
+        damaged = [whole[: int(n)] for n in rng.integers(0, len(whole), 10)]
+        for at in rng.integers(0, len(whole), 30):
+            changed = bytearray(whole)
+            changed[at] ^= 0xFF
+            damaged.append(bytes(changed))
+        for data in damaged:
+            path.write_bytes(data)
+            with contextlib.suppress(InvalidInputError):  # anything else fails the test
+                assert len(load_profile(path).model.samples) == 3
+
+    def test_opens_without_what_was_learned(self, tmp_path: Path) -> None:
+        path, where = tmp_path / "a.lensprofile", FieldPosition(0.5, 0.5)
+        save_profile(path, self.profile())
+        known = load_profile(path).model.query(where, GREEN, SIZE)
+        with zipfile.ZipFile(path) as archive:
+            parts = {name: archive.read(name) for name in ("profile.json", "kernels.npy")}
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, data in parts.items():
+                archive.writestr(name, data)
+
+        again = load_profile(path).model.query(where, GREEN, SIZE)
+
+        assert np.abs(again.kernel - known.kernel).max() <= 1e-6
+
+
+class TestLearned:
+    def test_gives_the_same_answers_without_a_fit(self, good: list[list[PsfSample]]) -> None:
+        model = LensModel.fit(merged(good[:3])).added(good[3][:2])
+        again = LensModel.restored(model.samples, model.learned())
+
+        for where in places(4, 2):
+            a, b = model.query(where, GREEN, SIZE), again.query(where, GREEN, SIZE)
+            assert np.array_equal(a.kernel, b.kernel)
+            assert a.predicted_error == b.predicted_error
+        assert again.flags() == model.flags()
+        assert again.added(good[4]).samples == model.added(good[4]).samples
+
+    def test_keeps_the_wavefront(self, good: list[list[PsfSample]]) -> None:
+        mixed, where = ModelSettings(mode="mixed"), FieldPosition(0.9, 0.5)
+        model = LensModel.fit(good[0], mixed).warmed()
+        again = LensModel.restored(model.samples, model.learned(), mixed)
+
+        assert again.warm
+        assert np.array_equal(again.query(where, GREEN, SIZE).kernel, model.query(where, GREEN, SIZE).kernel)
+
+    def test_of_other_samples_is_refused(self, good: list[list[PsfSample]]) -> None:
+        learned = LensModel.fit(good[0]).learned()
+
+        with pytest.raises(InvalidInputError, match="other samples"):
+            LensModel.restored(good[1], learned)
+        with pytest.raises(InvalidInputError, match="other samples"):
+            LensModel.restored(good[0], learned, ModelSettings(method="blended"))
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            {"widths": {"reference": math.nan}},
+            {"choice": {"mirror": -1.0}},
+            {"choice": {"r": 0.0}},
+            {"rule": {"r": 0.0}},
+            {"bandwidth": {"phi": math.inf}},
+            {"size": math.inf},
+            {"votes": 0.0},
+            {"errors": -1.0},
+        ],
+    )
+    def test_out_of_range_is_refused(self, change: dict[str, object], good: list[list[PsfSample]]) -> None:
+        with np.load(io.BytesIO(LensModel.fit(good[0]).learned())) as stored:
+            arrays = dict(stored)
+        document = json.loads(arrays["document"].tobytes())
+        for name, value in change.items():
+            if name in arrays:
+                arrays[name][:] = value
+            else:
+                document[name] = {**document[name], **value} if isinstance(value, dict) else value
+        arrays["document"] = np.frombuffer(json.dumps(document).encode(), dtype=np.uint8)
+        buffer = io.BytesIO()
+        np.savez(buffer, **arrays)
+
+        with pytest.raises(InvalidInputError):
+            LensModel.restored(good[0], buffer.getvalue())
+
+    def test_damaged_is_refused_or_harmless(self, good: list[list[PsfSample]]) -> None:
+        samples = good[0][:4]
+        whole, rng = LensModel.fit(samples).learned(), np.random.default_rng(0)
+        damaged = [whole[: int(n)] for n in rng.integers(0, len(whole), 10)]
+        for at in rng.integers(0, len(whole), 30):
+            changed = bytearray(whole)
+            changed[at] ^= 0xFF
+            damaged.append(bytes(changed))
+        for data in damaged:
+            with contextlib.suppress(InvalidInputError):  # anything else fails the test
+                assert len(LensModel.restored(samples, data).samples) == 4

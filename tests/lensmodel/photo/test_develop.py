@@ -1,0 +1,461 @@
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import imagecodecs
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image, ImageCms
+from scipy import ndimage
+
+from lensmodel import photo
+from lensmodel.core import codec
+from lensmodel.core.errors import (
+    InvalidInputError,
+    RawDecodeError,
+    TruncatedImageError,
+    UnsupportedFormatError,
+)
+from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, srgb_to_linear
+from lensmodel.photo.dng import ShotInfo, write_bayer_dng, write_linear_dng
+
+BLACK, WHITE = 512, 15000
+
+
+def raw_numbers(linear: NDArray[np.floating]) -> NDArray[np.uint16]:
+    return np.rint(BLACK + linear * (WHITE - BLACK)).astype(np.uint16)
+
+
+def textured(height: int, width: int, seed: int = 0) -> NDArray[np.float64]:
+    rng = np.random.default_rng(seed)
+    smooth = ndimage.gaussian_filter(rng.standard_normal((height, width)), 3)
+    return np.clip(0.3 + 1.2 * smooth, 0.05, 0.8)
+
+
+def save(tmp_path: Path, kind: str, pixels: NDArray[np.generic], **options: object) -> Path:
+    path = tmp_path / f"x.{kind}"
+    if kind == "tiff":
+        tifffile.imwrite(path, pixels, **options)
+    elif kind == "png":
+        path.write_bytes(imagecodecs.png_encode(pixels))
+    return path
+
+
+# --- RAW ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("level", [0.1, 0.5, 0.9])
+def test_raw_numbers_become_linear_light_with_saturation_at_one(tmp_path: Path, level: float) -> None:
+    mosaic = raw_numbers(np.full((64, 64), level))
+    mosaic[:, ::16] += 1  # a row of equal numbers would be an empty one
+    mosaic[20:44, 20:44] = WHITE
+    write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE)
+    developed = photo.develop(tmp_path / "x.dng")
+
+    assert developed.planes.dtype == np.float32
+    assert developed.planes[:, 4, 8] == pytest.approx(level, abs=1e-4)
+    assert (developed.planes[:, 32, 32] == 1.0).all()
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG"])
+def test_developed_planes_say_which_pixels_the_sensor_measured(tmp_path: Path, pattern: str) -> None:
+    mosaic = raw_numbers(textured(64, 96))
+    write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE, pattern=pattern)
+
+    developed = photo.develop(tmp_path / "x.dng")
+
+    assert developed.cfa is not None
+    assert "".join("RGB"[c] for row in developed.cfa for c in row) == pattern
+    rows, cols = np.indices(mosaic.shape)
+    channel = np.asarray(developed.cfa)[rows % 2, cols % 2]
+    at_sites = np.take_along_axis(developed.planes, channel[None], axis=0)[0]
+    inside = (slice(8, -8), slice(8, -8))
+    np.testing.assert_allclose(at_sites[inside], ((mosaic - BLACK) / (WHITE - BLACK))[inside], atol=2e-4)
+
+
+def test_half_size_planes_have_no_mosaic_any_more(tmp_path: Path) -> None:
+    write_bayer_dng(tmp_path / "x.dng", raw_numbers(textured(64, 96)), black=BLACK, white=WHITE)
+
+    assert photo.develop(tmp_path / "x.dng", demosaic="half").cfa is None
+
+
+def test_the_brightest_pixel_does_not_become_the_white(tmp_path: Path) -> None:
+    write_bayer_dng(tmp_path / "x.dng", raw_numbers(textured(64, 96)), black=BLACK, white=WHITE)
+
+    assert photo.develop(tmp_path / "x.dng").planes.max() < 0.85
+
+
+def test_saturation_is_where_the_clipped_pixels_pile_up_and_not_where_the_file_says(tmp_path: Path) -> None:
+    scene = textured(128, 128) * 1.0
+    scene[40:80, 40:80] = 2.0
+    mosaic = np.minimum(raw_numbers(scene), 13000)
+    write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE)
+    planes = photo.develop(tmp_path / "x.dng").planes
+
+    assert (planes[:, 60, 60] == 1.0).all()
+    expected = (textured(128, 128)[10, 10] * (WHITE - BLACK)) / (13000 - BLACK)
+    assert planes[:, 10, 10] == pytest.approx(expected, rel=0.05)
+
+
+def test_full_wells_that_differ_by_a_hundredth_are_one_pile_although_hot_pixels_shine_beyond(
+    tmp_path: Path,
+) -> None:
+    rng = np.random.default_rng(5)
+    scene = textured(128, 128) * 1.0
+    scene[40:80, 40:80] = 2.0
+    wells = 0.93 + 0.003 * np.clip(rng.standard_normal(scene.shape), -3.0, 3.0)
+    wells[41, 42] = wells[60, 60] = 0.97
+    mosaic = BLACK + np.rint(np.minimum(scene, wells) * (WHITE - BLACK)).astype(np.uint16)
+    write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE)
+    developed = photo.develop(tmp_path / "x.dng")
+
+    blown = developed.planes[:, 44:76, 44:76]
+    assert (blown >= np.array(developed.clip)[:, None, None] - 0.005).mean() > 0.97
+    assert developed.planes[:, 90:, 90:].max() < min(developed.clip)
+
+
+def test_a_colour_that_clips_below_the_others_says_so(tmp_path: Path) -> None:
+    scene = textured(128, 128)
+    scene[40:80, 40:80] = 1.0
+    mosaic = raw_numbers(scene)
+    green = np.zeros(mosaic.shape, dtype=bool)
+    green[::2, 1::2] = green[1::2, ::2] = True
+    mosaic[green] = np.minimum(mosaic[green], BLACK + round(0.95 * (WHITE - BLACK)))
+    write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE)
+
+    assert photo.develop(tmp_path / "x.dng").clip == pytest.approx((1.0, 0.95, 1.0), abs=1e-3)
+
+
+def test_white_balance_is_told_but_not_applied(tmp_path: Path) -> None:
+    mosaic = raw_numbers(np.full((64, 64), 0.4) + 0.001 * np.arange(64))
+    write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE, as_shot_neutral=(0.5, 1.0, 0.625))
+    developed = photo.develop(tmp_path / "x.dng")
+
+    assert developed.white_balance == pytest.approx((2.0, 1.0, 1.6), rel=1e-4)
+    r, g, b = developed.planes[:, 32, 32]
+    assert (r, b) == pytest.approx((g, g), abs=2e-3)
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
+def test_colours_land_in_the_planes_of_their_names(tmp_path: Path, pattern: str) -> None:
+    levels = {"R": 0.6, "G": 0.3, "B": 0.1}
+    mosaic = np.zeros((64, 64))
+    for k, letter in enumerate(pattern):
+        mosaic[k // 2 :: 2, k % 2 :: 2] = levels[letter]
+    write_bayer_dng(tmp_path / "x.dng", raw_numbers(mosaic), black=BLACK, white=WHITE, pattern=pattern)
+
+    assert photo.develop(tmp_path / "x.dng").planes[:, 30, 30] == pytest.approx((0.6, 0.3, 0.1), abs=1e-3)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_raw_stays_in_sensor_orientation(tmp_path: Path, orientation: int) -> None:
+    scene = np.full((64, 96), 0.2) + 0.0005 * np.arange(96)
+    scene[:32, :48] += 0.5  # bright at the upper left of the sensor
+    shot = ShotInfo(orientation=orientation)
+    write_bayer_dng(tmp_path / "x.dng", raw_numbers(scene), black=BLACK, white=WHITE, shot=shot)
+    developed = photo.develop(tmp_path / "x.dng")
+
+    assert developed.planes.shape == (3, 64, 96)
+    assert developed.planes[1, 10, 10] > 0.6
+    assert developed.planes[1, 50, 80] < 0.3
+    assert developed.encoding.orientation == orientation
+
+
+@pytest.mark.parametrize("demosaic", ["ahd", "dht"])
+def test_detail_of_a_weak_red_is_no_stronger_than_it_was(tmp_path: Path, demosaic: photo.Demosaic) -> None:
+    neutral = np.array([0.4, 1.0, 0.6])
+    rows, cols = np.mgrid[:128, :128]
+    grey = 0.4 + 0.2 * np.sin(2 * np.pi * cols / 5.0) * np.cos(2 * np.pi * rows / 7.0)  # 0.24 cycles/pixel
+    mosaic = raw_numbers(grey * neutral[np.tile([[0, 1], [1, 2]], (64, 64))])
+    write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE, as_shot_neutral=neutral)
+    planes = photo.develop(tmp_path / "x.dng", demosaic=demosaic).planes
+
+    for plane, share in zip(planes[:, 16:-16, 16:-16], neutral, strict=True):
+        truth = (grey * share)[16:-16, 16:-16]
+        slope = np.polyfit(truth.ravel(), plane.ravel(), 1)[0]
+        assert slope == pytest.approx(1.0, abs=0.12)
+
+
+def test_half_size_makes_one_pixel_of_each_cell(tmp_path: Path) -> None:
+    mosaic = raw_numbers(textured(64, 96))
+    write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE)
+    developed = photo.develop(tmp_path / "x.dng", demosaic="half")
+
+    assert developed.planes.shape == (3, 32, 48)
+    assert (developed.frame.height, developed.info.width) == (32, 48)
+    red = (mosaic[::2, ::2].astype(float) - BLACK) / (WHITE - BLACK)
+    assert developed.planes[0] == pytest.approx(red, abs=2e-4)
+
+
+def test_pixels_of_half_size_planes_are_twice_as_wide(tmp_path: Path) -> None:
+    mosaic, shot = raw_numbers(textured(64, 96)), ShotInfo(pixel_pitch_um=5.0)
+    write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE, shot=shot)
+    whole, half = (photo.develop(tmp_path / "x.dng", demosaic=how) for how in ("linear", "half"))
+
+    assert whole.info.metadata.pixel_pitch_um == pytest.approx(5.0)
+    assert half.info.metadata.pixel_pitch_um == pytest.approx(10.0)
+    assert half.encoding.metadata.pixel_pitch_um == pytest.approx(10.0)
+
+
+def test_the_pipeline_names_what_was_done(tmp_path: Path) -> None:
+    write_bayer_dng(tmp_path / "x.dng", raw_numbers(textured(64, 96)), black=BLACK, white=WHITE)
+
+    assert photo.develop(tmp_path / "x.dng").pipeline == "raw/ahd/1"
+    assert photo.develop(tmp_path / "x.dng", demosaic="linear").pipeline == "raw/linear/1"
+
+
+def test_an_unknown_demosaicing_is_refused_with_the_known_ones(tmp_path: Path) -> None:
+    write_bayer_dng(tmp_path / "x.dng", raw_numbers(textured(64, 96)), black=BLACK, white=WHITE)
+    with pytest.raises(InvalidInputError, match="ahd, dht, half, linear"):
+        photo.develop(tmp_path / "x.dng", demosaic="magic")  # type: ignore[arg-type]
+
+
+def test_a_linear_dng_keeps_its_planes(tmp_path: Path) -> None:
+    planes = np.stack([textured(64, 96, seed) for seed in range(3)])
+    write_linear_dng(tmp_path / "x.dng", np.rint(planes * 65535).astype(np.uint16))
+    developed = photo.develop(tmp_path / "x.dng")
+
+    assert developed.planes == pytest.approx(planes, abs=1e-4)
+    assert developed.sensor_noise is None
+
+
+def test_raw_data_without_a_picture_are_refused(tmp_path: Path) -> None:
+    write_bayer_dng(tmp_path / "x.dng", np.full((64, 64), 3000, dtype=np.uint16), black=BLACK, white=WHITE)
+    with pytest.raises(RawDecodeError, match="3000"):
+        photo.develop(tmp_path / "x.dng")
+
+
+def test_a_black_frame_is_refused(tmp_path: Path) -> None:
+    dark = np.random.default_rng(0).integers(BLACK - 40, BLACK + 1, (64, 64), dtype=np.uint16)
+    write_bayer_dng(tmp_path / "x.dng", dark, black=BLACK, white=WHITE)
+    with pytest.raises(RawDecodeError, match="black"):
+        photo.develop(tmp_path / "x.dng")
+
+
+def test_empty_rows_mean_that_the_data_were_cut_off(tmp_path: Path) -> None:
+    mosaic = raw_numbers(textured(64, 64))
+    mosaic[40:] = 0
+    write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE)
+    with pytest.raises(TruncatedImageError, match="38% of the rows"):
+        photo.develop(tmp_path / "x.dng")
+
+
+def test_a_saturated_sky_is_no_damage(tmp_path: Path) -> None:
+    mosaic = raw_numbers(textured(64, 64))
+    mosaic[:20] = WHITE
+    write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE)
+
+    assert photo.develop(tmp_path / "x.dng").planes[1, 5, 5] == 1.0
+
+
+def test_rows_of_random_numbers_mean_that_the_decoding_went_wrong(tmp_path: Path) -> None:
+    mosaic = raw_numbers(textured(96, 96))
+    mosaic[32:] = np.random.default_rng(0).integers(0, WHITE, (64, 96), dtype=np.uint16)
+    write_bayer_dng(tmp_path / "x.dng", mosaic, black=BLACK, white=WHITE)
+    with pytest.raises(RawDecodeError, match="random"):
+        photo.develop(tmp_path / "x.dng")
+
+
+# --- TIFF, PNG, JPEG ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["tiff", "png"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_srgb_is_decoded_in_full_precision(tmp_path: Path, kind: str, dtype: type) -> None:
+    top = np.iinfo(dtype).max
+    pixels = np.rint(np.stack([textured(40, 60, k) for k in range(3)], axis=-1) * top).astype(dtype)
+    developed = photo.develop(save(tmp_path, kind, pixels))
+
+    truth = srgb_to_linear(np.moveaxis(pixels, -1, 0) / top)
+    assert developed.planes == pytest.approx(truth, abs=1e-6)
+    assert developed.encoding.bit_depth == 8 * np.dtype(dtype).itemsize
+    assert developed.clip == (1.0, 1.0, 1.0)
+
+
+def test_jpeg_is_decoded_by_the_srgb_curve(tmp_path: Path) -> None:
+    Image.new("RGB", (64, 48), (255, 128, 0)).save(tmp_path / "x.jpg", quality=100, subsampling=0)
+    planes = photo.develop(tmp_path / "x.jpg").planes
+
+    assert planes[:, 20, 20] == pytest.approx([1.0, 0.2159, 0.0], abs=0.01)
+
+
+@pytest.mark.parametrize("compression", [None, "lzw", "zlib"])
+@pytest.mark.parametrize("planar", ["contig", "separate"])
+def test_tiffs_of_all_layouts_are_read(tmp_path: Path, compression: str | None, planar: str) -> None:
+    pixels = np.random.default_rng(0).integers(0, 65535, (40, 60, 3), dtype=np.uint16)
+    stored = pixels if planar == "contig" else np.ascontiguousarray(np.moveaxis(pixels, -1, 0))
+    path = save(tmp_path, "tiff", stored, photometric="rgb", planarconfig=planar, compression=compression)
+
+    truth = srgb_to_linear(np.moveaxis(pixels, -1, 0) / 65535)
+    assert photo.develop(path).planes == pytest.approx(truth, abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["tiff", "png"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_grey_becomes_three_equal_planes(tmp_path: Path, kind: str, dtype: type) -> None:
+    pixels = np.rint(textured(40, 60) * np.iinfo(dtype).max).astype(dtype)
+    planes = photo.develop(save(tmp_path, kind, pixels)).planes
+
+    assert planes[0] == pytest.approx(srgb_to_linear(pixels / np.iinfo(dtype).max), abs=1e-6)
+    assert (planes[1] == planes[0]).all()
+    assert (planes[2] == planes[0]).all()
+
+
+@pytest.mark.parametrize("kind", ["tiff", "png"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_alpha_is_dropped_and_changes_no_colour(tmp_path: Path, kind: str, dtype: type) -> None:
+    pixels = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, (40, 60, 4), dtype=dtype)
+    options = {"photometric": "rgb", "extrasamples": ["unassalpha"]} if kind == "tiff" else {}
+    planes = photo.develop(save(tmp_path, kind, pixels, **options)).planes
+
+    truth = srgb_to_linear(np.moveaxis(pixels[..., :3], -1, 0) / np.iinfo(dtype).max)
+    assert planes == pytest.approx(truth, abs=1e-6)
+
+
+def test_palettes_are_applied(tmp_path: Path) -> None:
+    image = Image.fromarray(np.random.default_rng(0).integers(0, 255, (40, 60, 3), dtype=np.uint8)).quantize(
+        16
+    )
+    image.save(tmp_path / "x.png")
+    image.save(tmp_path / "x.tif")
+    truth = srgb_to_linear(np.moveaxis(np.asarray(image.convert("RGB")), -1, 0) / 255)
+
+    assert photo.develop(tmp_path / "x.png").planes == pytest.approx(truth, abs=1e-6)
+    assert photo.develop(tmp_path / "x.tif").planes == pytest.approx(truth, abs=1e-6)
+
+
+def test_one_bit_is_black_and_white(tmp_path: Path) -> None:
+    bits = np.random.default_rng(0).integers(0, 2, (40, 64)).astype(bool)
+    Image.fromarray(bits).save(tmp_path / "x.png")
+    tifffile.imwrite(tmp_path / "x.tif", bits, photometric="minisblack")
+    tifffile.imwrite(tmp_path / "inverted.tif", ~bits, photometric="miniswhite")
+
+    for name in ("x.png", "x.tif", "inverted.tif"):
+        assert (photo.develop(tmp_path / name).planes[1] == bits).all(), name
+
+
+def test_float_tiffs_are_linear_light(tmp_path: Path) -> None:
+    pixels = np.stack([textured(40, 60, k) for k in range(3)], axis=-1).astype(np.float32)
+    pixels[0, 0] = np.nan
+    pixels[1, 1] = 3.0
+    developed = photo.develop(save(tmp_path, "tiff", pixels, photometric="rgb"))
+
+    assert developed.planes[:, 2:] == pytest.approx(np.moveaxis(pixels, -1, 0)[:, 2:])
+    assert np.isfinite(developed.planes).all()
+    assert developed.clip == (3.0, 3.0, 3.0)
+
+
+def test_only_the_first_of_several_pages_is_the_photo(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 255, (3, 40, 60, 3), dtype=np.uint8)
+    path = save(tmp_path, "tiff", pixels, photometric="rgb", metadata=None)
+
+    truth = srgb_to_linear(np.moveaxis(pixels[0], -1, 0) / 255)
+    assert photo.develop(path).planes == pytest.approx(truth, abs=1e-6)
+
+
+def test_only_the_first_picture_of_a_stereo_jpeg_is_the_photo(tmp_path: Path) -> None:
+    left, right = (Image.new("RGB", (64, 48), grey) for grey in ("white", "black"))
+    left.save(tmp_path / "x.jpg", "MPO", save_all=True, append_images=[right])
+
+    assert photo.develop(tmp_path / "x.jpg").planes.min() > 0.99
+
+
+def test_a_cmyk_tiff_is_refused(tmp_path: Path) -> None:
+    path = save(tmp_path, "tiff", np.zeros((40, 60, 4), dtype=np.uint8), photometric="separated")
+    with pytest.raises(UnsupportedFormatError, match="convert it to RGB"):
+        photo.develop(path)
+
+
+def test_the_curve_of_an_icc_profile_is_used_and_its_primaries_are_kept(tmp_path: Path) -> None:
+    profile = linear_profile(D65_TO_D50 @ SRGB_TO_XYZ_D65, "linear")
+    pixels = np.random.default_rng(0).integers(0, 65535, (40, 60, 3), dtype=np.uint16)
+    path = save(tmp_path, "tiff", pixels, photometric="rgb", iccprofile=profile)
+    developed = photo.develop(path)
+
+    assert developed.planes == pytest.approx(np.moveaxis(pixels, -1, 0) / 65535, abs=1e-6)
+    assert developed.encoding.transfer == "icc"
+    assert developed.encoding.icc == profile
+
+
+def test_the_srgb_profile_of_littlecms_gives_the_srgb_curve(tmp_path: Path) -> None:
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    pixels = np.random.default_rng(0).integers(0, 255, (40, 60, 3), dtype=np.uint8)
+    path = save(tmp_path, "tiff", pixels, photometric="rgb", iccprofile=profile)
+    developed = photo.develop(path)
+
+    assert developed.encoding.transfer == "icc"
+    assert developed.planes == pytest.approx(srgb_to_linear(np.moveaxis(pixels, -1, 0) / 255), abs=2e-4)
+
+
+def test_a_nonsense_profile_is_ignored(tmp_path: Path) -> None:
+    out = io.BytesIO()
+    Image.new("RGB", (64, 48), "grey").save(out, "JPEG", icc_profile=b"\0" * 200)
+    (tmp_path / "x.jpg").write_bytes(out.getvalue())
+
+    assert photo.develop(tmp_path / "x.jpg").encoding.transfer == "srgb"
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_a_turned_jpeg_is_developed_as_the_sensor_saw_it(tmp_path: Path, orientation: int) -> None:
+    pixels = np.zeros((48, 64, 3), dtype=np.uint8)
+    pixels[:24, :32] = 255
+    block = Image.Exif()
+    block[0x0112] = orientation
+    Image.fromarray(pixels).save(tmp_path / "x.jpg", exif=block)
+    developed = photo.develop(tmp_path / "x.jpg")
+
+    assert developed.planes.shape == (3, 48, 64)
+    assert developed.planes[1, 8, 8] > 0.9
+    assert developed.planes[1, 40, 56] < 0.1
+    assert developed.info.metadata.orientation == orientation
+
+
+def test_all_but_the_planes_travels_as_json(tmp_path: Path) -> None:
+    write_bayer_dng(tmp_path / "x.dng", raw_numbers(textured(64, 96)), black=BLACK, white=WHITE)
+    developed = photo.develop(tmp_path / "x.dng")
+    for value in (developed.info, developed.encoding, developed.frame):
+        assert codec.from_json(type(value), codec.to_json(value)) == value
+
+
+# --- real files --------------------------------------------------------------------------------
+
+
+@pytest.mark.tools
+@pytest.mark.parametrize(
+    ("name", "size", "pipeline"),
+    [
+        ("nikon_d1.nef", (1324, 2012), "raw/ahd/1"),
+        ("canon_kissx4_colorchart.dng", (1156, 1734), "raw/ahd/1"),
+        ("canon_6d_ef24-105_serial.dng", (816, 1224), "raw/none/1"),
+    ],
+)
+def test_real_raw_files_become_photos(
+    shared_data: Path, name: str, size: tuple[int, int], pipeline: str
+) -> None:
+    developed = photo.develop(shared_data / "raw" / name)
+    info = photo.inspect(shared_data / "raw" / name)
+
+    assert developed.planes.shape[1:] == size == (info.height, info.width)
+    assert developed.pipeline == pipeline
+    assert 0.01 < developed.planes.mean() < 0.5
+    # A picture: neighbours are alike, in each plane and between the planes.
+    for plane in developed.planes:
+        assert np.corrcoef(plane[:, 1:].ravel(), plane[:, :-1].ravel())[0, 1] > 0.9
+    assert np.corrcoef(developed.planes[0].ravel(), developed.planes[1].ravel())[0, 1] > 0.5
+
+
+@pytest.mark.tools
+def test_the_greens_of_the_nikon_d1_clip_below_its_red(shared_data: Path) -> None:
+    red, green, _ = photo.develop(shared_data / "raw" / "nikon_d1.nef").clip
+
+    assert red == 1.0
+    assert green == pytest.approx(0.973, abs=0.003)
+
+
+@pytest.mark.tools
+def test_a_raw_kind_that_libraw_lacks_is_refused_politely(shared_data: Path) -> None:
+    with pytest.raises(UnsupportedFormatError, match="VC-5"):
+        photo.inspect(shared_data / "raw" / "gopro_hero6_unsupported.gpr")

@@ -1,0 +1,254 @@
+from __future__ import annotations
+
+import contextlib
+import io
+import struct
+import tracemalloc
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from lensmodel import photo
+from lensmodel.core.errors import (
+    DecompressionBombError,
+    ImageTooLargeError,
+    LensModelError,
+    NotAnImageError,
+    TruncatedImageError,
+    UnsupportedFormatError,
+)
+from lensmodel.photo.dng import write_bayer_dng, write_linear_dng
+from lensmodel.photo.headers.ifd import Entry
+
+
+def chunk(name: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+
+
+def png_claiming(width: int, height: int) -> bytes:
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(b""))
+        + chunk(b"IEND", b"")
+    )
+
+
+def encoded(kind: str, image: Image.Image | None = None) -> bytes:
+    out = io.BytesIO()
+    noise = np.random.default_rng(3).integers(0, 255, (40, 60, 3), dtype=np.uint8)
+    (image or Image.fromarray(noise)).save(out, kind)
+    return out.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("head", "kind"),
+    [
+        (b"\xff\xd8\xff\xe0", "jpeg"),
+        (b"\x89PNG\r\n\x1a\n", "png"),
+        (b"II*\0\x08\0\0\0", "tiff"),
+        (b"MM\0*\0\0\0\x08", "tiff"),
+        (b"II*\0\x10\0\0\0CR\x02\0", "raw"),
+        (b"FUJIFILMCCD-RAW 0201", "raw"),
+        (b"IIU\0\x18\0\0\0", "raw"),
+        (b"IIRO\x08\0\0\0", "raw"),
+        (b"\0\0\0\x18ftypcrx \0\0\0\x01", "raw"),
+    ],
+)
+def test_sniff_names_the_kind_by_the_first_bytes(head: bytes, kind: str) -> None:
+    assert photo.sniff(head) == kind
+
+
+@pytest.mark.parametrize("head", [b"", b"hello world", b"%!PS", b"\0" * 64, b"PK\x03\x04", b"\xff\xd8"])
+def test_sniff_refuses_what_is_no_image(head: bytes) -> None:
+    with pytest.raises(NotAnImageError):
+        photo.sniff(head)
+
+
+@pytest.mark.parametrize("head", [b"GIF89a", b"RIFF\0\0\0\0WEBPVP8 ", b"\0\0\0\x1cftypheic", b"8BPS\0\x01"])
+def test_sniff_says_which_image_formats_it_does_not_read(head: bytes) -> None:
+    with pytest.raises(UnsupportedFormatError, match="not read"):
+        photo.sniff(head)
+
+
+@given(st.binary(max_size=64))
+def test_sniff_never_raises_anything_else(head: bytes) -> None:
+    with contextlib.suppress(LensModelError):
+        photo.sniff(head)
+
+
+def test_the_name_of_a_file_does_not_matter(tmp_path: Path) -> None:
+    path = tmp_path / "really.nef"
+    path.write_bytes(encoded("JPEG"))
+
+    assert photo.inspect(path).kind == "jpeg"
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF"])
+def test_inspect_tells_kind_and_size(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "photo"
+    path.write_bytes(encoded(kind))
+    info = photo.inspect(path)
+
+    assert (info.kind, info.width, info.height) == (kind.lower(), 60, 40)
+
+
+def test_inspect_tells_dng_from_tiff_and_its_size(tmp_path: Path) -> None:
+    mosaic = np.random.default_rng(0).integers(600, 9000, (48, 64), dtype=np.uint16)
+    write_bayer_dng(tmp_path / "bayer", mosaic, black=512, white=15000)
+    write_linear_dng(tmp_path / "linear", np.repeat(mosaic[None], 3, axis=0))
+
+    for name in ("bayer", "linear"):
+        info = photo.inspect(tmp_path / name)
+        assert (info.kind, info.width, info.height) == ("dng", 64, 48)
+
+
+def test_a_size_claimed_without_the_bytes_for_it_is_a_bomb(tmp_path: Path) -> None:
+    path = tmp_path / "bomb.png"
+    path.write_bytes(png_claiming(20000, 20000))
+    with pytest.raises(DecompressionBombError, match="20000 x 20000"):
+        photo.inspect(path)
+
+
+def test_a_bomb_within_the_limit_of_megapixels_is_still_a_bomb(tmp_path: Path) -> None:
+    path = tmp_path / "bomb.png"
+    path.write_bytes(png_claiming(10000, 10000))
+    with pytest.raises(DecompressionBombError):
+        photo.inspect(path)
+
+
+def test_an_honest_photo_over_the_limit_is_too_large_and_no_bomb(tmp_path: Path) -> None:
+    path = tmp_path / "big.tif"
+    tifffile.imwrite(path, np.zeros((400, 500, 3), dtype=np.uint8))
+    with pytest.raises(ImageTooLargeError, match=r"limit is 0\.1 MP") as caught:
+        photo.inspect(path, photo.Limits(max_megapixels=0.1))
+
+    assert not isinstance(caught.value, DecompressionBombError)
+
+
+def test_a_file_of_too_many_bytes_is_refused_before_it_is_parsed(tmp_path: Path) -> None:
+    path = tmp_path / "x.png"
+    path.write_bytes(encoded("PNG"))
+    with pytest.raises(ImageTooLargeError, match="limit is 100"):
+        photo.inspect(path, photo.Limits(max_bytes=100))
+
+
+def test_the_limits_hold_for_raw_files(tmp_path: Path) -> None:
+    mosaic = np.random.default_rng(0).integers(600, 9000, (400, 600), dtype=np.uint16)
+    write_bayer_dng(tmp_path / "x.dng", mosaic, black=512, white=15000)
+    with pytest.raises(ImageTooLargeError):
+        photo.inspect(tmp_path / "x.dng", photo.Limits(max_megapixels=0.1))
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF"])
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.6, 0.95])
+def test_a_file_that_was_cut_off_never_becomes_a_photo(tmp_path: Path, kind: str, share: float) -> None:
+    data = encoded(kind)
+    path = tmp_path / "cut"
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises((TruncatedImageError, NotAnImageError)):
+        photo.develop(path)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.5, 0.9])
+def test_a_raw_file_that_was_cut_off_never_becomes_a_photo(tmp_path: Path, share: float) -> None:
+    mosaic = np.random.default_rng(0).integers(600, 9000, (96, 128), dtype=np.uint16)
+    whole = tmp_path / "whole.dng"
+    write_bayer_dng(whole, mosaic, black=512, white=15000)
+    cut = tmp_path / "cut.dng"
+    cut.write_bytes(whole.read_bytes()[: int(share * whole.stat().st_size)])
+    with pytest.raises(TruncatedImageError):
+        photo.develop(cut)
+
+
+def test_an_empty_file_is_no_image(tmp_path: Path) -> None:
+    (tmp_path / "x").write_bytes(b"")
+    with pytest.raises(NotAnImageError, match="empty"):
+        photo.inspect(tmp_path / "x")
+
+
+def test_a_cmyk_jpeg_is_refused_with_the_remedy(tmp_path: Path) -> None:
+    path = tmp_path / "print.jpg"
+    path.write_bytes(encoded("JPEG", Image.new("CMYK", (64, 48))))
+    with pytest.raises(UnsupportedFormatError, match="convert it to RGB"):
+        photo.inspect(path)
+
+
+def test_an_icon_is_no_photo(tmp_path: Path) -> None:
+    path = tmp_path / "icon.png"
+    path.write_bytes(encoded("PNG", Image.new("RGB", (8, 8))))
+    with pytest.raises(NotAnImageError, match="8 x 8"):
+        photo.inspect(path)
+
+
+def test_a_tiff_whose_directories_form_a_loop_is_read_once(tmp_path: Path) -> None:
+    data = bytearray(encoded("TIFF"))
+    first = struct.unpack("<I", data[4:8])[0]
+    count = struct.unpack("<H", data[first : first + 2])[0]
+    data[first + 2 + 12 * count : first + 6 + 12 * count] = struct.pack("<I", first)
+    path = tmp_path / "loop.tif"
+    path.write_bytes(bytes(data))
+
+    assert photo.inspect(path).width == 60
+
+
+def test_a_tiff_of_a_hundred_pictures_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "many.tif"
+    tifffile.imwrite(path, np.zeros((100, 32, 32), dtype=np.uint8), photometric="minisblack", metadata=None)
+    with pytest.raises(UnsupportedFormatError, match="pictures"):
+        photo.inspect(path)
+
+
+def test_one_number_of_a_huge_tag_unpacks_no_other() -> None:
+    entry = Entry(kind=5, count=1 << 20, offset=0, order="<", buffer=struct.pack("<II", 7, 2) * (1 << 20))
+    tracemalloc.start()
+    found = entry.number()
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+
+    assert found == 3.5
+    assert peak < 2 * entry.count * 8  # a copy of the bytes; as numbers they take seven times as much
+
+
+@pytest.mark.parametrize("kind", ["tif", "dng"])
+def test_a_size_that_is_no_whole_number_is_no_size(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / f"x.{kind}"
+    if kind == "tif":
+        path.write_bytes(encoded("TIFF"))
+    else:
+        write_bayer_dng(path, np.full((32, 32), 900, dtype=np.uint16), black=512, white=15000)
+    data = bytearray(path.read_bytes())
+    first, far = struct.unpack("<I", data[4:8])[0], struct.pack("<I", len(data))
+    for tag in (256, 257):
+        at = next(i for i in range(first + 2, len(data), 12) if data[i : i + 2] == struct.pack("<H", tag))
+        data[at + 2 : at + 12] = struct.pack("<HI", 12, 1) + far  # a double
+    path.write_bytes(bytes(data) + struct.pack("<d", 1e300))
+
+    with pytest.raises(LensModelError):
+        photo.inspect(path)
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(data=st.data(), kind=st.sampled_from(["JPEG", "PNG", "TIFF", "DNG"]))
+def test_a_damaged_header_gives_our_errors_or_a_photo(
+    data: st.DataObject, kind: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.mktemp("fuzz") / "x"
+    if kind == "DNG":
+        write_bayer_dng(path, np.full((32, 32), 900, dtype=np.uint16), black=512, white=15000)
+    else:
+        path.write_bytes(encoded(kind))
+    damaged = bytearray(path.read_bytes())
+    places = st.tuples(st.integers(0, min(len(damaged), 600) - 1), st.integers(0, 255))
+    for at, value in data.draw(st.lists(places, min_size=1, max_size=6)):
+        damaged[at] = value
+    path.write_bytes(bytes(damaged))
+    with contextlib.suppress(LensModelError):
+        photo.inspect(path)

@@ -1,0 +1,180 @@
+"""Where a photo was taken is found wherever a file says it, and nothing else is touched."""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image, PngImagePlugin
+
+from lensmodel.photo.tags.location import FoundLocation, find_location
+
+LATITUDE = (47.0, 13.0, 14.159)
+SECRET = struct.pack(">II", 14159, 1000), struct.pack("<II", 14159, 1000)
+PIXELS = np.random.default_rng(1).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+XMP = (
+    b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF><rdf:Description exif:GPSLatitude="47,13.236N" '
+    b'drone-dji:GpsLongitude = "+11.376" exif:FNumber="14/10"><exif:GPSAltitude>519/1</exif:GPSAltitude>'
+    b"</rdf:Description></rdf:RDF></x:xmpmeta>"
+)
+
+
+def with_gps() -> Image.Exif:
+    exif = Image.Exif()
+    exif[0x010F] = "Maker"
+    exif.get_ifd(0x8769)[0x829D] = 1.4
+    exif.get_ifd(0x8825).update({1: "N", 2: LATITUDE, 3: "E", 4: (11.0, 22.0, 33.0)})
+    return exif
+
+
+def saved(kind: str, **options: Any) -> bytes:
+    out = io.BytesIO()
+    Image.fromarray(PIXELS).save(out, kind, **options)
+    return out.getvalue()
+
+
+def cleaned(data: bytes) -> tuple[bytes, FoundLocation]:
+    found = find_location(data)
+    changed = bytearray(data)
+    for one in found.overwrites:
+        changed[one.start : one.start + len(one.data)] = one.data
+    assert len(changed) == len(data)
+    return bytes(changed), found
+
+
+def tiff_with_gps() -> bytes:
+    """Write a grey TIFF by hand: image libraries leave GPS directories out of TIFF files."""
+    pixels = PIXELS[:, :, 0].tobytes()
+    rational = struct.pack("<6I", 47, 1, 13, 1, 14159, 1000)
+    exposure = struct.pack("<2I", 14, 10)
+    main, exif, gps = 8, 8 + 2 + 12 * 12 + 4, 8 + 2 + 12 * 12 + 4 + 18
+    maker = gps + 2 + 2 * 12 + 4
+    fraction, latitude, strip = maker + 6, maker + 14, maker + 38
+    tags = [
+        *((256, 4, 1, 64), (257, 4, 1, 48), (258, 3, 1, 8), (259, 3, 1, 1), (262, 3, 1, 1)),
+        *((271, 2, 6, maker), (273, 4, 1, strip), (277, 3, 1, 1), (278, 4, 1, 48), (279, 4, 1, len(pixels))),
+        *((34665, 4, 1, exif), (34853, 4, 1, gps)),
+    ]
+
+    def directory(entries: list[tuple[int, int, int, int]]) -> bytes:
+        packed = b"".join(struct.pack("<HHII", *entry) for entry in entries)
+        return struct.pack("<H", len(entries)) + packed + bytes(4)
+
+    places = [(1, 2, 2, int.from_bytes(b"N\0\0\0", "little")), (2, 5, 3, latitude)]
+    parts = [directory(tags), directory([(0x829D, 5, 1, fraction)]), directory(places), b"Maker\0"]
+    return b"II*\0" + struct.pack("<I", main) + b"".join(parts) + exposure + rational + pixels
+
+
+FILES = {
+    "jpeg": saved("jpeg", exif=with_gps(), quality=95),
+    "tiff": tiff_with_gps(),
+    "png": saved("png", exif=with_gps()),
+}
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_the_place_goes_and_the_rest_stays(kind: str) -> None:
+    data = FILES[kind]
+    assert Image.open(io.BytesIO(data)).getexif().get_ifd(0x8825)[2][0] == LATITUDE[0]
+
+    after, found = cleaned(data)
+
+    assert found.complete
+    assert not any(secret in after for secret in SECRET)
+    before, now = Image.open(io.BytesIO(data)), Image.open(io.BytesIO(after))
+    assert not now.getexif().get_ifd(0x8825)
+    assert now.getexif()[0x010F] == "Maker"
+    assert now.getexif().get_ifd(0x8769)[0x829D] == before.getexif().get_ifd(0x8769)[0x829D]
+    assert np.array_equal(np.asarray(now), np.asarray(before))
+    assert find_location(after).overwrites == ()  # nothing is left to find
+
+
+def test_values_in_xmp_become_blanks_and_other_values_stay() -> None:
+    after, _ = cleaned(saved("jpeg", xmp=XMP))
+
+    assert b"47,13" not in after
+    assert b"11.376" not in after
+    assert b"519/1" not in after
+    assert b'exif:FNumber="14/10"' in after
+    Image.open(io.BytesIO(after)).load()
+
+
+def test_the_checksums_of_a_png_are_right_afterwards_and_packed_metadata_are_hidden() -> None:
+    info = PngImagePlugin.PngInfo()
+    info.add_itxt("XML:com.adobe.xmp", XMP.decode(), zip=True)
+    info.add_text("Raw profile type exif", "\nexif\n 4\n47474747\n", zip=True)
+    info.add_text("Title", "stays")
+
+    after, _ = cleaned(saved("png", exif=with_gps(), pnginfo=info))
+
+    at = 8
+    names = []
+    while at < len(after):
+        length, name = struct.unpack(">I4s", after[at : at + 8])
+        end = at + 8 + length
+        assert zlib.crc32(after[at + 4 : end]) == struct.unpack(">I", after[end : end + 4])[0]
+        names.append(name)
+        at = end + 4
+    assert names.count(b"prVt") == 2
+    read = Image.open(io.BytesIO(after))
+    assert np.array_equal(np.asarray(read), PIXELS)
+    assert read.info["Title"] == "stays"
+
+
+def test_the_place_in_a_preview_inside_a_raw_file_goes_too() -> None:
+    raw = b"FUJIFILMCCD-RAW " + bytes(100) + FILES["jpeg"] + bytes(100)
+
+    after, _ = cleaned(raw)
+
+    assert not any(secret in after for secret in SECRET)
+
+
+def test_a_gps_box_of_canons_cr3_is_emptied() -> None:
+    tags = [(1, 2, 2, b"N\0\0\0"), (2, 5, 3, struct.pack("<I", 8 + 2 + 2 * 12 + 4))]
+    directory = struct.pack("<H", 2) + b"".join(struct.pack("<HHI", *tag[:3]) + tag[3] for tag in tags)
+    values = struct.pack("<6I", 47, 1, 13, 1, 14159, 1000)
+    box = b"CMT4" + b"II*\0" + struct.pack("<I", 8) + directory + bytes(4) + values
+    data = b"\0\0\0\x18ftypcrx " + bytes(40) + box + bytes(40)
+    assert SECRET[1] in data
+
+    after, _ = cleaned(data)
+
+    assert SECRET[1] not in after
+
+
+def test_photos_that_say_nothing_are_not_touched(tmp_path: Path) -> None:
+    path = tmp_path / "plain.tif"
+    tifffile.imwrite(path, PIXELS)
+
+    assert find_location(path.read_bytes()) == FoundLocation((), complete=True)
+    assert find_location(saved("jpeg")) == FoundLocation((), complete=True)
+
+
+def test_a_file_of_nothing_but_exif_blocks_is_said_to_be_more_than_was_looked_at() -> None:
+    assert not find_location(b"Exif\0\0II*\0" * 1000).complete
+
+
+@given(
+    kind=st.sampled_from(sorted(FILES)),
+    places=st.lists(st.tuples(st.integers(0, 2000), st.integers(0, 255)), max_size=30),
+    length=st.integers(0, 4000),
+)
+def test_damaged_files_are_searched_without_harm(
+    kind: str, places: list[tuple[int, int]], length: int
+) -> None:
+    damaged = bytearray(FILES[kind])
+    for at, value in places:
+        damaged[at % len(damaged)] = value
+    data = bytes(damaged[: max(len(damaged) - length, 0)])
+
+    found = find_location(data)
+
+    assert all(one.start >= 0 and one.start + len(one.data) <= len(data) for one in found.overwrites)

@@ -1,0 +1,126 @@
+"""Photos whose compression lost something: lossy DNG beside JPEG and lossless files."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image
+from scipy import ndimage
+
+from lensmodel import photo
+from lensmodel.core.types import LensSettings
+from lensmodel.photo.dng import ShotInfo, write_linear_dng
+from lensmodel.photo.headers.opening import opened_header
+from lensmodel.workflow import pipeline
+
+SIDE = 256
+
+
+def scene(seed: int = 0) -> NDArray[np.uint8]:
+    rng = np.random.default_rng(seed)
+    fine = ndimage.gaussian_filter(rng.standard_normal((SIDE, SIDE)), 1.0)
+    grey = np.clip(120 + 150 * fine, 5, 250).astype(np.uint8)
+    return np.stack([grey] * 3, axis=-1)
+
+
+def jpeg_tile(pixels: NDArray[np.uint8], quality: int) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "JPEG", quality=quality, subsampling=0)
+    return buffer.getvalue()
+
+
+def write_lossy_dng(
+    path: Path, pixels: NDArray[np.uint8], quality: int, *, tile: bytes | None = None
+) -> None:
+    """One tile of eight-bit LinearRaw, as a converter with lossy compression writes it."""
+    tile = jpeg_tile(pixels, quality) if tile is None else tile
+    matrix = (1, 1, 0, 1, 0, 1, 0, 1, 1, 1, 0, 1, 0, 1, 0, 1, 1, 1)
+    tifffile.imwrite(
+        path,
+        iter([tile]),
+        shape=pixels.shape,
+        dtype=np.uint8,
+        photometric=34892,
+        compression=34892,
+        tile=pixels.shape[:2],
+        metadata=None,
+        extratags=[
+            (50706, "B", 4, (1, 4, 0, 0), True),
+            (50708, "s", 0, "Made Up", True),
+            (50721, "2i", 9, matrix, True),
+            (50728, "2I", 3, (1, 1, 1, 1, 1, 1), True),
+        ],
+    )
+
+
+@pytest.mark.parametrize(("fine", "coarse"), [(97, 85), (85, 60)])
+def test_the_tables_of_a_lossy_dng_say_its_noise(tmp_path: Path, fine: int, coarse: int) -> None:
+    told = []
+    for quality in (fine, coarse):
+        write_lossy_dng(tmp_path / "x.dng", scene(), quality)
+        developed = photo.develop(tmp_path / "x.dng")
+        assert developed.info.kind == "dng"
+        assert developed.lossy
+        coded = developed.coding_noise
+        assert coded is not None
+        told.append(float(coded.variance(np.array(0.2))))
+        for noise in (*developed.correction_noise, *developed.coarse_noise):
+            assert noise.variance(np.array(0.2)) >= 0.999 * told[-1]
+
+    def median_step(quality: int) -> float:
+        table = Image.open(io.BytesIO(jpeg_tile(scene(), quality))).quantization[0]  # type: ignore[attr-defined]
+        return float(np.median(table))
+
+    assert told[1] / told[0] == pytest.approx((median_step(coarse) / median_step(fine)) ** 2, rel=0.2)
+
+
+def test_the_noise_of_a_lossy_dng_is_the_error_that_rounding_made(tmp_path: Path) -> None:
+    before = scene()
+    planes = []
+    for quality in (100, 70):
+        write_lossy_dng(tmp_path / "x.dng", before, quality)
+        developed = photo.develop(tmp_path / "x.dng")
+        planes.append(developed.planes[1])
+    coded = developed.coding_noise
+    assert coded is not None
+    error = planes[1] - planes[0]
+    expected = float(coded.variance(planes[0]).mean())
+    assert 0.3 < float(np.square(error).mean()) / expected < 3.0
+
+
+def test_patches_of_a_lossy_dng_say_nothing_of_kernels(tmp_path: Path) -> None:
+    write_lossy_dng(tmp_path / "x.dng", scene(), 90)
+    assert pipeline.witnesses_of(photo.develop(tmp_path / "x.dng"), LensSettings(aperture=2.8)) == []
+
+
+def test_a_linear_dng_without_loss_is_not_lossy(tmp_path: Path) -> None:
+    write_linear_dng(tmp_path / "x.dng", np.moveaxis(scene().astype(np.uint16) * 200, 2, 0), shot=ShotInfo())
+    developed = photo.develop(tmp_path / "x.dng")
+    assert developed.coding_noise is None
+    assert not developed.lossy
+
+
+@pytest.mark.parametrize(
+    "tile", [b"\xff\xd8\xff\xdb\x00\x43\x00", b"no JPEG at all", b"\xff\xd8" + b"\xff" * 40]
+)
+def test_a_damaged_tile_of_a_lossy_dng_leaves_its_noise_unknown(tmp_path: Path, tile: bytes) -> None:
+    write_lossy_dng(tmp_path / "x.dng", scene(), 90, tile=tile)
+    with opened_header(tmp_path / "x.dng", photo.Limits()) as header:
+        assert (header.kind, header.coarseness) == ("dng", 0.0)
+
+
+@pytest.mark.tools
+def test_a_converters_lossy_dng_is_known_as_such(shared_data: Path) -> None:
+    developed = photo.develop(shared_data / "raw" / "canon_6d_ef24-105_serial.dng")
+    assert developed.info.kind == "dng"
+    assert developed.lossy
+    coded = developed.coding_noise
+    assert coded is not None
+    # tables of a median of 5 at about 1/340 of white a number in the middle tones
+    assert float(coded.variance(np.array(0.18))) == pytest.approx((5 * 0.0029) ** 2 / 12, rel=0.9)
+    assert pipeline.witnesses_of(developed, LensSettings(aperture=4.0)) == []

@@ -1,0 +1,359 @@
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import shutil
+import struct
+import subprocess
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
+
+from lensmodel import photo
+from lensmodel.photo.dng import ShotInfo, write_bayer_dng
+from lensmodel.photo.tags.xmp import read_xmp
+
+# Lens names that EXPECTED.tsv gives from ExifTool's own tables, not from text in the file.
+_LOOKED_UP = {"61182", "Unknown (00 77 48 5C 80 24 24 0E)"}
+Read = Callable[[bytes], photo.PhotoMetadata]
+_XMP_HEAD = "http://ns.adobe.com/xap/1.0/\0"
+
+
+def jpeg_with(
+    main: dict[int, object] | None = None, exif: dict[int, object] | None = None, xmp: str | None = None
+) -> bytes:
+    """JPEG of 64 x 48 pixels whose EXIF was written by Pillow, not by us."""
+    block = Image.Exif()
+    for tag, value in (main or {}).items():
+        block[tag] = value
+    block.get_ifd(0x8769).update(exif or {})
+    out = io.BytesIO()
+    Image.new("RGB", (64, 48), "grey").save(out, "JPEG", exif=block)
+    data = out.getvalue()
+    if xmp is None:
+        return data
+    packet = (_XMP_HEAD + xmp).encode()
+    return data[:2] + b"\xff\xe1" + struct.pack(">H", len(packet) + 2) + packet + data[2:]
+
+
+def xmp_with(properties: str, head: str = "") -> str:
+    return (
+        f'{head}<x:xmpmeta xmlns:x="adobe:ns:meta/">'
+        '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+        '<rdf:Description xmlns:aux="http://ns.adobe.com/exif/1.0/aux/" '
+        'xmlns:exif="http://ns.adobe.com/exif/1.0/" '
+        f'xmlns:exifEX="http://cipa.jp/exif/1.0/" {properties}/></rdf:RDF></x:xmpmeta>'
+    )
+
+
+def canon_note(serial: bytes, *, shift: int = 0) -> bytes:
+    """Canon maker note with a lens serial; its offsets count from a TIFF header `shift` bytes away."""
+    at = 2 + 12 + 4
+    entry = struct.pack("<HHII", 0x4019, 7, len(serial), at + shift)
+    footer = b"II*\0" + struct.pack("<I", shift)
+    return struct.pack("<H", 1) + entry + bytes(4) + serial + bytes(len(serial) % 2) + footer
+
+
+@pytest.fixture
+def metadata_of(tmp_path: Path) -> Read:
+    def read(data: bytes) -> photo.PhotoMetadata:
+        path = tmp_path / "photo.jpg"
+        path.write_bytes(data)
+        return photo.read_metadata(path)
+
+    return read
+
+
+def test_exif_is_read_in_full(metadata_of: Read) -> None:
+    seen = metadata_of(
+        jpeg_with(
+            {0x010F: "Canon", 0x0110: "EOS 6D", 0x0112: 6},
+            {
+                0x829A: IFDRational(1, 160),
+                0x829D: IFDRational(28, 10),
+                0x8827: 400,
+                0x9003: "2020:02:03 04:05:06",
+                0x9206: IFDRational(15, 10),
+                0x920A: IFDRational(24, 1),
+                0xA431: "123",
+                0xA433: "Canon",
+                0xA434: "EF24mm f/1.4L",
+                0xA435: "00009f8eeb",
+            },
+        )
+    )
+
+    assert seen == photo.PhotoMetadata(
+        camera_maker="Canon",
+        camera_model="EOS 6D",
+        body_serial="123",
+        lens=photo.LensIdentity("Canon", "EF24mm f/1.4L", "00009f8eeb", "exif"),
+        aperture=2.8,
+        focal_mm=24.0,
+        focus_m=1.5,
+        iso=400,
+        exposure_s=1 / 160,
+        taken_at=datetime(2020, 2, 3, 4, 5, 6),  # noqa: DTZ001  the camera's clock has no zone
+        orientation=6,
+    )
+
+
+def test_a_file_without_metadata_says_nothing(metadata_of: Read) -> None:
+    assert metadata_of(jpeg_with()) == photo.PhotoMetadata()
+
+
+@pytest.mark.parametrize(
+    "serial",
+    ["0000000000", "0", "", "  ", "----", "No Lens", "n/a", "NONE", "unknown", "FFFFFFFF", "1111111"],
+)
+def test_a_placeholder_is_no_serial(serial: str) -> None:
+    assert photo.is_placeholder(serial)
+
+
+@pytest.mark.parametrize("serial", ["00009f8eeb", "AC1205545", "100000", "0000129324", "7", "N123456"])
+def test_a_serial_with_zeros_in_it_is_a_serial(serial: str) -> None:
+    assert not photo.is_placeholder(serial)
+
+
+def test_f_number_and_focal_length_of_zero_are_unknown(metadata_of: Read) -> None:
+    seen = metadata_of(jpeg_with({}, {0x829D: IFDRational(0, 1), 0x920A: IFDRational(0, 1), 0x8827: 0}))
+
+    assert (seen.aperture, seen.focal_mm, seen.iso) == (None, None, None)
+
+
+def test_a_division_by_zero_is_unknown(metadata_of: Read) -> None:
+    data = bytearray(jpeg_with({}, {0x829D: IFDRational(28, 10)}))
+    at = data.index(struct.pack(">II", 14, 5)) if struct.pack(">II", 14, 5) in data else -1
+    if at < 0:
+        at = data.index(struct.pack("<II", 14, 5))
+    data[at + 4 : at + 8] = bytes(4)
+
+    assert metadata_of(bytes(data)).aperture is None
+
+
+def test_the_apex_value_stands_in_for_a_missing_f_number(metadata_of: Read) -> None:
+    assert metadata_of(jpeg_with({}, {0x9202: IFDRational(3, 1)})).aperture == pytest.approx(2.8)
+
+
+def test_a_subject_distance_of_all_ones_is_infinity(metadata_of: Read) -> None:
+    assert metadata_of(jpeg_with({}, {0x9206: IFDRational(0xFFFFFFFF, 1)})).focus_m == math.inf
+
+
+def test_a_serial_of_exif_wins_over_that_of_xmp(metadata_of: Read) -> None:
+    lens = metadata_of(
+        jpeg_with({}, {0xA435: "EX1"}, xmp_with('aux:LensSerialNumber="XM2" aux:Lens="L"'))
+    ).lens
+
+    assert (lens.serial, lens.serial_source, lens.model) == ("EX1", "exif", "L")
+
+
+def test_a_serial_of_xmp_is_used_where_exif_has_none(metadata_of: Read) -> None:
+    lens = metadata_of(jpeg_with({}, {}, xmp_with('exifEX:LensSerialNumber="XM2"'))).lens
+
+    assert (lens.serial, lens.serial_source) == ("XM2", "xmp")
+
+
+def test_a_canon_serial_is_read_from_the_maker_note(metadata_of: Read) -> None:
+    data = jpeg_with({0x010F: "Canon"}, {0x927C: canon_note(bytes.fromhex("00009f8eeb"))})
+    at = data.index(canon_note(bytes.fromhex("00009f8eeb"))) - data.index(b"Exif\0\0") - 6
+    lens = metadata_of(
+        data.replace(
+            canon_note(bytes.fromhex("00009f8eeb")), canon_note(bytes.fromhex("00009f8eeb"), shift=at)
+        )
+    ).lens
+
+    assert (lens.serial, lens.serial_source) == ("00009f8eeb", "makernote")
+
+
+def test_a_maker_note_that_a_program_moved_is_still_read(metadata_of: Read) -> None:
+    moved = canon_note(bytes.fromhex("00009f8eeb"), shift=5000)
+
+    assert metadata_of(jpeg_with({0x010F: "Canon"}, {0x927C: moved})).lens.serial == "00009f8eeb"
+
+
+def test_a_maker_note_is_not_believed_against_zeros_in_exif(metadata_of: Read) -> None:
+    note = canon_note(bytes.fromhex("1c00009f00"), shift=5000)
+    lens = metadata_of(jpeg_with({0x010F: "Canon"}, {0x927C: note, 0xA435: "0000000000"})).lens
+
+    assert lens.serial is None
+    assert lens.serial_source == "none"
+
+
+def test_a_canon_serial_of_zeros_after_the_first_byte_is_none(metadata_of: Read) -> None:
+    note = canon_note(bytes.fromhex("1c00000000"), shift=5000)
+
+    assert metadata_of(jpeg_with({0x010F: "Canon"}, {0x927C: note})).lens.serial is None
+
+
+def test_an_olympus_serial_is_read_from_the_maker_note(metadata_of: Read) -> None:
+    serial = b"AC1205545\0"
+    equipment = (
+        struct.pack("<H", 1) + struct.pack("<HHII", 0x0202, 2, len(serial), 30 + 18) + bytes(4) + serial
+    )
+    note = (
+        b"OLYMPUS\0II\x03\0"
+        + struct.pack("<H", 1)
+        + struct.pack("<HHII", 0x2010, 13, 1, 30)
+        + bytes(4)
+        + equipment
+    )
+    lens = metadata_of(jpeg_with({0x010F: "OLYMPUS"}, {0x927C: note})).lens
+
+    assert (lens.serial, lens.serial_source) == ("AC1205545", "makernote")
+
+
+def test_the_pixel_pitch_follows_from_the_focal_plane_resolution(tmp_path: Path) -> None:
+    block = Image.Exif()
+    block.get_ifd(0x8769).update({0xA20E: IFDRational(1000, 36), 0xA210: 4})  # 1000 pixels on 36 mm
+    path = tmp_path / "wide.jpg"
+    Image.new("RGB", (1000, 700)).save(path, exif=block)
+
+    assert photo.read_metadata(path).pixel_pitch_um == pytest.approx(36.0)
+
+
+def test_the_pitch_of_a_photo_that_was_scaled_down_is_unknown(metadata_of: Read) -> None:
+    assert metadata_of(jpeg_with({}, {0xA20E: IFDRational(5728, 1), 0xA210: 2})).pixel_pitch_um is None
+
+
+@pytest.mark.parametrize(("told", "pitch"), [(4.5, 4.5), (59.0, 59.0), (352.8, None)])
+def test_the_pitch_of_a_small_mosaic_is_known_because_it_was_never_scaled(
+    told: float, pitch: float | None, tmp_path: Path
+) -> None:
+    shot, path = ShotInfo(pixel_pitch_um=told), tmp_path / "mosaic.dng"
+    write_bayer_dng(path, np.full((64, 96), 600, np.uint16), black=512, white=4095, shot=shot)
+
+    # 72 pixels to the inch, as some cameras write, is a sensor of nothing
+    assert photo.read_metadata(path).pixel_pitch_um == (pitch and pytest.approx(pitch))
+
+
+def test_no_sensor_is_larger_than_medium_format(tmp_path: Path) -> None:
+    shot, path = ShotInfo(pixel_pitch_um=50.0), tmp_path / "mosaic.dng"
+    write_bayer_dng(path, np.full((64, 1200), 600, np.uint16), black=512, white=4095, shot=shot)
+
+    assert photo.read_metadata(path).pixel_pitch_um is None
+
+
+@pytest.mark.parametrize(
+    ("focal", "film", "pitch"),
+    [
+        (IFDRational(50, 1), 75, 1000.0 * math.hypot(36, 24) / 1.5 / math.hypot(1200, 900)),
+        (IFDRational(50, 1), 0, None),  # the camera does not know
+        (IFDRational(50, 1), 2000, None),  # no sensor is that small
+    ],
+)
+def test_the_focal_length_for_film_tells_the_pitch_where_the_sensor_does_not(
+    focal: IFDRational, film: int, pitch: float | None, tmp_path: Path
+) -> None:
+    block = Image.Exif()
+    # 72 pixels to the inch say nothing of a sensor
+    block.get_ifd(0x8769).update({0x920A: focal, 0xA405: film, 0xA20E: IFDRational(72, 1), 0xA210: 2})
+    Image.new("RGB", (1200, 900)).save(tmp_path / "small.jpg", exif=block)
+
+    assert photo.read_metadata(tmp_path / "small.jpg").pixel_pitch_um == (pitch and pytest.approx(pitch))
+
+
+def test_an_orientation_outside_one_to_eight_is_upright(metadata_of: Read) -> None:
+    assert metadata_of(jpeg_with({0x0112: 77})).orientation == 1
+
+
+def test_entities_in_xmp_are_refused(metadata_of: Read) -> None:
+    bomb = '<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]>'
+    packet = xmp_with('aux:LensSerialNumber="&b;"', head=bomb)
+
+    assert read_xmp(packet.encode()) == {}
+    assert metadata_of(jpeg_with({}, {}, packet)).lens.serial is None
+
+
+def test_a_damaged_xmp_packet_gives_what_came_before() -> None:
+    packet = xmp_with('aux:LensSerialNumber="77"').encode()
+
+    assert read_xmp(packet[:-20])["aux:LensSerialNumber"] == "77"
+    assert read_xmp(b"\xff\xfe nonsense") == {}
+
+
+def test_xmp_properties_are_read_from_elements_and_lists_too() -> None:
+    packet = xmp_with("").replace(
+        "/></rdf:RDF>",
+        "><aux:Lens>EF 50</aux:Lens><exif:ISOSpeedRatings><rdf:Seq><rdf:li>200</rdf:li></rdf:Seq>"
+        "</exif:ISOSpeedRatings></rdf:Description></rdf:RDF>",
+    )
+
+    assert read_xmp(packet.encode()) == {"aux:Lens": "EF 50", "exif:ISOSpeedRatings": "200"}
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("71/10", 7.1), ("2.8", 2.8), ("1e1000000000", None), ("5/0", None), ("f/2", None)]
+)
+def test_xmp_numbers_are_read_and_absurd_ones_at_once_refused(
+    metadata_of: Read, text: str, value: float | None
+) -> None:
+    assert metadata_of(jpeg_with({}, {}, xmp_with(f'exif:FNumber="{text}"'))).aperture == value
+
+
+def test_metadata_without_serials_keep_everything_else(metadata_of: Read) -> None:
+    seen = metadata_of(jpeg_with({}, {0xA431: "B1", 0xA434: "L", 0xA435: "S1", 0x829D: IFDRational(2, 1)}))
+    bare = seen.without_serials()
+
+    assert (bare.body_serial, bare.lens.serial, bare.lens.serial_source) == (None, None, "none")
+    assert (bare.lens.model, bare.aperture) == ("L", 2.0)
+
+
+# --- real files --------------------------------------------------------------------------------
+
+
+def expected_rows(folder: Path) -> list[dict[str, str]]:
+    with (folder / "meta" / "EXPECTED.tsv").open(encoding="utf-8") as table:
+        return list(csv.DictReader(table, delimiter="\t", quoting=csv.QUOTE_NONE))
+
+
+@pytest.mark.tools
+def test_metadata_of_real_files_agree_with_the_table(shared_data: Path) -> None:
+    rows = expected_rows(shared_data)
+    assert len(rows) == 21
+    for row in rows:
+        seen = photo.read_metadata(shared_data / row["file"])
+        serials = {
+            part.partition("=")[2].strip()
+            for part in row["lens_serial_exiftool(group=value)"].split("|")
+            if row["serial_verdict"] == "usable"
+        }
+        assert {seen.lens.serial} == (serials or {None}), row["file"]
+        assert (seen.camera_maker or "") == row["make"], row["file"]
+        assert (seen.camera_model or "") == row["model"], row["file"]
+        assert (seen.aperture or 0.0) == pytest.approx(float(row["f_number"] or 0)), row["file"]
+        focal = float(row["focal_length"].removesuffix(" mm") or 0)
+        assert (seen.focal_mm or 0.0) == pytest.approx(focal, abs=0.05), row["file"]
+        assert (seen.iso or 0) == float(row["iso"] or 0), row["file"]
+        if row["body_serial"]:
+            assert seen.body_serial == row["body_serial"], row["file"]
+        if row["lens"] not in _LOOKED_UP:
+            assert (seen.lens.model or "") == row["lens"], row["file"]
+
+
+@pytest.mark.tools
+def test_metadata_of_real_files_agree_with_exiftool(shared_data: Path) -> None:
+    program = shutil.which("exiftool")
+    if program is None:
+        pytest.skip("the program exiftool is not installed")
+    paths = [shared_data / row["file"] for row in expected_rows(shared_data)]
+    tags = ["-FNumber", "-FocalLength", "-ExposureTime", "-DateTimeOriginal", "-LensModel", "-Orientation"]
+    listing = subprocess.run(
+        [program, "-j", "-n", *tags, *map(str, paths)], capture_output=True, check=True, text=True
+    ).stdout
+    for path, told in zip(paths, json.loads(listing), strict=True):
+        seen = photo.read_metadata(path)
+        assert (seen.aperture or 0) == pytest.approx(float(told.get("FNumber", 0))), path.name
+        assert (seen.focal_mm or 0) == pytest.approx(float(told.get("FocalLength", 0))), path.name
+        assert (seen.exposure_s or 0) == pytest.approx(float(told.get("ExposureTime", 0)), rel=1e-3), (
+            path.name
+        )
+        assert seen.orientation == told.get("Orientation", 1), path.name
+        if seen.taken_at is not None:
+            assert seen.taken_at.strftime("%Y:%m:%d %H:%M:%S") == told["DateTimeOriginal"][:19], path.name

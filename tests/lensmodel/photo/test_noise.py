@@ -1,0 +1,218 @@
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image
+from scipy import ndimage
+
+from lensmodel import photo
+from lensmodel.core.types import NoiseModel
+from lensmodel.photo.colour import curves_of
+from lensmodel.photo.dng import write_bayer_dng
+from lensmodel.photo.noise import estimate_noise, graininess
+
+BLACK, WHITE = 512, 15000
+
+
+@lru_cache(maxsize=4)  # most tests photograph the same one
+def scene(height: int, width: int, seed: int, blur: float = 1.0) -> NDArray[np.float64]:
+    """Leaves of random grey one over the other, out to the pixel, then a lens of some blur."""
+    rng = np.random.default_rng(seed)
+    rows, cols = np.mgrid[:height, :width]
+    image = np.full((height, width), 0.3)
+    for radius in np.sort(rng.pareto(1.5, 400) * 6 + 3)[::-1]:
+        row, col = rng.uniform(0, height), rng.uniform(0, width)
+        image[(rows - row) ** 2 + (cols - col) ** 2 < radius**2] = rng.uniform(0.03, 0.8)
+    image += 0.03 * ndimage.gaussian_filter(rng.standard_normal((height, width)), 1.0)
+    return np.clip(ndimage.gaussian_filter(image, blur), 0.02, 0.9)
+
+
+def noisy(clean: NDArray[np.float64], model: NoiseModel, seed: int) -> NDArray[np.float32]:
+    rng = np.random.default_rng(seed)
+    return (clean + np.sqrt(model.variance(clean)) * rng.standard_normal(clean.shape)).astype(np.float32)
+
+
+@pytest.mark.parametrize(("shot", "read"), [(1e-3, 1e-6), (1e-4, 1e-6), (2e-4, 1e-5), (0.0, 1e-4)])
+def test_noise_is_recovered_to_15_percent_from_a_textured_scene(shot: float, read: float) -> None:
+    truth = NoiseModel(shot, read)
+    found = estimate_noise(noisy(scene(600, 800, seed=1), truth, seed=2))
+
+    levels = np.array([0.05, 0.2, 0.5])
+    assert found.variance(levels) == pytest.approx(truth.variance(levels), rel=0.15)
+
+
+@pytest.mark.parametrize("shot", [5e-6, 2e-5, 5e-5])
+def test_noise_below_the_steps_of_8_bits_is_recovered_to_10_percent(shot: float) -> None:
+    steps = curves_of("srgb")[1][::257]
+    light = noisy(scene(600, 800, seed=1), NoiseModel(shot, 1e-7), seed=2)
+    numbers = np.rint(np.interp(light, steps, np.arange(256.0))).astype(np.intp)
+    found = estimate_noise(steps[numbers].astype(np.float32), codes=steps)
+
+    levels = np.array([0.05, 0.2, 0.5])
+    # what rounding adds is noise of the file as well
+    truth = shot * levels + 1e-7 + np.interp(levels, steps, np.gradient(steps)) ** 2 / 12
+    assert found.variance(levels) == pytest.approx(truth, rel=0.1)
+
+
+def test_numbers_of_8_bits_without_other_noise_have_that_of_rounding_at_every_level() -> None:
+    steps = curves_of("srgb")[1][::257]
+    numbers = np.rint(np.interp(scene(600, 800, seed=1, blur=3.0), steps, np.arange(256.0))).astype(np.intp)
+    found = estimate_noise(steps[numbers].astype(np.float32), codes=steps)
+
+    levels = np.array([0.1, 0.3, 0.6])
+    rounding = np.interp(levels, steps, np.gradient(steps) ** 2 / 12)
+    assert (found.variance(levels) > 0.8 * rounding).all()
+
+
+def test_both_terms_are_recovered_from_a_smooth_ramp() -> None:
+    truth = NoiseModel(1e-3, 1e-4)
+    ramp = np.linspace(0.02, 0.9, 1200)[None].repeat(900, axis=0)
+    found = estimate_noise(noisy(ramp, truth, seed=4))
+
+    assert found.shot == pytest.approx(1e-3, rel=0.05)
+    assert found.read == pytest.approx(1e-4, rel=0.15)
+
+
+def test_saturated_areas_do_not_count() -> None:
+    truth = NoiseModel(1e-3, 1e-6)
+    plane = noisy(scene(600, 800, seed=1), truth, seed=2)
+    plane[:300] = 1.0
+    found = estimate_noise(plane)
+
+    assert found.variance(np.array([0.3])) == pytest.approx(truth.variance(np.array([0.3])), rel=0.15)
+
+
+def test_noise_of_a_float_file_is_told_whatever_its_white(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).normal(50.0, 1.0, (256, 256, 3)).astype(np.float32)
+    tifffile.imwrite(tmp_path / "x.tif", pixels, photometric="rgb")
+
+    developed = photo.develop(tmp_path / "x.tif")
+
+    assert [model.variance(np.array(50.0)) for model in developed.noise] == pytest.approx([1.0] * 3, rel=0.1)
+    assert developed.grain == pytest.approx((1.0,) * 3, rel=0.2)
+
+
+def test_a_plane_without_noise_has_only_that_of_rounding() -> None:
+    assert estimate_noise(np.full((64, 64), 0.5, dtype=np.float32)) == NoiseModel(0.0, 0.0)
+    assert estimate_noise(np.full((64, 64), 0.5, dtype=np.float32), step=0.01).read == pytest.approx(
+        1e-4 / 12
+    )
+
+
+def test_a_plane_too_small_to_tell_gives_no_noise() -> None:
+    assert estimate_noise(np.zeros((5, 9), dtype=np.float32)) == NoiseModel(0.0, 0.0)
+
+
+def test_a_large_plane_gives_the_same_model_from_a_part_of_its_rows() -> None:
+    truth = NoiseModel(5e-4, 1e-6)
+    ramp = np.linspace(0.02, 0.9, 2500)[None].repeat(2600, axis=0)
+    found = estimate_noise(noisy(ramp, truth, seed=4))
+
+    assert found.shot == pytest.approx(5e-4, rel=0.05)
+
+
+def test_the_noise_of_the_sensor_is_found_on_the_mosaic(tmp_path: Path) -> None:
+    truth = NoiseModel(4e-4, 2e-6)
+    mosaic = noisy(scene(700, 900, seed=5), truth, seed=6) * (WHITE - BLACK) + BLACK
+    write_bayer_dng(tmp_path / "x.dng", np.rint(mosaic).astype(np.uint16), black=BLACK, white=WHITE)
+    developed = photo.develop(tmp_path / "x.dng")
+
+    levels = np.array([0.1, 0.3, 0.5])
+    assert developed.sensor_noise is not None
+    for found in developed.sensor_noise:
+        assert found.variance(levels) == pytest.approx(truth.variance(levels), rel=0.15)
+
+
+@pytest.mark.parametrize("demosaic", ["ahd", "dht", "linear", "half"])
+def test_the_noise_of_the_planes_is_the_variance_that_demosaicing_leaves(
+    tmp_path: Path, demosaic: photo.Demosaic
+) -> None:
+    flat = noisy(np.full((512, 512), 0.3), NoiseModel.white(0.01), seed=7) * (WHITE - BLACK) + BLACK
+    write_bayer_dng(tmp_path / "x.dng", np.rint(flat).astype(np.uint16), black=BLACK, white=WHITE)
+    developed = photo.develop(tmp_path / "x.dng", demosaic=demosaic)
+
+    inside = developed.planes[:, 16:-16, 16:-16].astype(np.float64)
+    for plane, model in zip(inside, developed.noise, strict=True):
+        assert model.variance(np.array(0.3)) == pytest.approx(plane.var(), rel=0.08)
+
+
+@pytest.mark.parametrize("demosaic", ["ahd", "dht", "linear"])
+def test_the_noise_of_the_planes_follows_the_white_balance(tmp_path: Path, demosaic: photo.Demosaic) -> None:
+    neutral = np.array([0.4, 1.0, 0.6])  # a grey scene on a sensor with weak red and blue
+    colours = np.tile([[0, 1], [1, 2]], (256, 256))
+    flat = noisy(0.4 * neutral[colours], NoiseModel(1e-3, 0.0), seed=8) * (WHITE - BLACK) + BLACK
+    write_bayer_dng(
+        tmp_path / "x.dng", np.rint(flat).astype(np.uint16), black=BLACK, white=WHITE, as_shot_neutral=neutral
+    )
+    developed = photo.develop(tmp_path / "x.dng", demosaic=demosaic)
+
+    inside = developed.planes[:, 16:-16, 16:-16].astype(np.float64)
+    for plane, model in zip(inside, developed.noise, strict=True):
+        assert model.variance(plane.mean()) == pytest.approx(plane.var(), rel=0.1)
+
+
+@pytest.mark.parametrize("quality", [75, 92])
+def test_the_noise_of_a_jpeg_counts_what_compression_takes_from_detail(tmp_path: Path, quality: int) -> None:
+    curve = curves_of("srgb")[1]
+    rng = np.random.default_rng(3)
+    # as much detail at all frequencies, far above the rounding of the coefficients
+    light = np.clip(0.2 + 0.06 * rng.standard_normal((256, 256)), 0.05, 0.5)
+    numbers = np.rint(np.interp(light, curve[::257], np.arange(256.0))).astype(np.uint8)
+    Image.fromarray(numbers).save(tmp_path / "x.jpg", quality=quality)
+    developed = photo.develop(tmp_path / "x.jpg")
+
+    assert developed.coding_noise is not None
+    error = developed.planes[1] - curve[::257][numbers]
+    # the middle step stands for all 64, of which some are twice as coarse
+    assert 0.3 < developed.coding_noise.variance(np.array(0.2)) / error.var() < 1.2
+    assert all(
+        model.variance(np.array(0.2)) >= 0.99 * developed.coding_noise.variance(np.array(0.2))
+        for model in developed.correction_noise
+    )
+
+
+@pytest.mark.parametrize("width", [0.0, 0.5, 1.0])
+def test_the_coarseness_of_correlated_noise_is_what_its_spectrum_says(width: float) -> None:
+    white = np.random.default_rng(9).standard_normal((1024, 1024))
+    plane = (0.3 + 0.01 * ndimage.gaussian_filter(white, width, mode="wrap")).astype(np.float32)
+
+    # The power that each of the two high passes sees: of pixels, and of means over 4 x 4 of them.
+    f = np.fft.fftfreq(1024)
+    point = np.zeros(1024)
+    point[0] = 1.0
+    power = np.abs(np.fft.fft(ndimage.gaussian_filter(point, width, mode="wrap"))) ** 2
+    box = np.abs(np.exp(-2j * np.pi * np.outer(f, np.arange(4))).mean(axis=1)) ** 2
+    fine = (power * (2 - 2 * np.cos(2 * np.pi * f)) ** 2).mean()
+    coarse = 4 * (power * box * (2 - 2 * np.cos(8 * np.pi * f)) ** 2).mean()
+    expected = (coarse / fine) ** 2
+    found = graininess(plane, estimate_noise(plane))
+
+    assert found == pytest.approx(expected, rel=0.1)
+
+
+def test_noise_that_denoising_left_coarse_counts_more_than_that_of_demosaicing(tmp_path: Path) -> None:
+    rng = np.random.default_rng(10)
+    noise = [ndimage.gaussian_filter(rng.standard_normal((400, 400, 3)), (s, s, 0)) for s in (0.0, 1.6)]
+    told = []
+    for grain in noise:
+        numbers = np.rint(np.clip(30000 + 600 * grain / grain.std(), 0, 65535)).astype(np.uint16)
+        tifffile.imwrite(tmp_path / "x.tif", numbers, photometric="rgb")
+        developed = photo.develop(tmp_path / "x.tif")
+        levels = np.array(0.2)
+        told.append([developed.correction_noise[1].variance(levels) / developed.noise[1].variance(levels)])
+
+    assert told[0] == pytest.approx([16.0])
+    assert told[1] == pytest.approx([64.0])
+
+
+def test_a_photo_with_its_mosaic_is_corrected_by_the_noise_of_the_sensor(tmp_path: Path) -> None:
+    flat = noisy(np.full((128, 128), 0.3), NoiseModel.white(0.01), seed=7) * (WHITE - BLACK) + BLACK
+    write_bayer_dng(tmp_path / "x.dng", np.rint(flat).astype(np.uint16), black=BLACK, white=WHITE)
+    developed = photo.develop(tmp_path / "x.dng")
+
+    assert developed.correction_noise == developed.sensor_noise

@@ -1,0 +1,456 @@
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import subprocess
+from dataclasses import replace
+from datetime import datetime
+from io import BytesIO
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import imagecodecs
+import numpy as np
+import pytest
+import rawpy
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image, ImageCms, ImageOps
+from skimage import io
+
+from lensmodel import photo
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.photo.colour import D65_TO_D50, SRGB_TO_XYZ_D65, linear_profile, srgb_to_linear
+from lensmodel.photo.dng import ShotInfo, write_bayer_dng
+from lensmodel.photo.tags.xmp_block import OWN, write_sidecar
+
+METADATA = photo.PhotoMetadata(
+    camera_maker="Canon",
+    camera_model="EOS 6D",
+    body_serial="BODY1",
+    lens=photo.LensIdentity("Canon", "EF24mm f/1.4L", "LENS1", "exif"),
+    aperture=2.8,
+    focal_mm=24.0,
+    iso=400,
+    exposure_s=1 / 160,
+    taken_at=datetime(2020, 2, 3, 4, 5, 6),  # noqa: DTZ001  the camera's clock has no zone
+)
+PLAIN = photo.Encoding(metadata=METADATA)
+FORMATS = ("tiff16", "png16", "png8", "jpeg", "dng")
+
+
+def planes(height: int = 48, width: int = 64) -> NDArray[np.float32]:
+    rows, cols = np.mgrid[:height, :width]
+    ramp = np.stack([rows / height, cols / width, (rows + cols) / (height + width)])
+    return (0.05 + 0.9 * ramp).astype(np.float32)
+
+
+def read_numbers(path: Path) -> NDArray[np.generic]:
+    """Numbers of a written file, of any depth."""
+    if path.read_bytes()[:2] == b"II":
+        return tifffile.imread(path, key=0)
+    return np.asarray(imagecodecs.png_decode(path.read_bytes()))
+
+
+def orientation_of(encoding: photo.Encoding, value: int) -> photo.Encoding:
+    return replace(encoding, metadata=replace(encoding.metadata, orientation=value))
+
+
+@pytest.mark.parametrize("output", ["tiff16", "png16"])
+def test_16_bit_outputs_hold_the_srgb_code_of_every_level(tmp_path: Path, output: photo.OutputFormat) -> None:
+    path = tmp_path / "x"
+    photo.write_image(path, planes(), PLAIN, format=output)
+
+    back = read_numbers(path)
+    assert back.dtype == np.uint16
+    assert srgb_to_linear(np.moveaxis(back, -1, 0) / 65535) == pytest.approx(planes(), abs=3e-5)
+
+
+@pytest.mark.parametrize("output", ["tiff16", "png16", "png8"])
+def test_what_was_developed_is_written_with_the_same_numbers(
+    tmp_path: Path, output: photo.OutputFormat
+) -> None:
+    dtype = np.uint8 if output == "png8" else np.uint16
+    pixels = np.random.default_rng(0).integers(0, np.iinfo(dtype).max + 1, (256, 256, 3), dtype=dtype)
+    (tmp_path / "in.png").write_bytes(imagecodecs.png_encode(pixels))
+    developed = photo.develop(tmp_path / "in.png")
+    photo.write_image(tmp_path / "out", developed.planes, developed.encoding, format=output)
+
+    assert (read_numbers(tmp_path / "out") == pixels).all()
+
+
+def test_a_profile_of_the_input_comes_back_with_the_same_numbers(tmp_path: Path) -> None:
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    pixels = np.random.default_rng(0).integers(0, 65536, (64, 64, 3), dtype=np.uint16)
+    tifffile.imwrite(tmp_path / "in.tif", pixels, photometric="rgb", iccprofile=profile)
+    developed = photo.develop(tmp_path / "in.tif")
+    photo.write_image(tmp_path / "out.tif", developed.planes, developed.encoding)
+
+    assert (read_numbers(tmp_path / "out.tif") == pixels).all()
+    with tifffile.TiffFile(tmp_path / "out.tif") as file:
+        assert file.pages[0].tags[34675].value == profile
+
+
+@pytest.mark.parametrize("output", ["tiff16", "png16", "png8", "jpeg"])
+@pytest.mark.parametrize("color_space", ["same", "srgb", "camera-linear"])
+def test_every_output_has_a_profile_that_littlecms_can_use(
+    tmp_path: Path, output: photo.OutputFormat, color_space: photo.ColorSpace
+) -> None:
+    path = tmp_path / "x"
+    photo.write_image(path, planes(), PLAIN, format=output, color_space=color_space)
+    icc = icc_of(path)
+    seen = ImageCms.applyTransform(
+        Image.new("RGB", (1, 1), (188, 128, 64)),
+        ImageCms.buildTransform(
+            ImageCms.ImageCmsProfile(BytesIO(icc)), ImageCms.createProfile("sRGB"), "RGB", "RGB"
+        ),
+    )
+    expected = (188, 128, 64)
+    if color_space == "camera-linear":
+        expected = tuple(round(255 * code(v / 255)) for v in expected)
+
+    assert np.asarray(seen)[0, 0] == pytest.approx(expected, abs=2)
+
+
+def code(linear: float) -> float:
+    return 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055
+
+
+def icc_of(path: Path) -> bytes:
+    data = path.read_bytes()
+    if data[:2] == b"II":
+        with tifffile.TiffFile(path) as file:
+            return bytes(file.pages[0].tags[34675].value)
+    with Image.open(path) as image:
+        return bytes(image.info["icc_profile"])
+
+
+def test_white_balance_and_matrix_make_a_raw_photo_srgb(tmp_path: Path) -> None:
+    to_srgb = ((1.5, -0.4, -0.1), (-0.2, 1.4, -0.2), (0.0, -0.5, 1.5))
+    encoding = replace(PLAIN, white_balance=(2.0, 1.0, 1.6), to_srgb=to_srgb)
+    grey = (
+        np.full((3, 32, 32), 0.4, dtype=np.float32)
+        / np.array([2.0, 1.0, 1.6], dtype=np.float32)[:, None, None]
+    )
+    photo.write_image(tmp_path / "x", grey, encoding)
+
+    back = srgb_to_linear(read_numbers(tmp_path / "x")[5, 5] / 65535)
+    assert back == pytest.approx([0.4, 0.4, 0.4], abs=1e-4)
+
+
+@pytest.mark.parametrize("balance", [(2.0, 1.0, 1.6), (0.7, 1.0, 1.6)])
+def test_saturated_pixels_of_a_raw_photo_become_white(
+    tmp_path: Path, balance: tuple[float, float, float]
+) -> None:
+    to_srgb = ((1.5, -0.4, -0.1), (-0.2, 1.4, -0.2), (0.0, -0.5, 1.5))
+    encoding = replace(PLAIN, white_balance=balance, to_srgb=to_srgb)
+    photo.write_image(tmp_path / "x", np.ones((3, 32, 32), dtype=np.float32), encoding)
+
+    assert (read_numbers(tmp_path / "x") == 65535).all()
+
+
+def test_a_wide_gamut_is_converted_when_srgb_is_asked_for(tmp_path: Path) -> None:
+    # Primaries of Adobe RGB (1998) under D50, as its profile gives them.
+    adobe = np.array([[0.60974, 0.20528, 0.14919], [0.31111, 0.62567, 0.06322], [0.01947, 0.06087, 0.74457]])
+    encoding = replace(PLAIN, transfer="icc", icc=linear_profile(adobe, "wide"))
+    green = (
+        np.zeros((3, 32, 32), dtype=np.float32) + np.array([0.2, 0.5, 0.3], dtype=np.float32)[:, None, None]
+    )
+    photo.write_image(tmp_path / "x", green, encoding, color_space="srgb")
+
+    expected = np.linalg.inv(D65_TO_D50 @ SRGB_TO_XYZ_D65) @ adobe @ [0.2, 0.5, 0.3]
+    assert expected[0] < 0.1  # far from the numbers of the input
+    assert srgb_to_linear(read_numbers(tmp_path / "x")[5, 5] / 65535) == pytest.approx(expected, abs=1e-4)
+
+
+def test_camera_linear_keeps_the_numbers_of_the_planes(tmp_path: Path) -> None:
+    encoding = replace(
+        PLAIN, white_balance=(2.0, 1.0, 1.6), to_srgb=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    )
+    photo.write_image(tmp_path / "x", planes(), encoding, color_space="camera-linear")
+
+    assert np.moveaxis(read_numbers(tmp_path / "x"), -1, 0) / 65535 == pytest.approx(
+        planes(), abs=0.75 / 65535
+    )
+
+
+def test_a_linear_dng_is_read_back_by_libraw_with_its_numbers(tmp_path: Path) -> None:
+    encoding = replace(PLAIN, white_balance=(2.0, 1.0, 1.6))
+    photo.write_image(tmp_path / "x.dng", planes(), encoding, format="dng")
+    developed = photo.develop(tmp_path / "x.dng")
+
+    assert developed.planes == pytest.approx(planes(), abs=1e-4)
+    assert developed.white_balance == pytest.approx((2.0, 1.0, 1.6), rel=1e-4)
+    with rawpy.imread(str(tmp_path / "x.dng")) as raw:
+        shown = raw.postprocess(use_camera_wb=True, no_auto_bright=True)
+    assert shown.shape == (48, 64, 3)
+
+
+OPENERS = {
+    "rawtherapee-cli": ["-Y", "-t", "-b16", "-o", "{to}", "-c", "{of}"],
+    # Tone curve and exposure of darktable's usual workflow depend on the kind of file, not on its numbers:
+    # filmic is left out where the pixels are no mosaic.
+    "darktable-cli": [
+        "{of}",
+        "{to}",
+        "--core",
+        "--configdir",
+        "{folder}/darktable",
+        "--library",
+        ":memory:",
+        "--conf",
+        "plugins/imageio/format/tiff/bpp=16",
+        "--conf",
+        "plugins/darkroom/workflow=none",
+        "--conf",
+        "plugins/darkroom/chromatic-adaptation=legacy",
+    ],
+}
+
+
+@pytest.mark.tools
+@pytest.mark.parametrize("stops", [None, 0.75])
+@pytest.mark.parametrize("program", OPENERS)
+def test_raw_converters_show_a_linear_dng_as_bright_as_the_mosaic_it_came_from(
+    tmp_path: Path, program: str, stops: float | None
+) -> None:
+    if shutil.which(program) is None:
+        pytest.skip(f"the program {program} is not installed")
+    smooth = planes(240, 320) * np.array([0.45, 0.9, 0.55], dtype=np.float32)[:, None, None]
+    mosaic = np.rint(512 + 15360 * smooth[1]).astype(np.uint16)
+    mosaic[::2, ::2] = np.rint(512 + 15360 * smooth[0, ::2, ::2])
+    mosaic[1::2, 1::2] = np.rint(512 + 15360 * smooth[2, 1::2, 1::2])
+    neutral = (0.5, 1.0, 0.6)
+    write_bayer_dng(
+        tmp_path / "mosaic.dng",
+        mosaic,
+        black=512,
+        white=15872,
+        as_shot_neutral=neutral,
+        shot=ShotInfo(baseline_exposure=stops),
+    )
+    developed = photo.develop(tmp_path / "mosaic.dng")
+    photo.write_image(tmp_path / "linear.dng", developed.planes, developed.encoding, format="dng")
+
+    def shown(name: str) -> NDArray[np.float64]:
+        target = tmp_path / f"{name}.tif"
+        fixed = {"of": str(tmp_path / f"{name}.dng"), "to": str(target), "folder": str(tmp_path)}
+        words = [program, *(word.format(**fixed) for word in OPENERS[program])]
+        subprocess.run(words, check=True, capture_output=True, env=os.environ | {"HOME": str(tmp_path)})
+        picture = tifffile.imread(target)[..., :3].astype(np.float64)
+        return srgb_to_linear(picture[20:-20, 20:-20].mean(axis=(0, 1)) / 65535)
+
+    assert shown("linear") == pytest.approx(shown("mosaic"), rel=0.01)
+
+
+@pytest.mark.parametrize("stops", [None, -1.25, 0.35])
+def test_a_linear_dng_asks_for_the_baseline_exposure_of_the_dng_it_came_from(
+    tmp_path: Path, stops: float | None
+) -> None:
+    mosaic = np.rint(512 + 15360 * planes(32, 48)[1]).astype(np.uint16)
+    shot = ShotInfo(baseline_exposure=stops)
+    write_bayer_dng(tmp_path / "mosaic.dng", mosaic, black=512, white=15872, shot=shot)
+    developed = photo.develop(tmp_path / "mosaic.dng")
+    photo.write_image(tmp_path / "linear.dng", developed.planes, developed.encoding, format="dng")
+
+    assert developed.encoding.baseline_exposure == stops
+    assert photo.develop(tmp_path / "linear.dng").encoding.baseline_exposure == stops
+    with tifffile.TiffFile(tmp_path / "linear.dng") as file:
+        assert (50730 in file.pages[0].tags) == (stops is not None)
+
+
+@pytest.mark.parametrize("output", FORMATS)
+def test_our_own_reader_finds_the_safe_metadata_again(tmp_path: Path, output: photo.OutputFormat) -> None:
+    path = tmp_path / "x"
+    photo.write_image(path, planes(), PLAIN, format=output, description="corrected")
+    seen = photo.read_metadata(path)
+
+    assert seen == METADATA.without_serials()
+
+
+@pytest.mark.parametrize("output", FORMATS)
+def test_focus_at_infinity_stays_there(tmp_path: Path, output: photo.OutputFormat) -> None:
+    far = replace(PLAIN, metadata=replace(METADATA, focus_m=math.inf))
+    photo.write_image(tmp_path / "x", planes(), far, format=output)
+
+    assert photo.read_metadata(tmp_path / "x").focus_m == math.inf
+
+
+@pytest.mark.parametrize("output", ["tiff16", "jpeg", "png8"])
+def test_pillow_reads_the_numbers_in_exif(tmp_path: Path, output: photo.OutputFormat) -> None:
+    path = tmp_path / "x"
+    photo.write_image(path, planes(), PLAIN, format=output, description="corrected é")
+    if output == "tiff16":  # Pillow reads no 16-bit RGB; its EXIF reader takes the bytes
+        block = Image.Exif()
+        block.load(b"Exif\0\0" + path.read_bytes())
+    else:
+        with Image.open(path) as image:
+            block = image.getexif()
+    exif = block.get_ifd(0x8769)
+
+    assert (block[0x010F], block[0x0131], block[0x010E]) == ("Canon", "lensmodel", "corrected ?")
+    assert float(exif[0x829D]) == 2.8
+    assert float(exif[0x829A]) == pytest.approx(1 / 160)
+    assert (exif[0x8827], exif[0xA434]) == (400, "EF24mm f/1.4L")
+
+
+@pytest.mark.parametrize("output", FORMATS)
+def test_serials_positions_and_maker_notes_are_not_written(
+    tmp_path: Path, output: photo.OutputFormat
+) -> None:
+    path = tmp_path / "x"
+    photo.write_image(path, planes(), PLAIN, format=output)
+    data = path.read_bytes()
+
+    assert b"BODY1" not in data
+    assert b"LENS1" not in data
+    assert b"GPS" not in data
+
+
+@pytest.mark.tools
+@pytest.mark.parametrize("output", FORMATS)
+def test_exiftool_finds_no_fault_and_the_same_values(tmp_path: Path, output: photo.OutputFormat) -> None:
+    program = shutil.which("exiftool")
+    if program is None:
+        pytest.skip("the program exiftool is not installed")
+    path = tmp_path / "x"
+    photo.write_image(path, planes(), orientation_of(PLAIN, 6), format=output, description="corrected")
+    run = subprocess.run([program, "-j", "-n", str(path)], capture_output=True, check=True, text=True)
+    told = json.loads(run.stdout)[0]
+
+    assert "Error" not in told
+    assert "Warning" not in told
+    assert (told["FNumber"], told["FocalLength"], told["ISO"]) == (2.8, 24, 400)
+    assert told["LensModel"] == "EF24mm f/1.4L"
+    assert told["DateTimeOriginal"] == "2020:02:03 04:05:06"
+    assert told["Orientation"] == (1 if output.startswith("png") else 6)
+    assert "SerialNumber" not in told
+
+
+def test_skimage_and_pillow_read_the_numbers_that_we_read(tmp_path: Path) -> None:
+    photo.write_image(tmp_path / "x.tif", planes(), PLAIN, format="tiff16")
+    photo.write_image(tmp_path / "x.png", planes(), PLAIN, format="png16")
+    photo.write_image(tmp_path / "8.png", planes(), PLAIN, format="png8")
+
+    assert (io.imread(tmp_path / "x.tif") == read_numbers(tmp_path / "x.tif")).all()
+    assert (read_numbers(tmp_path / "x.png") == read_numbers(tmp_path / "x.tif")).all()
+    with Image.open(tmp_path / "8.png") as image:
+        assert (np.asarray(image) == read_numbers(tmp_path / "8.png")).all()
+    with Image.open(tmp_path / "x.png") as image:  # Pillow shows 16 bits as 8
+        assert np.asarray(image) == pytest.approx(read_numbers(tmp_path / "8.png"), abs=1)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pngs_are_written_upright(tmp_path: Path, orientation: int) -> None:
+    photo.write_image(tmp_path / "x.png", planes(), orientation_of(PLAIN, orientation), format="png8")
+    photo.write_image(tmp_path / "flat.png", planes(), PLAIN, format="png8")
+    turned = Image.open(tmp_path / "flat.png").convert("RGB")
+    block = turned.getexif()
+    block[0x0112] = orientation
+    turned.info["exif"] = block.tobytes()
+    expected = np.asarray(ImageOps.exif_transpose(turned))
+
+    assert (np.asarray(Image.open(tmp_path / "x.png")) == expected).all()
+
+
+@pytest.mark.parametrize("output", ["tiff16", "jpeg", "dng"])
+def test_other_formats_keep_the_sensor_orientation_and_say_how_to_turn(
+    tmp_path: Path, output: photo.OutputFormat
+) -> None:
+    photo.write_image(tmp_path / "x", planes(), orientation_of(PLAIN, 6), format=output)
+    info = photo.inspect(tmp_path / "x")
+
+    assert (info.width, info.height) == (64, 48)
+    assert info.metadata.orientation == 6
+
+
+def test_jpeg_keeps_the_colour_of_single_pixels(tmp_path: Path) -> None:
+    checks = np.zeros((3, 32, 32), dtype=np.float32)
+    checks[0, ::2] = 1.0  # red lines, one pixel wide
+    photo.write_image(tmp_path / "x.jpg", checks, PLAIN, format="jpeg", quality=95)
+    with Image.open(tmp_path / "x.jpg") as image:
+        back = np.asarray(image)
+
+    assert back[10, 10, 0] > 230
+    assert back[11, 10, 0] < 25
+
+
+def test_the_same_planes_give_the_same_bytes(tmp_path: Path) -> None:
+    for output in FORMATS:
+        photo.write_image(tmp_path / "a", planes(), PLAIN, format=output)
+        photo.write_image(tmp_path / "b", planes(), PLAIN, format=output)
+        assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes(), output
+
+
+@pytest.mark.parametrize("output", ["tiff16", "png16", "jpeg"])
+def test_a_failed_write_leaves_the_old_file_and_no_remains(
+    tmp_path: Path, output: photo.OutputFormat, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "x"
+    path.write_bytes(b"old")
+
+    def full_disk(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        photo.write_image(path, planes(), PLAIN, format=output)
+
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"format": "bmp"}, "tiff16, png16"),
+        ({"color_space": "lab"}, "camera-linear"),
+        ({"format": "jpeg", "quality": 0}, "1..100"),
+    ],
+)
+def test_impossible_requests_are_refused(tmp_path: Path, options: dict[str, object], message: str) -> None:
+    with pytest.raises(InvalidInputError, match=message):
+        photo.write_image(tmp_path / "x", planes(), PLAIN, **options)  # type: ignore[arg-type]
+    with pytest.raises(InvalidInputError, match="shape"):
+        photo.write_image(tmp_path / "x", planes()[0], PLAIN)
+
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("output", FORMATS)
+def test_the_xmp_packet_says_what_was_done_and_which_lens_it_was(
+    tmp_path: Path, output: photo.OutputFormat
+) -> None:
+    path = tmp_path / "x"
+    done = 'corrected, strength <.5> & "more"'
+    photo.write_image(path, planes(), PLAIN, format=output, description=done, lens="My 24 mm & adapter")
+
+    data = path.read_bytes()
+    begin, end = data.index(b"<x:xmpmeta"), data.index(b"</x:xmpmeta>") + len(b"</x:xmpmeta>")
+    packet = ET.fromstring(data[begin:end])
+    rdf, aux, events = (
+        "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}",
+        "{http://ns.adobe.com/exif/1.0/aux/}",
+        "{http://ns.adobe.com/xap/1.0/sType/ResourceEvent#}",
+    )
+    described = next(packet.iter(f"{rdf}Description"))
+    assert described.get(f"{aux}Lens") == "My 24 mm & adapter"
+    event = next(one for one in packet.iter(f"{rdf}li") if one.get(f"{events}action"))
+    assert event.get(f"{events}parameters") == done
+    assert done in [one.text for one in packet.iter(f"{rdf}li")]
+    assert b"LENS1" not in data
+    assert b"BODY1" not in data
+
+
+def test_a_packet_of_names_that_xml_cannot_write_is_still_xml(tmp_path: Path) -> None:
+    strange = replace(PLAIN.metadata, camera_model="X\x01T\x1f-3 <&\ufffe>")
+    path = tmp_path / "one.xmp"
+
+    write_sidecar(path, strange, source="a\x00b.dng", description="done\x0b", done={"Method": "x\x02"})
+
+    packet = ET.fromstring(path.read_bytes())
+    described = next(packet.iter("{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"))
+    assert described.get("{http://ns.adobe.com/tiff/1.0/}Model") == "X T -3 <& >"
+    assert described.get(f"{{{OWN}}}Method") == "x "

@@ -1,0 +1,181 @@
+"""Edges of a chart are found without being told where; other pictures have none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lensmodel.core.geometry import Frame
+from lensmodel.core.psf import gaussian
+from lensmodel.core.types import Channel, FieldPosition, Kernel, LensSettings, NoiseModel
+from lensmodel.correction import correct_planes
+from lensmodel.quality import by_zone, edge_gains, find_edges, measure_edges
+from lensmodel.simulate import BlurOptions, blurred, demo_scene, draw_lens, edge_chart
+
+FRAME = Frame(900, 1200)
+CHART = edge_chart(FRAME)
+BOXES = [edge.box for edge in CHART.edges]
+RNG_SEED = 3
+
+
+def noisy(plane: NDArray[np.floating], noise: NoiseModel) -> NDArray[np.float32]:
+    rng = np.random.default_rng(RNG_SEED)
+    seen = plane + rng.normal(size=plane.shape) * np.sqrt(noise.variance(plane))
+    return seen.astype(np.float32)
+
+
+def soft(sigma: float) -> NDArray[np.float32]:
+    rows = (CHART.scene.shape[1] - FRAME.height) // 2
+    return ndimage.gaussian_filter(CHART.scene[1], sigma)[rows:-rows, rows:-rows]
+
+
+@pytest.mark.parametrize("sigma", [0.6, 1.5, 3.0])
+@pytest.mark.parametrize("noise", [NoiseModel(1 / 50000, 1e-6), NoiseModel(1 / 2500, 9e-6)])
+def test_found_edges_are_as_sharp_as_those_in_known_boxes(sigma: float, noise: NoiseModel) -> None:
+    photo = noisy(soft(sigma), noise)
+
+    table = by_zone(measure_edges(photo, find_edges(photo, noise=noise)))
+
+    known = by_zone(measure_edges(photo, BOXES))
+    assert table.keys() == known.keys() == {"center", "mid", "corner"}
+    for zone, row in table.items():
+        assert row.edges >= 2
+        assert row.mtf50 == pytest.approx(known[zone].mtf50, rel=0.05)
+
+
+def test_found_boxes_lie_in_the_frame_and_do_not_meet() -> None:
+    covered = np.zeros((FRAME.height, FRAME.width), dtype=int)
+
+    found = find_edges(soft(1.0))
+
+    for row, col, height, width in found:
+        assert min(row, col) >= 0
+        covered[row : row + height, col : col + width] += 1
+    assert covered.sum() == sum(height * width for _, _, height, width in found)
+    assert covered.max() == 1
+
+
+class Gaussian:
+    """A lens with the same kernel everywhere."""
+
+    def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
+        del position, channel
+        return gaussian(size, np.eye(2) * 1.4**2)
+
+
+def test_correction_with_the_true_psf_gains_in_every_zone() -> None:
+    noise = NoiseModel(1 / 50000, 1e-6)
+    planes = np.stack([noisy(soft(1.4), noise)] * 3)
+
+    corrected = correct_planes(planes, Gaussian(), FRAME, method="fast", noise=[noise] * 3, clip=[1.0] * 3)
+    gains = edge_gains(planes[1], corrected.planes[1], noise=noise)
+
+    known = by_zone(measure_edges(planes[1], BOXES))
+    better = by_zone(measure_edges(corrected.planes[1], BOXES))
+    assert gains.keys() == known.keys()
+    for zone, gain in gains.items():
+        assert gain.gain > 2.0
+        assert gain.mtf50_before == pytest.approx(known[zone].mtf50, rel=0.05)
+        assert gain.mtf50_after == pytest.approx(better[zone].mtf50, rel=0.05)
+        assert 0.0 < gain.overshoot_after < better[zone].overshoot + 1.0  # there the largest of the zone
+
+
+@pytest.mark.slow
+def test_edges_behind_a_lens_are_as_sharp_as_those_in_known_boxes_and_gain() -> None:
+    lens, settings = draw_lens(5, "soft-fast"), LensSettings()
+    noise = NoiseModel(1 / 50000, 1e-6)
+    options = BlurOptions(size=41, step=0.3, lateral=False)
+    planes = noisy(blurred(CHART.scene, lens, settings, FRAME, options), noise)
+
+    found = find_edges(planes[1], noise=noise)
+
+    ratios = []
+    for edge in measure_edges(planes[1], found):
+        for chart_edge in CHART.edges:
+            row, col, height, width = edge.box
+            if (
+                abs(row + height / 2 - chart_edge.row - chart_edge.height / 2) < chart_edge.height / 2
+                and abs(col + width / 2 - chart_edge.col - chart_edge.width / 2) < chart_edge.width / 2
+                and edge.direction == chart_edge.direction
+            ):
+                known = measure_edges(planes[1], [chart_edge.box])[0]
+                ratios.append(edge.response.mtf50 / known.response.mtf50)
+    assert len(ratios) >= 8
+    assert np.abs(np.median(ratios) - 1.0) < 0.05
+
+    corrected = correct_planes(planes, lens.field(settings), FRAME, noise=[noise] * 3, clip=[1.0] * 3)
+    gains = edge_gains(planes[1], corrected.planes[1], noise=noise)
+    assert gains.keys() == {"center", "mid", "corner"}
+    assert min(gain.gain for gain in gains.values()) > 1.3
+
+
+def test_part_of_a_frame_reports_the_zones_of_the_frame() -> None:
+    photo = soft(1.0)
+    top, left = 0, 700
+    part = photo[top:420, left:]
+
+    gains = edge_gains(part, part, FRAME, origin=(top, left))
+
+    assert "center" not in gains
+    assert "corner" in gains
+    assert all(gain.gain == 1.0 for gain in gains.values())
+
+
+@pytest.mark.parametrize("name", ["city", "lake"])
+@pytest.mark.parametrize("sigma", [0.0, 1.5])
+def test_photographs_of_other_things_have_none(name: str, sigma: float) -> None:
+    plane = ndimage.gaussian_filter(demo_scene(name)[1], sigma)
+
+    assert find_edges(plane) == ()
+
+
+def test_one_strong_edge_is_no_chart() -> None:
+    photo = np.full((FRAME.height, FRAME.width), 0.2, dtype=np.float32)
+    row, col, height, width = BOXES[0]
+    photo[row : row + height, col : col + width] = soft(1.0)[row : row + height, col : col + width]
+
+    assert find_edges(photo) == ()
+
+
+def test_clipped_edges_are_left_alone() -> None:
+    photo = soft(1.0)
+
+    assert find_edges(photo)
+    assert find_edges(photo, clip=float(photo.max())) == ()
+    assert find_edges(np.minimum(photo, 0.6), clip=0.6) == ()
+
+
+@pytest.mark.parametrize(
+    "plane",
+    [
+        np.zeros((0, 5)),
+        np.zeros((1, 1)),
+        np.zeros((300, 400)),
+        np.ones((300, 400)),
+        np.full((64, 64), -3.0),
+        np.full((64, 3000), 1e30),
+        np.full((200, 200), 1e-38),
+        np.random.default_rng(0).normal(0.0, 1e6, (300, 300)),
+        np.random.default_rng(1).random((65, 67)),
+        np.random.default_rng(4).random((200, 200)) * 1e30,
+        np.indices((200, 200)).sum(axis=0) % 2 * 0.5,
+        np.tri(300) * 0.5 + 0.1,
+        np.linspace(0.0, 1.0, 300)[:, None] * np.ones(300),
+        np.where(np.random.default_rng(2).random((300, 300)) > 0.999, 1e18, 0.0),
+    ],
+    ids=lambda plane: f"{plane.shape}",
+)
+def test_strange_planes_have_no_edges_and_no_errors(plane: NDArray[np.float64]) -> None:
+    plane = plane.astype(np.float32)
+
+    assert find_edges(plane) == ()
+    assert edge_gains(plane, plane) == {}
+
+
+def test_edges_that_a_correction_destroyed_are_not_counted() -> None:
+    photo = soft(1.0)
+
+    assert edge_gains(photo, np.full_like(photo, 0.5)) == {}
+    assert edge_gains(photo, np.full_like(photo, np.nan)) == {}

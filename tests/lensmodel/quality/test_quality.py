@@ -1,0 +1,413 @@
+"""Slanted edges, kernels and pictures against closed forms."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+from scipy import ndimage, optimize, special
+
+from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.core.geometry import Frame
+from lensmodel.core.psf import delta, gaussian
+from lensmodel.core.types import LensSettings
+from lensmodel.quality import (
+    best_shift,
+    by_zone,
+    crossing,
+    encircled_energy,
+    encircled_radius,
+    flat_noise,
+    lp_per_mm,
+    lp_per_ph,
+    measure_edges,
+    mtf50_from_kernel,
+    mtf_from_kernel,
+    noise_gain,
+    pixel_mtf,
+    psnr,
+    registered_zone_psnr,
+    shifted,
+    slanted_edge,
+    ssim,
+    tangential_sagittal_mtf50,
+    to_srgb,
+    zone_masks,
+    zone_psnr,
+)
+from lensmodel.simulate import (
+    Aberrations,
+    BlurOptions,
+    SimulatedLens,
+    blurred,
+    dead_leaves,
+    edge_chart,
+    slanted_edge_scene,
+)
+
+STEP = 0.6
+
+
+def blurred_edge(
+    sigma: float, degrees: float, shape: tuple[int, int] = (100, 80), *, dark: float = 0.2
+) -> NDArray[np.float64]:
+    """Edge with a Gaussian blur, then integrated over the pixels by quadrature; bright along `degrees`."""
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    normal = math.radians(degrees)
+    rows = (np.arange(shape[0]) - (shape[0] - 1) / 2)[:, None]
+    cols = (np.arange(shape[1]) - (shape[1] - 1) / 2)[None, :]
+    total = np.zeros(shape)
+    for a, wa in zip(nodes / 2, weights / 2, strict=True):
+        for b, wb in zip(nodes / 2, weights / 2, strict=True):
+            distance = (cols + b) * math.cos(normal) - (rows + a) * math.sin(normal)
+            total += wa * wb * special.ndtr(distance / sigma)
+    return dark + STEP * total
+
+
+def theory(sigma: float, degrees: float) -> float:
+    """MTF50 of exp(-2 pi^2 s^2 f^2) sinc(f cos) sinc(f sin)."""
+    n = math.radians(degrees)
+
+    def contrast(f: float) -> float:
+        gauss = math.exp(-2 * math.pi**2 * sigma**2 * f**2)
+        return float(gauss * np.sinc(f * math.cos(n)) * np.sinc(f * math.sin(n)) - 0.5)
+
+    return float(optimize.brentq(contrast, 1e-4, 0.9))
+
+
+# published check values of the procedure: sigma, theory, measured without noise, with 1 percent
+CHECK_VALUES = [
+    (0.5, 0.3231, 0.3240, 0.333),
+    (0.8, 0.2201, 0.2207, 0.221),
+    (1.0, 0.1800, 0.1804, 0.180),
+    (1.5, 0.1227, 0.1229, 0.123),
+    (2.0, 0.0927, 0.0931, 0.093),
+    (3.0, 0.0622, 0.0627, 0.063),
+]
+
+
+@pytest.mark.parametrize(("sigma", "wanted", "table", "_noisy"), CHECK_VALUES)
+def test_slanted_edge_reproduces_the_check_values(
+    sigma: float, wanted: float, table: float, _noisy: float
+) -> None:
+    assert theory(sigma, 5.0) == pytest.approx(wanted, abs=1e-4)
+    measured = slanted_edge(blurred_edge(sigma, 5.0))
+
+    assert measured.mtf50 == pytest.approx(wanted, rel=0.013)
+    assert measured.mtf50 == pytest.approx(table, rel=0.007)
+
+
+@pytest.mark.parametrize(("sigma", "wanted", "_table", "noisy"), CHECK_VALUES)
+def test_slanted_edge_reproduces_the_check_values_in_noise(
+    sigma: float, wanted: float, _table: float, noisy: float
+) -> None:
+    rng = np.random.default_rng(0)
+    edge = blurred_edge(sigma, 5.0)
+    measured = [slanted_edge(edge + rng.normal(0.0, 0.01 * STEP, edge.shape)).mtf50 for _ in range(10)]
+
+    assert np.mean(measured) == pytest.approx(wanted, rel=0.02)
+    assert np.mean(measured) == pytest.approx(noisy, rel=0.04)
+
+
+@pytest.mark.parametrize("degrees", [5.0, -5.0, 95.0, 175.0, -84.0, 33.0, -52.0, 124.0, -151.0])
+def test_slanted_edge_finds_any_direction_and_the_bright_side(degrees: float) -> None:
+    measured = slanted_edge(blurred_edge(0.8, degrees))
+
+    turn = (measured.normal - math.radians(degrees) + math.pi) % (2 * math.pi) - math.pi
+    assert abs(turn) < 2e-3
+    assert measured.mtf50 == pytest.approx(theory(0.8, degrees), rel=0.015)
+    assert measured.step == pytest.approx(STEP, rel=1e-3)
+    folded = abs(degrees) % 90
+    assert measured.angle_deg == pytest.approx(min(folded, 90 - folded), abs=0.1)
+
+
+def test_mtf_curve_agrees_with_theory_up_to_nyquist() -> None:
+    f = np.linspace(0.0, 0.5, 26)
+    measured = slanted_edge(blurred_edge(0.5, 5.0, (160, 120)))
+    wanted = np.exp(-2 * math.pi**2 * 0.25 * f**2) * pixel_mtf(f, math.radians(5.0))
+
+    np.testing.assert_allclose(measured.contrast(f), wanted, atol=0.012)
+
+
+def test_area_sampled_edge_has_the_mtf_of_one_pixel_box() -> None:
+    f = np.linspace(0.0, 0.5, 26)
+    normal = math.radians(5.0)
+    measured = slanted_edge(slanted_edge_scene(160, 120, normal))
+
+    np.testing.assert_allclose(measured.contrast(f), pixel_mtf(f, normal), atol=0.015)
+    np.testing.assert_allclose(measured.compensated().contrast(f), 1.0, atol=0.025)
+    assert measured.compensated().overshoot == measured.overshoot
+
+
+def test_sharpened_edge_shows_overshoot_and_an_mtf_above_one() -> None:
+    edge = blurred_edge(1.2, 5.0)
+    sharpened = edge + 1.5 * (edge - ndimage.gaussian_filter(edge, 2.0, mode="nearest"))
+    plain, over = slanted_edge(edge), slanted_edge(sharpened)
+
+    assert plain.overshoot < 0.1
+    assert plain.undershoot < 0.1
+    assert plain.mtf_max == pytest.approx(1.0, abs=1e-3)
+    assert plain.mtf50p == pytest.approx(plain.mtf50)
+    assert over.overshoot > 5.0
+    assert over.undershoot == pytest.approx(over.overshoot, rel=0.1)
+    assert over.mtf_max > 1.1
+    assert over.mtf50p < over.mtf50
+
+
+def test_measured_step_does_not_change_the_mtf() -> None:
+    edge = blurred_edge(1.0, 5.0)
+
+    assert slanted_edge(0.01 * edge + 0.4).mtf50 == pytest.approx(slanted_edge(edge).mtf50, rel=1e-6)
+
+
+def test_slanted_edge_refuses_what_holds_no_edge() -> None:
+    rng = np.random.default_rng(1)
+    with pytest.raises(NotEnoughEvidenceError):
+        slanted_edge(0.5 + rng.normal(0.0, 0.01, (80, 80)))
+    with pytest.raises(NotEnoughEvidenceError, match="lean"):
+        slanted_edge(blurred_edge(0.5, 0.0))
+    with pytest.raises(InvalidInputError, match="finite"):
+        slanted_edge(np.full((80, 80), np.nan))
+    with pytest.raises(InvalidInputError, match="16 x 16"):
+        slanted_edge(np.zeros((8, 80)))
+
+
+@pytest.mark.tools
+def test_published_edge_of_known_angle_and_width_is_measured_right(shared_data: Path) -> None:
+    edge = tifffile.imread(shared_data / "edges" / "simulated_edge_known_fwhm.tif")
+    measured = slanted_edge(edge.astype(np.float64))
+
+    assert measured.angle_deg == pytest.approx(16.776550, abs=5e-3)
+    assert 0.216 < measured.mtf50 < 0.226  # two independent tools say 0.218 and 0.224
+
+
+def test_crossing_interpolates_and_says_the_end_when_there_is_none() -> None:
+    assert crossing([0.0, 0.1, 0.2], [1.0, 0.6, 0.4], 0.5) == pytest.approx(0.15)
+    assert crossing([0.0, 0.1, 0.2], [1.0, 0.9, 0.8], 0.5) == 0.2
+
+
+def test_mtf_of_a_gaussian_kernel_is_the_closed_form_along_both_axes() -> None:
+    kernel = gaussian(41, [[4.0, 0.0], [0.0, 1.0]])  # rows wide, columns narrow
+    f = np.linspace(0.0, 0.4, 9)
+
+    for angle, variance in ((0.0, 1.0), (math.pi / 2, 4.0)):
+        wanted = np.exp(-2 * math.pi**2 * variance * f**2) * np.sinc(f)
+        np.testing.assert_allclose(mtf_from_kernel(kernel, angle, f), wanted, atol=2e-3)
+
+
+def test_tangential_is_along_u_and_sagittal_along_v() -> None:
+    phi = 0.6
+    c, s = math.cos(phi), math.sin(phi)
+    u, v = np.array([-s, c]), np.array([-c, -s])  # (row, col) of the local frame
+    kernel = gaussian(41, 4.0 * np.outer(u, u) + 1.0 * np.outer(v, v))  # stretched along u
+    tangential, sagittal = tangential_sagittal_mtf50(kernel, phi)
+
+    assert tangential == mtf50_from_kernel(kernel, phi)
+    assert tangential == pytest.approx(theory(2.0, math.degrees(phi)), rel=0.01)
+    assert sagittal == pytest.approx(theory(1.0, math.degrees(phi)), rel=0.01)
+
+
+def test_encircled_energy_of_a_gaussian_is_the_closed_form() -> None:
+    sigma = 3.0
+    kernel = gaussian(61, sigma**2 * np.eye(2))
+    radii = np.array([1.0, 3.0, 6.0])
+    spread = sigma**2 + 1 / 12  # the pixel widens it
+
+    np.testing.assert_allclose(
+        encircled_energy(kernel, radii), 1 - np.exp(-(radii**2) / (2 * spread)), atol=5e-3
+    )
+    assert encircled_radius(kernel, 0.5) == pytest.approx(math.sqrt(2 * math.log(2) * spread), rel=0.01)
+    with pytest.raises(InvalidInputError):
+        encircled_radius(kernel, 1.0)
+
+
+def test_units_convert_in_the_usual_way() -> None:
+    assert lp_per_mm(0.25, 5.0) == pytest.approx(50.0)
+    assert lp_per_ph(0.163, 3753) == pytest.approx(612, abs=1)
+    with pytest.raises(InvalidInputError):
+        lp_per_mm(0.2, 0.0)
+    with pytest.raises(InvalidInputError):
+        lp_per_ph(0.2, 0)
+
+
+@pytest.fixture(scope="module")
+def comatic() -> SimulatedLens:
+    return SimulatedLens(
+        (
+            Aberrations(
+                f_number=2.8,
+                coma=3.0,
+                astigmatism=1.5,
+                field_curvature=-0.5,
+                defocus=1.2,
+                decentring=(0.1, 0.1),
+            ),
+        )
+    )
+
+
+def test_photographed_chart_agrees_with_the_kernels_own_mtf(comatic: SimulatedLens) -> None:
+    frame = Frame(720, 960)
+    chart = edge_chart(frame, margin=16, guard=16)
+    options = BlurOptions(size=31, step=0.16, lateral=False)
+    image = blurred(chart.scene, comatic, LensSettings(), frame, options)[1]
+    measured = measure_edges(image, [edge.box for edge in chart.edges], rendered=True)
+
+    assert len(measured) == len(chart.edges)
+    ratios = []
+    for edge, seen in zip(chart.edges, measured, strict=True):
+        exact = mtf50_from_kernel(comatic.kernel(edge.position, size=31), edge.normal)
+        ratios.append(seen.response.mtf50 / exact)
+        assert seen.direction == edge.direction
+        assert seen.zone == edge.zone
+        assert abs(math.sin(seen.response.normal - edge.normal)) < 0.01
+    assert np.abs(np.array(ratios) - 1.0).max() < 0.03
+
+    table = by_zone(measured)
+    assert {zone: row.edges for zone, row in table.items()} == {"center": 2, "mid": 8, "corner": 8}
+    assert table["corner"].mtf50 < table["center"].mtf50
+    assert table["corner"].mtf_max < 1.01
+
+
+def test_measuring_skips_boxes_without_an_edge_and_says_when_none_is_left(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    plane = np.full((200, 200), 0.5)
+    plane[:100, :80] = blurred_edge(1.0, 5.0)
+    found = measure_edges(plane, [(0, 0, 100, 80), (100, 100, 90, 90)])
+
+    assert len(found) == 1
+    assert "no edge" in caplog.text
+    with pytest.raises(NotEnoughEvidenceError, match="none of the 1"):
+        measure_edges(plane, [(100, 100, 90, 90)])
+    with pytest.raises(InvalidInputError, match="leaves the frame"):
+        measure_edges(plane, [(150, 150, 90, 90)])
+    assert math.isnan(by_zone(found)[found[0].zone].sagittal_mtf50) != math.isnan(
+        by_zone(found)[found[0].zone].tangential_mtf50
+    )
+
+
+def test_psnr_is_that_of_the_mean_square_and_infinite_for_equal_pictures() -> None:
+    reference = np.full((3, 20, 30), 0.5)
+
+    assert psnr(reference + 0.1, reference) == pytest.approx(20.0)
+    assert psnr(reference, reference) == math.inf
+    mask = np.zeros((20, 30), dtype=bool)
+    mask[:, 0] = True
+    changed = reference.copy()
+    changed[:, :, 0] += 0.01
+    assert psnr(changed, reference, mask=mask) == pytest.approx(40.0)
+    assert psnr(reference * 0.9, reference, srgb=True) == pytest.approx(
+        -20 * math.log10(to_srgb(np.array(0.5)) - to_srgb(np.array(0.45)))
+    )
+    with pytest.raises(InvalidInputError, match="mask"):
+        psnr(reference, reference, mask=np.zeros((20, 30), dtype=bool))
+    with pytest.raises(InvalidInputError, match="same shape"):
+        psnr(reference, reference[:, 1:])
+
+
+def test_srgb_curve_has_its_known_values_and_clips() -> None:
+    np.testing.assert_allclose(
+        to_srgb(np.array([-1.0, 0.0, 0.0031308, 0.214041, 1.0, 2.0])), [0, 0, 0.04045, 0.5, 1, 1], atol=1e-4
+    )
+
+
+def test_ssim_is_one_for_equal_pictures_and_falls_with_blur() -> None:
+    scene = dead_leaves(64, 96, np.random.default_rng(0))
+    soft, softer = (np.stack([ndimage.gaussian_filter(p, s) for p in scene]) for s in (0.7, 2.0))
+
+    assert ssim(scene, scene) == pytest.approx(1.0)
+    assert ssim(scene, scene) > ssim(soft, scene) > ssim(softer, scene)
+    assert ssim(soft, scene, srgb=True) < 1.0
+    with pytest.raises(InvalidInputError, match="11"):
+        ssim(scene[:, :8], scene[:, :8])
+
+
+def smooth_scene() -> NDArray[np.float64]:
+    scene = dead_leaves(120, 160, np.random.default_rng(1))
+    return np.stack([ndimage.gaussian_filter(p.astype(np.float64), 1.5) for p in scene])
+
+
+@pytest.mark.parametrize("shift", [(0.3, -0.7), (1.6, 0.0), (-0.05, 2.2)])
+def test_best_shift_undoes_a_shift(shift: tuple[float, float]) -> None:
+    scene = smooth_scene()
+    moved = shifted(scene, *shift)
+    found = best_shift(moved, scene)
+
+    np.testing.assert_allclose(found, (-shift[0], -shift[1]), atol=0.01)
+
+
+def test_shift_moves_towards_growing_rows_and_columns() -> None:
+    picture = np.zeros((40, 50))
+    picture[20, 25] = 1.0
+
+    assert np.unravel_index(shifted(picture, 3.0, -2.0).argmax(), picture.shape) == (23, 23)
+    np.testing.assert_array_equal(shifted(picture, 0.0, 0.0), picture)
+
+
+def test_zone_psnr_forgives_a_global_shift_but_not_a_blurred_corner() -> None:
+    scene = smooth_scene()
+    frame = Frame(120, 160)
+    moved = shifted(scene, 0.4, -0.3)
+    soft = np.stack([ndimage.gaussian_filter(p, 1.5) for p in scene])
+    soft_corners = np.where(zone_masks(frame)["corner"], soft, scene)
+
+    assert psnr(moved, scene) < 40.0
+    assert min(zone_psnr(moved, scene, frame, border=6).values()) > 45.0
+    zones = zone_psnr(soft_corners, scene, frame, border=6)
+    assert zones["corner"] < 40.0 < zones["center"]
+    with pytest.raises(InvalidInputError, match="size"):
+        zone_psnr(scene, scene, Frame(100, 100))
+
+
+def test_best_shift_of_a_flat_picture_is_none() -> None:
+    assert best_shift(np.full((40, 40), 0.3), np.full((40, 40), 0.3)) == (0.0, 0.0)
+
+
+def test_zones_divide_the_frame() -> None:
+    masks = zone_masks(Frame(60, 90))
+
+    assert (sum(mask.astype(int) for mask in masks.values()) == 1).all()
+    assert masks["center"][30, 45]
+    assert masks["corner"][0, 0]
+    assert masks["mid"][30, 20]
+
+
+def test_noise_gain_sees_through_shading() -> None:
+    rng = np.random.default_rng(2)
+    shading = np.linspace(0.2, 0.5, 64)[None, :] * np.linspace(1.0, 1.3, 64)[:, None]
+    noise = rng.normal(0.0, 0.01, (64, 64))
+
+    assert flat_noise(shading + noise) == pytest.approx(0.01, rel=0.05)
+    assert noise_gain(shading + 2.5 * noise, shading + noise) == pytest.approx(2.5, rel=0.02)
+    with pytest.raises(InvalidInputError, match="no noise"):
+        noise_gain(noise, np.zeros((64, 64)))
+    with pytest.raises(InvalidInputError, match="8 x 8"):
+        flat_noise(np.zeros((4, 40)))
+
+
+def test_delta_kernel_passes_everything() -> None:
+    kernel = delta(15)
+
+    np.testing.assert_allclose(mtf_from_kernel(kernel, 0.3, [0.0, 0.2, 0.5]), 1.0)
+    assert mtf50_from_kernel(kernel, 0.3) == 1.0
+
+
+def test_registered_psnr_forgives_a_smooth_distortion_but_no_blur() -> None:
+    rng = np.random.default_rng(0)
+    sharp = ndimage.gaussian_filter(rng.random((256, 384)), 1.0)
+    rows, cols = np.mgrid[0:256, 0:384].astype(float)
+    bent = ndimage.map_coordinates(sharp, [rows + 0.004 * (cols - 192), cols], order=3, mode="mirror")
+    soft = ndimage.gaussian_filter(sharp, 1.0)
+    frame = Frame(256, 384)
+
+    plain = zone_psnr(bent, sharp, frame)["corner"]
+    registered = registered_zone_psnr(bent, sharp, frame)["corner"]
+    blurred = registered_zone_psnr(soft, sharp, frame)["corner"]
+
+    assert registered > plain + 6.0
+    assert blurred < registered - 3.0

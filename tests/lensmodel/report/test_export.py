@@ -1,0 +1,190 @@
+"""What is exported reads back as the same PSFs, upright and at their places."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import io
+import json
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from lensmodel.core.errors import InvalidInputError, UnknownMethodError
+from lensmodel.core.psf import PsfSample, centroid
+from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.model import LensModel
+from lensmodel.quality import tangential_sagittal_mtf50
+from lensmodel.report import PsfGrid, export, exporters, psf_grid
+from lensmodel.simulate import draw_lens
+
+SETTINGS = LensSettings(aperture=2.0)
+
+
+@pytest.fixture(scope="module")
+def model() -> LensModel:
+    lens = draw_lens(1000, "coma")
+    settings = LensSettings(aperture=max(2.0, lens.optics[0].f_number))
+    places = [FieldPosition(r, a + r) for r in (0.1, 0.4, 0.6, 0.9) for a in np.arange(6) * math.pi / 3]
+    return LensModel.fit([PsfSample(lens.kernel(p, settings, 15), p, settings, photo="a") for p in places])
+
+
+@pytest.fixture(scope="module")
+def psfs(model: LensModel) -> PsfGrid:
+    return psf_grid(model, SETTINGS, rows=2, cols=3, size=15)
+
+
+def arrow() -> PsfGrid:
+    """One kernel with its light above and to the right: a flipped axis shows."""
+    kernel = np.zeros((1, 5, 5), dtype=np.float32)
+    kernel[0, 0, 2], kernel[0, 2, 4] = 0.75, 0.25
+    return PsfGrid(kernel, (FieldPosition(0.5, 1.0),), 1, 1, SETTINGS, (0.1,))
+
+
+def test_a_grid_asks_the_model_at_each_place(model: LensModel, psfs: PsfGrid) -> None:
+    assert psfs.kernels.shape == (6, 15, 15)
+    for place, kernel in zip(psfs.positions, psfs.kernels, strict=True):
+        assert kernel == pytest.approx(model.query(place, SETTINGS, 15).kernel, abs=1e-7)
+
+
+def test_tiff_pages_are_the_kernels_and_their_places_stand_in_the_description(
+    psfs: PsfGrid, tmp_path: Path
+) -> None:
+    export(tmp_path / "psf.tif", psfs, "tiff")
+
+    with tifffile.TiffFile(tmp_path / "psf.tif") as file:
+        pages = np.stack([page.asarray() for page in file.pages])
+        about = json.loads(file.pages.first.description)
+    assert pages.dtype == np.float32
+    assert np.array_equal(pages, psfs.kernels)
+    assert [(p["r"], p["phi"]) for p in about["psfs"]] == [(p.r, p.phi) for p in psfs.positions]
+
+
+def test_fits_is_a_cube_stored_from_the_bottom_with_a_table_of_places(psfs: PsfGrid, tmp_path: Path) -> None:
+    fits = importlib.import_module("astropy.io.fits")
+    export(tmp_path / "psf.fits", psfs, "fits")
+
+    with fits.open(tmp_path / "psf.fits") as file:
+        cube, header = file[0].data, file[0].header
+        table = file["POSITIONS"].data
+        assert np.array_equal(cube[:, ::-1], psfs.kernels)
+        assert header["BITPIX"] == -32
+        assert header["ROWORDER"] == "BOTTOM-UP"
+        assert header["FNUMBER"] == 2.0
+        assert table["R"].tolist() == [p.r for p in psfs.positions]
+        assert table["PHI"].tolist() == [p.phi for p in psfs.positions]
+
+
+def test_fits_of_a_single_place_is_an_image_with_the_top_row_last(tmp_path: Path) -> None:
+    fits = importlib.import_module("astropy.io.fits")
+    export(tmp_path / "one.fits", arrow(), "fits")
+
+    with fits.open(tmp_path / "one.fits") as file:
+        assert file[0].data.shape == (5, 5)
+        assert file[0].data[4, 2] == 0.75
+        assert file[0].data[2, 4] == 0.25
+
+
+def test_fits_without_astropy_names_the_remedy(
+    psfs: PsfGrid, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "astropy.io.fits", None)
+
+    with pytest.raises(InvalidInputError, match=r"pip install '\.\[fits\]'"):
+        export(tmp_path / "psf.fits", psfs, "fits")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_npz_holds_kernels_and_places_without_pickle(psfs: PsfGrid, tmp_path: Path) -> None:
+    export(tmp_path / "psf.npz", psfs, "npz")
+
+    with np.load(tmp_path / "psf.npz", allow_pickle=False) as stored:
+        assert np.array_equal(stored["psf"], psfs.kernels)
+        assert stored["r"].tolist() == [p.r for p in psfs.positions]
+        assert stored["phi"].tolist() == [p.phi for p in psfs.positions]
+        assert stored["shape"].tolist() == [2, 3]
+        assert set(stored["aperture"]) == {2.0}
+
+
+def test_json_of_a_grid_holds_every_kernel_to_the_last_bit(psfs: PsfGrid, tmp_path: Path) -> None:
+    export(tmp_path / "psf.json", psfs, "json")
+
+    stored = json.loads((tmp_path / "psf.json").read_text(encoding="utf-8"))
+    kernels = np.array([entry["kernel"] for entry in stored["psfs"]], dtype=np.float32)
+    assert np.array_equal(kernels, psfs.kernels)
+    assert (stored["rows"], stored["cols"], stored["aperture"]) == (2, 3, 2.0)
+
+
+def test_json_of_a_single_place_is_a_bare_matrix_with_the_top_row_first(tmp_path: Path) -> None:
+    export(tmp_path / "one.json", arrow(), "json")
+
+    stored = np.array(json.loads((tmp_path / "one.json").read_text(encoding="utf-8")))
+    assert stored.shape == (5, 5)
+    assert stored[0, 2] == 0.75
+    assert stored[2, 4] == 0.25
+
+
+def test_csv_tells_the_contrast_of_each_kernel(psfs: PsfGrid, tmp_path: Path) -> None:
+    export(tmp_path / "mtf.csv", psfs, "csv")
+
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "mtf.csv").read_text(encoding="utf-8"))))
+    assert [(int(row["row"]), int(row["col"])) for row in rows] == [
+        (i, j) for i in range(2) for j in range(3)
+    ]
+    for row, place, kernel in zip(rows, psfs.positions, psfs.kernels, strict=True):
+        tangential, sagittal = tangential_sagittal_mtf50(kernel.astype(np.float64), place.phi)
+        assert float(row["mtf50_tangential"]) == pytest.approx(tangential, abs=1e-5)
+        assert float(row["mtf50_sagittal"]) == pytest.approx(sagittal, abs=1e-5)
+        assert 1.0 > float(row["tangential_0.05"]) > float(row["tangential_0.15"])
+
+
+def test_the_sheet_shows_each_kernel_at_its_place(psfs: PsfGrid, tmp_path: Path) -> None:
+    export(tmp_path / "sheet.png", psfs, "png")
+
+    sheet = np.asarray(Image.open(tmp_path / "sheet.png"), dtype=np.float64)
+    assert sheet.shape == (2 * 17 - 2, 3 * 17 - 2)
+    lower_left = sheet[17:32, :15]
+    assert lower_left / 65535.0 == pytest.approx(psfs.kernels[3] / psfs.kernels[3].max(), abs=1e-5)
+
+
+@pytest.mark.parametrize("name", sorted(exporters))
+class TestEveryFormat:
+    def test_writes_a_file_that_is_complete_or_absent(self, psfs: PsfGrid, tmp_path: Path, name: str) -> None:
+        target = tmp_path / f"psf{exporters.create(name).suffix}"
+
+        export(target, psfs, name)
+
+        assert target.stat().st_size > 100
+        assert [p.name for p in tmp_path.iterdir()] == [target.name]
+
+    def test_writes_a_single_place(self, name: str) -> None:
+        assert len(exporters.create(name).encode(arrow())) > 50
+
+
+def test_a_single_place_is_that_kernel(model: LensModel) -> None:
+    place = FieldPosition(0.7, 0.4)
+
+    one = psf_grid(model, SETTINGS, size=15, at=place)
+
+    assert (one.rows, one.cols, one.positions) == (1, 1, (place,))
+    assert np.hypot(*centroid(one.kernels[0].astype(np.float64))) < 2e-3
+
+
+def test_unknown_formats_are_refused_by_name(psfs: PsfGrid, tmp_path: Path) -> None:
+    with pytest.raises(UnknownMethodError, match="csv, fits, json, npz, png, tiff"):
+        export(tmp_path / "psf.bmp", psfs, "bmp")
+
+
+def test_grids_too_large_for_memory_are_refused(model: LensModel) -> None:
+    with pytest.raises(InvalidInputError, match="512 MiB"):
+        psf_grid(model, SETTINGS, rows=100, cols=100, size=255)
+
+
+def test_grids_of_another_number_of_kernels_are_refused(psfs: PsfGrid) -> None:
+    with pytest.raises(InvalidInputError, match="2 x 2 places"):
+        PsfGrid(psfs.kernels, psfs.positions, 2, 2, SETTINGS, psfs.predicted_error)

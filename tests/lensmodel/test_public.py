@@ -1,0 +1,305 @@
+"""What `import lensmodel` offers: the names, their signatures, and that it costs little."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lensmodel
+from lensmodel.core import processes
+from lensmodel.core.errors import InvalidInputError, UnknownMethodError
+from lensmodel.core.psf import centroid, gaussian
+from lensmodel.core.registry import Registry
+from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.workflow.lens import Lens, field_grid
+
+NAMES = [
+    "Bounds",
+    "CalibrationEvent",
+    "CancelledError",
+    "Corrected",
+    "Deconvolver",
+    "FieldPosition",
+    "Lens",
+    "LensModelError",
+    "LensSettings",
+    "LinearPhoto",
+    "ModelSettings",
+    "NoiseModel",
+    "PsfAnswer",
+    "PsfEstimate",
+    "PsfEstimator",
+    "PsfSample",
+    "Restored",
+    "Selector",
+    "Sensor",
+    "calibrate",
+    "correct",
+    "deconvolvers",
+    "develop",
+    "estimators",
+    "field_grid",
+    "photo_from_array",
+    "selectors",
+]
+
+SIGNATURES = {
+    "calibrate": "photos, *, lens, aperture, focal_mm, focus_m, estimator, selector, model, any_lens, "
+    "patches, "
+    "workers, executor, on_event",
+    "correct": "image, lens, output, *, aperture, focal_mm, focus_m, method, strength, bounds, file_format, "
+    "color_space, quality, least_gain_db, sidecar, workers, on_step",
+    "develop": "path, *, limits, demosaic",
+    "photo_from_array": "planes, *, noise, clip, aperture, focal_mm, focus_m, pixel_pitch_um",
+    "field_grid": "rows, cols, *, aspect",
+    "Lens": "profile",
+    "Lens.from_kernels": "kernels, r, phi, *, aperture, channel, weight, photo, pixel_pitch_um, model",
+    "Lens.load": "path",
+    "Lens.save": "self, path",
+    "Lens.psf": "self, r, phi, *, aperture, focal_mm, focus_m, channel, size",
+    "Lens.kernels": "self, r, phi, *, aperture, channel, size",
+    "Lens.mtf": "self, r, phi, frequencies, *, aperture, channel",
+    "Lens.mtf50_map": "self, rows, cols, *, aspect, aperture, channel",
+}
+
+HEAVY = {"numpy", "scipy", "rawpy", "fastapi", "sqlalchemy", "pydantic", "app", "lensmodel.lab"}
+SERVICE = {"fastapi", "sqlalchemy", "pydantic", "dbos", "structlog", "app", "lensmodel.lab"}
+
+
+def public(name: str) -> Any:
+    value: Any = lensmodel
+    for part in name.split("."):
+        value = getattr(value, part)
+    return value
+
+
+def parameters(function: Any) -> str:
+    words, starred = [], False
+    for parameter in inspect.signature(function).parameters.values():
+        if parameter.kind is parameter.KEYWORD_ONLY and not starred:
+            words.append("*")
+            starred = True
+        words.append(parameter.name)
+    return ", ".join(words)
+
+
+def test_public_names_are_these_and_sorted() -> None:
+    assert lensmodel.__all__ == sorted(NAMES)
+    assert set(lensmodel.__all__) <= set(dir(lensmodel))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_public_name_exists_and_is_documented(name: str) -> None:
+    value = getattr(lensmodel, name)
+
+    assert inspect.getdoc(value)
+
+
+@pytest.mark.parametrize("name", sorted(SIGNATURES))
+def test_a_public_signature_is_as_announced(name: str) -> None:
+    assert parameters(public(name)) == SIGNATURES[name]
+
+
+@pytest.mark.parametrize(
+    "name", ["calibrate", "correct", "photo_from_array", "Lens.from_kernels", "Lens.psf"]
+)
+def test_a_public_function_documents_each_parameter_and_its_errors(name: str) -> None:
+    text = inspect.getdoc(public(name)) or ""
+
+    for parameter in set(inspect.signature(public(name)).parameters) - {"self"}:
+        assert parameter in text
+    for section in ("Parameters", "Returns", "Raises"):
+        assert f"{section}\n---" in text
+
+
+def test_an_unknown_name_is_no_attribute() -> None:
+    with pytest.raises(AttributeError, match="nonsense"):
+        lensmodel.nonsense  # noqa: B018 - the access is the test
+
+
+@pytest.mark.parametrize(
+    ("code", "unwanted"), [("import lensmodel", HEAVY), ("import lensmodel; lensmodel.calibrate", SERVICE)]
+)
+def test_importing_the_library_brings_no_more_than_it_needs(code: str, unwanted: set[str]) -> None:
+    script = f"{code}\nimport json, sys\nprint(json.dumps(sorted(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+
+    assert not unwanted & set(json.loads(done.stdout))
+
+
+# --- a field from arrays ----------------------------------------------------------------------
+
+
+def field_of_gaussians(n: int = 24) -> tuple[Lens, np.ndarray]:
+    rng = np.random.default_rng(0)
+    r, phi = np.sqrt(rng.random(n)), rng.uniform(-np.pi, np.pi, n)
+    kernels = np.stack([gaussian(15, np.eye(2) * (0.8 + 2.0 * radius)) for radius in r])
+    return Lens.from_kernels(kernels, r, phi, aperture=2.0), r
+
+
+def test_a_lens_of_kernels_is_softer_where_they_were() -> None:
+    lens, _ = field_of_gaussians()
+
+    center, corner = lens.mtf([0.0, 0.9], [0.0, 0.5], [0.0, 0.2], aperture=2.0)[0]
+
+    assert (center[0], corner[0]) == pytest.approx((1.0, 1.0))
+    assert center[1] > corner[1] + 0.1
+    assert center[1] == pytest.approx(np.exp(-2 * np.pi**2 * 0.2**2 * 0.8), abs=0.1)
+
+
+def test_many_kernels_at_once_are_those_of_single_questions() -> None:
+    lens, _ = field_of_gaussians()
+
+    many = lens.kernels([[0.1], [0.8]], [0.3, 2.0, -1.0], aperture=2.0, size=15)
+
+    assert many.shape == (2, 3, 15, 15)
+    assert many[1, 2] == pytest.approx(lens.psf(0.8, -1.0, aperture=2.0, size=15).kernel)
+
+
+def test_a_kernel_that_is_given_off_center_is_centered() -> None:
+    kernel = np.zeros((1, 9, 9))
+    kernel[0, 4, 6] = 3.0
+
+    sample = Lens.from_kernels(kernel, [0.5], [0.0]).samples[0]
+
+    assert centroid(sample.kernel) == pytest.approx((0.0, 0.0), abs=1e-2)
+    assert sample.kernel.sum() == pytest.approx(1.0)
+
+
+def test_the_map_is_that_of_the_kernels_and_row_0_is_the_top() -> None:
+    r, phi = field_grid(2, 3, aspect=1.5)
+    lens, _ = field_of_gaussians()
+
+    assert phi[0, 1] == pytest.approx(np.pi / 2)
+    assert (r[0, 0], np.cos(phi[0, 2]) > 0, np.sin(phi[1, 0]) < 0) == (pytest.approx(r[1, 2]), True, True)
+    assert lens.mtf50_map(2, 3, aperture=2.0).shape == (2, 2, 3)
+
+
+def test_a_lens_comes_back_from_its_file(tmp_path: Path) -> None:
+    lens, _ = field_of_gaussians()
+    lens.save(tmp_path / "a.lensprofile")
+
+    back = Lens.load(tmp_path / "a.lensprofile")
+
+    asked = {"aperture": 2.0, "size": 15}
+    assert back.psf(0.7, 0.2, **asked).kernel == pytest.approx(lens.psf(0.7, 0.2, **asked).kernel, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"r": [0.1, 0.2]}, {"kernels": np.ones((5, 5))}, {"channel": ["g", "r"]}, {"aperture": [1.0, 2.0]}],
+    ids=str,
+)
+def test_arrays_that_do_not_fit_each_other_are_refused(change: dict[str, Any]) -> None:
+    given: dict[str, Any] = {"kernels": np.ones((1, 5, 5)), "r": [0.1], "phi": [0.0], **change}
+
+    with pytest.raises(InvalidInputError):
+        Lens.from_kernels(**given)
+
+
+# --- arrays in, arrays out; methods of one's own ----------------------------------------------
+
+
+class Doubled:
+    """A deconvolver that nobody else has."""
+
+    def deconvolve(self, blurred: Any, blur: Any, *, sensor: Any, on_step: Any = None) -> lensmodel.Restored:
+        return lensmodel.Restored(blurred, steps=1)
+
+
+def test_an_array_is_corrected_by_a_name_and_by_an_object(tmp_path: Path) -> None:
+    lens, _ = field_of_gaussians()
+    planes = np.random.default_rng(1).random((3, 96, 128), dtype=np.float32)
+    output = tmp_path / "out.tif"
+
+    named = lensmodel.correct(planes, lens, aperture=2.0, method="wiener", workers=1)
+    own = lensmodel.correct(planes, lens, output, aperture=2.0, method=Doubled(), workers=1)
+
+    assert named.planes.shape == own.planes.shape == planes.shape
+    assert named.planes.dtype == np.float32
+    assert output.stat().st_size > planes.size * 2
+
+
+def test_what_would_be_lost_work_is_refused_before_it() -> None:
+    lens, _ = field_of_gaussians()
+    planes = np.zeros((3, 8, 8), dtype=np.float32)
+
+    with pytest.raises(InvalidInputError, match=r"no format for out\.xyz"):
+        lensmodel.correct(planes, lens, "out.xyz")
+    with pytest.raises(UnknownMethodError, match="wiener"):
+        lensmodel.correct(planes, lens, method="nonsense")
+    with pytest.raises(InvalidInputError, match="height, width"):
+        lensmodel.correct(planes[0], lens)
+    with pytest.raises(FileNotFoundError):
+        lensmodel.calibrate("gone.dng")
+
+
+def test_a_photo_is_not_replaced_by_its_correction(tmp_path: Path) -> None:
+    lens, _ = field_of_gaussians()
+    path = tmp_path / "one.tif"
+    path.write_bytes(b"II*\0")
+
+    with pytest.raises(InvalidInputError, match="the photo itself"):
+        lensmodel.correct(path, lens, path)
+
+
+def test_a_registered_method_is_known_by_its_name() -> None:
+    registry: Registry[Doubled] = Registry("deconvolver", {"first": Doubled})
+    registry.register("doubled", Doubled)
+
+    assert isinstance(registry.resolve("doubled"), Doubled)
+    assert list(registry) == ["doubled", "first"]
+    with pytest.raises(InvalidInputError, match="exists already"):
+        registry.register("first", Doubled)
+
+
+def test_a_registered_method_is_seen_by_a_correction(monkeypatch: pytest.MonkeyPatch) -> None:
+    lens, _ = field_of_gaussians()
+    planes = np.random.default_rng(1).random((3, 64, 64), dtype=np.float32)
+    monkeypatch.delitem(lensmodel.deconvolvers.entries, "doubled", raising=False)  # type: ignore[arg-type]
+    lensmodel.deconvolvers.register("doubled", Doubled)
+
+    corrected = lensmodel.correct(planes, lens, aperture=2.0, method="doubled", workers=1)
+
+    assert corrected.planes.shape == planes.shape
+    lensmodel.deconvolvers.entries.pop("doubled")  # type: ignore[attr-defined]
+
+
+# --- worker processes -------------------------------------------------------------------------
+
+UNGUARDED = """
+from lensmodel.core import processes
+print("begun")
+with processes.pool(None, 1) as pool:
+    print(pool.submit(len, "four").result())
+"""
+
+
+def test_a_script_without_a_guard_may_start_workers(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(UNGUARDED, encoding="utf-8")
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False)
+
+    assert done.stdout.split() == ["begun", "4"], done.stderr
+
+
+def test_what_other_processes_cannot_load_runs_in_threads_of_this_one() -> None:
+    own = type("Own", (), {"__module__": "__main__"})()
+
+    assert processes.portable(Doubled())
+    assert not processes.portable(own)
+    assert not processes.portable(lambda: None)
+    with processes.pool(None, 1, own) as pool:
+        assert pool.submit(id, own).result() == id(own)
+
+
+def test_values_of_the_library_are_plain() -> None:
+    assert lensmodel.FieldPosition is FieldPosition
+    assert lensmodel.LensSettings is LensSettings

@@ -1,0 +1,229 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lensmodel import correction, photo, quality
+from lensmodel.core import codec
+from lensmodel.core.errors import InvalidInputError, MetadataMissingError, NotEnoughEvidenceError
+from lensmodel.core.geometry import Frame
+from lensmodel.core.psf import PsfSample
+from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel
+from lensmodel.estimation.patches import Patch, Selection
+from lensmodel.model import LensModel
+from lensmodel.photo import LinearPhoto
+from lensmodel.simulate import (
+    BlurOptions,
+    SimulatedCamera,
+    SimulatedPhoto,
+    demo_scene,
+    draw_lens,
+    photograph,
+    write_photo,
+)
+from lensmodel.workflow import correcting, pipeline
+
+LENS = draw_lens(5, "soft-fast")  # blurred in the center too: there is something to gain everywhere
+CAMERA = SimulatedCamera(height=384, width=576, pitch_um=9.0)
+SETTINGS = LensSettings(aperture=LENS.at_focal().f_number)
+
+
+def taken(name: str, folder: Path, seed: int) -> tuple[Path, SimulatedPhoto]:
+    scene = demo_scene(name)[:, 200 : 200 + CAMERA.height + 32, 400 : 400 + CAMERA.width + 32]
+    options = BlurOptions(pitch_um=CAMERA.pitch_um, step=0.3, size=41)  # coarse nodes: seconds, not minutes
+    rng = np.random.default_rng(seed)
+    shot = photograph(np.ascontiguousarray(scene), LENS, SETTINGS, CAMERA, rng, options=options)
+    path = folder / f"{name}.dng"
+    write_photo(path, shot)
+    return path, shot
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, SimulatedPhoto]]:
+    folder = tmp_path_factory.mktemp("photos")
+    return {name: taken(name, folder, seed) for seed, name in enumerate(("city", "lake"))}
+
+
+@pytest.fixture(scope="module")
+def city(photos: dict[str, tuple[Path, SimulatedPhoto]]) -> LinearPhoto:
+    return photo.develop(photos["city"][0])
+
+
+def test_developed_photo_comes_back_from_disk_as_it_was(city: LinearPhoto, tmp_path: Path) -> None:
+    pipeline.save_developed(city, tmp_path)
+    back = pipeline.load_developed(tmp_path)
+
+    assert np.array_equal(back.planes, city.planes)
+    assert back.planes.flags.writeable is False
+    assert (back.frame, back.noise, back.clip) == (city.frame, city.noise, city.clip)
+    assert (back.info, back.encoding) == (city.info, city.encoding)
+
+
+def test_half_written_folder_is_no_developed_photo(tmp_path: Path) -> None:
+    (tmp_path / "photo.json").write_text("{}", encoding="utf-8")
+
+    with pytest.raises(InvalidInputError, match="develop it again"):
+        pipeline.load_developed(tmp_path)
+
+
+def test_a_developed_photo_that_does_not_fit_the_disk_leaves_no_remains(
+    city: LinearPhoto, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full_disk(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("numpy.save", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        pipeline.save_developed(city, tmp_path)
+
+    assert [path.name for path in tmp_path.iterdir()] == ["photo.json"]
+
+
+def test_lateral_colour_does_not_hang_on_the_level_of_white(
+    city: LinearPhoto,
+) -> None:
+    brighter = replace(city, planes=4.0 * city.planes, clip=(4.0, 4.0, 4.0))
+
+    assert pipeline.lateral_of(city).red_points > 0
+    assert pipeline.lateral_of(brighter).red_points == pipeline.lateral_of(city).red_points
+
+
+def test_cells_hold_every_patch_once_largest_first() -> None:
+    place = FieldPosition(0.1, 0.0)
+    patches = tuple(Patch(i, i, 64, place, 1.0, cell) for i, cell in enumerate((2, 1, 2, 0, 2, 1)))
+
+    groups = pipeline.cells(Selection(patches, ()))
+
+    assert [len(group) for group in groups] == [3, 2, 1]
+    assert sorted(p.row for group in groups for p in group) == list(range(6))
+
+
+def test_calibrated_lens_makes_another_photo_sharper(
+    photos: dict[str, tuple[Path, SimulatedPhoto]], tmp_path: Path, short_search: None
+) -> None:
+    events: list[pipeline.CalibrationEvent] = []
+    model = pipeline.calibrate([photos["city"][0]], count=12, workers=1, on_event=events.append)
+    path, shot = photos["lake"]
+    output = tmp_path / "corrected.tif"
+
+    corrected = pipeline.correct(path, model, output)
+
+    before = quality.registered_zone_psnr(photo.develop(path).planes, shot.sharp, CAMERA.frame)
+    after = quality.registered_zone_psnr(corrected.planes, shot.sharp, CAMERA.frame)
+    assert after["corner"] > before["corner"] + 0.5
+    assert after["center"] > before["center"]
+    assert output.stat().st_size > CAMERA.height * CAMERA.width * 6
+    stages = [event.stage for event in events]
+    assert stages[0] == "developing"
+    assert stages[-1] == "counted"
+    assert pipeline.calibrate([photos["city"][0]] * 2, model=model, on_event=events.append) is model
+    assert [event.stage for event in events][len(stages) :] == ["skipped"] * 2
+
+
+@pytest.mark.parametrize(("kind", "kept"), [("dng", True), ("tiff", True), ("jpeg", False)])
+def test_spectra_of_photos_that_a_camera_sharpened_are_not_kept(
+    kind: photo.FileKind, kept: bool, city: LinearPhoto
+) -> None:
+    developed = replace(city, info=replace(city.info, kind=kind))
+    patch = Patch(128, 192, 128, developed.frame.position(192, 256), 1.0, 0)
+
+    found = pipeline.estimate_cell(
+        developed, [patch], settings=SETTINGS, photo_id="a", estimator="whittle", channels=("g",)
+    )
+
+    assert (found[0].sample.spectrum is not None) == kept
+
+
+def test_a_patch_that_took_no_part_has_no_evidence_of_its_own(
+    city: LinearPhoto,
+) -> None:
+    planes = city.planes.copy()
+    planes[:, :128, :128] = 0.4  # nothing is seen here
+    group = [Patch(row, row, 128, city.frame.position(row, row), 1.0, 0) for row in (0, 192)]
+
+    found = pipeline.estimate_cell(
+        replace(city, planes=planes),
+        group,
+        settings=SETTINGS,
+        photo_id="a",
+        estimator="michaeli-irani",
+        channels=("g",),
+        size=11,
+    )
+
+    assert [cell.patch for cell in found] == group
+    assert [cell.evidence is None for cell in found] == [True, False]
+
+
+def test_photos_that_cannot_help_are_skipped_with_the_reason(tmp_path: Path) -> None:
+    text = tmp_path / "notes.jpg"
+    text.write_text("not a photo", encoding="utf-8")
+    events: list[pipeline.CalibrationEvent] = []
+
+    with pytest.raises(NotEnoughEvidenceError, match=r"notes\.jpg"):
+        pipeline.calibrate([text], on_event=events.append)
+
+    assert [event.stage for event in events] == ["developing", "skipped"]
+
+
+def test_photo_without_aperture_asks_for_it(tmp_path: Path) -> None:
+    from PIL import Image  # noqa: PLC0415 - one test needs it
+
+    path = tmp_path / "scan.png"
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (300, 400, 3), dtype=np.uint8)).save(path)
+
+    with pytest.raises(MetadataMissingError, match="--aperture"):
+        pipeline.samples_of_photo(path)
+
+
+def test_settings_given_by_hand_fill_what_the_file_does_not_say() -> None:
+    developed = LinearPhoto(
+        planes=np.zeros((3, 4, 4), dtype=np.float32),
+        frame=Frame(4, 4),
+        noise=(NoiseModel.white(0.01),) * 3,
+        clip=(1.0, 1.0, 1.0),
+        info=photo.PhotoInfo("dng", 4, 4, photo.PhotoMetadata(aperture=2.8, focal_mm=35.0)),
+        encoding=photo.Encoding(),
+        pipeline="test",
+    )
+
+    chosen = pipeline.settings_of(developed, LensSettings(aperture=4.0, focus_m=2.0))
+
+    assert (chosen.aperture, chosen.focal_mm, chosen.focus_m) == (2.8, 35.0, 2.0)
+
+
+def test_json_refuses_what_it_could_not_read_back() -> None:
+    with pytest.raises(InvalidInputError, match="object"):
+        codec.to_json({"x": object()})
+
+
+def test_paper_method_warps_the_channels_before_it_corrects(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: dict[str, object] = {}
+
+    def record(planes: np.ndarray, *args: object, lateral: object, **rest: object) -> correction.Corrected:
+        seen.update(planes=planes, lateral=lateral)
+        return correction.Corrected(planes, {})
+
+    monkeypatch.setattr(correcting.correction, "correct_planes", record)
+    monkeypatch.setattr(correcting, "resample", lambda planes, *_: planes + 1)
+    developed = LinearPhoto(
+        planes=np.zeros((3, 4, 4), dtype=np.float32),
+        frame=Frame(4, 4),
+        noise=(NoiseModel.white(0.01),) * 3,
+        clip=(1.0, 1.0, 1.0),
+        info=photo.PhotoInfo("dng", 4, 4),
+        encoding=photo.Encoding(),
+        pipeline="test",
+    )
+    kernel = np.zeros((5, 5))
+    kernel[2, 2] = 1.0
+    model = LensModel.fit([PsfSample(kernel, FieldPosition(0.1, 0.0))])
+
+    for method, warped in (("paper", True), ("standard", False)):
+        pipeline.correct_photo(developed, model, LensSettings(), method=method, lateral="shift")  # type: ignore[arg-type]
+
+        assert bool(np.asarray(seen["planes"]).any()) is warped
+        assert seen["lateral"] == (None if warped else "shift")

@@ -1,0 +1,106 @@
+"""A corrected chart says how much sharper its edges are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from lensmodel import photo
+from lensmodel.core import codec
+from lensmodel.core.belief import UncertainField
+from lensmodel.core.geometry import Frame
+from lensmodel.core.psf import PsfSample, gaussian, rms_width
+from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel, Planes
+from lensmodel.correction import Corrected
+from lensmodel.model import LensModel
+from lensmodel.photo import LinearPhoto
+from lensmodel.simulate import edge_chart
+from lensmodel.workflow import correcting, pipeline
+
+FRAME = Frame(900, 1200)
+NOISE = NoiseModel.white(0.003)
+
+
+def developed(planes: Planes) -> LinearPhoto:
+    return LinearPhoto(
+        planes=planes,
+        frame=FRAME,
+        noise=(NOISE,) * 3,
+        clip=(1.0, 1.0, 1.0),
+        info=photo.PhotoInfo("tiff", FRAME.width, FRAME.height),
+        encoding=photo.Encoding(),
+        pipeline="test",
+    )
+
+
+@pytest.fixture(scope="module")
+def model() -> LensModel:
+    kernel = gaussian(15, np.eye(2) * 1.7)
+    places = [FieldPosition(r, phi) for r in (0.1, 0.5, 0.9) for phi in (-2.0, 0.5, 2.5)]
+    return LensModel.fit([PsfSample(kernel, place, photo="x") for place in places])
+
+
+@pytest.fixture(scope="module")
+def measured(model: LensModel) -> LensModel:
+    """The same kernels as a target gives them, which are sure of themselves."""
+    return LensModel.fit([replace(sample, error=0.05) for sample in model.samples])
+
+
+def test_corrected_chart_has_a_measured_gain_in_each_zone_and_its_part_in_the_zones_of_the_part(
+    measured: LensModel,
+) -> None:
+    scene = ndimage.gaussian_filter(edge_chart(FRAME).scene[1], 1.3)[40:-40, 40:-40]
+    noise = np.random.default_rng(1).normal(0.0, 0.003, (3, *scene.shape))
+    chart = developed((scene + noise).astype(np.float32))
+
+    whole = pipeline.correct_photo(chart, measured, LensSettings(), method="fast")
+    part = pipeline.correct_photo(chart, measured, LensSettings(), method="fast", roi=(0, 700, 420, 500))
+
+    for report in whole.zones.values():
+        assert report.measured is not None
+        assert report.measured.edges >= 2
+        assert report.measured.gain > 1.3
+    assert part.zones["corner"].measured is not None
+    stored = codec.to_json(whole.zones)
+    assert stored["corner"]["measured"]["mtf50_after"] > stored["corner"]["measured"]["mtf50_before"]
+
+
+def test_corrected_photo_without_a_chart_has_no_measured_gain(model: LensModel) -> None:
+    rng = np.random.default_rng(2)
+    grain = ndimage.gaussian_filter(rng.random((3, FRAME.height, FRAME.width)), (0, 2, 2)).astype(np.float32)
+
+    found = pipeline.correct_photo(
+        developed(grain), model, LensSettings(), method="fast", roi=(300, 400, 200, 300)
+    )
+
+    assert {report.measured for report in found.zones.values()} == {None}
+
+
+def test_photo_that_is_sharper_than_the_model_says_is_corrected_with_care(
+    model: LensModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(4)
+    rows, cols = np.fft.fftfreq(FRAME.height)[:, None], np.fft.rfftfreq(FRAME.width)
+    fall = np.maximum(np.hypot(rows, cols), 1e-3) ** -1.05
+    scene = np.fft.irfft2(np.fft.rfft2(rng.normal(size=(FRAME.height, FRAME.width))) * fall)
+    soft = 0.4 + 0.06 * ndimage.gaussian_filter(scene, 0.6) / scene.std()
+    seen = np.stack([soft + rng.normal(0.0, 0.003, soft.shape) for _ in range(3)]).astype(np.float32)
+    told: dict[str, tuple[float, float]] = {}
+    name = ""
+
+    def record(planes: Planes, field: UncertainField, *_: object, **__: object) -> Corrected:
+        belief = field.belief_at(FieldPosition(0.3, 0.5), "g", 31)
+        told[name] = rms_width(belief.kernel), belief.error
+        return Corrected(planes, {})
+
+    monkeypatch.setattr(correcting.correction, "correct_planes", record)
+    for name in ("tiff", "jpeg"):
+        picture = developed(seen)
+        info = photo.PhotoInfo(name, FRAME.width, FRAME.height)  # type: ignore[arg-type] # of a tuple
+        pipeline.correct_photo(replace(picture, info=info), model, LensSettings())
+
+    assert told["tiff"][0] < 0.85 * told["jpeg"][0]
+    assert told["tiff"][1] > told["jpeg"][1] + 0.1

@@ -1,6 +1,7 @@
 // Forms and buttons that talk to the API, and pages that wait for work to end.
 
-import { byId, problemText, send } from "./common.js";
+import { byId, send } from "./common.js";
+import { removing } from "./stream.js";
 
 function setUpForm(id, act) {
   const form = byId(id);
@@ -78,9 +79,7 @@ export function setUpActions() {
     include: () => send("PATCH", `/v1/photos/${photo}`, { excluded: false }),
     delete: async () => {
       if (!window.confirm("Delete this photo, its corrections, and what the lens learned from it?")) return;
-      const response = await fetch(`/v1/photos/${photo}`, { method: "DELETE" });
-      if (!response.ok) throw new Error(await problemText(response));
-      location.assign("/");
+      await removing("/", () => send("DELETE", `/v1/photos/${photo}`));
     },
   };
   for (const button of holder.querySelectorAll("button")) {

@@ -1,6 +1,7 @@
 // The lens: its map of blur, the blur at a point, and how its error fell.
 
 import { byId, problemText, send } from "./common.js";
+import { removing } from "./stream.js";
 
 const LEAST_VIEW = 0.02; // of the picture: the blur changes no more over less
 const ZONES = [
@@ -198,8 +199,7 @@ export function setUpLensActions() {
       const into = fields.get("lens");
       if (!into) throw new Error("Choose the lens that this one is a part of.");
       if (!window.confirm("Merge? All photos of this lens then teach the other one. This cannot be undone.")) return;
-      await send("PATCH", lens, { merge_into: into });
-      location.assign(`/lenses/${into}`);
+      await removing(`/lenses/${into}`, () => send("PATCH", lens, { merge_into: into }));
     },
     upload: async (fields) => {
       const file = fields.get("profile");
@@ -210,8 +210,7 @@ export function setUpLensActions() {
     },
     delete: async () => {
       if (!window.confirm("Delete this lens and all that was learned of it? Its photos stay.")) return;
-      await send("DELETE", lens);
-      location.assign("/");
+      await removing("/", () => send("DELETE", lens));
     },
   };
   const run = async (act, fields) => {

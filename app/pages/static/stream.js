@@ -4,6 +4,20 @@ import { byId } from "./common.js";
 
 const PATIENCE_MS = 4000;
 
+let afterwards = "/"; // where to go when what the page shows is gone
+
+// Do what removes what the page shows, and go on at `url`: the stream may tell of it before the answer comes.
+export async function removing(url, act) {
+  afterwards = url;
+  try {
+    await act();
+  } catch (reason) {
+    afterwards = "/";
+    throw reason;
+  }
+  location.assign(url);
+}
+
 // Make `old` like `fresh` and keep what is alike: focus, open details, what was typed.
 export function merge(old, fresh) {
   const kept = [...old.childNodes];
@@ -66,7 +80,7 @@ export function setUpStream(onPart) {
     });
     source.addEventListener("gone", () => {
       source.close();
-      location.assign("/");
+      location.assign(afterwards);
     });
   };
   window.addEventListener("offline", () => (away.hidden = false));

@@ -145,7 +145,7 @@ def hue_bounded(photo: Planes, made: Planes, clips: Sequence[float], noise: Sequ
     same = lost & np.all(~saturated | (made >= level), axis=0)
     amid = ndimage.minimum_filter(clipped, _AMID)[inner[1:]]
     white = amid & (made.sum(axis=0) >= _STILL_WHITE * photo[inner].sum(axis=0))
-    kept = np.where(white & saturated, np.maximum(made, level), made)
+    kept = np.where(white & saturated, np.maximum(made, np.minimum(photo[inner], level)), made)
     return np.where(white | same | (t == 1.0), kept, bounded).astype(np.float32)
 
 

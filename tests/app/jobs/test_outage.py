@@ -277,9 +277,9 @@ def until(condition: Callable[[], object], log: Path) -> None:
         time.sleep(0.1)
 
 
-def send(store: Store, storage: Storage, count: int) -> list[str]:
+def send(store: Store, storage: Storage, count: int, first: int = 0) -> list[str]:
     ids = []
-    for number in range(count):
+    for number in range(first, first + count):
         public_id = new_id()
         storage.put(f"photos/{public_id}/original", b"a photo")
         store.photos.receive(
@@ -317,16 +317,17 @@ def test_photos_outlast_a_storage_that_is_away(settings: Settings, store: Store,
     aside = storage.folder.with_name("aside")
     log = settings.data_dir / "workers.log"
     with hired(settings):
-        until(lambda: store.workers.live(60.0), log)
+        send(store, storage, 1)
+        until(lambda: states(store) == {"counted"}, log)  # a worker without any photo founds a missing folder
         storage.folder.rename(aside)
-        send(store, Storage(f"file://{aside}"), 3)
+        send(store, Storage(f"file://{aside}"), 3, first=1)
         until(lambda: log.read_text().count("is away") >= 6, log)
         seen = states(store)
         aside.rename(storage.folder)
         until(lambda: states(store) == {"counted"}, log)
 
     assert "failed" not in seen
-    check_counted_once(store, 3)
+    check_counted_once(store, 4)
 
 
 def test_workers_that_start_while_the_storage_is_away_wait_for_it(settings: Settings, store: Store) -> None:

@@ -408,6 +408,7 @@ def test_a_photo_is_corrected_and_compared(page: Page, learned: dict[str, Any], 
 
     page.get_by_role("button", name="Split", exact=True).click()
     handle = page.locator(".handle")
+    expect(handle).to_be_visible()  # drawn with the next frame; what is hidden takes no focus
     handle.focus()
     page.keyboard.press("ArrowRight")
     expect(handle).to_have_attribute("aria-valuenow", "52")

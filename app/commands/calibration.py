@@ -20,13 +20,15 @@ from lensmodel import estimation
 from lensmodel.core.errors import InvalidInputError, LensModelError, MetadataMissingError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings, StepHook
+from lensmodel.estimation.estimator import require_size
 from lensmodel.estimation.patches import selectors
 from lensmodel.model import LensModel, LensProfile, ModelSettings, save_profile
-from lensmodel.model.answer import KERNELS, MICROMETRE
+from lensmodel.model.answer import MICROMETRE
 from lensmodel.photo.endings import ENDINGS
 from lensmodel.workflow import pipeline
 from lensmodel.workflow.identity import Identity, difference
 from lensmodel.workflow.lens import Lens
+from lensmodel.workflow.ways import Way, way_named, way_of
 
 _ZIP: Final = b"PK"
 """How a profile begins, damaged or not."""
@@ -37,7 +39,7 @@ class Wishes:
     """What the options said."""
 
     aperture: float | None
-    estimator: str
+    estimator: str | None
     workers: int | None
     any_lens: bool
     force: bool
@@ -47,6 +49,8 @@ class Wishes:
     unit: str | None
     scheduler: str | None = None
     selector: str = "r-map"
+    model: str | None = None
+    kernel_size: int | None = None
 
 
 def run(names: Sequence[str], target: Path, wishes: Wishes, display: Display, *, as_json: bool) -> None:
@@ -62,11 +66,9 @@ def run(names: Sequence[str], target: Path, wishes: Wishes, display: Display, *,
     paths = files.photos(names)
     _refuse(target, paths, wishes)
     with files.as_usage():
-        estimation.estimators.create(wishes.estimator)
-        selectors.create(wishes.selector)
+        chosen = _chosen(wishes)
         settings = LensSettings(aperture=wishes.aperture)
         family = None if wishes.family is None else files.profile_at(wishes.family)
-        chosen = ModelSettings(mode=wishes.mode or KERNELS, unit=wishes.unit or MICROMETRE)
     calibration = Calibration(target, wishes, settings, chosen, family)
     results: list[dict[str, Any]] = []
     with display.progress() as bars:
@@ -107,6 +109,15 @@ def run(names: Sequence[str], target: Path, wishes: Wishes, display: Display, *,
         raise typer.Exit(1)
 
 
+def _chosen(wishes: Wishes) -> ModelSettings:
+    """Choose the model of a new profile; make sure that everything that was named is there."""
+    way = way_named(wishes.model or "default")
+    estimation.estimators.create(wishes.estimator or way.estimator)
+    require_size(wishes.kernel_size or way.kernel_size)
+    selectors.create(wishes.selector)
+    return ModelSettings(mode=wishes.mode or way.mode, unit=wishes.unit or MICROMETRE)
+
+
 def _refuse(target: Path, photos: Sequence[Path], wishes: Wishes) -> None:
     """Make sure that no photo is replaced, and that the options do not contradict each other."""
     if target.is_dir():
@@ -116,6 +127,8 @@ def _refuse(target: Path, photos: Sequence[Path], wishes: Wishes) -> None:
         raise UsageError(
             f"{target.name} is a photo; name a new file after --profile, for example my-24mm.lensprofile"
         )
+    if wishes.model is not None and wishes.mode is not None:
+        raise UsageError("--model and --mode exclude each other: a model has its own mode; give one of them")
     if wishes.family is not None and wishes.no_family:
         raise UsageError("--family and --no-family exclude each other; give one of them")
     if wishes.family is not None and files.same(target, wishes.family):
@@ -163,7 +176,8 @@ class Calibration:
         if self._settings.aperture is None and not files.says_aperture(path):
             return None
         wishes, count = self._wishes, pipeline.DEFAULT_PATCHES
-        return path.name, path.read_bytes(), self._settings, wishes.estimator, count, wishes.selector
+        settings = (self._settings, self._estimator, count, wishes.selector, self._kernel_size)
+        return path.name, path.read_bytes(), *settings
 
     def add(
         self, path: Path, on_event: pipeline.EventHook, estimated: Future[list[PsfSample]] | None = None
@@ -184,8 +198,9 @@ class Calibration:
             pipeline.samples_of_photo(
                 path,
                 settings=self._settings,
-                estimator=self._wishes.estimator,
+                estimator=self._estimator,
                 selector=self._wishes.selector,
+                kernel_size=self._kernel_size,
                 workers=self._wishes.workers,
                 on_event=on_event,
             )
@@ -204,6 +219,21 @@ class Calibration:
         self._grown = True
         return {"state": "counted", "samples": len(samples)}
 
+    @property
+    def _way(self) -> Way:
+        """The way the lens is learned: as was wished, or as it was before."""
+        if self._wishes.model is not None or self.profile is None:
+            return way_named(self._wishes.model or "default")
+        return way_of(self.profile.model)
+
+    @property
+    def _estimator(self) -> str:
+        return self._wishes.estimator or self._way.estimator
+
+    @property
+    def _kernel_size(self) -> int:
+        return self._wishes.kernel_size or self._way.kernel_size
+
     def _has(self, photo: str) -> bool:
         self._follow()
         return self.profile is not None and photo in self.profile.photos
@@ -221,7 +251,8 @@ class Calibration:
         if stamp in {None, self._seen}:
             return
         profile = _opened(self._target)
-        model = self._leaning(profile.model.answering(mode=self._wishes.mode, unit=self._wishes.unit))
+        mode = self._wishes.mode if self._wishes.model is None else way_named(self._wishes.model).mode
+        model = self._leaning(profile.model.answering(mode=mode, unit=self._wishes.unit))
         self.profile, self._seen = replace(profile, model=model), stamp
         self._grown = self._grown or model is not profile.model
 

@@ -42,7 +42,7 @@ class Wishes:
     """What the options said."""
 
     aperture: float | None
-    method: str
+    method: str | None
     strength: float
     bounds: correction.Bounds
     file_format: OutputFormat
@@ -73,7 +73,8 @@ def run(
     """
     targets = targets_of(files.photos(names), output, EXTENSION[wishes.file_format])
     with files.as_usage():
-        correction.deconvolvers.create(wishes.method)
+        if wishes.method is not None:
+            correction.deconvolvers.create(wishes.method)
         settings = LensSettings(aperture=wishes.aperture)
     lens = Lens(files.profile_at(source))
     lens = lens.warmed()  # once for all photos, where a run that was stopped left it undone

@@ -94,7 +94,8 @@ def run(
     with files.as_usage():
         estimation.estimators.create(learning.estimator)
         estimation.patches.selectors.create(learning.selector)
-        corrections.deconvolvers.create(wishes.method)
+        if wishes.method is not None:
+            corrections.deconvolvers.create(wishes.method)
         LensSettings(aperture=wishes.aperture)
     base = output or paths[0].parent / correction.FOLDER
     wishes = replace(wishes, least_gain_db=WORTH_DB)
@@ -255,7 +256,7 @@ class _Folder:
         samples = len(lens.profile.model.samples)
         wishes = self._wishes
         under = (
-            f"{target.name}, {samples} samples, {wishes.method}, strength {wishes.strength:g}, "
+            f"{target.name}, {samples} samples, {wishes.method or 'standard'}, strength {wishes.strength:g}, "
             f"{wishes.bounds}, aperture {wishes.aperture}"
         )
         known = self._journal.verdict("left", photo, under)

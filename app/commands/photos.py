@@ -34,8 +34,10 @@ from app.commands.console.options import (
     choice,
 )
 from lensmodel.correction import Bounds, deconvolvers
+from lensmodel.estimation import estimators
 from lensmodel.model.answer import MODES, UNITS
 from lensmodel.photo import OutputFormat
+from lensmodel.workflow.ways import WAYS
 
 
 def calibrate(
@@ -43,7 +45,27 @@ def calibrate(
     photos: Photos,
     profile: Profile,
     aperture: Aperture = None,
-    estimator: Estimator = "default",
+    model: Annotated[
+        str | None,
+        choice(
+            "--model",
+            tuple(WAYS),
+            "paper: learn the paper's own way, kernels by Michaeli and Irani and nothing but their "
+            "regression, and correct by Richardson-Lucy; to compare with. Kept from then on.",
+        ),
+    ] = None,
+    estimator: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME", help=f"Blind estimator: {', '.join(estimators)}; default: that of the model."
+        ),
+    ] = None,
+    kernel_size: Annotated[
+        int | None,
+        typer.Option(
+            metavar="PIXELS", help="Odd side of the kernels, 3 to 55; by default 31, of `paper` 55."
+        ),
+    ] = None,
     selector: Selector = "r-map",
     workers: Workers = None,
     scheduler: Annotated[
@@ -112,6 +134,8 @@ def calibrate(
             no_family=no_family,
             mode=mode,
             unit=unit,
+            model=model,
+            kernel_size=kernel_size,
             scheduler=scheduler,
             selector=selector,
         ),
@@ -160,7 +184,12 @@ def correct(
     ] = folder.LEARN_FROM,
     estimator: Estimator = "default",
     selector: Selector = "r-map",
-    method: Annotated[str, typer.Option(metavar="NAME", help=f"{', '.join(deconvolvers)}.")] = "standard",
+    method: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME", help=f"{', '.join(deconvolvers)}. Default: standard, or as the lens was learned."
+        ),
+    ] = None,
     strength: Annotated[
         float, typer.Option(min=0.0, max=1.0, metavar="0..1", help="0 nothing, 1 all that the noise allows.")
     ] = 1.0,

@@ -142,7 +142,7 @@ class _Remote:
     def _wish(self) -> dict[str, Any]:
         bounds = self._wishes.bounds
         wish = {
-            "method": self._wishes.method,
+            "method": self._wishes.method or "standard",
             "strength": self._wishes.strength,
             "texture": bounds.texture,
             "denoise": bounds.denoise,

@@ -64,6 +64,7 @@ class CorrectionJob:
     bounds: Bounds
     cell_factor: int
     audited: bool
+    plain: bool
     stored: StoredColour | None
 
     def __post_init__(self) -> None:
@@ -105,6 +106,10 @@ class CorrectionJob:
         down, across = ((blur_at(before), blur_at(after), pixels) for before, after, pixels in cell.beside)
         origin = (cell.middle[0] - corner[0], cell.middle[1] - corner[1])
         return UniformBlur(middle.kernel, middle.offset, Drift(down, across, origin))
+
+    def weakened(self, photo: Planes, restored: Planes) -> Planes:
+        """Go from the photo as far to what was made of it as the strength says."""
+        return restored if self.strength == 1.0 else photo + np.float32(self.strength) * (restored - photo)
 
     def reach(self, position: FieldPosition, channel: Channel) -> int:
         """How far the blur of a place reaches, in pixels."""
@@ -159,14 +164,18 @@ def restore_cell(job: CorrectionJob, cell: Cell) -> RestoredCell:
     plans = plan(cell, tile, beliefs, offsets, sensors, SHARE * job.bounds.texture)
     expected = plans.forecast
     worth = expected.gain_db >= WORTH_DB or job.bounds.denoise > 0.0
-    if job.strength == 0.0 or not worth:
+    if job.strength == 0.0 or not (worth or job.plain):
         untouched = replace(expected, after=expected.before)
         return RestoredCell(tile[inner], untouched, None, left=True)
     blurs = [
         job.blur(cell, channel, share, (top, left))
-        for channel, share in zip(CHANNELS, plans.shares, strict=True)
+        for channel, share in zip(
+            CHANNELS, (1.0,) * len(CHANNELS) if job.plain else plans.shares, strict=True
+        )
     ]
     restored = restore_planes(job.method, tile, blurs, sensors)
+    if job.plain:
+        return RestoredCell(job.weakened(tile[inner], restored[inner]), expected, None)
     restored = texture_kept(
         tile, restored, blurs, sensors, texture=job.bounds.texture, denoise=job.bounds.denoise
     )
@@ -192,8 +201,7 @@ def restore_cell(job: CorrectionJob, cell: Cell) -> RestoredCell:
     if expected.changed(tile[inner], restored).gain_db < WORTH_DB and job.bounds.denoise == 0.0:
         # bounds and audit left so little that what remains is a photo smoothed, not one made sharper
         return RestoredCell(tile[inner], replace(expected, after=expected.before), audit, left=True)
-    if job.strength < 1.0:
-        restored = tile[inner] + np.float32(job.strength) * (restored - tile[inner])
+    restored = job.weakened(tile[inner], restored)
     return RestoredCell(restored, expected.changed(tile[inner], restored), audit)
 
 

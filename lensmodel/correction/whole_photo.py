@@ -95,6 +95,7 @@ def correct_planes(
     cfa: BayerPattern | None = None,
     bounds: Bounds | None = None,
     audited: bool = True,
+    plain: bool = False,
     stored: StoredColour | None = None,
     roi: Roi | tuple[int, int, int, int] | None = None,
     workers: int = 1,
@@ -138,6 +139,9 @@ def correct_planes(
     audited : bool
         Whether to hold back what fails `lensmodel.correction.audit`; without it a method's own
         errors can be seen.
+    plain : bool
+        Give what the method makes of the PSFs as they are: nothing is weighed, bounded, given back or
+        audited, as in a paper's own experiments. Not for photos that somebody wants to keep.
     stored : StoredColour or None
         How the photo's file stored chroma, if at less than full resolution.
     roi : tuple of int or None
@@ -179,6 +183,7 @@ def correct_planes(
         # Kernels do not change within cells that are larger than usual.
         solver.cell_factor if isinstance(solver, CoarseMethod) and cfa is None else 1,
         audited,
+        plain,
         stored,
     )
     window = Roi.of(frame, roi)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,6 +152,22 @@ class StartingFrom(ABC):
         """Estimate from scratch, or on the finest level alone from a kernel to start with."""
 
 
+LARGEST: Final = 55
+"""Side of the largest kernel that is estimated, the paper's: a larger one leaves too little of a patch."""
+
+
+def require_size(size: int) -> None:
+    """Refuse sides of kernels that nobody can estimate.
+
+    Raises
+    ------
+    InvalidInputError
+        For an even size, or one out of range.
+    """
+    if size % 2 == 0 or not 3 <= size <= LARGEST:
+        raise InvalidInputError(f"the size of kernels must be odd and in 3..{LARGEST}, got {size}")
+
+
 def usable(
     patches: Sequence[Plane], noise: Sequence[NoiseModel], size: int
 ) -> list[tuple[Plane, NoiseModel]]:
@@ -164,8 +180,7 @@ def usable(
     NotEnoughEvidenceError
         If none is left; the text says why.
     """
-    if size % 2 == 0 or not 3 <= size <= 55:
-        raise InvalidInputError(f"kernel size must be odd and in 3..55, got {size}")
+    require_size(size)
     if len(patches) != len(noise) or not patches:
         raise InvalidInputError(f"every patch needs a noise model, got {len(patches)} and {len(noise)}")
     kept, reasons = [], []

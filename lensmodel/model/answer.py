@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -16,7 +16,8 @@ from lensmodel.core.types import Kernel
 KERNELS: Final = "kernels"
 MIXED: Final = "mixed"
 LIKELIEST: Final = "likeliest"
-MODES: Final = (KERNELS, MIXED, "evidence", "wavefront", LIKELIEST)
+PAPER: Final = "paper"
+MODES: Final = (KERNELS, MIXED, "evidence", "wavefront", LIKELIEST, PAPER)
 """What can be made of the neighbours of a question; `modes` tells what they are."""
 
 NEEDING_EVIDENCE: Final = frozenset({"evidence", LIKELIEST})
@@ -80,6 +81,13 @@ class ModelSettings:
         if self.unit not in UNITS:
             raise UnknownMethodError(f"no unit {self.unit!r} of the lens model; known: {', '.join(UNITS)}")
         object.__setattr__(self, "excluded", tuple(str(name) for name in self.excluded))
+
+    @property
+    def regression(self) -> ModelSettings:
+        """The choices that hold: the mode "paper" leaves none but those of bandwidths and photos."""
+        if self.mode != PAPER:
+            return self
+        return replace(self, method="nadaraya-watson", mirror=0.0, robust=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -105,6 +105,7 @@ class Fit:
         UnknownMethodError
             If `settings.method` is in no registry.
         """
+        settings = settings.regression
         if not samples:
             raise NoSamplesError("the lens has no PSF samples yet; calibrate it with a photo first")
         base = _claimed(samples, settings)

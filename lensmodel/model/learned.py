@@ -176,6 +176,8 @@ def _physical(document: Mapping[str, Any], lines: dict[str, Any], arrays: dict[s
     del scalars["front"]
     wavefront = Wavefront(**lines, **{**front, "eye": tuple(front["eye"])})
     found = Physics(front=wavefront, **scalars, **arrays)
+    if not 0.0 <= found.turned <= 1.0:
+        raise ValueError("a probability lies outside 0..1")
     if found.side < 1 or found.side % 2 == 0 or found.rest.shape != (len(found.vectors), found.side**2):
         raise ValueError("a wavefront and the rest of its samples do not fit together")
     return found

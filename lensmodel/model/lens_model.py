@@ -25,7 +25,7 @@ from lensmodel.core.types import ZONES, FieldPosition, Kernel, LensSettings, Ste
 from lensmodel.model import learned as memory
 from lensmodel.model import pitch as pitches
 from lensmodel.model import variables as va
-from lensmodel.model.answer import LIKELIEST, MICROMETRE, MIXED, MODES, ModelSettings, PsfAnswer
+from lensmodel.model.answer import LIKELIEST, MICROMETRE, MIXED, MODES, PAPER, ModelSettings, PsfAnswer
 from lensmodel.model.answering import AnsweringModel, ModelField
 from lensmodel.model.field.robust import Flag
 from lensmodel.model.fitting import Fit
@@ -36,6 +36,7 @@ from lensmodel.model.trust.expected_error import Evidence, expected_error, with_
 from lensmodel.model.trust.misleading_photos import without_misleading
 from lensmodel.model.trust.support import standard_error, support
 from lensmodel.model.wavefront.likelihood import Predict, likeliest
+from lensmodel.model.wavefront.physical_mean import Physics
 
 _LISTED = 1e-3  # share of the weight from which on a photo or a prior is named (chosen)
 
@@ -55,7 +56,7 @@ class LensModel:
         self.settings = settings
         self.prior = prior
         self._fit = fit
-        self._predictor = Predictor(fit, settings.method, prior)
+        self._predictor = Predictor(fit, settings.regression.method, prior)
 
     # --- building -------------------------------------------------------------------------------
 
@@ -346,10 +347,9 @@ class LensModel:
         return self._fit.mode
 
     @property
-    def diffraction_known(self) -> bool:
-        """Whether the wavefront was fitted knowing aperture and pixels, so that it tells narrow blur."""
-        physical = self._fit.physical
-        return physical is not None and physical.agreed and physical.diffraction_known
+    def physical(self) -> Physics | None:
+        """The wavefront that was fitted to the samples; None before `warmed`, or if it takes no part."""
+        return self._fit.physical
 
     @property
     def votes(self) -> NDArray[np.float64]:
@@ -395,4 +395,6 @@ class LensModel:
             model = LensModel(seen, self.settings, replace(fit, mode=mode))
             return model.kernel_of
 
-        return {mode: told_by(mode) for mode in MODES if mode != LIKELIEST and open_.get(mode, True)}
+        return {
+            mode: told_by(mode) for mode in MODES if mode not in {LIKELIEST, PAPER} and open_.get(mode, True)
+        }

@@ -6,6 +6,8 @@ mixed         the mixture of `combination`: kernels of both frames, and the wave
 evidence      their normal equations summed with the same weights, solved once (`normal_equations`)
 wavefront     the wavefront of the lens alone, fitted to all samples (`physical_mean`)
 likeliest     that of the four which makes patches likeliest that it was not fitted to (`likelihood`)
+paper         the kernels of the neighbours averaged, and nothing else: bandwidths by eq. (8) alone,
+              all samples as sure as they claim, no symmetry, nothing moved along the radius
 ============  ===============================================================================
 
 A mode that has nothing to go by at a place, no statistics or no wavefront, answers with averaged kernels.

@@ -21,6 +21,7 @@ from lensmodel.workflow import pipeline
 from lensmodel.workflow.identity import Identity, difference
 from lensmodel.workflow.lens import Lens
 from lensmodel.workflow.pipeline import CalibrationEvent, EventHook, ignore_event
+from lensmodel.workflow.ways import WAYS, way_named, way_of
 
 FORMATS: dict[str, photo.OutputFormat] = {
     ".tif": "tiff16",
@@ -40,9 +41,10 @@ def calibrate(
     aperture: float | None = None,
     focal_mm: float | None = None,
     focus_m: float | None = None,
-    estimator: str | PsfEstimator = "default",
+    estimator: str | PsfEstimator | None = None,
     selector: str | Selector = "r-map",
-    model: ModelSettings | None = None,
+    model: str | ModelSettings | None = None,
+    kernel_size: int | None = None,
     any_lens: bool = False,
     patches: int = pipeline.DEFAULT_PATCHES,
     workers: int | None = None,
@@ -66,11 +68,16 @@ def calibrate(
     estimator : str or PsfEstimator
         A name in `estimators`, or an object of one's own with the same methods. It is sent to worker
         processes; one that they cannot load, as of a class in a notebook, runs in threads of this process.
+        None takes that of `model`.
     selector : str or Selector
         A name in `selectors`, or an object of one's own, which scores the windows of a photo by how much they
         tell about the blur.
-    model : ModelSettings, optional
-        Choices of the regression, for a new lens; one that is given keeps its own.
+    model : {"default", "paper"} or ModelSettings, optional
+        "paper" learns a new lens the paper's own way, with nothing else mixed in, and corrects with it so:
+        to compare with, not for photos to keep. Or the choices of the regression. A lens that is given keeps
+        its own.
+    kernel_size : int, optional
+        Odd side of the estimated kernels in pixels, 3 to 55; by default 31, and 55 the paper's way.
     any_lens : bool
         Take photos that seem to be of another lens as well.
     patches : int
@@ -95,22 +102,31 @@ def calibrate(
     InvalidInputError
         If a value is out of its range, or both `lens` and `model` are given.
     UnknownMethodError
-        If there is no estimator of that name.
+        If there is no estimator or model of that name.
     NotEnoughEvidenceError
         If no photo could be used; the text says why for each.
     """
     paths = [Path(photos)] if isinstance(photos, str | Path) else [Path(path) for path in photos]
     for path in paths:
         path.stat()
+    way = (
+        way_named(model)
+        if isinstance(model, str)
+        else WAYS["default"]
+        if lens is None
+        else way_of(lens.model)
+    )
+    chosen = ModelSettings(mode=way.mode) if isinstance(model, str) else model
     grown = _Growing(lens, any_lens=any_lens, on_event=on_event)
     fitted = pipeline.calibrate(
         grown.admitted(paths),
         model=None if lens is None else lens.model,
         settings=LensSettings(aperture, focal_mm, focus_m),
-        model_settings=model,
-        estimator=estimator,
+        model_settings=chosen,
+        estimator=way.estimator if estimator is None else estimator,
         selector=selector,
         count=patches,
+        kernel_size=kernel_size or way.kernel_size,
         workers=workers,
         executor=executor,
         on_event=grown.heard,
@@ -170,7 +186,7 @@ def correct(
     aperture: float | None = None,
     focal_mm: float | None = None,
     focus_m: float | None = None,
-    method: str | correction.Deconvolver = "standard",
+    method: str | correction.Deconvolver | None = None,
     strength: float = 1.0,
     bounds: correction.Bounds | None = None,
     file_format: photo.OutputFormat | None = None,
@@ -195,8 +211,9 @@ def correct(
     aperture : float, optional
         f-number of a photo that does not say its own: what a photo says goes first. The same goes for
         `focal_mm` in mm and `focus_m` in metres. Unknown, the samples of all apertures answer together.
-    method : str or Deconvolver
-        A name in `deconvolvers`, or an object of one's own with the method `deconvolve`.
+    method : str or Deconvolver, optional
+        A name in `deconvolvers`, or an object of one's own with the method `deconvolve`. None takes
+        "standard", and "paper" for a lens that was learned the paper's way.
     strength : float
         0 leaves the photo as it is, 1 removes all that its noise allows.
     bounds : Bounds, optional
@@ -237,6 +254,7 @@ def correct(
     if target is not None and source is not None and target.exists() and target.samefile(source):
         raise InvalidInputError(f"{target} is the photo itself; name another file for the corrected one")
     known = (lens if isinstance(lens, Lens) else Lens.load(lens)).warmed()
+    method = way_of(known.model).method if method is None else method
     correction.deconvolvers.resolve(method)  # before the work of developing
     return pipeline.correct(
         source or (image if isinstance(image, photo.LinearPhoto) else photo_from_array(np.asarray(image))),

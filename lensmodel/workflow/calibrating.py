@@ -24,10 +24,12 @@ from lensmodel.core.types import (
     LensSettings,
 )
 from lensmodel.estimation import patches
+from lensmodel.estimation.estimator import require_size
 from lensmodel.estimation.patches import Patch
 from lensmodel.model import LensModel, ModelSettings
 from lensmodel.workflow.developed import load_developed, photo_id, save_developed, settings_of
 from lensmodel.workflow.estimating import (
+    DEFAULT_KERNEL_SIZE,
     DEFAULT_PATCHES,
     CellSample,
     cells,
@@ -71,6 +73,7 @@ def samples_of_photo(
     estimator: str | estimation.PsfEstimator = "default",
     selector: str | patches.Selector = "r-map",
     count: int = DEFAULT_PATCHES,
+    kernel_size: int = DEFAULT_KERNEL_SIZE,
     workers: int | None = None,
     executor: Executor | None = None,
     on_event: EventHook = ignore_event,
@@ -88,6 +91,7 @@ def samples_of_photo(
     NoUsablePatchesError
         If the photo tells nothing about the blur, or too little, or of one place only.
     """
+    require_size(kernel_size)
     method = estimation.estimators.resolve(estimator)
     on_event(CalibrationEvent(path, "developing"))
     developed = photo.develop(path)
@@ -108,7 +112,7 @@ def samples_of_photo(
         del developed
         with processes.pool(executor, workers, method) as pool:
             jobs = {
-                pool.submit(_cell_from_folder, folder, group, chosen, key, method): index
+                pool.submit(_cell_from_folder, folder, group, chosen, key, method, kernel_size): index
                 for index, group in enumerate(groups)
             }
             try:
@@ -141,9 +145,10 @@ def _cell_from_folder(
     settings: LensSettings,
     key: str,
     estimator: str | estimation.PsfEstimator,
+    size: int,
 ) -> list[CellSample]:
     return estimate_cell(
-        load_developed(Path(folder)), group, settings=settings, photo_id=key, estimator=estimator
+        load_developed(Path(folder)), group, settings=settings, photo_id=key, estimator=estimator, size=size
     )
 
 
@@ -154,6 +159,7 @@ def samples_of_bytes(
     estimator: str | estimation.PsfEstimator,
     count: int = DEFAULT_PATCHES,
     selector: str | patches.Selector = "r-map",
+    kernel_size: int = DEFAULT_KERNEL_SIZE,
 ) -> list[PsfSample]:
     """Do as `samples_of_photo` in this process alone, with a photo that lies on another machine."""
     with tempfile.TemporaryDirectory(prefix="lensmodel-") as folder:
@@ -165,6 +171,7 @@ def samples_of_bytes(
             estimator=estimator,
             selector=selector,
             count=count,
+            kernel_size=kernel_size,
             executor=parallel.Here(),
         )
 
@@ -178,6 +185,7 @@ def calibrate(
     estimator: str | estimation.PsfEstimator = "default",
     selector: str | patches.Selector = "r-map",
     count: int = DEFAULT_PATCHES,
+    kernel_size: int = DEFAULT_KERNEL_SIZE,
     workers: int | None = None,
     executor: Executor | None = None,
     on_event: EventHook = ignore_event,
@@ -215,7 +223,8 @@ def calibrate(
 
     def sent(path: Path) -> tuple[Any, ...] | None:
         wanted = executor is not None and photo_id(path) not in known
-        return (path.name, path.read_bytes(), settings, estimator, count, selector) if wanted else None
+        order = (settings, estimator, count, selector, kernel_size)
+        return (path.name, path.read_bytes(), *order) if wanted else None
 
     ahead = 1 if executor is None else AHEAD
     for path, job in parallel.in_order(
@@ -232,6 +241,7 @@ def calibrate(
                     estimator=estimator,
                     selector=selector,
                     count=count,
+                    kernel_size=kernel_size,
                     workers=workers,
                     on_event=on_event,
                 )

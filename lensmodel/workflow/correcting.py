@@ -7,17 +7,21 @@ import logging
 from pathlib import Path
 
 from lensmodel import correction, photo, quality
+from lensmodel.core.belief import UncertainField
+from lensmodel.core.psf import PsfField
 from lensmodel.core.types import (
     LensSettings,
     StepHook,
     ignore_step,
 )
 from lensmodel.model import LensModel, WitnessedField
+from lensmodel.model.answer import PAPER
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.lateral import LateralColour, estimate_lateral, resample
 from lensmodel.photo.tags.xmp_block import sidecar_path, write_sidecar
 from lensmodel.workflow.developed import settings_of
 from lensmodel.workflow.estimating import witnesses_of
+from lensmodel.workflow.ways import way_of
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +36,7 @@ def correct_photo(
     model: LensModel,
     settings: LensSettings,
     *,
-    method: str | correction.Deconvolver = "standard",
+    method: str | correction.Deconvolver | None = None,
     strength: float = 1.0,
     bounds: correction.Bounds | None = None,
     lateral: LateralColour | None = None,
@@ -44,9 +48,13 @@ def correct_photo(
 
     What is thought of each PSF, its mean and its uncertainty, comes from two opinions of the model and from
     the patches of the lens and of this photo (`lensmodel.model.trust.witness`); the less sure, the gentler.
+    A lens that was learned the paper's way is corrected the paper's way: its PSFs are taken as right, and
+    Richardson-Lucy deconvolution is all that is done.
 
     Parameters
     ----------
+    method : str or Deconvolver, optional
+        None takes that of the way the lens was learned (`way_of`).
     bounds : Bounds, optional
         What to allow beside edges and in flat areas.
     roi : tuple of int, optional
@@ -57,15 +65,22 @@ def correct_photo(
     Corrected
         Of a chart, with what was measured on its edges (`find_edges`) in each zone.
     """
-    field = WitnessedField.of(
-        model.warmed(),
-        settings,
-        witnesses_of(developed, settings),
-        pitch_um=developed.info.metadata.pixel_pitch_um,
-        half_diagonal_px=developed.frame.half_diagonal,
+    pitch_um, half_diagonal_px = developed.info.metadata.pixel_pitch_um, developed.frame.half_diagonal
+    wanted = way_of(model).method if method is None else method
+    plain = model.mode == PAPER and wanted == PAPER
+    field: PsfField | UncertainField = (
+        model.field(settings, pitch_um=pitch_um, half_diagonal_px=half_diagonal_px)
+        if plain
+        else WitnessedField.of(
+            model.warmed(),
+            settings,
+            witnesses_of(developed, settings),
+            pitch_um=pitch_um,
+            half_diagonal_px=half_diagonal_px,
+        )
     )
     planes, cfa = developed.planes, developed.cfa
-    solver = correction.deconvolvers.resolve(method)
+    solver = correction.deconvolvers.resolve(wanted)
     if isinstance(solver, correction.WarpableMethod) and solver.warped and lateral is not None:
         planes, lateral, cfa = resample(planes, developed.frame, lateral), None, None
     corrected = correction.correct_planes(
@@ -79,6 +94,7 @@ def correct_photo(
         lateral=lateral,
         cfa=cfa,
         bounds=bounds,
+        plain=plain,
         stored=correction.StoredColour.of_photo(developed),
         roi=roi,
         workers=workers,
@@ -113,7 +129,7 @@ def correct(
     output: Path | None,
     *,
     settings: LensSettings | None = None,
-    method: str | correction.Deconvolver = "standard",
+    method: str | correction.Deconvolver | None = None,
     strength: float = 1.0,
     bounds: correction.Bounds | None = None,
     file_format: photo.OutputFormat = "tiff16",
@@ -132,6 +148,7 @@ def correct(
     tells what was done.
     """
     developed = source if isinstance(source, LinearPhoto) else photo.develop(source)
+    method = way_of(model).method if method is None else method
     chosen = settings_of(developed, settings)
     corrected = correct_photo(
         developed,

@@ -51,9 +51,8 @@ NAMES = [
 ]
 
 SIGNATURES = {
-    "calibrate": "photos, *, lens, aperture, focal_mm, focus_m, estimator, selector, model, any_lens, "
-    "patches, "
-    "workers, executor, on_event",
+    "calibrate": "photos, *, lens, aperture, focal_mm, focus_m, estimator, selector, model, "
+    "kernel_size, any_lens, patches, workers, executor, on_event",
     "correct": "image, lens, output, *, aperture, focal_mm, focus_m, method, strength, bounds, file_format, "
     "color_space, quality, least_gain_db, sidecar, workers, on_step",
     "develop": "path, *, limits, demosaic",

@@ -18,9 +18,10 @@ from lensmodel.correction.lights.clipped import around
 from lensmodel.correction.lights.saturation import closed, compact, far, positive
 from lensmodel.correction.limits.hue import of_known_hue
 
-_UNSURE, _NEAREST = 0.1, 2
-"""Error of a kernel from which on the glow of a light is left alone, and pixels that count as nearby then: an
-error of .1 of a light ten times beyond saturation is as bright as white (chosen)."""
+_UNSURE, _NEAREST, _NEXT = 0.1, 2, 1
+"""Error of a kernel from which on the glow of a light is left alone, how many pixels count as nearby then,
+and how many for the most light: specks in a dark glow are seen, darker twigs are not (chosen). An error of .1
+of a light ten times beyond saturation is as bright as white."""
 
 _EVEN: Final = 1.5
 """Standard deviation in pixels of the means that tell where light comes from: pixel by pixel noise and the
@@ -45,10 +46,10 @@ def held_beside_clipped(
     How much light a clipped pixel had is not known, and what a wrong guess of it does to its neighbours looks
     like the worst of corrections: dark rings and pixels of another colour. So within the kernel's
     reach of a clipped pixel each colour stays between the least and the most that the photo shows nearby, and
-    so does its share of the light of all colours. Nearby is the kernel's reach where the kernel is
-    sure, so that the glow of a lamp can be taken off, and two pixels where it is not. Clipped areas too
-    broad to be a light spread by the lens stay as they are, and where the kernel is not sure so does as much
-    of a pixel as its light comes from there.
+    so does its share of the light of all colours. Nearby is the kernel's reach where the kernel is sure, so
+    that the glow of a lamp can be taken off, and where it is not two pixels for the least and one for the
+    most. Clipped areas too broad to be a light spread by the lens stay as they are, and where the kernel is
+    not sure so does as much of a pixel as its light comes from there.
 
     Parameters
     ----------
@@ -69,10 +70,12 @@ def held_beside_clipped(
     seen, made, lost = photo[here], restored[here].copy(), clipped[here]
     broad = np.stack([mask & ~compact(mask, reach) for mask in lost])
     np.copyto(made, seen, where=broad)
-    near = max(round(reach * (1.0 - max(errors) / _UNSURE)), min(_NEAREST, reach))
-    window = (1, 2 * near + 1, 2 * near + 1)
-    low, high = (f(seen, window, mode="nearest") for f in (ndimage.minimum_filter, ndimage.maximum_filter))
-    low, high = np.minimum(low, seen), np.where(lost, np.float32(np.inf), high)
+    near, next_to = (
+        max(round(reach * (1.0 - max(errors) / _UNSURE)), min(n, reach)) for n in (_NEAREST, _NEXT)
+    )
+    window, lit = ((1, 2 * n + 1, 2 * n + 1) for n in (near, next_to))
+    low = np.minimum(ndimage.minimum_filter(seen, window, mode="nearest"), seen)
+    high = np.where(lost, np.float32(np.inf), ndimage.maximum_filter(seen, lit, mode="nearest"))
     held = np.clip(made, low, high)
     if len(seen) > 1:
         noise = np.stack([s.variance(p) for p, s in zip(seen, sensors, strict=True)])

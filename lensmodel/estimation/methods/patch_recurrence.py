@@ -82,7 +82,7 @@ class PatchRecurrence:
     ridge : float
         lambda2 over the mean diagonal of the normal matrix.
     support : int or None
-        Odd side of the estimated kernel; None takes it from `size`, at most 31.
+        Odd side of the estimated kernel; None takes it from `size`.
     search : Search
         How thoroughly matches are looked for.
     """
@@ -136,7 +136,7 @@ class PatchRecurrence:
         began = time.process_time()
         kept = usable(patches, noise, size)
         scaled = [_Scaled.of(patch, model) for patch, model in kept]
-        widest = self.support or min(size, 31)
+        widest = self.support or size
         while levels > 1 and min(level_shape(scaled[0].y.shape, levels - 1)) < 40:
             levels -= 1
         kernel, latent = start, [view.y for view in (s.at(levels - 1) for s in scaled)]

@@ -30,8 +30,8 @@ from scipy import ndimage, signal
 from lensmodel import correction, photo
 from lensmodel.core.belief import Belief, UncertainField
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import PsfField, PsfSample, centred, delta, resized
-from lensmodel.core.spectrum import PatchSpectrum, binned_spectrum
+from lensmodel.core.psf import PsfField, PsfSample, centred, delta, resized, rms_width
+from lensmodel.core.spectrum import PatchSpectrum
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensSettings, Planes
 from lensmodel.lab.cases import list_photos, photo_half
 from lensmodel.model import LensModel, WitnessedField
@@ -99,11 +99,11 @@ class Shot:
         row, col = CORNERS[number]
         return slice(row + INNER.start, row + INNER.stop), slice(col + INNER.start, col + INNER.stop)
 
-    def spectrum(self, number: int, channel: Channel) -> PatchSpectrum:
-        """Spectrum of a patch."""
+    def spectrum(self, number: int, channel: Channel, kernel: Kernel) -> PatchSpectrum:
+        """Spectrum of a patch and the side of its tails, as they are kept with an estimate of its kernel."""
         index = CHANNELS.index(channel)
         plane = np.ascontiguousarray(self.photo.planes[index][self.patch(number)])
-        return PatchSpectrum(*binned_spectrum(plane, self.photo.noise[index]))
+        return PatchSpectrum.of(plane, self.photo.noise[index], rms_width(kernel))
 
     def gain(self, number: int, field: UncertainField) -> float:
         """Gain in PSNR (dB, sRGB) of one tile corrected with what is thought of its PSF."""
@@ -199,7 +199,7 @@ def outcome(
             photo=f"{shot_number}",
             error=ERROR,
             pixel_pitch_um=pitch,
-            spectrum=shot.spectrum(number, channel),
+            spectrum=shot.spectrum(number, channel, kernels[number][channel]),
         )
         for shot_number, shot in enumerate(shots[:-1])
         for number, place in enumerate(PLACES)
@@ -207,7 +207,13 @@ def outcome(
     ]
     model = LensModel.fit(samples)
     own = [
-        PsfSample(delta(41), place, green, pixel_pitch_um=pitch, spectrum=shots[-1].spectrum(number, "g"))
+        PsfSample(
+            delta(41),
+            place,
+            green,
+            pixel_pitch_um=pitch,
+            spectrum=shots[-1].spectrum(number, "g", kernels[number]["g"]),
+        )
         for number, place in enumerate(PLACES)
     ]
     field, gains = WitnessedField.of(model.warmed(), settings, own), []

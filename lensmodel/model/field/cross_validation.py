@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import WAVELENGTH_NM
 from lensmodel.model import variables as va
-from lensmodel.model.answer import ModelSettings
+from lensmodel.model.answer import PAPER, ModelSettings
 from lensmodel.model.field import robust
 from lensmodel.model.field.kriging import ImageFrame
 from lensmodel.model.field.leave_one_out import Choice, Held, choose
@@ -69,7 +69,7 @@ class Judgement:
 
 def bandwidth(rule: dict[str, float], settings: ModelSettings, choice: Choice) -> dict[str, float]:
     """Bandwidths of a rule, factors of cross-validation and the wishes of a user."""
-    found = dict(rule)
+    found = rule = va.support(rule) if settings.mode == PAPER else dict(rule)
     found["r"] = settings.r or rule["r"] * choice.r
     phi = rule["phi"] * choice.phi
     if settings.rotational is not None:
@@ -136,7 +136,7 @@ def judge(
 
     green = voting[where[voting, 4] == _judging_channel(where[voting, 4])]
     choice = Choice(mirror=settings.mirror or 0.0)
-    automatic = len(np.unique(photo[voting])) >= _CV_PHOTOS
+    automatic = settings.mode != PAPER and len(np.unique(photo[voting])) >= _CV_PHOTOS
 
     def chosen(votes: NDArray[np.float64]) -> Choice:
         if not automatic:

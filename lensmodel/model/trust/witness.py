@@ -15,8 +15,10 @@ a scene that is soft itself, so that t = 2 m / (m + 2) grows with the number m o
 thought of the PSF is the mixture of all alternatives under q: its mean, and its variance at each frequency
 (`Belief`).
 
-Power spectra are blind to a kernel turned by 180 degrees and to one that is shifted. Where patches cannot
-tell kernels apart (blur of less than half a pixel) the prior p stays, and the variance says so.
+Power spectra are blind to a kernel turned by 180 degrees: where the tails of the patches do not tell for
+sure which side a wavefront's lie on (`Physics.turned`), the turned kernel is an alternative too. Where
+patches cannot tell kernels apart (blur of less than half a pixel) the prior p stays, and the variance says
+so.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.belief import Belief, Narrowing
-from lensmodel.core.psf import PsfField, PsfSample
+from lensmodel.core.psf import PsfField, PsfSample, as_kernel
 from lensmodel.core.types import Channel, FieldPosition, Kernel, LensSettings
 from lensmodel.model import variables as va
 from lensmodel.model.field.kriging import field_vector, settings_gap
@@ -196,11 +198,21 @@ class WitnessedField:
         if self.witness.heard(position) < _HEARD:
             return self._unheard(position, answer.kernel, expected)
         kernels = [answer.kernel, *(field.kernel_at(position, channel, size) for field in self.fields[1:])]
-        belief = Belief.mixture(kernels, NARROWINGS, self.witness.shares(position, expected))
         spread = _SPREAD_OF_BOTH if len(kernels) > 1 else _SPREAD_OF_ONE
+        shares = self.witness.shares(position, expected)
+        if len(kernels) > 1 and self.turned > 0.0:
+            kernels.append(as_kernel(kernels[1][::-1, ::-1]))
+            shares = np.stack([shares[0], (1.0 - self.turned) * shares[1], self.turned * shares[1]])
+        belief = Belief.mixture(kernels, NARROWINGS, shares)
         if answer.extrapolated and belief.error > 0.0:
             spread = max(spread, (expected / belief.error) ** 2)
         return belief.widened(spread)
+
+    @property
+    def turned(self) -> float:
+        """Probability that the wavefront's kernels lie on the wrong side."""
+        physical = self.opinions[0].physical
+        return 0.0 if physical is None else physical.turned
 
     def _unheard(self, position: FieldPosition, kernel: Kernel, expected: float) -> Belief:
         """What is thought of a kernel about which no patch speaks: the prior stays, no surer than it expects.
@@ -225,7 +237,9 @@ def opinions_of(model: LensModel) -> list[LensModel]:
 def _prior(opinions: Sequence[LensModel]) -> tuple[tuple[float, ...], ...]:
     if len(opinions) == 1:
         return _OF_ONE
-    return _OF_BOTH if opinions[0].diffraction_known else _OF_UNKNOWN
+    physical = opinions[0].physical
+    sure = physical is not None and physical.agreed and physical.diffraction_known
+    return _OF_BOTH if sure else _OF_UNKNOWN
 
 
 def _costs(patch: PsfSample, kernel: Kernel) -> list[float]:

@@ -50,6 +50,9 @@ _USUAL_SHAPE: Final = {
 _FOCUS_SPREAD = 0.5  # about `BALANCE`
 
 _TAIL_SIDE = 31
+_VOTE_SPREAD: Final = 2.0
+"""Standard deviation of the vote for a side: patches of one motif err alike (chosen)."""
+
 _ERROR_PLACES, _DRAWS, _SEED = 14, 6, 0
 _DRAWN, _LEAST_DRAWN = 0.7, 0.3
 """Share of the scatter of draws that is told of one photo, and the least of what n photos leave of it. The
@@ -89,6 +92,11 @@ class Pooled:
     def front(self) -> Wavefront:
         """The wavefront."""
         return self.fit.front
+
+    @property
+    def turned(self) -> float:
+        """Probability that the side of the tails is the wrong one, of the normal distribution of the vote."""
+        return 0.5 * math.erfc(abs(self.tails) / _VOTE_SPREAD / math.sqrt(2.0))
 
     def kernel(self, sample: PsfSample, size: int) -> Kernel:
         """Kernel at the place and settings of a sample."""

@@ -69,6 +69,8 @@ class Physics:
         Whether the wavefront was fitted to the spectra of all patches, and nothing is left to krige.
     diffraction_known : bool
         Whether aperture and pixel pitch of an agreed wavefront are known.
+    turned : float
+        Probability that an agreed wavefront gives all kernels turned by 180 degrees.
     """
 
     front: Wavefront
@@ -80,6 +82,7 @@ class Physics:
     errors: NDArray[np.float64]
     agreed: bool = False
     diffraction_known: bool = False
+    turned: float = 0.0
 
     @classmethod
     def fit(
@@ -116,6 +119,7 @@ class Physics:
                 *(pooled.front, side, *empty, pooled.errors(samples)),
                 agreed=True,
                 diffraction_known=pooled.diffraction_known,
+                turned=pooled.turned,
             )
         known = {id(samples[i]): i for i in voting}
         front = fit_wavefront(trusted)

@@ -576,6 +576,24 @@ def test_a_profile_keeps_the_mode_and_the_unit_that_it_was_told(
     assert here(*words, "--mode", "guess").returncode == 2
 
 
+def test_a_lens_learned_the_papers_way_stays_so_and_is_corrected_so(
+    folder: Path, here: Here, few_patches: None
+) -> None:
+    words = ("calibrate", "one.dng", "-p", PROFILE, "--workers", "1", "--any-lens", "--json")
+    quick = ("--estimator", "whittle", "--kernel-size", "21")
+    told = json.loads(here(*words, *quick, "--model", "paper").stdout)
+
+    kept = load_profile(folder / PROFILE).model
+    assert (told["mode"], kept.settings.mode, kept.samples[0].kernel.shape) == ("paper", "paper", (21, 21))
+    assert json.loads(here(*words, *quick).stdout)["mode"] == "paper"
+    assert here("correct", "one.dng", "-p", PROFILE, "-o", "out").returncode == 0
+    with Image.open(folder / "out" / "one-corrected.tif") as written:
+        assert "method paper" in str(written.tag_v2.get(270))
+    assert here(*words, *quick, "--model", "default", "--mode", "kernels").returncode == 2
+    assert here(*words, "--kernel-size", "57").returncode == 2
+    assert json.loads(here(*words, *quick, "--model", "default").stdout)["mode"] == "kernels"
+
+
 def test_a_photo_that_says_little_is_corrected_with_a_word_of_warning(folder: Path, here: Here) -> None:
     Image.fromarray(_picture()).save(folder / "scan.tif")
     done = here("correct", "scan.tif", "-p", PROFILE, "-o", "out", "--method", "fast")

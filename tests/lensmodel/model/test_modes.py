@@ -226,3 +226,23 @@ def test_likeliest_mode_is_found_by_warming_and_kept_by_what_was_learned(noisy: 
     assert found in {"mixed", "kernels"}
     again = LensModel.restored(samples, warmed.learned(), wide("likeliest"))
     assert again.query(place, SETTINGS, SIZE).mode == found
+
+
+def test_the_papers_way_is_its_equations_and_nothing_else(noisy: list[PsfSample]) -> None:
+    # all on one meridian, where turning into local frames changes nothing; one kernel is far off
+    line = [replace(s, position=FieldPosition(0.02 * i, 1.0)) for i, s in enumerate(noisy)]
+    odd = replace(line[7], kernel=centred(as_kernel(np.eye(SIZE))), weight=0.3)
+    samples = [*line[:7], odd, *line[8:]]
+    model = LensModel.fit(samples, ModelSettings(mode="paper"))
+    asked = FieldPosition(0.31, 1.0)
+
+    radii = np.array([s.position.r for s in samples])
+    d = 2  # r and phi: no setting varies
+    h = radii.std() * (4.0 / ((d + 2) * len(radii))) ** (1.0 / (d + 4))
+    votes = np.array([s.weight for s in samples]) * np.exp(-0.5 * ((radii - asked.r) / h) ** 2)
+    wanted = np.average([s.kernel for s in samples], axis=0, weights=votes)
+
+    answer = model.warmed().query(asked, SETTINGS, SIZE)
+
+    assert (answer.mode, answer.wavefront_share, model.flags()) == ("paper", 0.0, ())
+    assert distance(answer.kernel, wanted).rel_l2 < 0.02

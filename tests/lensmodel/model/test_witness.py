@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lensmodel.core.psf import PsfSample, delta, gaussian, otf, rms_width
+from lensmodel.core.psf import PsfSample, as_kernel, delta, gaussian, otf, rms_width
 from lensmodel.core.spectrum import RING_LIMITS, RINGS, SECTORS, PatchSpectrum
-from lensmodel.core.types import Channel, FieldPosition, LensSettings
+from lensmodel.core.types import Channel, FieldPosition, Kernel, LensSettings
 from lensmodel.model import LensModel, WitnessedField
 from lensmodel.model.trust.witness import NARROWINGS
 
@@ -73,6 +73,17 @@ def width_at(field: WitnessedField, place: FieldPosition, channel: Channel = "g"
     return rms_width(field.kernel_at(place, channel, 31))
 
 
+class Comet:
+    """A field of one kernel with a tail to the right."""
+
+    kernel = as_kernel(
+        np.asarray(gaussian(31, np.eye(2))) + np.roll(gaussian(31, 4.0 * np.eye(2)), 4, axis=1)
+    )
+
+    def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
+        return self.kernel
+
+
 @pytest.mark.parametrize("place", [RIGHT, LEFT])
 def test_right_kernels_hardly_change(place: FieldPosition) -> None:
     known = model(1.4, 1.4)
@@ -107,6 +118,13 @@ def test_wavefront_is_heard_as_a_second_opinion_where_patches_fit_it(
     assert alone.witness.shares(RIGHT).shape == (1, len(NARROWINGS))
     kernels, wavefront = field.witness.shares(RIGHT)
     assert wavefront.sum() > 2.0 * kernels.sum()
+
+    # no patch told on which side the tails of the wavefront's kernels lie: either is as likely
+    assert field.turned == pytest.approx(0.5)
+    belief = replace(field, fields=[field.fields[0], Comet()]).belief_at(RIGHT, "g", 31)
+    lopsided, left = (np.abs(k - k[::-1, ::-1]).sum() for k in (Comet.kernel, belief.kernel))
+    assert left < 0.05 * lopsided
+    assert belief.error > 0.3
 
 
 def test_patches_of_the_photo_speak_where_those_of_the_lens_cannot() -> None:

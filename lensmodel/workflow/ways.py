@@ -1,0 +1,63 @@
+"""Whole ways from photos to corrected photos, by name: which estimator, which model, which deconvolution."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final
+
+from lensmodel.core.errors import UnknownMethodError
+from lensmodel.model import LensModel
+from lensmodel.model.answer import KERNELS, PAPER
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """What is taken where nobody asks for something else.
+
+    Parameters
+    ----------
+    estimator : str
+        Of `estimators`.
+    kernel_size : int
+        Odd side of the estimated kernels in pixels.
+    mode : str
+        Of `MODES`.
+    method : str
+        Of `deconvolvers`.
+    """
+
+    estimator: str
+    kernel_size: int
+    mode: str
+    method: str
+
+
+WAYS: Final[Mapping[str, Way]] = MappingProxyType(
+    {
+        "default": Way("default", 31, KERNELS, "standard"),
+        "paper": Way("michaeli-irani", 55, PAPER, "paper"),
+    }
+)
+"""`paper` is that of M. Hirsch and B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, sections 4
+to 7, to be compared with: kernels by T. Michaeli and M. Irani, their Nadaraya-Watson regression, and
+Richardson-Lucy deconvolution, without what guards photos from errors of any of them."""
+
+
+def way_named(name: str) -> Way:
+    """Return a way.
+
+    Raises
+    ------
+    UnknownMethodError
+        If there is none of that name.
+    """
+    if name not in WAYS:
+        raise UnknownMethodError(f"no model {name!r}; known: {', '.join(WAYS)}")
+    return WAYS[name]
+
+
+def way_of(model: LensModel) -> Way:
+    """Return the way that a lens was learned."""
+    return WAYS["paper" if model.settings.mode == PAPER else "default"]

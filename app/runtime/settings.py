@@ -140,7 +140,7 @@ class Settings(BaseSettings):
     patches: int = Field(default=24, ge=1, le=1000, description="Patches that are used of one photo.")
     min_good_patches: int = Field(default=1, ge=1, description="Fewer than this and the photo fails.")
     kernel_size: int = Field(
-        default=31, ge=3, le=255, description="Side of the estimated kernels in pixels, odd."
+        default=31, ge=3, le=55, description="Side of the estimated kernels in pixels, odd."
     )
     estimator: str = Field(default="default", description="Name in the registry of blind estimators.")
     selector: str = Field(default="r-map", description="Name in the registry of patch selectors.")
@@ -152,7 +152,7 @@ class Settings(BaseSettings):
         default=True,
         description="A lens that has seen little leans on its owner's other copies of the same model.",
     )
-    model_mode: Literal["kernels", "mixed", "evidence", "wavefront", "likeliest"] = Field(
+    model_mode: Literal["kernels", "mixed", "evidence", "wavefront", "likeliest", "paper"] = Field(
         default="kernels",
         description="What lens models make of their samples; likeliest chooses for each lens.",
     )

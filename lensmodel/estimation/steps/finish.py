@@ -54,6 +54,11 @@ def signal_share(kept: Sequence[tuple[Plane, NoiseModel]]) -> NDArray[np.float64
     return np.asarray(np.mean(shares, axis=0), dtype=np.float64)
 
 
+def confidence_of(error: float) -> float:
+    """Confidence of an estimate with an expected relative L2 error; 1/2 at 0.4."""
+    return 1.0 / (1.0 + (error / _HALF_CONFIDENT) ** 2)
+
+
 def finished(
     kernel: Kernel,
     kept: Sequence[tuple[Plane, NoiseModel]],
@@ -84,7 +89,7 @@ def finished(
     error = min(max(error, 0.0), 1.0) if math.isfinite(error) else 1.0
     return PsfEstimate(
         kernel=final,
-        confidence=1.0 / (1.0 + (error / _HALF_CONFIDENT) ** 2),
+        confidence=confidence_of(error),
         reliability=signal_share(kept),
         predicted_error=error,
         diagnostics={"width": rms_width(final), **diagnostics},

@@ -15,10 +15,9 @@ a scene that is soft itself, so that t = 2 m / (m + 2) grows with the number m o
 thought of the PSF is the mixture of all alternatives under q: its mean, and its variance at each frequency
 (`Belief`).
 
-Power spectra are blind to a kernel turned by 180 degrees: where the tails of the patches do not tell for
-sure which side a wavefront's lie on (`Physics.turned`), the turned kernel is an alternative too. Where
-patches cannot tell kernels apart (blur of less than half a pixel) the prior p stays, and the variance says
-so.
+Power spectra are blind to a kernel turned by 180 degrees: where no patch tells on which side a wavefront's
+tails lie (`Physics.turned`), the turned kernel is an alternative too. Where patches cannot tell kernels apart
+(blur of less than half a pixel) the prior p stays, and the variance says so.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from lensmodel.model.combination import Experts, agreed_share, kernel_error
 from lensmodel.model.field.local_frame import Answers
 from lensmodel.model.wavefront.aberration_prior import BALANCE, corner_ratio, unlikeliness
 from lensmodel.model.wavefront.from_spectra import PatchView, PooledFit, fit_spectra
-from lensmodel.model.wavefront.joint_kernels import MIN_PLACES, Pooled, pool
+from lensmodel.model.wavefront.joint_kernels import MIN_PLACES, Pooled, _pairs, pool
 from lensmodel.model.wavefront.scene_spectrum import BIAS, WITH_POWER, Floats, SceneView
 from lensmodel.optics.transfer import (
     BINS,
@@ -428,3 +428,16 @@ def test_wavefront_is_never_surer_than_the_kernels_nor_than_it_agrees_with_them(
     assert apart > 0.3
     assert answer.predicted_error >= min(apart, 1.0) - 1e-6
     assert answer.predicted_error >= other.predicted_error
+
+
+def test_photos_are_paired_whatever_their_order_and_few_are_not() -> None:
+    samples = [
+        PsfSample(gaussian(9, np.eye(2)), FieldPosition(0.1 * i, 1.0), LensSettings(2.0), photo=photo)
+        for i, photo in enumerate("edcbaabcde")
+    ]
+
+    pairs = [{s.photo for s in part} for part in _pairs(samples)]
+
+    assert pairs == [{s.photo for s in part} for part in _pairs(samples[::-1])] == [{"a", "b"}, {"c", "d"}]
+    assert [len(part) for part in _pairs(samples)] == [4, 4]
+    assert _pairs([s for s in samples if s.photo in "ab"]) == []

@@ -140,8 +140,8 @@ def hue_bounded(photo: Planes, made: Planes, clips: Sequence[float], noise: Sequ
     bounded = (own + t * change) * light - floor / len(made)
     saturated = np.stack([f[inner[1:]] for f in full])
     level = np.asarray(clips, dtype=np.float32)[:, None, None]
-    # what was clipped and still is looks as it did; a pixel amid white that is hardly darker stays white: with
-    # the hue of the glow around the light it would be a dot
+    # what was clipped and still is looks as it did; a pixel amid white that is hardly darker stays white:
+    # with the hue of the glow around the light it would be a dot
     same = lost & np.all(~saturated | (made >= level), axis=0)
     amid = ndimage.minimum_filter(clipped, _AMID)[inner[1:]]
     white = amid & (made.sum(axis=0) >= _STILL_WHITE * photo[inner].sum(axis=0))

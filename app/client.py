@@ -14,41 +14,30 @@ from __future__ import annotations
 
 import io
 import os
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Self, TypeAlias, TypeVar
+from typing import Final
 
 import httpx2
-import numpy as np
-from numpy.typing import NDArray
-from pydantic import BaseModel, ValidationError
 
 from app import schemas as s
-from app.client_retries import RETRIES, Retrying
-from app.runtime.settings import CLIENT_KEY
+from app.client_connection import DEFAULT_URL, Query, ServiceProblemError, check, read, said
+from app.client_lenses import LensCalls
 from app.schemas.account import AccountOut
 from lensmodel.core.errors import LensModelError
-from lensmodel.core.types import Channel
 
-M = TypeVar("M", bound=BaseModel)
-Query: TypeAlias = Mapping[str, str | int | float | bool | None]
+__all__ = [
+    "DEFAULT_URL",
+    "Client",
+    "JobEndedError",
+    "JobPatienceError",
+    "ServiceProblemError",
+    "ended",
+]
 
-DEFAULT_URL: Final = "http://127.0.0.1:8000"
 LONG_POLL_SECONDS: Final = 20
 PAUSE_SECONDS: Final = 0.1
-ANSWER_SECONDS: Final = 60.0
-FINAL: Final = {"succeeded", "failed", "cancelled"}
-
-
-class ServiceProblemError(LensModelError):
-    """The service said no; `problem` says why."""
-
-    def __init__(self, problem: s.Problem) -> None:
-        super().__init__(f"{problem.detail or problem.title} ({problem.code}, status {problem.status})")
-        self.problem = problem
 
 
 class JobEndedError(LensModelError):
@@ -64,52 +53,8 @@ class JobPatienceError(LensModelError):
     """A job took longer than its caller would wait."""
 
 
-class Client:
-    """Speaks with one service.
-
-    Parameters
-    ----------
-    url : str
-        Where the service listens.
-    http : httpx2.Client, optional
-        A connection to use instead of an own one, for instance with other time limits.
-    key : str, optional
-        What `lensmodel keys create` printed, where the service asks for it; by default LENS_API_KEY of the
-        environment. It is not sent over a connection that is given as `http`.
-    retries : int
-        How often a request is sent again, after a pause, where the service cannot be reached or says that it
-        is busy; only requests that do no harm twice. Not of a connection that is given as `http`.
-    """
-
-    def __init__(
-        self,
-        url: str = DEFAULT_URL,
-        *,
-        http: httpx2.Client | None = None,
-        key: str | None = None,
-        retries: int = RETRIES,
-    ) -> None:
-        if http is None:
-            shown = os.environ.get(CLIENT_KEY, "") if key is None else key
-            headers = {"Authorization": f"Bearer {shown}"} if shown else {}
-            http = httpx2.Client(
-                base_url=url, timeout=ANSWER_SECONDS, headers=headers, transport=Retrying(retries)
-            )
-        self._http = http
-
-    def __enter__(self) -> Self:
-        """Return itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close the connections."""
-        self.close()
-
-    def close(self) -> None:
-        """Close the connections."""
-        self._http.close()
+class Client(LensCalls):
+    """Speaks with one service; see `app.client_connection.Connection` for where and how."""
 
     def upload(
         self,
@@ -142,7 +87,7 @@ class Client:
         OSError
             If the file cannot be read.
         """
-        said: Query = {
+        fields: Query = {
             "filename": Path(path).name,
             "calibrate": str(calibrate).lower(),
             "lens_id": lens_id,
@@ -159,11 +104,11 @@ class Client:
         with Path(path).open("rb") as file:
             answer = self._http.post(
                 "/v1/photos",
-                params=_said(said),
+                params=said(fields),
                 content=_pieces(file, on_progress),
                 headers={"Content-Type": "application/octet-stream"},
             )
-        return _read(s.PhotoOut, answer)
+        return read(s.PhotoOut, answer)
 
     def photo(self, photo_id: str) -> s.PhotoOut:
         """Return one photo."""
@@ -176,34 +121,44 @@ class Client:
     def change_photo(self, /, photo_id: str, **changes: object) -> s.PhotoOut:
         """Name the lens of a photo, correct its settings, or exclude it: fields of `PhotoChange`."""
         body = s.PhotoChange.model_validate(changes).model_dump(exclude_unset=True)
-        return _read(s.PhotoOut, self._http.patch(f"/v1/photos/{photo_id}", json=body))
+        return read(s.PhotoOut, self._http.patch(f"/v1/photos/{photo_id}", json=body))
+
+    def change_photos(self, /, photo_ids: Iterable[str], **changes: object) -> list[s.PhotoOut]:
+        """Name the lens of several photos at once, or correct their settings: fields of `PhotosChange`."""
+        body = s.PhotosChange.model_validate({"photo_ids": list(photo_ids), **changes})
+        sent = body.model_dump(exclude_unset=True)
+        return read(s.PhotoPage, self._http.patch("/v1/photos", json=sent)).items
+
+    def patches(self, photo_id: str) -> list[s.PatchOut]:
+        """Return where a photo was learned from, and where not and why."""
+        return self._get(s.PatchPage, f"/v1/photos/{photo_id}/patches").items
 
     def delete_photo(self, photo_id: str) -> None:
         """Delete a photo with all that was made of it."""
-        _check(self._http.delete(f"/v1/photos/{photo_id}"))
+        check(self._http.delete(f"/v1/photos/{photo_id}"))
 
     def job(self, job_id: str) -> s.JobOut:
         """Return one job."""
         return self._get(s.JobOut, f"/v1/jobs/{job_id}")
 
+    def jobs(self) -> list[s.JobOut]:
+        """Return the jobs of all photos and corrections, newest first."""
+        return list(self._pages(s.JobPage, "/v1/jobs"))
+
     def cancel(self, job_id: str) -> s.JobOut:
         """Cancel a job."""
-        return _read(s.JobOut, self._http.post(f"/v1/jobs/{job_id}/cancel"))
-
-    def delete_lens(self, lens_id: str) -> None:
-        """Delete a lens with all that was learned of it."""
-        _check(self._http.delete(f"/v1/lenses/{lens_id}"))
+        return read(s.JobOut, self._http.post(f"/v1/jobs/{job_id}/cancel"))
 
     def retry(self, job_id: str) -> s.JobOut:
         """Start a failed or cancelled job anew."""
-        return _read(s.JobOut, self._http.post(f"/v1/jobs/{job_id}/retry"))
+        return read(s.JobOut, self._http.post(f"/v1/jobs/{job_id}/retry"))
 
     def retry_all(self, code: str = "outage") -> int:
         """Start anew all jobs that failed with a code; return how many."""
         again = 0
         while True:
             answer = self._http.post("/v1/jobs/retry", params={"code": code})
-            retried = _read(s.RetriedOut, answer).retried
+            retried = read(s.RetriedOut, answer).retried
             again += retried
             if retried == 0:
                 return again
@@ -253,62 +208,24 @@ class Client:
         answer = self._http.get(f"/v1/jobs/{job_id}", params={"wait": seconds}, headers=headers)
         if answer.status_code == httpx2.codes.NOT_MODIFIED:
             return None, tag
-        return _read(s.JobOut, answer), answer.headers.get("ETag")
-
-    def lenses(self, *, model: str | None = None, serial: str | None = None) -> list[s.LensOut]:
-        """Return all lenses, newest first, optionally of one model or serial."""
-        return list(self._pages(s.LensPage, "/v1/lenses", {"model": model, "serial": serial}))
-
-    def lens(self, lens_id: str) -> s.LensOut:
-        """Return one lens."""
-        return self._get(s.LensOut, f"/v1/lenses/{lens_id}")
-
-    def calibrations(self, lens_id: str) -> list[s.CalibrationOut]:
-        """Return the history of a lens, oldest first."""
-        return list(self._pages(s.CalibrationPage, f"/v1/lenses/{lens_id}/calibrations"))
-
-    def lateral_colour(self, lens_id: str) -> s.LateralOut:
-        """Return the lateral colour shift of a lens."""
-        return self._get(s.LateralOut, f"/v1/lenses/{lens_id}/lateral-colour")
-
-    def psf(
-        self,
-        /,
-        lens_id: str,
-        *,
-        r: float,
-        phi: float = 0.0,
-        aperture: float | None = None,
-        channel: Channel = "g",
-        size: int = 55,
-        **more: float | bool | None,
-    ) -> s.PsfOut:
-        """Return the PSF of a lens at one place and setting, with what it rests on."""
-        query: Query = {"r": r, "phi": phi, "aperture": aperture, "channel": channel, "size": size, **more}
-        return self._get(s.PsfOut, f"/v1/lenses/{lens_id}/psf.json", query)
-
-    def kernel(
-        self, /, lens_id: str, *, r: float, phi: float = 0.0, **query: str | float | None
-    ) -> NDArray[np.float32]:
-        """Return only the kernel, shape (size, size), float32; the parameters are those of `psf`."""
-        params = _said({"r": r, "phi": phi, **query})
-        answer = _check(self._http.get(f"/v1/lenses/{lens_id}/psf.npy", params=params))
-        kernel: NDArray[np.float32] = np.load(io.BytesIO(answer.content), allow_pickle=False)
-        return kernel
-
-    def field_png(self, /, lens_id: str, **query: str | float | None) -> bytes:
-        """Return the map of PSFs over the field as a PNG; the parameters are those of the endpoint."""
-        params = {name: value for name, value in query.items() if value is not None}
-        return _check(self._http.get(f"/v1/lenses/{lens_id}/field.png", params=params)).content
+        return read(s.JobOut, answer), answer.headers.get("ETag")
 
     def correct(self, /, photo_id: str, **wish: object) -> s.CorrectionOut:
         """Ask for a correction: fields of `CorrectionIn`."""
         body = s.CorrectionIn.model_validate({"photo_id": photo_id, **wish}).model_dump(mode="json")
-        return _read(s.CorrectionOut, self._http.post("/v1/corrections", json=body))
+        return read(s.CorrectionOut, self._http.post("/v1/corrections", json=body))
 
     def correction(self, correction_id: str) -> s.CorrectionOut:
         """Return one correction."""
         return self._get(s.CorrectionOut, f"/v1/corrections/{correction_id}")
+
+    def corrections(self, *, photo_id: str | None = None) -> list[s.CorrectionOut]:
+        """Return all corrections, newest first, optionally those of one photo."""
+        return list(self._pages(s.CorrectionPage, "/v1/corrections", {"photo_id": photo_id}))
+
+    def delete_correction(self, correction_id: str) -> None:
+        """Delete a correction with its file; one that runs stops."""
+        check(self._http.delete(f"/v1/corrections/{correction_id}"))
 
     def account(self) -> AccountOut:
         """Return who asks, what he has and what he may have."""
@@ -320,37 +237,11 @@ class Client:
 
     def erase_account(self) -> None:
         """Erase all that the service keeps of this owner, its keys too. There is no way back."""
-        _check(self._http.delete("/v1/account"))
+        check(self._http.delete("/v1/account"))
 
     def download(self, correction_id: str, path: str | Path) -> Path:
         """Save the corrected photo; the file appears under its name only when it is complete."""
         return self._save(f"/v1/corrections/{correction_id}/result", Path(path))
-
-    def _save(self, address: str, target: Path) -> Path:
-        with self._http.stream("GET", address) as answer:
-            if answer.is_error:
-                answer.read()
-            _check(answer)
-            with tempfile.NamedTemporaryFile(dir=target.parent, suffix=".part", delete=False) as part:
-                try:
-                    for piece in answer.iter_bytes():
-                        part.write(piece)
-                except BaseException:
-                    Path(part.name).unlink()
-                    raise
-        Path(part.name).replace(target)
-        return target
-
-    def _get(self, answer: type[M], path: str, query: Query | None = None) -> M:
-        # None and not {}: empty parameters would cut off the query that an address carries already
-        return _read(answer, self._http.get(path, params=_said(query) if query else None))
-
-    def _pages(self, answer: type[M], path: str, query: Query | None = None) -> Iterator[Any]:
-        page: Any = self._get(answer, path, query)
-        yield from page.items
-        while page.next is not None:
-            page = self._get(answer, page.next)
-            yield from page.items
 
 
 def ended(job: s.JobOut, on_change: Callable[[s.JobOut], None] | None) -> bool:
@@ -368,30 +259,9 @@ def ended(job: s.JobOut, on_change: Callable[[s.JobOut], None] | None) -> bool:
     return job.state == "succeeded"
 
 
-def _said(query: Query) -> dict[str, str | int | float | bool]:
-    return {name: value for name, value in query.items() if value is not None}
-
-
 def _pieces(file: io.BufferedReader, on_progress: Callable[[int, int], None] | None) -> Iterator[bytes]:
     total = os.fstat(file.fileno()).st_size
     while piece := file.read(1 << 20):
         yield piece
         if on_progress is not None:
             on_progress(file.tell(), total)
-
-
-def _check(answer: httpx2.Response) -> httpx2.Response:
-    if not answer.is_error:
-        return answer
-    try:
-        problem = s.Problem.model_validate_json(answer.content)
-    except ValidationError:  # a proxy between us and the service
-        text = answer.text[:200]
-        problem = s.Problem(
-            title=answer.reason_phrase, status=answer.status_code, detail=text, code="no_problem"
-        )
-    raise ServiceProblemError(problem)
-
-
-def _read(model: type[M], answer: httpx2.Response) -> M:
-    return model.model_validate_json(_check(answer).content)

@@ -180,8 +180,11 @@ class CorrectionWork:
         if row is None or row.state != "succeeded":  # another worker may have handed it in
             self._bench.storage.delete(folder_of(correction))
 
-    def measure(self, lens_id: str, version: int) -> None:
-        """Measure how well one version of a lens predicts photos that it was not shown."""
+    def measure(self, lens_id: str, version: int, _again: int = 0) -> None:
+        """Measure how well one version of a lens predicts photos that it was not shown, and test the lens.
+
+        Again, for the sake of its report, it leaves the figures that were measured first.
+        """
         lenses = self._bench.store.lenses
 
         def wanted() -> bool:

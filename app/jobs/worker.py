@@ -24,7 +24,9 @@ from app.blobs.founding import settle
 from app.blobs.storage import Storage
 from app.jobs.context import Workbench
 from app.jobs.correction_work import CorrectionWork
+from app.jobs.developed_cache import drop_developed
 from app.jobs.job_log import Account, accounted
+from app.jobs.missing_reports import ask_for_reports
 from app.jobs.photo_work import PhotoWork
 from app.jobs.queue import DbosEngine, Handler, Job, JobEngine
 from app.jobs.task_files import GLANCE, PREVIEW, R_MAP, SHOWN
@@ -47,8 +49,8 @@ EXIT_FENCED: Final = 70
 
 RECONCILE_S: Final = 10.0
 TIDY_S: Final = 60.0
+REPORTS_S: Final = 6 * 3600.0
 KEEP_JOBS: Final = timedelta(days=2)
-KEEP_DEVELOPED_BYTES: Final = 20 << 30
 
 _OURS: Final = "an error of ours; the log of the worker has it; retry later, or report the file"
 _LATER: Final = "retry once its operator has mended that"
@@ -124,6 +126,7 @@ class Worker:
         )
         self._bury_the_gone(host)
         self._start_thread(TIDY_S, self._tidy)  # deleting may take long
+        self._start_thread(REPORTS_S, self._ask_for_reports)  # and so may asking what is there
         duties = (
             (self._settings.sweep_seconds, self._sweep),
             (beat_s, self._bury_the_silent),
@@ -234,7 +237,7 @@ class Worker:
     def _correction_broke(self, ending: Ending, correction_id: str, epoch: int = 1) -> None:
         self._store.corrections.fail(correction_id, ending.code, ending.detail, epoch=epoch)
 
-    def _measure_broke(self, ending: Ending, lens_id: str, version: int) -> None:
+    def _measure_broke(self, ending: Ending, lens_id: str, version: int, _again: int = 0) -> None:
         unknown = {"error": None, "coverage": None, "problem": ending.code}
         self._store.lenses.record_metrics(lens_id, version, unknown)
 
@@ -248,6 +251,9 @@ class Worker:
             self._engine.enqueue(_correction_job(correction_id, epoch, owner))
         for lens_id, version in self._store.lenses.unmeasured():
             self._engine.enqueue(Job("measure", (lens_id, version)))
+
+    def _ask_for_reports(self) -> None:
+        ask_for_reports(self._store, self._bench.storage, self._engine)
 
     def _leave_metrics(self) -> None:
         with contextlib.suppress(OSError):  # a full disk: numbers are no reason to stop
@@ -325,7 +331,8 @@ class Worker:
         for prefix in self._store.workers.garbage():
             self._do(partial(self._delete, prefix))  # what cannot be deleted keeps nothing else
         self._do(lambda: self._engine.forget(datetime.now(UTC) - KEEP_JOBS))
-        self._drop_developed()
+        developed = self._bench.developed_folder("x").parent
+        drop_developed(developed, self._bench.jobs.existing_photos, self._settings.correct_seconds)
 
     def _delete(self, prefix: str) -> None:
         if prefix.endswith("/"):
@@ -333,21 +340,6 @@ class Worker:
         else:
             self._bench.storage.remove(prefix)
         self._store.workers.forget_garbage(prefix)
-
-    def _drop_developed(self) -> None:
-        """Bound the cache of developed photos; those of deleted photos go first."""
-        base = self._bench.developed_folder("x").parent
-        folders = [path for path in base.iterdir() if path.is_dir()] if base.is_dir() else []
-        existing = self._bench.jobs.existing_photos(path.name for path in folders)
-        used = sorted((_used(path), path) for path in folders)
-        free = shutil.disk_usage(base).free if folders else 0
-        room = min(KEEP_DEVELOPED_BYTES, free // 2) if free else 0
-        total = sum(_size(path) for path in folders)
-        for last, path in used:
-            idle = time.time() - last > self._settings.correct_seconds
-            if path.name not in existing or (total > room and idle):
-                total -= _size(path)
-                shutil.rmtree(path, ignore_errors=True)
 
     def _database_files(self) -> list[Path]:
         return [self._store.database.path] if self._store.database.is_sqlite else []
@@ -375,15 +367,6 @@ def _identity(path: Path) -> tuple[int, int]:
     except FileNotFoundError:
         return (0, 0)
     return (found.st_dev, found.st_ino)
-
-
-def _size(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.glob("*"))
-
-
-def _used(folder: Path) -> float:
-    planes = folder / "planes.npy"
-    return planes.stat().st_mtime if planes.exists() else 0.0
 
 
 def main() -> None:

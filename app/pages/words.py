@@ -204,7 +204,7 @@ def error_words(error: dict[str, Any] | float | None) -> str:
 
 def percent(share: float | None) -> str:
     """Write a share in percent."""
-    return "?" if share is None else f"{share:.0%}"
+    return "not known" if share is None else f"{100 * share:.0f} %"
 
 
 EVENTS: Final[Mapping[str, str]] = {

@@ -322,6 +322,16 @@ class LensStore:
                     .values(metrics=metrics)
                 )
 
+    def measured(self) -> list[tuple[str, int, int]]:
+        """Return `(lens_id, version, rebuild_epoch)` of the newest versions that were measured."""
+        query = (
+            select(LensRow.public_id, LensRow.version, LensRow.rebuild_epoch)
+            .join(EventRow, (EventRow.lens_id == LensRow.id) & (EventRow.version == LensRow.version))
+            .where(EventRow.metrics.is_not(None), LensRow.deleted_at.is_(None), LensRow.sample_count > 0)
+        )
+        with self._db.reading() as session:
+            return [(row[0], row[1], row[2]) for row in session.execute(query)]
+
     def unmeasured(self, limit: int = 10) -> list[tuple[str, int]]:
         """Return `(lens_id, version)` of the newest versions that were not measured yet."""
         query = (

@@ -36,9 +36,12 @@ def new_version(session: Session, lens_id: int, *, rebuild: bool = False) -> int
     return int(version)
 
 
+LEARNED_ROOT: Final = "models/"
+
+
 def learned_prefix(lens_id: str, version: int, epoch: int) -> str:
     """Where workers keep what they have learned from the samples of one version of a lens."""
-    return f"models/{lens_id}/{version}-{epoch}/"
+    return f"{LEARNED_ROOT}{lens_id}/{version}-{epoch}/"
 
 
 def learned_key(lens_id: str, version: int, epoch: int) -> str:

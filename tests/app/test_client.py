@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,11 @@ from app.runtime.settings import Settings
 from app.schemas import JobOut
 from app.store import Store
 from app.store.corrections import Result
+from app.store.versions import report_key
+from lensmodel.core.codec import to_json
 from lensmodel.core.errors import LensModelError
+from lensmodel.model import LensModel
+from lensmodel.report.lens_test import lens_test
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 
@@ -149,6 +154,77 @@ def test_a_corrected_photo_is_saved_whole_or_not_at_all(
     assert api.wait(correction).links.result is not None
     assert api.download(correction.id, target).read_bytes() == b"the file"
     assert api.correction(correction.id).output["format"] == "png16"
+
+
+def test_lenses_are_named_merged_and_set_back(api: Client, steps: Steps) -> None:
+    photos = [steps.counted(serial=serial) for serial in ("1", "2", "2")]
+    first, second = steps.lens_id(photos[0]), steps.lens_id(photos[1])
+
+    assert api.rename_lens(first, "Old one").label == "Old one"
+    assert api.rename_lens(first, None).label is None
+    merged = api.merge_lens(first, into=second)
+    assert (merged.id, merged.photos) == (second, 3)
+    assert [lens.id for lens in api.lenses()] == [second]
+    assert [event.version for event in api.calibrations(second)][:2] == [1, 2]
+    assert api.go_back(second, 1).photos == 1
+
+
+def test_a_profile_is_saved_and_added(api: Client, steps: Steps, tmp_path: Path) -> None:
+    one, other = (steps.lens_id(steps.counted(serial=serial)) for serial in "12")
+
+    path = api.save_profile(one, tmp_path / "one.lensprofile")
+    added = api.add_profile(other, path)
+
+    assert added.photos == 2
+    assert added.samples == 2 * api.lens(one).samples
+
+
+def test_a_report_that_is_not_made_yet_is_refused_and_one_that_is_there_saved(
+    api: Client, steps: Steps, store: Store, settings: Settings, tmp_path: Path
+) -> None:
+    lens_id = steps.lens_id(steps.counted(patches=6))
+    with pytest.raises(ServiceProblemError, match="not_ready"):
+        api.save_report(lens_id, tmp_path / "report.html")
+    _, stored = store.samples.of_lens(lens_id)
+    model = LensModel.fit([one.sample for one in stored])
+    test = lens_test(model, "A lens", draws=0, rows=5, size=15, channels=("g",))
+    lens = store.lenses.get(lens_id)
+    assert lens is not None
+    key = report_key(lens_id, lens.version, lens.rebuild_epoch)
+    Storage(settings.storage).put(key, json.dumps(to_json(test)).encode())
+
+    page = api.save_report(lens_id, tmp_path / "report.html").read_text(encoding="utf-8")
+    table = api.save_report(lens_id, tmp_path / "figures", form="csv").read_text(encoding="utf-8")
+
+    assert page.lower().startswith("<!doctype html>")
+    assert "," in table.splitlines()[0]
+
+
+def test_several_photos_are_named_at_once_and_say_where_they_were_learned_from(
+    api: Client, steps: Steps, store: Store
+) -> None:
+    waiting = [steps.receive() for _ in range(2)]
+    for photo in waiting:
+        steps.inspect(photo, serial=None)
+        store.photos.set_state(photo.public_id, ("inspecting",), "needs_lens")
+
+    keys = [photo.public_id for photo in waiting]
+    named = api.change_photos(keys, new_lens={"label": "Mine"}, aperture=2.0)
+
+    assert {photo.state for photo in named} == {"received"}  # they go on, with the lens and aperture given
+    assert {job.id for job in api.jobs()} == set(keys)
+    learned = steps.counted()
+    counts = api.photo(learned.public_id).patches
+    assert len(api.patches(learned.public_id)) == counts.total + counts.rejected > 0
+
+
+def test_corrections_are_listed_and_deleted(api: Client, steps: Steps) -> None:
+    photo = steps.counted()
+    wanted = api.correct(photo.public_id, method="fast")
+
+    assert [one.id for one in api.corrections(photo_id=photo.public_id)] == [wanted.id]
+    api.delete_correction(wanted.id)
+    assert api.corrections() == []
 
 
 def test_an_error_page_of_a_proxy_is_told_as_it_is() -> None:

@@ -8,6 +8,7 @@ export class Tiles {
     Object.assign(this, { base, width, height, onLoad });
     this.kept = new Map();
     this.failed = false;
+    this.loading = false; // whether something of what was drawn last is on its way
     this.levels = Math.max(0, Math.ceil(Math.log2(Math.max(width, height) / TILE)));
     this.whole = new Image();
     this.whole.addEventListener("load", onLoad);
@@ -31,16 +32,19 @@ export class Tiles {
       tile = new Image();
       tile.decoding = "async";
       tile.addEventListener("load", this.onLoad);
+      tile.addEventListener("error", this.onLoad);
       tile.src = `${this.base}/${key}.jpg`;
     }
     this.kept.set(key, tile);
     while (this.kept.size > MOST) this.kept.delete(this.kept.keys().next().value);
+    this.loading ||= !tile.complete;
     return tile.complete && tile.naturalWidth ? tile : null;
   }
 
   // Draw the part of the picture that a pane shows; `toPane` maps photo pixels to the canvas.
   draw(context, view, pane, ratio) {
     const { scale } = view;
+    this.loading ||= !this.whole.complete;
     const left = pane.x + pane.width / 2 - view.x * scale;
     const top = pane.y + pane.height / 2 - view.y * scale;
     context.imageSmoothingEnabled = scale * ratio < 0.999;

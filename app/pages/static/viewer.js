@@ -145,6 +145,7 @@ export class Viewer {
   }
 
   changed() {
+    this.handle.hidden = !this.hasAfter || this.shown !== "split"; // at once: the next key may be meant for it
     this.redraw();
     const percent = Math.round(this.view.scale * this.ratio * 100);
     this.words.textContent = `${percent} %`;
@@ -167,6 +168,7 @@ export class Viewer {
   redraw() {
     if (this.waiting) return;
     this.waiting = true;
+    this.canvas.setAttribute("aria-busy", "true");
     requestAnimationFrame(() => {
       this.waiting = false;
       this.draw();
@@ -180,6 +182,8 @@ export class Viewer {
     context.clearRect(0, 0, this.canvas.width, this.canvas.height);
     const shown = this.hasAfter ? this.shown : "before";
     const panes = this.panes;
+    const pictures = [this.before, this.after].filter(Boolean);
+    for (const tiles of pictures) tiles.loading = false;
     const split = shown === "split";
     if (split) {
       const [pane] = panes;
@@ -194,6 +198,7 @@ export class Viewer {
     this.handle.hidden = !split;
     this.root.dataset.shown = shown;
     this.root.classList.toggle("stacked", shown === "side" && panes[1].y > 0);
+    this.canvas.setAttribute("aria-busy", String(pictures.some(({ loading }) => loading)));
   }
 
   drawPane(context, pane, which, clip) {

@@ -46,6 +46,7 @@ REACH: Final = 2.5
 
 _ROWS: Final = 4096  # at once: the design matrix of a window would take hundreds of megabytes
 _STEPS: Final = 300
+_STILL: Final = 1e-7  # of the light: no value moves by more
 _WORST: Final = 1.0  # an error beyond it says that nothing was measured
 
 
@@ -110,6 +111,41 @@ def solve(
     NotEnoughEvidenceError
         If fewer pixels count than the kernel has, or no kernel explains them.
     """
+    require_fit(observed, latent, measured, size)
+    weight = weights_of(measured, variance)
+    a, b, power = _normal_equations(observed, latent, weight, size)
+    if latent_noise is not None:
+        a -= stationary(latent_noise, size) * weight.sum()
+    prior = np.diag(1.0 / prior_width(size) ** 2)
+    count = int(measured.sum())
+    misfit = 1.0
+    start = np.zeros(size * size)
+    for _ in range(2):  # the second time with the residuals of the first
+        if latent_noise is None:
+            k = bounded(a / misfit + prior, b / misfit, start)
+        else:  # less its noise a latent picture leaves directions open, and the free minimum's sum with them
+            k = nonnegative_least_squares(a / misfit + prior, b / misfit, start, _STEPS)
+        misfit = max((power - 2.0 * float(b @ k) + float(k @ a @ k)) / count, 1.0)
+        start = k
+    light = float(k.sum())
+    if not light > 0.0:
+        raise NotEnoughEvidenceError("no kernel explains this window; the latent picture does not match it")
+    kernel = as_kernel(k.reshape(size, size))
+    mean_y, mean_x = weighted_mean(observed, weight), means_of_latent(latent, weight, size)
+    return Solved(
+        kernel=kernel,
+        light=light,
+        offset=mean_y - float(mean_x @ k),
+        shift=centroid(kernel),
+        error=error_of(a / misfit + prior, k),
+        misfit=misfit,
+    )
+
+
+def require_fit(
+    observed: NDArray[np.floating], latent: NDArray[np.floating], measured: NDArray[np.bool_], size: int
+) -> None:
+    """Refuse shapes that do not fit each other, and too few pixels; see `solve`."""
     if size < 3 or size % 2 == 0 or latent.shape != tuple(n + size - 1 for n in observed.shape):
         raise InvalidInputError(
             f"a latent picture of {latent.shape} does not fit a window of {observed.shape} and kernels of "
@@ -119,40 +155,17 @@ def solve(
         raise NotEnoughEvidenceError(
             f"{int(measured.sum())} pixels count, {size * size} are needed for a kernel of side {size}"
         )
-    weight = np.where(measured, 1.0 / np.maximum(variance, 1e-12), 0.0)
-    a, b, power = _normal_equations(observed, latent, weight, size)
-    if latent_noise is not None:
-        a -= _stationary(latent_noise, size) * weight.sum()
-    prior = np.diag(1.0 / _prior(size) ** 2)
-    count = int(measured.sum())
-    misfit = 1.0
-    start = np.zeros(size * size)
-    for _ in range(2):  # the second time with the residuals of the first
-        if latent_noise is None:
-            k = _bounded(a / misfit + prior, b / misfit, start)
-        else:  # less its noise a latent picture leaves directions open, and the free minimum's sum with them
-            k = nonnegative_least_squares(a / misfit + prior, b / misfit, start, _STEPS)
-        misfit = max((power - 2.0 * float(b @ k) + float(k @ a @ k)) / count, 1.0)
-        start = k
-    light = float(k.sum())
-    if not light > 0.0:
-        raise NotEnoughEvidenceError("no kernel explains this window; the latent picture does not match it")
-    kernel = as_kernel(k.reshape(size, size))
-    mean_y, mean_x = _mean(observed, weight), _means_of_latent(latent, weight, size)
-    return Solved(
-        kernel=kernel,
-        light=light,
-        offset=mean_y - float(mean_x @ k),
-        shift=centroid(kernel),
-        error=_error(a / misfit + prior, k),
-        misfit=misfit,
-    )
 
 
-def _bounded(
+def weights_of(measured: NDArray[np.bool_], variance: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return one over the variance of each pixel, 0 where it does not count."""
+    return np.where(measured, 1.0 / np.maximum(variance, 1e-12), 0.0)
+
+
+def bounded(
     a: NDArray[np.float64], b: NDArray[np.float64], start: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Minimise k'Ak/2 - b'k over k >= 0 of the free minimum's sum, by accelerated projected gradients."""
+    """Minimise k'Ak/2 - b'k over k >= 0 of the free minimum's sum."""
     eigenvalues = np.linalg.eigvalsh(a)
     largest = float(eigenvalues[-1])
     lift = max(1e-6 * largest - float(eigenvalues[0]), 0.0)  # single precision may leave it indefinite
@@ -160,12 +173,29 @@ def _bounded(
     light = float(linalg.solve(a, b, assume_a="pos").sum())
     if not light > 0.0:
         raise NotEnoughEvidenceError("no kernel explains this window; the latent picture does not match it")
-    step = 1.0 / (largest + lift)
+    return of_sum(a, b, start, light, largest + lift)
+
+
+def of_sum(
+    a: NDArray[np.float64],
+    b: NDArray[np.float64],
+    start: NDArray[np.float64],
+    light: float,
+    largest: float,
+    steps: int = _STEPS,
+) -> NDArray[np.float64]:
+    """Minimise k'Ak/2 - b'k over k >= 0 of sum `light` by accelerated projected gradients.
+
+    `largest` bounds the eigenvalues of A.
+    """
+    step = 1.0 / largest
     k, momentum, t = start.copy(), start.copy(), 1.0
-    for _ in range(_STEPS):
+    for _ in range(steps):
         after = _on_simplex(momentum - step * (a @ momentum - b), light)
         t_next = 0.5 * (1.0 + math.sqrt(1.0 + 4.0 * t * t))
         momentum = after + (t - 1.0) / t_next * (after - k)
+        if float(np.abs(after - k).max()) < _STILL * light:
+            return after
         k, t = after, t_next
     return k
 
@@ -186,7 +216,7 @@ def _normal_equations(
     observed: NDArray[np.floating], latent: NDArray[np.floating], weight: NDArray[np.float64], size: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """X'WX, X'Wy and y'Wy after the constant was taken out of both."""
-    mean_y, mean_x = _mean(observed, weight), _means_of_latent(latent, weight, size)
+    mean_y, mean_x = weighted_mean(observed, weight), means_of_latent(latent, weight, size)
     views = sliding_window_view(np.asarray(latent, dtype=np.float32), (size, size))[:, :, ::-1, ::-1]
     rows, cols = np.nonzero(weight)
     a, b, power = np.zeros((size * size, size * size)), np.zeros(size * size), 0.0
@@ -201,14 +231,15 @@ def _normal_equations(
     return a, b, power
 
 
-def _mean(values: NDArray[np.floating], weight: NDArray[np.float64]) -> float:
+def weighted_mean(values: NDArray[np.floating], weight: NDArray[np.float64]) -> float:
+    """Return the mean of values that count by their weight."""
     return float((values * weight).sum() / weight.sum())
 
 
-def _means_of_latent(
+def means_of_latent(
     latent: NDArray[np.floating], weight: NDArray[np.float64], size: int
 ) -> NDArray[np.float64]:
-    """Weighted mean of x(p - u) for each u, in the order of the kernel's values."""
+    """Return the weighted mean of x(p - u) for each u, in the order of the kernel's values."""
     height, width = weight.shape
     means = np.empty((size, size))
     for i in range(size):
@@ -218,20 +249,22 @@ def _means_of_latent(
     return means.ravel() / weight.sum()
 
 
-def _stationary(covariance: NDArray[np.floating], size: int) -> NDArray[np.float64]:
+def stationary(covariance: NDArray[np.floating], size: int) -> NDArray[np.float64]:
+    """Return the covariance of all values of a window of `size` pixels, shape (k², k²)."""
     rows, cols = np.divmod(np.arange(size * size), size)
     return np.asarray(
         covariance[rows[:, None] - rows + size - 1, cols[:, None] - cols + size - 1], dtype=np.float64
     )
 
 
-def _prior(size: int) -> NDArray[np.float64]:
+def prior_width(size: int) -> NDArray[np.float64]:
+    """Return t(d), shape (k²,)."""
     t = np.arange(size) - size // 2
     return (PEAK / (1.0 + (t[:, None] ** 2 + t[None, :] ** 2) / REACH**2)).ravel()
 
 
-def _error(precision: NDArray[np.float64], k: NDArray[np.float64]) -> float:
-    """Root of the posterior variance of all values over the norm of the kernel."""
+def error_of(precision: NDArray[np.float64], k: NDArray[np.float64]) -> float:
+    """Return the root of the posterior variance of all values over the norm of the kernel."""
     try:
         inverse = linalg.inv(precision, check_finite=False)
     except linalg.LinAlgError:

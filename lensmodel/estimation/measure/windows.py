@@ -12,6 +12,7 @@ from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import centred
 from lensmodel.core.types import CHANNELS, Channel, Kernel
 from lensmodel.estimation.measure.solve import Solved, solve
+from lensmodel.estimation.measure.varying import solve_varying
 from lensmodel.photo import LinearPhoto
 
 Latent = Callable[[tuple[float, float], int], NDArray[np.floating]]
@@ -60,12 +61,13 @@ def window_psf(
     """Measure the PSF of one window.
 
     First a small kernel, whose centre of mass says how far the photo lies beyond the latent picture; that
-    is moved, and solved again, so that the kernel comes out centred and needs no interpolation.
+    is moved, and solved again, so that the kernel comes out nearly centred and needs no interpolation, which
+    would soften a peak as narrow as a pixel.
 
     Returns
     -------
     kernel : Kernel, shape (size, size)
-        Centred.
+        Its centre of mass lies within parts of a pixel of the middle.
     solved : Solved
         As it was found.
     shift : tuple of float
@@ -95,7 +97,12 @@ def window_psf(
             raise NotEnoughEvidenceError("the window lies elsewhere than the rest of the reference says")
         if max(map(abs, first.shift)) < 0.02:
             break
-    found = solve(observed, latent(shift, size // 2), measured, variance, size, latent_noise)
+    sharp = latent(shift, size // 2)
+    if latent_noise is None:
+        found = solve_varying(observed, sharp, measured, variance, size)
+        return found.kernel, found, shift
+    # less its noise a latent picture says too little of how the kernel changes, and of the best grid
+    found = solve(observed, sharp, measured, variance, size, latent_noise)
     return centred(found.kernel), found, shift
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,6 +16,7 @@ from app.blobs.storage import Storage
 from app.http import views
 from app.jobs.context import JobFailedError, NotWantedError, Workbench
 from app.jobs.correction_work import CorrectionWork
+from app.jobs.missing_reports import ask_for_reports
 from app.jobs.photo_work import PhotoWork
 from app.jobs.queue import Handler, Job, Kind, Status
 from app.jobs.task_files import KERNELS, LEARNED, PREVIEW, SAMPLES
@@ -24,7 +25,7 @@ from app.sandbox.child import Progress
 from app.sandbox.runner import Budget, Limits, Outcome
 from app.store import Store
 from app.store.tables import PhotoRow
-from app.store.versions import learned_key
+from app.store.versions import learned_key, report_key
 from lensmodel.core.psf import gaussian
 from lensmodel.core.types import ignore_step
 
@@ -711,3 +712,34 @@ def test_a_version_that_cannot_be_measured_is_not_tried_for_ever(
     CorrectionWork(bench).measure(steps.lens_id(counted), 1)
 
     assert bench.store.lenses.unmeasured() == []
+
+
+class Asked:
+    """An engine that only notes what it is asked for."""
+
+    def __init__(self) -> None:
+        self.jobs: list[Job] = []
+
+    def enqueue(self, job: Job) -> None:
+        self.jobs.append(job)
+
+
+def test_a_lens_that_was_measured_before_there_were_reports_gets_one(
+    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+) -> None:
+    first = {"error": {"mid": 0.2}, "coverage": {"mid": 4}}
+    sandbox.answers["measure"] = [ok(first), ok({"error": {"mid": 9.9}, "coverage": {"mid": 4}})]
+    lens_id = steps.lens_id(counted)
+    work, engine = CorrectionWork(bench), cast("Any", Asked())
+    assert ask_for_reports(bench.store, bench.storage, engine) == 0  # not measured yet: that makes one
+    work.measure(lens_id, 1)
+    assert ask_for_reports(bench.store, bench.storage, engine) == 1
+    (job,) = engine.jobs
+    assert job.id != Job("measure", (lens_id, 1)).id
+
+    work.measure(*job.arguments)
+    lens = bench.store.lenses.get(lens_id)
+    assert lens is not None
+    assert bench.store.lenses.history(lens)[-1].metrics == first
+    bench.storage.put(report_key(lens_id, 1, lens.rebuild_epoch), b"{}")
+    assert ask_for_reports(bench.store, bench.storage, engine) == 0

@@ -18,7 +18,7 @@ set -euo pipefail
 here=$(cd "$(dirname "$0")/.." && pwd)
 patience=300 # seconds that each wait may take; a busy machine needs most of them
 folder=${1:-${TMPDIR:-/tmp}/lensmodel-container}
-photo=$here/lensmodel/demo_data/canon_kissx4_colorchart.dng
+photo=$here/lensmodel/demo_data/city.jpg
 packages=python3,python3-venv,ca-certificates
 service=""
 parts=()

@@ -18,7 +18,6 @@ each photo for another run.
 from __future__ import annotations
 
 import argparse
-import pickle
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -42,7 +41,7 @@ from lensmodel.lab.chain.blind_gain import (
     seed_range,
     shot,
 )
-from lensmodel.model import LensModel, ModelSettings
+from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
 from lensmodel.simulate import CAMERA_JPEGS
 from lensmodel.workflow import pipeline
 
@@ -82,17 +81,18 @@ def outcomes(
 def learned(lens: Lens, camera: str, number: int, folder: Path) -> list[PsfSample]:
     """Samples of one photo, kept in the folder."""
     path = folder / f"{lens.number}-{number}-{camera}.jpg"
-    kept = path.with_suffix(".samples")
-    if kept.exists():
-        own: list[PsfSample] = pickle.loads(kept.read_bytes())  # noqa: S301 - written by the line below
-        return own
-    CAMERA_JPEGS[camera].write(path, shot(lens, number))
-    try:
-        own = pipeline.samples_of_photo(path, workers=1)
-    except NotEnoughEvidenceError:
-        own = []
-    kept.write_bytes(pickle.dumps(own))
-    return own
+    kept, refused = path.with_suffix(".lensprofile"), path.with_suffix(".refused")
+    if refused.exists():
+        return []
+    if not kept.exists():
+        CAMERA_JPEGS[camera].write(path, shot(lens, number))
+        try:
+            own = pipeline.samples_of_photo(path, workers=1)
+        except NotEnoughEvidenceError:
+            refused.touch()
+            return []
+        save_profile(kept, LensProfile(LensModel.fit(own)))
+    return list(load_profile(kept).model.samples)
 
 
 def values(planes: Planes) -> Planes:

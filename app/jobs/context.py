@@ -23,7 +23,8 @@ from app.runtime import metrics
 from app.runtime.outage import OutageError, is_outage
 from app.runtime.settings import Settings
 from app.sandbox.child import Progress
-from app.sandbox.runner import Limits, Outcome, Sandbox
+from app.sandbox.outcome import Limits, Outcome
+from app.sandbox.runner import Sandbox
 from app.schemas import distances
 from app.store import Store, StoredSample
 from app.store.jobs import JobStore

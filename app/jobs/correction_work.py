@@ -23,7 +23,7 @@ from app.jobs.context import (
 from app.jobs.task_files import AFTER, BEFORE, FAMILY, LAYERS, LEARNED, REPORT, SUFFIX
 from app.runtime.outage import missable
 from app.sandbox.child import Progress
-from app.sandbox.runner import Limits
+from app.sandbox.outcome import Limits
 from app.store.corrections import CorrectionPlan, Result, folder_of
 from app.store.photo_steps import settings_of
 from app.store.samples import LensState, Relative, StoredSample

@@ -8,7 +8,7 @@ from typing import Any
 
 from app.jobs.context import SPARE_MB, Workbench
 from app.jobs.task_files import GLANCE
-from app.sandbox.runner import Limits
+from app.sandbox.outcome import Limits
 from app.store.photo_steps import folder_of
 from app.store.tables import PhotoRow
 

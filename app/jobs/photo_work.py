@@ -22,7 +22,7 @@ from app.jobs.glance_work import keep_glance
 from app.jobs.measurement_work import MeasurementWork
 from app.jobs.queue import Job, JobEngine
 from app.jobs.task_files import KERNELS
-from app.sandbox.runner import Limits
+from app.sandbox.outcome import Limits
 from app.store import LensName, NewPatch, NewSample
 from app.store.photo_steps import settings_of, statistics_of
 from app.store.tables import PHOTO_RUNNING, PatchRow, PhotoRow

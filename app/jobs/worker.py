@@ -38,7 +38,8 @@ from app.runtime.processes import is_running, started_at
 from app.runtime.settings import Settings
 from app.runtime.signals import on_signals
 from app.sandbox import confine
-from app.sandbox.runner import Budget, Sandbox
+from app.sandbox.budget import Budget
+from app.sandbox.runner import Sandbox
 from app.store import Store
 from app.store.ids import new_id
 

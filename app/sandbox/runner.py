@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import logging
 import math
 import multiprocessing
 import os
@@ -21,125 +20,22 @@ import signal
 import tempfile
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
-from typing import Any, Final, Literal, TypeAlias
+from typing import Any, Final
 
 from app.sandbox import child
+from app.sandbox.budget import POLL_S, Budget
+from app.sandbox.outcome import Limits, Outcome, cancelled, outcome_of
 from lensmodel.core.types import ignore_step
 
-log = logging.getLogger(__name__)
-
-Ending: TypeAlias = Literal["ok", "error", "memory_limit", "time_limit", "outage", "crashed", "cancelled"]
-
-POLL_S: Final = 0.25
 MAX_MESSAGE: Final = 64 * 1024
-MAX_RESULT: Final = 16 * 1024 * 1024
 TASKS_MODULE = "app.jobs.tasks"
 """Default module of the tasks; tests of the workers put in another."""
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """What one task may take.
-
-    Parameters
-    ----------
-    memory_mb : int
-        Address space in MiB beyond that of the program itself; mapped files count.
-    wall_s : float
-        Seconds until it is killed.
-    cpu_s : int or None
-        Seconds of processor time; by default a little more than `wall_s`.
-    file_mb : int
-        Largest file it may write, in MiB.
-    open_files : int
-        Files it may have open at once.
-    """
-
-    memory_mb: int
-    wall_s: float
-    cpu_s: int | None = None
-    file_mb: int = 8192
-    open_files: int = 256
-
-    def with_memory(self, memory_mb: int) -> Limits:
-        """Return the same limits with another memory."""
-        return replace(self, memory_mb=memory_mb)
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """How a task ended.
-
-    Parameters
-    ----------
-    ending : str
-        `ok`, `error` (the library refused, with its reason), `memory_limit`, `time_limit`,
-        `outage` (the machine had no room, or killed it), `crashed` (another signal, or an
-        exception that nobody foresaw) or `cancelled`.
-    value : object
-        What the task returned.
-    code, detail : str
-        The fixed word and the sentence for whoever asked for the work.
-    """
-
-    ending: Ending
-    value: Any = None
-    code: str = ""
-    detail: str = ""
-
-
-class Budget:
-    """How many children run at once, and how much memory they may take together; first come, first served."""
-
-    def __init__(self, slots: int, memory_mb: int) -> None:
-        self._changed = threading.Condition()
-        self._queue: deque[object] = deque()
-        self._slots, self._memory = slots, memory_mb
-        self.memory_mb = memory_mb
-
-    @contextlib.contextmanager
-    def share(self, memory_mb: int, wanted: Callable[[], bool]) -> Iterator[bool]:
-        """Wait for a slot and memory; give False if nobody wants it any more.
-
-        A task that asks for more than there is at all runs alone.
-        """
-        memory = min(memory_mb, self.memory_mb)
-        ticket = object()
-        entered = self._enter(ticket, memory, wanted)
-        try:
-            yield entered
-        finally:
-            if entered:
-                with self._changed:
-                    self._slots += 1
-                    self._memory += memory
-                    self._changed.notify_all()
-
-    def _enter(self, ticket: object, memory: int, wanted: Callable[[], bool]) -> bool:
-        with self._changed:
-            self._queue.append(ticket)
-        entered = False
-        try:
-            while not entered and wanted():
-                with self._changed:
-                    if self._queue[0] is ticket and self._slots > 0 and self._memory >= memory:
-                        self._slots -= 1
-                        self._memory -= memory
-                        entered = True
-                    else:
-                        self._changed.wait(POLL_S)
-        finally:
-            with self._changed:
-                self._queue.remove(ticket)
-                self._changed.notify_all()
-        return entered
 
 
 @dataclass(slots=True)
@@ -275,7 +171,7 @@ class Sandbox:
 
         with self.budget.share(limits.memory_mb, still_wanted) as entered:
             if not entered:
-                return _cancelled()
+                return cancelled()
             line, far_end = self._context.Pipe(duplex=True)
             with line:
                 order = self._order(task, arguments, folder, limits)
@@ -285,7 +181,7 @@ class Sandbox:
                 try:
                     watched = _Watched(process, line, time.monotonic() + limits.wall_s)
                     cut = self._watch(watched, limits, still_wanted, on_progress)
-                    return cut or _outcome(watched.ended, self._exit_status(process), folder, limits)
+                    return cut or outcome_of(watched.ended, self._exit_status(process), folder, limits)
                 finally:
                     self._end(process)
 
@@ -331,7 +227,7 @@ class Sandbox:
             if time.monotonic() - asked > POLL_S:
                 asked = time.monotonic()
                 if not wanted():
-                    return _cancelled()
+                    return cancelled()
             if time.monotonic() > watched.deadline:
                 text = f"stopped after {limits.wall_s:g} s; give a smaller photo or raise the time limit"
                 return Outcome("time_limit", code="time_limit", detail=text)
@@ -368,69 +264,3 @@ def _read(line: Connection) -> dict[str, Any] | None:
     except (EOFError, OSError, ValueError):
         return None
     return message if isinstance(message, dict) else None
-
-
-def _outcome(ended: dict[str, Any] | None, status: int, folder: Path, limits: Limits) -> Outcome:
-    ending = None if ended is None else ended.get("end")
-    if ending == "ok" and status == 0:
-        return _result(folder / child.RESULT)
-    if ending in _SAID:
-        code, text = (str((ended or {}).get(key, "")) for key in ("code", "text"))
-        return _SAID[ending](code, text, limits)
-    if -status == signal.SIGXCPU:
-        detail = f"took more than {limits.cpu_s or limits.wall_s:g} s of processor time; give a smaller photo"
-        return Outcome("time_limit", code="time_limit", detail=detail)
-    why = f"signal {-status} ({_signal_name(-status)})" if status < 0 else f"exit status {status}"
-    detail = f"the process that did the work died: {why}"
-    if -status == signal.SIGKILL:  # neither by itself nor by us: the kernel does so for want of memory
-        return Outcome("outage", code="outage", detail=detail)
-    return Outcome("crashed", code="crashed", detail=detail)
-
-
-def _refused(code: str, text: str, limits: Limits) -> Outcome:
-    del limits
-    return Outcome("error", code=code, detail=text)
-
-
-def _swollen(code: str, text: str, limits: Limits) -> Outcome:
-    del code, text
-    detail = f"needs more than the {limits.memory_mb} MiB it may take; give a smaller photo"
-    return Outcome("memory_limit", code="memory_limit", detail=detail)
-
-
-def _no_room(code: str, text: str, limits: Limits) -> Outcome:
-    del code, text, limits
-    return Outcome("outage", code="outage", detail="there is no room on the disk for the work")
-
-
-def _bug(code: str, text: str, limits: Limits) -> Outcome:
-    del limits
-    log.error("unforeseen %s in a task:\n%s", code, text)
-    why = f"an unforeseen {code} stopped the work; the log of the worker says where"
-    return Outcome("crashed", code="internal_error", detail=why)
-
-
-_SAID: Final[Mapping[object, Callable[[str, str, Limits], Outcome]]] = {
-    "error": _refused,
-    "memory_limit": _swollen,
-    "no_room": _no_room,
-    "bug": _bug,
-}
-"""What to make of the last words of a child, by how it says that it ended."""
-
-
-def _result(path: Path) -> Outcome:
-    if path.stat().st_size > MAX_RESULT:
-        return Outcome("crashed", code="internal_error", detail="the task returned more than may be read")
-    return Outcome("ok", value=json.loads(path.read_text(encoding="utf-8")))
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return "unknown"
-
-
-def _cancelled() -> Outcome:
-    return Outcome("cancelled", code="cancelled", detail="the work was cancelled")

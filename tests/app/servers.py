@@ -33,6 +33,10 @@ def free_port() -> int:
         return port
 
 
+SMALL_LOG = ("--wal-segsize=1",)
+"""MiB of each file of its log: small, so that a full disk is felt at once."""
+
+
 class Postgres:
     """One PostgreSQL server with an empty database for the tables and one for the jobs."""
 
@@ -42,7 +46,15 @@ class Postgres:
         self._as = {"user": ACCOUNT} if os.geteuid() == 0 else {}
         if self._as:
             shutil.chown(folder, ACCOUNT)
-        self._run("initdb", "--auth=trust", "--username=lens", "--no-sync", "--pgdata", str(folder / "data"))
+        self._run(
+            "initdb",
+            "--auth=trust",
+            "--username=lens",
+            "--no-sync",
+            *SMALL_LOG,
+            "--pgdata",
+            str(folder / "data"),
+        )
 
         with (folder / "data" / "pg_hba.conf").open("a") as rules:
             rules.write(f"host all all {NETWORK} trust\n")
@@ -54,6 +66,13 @@ class Postgres:
         options = f"-p {self.port} -h {self._addresses} -k {self._folder} -c fsync=off"
         data, log = str(self._folder / "data"), str(self._folder / "log")
         self._run("pg_ctl", "-D", data, "-l", log, "-w", "-t", "120", "-o", options, "start")
+
+    def start_if_down(self) -> None:
+        """Start it where it ended itself, as on a full disk; one that recovers is waited for."""
+        try:
+            self._run("pg_ctl", "-D", str(self._folder / "data"), "status")
+        except subprocess.CalledProcessError:
+            self.start()
 
     def create(self, *names: str) -> None:
         for name in names:
@@ -144,12 +163,13 @@ def programs_of_postgres() -> Path | None:
 
 
 @contextlib.contextmanager
-def postgres(addresses: str = "127.0.0.1") -> Iterator[Postgres]:
-    """Give a running server; skip the test where none is installed."""
+def postgres(addresses: str = "127.0.0.1", folder: Path | None = None) -> Iterator[Postgres]:
+    """Give a running server, in an empty folder if one is named; skip the test where none is installed."""
     programs = programs_of_postgres()
     if programs is None:
         missing("PostgreSQL is not installed (Debian: apt-get install postgresql)")
-    folder = Path(tempfile.mkdtemp(prefix="lensmodel-pg-"))  # short: a socket lies in it
+    made = folder is None
+    folder = folder or Path(tempfile.mkdtemp(prefix="lensmodel-pg-"))  # short: a socket lies in it
     try:
         server = Postgres(programs, folder, addresses)
         server.start()
@@ -158,7 +178,8 @@ def postgres(addresses: str = "127.0.0.1") -> Iterator[Postgres]:
         with contextlib.suppress(subprocess.CalledProcessError):
             server.stop()
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        if made:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def main() -> None:

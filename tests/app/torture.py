@@ -4,8 +4,9 @@
     python tests/app/torture.py --seeds 20 --servers    # PostgreSQL and S3 (moto)
 
 Three workers estimate the photos of two owners while, as the seed says, workers are killed (alone, or with
-their children), the database server crashes, and the storage goes away. What must hold afterwards is what
-`lensmodel doctor` checks, and the exact numbers of photos, samples and versions.
+their children), the database server crashes, the storage goes away, and disks are full: that of the data
+folder, and that of the database server. What must hold afterwards is what `lensmodel doctor` checks, and the
+exact numbers of photos, samples and versions. Disks are filled where this may mount small ones, as root.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 from sqlalchemy import func, select
 
@@ -30,6 +32,7 @@ sys.path.insert(0, str(HERE))
 
 from deadline import stretched  # noqa: E402 - beside this file
 from servers import Postgres, moto, postgres  # noqa: E402
+from small_disk import kept_full, small_disk  # noqa: E402
 
 from app.blobs.storage import Storage  # noqa: E402
 from app.runtime.doctor import examine  # noqa: E402
@@ -53,14 +56,15 @@ class Plan:
     workers: int = 3
     kills: int = 20
     outages: int = 3
+    full_disks: int = 3
     patience_s: float = 300.0
 
 
 class Crew:
     """Worker processes of one installation."""
 
-    def __init__(self, settings: Settings, extra: dict[str, str]) -> None:
-        self.log = settings.data_dir / "workers.log"
+    def __init__(self, settings: Settings, extra: dict[str, str], log: Path) -> None:
+        self.log = log
         path = os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")])
         self._environment = os.environ | environment(settings) | {"PYTHONPATH": path} | extra
         self.processes: list[subprocess.Popen[bytes]] = []
@@ -83,6 +87,11 @@ class Crew:
         process.kill()
         process.wait()
         self.processes.remove(process)
+
+    def lose_one(self, chance: random.Random) -> None:
+        """Kill one of them, alone or with its children, and hire another."""
+        self.bury(chance.choice(self.processes), group=chance.random() < 0.5)
+        self.hire()
 
     def replace_the_dead(self) -> None:
         """Hire for those that ended themselves: fenced, or without their database for a lease."""
@@ -118,16 +127,45 @@ def crashed(server: Postgres) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def installation(
-    folder: Path, *, servers: bool
-) -> Iterator[tuple[Settings, dict[str, str], list[Callable[[], contextlib.AbstractContextManager[None]]]]]:
-    """Give settings, what the environment of workers holds besides, and the outages that there can be."""
-    common = {"data_dir": folder / "data", "lease_seconds": 4.0, "sweep_seconds": 0.1, "worker_slots": 2}
-    if not servers:
-        settings = Settings(**common, min_free_mb=0)  # type: ignore[arg-type]  # checked by pydantic
-        yield settings, {}, [lambda: folder_away(settings)]
-        return
-    with postgres() as server, moto("torture") as store, in_environment(store.environment):
+def cramped(server: Postgres, disk: Path) -> Iterator[None]:
+    """Fill the disk of a database server; who frees it starts the server again, where it gave up."""
+    with kept_full(disk):
+        yield
+    server.start_if_down()
+
+
+Spell: TypeAlias = Callable[[], contextlib.AbstractContextManager[None]]
+
+
+@dataclass(frozen=True)
+class Installation:
+    """Settings, what the environment of workers holds besides, and what outages and full disks can be."""
+
+    settings: Settings
+    extra: dict[str, str]
+    outages: list[Spell]
+    full_disks: list[Spell]
+
+
+@contextlib.contextmanager
+def installation(folder: Path, *, servers: bool) -> Iterator[Installation]:
+    with contextlib.ExitStack() as stack:
+        disk = folder / "disk"
+        disk.mkdir()
+        small = stack.enter_context(small_disk(disk, 128))
+        common = {"data_dir": disk / "data", "lease_seconds": 4.0, "sweep_seconds": 0.1, "worker_slots": 2}
+        full: list[Spell] = [lambda: kept_full(disk)] if small else []
+        if not servers:
+            settings = Settings(**common, min_free_mb=0)  # type: ignore[arg-type]  # checked by pydantic
+            yield Installation(settings, {}, [lambda: folder_away(settings)], full)
+            return
+        cluster = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lensmodel-pg-")))
+        small = stack.enter_context(small_disk(cluster, 512))
+        server = stack.enter_context(postgres(folder=cluster))
+        if small:
+            full.append(lambda: cramped(server, cluster))
+        store = stack.enter_context(moto("torture"))
+        stack.enter_context(in_environment(store.environment))
         settings = Settings(
             **common,  # type: ignore[arg-type]  # checked by pydantic
             min_free_mb=0,
@@ -136,7 +174,7 @@ def installation(
             storage_url="s3://torture",
             storage_seconds=3.0,
         )
-        yield settings, store.environment, [lambda: crashed(server), store.hanging]
+        yield Installation(settings, store.environment, [lambda: crashed(server), store.hanging], full)
 
 
 @contextlib.contextmanager
@@ -190,26 +228,32 @@ def torture(folder: Path, seed: int, *, servers: bool, plan: Plan | None = None)
         If anything was lost, counted twice, or seen by another owner.
     """
     plan, chance, began = plan or Plan(), random.Random(seed), time.monotonic()
-    with installation(folder, servers=servers) as (settings, extra, outages):
+    with installation(folder, servers=servers) as given:
+        settings = given.settings
         settings.data_dir.mkdir(parents=True)
         store, storage = Store(settings), Storage(settings.storage)
         upgrade(store.database)
-        crew = Crew(settings, extra)
+        crew = Crew(settings, given.extra, folder / "workers.log")
+        full_disks = plan.full_disks if given.full_disks else 0
         try:
             for number in range(plan.photos):
                 send(store, storage, number)
             for _ in range(plan.workers):
                 crew.hire()
-            deeds = ["kill"] * plan.kills + ["outage"] * plan.outages
+            deeds = ["kill"] * plan.kills + ["outage"] * plan.outages + ["full disk"] * full_disks
             chance.shuffle(deeds)
             for deed in deeds:
                 time.sleep(chance.uniform(0.2, 1.5))
                 if deed == "kill":
-                    crew.bury(chance.choice(crew.processes), group=chance.random() < 0.5)
-                    crew.hire()
-                else:
-                    with chance.choice(outages)():
+                    crew.lose_one(chance)
+                elif deed == "outage":
+                    with chance.choice(given.outages)():
                         time.sleep(chance.uniform(1.0, 5.0))
+                else:
+                    with chance.choice(given.full_disks)():
+                        time.sleep(chance.uniform(0.5, 2.5))
+                        crew.lose_one(chance)  # the next one starts without room
+                        time.sleep(chance.uniform(0.5, 2.5))
                 crew.replace_the_dead()
             end = time.monotonic() + stretched(plan.patience_s)
             while (now := set(states(store))) != {"counted"}:
@@ -224,6 +268,7 @@ def torture(folder: Path, seed: int, *, servers: bool, plan: Plan | None = None)
     return (
         f"seed {seed}: {plan.photos} of {plan.photos} photos counted once, "
         f"{plan.photos * CELLS * CHANNELS} samples, {plan.kills} kills, {plan.outages} outages, "
+        f"{full_disks} full disks, "
         f"{time.monotonic() - began:.0f} s"
     )
 

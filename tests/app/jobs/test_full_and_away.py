@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -29,7 +26,8 @@ from app.store.upkeep.migrate import upgrade
 
 HERE = Path(__file__).parents[1]
 sys.path.insert(0, str(HERE))
-from servers import postgres  # noqa: E402 - beside this file
+import small_disk as disks  # noqa: E402 - beside this file
+from servers import postgres  # noqa: E402
 
 sys.path.remove(str(HERE))
 
@@ -60,12 +58,10 @@ def test_photos_that_wait_for_their_owner_keep_no_others_out(
 def small_disk(tmp_path: Path) -> Iterator[Path]:
     folder = tmp_path / "disk"
     folder.mkdir()
-    options = ["-t", "tmpfs", "-o", "size=64m", "none", str(folder)]
-    made = os.geteuid() == 0 and subprocess.run(["mount", *options], check=False).returncode == 0
-    if not made:
-        pytest.skip("needs root and the right to mount a small disk")
-    yield folder
-    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+    with disks.small_disk(folder, 64) as made:
+        if not made:
+            pytest.skip("needs root and the right to mount a small disk")
+        yield folder
 
 
 @pytest.fixture
@@ -83,12 +79,6 @@ def pieces(megabytes: int) -> Iterator[bytes]:
     yield b"II*\x00"
     for _ in range(megabytes):
         yield bytes(1 << 20)
-
-
-def fill(path: Path) -> None:
-    with contextlib.suppress(OSError), path.open("wb", buffering=0) as file:
-        while True:
-            file.write(bytes(4096))
 
 
 @pytest.mark.tools
@@ -114,7 +104,7 @@ def test_photos_can_be_deleted_on_a_full_disk(on_small_disk: tuple[TestClient, P
     sent = [client.post("/v1/photos", content=TIFF + bytes([k])).json()["id"] for k in range(20)]
     reserve = data / "reserve"
     assert reserve.stat().st_size >= 16 << 20
-    fill(data / "filler")
+    disks.fill(data / "filler")
 
     full = client.post("/v1/photos", content=TIFF + b"one more")
     deleted = [client.delete(f"/v1/photos/{photo}").status_code for photo in sent]

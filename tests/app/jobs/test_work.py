@@ -21,8 +21,9 @@ from app.jobs.photo_work import PhotoWork
 from app.jobs.queue import Handler, Job, Kind, Status
 from app.jobs.task_files import KERNELS, LEARNED, PREVIEW, SAMPLES
 from app.runtime.settings import Settings
+from app.sandbox.budget import Budget
 from app.sandbox.child import Progress
-from app.sandbox.runner import Budget, Limits, Outcome
+from app.sandbox.outcome import Limits, Outcome
 from app.store import Store
 from app.store.tables import PhotoRow
 from app.store.versions import learned_key, report_key

@@ -19,8 +19,10 @@ import numpy as np
 import pytest
 
 from app.sandbox import confine
+from app.sandbox.budget import Budget
 from app.sandbox.child import NICENESS
-from app.sandbox.runner import Budget, Limits, Outcome, Sandbox
+from app.sandbox.outcome import Limits, Outcome
+from app.sandbox.runner import Sandbox
 
 HERE = Path(__file__).parents[1]
 sys.path.insert(0, str(HERE))
@@ -240,7 +242,9 @@ def test_a_child_dies_with_its_killed_parent(tmp_path: Path) -> None:
         import sys
         from pathlib import Path
         sys.path.insert(0, {str(HERE)!r})
-        from app.sandbox.runner import Budget, Limits, Sandbox
+        from app.sandbox.budget import Budget
+        from app.sandbox.outcome import Limits
+        from app.sandbox.runner import Sandbox
         if __name__ == "__main__":
             scratch, shared = Path({str(tmp_path / "scratch")!r}), Path({str(pid_file.parent)!r})
             box = Sandbox(scratch, Budget(1, 1024), module="hostile_tasks", preload=[], cache=shared)
@@ -270,7 +274,8 @@ def test_the_fork_server_listens_where_files_may_be_made(tmp_path: Path) -> None
     script = f"""if True:
         from multiprocessing import forkserver
         from pathlib import Path
-        from app.sandbox.runner import Budget, Sandbox
+        from app.sandbox.budget import Budget
+        from app.sandbox.runner import Sandbox
         if __name__ == "__main__":
             Sandbox(Path({str(tmp_path)!r}), Budget(1, 64), preload=[])
             print(forkserver._forkserver._forkserver_address)
@@ -288,7 +293,9 @@ import json, os, sys
 from pathlib import Path
 sys.path.insert(0, {here!r})
 from app.sandbox import confine
-from app.sandbox.runner import Budget, Limits, Sandbox
+from app.sandbox.budget import Budget
+from app.sandbox.outcome import Limits
+from app.sandbox.runner import Sandbox
 if __name__ == "__main__":
     data = Path({data!r})
     confine.hide_memory()

@@ -1,0 +1,58 @@
+"""How many children run at once, and how much memory they take together."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Final
+
+POLL_S: Final = 0.25
+
+
+class Budget:
+    """How many children run at once, and how much memory they may take together; first come, first served."""
+
+    def __init__(self, slots: int, memory_mb: int) -> None:
+        self._changed = threading.Condition()
+        self._queue: deque[object] = deque()
+        self._slots, self._memory = slots, memory_mb
+        self.memory_mb = memory_mb
+
+    @contextlib.contextmanager
+    def share(self, memory_mb: int, wanted: Callable[[], bool]) -> Iterator[bool]:
+        """Wait for a slot and memory; give False if nobody wants it any more.
+
+        A task that asks for more than there is at all runs alone.
+        """
+        memory = min(memory_mb, self.memory_mb)
+        ticket = object()
+        entered = self._enter(ticket, memory, wanted)
+        try:
+            yield entered
+        finally:
+            if entered:
+                with self._changed:
+                    self._slots += 1
+                    self._memory += memory
+                    self._changed.notify_all()
+
+    def _enter(self, ticket: object, memory: int, wanted: Callable[[], bool]) -> bool:
+        with self._changed:
+            self._queue.append(ticket)
+        entered = False
+        try:
+            while not entered and wanted():
+                with self._changed:
+                    if self._queue[0] is ticket and self._slots > 0 and self._memory >= memory:
+                        self._slots -= 1
+                        self._memory -= memory
+                        entered = True
+                    else:
+                        self._changed.wait(POLL_S)
+        finally:
+            with self._changed:
+                self._queue.remove(ticket)
+                self._changed.notify_all()
+        return entered

@@ -1,0 +1,138 @@
+"""What a child may take, and what to make of how it ended."""
+
+from __future__ import annotations
+
+import json
+import logging
+import signal
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final, Literal, TypeAlias
+
+from app.sandbox import child
+
+log = logging.getLogger(__name__)
+
+Ending: TypeAlias = Literal["ok", "error", "memory_limit", "time_limit", "outage", "crashed", "cancelled"]
+
+MAX_RESULT: Final = 16 * 1024 * 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What one task may take.
+
+    Parameters
+    ----------
+    memory_mb : int
+        Address space in MiB beyond that of the program itself; mapped files count.
+    wall_s : float
+        Seconds until it is killed.
+    cpu_s : int or None
+        Seconds of processor time; by default a little more than `wall_s`.
+    file_mb : int
+        Largest file it may write, in MiB.
+    open_files : int
+        Files it may have open at once.
+    """
+
+    memory_mb: int
+    wall_s: float
+    cpu_s: int | None = None
+    file_mb: int = 8192
+    open_files: int = 256
+
+    def with_memory(self, memory_mb: int) -> Limits:
+        """Return the same limits with another memory."""
+        return replace(self, memory_mb=memory_mb)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a task ended.
+
+    Parameters
+    ----------
+    ending : str
+        `ok`, `error` (the library refused, with its reason), `memory_limit`, `time_limit`,
+        `outage` (the machine had no room, or killed it), `crashed` (another signal, or an
+        exception that nobody foresaw) or `cancelled`.
+    value : object
+        What the task returned.
+    code, detail : str
+        The fixed word and the sentence for whoever asked for the work.
+    """
+
+    ending: Ending
+    value: Any = None
+    code: str = ""
+    detail: str = ""
+
+
+def outcome_of(ended: dict[str, Any] | None, status: int, folder: Path, limits: Limits) -> Outcome:
+    """Judge a child by its last message, if any, and its exit status (minus the signal's number)."""
+    ending = None if ended is None else ended.get("end")
+    if ending == "ok" and status == 0:
+        return _result(folder / child.RESULT)
+    if ending in _SAID:
+        code, text = (str((ended or {}).get(key, "")) for key in ("code", "text"))
+        return _SAID[ending](code, text, limits)
+    if -status == signal.SIGXCPU:
+        detail = f"took more than {limits.cpu_s or limits.wall_s:g} s of processor time; give a smaller photo"
+        return Outcome("time_limit", code="time_limit", detail=detail)
+    why = f"signal {-status} ({_signal_name(-status)})" if status < 0 else f"exit status {status}"
+    detail = f"the process that did the work died: {why}"
+    if -status == signal.SIGKILL:  # neither by itself nor by us: the kernel does so for want of memory
+        return Outcome("outage", code="outage", detail=detail)
+    return Outcome("crashed", code="crashed", detail=detail)
+
+
+def _refused(code: str, text: str, limits: Limits) -> Outcome:
+    del limits
+    return Outcome("error", code=code, detail=text)
+
+
+def _swollen(code: str, text: str, limits: Limits) -> Outcome:
+    del code, text
+    detail = f"needs more than the {limits.memory_mb} MiB it may take; give a smaller photo"
+    return Outcome("memory_limit", code="memory_limit", detail=detail)
+
+
+def _no_room(code: str, text: str, limits: Limits) -> Outcome:
+    del code, text, limits
+    return Outcome("outage", code="outage", detail="there is no room on the disk for the work")
+
+
+def _bug(code: str, text: str, limits: Limits) -> Outcome:
+    del limits
+    log.error("unforeseen %s in a task:\n%s", code, text)
+    why = f"an unforeseen {code} stopped the work; the log of the worker says where"
+    return Outcome("crashed", code="internal_error", detail=why)
+
+
+_SAID: Final[Mapping[object, Callable[[str, str, Limits], Outcome]]] = {
+    "error": _refused,
+    "memory_limit": _swollen,
+    "no_room": _no_room,
+    "bug": _bug,
+}
+"""What to make of the last words of a child, by how it says that it ended."""
+
+
+def _result(path: Path) -> Outcome:
+    if path.stat().st_size > MAX_RESULT:
+        return Outcome("crashed", code="internal_error", detail="the task returned more than may be read")
+    return Outcome("ok", value=json.loads(path.read_text(encoding="utf-8")))
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return "unknown"
+
+
+def cancelled() -> Outcome:
+    """Say that nobody wanted the result any more."""
+    return Outcome("cancelled", code="cancelled", detail="the work was cancelled")

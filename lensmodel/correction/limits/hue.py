@@ -39,6 +39,10 @@ _PURER: Final = np.float32(0.03)
 """By how much a colour's share of the light may leave those nearby: what blur has washed out gets purer, and
 three times this is seen in a light grey (chosen)."""
 
+_COLOURLESS: Final = np.float32(0.05)
+"""Share of the brightest light nearby that counts as grey in everything: what is darker by far has no colour
+that one sees beside it, and none that it could lend (chosen)."""
+
 
 def hue_held(
     photo: Planes,
@@ -117,7 +121,9 @@ def hue_bounded(photo: Planes, made: Planes, clips: Sequence[float], noise: Sequ
     if len(made) != 3:
         return made
     side = 2 * HUE_REACH + 1
-    floor = np.float32(_LEAST_LIGHT * float(np.sqrt(np.square(noise).sum())) + 1e-6)
+    dark = np.float32(_LEAST_LIGHT * float(np.sqrt(np.square(noise).sum())) + 1e-6)
+    brightest = ndimage.maximum_filter(np.maximum(photo, np.float32(0.0)).sum(axis=0), side)
+    floor = np.maximum(dark, _COLOURLESS * brightest)
     full = [closed(p >= np.float32(clip)) for p, clip in zip(photo, clips, strict=True)]
     clipped = np.sum(full, axis=0) > 1  # of one colour alone the hue is the one that is seen: red paint
     shares = _shares(photo, floor)
@@ -132,6 +138,7 @@ def hue_bounded(photo: Planes, made: Planes, clips: Sequence[float], noise: Sequ
         mean = ndimage.uniform_filter(np.where(clipped, np.float32(0.0), shares), (0, side, side))
         near = np.where(known > _SOME, mean / np.maximum(known, _SOME), shares)[inner]
         own = np.where(lost, near, own)
+    floor = floor[inner[1:]]
     light = np.maximum(made, np.float32(0.0)).sum(axis=0) + floor
     change = _shares(made, floor) - own
     start, step = _axes(own), _axes(change)

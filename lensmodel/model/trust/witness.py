@@ -11,8 +11,8 @@ that no patch speaks for all,
 
 where w falls off with the distance in the field and in the settings: a mean over patches, since neighbouring
 bins and patches of one motif err alike, and less than a mean below n patches. All patches of a photo may show
-a scene that is soft itself, so that t = 2 m / (m + 2) grows with the number m of photos that speak. What is
-thought of the PSF is the mixture of all alternatives under q: its mean, and its variance at each frequency
+a scene that is soft itself, so that t = 1.6 m / (m + 2.5) grows with the number m of photos that speak. What
+is thought of the PSF is the mixture of all alternatives under q: its mean, and its variance at each frequency
 (`Belief`).
 
 Power spectra are blind to a kernel turned by 180 degrees: where no patch tells on which side a wavefront's
@@ -41,23 +41,23 @@ from lensmodel.model.wavefront.likelihood import surprise
 NARROWINGS: Final = (Narrowing(), Narrowing(width=0.7), Narrowing(width=0.55), Narrowing(share=0.45))
 """What may have become of a kernel that is not the true one. Wider ones do no harm where they are missed."""
 
-# Chosen on lenses of development (third order 0 to 3 and 6, and three ray-traced designs; one, two and five
-# photos each) for the error that a linear filter by such a belief would leave; half or twice any of these
-# moved the mean gain by some tenth. `python -m lensmodel.lab.model.witness` and
+# Chosen on lenses of development (third order 0 to 9, and two ray-traced designs; one and two photos each)
+# for the error that a linear filter by such a belief would leave: `lensmodel.lab.model.belief_prior` prints
+# it, and with each of these halved and doubled. `python -m lensmodel.lab.model.witness` and
 # `python -m lensmodel.lab.chain.blind_gain` judge the choice on others.
-_OF_BOTH: Final = ((0.02, 0.05, 0.05, 0.05), (0.20, 0.23, 0.30, 0.10))  # p of kernels and of the wavefront
+OF_BOTH: Final = ((0.01, 0.05, 0.04, 0.15), (0.40, 0.26, 0.04, 0.05))  # p of kernels and of the wavefront
 _OF_UNKNOWN: Final = ((0.20, 0.10, 0.10, 0.05), (0.15, 0.15, 0.15, 0.10))
 """p where aperture or pixels are not known: a wavefront cannot tell narrow blur from diffraction then."""
 _OF_ONE: Final = ((0.1, 0.3, 0.3, 0.3),)  # p where the samples have no wavefront
 _MEASURED, _BLIND = 0.08, 0.15
 """Expected errors of kernels up to which, as of those measured on a target, they are believed more than
 patches are, and from which on they count as blind estimates do, none of which expects less (chosen)."""
-_SPREAD_OF_BOTH, _SPREAD_OF_ONE = 1.5, 3.0
+SPREAD_OF_BOTH, _SPREAD_OF_ONE = 1.5, 3.0
 """Factors on the variance: the true kernel is none of the alternatives."""
 _AGAINST, _FOR = 12.0, 6.0  # bounds of what one patch says, from the first alternative on
 _RADIUS: Final = 0.3  # half-diagonals
 _FEWEST: Final = 5.0  # patches whose mean counts in full; one alone overrules nothing
-_TEMPER, _HALF = 2.0, 2.0  # t of many photos, and how many photos halve it
+TEMPER, HALF = 1.6, 2.5  # t of many photos, and how many photos halve it
 _HEARD: Final = 0.5  # patches below which nobody has spoken
 _MOST: Final = 96  # patches of a model that are asked
 _TINY: Final = 1e-12
@@ -88,7 +88,7 @@ class Witness:
     votes: NDArray[np.float64]
     photos: NDArray[np.intp]
     costs: NDArray[np.float64]
-    prior: tuple[tuple[float, ...], ...] = _OF_BOTH
+    prior: tuple[tuple[float, ...], ...] = OF_BOTH
 
     @classmethod
     def of(
@@ -121,19 +121,26 @@ class Witness:
         """How many patches speak about a place."""
         return float(self._weights(position).sum())
 
-    def shares(self, position: FieldPosition, error: float = 1.0) -> NDArray[np.float64]:
-        """Probabilities of the alternatives at a place, shape (opinions, len(NARROWINGS)), of sum 1.
+    def evidence(self, position: FieldPosition) -> tuple[NDArray[np.float64], float]:
+        """Mean costs M of the alternatives at a place, and how many photos speak there.
 
-        `error` is what the kernels of the regression expect of themselves there.
+        The costs have the shape (opinions, len(NARROWINGS)).
         """
         weights = self._weights(position)
         total = float(weights.sum())
         mean = np.tensordot(weights, self.costs, axes=1) / max(total, _FEWEST)
         by_photo = np.bincount(self.photos, weights)
-        photos = total**2 / max(float(by_photo @ by_photo), _TINY)
+        return mean, total**2 / max(float(by_photo @ by_photo), _TINY)
+
+    def shares(self, position: FieldPosition, error: float = 1.0) -> NDArray[np.float64]:
+        """Probabilities of the alternatives at a place, shape (opinions, len(NARROWINGS)), of sum 1.
+
+        `error` is what the kernels of the regression expect of themselves there.
+        """
+        mean, photos = self.evidence(position)
         prior = np.array(self.prior)
         measured = float(np.interp(error, (_MEASURED, _BLIND), (1.0, 0.0)))
-        shares = prior * np.exp(-_TEMPER * photos / (photos + _HALF) * (mean - mean.min()))
+        shares = prior * np.exp(-TEMPER * photos / (photos + HALF) * (mean - mean.min()))
         shares *= (1.0 - measured) / shares.sum()
         shares[0, 0] += measured
         return np.asarray(shares)
@@ -197,7 +204,7 @@ class WitnessedField:
         if self.witness.heard(position) < _HEARD:
             return self._unheard(position, answer.kernel, expected)
         kernels = [answer.kernel, *(field.kernel_at(position, channel, size) for field in self.fields[1:])]
-        spread = _SPREAD_OF_BOTH if len(kernels) > 1 else _SPREAD_OF_ONE
+        spread = SPREAD_OF_BOTH if len(kernels) > 1 else _SPREAD_OF_ONE
         shares = self.witness.shares(position, expected)
         if len(kernels) > 1 and self.turned > 0.0:
             kernels.append(as_kernel(kernels[1][::-1, ::-1]))
@@ -238,7 +245,7 @@ def _prior(opinions: Sequence[LensModel]) -> tuple[tuple[float, ...], ...]:
         return _OF_ONE
     physical = opinions[0].physical
     sure = physical is not None and physical.agreed and physical.diffraction_known
-    return _OF_BOTH if sure else _OF_UNKNOWN
+    return OF_BOTH if sure else _OF_UNKNOWN
 
 
 def _costs(patch: PsfSample, kernel: Kernel) -> list[float]:

@@ -307,12 +307,17 @@ def _view(group: dict[Channel, PsfSample]) -> PatchView:
 
 
 def _tail_vote(front: Wavefront, samples: Sequence[PsfSample]) -> float:
-    """How much the patches' tails agree with those of a wavefront, in standard deviations."""
+    """How much the patches' tails agree with those of a wavefront, in standard deviations.
+
+    Each patch votes by the cosine of the angle between the two: its strength is that of its scene's edges.
+    """
     votes = []
     for sample in samples:
         if sample.spectrum is not None:
-            x, y = _third_moment(front.kernel(sample.position, sample.settings, _TAIL_SIDE))
-            votes.append(x * sample.spectrum.tail[0] + y * sample.spectrum.tail[1])
+            own = _third_moment(front.kernel(sample.position, sample.settings, _TAIL_SIDE))
+            seen = sample.spectrum.tail
+            lengths = math.hypot(*own) * math.hypot(*seen)
+            votes.append((own[0] * seen[0] + own[1] * seen[1]) / lengths if lengths > 0.0 else 0.0)
     total, scatter = float(np.sum(votes)), float(np.sqrt(np.sum(np.square(votes))))
     return total / scatter if scatter > 0 else 0.0
 

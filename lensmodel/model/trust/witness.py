@@ -11,7 +11,7 @@ that no patch speaks for all,
 
 where w falls off with the distance in the field and in the settings: a mean over patches, since neighbouring
 bins and patches of one motif err alike, and less than a mean below n patches. All patches of a photo may show
-a scene that is soft itself, so that t = 1.6 m / (m + 2.5) grows with the number m of photos that speak. What
+a scene that is soft itself, so that t = 2 m / (m + 2) grows with the number m of photos that speak. What
 is thought of the PSF is the mixture of all alternatives under q: its mean, and its variance at each frequency
 (`Belief`).
 
@@ -57,7 +57,7 @@ SPREAD_OF_BOTH, _SPREAD_OF_ONE = 1.5, 3.0
 _AGAINST, _FOR = 12.0, 6.0  # bounds of what one patch says, from the first alternative on
 _RADIUS: Final = 0.3  # half-diagonals
 _FEWEST: Final = 5.0  # patches whose mean counts in full; one alone overrules nothing
-TEMPER, HALF = 1.6, 2.5  # t of many photos, and how many photos halve it
+TEMPER, HALF = 2.0, 2.0  # t of many photos, and how many photos halve it
 _HEARD: Final = 0.5  # patches below which nobody has spoken
 _MOST: Final = 96  # patches of a model that are asked
 _TINY: Final = 1e-12

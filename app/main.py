@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 from importlib.metadata import version
 
 from fastapi import Depends, FastAPI
+from starlette.concurrency import run_in_threadpool
 
 from app import pages
 from app.access.authentication import Gate
@@ -18,7 +21,9 @@ from app.http.dependencies import Places, Services, call_of
 from app.http.job_watch import Watch
 from app.http.middleware import Heads, OwnNames, RequestLog, SameSite
 from app.http.model_cache import ModelCache
+from app.http.open_pages import LOOK_S, OpenPages
 from app.http.picture_cache import Drawn
+from app.pages import shown
 from app.routes import (
     account,
     corrections,
@@ -39,6 +44,7 @@ from app.runtime.outage import missable
 from app.runtime.settings import MIB, Settings
 from app.store import Store
 from app.store.jobs import JobStore
+from app.store.notices import Notices
 from lensmodel.model import ModelSettings
 
 
@@ -64,7 +70,18 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             settings=ModelSettings(mode=chosen.model_mode, unit=chosen.model_unit),
         )
         reserve = Reserve(store.database.path.with_name("reserve") if store.database.is_sqlite else None)
-        watch = Watch(JobStore(store.database).marks)
+        rows = JobStore(store.database)
+        loop = asyncio.get_running_loop()
+
+        def look_soon() -> None:
+            for each in (watch, owners):
+                loop.call_soon_threadsafe(each.nudge)
+
+        notices = Notices(store.database, look_soon)
+        watch = Watch(rows.marks, hears=notices.hears)
+        newest = partial(rows.marks_of_owners, newest=shown.PHOTOS)
+        owners = Watch(newest, every_s=LOOK_S, hears=notices.hears)
+        notices.start()
         app.state.services = Services(
             chosen,
             store,
@@ -74,10 +91,13 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             reserve,
             Drawn(),
             watch,
+            OpenPages(owners),
             Gate(chosen, store.keys),
         )
         yield
+        await run_in_threadpool(notices.stop)
         watch.stop()
+        owners.stop()
         store.close()
 
     app = FastAPI(

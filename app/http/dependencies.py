@@ -15,6 +15,7 @@ from app.access.authentication import Gate, Who
 from app.blobs.storage import Storage
 from app.http.job_watch import Watch
 from app.http.model_cache import ModelCache
+from app.http.open_pages import OpenPages
 from app.http.picture_cache import Drawn
 from app.runtime.disk_reserve import Reserve
 from app.runtime.settings import Settings
@@ -33,6 +34,7 @@ class Services:
     reserve: Reserve
     pictures: Drawn
     watch: Watch
+    pages: OpenPages
     gate: Gate
 
 

@@ -1,4 +1,4 @@
-"""Who waits for changes of jobs: one look at the tables for all of them, however many they are."""
+"""Who waits for changes: one look at the tables for all of them, however many they are."""
 
 from __future__ import annotations
 
@@ -7,43 +7,73 @@ import contextlib
 import logging
 from collections import defaultdict
 from collections.abc import Awaitable, Callable, Hashable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Final
 
 from starlette.concurrency import run_in_threadpool
 
 log = logging.getLogger(__name__)
 
-LOOK_S = 0.1
+LOOK_S: Final = 0.1
 """How often the tables are looked at while anybody waits: one or two reads of some 0.1 ms."""
 
+CALM_S: Final = 5.0
+"""How often nevertheless where the database tells of changes by itself."""
+
 Marks = Mapping[str, Hashable]
-"""What tells two states of each job apart; a job that is gone is not there."""
+"""What tells two states of each key apart; what is gone is not there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Waiting:
+    """Somebody who waits for changes of one key."""
+
+    changed: Callable[[float], Awaitable[None]]
+    """`await changed(seconds)` ends with a change, or with that time."""
+
+    count: Callable[[], int]
+    """How many changes were seen of this key: what is read after it holds at least that many."""
 
 
 class Watch:
-    """Tells those that wait for jobs of one process when theirs has changed.
+    """Tells those that wait for jobs, or for owners, of one process when theirs has changed.
 
     Parameters
     ----------
     look : callable
-        Returns the marks of the jobs of these ids; called in a thread.
+        Returns the marks of these keys; called in a thread.
+    every_s : float
+        How often it is called at most, in seconds.
+    hears : callable
+        Whether `nudge` is called after each change: then one looks only then, and every `CALM_S`.
     """
 
-    def __init__(self, look: Callable[[list[str]], Marks]) -> None:
-        self._look = look
+    def __init__(
+        self,
+        look: Callable[[list[str]], Marks],
+        *,
+        every_s: float = LOOK_S,
+        hears: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._look, self._every_s, self._hears = look, every_s, hears
         self._waiting: defaultdict[str, set[asyncio.Event]] = defaultdict(set)
         self._marks: dict[str, Hashable] = {}
+        self._counts: defaultdict[str, int] = defaultdict(int)
+        self._nudged = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
 
     @contextlib.contextmanager
-    def of(self, job_id: str) -> Iterator[Callable[[float], Awaitable[None]]]:
-        """Give a function to await: `await changed(seconds)` ends with a change, or with that time.
+    def of(self, key: str) -> Iterator[Waiting]:
+        """Let somebody wait for changes of one key.
 
-        The first look at a job counts as a change: nothing is missed between reading it and waiting.
+        The first look at it counts as a change: nothing is missed between reading it and waiting.
         """
         event = asyncio.Event()
-        self._waiting[job_id].add(event)
-        if job_id in self._marks:
+        self._waiting[key].add(event)
+        if key in self._marks:
             event.set()
+        else:
+            self.nudge()
         if self._task is None or self._task.done():
             self._task = asyncio.get_running_loop().create_task(self._run())
 
@@ -53,27 +83,38 @@ class Watch:
             event.clear()
 
         try:
-            yield changed
+            yield Waiting(changed, lambda: self._counts.get(key, 0))
         finally:
-            self._waiting[job_id].discard(event)
-            if not self._waiting[job_id]:
-                del self._waiting[job_id]
-                self._marks.pop(job_id, None)
+            self._waiting[key].discard(event)
+            if not self._waiting[key]:
+                del self._waiting[key]
+                self._marks.pop(key, None)
+                self._counts.pop(key, None)
+
+    def nudge(self) -> None:
+        """Look soon: something may have changed. To be called in the loop's thread."""
+        self._nudged.set()
 
     async def _run(self) -> None:
         while self._waiting:
-            await asyncio.sleep(LOOK_S)
-            ids = list(self._waiting)
+            await asyncio.sleep(self._every_s)
+            if self._hears():
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._nudged.wait(), CALM_S)
+            self._nudged.clear()  # before the look: what changes during it is looked at again
+            keys = list(self._waiting)
             try:
-                marks = await run_in_threadpool(self._look, ids)
+                marks = await run_in_threadpool(self._look, keys)
             except Exception as error:  # noqa: BLE001 - those who wait ask again, and hear of it then
-                log.warning("the jobs could not be looked at: %s", error)
+                log.warning("the tables could not be looked at: %s", error)
+                self.nudge()
                 continue
-            for job_id in ids:
-                mark = marks.get(job_id)
-                if job_id not in self._marks or self._marks[job_id] != mark:
-                    self._marks[job_id] = mark
-                    for event in self._waiting.get(job_id, ()):
+            for key in keys:
+                mark = marks.get(key)
+                if key in self._waiting and (key not in self._marks or self._marks[key] != mark):
+                    self._marks[key] = mark
+                    self._counts[key] += 1
+                    for event in self._waiting[key]:
                         event.set()
 
     def stop(self) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping
-from typing import Annotated, Final, Literal, TypeAlias
+from functools import partial
+from typing import Annotated, Final, Literal
 
 from fastapi import APIRouter, Query
 from sse_starlette import EventSourceResponse, ServerSentEvent
@@ -13,24 +13,19 @@ from starlette.concurrency import run_in_threadpool
 from app.http import views
 from app.http.dependencies import Call, CallDep
 from app.http.errors import UnknownCorrectionError, UnknownLensError, UnknownPhotoError
+from app.http.open_pages import Fragments
 from app.pages import shown
 from app.pages.rendering import fragment
 from app.routes import corrections as correction_routes
 from app.routes import lenses as lens_routes
 from app.routes import photos as photo_routes
-from app.store.jobs import JobStore
 
 router = APIRouter(include_in_schema=False)
-
-LOOK_S: Final = 0.5
-"""How often the tables are looked at for an open page: some milliseconds of reading."""
 
 REDRAW_S: Final = 15.0
 """How often a page is drawn anew though nothing happened: estimates of the time left change."""
 
 Page = Literal["home", "photo", "correction", "lens"]
-Fragments: TypeAlias = Mapping[str, str]
-"""HTML by the id of the element that it belongs into."""
 
 
 @router.get("/ui/events")
@@ -42,22 +37,18 @@ async def events(
     """Send the parts of a page now and whenever they change."""
     draw = _DRAWERS[page]
     await run_in_threadpool(draw, call, id)  # what is not there is refused before the stream begins
-    return EventSourceResponse(_changes(call, lambda: draw(call, id)), ping=15)
+    return EventSourceResponse(_changes(call, page, id), ping=15)
 
 
-async def _changes(call: Call, draw: Callable[[], Fragments]) -> AsyncIterator[ServerSentEvent]:
-    jobs = JobStore(call.store.database)
+async def _changes(call: Call, page: Page, key: str) -> AsyncIterator[ServerSentEvent]:
     sent: dict[str, str] = {}
-    mark, drawn_at = None, 0.0
-    clock = asyncio.get_running_loop().time
-    while True:
-        seen = await run_in_threadpool(jobs.mark_of_owner, call.owner, shown.PHOTOS)
-        if seen != mark or clock() - drawn_at > REDRAW_S:
-            mark, drawn_at = seen, clock()
+    draw = partial(_DRAWERS[page], call, key)
+    with call.services.pages.view(call.owner, page, key, draw) as view:
+        while True:
             if not await run_in_threadpool(call.services.gate.is_still, call.who):
                 return  # his key was revoked while he watched
             try:
-                parts = await run_in_threadpool(draw)
+                parts = await view.parts()
             except (UnknownPhotoError, UnknownLensError, UnknownCorrectionError):  # deleted while watched
                 yield ServerSentEvent(data="", event="gone")
                 return
@@ -65,7 +56,7 @@ async def _changes(call: Call, draw: Callable[[], Fragments]) -> AsyncIterator[S
                 if sent.get(name) != html:
                     sent[name] = html
                     yield ServerSentEvent(data=html, event="part", id=name)
-        await asyncio.sleep(LOOK_S)
+            await view.changed(REDRAW_S)
 
 
 def _home(call: Call, _: str) -> Fragments:

@@ -86,9 +86,9 @@ async def read_job(
     before = seen or fingerprint(job)
     deadline = time.monotonic() + min(wait, call.settings.long_poll_seconds)
     if wait > 0:
-        with call.services.watch.of(job_id) as changed:
+        with call.services.watch.of(job_id) as waiting:
             while fingerprint(job) == before and job.state not in FINAL and time.monotonic() < deadline:
-                await changed(max(deadline - time.monotonic(), 0.0))
+                await waiting.changed(max(deadline - time.monotonic(), 0.0))
                 job = await run_in_threadpool(find_job, call, job_id)
     tag = fingerprint(job)
     headers = {"ETag": f'W/"{tag}"', "Cache-Control": "no-cache"}
@@ -196,7 +196,7 @@ async def watch_job(job_id: str, call: CallDep) -> EventSourceResponse:
 
 async def _events(call: Call, job: JobOut) -> AsyncIterator[ServerSentEvent]:
     sent = ""
-    with call.services.watch.of(job.id) as changed:
+    with call.services.watch.of(job.id) as waiting:
         while True:
             tag = fingerprint(job)
             if tag != sent:
@@ -204,7 +204,7 @@ async def _events(call: Call, job: JobOut) -> AsyncIterator[ServerSentEvent]:
                 sent = tag
             if job.state in FINAL:
                 return
-            await changed(LOOK_AGAIN_S)
+            await waiting.changed(LOOK_AGAIN_S)
             try:
                 if not await run_in_threadpool(call.services.gate.is_still, call.who):
                     return  # his key was revoked while he watched

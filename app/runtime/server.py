@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
+from collections.abc import Iterator
 from typing import Final
 
 import uvicorn
@@ -12,6 +14,7 @@ from app.runtime import logs
 from app.runtime.idle_connections import impatient
 from app.runtime.parent_watch import on_parents_end
 from app.runtime.settings import Settings
+from app.runtime.signals import on_signals
 from app.sandbox import confine
 
 SOCKET: Final = "LENSMODEL_SOCKET"
@@ -36,13 +39,23 @@ def run(settings: Settings, listener: socket.socket) -> None:
         limit_concurrency=settings.max_connections,
         http=impatient(settings.stall_seconds),
     )
-    server = uvicorn.Server(config)
+    server = _Server(config)
 
     def stop() -> None:
         server.should_exit = True
 
     on_parents_end(stop)
     server.run(sockets=[listener])
+
+
+class _Server(uvicorn.Server):
+    """Ends its process well when told to: uvicorn would raise the signal again afterwards."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Let signals of the process stop the server, and the streams that are open."""
+        on_signals(lambda number: self.handle_exit(number, None))
+        yield
 
 
 def listen(host: str, port: int) -> socket.socket:

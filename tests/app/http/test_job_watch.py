@@ -28,9 +28,9 @@ def test_two_hundred_that_wait_cost_no_more_looks_than_one() -> None:
         return {job_id: state[job_id] for job_id in ids}
 
     async def wait_for(watch: Watch, job_id: str, woken: list[str]) -> None:
-        with watch.of(job_id) as changed:
-            await changed(60)  # the first look
-            await changed(60)
+        with watch.of(job_id) as waiting:
+            await waiting.changed(60)  # the first look
+            await waiting.changed(60)
             woken.append(job_id)
 
     async def run() -> tuple[list[str], int]:

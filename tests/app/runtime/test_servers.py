@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,8 @@ import pytest
 
 HERE = Path(__file__).parents[1]
 sys.path.insert(0, str(HERE))
-from servers import Moto, Postgres, moto, postgres  # noqa: E402 - beside this file
+from deadline import stretched  # noqa: E402 - beside this file
+from servers import Moto, Postgres, moto, postgres  # noqa: E402
 from torture import Plan, in_environment, torture  # noqa: E402
 
 sys.path.remove(str(HERE))
@@ -24,7 +26,9 @@ from app.runtime.doctor import examine  # noqa: E402
 from app.runtime.metrics import Tables  # noqa: E402
 from app.runtime.settings import Settings  # noqa: E402
 from app.store import Store  # noqa: E402
+from app.store.notices import Notices  # noqa: E402
 from app.store.tables import PhotoRow  # noqa: E402
+from app.store.upkeep.migrate import upgrade  # noqa: E402
 
 pytestmark = pytest.mark.tools
 
@@ -101,3 +105,31 @@ def test_deaths_and_outages_lose_nothing_and_count_nothing_twice(servers_too: bo
     said = torture(tmp_path, 5, servers=servers_too, plan=Plan(photos=4, kills=6, outages=2))
 
     assert "4 of 4 photos counted once" in said
+
+
+def test_postgresql_tells_of_changes_by_itself_and_again_after_it_was_away(
+    servers: tuple[Postgres, Moto], far: tuple[Settings, Store, Storage], steps: Any
+) -> None:
+    _, there, _ = far
+    upgrade(there.database)
+    busy, told = type(steps)(there), threading.Event()
+    notices = Notices(there.database, told.set)
+
+    def hears_of(change: Callable[[], object]) -> bool:
+        told.clear()
+        change()
+        return told.wait(stretched(60))
+
+    notices.start()
+    try:
+        assert told.wait(stretched(60))  # it listens
+        photo = busy.receive()
+        assert hears_of(lambda: there.photos.cancel(photo.public_id))
+        told.clear()
+        servers[0].stop()
+        servers[0].start()
+        assert told.wait(stretched(60))
+        assert hears_of(busy.receive)
+    finally:
+        notices.stop()
+    assert not notices.hears()

@@ -21,8 +21,12 @@ RUN /opt/build/bin/python -m hatchling build --target wheel --directory /wheels 
 FROM ${BASE}
 RUN groupadd --gid 10001 lens \
  && useradd --uid 10001 --gid lens --no-create-home --home-dir /data --shell /usr/sbin/nologin lens \
+ && groupadd --gid 10002 lens-task \
+ && useradd --uid 10002 --gid lens-task --no-create-home --home-dir /nonexistent --shell /usr/sbin/nologin lens-task \
+ && usermod --append --groups lens-task lens \
  && install --directory --owner=lens --group=lens --mode=0750 /data
 COPY --from=build /opt/lensmodel /opt/lensmodel
+COPY --chmod=755 tools/container_entry.sh /usr/local/bin/lensmodel-entry
 # Listening on every address of a container reaches nobody: publishing its port does, and that is
 # the host's decision (compose.yaml publishes it on loopback). LENS_PUBLIC has it ask for keys; the first
 # is made by the command "keys create" in a container with the same volume. Whoever publishes it under a
@@ -49,5 +53,5 @@ EXPOSE 8000
 STOPSIGNAL SIGTERM
 HEALTHCHECK --interval=30s --timeout=5s --start-period=60s --retries=3 \
   CMD ["python3", "-c", "import os, urllib.request as u; u.urlopen('http://127.0.0.1:' + os.environ['LENS_PORT'] + '/readyz', timeout=4)"]
-ENTRYPOINT ["/bin/sh", "-c", "mkdir -p /data/tmp && exec lensmodel \"$@\"", "lensmodel"]
+ENTRYPOINT ["lensmodel-entry"]
 CMD ["serve"]

@@ -12,7 +12,7 @@
 # becomes ready and healthy; takes a photo and calibrates from it; stops on SIGTERM with status 0; writes nothing
 # outside /data; and keeps what it knew over a restart. Then, where Debian's postgresql and Python's moto[server]
 # are there too (PYTHON names an interpreter that has it; default: that of `make install`), the API and the worker
-# of compose.yaml run as two such containers on PostgreSQL and S3.
+# of compose.yaml run as two such containers on PostgreSQL and S3, and photos are decoded by a user of their own.
 set -euo pipefail
 
 here=$(cd "$(dirname "$0")/.." && pwd)
@@ -128,6 +128,8 @@ port=$(python3 -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0));
 # A cheap estimator and few patches: this is about the container.
 environment+=("LENS_PORT=$port" LENS_ESTIMATOR=whittle LENS_PATCHES=4 LENS_KERNEL_SIZE=15)
 inside=(setpriv --reuid=10001 --regid=10001 --clear-groups --no-new-privs --bounding-set=-all --inh-caps=-all)
+# As compose.yaml has its worker begin.
+as_root=(setpriv --reuid=0 --regid=0 --clear-groups --no-new-privs --bounding-set=-all,+setuid,+setgid,+kill --inh-caps=-all)
 
 rm -f "$folder"/{service,api,worker}.log
 
@@ -259,10 +261,14 @@ if ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 && "$python" -c 'import m
   isolated "${entry[@]}" api --port "$port" >>"$folder/api.log" 2>&1 &
   api=$!
   volume -worker
-  isolated "${entry[@]}" worker >>"$folder/worker.log" 2>&1 &
+  (inside=("${as_root[@]}") && isolated "${entry[@]}" worker) >>"$folder/worker.log" 2>&1 &
   worker=$!
   parts+=("$api" "$worker")
   until_ready "$api" "$worker"
+  first=$(pgrep -P "$worker" | head -n 1)
+  [ "$(awk '/^Uid:/ { print $2 }' "/proc/$first/status")" = 10001 ] || fail "the worker is not of uid 10001"
+  ask /readyz | python3 -c 'import json, sys; sys.exit(not json.load(sys.stdin)["sandbox"]["account"])' \
+    || fail "what decodes photos keeps the worker's user: $(ask /readyz)"
   calibrate
   end "$worker"
   end "$api"

@@ -171,10 +171,10 @@ class Storage:
             yield bytes(obstore.get_range(self._store, key, start=low, end=min(end, low + 4 * CHUNK)))
 
     @contextmanager
-    def as_file(self, key: str, scratch: Path) -> Iterator[Path]:
-        """Give a blob as a file to read: itself where it is one, else a copy in `scratch`."""
+    def as_file(self, key: str, scratch: Path, *, copied: bool = False) -> Iterator[Path]:
+        """Give a blob as a file to read: itself where it is one, else, or if wanted, a copy in `scratch`."""
         store = self._store
-        if self.folder is not None:
+        if self.folder is not None and not copied:
             path = self.folder / key
             if not path.is_file():
                 raise FileNotFoundError(key)

@@ -158,7 +158,9 @@ class Workbench:
         """Give the file of a photo."""
         with self.sandbox.folder() as folder:
             try:
-                with self.storage.as_file(photo.blob_key, folder) as path:
+                # another account reads a copy, not the blob
+                copied = self.sandbox.account is not None
+                with self.storage.as_file(photo.blob_key, folder, copied=copied) as path:
                     yield path
             except FileNotFoundError as error:
                 text = f"the file of photo {photo.public_id} is no longer stored; upload it again"

@@ -37,7 +37,7 @@ from app.runtime.parent_watch import on_parents_end
 from app.runtime.processes import is_running, started_at
 from app.runtime.settings import Settings
 from app.runtime.signals import on_signals
-from app.sandbox import confine
+from app.sandbox import account, confine
 from app.sandbox.budget import Budget
 from app.sandbox.runner import Sandbox
 from app.store import Store
@@ -85,12 +85,16 @@ class Worker:
         self.id = new_id()
         self._settings = settings
         self._store = Store(settings)
-        scratch = settings.data_dir.resolve() / "scratch"
-        self._scratch = scratch
+        data = settings.data_dir.resolve()
+        self._confined = [
+            name for name, is_so in confine.available(settings.task_user, data).items() if is_so
+        ]
+        self._scratch = data / "scratch"
         self._sandbox = Sandbox(
-            scratch / self.id,
+            self._scratch / self.id,
             Budget(settings.worker_slots, settings.worker_memory_mb),
-            cache=settings.data_dir.resolve() / "cache",
+            cache=data / "cache",
+            account=self._task_account(data),
             niceness=settings.task_niceness,
         )
         self._bench = Workbench(
@@ -104,12 +108,27 @@ class Worker:
         self._last_beat = time.monotonic()
         self._files = {path: _identity(path) for path in self._database_files()}
 
+    def _task_account(self, data: Path) -> account.Account | None:
+        """Return the account that children change to; let it reach their folders, and nothing beside them."""
+        if "account" not in self._confined:
+            return None
+        found = account.find(self._settings.task_user)
+        if found is not None:
+            own = [data / "developed", self._scratch, data / "cache"]
+            account.close_to_others(data, {path.name for path in own})
+            for folder in [data, *own]:
+                found.lets_through(folder)
+        return found
+
     def run(self) -> None:
         """Work until told to stop."""
+        log.info("children are confined by: %s", ", ".join(self._confined) or "nothing that the kernel has")
         host = socket.gethostname()
         began = started_at(os.getpid())
         self._insist(
-            lambda: self._store.workers.register(self.id, host=host, pid=os.getpid(), pid_started=began)
+            lambda: self._store.workers.register(
+                self.id, host=host, pid=os.getpid(), pid_started=began, confined=self._confined
+            )
         )
         self._last_beat = time.monotonic()
         beat_s = min(self._settings.lease_seconds / 4, 5.0)
@@ -353,10 +372,6 @@ class Worker:
         os._exit(EXIT_FENCED)
 
 
-def _in_force() -> list[str]:
-    return [name for name, is_so in confine.available().items() if is_so]
-
-
 def _correction_job(correction_id: str, epoch: int, owner: str) -> Job:
     """Name the job; the first try has no number, as in jobs that an older program asked for."""
     return Job("correction", (correction_id,) if epoch == 1 else (correction_id, epoch), owner)
@@ -374,8 +389,7 @@ def main() -> None:
     """Run a worker with the settings of the environment until SIGTERM or the supervisor's end."""
     settings = Settings()
     logs.begin("worker", settings.log_level, settings.log_format)
-    confine.hide_memory()
-    log.info("children are confined by: %s", ", ".join(_in_force()) or "nothing that the kernel has")
+    confine.keep_private()
     if settings.metrics_port:
         metrics.publish(settings.metrics_port, settings.host, settings.data_dir.resolve())
     worker = Worker(settings)

@@ -53,10 +53,11 @@ def healthz() -> Health:
 )
 def readyz(call: ProbeDep) -> Readiness:
     """Say whether work can be taken: schema, storage and a worker are there."""
+    confined: dict[str, bool] = {}
     tried: dict[str, Callable[[], None]] = {
         "schema": lambda: _schema(call),
         "storage": lambda: _storage(call),
-        "worker": lambda: _worker(call),
+        "worker": lambda: confined.update(_worker(call)),
     }
     running = {name: _begun(probe) for name, probe in tried.items()}
     end = time.monotonic() + READY_S
@@ -66,7 +67,7 @@ def readyz(call: ProbeDep) -> Readiness:
     ready = all(said == "ok" for said in checks.values())
     if not ready:
         call.response.status_code = status.HTTP_503_SERVICE_UNAVAILABLE
-    return Readiness(status="ready" if ready else "not ready", checks=checks, sandbox=confine.available())
+    return Readiness(status="ready" if ready else "not ready", checks=checks, sandbox=confined)
 
 
 def _begun(probe: Callable[[], None]) -> Future[None]:
@@ -106,11 +107,14 @@ def _storage(call: Call) -> None:
     call.storage.check_writable()
 
 
-def _worker(call: Call) -> None:
-    if not call.store.workers.live(call.settings.lease_seconds):
+def _worker(call: Call) -> dict[str, bool]:
+    """Return which measures confine the children of all workers."""
+    live = call.store.workers.live(call.settings.lease_seconds)
+    if not live:
         raise RuntimeError(
             f"no worker was heard of for {call.settings.lease_seconds:g} s: run `lensmodel worker`"
         )
+    return {name: all(name in worker.confined.split() for worker in live) for name in confine.MEASURES}
 
 
 @probes.get("/metrics", include_in_schema=False)

@@ -27,7 +27,7 @@ GRACE_S: Final = 5
 def run(settings: Settings, listener: socket.socket) -> None:
     """Serve until SIGTERM, or until the supervisor is gone; log as a service does."""
     logs.begin("api", settings.log_level, settings.log_format)
-    confine.hide_memory()
+    confine.keep_private()
     from app.main import create_app  # noqa: PLC0415 - the supervisor need not load the application
 
     config = uvicorn.Config(
@@ -45,6 +45,8 @@ def run(settings: Settings, listener: socket.socket) -> None:
         server.should_exit = True
 
     on_parents_end(stop)
+    # uvicorn raises again what it was stopped by: an ordered end must not look like a death by it
+    on_signals(lambda _: stop())
     server.run(sockets=[listener])
 
 

@@ -14,6 +14,7 @@ from typing import Literal
 from pydantic import Field, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from app.sandbox import account
 from lensmodel.core.errors import UnknownMethodError
 
 PREFIX = "LENS_"
@@ -113,6 +114,13 @@ class Settings(BaseSettings):
         le=19,
         description="How far photo work gives way to requests, as of nice(1); 0 = not at all.",
     )
+    task_user: str = Field(
+        default="auto",
+        description=(
+            "Account of the processes that decode photos, where a worker may change to it: a name; auto = "
+            "lens-task if there is one, else nobody; none = that of the worker."
+        ),
+    )
     lease_seconds: float = Field(
         default=20.0, gt=0, description="A worker silent for so long is taken for dead."
     )
@@ -202,6 +210,11 @@ class Settings(BaseSettings):
                 estimators.create(self.estimator)
             except UnknownMethodError as error:
                 raise ValueError(str(error)) from error
+        return self
+
+    @model_validator(mode="after")
+    def _known_account(self) -> Settings:
+        account.find(self.task_user)
         return self
 
     @model_validator(mode="after")

@@ -63,7 +63,7 @@ def serve(settings: Settings) -> int:
     InvalidInputError
         If the address cannot be listened on, or the database is of a newer program.
     """
-    confine.hide_memory()
+    confine.keep_private()
     settings.data_dir.mkdir(parents=True, exist_ok=True)
     with alone(settings.data_dir), contextlib.closing(_listener(settings)) as listener:
         _prepare(settings)
@@ -72,6 +72,7 @@ def serve(settings: Settings) -> int:
 
 def run_api(settings: Settings) -> None:
     """Run one API process in this process."""
+    confine.keep_private()
     _prepare(settings)
     with contextlib.closing(_listener(settings)) as listener:
         server.run(settings, listener)
@@ -83,6 +84,7 @@ def run_worker(settings: Settings) -> None:
     A new program rather than a call: children import the main module of their parent again, and
     that of a worker is small for this reason.
     """
+    confine.keep_private()
     _migrate(settings)
     os.environ.update(ONE_THREAD | environment(settings))
     os.execv(sys.executable, [sys.executable, "-m", "app.runtime.worker_main"])  # noqa: S606 - no shell is wanted

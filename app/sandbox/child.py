@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 from app.sandbox import confine
+from app.sandbox.account import Account
 from lensmodel.core.errors import LensModelError
 
 Progress: TypeAlias = Callable[[int, int], None]
@@ -51,15 +52,14 @@ def main(order: dict[str, Any], line: Connection) -> None:
     """Carry out one order: `module`, `task`, `arguments` (JSON), `folder`, `limits`, `niceness`, its reach.
 
     `reads` are files and folders that it may read, `writes` folders that it may write besides its own;
-    None in place of `reads` leaves the file system, the network and other programs open to it.
+    None in place of `reads` leaves the file system, the network and other programs open to it. `account`
+    are the numbers of what it changes to, if any.
     """
     folder = Path(order["folder"])
     tasks = importlib.import_module(order["module"])  # our own code: it may still be read
     contain(folder, order["limits"], order["niceness"])
     if order["reads"] is not None:
-        writes = [folder, *map(Path, order["writes"])]
-        confine.confine(writes, map(Path, order["reads"]))
-        _die_with_parent()  # again: the kernel forgets it when a process changes what it may
+        _confine(folder, order)
     # no thread before this line: it would keep what the others gave up
     threading.Thread(target=_end_with_parent, args=(line,), daemon=True).start()
     last = 0.0
@@ -90,6 +90,15 @@ def main(order: dict[str, Any], line: Connection) -> None:
         _tell(line, end="bug", code=type(error).__name__, text=_last_lines())
     finally:
         sys.stdout.flush()
+
+
+def _confine(folder: Path, order: dict[str, Any]) -> None:
+    writes = [folder, *map(Path, order["writes"])]
+    account = Account(*order["account"]) if order["account"] else None
+    if account is not None:
+        os.umask(0o007)  # its worker reads what it writes, as one of its group
+    confine.confine(writes, map(Path, order["reads"]), account)
+    _die_with_parent()  # again: the kernel forgets it when a process changes what it may
 
 
 def clean_environment() -> dict[str, str]:

@@ -2,9 +2,9 @@
 
 What a child decodes comes from strangers. Should one of them take it over, there must be little to
 take: no secret in its environment, no file but those of its task, no network, no program to start.
-Each measure here is of the kernel and cannot be undone by the process. None needs privileges; which
-of them there are depends on the kernel and on what a container allows, so each says whether it is in
-force, and the service tells it under `/readyz`.
+Each measure here is of the kernel and cannot be undone by the process. Only the change to another
+account needs privileges; which of the others there are depends on the kernel and on what a container
+allows, so each says whether it is in force, and the service tells it under `/readyz`.
 
 References
 ----------
@@ -25,11 +25,13 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
+from app.sandbox import account as accounts
 from app.sandbox import seccomp
+from app.sandbox.account import Account
 
-MEASURES: Final = ("no_new_privs", "namespaces", "files", "system_calls")
-"""`namespaces`: a network without interfaces and a count of processes of its own; `files`: Landlock;
-`system_calls`: seccomp."""
+MEASURES: Final = ("account", "no_new_privs", "namespaces", "files", "system_calls")
+"""`account`: one of its own; `namespaces`: a network without interfaces and a count of processes of its own;
+`files`: Landlock; `system_calls`: seccomp."""
 
 MAX_PROCESSES: Final = 128
 """Threads of one task; chosen, far above what a machine's corrections start."""
@@ -67,7 +69,7 @@ class _Beneath(ctypes.Structure):
     _fields_ = (("allowed", ctypes.c_uint64), ("parent", ctypes.c_int32))
 
 
-def confine(writes: Sequence[Path], reads: Iterable[Path] = ()) -> list[str]:
+def confine(writes: Sequence[Path], reads: Iterable[Path] = (), account: Account | None = None) -> list[str]:
     """Give up all but the program itself, `reads`, and `writes`; return which measures are in force.
 
     Call it while the process has one thread: the others would keep what this one gives up.
@@ -78,16 +80,21 @@ def confine(writes: Sequence[Path], reads: Iterable[Path] = ()) -> list[str]:
         Folders where files may be made, changed and removed; the first is the task's own.
     reads : iterable of Path
         Files and folders that may be read besides the libraries.
+    account : Account, optional
+        What to change to; OSError if that is refused.
     """
+    in_force = []
+    if account is not None:
+        account.become()
+        in_force.append("account")
     if sys.platform != "linux":
-        return []
+        return in_force
     tried = {
         "no_new_privs": lambda: _prctl(_PR_SET_NO_NEW_PRIVS, 1),
         "namespaces": _separate,
         "files": lambda: _restrict_files(writes, reads),
         "system_calls": seccomp.refuse,
     }
-    in_force = []
     for name, measure in tried.items():
         with contextlib.suppress(OSError):
             measure()
@@ -95,28 +102,43 @@ def confine(writes: Sequence[Path], reads: Iterable[Path] = ()) -> list[str]:
     return in_force
 
 
-def hide_memory() -> None:
-    """Keep other processes of the same account from reading this one's memory and environment."""
+def keep_private() -> None:
+    """Keep other accounts from what this process writes, and others of its own from its memory."""
+    os.umask(0o077)
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
             _prctl(_PR_SET_DUMPABLE, 0)
 
 
+def available(user: str, data: Path) -> dict[str, bool]:
+    """Say which measures children of this machine have: tried out, once, in a process of its own.
+
+    Parameters
+    ----------
+    user : str
+        The setting `LENS_TASK_USER`.
+    data : Path
+        The data folder, which another account has to reach.
+    """
+    changes = user != accounts.NONE and accounts.may_change()
+    in_force = _tried(user, str(data.resolve())) if changes else _tried(accounts.NONE, "")
+    return {name: name in in_force for name in MEASURES}
+
+
 @functools.cache
-def available() -> dict[str, bool]:
-    """Say which measures children of this machine have: tried out, once, in a process of its own."""
+def _tried(user: str, data: str) -> list[str]:
     try:
-        said = subprocess.run(
-            [sys.executable, "-m", "app.sandbox.confine"],
+        said = subprocess.run(  # noqa: S603 - ourselves
+            [sys.executable, "-m", "app.sandbox.confine", user, data],
             check=True,
             capture_output=True,
             timeout=60,
             cwd=Path(__file__).parents[2],
         ).stdout
-        in_force = json.loads(said)
+        in_force: list[str] = json.loads(said)
     except (OSError, ValueError, subprocess.SubprocessError):
-        in_force = []
-    return {name: name in in_force for name in MEASURES}
+        return []
+    return in_force
 
 
 def _prctl(option: int, value: int) -> None:
@@ -184,5 +206,11 @@ def _allow(rules: int, path: Path, rights: int) -> None:
         os.close(opened)
 
 
+def _trial(user: str, data: Path) -> list[str]:
+    account = accounts.find(user)
+    of_use = account is not None and account.is_of_use(data)
+    return confine([Path("/nonexistent")], account=account if of_use else None)
+
+
 if __name__ == "__main__":
-    print(json.dumps(confine([Path("/nonexistent")])))  # noqa: T201 - this is its answer
+    print(json.dumps(_trial(sys.argv[1], Path(sys.argv[2]))))  # noqa: T201 - this is its answer

@@ -17,6 +17,7 @@ import multiprocessing
 import os
 import shutil
 import signal
+import stat
 import tempfile
 import threading
 import time
@@ -29,6 +30,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from app.sandbox import child
+from app.sandbox.account import Account
 from app.sandbox.budget import POLL_S, Budget
 from app.sandbox.outcome import Limits, Outcome, cancelled, outcome_of
 from lensmodel.core.types import ignore_step
@@ -64,7 +66,10 @@ class Sandbox:
     confined : bool
         Whether children are kept from files, network and programs; see `app.sandbox.confine`.
     cache : Path, optional
-        Where tasks that decode nothing of strangers keep what they compiled.
+        Where tasks that decode nothing of strangers keep what they compiled, unless the environment names
+        another place; that one an `account` might not reach.
+    account : Account, optional
+        What confined children change to; None leaves them that of this process.
     niceness : int, optional
         How far the children give way to this process, see nice(2); 0 = not at all.
     """
@@ -78,12 +83,14 @@ class Sandbox:
         preload: Sequence[str] | None = None,
         confined: bool = True,
         cache: Path | None = None,
+        account: Account | None = None,
         niceness: int = child.NICENESS,
     ) -> None:
         self._niceness = niceness
+        self.account = account if confined else None
         self.scratch, self.budget, self._confined = scratch, budget, confined
         kept = os.environ.get("NUMBA_CACHE_DIR")
-        self._cache = Path(kept).resolve() if kept else cache
+        self._cache = Path(kept).resolve() if kept and self.account is None else cache
         self._module = module or TASKS_MODULE
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload(["numpy", self._module] if preload is None else list(preload))
@@ -93,6 +100,10 @@ class Sandbox:
         scratch.mkdir(parents=True, mode=0o700)
         if self._cache is not None:
             self._cache.mkdir(parents=True, exist_ok=True)
+        if self.account is not None:
+            self.account.lets_through(scratch)
+            if self._cache is not None:
+                self.account.may_change(self._cache)
         self._serve()
 
     def _serve(self) -> None:
@@ -120,6 +131,8 @@ class Sandbox:
     def folder(self) -> Iterator[Path]:
         """Give an empty folder that only one task sees, removed afterwards."""
         path = Path(tempfile.mkdtemp(dir=self.scratch))
+        if self.account is not None:
+            self.account.lets_through(path)
         try:
             yield path
         finally:
@@ -177,13 +190,22 @@ class Sandbox:
                 order = self._order(task, arguments, folder, limits)
                 order["reads"] = [str(path.resolve()) for path in reads] if self._confined else None
                 order["writes"] = [str(self._cache)] if compiles and self._cache else []
+                self._open_to_child(folder, reads)
                 process = self._start(order, far_end)
                 try:
                     watched = _Watched(process, line, time.monotonic() + limits.wall_s)
                     cut = self._watch(watched, limits, still_wanted, on_progress)
-                    return cut or outcome_of(watched.ended, self._exit_status(process), folder, limits)
+                    status = 0 if cut else self._exit_status(process)
                 finally:
                     self._end(process)
+                _leave_plain_files(folder)
+                return cut or outcome_of(watched.ended, status, folder, limits)
+
+    def _open_to_child(self, folder: Path, reads: Sequence[Path]) -> None:
+        if self.account is not None:
+            self.account.may_change(folder)
+            for path in reads:
+                self.account.may_read(path)
 
     def _order(self, task: str, arguments: Mapping[str, Any], folder: Path, limits: Limits) -> dict[str, Any]:
         numbers = asdict(limits)
@@ -195,6 +217,7 @@ class Sandbox:
             "folder": str(folder.resolve()),
             "limits": numbers,
             "niceness": self._niceness,
+            "account": [self.account.uid, self.account.gid] if self.account else None,
         }
 
     def _start(self, order: dict[str, Any], far_end: Connection) -> ForkServerProcess:
@@ -247,6 +270,18 @@ class Sandbox:
                 process.kill()
             process.join()
             process.close()
+
+
+def _leave_plain_files(folder: Path) -> None:
+    """Remove what a child left that is no file of its own: a link would have us read what it could not."""
+    for place, folders, files in os.walk(folder):
+        for name in [*folders, *files]:
+            path = Path(place, name)
+            found = path.lstat()
+            if stat.S_ISREG(found.st_mode) and found.st_nlink == 1:
+                continue
+            if not stat.S_ISDIR(found.st_mode):
+                path.unlink()
 
 
 def _lives(pid: int) -> bool:

@@ -21,7 +21,7 @@ class Readiness(Model):
     status: Literal["ready", "not ready"]
     checks: dict[str, str]
     sandbox: dict[str, bool] = Field(
-        description="Which measures of the kernel confine what decodes photos, on the machine that answers."
+        description="Which measures of the kernel confine what decodes photos, in all workers."
     )
 
 

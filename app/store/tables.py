@@ -372,6 +372,8 @@ class WorkerRow(Base):
     state: Mapped[str] = mapped_column(String(10))
     started_at: Mapped[datetime]
     heartbeat_at: Mapped[datetime]
+    confined: Mapped[str] = mapped_column(String(200), server_default="")
+    """What its children are confined by: names of `app.sandbox.confine.MEASURES`, with spaces between."""
 
 
 class GarbageRow(Base):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from datetime import datetime, timedelta
 
 from sqlalchemy import delete, func, select, update
@@ -22,8 +23,10 @@ class WorkerStore:
         """Return the time that all workers share: a database server's, whatever their own clocks say."""
         return now() if self._db.is_sqlite else session.scalars(select(func.now())).one()
 
-    def register(self, worker_id: str, *, host: str, pid: int, pid_started: float) -> None:
-        """Enter a new worker."""
+    def register(
+        self, worker_id: str, *, host: str, pid: int, pid_started: float, confined: Iterable[str] = ()
+    ) -> None:
+        """Enter a new worker, with the measures that confine its children."""
         with self._db.writing() as session:
             at = self._now(session)
             session.add(
@@ -32,6 +35,7 @@ class WorkerStore:
                     host=host,
                     pid=pid,
                     pid_started=pid_started,
+                    confined=" ".join(confined),
                     state="live",
                     started_at=at,
                     heartbeat_at=at,

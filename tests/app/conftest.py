@@ -123,6 +123,7 @@ def settings(tmp_path: Path) -> Settings:
         shared_filesystem=True,
         long_poll_seconds=2.0,
         min_free_mb=0,
+        task_user="none",  # trying others out takes a process for each folder
         task_niceness=0,  # tests wait for photos too: beside other programs they would starve
         max_upload_mb=1,
         patches=3,  # of so few one is enough: the made-up photos of these tests have two

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import site
 import socket
 import subprocess
 import sys
@@ -113,7 +114,7 @@ def test_a_task_sees_nothing_of_the_services_environment(run: Run, monkeypatch: 
 def test_a_task_gives_way_to_whoever_waits_for_an_answer(run: Run) -> None:
     seen = run("weight").value
 
-    assert seen["nice"] == os.getpriority(os.PRIO_PROCESS, 0) + NICENESS
+    assert seen["nice"] == min(os.getpriority(os.PRIO_PROCESS, 0) + NICENESS, 19)
     assert not seen["session"] or seen["session"].rstrip().endswith(f"nice {NICENESS}")
 
 
@@ -293,47 +294,56 @@ import json, os, sys
 from pathlib import Path
 sys.path.insert(0, {here!r})
 from app.sandbox import confine
+from app.sandbox.account import find
 from app.sandbox.budget import Budget
 from app.sandbox.outcome import Limits
 from app.sandbox.runner import Sandbox
 if __name__ == "__main__":
     data = Path({data!r})
-    confine.hide_memory()
-    box = Sandbox(data / "scratch", Budget(1, 1024), module="hostile_tasks", preload=["numpy"],
-                  cache=data / "cache")
+    confine.keep_private()
+    (data / "app.db").write_text("rows of all owners")
+    (data / "blobs").mkdir()
+    (data / "blobs" / "other").write_text("a photo of another owner")
+    account = find({user!r})
+    if account:
+        for folder in [data, data / "scratch"]:
+            account.lets_through(folder)
+    box = Sandbox(data / "scratch" / "w", Budget(1, 1024), module={module!r}, preload=["numpy"],
+                  cache=data / "cache", account=account)
     arguments = {{"parent": os.getpid(), "database": str(data / "app.db"), "cache": str(data / "cache"),
-                  "other": str(data / "blobs" / "other"), "own": str(data / "blobs" / "own"), "port": {port}}}
-    with box.folder() as folder:
+                  "other": str(data / "blobs" / "other"), "port": {port}, "but": {but!r}}}
+    with box.folder() as folder, box.folder() as copies:
+        (copies / "own").write_text("the photo of this task")
+        arguments["own"] = str(copies / "own")
         outcome = box.run("probe", arguments, folder=folder, limits=Limits(1024, 300),
-                          reads=[data / "blobs" / "own"])
+                          reads=[copies / "own"])
     print(json.dumps([outcome.ending, outcome.detail, outcome.value]))
 """
 
 
-@pytest.fixture
-def probed(tmp_path: Path) -> dict[str, str]:
-    """What a task that a hostile file took over can do, in a service with secrets."""
-    missing = [name for name, is_so in confine.available().items() if not is_so]
-    if missing:
-        pytest.skip(f"this kernel, or this container, has no {', '.join(missing)}")
-    data = tmp_path / "data"
-    (data / "blobs").mkdir(parents=True)
-    (data / "app.db").write_text("rows of all owners")
-    (data / "blobs" / "other").write_text("a photo of another owner")
-    (data / "blobs" / "own").write_text("the photo of this task")
+def probed(
+    data: Path,
+    *,
+    program: str = sys.executable,
+    user: str = "none",
+    module: str = "hostile_tasks",
+    but: tuple[str, ...] = (),
+) -> dict[str, str]:
+    """Return what a task that a hostile file took over can do, in a service with secrets."""
     secrets = {
         "LENS_DATABASE_URL": "postgresql://lens:secret@db/lens",
         "AWS_SECRET_ACCESS_KEY": "secret",
     }
     with closing(socket.create_server(("127.0.0.1", 0))) as listener:
-        script = tmp_path / "service.py"
+        port = listener.getsockname()[1]
+        script = data.with_name("service.py")
         script.write_text(
-            PROBE.format(here=str(HERE), data=str(data), port=listener.getsockname()[1]), encoding="utf-8"
+            PROBE.format(here=str(HERE), data=str(data), port=port, user=user, module=module, but=but),
+            encoding="utf-8",
         )
-        environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
         said = subprocess.run(
-            [sys.executable, str(script)],
-            env=environment | secrets,
+            [program, str(script)],
+            env=clean() | secrets,
             check=True,
             stdout=subprocess.PIPE,
             text=True,
@@ -346,12 +356,90 @@ def probed(tmp_path: Path) -> dict[str, str]:
     return dict(found)
 
 
-def test_a_task_that_was_taken_over_can_do_nothing_but_its_work(probed: dict[str, str]) -> None:
-    allowed = {"own environment", "own photo", "own folder", "thread", "import"}
+def clean() -> dict[str, str]:
+    """Return an environment in which any interpreter of this version finds what this one does."""
+    kept = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    return kept | {"PYTHONPATH": os.pathsep.join([str(HERE.parents[1]), *site.getsitepackages()])}
 
-    assert {name for name, said in probed.items() if said.startswith("done")} == allowed
-    assert "secret" not in probed["own environment"]
-    assert "LENS_" not in probed["own environment"]
+
+def done(found: dict[str, str]) -> set[str]:
+    return {name for name, said in found.items() if said.startswith("done")}
+
+
+ITS_WORK = {"own photo", "own folder", "thread", "import"}
+
+
+def test_a_task_that_was_taken_over_can_do_nothing_but_its_work(tmp_path: Path) -> None:
+    missing = [
+        name for name, is_so in confine.available("none", tmp_path).items() if not is_so and name != "account"
+    ]
+    if missing:
+        pytest.skip(f"this kernel, or this container, has no {', '.join(missing)}")
+    (tmp_path / "data").mkdir()
+
+    found = probed(tmp_path / "data")
+
+    assert done(found) == ITS_WORK | {"own environment"}
+    assert "secret" not in found["own environment"]
+    assert "LENS_" not in found["own environment"]
+
+
+@pytest.fixture
+def reachable() -> Iterator[tuple[str, Path]]:
+    """An interpreter and a data folder that another account of this machine can use."""
+    if os.geteuid() != 0:
+        pytest.skip("only root changes to other accounts")
+    with tempfile.TemporaryDirectory(prefix="lensmodel-", dir="/tmp") as folder:
+        data = Path(folder, "data")
+        data.mkdir()
+        Path(folder).chmod(0o755)
+        for program in (sys.executable, "/usr/bin/python3"):
+            tried = subprocess.run(
+                [program, "-m", "app.sandbox.confine", "nobody", str(data)],
+                env=clean(),
+                check=False,
+                capture_output=True,
+                text=True,
+            )
+            if tried.returncode == 0 and "account" in json.loads(tried.stdout):
+                yield program, data
+                return
+        pytest.skip("no interpreter that another account may use has the libraries")
+
+
+def test_another_account_alone_keeps_a_task_from_all_files_and_processes(
+    reachable: tuple[str, Path],
+) -> None:
+    program, data = reachable
+
+    found = probed(
+        data,
+        program=program,
+        user="nobody",
+        module="account_only_tasks",
+        but=("become another program",),  # it would
+    )
+
+    theirs = {"accounts of the machine", "connect", "send a datagram", "fork", "run a program"}
+    assert done(found) == ITS_WORK | theirs | {"change the cache"}  # the other measures are for these
+
+
+def test_another_account_and_the_other_measures_go_together(reachable: tuple[str, Path]) -> None:
+    program, data = reachable
+
+    assert done(probed(data, program=program, user="nobody")) == ITS_WORK
+
+
+def test_links_that_a_task_leaves_lead_nowhere(sandbox: Sandbox, tmp_path: Path) -> None:
+    database = tmp_path / "app.db"
+    database.write_text("rows of all owners")
+
+    with sandbox.folder() as folder:
+        outcome = sandbox.run("link", {"database": str(database)}, folder=folder, limits=LIMITS)
+
+        assert outcome.ending == "ok"
+        assert {path.name for path in folder.rglob("*")} == {"result.json", "inner", "made"}
+    assert database.read_text() == "rows of all owners"
 
 
 def test_the_budget_lets_no_more_children_run_than_there_are_slots() -> None:

@@ -1,0 +1,24 @@
+"""Tasks that misbehave, where the kernel has no measure but another account."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from hostile_tasks import TASKS
+
+from app.sandbox import confine
+from app.sandbox.account import Account
+
+__all__ = ["TASKS"]
+
+
+def _only_account(
+    writes: Sequence[Path], reads: Iterable[Path] = (), account: Account | None = None
+) -> list[str]:
+    assert account is not None
+    account.become()
+    return ["account"]
+
+
+confine.confine = _only_account

@@ -45,8 +45,6 @@ def run(settings: Settings, listener: socket.socket) -> None:
         server.should_exit = True
 
     on_parents_end(stop)
-    # uvicorn raises again what it was stopped by: an ordered end must not look like a death by it
-    on_signals(lambda _: stop())
     server.run(sockets=[listener])
 
 

@@ -3,6 +3,9 @@
 All functions take and give public ids. Rows are returned detached: plain values that no longer
 talk to the database. State changes are conditional updates that say whether they happened, so a
 step that runs twice, or loses a race against a cancel, changes nothing the second time.
+
+There are more than fifteen modules because there is one for each thing that is stored: a folder for the
+few that belong to photos, or to lenses, would part what one transaction changes together.
 """
 
 from __future__ import annotations

@@ -1,4 +1,8 @@
-"""What a lens model says in words, numbers and pictures, and how to take it elsewhere."""
+"""What a lens model says in words, numbers and pictures, and how to take it elsewhere.
+
+There are more than fifteen modules because each draws, counts or writes one thing; all of them together are
+one report, and none is of use to other rooms.
+"""
 
 from lensmodel.report.advice import Advice, Wish, advice
 from lensmodel.report.decentring import Asymmetry, Decentring, decentring

@@ -42,9 +42,9 @@ NARROWINGS: Final = (Narrowing(), Narrowing(width=0.7), Narrowing(width=0.55), N
 """What may have become of a kernel that is not the true one. Wider ones do no harm where they are missed."""
 
 # Chosen on lenses of development (third order 0 to 3 and 6, and three ray-traced designs; one, two and five
-# photos each) for the error that a linear filter by such a belief would leave. What gains most on those,
-# `lensmodel.lab.model.belief_prior` says, leans more on the wavefront: 0.1 to 0.2 dB more on them, and halos of
-# 17 percent instead of 11 in a real photograph of a tree, harder to look at. So these stay.
+# photos each) for the error that a linear filter by such a belief would leave. What gains most on those, says
+# `lensmodel.lab.model.belief_prior`, leans more on the wavefront: 0.1 to 0.2 dB more on them, and halos of 17
+# percent instead of 11 in a real photograph of a tree, which is harder to look at. So these stay.
 OF_BOTH: Final = ((0.02, 0.05, 0.05, 0.05), (0.20, 0.23, 0.30, 0.10))  # p of kernels and of the wavefront
 _OF_UNKNOWN: Final = ((0.20, 0.10, 0.10, 0.05), (0.15, 0.15, 0.15, 0.10))
 """p where aperture or pixels are not known: a wavefront cannot tell narrow blur from diffraction then."""

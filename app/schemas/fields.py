@@ -58,7 +58,7 @@ Aperture = Annotated[float, Field(ge=0.5, le=128, allow_inf_nan=False, descripti
 FocalLength = Annotated[float, Field(ge=0.1, le=20000, allow_inf_nan=False, description="mm")]
 
 
-FocusDistance = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False, description="m")]
+FocusDistance = Annotated[float, Field(ge=0.001, le=1e9, allow_inf_nan=False, description="m")]
 
 
 PixelPitch = Annotated[float, Field(gt=0.1, le=1000, allow_inf_nan=False, description="micrometres")]

@@ -33,14 +33,14 @@ class PsfQuery(Question):
     focus_distance_m: FocusDistance | None = None
     pixel_pitch_um: float | None = Field(
         None,
-        gt=0,
+        gt=0.1,
         le=100,
         allow_inf_nan=False,
         description="pixel of the answer; that of most photos by default",
     )
     half_diagonal_px: float | None = Field(
         None,
-        gt=0,
+        ge=10,
         le=1e6,
         allow_inf_nan=False,
         description="half the diagonal of the frame, if bodies agree in those",

@@ -37,11 +37,17 @@ for program in buildah debootstrap unshare setpriv curl; do
   command -v "$program" >/dev/null || fail "$program is missing; apt-get install buildah debootstrap util-linux curl"
 done
 mkdir -p "$folder"
+exec {lock}>"$folder/lock"
+flock --nonblock "$lock" || fail "another check works in $folder"
 
 engine() { buildah --root "$folder/storage" --runroot "$folder/run" "$@"; }
 
 cleanup() {
   for started in $service ${parts[@]+"${parts[@]}"}; do kill -KILL "$started" 2>/dev/null || true; done
+  if [ -n "${SERVERS_PID:-}" ]; then
+    eval "exec ${SERVERS[1]}>&-" # they end themselves, and what they started
+    wait "$SERVERS_PID" || true
+  fi
   engine rm --all >/dev/null 2>&1 || true
 }
 trap cleanup EXIT
@@ -251,7 +257,6 @@ python=${PYTHON:-$here/.venv/bin/python}
 if ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 && "$python" -c 'import moto, flask' 2>/dev/null; then
   say "starting an API and a worker from it, on PostgreSQL and S3 ..."
   coproc SERVERS { PYTHONPATH=$here exec "$python" "$here/tests/app/servers.py" lensmodel; }
-  parts+=("$SERVERS_PID")
   while read -r line <&"${SERVERS[0]}"; do
     environment+=("$line")
     case $line in AWS_SECRET_ACCESS_KEY=*) break ;; esac

@@ -5,14 +5,17 @@
 
 `rows` fills an empty database (a SQLite file, or ADDRESS) with samples of made-up kernels, a hundred photos a
 lens, then times what the service asks: the version of a lens, its samples, a page of lenses, the numbers of
-`/metrics`, the checks of `lensmodel doctor`, and a photo that leaves and joins. `queue` lets photos arrive at
-random with the hours of a day, each with its cells, and tells how long they wait for a given number of slots;
-`--seconds` are the CPU seconds of a photo, which `python -m lensmodel.lab.chain.calibration_cost` measures.
+`/metrics`, the checks of `lensmodel doctor`, a photo that leaves and joins, and the steps of the schema.
+
+`queue` lets photos arrive at random with the hours of a day, each with its cells, and tells how long they wait
+for a given number of slots; `--seconds` are the CPU seconds of a photo, which
+`python -m lensmodel.lab.chain.calibration_cost` measures.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import heapq
 import json
 import math
@@ -28,7 +31,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sqlalchemy import insert, select
+from sqlalchemy import func, insert, select
 
 from app.runtime.settings import Settings
 from app.store import Store
@@ -234,7 +237,31 @@ def rows(wishes: argparse.Namespace) -> dict[str, Any]:
                     assert not broken, (invariant.name, broken[:3])
             if store.database.is_sqlite:
                 found["file_mb"] = store.database.path.stat().st_size >> 20
-            return found
+            return found | migrations(store)
+
+
+def migrations(store: Store) -> dict[str, float]:
+    """Undo all schema steps but the first on the filled tables, then do them at once, as an update does."""
+
+    def spent(what: Callable[[], object]) -> float:
+        began = time.perf_counter()
+        what()
+        return round(time.perf_counter() - began, 2)
+
+    count = select(func.count()).select_from(SampleRow)
+    with store.database.reading() as session:
+        before = session.scalar(count)
+    found = {
+        f"schema {step.revision} undone, s": spent(
+            functools.partial(migrate.downgrade, store.database, str(step.down_revision))
+        )
+        for step in migrate.steps()
+        if step.down_revision
+    }
+    found["all of them done, s"] = spent(lambda: migrate.upgrade(store.database))
+    with store.database.reading() as session:
+        assert session.scalar(count) == before
+    return found
 
 
 def simulate(photos_a_day: float, slots: int, seconds: float, *, days: float, seed: int) -> dict[str, float]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from alembic import command
 from alembic.config import Config
 from alembic.migration import MigrationContext
-from alembic.script import ScriptDirectory
+from alembic.script import Script, ScriptDirectory
 from sqlalchemy import Connection, text
 
 import migrations
@@ -31,6 +31,11 @@ def config(connection: Connection | None = None) -> Config:
 def head() -> str | None:
     """Return the newest revision that this program knows."""
     return ScriptDirectory.from_config(config()).get_current_head()
+
+
+def steps() -> list[Script]:
+    """Return all steps, the newest first."""
+    return list(ScriptDirectory.from_config(config()).walk_revisions())
 
 
 def current(database: Database) -> str | None:
@@ -55,10 +60,10 @@ def upgrade(database: Database) -> bool:
     InvalidInputError
         If a newer program made the database.
     """
-    before, steps = current(database), ScriptDirectory.from_config(config())
-    if before == steps.get_current_head():
+    before = current(database)
+    if before == head():
         return False
-    if before is not None and before not in {step.revision for step in steps.walk_revisions()}:
+    if before is not None and before not in {step.revision for step in steps()}:
         raise InvalidInputError(
             f"the database was made by a newer program, schema {before}; update lensmodel, or use other data"
         )
@@ -77,10 +82,24 @@ def downgrade(database: Database, revision: str) -> None:
 
 @contextmanager
 def _alone(database: Database) -> Iterator[Connection]:
-    with database.writer.begin() as connection:  # SQLite: BEGIN IMMEDIATE shuts the others out
-        if not database.is_sqlite:
+    with database.writer.connect() as connection, _without_cascades(connection), connection.begin():
+        if not database.is_sqlite:  # on SQLite BEGIN IMMEDIATE shuts the others out
             connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _LOCK})
         yield connection
+
+
+@contextmanager
+def _without_cascades(connection: Connection) -> Iterator[None]:
+    """Let SQLite copy tables: to drop the old one of a parent would delete its children with it."""
+    driver = connection.connection.driver_connection
+    if not isinstance(driver, sqlite3.Connection):
+        yield
+        return
+    driver.execute("PRAGMA foreign_keys=OFF")  # within a transaction it would do nothing
+    try:
+        yield
+    finally:
+        driver.execute("PRAGMA foreign_keys=ON")
 
 
 def _copy(path: Path, revision: str) -> None:

@@ -7,8 +7,8 @@
 lens, then times what the service asks: the version of a lens, its samples, a page of lenses, the numbers of
 `/metrics`, the checks of `lensmodel doctor`, a photo that leaves and joins, and the steps of the schema.
 
-`queue` lets photos arrive at random with the hours of a day, each with its cells, and tells how long they wait
-for a given number of slots; `--seconds` are the CPU seconds of a photo, which
+`queue` lets photos arrive at random with the hours of a day, each with its cells, and tells how long they
+wait for a given number of slots; `--seconds` are the CPU seconds of a photo, which
 `python -m lensmodel.lab.chain.calibration_cost` measures.
 """
 

@@ -103,6 +103,7 @@ class Scripted:
     def __init__(self, scratch: Path) -> None:
         self.scratch = scratch
         self.budget = Budget(2, 2048)
+        self.account = None
         self.stopping = False
         self.limits: list[Limits] = []
         self.ran: list[str] = []

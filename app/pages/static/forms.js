@@ -103,34 +103,33 @@ export function setUpSettling() {
   return (name) => {
     const part = byId(name);
     if (open.includes(part) && part.querySelector("[data-settled]")) location.reload();
-    if (name === "waiting") setUpGroups();
   };
 }
 
-// Photos that do not say their lens, named group by group.
+// Photos that do not say their lens, named group by group. The stream makes the groups anew at any moment,
+// so one listener above them serves all, and a group whose answer is still to come takes no second wish.
 export function setUpGroups() {
-  for (const form of document.querySelectorAll("[data-group]:not([data-ready])")) {
-    form.dataset.ready = "";
+  const underWay = new Set();
+  byId("waiting")?.addEventListener("submit", async (event) => {
+    event.preventDefault();
+    const form = event.target;
+    if (underWay.has(form.id)) return;
+    underWay.add(form.id);
     const error = form.querySelector(".alert");
-    const button = form.querySelector("button");
-    form.addEventListener("submit", async (event) => {
-      event.preventDefault();
-      error.hidden = true;
-      try {
-        const fields = new FormData(form);
-        const change = { photo_ids: fields.getAll("photo"), ...namedLens(fields), ...givenAperture(fields) };
-        if (!change.photo_ids.length) throw new Error("Choose at least one photo of this group.");
-        if (!change.lens_id && !change.new_lens) throw new Error("Choose a lens, or give a new one a name.");
-        button.disabled = true;
-        await send("PATCH", "/v1/photos", change);
-        byId("announce").textContent = `${change.photo_ids.length} photos go on.`;
-      } catch (reason) {
-        error.textContent = reason.message;
-        error.hidden = false;
-      }
-      button.disabled = false;
-    });
-  }
+    error.hidden = true;
+    try {
+      const fields = new FormData(form);
+      const change = { photo_ids: fields.getAll("photo"), ...namedLens(fields), ...givenAperture(fields) };
+      if (!change.photo_ids.length) throw new Error("Choose at least one photo of this group.");
+      if (!change.lens_id && !change.new_lens) throw new Error("Choose a lens, or give a new one a name.");
+      await send("PATCH", "/v1/photos", change);
+      byId("announce").textContent = `${change.photo_ids.length} photos go on.`;
+    } catch (reason) {
+      error.textContent = reason.message;
+      error.hidden = false;
+    }
+    underWay.delete(form.id);
+  });
 }
 
 function namedLens(fields) {

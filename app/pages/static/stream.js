@@ -46,6 +46,7 @@ function mergeNode(old, fresh) {
     old.replaceWith(fresh);
     return;
   }
+  if (fresh.matches(".alert[hidden]")) return; // what the page itself said stays
   const typed = old.matches("input, select, textarea");
   for (const { name, value } of fresh.attributes) if (old.getAttribute(name) !== value) old.setAttribute(name, value);
   for (const { name } of [...old.attributes])

@@ -51,6 +51,8 @@ def main() -> int:
     wishes = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder, running(Path(folder) / "data", LIGHT) as service:
         ids, spare = things(service, Path(folder))
+        profile = Path(folder) / "known.lensprofile"
+        profile.write_bytes(service.http.get(f"/v1/lenses/{ids['lens_id'][0]}/profile").content)
         program = Path(sys.executable).with_name("schemathesis")
         command = [
             *(str(program), "run", f"{service.info()['url']}/openapi.json"),
@@ -63,6 +65,7 @@ def main() -> int:
             "SCHEMATHESIS_HOOKS": str(HERE / "fuzz_hooks.py"),
             "LENSMODEL_FUZZ_IDS": json.dumps(ids),
             "LENSMODEL_FUZZ_SPARE": json.dumps(spare),
+            "LENSMODEL_FUZZ_PROFILE": str(profile),
         }
         status = subprocess.run(command, env=environment, cwd=folder, check=False).returncode
         lost = [line for line in service.log.read_text().splitlines() if " ERROR " in line]

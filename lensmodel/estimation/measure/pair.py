@@ -23,8 +23,9 @@ from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.types import CHANNELS, Channel, StepHook, ignore_step
 from lensmodel.estimation.measure.measurer import MeasuredPsf, require_photos
 from lensmodel.estimation.measure.quiet import with_bounded_noise
+from lensmodel.estimation.measure.smooth import quadratic
 from lensmodel.estimation.measure.warp import Warp, match, matched
-from lensmodel.estimation.measure.windows import grid, measured_pixels, quadratic, window_psf
+from lensmodel.estimation.measure.windows import grid, measured_pixels, window_psf
 from lensmodel.optics.diffraction import diffraction_otf
 from lensmodel.photo import LinearPhoto
 

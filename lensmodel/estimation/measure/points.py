@@ -192,7 +192,7 @@ def _stacked(
         else:
             light = np.maximum(signal.fftconvolve(stamp.latent(size), kernel, mode="valid"), 0.0)
         variance[rows] = shot * (stamp.sky + light) + read
-    return solve(observed, latent, measured, variance, size)
+    return solve(observed, latent, measured, variance, size, even=True)
 
 
 def _refined(stamp: _Stamp, kernel: NDArray[np.float64]) -> _Stamp:

@@ -2,9 +2,10 @@
 
 For the pixels p that the sensor measured in a window,
 
-    y(p) = sum_u k(u) x(p - u) + c + n(p)          var n(p) = s(p)²
+    y(p) = sum_u k(u) x(p - u) + c(p) + n(p)          var n(p) = s(p)²
 
-so that only the latent picture x must be known everywhere, and a mosaic needs no demosaicing. Every
+so that only the latent picture x must be known everywhere, and a mosaic needs no demosaicing; c changes
+slowly over the window and is taken out of both sides (`Smooth`). Every
 value of the kernel has a prior, normal with mean 0, whose width falls with the distance d to the middle
 as the light of a lens does:
 
@@ -38,6 +39,7 @@ from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.evidence import nonnegative_least_squares
 from lensmodel.core.psf import as_kernel, centroid
 from lensmodel.core.types import Kernel
+from lensmodel.estimation.measure.smooth import Smooth
 
 PEAK: Final = 0.5
 """T: the middle of the sharpest kernel, a pixel's box and some diffraction, holds about as much light."""
@@ -61,7 +63,7 @@ class Solved:
     light : float
         Sum of the kernel before it was normalised: what the latent picture must be multiplied with.
     offset : float
-        The constant c.
+        The mean of c.
     shift : tuple of float
         Its centre of mass, (row, col) pixels from the middle.
     error : float
@@ -85,6 +87,8 @@ def solve(
     variance: NDArray[np.floating],
     size: int,
     latent_noise: NDArray[np.floating] | None = None,
+    *,
+    even: bool = False,
 ) -> Solved:
     """Find the kernel that makes the latent picture the observed one.
 
@@ -103,6 +107,8 @@ def solve(
     latent_noise : ndarray, shape (2 size - 1, 2 size - 1), optional
         Autocovariance of the noise that the latent picture has itself; it is taken off the normal
         equations, or noise would be taken for picture and the kernel come out too wide.
+    even : bool
+        Whether c is the same all over the window, as it has to be where that is hardly wider than the kernel.
 
     Raises
     ------
@@ -113,7 +119,7 @@ def solve(
     """
     require_fit(observed, latent, measured, size)
     weight = weights_of(measured, variance)
-    a, b, power = _normal_equations(observed, latent, weight, size)
+    a, b, power = _normal_equations(observed, latent, weight, size, even=even)
     if latent_noise is not None:
         a -= stationary(latent_noise, size) * weight.sum()
     prior = np.diag(1.0 / prior_width(size) ** 2)
@@ -213,18 +219,23 @@ def _on_simplex(values: NDArray[np.float64], total: float) -> NDArray[np.float64
 
 
 def _normal_equations(
-    observed: NDArray[np.floating], latent: NDArray[np.floating], weight: NDArray[np.float64], size: int
+    observed: NDArray[np.floating],
+    latent: NDArray[np.floating],
+    weight: NDArray[np.float64],
+    size: int,
+    *,
+    even: bool,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """X'WX, X'Wy and y'Wy after the constant was taken out of both."""
-    mean_y, mean_x = weighted_mean(observed, weight), means_of_latent(latent, weight, size)
+    """X'WX, X'Wy and y'Wy after slow changes were taken out of both."""
+    smooth = Smooth.of(observed, latent, weight, size, even=even)
     views = sliding_window_view(np.asarray(latent, dtype=np.float32), (size, size))[:, :, ::-1, ::-1]
     rows, cols = np.nonzero(weight)
     a, b, power = np.zeros((size * size, size * size)), np.zeros(size * size), 0.0
     for first in range(0, rows.size, _ROWS):
         part = rows[first : first + _ROWS], cols[first : first + _ROWS]
         root = np.sqrt(weight[part]).astype(np.float32)
-        x = (views[part].reshape(root.size, -1) - mean_x.astype(np.float32)) * root[:, None]
-        y = (np.asarray(observed[part], dtype=np.float64) - mean_y).astype(np.float32) * root
+        x = smooth.out_of_x(views[part].reshape(root.size, -1), part) * root[:, None]
+        y = smooth.out_of_y(observed[part], part) * root
         a += x.T @ x
         b += x.T @ y
         power += float(y @ y)

@@ -17,16 +17,25 @@ from typing import ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, signal
+from scipy import fft, signal
 
 from lensmodel.core.errors import InvalidInputError, LensModelError, NotEnoughEvidenceError
 from lensmodel.core.types import CHANNELS, Channel, StepHook, ignore_step
+from lensmodel.estimation.measure.light import Light, fitted_light
 from lensmodel.estimation.measure.marks import find_marks
 from lensmodel.estimation.measure.measurer import MeasuredPsf, require_photos
 from lensmodel.estimation.measure.page import DETAILS, MEAN, TargetPage
 from lensmodel.estimation.measure.solve import Solved
 from lensmodel.estimation.measure.warp import Warp, homography_of, match, matched
-from lensmodel.estimation.measure.windows import grid, measured_pixels, quadratic, window_psf
+from lensmodel.estimation.measure.windows import (
+    SMALL,
+    Latent,
+    even_variance,
+    grid,
+    measured_pixels,
+    roughly,
+    window_psf,
+)
 from lensmodel.photo import LinearPhoto
 
 FLOOR: Final = 0.02
@@ -39,7 +48,9 @@ _SURE: Final = 0.3  # error beyond which a measurement is not worth having
 _PARTS: Final = 5
 _TONE_WINDOWS: Final = 6
 _TRIED: Final = 6  # windows looked at along each axis for one that is measured: the page may end anywhere
-_TAPS: Final = 63
+_FINE: Final = 2  # samples a pixel that the page is drawn with before it is cut at the pixels' frequencies
+_SPARE: Final = 16  # pixels around a window, where the taper is
+_LIGHT_ROUNDS: Final = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,19 +72,19 @@ class PlacedPage:
 
     def window(self, row: float, col: float, shape: tuple[int, int]) -> NDArray[np.float32]:
         """Light of the page as pixels would see it that are points; no frequency beyond theirs."""
-        fine = 2 if self.warp.scale(row + shape[0] / 2.0, col + shape[1] / 2.0) > 0.95 else 1
-        spare = _TAPS // 2 // fine + 1 if fine > 1 else 0
-        rows = row + (np.arange((shape[0] + 2 * spare) * fine)) / fine - spare
-        cols = col + (np.arange((shape[1] + 2 * spare) * fine)) / fine - spare
-        places = self.warp(*np.meshgrid(rows, cols, indexing="ij"))
-        seen = self._toned(self.page.at(*places))
-        if fine == 1:
-            return seen
-        for axis in (0, 1):
-            seen = ndimage.convolve1d(seen, _lowpass(), axis=axis, mode="nearest")
-        cut = spare * fine
+        # turned or aslant, a page has frequencies along the pixels' axes that pixels do not hold
+        high, wide = (fft.next_fast_len(n + 2 * _SPARE, real=True) for n in shape)
+        rows = row - _SPARE + np.arange(high * _FINE) / _FINE
+        cols = col - _SPARE + np.arange(wide * _FINE) / _FINE
+        seen = self._toned(self.page.at(*self.warp(*np.meshgrid(rows, cols, indexing="ij"))))
+        spectrum = fft.rfft2((seen - MEAN) * _taper(high * _FINE)[:, None] * _taper(wide * _FINE))
+        coarse = np.zeros((high, wide // 2 + 1), dtype=spectrum.dtype)
+        up, down, across = (high + 1) // 2, (high - 1) // 2, (wide + 1) // 2
+        coarse[:up, :across] = spectrum[:up, :across]
+        coarse[-down:, :across] = spectrum[-down:, :across]
+        plane = fft.irfft2(coarse, s=(high, wide)) / _FINE**2 + MEAN
         return np.ascontiguousarray(
-            seen[cut : cut + shape[0] * fine : fine, cut : cut + shape[1] * fine : fine], dtype=np.float32
+            plane[_SPARE : _SPARE + shape[0], _SPARE : _SPARE + shape[1]], dtype=np.float32
         )
 
     def holds(self, row: int, col: int, side: int, margin: int) -> bool:
@@ -88,9 +99,9 @@ class PlacedPage:
 
 
 @cache
-def _lowpass() -> NDArray[np.float64]:
-    """Half-band filter: everything up to the highest frequency of the pixels, nothing beyond."""
-    return np.asarray(signal.firwin(_TAPS, 0.5, window=("kaiser", 6.0)), dtype=np.float64)
+def _taper(length: int) -> NDArray[np.float32]:
+    """1 in the middle, falling to 0 within the spare samples at both ends: the rim makes no frequencies."""
+    return np.asarray(signal.windows.tukey(length, 2.0 * _SPARE * _FINE / length), dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,13 +200,13 @@ class Target:
         found = []
         for channel in channels:
             try:
-                kernel, solved, _ = _solved(photo, placed, channel, corner, self.side, size)
+                window = _solved(photo, placed, channel, corner, self.side, size)
             except NotEnoughEvidenceError:
                 continue
-            error = float(np.hypot(solved.error, FLOOR))
+            error = float(np.hypot(window.solved.error, FLOOR))
             if error < _SURE:
                 position = photo.frame.position(*pixel)
-                found.append(MeasuredPsf(kernel, position, channel, error, pixel, self.side))
+                found.append(MeasuredPsf(window.kernel, position, channel, error, pixel, self.side))
         return found
 
 
@@ -253,6 +264,16 @@ def _parts(count: int) -> NDArray[np.float64]:
     return np.linspace(0.0, 1.0, count) if count > 1 else np.array([0.5])
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Window:
+    """A window that is solved: the kernel, how it was found, how far the page was moved, and its light."""
+
+    kernel: NDArray[np.float64]
+    solved: Solved
+    shift: tuple[float, float]
+    light: Light
+
+
 def _solved(
     photo: LinearPhoto,
     placed: PlacedPage,
@@ -260,42 +281,39 @@ def _solved(
     corner: tuple[int, int],
     side: int,
     size: int,
-) -> tuple[NDArray[np.float64], Solved, tuple[float, float]]:
-    light = _illumination(photo, channel, corner, side)
+) -> _Window:
+    light = _light_on(photo, placed, channel, corner, side)
+    kernel, solved, shift = window_psf(
+        photo, channel, corner, (side, side), _lit(placed, light, corner, side), size
+    )
+    return _Window(kernel, solved, shift, light)
+
+
+def _light_on(
+    photo: LinearPhoto, placed: PlacedPage, channel: Channel, corner: tuple[int, int], side: int
+) -> Light:
+    """Light and a small kernel of a window, each found with the other."""
+    row, col = corner
+    measured = measured_pixels(photo, channel, row, col, (side, side))
+    plane = photo.planes[CHANNELS.index(channel), row : row + side, col : col + side]
+    observed = np.asarray(plane, dtype=np.float64)
+    variance = even_variance(photo, channel, observed, measured)
+    light, page = Light.even(side), _lit(placed, Light.even(side), corner, side)
+    for _ in range(_LIGHT_ROUNDS):
+        rough, shift = roughly(observed, measured, variance, _lit(placed, light, corner, side))
+        light = fitted_light(observed, measured, page(shift, SMALL // 2), rough.kernel)
+    return light
+
+
+def _lit(placed: PlacedPage, light: Light, corner: tuple[int, int], side: int) -> Latent:
+    """Return what a window shows without blur in some light."""
 
     def latent(shift: tuple[float, float], margin: int) -> NDArray[np.floating]:
         shape = side + 2 * margin, side + 2 * margin
         page = placed.window(corner[0] - margin - shift[0], corner[1] - margin - shift[1], shape)
         return page * light(margin)
 
-    return window_psf(photo, channel, corner, (side, side), latent, size)
-
-
-class _Illumination:
-    """A quadratic in row and column, fitted to the photo: noise has the same mean everywhere."""
-
-    def __init__(self, terms: NDArray[np.float64], side: int) -> None:
-        self._terms, self._side = terms, side
-
-    def __call__(self, margin: int) -> NDArray[np.float64]:
-        t = (np.arange(-margin, self._side + margin) - (self._side - 1) / 2.0) / self._side
-        return quadratic(t[:, None], t[None, :]) @ self._terms
-
-
-def _illumination(photo: LinearPhoto, channel: Channel, corner: tuple[int, int], side: int) -> _Illumination:
-    """Light of a window over its mean."""
-    row, col = corner
-    good = measured_pixels(photo, channel, row, col, (side, side))
-    plane = photo.planes[CHANNELS.index(channel), row : row + side, col : col + side]
-    t = (np.arange(side) - (side - 1) / 2.0) / side
-    basis = quadratic(t[:, None], t[None, :])
-    if good.sum() < 64:
-        raise NotEnoughEvidenceError("nearly all pixels of a window are clipped; expose less")
-    terms, *_ = np.linalg.lstsq(basis[good], np.asarray(plane[good], dtype=np.float64), rcond=None)
-    level = float((basis @ terms).mean())
-    if not level > 0.0:
-        raise NotEnoughEvidenceError("a window of the page is black; light it")
-    return _Illumination(np.asarray(terms / level, dtype=np.float64), side)
+    return latent
 
 
 def _tones(
@@ -322,9 +340,9 @@ def _tones_of(
     photo: LinearPhoto, placed: PlacedPage, corner: tuple[int, int], side: int
 ) -> NDArray[np.float64]:
     half = 7
-    kernel, _, shift = _solved(photo, placed, "g", corner, side, 2 * half + 1)
-    light = _illumination(photo, "g", corner, side)(half)
-    start = corner[0] - half - shift[0], corner[1] - half - shift[1]
+    window = _solved(photo, placed, "g", corner, side, 2 * half + 1)
+    light, kernel = window.light(half), window.kernel
+    start = corner[0] - half - window.shift[0], corner[1] - half - window.shift[1]
     shape = side + 2 * half, side + 2 * half
     powers = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     columns = [

@@ -2,7 +2,7 @@
 
 Within a window the kernel is linear in the place, with u and v from -1 to 1 over its rows and columns:
 
-    y(p) = sum_t (k(t) + u k_u(t) + v k_v(t)) x(p - t) + c + n(p)
+    y(p) = sum_t (k(t) + u k_u(t) + v k_v(t)) x(p - t) + c(p) + n(p)
 
 k_u and k_v have the prior of `solve` with `CHANGE` of its width. What they explain is taken out of the
 normal equations (Schur's complement), so that k is found as if it were the same everywhere.
@@ -27,6 +27,7 @@ from scipy import linalg
 
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import as_kernel, centroid
+from lensmodel.estimation.measure.smooth import Smooth
 from lensmodel.estimation.measure.solve import (
     Solved,
     bounded,
@@ -105,8 +106,8 @@ def solve_varying(
 def _normal_equations(
     observed: NDArray[np.floating], latent: NDArray[np.floating], weight: NDArray[np.float64], size: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """X'WX, X'Wy and y'Wy of k, k_u and k_v, after the constant was taken out."""
-    mean_y, mean_x = weighted_mean(observed, weight), means_of_latent(latent, weight, size)
+    """X'WX, X'Wy and y'Wy of k, k_u and k_v, after slow changes were taken out."""
+    smooth = Smooth.of(observed, latent, weight, size)
     views = sliding_window_view(np.asarray(latent, dtype=np.float32), (size, size))[:, :, ::-1, ::-1]
     u, v = (np.linspace(-1.0, 1.0, n, dtype=np.float32) for n in weight.shape)
     rows, cols = np.nonzero(weight)
@@ -116,10 +117,10 @@ def _normal_equations(
         part = rows[first : first + _ROWS], cols[first : first + _ROWS]
         root = np.sqrt(weight[part]).astype(np.float32)
         x = np.empty((root.size, 3 * n), dtype=np.float32)
-        x[:, :n] = (views[part].reshape(root.size, -1) - mean_x.astype(np.float32)) * root[:, None]
+        x[:, :n] = smooth.out_of_x(views[part].reshape(root.size, -1), part) * root[:, None]
         x[:, n : 2 * n] = x[:, :n] * u[part[0], None]
         x[:, 2 * n :] = x[:, :n] * v[part[1], None]
-        y = (np.asarray(observed[part], dtype=np.float64) - mean_y).astype(np.float32) * root
+        y = smooth.out_of_y(observed[part], part) * root
         a += x.T @ x
         b += x.T @ y
         power += float(y @ y)

@@ -84,19 +84,8 @@ def window_psf(
     observed = np.asarray(photo.planes[index, row : row + height, col : col + width], dtype=np.float64)
     if measured is None:
         measured = measured_pixels(photo, channel, row, col, shape)
-    shot, read = photo_noise(photo, channel)
-    variance = shot * np.maximum(observed, 0.0) + read
-    # the mean level stands for each pixel's own: a pixel that is dark by chance must not count more
-    variance = np.full(shape, float(variance[measured].mean()) if measured.any() else 1.0)
-    small = min(SMALL, size)
-    shift = (0.0, 0.0)
-    for _ in range(2):
-        first = solve(observed, latent(shift, small // 2), measured, variance, small)
-        shift = shift[0] + first.shift[0], shift[1] + first.shift[1]
-        if max(map(abs, shift)) > _MOST_SHIFT:
-            raise NotEnoughEvidenceError("the window lies elsewhere than the rest of the reference says")
-        if max(map(abs, first.shift)) < 0.02:
-            break
+    variance = even_variance(photo, channel, observed, measured)
+    _, shift = roughly(observed, measured, variance, latent, min(SMALL, size))
     sharp = latent(shift, size // 2)
     if latent_noise is None:
         found = solve_varying(observed, sharp, measured, variance, size)
@@ -104,6 +93,40 @@ def window_psf(
     # less its noise a latent picture says too little of how the kernel changes, and of the best grid
     found = solve(observed, sharp, measured, variance, size, latent_noise)
     return centred(found.kernel), found, shift
+
+
+def roughly(
+    observed: NDArray[np.float64],
+    measured: NDArray[np.bool_],
+    variance: NDArray[np.float64],
+    latent: Latent,
+    size: int = SMALL,
+) -> tuple[Solved, tuple[float, float]]:
+    """Find a small kernel of a window, and how far to move the latent picture that its middle is centred.
+
+    Raises
+    ------
+    NotEnoughEvidenceError
+        If too few pixels count, or the latent picture does not match.
+    """
+    shift = (0.0, 0.0)
+    for _ in range(2):
+        first = solve(observed, latent(shift, size // 2), measured, variance, size)
+        shift = shift[0] + first.shift[0], shift[1] + first.shift[1]
+        if max(map(abs, shift)) > _MOST_SHIFT:
+            raise NotEnoughEvidenceError("the window lies elsewhere than the rest of the reference says")
+        if max(map(abs, first.shift)) < 0.02:
+            break
+    return first, shift
+
+
+def even_variance(
+    photo: LinearPhoto, channel: Channel, observed: NDArray[np.float64], measured: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Noise of a window: the mean level stands for each pixel's own, or one dark by chance counted more."""
+    shot, read = photo_noise(photo, channel)
+    variance = shot * np.maximum(observed, 0.0) + read
+    return np.full(observed.shape, float(variance[measured].mean()) if measured.any() else 1.0)
 
 
 def grid(shape: tuple[int, int], side: int, across: int, down: int, margin: int) -> list[tuple[int, int]]:
@@ -114,9 +137,3 @@ def grid(shape: tuple[int, int], side: int, across: int, down: int, margin: int)
     rows = np.unique(np.rint(np.linspace(margin, last[0], down)).astype(int))
     cols = np.unique(np.rint(np.linspace(margin, last[1], across)).astype(int))
     return [(int(row), int(col)) for row in rows for col in cols]
-
-
-def quadratic(r: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Terms 1, r, c, r², rc, c² of a smooth change of light, last axis."""
-    r, c = np.broadcast_arrays(r, c)
-    return np.stack([np.ones_like(r), r, c, r * r, r * c, c * c], axis=-1)

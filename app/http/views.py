@@ -66,8 +66,8 @@ def _photo_problem(row: PhotoRow, candidates: Sequence[str]) -> s.Problem | None
         return problem_of(
             "metadata_missing",
             row.error_detail
-            or f"the file does not say which copy of the lens it was (model {row.lens_model or 'unknown'}): "
-            'PATCH the photo with {"lens_id"}, {"lens_serial"} or {"new_lens": {"label"}}',
+            or f"the photo does not say which copy of the lens took it ({row.lens_model or 'unknown model'}): "
+            "choose a lens, give its serial with the model, or name a new one",
             candidates=candidates,
         )
     if row.state == "cancelled":

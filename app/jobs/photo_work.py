@@ -332,11 +332,11 @@ def _missing(photo: PhotoRow, *, lens_known: bool) -> str:
     if not lens_known:
         model = photo.lens_model or "unknown model"
         return (
-            f"the photo names no lens serial ({model}): send lens_id, lens_serial with lens_model, or "
-            'new_lens {"label": ...} by PATCH'
+            f"the photo does not say which copy of the lens took it ({model}): choose a lens, give its serial "
+            "with the model, or name a new one"
         )
     if photo.aperture is None:
-        return 'the photo does not say its aperture: send {"aperture": f-number} by PATCH'
+        return "the photo does not say its aperture: give the f-number"
     return ""
 
 

@@ -4,8 +4,8 @@
 
 A cluster on this machine, each worker a process with one thread, gets the same photos (composed as in
 `lensmodel.lab.chain.calibration_cost`) from `lensmodel calibrate --scheduler`, once for each number of
-workers. Printed are the wall clock of the whole command, with its start and the fit at its end, the photos an
-hour, and how many times the first number's that is. One photo goes before, so that all is loaded and compiled.
+workers. Printed are the wall clock of the whole command, with its start and the fit at its end, the photos
+an hour, and how many times the first number's that is. One photo goes before, so that all is compiled.
 """
 
 from __future__ import annotations

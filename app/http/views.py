@@ -66,7 +66,7 @@ def _photo_problem(row: PhotoRow, candidates: Sequence[str]) -> s.Problem | None
         return problem_of(
             "metadata_missing",
             row.error_detail
-            or f"the photo does not say which copy of the lens took it ({row.lens_model or 'unknown model'}): "
+            or f"the photo does not say which copy of a lens took it ({row.lens_model or 'model unknown'}): "
             "choose a lens, give its serial with the model, or name a new one",
             candidates=candidates,
         )

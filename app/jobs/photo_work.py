@@ -332,8 +332,8 @@ def _missing(photo: PhotoRow, *, lens_known: bool) -> str:
     if not lens_known:
         model = photo.lens_model or "unknown model"
         return (
-            f"the photo does not say which copy of the lens took it ({model}): choose a lens, give its serial "
-            "with the model, or name a new one"
+            f"the photo does not say which copy of a lens took it ({model}): choose a lens, give its "
+            "serial with the model, or name a new one"
         )
     if photo.aperture is None:
         return "the photo does not say its aperture: give the f-number"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 import sys
 import time
@@ -10,7 +11,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
+
+from lensmodel.simulate import demo_data_path
 
 HERE = Path(__file__).parents[1]
 sys.path.insert(0, str(HERE))
@@ -54,6 +59,25 @@ def png(width: int, height: int, data: bytes = b"") -> bytes:
 def tiff(entries: list[tuple[int, int, int, int]], following: int = 0) -> bytes:
     fields = b"".join(struct.pack("<HHII", *entry) for entry in entries)
     return b"II*\0" + struct.pack("<IH", 8, len(entries)) + fields + struct.pack("<I", following)
+
+
+def jpeg(picture: Image.Image) -> bytes:
+    target = io.BytesIO()
+    picture.save(target, "JPEG", quality=95)
+    return target.getvalue()
+
+
+def thumbnail() -> bytes:
+    """A real photograph as small as a file's preview: sharp all over, and says nothing of a lens."""
+    with Image.open(demo_data_path("city.jpg")) as picture:
+        return jpeg(picture.resize((88, 64), Image.Resampling.LANCZOS))
+
+
+def one_window() -> bytes:
+    """Detail in one place only, as of a moth on a wall: one window of hundreds tells anything."""
+    pixels = np.full((900, 1200), 120.0)
+    pixels[400:500, 600:700] += 60.0 * np.random.default_rng(1).standard_normal((100, 100))
+    return jpeg(Image.fromarray(np.clip(pixels, 0, 255).astype(np.uint8)).convert("RGB"))
 
 
 OWN = {
@@ -148,3 +172,14 @@ def test_each_file_of_the_collection_is_refused_or_processed_and_none_is_stuck(
     assert codes.keys() == files.keys()
     assert {name: code for name, code in codes.items() if code not in KNOWN_CODES | {"counted"}} == {}
     assert "started again" not in service.log.read_text()
+
+
+def test_a_thumbnail_and_detail_in_one_place_do_not_count(tmp_path: Path) -> None:
+    # the fewest patches of which as much evidence is asked as of the default
+    with running(tmp_path / "data", LENS_PATCHES="18") as strict:
+        answers = send_all(strict, {"thumbnail.jpg": thumbnail(), "one_window.jpg": one_window()})
+
+        assert {name: answer["code"] for name, answer in answers.items()} == dict.fromkeys(
+            answers, "no_usable_patches"
+        )
+        assert strict.get("/v1/lenses")["items"] == []

@@ -31,6 +31,7 @@ from app.store.jobs import JobStore
 from app.store.photo_steps import folder_of
 from app.store.tables import PhotoRow
 from lensmodel.core.evidence import PatchEvidence
+from lensmodel.core.files import save_array
 from lensmodel.core.types import ignore_step
 
 log = logging.getLogger(__name__)
@@ -236,5 +237,6 @@ def write_samples(folder: Path, stored: Sequence[StoredSample]) -> None:
                 },
             }
         )
-    np.save(folder / KERNELS, kernels)
+    with (folder / KERNELS).open("wb") as file:
+        save_array(file, kernels)
     (folder / SAMPLES).write_text(json.dumps(listed), encoding="utf-8")

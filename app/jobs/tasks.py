@@ -39,6 +39,7 @@ from lensmodel import correction, photo
 from lensmodel.core import codec
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.evidence import PatchEvidence
+from lensmodel.core.files import save_array
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.spectrum import PatchSpectrum
 from lensmodel.core.types import FieldPosition, LensSettings, Planes, StepHook, ignore_step
@@ -119,7 +120,8 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: Progress) -> lis
         seed=arguments["seed"],
         on_step=progress,
     )
-    np.save(folder / KERNELS, np.stack([np.asarray(result.sample.kernel) for result in results]))
+    with (folder / KERNELS).open("wb") as file:
+        save_array(file, np.stack([np.asarray(result.sample.kernel) for result in results]))
     listed = []
     for number, result in enumerate(results):
         evidence = None
@@ -234,7 +236,8 @@ def measure_lens(arguments: dict[str, Any], folder: Path, progress: Progress) ->
     photos = [pipeline.load_developed(Path(name)) for name in arguments["developed"]]
     method = lens_measure.methods.create(arguments["kind"])
     found = method.measure(photos, size=arguments["size"], on_step=progress)
-    np.save(folder / KERNELS, np.stack([np.asarray(one.kernel) for one in found]))
+    with (folder / KERNELS).open("wb") as file:
+        save_array(file, np.stack([np.asarray(one.kernel) for one in found]))
     numbers: dict[tuple[float, float], int] = {}
     return [
         {

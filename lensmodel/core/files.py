@@ -1,4 +1,4 @@
-"""Files that appear complete or not at all."""
+"""Files that appear complete or not at all, and say why they do not."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
 
 
 @contextmanager
@@ -23,3 +26,19 @@ def atomic(path: Path) -> Iterator[BinaryIO]:
     except BaseException:
         part.unlink(missing_ok=True)
         raise
+
+
+def save_array(file: BinaryIO, array: NDArray[Any]) -> None:
+    """Write an array of one axis or more and a plain dtype in NumPy's own format.
+
+    `numpy.save` writes to files by a C function and forgets why it failed: that a disk is full would pass
+    for a fault of the program.
+
+    Raises
+    ------
+    OSError
+        With its number.
+    """
+    whole = np.ascontiguousarray(array)
+    np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(whole))
+    file.write(whole.reshape(-1).view(np.uint8).data)

@@ -13,7 +13,7 @@ from lensmodel.core import codec
 from lensmodel.core.errors import (
     InvalidInputError,
 )
-from lensmodel.core.files import atomic
+from lensmodel.core.files import atomic, save_array
 from lensmodel.core.types import (
     LensSettings,
 )
@@ -31,7 +31,7 @@ def save_developed(developed: LinearPhoto, folder: Path) -> None:
     }
     (folder / "photo.json").write_text(json.dumps(codec.to_json(fields)), encoding="utf-8")
     with atomic(folder / "planes.npy") as file:
-        np.save(file, developed.planes, allow_pickle=False)
+        save_array(file, developed.planes)
 
 
 def load_developed(folder: Path) -> LinearPhoto:

@@ -11,6 +11,7 @@ import numpy as np
 
 from app.jobs.task_files import KERNELS
 from app.sandbox.child import Progress
+from lensmodel.core.files import save_array
 from lensmodel.core.psf import gaussian
 
 CELLS = 8
@@ -32,7 +33,8 @@ def inspect(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
 
 
 def develop(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
-    np.save(folder / "planes.npy", np.zeros((3, 48, 64), np.float32))
+    with (folder / "planes.npy").open("wb") as file:
+        save_array(file, np.zeros((3, 48, 64), np.float32))
     return {}
 
 
@@ -53,7 +55,8 @@ def select(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[
 
 def estimate(arguments: dict[str, Any], folder: Path, progress: Progress) -> list[dict[str, Any]]:
     time.sleep(SECONDS)
-    np.save(folder / KERNELS, np.stack([gaussian(5, np.eye(2))] * 3))
+    with (folder / KERNELS).open("wb") as file:
+        save_array(file, np.stack([gaussian(5, np.eye(2))] * 3))
     common = {
         "weight": 1.0,
         "estimator": "quick/1",

@@ -219,6 +219,12 @@ def said(store: Store) -> list[str]:
         return [" ".join(filter(None, row)) for row in rows]
 
 
+def faults(log: Path) -> str:
+    """Return the last two errors that nobody foresaw of those in tasks, tracebacks and all."""
+    parts = [part for part in log.read_text().split("unforeseen ")[1:] if " in a task" in part[:40]]
+    return "\n".join(part[:1500] for part in parts[-2:])
+
+
 def torture(folder: Path, seed: int, *, servers: bool, plan: Plan | None = None) -> str:
     """Do it once; return what happened in one line.
 
@@ -258,7 +264,7 @@ def torture(folder: Path, seed: int, *, servers: bool, plan: Plan | None = None)
             end = time.monotonic() + stretched(plan.patience_s)
             while (now := set(states(store))) != {"counted"}:
                 crew.replace_the_dead()
-                assert not now & {"failed", "cancelled", "needs_lens"}, said(store)
+                assert not now & {"failed", "cancelled", "needs_lens"}, f"{said(store)}\n{faults(crew.log)}"
                 assert time.monotonic() < end, f"{states(store)}\n{crew.log.read_text()[-4000:]}"
                 time.sleep(0.2)
             check(settings, store, storage, plan)

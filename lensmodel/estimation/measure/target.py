@@ -19,12 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, signal
 
-from lensmodel.core.errors import InvalidInputError, LensModelError, NotEnoughEvidenceError
+from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.types import CHANNELS, Channel, StepHook, ignore_step
 from lensmodel.estimation.measure.light import Light, fitted_light
 from lensmodel.estimation.measure.marks import find_marks
 from lensmodel.estimation.measure.measurer import MeasuredPsf, require_photos
 from lensmodel.estimation.measure.page import DETAILS, MEAN, TargetPage
+from lensmodel.estimation.measure.smooth import quadratic
 from lensmodel.estimation.measure.solve import Solved
 from lensmodel.estimation.measure.warp import Warp, homography_of, match, matched
 from lensmodel.estimation.measure.windows import (
@@ -42,10 +43,18 @@ FLOOR: Final = 0.02
 """Error that no window shows of itself: what the smooth models of light, tones and place leave out.
 Chosen: at 0.037 to 0.056 off, windows of a simulated page said 0.043 to 0.064 with it."""
 
+TONE_SPREAD: Final = 0.3
+"""Standard deviation of q and c, see `_tones`: what tones a print of unknown making may have (chosen:
+a gamma of 1.3 has a q of 0.3)."""
+
+EXPLAINED: Final = 1.15
+"""Residuals over the noise above which its kernel changes too much for a window (chosen)."""
+
 _CLEAR: Final = 8.0  # of the standard deviation: peaks of 10 000 lags of noise reach 4 to 5
 _SIDE: Final = 144
 _SURE: Final = 0.3  # error beyond which a measurement is not worth having
-_PARTS: Final = 5
+_SMALLER: Final = (2 / 3, 1 / 2)
+_LEAST_PIXELS: Final = 2.0  # for each of the kernel
 _TONE_WINDOWS: Final = 6
 _TRIED: Final = 6  # windows looked at along each axis for one that is measured: the page may end anywhere
 _FINE: Final = 2  # samples a pixel that the page is drawn with before it is cut at the pixels' frequencies
@@ -196,18 +205,41 @@ class Target:
         size: int,
         channels: Iterable[Channel],
     ) -> list[MeasuredPsf]:
-        pixel = corner[0] + (self.side - 1) / 2.0, corner[1] + (self.side - 1) / 2.0
         found = []
         for channel in channels:
             try:
-                window = _solved(photo, placed, channel, corner, self.side, size)
+                at, window = self._explained(photo, placed, channel, corner, size)
             except NotEnoughEvidenceError:
                 continue
             error = float(np.hypot(window.solved.error, FLOOR))
             if error < _SURE:
+                pixel = at[0] + (window.side - 1) / 2.0, at[1] + (window.side - 1) / 2.0
                 position = photo.frame.position(*pixel)
-                found.append(MeasuredPsf(window.kernel, position, channel, error, pixel, self.side))
+                found.append(MeasuredPsf(window.kernel, position, channel, error, pixel, window.side))
         return found
+
+    def _explained(
+        self, photo: LinearPhoto, placed: PlacedPage, channel: Channel, corner: tuple[int, int], size: int
+    ) -> tuple[tuple[int, int], _Window]:
+        """Solve a window, and smaller ones at its middle as long as the kernel changes too much within."""
+        best = corner, _solved(photo, placed, channel, corner, self.side, size)
+        for part in _SMALLER:
+            side = round(self.side * part)
+            if best[1].solved.misfit <= EXPLAINED:
+                break
+            if _pixels(photo, channel, side) < _LEAST_PIXELS * size * size:
+                break
+            inner = corner[0] + (self.side - side) // 2, corner[1] + (self.side - side) // 2
+            best = inner, _solved(photo, placed, channel, inner, side, size)
+        return best
+
+
+def _pixels(photo: LinearPhoto, channel: Channel, side: int) -> float:
+    """How many pixels of a window the sensor measures in a channel."""
+    if photo.cfa is None:
+        return float(side * side)
+    own = sum(row.count(CHANNELS.index(channel)) for row in photo.cfa)
+    return side * side * own / 4.0
 
 
 def _light(
@@ -272,6 +304,7 @@ class _Window:
     solved: Solved
     shift: tuple[float, float]
     light: Light
+    side: int
 
 
 def _solved(
@@ -286,7 +319,7 @@ def _solved(
     kernel, solved, shift = window_psf(
         photo, channel, corner, (side, side), _lit(placed, light, corner, side), size
     )
-    return _Window(kernel, solved, shift, light)
+    return _Window(kernel, solved, shift, light, side)
 
 
 def _light_on(
@@ -319,41 +352,45 @@ def _lit(placed: PlacedPage, light: Light, corner: tuple[int, int], side: int) -
 def _tones(
     photo: LinearPhoto, placed: PlacedPage, corners: Sequence[tuple[int, int]], side: int
 ) -> tuple[float, float, float]:
-    """Fit the tones of the print where the lens is sharpest: how the photo follows R, R² and R³.
+    """Fit the tones of the print where the lens is sharpest: how the photo follows R.
 
-    With a kernel k found for the straight line, y = sum_j t_j (k * E R^j) + c is linear in t.
+    With z = R - `MEAN`, tones are  a (z + q z² + c z³)  and a constant, which is light like any other that is
+    laid over a window. What windows say of (q, c) is joined by its precision, and with the prior: behind much
+    blur, z, z² and z³ look alike, and nothing is known.
     """
-    rows = []
+    precision, told = np.eye(2) / TONE_SPREAD**2, np.zeros(2)
+    seen = 0
     for corner in corners:
         try:
-            row = _tones_of(photo, placed, corner, side)
-        except LensModelError:
+            own, bent = _tones_of(photo, placed, corner, side)
+        except NotEnoughEvidenceError:
             continue
-        rows.append(row)
-    if len(rows) < 2:
+        precision, told, seen = precision + own, told + own @ bent, seen + 1
+    if seen < 2:
         raise NotEnoughEvidenceError("the page is too blurred to be measured; focus on it")
-    first, second, third = np.median(rows, axis=0)
-    return float(first), float(second), float(third)
+    q, c = np.linalg.solve(precision, told)
+    return float(1.0 - 2.0 * q * MEAN + 3.0 * c * MEAN**2), float(q - 3.0 * c * MEAN), float(c)
 
 
 def _tones_of(
     photo: LinearPhoto, placed: PlacedPage, corner: tuple[int, int], side: int
-) -> NDArray[np.float64]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Precision (2, 2) and value (2,) of (q, c) in one window."""
     half = 7
     window = _solved(photo, placed, "g", corner, side, 2 * half + 1)
     light, kernel = window.light(half), window.kernel
     start = corner[0] - half - window.shift[0], corner[1] - half - window.shift[1]
-    shape = side + 2 * half, side + 2 * half
-    powers = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    columns = [
-        signal.fftconvolve(replace(placed, tones=tones).window(*start, shape) * light, kernel, mode="valid")
-        for tones in powers
-    ]
+    z = placed.window(*start, (side + 2 * half, side + 2 * half)) - MEAN
+    columns = [signal.fftconvolve(z**power * light, kernel, mode="valid") for power in (1, 2, 3)]
+    t = np.linspace(-1.0, 1.0, side)
+    columns += list(np.moveaxis(quadratic(t[:, None], t[None, :]), -1, 0))
     good = measured_pixels(photo, "g", *corner, (side, side))
     plane = photo.planes[1, corner[0] : corner[0] + side, corner[1] : corner[1] + side]
-    basis = np.stack([*(column[good] for column in columns), np.ones(int(good.sum()))], axis=-1)
-    terms, *_ = np.linalg.lstsq(basis, np.asarray(plane[good], dtype=np.float64), rcond=None)
-    slope = terms[0] + 2.0 * terms[1] * MEAN + 3.0 * terms[2] * MEAN**2
-    if not slope > 0.0:
+    basis = np.stack([column[good] for column in columns], axis=-1)
+    observed = np.asarray(plane[good], dtype=np.float64)
+    terms, *_ = np.linalg.lstsq(basis, observed, rcond=None)
+    if not terms[0] > 0.0:
         raise InvalidInputError("the print is a negative of the target")
-    return np.asarray(terms[:3] / slope)
+    left = float(np.square(observed - basis @ terms).sum()) / max(observed.size - terms.size, 1)
+    covariance = np.linalg.inv(basis.T @ basis)[1:3, 1:3] * left / terms[0] ** 2
+    return np.linalg.inv(covariance), np.asarray(terms[1:3] / terms[0])

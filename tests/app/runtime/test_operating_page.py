@@ -1,0 +1,55 @@
+"""The page for operators, typed word for word in an empty folder."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PAGE = Path(__file__).parents[3] / "docs" / "operating.md"
+ELSEWHERE = "/var/lib/postgresql"
+"""Commands about another machine's disk."""
+
+
+def commands() -> list[str]:
+    blocks = re.findall(
+        r"^```sh\n(.*?)^```", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL
+    )
+    return [line for block in blocks for line in block.splitlines() if ELSEWHERE not in line]
+
+
+@pytest.mark.slow
+def test_each_command_of_the_page_does_what_it_says(tmp_path: Path) -> None:
+    if shutil.which("curl") is None or shutil.which("bash") is None:
+        pytest.skip("needs bash and curl, as the page does")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    lines = ["set -e"]
+    for line in commands():
+        lines.append(line.replace("8000", port))
+        if line.endswith("&"):  # a person waits for the address
+            lines.append(f"until curl -sf http://127.0.0.1:{port}/readyz > ready; do sleep 0.2; done")
+    home = {name: value for name, value in os.environ.items() if not name.startswith("LENS_")}
+    home["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{home['PATH']}"
+
+    done = subprocess.run(
+        ["bash", "-c", "\n".join(lines)],
+        cwd=tmp_path,
+        env=home,
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "lensmodel_queue_jobs" in done.stdout
+    assert (tmp_path / "my-backup").is_dir()
+    assert (tmp_path / "elsewhere.db").is_file()

@@ -20,10 +20,10 @@ body { margin: 0 auto; max-width: 84rem; padding: 1.5rem; font: 16px/1.55 system
 h1 { line-height: 1.2; margin: 0; } h2 { margin: 2.2rem 0 .6rem; }
 .verdict { font-size: 1.25rem; max-width: 46rem; }
 .facts, .note { color: light-dark(#55585d, #b1b4b9); max-width: 60rem; }
-.charts { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fill, minmax(min(100%, 36rem), 1fr));
+.charts { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fill, minmax(min(100%, 34rem), 1fr));
   align-items: start; }
 figure { margin: 0; border: 1px solid light-dark(#dcdcd8, #363a3f); border-radius: .5rem; overflow-x: auto; }
-svg { display: block; width: 100%; min-width: 35rem; height: auto; }
+svg { display: block; width: 100%; min-width: 33rem; height: auto; }
 table { border-collapse: collapse; } th, td { text-align: left; padding: .3rem 1.4rem .3rem 0;
   border-bottom: 1px solid light-dark(#dcdcd8, #363a3f); font-variant-numeric: tabular-nums; }
 .scroll { overflow-x: auto; }

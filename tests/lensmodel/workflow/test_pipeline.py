@@ -75,7 +75,7 @@ def test_a_developed_photo_that_does_not_fit_the_disk_leaves_no_remains(
     def full_disk(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("numpy.save", full_disk)
+    monkeypatch.setattr("lensmodel.workflow.developed.save_array", full_disk)
     with pytest.raises(OSError, match="No space left"):
         pipeline.save_developed(city, tmp_path)
 

@@ -52,7 +52,8 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder, running(Path(folder) / "data", LIGHT) as service:
         ids, spare = things(service, Path(folder))
         profile = Path(folder) / "known.lensprofile"
-        profile.write_bytes(service.http.get(f"/v1/lenses/{ids['lens_id'][0]}/profile").content)
+        answer = service.http.get(f"/v1/lenses/{ids['lens_id'][0]}/profile")
+        profile.write_bytes(answer.raise_for_status().content)
         program = Path(sys.executable).with_name("schemathesis")
         command = [
             *(str(program), "run", f"{service.info()['url']}/openapi.json"),

@@ -13,6 +13,7 @@ is linear in e_j, the light, and c_j, what the lens and its reflections lay over
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.types import Kernel
 from lensmodel.estimation.measure.smooth import quadratic
 
-_FEWEST = 64
+_FEWEST: Final = 64  # pixels: five times as many as there are terms
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, signal
 
-from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.types import CHANNELS, Channel, StepHook, ignore_step
 from lensmodel.estimation.measure.light import Light, fitted_light
 from lensmodel.estimation.measure.marks import find_marks
@@ -40,8 +40,8 @@ from lensmodel.estimation.measure.windows import (
 from lensmodel.photo import LinearPhoto
 
 FLOOR: Final = 0.02
-"""Error that no window shows of itself: what the smooth models of light, tones and place leave out.
-Chosen: at 0.037 to 0.056 off, windows of a simulated page said 0.043 to 0.064 with it."""
+"""Error that no window shows of itself: what the smooth models of light, tones and place leave out
+(chosen)."""
 
 TONE_SPREAD: Final = 0.3
 """Standard deviation of q and c, see `_tones`: what tones a print of unknown making may have (chosen:
@@ -56,6 +56,9 @@ _SURE: Final = 0.3  # error beyond which a measurement is not worth having
 _SMALLER: Final = (2 / 3, 1 / 2)
 _LEAST_PIXELS: Final = 2.0  # for each of the kernel
 _TONE_WINDOWS: Final = 6
+_POWERS: Final = ((1.0, 0.0, 0.0), (-2.0 * MEAN, 1.0, 0.0), (3.0 * MEAN**2, -3.0 * MEAN, 1.0))
+"""z, z² and z³ of `_tones` in powers of R, less their constants."""
+_TINY: Final = 1e-20
 _TRIED: Final = 6  # windows looked at along each axis for one that is measured: the page may end anywhere
 _FINE: Final = 2  # samples a pixel that the page is drawn with before it is cut at the pixels' frequencies
 _SPARE: Final = 16  # pixels around a window, where the taper is
@@ -380,8 +383,11 @@ def _tones_of(
     window = _solved(photo, placed, "g", corner, side, 2 * half + 1)
     light, kernel = window.light(half), window.kernel
     start = corner[0] - half - window.shift[0], corner[1] - half - window.shift[1]
-    z = placed.window(*start, (side + 2 * half, side + 2 * half)) - MEAN
-    columns = [signal.fftconvolve(z**power * light, kernel, mode="valid") for power in (1, 2, 3)]
+    shape = side + 2 * half, side + 2 * half
+    columns = [
+        signal.fftconvolve(replace(placed, tones=tones).window(*start, shape) * light, kernel, mode="valid")
+        for tones in _POWERS
+    ]
     t = np.linspace(-1.0, 1.0, side)
     columns += list(np.moveaxis(quadratic(t[:, None], t[None, :]), -1, 0))
     good = measured_pixels(photo, "g", *corner, (side, side))
@@ -390,7 +396,9 @@ def _tones_of(
     observed = np.asarray(plane[good], dtype=np.float64)
     terms, *_ = np.linalg.lstsq(basis, observed, rcond=None)
     if not terms[0] > 0.0:
-        raise InvalidInputError("the print is a negative of the target")
+        raise NotEnoughEvidenceError("a window shows a negative of the page")
     left = float(np.square(observed - basis @ terms).sum()) / max(observed.size - terms.size, 1)
-    covariance = np.linalg.inv(basis.T @ basis)[1:3, 1:3] * left / terms[0] ** 2
-    return np.linalg.inv(covariance), np.asarray(terms[1:3] / terms[0])
+    # what of the two columns the others cannot explain is what tells of q and c
+    others = np.delete(basis, (1, 2), axis=1)
+    own = basis[:, 1:3] - others @ np.linalg.lstsq(others, basis[:, 1:3], rcond=None)[0]
+    return own.T @ own * terms[0] ** 2 / max(left, _TINY), np.asarray(terms[1:3] / terms[0])

@@ -102,7 +102,21 @@ def roughly(
     latent: Latent,
     size: int = SMALL,
 ) -> tuple[Solved, tuple[float, float]]:
-    """Find a small kernel of a window, and how far to move the latent picture that its middle is centred.
+    """Find a small kernel of a window.
+
+    Parameters
+    ----------
+    observed, measured, variance : ndarray, shape (H, W)
+        As in `solve`.
+    latent : Latent
+    size : int
+        Side of the kernel.
+
+    Returns
+    -------
+    solved : Solved
+    shift : tuple of float
+        How far to move the latent picture, (row, col) pixels, so that the kernel is centred.
 
     Raises
     ------
@@ -123,7 +137,10 @@ def roughly(
 def even_variance(
     photo: LinearPhoto, channel: Channel, observed: NDArray[np.float64], measured: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Noise of a window: the mean level stands for each pixel's own, or one dark by chance counted more."""
+    """Return the variance of a window's noise, its mean for each pixel, in the photo's units squared.
+
+    By its own level a pixel that is dark by chance would count more than others.
+    """
     shot, read = photo_noise(photo, channel)
     variance = shot * np.maximum(observed, 0.0) + read
     return np.full(observed.shape, float(variance[measured].mean()) if measured.any() else 1.0)

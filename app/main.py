@@ -114,10 +114,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_middleware(OwnNames, allowed=chosen.hosts)
     app.add_middleware(RequestLog)  # the last is the outermost
     errors.install(app)
-    pages.install(app)
     app.include_router(health.probes)
     app.include_router(session.router, prefix="/v1")
     resources = (
+        psf,  # first: routes are tried in their order, and this one is asked for most often
         photos,
         photo_sets,
         jobs,
@@ -125,7 +125,6 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         lens_changes,
         lens_profiles,
         lens_reports,
-        psf,
         corrections,
         account,
         health,
@@ -138,4 +137,5 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             dependencies=[Depends(call_of)],
             responses=problems(401, 403, 429),
         )
+    pages.install(app)
     return app

@@ -7,12 +7,13 @@ import math
 from typing import Annotated, Final, Literal
 
 import numpy as np
-from fastapi import APIRouter, Query, Response, status
+from fastapi import APIRouter, Depends, Response, status
 
 from app.http import psf_formats
 from app.http.dependencies import Call, CallDep
 from app.http.errors import InvalidParameterError, NotAcceptableError, UnknownLensError
 from app.http.model_cache import Fitted
+from app.http.questions import Asked
 from app.routes.common import Answers, problems
 from app.runtime import metrics
 from app.schemas import FieldQuery, PsfOut, PsfQuery, QueryOut
@@ -34,6 +35,9 @@ MAX_GRID: Final = 25
 MAX_FIELD_PIXELS: Final = 2_000_000
 """A picture of 25 x 25 kernels of 55 pixels; one of 255 pixels each took 8.5 s."""
 
+_PSF: Final = Asked(PsfQuery)
+_FIELD: Final = Asked(FieldQuery)
+
 _CONTENT = {
     name: {"schema": {"type": "string", "format": "binary"}}
     for name in MEDIA_TYPES.values()
@@ -49,9 +53,10 @@ _ANSWERS: Final[Answers] = {
     "/lenses/{lens_id}/psf",
     operation_id="getPsf",
     response_class=Response,
+    openapi_extra=_PSF.described,
     responses=problems(404, 406, 409, 422, also=_ANSWERS),
 )
-def read_psf(lens_id: str, at: Annotated[PsfQuery, Query()], call: CallDep) -> Response:
+def read_psf(lens_id: str, at: Annotated[PsfQuery, Depends(_PSF)], call: CallDep) -> Response:
     """Return the PSF in the format that `Accept` asks for; JSON by default."""
     with metrics.QUERY_SECONDS.time():
         return _answer(lens_id, at, accepted(call.request.headers.get("accept", "*/*")), call)
@@ -61,12 +66,13 @@ def read_psf(lens_id: str, at: Annotated[PsfQuery, Query()], call: CallDep) -> R
     "/lenses/{lens_id}/psf.{suffix}",
     operation_id="getPsfAs",
     response_class=Response,
+    openapi_extra=_PSF.described,
     responses=problems(404, 409, 422, also=_ANSWERS),
 )
 def read_psf_as(
     lens_id: str,
     suffix: Format,
-    at: Annotated[PsfQuery, Query()],
+    at: Annotated[PsfQuery, Depends(_PSF)],
     call: CallDep,
 ) -> Response:
     """Return the PSF in the format of the suffix."""
@@ -161,6 +167,7 @@ def _matches(call: Call, tag: str) -> bool:
     "/lenses/{lens_id}/field.png",
     operation_id="getFieldMap",
     response_class=Response,
+    openapi_extra=_FIELD.described,
     responses=problems(
         404,
         409,
@@ -174,7 +181,7 @@ def _matches(call: Call, tag: str) -> bool:
         },
     ),
 )
-def read_field(lens_id: str, at: Annotated[FieldQuery, Query()], call: CallDep) -> Response:
+def read_field(lens_id: str, at: Annotated[FieldQuery, Depends(_FIELD)], call: CallDep) -> Response:
     """Return a picture of the kernels all over the field, each scaled to its own peak."""
     columns, rows = (int(count) for count in at.grid.split("x"))
     if not (1 <= columns <= MAX_GRID and 1 <= rows <= MAX_GRID):

@@ -18,7 +18,7 @@ from starlette.requests import Request
 from app.access import keys
 from app.access.keys import SCOPES, Scope
 from app.access.rate_limits import Rates
-from app.http.errors import BusyError, ForbiddenError, NotSignedInError, QuotaError
+from app.errors import BusyError, ForbiddenError, NotSignedInError, QuotaError
 from app.store.access.keys import Holder, KeyStore
 from app.store.access.owners import LOCAL
 
@@ -245,17 +245,6 @@ def shown_by(request: Request) -> str | None:
     if scheme.lower() == "bearer":
         return text.strip()
     return request.cookies.get(COOKIE) or None
-
-
-def require_somebody(settings: Settings, store: KeyStore) -> str | None:
-    """Say why a service cannot begin that others can reach and nobody could use; None if it can."""
-    if not settings.needs_keys or store.any_valid():
-        return None
-    return (
-        f"the service asks for keys (LENS_HOST={settings.host}, LENS_PUBLIC={str(settings.public).lower()}, "
-        f"LENS_AUTH={settings.auth}) and there is no valid key yet: make one by `lensmodel keys create "
-        "--owner NAME` with the same settings, or listen on 127.0.0.1 without LENS_PUBLIC"
-    )
 
 
 def _digest(shown: str) -> str:

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from lensmodel.core.names import name_key, serial_key
 from lensmodel.photo import inspect
 from lensmodel.photo.values import PhotoMetadata
-from lensmodel.workflow.identity import Identity, name_key, serial_key
+from lensmodel.workflow.identity import Identity
 
 SAME_FOCAL: Final = 1.19
 """Focal lengths up to this ratio count as one: 2^(1/4), the reach of the lens model over focal lengths

@@ -15,7 +15,8 @@ from starlette.datastructures import Headers
 from starlette.requests import ClientDisconnect, Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.http.errors import SlowBodyError, respond
+from app.errors import SlowBodyError
+from app.http.errors import respond
 
 MAX_JSON_BYTES: Final = 64 * 1024
 """Far more than any question of the interface; parsed, it takes some ten times as much memory."""

@@ -18,7 +18,7 @@ from typing import Final, TypeAlias
 
 from app.blobs.evidence import with_evidence
 from app.blobs.storage import Storage
-from app.http.errors import ConflictError, UnknownLensError
+from app.errors import ConflictError, UnknownLensError
 from app.runtime import metrics
 from app.store import Store, StoredSample
 from app.store.samples import Family, LensState

@@ -19,8 +19,8 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import ClientDisconnect
 
 from app.blobs.storage import AsyncBlobWriter, Storage
+from app.errors import MalformedUploadError, TooLargeError
 from app.http.bodies import Pace
-from app.http.errors import MalformedUploadError, TooLargeError
 from app.schemas import UploadFields
 from lensmodel import photo
 

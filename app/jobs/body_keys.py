@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 
-from lensmodel.workflow.identity import name_key, serial_key
+from lensmodel.core.names import name_key, serial_key
 
 
 def body_key(maker: str | None, model: str | None, serial: str | None) -> str | None:

@@ -10,8 +10,8 @@ from fastapi import APIRouter, Query
 from fastapi.responses import HTMLResponse
 from pydantic import TypeAdapter, ValidationError
 
+from app.errors import InvalidParameterError, NotReadyError
 from app.http.dependencies import Call, CallDep
-from app.http.errors import InvalidParameterError, NotReadyError
 from app.pages import shown, words
 from app.pages.rendering import page
 from app.routes import lenses as lens_routes

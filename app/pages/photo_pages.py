@@ -8,9 +8,9 @@ from typing import Final
 from fastapi import APIRouter
 from fastapi.responses import HTMLResponse
 
+from app.errors import InvalidParameterError
 from app.http import views
 from app.http.dependencies import CallDep
-from app.http.errors import InvalidParameterError
 from app.jobs.task_files import AFTER, SHOWN
 from app.pages import pictures, shown, words
 from app.pages.audit_words import held_places, held_squares

@@ -6,8 +6,8 @@ from typing import Annotated, Final, Literal
 
 from fastapi import APIRouter, Path, Query, Response
 
+from app.errors import InvalidParameterError, NotReadyError
 from app.http.dependencies import Call, CallDep
-from app.http.errors import InvalidParameterError, NotReadyError
 from app.jobs.task_files import AFTER, BEFORE, GLANCE, LAYERS, PREVIEW, R_MAP, SHOWN
 from app.pages import pictures
 from app.routes import corrections as correction_routes

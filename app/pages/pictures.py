@@ -14,7 +14,7 @@ from PIL import Image
 
 from app.blobs.previews import upright
 from app.blobs.storage import Storage
-from app.http.errors import NotReadyError, UnknownPictureError
+from app.errors import NotReadyError, UnknownPictureError
 from app.schemas import PatchOut, Region
 
 Picture = NDArray[np.uint8]

@@ -10,9 +10,9 @@ from fastapi import APIRouter, Query
 from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.concurrency import run_in_threadpool
 
+from app.errors import UnknownCorrectionError, UnknownLensError, UnknownPhotoError
 from app.http import views
 from app.http.dependencies import Call, CallDep
-from app.http.errors import UnknownCorrectionError, UnknownLensError, UnknownPhotoError
 from app.http.open_pages import Fragments
 from app.pages import shown
 from app.pages.rendering import fragment

@@ -10,9 +10,7 @@ from urllib.parse import quote
 from fastapi import APIRouter, Response, status
 from starlette.responses import StreamingResponse
 
-from app.http import views
-from app.http.dependencies import Call, CallDep
-from app.http.errors import (
+from app.errors import (
     ConflictError,
     InvalidParameterError,
     NotReadyError,
@@ -20,6 +18,8 @@ from app.http.errors import (
     UnknownCorrectionError,
     UnknownLensError,
 )
+from app.http import views
+from app.http.dependencies import Call, CallDep
 from app.http.idempotency import OnceDep
 from app.http.middleware import ONLY_HEAD
 from app.http.model_cache import check_version

@@ -11,9 +11,9 @@ from fastapi import APIRouter, Query, Response, status
 from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.concurrency import run_in_threadpool
 
+from app.errors import ConflictError, UnknownJobError
 from app.http import views
 from app.http.dependencies import Call, CallDep
-from app.http.errors import ConflictError, UnknownJobError
 from app.http.idempotency import OnceDep
 from app.routes.common import Cursor, Limit, next_link, problems
 from app.routes.photos import SEND_AGAIN, candidates

@@ -5,8 +5,8 @@ from __future__ import annotations
 from fastapi import APIRouter
 from pydantic import Field
 
+from app.errors import ConflictError, InvalidParameterError
 from app.http.dependencies import CallDep
-from app.http.errors import ConflictError, InvalidParameterError
 from app.routes.common import problems
 from app.routes.lenses import find_lens, read_lens
 from app.schemas import LensOut

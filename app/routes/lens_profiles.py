@@ -9,9 +9,9 @@ from typing import Final
 from fastapi import APIRouter, Response
 from starlette.concurrency import run_in_threadpool
 
+from app.errors import BusyError, MalformedUploadError, TooLargeError, UnknownLensError
 from app.http.bodies import CLOSE, Pace
 from app.http.dependencies import Call, CallDep
-from app.http.errors import BusyError, MalformedUploadError, TooLargeError, UnknownLensError
 from app.routes.common import problems
 from app.routes.lenses import find_lens, read_lens
 from app.schemas import LensOut

@@ -10,8 +10,8 @@ from urllib.parse import quote
 
 from fastapi import APIRouter, Query, Response, status
 
+from app.errors import NotReadyError
 from app.http.dependencies import Call, CallDep
-from app.http.errors import NotReadyError
 from app.routes.common import problems
 from app.routes.lenses import find_lens
 from app.schemas.fields import Aperture, OptionalId

@@ -7,9 +7,9 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, status
 
+from app.errors import UnknownLensError
 from app.http import views
 from app.http.dependencies import Call, CallDep
-from app.http.errors import UnknownLensError
 from app.routes.common import Cursor, Limit, OnlyName, cut, next_link, problems
 from app.schemas import MAX_VERSION, CalibrationPage, LateralOut, LensOut, LensPage
 from app.store.tables import LensRow

@@ -6,8 +6,8 @@ from typing import Any
 
 from fastapi import APIRouter
 
+from app.errors import InvalidParameterError, UnknownLensError
 from app.http.dependencies import CallDep
-from app.http.errors import InvalidParameterError, UnknownLensError
 from app.routes.common import problems
 from app.routes.photos import describe, find_photo
 from app.schemas import PhotoPage, PhotosChange

@@ -10,10 +10,7 @@ from starlette.concurrency import run_in_threadpool
 from structlog.contextvars import bind_contextvars
 
 from app.blobs import location
-from app.http import upload, views
-from app.http.bodies import CLOSE
-from app.http.dependencies import Call, CallDep
-from app.http.errors import (
+from app.errors import (
     BusyError,
     ConflictError,
     InvalidParameterError,
@@ -23,6 +20,9 @@ from app.http.errors import (
     UnknownLensError,
     UnknownPhotoError,
 )
+from app.http import upload, views
+from app.http.bodies import CLOSE
+from app.http.dependencies import Call, CallDep
 from app.http.idempotency import Once, OnceDep
 from app.routes.common import Cursor, Limit, OnlyId, cut, next_link, problems
 from app.runtime.settings import MIB, Settings

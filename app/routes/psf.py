@@ -9,9 +9,9 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from fastapi import APIRouter, Depends, Response, status
 
+from app.errors import InvalidParameterError, NotAcceptableError, UnknownLensError
 from app.http import psf_formats
 from app.http.dependencies import Call, CallDep
-from app.http.errors import InvalidParameterError, NotAcceptableError, UnknownLensError
 from app.http.model_cache import Fitted
 from app.http.questions import Asked
 from app.routes.common import Answers, problems

@@ -24,7 +24,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from app.access.authentication import require_somebody
 from app.commands.console.failure import UsageError
 from app.runtime import server
 from app.runtime.parent_watch import VARIABLE as LIFELINE
@@ -101,11 +100,16 @@ def _prepare(settings: Settings) -> None:
     _migrate(settings)
     database = Database(settings.database)
     try:
-        refusal = require_somebody(settings, KeyStore(database))
+        somebody = not settings.needs_keys or KeyStore(database).any_valid()
     finally:
         database.close()
-    if refusal is not None:
-        raise UsageError(refusal)
+    if somebody:
+        return
+    raise UsageError(
+        f"the service asks for keys (LENS_HOST={settings.host}, LENS_PUBLIC={str(settings.public).lower()}, "
+        f"LENS_AUTH={settings.auth}) and there is no valid key yet: make one by `lensmodel keys create "
+        "--owner NAME` with the same settings, or listen on 127.0.0.1 without LENS_PUBLIC"
+    )
 
 
 def _migrate(settings: Settings) -> None:

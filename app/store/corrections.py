@@ -10,7 +10,7 @@ from typing import Any
 
 from sqlalchemy import Select, select, update
 
-from app.http.errors import ConflictError, UnknownPhotoError
+from app.errors import ConflictError, UnknownPhotoError
 from app.store.access.owners import find, find_to_change, is_id, now, owned
 from app.store.database import Database, insert_new
 from app.store.ids import new_id

@@ -14,7 +14,7 @@ from app.store.database import Database, insert_new
 from app.store.ids import new_id
 from app.store.tables import CorrectionRow, EventRow, GarbageRow, LensRow, PhotoRow
 from app.store.versions import drop_samples, new_version, take_samples
-from lensmodel.workflow.identity import name_key, serial_key
+from lensmodel.core.names import name_key, serial_key
 
 TRIES: Final = 10
 """How often to look again for a lens that was deleted when we looked."""

@@ -10,7 +10,7 @@ from typing import Any, Final
 from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session
 
-from app.http.errors import BusyError
+from app.errors import BusyError
 from app.store import lenses
 from app.store.access.idempotency import forget_answers
 from app.store.access.owners import ensure_owner, find, find_to_change, now

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
-from scipy import fft, ndimage
+import scipy  # its parts are loaded when they are needed: processes that compute nothing do not wait
 
 from lensmodel.core.errors import InvalidInputError, InvalidKernelError
 from lensmodel.core.spectrum import PatchSpectrum
@@ -106,7 +106,7 @@ def centred(kernel: npt.ArrayLike) -> Kernel:
         whole = (-round(row), -round(col))
         order = 1 if whole != (0, 0) else 3
         step = whole if whole != (0, 0) else (-row, -col)
-        current = ndimage.shift(current, step, order=order, mode="constant")
+        current = scipy.ndimage.shift(current, step, order=order, mode="constant")
         current = np.maximum(current, 0.0)
         current /= current.sum()
     return as_kernel(current)
@@ -138,7 +138,7 @@ def otf(kernel: npt.NDArray[np.float64], shape: tuple[int, int]) -> npt.NDArray[
         raise InvalidInputError(f"a kernel of side {size} does not fit a grid of {shape}")
     grid = np.zeros(shape)
     grid[:size, :size] = kernel
-    return fft.rfft2(np.roll(grid, (-(size // 2), -(size // 2)), axis=(0, 1)))
+    return scipy.fft.rfft2(np.roll(grid, (-(size // 2), -(size // 2)), axis=(0, 1)))
 
 
 def mtf(kernel: npt.NDArray[np.float64], size: int = 128) -> npt.NDArray[np.float64]:
@@ -177,14 +177,14 @@ def distance(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> KernelDi
         ncc = c / (|a| |b|)        rel_l2² = (|a|² + |b|² - 2 c) / |b|²
     """
     a, b = a / a.sum(), b / b.sum()
-    n = int(fft.next_fast_len(2 * max(a.shape[0], b.shape[0]), real=True))
+    n = int(scipy.fft.next_fast_len(2 * max(a.shape[0], b.shape[0]), real=True))
     fa, fb = _centred_fft(a, n), _centred_fft(b, n)
     cross = fa * np.conj(fb)
-    surface = fft.ifft2(cross).real
+    surface = scipy.fft.ifft2(cross).real
     peak = np.unravel_index(int(surface.argmax()), surface.shape)
     # The peak of corr(a, b) at lag p says that a sits p pixels beyond b.
     d = -np.array([(p + n // 2) % n - n // 2 for p in peak], dtype=np.float64)
-    freq = 2 * np.pi * fft.fftfreq(n)
+    freq = 2 * np.pi * scipy.fft.fftfreq(n)
     w = np.stack(np.broadcast_arrays(freq[:, None], freq[None, :]))
     for _ in range(8):
         phased = cross * np.exp(-1j * (w[0] * d[0] + w[1] * d[1]))
@@ -212,7 +212,7 @@ def _centred_fft(kernel: npt.NDArray[np.float64], n: int) -> npt.NDArray[np.comp
     half = kernel.shape[0] // 2
     grid = np.zeros((n, n))
     grid[: kernel.shape[0], : kernel.shape[1]] = kernel
-    return fft.fft2(np.roll(grid, (-half, -half), axis=(0, 1)))
+    return scipy.fft.fft2(np.roll(grid, (-half, -half), axis=(0, 1)))
 
 
 class PatchStatistics(Protocol):

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import scipy  # its parts are loaded when they are needed: processes that compute nothing do not wait
 from numpy.typing import NDArray
-from scipy import fft
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import NoiseModel, Plane
@@ -112,10 +112,10 @@ def binned_spectrum(patch: Plane, noise: NoiseModel) -> tuple[NDArray[np.float32
     for row in range(0, patch.shape[0] - side + 1, side // 2):
         for col in range(0, patch.shape[1] - side + 1, side // 2):
             tile = patch[row : row + side, col : col + side].astype(np.float64)
-            total += np.abs(fft.rfft2((tile - tile.mean()) * window)) ** 2
+            total += np.abs(scipy.fft.rfft2((tile - tile.mean()) * window)) ** 2
             count += 1
     power = total / (count * energy)
-    f_row, f_col = np.meshgrid(fft.fftfreq(side), fft.rfftfreq(side), indexing="ij")
+    f_row, f_col = np.meshgrid(scipy.fft.fftfreq(side), scipy.fft.rfftfreq(side), indexing="ij")
     frequency, angle = np.hypot(f_row, f_col), np.mod(np.arctan2(f_row, f_col), np.pi)
     edges = np.geomspace(*RING_LIMITS, RINGS + 1)
     ring = np.searchsorted(edges, frequency, side="right") - 1
@@ -149,16 +149,17 @@ def tail_of(patch: Plane, width_px: float) -> tuple[float, float]:
         raise InvalidInputError(f"a patch must measure at least 40 x 40 pixels, got {height} x {width}")
     values = patch.astype(np.float64)
     window = np.sqrt(np.hanning(height)[:, None] * np.hanning(width)[None, :])
-    down, right = np.meshgrid(fft.fftfreq(height), fft.rfftfreq(width), indexing="ij")
+    down, right = np.meshgrid(scipy.fft.fftfreq(height), scipy.fft.rfftfreq(width), indexing="ij")
     across, up = 2.0 * np.pi * right, -2.0 * np.pi * down
     square = across**2 + up**2
-    spectrum = fft.rfft2((values - values.mean()) * window) * np.exp(-0.5 * _TAIL_SOFT_PX**2 * square)
+    spectrum = scipy.fft.rfft2((values - values.mean()) * window) * np.exp(-0.5 * _TAIL_SOFT_PX**2 * square)
     skew = float(np.clip(width_px, *_TAIL_SIGMA)) ** 3 / 6.0
     found = []
     for along in (across, up):
         phase = np.clip(skew * along * square, -_TAIL_PHASE, _TAIL_PHASE)
         towards, away = (
-            _sparsity(fft.irfft2(spectrum * np.exp(sign * 1j * phase), s=patch.shape)) for sign in (-1, 1)
+            _sparsity(scipy.fft.irfft2(spectrum * np.exp(sign * 1j * phase), s=patch.shape))
+            for sign in (-1, 1)
         )
         found.append((away - towards) / max(away + towards, 1e-12))
     return found[0], found[1]
@@ -177,8 +178,8 @@ def repeats(patch: Plane) -> bool:
 
     Its autocorrelation then falls far below zero and comes back nearly to one.
     """
-    power = np.abs(fft.rfft2((patch - patch.mean()).astype(np.float64))) ** 2
-    correlation = fft.irfft2(power, s=patch.shape)
+    power = np.abs(scipy.fft.rfft2((patch - patch.mean()).astype(np.float64))) ** 2
+    correlation = scipy.fft.irfft2(power, s=patch.shape)
     if not correlation[0, 0] > 0:
         return False
     correlation /= correlation[0, 0]

@@ -2,7 +2,6 @@
 
 from lensmodel.model.answer import ModelSettings, PsfAnswer
 from lensmodel.model.answering import ModelField
-from lensmodel.model.field.exact import PaperModel, all_pairs, factorised
 from lensmodel.model.field.robust import Flag
 from lensmodel.model.field.smoothers import Neighbours, Smoother, smoothers
 from lensmodel.model.lens_model import LensModel
@@ -20,15 +19,12 @@ __all__ = [
     "ModelField",
     "ModelSettings",
     "Neighbours",
-    "PaperModel",
     "Prior",
     "PsfAnswer",
     "Smoother",
     "Wavefront",
     "Witness",
     "WitnessedField",
-    "all_pairs",
-    "factorised",
     "fit_wavefront",
     "load_profile",
     "save_profile",

@@ -6,9 +6,9 @@ import math
 from typing import Final
 
 import numpy as np
+import skimage
 from numpy.typing import NDArray
 from scipy import fft
-from skimage.metrics import structural_similarity
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import CENTER_ZONE_R, CORNER_ZONE_R, Frame
@@ -69,7 +69,7 @@ def ssim(image: NDArray[np.floating], reference: NDArray[np.floating], *, srgb: 
     b = to_srgb(reference) if srgb else np.asarray(reference, dtype=np.float64)
     planes = zip(a.reshape(-1, *a.shape[-2:]), b.reshape(-1, *b.shape[-2:]), strict=True)
     values = [
-        structural_similarity(  # type: ignore[no-untyped-call]  # scikit-image ships no types
+        skimage.metrics.structural_similarity(  # type: ignore[no-untyped-call]  # scikit-image ships no types
             x, y, data_range=1.0, gaussian_weights=True, use_sample_covariance=False
         )
         for x, y in planes

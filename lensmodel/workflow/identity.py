@@ -2,25 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
+from lensmodel.core.names import name_key, serial_key
 from lensmodel.model.profile import Camera
 from lensmodel.photo.values import PhotoMetadata
-
-
-def name_key(text: str | None) -> str:
-    """Return what is compared of a maker or a model.
-
-    Case, punctuation and blanks differ between programs that write the same name.
-    """
-    return re.sub(r"[\W_]+", "", (text or "").casefold())
-
-
-def serial_key(text: str | None) -> str:
-    """Return what is compared of a serial: with its punctuation, which may be all that tells copies apart."""
-    return (text or "").strip().casefold()
 
 
 @dataclass(frozen=True, slots=True)

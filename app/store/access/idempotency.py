@@ -9,7 +9,7 @@ from typing import Any, Final
 from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session
 
-from app.http.errors import ConflictError, InvalidParameterError
+from app.errors import ConflictError, InvalidParameterError
 from app.store.access.access_tables import IdempotencyRow
 from app.store.access.owners import LOCAL, ensure_owner, now, owner_id
 from app.store.database import Database, insert_new

@@ -8,7 +8,7 @@ from typing import Final, TypeVar
 from sqlalchemy import Select, select
 from sqlalchemy.orm import Session
 
-from app.http.errors import NotSignedInError
+from app.errors import NotSignedInError
 from app.store.database import insert_new
 from app.store.tables import CorrectionRow, LensRow, OwnerRow, PhotoRow
 

@@ -7,8 +7,8 @@ from functools import lru_cache
 from types import ModuleType
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import sparse
 
 from lensmodel.core.types import Planes
 from lensmodel.correction.tiles.canvas import Canvas
@@ -98,10 +98,10 @@ def spread(blocks: NDArray[np.float32], canvas: Canvas) -> NDArray[np.float32]:
 
 
 @lru_cache(maxsize=64)
-def _interpolation(extent: int, margin: int, length: int) -> sparse.csr_array:
+def _interpolation(extent: int, margin: int, length: int) -> scipy.sparse.csr_array:
     """Matrix that takes blocks of `extent` pixels to a canvas of `length`."""
     starts = np.arange(0, extent, BLOCK)
     middles = (starts + np.minimum(starts + BLOCK, extent) - 1) / 2.0
     t = np.arange(extent)
     fine = np.stack([np.interp(t, middles, row) for row in np.eye(starts.size)], axis=1)
-    return sparse.csr_array(Canvas.wrap(fine.astype(np.float32), margin, length))
+    return scipy.sparse.csr_array(Canvas.wrap(fine.astype(np.float32), margin, length))

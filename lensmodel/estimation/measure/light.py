@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import signal
 
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.types import Kernel
@@ -76,7 +76,7 @@ def fitted_light(
     if int(measured.sum()) < _FEWEST:
         raise NotEnoughEvidenceError("nearly all pixels of a window are clipped; expose less")
     outer, inner = _terms(side, kernel.shape[0] // 2), _terms(side, 0)
-    lit = [signal.fftconvolve(page * outer[..., j], kernel, mode="valid")[measured] for j in range(6)]
+    lit = [scipy.signal.fftconvolve(page * outer[..., j], kernel, mode="valid")[measured] for j in range(6)]
     basis = np.stack([*lit, *(inner[..., j][measured] for j in range(6))], axis=-1)
     terms, *_ = np.linalg.lstsq(basis, np.asarray(observed[measured], dtype=np.float64), rcond=None)
     light = inner @ terms[:6]

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import signal
 
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import centred
@@ -190,7 +190,7 @@ def _stacked(
         if kernel is None:
             light = np.full((size, size), max(stamp.flux, 0.0) / size**2)
         else:
-            light = np.maximum(signal.fftconvolve(stamp.latent(size), kernel, mode="valid"), 0.0)
+            light = np.maximum(scipy.signal.fftconvolve(stamp.latent(size), kernel, mode="valid"), 0.0)
         variance[rows] = shot * (stamp.sky + light) + read
     return solve(observed, latent, measured, variance, size, even=True)
 
@@ -202,7 +202,7 @@ def _refined(stamp: _Stamp, kernel: NDArray[np.float64]) -> _Stamp:
 
     def seen(row: float, col: float) -> NDArray[np.float64]:
         moved = replace(stamp, place=(stamp.place[0] + row, stamp.place[1] + col))
-        return np.asarray(signal.fftconvolve(moved.latent(size), kernel, mode="valid"))
+        return np.asarray(scipy.signal.fftconvolve(moved.latent(size), kernel, mode="valid"))
 
     here = seen(0.0, 0.0)
     by_row = (seen(step, 0.0) - seen(-step, 0.0)) / (2 * step)

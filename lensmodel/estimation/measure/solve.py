@@ -31,9 +31,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import scipy
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy import linalg
 
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.evidence import nonnegative_least_squares
@@ -176,7 +176,7 @@ def bounded(
     largest = float(eigenvalues[-1])
     lift = max(1e-6 * largest - float(eigenvalues[0]), 0.0)  # single precision may leave it indefinite
     a = a + lift * np.eye(len(b))
-    light = float(linalg.solve(a, b, assume_a="pos").sum())
+    light = float(scipy.linalg.solve(a, b, assume_a="pos").sum())
     if not light > 0.0:
         raise NotEnoughEvidenceError("no kernel explains this window; the latent picture does not match it")
     return of_sum(a, b, start, light, largest + lift)
@@ -277,8 +277,8 @@ def prior_width(size: int) -> NDArray[np.float64]:
 def error_of(precision: NDArray[np.float64], k: NDArray[np.float64]) -> float:
     """Return the root of the posterior variance of all values over the norm of the kernel."""
     try:
-        inverse = linalg.inv(precision, check_finite=False)
-    except linalg.LinAlgError:
+        inverse = scipy.linalg.inv(precision, check_finite=False)
+    except scipy.linalg.LinAlgError:
         return _WORST
     variance = float(np.maximum(np.diag(inverse), 0.0).sum())
     return min(math.sqrt(variance / float(k @ k)), _WORST)

@@ -16,8 +16,9 @@ from functools import cache, partial
 from typing import ClassVar, Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft, signal
+from scipy import fft
 
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.types import CHANNELS, Channel, StepHook, ignore_step
@@ -113,7 +114,7 @@ class PlacedPage:
 @cache
 def _taper(length: int) -> NDArray[np.float32]:
     """1 in the middle, falling to 0 within the spare samples at both ends: the rim makes no frequencies."""
-    return np.asarray(signal.windows.tukey(length, 2.0 * _SPARE * _FINE / length), dtype=np.float32)
+    return np.asarray(scipy.signal.windows.tukey(length, 2.0 * _SPARE * _FINE / length), dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -385,7 +386,9 @@ def _tones_of(
     start = corner[0] - half - window.shift[0], corner[1] - half - window.shift[1]
     shape = side + 2 * half, side + 2 * half
     columns = [
-        signal.fftconvolve(replace(placed, tones=tones).window(*start, shape) * light, kernel, mode="valid")
+        scipy.signal.fftconvolve(
+            replace(placed, tones=tones).window(*start, shape) * light, kernel, mode="valid"
+        )
         for tones in _POWERS
     ]
     t = np.linspace(-1.0, 1.0, side)

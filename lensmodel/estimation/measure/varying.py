@@ -21,9 +21,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import scipy
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy import linalg
 
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import as_kernel, centroid
@@ -134,7 +134,7 @@ def _without_change(
     n = len(prior)
     inner = a[n:, n:] + np.diag(np.tile(prior / CHANGE**2, 2))
     right = np.concatenate([a[n:, :n], b[n:, None]], axis=1)
-    solved = linalg.solve(inner, right, assume_a="sym", check_finite=False)
+    solved = scipy.linalg.solve(inner, right, assume_a="sym", check_finite=False)
     return _Equations(
         a[:n, :n] - a[:n, n:] @ solved[:, :n],
         b[:n] - a[:n, n:] @ solved[:, n],
@@ -148,7 +148,9 @@ def _on_its_grid(
     """Kernel and phase (row, col) in pixels at which k >= 0 explains the window best."""
     light = float(start.sum())
     # moving a kernel by sinc lengthens none; the prior is the same for all
-    largest = 1.02 * float(linalg.eigvalsh(eq.a + np.diag(prior), subset_by_index=(len(prior) - 1,) * 2)[0])
+    largest = 1.02 * float(
+        scipy.linalg.eigvalsh(eq.a + np.diag(prior), subset_by_index=(len(prior) - 1,) * 2)[0]
+    )
     known: dict[tuple[float, float], tuple[float, NDArray[np.float64]]] = {}
 
     def cost(phase: tuple[float, float], near: NDArray[np.float64]) -> float:

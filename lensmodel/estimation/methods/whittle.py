@@ -12,8 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft, optimize
+from scipy import fft
 
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import centred, gaussian, resized
@@ -83,13 +84,13 @@ class Whittle:
         began = time.process_time()
         band = _Band.of(_TILE)
         spectra = [_periodogram(patch, model, band) for patch, model in usable(patches, noise, size)]
-        best: optimize.OptimizeResult | None = None
+        best: scipy.optimize.OptimizeResult | None = None
         for done, width in enumerate(_STARTS_PX, start=1):
             start = [width, 0.0, width]
             for s in spectra:
                 start += [float(np.log(np.median(s.power) + 1e-12)), _SLOPE, 0.0, 0.0]
             options = {"maxiter": 80}
-            found = optimize.minimize(
+            found = scipy.optimize.minimize(
                 _cost, start, args=(spectra, band), jac=True, method="L-BFGS-B", options=options
             )
             if best is None or found.fun < best.fun:

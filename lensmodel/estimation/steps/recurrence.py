@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import scipy
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy import fft, ndimage
-from scipy.spatial import cKDTree
 
 from lensmodel.core.psf import otf
 
@@ -129,7 +129,7 @@ def _matches(
     examples = examples[:: -(-len(examples) // search.examples)]
     _, basis = np.linalg.eigh(examples.T @ examples)
     basis = basis[:, -_COMPONENTS:]
-    tree = cKDTree(examples @ basis, leafsize=32, balanced_tree=False, compact_nodes=False)
+    tree = scipy.spatial.cKDTree(examples @ basis, leafsize=32, balanced_tree=False, compact_nodes=False)
     index = tree.query(wanted @ basis, k=_NEIGHBOURS, eps=search.tolerance)[1]
     near = examples[index]
     gap = ((near - wanted[:, None, :]) ** 2).sum(axis=2)

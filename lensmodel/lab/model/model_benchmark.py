@@ -37,8 +37,9 @@ from lensmodel.core.psf import PsfSample, as_kernel, centred, distance, gaussian
 from lensmodel.core.types import ZONES, FieldPosition, Kernel, LensSettings, StepHook, Zone, ignore_step
 from lensmodel.lab.cases import list_photos, photo_half
 from lensmodel.lab.model.estimated import estimated_samples
+from lensmodel.lab.model.exact import PaperModel
 from lensmodel.lab.model.stars import stars_of
-from lensmodel.model import LensModel, ModelSettings, PaperModel, fit_wavefront, smoothers
+from lensmodel.model import LensModel, ModelSettings, fit_wavefront, smoothers
 from lensmodel.model.answer import MIXED, MODES
 from lensmodel.simulate import draw_lens
 

@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy  # `spatial` is loaded where it is needed: it takes a second
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from lensmodel.model import variables as va
 
@@ -26,7 +26,9 @@ class _Block:
 
     start: int
     stop: int
-    trees: dict[tuple[int, ...], tuple[cKDTree, NDArray[np.float64]]] = field(default_factory=dict)
+    trees: dict[tuple[int, ...], tuple[scipy.spatial.cKDTree, NDArray[np.float64]]] = field(
+        default_factory=dict
+    )
 
     def near(
         self,
@@ -42,7 +44,10 @@ class _Block:
         stored = self.trees.get(columns)
         stretch = np.inf if stored is None else float((scale / stored[1])[list(columns)].max())
         if stored is None or not _TIGHT <= stretch <= _LOOSE:
-            stored = self.trees[columns] = (cKDTree(rows[:, columns] / scale[list(columns)]), scale)
+            stored = self.trees[columns] = (
+                scipy.spatial.cKDTree(rows[:, columns] / scale[list(columns)]),
+                scale,
+            )
             stretch = 1.0
         tree, built = stored
         # bandwidths shrink as samples come: an older tree is asked for a ball that surely holds ours

@@ -21,9 +21,9 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
+import scipy  # `interpolate` is loaded where it is needed: it takes a second
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.interpolate import make_interp_spline
 
 from lensmodel.core.loops import compiled
 
@@ -50,7 +50,9 @@ def _refining(side: int, degree: int, finer: int) -> NDArray[np.float64]:
     reach = half * finer
     pixels = np.zeros((side + 2 * _MARGIN, side))
     pixels[_MARGIN : _MARGIN + side] = np.eye(side)
-    through = make_interp_spline(np.arange(-half - _MARGIN, half + _MARGIN + 1), pixels, k=degree)
+    through = scipy.interpolate.make_interp_spline(
+        np.arange(-half - _MARGIN, half + _MARGIN + 1), pixels, k=degree
+    )
     found = _inverse(2 * reach + 1) @ through(np.arange(-reach, reach + 1) / finer)
     found.setflags(write=False)
     return np.asarray(found)

@@ -17,17 +17,8 @@ import pytest
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample, distance, gaussian
 from lensmodel.core.types import FieldPosition, Kernel, LensSettings
-from lensmodel.model import (
-    LensModel,
-    LensProfile,
-    ModelSettings,
-    PaperModel,
-    Prior,
-    all_pairs,
-    factorised,
-    load_profile,
-    save_profile,
-)
+from lensmodel.lab.model.exact import PaperModel, all_pairs, factorised
+from lensmodel.model import LensModel, LensProfile, ModelSettings, Prior, load_profile, save_profile
 
 SIZE = 21
 GREEN = LensSettings(aperture=2.0)

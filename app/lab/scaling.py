@@ -1,9 +1,9 @@
 """What 10,000 lenses and 1,000,000 photos need: tables of that size timed, and their queue simulated.
 
-    python -m app.lab.scaling rows [--rows 1000000] [--url ADDRESS]
+    python -m app.lab.scaling rows [--rows 1000000] [--photos 4] [--url ADDRESS]
     python -m app.lab.scaling queue --seconds 59 [--photos 1000000] [--days 365] [--slots 4 8]
 
-`rows` fills an empty database (a SQLite file, or ADDRESS) with samples of made-up kernels, a hundred photos a
+`rows` fills an empty database (a SQLite file, or ADDRESS) with samples of made-up kernels, so many photos a
 lens, then times what the service asks: the version of a lens, its samples, a page of lenses, the numbers of
 `/metrics`, the checks of `lensmodel doctor`, a photo that leaves and joins, and the steps of the schema.
 
@@ -35,12 +35,13 @@ from sqlalchemy import func, insert, select
 
 from app.runtime.settings import Settings
 from app.store import Store
+from app.store.kinds import kind_key
 from app.store.tables import EventRow, LensRow, OwnerRow, PatchRow, PhotoRow, SampleRow
 from app.store.upkeep import migrate
 from app.store.upkeep.invariants import INVARIANTS
 from lensmodel.core.psf import gaussian
 
-PATCHES, CHANNELS, PHOTOS_OF_A_LENS = 8, "rgb", 100
+PATCHES, CHANNELS = 8, "rgb"
 SIDE = 31
 PEAK = 2.5
 """The busiest hour of a day over its mean hour (chosen: people send photos in the evening)."""
@@ -50,18 +51,18 @@ FIRST_SHARE = 0.2
 """Cells of a photo with 24 patches, and the share of its cost before them (chosen: it hardly matters)."""
 
 
-def fill(store: Store, rows: int) -> int:
+def fill(store: Store, rows: int, photos_of_a_lens: int) -> int:
     """Put counted photos with their samples into empty tables; return the number of lenses."""
     now = datetime.now(UTC)
     each = PATCHES * len(CHANNELS)
     photos = max(rows // each, 1)
-    lenses = max(photos // PHOTOS_OF_A_LENS, 1)
+    lenses = max(photos // photos_of_a_lens, 1)
     kernel = gaussian(SIDE, np.eye(2)).astype("<f4").tobytes()
     crc = zlib.crc32(kernel)
     with store.database.writing() as session:
         session.execute(insert(OwnerRow), [{"id": 1, "name": "local", "created_at": now}])
     for lens in range(1, lenses + 1):
-        mine = range((lens - 1) * PHOTOS_OF_A_LENS + 1, min(lens * PHOTOS_OF_A_LENS, photos) + 1)
+        mine = range((lens - 1) * photos_of_a_lens + 1, min(lens * photos_of_a_lens, photos) + 1)
         with store.database.writing() as session:
             session.execute(insert(LensRow), [_lens(lens, len(mine), each, now)])
             session.execute(insert(PhotoRow), [_photo(key, lens, now) for key in mine])
@@ -92,6 +93,7 @@ def _lens(key: int, photos: int, each: int, now: datetime) -> dict[str, Any]:
         "serial": str(key),
         "serial_source": "exif",
         "identity_key": f"k{key}",
+        "kind_key": kind_key("M", f"Model {key % 50}"),
         "version": photos,
         "rebuild_epoch": 0,
         "photo_count": photos,
@@ -207,14 +209,14 @@ def rows(wishes: argparse.Namespace) -> dict[str, Any]:
         with closing(Store(settings)) as store:
             migrate.upgrade(store.database)
             began = time.perf_counter()
-            lenses = fill(store, wishes.rows)
+            lenses = fill(store, wishes.rows, wishes.photos)
             filled = time.perf_counter() - began
             middle = f"L{max(lenses // 2, 1):08d}"
             with store.database.reading() as session:
                 photo = session.scalars(select(PhotoRow).order_by(PhotoRow.id.desc()).limit(1)).one()
             asked: dict[str, tuple[Callable[[], object], int]] = {
                 "version of a lens": (lambda: store.samples.known_of(middle, "local"), 200),
-                "samples of a lens of 100 photos": (lambda: store.samples.of_lens(middle), 5),
+                f"samples of a lens of {wishes.photos} photos": (lambda: store.samples.of_lens(middle), 5),
                 "page of 50 lenses": (lambda: store.lenses.page("local", before=None, limit=50), 20),
                 "numbers of /metrics": (store.operation.load, 5),
                 "what the worker's sweep looks for": (store.photos.to_do, 20),
@@ -328,6 +330,7 @@ def main() -> int:
     parts = parser.add_subparsers(required=True)
     tables = parts.add_parser("rows")
     tables.add_argument("--rows", type=int, default=1_000_000)
+    tables.add_argument("--photos", type=int, default=4, help="of each lens")
     tables.add_argument("--url", default="")
     tables.set_defaults(run=rows)
     waiting = parts.add_parser("queue")

@@ -51,7 +51,7 @@ class LensChanges:
                 return False
             for photo in photos:
                 move(session, photo, target)
-            target.maker, target.model = target.maker or lens.maker, target.model or lens.model
+            target.complete(lens.maker, lens.model)
             session.flush()
             forget(session, lens)
             return True

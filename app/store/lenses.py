@@ -12,9 +12,9 @@ from sqlalchemy.orm import Session
 from app.store.access.owners import find, now, owned
 from app.store.database import Database, insert_new
 from app.store.ids import new_id
+from app.store.kinds import identity_key, kind_key
 from app.store.tables import CorrectionRow, EventRow, GarbageRow, LensRow, PhotoRow
 from app.store.versions import drop_samples, new_version, take_samples
-from lensmodel.core.names import name_key, serial_key
 
 TRIES: Final = 10
 """How often to look again for a lens that was deleted when we looked."""
@@ -29,16 +29,6 @@ class LensName:
     serial: str | None
     serial_source: str = "user"
     label: str | None = None
-
-
-def identity_key(maker: str | None, model: str | None, serial: str | None) -> str:
-    """Return the key by which two photos are known to show the same copy."""
-    return f"{kind_key(maker, model)}|{serial_key(serial)}"
-
-
-def kind_key(maker: str | None, model: str | None) -> str:
-    """Return the key by which two lenses are known to be of one kind, see `identity_key`."""
-    return f"{name_key(maker)}|{name_key(model)}"
 
 
 def lens_of_photo(session: Session, photo: PhotoRow, *, single_copy: bool) -> LensRow | None:
@@ -88,6 +78,7 @@ def _new_lens(
         "identity_key": key,
         "maker": maker,
         "model": model,
+        "kind_key": kind_key(maker, model),
         "serial": serial,
         "serial_source": source if serial else "none",
         "created_at": now(),

@@ -130,5 +130,4 @@ def move(
 
 def widen(lens: LensRow, photo: PhotoRow) -> None:
     """Take over what a photo knows of its lens and others did not."""
-    lens.maker = lens.maker or photo.lens_maker
-    lens.model = lens.model or photo.lens_model
+    lens.complete(photo.lens_maker, photo.lens_model)

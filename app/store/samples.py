@@ -15,7 +15,6 @@ from sqlalchemy.orm import aliased
 from app.schemas import distances
 from app.store.access.owners import is_id
 from app.store.database import Database
-from app.store.lenses import kind_key
 from app.store.patches import DTYPE
 from app.store.tables import LensRow, OwnerRow, PhotoRow, SampleRow
 from lensmodel.core.errors import LensModelError
@@ -28,26 +27,29 @@ _STATE = select(LensRow.version, LensRow.rebuild_epoch).where(
 )
 _ME, _OTHER = aliased(LensRow), aliased(LensRow)
 _RELATIVES = (
-    _ME.maker,
-    _ME.model,
     _OTHER.public_id,
     _OTHER.version,
     _OTHER.rebuild_epoch,
     _OTHER.sample_count,
-    _OTHER.maker.label("other_maker"),
-    _OTHER.model.label("other_model"),
 )
 _MAY_BE_RELATED = and_(
     _OTHER.owner_id == _ME.owner_id,
     _OTHER.id != _ME.id,
     _OTHER.deleted_at.is_(None),
     _OTHER.sample_count > 0,
-    _ME.model.is_not(None),
+    _OTHER.kind_key == _ME.kind_key,
 )
 _THIS = and_(_ME.public_id == bindparam("lens"), _ME.deleted_at.is_(None))
-_OTHERS = select(*_RELATIVES).join(_OTHER, _MAY_BE_RELATED).where(_THIS).order_by(_OTHER.public_id.desc())
+_OTHERS = (
+    select(*_RELATIVES)
+    .select_from(_ME)
+    .join(_OTHER, _MAY_BE_RELATED)
+    .where(_THIS)
+    .order_by(_OTHER.public_id.desc())
+)
 _KNOWN = (
     select(_ME.version.label("my_version"), _ME.rebuild_epoch.label("my_epoch"), *_RELATIVES)
+    .select_from(_ME)
     .join(OwnerRow, OwnerRow.id == _ME.owner_id)
     .outerjoin(_OTHER, _MAY_BE_RELATED)
     .where(_THIS, OwnerRow.name == bindparam("owner"))
@@ -179,12 +181,11 @@ class SampleStore:
 
 
 def _family(rows: Iterable[Row[*tuple[Any, ...]]]) -> Family:
-    """Those of the same maker and model, until they have enough samples."""
+    """Those that it takes to have enough samples."""
     found: list[Relative] = []
     samples = 0
     for row in rows:
-        same = kind_key(row.maker, row.model) == kind_key(row.other_maker, row.other_model)
-        if same and samples < MOST_OF_FAMILY:
+        if samples < MOST_OF_FAMILY:
             found.append(Relative(row.public_id, LensState(row.version, row.rebuild_epoch)))
             samples += row.sample_count
     return tuple(found)

@@ -30,6 +30,7 @@ from sqlalchemy import (
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 from app.schemas import CorrectionState, PhotoState
+from app.store.kinds import kind_key
 
 PHOTO_STATES: Final[tuple[str, ...]] = get_args(PhotoState)
 PHOTO_RUNNING: Final = ("inspecting", "developing", "selecting", "estimating")
@@ -111,6 +112,7 @@ class LensRow(Base):
             sqlite_where=text("deleted_at IS NULL"),
             postgresql_where=text("deleted_at IS NULL"),
         ),
+        Index("ix_lens_kind", "owner_id", "kind_key"),
     )
 
     id: Mapped[int] = mapped_column(primary_key=True)
@@ -118,6 +120,7 @@ class LensRow(Base):
     owner_id: Mapped[int] = mapped_column(ForeignKey("owner.id"))
     maker: Mapped[str | None]
     model: Mapped[str | None]
+    kind_key: Mapped[str | None]
     serial: Mapped[str | None]
     serial_source: Mapped[str] = mapped_column(String(20))
     identity_key: Mapped[str]
@@ -128,6 +131,11 @@ class LensRow(Base):
     sample_count: Mapped[int] = mapped_column(default=0)
     created_at: Mapped[datetime]
     deleted_at: Mapped[datetime | None]
+
+    def complete(self, maker: str | None, model: str | None) -> None:
+        """Take over what is not known yet of the maker and the model."""
+        self.maker, self.model = self.maker or maker, self.model or model
+        self.kind_key = kind_key(self.maker, self.model)
 
 
 class PhotoRow(Base):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import Text, cast, func, select, text
+from sqlalchemy import Text, cast, event, func, select, text
 from sqlalchemy.exc import DBAPIError, IntegrityError
 
 from app.runtime.settings import Settings
@@ -422,6 +422,43 @@ def test_migrations_down_and_up_again_lose_no_row(store: Store, steps: Steps) ->
     assert 0 not in before
     with pytest.raises(IntegrityError), store.database.writing() as session:
         session.execute(text("UPDATE photo SET lens_id = 4711"))  # references are watched again
+
+
+def test_a_schema_step_tells_lenses_that_are_there_their_kind(store: Store, steps: Steps) -> None:
+    lens_id = steps.lens_id(steps.counted(serial="one"))
+    other = steps.lens_id(steps.counted(serial="two"))
+    with store.database.writing() as session:  # the same kind, as another program writes it
+        session.execute(text("UPDATE lens SET model = upper(model) || ' ' WHERE serial = 'two'"))
+    downgrade(store.database, "0008")
+    assert upgrade(store.database)
+
+    family = store.samples.family_of(lens_id)
+
+    assert [relative.lens_id for relative in family] == [other]
+
+
+def test_other_copies_are_found_by_an_index_and_not_among_all_lenses(store: Store, steps: Steps) -> None:
+    if not store.database.is_sqlite:
+        pytest.skip("reads SQLite's plans")
+    lens_id = steps.lens_id(steps.counted())
+    seen = []
+
+    def note(connection: object, cursor: object, statement: str, *rest: object) -> None:
+        del connection, cursor
+        seen.append((statement, rest[0]))
+
+    engine = store.database.reader
+    event.listen(engine, "before_cursor_execute", note)
+    store.samples.known_of(lens_id, "local")
+    event.remove(engine, "before_cursor_execute", note)
+
+    asked = [(statement, values) for statement, values in seen if "kind_key" in statement]
+    with engine.connect() as connection:
+        for statement, values in asked:
+            plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", values).all()
+            assert any("ix_lens_kind" in row[-1] for row in plan)
+            assert not any(row[-1].startswith("SCAN") for row in plan)
+    assert len(asked) == 1
 
 
 def test_an_unknown_setting_is_refused_with_the_likely_name(monkeypatch: pytest.MonkeyPatch) -> None:

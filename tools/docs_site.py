@@ -20,9 +20,16 @@ DEPTH = 4
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the generated pages."""
     pages = {"library": library(), "client": client(), "http": http()}
+    files.append(File.generated(config, "index.md", content=front()))
     for name, text in pages.items():
         files.append(File.generated(config, f"reference/{name}.md", content=text))
     return files
+
+
+def front() -> str:
+    """The README as the first page: what it links to in this folder lies beside it."""
+    text = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    return text.replace("](docs/", "](").replace('src="docs/', 'src="')
 
 
 def library() -> str:

@@ -28,12 +28,15 @@ def check(
     context: typer.Context,
     original: Annotated[Path, typer.Argument(metavar="ORIGINAL", help="The photo.")],
     corrected: Annotated[
-        Path, typer.Argument(metavar="CORRECTED", help="What a program made of it, of the same size.")
+        Path, typer.Argument(metavar="CORRECTED", help="The corrected version, of the same size.")
     ],
     profile: Annotated[
         Path | None,
         typer.Option(
-            "--profile", "-p", metavar="FILE", help="The lens profile: the result is blurred again by it."
+            "--profile",
+            "-p",
+            metavar="FILE",
+            help="The lens profile, with which the result is blurred again.",
         ),
     ] = None,
     picture: Annotated[
@@ -46,9 +49,9 @@ def check(
     quiet: Quiet = False,
     verbose: Verbose = 0,
 ) -> None:
-    """Tell where a corrected photo, of any program, shows what the photo cannot have contained.
+    """Find where a photo corrected by any program shows what the original cannot have contained.
 
-    Light below nothing, colours that are not there, single pixels, lines, rings and erased texture are
+    Light below zero, colours that are not there, stray pixels, lines, rings and erased texture are
     found by comparing the two files; with a profile, the result is also blurred again and compared with
     the photo. It is the audit that each correction of lensmodel goes through.
 

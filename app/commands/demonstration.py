@@ -30,7 +30,7 @@ def demo(
     quiet: Quiet = False,
     verbose: Verbose = 0,
 ) -> None:
-    """Show the whole way on a real RAW file and on a lens whose truth is known.
+    """Run the whole process on a real RAW file and on a simulated lens whose true blur is known.
 
     Starts a service of its own, uploads photos, calibrates their lens, corrects a photo, measures,
     and stops the service: about six minutes on two cores. What an earlier demo left in the folder

@@ -68,41 +68,41 @@ def _opened(data: Data) -> Iterator[KeyStore]:
 
 def _show(text: str) -> None:
     """Print a new key alone on the standard output, so that it can be passed on."""
-    typer.echo("Shown once, and kept nowhere: store it where passwords are stored.", err=True)
+    typer.echo("Shown once and stored nowhere: keep it where you keep passwords.", err=True)
     typer.echo(text)
 
 
 @keys.command()
 def create(
     owner: Annotated[
-        str, typer.Option(metavar="NAME", help="Whose photos the key opens; he is made if he is new.")
+        str, typer.Option(metavar="NAME", help="Whose photos the key opens; a new owner is created.")
     ] = "local",
     scope: Annotated[
         str,
         choice(
             "--scope",
             ("read", "write", "admin"),
-            "What it allows: read asks, write also changes, admin also erases the account.",
+            "What it allows: read only reads, write also changes, admin may also erase the account.",
         ),
     ] = "write",
     expires: Annotated[
-        str, typer.Option(metavar="SPAN", help="When it ends: 12h, 90d, 6w, 1y or never.")
+        str, typer.Option(metavar="SPAN", help="When it expires: 12h, 90d, 6w, 1y or never.")
     ] = "1y",
     label: Annotated[
         str | None, typer.Option(metavar="TEXT", help="What it is for, shown by keys list.")
     ] = None,
     quota_gb: Annotated[
         float | None,
-        typer.Option(min=0.0, metavar="GIB", help="Most photo bytes of this owner."),
+        typer.Option(min=0.0, metavar="GIB", help="Limit on this owner's stored photos, in GiB."),
     ] = None,
     quota_photos: Annotated[
-        int | None, typer.Option(min=0, metavar="N", help="Most photos of this owner.")
+        int | None, typer.Option(min=0, metavar="N", help="Limit on the number of this owner's photos.")
     ] = None,
     data: Data = None,
 ) -> None:
     """Make a key and print it, once.
 
-    Photos of a service that had no keys yet belong to the owner "local": his key opens them.
+    Photos of a service that had no keys yet belong to the owner "local", whose key opens them.
 
     Examples:
 
@@ -114,7 +114,9 @@ def create(
     """
     name = owner.strip()
     if not (0 < len(name) <= 100 and name.isprintable() and "|" not in name):
-        raise UsageError(f"an owner's name has 1 to 100 printable signs and no bar, got {owner!r}")
+        raise UsageError(
+            f"an owner's name has 1 to 100 printable characters and no vertical bar, got {owner!r}"
+        )
     lasts = _span_or_none(expires)
     with _opened(data) as store:
         made = store.create(
@@ -134,7 +136,7 @@ def listed(
     data: Data = None,
     json_output: Json = False,
 ) -> None:
-    """List the keys, without what they consist of.
+    """List the keys, without showing the keys themselves.
 
     Examples:
 
@@ -175,7 +177,7 @@ def _day(moment: datetime | None) -> str | None:
     return None if moment is None else moment.isoformat(timespec="seconds")
 
 
-Prefix = Annotated[str, typer.Argument(metavar="PREFIX", help="The signs after lpk_, or the whole key.")]
+Prefix = Annotated[str, typer.Argument(metavar="PREFIX", help="The characters after lpk_, or the whole key.")]
 
 
 def _prefix(text: str) -> str:
@@ -187,7 +189,7 @@ def _prefix(text: str) -> str:
 def rotate(
     prefix: Prefix,
     keep: Annotated[
-        str, typer.Option(metavar="SPAN", help="How long the old key goes on: 0h ends it at once.")
+        str, typer.Option(metavar="SPAN", help="How long the old key stays valid: 0h ends it at once.")
     ] = "24h",
     data: Data = None,
 ) -> None:
@@ -208,7 +210,7 @@ def rotate(
 
 @keys.command()
 def revoke(prefix: Prefix, data: Data = None) -> None:
-    """End a key, and all browsers that signed in with it, within a second.
+    """Revoke a key and sign out all browsers that signed in with it, within a second.
 
     Example:
 

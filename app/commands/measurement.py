@@ -54,7 +54,9 @@ def measure(
     photos: Photos,
     profile: Profile,
     aperture: Aperture = None,
-    size: Annotated[int, typer.Option(min=9, max=101, metavar="N", help="Odd side of a PSF in pixels.")] = 31,
+    size: Annotated[
+        int, typer.Option(min=9, max=101, metavar="N", help="Side of a PSF in pixels, an odd number.")
+    ] = 31,
     replace_blind: Annotated[
         bool,
         typer.Option(
@@ -66,17 +68,17 @@ def measure(
     quiet: Quiet = False,
     verbose: Verbose = 0,
 ) -> None:
-    """Measure the blur of a lens on photos made for it, into a profile.
+    """Measure the blur of a lens from photos made for the purpose, into a profile.
 
-    A profile that exists is added to: measured samples stand beside the blind ones, and count more.
+    An existing profile is added to: measured samples stand beside the blind ones and count for more.
 
     - target: the page that `lensmodel target` prints, photographed flat, nearly filling the frame.
 
-    - pair: one scene from a tripod, wide open and at about f/8. Photos are taken in twos.
+    - pair: one scene from a tripod, wide open and at about f/8. Photos are given in pairs.
 
-    - points: stars, or pinholes before a lamp; not saturated.
+    - points: stars, or pinholes in front of a lamp; not saturated.
 
-    - edges: an ISO 12233 chart or a checkerboard that leans by 5 degrees.
+    - edges: an ISO 12233 chart or a checkerboard tilted by 5 degrees.
 
     Examples:
 
@@ -183,13 +185,13 @@ def _counts(photo: str, model: LensModel) -> bool:
 def target(
     context: typer.Context,
     output: Annotated[Path, typer.Argument(metavar="FILE", help="Name ending in .pdf, .png or .svg.")],
-    paper: Annotated[str, choice("--paper", PAPERS, "Size of the paper, lying.")] = "a3",
+    paper: Annotated[str, choice("--paper", PAPERS, "Size of the paper, in landscape orientation.")] = "a3",
     detail: Annotated[
         int,
         typer.Option(
             metavar="N",
-            help="Samples along the long side: 1000, 1400, 2000, 2800, 4000 or 5600. Choose the nearest to "
-            "the pixels that the page will take in the photo.",
+            help="Samples along the long side: 1000, 1400, 2000, 2800, 4000 or 5600. Choose the one nearest "
+            "to the number of pixels that the page will span in the photo.",
         ),
     ] = USUAL_DETAIL,
     force: Force = False,

@@ -63,20 +63,23 @@ def calibrate(
     kernel_size: Annotated[
         int | None,
         typer.Option(
-            metavar="PIXELS", help="Odd side of the kernels, 3 to 55; by default 31, of `paper` 55."
+            metavar="PIXELS",
+            help="Side of the kernels, an odd number from 3 to 55; default: 31, with --model paper 55.",
         ),
     ] = None,
     selector: Selector = "r-map",
     workers: Workers = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="Of a Dask cluster, which then estimates the photos."),
+        typer.Option(metavar="ADDRESS", help="Address of a Dask cluster that estimates the photos."),
     ] = None,
     any_lens: AnyLens = False,
     force: Annotated[bool, typer.Option("--force", help="Forget what the profile knew; begin anew.")] = False,
     family: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Profile of another copy, to borrow from where photos lack."),
+        typer.Option(
+            metavar="FILE", help="Profile of another copy, to borrow from where this one lacks photos."
+        ),
     ] = None,
     no_family: Annotated[bool, typer.Option("--no-family", help="Stop borrowing from another copy.")] = False,
     mode: Annotated[
@@ -85,7 +88,7 @@ def calibrate(
             "--mode",
             MODES,
             "What answers are made of: kernels (default), mixed with a fitted wavefront, or likeliest, which "
-            "chooses by photos set aside. Kept from then on.",
+            "decides by photos that are set aside. Kept from then on.",
         ),
     ] = None,
     unit: Annotated[
@@ -93,8 +96,8 @@ def calibrate(
         choice(
             "--unit",
             UNITS,
-            "In what bodies with other pixels agree: micrometre (default), or half-diagonal where the pixel "
-            "size is unknown. Kept from then on.",
+            "Unit in which the blur is the same on bodies with different pixels: micrometre (default), or "
+            "half-diagonal where the pixel size is unknown. Kept from then on.",
         ),
     ] = None,
     json_output: Json = False,
@@ -103,10 +106,10 @@ def calibrate(
 ) -> None:
     """Learn the blur of one lens from photos, into a profile.
 
-    A profile that exists is added to. Photos that it has seen are skipped, and it is saved after
+    An existing profile is added to. Photos that it has seen are skipped, and it is saved after
     each photo: a run that was stopped goes on where it was. In folders, JPEG, TIFF and PNG files
     beside a RAW file of the same name are passed over, and so are corrected photos. --scheduler lets
-    the machines of a Dask cluster do the work, by their address such as tcp://10.0.0.1:8786.
+    a Dask cluster do the work; give its address, such as tcp://10.0.0.1:8786.
 
     Examples:
 
@@ -155,12 +158,14 @@ def correct(
         typer.Option(
             metavar="auto|ID",
             help="auto: sort the photos by body, lens and focal length, learn each lens from them, and "
-            "correct those that gain by it. With --server also the id of a lens there.",
+            "correct those that gain from it. With --server, also the id of a lens there.",
         ),
     ] = None,
     server: Annotated[
         str | None,
-        typer.Option(metavar="URL", help="Have a service elsewhere do the work; its key is LENS_API_KEY."),
+        typer.Option(
+            metavar="URL", help="Have a service elsewhere do the work; its key is read from LENS_API_KEY."
+        ),
     ] = None,
     output: Annotated[
         Path | None,
@@ -180,7 +185,9 @@ def correct(
     ] = None,
     learn_from: Annotated[
         int,
-        typer.Option(min=1, metavar="N", help="With --lens auto: photos of a group to learn from at most."),
+        typer.Option(
+            min=1, metavar="N", help="With --lens auto: learn from at most this many photos of a group."
+        ),
     ] = folder.LEARN_FROM,
     estimator: Estimator = "default",
     selector: Selector = "r-map",
@@ -191,14 +198,17 @@ def correct(
         ),
     ] = None,
     strength: Annotated[
-        float, typer.Option(min=0.0, max=1.0, metavar="0..1", help="0 nothing, 1 all that the noise allows.")
+        float,
+        typer.Option(
+            min=0.0, max=1.0, metavar="0..1", help="0: correct nothing; 1: all that the noise allows."
+        ),
     ] = 1.0,
     halo: Annotated[
         float | None,
         typer.Option(
             metavar="SHARE",
             help="How far results may go beyond the photo's own range beside edges, as a share of that "
-            "range: 0 not at all, inf without bound. Default: the less sure the profile, the less.",
+            "range: 0 for not at all, inf for no limit. Default: less, the less certain the profile is.",
         ),
     ] = None,
     texture: Annotated[
@@ -213,7 +223,10 @@ def correct(
         OutputFormat, choice("--format", get_args(OutputFormat), "dng: linear, for a raw converter.")
     ] = "tiff16",
     sidecar: Annotated[
-        bool, typer.Option("--sidecar", help="Write an XMP file beside each: what was done, and the lens.")
+        bool,
+        typer.Option(
+            "--sidecar", help="Write an XMP file beside each photo, saying what was done and with which lens."
+        ),
     ] = False,
     aperture: Aperture = None,
     workers: Workers = None,
@@ -227,8 +240,8 @@ def correct(
 
     Corrected photos are new files, NAME-corrected. Those that are there already are left alone:
     a run that was stopped goes on where it was. Each appears complete or not at all. The names of
-    the written files go to standard output; with --lens auto a table does, one line for each lens,
-    and -v tells of every photo. The photos themselves are never changed.
+    the written files go to standard output; with --lens auto a table is printed instead, one line per lens,
+    and -v reports every photo. The photos themselves are never changed.
 
     Examples:
 
@@ -288,14 +301,16 @@ def psf(
     size: Size = 55,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="FILE", help="Write it: .npy, .json, .tif or .png."),
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="Write the PSF to this file: .npy, .json, .tif or .png."
+        ),
     ] = None,
     force: Force = False,
     json_output: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = 0,
 ) -> None:
-    """Answer what the lens makes of a point at one place of the picture.
+    """Show what the lens makes of a point of light at one place in the picture.
 
     Examples:
 

@@ -67,14 +67,16 @@ def report(
     aspect: Aspect = 1.5,
     against: Annotated[
         Path | None,
-        typer.Option("--against", metavar="PROFILE", help="Another copy, to compare with; needs --output."),
+        typer.Option(
+            "--against", metavar="PROFILE", help="Profile of another copy to compare with; needs --output."
+        ),
     ] = None,
     json_output: Json = False,
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = 0,
 ) -> None:
-    """Tell how sharp a lens is, whether it is centred, and which photo would help most.
+    """Say how sharp a lens is, whether it is centred, and which photo would help most.
 
     Examples:
 
@@ -147,7 +149,7 @@ def export_psfs(
         typer.Option(
             "--format",
             metavar=f"<{'|'.join(exporters)}>",
-            help="Default: what the name of the file ends in.",
+            help="Default: by the ending of the file name.",
         ),
     ] = None,
     aperture: Aperture = None,

@@ -20,7 +20,9 @@ Data = Annotated[
 ]
 Port = Annotated[
     int | None,
-    typer.Option("--port", "-p", min=0, max=65535, help="0 takes any free port.", show_default="8000"),
+    typer.Option(
+        "--port", "-p", min=0, max=65535, help="Port to listen on; 0 takes any free one.", show_default="8000"
+    ),
 ]
 Host = Annotated[str | None, typer.Option("--host", help="Address to listen on.", show_default="127.0.0.1")]
 
@@ -86,9 +88,9 @@ def config(
     data: Data = None,
     json_output: Annotated[bool, typer.Option("--json", help="Print the settings as JSON.")] = False,
 ) -> None:
-    """Print the effective settings as the environment that would give them; secrets are masked.
+    """Print the effective settings as environment variables; secrets are masked.
 
-    The last lines tell which measures of this machine's kernel confine what decodes photos.
+    The last lines tell which measures of this machine's kernel confine the processes that decode photos.
 
     Examples:
 

@@ -30,7 +30,7 @@ def doctor(
     json_output: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Examine an installation, running or not: tables, blobs, and whether somebody works.
+    """Check an installation, running or not: tables, blobs, and whether a worker is running.
 
     Examples:
 
@@ -66,14 +66,16 @@ def doctor(
 
 def backup(
     context: typer.Context,
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of the backup; an older one is renewed.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="Folder of the backup; an older one there is updated.")
+    ],
     data: Data = None,
     json_output: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Copy all rows and blobs of an installation into a folder, while it works.
+    """Copy all rows and blobs of an installation into a folder, even while it runs.
 
-    The folder is a whole backup at every moment: the new one replaces the old one by its last step.
+    The folder is a complete backup at every moment: the last step replaces the old one by the new one.
     Only blobs that are not there yet are copied.
 
     Examples:
@@ -107,14 +109,14 @@ def backup(
 
 def restore(
     context: typer.Context,
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of the backup.")],
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the backup.")],
     data: Data = None,
     quiet: Quiet = False,
 ) -> None:
     """Fill an empty installation from a backup.
 
-    Which installation, the settings say: it may use another database or storage than the one that was
-    backed up. Photos that were being worked on are taken up by its workers.
+    The settings say which installation: it may use a different database or storage from the one that was
+    backed up. Its workers resume the photos that were being worked on.
 
     Examples:
 
@@ -142,14 +144,16 @@ def migrate(
     to: Annotated[str, typer.Option("--to", metavar="URL", help="SQLAlchemy address of an empty database.")],
     storage_url: Annotated[
         str | None,
-        typer.Option("--storage", metavar="URL", help="file:// or s3:// address; default: as it is."),
+        typer.Option(
+            "--storage", metavar="URL", help="file:// or s3:// address; default: storage is not moved."
+        ),
     ] = None,
     data: Data = None,
     quiet: Quiet = False,
 ) -> None:
     """Move a stopped installation to another database, and to another storage.
 
-    The old one is only read, and stays as it is. At the end stand the settings for the new one. A
+    The old one is only read, and stays as it is. The settings for the new one are printed at the end. A
     database server has an address such as postgresql+psycopg://lens@db/lens, an object store s3://lenses.
 
     Examples:

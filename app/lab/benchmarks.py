@@ -52,7 +52,7 @@ bench = typer.Typer(
 
     - bench correct --methods fast,standard
 
-    They take some minutes, and write nothing but finished cases, in bench-output/cache.
+    They take a few minutes, and write nothing but finished cases, to bench-output/cache.
 
     Examples:
 

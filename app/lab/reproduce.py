@@ -36,11 +36,11 @@ def reproduce(
         bool, typer.Option("--quick", help="Two lenses, small photos, n = 1, 2: minutes.")
     ] = False,
     full: Annotated[
-        bool, typer.Option("--full", help="Two apertures a lens, n up to 20: over night.")
+        bool, typer.Option("--full", help="Two apertures a lens, n up to 20: takes all night.")
     ] = False,
     hard: Annotated[
         bool,
-        typer.Option("--hard", help="Add scenes that hurt: depth, motion, night, sky, snow, text, foliage."),
+        typer.Option("--hard", help="Add difficult scenes: depth, motion, night, sky, snow, text, foliage."),
     ] = False,
     lenses: Annotated[
         int | None,
@@ -59,7 +59,7 @@ def reproduce(
         ),
     ] = None,
     benchmark: Annotated[
-        Path, typer.Option(help="Output of `lensmodel bench blind`: Fig. 1 where it is there.")
+        Path, typer.Option(help="Output of `lensmodel bench blind`: for Fig. 1, if it exists.")
     ] = Path("bench-output"),
     estimator: Estimator = "default",
     force: Force = False,

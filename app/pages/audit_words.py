@@ -9,13 +9,13 @@ from typing import Any, Final
 from app.pages.pictures import upright_point
 
 CHECKS: Final[Mapping[str, str]] = {
-    "too dark": "darker than anything there",
-    "too bright": "brighter than anything there",
+    "too dark": "darker than anything nearby",
+    "too bright": "brighter than anything nearby",
     "isolated pixels": "single pixels that stand out",
-    "hue, spots": "spots of a colour that is not there",
-    "hue, area": "a tint that is not there",
-    "re-blur": "detail that, blurred again, does not give the photo",
-    "spectrum": "sharper than this lens can have been blurred",
+    "hue, spots": "spots of a colour that the photo does not have there",
+    "hue, area": "a tint that the photo does not have there",
+    "re-blur": "detail that does not match the photo",
+    "spectrum": "sharper than this lens allows",
     "comb": "lines beside lines",
     "ringing": "rings beside edges",
     "grain": "grain beyond that of the photo",
@@ -70,7 +70,7 @@ def held_places(audit: Mapping[str, Any], height: int, width: int, orientation: 
         else f"{share:.0%} of the correction was held back over the whole photo."
     )
     places = []
-    for found in audit.get("worst", [])[:NAMED]:
+    for found in audit.get("worst", [])[:NAMED] if share >= LEAST else []:
         y, x = upright_point(found["row"], found["col"], height, width, orientation)
         places.append(Place(x, y, f"{found['held_back']:.0%}: {check_words(found['check'])}"))
     return Held(words, reasons, places)

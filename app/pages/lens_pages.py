@@ -61,6 +61,7 @@ def lens_page(lens_id: str, call: CallDep) -> HTMLResponse:
         photos=photos,
         more=more,
         others=[other for other in shown.lenses(call) if other.id != lens_id],
+        comparable=[other for other in shown.lenses(call) if other.id != lens_id and other.samples],
         test=test,
         centring=None if test is None else test.tested[0].report.decentring,
         **({} if test is None else _charts(test, None, "c/px")),
@@ -78,7 +79,8 @@ def lens_charts(
     """Show the charts of one aperture, or two lenses or apertures in one."""
     test = stored_report(call, lens_routes.find_lens(call, lens_id))
     chosen = _aperture(aperture)
-    if not against:
+    with_itself = against.startswith("at ") and _aperture(against.removeprefix("at ")) == chosen
+    if not against or with_itself:
         return page("_charts.html", **_charts(test, chosen, unit))
     if against.startswith("at "):
         other = test

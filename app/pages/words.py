@@ -16,20 +16,20 @@ from lensmodel.report.units import Unit
 
 PHOTO_STATES: Final[Mapping[str, str]] = {
     "received": "Waiting its turn",
-    "inspecting": "Reading what the file says",
-    "developing": "Developing to linear light",
-    "selecting": "Looking for parts that tell about the blur",
+    "inspecting": "Reading the file's details",
+    "developing": "Developing the photo",
+    "selecting": "Looking for parts that show the blur",
     "needs_lens": "Waiting for you: which lens was it?",
     "counted": "Learned from",
-    "stored": "Kept, to be corrected",
-    "excluded": "Left out of the lens by you",
+    "stored": "Ready to correct",
+    "excluded": "You left it out of the lens",
     "cancelled": "Cancelled",
 }
 FAILURES: Final[Mapping[str, str]] = {
-    "no_usable_patches": "nothing in it tells about the blur. A photo with fine detail in focus would",
+    "no_usable_patches": "nothing in it shows the blur of the lens. A photo with fine detail in focus would",
     "truncated_image": "the file ends too early. Copy it again from the camera or card",
     "raw_decode_failed": "the RAW data cannot be read. It may be damaged, or the camera too new",
-    "decompression_bomb": "it would unpack to far more than a photo holds",
+    "decompression_bomb": "it would unpack to far more than any photo holds",
     "memory_limit": "it needs more memory than the service may use",
     "time_limit": "it took longer than the service allows",
     "crashed_repeatedly": "reading it failed again and again. The file is probably damaged",
@@ -50,7 +50,7 @@ REASONS: Final[Mapping[str, str]] = {
     "clipped": "too bright: the sensor was saturated",
     "flat": "no detail",
     "dark": "too dark for its noise",
-    "one-directional": "lines in one direction only",
+    "one-directional": "detail in one direction only",
     "periodic": "a repeating pattern, which misleads the estimate",
     "jpeg-blocks": "blocks of JPEG compression",
     "defocus": "blurrier than its surroundings: probably out of focus",
@@ -73,7 +73,7 @@ def lens_name(lens: LensOut) -> str:
 def serial_words(lens: LensOut) -> str:
     """Say how sure it is that all photos are of one copy; the serial is shown shortened."""
     if not lens.serial:
-        return "The photos do not say a serial number: all of them must be of one copy."
+        return "The photos do not give a serial number, so all of them are taken to be from one copy."
     return f"This copy: serial number ending in {lens.serial[-4:]}."
 
 
@@ -99,7 +99,7 @@ def photo_state(photo: PhotoOut) -> str:
 def failure(error: Problem | None) -> str:
     """Say why something failed: in our own words where we have some, else in those of the error."""
     if error is None:
-        return "the reason was not noted"
+        return "the reason was not recorded"
     return FAILURES.get(error.code, error.detail)
 
 
@@ -175,11 +175,11 @@ def refusal(status: int, detail: str) -> tuple[str, str]:
     if status == 404:
         return (
             "Not here",
-            "There is nothing at this address. It may have been deleted, or the address was cut.",
+            "There is nothing at this address. It may have been deleted, or the address is incomplete.",
         )
     if status < 500:
-        return "Not like this", detail
-    return "That was our fault", "Something went wrong here; the log says what. Try again in a moment."
+        return "That did not work", detail
+    return "That is our fault", "Something went wrong here; the log says what. Try again in a moment."
 
 
 def reason_words(reason: str | None) -> str:
@@ -211,8 +211,8 @@ EVENTS: Final[Mapping[str, str]] = {
     "photo_added": "learned from a photo",
     "photo_included": "counted a photo again",
     "photo_excluded": "left a photo out",
-    "photo_removed": "lost a photo",
-    "photo_changed": "took over what you said of a photo",
+    "photo_removed": "a photo was deleted",
+    "photo_changed": "your details of a photo were taken over",
 }
 
 
@@ -223,7 +223,9 @@ def event_words(event: CalibrationOut) -> str:
 
 def centring_verdict(found: Decentring) -> str:
     """Say in a word or two whether a lens is centred."""
-    return {"centred": "Yes.", "decentred": "No.", "unknown": "Undecided."}[found.verdict]
+    return {"centred": "As far as can be told, yes.", "decentred": "No.", "unknown": "Undecided."}[
+        found.verdict
+    ]
 
 
 def centring_words(found: Decentring) -> str:
@@ -245,10 +247,10 @@ def history_words(history: Sequence[CalibrationOut]) -> str:
         found = tested[-1].error
         zones = found if isinstance(found, Mapping) else dict.fromkeys(ZONES, found)
         said = ", ".join(f"{ZONES[zone].lower()} {percent(zones.get(zone))}" for zone in ZONES)
-        return f"With {counted(tested[-1].photos, 'photo')}: {said}. The curve begins with the next one."
+        return f"With {counted(tested[-1].photos, 'photo')}: {said}. The curve starts with the next photo."
     if history and history[-1].photos > 1:
         return "The photos are being tested on one another."
-    return "One photo so far. It is tested on the others once there are some."
+    return "One photo so far. Once there are more, they are tested on one another."
 
 
 def coverage_words(coverage: Mapping[str, Any] | None) -> str:
@@ -292,7 +294,7 @@ def coverage_advice(bars: Sequence[ZoneBar], seen: Sequence[FieldPosition]) -> s
     few = few or [place_in_words(place) for place in little_seen(seen)[:SHOWN_PLACES]]
     if not few:
         return "Every part of the picture has been seen well."
-    return f"Little seen yet of: {', '.join(few)}. A photo with fine detail there, in focus, helps most."
+    return f"Little seen so far: {', '.join(few)}. A photo with fine detail there, in focus, would help most."
 
 
 def gain_bars(zones: Mapping[str, Mapping[str, Any]]) -> list[ZoneBar]:

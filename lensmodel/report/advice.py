@@ -131,13 +131,14 @@ def advice(model: LensModel, settings: LensSettings | None = None) -> Advice:
     enough = satisfied and not dark
     if dark:
         first = next(w for w in found if w.position == dark[0])
-        text = f"What would help most is a photo of {first.text}: little fine detail was seen there yet."
+        text = f"Most useful next: a photo of {first.text}. Little fine detail was seen there yet."
     elif enough:
         text = (
-            f"The photos cover the picture well; another one changes little. If you add one: {best[0].text}."
+            "The photos cover the picture well; another one would change little. "
+            f"If you add one, make it {best[0].text}."
         )
     else:
-        text = f"What would help most is a photo of {best[0].text}: {best[0].reason}."
+        text = f"Most useful next: a photo of {best[0].text}, because {best[0].reason}."
     return Advice(text, tuple(best), enough)
 
 
@@ -189,6 +190,6 @@ def _text(place: FieldPosition, settings: LensSettings) -> str:
 def _reason(answer: PsfAnswer, photos: int) -> str:
     error = f"its blur is expected to be wrong by {100 * answer.predicted_error:.0f} %"
     if photos == 0:
-        return f"no photo shows that place at that setting yet, and {error}"
+        return f"no photo shows that place at these settings yet, and {error}"
     some = "one photo speaks" if photos == 1 else f"{photos} photos speak"
     return f"{some} for that place, and {error}"

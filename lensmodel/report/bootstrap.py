@@ -92,7 +92,32 @@ def spreads_of(
     channel = reports[0].settings.channel
     excluded = model.settings.excluded
     samples = [s for s in model.samples if s.photo not in excluded and s.settings.channel == channel]
-    drawn: Drawn = "photos" if len({s.photo for s in samples}) >= FEWEST_PHOTOS else "patches"
+    found: dict[int, Spread | None] = {}
+    kinds: tuple[Drawn, ...] = ("photos", "patches")
+    for drawn in kinds:
+        those = [i for i, report in enumerate(reports) if _drawn(samples, report) == drawn]
+        if those:
+            spreads = _spreads(model, [reports[i] for i in those], samples, drawn, size, rng, draws)
+            found |= dict(zip(those, spreads, strict=True))
+    return [found[i] for i in range(len(reports))]
+
+
+def _drawn(samples: Sequence[PsfSample], report: LensReport) -> Drawn:
+    """Photos where enough of them were taken at the aperture of a report: others say little of it."""
+    at = report.settings.aperture
+    photos = {s.photo for s in samples if at is None or s.settings.aperture == at}
+    return "photos" if len(photos) >= FEWEST_PHOTOS else "patches"
+
+
+def _spreads(
+    model: LensModel,
+    reports: Sequence[LensReport],
+    samples: Sequence[PsfSample],
+    drawn: Drawn,
+    size: int,
+    rng: np.random.Generator,
+    draws: int,
+) -> list[Spread | None]:
     groups = _groups(samples, drawn)
     if len(groups) < FEWEST_PHOTOS:
         return [None] * len(reports)

@@ -17,6 +17,7 @@ HEIGHT: Final = 380
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 160, 40, 52
 _GAP: Final = 20
 _SCALE_HIGH: Final = 14
+_LEAST_WIDTH_PX: Final = 0.5  # what the axis of widths shows at least: a point may have none
 _RADII_TICKS: Final = tuple((k / 5, f"{k / 5:.1f}") for k in range(6))
 _TURNS: Final = tuple(k * math.pi / 24 for k in range(48))
 _INKS: Final[dict[Channel, str]] = {"r": "#c2410c", "g": "#15803d", "b": "#0b6e99"}
@@ -150,7 +151,7 @@ def colours_chart(test: LensTest, aperture: float | None) -> Chart:
 def field_chart(tested: Tested) -> Chart:
     """Draw how wide points are along the radius and around the center, see `FieldShape`."""
     shape, radii = tested.report.shape, tested.report.radii
-    top = 1.15 * max(*shape.along_u, *shape.along_v)
+    top = 1.15 * max(*shape.along_u, *shape.along_v, _LEAST_WIDTH_PX)
     axes = _axes(top)
     parts: list[Part] = [Label(_LEFT, 24, f"Width of a point in pixels{_at(tested)}")]
     parts += axes.grid(_RADII_TICKS, _steps(top), "r: 0 center, 1 corner")
@@ -215,7 +216,10 @@ def centring_chart(tested: Tested) -> Chart:
         error = 100.0 * math.expm1(2.0 * found.softer.error)
         text = f"opposite sides differ by {sides:.0f} %, give or take {error:.0f} % (two standard errors)"
         parts.append(Label(WIDTH / 2, top + high + 22, text, INK, "middle"))
-    note = "arrow: the softer side; circle: where the tip may be; an arrow out of it is sure"
+    note = (
+        "arrow: points to the softer side; circle: two standard errors around its tip; "
+        "certain if the cross lies outside"
+    )
     parts.append(Label(WIDTH / 2, top + high + 42, note, GREY, "middle", 10))
     return Chart("Centring", WIDTH, top + high + 56, tuple(parts))
 

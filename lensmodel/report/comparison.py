@@ -119,12 +119,12 @@ def _verdict(first: Side, second: Side, zones: tuple[ZoneChange, ...]) -> str:
     for change in zones:
         place = _NAMES[change.zone]
         if abs(change.share) < _ALIKE:
-            words.append(f"alike {place}")
+            words.append(f"about the same {place}")
         elif change.error is not None and not change.sure:
-            words.append(f"not told apart {place}")
+            words.append(f"not to be told apart {place}")
         else:
             words.append(f"{abs(change.share):.0%} {'sharper' if change.share > 0 else 'softer'} {place}")
-    return f"Beside {first.name}, {second.name} is {', '.join(words[:-1])} and {words[-1]}."
+    return f"Compared with {first.name}, {second.name} is {', '.join(words[:-1])} and {words[-1]}."
 
 
 def _curves(first: Side, second: Side, low: bool) -> Chart:
@@ -181,7 +181,7 @@ def _difference(first: Side, second: Side) -> Chart | None:
         parts.append(
             Label(x + wide / one.cols / 2, y + high / one.rows / 2 + 4, text, ink(fill), "middle", 11)
         )
-    note = f"blue: {second.name} is sharper; ? not told apart from chance"
+    note = f"blue: {second.name} is sharper; ? within the error"
     parts.append(Label(20, 40 + high + 20, note, GREY))
     return Chart(title, WIDTH, round(high + 72), tuple(parts))
 

@@ -303,6 +303,7 @@ def _verdict(softer: Asymmetry, coma: Asymmetry | None, photos: int) -> tuple[Ve
     found = "; ".join(signs)
     if photos == 1:
         return "unknown", (
-            f"perhaps decentred: {found}; one photo cannot tell this from a subject at a slant, another can"
+            f"perhaps decentred: {found}; one photo cannot tell this from a subject at a slant; "
+            "a second one can"
         )
     return "decentred", f"decentred: {found}"

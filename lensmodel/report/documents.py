@@ -46,9 +46,12 @@ def facts(test: LensTest) -> str:
 def error_words(tested: Tested) -> str:
     """Say what the bands and error maps of a report are."""
     if tested.spread is None:
-        return "Too little is known to tell the error of these figures."
-    again = f"{tested.spread.draws} times drawn again from the {tested.spread.drawn}"
-    words = f"Bands and error maps: one standard error, {again}. What all photos share does not show in them."
+        return "Too little is known to estimate the error of these figures."
+    again = f"{tested.spread.draws} random redraws of the {tested.spread.drawn}"
+    words = (
+        f"Bands and error maps: one standard error, from {again}. "
+        "Errors that all photos share are not included."
+    )
     if tested.spread.drawn == "patches":
         words += " With fewer than three photos this error is too small: patches of a photo share its focus."
     return words

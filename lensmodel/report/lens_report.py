@@ -333,11 +333,14 @@ def _shape(rings: list[_Ring]) -> FieldShape:
         along_v.append(float(math.sqrt(squared[1])))
     apart = tuple(u - v for u, v in zip(along_u, along_v, strict=True))
     largest = max(range(len(apart)), key=lambda i: abs(apart[i]))
-    grown = (along_u[-1] + along_v[-1]) / (along_u[0] + along_v[0])
-    way = "grows" if grown >= 1.0 else "shrinks"
-    growth = f"the blur {way} to {grown:.1f} times its width at the center towards the corners"
+    center, corner = along_u[0] + along_v[0], along_u[-1] + along_v[-1]
+    if center < _EVEN_PX:  # a point within one pixel has no width to compare with
+        growth = f"in the center a point stays within a pixel, in the corners it is {corner / 2:.1f} px wide"
+    else:
+        way = "grows" if corner >= center else "shrinks"
+        growth = f"towards the corners the blur {way} to {corner / center:.1f} times its width at the center"
     if abs(apart[largest]) < _EVEN_PX:
-        text = f"points stay round over the field; {growth}"
+        text = f"points stay round across the field; {growth}"
     else:
         along = "radially" if apart[largest] > 0 else "around the center"
         text = (
@@ -388,5 +391,8 @@ def _summary(
             f"at f/{best['whole']:g} over the whole picture"
         )
     if unseen > 0:
-        lines.append(f"no photo shows {100.0 * unseen:.0f} % of the picture at these settings: guessed there")
+        lines.append(
+            f"no photo shows {100.0 * unseen:.0f} % of the picture at these settings; "
+            "the figures there are guesses"
+        )
     return tuple(lines)

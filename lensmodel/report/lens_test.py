@@ -23,9 +23,9 @@ from lensmodel.report.units import Sensor
 MOST_APERTURES: Final = 4
 ROWS: Final = 7
 
-_EVEN, _SOFTER = 0.8, 0.5
-"""Shares of the center's MTF50 above which corners are called even with it, and clearly softer (chosen:
-a fifth less is hardly seen in a print, half as much at a glance)."""
+_EVEN, _NEARLY, _SOFTER = 0.95, 0.8, 0.5
+"""Shares of the center's MTF50 above which corners are called as good, nearly as good, and clearly softer
+(chosen: a fifth less is hardly seen in a print, half as much at a glance)."""
 
 _CRISP, _SHARP, _SOFT = 0.35, 0.2, 0.1
 """MTF50 in cycles/pixel of the center above which a lens is called as sharp as a sensor shows, sharp, and
@@ -230,16 +230,16 @@ def verdict(report: LensReport) -> str:
     centring = {
         "centred": " It is well centred.",
         "decentred": " It is decentred: one side is softer than the other.",
-        "unknown": " Whether it is centred cannot be told yet.",
+        "unknown": " It is not yet possible to say whether it is centred.",
     }[report.decentring.verdict]
     error = float(np.mean([point.predicted_error for point in report.field]))
-    doubt = " Much of this is a guess yet: more photos will tell." if not error < _GUESSED else ""
+    doubt = " Much of this is still a guess; more photos will help." if not error < _GUESSED else ""
     return f"{sharpness}{best}{centring}{doubt}"
 
 
 def _level(center: float) -> str:
     if center >= _CRISP:
-        return "as sharp as a sensor shows"
+        return "as sharp as the sensor can show"
     if center >= _SHARP:
         return "sharp"
     return "a little soft" if center >= _SOFT else "soft"
@@ -249,5 +249,7 @@ def _fall(share: float) -> str:
     if not math.isfinite(share):
         return "little is known of its corners"
     if share >= _EVEN:
-        return "its corners are as good"
+        return "its corners are just as good"
+    if share >= _NEARLY:
+        return "its corners are nearly as good"
     return "its corners are clearly softer" if share >= _SOFTER else "its corners are much softer"

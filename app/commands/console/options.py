@@ -63,7 +63,7 @@ Profile = Annotated[Path, typer.Option("--profile", "-p", metavar="FILE", help="
 ProfileFile = Annotated[Path, typer.Argument(metavar="FILE", help="The lens profile.")]
 Aperture = Annotated[float | None, aperture_option("f-number, where a photo does not say its own.")]
 AnyLens = Annotated[
-    bool, typer.Option("--any-lens", help="Also photos that seem to be of another lens than the profile.")
+    bool, typer.Option("--any-lens", help="Also use photos that seem to be from a different lens.")
 ]
 Estimator = Annotated[
     str, typer.Option(metavar="NAME", help=f"Blind estimator: {', '.join(estimation.estimators)}.")
@@ -71,17 +71,26 @@ Estimator = Annotated[
 Selector = Annotated[
     str, typer.Option(metavar="NAME", help=f"How patches of a photo are chosen: {', '.join(selectors)}.")
 ]
-Channel = Annotated[types.Channel, choice("--channel", get_args(types.Channel), "Which color.")]
-RADIUS = typer.Option("--r", min=0.0, max=1.0, metavar="0..1", help="0 center, 1 corner.")
-ANGLE = typer.Option("--phi", metavar="RADIAN", callback=_radians, help="Counter-clockwise from the right.")
-Size = Annotated[int, typer.Option(min=3, max=255, metavar="N", callback=_odd, help="Odd side in pixels.")]
+Channel = Annotated[types.Channel, choice("--channel", get_args(types.Channel), "Colour channel.")]
+RADIUS = typer.Option(
+    "--r", min=0.0, max=1.0, metavar="0..1", help="Distance from the center: 0 center, 1 corner."
+)
+ANGLE = typer.Option(
+    "--phi", metavar="RADIAN", callback=_radians, help="Angle of the place, counter-clockwise from the right."
+)
+Size = Annotated[
+    int, typer.Option(min=3, max=255, metavar="N", callback=_odd, help="Side in pixels, an odd number.")
+]
 Workers = Annotated[
-    int | None, typer.Option("--workers", "-j", min=1, metavar="N", help="In parallel; default: all cores.")
+    int | None,
+    typer.Option("--workers", "-j", min=1, metavar="N", help="Processes in parallel; default: all cores."),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace what is there already.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no notes, only errors.")]
 Verbose = Annotated[
     int,
-    typer.Option("--verbose", "-v", count=True, metavar="", help="Say more; twice: all.", show_default=False),
+    typer.Option(
+        "--verbose", "-v", count=True, metavar="", help="More output; twice: everything.", show_default=False
+    ),
 ]

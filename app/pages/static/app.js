@@ -10,17 +10,26 @@ import { setUpStream } from "./stream.js";
 import { setUpUpload } from "./upload.js";
 import { setUpViewer } from "./view_tools.js";
 
-setUpUpload();
-setUpForms();
-setUpGroups();
-setUpActions();
-setUpField();
-setUpCharts();
-setUpLensActions();
-setUpHistory();
-setUpPhoto();
-setUpMeasure();
-setUpSignIn();
-setUpSignOut();
-setUpPreview(setUpViewer());
-setUpStream(setUpSettling());
+const parts = [
+  setUpUpload,
+  setUpForms,
+  setUpGroups,
+  setUpActions,
+  setUpField,
+  setUpCharts,
+  setUpLensActions,
+  setUpHistory,
+  setUpPhoto,
+  setUpMeasure,
+  setUpSignIn,
+  setUpSignOut,
+  () => setUpPreview(setUpViewer()),
+  () => setUpStream(setUpSettling()),
+];
+for (const setUp of parts) {
+  try {
+    setUp();
+  } catch (reason) {
+    console.error(reason); // one part that fails leaves the others working
+  }
+}

@@ -2,16 +2,6 @@
 
 export const byId = (id) => document.getElementById(id);
 
-export async function problemText(response) {
-  try {
-    const problem = await response.json();
-    const first = problem.errors?.[0]?.message;
-    return first && !problem.detail.includes(first) ? `${problem.detail}: ${first}` : problem.detail;
-  } catch {
-    return `The service answered ${response.status}. Try again in a moment.`;
-  }
-}
-
 const PLAIN = {
   not_an_image: "This is not a photo that can be read. Give RAW, DNG, TIFF, PNG or JPEG.",
   unsupported_format: "This kind of file cannot be read. Give RAW, DNG, TIFF, PNG or JPEG.",
@@ -19,6 +9,17 @@ const PLAIN = {
   image_too_large: "This photo is larger than the service takes.",
   decompression_bomb: "This file would unpack to far more than a photo holds.",
 };
+
+export async function problemText(response) {
+  try {
+    const problem = await response.json();
+    if (PLAIN[problem.code]) return PLAIN[problem.code];
+    const first = problem.errors?.[0]?.message;
+    return first && !problem.detail.includes(first) ? `${problem.detail}: ${first}` : problem.detail;
+  } catch {
+    return `The service answered ${response.status}. Try again in a moment.`;
+  }
+}
 
 // The answer to a refused upload as a sentence for people; the service's own words where we have none.
 export function refusalText(answered, status) {

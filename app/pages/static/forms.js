@@ -5,7 +5,7 @@ import { removing } from "./stream.js";
 
 function setUpForm(id, act) {
   const form = byId(id);
-  if (!form) return;
+  if (!form?.querySelector("button")) return; // a photo without any lens has nothing to send
   const error = form.querySelector(".alert");
   const button = form.querySelector("button");
   button.disabled = false; // until now a click would have gone nowhere
@@ -120,10 +120,12 @@ export function setUpGroups() {
     try {
       const fields = new FormData(form);
       const change = { photo_ids: fields.getAll("photo"), ...namedLens(fields), ...givenAperture(fields) };
+      if (fields.has("aperture") && !change.aperture) throw new Error("Give the aperture, a number such as 2.8.");
       if (!change.photo_ids.length) throw new Error("Choose at least one photo of this group.");
       if (!change.lens_id && !change.new_lens) throw new Error("Choose a lens, or give a new one a name.");
       await send("PATCH", "/v1/photos", change);
-      byId("announce").textContent = `${change.photo_ids.length} photos go on.`;
+      const count = change.photo_ids.length;
+      byId("announce").textContent = count === 1 ? "1 photo is being processed." : `${count} photos are being processed.`;
     } catch (reason) {
       error.textContent = reason.message;
       error.hidden = false;
@@ -143,5 +145,6 @@ function givenAperture(fields) {
   if (!text) return {};
   const aperture = Number(text);
   if (Number.isNaN(aperture)) throw new Error(`The aperture must be a number such as 2.8, not "${text}".`);
+  if (aperture < 0.5 || aperture > 128) throw new Error("Give an f-number between 0.5 and 128, for example 2.8.");
   return { aperture };
 }

@@ -100,10 +100,10 @@ export function setUpField() {
     byId("psf-words").textContent = support.extrapolated ? `${where}: beyond what photos showed, a guess` : where;
     const error = support.predicted_error === null ? "unknown" : `${Math.round(support.predicted_error * 100)} %`;
     tell(byId("psf-numbers"), [
-      ["A point is drawn", `${width} wide`],
-      ["Picture above", `${psf.data.length} pixels across`],
+      ["Width of a point", width],
+      ["Size of the picture above", `${psf.data.length} pixels`],
       ["Seen in", `${support.photos} photo${support.photos === 1 ? "" : "s"}`],
-      ["Worth", `${support.effective_samples.toFixed(1)} samples`],
+      ["Based on", `about ${Math.round(support.effective_samples) || 1} sample${Math.round(support.effective_samples) > 1 ? "s" : ""}`],
       ["Expected error", error],
       ...(support.family ? [["Leans on your other copies", `${Math.round(support.family.weight * 100)} %`]] : []),
     ]);
@@ -174,7 +174,7 @@ export function setUpCharts() {
     holder.classList.add("loading");
     try {
       const response = await fetch(`/ui/lenses/${controls.dataset.lens}/charts?${new URLSearchParams(new FormData(controls))}`);
-      if (!response.ok) throw new Error(response.status === 409 ? "There are no charts of that lens yet." : await problemText(response));
+      if (!response.ok) throw new Error(response.status === 409 ? "There are no charts for that lens yet." : await problemText(response));
       holder.innerHTML = await response.text();
     } catch (reason) {
       holder.innerHTML = '<p class="alert" role="alert"></p>';
@@ -197,19 +197,20 @@ export function setUpLensActions() {
     },
     merge: async (fields) => {
       const into = fields.get("lens");
-      if (!into) throw new Error("Choose the lens that this one is a part of.");
-      if (!window.confirm("Merge? All photos of this lens then teach the other one. This cannot be undone.")) return;
+      if (!into) throw new Error("Choose the lens that this one is to be merged into.");
+      if (!window.confirm("Merge? All photos of this lens will then count for the other one. This cannot be undone.")) return;
       await removing(`/lenses/${into}`, () => send("PATCH", lens, { merge_into: into }));
     },
     upload: async (fields) => {
       const file = fields.get("profile");
       if (!file?.size) throw new Error("Choose a profile first.");
       const response = await fetch(`${lens}/profile`, { method: "PUT", body: file, headers: { "Content-Type": "application/zip" } });
+      if ([400, 415, 422].includes(response.status)) throw new Error("This file is not a lens profile. Choose one whose name ends in .lensprofile.");
       if (!response.ok) throw new Error(await problemText(response));
       location.reload();
     },
     delete: async () => {
-      if (!window.confirm("Delete this lens and all that was learned of it? Its photos stay.")) return;
+      if (!window.confirm("Delete this lens and everything learned from its photos? The photos themselves are kept; upload them again to learn from them anew.")) return;
       await removing("/", () => send("DELETE", lens));
     },
   };

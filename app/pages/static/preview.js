@@ -46,7 +46,11 @@ export function setUpPreview(viewer) {
   if (!viewer || !form || !("preview" in form.dataset)) return;
   const words = byId("preview-words");
   const canvas = document.createElement("canvas");
-  let [part, asked, timer] = [null, 0, 0];
+  let [part, asked, timer, running] = [null, 0, 0, ""];
+  const stop = () => {
+    if (running) fetch(`/v1/jobs/${running}/cancel`, { method: "POST", keepalive: true }); // nobody waits for it any more
+    running = "";
+  };
   const value = (name) => Number(form.elements[name].value);
   const show = () => {
     if (!part) return;
@@ -67,12 +71,22 @@ export function setUpPreview(viewer) {
   const compute = async (region) => {
     asked += 1;
     const mine = asked;
+    stop();
     words.textContent = "Working out what a correction does here …";
     try {
       const lens = form.elements.lens_id?.value;
       const made = await send("POST", `/ui/photos/${form.dataset.photo}/preview`, { ...region, ...(lens ? { lens_id: lens } : {}) });
-      const end = await settled(made.id, () => mine === asked);
+      if (mine !== asked) {
+        fetch(`/v1/jobs/${made.id}/cancel`, { method: "POST" });
+        return;
+      }
+      running = made.id;
+      const end = await settled(made.id, (job) => {
+        if (mine === asked && job.state === "queued") words.textContent = "Waiting for other work to finish …";
+        return mine === asked;
+      });
       if (mine !== asked) return;
+      running = "";
       if (end.state !== "succeeded") throw new Error(end.error?.detail ?? "the preview was stopped");
       const base = `/ui/corrections/${made.id}/layer`;
       const [before, after, smooth, clean] = await Promise.all(
@@ -107,22 +121,24 @@ export function setUpPreview(viewer) {
     part = null;
     look();
   });
+  window.addEventListener("pagehide", stop);
   look();
 }
 
-async function settled(id, wanted) {
-  let tag = "";
+// Wait for the end of a job; `heard` is told each state and says whether anybody still waits.
+async function settled(id, heard) {
+  let [tag, job] = ["", { state: "queued" }];
   for (;;) {
     const response = await fetch(`/v1/jobs/${id}?wait=20`, { headers: tag ? { "If-None-Match": tag } : {} });
     if (response.status !== 304 && !response.ok) throw new Error(await problemText(response));
     if (response.status !== 304) {
       tag = response.headers.get("ETag") ?? "";
-      const job = await response.json();
+      job = await response.json();
       if (["succeeded", "failed", "cancelled"].includes(job.state)) {
         const correction = await (await fetch(`/v1/corrections/${id}`)).json();
         return { ...job, untouched: correction.report?.nothing_to_correct };
       }
     }
-    if (!wanted()) return { state: "left" };
+    if (!heard(job)) return { state: "left" };
   }
 }

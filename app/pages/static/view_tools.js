@@ -94,6 +94,13 @@ function setUpPlaces(viewer) {
 
 // Where checks held the correction back: squares over the photo, and a list that leads to the worst of them.
 function setUpOverlays(root, viewer) {
+  for (const place of document.querySelectorAll("[data-x]")) {
+    place.disabled = false;
+    place.addEventListener("click", () => {
+      viewer.goTo(Number(place.dataset.x), Number(place.dataset.y));
+      root.scrollIntoView({ block: "nearest" });
+    });
+  }
   const box = byId("show-held");
   if (!box) return;
   const { tiles, side, most } = JSON.parse(byId("held").textContent);
@@ -110,11 +117,4 @@ function setUpOverlays(root, viewer) {
         };
     viewer.redraw();
   });
-  for (const place of document.querySelectorAll("[data-x]")) {
-    place.disabled = false;
-    place.addEventListener("click", () => {
-      viewer.goTo(Number(place.dataset.x), Number(place.dataset.y));
-      root.scrollIntoView({ block: "nearest" });
-    });
-  }
 }

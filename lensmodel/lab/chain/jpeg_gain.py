@@ -9,10 +9,10 @@ chroma, compression). The lens is learned from the first n by default settings, 
 from is corrected by default settings.
 
 Printed are the gains in PSNR of the file's numbers over the photo as it was, by zone, against what that
-camera shows of the sharp scene, sharpened and with chroma as in the file, without noise and compression; the
-gain of luma and of chroma alone over the whole photo; the share of blocks of 128 pixels that lose more than
-0.5 dB, and the worst of them. Some two minutes a photo on one core. `--keep FOLDER` keeps what was learned of
-each photo for another run.
+camera shows of the sharp scene, sharpened and with chroma as in the file, without noise and compression;
+what the correction expected in linear light; the gain of luma and of chroma alone over the whole photo; the
+share of blocks of 128 pixels that lose more than 0.5 dB, and the worst of them. Some two minutes a photo on
+one core. `--keep FOLDER` keeps what was learned of each photo for another run.
 """
 
 from __future__ import annotations
@@ -50,9 +50,10 @@ LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601, as JFI
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """Gains in decibels of one correction: by zone, of luma and chroma, and by block."""
+    """Gains in decibels of one correction: by zone, as expected there, of luma, of chroma, by block."""
 
     zones: dict[Zone, float]
+    expected: dict[Zone, float]
     luma: float
     chroma: float
     blocks: NDArray[np.float64]
@@ -75,7 +76,8 @@ def outcomes(
             continue
         model = LensModel.fit(known, ModelSettings()).warmed()
         made = pipeline.correct_photo(developed, model, lens.settings, lateral=pipeline.lateral_of(developed))
-        yield count, outcome(values(made.planes), before, truth)
+        expected = {zone: of.expected_gain_db or 0.0 for zone, of in made.zones.items()}
+        yield count, outcome(values(made.planes), before, truth, expected)
 
 
 def learned(lens: Lens, camera: str, number: int, folder: Path) -> list[PsfSample]:
@@ -102,7 +104,7 @@ def values(planes: Planes) -> Planes:
     return np.where(dark, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
-def outcome(made: Planes, before: Planes, truth: Planes) -> Outcome:
+def outcome(made: Planes, before: Planes, truth: Planes, expected: dict[Zone, float]) -> Outcome:
     """Compare with what the camera should have shown."""
     after, first = made - truth, before - truth
     squared = [np.square(error).mean(axis=0) for error in (after, first)]
@@ -122,6 +124,7 @@ def outcome(made: Planes, before: Planes, truth: Planes) -> Outcome:
     ]
     return Outcome(
         zones,
+        expected,
         decibels(*(np.square(error) for error in reversed(luma))),
         decibels(*(np.square(error) for error in reversed(chroma))),
         np.array(blocks),
@@ -141,8 +144,8 @@ def main() -> None:
     parser.add_argument("--cameras", nargs="+", choices=CAMERA_JPEGS, default=["usual"])
     parser.add_argument("--keep", type=Path)
     wanted = parser.parse_args()
-    print("| lens | camera | n | gain center / mid / corner, dB | luma / chroma | lost blocks | worst |")
-    print("|---|---|---|---|---|---|---|")
+    print("| lens | camera | n | gain center / mid / corner, dB | expected | luma / chroma | lost | worst |")
+    print("|---|---|---|---|---|---|---|---|")
     zones: list[float] = []
     blocks: list[float] = []
     with tempfile.TemporaryDirectory() as name:
@@ -152,11 +155,12 @@ def main() -> None:
             for camera in wanted.cameras:
                 for count, seen in outcomes(lens, camera, wanted.photos, folder):
                     if isinstance(seen, str):
-                        print(f"| {lens.name} | {camera} | {count} | {seen} | | | |", flush=True)
+                        print(f"| {lens.name} | {camera} | {count} | {seen} | | | | |", flush=True)
                         continue
                     words = " / ".join(f"{seen.zones[zone]:+.2f}" for zone in ZONES)
+                    hoped = " / ".join(f"{seen.expected.get(zone, 0.0):+.2f}" for zone in ZONES)
                     print(
-                        f"| {lens.name} | {camera} | {count} | {words} | {seen.luma:+.2f} / "
+                        f"| {lens.name} | {camera} | {count} | {words} | {hoped} | {seen.luma:+.2f} / "
                         f"{seen.chroma:+.2f} | {(seen.blocks < -LOSS_DB).mean():.1%} "
                         f"| {seen.blocks.min():+.2f} |",
                         flush=True,

@@ -226,6 +226,23 @@ def test_a_file_that_is_no_photo_is_refused_in_a_plain_sentence(visitor: Visitor
     visitor.complaints.clear()
 
 
+def test_a_photo_without_any_lens_can_still_be_looked_at_and_deleted(
+    page: Page, learned: dict[str, Any]
+) -> None:
+    def without_lens(route: Route) -> None:
+        answer = route.fetch()
+        route.fulfill(
+            response=answer, body=answer.text().replace("<button disabled>Correct this photo</button>", "")
+        )
+
+    page.route(f"**/photos/{learned['id']}", without_lens)
+    page.goto(f"/photos/{learned['id']}")
+
+    expect(page.get_by_role("button", name="Correct this photo")).to_have_count(0)
+    expect(page.get_by_role("button", name="Delete photo")).to_be_enabled()
+    expect(page.get_by_role("button", name="Whole photo")).to_be_enabled()
+
+
 def test_photos_that_wait_are_named_together_by_their_pictures(
     page: Page, service: Service, learned: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -241,12 +258,12 @@ def test_photos_that_wait_are_named_together_by_their_pictures(
     expect(group.locator("img").first).not_to_have_js_property("naturalWidth", 0)
     assert faults(page) == []
 
-    group.get_by_role("button", name="Go on with these").click()
+    group.get_by_role("button", name="Continue").click()
     expect(group.locator(".alert")).to_have_text("Choose a lens, or give a new one a name.")
     wishes: list[str] = []
     page.on("request", lambda request: wishes.append(request.url) if request.method == "PATCH" else None)
     group.get_by_label("Or a new one, called").fill("Grandfather's 35 mm")
-    group.get_by_role("button", name="Go on with these").click()
+    group.get_by_role("button", name="Continue").click()
 
     expect(page.locator("[data-group]")).to_have_count(0)
     assert [url.rpartition("/v1/")[2] for url in wishes] == ["photos"]
@@ -296,7 +313,7 @@ def test_a_lens_shows_its_blur_at_any_place_aperture_and_colour(page: Page, lear
         page.get_by_label("Colour").select_option("b")
 
     assert told.value.ok
-    expect(page.locator("#psf-numbers")).to_contain_text("pixels wide")
+    expect(page.locator("#psf-numbers")).to_contain_text("Width of a point")
     expect(page.locator("#psf-npy")).to_have_attribute("href", re.compile("channel=b"))
 
 
@@ -332,7 +349,7 @@ def test_two_measured_versions_make_a_curve(page: Page, learned: dict[str, Any])
 
 def test_a_photo_shows_where_it_learned_and_why_not_elsewhere(page: Page, learned: dict[str, Any]) -> None:
     page.goto(f"/photos/{learned['id']}")
-    page.get_by_text("Where it was learned from").click()  # the correction comes first
+    page.get_by_text("Which places were used").click()  # the correction comes first
     used, left = page.locator(".overlay rect.done"), page.locator(".overlay rect.rejected")
     expect(used).to_have_count(learned["patches"]["done"])
     assert left.count() == learned["patches"]["rejected"] > 0
@@ -344,7 +361,7 @@ def test_a_photo_shows_where_it_learned_and_why_not_elsewhere(page: Page, learne
     reason.click()
     lit = page.locator(".overlay rect.lit")
     expect(lit).to_have_count(int(reason.locator("b").inner_text()))
-    page.get_by_label("Show where edges are sharp enough to tell").check()
+    page.get_by_label("Show where edges are sharp enough to learn from").check()
     expect(page.locator("#rmap")).not_to_have_js_property("naturalWidth", 0)
     expect(page.locator("#rmap")).to_be_visible()
 
@@ -483,7 +500,7 @@ def test_a_lens_has_charts_a_verdict_and_a_report(page: Page, learned: dict[str,
     assert got.value.ok
     expect(page.locator("#charts")).to_contain_text("f/5.6")
     controls.locator("[name=against]").select_option("at 2.8")
-    expect(page.locator("#charts .lead")).to_contain_text("Beside f/5.6, f/2.8 is")
+    expect(page.locator("#charts .lead")).to_contain_text("Compared with f/5.6, f/2.8 is")
     with page.expect_download() as saved:
         page.get_by_role("link", name="As CSV").click()
     assert saved.value.suggested_filename.endswith(".csv")
@@ -507,14 +524,14 @@ def test_a_lens_is_renamed_merged_and_its_profile_taken_along(
     expect(page.locator("h1")).to_have_text("My first")
 
     page.on("dialog", lambda dialog: dialog.accept())
-    page.get_by_label("The same copy as").select_option(made[1])
+    page.get_by_label("It is the same copy as").select_option(made[1])
     page.get_by_role("button", name="Merge into it").click()
     page.wait_for_url(f"**/lenses/{made[1]}")
     expect(page.locator(".facts").first).to_contain_text("2 photos")
     assert service.http.get(f"/v1/lenses/{made[0]}").status_code == 404
 
     before = service.get(f"/v1/lenses/{made[1]}")
-    page.get_by_label("Add what a profile knows").set_input_files(tmp_path / "one.lensprofile")
+    page.get_by_label("Add a lens profile").set_input_files(tmp_path / "one.lensprofile")
     page.get_by_role("button", name="Add", exact=True).click()
     expect(page.locator(".facts").first).to_contain_text("3 photos")
     assert service.get(f"/v1/lenses/{made[1]}")["samples"] > before["samples"]

@@ -30,15 +30,16 @@ def version(number: int, error: dict[str, Any] | float | None) -> CalibrationOut
 @pytest.mark.parametrize(
     ("history", "words"),
     [
-        ([version(1, {})], "One photo so far. It is tested on the others once there are some."),
+        ([version(1, {})], "One photo so far. Once there are more, they are tested on one another."),
         ([version(1, {}), version(2, None)], "The photos are being tested on one another."),
         (
             [version(1, {}), version(2, {"center": 0.115, "mid": 0.1682})],
-            "With 2 photos: center 12 %, middle 17 %, corners not known. The curve begins with the next one.",
+            "With 2 photos: center 12 %, middle 17 %, corners not known. "
+            "The curve starts with the next photo.",
         ),
         (
             [version(1, None), version(2, 0.25)],
-            "With 2 photos: center 25 %, middle 25 %, corners 25 %. The curve begins with the next one.",
+            "With 2 photos: center 25 %, middle 25 %, corners 25 %. The curve starts with the next photo.",
         ),
     ],
 )
@@ -74,4 +75,4 @@ def test_every_part_has_been_seen_only_where_there_is_evidence_near_each() -> No
 def test_a_zone_with_few_places_is_asked_for_first() -> None:
     bars = coverage_bars({"center": 60, "mid": 80, "corner": 3})
 
-    assert coverage_advice(bars, everywhere()).startswith("Little seen yet of: corners.")
+    assert coverage_advice(bars, everywhere()).startswith("Little seen so far: corners.")

@@ -99,7 +99,8 @@ def test_the_first_sentence_is_for_photographers(soft: LensTest) -> None:
     assert soft.verdict.startswith("At f/2.8 this copy is a little soft in the center, and its corners are")
     assert "softer" in soft.verdict
     even = report_of(draws=0, corner=0.8)
-    assert "its corners are as good" in even.verdict
+    assert "its corners are just as good" in even.verdict
+    assert "its corners are nearly as good" in report_of(draws=0, corner=0.9).verdict
 
 
 def test_errors_grow_with_what_photos_disagree_about(soft: LensTest) -> None:
@@ -114,6 +115,33 @@ def test_errors_grow_with_what_photos_disagree_about(soft: LensTest) -> None:
     assert single is not None
     assert single.drawn == "patches"
     assert [one.spread is None for one in soft.tested] == [False, True, True]  # green first
+
+
+def test_a_lens_that_draws_points_within_a_pixel_is_reported() -> None:
+    point = np.zeros((SIZE, SIZE))
+    point[SIZE // 2, SIZE // 2] = 1.0
+    given = [s for s in samples() if s.settings.channel == "g"]
+    narrow = [s if s.position.r > 0.9 else replace(s, kernel=point) for s in given]
+
+    test = lens_test(LensModel.fit(narrow, QUICK), "Sharp", draws=0, rows=5, size=SIZE, channels=("g",))
+    nothing = [replace(s, kernel=point) for s in given]
+    perfect = lens_test(LensModel.fit(nothing, QUICK), "Perfect", draws=0, rows=5, size=SIZE, channels=("g",))
+
+    text = "in the center a point stays within a pixel, in the corners it is 1.5 px wide"
+    assert text in test.tested[0].report.shape.text
+    assert "a point stays within a pixel" in perfect.tested[0].report.shape.text
+    assert "Astigmatism" in to_html(perfect)
+    assert to_pdf(perfect).startswith(b"%PDF-")
+
+
+def test_photos_at_other_apertures_do_not_make_one_photo_look_well_known() -> None:
+    once = [replace(s, photo="stopped", settings=replace(s.settings, aperture=5.6)) for s in samples(1)]
+    given = [s for s in samples(3, spread=0.1) + once if s.settings.channel == "g"]
+
+    test = lens_test(LensModel.fit(given, QUICK), "Two", draws=4, rows=5, size=SIZE, channels=("g",))
+
+    drawn = {t.report.settings.aperture: t.spread.drawn for t in test.tested if t.spread is not None}
+    assert drawn == {2.8: "photos", 5.6: "patches"}
 
 
 def test_all_documents_hold_the_same_figures(soft: LensTest) -> None:
@@ -152,7 +180,8 @@ def test_two_copies_are_compared_with_their_error(soft: LensTest) -> None:
     assert "sharper in the corners" in found.verdict
     same = compare(Side("one", soft.tested[0]), Side("two", soft.tested[0]))
     assert (
-        same.verdict == "Beside one, two is alike in the center, alike halfway out and alike in the corners."
+        same.verdict == "Compared with one, two is about the same in the center, about the same halfway out "
+        "and about the same in the corners."
     )
     assert len(found.charts) == 3
     assert "sharper in the corners" in comparison_html(found)

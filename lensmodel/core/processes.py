@@ -15,6 +15,7 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
+from multiprocessing import parent_process
 from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.process import BaseProcess
 from types import ModuleType
@@ -64,10 +65,21 @@ def pool(executor: Executor | None, workers: int | None, part: object = None) ->
 
 
 def _begin() -> None:
-    """Prepare a worker, before it imports NumPy: one thread, and Ctrl-C is left to who started it."""
+    """Prepare a worker, before it imports NumPy: one thread, and Ctrl-C is left to who started it.
+
+    A worker ends with its parent, however that ends: left alone it would wait for work for ever.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     for name in _ONE_THREAD:
         os.environ.setdefault(name, "1")
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 class _Process(SpawnProcess):

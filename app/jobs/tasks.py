@@ -157,13 +157,16 @@ def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
     output = arguments["output"]
     roi = arguments["roi"]
     model = _leaning(folder, ModelSettings(**arguments["model"]))
+    settings = _settings(arguments["settings"])
+    known = pipeline.psfs_for(developed, model, settings, method=arguments["method"])
 
     def corrected_with(bounds: correction.Bounds, on_step: StepHook) -> correction.Corrected:
         return pipeline.correct_photo(
             developed,
             model,
-            _settings(arguments["settings"]),
+            settings,
             method=arguments["method"],
+            known=known,
             strength=arguments["strength"],
             bounds=bounds,
             lateral=lateral,

@@ -47,6 +47,7 @@ def correct_photo(
     bounds: correction.Bounds | None = None,
     lateral: LateralColour | None = None,
     roi: tuple[int, int, int, int] | None = None,
+    known: PsfField | UncertainField | None = None,
     workers: int = 1,
     on_step: StepHook = ignore_step,
 ) -> correction.Corrected:
@@ -67,26 +68,17 @@ def correct_photo(
         What to allow beside edges and in flat areas.
     roi : tuple of int, optional
         `(row, col, height, width)` in sensor orientation; only that part is corrected.
+    known : PsfField or UncertainField, optional
+        What `psfs_for` found for this photo; hand it over where the same photo is corrected several times.
 
     Returns
     -------
     Corrected
         Of a chart, with what was measured on its edges (`find_edges`) in each zone.
     """
-    pitch_um, half_diagonal_px = developed.info.metadata.pixel_pitch_um, developed.frame.half_diagonal
     wanted = way_of(model).method if method is None else method
     plain = model.mode == PAPER and wanted == PAPER
-    field: PsfField | UncertainField = (
-        model.field(settings, pitch_um=pitch_um, half_diagonal_px=half_diagonal_px)
-        if plain
-        else WitnessedField.of(
-            model.warmed(),
-            settings,
-            witnesses_of(developed, settings),
-            pitch_um=pitch_um,
-            half_diagonal_px=half_diagonal_px,
-        )
-    )
+    field = psfs_for(developed, model, settings, method=method) if known is None else known
     planes, cfa = developed.planes, developed.cfa
     if developed.lossy and not plain:
         strength *= LOSSY_SHARE
@@ -111,6 +103,27 @@ def correct_photo(
         on_step=on_step,
     )
     return _with_measured_gain(corrected, developed, roi)
+
+
+def psfs_for(
+    developed: LinearPhoto,
+    model: LensModel,
+    settings: LensSettings,
+    *,
+    method: str | correction.Deconvolver | None = None,
+) -> PsfField | UncertainField:
+    """Return what a correction of a photo is to think of the PSFs of its lens, see `correct_photo`."""
+    pitch_um, half_diagonal_px = developed.info.metadata.pixel_pitch_um, developed.frame.half_diagonal
+    wanted = way_of(model).method if method is None else method
+    if model.mode == PAPER and wanted == PAPER:
+        return model.field(settings, pitch_um=pitch_um, half_diagonal_px=half_diagonal_px)
+    return WitnessedField.of(
+        model.warmed(),
+        settings,
+        witnesses_of(developed, settings),
+        pitch_um=pitch_um,
+        half_diagonal_px=half_diagonal_px,
+    )
 
 
 def _with_measured_gain(

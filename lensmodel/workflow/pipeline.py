@@ -16,7 +16,7 @@ from lensmodel.workflow.calibrating import (
     samples_of_bytes,
     samples_of_photo,
 )
-from lensmodel.workflow.correcting import correct, correct_photo, lateral_of
+from lensmodel.workflow.correcting import correct, correct_photo, lateral_of, psfs_for
 from lensmodel.workflow.developed import load_developed, photo_id, save_developed, settings_of
 from lensmodel.workflow.estimating import (
     DEFAULT_KERNEL_SIZE,
@@ -45,6 +45,7 @@ __all__ = [
     "lateral_of",
     "load_developed",
     "photo_id",
+    "psfs_for",
     "require_spread",
     "samples_of_bytes",
     "samples_of_photo",

@@ -70,7 +70,8 @@ def held_places(audit: Mapping[str, Any], height: int, width: int, orientation: 
         else f"{share:.0%} of the correction was held back over the whole photo."
     )
     places = []
-    for found in audit.get("worst", [])[:NAMED] if share >= LEAST else []:
+    worst = audit.get("worst", []) if share >= LEAST else []  # less is not worth a look
+    for found in worst[:NAMED]:
         y, x = upright_point(found["row"], found["col"], height, width, orientation)
         places.append(Place(x, y, f"{found['held_back']:.0%}: {check_words(found['check'])}"))
     return Held(words, reasons, places)

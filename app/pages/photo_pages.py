@@ -63,6 +63,7 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
         "photo.html",
         photo=_upright(photo, row),
         can_look=pictures.exists(call.storage, f"{folder_of(row)}{SHOWN}"),
+        gently=row.kind == "jpeg",
         patches=patches,
         used=sum(patch.state == "done" for patch in patches),
         reasons=left_out.most_common(),

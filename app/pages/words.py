@@ -223,7 +223,7 @@ def event_words(event: CalibrationOut) -> str:
 
 def centring_verdict(found: Decentring) -> str:
     """Say in a word or two whether a lens is centred."""
-    return {"centred": "As far as can be told, yes.", "decentred": "No.", "unknown": "Undecided."}[
+    return {"centred": "Yes, as far as can be told.", "decentred": "No.", "unknown": "Undecided."}[
         found.verdict
     ]
 

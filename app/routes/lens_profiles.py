@@ -90,9 +90,9 @@ async def _received(call: Call) -> bytes:
 
 def _add(lens_id: str, data: bytes, call: Call) -> LensOut:
     try:
-        profile = read_profile(io.BytesIO(data), "the file")
+        profile = read_profile(io.BytesIO(data), "This file")
     except InvalidInputError as error:
-        raise MalformedUploadError(f"{error}: send a .lensprofile") from error
+        raise MalformedUploadError(str(error)) from error
     names = {key: name for key, name in profile.photos.items() if name.isprintable()}
     if take_in(call.store.database, lens_id, call.owner, profile.model.samples, names) is None:
         raise UnknownLensError(f"there is no lens {lens_id[:60]}: it may be deleted already")

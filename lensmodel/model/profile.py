@@ -190,7 +190,9 @@ def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> 
     except FileNotFoundError:
         raise
     except _UNREADABLE as error:
-        raise InvalidInputError(f"{name} is no lens profile; make one with `lensmodel calibrate`") from error
+        raise InvalidInputError(
+            f"{name} is no lens profile; choose one whose name ends in .lensprofile"
+        ) from error
     try:
         if document["format"] != FORMAT:
             raise InvalidInputError(

@@ -76,8 +76,7 @@ def correct_photo(
     Corrected
         Of a chart, with what was measured on its edges (`find_edges`) in each zone.
     """
-    wanted = way_of(model).method if method is None else method
-    plain = model.mode == PAPER and wanted == PAPER
+    wanted, plain = _way(model, method)
     field = psfs_for(developed, model, settings, method=method) if known is None else known
     planes, cfa = developed.planes, developed.cfa
     if developed.lossy and not plain:
@@ -105,6 +104,14 @@ def correct_photo(
     return _with_measured_gain(corrected, developed, roi)
 
 
+def _way(
+    model: LensModel, method: str | correction.Deconvolver | None
+) -> tuple[str | correction.Deconvolver, bool]:
+    """Which method is wanted, and whether all is done the paper's way and nothing else."""
+    wanted = way_of(model).method if method is None else method
+    return wanted, model.mode == PAPER and wanted == PAPER
+
+
 def psfs_for(
     developed: LinearPhoto,
     model: LensModel,
@@ -114,8 +121,8 @@ def psfs_for(
 ) -> PsfField | UncertainField:
     """Return what a correction of a photo is to think of the PSFs of its lens, see `correct_photo`."""
     pitch_um, half_diagonal_px = developed.info.metadata.pixel_pitch_um, developed.frame.half_diagonal
-    wanted = way_of(model).method if method is None else method
-    if model.mode == PAPER and wanted == PAPER:
+    _, plain = _way(model, method)
+    if plain:
         return model.field(settings, pitch_um=pitch_um, half_diagonal_px=half_diagonal_px)
     return WitnessedField.of(
         model.warmed(),

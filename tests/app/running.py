@@ -187,7 +187,7 @@ def scene(seed: int, height: int = 320, width: int = 448) -> NDArray[np.float64]
 
 
 def write_photo(
-    path: Path, seed: int, *, sigma: float = 1.3, serial: str = "L-42", aperture: float = 2.8
+    path: Path, seed: int, *, sigma: float = 1.3, serial: str = "L-42", aperture: float | None = 2.8
 ) -> Path:
     """Write a raw photo of such a scene, taken through a round Gaussian blur."""
     rng = np.random.default_rng(seed)

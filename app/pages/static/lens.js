@@ -205,7 +205,6 @@ export function setUpLensActions() {
       const file = fields.get("profile");
       if (!file?.size) throw new Error("Choose a profile first.");
       const response = await fetch(`${lens}/profile`, { method: "PUT", body: file, headers: { "Content-Type": "application/zip" } });
-      if ([400, 415, 422].includes(response.status)) throw new Error("This file is not a lens profile. Choose one whose name ends in .lensprofile.");
       if (!response.ok) throw new Error(await problemText(response));
       location.reload();
     },

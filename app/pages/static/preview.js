@@ -4,6 +4,7 @@ import { byId, problemText, send } from "./common.js";
 
 const MOST = 1_200_000; // pixels of a part that is computed: a second or two of work
 const PAUSE_MS = 500;
+const WORKING = "Working out what a correction does here …";
 const LIGHT = Float32Array.from({ length: 256 }, (_, code) => {
   const value = code / 255;
   return value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4;
@@ -47,8 +48,15 @@ export function setUpPreview(viewer) {
   const words = byId("preview-words");
   const canvas = document.createElement("canvas");
   let [part, asked, timer, running] = [null, 0, 0, ""];
-  const stop = () => {
-    if (running) fetch(`/v1/jobs/${running}/cancel`, { method: "POST", keepalive: true }); // nobody waits for it any more
+  const forget = (id) => fetch(`/v1/corrections/${id}`, { method: "DELETE", keepalive: true }).catch(() => {}); // it may be gone
+  const left = new Set();
+  // What nobody waits for any more stops; but the same wish again is the same correction.
+  const sweep = () => {
+    for (const id of left) if (id !== running) forget(id);
+    left.clear();
+  };
+  const leave = () => {
+    if (running) left.add(running);
     running = "";
   };
   const value = (name) => Number(form.elements[name].value);
@@ -71,36 +79,41 @@ export function setUpPreview(viewer) {
   const compute = async (region) => {
     asked += 1;
     const mine = asked;
-    stop();
-    words.textContent = "Working out what a correction does here …";
+    leave();
+    words.textContent = WORKING;
     try {
       const lens = form.elements.lens_id?.value;
       const made = await send("POST", `/ui/photos/${form.dataset.photo}/preview`, { ...region, ...(lens ? { lens_id: lens } : {}) });
       if (mine !== asked) {
-        fetch(`/v1/jobs/${made.id}/cancel`, { method: "POST" });
+        left.add(made.id);
+        if (running) sweep();
         return;
       }
       running = made.id;
+      sweep();
       const end = await settled(made.id, (job) => {
-        if (mine === asked && job.state === "queued") words.textContent = "Waiting for other work to finish …";
+        if (mine === asked) words.textContent = job.state === "queued" ? "Waiting for other work to finish …" : WORKING;
         return mine === asked;
       });
       if (mine !== asked) return;
-      running = "";
       if (end.state !== "succeeded") throw new Error(end.error?.detail ?? "the preview was stopped");
       const base = `/ui/corrections/${made.id}/layer`;
       const [before, after, smooth, clean] = await Promise.all(
         ["before", "after", "smooth", "clean"].map((name) => pixelsOf(`${base}/${name}`)),
       );
       if (mine !== asked) return;
+      running = "";
       part = { region, layers: { before, after, smooth, clean } };
       words.textContent = end.untouched
         ? "Nothing to correct here: this part stays as it is."
         : "This is what you get. The sliders show their effect at once.";
       show();
-      fetch(`/v1/corrections/${made.id}`, { method: "DELETE" }); // its pictures are here now
+      forget(made.id); // its pictures are here now
     } catch (reason) {
-      if (mine === asked) words.textContent = `No preview: ${reason.message}`;
+      if (mine !== asked) return;
+      leave();
+      sweep();
+      words.textContent = `No preview: ${reason.message}`;
     }
   };
   const look = () => {
@@ -121,7 +134,11 @@ export function setUpPreview(viewer) {
     part = null;
     look();
   });
-  window.addEventListener("pagehide", stop);
+  window.addEventListener("pagehide", () => {
+    leave();
+    sweep();
+  });
+  window.addEventListener("pageshow", (event) => event.persisted && look()); // back from another page: it was stopped
   look();
 }
 

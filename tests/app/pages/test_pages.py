@@ -243,6 +243,33 @@ def test_a_photo_without_any_lens_can_still_be_looked_at_and_deleted(
     expect(page.get_by_role("button", name="Whole photo")).to_be_enabled()
 
 
+def test_a_preview_that_nobody_waits_for_is_stopped(page: Page, learned: dict[str, Any]) -> None:
+    page.goto(f"/photos/{learned['id']}")
+    with page.expect_response(lambda answer: answer.url.endswith("/preview")) as begun:
+        page.get_by_role("button", name="upper left").click()
+    first = begun.value.json()["id"]
+    with page.expect_request(lambda request: request.method == "DELETE" and request.url.endswith(first)):
+        page.get_by_role("button", name="lower right").click()
+
+    expect(page.locator("#preview-words")).to_contain_text("This is what you get")
+
+
+def test_an_aperture_is_asked_for_where_photos_do_not_say_it(
+    page: Page, service: Service, tmp_path: Path
+) -> None:
+    sent = service.upload(write_photo(tmp_path / "old.dng", 33, serial="", aperture=None))
+    service.job(sent["id"], until=lambda job: job["state"] == "waiting")
+    page.goto("/")
+    group = page.locator("[data-group]")
+    group.get_by_label("Or a new one, called").fill("Old 50 mm")
+
+    for given, told in (("", "such as 2.8"), ("1000", "between 0.5 and 128"), ("wide", "must be a number")):
+        group.get_by_label("Aperture, f/").fill(given)
+        group.get_by_role("button", name="Continue").click()
+        expect(group.locator(".alert")).to_contain_text(told)
+    assert service.http.delete(f"/v1/photos/{sent['id']}").status_code == 204
+
+
 def test_photos_that_wait_are_named_together_by_their_pictures(
     page: Page, service: Service, learned: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -486,7 +513,9 @@ def test_fingers_zoom_and_move_the_view(page: Page, correction: dict[str, Any]) 
     expect(page.locator(".zoom-words")).not_to_have_text(first)
 
 
-def test_a_lens_has_charts_a_verdict_and_a_report(page: Page, learned: dict[str, Any]) -> None:
+def test_a_lens_has_charts_a_verdict_and_a_report(
+    page: Page, service: Service, learned: dict[str, Any]
+) -> None:
     page.goto(f"/lenses/{learned['lens_id']}")
     expect(page.locator("#lens-state [data-settled]")).to_be_attached()
     expect(page.locator("#charts svg").first).to_be_visible()
@@ -494,6 +523,8 @@ def test_a_lens_has_charts_a_verdict_and_a_report(page: Page, learned: dict[str,
     expect(page.locator("section[aria-labelledby=centring-title]")).to_contain_text(
         re.compile("Yes|No|Undecided")
     )
+    charts = service.http.get(f"/ui/lenses/{learned['lens_id']}/charts?aperture=5.6&against=at%205.6").text
+    assert "Compared with" not in charts  # with itself there is nothing to compare
     controls = page.locator("#chart-controls")
     with page.expect_response(lambda answer: "/charts?" in answer.url and "lp%2Fmm" not in answer.url) as got:
         controls.locator("[name=aperture]").select_option("5.6")

@@ -42,7 +42,7 @@ from lensmodel.core.evidence import PatchEvidence
 from lensmodel.core.files import save_array
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.spectrum import PatchSpectrum
-from lensmodel.core.types import FieldPosition, LensSettings, Planes, StepHook, ignore_step
+from lensmodel.core.types import FieldPosition, LensSettings, Planes
 from lensmodel.correction.engine import first_use
 from lensmodel.estimation import estimators
 from lensmodel.estimation import measure as lens_measure
@@ -78,6 +78,7 @@ def develop(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
     limits = photo.Limits(max_megapixels=arguments["max_megapixels"])
     developed = photo.develop(Path(arguments["path"]), limits=limits)
     pipeline.save_developed(developed, folder)
+    pipeline.save_seen(pipeline.seen_patches(developed), folder)
     (folder / PREVIEW).write_bytes(previews.preview(developed))
     (folder / R_MAP).write_bytes(previews.confidence_map(developed))
     _show(folder / SHOWN, developed.planes, developed)
@@ -158,25 +159,24 @@ def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
     roi = arguments["roi"]
     model = _leaning(folder, ModelSettings(**arguments["model"]))
     settings = _settings(arguments["settings"])
-    known = pipeline.psfs_for(developed, model, settings, method=arguments["method"])
-
-    def corrected_with(bounds: correction.Bounds, on_step: StepHook) -> correction.Corrected:
-        return pipeline.correct_photo(
-            developed,
-            model,
-            settings,
-            method=arguments["method"],
-            known=known,
-            strength=arguments["strength"],
-            bounds=bounds,
-            lateral=lateral,
-            roi=None if roi is None else (roi["y"], roi["x"], roi["height"], roi["width"]),
-            workers=arguments["workers"],
-            on_step=on_step,
-        )
-
+    seen = pipeline.load_seen(Path(arguments["developed"]))
+    known = pipeline.psfs_for(developed, model, settings, method=arguments["method"], seen=seen)
     bounds = correction.Bounds(**arguments["bounds"])
-    corrected = corrected_with(bounds, progress)
+    extremes = (replace(bounds, texture=0.0), replace(bounds, texture=1.0, denoise=1.0))
+    corrected = pipeline.correct_photo(
+        developed,
+        model,
+        settings,
+        method=arguments["method"],
+        known=known,
+        strength=arguments["strength"],
+        bounds=bounds,
+        layers=extremes if arguments.get("layers") else (),
+        lateral=lateral,
+        roi=None if roi is None else (roi["y"], roi["x"], roi["height"], roi["width"]),
+        workers=arguments["workers"],
+        on_step=progress,
+    )
     name = f"result{SUFFIX[output['format']]}"
     photo.write_image(
         folder / name,
@@ -193,10 +193,8 @@ def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
     part = np.ascontiguousarray(developed.planes[:, top : top + height, left : left + width])
     _show(folder / BEFORE, part, developed)
     _show(folder / AFTER, corrected.planes, developed)
-    if arguments.get("layers"):
-        extremes = (replace(bounds, texture=0.0), replace(bounds, texture=1.0, denoise=1.0))
-        for layer, extreme in zip(LAYERS, extremes, strict=True):
-            planes = corrected_with(extreme, ignore_step).planes
+    if corrected.layers:
+        for layer, planes in zip(LAYERS, corrected.layers, strict=True):
             photo.write_image(folder / layer, planes, developed.encoding, format="png8", color_space="srgb")
     report = {
         "zones": corrected.zones,

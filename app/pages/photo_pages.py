@@ -75,14 +75,18 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
 
 
 class PreviewIn(Region):
-    """A part of the upright photo, in its pixels; and the lens, where the photo does not say it."""
+    """A part of the upright photo, in its pixels; and the lens, where the photo does not say it.
+
+    With `layers` it is also wanted as the sliders of texture and grain need it.
+    """
 
     lens_id: Id | None = None
+    layers: bool = False
 
 
 @router.post("/ui/photos/{photo_id}/preview", status_code=202)
 def preview(photo_id: str, wish: PreviewIn, call: CallDep) -> dict[str, str]:
-    """Begin to correct a part of a photo, in all the ways that the sliders mix."""
+    """Begin to correct a part of a photo."""
     row = photo_routes.find_photo(call, photo_id)
     if not row.width or not row.height:
         raise InvalidParameterError("the photo is not read yet: wait a moment")
@@ -94,7 +98,7 @@ def preview(photo_id: str, wish: PreviewIn, call: CallDep) -> dict[str, str]:
             "photo_id": photo_id,
             "lens_id": wish.lens_id,
             "roi": turned.model_dump(),
-            "layers": True,
+            "layers": wish.layers,
             "output": {"format": "png8", "color_space": "srgb"},
         }
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -66,6 +67,7 @@ class CorrectionJob:
     audited: bool
     plain: bool
     stored: StoredColour | None
+    layers: tuple[Bounds, ...] = ()
 
     def __post_init__(self) -> None:
         wanted = (len(CHANNELS), self.frame.height, self.frame.width)
@@ -118,91 +120,140 @@ class CorrectionJob:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RestoredCell:
-    """One cell as it leaves: its pixels, what they should have gained, and what the audit said of them."""
+    """One cell as it leaves: its pixels, what they should have gained, and what the audit said of them.
+
+    `layers` are the same within each of the job's other bounds.
+    """
 
     planes: Planes
     forecast: CellForecast
     audit: TileAudit | None
     left: bool = False
+    layers: tuple[Planes, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _CellTile:
+    """A cell with its halo, as the photo shows it, and what is known of it."""
+
+    cell: Cell
+    corner: tuple[int, int]
+    photo: Planes
+    inner: tuple[slice, slice, slice]
+    beliefs: Sequence[Belief]
+    sensors: Sequence[Sensor]
+
+    @classmethod
+    def of(cls, job: CorrectionJob, cell: Cell) -> _CellTile:
+        """Cut the tile of a cell out of a photo."""
+        reach = max(job.reach(cell.position, channel) for channel in CHANNELS)
+        halo = fitted_halo((len(cell.rise), len(cell.run)), max(MIN_HALO, reach + MORE))
+        top, left = max(cell.top - halo, 0), max(cell.left - halo, 0)
+        tile = np.asarray(job.planes[:, top : cell.bottom + halo, left : cell.right + halo], dtype=np.float32)
+        surrounded = (
+            min(cell.top - halo, cell.left - halo) >= 0
+            and cell.bottom + halo <= job.frame.height
+            and cell.right + halo <= job.frame.width
+        )
+        edges = (
+            top == 0,
+            cell.bottom + halo >= job.frame.height,
+            left == 0,
+            cell.right + halo >= job.frame.width,
+        )
+        sensors = [
+            Sensor(job.noise[c], job.clip[c], job.measured(c, top, left, plane.shape), surrounded, edges)
+            for c, plane in enumerate(tile)
+        ]
+        inner = (
+            slice(None),
+            slice(cell.top - top, cell.bottom - top),
+            slice(cell.left - left, cell.right - left),
+        )
+        beliefs = [job.beliefs(cell.position, channel) for channel in CHANNELS]
+        return cls(cell, (top, left), tile, inner, beliefs, sensors)
+
+    @property
+    def here(self) -> Planes:
+        """The cell without its halo."""
+        return self.photo[self.inner]
+
+
+Solution = tuple[Sequence[UniformBlur], Planes]
+"""Blurs of a tile by channel, and the tile without them."""
 
 
 def restore_cell(job: CorrectionJob, cell: Cell) -> RestoredCell:
     """Restore one cell, halo cut off again."""
-    beliefs = [job.beliefs(cell.position, channel) for channel in CHANNELS]
-    errors = [belief.error for belief in beliefs]
-    reach = max(job.reach(cell.position, channel) for channel in CHANNELS)
-    halo = fitted_halo((len(cell.rise), len(cell.run)), max(MIN_HALO, reach + MORE))
-    top, left = max(cell.top - halo, 0), max(cell.left - halo, 0)
-    tile = np.asarray(job.planes[:, top : cell.bottom + halo, left : cell.right + halo], dtype=np.float32)
-    surrounded = (
-        min(cell.top - halo, cell.left - halo) >= 0
-        and cell.bottom + halo <= job.frame.height
-        and cell.right + halo <= job.frame.width
-    )
-    edges = (
-        top == 0,
-        cell.bottom + halo >= job.frame.height,
-        left == 0,
-        cell.right + halo >= job.frame.width,
-    )
-    sensors = [
-        Sensor(
-            job.noise[c],
-            job.clip[c],
-            job.measured(c, top, left, plane.shape),
-            surrounded,
-            edges,
-        )
-        for c, plane in enumerate(tile)
-    ]
-    inner = (
-        slice(None),
-        slice(cell.top - top, cell.bottom - top),
-        slice(cell.left - left, cell.right - left),
-    )
+    tile = _CellTile.of(job, cell)
+
+    @lru_cache  # what bounds allow seldom changes the kernels
+    def solved(shares: tuple[float, ...]) -> Solution:
+        blurs = [
+            job.blur(cell, channel, share, tile.corner)
+            for channel, share in zip(CHANNELS, shares, strict=True)
+        ]
+        return blurs, restore_planes(job.method, tile.photo, blurs, tile.sensors)
+
+    found = _within(job, tile, job.bounds, solved)
+    layers = tuple(_within(job, tile, bounds, solved).planes for bounds in job.layers)
+    return replace(found, layers=layers) if layers else found
+
+
+def _within(
+    job: CorrectionJob,
+    tile: _CellTile,
+    bounds: Bounds,
+    solved: Callable[[tuple[float, ...]], Solution],
+) -> RestoredCell:
+    """Restore a tile within bounds, checked; cut its halo off."""
+    cell, sensors = tile.cell, tile.sensors
     offsets = [job.offset(cell.position, channel) for channel in CHANNELS]
-    plans = plan(cell, tile, beliefs, offsets, sensors, SHARE * job.bounds.texture)
+    plans = plan(cell, tile.photo, tile.beliefs, offsets, sensors, SHARE * bounds.texture)
     expected = plans.forecast
-    worth = expected.gain_db >= WORTH_DB or job.bounds.denoise > 0.0
+    worth = expected.gain_db >= WORTH_DB or bounds.denoise > 0.0
     if job.strength == 0.0 or not (worth or job.plain):
-        untouched = replace(expected, after=expected.before)
-        return RestoredCell(tile[inner], untouched, None, left=True)
-    blurs = [
-        job.blur(cell, channel, share, (top, left))
-        for channel, share in zip(
-            CHANNELS, (1.0,) * len(CHANNELS) if job.plain else plans.shares, strict=True
-        )
-    ]
-    restored = restore_planes(job.method, tile, blurs, sensors)
+        return RestoredCell(tile.here, replace(expected, after=expected.before), None, left=True)
+    blurs, restored = solved((1.0,) * len(CHANNELS) if job.plain else plans.shares)
     if job.plain:
-        return RestoredCell(job.weakened(tile[inner], restored[inner]), expected, None)
-    restored = texture_kept(
-        tile, restored, blurs, sensors, texture=job.bounds.texture, denoise=job.bounds.denoise
-    )
-    restored = hue_held(tile, restored, blurs, sensors, errors)
-    restored = held_beside_clipped(tile, restored, blurs, sensors, errors)
+        return RestoredCell(job.weakened(tile.here, restored[tile.inner]), expected, None)
+    restored, audit = _checked(job, tile, bounds, blurs, restored)
+    if expected.changed(tile.here, restored).gain_db < WORTH_DB and bounds.denoise == 0.0:
+        # bounds and audit left so little that what remains is a photo smoothed, not one made sharper
+        return RestoredCell(tile.here, replace(expected, after=expected.before), audit, left=True)
+    restored = job.weakened(tile.here, restored)
+    return RestoredCell(restored, expected.changed(tile.here, restored), audit)
+
+
+def _checked(
+    job: CorrectionJob,
+    tile: _CellTile,
+    bounds: Bounds,
+    blurs: Sequence[UniformBlur],
+    restored: Planes,
+) -> tuple[Planes, TileAudit | None]:
+    """Give texture back, hold what a lens cannot have hidden, audit; the cell without its halo."""
+    photo, sensors, errors = tile.photo, tile.sensors, [belief.error for belief in tile.beliefs]
+    restored = texture_kept(photo, restored, blurs, sensors, texture=bounds.texture, denoise=bounds.denoise)
+    restored = hue_held(photo, restored, blurs, sensors, errors)
+    restored = held_beside_clipped(photo, restored, blurs, sensors, errors)
     if job.stored is not None:
-        restored = job.stored.held(tile, restored)
+        restored = job.stored.held(photo, restored)
     verdict: TileAudit | None = None
     if job.audited:
         evidence = Evidence(job.noise, job.clip, blurs, errors, [sensor.measured for sensor in sensors])
         # before the bounds, which would hide what tells of a wrong kernel: light below black, foreign hues
-        restored, verdict = held_back(tile, restored, evidence, inner=inner[1:])
+        restored, verdict = held_back(photo, restored, evidence, inner=tile.inner[1:])
     else:
-        restored = restored[inner]
-    corner, spread = (cell.top, cell.left), max(map(far, blurs))
-    restored = job.bounds.hold(job.planes, corner, restored, errors, spread)
+        restored = restored[tile.inner]
+    corner, spread = (tile.cell.top, tile.cell.left), max(map(far, blurs))
+    restored = bounds.hold(job.planes, corner, restored, errors, spread)
     around = photo_around(job.planes, corner, restored, HUE_REACH)
     dark = [sensor.noise.sigma_at(0.0) for sensor in sensors]
     restored = hue_bounded(around, restored, job.clip, dark)
-    if job.bounds.halo is not None:  # a range that was asked for holds to the last bit
-        restored = job.bounds.hold(job.planes, corner, restored, errors, spread)
-    audit = None if verdict is None else verdict.without_map()
-    if expected.changed(tile[inner], restored).gain_db < WORTH_DB and job.bounds.denoise == 0.0:
-        # bounds and audit left so little that what remains is a photo smoothed, not one made sharper
-        return RestoredCell(tile[inner], replace(expected, after=expected.before), audit, left=True)
-    restored = job.weakened(tile[inner], restored)
-    return RestoredCell(restored, expected.changed(tile[inner], restored), audit)
+    if bounds.halo is not None:  # a range that was asked for holds to the last bit
+        restored = bounds.hold(job.planes, corner, restored, errors, spread)
+    return restored, None if verdict is None else verdict.without_map()
 
 
 def _mixed(kernel: Kernel, share: float) -> Kernel:

@@ -58,12 +58,15 @@ class Corrected:
     chroma_step : tuple of int
         Rows and columns of pixels that share one value of chroma in the photo's file; where that is more than
         one pixel, chroma was corrected no more finely.
+    layers : tuple of Planes
+        The same within the other bounds that were asked for.
     """
 
     planes: Planes
     zones: dict[Zone, ZoneReport]
     audit: AuditReport = field(default_factory=lambda: pooled(()))
     chroma_step: tuple[int, int] = (1, 1)
+    layers: tuple[Planes, ...] = ()
 
     @property
     def nothing_to_correct(self) -> bool:
@@ -94,6 +97,7 @@ def correct_planes(
     lateral: LateralShift | None = None,
     cfa: BayerPattern | None = None,
     bounds: Bounds | None = None,
+    layers: Sequence[Bounds] = (),
     audited: bool = True,
     plain: bool = False,
     stored: StoredColour | None = None,
@@ -136,6 +140,9 @@ def correct_planes(
         "standard" and "fast" demosaic and deblur in one. `noise` is that of the sensor then.
     bounds : Bounds or None
         What to allow beside edges and in flat areas; None lets `psf_error` decide.
+    layers : sequence of Bounds
+        Others to correct the photo within as well, for a preview: the solution is shared, which is a third
+        of the work.
     audited : bool
         Whether to hold back what fails `lensmodel.correction.audit`; without it a method's own
         errors can be seen.
@@ -185,16 +192,20 @@ def correct_planes(
         audited,
         plain,
         stored,
+        tuple(layers),
     )
     window = Roi.of(frame, roi)
     keep_freed_memory()
-    out = _zeroed(out, (len(CHANNELS), window.height, window.width))
+    shape = (len(CHANNELS), window.height, window.width)
+    out, others = _zeroed(out, shape), tuple(_zeroed(None, shape) for _ in layers)
     if pitch is None:
         pitch = usual_pitch(frame, job.cell_factor)
     wanted = [cell for cell in cells(frame, pitch) if cell.meets(window)]
     forecasts, audits, left = [], [], Counter[Zone]()
     for done, (cell, restored) in enumerate(_restored(job, wanted, workers), start=1):
         _add(out, window, cell, restored.planes)
+        for other, planes_of_it in zip(others, restored.layers, strict=True):
+            _add(other, window, cell, planes_of_it)
         forecasts.append(restored.forecast)
         left[restored.forecast.zone] += restored.left
         if restored.audit is not None:
@@ -202,7 +213,7 @@ def correct_planes(
         on_step(done, len(wanted))
     report = pooled(audits, pitch)
     step = (1, 1) if stored is None else stored.step
-    return Corrected(out, zone_reports(forecasts, left, report), report, step)
+    return Corrected(out, zone_reports(forecasts, left, report), report, step, others)
 
 
 def _zeroed(out: Planes | None, shape: tuple[int, int, int]) -> Planes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -21,7 +22,7 @@ from lensmodel.photo import LinearPhoto
 from lensmodel.photo.lateral import LateralColour, estimate_lateral, resample
 from lensmodel.photo.tags.xmp_block import sidecar_path, write_sidecar
 from lensmodel.workflow.developed import settings_of
-from lensmodel.workflow.estimating import witnesses_of
+from lensmodel.workflow.estimating import SeenPatch, witnesses_of
 from lensmodel.workflow.ways import way_of
 
 log = logging.getLogger(__name__)
@@ -45,6 +46,7 @@ def correct_photo(
     method: str | correction.Deconvolver | None = None,
     strength: float = 1.0,
     bounds: correction.Bounds | None = None,
+    layers: Sequence[correction.Bounds] = (),
     lateral: LateralColour | None = None,
     roi: tuple[int, int, int, int] | None = None,
     known: PsfField | UncertainField | None = None,
@@ -66,6 +68,8 @@ def correct_photo(
         0 leaves the photo as it is, 1 applies what the noise allows, or `LOSSY_SHARE` of it if it is lossy.
     bounds : Bounds, optional
         What to allow beside edges and in flat areas.
+    layers : sequence of Bounds
+        Others to correct it within as well, in little more than the time of one.
     roi : tuple of int, optional
         `(row, col, height, width)` in sensor orientation; only that part is corrected.
     known : PsfField or UncertainField, optional
@@ -95,6 +99,7 @@ def correct_photo(
         lateral=lateral,
         cfa=cfa,
         bounds=bounds,
+        layers=layers,
         plain=plain,
         stored=correction.StoredColour.of_photo(developed),
         roi=roi,
@@ -118,8 +123,12 @@ def psfs_for(
     settings: LensSettings,
     *,
     method: str | correction.Deconvolver | None = None,
+    seen: Sequence[SeenPatch] | None = None,
 ) -> PsfField | UncertainField:
-    """Return what a correction of a photo is to think of the PSFs of its lens, see `correct_photo`."""
+    """Return what a correction of a photo is to think of the PSFs of its lens, see `correct_photo`.
+
+    `seen` are the photo's `seen_patches` where they are known already.
+    """
     pitch_um, half_diagonal_px = developed.info.metadata.pixel_pitch_um, developed.frame.half_diagonal
     _, plain = _way(model, method)
     if plain:
@@ -127,7 +136,7 @@ def psfs_for(
     return WitnessedField.of(
         model.warmed(),
         settings,
-        witnesses_of(developed, settings),
+        witnesses_of(developed, settings, seen),
         pitch_um=pitch_um,
         half_diagonal_px=half_diagonal_px,
     )

@@ -17,6 +17,7 @@ from lensmodel.core.spectrum import PatchSpectrum, binned_spectrum
 from lensmodel.core.types import (
     CHANNELS,
     Channel,
+    FieldPosition,
     LensSettings,
     NoiseModel,
     Plane,
@@ -60,6 +61,14 @@ class CellSample:
     sample: PsfSample
     evidence: bytes | None
     diagnostics: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenPatch:
+    """A patch of a photo as a witness of a model's kernels: where it lies, and its spectrum in green."""
+
+    position: FieldPosition
+    spectrum: PatchSpectrum
 
 
 def find_patches(
@@ -190,8 +199,8 @@ def estimate_cell(
     return results
 
 
-def witnesses_of(developed: LinearPhoto, settings: LensSettings) -> list[PsfSample]:
-    """Patches of a photo that tell whether a model's kernels fit it: spectra without kernels of their own.
+def seen_patches(developed: LinearPhoto) -> list[SeenPatch]:
+    """Patches of a photo that tell whether a model's kernels fit it.
 
     None of a JPEG file or a lossy DNG: cameras sharpen them, and a sharpened spectrum passes for that of a
     sharper lens, as errors of compression do.
@@ -202,6 +211,16 @@ def witnesses_of(developed: LinearPhoto, settings: LensSettings) -> list[PsfSamp
         selection = find_patches(developed)
     except (NoUsablePatchesError, InvalidInputError):  # nothing to see, or too small a picture
         return []
+    return [
+        SeenPatch(patch.position, PatchSpectrum(*binned_spectrum(*_view(developed, patch, "g"))))
+        for patch in selection.patches
+    ]
+
+
+def witnesses_of(
+    developed: LinearPhoto, settings: LensSettings, seen: Sequence[SeenPatch] | None = None
+) -> list[PsfSample]:
+    """Samples of a photo's `seen_patches`, found if not handed over, without kernels of their own."""
     known, none = developed.info.metadata, delta(DEFAULT_KERNEL_SIZE)
     return [
         PsfSample(
@@ -210,9 +229,9 @@ def witnesses_of(developed: LinearPhoto, settings: LensSettings) -> list[PsfSamp
             settings=settings.with_channel("g"),
             pixel_pitch_um=known.pixel_pitch_um,
             half_diagonal_px=developed.frame.half_diagonal,
-            spectrum=PatchSpectrum(*binned_spectrum(*_view(developed, patch, "g"))),
+            spectrum=patch.spectrum,
         )
-        for patch in selection.patches
+        for patch in (seen_patches(developed) if seen is None else seen)
     ]
 
 

@@ -17,7 +17,14 @@ from lensmodel.workflow.calibrating import (
     samples_of_photo,
 )
 from lensmodel.workflow.correcting import correct, correct_photo, lateral_of, psfs_for
-from lensmodel.workflow.developed import load_developed, photo_id, save_developed, settings_of
+from lensmodel.workflow.developed import (
+    load_developed,
+    load_seen,
+    photo_id,
+    save_developed,
+    save_seen,
+    settings_of,
+)
 from lensmodel.workflow.estimating import (
     DEFAULT_KERNEL_SIZE,
     DEFAULT_PATCHES,
@@ -26,6 +33,7 @@ from lensmodel.workflow.estimating import (
     estimate_cell,
     find_patches,
     require_spread,
+    seen_patches,
     witnesses_of,
 )
 
@@ -44,12 +52,15 @@ __all__ = [
     "ignore_event",
     "lateral_of",
     "load_developed",
+    "load_seen",
     "photo_id",
     "psfs_for",
     "require_spread",
     "samples_of_bytes",
     "samples_of_photo",
     "save_developed",
+    "save_seen",
+    "seen_patches",
     "settings_of",
     "witnesses_of",
 ]

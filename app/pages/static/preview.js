@@ -2,7 +2,7 @@
 
 import { byId, problemText, send } from "./common.js";
 
-const MOST = 1_200_000; // pixels of a part that is computed: a second or two of work
+const MOST = 1_200_000; // pixels of a part that is computed: some seconds of work on one core
 const PAUSE_MS = 500;
 const WORKING = "Working out what a correction does here …";
 const LIGHT = Float32Array.from({ length: 256 }, (_, code) => {
@@ -25,7 +25,7 @@ async function pixelsOf(url) {
 }
 
 // Strength, texture and grain enter a correction linearly in light, but for its last bounds: so they are mixed.
-export function mix({ before, after, smooth, clean }, { strength, texture, denoise }) {
+export function mix({ before, after, smooth = after, clean = after }, { strength, texture, denoise }) {
   const mixed = new ImageData(before.width, before.height);
   const out = mixed.data;
   for (let i = 0; i < out.length; i += 4) {
@@ -60,6 +60,8 @@ export function setUpPreview(viewer) {
     running = "";
   };
   const value = (name) => Number(form.elements[name].value);
+  // What texture and grain need takes as long again: only for those who move their sliders.
+  const layered = () => value("texture") !== 1 || value("denoise") !== 0;
   const show = () => {
     if (!part) return;
     const mixed = mix(part.layers, { strength: value("strength"), texture: value("texture"), denoise: value("denoise") });
@@ -78,12 +80,16 @@ export function setUpPreview(viewer) {
     wanted.y + wanted.height <= region.y + region.height;
   const compute = async (region) => {
     asked += 1;
-    const mine = asked;
+    const [mine, layers] = [asked, layered()];
     leave();
     words.textContent = WORKING;
     try {
       const lens = form.elements.lens_id?.value;
-      const made = await send("POST", `/ui/photos/${form.dataset.photo}/preview`, { ...region, ...(lens ? { lens_id: lens } : {}) });
+      const made = await send("POST", `/ui/photos/${form.dataset.photo}/preview`, {
+        ...region,
+        layers,
+        ...(lens ? { lens_id: lens } : {}),
+      });
       if (mine !== asked) {
         left.add(made.id);
         if (running) sweep();
@@ -98,17 +104,17 @@ export function setUpPreview(viewer) {
       if (mine !== asked) return;
       if (end.state !== "succeeded") throw new Error(end.error?.detail ?? "the preview was stopped");
       const base = `/ui/corrections/${made.id}/layer`;
-      const [before, after, smooth, clean] = await Promise.all(
-        ["before", "after", "smooth", "clean"].map((name) => pixelsOf(`${base}/${name}`)),
-      );
+      const names = layers ? ["before", "after", "smooth", "clean"] : ["before", "after"];
+      const pixels = await Promise.all(names.map((name) => pixelsOf(`${base}/${name}`)));
       if (mine !== asked) return;
       running = "";
-      part = { region, layers: { before, after, smooth, clean } };
+      part = { region, layered: layers, layers: Object.fromEntries(names.map((name, k) => [name, pixels[k]])) };
       words.textContent = end.untouched
         ? "Nothing to correct here: this part stays as it is."
-        : "This is what you get. The sliders show their effect at once.";
+        : "This is what you get. Move the sliders to change it.";
       show();
       forget(made.id); // its pictures are here now
+      if (layered() !== layers) look(); // a slider was moved meanwhile
     } catch (reason) {
       if (mine !== asked) return;
       leave();
@@ -124,12 +130,15 @@ export function setUpPreview(viewer) {
         words.textContent = "Zoom in, or choose a place below, to see what a correction does there.";
         return;
       }
-      if (part && covers(part, region)) return;
+      if (part && covers(part, region) && (part.layered || !layered())) return;
       compute(region);
     }, PAUSE_MS);
   };
   viewer.onChange(look);
-  form.addEventListener("input", show);
+  form.addEventListener("input", () => {
+    show();
+    if (part && layered() && !part.layered) look();
+  });
   form.elements.lens_id?.addEventListener("change", () => {
     part = null;
     look();

@@ -426,7 +426,18 @@ def test_sliders_show_their_effect_on_the_part_that_is_seen(page: Page, learned:
     page.on("request", lambda request: asked.append(request.url))
     page.get_by_label("Strength").fill("0.5")
     assert shown(page) not in {none, full}
-    assert asked == []  # mixed here, from layers that are there
+    assert asked == []  # mixed here, from what is there
+    with page.expect_request(lambda request: request.url.endswith("/preview")) as more:
+        page.get_by_label("Grain removed").fill("1")
+    assert more.value.post_data_json["layers"] is True  # only now: they take as long again
+    half = shown(page)
+    page.wait_for_function(
+        "before => document.querySelector('#viewer canvas').toDataURL() !== before", arg=half
+    )
+    asked.clear()
+    page.get_by_label("Faint texture kept").fill("0.5")
+    assert shown(page) != half
+    assert asked == []
     assert page.locator(".rows a[href^='/corrections/']").count() == 0
 
 

@@ -440,6 +440,22 @@ def test_roi_accepts_its_own_kind() -> None:
     assert Roi.of(FRAME, Roi(1, 2, 3, 4)) == Roi.of(FRAME, (1, 2, 3, 4))
 
 
+def test_layers_are_what_each_would_be_alone_to_the_last_bit() -> None:
+    lens, roi = Soft(), (20, 60, 90, 120)
+    seen, _ = photo(lens, BASE)
+    wishes = (Bounds(texture=0.0), Bounds(denoise=1.0), Bounds(halo=0.0))
+
+    together = correct_planes(seen, lens, FRAME, noise=BASE, layers=wishes, roi=roi, workers=2)
+
+    alone = [correct_planes(seen, lens, FRAME, noise=BASE, bounds=wish, roi=roi).planes for wish in wishes]
+    np.testing.assert_array_equal(
+        together.planes, correct_planes(seen, lens, FRAME, noise=BASE, roi=roi).planes
+    )
+    for layer, wanted in zip(together.layers, alone, strict=True):
+        np.testing.assert_array_equal(layer, wanted)
+    assert not any(np.array_equal(together.planes, layer) for layer in together.layers)
+
+
 def test_mosaic_is_restored_better_than_what_demosaicing_made_of_it() -> None:
     lens = Soft(1.0, 1.0)
     seen, sharp = photo(lens, BASE)

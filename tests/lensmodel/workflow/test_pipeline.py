@@ -11,6 +11,7 @@ from lensmodel.core import codec
 from lensmodel.core.errors import InvalidInputError, MetadataMissingError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample
+from lensmodel.core.spectrum import PatchSpectrum
 from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel
 from lensmodel.estimation.patches import Patch, Selection
 from lensmodel.model import LensModel
@@ -25,6 +26,7 @@ from lensmodel.simulate import (
     write_photo,
 )
 from lensmodel.workflow import correcting, pipeline
+from lensmodel.workflow.estimating import SeenPatch
 
 LENS = draw_lens(5, "soft-fast")  # blurred in the center too: there is something to gain everywhere
 CAMERA = SimulatedCamera(height=384, width=576, pitch_um=9.0)
@@ -60,6 +62,27 @@ def test_developed_photo_comes_back_from_disk_as_it_was(city: LinearPhoto, tmp_p
     assert back.planes.flags.writeable is False
     assert (back.frame, back.noise, back.clip) == (city.frame, city.noise, city.clip)
     assert (back.info, back.encoding) == (city.info, city.encoding)
+
+
+def test_the_patches_that_judge_a_model_come_back_from_disk_as_they_were(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    seen = [
+        SeenPatch(FieldPosition(r, -2.0), PatchSpectrum(rng.random((14, 12), dtype=np.float32), r / 7.0))
+        for r in (0.1, 0.8)
+    ]
+    assert pipeline.load_seen(tmp_path) is None
+    pipeline.save_seen(seen, tmp_path)
+    back = pipeline.load_seen(tmp_path)
+
+    assert back is not None
+    assert len(back) == len(seen)
+    for one, other in zip(back, seen, strict=True):
+        assert one.position == other.position
+        assert one.spectrum.noise == other.spectrum.noise
+        assert one.spectrum.power.dtype == other.spectrum.power.dtype
+        np.testing.assert_array_equal(one.spectrum.power, other.spectrum.power)
+    (tmp_path / "seen.json").write_text('[{"position": null}]', encoding="utf-8")
+    assert pipeline.load_seen(tmp_path) is None
 
 
 def test_half_written_folder_is_no_developed_photo(tmp_path: Path) -> None:

@@ -41,9 +41,7 @@ def write(folder: Path, test: LensTest) -> list[str]:
 
 def write_comparison(folder: Path, first: LensTest, second: LensTest, aperture: float | None) -> list[str]:
     """Write two lens tests beside each other; return as `write`."""
-    names = [first.name, second.name if second.name != first.name else f"{second.name} (2)"]
-    sides = [Side(name, test.at(aperture)) for name, test in zip(names, (first, second), strict=True)]
-    found = compare(*sides)
+    found = compare(Side(first.name, first.at(aperture)), Side(second.name, second.at(aperture)))
     return _written(
         folder,
         {

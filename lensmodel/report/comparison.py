@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -23,6 +23,9 @@ _SURE: Final = 2.0
 _ALIKE: Final = 0.05
 """Share by which zones may differ and still be called alike: less is not seen (chosen)."""
 
+_LETTERS: Final = 18
+"""Of a name in the key of a chart."""
+
 _TICKS: Final = tuple((k / 5, f"{k / 5:.1f}") for k in range(6))
 _NAMES: Final[dict[Zone, str]] = {"center": "in the center", "mid": "halfway out", "corner": "in the corners"}
 
@@ -33,6 +36,15 @@ class Side:
 
     name: str
     tested: Tested
+
+    @property
+    def facts(self) -> str:
+        """What its figures rest on."""
+        report = self.tested.report
+        stop = report.settings.aperture
+        at = "an unknown aperture" if stop is None else f"f/{stop:g}"
+        photos = "1 photo" if report.photos == 1 else f"{report.photos} photos"
+        return f"{self.name}: {at}, {photos}, {report.samples} blur samples"
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +96,11 @@ class Comparison:
 
 
 def compare(first: Side, second: Side) -> Comparison:
-    """Compare two copies at one aperture, or two apertures of one copy."""
+    """Compare two copies at one aperture, or two apertures of one copy; those of one name are numbered."""
+    if first.name == second.name:
+        first, second = (
+            replace(side, name=f"{side.name} ({k})") for k, side in enumerate((first, second), 1)
+        )
     zones = tuple(_zone(first.tested, second.tested, zone) for zone in ZONES)
     charts = [_curves(first, second, low) for low in (True, False)]
     difference = _difference(first, second)
@@ -133,9 +149,10 @@ def _curves(first: Side, second: Side, low: bool) -> Chart:
         (a, b) for a in first.tested.report.curves for b in second.tested.report.curves if _same(a, b)
     ] or [(first.tested.report.curves[0], second.tested.report.curves[0])]
     a, b = pairs[0 if low else -1]
-    name = f"{a.frequency:.3g} c/px" if a.lp_mm is None else f"{a.lp_mm:.3g} lp/mm"
     axes = Axes(56, 40, WIDTH - 190, HEIGHT - 52, (0.0, 1.0), (0.0, 1.0))
-    title = f"Contrast at {name}"
+    title = f"Contrast at {_frequency(a)}"
+    if not _same(a, b):
+        title += f", of {second.name} at {_frequency(b)}"
     parts: list[Part] = [Label(56, 24, title), *axes.grid(_TICKS, _TICKS, "r: 0 center, 1 corner")]
     lines: list[Part] = []
     for i, (side, curve) in enumerate(((first, a), (second, b))):
@@ -148,9 +165,18 @@ def _curves(first: Side, second: Side, low: bool) -> Chart:
                 parts.append(Area(held, ink_, 0.12))
         lines.append(axes.curve(radii, curve.sagittal, ink_))
         lines.append(axes.curve(radii, curve.tangential, ink_, dashed=True))
-        lines += axes.key(2 * i, f"{side.name[:18]} S", ink_)
-        lines += axes.key(2 * i + 1, f"{side.name[:18]} T", ink_, dashed=True)
+        lines += axes.key(2 * i, f"{_short(side.name)} S", ink_)
+        lines += axes.key(2 * i + 1, f"{_short(side.name)} T", ink_, dashed=True)
     return Chart(title, WIDTH, HEIGHT, (*parts, *lines))
+
+
+def _frequency(curve: Curve) -> str:
+    return f"{curve.frequency:.3g} c/px" if curve.lp_mm is None else f"{curve.lp_mm:.3g} lp/mm"
+
+
+def _short(name: str) -> str:
+    """Shorten a name for a key; two of one maker differ at the end."""
+    return name if len(name) <= _LETTERS else f"{name[: _LETTERS // 2 - 1]}...{name[-_LETTERS // 2 + 2 :]}"
 
 
 def _same(a: Curve, b: Curve) -> bool:

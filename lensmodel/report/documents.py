@@ -110,8 +110,10 @@ def comparison_html(comparison: Comparison) -> str:
     parts = [
         f"<h1>{escape(title)}</h1>",
         f'<p class="verdict">{escape(comparison.verdict)}</p>',
+        *(f'<p class="facts">{escape(side.facts)}.</p>' for side in (first, second)),
         _table(head, rows),
         _figures(comparison.charts),
+        f'<p class="note">{escape(error_words(first.tested))}</p>',
     ]
     return _page(title, parts)
 

@@ -56,10 +56,13 @@ def comparison_pdf(comparison: Comparison) -> bytes:
     story = _Story(title)
     story.heading(title, 16)
     story.text(comparison.verdict, 12)
+    for side in (comparison.first, comparison.second):
+        story.text(f"{side.facts}.", 9)
     head = ["Zone", "First, c/px", "Second, c/px", "Difference"]
     rows = [[c.zone, f"{c.first:.3f}", f"{c.second:.3f}", f"{c.share:+.0%}"] for c in comparison.zones]
     story.table(head, rows)
     story.charts(comparison.charts)
+    story.text(error_words(comparison.first.tested), 8.5)
     return story.done()
 
 
@@ -74,6 +77,7 @@ class _Story:
         self._wide, self._high = A4
         # the same report is the same file: no time of day in it
         self._canvas: Any = Canvas(self._out, pagesize=A4, invariant=True)
+        self._title = title
         self._canvas.setTitle(title)
         self._canvas.setCreator("lensmodel")
         self._y = self._high - _MARGIN
@@ -85,8 +89,16 @@ class _Story:
     def _need(self, high: float) -> None:
         """Begin a new page where so much does not fit."""
         if self._y - high < _MARGIN:
-            self._canvas.showPage()
+            self._end_page()
             self._y = self._high - _MARGIN
+
+    def _end_page(self) -> None:
+        """Write the number at the foot of a page and close it."""
+        self._canvas.setFillColor("#55585d")
+        self._canvas.setFont(_FONT, 8)
+        foot = f"{self._title} - page {self._canvas.getPageNumber()}"
+        self._canvas.drawRightString(self._wide - _MARGIN, _MARGIN / 2.0, _plain(foot))
+        self._canvas.showPage()
 
     def heading(self, text: str, size: float) -> None:
         self._need(size * 4.0)
@@ -119,16 +131,13 @@ class _Story:
         self._y -= size
 
     def charts(self, charts: Sequence[Chart]) -> None:
-        """Draw charts two beside each other."""
-        gap = 10.0
-        wide = (self._room - gap) / 2.0
-        for first in range(0, len(charts), 2):
-            pair = charts[first : first + 2]
-            high = max(chart.height * wide / chart.width for chart in pair)
-            self._need(high + gap)
-            for k, chart in enumerate(pair):
-                self._chart(chart, _MARGIN + k * (wide + gap), self._y - gap, wide / chart.width)
-            self._y -= high + gap
+        """Draw charts one below the other, so large that their lettering reads like small print."""
+        gap = 12.0
+        for chart in charts:
+            scale = min(self._room / chart.width, (self._high - 2.0 * _MARGIN - gap) / chart.height)
+            self._need(chart.height * scale + gap)
+            self._chart(chart, _MARGIN, self._y - gap, scale)
+            self._y -= chart.height * scale + gap
 
     def _chart(self, chart: Chart, left: float, top: float, scale: float) -> None:
         self._canvas.saveState()
@@ -139,6 +148,7 @@ class _Story:
         self._canvas.restoreState()
 
     def done(self) -> bytes:
+        self._end_page()
         self._canvas.save()
         return self._out.getvalue()
 

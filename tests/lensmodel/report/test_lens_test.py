@@ -188,6 +188,18 @@ def test_two_copies_are_compared_with_their_error(soft: LensTest) -> None:
     assert comparison_pdf(found).startswith(b"%PDF-")
 
 
+def test_two_copies_of_one_name_can_be_told_apart(soft: LensTest) -> None:
+    sharp = report_of(corner=1.0, spread=0.02)
+
+    found = compare(Side("Nikkor 50mm", soft.tested[0]), Side("Nikkor 50mm", sharp.tested[0]))
+
+    assert found.verdict.startswith("Compared with Nikkor 50mm (1), Nikkor 50mm (2) is ")
+    page = comparison_html(found)
+    for side in (found.first, found.second):
+        assert side.facts in page
+        assert f"{side.tested.report.samples} blur samples" in side.facts
+
+
 def test_apertures_are_tested_each_and_the_best_is_named() -> None:
     both = samples(aperture=2.8, corner=2.0) + samples(aperture=8.0, corner=0.9)
     test = lens_test(LensModel.fit(both, QUICK), "A lens", draws=0, rows=5, size=SIZE, channels=("g",))

@@ -324,7 +324,7 @@ def delete_photo(photo_id: str, call: CallDep) -> None:
 
 @router.patch("/photos/{photo_id}", operation_id="changePhoto", responses=problems(404, 409, 422))
 def change_photo(photo_id: str, change: PhotoChange, call: CallDep) -> PhotoOut:
-    """Name the lens, correct the settings, or take the photo out of its lens's model.
+    """Name the lens, correct the settings, take the photo out of its lens's model, or let it teach that.
 
     A photo that waited for its lens, or was still being worked on, starts again with what is
     now known. A counted one changes its lens's model at once.
@@ -336,7 +336,18 @@ def change_photo(photo_id: str, change: PhotoChange, call: CallDep) -> PhotoOut:
         )
     given: dict[str, Any] = change.model_dump(include=set(GIVEN_SETTINGS), exclude_none=True)
     lens = _target_lens(call, photo, change)
-    done = call.store.photos.change(photo_id, call.owner, given, lens=lens, excluded=change.excluded)
+    if change.calibrate is False:
+        raise InvalidParameterError("calibrate=false: send excluded=true to take a photo out of its lens")
+    if change.calibrate and photo.file_gone_at is not None:
+        raise ConflictError(f"the file of photo {photo_id} is no longer kept: {SEND_AGAIN}")
+    done = call.store.photos.change(
+        photo_id,
+        call.owner,
+        given,
+        lens=lens,
+        excluded=change.excluded,
+        calibrate=bool(change.calibrate),
+    )
     photo = find_photo(call, photo_id)
     if not done:
         raise ConflictError(

@@ -75,6 +75,9 @@ class PhotoChange(Question):
     focus_distance_m: FocusDistance | None = None
     pixel_pitch_um: PixelPitch | None = None
     excluded: bool | None = None
+    calibrate: bool | None = Field(
+        None, description="true: learn the lens from a photo that was stored without"
+    )
 
 
 class PhotosChange(Question):

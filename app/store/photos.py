@@ -240,8 +240,11 @@ class PhotoStore(PhotoReads):
         *,
         lens: LensName | str | None = None,
         excluded: bool | None = None,
+        calibrate: bool = False,
     ) -> bool:
         """Take over what the owner says now: settings, the lens or its id, whether the photo counts.
+
+        With `calibrate` a photo that was merely stored starts again, to teach its lens.
 
         All of it, or nothing and False where the photo cannot be excluded or included. A photo that has
         a result changes its lens's model at once, any other starts again.
@@ -254,18 +257,18 @@ class PhotoStore(PhotoReads):
                 wish: Final = "excluded" if excluded else "counted"
                 if photo.state != wish and not lenses.switch(session, photo, wish):
                     return False
-            chosen = None
-            if isinstance(lens, LensName):
-                chosen = lenses.named(session, photo.owner_id, lens)
-            elif lens is not None:
-                chosen = find(session, LensRow, lens, owner)
-            if photo.state in {"counted", "stored", "excluded"}:
+            chosen = _chosen(session, photo, lens, owner)
+            begins = calibrate and not photo.calibrate
+            if begins and photo.file_gone_at is not None:
+                return False
+            photo.calibrate |= begins
+            if photo.state in {"counted", "stored", "excluded"} and not begins:
                 if given:
                     columns = {GIVEN_SETTINGS[name]: value for name, value in given.items()}
                     lenses.change_settings(session, photo, given, columns)
                 if chosen is not None:
                     lenses.move(session, photo, chosen)
-            elif given or chosen is not None:
+            elif begins or given or chosen is not None:
                 named = {} if chosen is None else {"lens_id": chosen.public_id}
                 photo.given = {**photo.given, **given, **named}
                 restart(session, photo)
@@ -364,3 +367,10 @@ def _known(session: Session, owner_key: int, sha256: str) -> PhotoRow | None:
         .where(PhotoRow.owner_id == owner_key, PhotoRow.sha256 == sha256, PhotoRow.deleted_at.is_(None))
         .with_for_update()
     )
+
+
+def _chosen(session: Session, photo: PhotoRow, lens: LensName | str | None, owner: str) -> LensRow | None:
+    """Find the lens that an owner names, or whose id they give; none where they do neither."""
+    if isinstance(lens, LensName):
+        return lenses.named(session, photo.owner_id, lens)
+    return None if lens is None else find(session, LensRow, lens, owner)

@@ -76,6 +76,7 @@ export function setUpActions() {
     cancel: () => send("POST", `/v1/jobs/${photo}/cancel`),
     retry: () => send("POST", `/v1/jobs/${photo}/retry`),
     exclude: () => send("PATCH", `/v1/photos/${photo}`, { excluded: true }),
+    learn: () => send("PATCH", `/v1/photos/${photo}`, { calibrate: true }),
     include: () => send("PATCH", `/v1/photos/${photo}`, { excluded: false }),
     delete: async () => {
       if (!window.confirm("Delete this photo, its corrections, and what the lens learned from it?")) return;

@@ -162,6 +162,42 @@ def test_a_photo_that_does_not_count_cannot_be_excluded(client: TestClient, step
     assert (answer.status_code, answer.json()["code"]) == (409, "conflict")
 
 
+def test_a_photo_that_was_stored_can_still_teach_its_lens(
+    client: TestClient, steps: Steps, store: Store
+) -> None:
+    photo = steps.receive(calibrate=False)
+    steps.inspect(photo)
+    store.photos.set_state(photo.public_id, ("inspecting",), "stored")
+    path = f"/v1/photos/{photo.public_id}"
+
+    begun = client.patch(path, json={"calibrate": True, "aperture": 2.8})
+
+    assert (begun.status_code, begun.json()["state"], begun.json()["calibrate"]) == (200, "received", True)
+    row = store.photos.get(photo.public_id)
+    assert row is not None
+    assert row.epoch == photo.epoch + 1
+    assert row.given["aperture"] == 2.8
+    again = client.patch(path, json={"calibrate": True})  # nothing begins twice
+    assert again.status_code == 200
+    row = store.photos.get(photo.public_id)
+    assert row is not None
+    assert row.epoch == photo.epoch + 1
+    assert client.patch(path, json={"calibrate": False}).status_code == 422
+
+
+def test_a_photo_whose_file_is_gone_cannot_teach(client: TestClient, steps: Steps, store: Store) -> None:
+    photo = steps.receive(calibrate=False)
+    steps.inspect(photo)
+    store.photos.set_state(photo.public_id, ("inspecting",), "stored")
+    assert store.photos.give_up_file(photo.public_id, ())
+
+    answer = client.patch(f"/v1/photos/{photo.public_id}", json={"calibrate": True})
+
+    assert (answer.status_code, answer.json()["code"]) == (409, "conflict")
+    assert "send the same file again" in answer.json()["detail"]
+    assert get(client, f"/v1/photos/{photo.public_id}")["calibrate"] is False
+
+
 def waiting(store: Store, steps: Steps) -> Any:
     photo = steps.receive()
     steps.inspect(photo, serial=None)

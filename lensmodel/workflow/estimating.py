@@ -208,13 +208,12 @@ def seen_patches(developed: LinearPhoto) -> list[SeenPatch]:
     if developed.lossy:
         return []
     try:
-        selection = find_patches(developed)
+        return [
+            SeenPatch(patch.position, PatchSpectrum(*binned_spectrum(*_view(developed, patch, "g"))))
+            for patch in find_patches(developed).patches
+        ]
     except (NoUsablePatchesError, InvalidInputError):  # nothing to see, or too small a picture
         return []
-    return [
-        SeenPatch(patch.position, PatchSpectrum(*binned_spectrum(*_view(developed, patch, "g"))))
-        for patch in selection.patches
-    ]
 
 
 def witnesses_of(

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from lensmodel.core.types import Channel
+from lensmodel.core.types import ZONES, Channel
 from lensmodel.report.drawing import COLOURS, GREY, INK, Area, Axes, Box, Chart, Label, Line, Part
 from lensmodel.report.lens_test import LensTest, Tested
 from lensmodel.report.palette import colour, ink, rgb
@@ -170,18 +170,18 @@ def field_chart(tested: Tested) -> Chart:
 
 def apertures_chart(test: LensTest, unit: Unit = "c/px") -> Chart | None:
     """Draw MTF50 of each zone by aperture; None with fewer than two."""
-    rows = test.tested[0].report.apertures
-    if len(rows) < 2:
+    apertures = [aperture for aperture in test.apertures if aperture is not None]
+    if len(apertures) < 2:
         return None
     factor = test.sensor.factor(unit) or 1.0
-    zones = ("center", "mid", "corner")
-    values = [factor * min(getattr(row, zone), NYQUIST) for row in rows for zone in zones]
+    rows = [test.at(aperture).zones for aperture in apertures]
+    values = [factor * min(row[zone], NYQUIST) for row in rows for zone in ZONES]
     top = 1.15 * max(values)
     axes = Axes(_LEFT, _TOP, WIDTH - _RIGHT, HEIGHT - _BOTTOM, (-0.3, len(rows) - 0.7), (0.0, top))
     parts: list[Part] = [Label(_LEFT, 24, f"MTF50 by aperture, {unit}")]
-    parts += axes.grid([(i, f"f/{row.aperture:g}") for i, row in enumerate(rows)], _steps(top), "aperture")
-    for i, zone in enumerate(zones):
-        own = [factor * min(getattr(row, zone), NYQUIST) for row in rows]
+    parts += axes.grid([(i, f"f/{n:g}") for i, n in enumerate(apertures)], _steps(top), "aperture")
+    for i, zone in enumerate(ZONES):
+        own = [factor * min(row[zone], NYQUIST) for row in rows]
         parts.append(axes.curve(range(len(rows)), own, COLOURS[i]))
         parts += axes.key(i, zone, COLOURS[i])
     return Chart("MTF50 by aperture", WIDTH, HEIGHT, tuple(parts))

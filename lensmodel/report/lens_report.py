@@ -136,7 +136,7 @@ class FieldShape:
 
 @dataclass(frozen=True, slots=True)
 class ApertureRow:
-    """MTF50 in cycles/pixel by zone at one aperture; `whole` weighs the zones by their area."""
+    """MTF50 in cycles/pixel at one aperture at r = 0.15, 0.5 and 0.88; `whole` weighs them by area."""
 
     aperture: float
     center: float

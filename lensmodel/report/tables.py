@@ -43,6 +43,8 @@ def to_csv(test: LensTest) -> str:
 
 def _rows(tested: Tested) -> Iterator[dict[str, str]]:
     report, spread = tested.report, tested.spread
+    for zone, value in tested.zones.items():
+        yield {"quantity": f"MTF50, mean of {zone}", "value": _number(value), "unit": UNIT_NAMES["c/px"]}
     for i, point in enumerate(report.field):
         row, col = divmod(i, report.cols)
         place = {

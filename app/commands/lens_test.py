@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
 from lensmodel.core.codec import to_json
 from lensmodel.model.profile import LensProfile
+from lensmodel.photo import develop
 from lensmodel.report import bootstrap
 from lensmodel.report.comparison import Side, compare
 from lensmodel.report.documents import comparison_html, to_html
@@ -16,16 +17,18 @@ from lensmodel.report.exporters import write_atomically
 from lensmodel.report.lens_test import LensTest, lens_test
 from lensmodel.report.pdf import comparison_pdf, to_pdf
 from lensmodel.report.tables import to_csv
+from lensmodel.workflow.pipeline import lateral_of
 
 FILES: Final = ("lens-test.html", "lens-test.pdf", "lens-test.csv", "lens-test.json")
 COMPARED: Final = ("comparison.html", "comparison.pdf")
 
 
-def tested(profile: LensProfile, path: Path, aspect: float) -> LensTest:
-    """Test the lens of a profile."""
+def tested(profile: LensProfile, path: Path, aspect: float, photos: Sequence[Path]) -> LensTest:
+    """Test the lens of a profile; its lateral colour is measured on the photos, if there are any."""
     words = [profile.lens[key] for key in ("maker", "model") if profile.lens.get(key)]
     name = profile.lens.get("label") or " ".join(words) or path.stem
-    return lens_test(profile.model, name, aspect=aspect, draws=bootstrap.DRAWS)
+    lateral = [lateral_of(develop(photo)) for photo in photos]
+    return lens_test(profile.model, name, aspect=aspect, lateral=lateral, draws=bootstrap.DRAWS)
 
 
 def write(folder: Path, test: LensTest) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -71,6 +72,14 @@ def report(
             "--against", metavar="PROFILE", help="Profile of another copy to compare with; needs --output."
         ),
     ] = None,
+    photo: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--photo",
+            metavar="PHOTO",
+            help="A photo of this lens on which lateral colour is measured; may be repeated; needs --output.",
+        ),
+    ] = None,
     json_output: Json = False,
     force: Force = False,
     quiet: Quiet = False,
@@ -84,6 +93,8 @@ def report(
 
         lensmodel report my-24mm.lensprofile --aperture 2 -o my-24mm-report
 
+        lensmodel report my-24mm.lensprofile --photo one.dng -o with-lateral-colour
+
         lensmodel report my-24mm.lensprofile --against a-friends-24mm.lensprofile -o both
 
         lensmodel report my-24mm.lensprofile --json
@@ -94,8 +105,9 @@ def report(
     if output is not None:
         names = (*_FILES, *lens_test.FILES, *(lens_test.COMPARED if against else ()))
         files.refuse_existing(*(output / name for name in names), force=force)
-    elif against is not None:
-        raise UsageError("--against needs --output: the comparison is two files")
+    elif against is not None or photo:
+        option = "--photo" if against is None else "--against"
+        raise UsageError(f"{option} needs --output: what it adds is written to files")
     with shown.busy("asking the lens at 200 places"):
         model = files.profile_at(profile).model
         found = lens_report(model, _settings(model, aperture, channel), ReportSettings(aspect=aspect))
@@ -113,7 +125,7 @@ def report(
         output.mkdir(parents=True, exist_ok=True)
         for name, text in texts.items():
             write_atomically(output / name, text.encode())
-        missing = _tested(shown, profile, against, output, aspect, aperture)
+        missing = _tested(shown, profile, against, output, aspect, aperture, photo or [])
         if missing:
             shown.note(f"not written: {', '.join(missing)}; pip install 'lensmodel[report]' brings PDF")
     if json_output:
@@ -129,13 +141,14 @@ def _tested(
     output: Path,
     aspect: float,
     aperture: float | None,
+    photos: Sequence[Path],
 ) -> list[str]:
     """Write the lens test; return the files that were left out."""
     with shown.busy("testing the lens"):
-        first = lens_test.tested(files.profile_at(profile), profile, aspect)
+        first = lens_test.tested(files.profile_at(profile), profile, aspect, photos)
         missing = lens_test.write(output, first)
         if against is not None:
-            second = lens_test.tested(files.profile_at(against), against, aspect)
+            second = lens_test.tested(files.profile_at(against), against, aspect, [])
             missing += lens_test.write_comparison(output, first, second, aperture)
     return missing
 

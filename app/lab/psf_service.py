@@ -1,4 +1,4 @@
-"""What a PSF costs over HTTP, and when a new version is seen; prints the table of docs/lens-model.md.
+"""What a PSF costs over HTTP, and when a new version is seen; prints the table of docs/lab/lens-model.md.
 
     python -m app.lab.psf_service [--requests 400] [--photos 6] [--processes 3] [--size 55] [--busy 0]
         [--mode kernels]

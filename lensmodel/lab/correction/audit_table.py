@@ -9,7 +9,7 @@ Simulated lenses of five kinds photograph pairs of sharp photographs in center, 
 on mosaics, at base and high ISO. Blocks of 128 x 128 pixels that gain with the true PSF must be left alone;
 blocks that lose more than 1 dB against the photo by a fault must be caught: more than a tenth of the
 correction held back, or half of the error beyond the photo's gone. The limits of the checks were chosen on
-the half "development", with `--limits`; the table of docs/correction.md is of the other half.
+the half "development", with `--limits`; the table of docs/lab/correction.md is of the other half.
 
 `--limits` prints, for each check, the limit at which no sound block of the development half is held back
 by more than a tenth by it alone, and the quantiles below; of a mosaic, over what `tolerances.MOSAIC` allows.

@@ -1,4 +1,4 @@
-"""What the choice of demosaicing does to PSFs and to corrections; prints the table of docs/correction.md.
+"""What the choice of demosaicing does to PSFs and to corrections; prints the table of docs/lab/correction.md.
 
     LENSMODEL_TEST_DATA=... python -m lensmodel.lab.correction.demosaic [--seeds 0 1 2] [--electrons 20000]
 

@@ -1,4 +1,4 @@
-"""Peak memory from file to file; prints the figures of docs/performance.md.
+"""Peak memory from file to file; prints the figures of docs/lab/performance.md.
 
     python -m lensmodel.lab.correction.memory [--kind tif] [--megapixels 100] [--method fast]
 

@@ -2,7 +2,7 @@
 
     LENSMODEL_TEST_DATA=... python -m lensmodel.lab.correction.quality_table [--kinds coma] [--cache FOLDER]
 
-Prints the tables of docs/correction.md: gain in PSNR of the sRGB picture in center, mid and corner of a
+Prints the tables of docs/lab/correction.md: gain in PSNR of the sRGB picture in center, mid and corner of a
 frame of 6 megapixels with the true PSF field, SSIM, edges, noise in flats, and light near clipped lamps.
 Each lens and exposure is kept in the cache folder, so that a run that was stopped goes on where it was.
 Some ten minutes on an idle core.

@@ -1,4 +1,4 @@
-"""Speed and size of the lens model as ratios of one run; prints the table of docs/lens-model.md.
+"""Speed and size of the lens model as ratios of one run; prints the table of docs/lab/lens-model.md.
 
     python -m lensmodel.lab.model.speed [--samples 1000] [--many 100000] [--methods blended nadaraya-watson]
 

@@ -3,8 +3,8 @@
     python -m lensmodel.lab.reproduce.pages.publish reproduction figures.json --lenses 3 --seed 1002
 
 `reproduction` is the output folder of the run, `figures.json` what `--json` wrote. Written are
-`docs/results/reproduction.md` with its pictures (those of the first lenses only, crops as JPEG), the picture
-`docs/images/before-after.jpg` and the lines of README.md between its two markers.
+`docs/lab/results/reproduction.md` with its pictures (those of the first lenses only, crops as JPEG), the
+picture `docs/images/before-after.jpg` and the lines of README.md between its two markers.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from PIL import Image, ImageDraw
 from lensmodel.core.types import ZONES, Zone
 
 ROOT = Path(__file__).resolve().parents[4]
-PAGE, PICTURE = ROOT / "docs/results", ROOT / "docs/images/before-after.jpg"
+PAGE, PICTURE = ROOT / "docs/lab/results", ROOT / "docs/images/before-after.jpg"
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 SHOWN: tuple[Zone, ...] = ("center", "corner")
 METHOD = "standard"
@@ -126,7 +126,7 @@ def words(result: Mapping[str, Any]) -> str:
         "unlike each other as lenses are, and photographs that nothing was tuned on (lens seeds "
         f"{seeds[0]} to {seeds[-1]}, raw files at base ISO). The last column is the worst zone of any lens. "
         "`lensmodel reproduce` made it; of the bars that were set before measuring "
-        f"{held['held']} hold and {held['missed']} are missed: [all of it](docs/results/reproduction.md)."
+        f"{held['held']} hold and {held['missed']} are missed: [all of it](docs/lab/results/reproduction.md)."
     )
     return textwrap.fill(said, 110, break_long_words=False, break_on_hyphens=False)
 

@@ -404,11 +404,11 @@ def test_refusal_is_one_sentence_with_the_value_and_a_remedy(
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
-def test_the_readme_says_the_same_of_the_exit_status(here: Here) -> None:
+def test_the_guide_says_the_same_of_the_exit_status(here: Here) -> None:
     codes = "0 done, 1 something failed, 2 called wrongly, 130 stopped by Ctrl-C, 143 by SIGTERM"
-    readme = (HERE.parents[1] / "README.md").read_text(encoding="utf-8")
+    guide = (HERE.parents[1] / "docs" / "guide.md").read_text(encoding="utf-8")
 
-    for text in (readme, here("--help").stdout):
+    for text in (guide, here("--help").stdout):
         assert codes in " ".join(text.split())
 
 

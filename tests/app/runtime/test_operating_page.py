@@ -1,4 +1,4 @@
-"""The page for operators, typed word for word in an empty folder."""
+"""The pages for operators, typed word for word in an empty folder, one after the other."""
 
 from __future__ import annotations
 
@@ -14,20 +14,19 @@ from pathlib import Path
 
 import pytest
 
-PAGE = Path(__file__).parents[3] / "docs" / "operating.md"
+PAGES = [Path(__file__).parents[3] / "docs" / name for name in ("service.md", "operating.md")]
 ELSEWHERE = "/var/lib/postgresql"
 """Commands about another machine's disk."""
 
 
 def commands() -> list[str]:
-    blocks = re.findall(
-        r"^```sh\n(.*?)^```", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL
-    )
+    text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    blocks = re.findall(r"^```sh\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)
     return [line for block in blocks for line in block.splitlines() if ELSEWHERE not in line]
 
 
 @pytest.mark.slow
-def test_each_command_of_the_page_does_what_it_says(tmp_path: Path) -> None:
+def test_each_command_of_the_pages_does_what_it_says(tmp_path: Path) -> None:
     if shutil.which("curl") is None or shutil.which("bash") is None:
         pytest.skip("needs bash and curl, as the page does")
     with socket.socket() as free:

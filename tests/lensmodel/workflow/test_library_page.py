@@ -17,7 +17,6 @@ PAGE = Path(__file__).parents[3] / "docs" / "library.md"
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 CAMERA = SimulatedCamera(height=384, width=576, pitch_um=9.0)
 SHOTS = {"a.dng": ("tea-gardens", 400), "b.dng": ("lake", 400), "c.dng": ("city", 500)}
-MOST_WORDS = 900
 
 
 @pytest.fixture
@@ -53,10 +52,6 @@ def test_every_block_of_the_page_runs(photos: Path, monkeypatch: pytest.MonkeyPa
     assert {"c.tif", "my-24mm.lensprofile"} <= {path.name for path in photos.iterdir()}
     assert names["lens"].model.warm
     assert sorted(names["lens"].profile.photos.values()) == ["a.dng", "b.dng"]
-
-
-def test_the_page_is_short() -> None:
-    assert len(PAGE.read_text(encoding="utf-8").split()) < MOST_WORDS
 
 
 def _registries() -> dict[str, Any]:

@@ -1,10 +1,10 @@
-"""Put the output of `lensmodel reproduce` into the documentation: the page, README's picture and its table.
+"""Put the output of `lensmodel reproduce` into the documentation: the page with a summary, README's picture.
 
     python -m lensmodel.lab.reproduce.pages.publish reproduction figures.json --lenses 3 --seed 1002
 
 `reproduction` is the output folder of the run, `figures.json` what `--json` wrote. Written are
-`docs/lab/results/reproduction.md` with its pictures (those of the first lenses only, crops as JPEG), the
-picture `docs/images/before-after.jpg` and the lines of README.md between its two markers.
+`docs/lab/results/reproduction.md`, a table of means first, with its pictures (those of the first lenses only,
+crops as JPEG), and the picture `docs/images/before-after.jpg`.
 """
 
 from __future__ import annotations
@@ -25,15 +25,14 @@ from lensmodel.core.types import ZONES, Zone
 
 ROOT = Path(__file__).resolve().parents[4]
 PAGE, PICTURE = ROOT / "docs/lab/results", ROOT / "docs/images/before-after.jpg"
-BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 SHOWN: tuple[Zone, ...] = ("center", "corner")
 METHOD = "standard"
 _QUALITY = 90
 _LABEL_PX = 96
 
 
-def page(folder: Path, kept: set[str]) -> int:
-    """Copy the page with the pictures of the figures and of some cases; return how many pictures."""
+def page(folder: Path, kept: set[str], summary: str) -> int:
+    """Copy the page, a summary under its title, with some of the pictures; return how many pictures."""
     shown = PAGE / "pictures"
     shutil.rmtree(PAGE, ignore_errors=True)
     shown.mkdir(parents=True)
@@ -62,7 +61,8 @@ def page(folder: Path, kept: set[str]) -> int:
         for block, after in zip(blocks, [*blocks[1:], "#"], strict=True)
         if not (block.startswith("### ") and after.startswith("#"))
     ]
-    (PAGE / "reproduction.md").write_text("\n\n".join(told) + "\n", encoding="utf-8")
+    title, *rest = told
+    (PAGE / "reproduction.md").write_text("\n\n".join([title, summary, *rest]) + "\n", encoding="utf-8")
     return count
 
 
@@ -126,13 +126,13 @@ def words(result: Mapping[str, Any]) -> str:
         "unlike each other as lenses are, and photographs that nothing was tuned on (lens seeds "
         f"{seeds[0]} to {seeds[-1]}, raw files at base ISO). The last column is the worst zone of any lens. "
         "`lensmodel reproduce` made it; of the bars that were set before measuring "
-        f"{held['held']} hold and {held['missed']} are missed: [all of it](docs/lab/results/reproduction.md)."
+        f"{held['held']} hold and {held['missed']} are missed."
     )
     return textwrap.fill(said, 110, break_long_words=False, break_on_hyphens=False)
 
 
 def main() -> None:
-    """Write page, picture and table."""
+    """Write page and picture."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -141,17 +141,12 @@ def main() -> None:
     parser.add_argument("--lenses", type=int, default=3, help="so many lenses keep their pictures")
     parser.add_argument("--seed", type=int, default=1000, help="of the lens whose crops README shows")
     asked = parser.parse_args()
-    readme = ROOT / "README.md"
-    before, _, rest = readme.read_text(encoding="utf-8").partition(BEGIN)
-    _, found, after = rest.partition(END)
-    if not found:
-        parser.error(f"README.md has no lines {BEGIN} and {END}")
     result = json.loads(asked.figures.read_text(encoding="utf-8"))
     cases = result["cases"]
-    count = page(asked.folder, {case["name"] for case in cases[: asked.lenses]})
+    kept = {case["name"] for case in cases[: asked.lenses]}
+    count = page(asked.folder, kept, f"{table(cases)}\n\n{words(result)}")
     picture(asked.folder, next(case for case in cases if case["settings"]["seed"] == asked.seed))
-    readme.write_text(f"{before}{BEGIN}\n{table(cases)}\n\n{words(result)}\n{END}{after}", encoding="utf-8")
-    print(f"{count} pictures; {PAGE / 'reproduction.md'}, {PICTURE}, {readme}")
+    print(f"{count} pictures; {PAGE / 'reproduction.md'}, {PICTURE}")
 
 
 if __name__ == "__main__":

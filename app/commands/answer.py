@@ -19,7 +19,7 @@ from lensmodel import quality
 from lensmodel.core.codec import to_json
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.psf import rms_width
-from lensmodel.core.types import Channel, FieldPosition, LensSettings
+from lensmodel.core.types import ZONE_WORDS, Channel, FieldPosition, LensSettings
 from lensmodel.model import PsfAnswer
 
 WRITTEN: Final = (".npy", ".json", ".tif", ".png")
@@ -90,8 +90,8 @@ def _words(place: FieldPosition, answer: PsfAnswer, tangential: float, sagittal:
     prior = f", {100 * answer.prior_share:.0f} % from {answer.prior}" if answer.prior else ""
     photos = "1 photo" if answer.photos == 1 else f"{answer.photos} photos"
     return (
-        f"{zone_of(place.r)}, r {place.r:g}: rms width {rms_width(answer.kernel):.2f} px, MTF50 tangential "
-        f"{mtf50_words(tangential)}, sagittal {mtf50_words(sagittal)} cycles/px; {photos}, "
+        f"{ZONE_WORDS[zone_of(place.r)]}, r {place.r:g}: rms width {rms_width(answer.kernel):.2f} px, "
+        f"MTF50 tangential {mtf50_words(tangential)}, sagittal {mtf50_words(sagittal)} cycles/px; {photos}, "
         f"{answer.effective_samples:.1f} effective samples, expected error "
         f"{answer.predicted_error:.2f}{beyond}{prior}"
     )

@@ -19,7 +19,7 @@ from app.commands.console.failure import UsageError
 from lensmodel import estimation
 from lensmodel.core.errors import InvalidInputError, LensModelError, MetadataMissingError
 from lensmodel.core.psf import PsfSample
-from lensmodel.core.types import LensSettings, StepHook
+from lensmodel.core.types import ZONE_WORDS, LensSettings, StepHook
 from lensmodel.estimation.estimator import require_size
 from lensmodel.estimation.patches import selectors
 from lensmodel.model import LensModel, LensProfile, ModelSettings, save_profile
@@ -99,7 +99,7 @@ def run(names: Sequence[str], target: Path, wishes: Wishes, display: Display, *,
     if as_json:
         display.document(summary)
     elif profile is not None and any(result["state"] != "failed" for result in results):
-        cover = ", ".join(f"{zone} {count}" for zone, count in profile.model.coverage().items())
+        cover = ", ".join(f"{ZONE_WORDS[zone]} {count}" for zone, count in profile.model.coverage().items())
         display.result(f"{target}: photos {summary['photos']}, samples {summary['samples']} ({cover})")
     if profile is None:
         display.error(

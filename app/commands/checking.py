@@ -16,7 +16,7 @@ from app.commands.console import display, files
 from app.commands.console.failure import UsageError
 from app.commands.console.options import Aperture, Force, Json, Quiet, Verbose
 from lensmodel import photo
-from lensmodel.core.types import LensSettings
+from lensmodel.core.types import ZONE_WORDS, LensSettings
 from lensmodel.correction.audit import AuditReport
 from lensmodel.workflow import checking
 
@@ -102,7 +102,8 @@ def _words(report: AuditReport) -> list[str]:
         checks = sorted(zone.checks.items(), key=lambda item: -item[1])
         why = ", ".join(f"{check} {share:.1%}" for check, share in checks if share >= 0.0005)
         lines.append(
-            f"{name:8}{zone.tiles:7}{zone.tiles_held:10}{zone.held_back:11.1%}  {why or 'nothing to say'}"
+            f"{ZONE_WORDS[name]:8}{zone.tiles:7}{zone.tiles_held:10}{zone.held_back:11.1%}  "
+            f"{why or 'nothing to say'}"
         )
     if report.worst:
         lines += ["", f"{'row':>6}{'col':>7}  {'held back':>9}  check"]

@@ -18,7 +18,7 @@ from app.commands.console.failure import UsageError
 from app.words import gain_words, mtf50_words
 from lensmodel import correction
 from lensmodel.core.errors import InvalidInputError, LensModelError
-from lensmodel.core.types import LensSettings, StepHook, Zone
+from lensmodel.core.types import ZONE_WORDS, LensSettings, StepHook, Zone
 from lensmodel.correction.audit import HELD, AuditReport
 from lensmodel.photo import OutputFormat
 from lensmodel.workflow.identity import difference
@@ -206,7 +206,7 @@ def colour(step: tuple[int, int]) -> list[str]:
 def measured(zones: Mapping[Zone, correction.ZoneReport]) -> list[str]:
     """Tell in words what the edges of a chart gained; nothing of any other photo."""
     return [
-        f"{zone} of the chart: MTF50 from {mtf50_words(seen.mtf50_before)} "
+        f"{ZONE_WORDS[zone]} of the chart: MTF50 from {mtf50_words(seen.mtf50_before)} "
         f"to {mtf50_words(seen.mtf50_after)} cycles/pixel, {seen.gain:.1f} times "
         f"(median of {seen.edges} edges), overshoot {seen.overshoot_after:.1f} %; "
         f"predicted for a usual scene {gain_words(report.expected_gain_db)}"
@@ -218,7 +218,7 @@ def measured(zones: Mapping[Zone, correction.ZoneReport]) -> list[str]:
 def audited(audit: AuditReport) -> list[str]:
     """Tell in words where the audit held back more than a tenth of the correction."""
     return [
-        f"{zone}: {zone_audit.held_back:.0%} of the correction was held back ({', '.join(most)})"
+        f"{ZONE_WORDS[zone]}: {zone_audit.held_back:.0%} of the correction was held back ({', '.join(most)})"
         for zone, zone_audit in audit.zones.items()
         if zone_audit.held_back > HELD
         and (most := sorted(zone_audit.checks, key=lambda name: -zone_audit.checks[name])[:3])

@@ -17,6 +17,7 @@ from app.commands.console.display import Display
 from app.commands.console.failure import UsageError
 from app.words import gain_words
 from lensmodel.core.errors import LensModelError
+from lensmodel.core.types import ZONE_WORDS
 
 if TYPE_CHECKING:
     from app.client import Client
@@ -164,7 +165,11 @@ class _Remote:
             self._display.result(str(target))
         if result["state"] == "corrected":
             zones = result["report"].get("zones", {})
-            gains = (f"{zone} {gain_words(of.get('expected_gain_db'))}" for zone, of in zones.items())
+            gains = (
+                f"{word} {gain_words(zones[zone].get('expected_gain_db'))}"
+                for zone, word in ZONE_WORDS.items()
+                if zone in zones
+            )
             self._display.detail(f"{path.name}, expected gain: {', '.join(gains)}")
 
 

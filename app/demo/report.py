@@ -31,7 +31,7 @@ class Report:
 
     @property
     def improved(self) -> bool:
-        """Whether the photo never used for calibration has become better in center and corner."""
+        """Whether the photo never used for calibration has become better in centre and corner."""
         return bool(self.psnr_after) and improved(self.psnr_before, self.psnr_after[-1], _JUDGED)
 
     def write(self, folder: Path) -> None:
@@ -46,10 +46,10 @@ class Report:
             "# What the demo measured",
             "",
             f"Lens: {self.lens}, at f/{self.aperture:g}, simulated, so that the truth is known. The photo "
-            f"that it was never calibrated with became **{verdict}** in center and corner. "
+            f"that it was never calibrated with became **{verdict}** in centre and corner. "
             f"Blind estimator: {self.estimator}.",
             "",
-            "| photos learned from | PSF error center / mid / corner | PSNR center / mid / corner (dB) |",
+            "| photos learned from | PSF error centre / mid / corner | PSNR centre / mid / corner (dB) |",
             "| --- | --- | --- |",
             f"| 0, the photo as it was | | {_row(self.psnr_before, 2)} |",
         ]

@@ -26,7 +26,7 @@ from app.store.tables import PhotoRow
 ROWS: Final = (("upper", 0.0), ("", 0.5), ("lower", 1.0))
 COLUMNS: Final = (("left", 0.0), ("middle", 0.5), ("right", 1.0))
 PLACES: Final = tuple(
-    (f"{above} {beside}".strip() if (above or beside != "middle") else "center", row, col)
+    (f"{above} {beside}".strip() if (above or beside != "middle") else "centre", row, col)
     for above, row in ROWS
     for beside, col in COLUMNS
 )

@@ -34,7 +34,7 @@ FAILURES: Final[Mapping[str, str]] = {
     "time_limit": "it took longer than the service allows",
     "crashed_repeatedly": "reading it failed again and again. The file is probably damaged",
 }
-ZONES: Final[Mapping[str, str]] = {"center": "Center", "mid": "Middle", "corner": "Corners"}
+ZONES: Final[Mapping[str, str]] = {"center": "Centre", "mid": "Middle", "corner": "Corners"}
 FILES: Final[Mapping[str, str]] = {
     "tiff16": "TIFF, 16 bit",
     "png16": "PNG, 16 bit",

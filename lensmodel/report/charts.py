@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from lensmodel.core.types import ZONES, Channel
+from lensmodel.core.types import ZONE_WORDS, ZONES, Channel
 from lensmodel.report.drawing import COLOURS, GREY, INK, Area, Axes, Box, Chart, Label, Line, Part
 from lensmodel.report.lens_test import LensTest, Tested
 from lensmodel.report.palette import colour, ink, rgb
@@ -113,7 +113,7 @@ def curves_chart(tested: Tested) -> Chart:
     """Draw contrast over the radius: sagittal solid, tangential dashed, bands of one standard error."""
     report, axes = tested.report, _axes(1.0)
     parts: list[Part] = [Label(_LEFT, 24, f"Contrast over the picture{_at(tested)}")]
-    parts += axes.grid(_RADII_TICKS, _RADII_TICKS, "r: 0 center, 1 corner")
+    parts += axes.grid(_RADII_TICKS, _RADII_TICKS, "r: 0 centre, 1 corner")
     bands: list[Part] = []
     lines: list[Part] = []
     for i, curve in enumerate(report.curves):
@@ -138,7 +138,7 @@ def colours_chart(test: LensTest, aperture: float | None) -> Chart:
     curve = found[0].report.curves[second]
     name = f"{curve.frequency:.3g} c/px" if curve.lp_mm is None else f"{curve.lp_mm:.3g} lp/mm"
     parts: list[Part] = [Label(_LEFT, 24, f"Contrast by colour at {name}{_at(found[0])}")]
-    parts += axes.grid(_RADII_TICKS, _RADII_TICKS, "r: 0 center, 1 corner")
+    parts += axes.grid(_RADII_TICKS, _RADII_TICKS, "r: 0 centre, 1 corner")
     for i, one in enumerate(found):
         channel = one.report.settings.channel
         own = one.report.curves[second]
@@ -149,13 +149,13 @@ def colours_chart(test: LensTest, aperture: float | None) -> Chart:
 
 
 def field_chart(tested: Tested) -> Chart:
-    """Draw how wide points are along the radius and around the center, see `FieldShape`."""
+    """Draw how wide points are along the radius and around the centre, see `FieldShape`."""
     shape, radii = tested.report.shape, tested.report.radii
     top = 1.15 * max(*shape.along_u, *shape.along_v, _LEAST_WIDTH_PX)
     axes = _axes(top)
     parts: list[Part] = [Label(_LEFT, 24, f"Width of a point in pixels{_at(tested)}")]
-    parts += axes.grid(_RADII_TICKS, _steps(top), "r: 0 center, 1 corner")
-    rows = (("along the radius", shape.along_u), ("around the center", shape.along_v))
+    parts += axes.grid(_RADII_TICKS, _steps(top), "r: 0 centre, 1 corner")
+    rows = (("along the radius", shape.along_u), ("around the centre", shape.along_v))
     for i, (name, values) in enumerate(rows):
         parts.append(axes.curve(radii, values, COLOURS[i]))
         parts += axes.key(i, name, COLOURS[i])
@@ -183,7 +183,7 @@ def apertures_chart(test: LensTest, unit: Unit = "c/px") -> Chart | None:
     for i, zone in enumerate(ZONES):
         own = [factor * min(row[zone], NYQUIST) for row in rows]
         parts.append(axes.curve(range(len(rows)), own, COLOURS[i]))
-        parts += axes.key(i, zone, COLOURS[i])
+        parts += axes.key(i, ZONE_WORDS[zone], COLOURS[i])
     return Chart("MTF50 by aperture", WIDTH, HEIGHT, tuple(parts))
 
 
@@ -234,7 +234,7 @@ def lateral_chart(test: LensTest) -> Chart | None:
     axes = Axes(_LEFT, _TOP, WIDTH - _RIGHT, HEIGHT - _BOTTOM, (0.0, 1.0), (-reach, reach))
     ticks = [(k * most / 2.0, f"{k * most / 2.0:+.2f}") for k in range(-2, 3)]
     parts: list[Part] = [Label(_LEFT, 24, "Lateral colour: pixels outwards of green")]
-    parts += axes.grid(_RADII_TICKS, ticks, "r: 0 center, 1 corner")
+    parts += axes.grid(_RADII_TICKS, ticks, "r: 0 centre, 1 corner")
     rows: tuple[tuple[Channel, tuple[float, ...]], ...] = (("r", shift.red), ("b", shift.blue))
     for i, (channel, values) in enumerate(rows):
         parts.append(axes.curve(shift.radii, values, _INKS[channel]))

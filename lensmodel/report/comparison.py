@@ -27,7 +27,7 @@ _LETTERS: Final = 18
 """Of a name in the key of a chart."""
 
 _TICKS: Final = tuple((k / 5, f"{k / 5:.1f}") for k in range(6))
-_NAMES: Final[dict[Zone, str]] = {"center": "in the center", "mid": "halfway out", "corner": "in the corners"}
+_NAMES: Final[dict[Zone, str]] = {"center": "in the centre", "mid": "halfway out", "corner": "in the corners"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +153,7 @@ def _curves(first: Side, second: Side, low: bool) -> Chart:
     title = f"Contrast at {_frequency(a)}"
     if not _same(a, b):
         title += f", of {second.name} at {_frequency(b)}"
-    parts: list[Part] = [Label(56, 24, title), *axes.grid(_TICKS, _TICKS, "r: 0 center, 1 corner")]
+    parts: list[Part] = [Label(56, 24, title), *axes.grid(_TICKS, _TICKS, "r: 0 centre, 1 corner")]
     lines: list[Part] = []
     for i, (side, curve) in enumerate(((first, a), (second, b))):
         radii, ink_ = side.tested.report.radii, COLOURS[i]

@@ -335,14 +335,14 @@ def _shape(rings: list[_Ring]) -> FieldShape:
     largest = max(range(len(apart)), key=lambda i: abs(apart[i]))
     center, corner = along_u[0] + along_v[0], along_u[-1] + along_v[-1]
     if center < _EVEN_PX:  # a point within one pixel has no width to compare with
-        growth = f"in the center a point stays within a pixel, in the corners it is {corner / 2:.1f} px wide"
+        growth = f"in the centre a point stays within a pixel, in the corners it is {corner / 2:.1f} px wide"
     else:
         way = "grows" if corner >= center else "shrinks"
-        growth = f"towards the corners the blur {way} to {corner / center:.1f} times its width at the center"
+        growth = f"towards the corners the blur {way} to {corner / center:.1f} times its width at the centre"
     if abs(apart[largest]) < _EVEN_PX:
         text = f"points stay round across the field; {growth}"
     else:
-        along = "radially" if apart[largest] > 0 else "around the center"
+        along = "radially" if apart[largest] > 0 else "around the centre"
         text = (
             f"points are drawn out {along}, most at r = {_RADII[largest]:.2f} by "
             f"{abs(apart[largest]):.2f} px; {growth}"
@@ -387,7 +387,7 @@ def _summary(
     ]
     if best:
         lines.append(
-            f"sharpest at f/{best['center']:g} in the center, at f/{best['corner']:g} in the corners, "
+            f"sharpest at f/{best['center']:g} in the centre, at f/{best['corner']:g} in the corners, "
             f"at f/{best['whole']:g} over the whole picture"
         )
     if unseen > 0:

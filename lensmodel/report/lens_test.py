@@ -24,11 +24,11 @@ MOST_APERTURES: Final = 4
 ROWS: Final = 7
 
 _EVEN, _NEARLY, _SOFTER = 0.95, 0.8, 0.5
-"""Shares of the center's MTF50 above which corners are called as good, nearly as good, and clearly softer
+"""Shares of the centre's MTF50 above which corners are called as good, nearly as good, and clearly softer
 (chosen: a fifth less is hardly seen in a print, half as much at a glance)."""
 
 _CRISP, _SHARP, _SOFT = 0.35, 0.2, 0.1
-"""MTF50 in cycles/pixel of the center above which a lens is called as sharp as a sensor shows, sharp, and
+"""MTF50 in cycles/pixel of the centre above which a lens is called as sharp as a sensor shows, sharp, and
 a little soft (chosen: an ideal pixel behind an ideal lens reaches .6, a demosaiced photo about .3)."""
 
 _GUESSED: Final = 0.5
@@ -217,7 +217,7 @@ def verdict(report: LensReport) -> str:
     center, corner = found["center"], found["corner"]
     aperture = report.settings.aperture
     at = "" if aperture is None else f"At f/{aperture:g} "
-    sharpness = f"{at}this copy is {_level(center)} in the center, and {_fall(corner / center)}."
+    sharpness = f"{at}this copy is {_level(center)} in the centre, and {_fall(corner / center)}."
     sharpness = sharpness[0].upper() + sharpness[1:]
     best = ""
     if report.best_aperture and report.best_aperture["whole"] != aperture:

@@ -1,4 +1,4 @@
-"""Pictures for reports: sRGB as shown, and 1:1 crops of the center and the corners."""
+"""Pictures for reports: sRGB as shown, and 1:1 crops of the centre and the corners."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def as_shown(planes: Planes, gain: tuple[float, float, float] = (1.0, 1.0, 1.0))
 
 
 def crop_boxes(height: int, width: int, side: int) -> dict[str, tuple[int, int]]:
-    """Top-left pixels of five crops: the center and the four corners, clear of the border."""
+    """Top-left pixels of five crops: the centre and the four corners, clear of the border."""
     bottom, right = height - side - _EDGE, width - side - _EDGE
     return {
         "center": ((height - side) // 2, (width - side) // 2),

@@ -6,6 +6,7 @@ import math
 import textwrap
 from typing import Final
 
+from lensmodel.core.types import ZONE_WORDS, ZONES
 from lensmodel.report.drawing import COLOURS, GREY, Axes, Box, Label, Part, svg
 from lensmodel.report.lens_report import LensReport
 from lensmodel.report.palette import colour, ink, rgb
@@ -51,7 +52,7 @@ def curves_svg(report: LensReport) -> str:
     title = f"Contrast over the picture{_at(report)}"
     axes = Axes(_LEFT, _TOP, WIDTH - _RIGHT, HEIGHT - _BOTTOM, (0.0, 1.0), (0.0, 1.0))
     parts: list[Part] = [Label(_LEFT, 24, title)]
-    parts += axes.grid(_TICKS, _TICKS, "r: 0 center, 1 corner")
+    parts += axes.grid(_TICKS, _TICKS, "r: 0 centre, 1 corner")
     for i, curve in enumerate(report.curves):
         own = COLOURS[i % len(COLOURS)]
         name = f"{curve.frequency:.3g} c/px" if curve.lp_mm is None else f"{curve.lp_mm:.3g} lp/mm"
@@ -63,20 +64,19 @@ def curves_svg(report: LensReport) -> str:
 
 
 def apertures_svg(report: LensReport) -> str:
-    """Draw MTF50 of center, mid and corner over the apertures that photos had, as SVG."""
+    """Draw MTF50 of centre, mid and corner over the apertures that photos had, as SVG."""
     title = "MTF50 in cycles/pixel by aperture"
-    zones = ("center", "mid", "corner")
     rows = report.apertures
-    values = [getattr(row, zone) for row in rows for zone in zones]
+    values = [getattr(row, zone) for row in rows for zone in ZONES]
     top = max(0.1, *values) * 1.1 if values else 0.5
     axes = Axes(
         _LEFT, _TOP, WIDTH - _RIGHT, HEIGHT - _BOTTOM, (-0.3, max(len(rows) - 1, 1) + 0.3), (0.0, top)
     )
     parts: list[Part] = [Label(_LEFT, 24, title)]
     parts += axes.grid([(i, f"f/{row.aperture:g}") for i, row in enumerate(rows)], _steps(top), "aperture")
-    for number, zone in enumerate(zones):
+    for number, zone in enumerate(ZONES):
         parts.append(axes.curve(range(len(rows)), [getattr(row, zone) for row in rows], COLOURS[number]))
-        parts += axes.key(number, zone, COLOURS[number])
+        parts += axes.key(number, ZONE_WORDS[zone], COLOURS[number])
     return svg(title, WIDTH, HEIGHT, parts)
 
 

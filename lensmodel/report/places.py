@@ -42,7 +42,7 @@ def direction_in_words(phi: float) -> str:
 def place_in_words(position: FieldPosition) -> str:
     """Name a place so that somebody can put it into the viewfinder: "the upper left corner"."""
     if position.r < CENTER_ZONE_R:
-        return "the center"
+        return "the centre"
     side = direction_in_words(position.phi)
     if position.r <= CORNER_ZONE_R:
         return f"the {side}"

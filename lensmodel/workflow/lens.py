@@ -33,7 +33,7 @@ class Lens:
     """One copy of a lens: its PSF at every place of the picture, aperture and color.
 
     The PSF is the function f(u, v, r, phi, settings) of M. Hirsch and B. Schölkopf, "Self-Calibration of
-    Optical Lenses", ICCV 2015, section 6. Places are field positions: `r` is the distance to the center over
+    Optical Lenses", ICCV 2015, section 6. Places are field positions: `r` is the distance to the centre over
     the half diagonal (0 center, 1 corner), `phi` the angle in radians, counter-clockwise from the right, in
     sensor orientation. Kernels are float64, of odd side, not negative, of sum 1, on the pixel grid of the
     sensor that the lens was calibrated on.
@@ -359,7 +359,7 @@ class Lens:
 def field_grid(
     rows: int, cols: int, *, aspect: float = 1.5
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the field positions of the centers of equal cells of a picture.
+    """Return the field positions of the centres of equal cells of a picture.
 
     Parameters
     ----------

@@ -73,7 +73,7 @@ Selector = Annotated[
 ]
 Channel = Annotated[types.Channel, choice("--channel", get_args(types.Channel), "Colour channel.")]
 RADIUS = typer.Option(
-    "--r", min=0.0, max=1.0, metavar="0..1", help="Distance from the center: 0 center, 1 corner."
+    "--r", min=0.0, max=1.0, metavar="0..1", help="Distance from the centre: 0 centre, 1 corner."
 )
 ANGLE = typer.Option(
     "--phi", metavar="RADIAN", callback=_radians, help="Angle of the place, counter-clockwise from the right."

@@ -5,7 +5,7 @@ import { removing } from "./stream.js";
 
 const LEAST_VIEW = 0.02; // of the picture: the blur changes no more over less
 const ZONES = [
-  ["center", "Center", []],
+  ["center", "Centre", []],
   ["mid", "Middle", [8, 4]],
   ["corner", "Corners", [2, 3]],
 ];
@@ -87,7 +87,7 @@ export function setUpField() {
       failed = "The service does not answer. Try again in a moment.";
     }
     if (mine !== asked) return; // the point has moved on meanwhile
-    const where = r < 0.02 ? "In the center" : `${Math.round(r * 100)} % of the way to the corner`;
+    const where = r < 0.02 ? "In the centre" : `${Math.round(r * 100)} % of the way to the corner`;
     if (failed) {
       byId("psf-words").textContent = failed;
       tell(byId("psf-numbers"), []);

@@ -698,7 +698,7 @@ def test_a_benchmark_of_the_lens_model_says_how_far_it_is(folder: Path) -> None:
 def test_a_question_to_the_lens_says_that_it_is_being_answered(folder: Path) -> None:
     said, seen = on_a_terminal(folder, "psf", PROFILE)
 
-    assert said.startswith("center, r 0")
+    assert said.startswith("centre, r 0")
     assert "asking the lens" in seen
 
 

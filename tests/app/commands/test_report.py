@@ -78,7 +78,7 @@ def test_the_report_folder_holds_numbers_and_pictures_that_agree(
     }
     page = (folder / "out" / "lens-test.html").read_text(encoding="utf-8")
     assert "At f/2 this copy is" in page
-    assert "about the same in the center" in (folder / "out" / "comparison.html").read_text(encoding="utf-8")
+    assert "about the same in the centre" in (folder / "out" / "comparison.html").read_text(encoding="utf-8")
     stored = json.loads((folder / "out" / "report.json").read_text(encoding="utf-8"))
     with (folder / "out" / "mtf.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))

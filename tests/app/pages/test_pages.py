@@ -326,7 +326,7 @@ def test_a_lens_shows_its_blur_at_any_place_aperture_and_colour(page: Page, lear
     box = field.bounding_box()
     assert box is not None
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-    expect(words).to_contain_text("In the center")
+    expect(words).to_contain_text("In the centre")
     assert drawn.evaluate(picture) != begun
     field.press("ArrowRight")
     expect(words).to_contain_text("10 % of the way to the corner")

@@ -34,12 +34,12 @@ def version(number: int, error: dict[str, Any] | float | None) -> CalibrationOut
         ([version(1, {}), version(2, None)], "The photos are being tested on one another."),
         (
             [version(1, {}), version(2, {"center": 0.115, "mid": 0.1682})],
-            "With 2 photos: center 12 %, middle 17 %, corners not known. "
+            "With 2 photos: centre 12 %, middle 17 %, corners not known. "
             "The curve starts with the next photo.",
         ),
         (
             [version(1, None), version(2, 0.25)],
-            "With 2 photos: center 25 %, middle 25 %, corners 25 %. The curve starts with the next photo.",
+            "With 2 photos: centre 25 %, middle 25 %, corners 25 %. The curve starts with the next photo.",
         ),
     ],
 )

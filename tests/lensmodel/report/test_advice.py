@@ -60,7 +60,7 @@ def test_angles_are_named_counter_clockwise_from_the_right_with_the_top_at_plus_
 
 
 def test_places_are_named_by_zone_and_side() -> None:
-    assert place_in_words(FieldPosition(0.1, 2.0)) == "the center"
+    assert place_in_words(FieldPosition(0.1, 2.0)) == "the centre"
     assert place_in_words(FieldPosition(0.5, math.pi - CORNER)) == "the upper left"
     assert place_in_words(FieldPosition(0.9, -CORNER)) == "the lower right corner"
     assert place_in_words(FieldPosition(0.8, math.pi)) == "the left edge"

@@ -273,7 +273,7 @@ def test_points_drawn_out_around_the_center_are_told_apart() -> None:
     report = lens_report(ring_model(0.2, 1.0), options=SMALL)
 
     assert report.curves[-1].sagittal[-1] < report.curves[-1].tangential[-1]
-    assert "drawn out around the center" in report.shape.text
+    assert "drawn out around the centre" in report.shape.text
 
 
 def test_contrast_of_curves_falls_with_frequency_and_is_that_of_a_gaussian() -> None:

@@ -96,7 +96,7 @@ def test_curves_lie_below_the_nyquist_frequency(pitch: float | None, pairs: list
 
 
 def test_the_first_sentence_is_for_photographers(soft: LensTest) -> None:
-    assert soft.verdict.startswith("At f/2.8 this copy is a little soft in the center, and its corners are")
+    assert soft.verdict.startswith("At f/2.8 this copy is a little soft in the centre, and its corners are")
     assert "softer" in soft.verdict
     even = report_of(draws=0, corner=0.8)
     assert "its corners are just as good" in even.verdict
@@ -127,7 +127,7 @@ def test_a_lens_that_draws_points_within_a_pixel_is_reported() -> None:
     nothing = [replace(s, kernel=point) for s in given]
     perfect = lens_test(LensModel.fit(nothing, QUICK), "Perfect", draws=0, rows=5, size=SIZE, channels=("g",))
 
-    text = "in the center a point stays within a pixel, in the corners it is 1.5 px wide"
+    text = "in the centre a point stays within a pixel, in the corners it is 1.5 px wide"
     assert text in test.tested[0].report.shape.text
     assert "a point stays within a pixel" in perfect.tested[0].report.shape.text
     assert "Astigmatism" in to_html(perfect)
@@ -184,7 +184,7 @@ def test_two_copies_are_compared_with_their_error(soft: LensTest) -> None:
     assert "sharper in the corners" in found.verdict
     same = compare(Side("one", soft.tested[0]), Side("two", soft.tested[0]))
     assert (
-        same.verdict == "Compared with one, two is about the same in the center, about the same halfway out "
+        same.verdict == "Compared with one, two is about the same in the centre, about the same halfway out "
         "and about the same in the corners."
     )
     assert len(found.charts) == 3

@@ -76,7 +76,7 @@ def test_apertures_have_a_tick_each_and_a_line_for_each_zone(report: LensReport)
     root = ET.fromstring(apertures_svg(report))
 
     texts = [e.text for e in root.findall(f"{SVG}text")]
-    assert {"f/2", "f/4", "center", "mid", "corner"} <= set(texts)
+    assert {"f/2", "f/4", "centre", "mid", "corner"} <= set(texts)
 
 
 def test_texts_are_escaped() -> None:

@@ -185,7 +185,7 @@ class Calibration:
         """Learn from one photo, whose samples may come from elsewhere; say what became of it."""
         if path.stem.endswith(files.CORRECTED):
             raise InvalidInputError(
-                "it was corrected already and tells nothing of the lens; give the original"
+                "it was corrected already and says nothing about the lens; give the original"
             )
         key = pipeline.photo_id(path)
         if self._has(key):

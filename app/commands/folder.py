@@ -170,7 +170,7 @@ class _Folder:
                 counted += 1
                 bars.update(task, completed=counted)
         if not counted:
-            self._display.note(f"{group.lens}, {group.focal}: no photo tells enough to learn its blur from")
+            self._display.note(f"{group.lens}, {group.focal}: no photo shows enough to learn its blur from")
         bars.remove_task(task)
         self._learned[group.name, group.focal] = counted
 

@@ -123,7 +123,7 @@ def test_what_cannot_be_read_is_named_and_the_rest_goes_on(journey: Path) -> Non
     errors = (journey / "errors.txt").read_text().splitlines()
 
     assert any("broken.dng" in line for line in errors)
-    assert any("#L-43" in line and "no photo tells enough" in line for line in errors)
+    assert any("#L-43" in line and "no photo shows enough" in line for line in errors)
 
 
 def test_corrected_photos_and_sidecars_are_beside_the_originals(journey: Path) -> None:

@@ -34,7 +34,6 @@ samples.jsonl  `psf`: base64 of little-endian float32, size x size, row by row; 
                format of lensmodel.core.spectrum.
 originals/     the photos as they are stored: without the place where they were taken.
 corrections/   corrected photos.
-statistics/    what the patches of the photos say besides their kernels (NumPy's npz).
 """
 
 
@@ -100,10 +99,6 @@ def _files(
     ]
     for name, key in kept:
         yield from _blob(storage, name, key, missing, as_is)
-    for row in store.accounts.rows(SampleRow, owner):
-        if row["statistics_key"] is not None:
-            name = f"statistics/{row['statistics_key'].partition('/')[2]}"
-            yield from _blob(storage, name, row["statistics_key"], missing, as_is)
 
 
 def _blob(

@@ -87,8 +87,8 @@ def calibrate(
         choice(
             "--mode",
             MODES,
-            "What answers are made of: kernels (default), mixed with a fitted wavefront, or likeliest, which "
-            "decides by photos that are set aside. Kept from then on.",
+            "What answers are made of: kernels (default), kernels mixed with a fitted wavefront, that "
+            "wavefront alone, or kernels averaged as in the paper. Kept from then on.",
         ),
     ] = None,
     unit: Annotated[

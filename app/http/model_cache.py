@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, TypeAlias
 
-from app.blobs.evidence import with_evidence
 from app.blobs.storage import Storage
 from app.errors import ConflictError, UnknownLensError
 from app.runtime import metrics
@@ -151,7 +150,7 @@ class ModelCache:
             found = self._recall(key)
             prior = None if found is None or found.family != family else found.model.prior
             if prior is None:
-                others = self._whole(self._store.samples.of_family(family))
+                others = self._store.samples.of_family(family)
                 if not others:  # removed while we looked
                     return own
                 source = LensModel.fit([stored.sample for stored in others], self._settings)
@@ -184,7 +183,6 @@ class ModelCache:
         if old is not None:
             state, samples = self._store.samples.of_lens(lens_id, after_version=old.state.version)
             if state.rebuild_epoch == old.state.rebuild_epoch:
-                samples = self._whole(samples)
                 model = old.model.added([stored.sample for stored in samples]) if samples else old.model
                 size = old.size_bytes + _size(samples)
                 return Fitted(lens_id, state, model, model.pitch_um, size, learned=False)
@@ -207,16 +205,11 @@ class ModelCache:
                 f"lens {lens_id} has no samples yet (version {state.version}): "
                 "upload photos taken with it and wait until they are counted"
             )
-        samples = self._whole(samples)
         values = [stored.sample for stored in samples]
         model = self._restored(lens_id, state, values)
         learned = model is not None
         model = model or LensModel.fit(values, self._settings)
         return Fitted(lens_id, state, model, model.pitch_um, _size(samples), learned)
-
-    def _whole(self, samples: Sequence[StoredSample]) -> list[StoredSample]:
-        """Samples with all that the mode of the models needs."""
-        return with_evidence(samples, self._storage, self._settings.mode)
 
     def _restored(self, lens_id: str, state: LensState, samples: Sequence[PsfSample]) -> LensModel | None:
         if self._storage is None:
@@ -280,8 +273,4 @@ def check_version(store: Store, lens_id: str, version: int, state: LensState) ->
 
 
 def _size(samples: Sequence[StoredSample]) -> int:
-    return BYTES_FACTOR * sum(
-        stored.sample.kernel.nbytes
-        + (0 if stored.sample.evidence is None else stored.sample.evidence.autocorrelation.nbytes)
-        for stored in samples
-    )
+    return BYTES_FACTOR * sum(stored.sample.kernel.nbytes for stored in samples)

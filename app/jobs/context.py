@@ -18,7 +18,7 @@ from typing import Any, Final, NoReturn
 import numpy as np
 
 from app.blobs.storage import Storage
-from app.jobs.task_files import EVIDENCE, KERNELS, PREVIEW, R_MAP, SAMPLES, SHOWN
+from app.jobs.task_files import KERNELS, PREVIEW, R_MAP, SAMPLES, SHOWN
 from app.runtime import metrics
 from app.runtime.outage import OutageError, is_outage
 from app.runtime.settings import Settings
@@ -30,7 +30,6 @@ from app.store import Store, StoredSample
 from app.store.jobs import JobStore
 from app.store.photo_steps import folder_of
 from app.store.tables import PhotoRow
-from lensmodel.core.evidence import PatchEvidence
 from lensmodel.core.files import save_array
 from lensmodel.core.types import ignore_step
 
@@ -215,8 +214,6 @@ def write_samples(folder: Path, stored: Sequence[StoredSample]) -> None:
         size = sample.kernel.shape[0]
         margin = (side - size) // 2
         kernels[number, margin : margin + size, margin : margin + size] = sample.kernel
-        if isinstance(sample.evidence, PatchEvidence):
-            (folder / EVIDENCE.format(number)).write_bytes(sample.evidence.to_bytes())
         listed.append(
             {
                 "size": size,

@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any, Final
 
-from app.blobs.evidence import with_evidence
 from app.jobs.context import (
     SPARE_MB,
     JobFailedError,
@@ -26,7 +25,7 @@ from app.sandbox.child import Progress
 from app.sandbox.outcome import Limits
 from app.store.corrections import CorrectionPlan, Result, folder_of
 from app.store.photo_steps import settings_of
-from app.store.samples import LensState, Relative, StoredSample
+from app.store.samples import LensState, Relative
 from app.store.tables import CorrectionRow
 from app.store.versions import learned_key, report_key
 from lensmodel.correction import Bounds
@@ -119,7 +118,7 @@ class CorrectionWork:
     def _family(self, listed: list[dict[str, Any]], folder: Path) -> int:
         """Hand over what other copies of the lens say; return how many of them still say something."""
         family = [Relative(one["lens_id"], LensState(**one["state"])) for one in listed]
-        stored = self._whole(self._bench.store.samples.of_family(family))
+        stored = self._bench.store.samples.of_family(family)
         if not stored:
             return 0
         (folder / FAMILY).mkdir()
@@ -131,14 +130,11 @@ class CorrectionWork:
         if not stored:
             text = f"version {version} of lens {lens_id} has no samples any more; ask for the newest version"
             raise JobFailedError("no_samples", text)
-        write_samples(folder, self._whole(stored))
+        write_samples(folder, stored)
         key = learned_key(lens_id, version, state.rebuild_epoch)
         with suppress(FileNotFoundError):  # not learned yet: the task does it
             (folder / LEARNED).write_bytes(self._bench.storage.get(key))
         return state
-
-    def _whole(self, stored: list[StoredSample]) -> list[StoredSample]:
-        return with_evidence(stored, self._bench.storage, self._bench.settings.model_mode)
 
     def _teller(self, correction_id: str) -> Progress:
         last = 0.0

@@ -24,7 +24,7 @@ from app.jobs.queue import Job, JobEngine
 from app.jobs.task_files import KERNELS
 from app.sandbox.outcome import Limits
 from app.store import LensName, NewPatch, NewSample
-from app.store.photo_steps import settings_of, statistics_of
+from app.store.photo_steps import settings_of
 from app.store.tables import PHOTO_RUNNING, PatchRow, PhotoRow
 from lensmodel.core.errors import InvalidInputError, InvalidKernelError, NoUsablePatchesError
 from lensmodel.core.psf import as_kernel
@@ -294,37 +294,33 @@ class PhotoWork:
                 reads=[developed],
                 compiles=True,
             )
-            return [self._sample(photo, folder, number, entry) for number, entry in enumerate(listed)]
+            return [_sample(folder, number, entry) for number, entry in enumerate(listed)]
 
-    def _sample(self, photo: PhotoRow, folder: Path, number: int, entry: dict[str, Any]) -> NewSample:
-        """Check one result of a child as if a stranger had sent it, and keep its statistics."""
-        try:
-            kernels = np.load(folder / KERNELS, allow_pickle=False, mmap_mode="r")
-            kernel = as_kernel(kernels[number])
-            weight = float(np.clip(entry["weight"], 0.0, 1.0))
-            spectrum = None if entry["spectrum"] is None else bytes.fromhex(entry["spectrum"])
-            if spectrum is not None:
-                PatchSpectrum.from_bytes(spectrum)
-        except (
-            *(InvalidKernelError, InvalidInputError, OSError),
-            *(ValueError, TypeError, LookupError),  # not the JSON that was agreed on
-        ) as error:
-            raise JobFailedError("internal_error", f"the estimator gave no kernel: {error}") from error
-        key = None
-        if entry["evidence"] is not None:
-            key = f"{statistics_of(photo)}{entry['idx']}-{entry['channel']}.npz"
-            self._bench.storage.put_file(key, folder / Path(entry["evidence"]).name)
-        return NewSample(
-            idx=entry["idx"],
-            channel=entry["channel"],
-            kernel=kernel,
-            weight=weight,
-            estimator=entry["estimator"],
-            predicted_error=entry["predicted_error"],
-            statistics_key=key,
-            spectrum=spectrum,
-            diagnostics=entry["diagnostics"],
-        )
+
+def _sample(folder: Path, number: int, entry: dict[str, Any]) -> NewSample:
+    """Check one result of a child as if a stranger had sent it."""
+    try:
+        kernels = np.load(folder / KERNELS, allow_pickle=False, mmap_mode="r")
+        kernel = as_kernel(kernels[number])
+        weight = float(np.clip(entry["weight"], 0.0, 1.0))
+        spectrum = None if entry["spectrum"] is None else bytes.fromhex(entry["spectrum"])
+        if spectrum is not None:
+            PatchSpectrum.from_bytes(spectrum)
+    except (
+        *(InvalidKernelError, InvalidInputError, OSError),
+        *(ValueError, TypeError, LookupError),  # not the JSON that was agreed on
+    ) as error:
+        raise JobFailedError("internal_error", f"the estimator gave no kernel: {error}") from error
+    return NewSample(
+        idx=entry["idx"],
+        channel=entry["channel"],
+        kernel=kernel,
+        weight=weight,
+        estimator=entry["estimator"],
+        predicted_error=entry["predicted_error"],
+        spectrum=spectrum,
+        diagnostics=entry["diagnostics"],
+    )
 
 
 def _missing(photo: PhotoRow, *, lens_known: bool) -> str:

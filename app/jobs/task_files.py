@@ -11,9 +11,6 @@ KERNELS: Final = "kernels.npy"
 SAMPLES: Final = "samples.json"
 """What else belongs to each of the kernels."""
 
-EVIDENCE: Final = "evidence-{}.npz"
-"""The normal equations of the sample of that number; not there where it has none, or none are wanted."""
-
 FAMILY: Final = "family"
 """Folder of the samples of other copies that the model leans on; not there without any."""
 

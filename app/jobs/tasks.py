@@ -20,7 +20,6 @@ from app.blobs import glances, previews
 from app.jobs.task_files import (
     AFTER,
     BEFORE,
-    EVIDENCE,
     FAMILY,
     GLANCE,
     KERNELS,
@@ -38,7 +37,6 @@ from app.schemas import distances
 from lensmodel import correction, photo
 from lensmodel.core import codec
 from lensmodel.core.errors import InvalidInputError, LensModelError
-from lensmodel.core.evidence import PatchEvidence
 from lensmodel.core.files import save_array
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.spectrum import PatchSpectrum
@@ -124,11 +122,7 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: Progress) -> lis
     with (folder / KERNELS).open("wb") as file:
         save_array(file, np.stack([np.asarray(result.sample.kernel) for result in results]))
     listed = []
-    for number, result in enumerate(results):
-        evidence = None
-        if result.evidence is not None:
-            evidence = f"evidence-{number}.npz"
-            (folder / evidence).write_bytes(result.evidence)
+    for result in results:
         spectrum = result.sample.spectrum
         diagnostics = {name: _finite(value) for name, value in result.diagnostics.items()}
         listed.append(
@@ -139,7 +133,6 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: Progress) -> lis
                 "estimator": result.sample.estimator,
                 "predicted_error": diagnostics.pop("predicted_error", None),
                 "diagnostics": diagnostics,
-                "evidence": evidence,
                 "spectrum": None if spectrum is None else spectrum.to_bytes().hex(),
             }
         )
@@ -319,7 +312,7 @@ def _samples(folder: Path) -> list[PsfSample]:
     kernels = np.load(folder / KERNELS, allow_pickle=False, mmap_mode="r")
     listed = json.loads((folder / SAMPLES).read_text(encoding="utf-8"))
     samples = []
-    for number, (kernel, entry) in enumerate(zip(kernels, listed, strict=True)):
+    for kernel, entry in zip(kernels, listed, strict=True):
         margin = (kernel.shape[0] - entry["size"]) // 2
         inner = slice(margin, margin + entry["size"])
         samples.append(
@@ -333,7 +326,6 @@ def _samples(folder: Path) -> list[PsfSample]:
                 estimator=entry["estimator"],
                 error=entry["error"],
                 spectrum=_spectrum(entry["spectrum"]),
-                evidence=_evidence(folder / EVIDENCE.format(number)),
                 half_diagonal_px=entry["half_diagonal_px"],
             )
         )
@@ -342,10 +334,6 @@ def _samples(folder: Path) -> list[PsfSample]:
 
 def _spectrum(stored: str | None) -> PatchSpectrum | None:
     return None if stored is None else PatchSpectrum.from_bytes(bytes.fromhex(stored))
-
-
-def _evidence(path: Path) -> PatchEvidence | None:
-    return PatchEvidence.from_bytes(path.read_bytes()) if path.is_file() else None
 
 
 def _settings(stored: Mapping[str, Any]) -> LensSettings:

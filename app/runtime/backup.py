@@ -29,7 +29,7 @@ from sqlalchemy import Connection, select
 from app.blobs.storage import Storage
 from app.store.access import access_tables as _all_tables  # noqa: F401 - a copy holds every table
 from app.store.database import Database
-from app.store.tables import CorrectionRow, PhotoRow, SampleRow
+from app.store.tables import CorrectionRow, PhotoRow
 from app.store.upkeep import migrate, transfer
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.files import atomic
@@ -124,8 +124,7 @@ def _named(rows: Connection) -> set[str]:
     results = select(CorrectionRow.result_key).where(
         CorrectionRow.state == "succeeded", CorrectionRow.result_key.is_not(None)
     )
-    statistics = select(SampleRow.statistics_key).where(SampleRow.statistics_key.is_not(None))
-    return {str(key) for query in (alive, results, statistics) for key in rows.execute(query).scalars()}
+    return {str(key) for query in (alive, results) for key in rows.execute(query).scalars()}
 
 
 def _finish(folder: Path, part: Path, moment: datetime, rows: dict[str, int], named: set[str]) -> Backup:

@@ -73,7 +73,7 @@ def examine(
         "blobs": lambda: _blobs(store, storage, repair=repair),
     }
     if deep:
-        blobs |= {"kernels": lambda: _kernels(store, storage), "photos": lambda: _photos(store, storage)}
+        blobs |= {"kernels": lambda: _kernels(store), "photos": lambda: _photos(store, storage)}
     for name, check in blobs.items():
         checks.append(name)
         findings.extend(check())
@@ -169,25 +169,23 @@ def _orphan(store: Store, prefix: str, *, repair: bool) -> Finding:
     return Finding("blobs", prefix, f"{says}; they will be deleted", "", mended=True)
 
 
-def _kernels(store: Store, storage: Storage) -> Iterator[Finding]:
+def _kernels(store: Store) -> Iterator[Finding]:
     last = 0
     while True:
         with store.database.reading() as session:
             rows = session.execute(
-                select(SampleRow.id, SampleRow.psf, SampleRow.crc32, SampleRow.statistics_key)
+                select(SampleRow.id, SampleRow.psf, SampleRow.crc32)
                 .where(SampleRow.id > last)
                 .order_by(SampleRow.id)
                 .limit(1000)
             ).all()
         if not rows:
             return
-        for key, psf, crc32, statistics in rows:
+        for key, psf, crc32 in rows:
             if zlib.crc32(psf) != crc32:
                 yield Finding(
                     "kernels", f"sample {key}", "differs from what was written", "restore the database"
                 )
-            if statistics is not None and not _exists(storage, statistics):
-                yield Finding("kernels", f"sample {key}", "its statistics are missing", "restore the blobs")
         last = rows[-1][0]
 
 

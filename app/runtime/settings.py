@@ -11,7 +11,7 @@ import os
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from app.sandbox import account
@@ -160,9 +160,8 @@ class Settings(BaseSettings):
         default=True,
         description="A lens that has seen little leans on its owner's other copies of the same model.",
     )
-    model_mode: Literal["kernels", "mixed", "evidence", "wavefront", "likeliest", "paper"] = Field(
-        default="kernels",
-        description="What lens models make of their samples; likeliest chooses for each lens.",
+    model_mode: Literal["kernels", "mixed", "wavefront", "paper"] = Field(
+        default="kernels", description="What lens models make of their samples."
     )
     model_unit: Literal["micrometre", "half-diagonal"] = Field(
         default="micrometre", description="In what the kernels of bodies with different pixels agree."
@@ -193,6 +192,15 @@ class Settings(BaseSettings):
                 hint = f"did you mean {near[0]}?" if near else "run `lensmodel config` to see all settings"
                 raise ValueError(f"unknown setting {name}: {hint}")
         return values
+
+    @field_validator("model_mode", mode="before")
+    @classmethod
+    def _no_former_mode(cls, value: object) -> object:
+        if value in {"evidence", "likeliest"}:
+            raise ValueError(
+                f"the mode {value!r} is gone: leave LENS_MODEL_MODE out, or set it to kernels or mixed"
+            )
+        return value
 
     @model_validator(mode="after")
     def _odd_kernel(self) -> Settings:

@@ -33,7 +33,6 @@ class NewSample:
     weight: float
     estimator: str
     predicted_error: float | None = None
-    statistics_key: str | None = None
     spectrum: bytes | None = None
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
 
@@ -200,7 +199,6 @@ def _sample_row(photo: PhotoRow, patch: PatchRow, sample: NewSample) -> dict[str
         "crc32": zlib.crc32(blob),
         "psf": blob,
         "spectrum": sample.spectrum,
-        "statistics_key": sample.statistics_key,
         "estimator": sample.estimator,
         "diagnostics": dict(sample.diagnostics),
         "created_at": now(),

@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from app.store.access.owners import now
 from app.store.database import insert_new
-from app.store.removal import forget_if_empty
+from app.store.removal import forget_if_empty, statistics_of
 from app.store.tables import PHOTO_RUNNING, GarbageRow, LensRow, PatchRow, PhotoRow
 
 WORKED_ON = ("received", *PHOTO_RUNNING)
@@ -64,11 +64,6 @@ def folder_of(photo: PhotoRow) -> str:
     return f"{photo.blob_key.rpartition('/')[0]}/"
 
 
-def statistics_of(photo: PhotoRow) -> str:
-    """Return the prefix of what the patches of this epoch of a photo say besides their kernels."""
-    return f"{folder_of(photo)}statistics/e{photo.epoch}/"
-
-
 def settings_of(photo: PhotoRow) -> dict[str, Any]:
     """Return how the lens was set, as tasks read it."""
     return {"aperture": photo.aperture, "focal_mm": photo.focal_mm, "focus_m": photo.focus_m}
@@ -90,7 +85,7 @@ def let_go(session: Session, photo_id: str) -> None:
 
 
 def drop_patches(session: Session, photo: PhotoRow) -> None:
-    """Forget the patches of an epoch with their samples; a worker may write one more blob of them."""
+    """Forget the patches of an epoch with their samples."""
     session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
     insert_new(session, GarbageRow, [{"prefix": statistics_of(photo), "not_before": now() + LATE}])
 

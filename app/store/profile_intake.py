@@ -120,7 +120,6 @@ def _row(photo: PhotoRow, patch_id: int, sample: PsfSample) -> dict[str, Any]:
         "crc32": zlib.crc32(blob),
         "psf": blob,
         "spectrum": None if sample.spectrum is None else sample.spectrum.to_bytes(),
-        "statistics_key": None,
         "estimator": sample.estimator[:60] or "profile",
         "diagnostics": {},
         "created_at": now(),

@@ -90,8 +90,12 @@ def _unlearn(session: Session, photo: PhotoRow) -> None:
     photo.windows, photo.windows_rejected = None, 0
     session.execute(delete(SampleRow).where(SampleRow.photo_id == photo.id))
     session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
-    statistics = f"{photo.blob_key.rpartition('/')[0]}/statistics/"
-    insert_new(session, GarbageRow, [{"prefix": statistics, "not_before": now() + STILL_WRITTEN}])
+    insert_new(session, GarbageRow, [{"prefix": statistics_of(photo), "not_before": now() + STILL_WRITTEN}])
+
+
+def statistics_of(photo: PhotoRow) -> str:
+    """Return the prefix of what earlier versions kept of the patches of a photo besides their kernels."""
+    return f"{photo.blob_key.rpartition('/')[0]}/statistics/"
 
 
 def forget(session: Session, lens: LensRow) -> None:

@@ -91,7 +91,6 @@ class StoredSample:
     id: int
     version_added: int
     sample: PsfSample
-    statistics_key: str | None = None
 
 
 class SampleStore:
@@ -155,7 +154,6 @@ class SampleStore:
                 SampleRow.spectrum,
                 SampleRow.estimator,
                 SampleRow.predicted_error,
-                SampleRow.statistics_key,
                 PhotoRow.public_id.label("photo"),
                 PhotoRow.aperture,
                 PhotoRow.focal_mm,
@@ -214,5 +212,4 @@ def _stored(row: Row[*tuple[Any, ...]]) -> StoredSample:
             if not (row.width and row.height)
             else math.hypot(row.width, row.height) / 2,
         ),
-        row.statistics_key,
     )

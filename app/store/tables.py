@@ -281,7 +281,7 @@ class SampleRow(Base):
     crc32: Mapped[int] = mapped_column(BigInteger)
     psf: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)
     spectrum: Mapped[bytes | None] = mapped_column(LargeBinary)
-    statistics_key: Mapped[str | None]
+    statistics_key: Mapped[str | None]  # of earlier versions: a blob that nothing reads any more
     estimator: Mapped[str]
     diagnostics: Mapped[dict[str, Any]]
     created_at: Mapped[datetime]

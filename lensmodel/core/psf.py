@@ -215,28 +215,6 @@ def _centred_fft(kernel: npt.NDArray[np.float64], n: int) -> npt.NDArray[np.comp
     return scipy.fft.fft2(np.roll(grid, (-half, -half), axis=(0, 1)))
 
 
-class PatchStatistics(Protocol):
-    """Sufficient statistics of one patch, which can be summed over patches before a kernel is solved for.
-
-    `evidence.PatchEvidence` is one; it lies above this module.
-    """
-
-    @property
-    def autocorrelation(self) -> npt.NDArray[np.float32]:
-        """Sums R of products of the latent patch with itself, shape (2 k - 1, 2 k - 1)."""
-
-    @property
-    def crosscorrelation(self) -> npt.NDArray[np.float32]:
-        """Sums r of products of the observed patch with the latent one, shape (k, k)."""
-
-    @property
-    def noise(self) -> float:
-        """Standard deviation of the noise in units of the patch's own range."""
-
-    def to_bytes(self) -> bytes:
-        """Serialise, without pickle."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PsfSample:
     """One local PSF estimate: what was seen, where, at which settings, how sure.
@@ -261,8 +239,6 @@ class PsfSample:
         What the patch says without a kernel, so that all patches of a lens can be solved together.
     error : float or None
         Relative L2 distance to the truth that the method expects of it; None where it says nothing.
-    evidence : PatchStatistics or None
-        Normal equations of the patch, for models that solve those of many patches at once.
     half_diagonal_px : float or None
         Half the diagonal of the frame in pixels; None where unknown.
     """
@@ -276,7 +252,6 @@ class PsfSample:
     estimator: str = ""
     spectrum: PatchSpectrum | None = None
     error: float | None = None
-    evidence: PatchStatistics | None = None
     half_diagonal_px: float | None = None
 
     def __post_init__(self) -> None:

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
-from lensmodel.core.evidence import PatchEvidence
 from lensmodel.core.psf import second_moments
 from lensmodel.core.spectrum import repeats
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
@@ -41,8 +40,6 @@ class PsfEstimate:
         What the estimator reports of itself.
     seconds : float
         CPU time.
-    evidence : tuple of PatchEvidence or None
-        One for each patch, None for one that took no part; empty where the method keeps none.
     no_blur : bool
         The kernel is too narrow to be told from none.
     """
@@ -53,7 +50,6 @@ class PsfEstimate:
     predicted_error: float
     diagnostics: Mapping[str, float]
     seconds: float
-    evidence: tuple[PatchEvidence | None, ...] = ()
     no_blur: bool = False
 
 
@@ -199,16 +195,6 @@ def usable(
             f"no patch determines a kernel ({', '.join(sorted(set(reasons)))}); choose parts with fine detail"
         )
     return kept
-
-
-def placed(
-    evidence: Sequence[PatchEvidence | None],
-    kept: Sequence[tuple[Plane, NoiseModel]],
-    patches: Sequence[Plane],
-) -> tuple[PatchEvidence | None, ...]:
-    """Evidence of the patches that `usable` kept, at their places among all."""
-    own = {id(patch): one for (patch, _), one in zip(kept, evidence, strict=True)}
-    return tuple(own.get(id(patch)) for patch in patches)
 
 
 def _unfit(patch: Plane, model: NoiseModel) -> str | None:

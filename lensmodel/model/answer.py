@@ -15,13 +15,13 @@ from lensmodel.core.types import Kernel
 
 KERNELS: Final = "kernels"
 MIXED: Final = "mixed"
-LIKELIEST: Final = "likeliest"
+WAVEFRONT: Final = "wavefront"
 PAPER: Final = "paper"
-MODES: Final = (KERNELS, MIXED, "evidence", "wavefront", LIKELIEST, PAPER)
+MODES: Final = (KERNELS, MIXED, WAVEFRONT, PAPER)
 """What can be made of the neighbours of a question; `modes` tells what they are."""
 
-NEEDING_EVIDENCE: Final = frozenset({"evidence", LIKELIEST})
-"""Modes that use the normal equations of patches."""
+FORMER_MODES: Final = frozenset({"evidence", "likeliest"})
+"""Modes that profiles of earlier versions may name; they are read as `KERNELS`."""
 
 MICROMETRE: Final = "micrometre"
 HALF_DIAGONAL: Final = "half-diagonal"
@@ -77,7 +77,10 @@ class ModelSettings:
             if value is not None and not 0.0 <= value <= 1.0:
                 raise InvalidInputError(f"{name} symmetry must lie in 0..1, or None, got {value}")
         if self.mode not in MODES:
-            raise UnknownMethodError(f"no mode {self.mode!r} of the lens model; known: {', '.join(MODES)}")
+            why = "is gone" if self.mode in FORMER_MODES else "is not known"
+            raise UnknownMethodError(
+                f"the mode {self.mode!r} of the lens model {why}; choose one of {', '.join(MODES)}"
+            )
         if self.unit not in UNITS:
             raise UnknownMethodError(f"no unit {self.unit!r} of the lens model; known: {', '.join(UNITS)}")
         object.__setattr__(self, "excluded", tuple(str(name) for name in self.excluded))

@@ -13,11 +13,10 @@ from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings, StepHook, ignore_step
 from lensmodel.model import pitch as pitches
 from lensmodel.model import variables as va
-from lensmodel.model.answer import KERNELS, LIKELIEST, MICROMETRE, NEEDING_EVIDENCE, ModelSettings
+from lensmodel.model.answer import KERNELS, MICROMETRE, ModelSettings
 from lensmodel.model.field.cross_validation import Judgement, bandwidth, held_together, judge
 from lensmodel.model.field.index import SampleIndex
 from lensmodel.model.field.local_frame import LocalKernels
-from lensmodel.model.field.normal_equations import NormalEquations
 from lensmodel.model.field.smoothers import smoothers
 from lensmodel.model.field.transport import WidthField
 from lensmodel.model.wavefront.physical_mean import Physics
@@ -70,10 +69,8 @@ class Fit:
         None until `warmed`, or if it takes no part.
     ends : tuple of End
         Of a zoom: focal lengths that answer by a wavefront of their own.
-    statistics : NormalEquations or None
-        Those of the patches, where the mode may need them.
     mode : str
-        Which mode answers: that of the settings, or the one that was found likeliest.
+        Which mode answers.
     unit : str
         That of the settings.
     """
@@ -89,7 +86,6 @@ class Fit:
     rule: dict[str, float]
     bandwidth: dict[str, float]
     physical: Physics | None = None
-    statistics: NormalEquations | None = None
     mode: str = KERNELS
     unit: str = MICROMETRE
     ends: tuple[End, ...] = ()
@@ -128,8 +124,7 @@ class Fit:
         used = bandwidth(rule, settings, judgement.choice)
         return cls(
             *(pixel, len(samples), widths, local, index, roster, judgement, told_errors(samples), rule, used),
-            statistics=statistics_of(common, settings),
-            mode=KERNELS if settings.mode == LIKELIEST else settings.mode,
+            mode=settings.mode,
             unit=settings.unit,
         )
 
@@ -170,13 +165,7 @@ class Fit:
             roster=self.roster.extended(common),
             judgement=self.judgement.extended(_claimed(samples, settings)),
             told=np.concatenate([self.told, told_errors(samples)]),
-            statistics=None if self.statistics is None else self.statistics.extended(common),
         )
-
-
-def statistics_of(samples: Sequence[PsfSample], settings: ModelSettings) -> NormalEquations | None:
-    """Normal equations of samples of one pitch, where the mode may ask for them."""
-    return NormalEquations.of(samples) if settings.mode in NEEDING_EVIDENCE else None
 
 
 def told_errors(samples: Sequence[PsfSample]) -> NDArray[np.float64]:

@@ -21,7 +21,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample
 from lensmodel.model import pitch as pitches
 from lensmodel.model import variables as va
-from lensmodel.model.answer import LIKELIEST, MODES, ModelSettings
+from lensmodel.model.answer import MODES, ModelSettings
 from lensmodel.model.field.cross_validation import Judgement
 from lensmodel.model.field.index import SampleIndex
 from lensmodel.model.field.kriging import ImageFrame
@@ -29,7 +29,7 @@ from lensmodel.model.field.leave_one_out import Choice
 from lensmodel.model.field.local_frame import LocalKernels
 from lensmodel.model.field.robust import Flag
 from lensmodel.model.field.transport import WidthField
-from lensmodel.model.fitting import Fit, Roster, statistics_of, told_errors
+from lensmodel.model.fitting import Fit, Roster, told_errors
 from lensmodel.model.wavefront.physical_mean import Physics
 from lensmodel.model.wavefront.zoom import End
 from lensmodel.optics.wavefront import NAMES, Wavefront
@@ -217,7 +217,7 @@ def _fit(
     rule = {str(k): float(v) for k, v in document["rule"].items()}
     used = {str(k): float(v) for k, v in document["bandwidth"].items()}
     mode = str(document["mode"])
-    if mode not in MODES or mode == LIKELIEST:
+    if mode not in MODES:
         raise ValueError(f"no mode {mode!r}")
     scales = np.concatenate([va.scales(rule), va.scales(used)])
     if not (np.isfinite(scales).all() and scales.min() > 0):
@@ -236,7 +236,6 @@ def _fit(
         rule=rule,
         bandwidth=used,
         physical=physical,
-        statistics=statistics_of(common, settings),
         mode=mode,
         unit=settings.unit,
         ends=ends,

@@ -25,17 +25,15 @@ from lensmodel.core.types import ZONES, FieldPosition, Kernel, LensSettings, Ste
 from lensmodel.model import learned as memory
 from lensmodel.model import pitch as pitches
 from lensmodel.model import variables as va
-from lensmodel.model.answer import LIKELIEST, MICROMETRE, MIXED, MODES, PAPER, ModelSettings, PsfAnswer
+from lensmodel.model.answer import MICROMETRE, MIXED, WAVEFRONT, ModelSettings, PsfAnswer
 from lensmodel.model.answering import AnsweringModel, ModelField
 from lensmodel.model.field.robust import Flag
 from lensmodel.model.fitting import Fit
-from lensmodel.model.modes import NEEDING_WAVEFRONT
 from lensmodel.model.predictor import Predictor
 from lensmodel.model.prior import Prior
 from lensmodel.model.trust.expected_error import Evidence, expected_error, with_prior
 from lensmodel.model.trust.misleading_photos import without_misleading
 from lensmodel.model.trust.support import standard_error, support
-from lensmodel.model.wavefront.likelihood import Predict, likeliest
 from lensmodel.model.wavefront.physical_mean import Physics
 
 _LISTED = 1e-3  # share of the weight from which on a photo or a prior is named (chosen)
@@ -132,7 +130,7 @@ class LensModel:
     @property
     def _wants_wavefront(self) -> bool:
         """Whether answers need a wavefront, or patches can judge it as a second opinion."""
-        if self.settings.mode in NEEDING_WAVEFRONT:
+        if self.settings.mode == WAVEFRONT:
             return True
         heard = self.settings.mode == MIXED or any(s.spectrum is not None for s in self.samples)
         return heard and self._predictor.smoother.physical
@@ -144,16 +142,12 @@ class LensModel:
         anybody's back: call it once when the samples are complete. The same samples give the same model.
         A correction hears the wavefront as a second opinion (`witness`), whatever mode answers. Photos that
         make the patches of the others less likely lose their votes here (`misleading`).
-        The mode "likeliest" is chosen here too, which takes up to three such fits more.
         """
         if self.warm:
             return self
         prior = None if self.prior is None else self.prior.warmed()
         judged = without_misleading(self._fit, self.samples, self.settings)
         fit = judged.warmed(self.samples, on_step)
-        if self.settings.mode == LIKELIEST:
-            voting = [s for s, vote in zip(self.samples, fit.judgement.votes, strict=True) if vote > 0]
-            fit = replace(fit, mode=likeliest(voting, self._by_mode))
         return LensModel(self.samples, self.settings, fit, prior=prior)
 
     def without_photo(self, photo: str) -> LensModel:
@@ -172,7 +166,7 @@ class LensModel:
 
     def opinion(self, mode: str) -> LensModel | None:
         """Return the model of the same fit that answers in another mode; None without a wavefront for it."""
-        if mode in NEEDING_WAVEFRONT and self._fit.physical is None:
+        if mode == WAVEFRONT and self._fit.physical is None:
             return None
         return LensModel(self.samples, self.settings, replace(self._fit, mode=mode), prior=self.prior)
 
@@ -244,7 +238,7 @@ class LensModel:
             usual=float(np.mean(fit.judgement.errors**2)),
         )
         physical = fit.physical_at(settings)
-        alone = fit.mode in {MIXED, "wavefront"} and physical is not None and physical.agreed
+        alone = fit.mode in {MIXED, WAVEFRONT} and physical is not None and physical.agreed
         error = expected_error(evidence, mixture, wavefront_alone=alone)
         share = float(prior_shares[0])
         if self.prior is not None and share > _LISTED:
@@ -343,7 +337,7 @@ class LensModel:
 
     @property
     def mode(self) -> str:
-        """Which of `MODES` answers: that of the settings, or the one that `warmed` found likeliest."""
+        """Which of `MODES` answers."""
         return self._fit.mode
 
     @property
@@ -382,19 +376,3 @@ class LensModel:
     def nbytes(self) -> int:
         """Bytes of stored kernels, those of the samples included."""
         return self._fit.nbytes + sum(s.kernel.nbytes for s in self.samples)
-
-    # --- inside ---------------------------------------------------------------------------------
-
-    def _by_mode(self, samples: Sequence[PsfSample]) -> dict[str, Predict]:
-        """Predictors by mode, learned from some of the samples."""
-        seen = tuple(samples)
-        fit = Fit.of(seen, self.settings).warmed(seen)
-        open_ = {"evidence": fit.statistics is not None, "wavefront": fit.physical is not None}
-
-        def told_by(mode: str) -> Predict:
-            model = LensModel(seen, self.settings, replace(fit, mode=mode))
-            return model.kernel_of
-
-        return {
-            mode: told_by(mode) for mode in MODES if mode not in {LIKELIEST, PAPER} and open_.get(mode, True)
-        }

@@ -3,14 +3,12 @@
 ============  ===============================================================================
 kernels       the kernels of the neighbours averaged, as in the paper (the default)
 mixed         the mixture of `combination`: kernels of both frames, and the wavefront
-evidence      their normal equations summed with the same weights, solved once (`normal_equations`)
 wavefront     the wavefront of the lens alone, fitted to all samples (`physical_mean`)
-likeliest     that of the four which makes patches likeliest that it was not fitted to (`likelihood`)
 paper         the kernels of the neighbours averaged, and nothing else: bandwidths by eq. (8) alone,
               all samples as sure as they claim, no symmetry, nothing moved along the radius
 ============  ===============================================================================
 
-A mode that has nothing to go by at a place, no statistics or no wavefront, answers with averaged kernels.
+A mode that needs a wavefront where none could be fitted answers with averaged kernels.
 
 Behind lenses of third order, of which the wavefront is made, `mixed` is nearer to the truth. Behind
 ray-traced designs it is confidently wrong in places, and a photo corrected by it loses there what `kernels`
@@ -21,26 +19,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model.answer import LIKELIEST, MIXED
+from lensmodel.model.answer import MIXED, WAVEFRONT
 from lensmodel.model.combination import Experts, Mixture, relative_l2
 from lensmodel.model.field.kriging import as_kernels
 from lensmodel.model.field.local_frame import Answers, LocalKernels
-from lensmodel.model.field.normal_equations import NormalEquations
-
-NEEDING_WAVEFRONT: Final = frozenset({"wavefront", LIKELIEST})
 
 
 def answered(
     mode: str,
     experts: Experts,
     local: LocalKernels,
-    statistics: NormalEquations | None,
     near: Answers,
     positions: Sequence[FieldPosition],
     settings: LensSettings,
@@ -52,21 +45,16 @@ def answered(
     Parameters
     ----------
     mode : str
-        Of `answer.MODES`, but "likeliest".
+        Of `answer.MODES`.
     near : Answers
         Neighbours of the places and their weights.
     widths : ndarray, shape (q, 2)
         Scales of the places.
-
-    Notes
-    -----
-    The squared errors of "evidence" are those of its neighbours' kernels: what one step for all gains over
-    them is not told apart.
     """
     angles, mirror = np.array([p.phi for p in positions]), experts.judgement.choice.mirror
     physical = experts.physical
     kernels = local.kernels(near, angles, widths, size, mirror)
-    if mode == "wavefront" and physical is not None:
+    if mode == WAVEFRONT and physical is not None:
         rows = as_kernels(physical.rows(positions, settings), size)
         errors = physical.extended_errors(len(experts.judgement.votes))
         alone = _alone(rows, near, errors, 2)
@@ -74,13 +62,6 @@ def answered(
         return replace(alone, averaged=averaged, apart=apart)
     if mode == MIXED:
         return experts.mixed(kernels, near, positions, settings)
-    if mode == "evidence" and statistics is not None:
-        for question in range(len(positions)):
-            found = statistics.kernel(
-                local, near, question, float(angles[question]), widths[question], size, mirror
-            )
-            if found is not None:
-                kernels[question] = found
     return _alone(kernels, near, experts.judgement.errors, 0)
 
 

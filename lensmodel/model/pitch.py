@@ -65,7 +65,6 @@ def _seen_with(sample: PsfSample, pixel: float | None, own: float | None) -> Psf
         sample,
         kernel=rescaled(sample.kernel, own, pixel, _side(sample, ratio)),
         spectrum=None,  # its frequencies are those of the other pixels
-        evidence=None,
         pixel_pitch_um=None if pitch is None else pitch * ratio,
         half_diagonal_px=None if half is None else half / ratio,
     )

@@ -73,9 +73,7 @@ class Predictor:
         end, share = nearest(fit.ends, settings)
 
         def mixed(experts: Experts) -> Mixture:
-            return answered(
-                fit.mode, experts, fit.local, fit.statistics, near, positions, settings, widths, size
-            )
+            return answered(fit.mode, experts, fit.local, near, positions, settings, widths, size)
 
         mixture = mixed(self._experts) if end is None or share < 1.0 else None
         if end is not None:

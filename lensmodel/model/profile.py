@@ -5,11 +5,11 @@ Layout of a `.lensprofile`, format 1::
     profile.json    format, lens, cameras, provenance, settings of the model, one entry for each sample
     kernels.npy     (n, k, k) float32, sum 1, centred, in the order of the entries
     spectra.npy     optional: what each patch says without a kernel, see `PatchSpectrum`
-    evidence/N.npz  optional: the normal equations of sample N, see `PatchEvidence`
     learned.npz     optional: what the model has learned from them, see `learned`
     family.lensprofile  optional: the profile of other copies that the model leans on, without one of its own
 
-Nothing in it can run code: no pickle, sizes bounded before arrays are made.
+Other files, as the `evidence/` of earlier versions, are passed over. Nothing in it can run code: no pickle,
+sizes bounded before arrays are made.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ import logging
 import math
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
@@ -29,12 +29,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, LensModelError
-from lensmodel.core.evidence import PatchEvidence
 from lensmodel.core.files import atomic
 from lensmodel.core.psf import PsfSample, resized
 from lensmodel.core.spectrum import RINGS, SECTORS, PatchSpectrum
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model.answer import ModelSettings
+from lensmodel.model.answer import FORMER_MODES, KERNELS, ModelSettings
 from lensmodel.model.lens_model import LensModel
 
 FORMAT = 1
@@ -44,7 +43,6 @@ _MAX_SIDE = 255
 _INFINITY = "infinity"
 _LEARNED = "learned.npz"
 _SPECTRA = "spectra.npy"
-_EVIDENCE = "evidence/"
 _FAMILY = "family.lensprofile"
 
 log = logging.getLogger(__name__)
@@ -130,9 +128,6 @@ def write_profile(file: IO[bytes], profile: LensProfile) -> None:
         archive.writestr("kernels.npy", arrays.getvalue())
         if any(sample.spectrum is not None for sample in samples):
             archive.writestr(_SPECTRA, _spectra(samples))
-        for i, sample in enumerate(samples):
-            if sample.evidence is not None:
-                archive.writestr(f"{_EVIDENCE}{i}.npz", sample.evidence.to_bytes())
         archive.writestr(_LEARNED, profile.model.learned(), zipfile.ZIP_STORED)
         if prior is not None and isinstance(prior.source, LensModel):
             family = io.BytesIO()
@@ -184,7 +179,6 @@ def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> 
             document = json.loads(archive.read("profile.json"))
             stack = np.load(io.BytesIO(archive.read("kernels.npy")), allow_pickle=False)
             spectra = archive.read(_SPECTRA) if _SPECTRA in names else None
-            evidence = {name: archive.read(name) for name in names if name.startswith(_EVIDENCE)}
             learned = archive.read(_LEARNED) if _LEARNED in names else None
             family = archive.read(_FAMILY) if _FAMILY in names and not alone else None
     except FileNotFoundError:
@@ -210,7 +204,7 @@ def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> 
                 f"{name} holds {len(entries)} samples but kernels of shape {stack.shape}; "
                 f"one is needed for each, of side {_MAX_SIDE} at most"
             )
-        samples = _samples(entries, stack, spectra, evidence)
+        samples = _samples(entries, stack, spectra)
         model = _model(samples, _settings(document["model"]), learned)
         if family is not None:
             other = _read(io.BytesIO(family), f"the family in {name}", alone=True)
@@ -260,17 +254,10 @@ def _opened(data: bytes | None, count: int) -> list[PatchSpectrum | None]:
 
 
 def _samples(
-    entries: Sequence[dict[str, Any]],
-    stack: NDArray[np.float32],
-    spectra: bytes | None,
-    evidence: Mapping[str, bytes],
+    entries: Sequence[dict[str, Any]], stack: NDArray[np.float32], spectra: bytes | None
 ) -> list[PsfSample]:
-    found = []
     seen = _opened(spectra, len(entries))
-    for i, (entry, kernel, spectrum) in enumerate(zip(entries, stack, seen, strict=True)):
-        sample, data = _sample(entry, kernel, spectrum), evidence.get(f"{_EVIDENCE}{i}.npz")
-        found.append(sample if data is None else replace(sample, evidence=PatchEvidence.from_bytes(data)))
-    return found
+    return [_sample(*one) for one in zip(entries, stack, seen, strict=True)]
 
 
 def _sample(
@@ -306,7 +293,11 @@ def _model(samples: list[PsfSample], settings: ModelSettings, learned: bytes | N
 
 def _settings(values: dict[str, Any]) -> ModelSettings:
     # written until 0.2; it changed how finely kernels were kept, and no answer
-    return ModelSettings(**{key: value for key, value in values.items() if key != "oversampling"})
+    known = {key: value for key, value in values.items() if key != "oversampling"}
+    if known.get("mode") in FORMER_MODES:
+        log.info("the mode %s of the profile is gone: its kernels are averaged", known["mode"])
+        known["mode"] = KERNELS
+    return ModelSettings(**known)
 
 
 def _named(values: dict[str, Any]) -> dict[str, Any]:

@@ -50,8 +50,6 @@ class CellSample:
         Which colour plane.
     sample : PsfSample
         The estimate, ready for the model.
-    evidence : bytes or None
-        The patch's sufficient statistics, serialised.
     diagnostics : mapping of str to float
         What the estimator reports of itself.
     """
@@ -59,7 +57,6 @@ class CellSample:
     patch: Patch
     channel: Channel
     sample: PsfSample
-    evidence: bytes | None
     diagnostics: Mapping[str, float]
 
 
@@ -176,8 +173,7 @@ def estimate_cell(
         if channel == "g":
             green = estimate
         width = rms_width(estimate.kernel)
-        proofs = estimate.evidence or (None,) * len(group)
-        for patch, evidence, plane, noise in zip(group, proofs, planes, noises, strict=True):
+        for patch, plane, noise in zip(group, planes, noises, strict=True):
             sample = PsfSample(
                 kernel=estimate.kernel,
                 position=patch.position,
@@ -189,12 +185,10 @@ def estimate_cell(
                 error=estimate.predicted_error if math.isfinite(estimate.predicted_error) else None,
                 # sharpened by cameras and compressed: no power law of a scene times a lens is left in them
                 spectrum=None if developed.lossy else PatchSpectrum.of(plane, noise, width),
-                evidence=evidence,
                 half_diagonal_px=developed.frame.half_diagonal,
             )
-            stored = None if evidence is None else evidence.to_bytes()
             diagnostics = {**estimate.diagnostics, "predicted_error": estimate.predicted_error}
-            results.append(CellSample(patch, channel, sample, stored, diagnostics))
+            results.append(CellSample(patch, channel, sample, diagnostics))
         on_step(done + 1, len(order))
     return results
 

@@ -29,7 +29,6 @@ from python_multipart.exceptions import FormParserError
 from app.http.upload import _Form
 from lensmodel import photo
 from lensmodel.core.errors import LensModelError
-from lensmodel.core.evidence import PatchEvidence
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.spectrum import PatchSpectrum
 from lensmodel.core.types import FieldPosition, LensSettings
@@ -62,7 +61,6 @@ READERS: dict[str, tuple[str, Reader]] = {
     "sniff": ("a.dng", lambda path: photo.sniff(path.read_bytes()[: photo.HEAD_BYTES])),
     "profile": ("a.lensprofile", load_profile),
     "spectrum": ("spectrum", lambda path: PatchSpectrum.from_bytes(path.read_bytes())),
-    "statistics": ("spectrum", lambda path: PatchEvidence.from_bytes(path.read_bytes())),
     "multipart": ("multipart", _multipart),
 }
 

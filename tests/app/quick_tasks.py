@@ -62,7 +62,6 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: Progress) -> lis
         "estimator": "quick/1",
         "predicted_error": 0.1,
         "diagnostics": {"worker": float(os.getppid())},  # its fork server: one of each worker
-        "evidence": None,
         "spectrum": None,
     }
     return [{"idx": arguments["numbers"][0], "channel": channel, **common} for channel in ("r", "g", "b")]

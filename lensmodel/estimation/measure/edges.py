@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, LensModelError, NotEnoughEvidenceError
-from lensmodel.core.evidence import nonnegative_least_squares
+from lensmodel.core.least_squares import nonnegative_least_squares
 from lensmodel.core.psf import as_kernel, centred, gaussian
 from lensmodel.core.types import CHANNELS, Channel, Kernel, StepHook, ignore_step
 from lensmodel.estimation.measure.measurer import MeasuredPsf, require_photos

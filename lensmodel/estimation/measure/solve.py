@@ -36,7 +36,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
-from lensmodel.core.evidence import nonnegative_least_squares
+from lensmodel.core.least_squares import nonnegative_least_squares
 from lensmodel.core.psf import as_kernel, centroid
 from lensmodel.core.types import Kernel
 from lensmodel.estimation.measure.smooth import Smooth

@@ -11,7 +11,7 @@ import numpy as np
 
 from lensmodel.core.psf import as_kernel, distance, rms_width
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
-from lensmodel.estimation.estimator import PsfEstimate, is_no_blur, placed, usable
+from lensmodel.estimation.estimator import PsfEstimate, is_no_blur, usable
 from lensmodel.estimation.methods.patch_recurrence import PatchRecurrence
 from lensmodel.estimation.methods.whittle import Whittle
 from lensmodel.estimation.spectra.kernel_choice import Judgement
@@ -76,7 +76,6 @@ class Cautious:
             inner, models = [_middle(patch) for patch, _ in kept], [model for _, model in kept]
             recurrence = PatchRecurrence(support=min(_POOLED_SUPPORT, size), iterations=_POOLED_ITERATIONS)
             found = recurrence.estimate(inner, models, size=size, on_step=_half(on_step, 0))
-            found = replace(found, evidence=placed(found.evidence, kept, patches))
             return self._agreed(kept, found, began, size, on_step)
         gaussian = Whittle().estimate(patches, noise, size=size)
         support = min(max(2 * round(3.0 * gaussian.diagnostics["width"] + 3.0) + 1, 15), 31, size)
@@ -99,7 +98,7 @@ class Cautious:
         began = time.process_time()
         kept = usable(patches, noise, size)
         if len(kept) >= self.pooled:
-            same_phase = replace(reference, evidence=(), reliability=signal_share(kept))
+            same_phase = replace(reference, reliability=signal_share(kept))
             return self._agreed(kept, same_phase, began, size, on_step)
         support = int(reference.diagnostics.get("support", 21.0))
         recurrence = PatchRecurrence(support=support, iterations=3, search=QUICK)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lensmodel.core.errors import NotEnoughEvidenceError
-from lensmodel.core.evidence import nonnegative_least_squares
+from lensmodel.core.least_squares import nonnegative_least_squares
 from lensmodel.core.psf import gaussian
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
 from lensmodel.estimation.estimator import PsfEstimate, usable

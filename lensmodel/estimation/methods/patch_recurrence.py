@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from lensmodel.core.errors import NotEnoughEvidenceError
-from lensmodel.core.evidence import PatchEvidence, nonnegative_least_squares
+from lensmodel.core.least_squares import nonnegative_least_squares
 from lensmodel.core.psf import as_kernel, centred, distance, resized, rms_width
-from lensmodel.core.spectrum import RINGS, binned_spectrum
+from lensmodel.core.spectrum import binned_spectrum
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
-from lensmodel.estimation.estimator import PsfEstimate, is_no_blur, placed, usable
+from lensmodel.estimation.estimator import PsfEstimate, is_no_blur, usable
 from lensmodel.estimation.steps.finish import confidence_of
 from lensmodel.estimation.steps.gram import window_products
 from lensmodel.estimation.steps.recurrence import (
@@ -160,10 +160,6 @@ class PatchRecurrence:
                 on_step(done, total)
         if state is None:
             raise NotEnoughEvidenceError("the patches determine no kernel; choose parts with more detail")
-        evidence = [
-            _evidence(a, b, n, view.noise, patch, model)
-            for (a, b, n), view, (patch, model) in zip(state.parts, scaled, kept, strict=True)
-        ]
         final = resized(centred(state.kernel), size)
         apart = self._disagreement(state, views, latent)
         error = min(_ERROR[0] + _ERROR[1] * apart, 1.0)
@@ -171,11 +167,10 @@ class PatchRecurrence:
         return PsfEstimate(
             kernel=final,
             confidence=confidence_of(error),
-            reliability=reliability(evidence),
+            reliability=reliability(kept),
             predicted_error=error,
             diagnostics={**told, "disagreement": apart},
             seconds=time.process_time() - began,
-            evidence=placed(evidence, kept, patches),
             no_blur=is_no_blur(final),
         )
 
@@ -186,7 +181,7 @@ class PatchRecurrence:
             latent[i], response = blend(view.y, kernel, z, self.beta)
             parts.append(normal_equations(latent[i], view.y, side, view.noise, response))
             responses.append(response)
-        return _Equations(self._solved(parts, views, np.asarray(resized(kernel, side))), parts, responses)
+        return _Equations(self._solved(parts, views, np.asarray(resized(kernel, side))), responses)
 
     def _solved(self, parts: Sequence[Part], views: Sequence[_Scaled], begin: NDArray[np.float64]) -> Kernel:
         """Kernel of the normal equations of all patches together."""
@@ -221,20 +216,17 @@ class PatchRecurrence:
         return min(distance(*found).rel_l2, 1.0)
 
 
-Part: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64], int]
-"""Normal equations of one patch, A and b, and its number of pixels."""
+Part: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Normal equations of one patch, A and b."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Equations:
     kernel: Kernel
-    parts: list[Part]
     responses: list[NDArray[np.float64]]
 
 
-def normal_equations(
-    x: Image, y: Image, side: int, noise: float, response: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+def normal_equations(x: Image, y: Image, side: int, noise: float, response: NDArray[np.float64]) -> Part:
     """Normal equations of y = k * x over the interior, the noise that x took from y taken off.
 
     With h the filter by which y entered x, s the noise of y and N interior pixels::
@@ -257,7 +249,6 @@ def normal_equations(
     -------
     A : ndarray, shape (side², side²)
     b : ndarray, shape (side²,)
-    N : int
     """
     half = side // 2
     margin = _BORDER
@@ -272,40 +263,15 @@ def normal_equations(
     acf = fft.irfft2(np.abs(spectrum) ** 2, s=response.shape)
     a -= n * noise**2 * acf[rows[:, None] - rows, cols[:, None] - cols]
     b -= n * noise**2 * response[half - rows, half - cols]
-    return a, b, n
+    return a, b
 
 
-def reliability(evidence: Sequence[PatchEvidence]) -> NDArray[np.float64]:
-    """Share of signal in the power of each ring of frequency, pooled over patches."""
-    power = np.mean([e.spectrum.mean(axis=1) for e in evidence], axis=0) if evidence else np.ones(RINGS)
-    floor = float(np.mean([e.spectrum_noise for e in evidence])) if evidence else 0.0
+def reliability(kept: Sequence[tuple[Plane, NoiseModel]]) -> NDArray[np.float64]:
+    """Share of signal in the power of each ring of frequency, pooled over patches, shape (rings,)."""
+    spectra = [binned_spectrum(patch, model) for patch, model in kept]
+    power = np.mean([spectrum.mean(axis=1) for spectrum, _ in spectra], axis=0)
+    floor = float(np.mean([noise for _, noise in spectra]))
     return np.clip(1.0 - floor / np.maximum(power, 1e-30), 0.0, 1.0)
-
-
-def _evidence(
-    a: NDArray[np.float64], b: NDArray[np.float64], pixels: int, noise: float, patch: Plane, model: NoiseModel
-) -> PatchEvidence:
-    """Keep A by its means along u - v: sums over shifted windows differ only at their borders."""
-    side = int(np.sqrt(b.size))
-    full = a.reshape(side, side, side, side)
-    correlation = np.zeros((2 * side - 1, 2 * side - 1))
-    for i in range(2 * side - 1):
-        p = i - side + 1
-        for j in range(2 * side - 1):
-            q = j - side + 1
-            block = full[max(p, 0) : side + min(p, 0), max(q, 0) : side + min(q, 0)]
-            u = np.arange(block.shape[0]) + max(p, 0)
-            v = np.arange(block.shape[1]) + max(q, 0)
-            correlation[i, j] = full[u[:, None], v, u[:, None] - p, v - q].mean()
-    spectrum, floor = binned_spectrum(patch, model)
-    return PatchEvidence(
-        correlation.astype(np.float32),
-        b.reshape(side, side).astype(np.float32),
-        pixels,
-        noise,
-        spectrum,
-        floor,
-    )
 
 
 def _odd(value: float) -> int:

@@ -21,7 +21,7 @@ _MARGIN = 56  # pixels of the scene beyond the frame, which a wide kernel brings
 def estimated_samples(
     lens: SimulatedLens, files: Sequence[Path], seed: int, *, count: int = pipeline.DEFAULT_PATCHES
 ) -> list[PsfSample]:
-    """Green samples of photographs taken wide open, with their spectra and normal equations.
+    """Green samples of photographs taken wide open, with their spectra.
 
     Parameters
     ----------

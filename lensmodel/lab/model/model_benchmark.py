@@ -5,7 +5,7 @@ Three kinds of input:
 * lenses of `draw_lens` whose kernels are known: models are fed with true kernels at the patches of
   n photos and asked at places in between and beyond;
 * the same lenses behind photographs whose patches are estimated blindly (`--photographs FOLDER`): there the
-  ways to answer from kernels, from pooled evidence and from one wavefront can be compared;
+  ways to answer from kernels and from one wavefront can be compared;
 * a file of measured PSFs (`--psf-field FILE.npz`, keys psf (n, k, k), r, phi, and optionally
   aperture and group) or a TIFF of a star field: groups are held out in turn.
 
@@ -131,8 +131,8 @@ def run_model_benchmark(
         How many photos of 24 patches a model sees.
     methods : sequence of str, optional
         Names in `smoothers` (each in mode "mixed"), "eff-linear", "polynomial", "wavefront", "paper", or the
-        modes "mode-kernels", "mode-evidence", "mode-wavefront", "mode-likeliest"; by default all, but modes
-        only of `photographs`.
+        modes "mode-kernels", "mode-wavefront", "mode-paper"; by default all, but modes only of
+        `photographs`.
     psf_field : Path, optional
         Measured PSFs; then `seeds` and `photos` play no part.
     spoiled : float
@@ -149,7 +149,7 @@ def run_model_benchmark(
     dict
         `rows` of method, photos, errors by zone, seconds; and what was asked.
     """
-    fits = _fits(methods, evidence=photographs is not None)
+    fits = _fits(methods, modes=photographs is not None)
     if psf_field is not None:
         samples = load_field(psf_field)
         rows: list[Row] = []
@@ -247,7 +247,7 @@ def _drawn(folder: Path, seed: int, count: int) -> list[Path]:
     return [files[i] for i in np.random.default_rng(seed).permutation(len(files))[:count]]
 
 
-def _fits(methods: Sequence[str] | None, *, evidence: bool = False) -> dict[str, Fit]:
+def _fits(methods: Sequence[str] | None, *, modes: bool = False) -> dict[str, Fit]:
     known: dict[str, Fit] = {
         "eff-linear": _linear,
         "polynomial": _polynomial,
@@ -259,7 +259,7 @@ def _fits(methods: Sequence[str] | None, *, evidence: bool = False) -> dict[str,
     unknown = [name for name in methods or () if name not in known]
     if unknown:
         raise InvalidInputError(f"no method {unknown[0]!r}; known: {', '.join(sorted(known))}")
-    usual = [name for name in known if evidence or not name.startswith("mode-")]
+    usual = [name for name in known if modes or not name.startswith("mode-")]
     return {name: known[name] for name in methods or usual}
 
 

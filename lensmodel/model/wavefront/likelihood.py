@@ -2,14 +2,13 @@
 
 The power spectrum of a patch is that of its scene times |OTF|^2 (`scene_spectrum`). With the scene's few
 unknowns fitted to each patch, the better kernel leaves the smaller rest. No kernel that was estimated from
-the patch takes part, so that a mode is not judged by the mistakes that it shares with the estimator. Where
+the patch takes part, so that a model is not judged by the mistakes that it shares with the estimator. Where
 samples have no spectra, their kernels are all there is to judge by.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -18,48 +17,14 @@ from numpy.typing import NDArray
 from lensmodel.core.psf import PsfSample, distance
 from lensmodel.core.spectrum import SECTORS
 from lensmodel.core.types import Kernel
-from lensmodel.model.answer import KERNELS
 from lensmodel.model.wavefront.from_spectra import fit_scene
 from lensmodel.model.wavefront.scene_spectrum import SceneView
 from lensmodel.optics.transfer import BINS, bin_frequencies
 
-Predict = Callable[[PsfSample], Kernel]
-
-_FOLDS, _FEWEST_GROUPS = 3, 2
-_MOST = 32  # patches of a fold that are asked
 _TAILS, _PATCH_TAILS = 6.0, 3.0  # degrees of freedom of a bin, and of a patch in units of its bins
 _FLOOR = (-6.5, 3.0)  # logarithm of what is added to |OTF|^2: whoever sees none may have none
 _INSIDE = (-1.0 / 3.0, 0.0, 1.0 / 3.0)  # where a bin is sampled, in parts of its width
 _LEAST_ERROR = 1e-3
-
-
-def likeliest(
-    samples: Sequence[PsfSample], learn: Callable[[Sequence[PsfSample]], Mapping[str, Predict]]
-) -> str:
-    """Choose the name under which patches are likeliest that `learn` was not shown.
-
-    Photos are held out in turn, three groups of them at most; of a single photo, groups of its patches. Where
-    all share one kernel, the usual mode is taken.
-
-    Parameters
-    ----------
-    samples : sequence of PsfSample
-    learn : callable
-        Predictors by name, learned from some of the samples.
-    """
-    groups = _groups(samples)
-    if len(np.unique(groups)) < _FEWEST_GROUPS:
-        return KERNELS  # nothing can be held out
-    costs: dict[str, list[float]] = {}
-    for group in range(int(groups.max()) + 1):
-        held = [s for s, g in zip(samples, groups, strict=True) if g == group]
-        seen = [s for s, g in zip(samples, groups, strict=True) if g != group]
-        asked = _asked(held)
-        for name, predict in learn(seen).items():
-            costs.setdefault(name, []).extend(surprise(s, predict(s)) for s in asked)
-    most = max(len(found) for found in costs.values())
-    complete = {name: sum(found) for name, found in costs.items() if len(found) == most}
-    return min(complete, key=lambda name: complete[name])
 
 
 def surprise(sample: PsfSample, kernel: Kernel, share: float = 1.0) -> float:
@@ -76,24 +41,6 @@ def surprise(sample: PsfSample, kernel: Kernel, share: float = 1.0) -> float:
     cost = float((_TAILS + 1.0) * np.log1p(squared / _TAILS).sum() + view.vote @ (unknowns - view.usual) ** 2)
     nu = _PATCH_TAILS * BINS
     return nu * math.log1p(cost / nu)
-
-
-def _groups(samples: Sequence[PsfSample]) -> NDArray[np.intp]:
-    """Which samples are held out together: photos, or patches that share one kernel."""
-    several = len({s.photo for s in samples}) > 1
-    # patches of a cell share one kernel: one of them would tell of the others
-    keys = [s.photo.encode() if several else s.kernel.tobytes() for s in samples]
-    numbers = {key: i % _FOLDS for i, key in enumerate(dict.fromkeys(keys))}
-    return np.array([numbers[key] for key in keys], dtype=np.intp)
-
-
-def _asked(held: Sequence[PsfSample]) -> list[PsfSample]:
-    """Samples of one channel, those with spectra if there are any, evenly thinned."""
-    green = [s for s in held if s.settings.channel == "g"] or list(held)
-    told = [s for s in green if s.spectrum is not None] or green
-    if len(told) <= _MOST:
-        return told
-    return [told[i] for i in np.linspace(0, len(told) - 1, _MOST).round().astype(int)]
 
 
 def _power(kernel: Kernel, share: float) -> NDArray[np.float64]:

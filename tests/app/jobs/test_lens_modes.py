@@ -1,57 +1,34 @@
-"""What the service makes of samples: pooled evidence, the likeliest mode, and pixels of several bodies."""
+"""What the service makes of samples: its mode, and pixels of several bodies."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import event
+from sqlalchemy import event, update
 from starlette.testclient import TestClient
 
-from app.blobs.evidence import MODES, with_evidence
 from app.blobs.storage import Storage
 from app.http.model_cache import ModelCache
 from app.jobs import tasks
 from app.jobs.context import write_samples
-from app.jobs.task_files import EVIDENCE, LEARNED
+from app.jobs.task_files import LEARNED
 from app.main import create_app
 from app.runtime.settings import Settings
 from app.store import LensName, NewPatch, NewSample, Store
+from app.store.tables import SampleRow
 from app.store.versions import learned_key
-from lensmodel.core.evidence import PatchEvidence
 from lensmodel.core.psf import gaussian, rms_width
-from lensmodel.core.spectrum import RINGS, SECTORS
 from lensmodel.core.types import FieldPosition, LensSettings, ignore_step
-from lensmodel.model import LensModel, ModelSettings
-from lensmodel.model.answer import NEEDING_EVIDENCE
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 SIDE, SUPPORT = 64, 11
 ASKED = {"r": 0.5, "phi": 0.4, "aperture": 1.4, "size": 15}
 PLACE, SETTINGS = FieldPosition(0.5, 0.4), LensSettings(1.4)
-
-
-def evidence(seed: int) -> PatchEvidence:
-    """Of a patch whose scene is known, behind a blur of 1.3 px."""
-    rng = np.random.default_rng(seed)
-    scene = np.kron(rng.random((SIDE // 4, SIDE // 4)), np.ones((4, 4))) + 0.2 * rng.random((SIDE, SIDE))
-    x = np.fft.fft2(scene - scene.mean())
-    spread = np.zeros((SIDE, SIDE))
-    spread[:SUPPORT, :SUPPORT] = gaussian(SUPPORT, 1.3**2 * np.eye(2))
-    blur = np.fft.fft2(np.roll(spread, (-(SUPPORT // 2),) * 2, axis=(0, 1)))
-    own = np.roll(np.fft.ifft2(np.abs(x) ** 2).real, (SUPPORT - 1,) * 2, axis=(0, 1))
-    cross = np.roll(np.fft.ifft2(np.abs(x) ** 2 * blur).real, (SUPPORT // 2,) * 2, axis=(0, 1))
-    return PatchEvidence(
-        own[: 2 * SUPPORT - 1, : 2 * SUPPORT - 1].astype(np.float32),
-        cross[:SUPPORT, :SUPPORT].astype(np.float32),
-        SIDE * SIDE,
-        0.01,
-        np.ones((RINGS, SECTORS), dtype=np.float32),
-        0.0,
-    )
 
 
 @pytest.fixture
@@ -60,21 +37,9 @@ def storage(settings: Settings) -> Storage:
 
 
 @pytest.fixture
-def lens(steps: Steps, store: Store, storage: Storage) -> str:
-    """Return the id of a lens with a photo of six green patches with evidence, their kernels too narrow."""
-    photo = steps.receive()
-    steps.inspect(photo)
-    steps.plan(photo, 6)
-    samples = []
-    for k in range(6):
-        key = f"photos/{photo.public_id}/statistics/e1/{k}-g.npz"
-        storage.put(key, evidence(k).to_bytes())
-        samples.append(
-            NewSample(k, "g", gaussian(15, (1 + 0.01 * k) * np.eye(2)), 0.5, "default/1", statistics_key=key)
-        )
-    store.patches.finish(photo.public_id, photo.epoch, samples)
-    assert store.photos.finish(photo.public_id, photo.epoch) is not None
-    return str(steps.lens_id(photo))
+def lens(steps: Steps) -> str:
+    """Return the id of a lens with a photo of six green patches."""
+    return str(steps.lens_id(steps.counted(patches=6)))
 
 
 def serve(settings: Settings, mode: str) -> TestClient:
@@ -92,83 +57,43 @@ def width(answer: dict[str, Any]) -> float:
     return rms_width(np.array(answer["psf"]["data"]))
 
 
-def test_worker_and_model_agree_on_what_needs_evidence() -> None:
-    assert MODES == NEEDING_EVIDENCE
-
-
-def test_pooled_evidence_answers_over_http(
-    settings: Settings, store: Store, storage: Storage, lens: str
-) -> None:
-    with serve(settings, "kernels") as plain, serve(settings, "evidence") as pooling:
-        averaged, pooled = psf(plain, lens), psf(pooling, lens)
-
-    assert (averaged["support"]["mode"], pooled["support"]["mode"]) == ("kernels", "evidence")
-    assert width(averaged) == pytest.approx(1.0, abs=0.05)
-    assert width(pooled) > 1.2  # the patches know better than the kernels that came with them
-    samples = with_evidence(store.samples.of_lens(lens)[1], storage, "evidence")
-    model = LensModel.fit([one.sample for one in samples], ModelSettings(mode="evidence"))
-    mine = model.query(PLACE, SETTINGS, 15).kernel
-    assert np.abs(np.array(pooled["psf"]["data"]) - mine).max() < 1e-6
-
-
-def test_photo_that_joins_a_pooling_lens_brings_its_evidence(
-    settings: Settings, steps: Steps, store: Store, storage: Storage, lens: str
-) -> None:
-    cache = ModelCache(store, 1 << 30, storage, settings=ModelSettings(mode="evidence"))
-    before = cache.get(lens)
-    photo = steps.counted(patches=6)
-    assert steps.lens_id(photo) == lens
-
-    after = cache.get(lens)
-
-    assert after.state.version == before.state.version + 1
-    assert sum(s.evidence is not None for s in after.model.samples) == 6
-    assert after.model.query(PLACE, SETTINGS, 15).mode == "evidence"
-
-
-def test_lost_and_damaged_evidence_costs_only_itself(store: Store, storage: Storage, lens: str) -> None:
-    stored = store.samples.of_lens(lens)[1]
-    keys = [one.statistics_key for one in stored]
-    assert keys[0] is not None
-    assert keys[1] is not None
-    storage.delete(f"{keys[0].rpartition('/')[0]}/")
-    storage.put(keys[1], b"torn")
-    storage.put(str(keys[2]), evidence(2).to_bytes())
-
-    found = with_evidence(stored, storage, "likeliest")
-
-    assert [one.sample.evidence is not None for one in found] == [False, False, True, False, False, False]
-
-
-def test_evidence_is_bounded_and_the_newest_kept(store: Store, storage: Storage, lens: str) -> None:
-    stored = store.samples.of_lens(lens)[1]
-    one = evidence(0)
-    room = 2 * (one.autocorrelation.nbytes + one.crosscorrelation.nbytes)
-
-    found = with_evidence(stored, storage, "evidence", most_bytes=room)
-
-    assert [s.sample.evidence is not None for s in found] == [False] * 4 + [True] * 2
-    assert all(s.sample.evidence is None for s in with_evidence(stored, storage, "kernels"))
-
-
-def test_likeliest_mode_is_found_by_a_worker_and_served(
+def test_what_a_worker_learned_in_a_mode_is_served_in_that_mode_alone(
     settings: Settings, store: Store, storage: Storage, lens: str, tmp_path: Path
 ) -> None:
     state, stored = store.samples.of_lens(lens)
     folder = tmp_path / "task"
     folder.mkdir()
-    write_samples(folder, with_evidence(stored, storage, "likeliest"))
-    assert (folder / EVIDENCE.format(5)).is_file()
+    write_samples(folder, stored)
 
-    tasks.measure({"model": {"mode": "likeliest", "unit": "micrometre"}}, folder, ignore_step)
+    tasks.measure({"model": {"mode": "mixed", "unit": "micrometre"}}, folder, ignore_step)
     storage.put(learned_key(lens, state.version, state.rebuild_epoch), (folder / LEARNED).read_bytes())
 
-    with serve(settings, "likeliest") as client:
-        # kernels are all that these patches are judged by, and evidence says something else than they
-        assert psf(client, lens)["support"]["mode"] in {"kernels", "mixed"}
+    with serve(settings, "mixed") as client:
+        assert psf(client, lens)["support"]["mode"] == "mixed"
         assert "-l-" in client.get(f"/v1/lenses/{lens}/psf", params=ASKED).headers["etag"]
-    cache = ModelCache(store, 1 << 30, storage)  # of another mode: what was learned is not for it
-    assert not cache.get(lens).learned
+    assert not ModelCache(store, 1 << 30, storage).get(lens).learned
+
+
+@pytest.mark.parametrize("mode", ["evidence", "likeliest"])
+def test_a_former_mode_is_refused_with_the_remedy(mode: str) -> None:
+    with pytest.raises(ValueError, match="is gone: leave LENS_MODEL_MODE out"):
+        Settings(model_mode=mode)  # type: ignore[arg-type] # what an environment may say
+
+
+def test_what_an_earlier_version_kept_of_patches_goes_with_its_photo(
+    store: Store, storage: Storage, steps: Steps
+) -> None:
+    photo = steps.counted(patches=6)
+    key = f"photos/{photo.public_id}/statistics/e1/0-g.npz"
+    storage.put(key, b"of an earlier version")
+    with store.database.writing() as session:
+        session.execute(update(SampleRow).where(SampleRow.photo_id == photo.id).values(statistics_key=key))
+    assert len(store.samples.of_lens(str(steps.lens_id(photo)))[1]) == 18
+
+    assert store.photos.delete(photo.public_id, "local")
+
+    due = datetime.now(UTC) + timedelta(days=30)
+    assert any(key.startswith(prefix) for prefix in store.workers.garbage(at=due))
 
 
 @pytest.fixture

@@ -87,7 +87,6 @@ def estimate(arguments: dict[str, Any], folder: Path) -> Outcome:
             "estimator": "whittle/1",
             "predicted_error": 0.1,
             "diagnostics": {},
-            "evidence": None,
             "spectrum": None,
         }
         for number in arguments["numbers"]

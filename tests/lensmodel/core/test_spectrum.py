@@ -7,7 +7,7 @@ import pytest
 from scipy import signal
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.spectrum import RINGS, SECTORS, PatchSpectrum, tail_of
+from lensmodel.core.spectrum import RINGS, SECTORS, PatchSpectrum, binned_spectrum, tail_of
 from lensmodel.core.types import NoiseModel
 
 
@@ -72,3 +72,13 @@ def test_other_bytes_are_no_spectrum(data: bytes) -> None:
 def test_small_patch_has_no_tail() -> None:
     with pytest.raises(InvalidInputError, match="40 x 40"):
         tail_of(np.zeros((32, 64), np.float32), 1.0)
+
+
+def test_white_noise_fills_every_bin_with_its_variance() -> None:
+    noise = np.random.default_rng(0).normal(0.5, 0.1, (512, 512)).astype(np.float32)
+
+    spectrum, floor = binned_spectrum(noise, NoiseModel.white(0.1))
+
+    assert spectrum.shape == (RINGS, SECTORS)
+    assert floor == pytest.approx(0.01)
+    assert spectrum[4:].mean() == pytest.approx(floor, rel=0.05)

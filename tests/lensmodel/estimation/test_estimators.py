@@ -6,7 +6,7 @@ from scipy import signal
 
 from lensmodel import estimation
 from lensmodel.core.errors import CancelledError, InvalidInputError, LensModelError, NotEnoughEvidenceError
-from lensmodel.core.evidence import nonnegative_least_squares
+from lensmodel.core.least_squares import nonnegative_least_squares
 from lensmodel.core.psf import centroid, delta, distance, gaussian, rms_width
 from lensmodel.core.types import NoiseModel, Plane
 from lensmodel.estimation.methods.patch_recurrence import normal_equations
@@ -128,10 +128,9 @@ def test_kernel_step_recovers_the_kernel_where_the_scene_is_known() -> None:
     y = signal.fftconvolve(scene, truth, mode="same") + rng.normal(0, SIGMA, scene.shape)
     response = np.zeros((40, 40))  # this scene took nothing from y
 
-    a, b, n = normal_equations(scene, y, 9, SIGMA, response)
+    a, b = normal_equations(scene, y, 9, SIGMA, response)
     k = nonnegative_least_squares(a, b, np.asarray(delta(9)).ravel()).reshape(9, 9)
 
-    assert n == (160 - 2 * 3 - 8) ** 2
     assert distance(k, truth).rel_l2 < 0.08  # the noise alone costs 0.057
 
 
@@ -140,8 +139,8 @@ def test_noise_correction_leaves_nothing_of_pure_noise() -> None:
     y = rng.normal(0, 0.1, (220, 220))
     x, response = blend(y, gaussian(9, 0.8 * np.eye(2)), np.zeros_like(y), 0.2)
 
-    raw_a, raw_b, _ = normal_equations(x, y, 9, 0.0, response)
-    a, b, _ = normal_equations(x, y, 9, 0.1, response)
+    raw_a, raw_b = normal_equations(x, y, 9, 0.0, response)
+    a, b = normal_equations(x, y, 9, 0.1, response)
 
     assert np.abs(a).max() < 0.06 * np.abs(raw_a).max()
     assert np.abs(b).max() < 0.06 * np.abs(raw_b).max()
@@ -174,15 +173,6 @@ def test_turning_the_patch_turns_the_kernel() -> None:
     turned = method.estimate([np.ascontiguousarray(np.rot90(y))], [noise], size=15).kernel
 
     assert distance(np.rot90(upright).copy(), turned).rel_l2 < 0.15
-
-
-def test_more_evidence_comes_with_the_estimate() -> None:
-    patches = [patch(gaussian(15, np.eye(2)), seed=s) for s in (0, 1)]
-
-    found = estimation.estimators.create("default").estimate(patches, [NoiseModel.white(SIGMA)] * 2)
-
-    assert len(found.evidence) == 2
-    assert all(len(e.to_bytes()) < 200_000 for e in found.evidence)
 
 
 def test_whittle_gradient_is_the_derivative_of_its_cost() -> None:

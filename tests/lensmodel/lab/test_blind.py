@@ -47,7 +47,6 @@ def answer(kernel: Kernel, seconds: float = 0.0) -> PsfEstimate:
         predicted_error=0.3,
         diagnostics={},
         seconds=seconds,
-        evidence=(),
         no_blur=False,
     )
 

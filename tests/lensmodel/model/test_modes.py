@@ -1,8 +1,10 @@
-"""What is made of the neighbours of a question: kernels averaged, evidence pooled, one wavefront."""
+"""What is made of the neighbours of a question, and how likely patches are behind it."""
 
 from __future__ import annotations
 
+import json
 import math
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,14 +12,13 @@ import numpy as np
 import pytest
 
 from lensmodel.core.errors import UnknownMethodError
-from lensmodel.core.evidence import PatchEvidence, solve_kernel
 from lensmodel.core.psf import PsfSample, as_kernel, centred, distance, gaussian
 from lensmodel.core.spectrum import PatchSpectrum, binned_spectrum
 from lensmodel.core.types import FieldPosition, Kernel, LensSettings, NoiseModel
 from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
-from lensmodel.model.wavefront.likelihood import likeliest, surprise
+from lensmodel.model.wavefront.likelihood import surprise
 
-SIZE, SIDE = 13, 128
+SIZE = 13
 SETTINGS = LensSettings(aperture=2.0)
 
 
@@ -34,39 +35,10 @@ def truth(place: FieldPosition) -> Kernel:
     return centred(as_kernel(core + 0.5 * tail / tail.sum()))
 
 
-def scene(rng: np.random.Generator) -> np.ndarray:
-    blocks = np.kron(rng.random((SIDE // 4, SIDE // 4)), np.ones((4, 4)))
-    whole = blocks + 0.2 * rng.random((SIDE, SIDE))
-    return np.asarray(whole - whole.mean())
-
-
-def seen(place: FieldPosition, rng: np.random.Generator, sigma: float, photo: str = "a") -> PsfSample:
-    """A patch whose scene is known: its statistics, and the kernel that they give alone."""
-    spread = np.zeros((SIDE, SIDE))
-    spread[:SIZE, :SIZE] = truth(place)
-    spread = np.roll(spread, (-(SIZE // 2),) * 2, axis=(0, 1))
-    x = np.fft.fft2(scene(rng))
-    y = np.fft.ifft2(x * np.fft.fft2(spread)).real + rng.normal(0.0, sigma, (SIDE, SIDE))
-    own = np.roll(np.fft.ifft2(np.abs(x) ** 2).real, (SIZE - 1,) * 2, axis=(0, 1))
-    cross = np.roll(np.fft.ifft2(np.fft.fft2(y) * np.conj(x)).real, (SIZE // 2,) * 2, axis=(0, 1))
-    noise = NoiseModel.white(sigma)
-    power, floor = binned_spectrum(y.astype(np.float32), noise)
-    evidence = PatchEvidence(
-        own[: 2 * SIZE - 1, : 2 * SIZE - 1].astype(np.float32),
-        cross[:SIZE, :SIZE].astype(np.float32),
-        SIDE * SIDE,
-        sigma,
-        power,
-        floor,
-    )
-    return PsfSample(
-        solve_kernel([evidence], [1.0], SIZE),
-        place,
-        SETTINGS,
-        photo=photo,
-        evidence=evidence,
-        spectrum=PatchSpectrum(power, floor),
-    )
+def seen(place: FieldPosition, rng: np.random.Generator, photo: str = "a") -> PsfSample:
+    """The kernel of a place with noise in it."""
+    spoilt = truth(place) + 0.01 * rng.normal(size=(SIZE, SIZE))
+    return PsfSample(centred(as_kernel(np.maximum(spoilt, 0.0))), place, SETTINGS, photo=photo)
 
 
 def places(count: int, seed: int, outmost: float = 0.9) -> list[FieldPosition]:
@@ -78,89 +50,41 @@ def places(count: int, seed: int, outmost: float = 0.9) -> list[FieldPosition]:
 @pytest.fixture(scope="module")
 def noisy() -> list[PsfSample]:
     rng = np.random.default_rng(0)
-    return [seen(place, rng, 0.5, f"p{i % 2}") for i, place in enumerate(places(40, 1))]
+    return [seen(place, rng, f"p{i % 2}") for i, place in enumerate(places(40, 1))]
 
 
-def wide(mode: str) -> ModelSettings:
-    """Bandwidths at which many patches count."""
-    return ModelSettings(mode=mode, r=0.15, phi=3.0)
+@pytest.mark.parametrize(
+    ("mode", "why"), [("guess", "not known"), ("likeliest", "gone"), ("evidence", "gone")]
+)
+def test_unknown_modes_are_refused_with_the_known_ones(mode: str, why: str) -> None:
+    with pytest.raises(UnknownMethodError, match=f"{why}; choose one of kernels, mixed, wavefront, paper"):
+        ModelSettings(mode=mode)
 
 
-def errors(model: LensModel) -> float:
-    asked = places(5, 2, 0.8)
-    return float(np.mean([distance(model.query(p, SETTINGS, SIZE).kernel, truth(p)).rel_l2 for p in asked]))
+def test_a_profile_of_a_former_mode_opens_with_averaged_kernels(
+    noisy: list[PsfSample], tmp_path: Path
+) -> None:
+    model = LensModel.fit(noisy)
+    save_profile(tmp_path / "new.lensprofile", LensProfile(model))
+    with (
+        zipfile.ZipFile(tmp_path / "new.lensprofile") as new,
+        zipfile.ZipFile(tmp_path / "old.lensprofile", "w") as old,
+    ):
+        for name in new.namelist():
+            data = new.read(name)
+            if name == "profile.json":
+                document = json.loads(data)
+                document["model"]["mode"] = "likeliest"
+                data = json.dumps(document).encode()
+            old.writestr(name, data)
+        old.writestr("evidence/0.npz", b"of an earlier version")
 
+    back = load_profile(tmp_path / "old.lensprofile").model
 
-def test_pooled_evidence_is_nearer_to_the_truth_than_averaged_kernels(noisy: list[PsfSample]) -> None:
-    alone = float(np.mean([distance(s.kernel, truth(s.position)).rel_l2 for s in noisy]))
-    averaged = errors(LensModel.fit(noisy, wide("kernels")))
-    pooled = errors(LensModel.fit(noisy, wide("evidence")))
-
-    assert pooled < 0.85 * averaged < 0.85 * 0.5 * alone
-
-
-def test_order_of_samples_does_not_matter_to_pooled_evidence(noisy: list[PsfSample]) -> None:
+    assert back.settings.mode == "kernels"
     place = FieldPosition(0.5, 1.0)
-    shuffled = [noisy[i] for i in np.random.default_rng(1).permutation(len(noisy))]
-
-    one = LensModel.fit(noisy, wide("evidence")).query(place, SETTINGS, SIZE).kernel
-    other = LensModel.fit(shuffled, wide("evidence")).query(place, SETTINGS, SIZE).kernel
-
-    assert np.abs(one - other).max() < 1e-4 * one.max()
-
-
-def test_evidence_added_later_counts_as_if_it_had_been_there() -> None:
-    rng = np.random.default_rng(5)
-    samples = [seen(place, rng, 0.2) for place in places(42, 4)]
-    place = FieldPosition(0.4, -1.0)
-    settings = replace(wide("evidence"), robust=False, mirror=0.0)
-
-    grown = LensModel.fit(samples[:40], settings).added(samples[40:])
-    whole = LensModel.fit(samples, settings)
-
-    # widths and bandwidths of settings are those of the first forty: the kernels are alike, not equal
-    apart = distance(grown.query(place, SETTINGS, SIZE).kernel, whole.query(place, SETTINGS, SIZE).kernel)
-    assert apart.rel_l2 < 0.05
-    assert len(grown.weights(place, SETTINGS)[0]) == len(whole.weights(place, SETTINGS)[0])
-
-
-def test_evidence_turns_with_its_place() -> None:
-    rng, turn = np.random.default_rng(3), math.pi / 2
-    there = [FieldPosition(0.6 + 0.01 * i, 0.0) for i in range(3)]
-    model = LensModel.fit([seen(p, rng, 0.01) for p in there], ModelSettings(mode="evidence"))
-    place = FieldPosition(0.61, turn)
-
-    answer = model.query(place, SETTINGS, SIZE)
-
-    assert answer.mode == "evidence"
-    assert distance(answer.kernel, truth(place)).rel_l2 < 0.05
-    assert distance(answer.kernel[::-1, ::-1], truth(place)).rel_l2 > 0.2
-
-
-def test_without_evidence_kernels_are_averaged(noisy: list[PsfSample]) -> None:
-    bare = [replace(s, evidence=None) for s in noisy]
-    place = FieldPosition(0.5, 1.0)
-
-    averaged = LensModel.fit(bare, wide("kernels")).query(place, SETTINGS, SIZE).kernel
-    pooled = LensModel.fit(bare, wide("evidence")).query(place, SETTINGS, SIZE).kernel
-
-    assert np.array_equal(averaged, pooled)
-
-
-def test_evidence_travels_with_the_profile(noisy: list[PsfSample], tmp_path: Path) -> None:
-    model, place = LensModel.fit(noisy, wide("evidence")), FieldPosition(0.5, 1.0)
-    save_profile(tmp_path / "a.lensprofile", LensProfile(model))
-
-    back = load_profile(tmp_path / "a.lensprofile").model
-
-    assert back.settings.mode == "evidence"
     one, other = (m.query(place, SETTINGS, SIZE).kernel for m in (model, back))
-    assert np.abs(one - other).max() < 1e-5
-
-
-def test_unknown_modes_are_refused_with_the_known_ones() -> None:
-    with pytest.raises(UnknownMethodError, match="evidence"):
-        ModelSettings(mode="guess")
+    assert np.abs(one - other).max() < 1e-6
 
 
 def patch_behind(kernel: Kernel, rng: np.random.Generator) -> PsfSample:
@@ -187,45 +111,6 @@ def test_true_kernel_makes_patches_likelier_than_others() -> None:
 
     wrong = ([[0.9**2, 0.0], [0.0, 1.6**2]], [[2.4**2, 0.0], [0.0, 1.4**2]], [[0.6**2, 0.0], [0.0, 0.4**2]])
     assert all(cost(right) < cost(gaussian(SIZE, covariance)) for covariance in wrong)
-
-
-def test_likeliest_predictor_wins_and_none_sees_what_it_is_judged_by() -> None:
-    rng = np.random.default_rng(8)
-    right = gaussian(SIZE, [[1.5**2, 0.0], [0.0, 1.0]])
-    patches = [replace(patch_behind(right, rng), photo=f"p{i % 4}") for i in range(8)]
-    shown: list[set[str]] = []
-
-    def learn(seen: list[PsfSample]) -> dict[str, object]:
-        shown.append({s.photo for s in seen})
-        return {"narrow": lambda _: gaussian(SIZE, 0.3 * np.eye(2)), "right": lambda _: right}
-
-    assert likeliest(patches, learn) == "right"  # type: ignore[arg-type] # lambdas of one sample
-    assert len(shown) == 3
-    assert all(len(photos) < 4 for photos in shown)
-
-
-def test_patches_that_share_one_kernel_choose_no_mode(noisy: list[PsfSample]) -> None:
-    twins = [replace(s, photo="one", kernel=gaussian(SIZE, np.eye(2))) for s in noisy[:3]]
-
-    model = LensModel.fit(twins, wide("likeliest")).warmed()
-
-    assert model.query(FieldPosition(0.5, 1.0), SETTINGS, SIZE).mode == "kernels"
-
-
-def test_likeliest_mode_is_found_by_warming_and_kept_by_what_was_learned(noisy: list[PsfSample]) -> None:
-    # spectra of so small patches tell little: kernels are what is judged by here
-    samples = [replace(s, spectrum=None, kernel=truth(s.position)) for s in noisy[:10]]
-    samples = [replace(s, evidence=None) for s in samples]
-    model = LensModel.fit(samples, wide("likeliest"))
-
-    warmed = model.warmed()
-    place = FieldPosition(0.5, 1.0)
-
-    assert model.query(place, SETTINGS, SIZE).mode == "kernels"
-    found = warmed.query(place, SETTINGS, SIZE).mode
-    assert found in {"mixed", "kernels"}
-    again = LensModel.restored(samples, warmed.learned(), wide("likeliest"))
-    assert again.query(place, SETTINGS, SIZE).mode == found
 
 
 def test_the_papers_way_is_its_equations_and_nothing_else(noisy: list[PsfSample]) -> None:

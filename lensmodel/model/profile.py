@@ -34,6 +34,7 @@ from lensmodel.core.psf import PsfSample, resized
 from lensmodel.core.spectrum import RINGS, SECTORS, PatchSpectrum
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model.answer import FORMER_MODES, KERNELS, ModelSettings
+from lensmodel.model.field.smoothers import FORMER_METHODS
 from lensmodel.model.lens_model import LensModel
 
 FORMAT = 1
@@ -297,6 +298,9 @@ def _settings(values: dict[str, Any]) -> ModelSettings:
     if known.get("mode") in FORMER_MODES:
         log.info("the mode %s of the profile is gone: its kernels are averaged", known["mode"])
         known["mode"] = KERNELS
+    if known.get("method") in FORMER_METHODS:
+        log.info("the regression %s of the profile is gone: the usual one answers", known["method"])
+        del known["method"]
     return ModelSettings(**known)
 
 

@@ -38,6 +38,7 @@ from lensmodel.core.types import ZONES, FieldPosition, Kernel, LensSettings, Ste
 from lensmodel.lab.cases import list_photos, photo_half
 from lensmodel.lab.model.estimated import estimated_samples
 from lensmodel.lab.model.exact import PaperModel
+from lensmodel.lab.model.smoothers import make_known
 from lensmodel.lab.model.stars import stars_of
 from lensmodel.model import LensModel, ModelSettings, fit_wavefront, smoothers
 from lensmodel.model.answer import MIXED, MODES
@@ -130,9 +131,9 @@ def run_model_benchmark(
     photos : sequence of int
         How many photos of 24 patches a model sees.
     methods : sequence of str, optional
-        Names in `smoothers` (each in mode "mixed"), "eff-linear", "polynomial", "wavefront", "paper", or the
-        modes "mode-kernels", "mode-wavefront", "mode-paper"; by default all, but modes only of
-        `photographs`.
+        Names in `smoothers`, those of `lab.model.smoothers` included (each in mode "mixed"), "eff-linear",
+        "polynomial", "wavefront", "paper", or the modes "mode-kernels", "mode-wavefront", "mode-paper"; by
+        default all, but modes only of `photographs`.
     psf_field : Path, optional
         Measured PSFs; then `seeds` and `photos` play no part.
     spoiled : float
@@ -248,6 +249,7 @@ def _drawn(folder: Path, seed: int, count: int) -> list[Path]:
 
 
 def _fits(methods: Sequence[str] | None, *, modes: bool = False) -> dict[str, Fit]:
+    make_known()
     known: dict[str, Fit] = {
         "eff-linear": _linear,
         "polynomial": _polynomial,

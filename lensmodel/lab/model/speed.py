@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 from lensmodel.core.geometry import pixel_to_local
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
+from lensmodel.lab.model.smoothers import make_known
 from lensmodel.model import LensModel, ModelSettings
 
 SIDE, NEAREST = 31, 200
@@ -102,6 +103,7 @@ def main() -> None:
     parser.add_argument("--many", type=int, default=4000)
     parser.add_argument("--methods", nargs="+", default=["combined", "blended", "nadaraya-watson"])
     wanted = parser.parse_args()
+    make_known()
     samples = lens(max(wanted.samples, wanted.many))
     few, places = samples[: wanted.samples], asked(15)
 

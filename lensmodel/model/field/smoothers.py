@@ -8,7 +8,7 @@ one measure of what stands behind an answer.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,7 +60,8 @@ class Smoother(Protocol):
         """Weights of sum 1, shape (m,)."""
 
 
-def _gaussian(squared: NDArray[np.float64], votes: NDArray[np.float64]) -> NDArray[np.float64]:
+def gaussian_weights(squared: NDArray[np.float64], votes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Votes times exp(-d^2 / 2) of squared distances in bandwidths, sum 1, shape (m,)."""
     # relative to the nearest: far from all data the nearest still speak
     weight = votes * np.exp(-0.5 * (squared - squared.min()))
     total = weight.sum()
@@ -81,142 +82,22 @@ class NadarayaWatson:
 
     def weights(self, near: Neighbours) -> NDArray[np.float64]:
         """Weights of sum 1."""
-        return _gaussian(near.squared, near.votes)
-
-
-@dataclass(frozen=True, slots=True)
-class NearestNeighbours:
-    """Bandwidth that grows where samples are rare: the k-th neighbour lies at `at` bandwidths.
-
-    The paper's closing proposal for the corners. Where samples are dense it is the fixed one.
-    """
-
-    k: int = 6
-    at: float = 1.0
-    transport: bool = False
-    reach: float = 8.0
-    blend: bool = False
-    physical: bool = False
-
-    def weights(self, near: Neighbours) -> NDArray[np.float64]:
-        """Weights of sum 1."""
-        squared = near.squared
-        kth = np.sqrt(np.partition(squared, min(self.k, squared.size) - 1)[min(self.k, squared.size) - 1])
-        return _gaussian(squared / max(1.0, float(kth) / self.at) ** 2, near.votes)
-
-
-@dataclass(frozen=True, slots=True)
-class Abramson:
-    """Bandwidths that belong to the samples: lambda_i = (p(x_i) / g)^(-1/2) within 0.5..3.
-
-    p is a pilot density of the neighbours, g its geometric mean; a sample's kernel is divided by
-    lambda_i^2, its volume in the field. Source: I. S. Abramson, "On bandwidth variation in kernel
-    estimates", Annals of Statistics 10, 1982.
-    """
-
-    transport: bool = False
-    reach: float = 5.0
-    blend: bool = False
-    physical: bool = False
-
-    def weights(self, near: Neighbours) -> NDArray[np.float64]:
-        """Weights of sum 1."""
-        place = near.gaps
-        apart = ((place[:, None, :] - place[None, :, :]) ** 2).sum(axis=-1)
-        density = np.exp(-0.5 * apart).mean(axis=1)
-        stretch = np.clip((density / np.exp(np.log(density).mean())) ** -0.5, 0.5, 3.0)
-        return _gaussian(near.squared / stretch**2, near.votes / stretch**2)
-
-
-@dataclass(frozen=True, slots=True)
-class LocalLinear:
-    """A straight line in r through the neighbours: no first-order bias at the edge of the data.
-
-    With rows t_i = (1, (r_i - r) / h_r) and W = diag(w)::
-
-        l = e1' (T'WT + diag(0, ridge))^-1 T'W
-
-    Falls back to `NadarayaWatson` where fewer than `least` samples stand behind the answer.
-    """
-
-    ridge: float = 0.3
-    least: float = 5.0
-    transport: bool = False
-    reach: float = 4.0
-    blend: bool = False
-    physical: bool = False
-
-    def weights(self, near: Neighbours) -> NDArray[np.float64]:
-        """Weights of sum 1; some may be negative."""
-        w = _gaussian(near.squared, near.votes)
-        if 1.0 / float((w**2).sum()) < self.least:
-            return w
-        t = near.gaps[:, 0]
-        first, second = float((w * t).sum()), float((w * t * t).sum()) + self.ridge
-        equivalent = w * (second - first * t)
-        return np.asarray(equivalent / equivalent.sum())
-
-
-@dataclass(frozen=True, slots=True)
-class GaussianProcess:
-    """Kriging with an unknown mean: weights of a Gaussian process on every pixel at once.
-
-    Pixels, or their principal components, that share one covariance share one set of weights, so
-    a process on PCA coefficients with common parameters is this, without the truncation::
-
-        l = K^-1 k + K^-1 1 (1 - 1'K^-1 k) / (1'K^-1 1),   K = exp(-d_ij^2 / 2 L^2) + noise / q
-
-    Parameters
-    ----------
-    length : float
-        L, in bandwidths.
-    noise : float
-        Variance of a sample of vote 1, over that of the field.
-    most : int
-        Nearest neighbours that are used: the cost grows with their cube.
-    """
-
-    length: float = 4.0
-    noise: float = 0.05
-    most: int = 128
-    transport: bool = False
-    reach: float = 12.0
-    blend: bool = False
-    physical: bool = False
-
-    def weights(self, near: Neighbours) -> NDArray[np.float64]:
-        """Weights of sum 1; some may be negative."""
-        squared = near.squared
-        chosen = np.argsort(squared, kind="stable")[: self.most]
-        gaps = near.gaps[chosen]
-        cross = gaps @ gaps.T
-        norms = np.diag(cross)
-        apart = np.maximum(norms[:, None] + norms[None, :] - 2 * cross, 0.0)
-        covariance = np.exp(-0.5 * apart / self.length**2)
-        covariance[np.diag_indices_from(covariance)] += self.noise / np.maximum(near.votes[chosen], 1e-3)
-        sides = np.stack([np.exp(-0.5 * squared[chosen] / self.length**2), np.ones(chosen.size)], axis=1)
-        solved = np.linalg.solve(covariance, sides)
-        local = solved[:, 0] + solved[:, 1] * (1.0 - solved[:, 0].sum()) / solved[:, 1].sum()
-        weights = np.zeros(squared.size)
-        weights[chosen] = local
-        return weights
+        return gaussian_weights(near.squared, near.votes)
 
 
 smoothers: Registry[Smoother] = Registry(
     "regression",
     {
-        "blended": lambda **params: NadarayaWatson(transport=True, blend=True, **params),
         "combined": lambda **params: NadarayaWatson(transport=True, blend=True, physical=True, **params),
-        "blended-gaussian-process": lambda **params: GaussianProcess(transport=True, blend=True, **params),
         "nadaraya-watson": NadarayaWatson,
-        "nearest": NearestNeighbours,
-        "abramson": Abramson,
-        "local-linear": LocalLinear,
-        "gaussian-process": GaussianProcess,
-        "transport": lambda **params: NadarayaWatson(transport=True, **params),
-        "transport-nearest": lambda **params: NearestNeighbours(transport=True, **params),
-        "transport-local-linear": lambda **params: LocalLinear(transport=True, **params),
-        "transport-gaussian-process": lambda **params: GaussianProcess(transport=True, **params),
     },
 )
-"""Methods of regression by name; `smoothers.extended(mine=...)` adds others."""
+"""Methods of regression by name, the usual one and the paper's; `register` adds others."""
+
+FORMER_METHODS: Final = frozenset(
+    {
+        *("abramson", "blended", "blended-gaussian-process", "gaussian-process", "local-linear", "nearest"),
+        *("transport", "transport-gaussian-process", "transport-local-linear", "transport-nearest"),
+    }
+)
+"""Methods that profiles of earlier versions may name; the usual one answers then."""

@@ -43,7 +43,7 @@ def test_a_deleted_lens_is_gone_and_its_photos_can_be_corrected_with_another(
     assert rows(store, SampleRow) == rows(store, PatchRow) == rows(store, EventRow) == []
     left = rows(store, LensRow)[0]
     assert (left.serial, left.label) == (None, None)
-    assert "123" not in left.identity_key
+    assert left.identity_key == f"deleted|{lens_id}"  # and no serial
 
 
 def test_nothing_that_still_ran_brings_a_deleted_lens_back(

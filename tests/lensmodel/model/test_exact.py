@@ -167,7 +167,7 @@ def test_spline_goes_through_the_pixels(finer: int, engine: splines.Engine) -> N
     assert np.abs(read[0] - kernel).max() < 1e-6
 
 
-@pytest.mark.parametrize("method", ["nadaraya-watson", "blended", "transport-gaussian-process"])
+@pytest.mark.parametrize("method", ["nadaraya-watson", "combined"])
 def test_many_places_at_once_are_the_same_as_one_by_one(samples: list[PsfSample], method: str) -> None:
     model, asked = LensModel.fit(samples, ModelSettings(method=method)), places(9, 5)
 

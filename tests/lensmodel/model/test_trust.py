@@ -413,7 +413,7 @@ class TestLearned:
         with pytest.raises(InvalidInputError, match="other samples"):
             LensModel.restored(good[1], learned)
         with pytest.raises(InvalidInputError, match="other samples"):
-            LensModel.restored(good[0], learned, ModelSettings(method="blended"))
+            LensModel.restored(good[0], learned, ModelSettings(method="nadaraya-watson"))
 
     @pytest.mark.parametrize(
         "change",

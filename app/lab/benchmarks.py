@@ -91,7 +91,9 @@ def blind(
     photos: Annotated[Path | None, typer.Option(help="Folder of sharp photographs.")] = None,
     psfs: Annotated[Path | None, typer.Option(help="npz with the key psf, shape (n, k, k).")] = None,
     noise: Annotated[str, typer.Option(help="Standard deviations, comma separated.")] = NOISE,
-    methods: Annotated[str, typer.Option(help="Estimators, comma separated.")] = ESTIMATORS,
+    methods: Annotated[
+        str, typer.Option(help="Estimators, comma separated; also cho-lee, edges, l0, sun, xu-jia and zhang.")
+    ] = ESTIMATORS,
     patch: Annotated[int, typer.Option(help="Side of a patch.")] = 256,
     cases: Annotated[int | None, typer.Option(help="At most so many.")] = None,
     pool: Annotated[int, typer.Option(help="Patches that share one kernel.")] = 1,

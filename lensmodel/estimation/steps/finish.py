@@ -8,40 +8,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
-from lensmodel.core.errors import NotEnoughEvidenceError
-from lensmodel.core.psf import as_kernel, centred, resized, rms_width
+from lensmodel.core.psf import centred, resized, rms_width
 from lensmodel.core.spectrum import binned_spectrum
 from lensmodel.core.types import Kernel, NoiseModel, Plane
 from lensmodel.estimation.estimator import PsfEstimate, is_no_blur
 
-_EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=np.int_)
 _HALF_CONFIDENT = 0.4
-
-
-def cleaned(kernel: NDArray[np.float64], threshold: float, least_mass: float = 0.0) -> Kernel:
-    """Drop values below `threshold` times the peak and islands below `least_mass` of the sum.
-
-    Not centred. The largest island always stays.
-
-    Raises
-    ------
-    NotEnoughEvidenceError
-        If nothing positive is there.
-    """
-    kept = np.maximum(kernel, 0.0)
-    if not kept.max() > 0:
-        raise NotEnoughEvidenceError("the kernel vanished; the patches hold no detail beyond the noise")
-    kept = np.where(kept >= threshold * kept.max(), kept, 0.0)
-    if least_mass > 0.0:
-        label, count = ndimage.label(kept > 0, _EIGHT_NEIGHBOURS)
-        mass = np.bincount(label.ravel(), weights=kept.ravel(), minlength=count + 1)
-        mass[0] = 0.0
-        heavy = mass >= min(least_mass * float(mass.sum()), float(mass.max()))
-        heavy[0] = False
-        kept = np.where(heavy[label], kept, 0.0)
-    return as_kernel(kept)
 
 
 def signal_share(kept: Sequence[tuple[Plane, NoiseModel]]) -> NDArray[np.float64]:

@@ -30,8 +30,9 @@ from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import Kernel, StepHook, ignore_step
-from lensmodel.estimation import PsfEstimator, estimators
+from lensmodel.estimation import PsfEstimator
 from lensmodel.lab.blind.judges import Judge, judges, squared_error
+from lensmodel.lab.blind.methods import compared
 from lensmodel.lab.cases import (
     CHOICES,
     HALVES,
@@ -229,7 +230,7 @@ def run_blind_benchmark(
         Folder for finished results, one line of JSON each, keyed by the content of photo, PSF,
         method and settings. A run that was stopped goes on from there.
     methods : Registry of PsfEstimator or None
-        Where the method names are looked up; None means `lensmodel.estimation.estimators`.
+        Where the method names are looked up; None means `methods.compared`.
     only : collection of str or None
         Names of photographs, without suffix; cases that begin with another one are left out.
     on_step : StepHook
@@ -242,7 +243,7 @@ def run_blind_benchmark(
     InvalidInputError
         If there are no photos or PSFs.
     """
-    registry = estimators if methods is None else methods
+    registry = compared if methods is None else methods
     chosen = {name: registry.create(name) for name in settings.methods}
     judge = judges.create(settings.judge)
     photos, kernels = list_photos(settings.photos), load_psfs(settings.psfs)

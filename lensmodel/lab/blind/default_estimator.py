@@ -21,13 +21,14 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from lensmodel import estimation, quality
+from lensmodel import quality
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import distance, resized, rms_width
 from lensmodel.core.types import FieldPosition, Kernel, LensSettings, NoiseModel, Plane, Planes
 from lensmodel.correction import Sensor, SparseGradient
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.lab import cases
+from lensmodel.lab.blind.methods import compared
 from lensmodel.lab.cases import Case, Half
 from lensmodel.simulate import draw_lens, load_scene
 
@@ -90,7 +91,7 @@ def rows(
             try:
                 estimate = resized(kernel, SIZE)
                 if name != TRUTH:
-                    answer = estimation.estimators.create(name).estimate(
+                    answer = compared.create(name).estimate(
                         [s.patches[0] for s in seen], [noise] * pool, size=SIZE
                     )
                     estimate = answer.kernel

@@ -22,7 +22,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lensmodel.estimation import PsfEstimate, estimators
+from lensmodel.estimation import PsfEstimate
+from lensmodel.lab.blind.methods import compared
 from lensmodel.lab.cases import Observation, list_photos, load_psfs, make_cases, observe
 
 
@@ -45,7 +46,7 @@ def yardstick() -> None:
 
 def all_of(name: str, seen: Sequence[Observation], repeats: int) -> list[float]:
     """CPU seconds of each window."""
-    method = estimators.create(name)
+    method = compared.create(name)
 
     def estimate(one: Observation) -> PsfEstimate:
         return method.estimate(one.patches, [one.noise], size=31)

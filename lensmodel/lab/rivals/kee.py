@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 from lensmodel.core import psf
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel
-from lensmodel.estimation.methods.edges import EdgeProfile, profiles
-from lensmodel.estimation.steps.pyramid import View
+from lensmodel.lab.blind.methods.edges import EdgeProfile, profiles
+from lensmodel.lab.blind.steps.pyramid import View
 from lensmodel.lab.rivals.rival import Window, polynomial, powers, windows_of
 from lensmodel.photo import LinearPhoto
 

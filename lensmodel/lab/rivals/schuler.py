@@ -29,7 +29,7 @@ from scipy import fft
 
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.types import CHANNELS, Kernel
-from lensmodel.estimation.steps.gradients import (
+from lensmodel.lab.blind.steps.gradients import (
     Canvas,
     KernelEquations,
     Pair,
@@ -40,7 +40,7 @@ from lensmodel.estimation.steps.gradients import (
     oriented_threshold,
     shock_filtered,
 )
-from lensmodel.estimation.steps.pyramid import Image, View
+from lensmodel.lab.blind.steps.pyramid import Image, View
 from lensmodel.lab.rivals.basis import BasisField, RadialBasis, composed, harmonics, load_basis
 from lensmodel.lab.rivals.rival import Window, windows_of
 from lensmodel.photo import LinearPhoto

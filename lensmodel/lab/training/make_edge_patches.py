@@ -1,7 +1,7 @@
 """Make the prior of the estimator `sun`: small windows of ideal edges, and how steep they are.
 
 Run as ``python -m lensmodel.lab.training.make_edge_patches``; writes
-lensmodel/estimation/data/edge_patches.npz. Everything is drawn here: steps, bars and corners integrated over
+lensmodel/lab/data/edge_patches.npz. Everything is drawn here: steps, bars and corners integrated over
 the pixel, and the steepness of the strongest edges of dead-leaves scenes. No photograph takes part.
 """
 
@@ -14,10 +14,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel import estimation
 from lensmodel.core.types import NoiseModel
-from lensmodel.estimation.steps.edge_patches import SIDE, edge_mask, steepness_of
-from lensmodel.estimation.steps.pyramid import View
+from lensmodel.lab.blind.steps.edge_patches import SIDE, edge_mask, steepness_of
+from lensmodel.lab.blind.steps.pyramid import View
 from lensmodel.simulate import dead_leaves
 
 COUNT: Final = 220
@@ -25,7 +24,7 @@ ANGLES: Final = 32
 SCENES: Final = 6
 QUANTILES: Final = 64
 
-OUT: Final = Path(estimation.__file__).parent / "data" / "edge_patches.npz"
+OUT: Final = Path(__file__).parents[1] / "data" / "edge_patches.npz"
 
 _FINE = 8
 

@@ -28,13 +28,14 @@ from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel, ignore_step
-from lensmodel.estimation import PsfEstimator, estimators
+from lensmodel.estimation import PsfEstimator
 from lensmodel.estimation.patches.blocks import BLOCKS_A_SIDE, measure_blocks
 from lensmodel.estimation.patches.details import joined, look_at
 from lensmodel.estimation.patches.good_regions import FEATURES, TreeEnsemble, features_of
 from lensmodel.estimation.patches.select import RMapSelector, first_reasons
 from lensmodel.estimation.patches.windows import windows_of
 from lensmodel.lab.blind.judges import HyperLaplacian, squared_error
+from lensmodel.lab.blind.methods import compared
 from lensmodel.lab.cases import list_photos, photo_half, scene_of
 from lensmodel.simulate import draw_lens
 
@@ -117,7 +118,7 @@ def label_group(photo: Path, number: int, estimator: PsfEstimator) -> Iterator[L
 
 def collect(photos: Path | None, table: Path, groups: int, method: str = "default") -> None:
     """Append labelled windows of `groups` photo-lens pairs to the table, skipping those it has."""
-    estimator = estimators.create(method)
+    estimator = compared.create(method)
     found = list_photos(photos)
     known = {row.group for row in read_table(table)} if table.exists() else set()
     for number in range(groups):

@@ -11,7 +11,8 @@ from scipy import signal
 
 from lensmodel.core.psf import as_kernel, centred, delta, distance, gaussian, resized
 from lensmodel.core.types import Kernel, NoiseModel, Plane
-from lensmodel.estimation import PsfEstimator, estimators
+from lensmodel.estimation import PsfEstimator
+from lensmodel.lab.blind.methods import compared
 from lensmodel.simulate import dead_leaves, load_scene
 
 SIGMA = 0.005
@@ -33,7 +34,7 @@ class Method:
 @pytest.fixture(scope="module", params=[("cho-lee", 0.85), ("xu-jia", 0.75), ("l0", 0.8)], ids=lambda p: p[0])
 def method(request: pytest.FixtureRequest) -> Method:
     name, ncc = request.param
-    return Method(estimators.create(name), ncc)
+    return Method(compared.create(name), ncc)
 
 
 def shot(kernel: Kernel, *, side: int = 128, seed: int = 0, sigma: float = SIGMA) -> Plane:

@@ -7,9 +7,9 @@ from scipy import signal
 
 from lensmodel.core.psf import as_kernel, delta, distance, gaussian, rms_width
 from lensmodel.core.types import Kernel, NoiseModel, Plane
-from lensmodel.estimation.methods.zhang import Zhang
-from lensmodel.estimation.methods.zhang_model import Scene, pooled_kernel
-from lensmodel.estimation.steps.kernel_step import Grid, Term, least_squares_kernel
+from lensmodel.lab.blind.methods.zhang import Zhang
+from lensmodel.lab.blind.methods.zhang_model import Scene, pooled_kernel
+from lensmodel.lab.blind.steps.kernel_step import Grid, Term, least_squares_kernel
 from lensmodel.simulate import dead_leaves
 
 SIGMA = 0.01

@@ -29,7 +29,7 @@ _REACH = 4
 _ALONG_PX, _ACROSS_PX = 2.0, 1.0
 _LEAST_LENGTH = 4
 _AROUND = 11
-_DATA = Path(__file__).parents[1] / "data" / "edge_patches.npz"
+_DATA = Path(__file__).parents[2] / "data" / "edge_patches.npz"
 
 Image = NDArray[np.float64]
 

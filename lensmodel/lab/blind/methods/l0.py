@@ -25,8 +25,8 @@ from scipy import fft
 
 from lensmodel.core.psf import centred
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
-from lensmodel.estimation.estimator import PsfEstimate, StartingFrom
-from lensmodel.estimation.steps.gradients import (
+from lensmodel.estimation import PsfEstimate
+from lensmodel.lab.blind.steps.gradients import (
     Canvas,
     KernelEquations,
     Pair,
@@ -38,7 +38,8 @@ from lensmodel.estimation.steps.gradients import (
     oriented_threshold,
     pruned,
 )
-from lensmodel.estimation.steps.pyramid import Image, Level, LevelResult, Tick, View
+from lensmodel.lab.blind.steps.pyramid import Image, Level, LevelResult, Tick, View
+from lensmodel.lab.blind.steps.starting_from import StartingFrom
 
 _LAST_BETA = 1e5
 _GROWTH = 2.0

@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.estimation.steps.kernel_step import Floats, Grid, Kernelish, Term, least_squares_kernel
+from lensmodel.lab.blind.steps.kernel_step import Floats, Grid, Kernelish, Term, least_squares_kernel
 
 _TINY = 1e-12
 _FIRST_NOISE = 0.5

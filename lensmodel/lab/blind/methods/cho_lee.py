@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
-from lensmodel.estimation.estimator import PsfEstimate, StartingFrom
-from lensmodel.estimation.steps.gradients import (
+from lensmodel.estimation import PsfEstimate
+from lensmodel.lab.blind.steps.gradients import (
     Canvas,
     KernelEquations,
     Pair,
@@ -36,7 +36,8 @@ from lensmodel.estimation.steps.gradients import (
     pruned,
     shock_filtered,
 )
-from lensmodel.estimation.steps.pyramid import Image, Level, LevelResult, Tick
+from lensmodel.lab.blind.steps.pyramid import Image, Level, LevelResult, Tick
+from lensmodel.lab.blind.steps.starting_from import StartingFrom
 
 _ORDER_WEIGHTS = (50.0, 25.0, 12.5)
 _ALPHA = 0.1

@@ -22,11 +22,13 @@ from scipy import fft, ndimage
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import centred, distance, otf
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
-from lensmodel.estimation.estimator import PsfEstimate, StartingFrom, usable
-from lensmodel.estimation.steps.edge_patches import SIDE, PatchPrior, default_prior, edge_mask, target
-from lensmodel.estimation.steps.finish import cleaned, finished
-from lensmodel.estimation.steps.kernel_step import Grid, Term, least_squares_kernel
-from lensmodel.estimation.steps.pyramid import Image, Level, LevelResult, Schedule, Tick, View, coarse_to_fine
+from lensmodel.estimation.estimator import PsfEstimate, usable
+from lensmodel.estimation.steps.finish import finished
+from lensmodel.lab.blind.steps.cleaning import cleaned
+from lensmodel.lab.blind.steps.edge_patches import SIDE, PatchPrior, default_prior, edge_mask, target
+from lensmodel.lab.blind.steps.kernel_step import Grid, Term, least_squares_kernel
+from lensmodel.lab.blind.steps.pyramid import Image, Level, LevelResult, Schedule, Tick, View, coarse_to_fine
+from lensmodel.lab.blind.steps.starting_from import StartingFrom
 
 _INTENSITY_WEIGHT = 0.1
 _LEAST_EDGE_PX = 30

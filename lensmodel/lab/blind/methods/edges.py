@@ -26,9 +26,10 @@ from lensmodel.core.least_squares import nonnegative_least_squares
 from lensmodel.core.psf import gaussian
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
 from lensmodel.estimation.estimator import PsfEstimate, usable
-from lensmodel.estimation.steps.edge_patches import edge_mask
-from lensmodel.estimation.steps.finish import cleaned, finished
-from lensmodel.estimation.steps.pyramid import Image, View
+from lensmodel.estimation.steps.finish import finished
+from lensmodel.lab.blind.steps.cleaning import cleaned
+from lensmodel.lab.blind.steps.edge_patches import edge_mask
+from lensmodel.lab.blind.steps.pyramid import Image, View
 
 _DIRECTIONS = 24
 _STEP_PX = 0.25

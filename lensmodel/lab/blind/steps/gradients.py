@@ -23,8 +23,9 @@ from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import as_kernel, centred, centroid, distance, otf
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
 from lensmodel.estimation.estimator import PsfEstimate, usable
-from lensmodel.estimation.steps.finish import cleaned, finished
-from lensmodel.estimation.steps.pyramid import Image, LevelSolver, Schedule, View, coarse_to_fine
+from lensmodel.estimation.steps.finish import finished
+from lensmodel.lab.blind.steps.cleaning import cleaned
+from lensmodel.lab.blind.steps.pyramid import Image, LevelSolver, Schedule, View, coarse_to_fine
 
 _ORIENTATIONS = 4
 _TINY = 1e-12

@@ -7,7 +7,7 @@ from scipy import signal
 from lensmodel.core.errors import CancelledError, InvalidInputError
 from lensmodel.core.psf import centroid, gaussian, second_moments
 from lensmodel.core.types import Kernel, NoiseModel
-from lensmodel.estimation.steps.pyramid import (
+from lensmodel.lab.blind.steps.pyramid import (
     RATIO,
     Image,
     Level,

@@ -9,10 +9,10 @@ from scipy import signal
 
 from lensmodel.core.psf import as_kernel, delta, distance, gaussian
 from lensmodel.core.types import Kernel, NoiseModel, Plane
-from lensmodel.estimation.methods.sun import Sun, edge_terms, image_step
-from lensmodel.estimation.steps.edge_patches import SIDE, default_prior, edge_mask, target
-from lensmodel.estimation.steps.kernel_step import least_squares_kernel
-from lensmodel.estimation.steps.pyramid import View
+from lensmodel.lab.blind.methods.sun import Sun, edge_terms, image_step
+from lensmodel.lab.blind.steps.edge_patches import SIDE, default_prior, edge_mask, target
+from lensmodel.lab.blind.steps.kernel_step import least_squares_kernel
+from lensmodel.lab.blind.steps.pyramid import View
 from lensmodel.lab.training import make_edge_patches
 from lensmodel.simulate import dead_leaves, edge_area
 

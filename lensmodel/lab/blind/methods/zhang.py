@@ -24,10 +24,12 @@ import numpy as np
 
 from lensmodel.core.psf import centred, distance, gaussian
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
-from lensmodel.estimation.estimator import PsfEstimate, StartingFrom, usable
-from lensmodel.estimation.methods.zhang_model import Scene, pooled_kernel
-from lensmodel.estimation.steps.finish import cleaned, finished
-from lensmodel.estimation.steps.pyramid import Image, Level, LevelResult, Schedule, Tick, View, coarse_to_fine
+from lensmodel.estimation.estimator import PsfEstimate, usable
+from lensmodel.estimation.steps.finish import finished
+from lensmodel.lab.blind.methods.zhang_model import Scene, pooled_kernel
+from lensmodel.lab.blind.steps.cleaning import cleaned
+from lensmodel.lab.blind.steps.pyramid import Image, Level, LevelResult, Schedule, Tick, View, coarse_to_fine
+from lensmodel.lab.blind.steps.starting_from import StartingFrom
 
 _FIRST_SIGMA_PX = 0.7
 _ERROR_FLOOR, _ERROR_SLOPE = 0.15, 0.5

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from lensmodel import estimation
 from lensmodel.core.psf import as_kernel, centred, delta, distance
 from lensmodel.core.types import Kernel, NoiseModel, Plane
+from lensmodel.lab.blind.methods import compared
 from lensmodel.lab.cases import scene_of
 
 SIGMA = 0.003
@@ -54,7 +54,7 @@ def test_camera_shake_is_recovered_from_photographs(
     similar, nothing = [], []
     for i, kernel in enumerate(kernels):
         y = shaken(shared_data / "sharp" / f"{SHARP[i % 2]}.png", kernel, i)
-        found = estimation.estimators.create(name).estimate([y], [NoiseModel.white(SIGMA)], size=29)
+        found = compared.create(name).estimate([y], [NoiseModel.white(SIGMA)], size=29)
         similar.append(distance(found.kernel, kernel).ncc)
         nothing.append(distance(delta(29), kernel).ncc)
 

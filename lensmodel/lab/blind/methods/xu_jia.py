@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
-from lensmodel.estimation.estimator import PsfEstimate, StartingFrom
-from lensmodel.estimation.steps.gradients import (
+from lensmodel.estimation import PsfEstimate
+from lensmodel.lab.blind.steps.gradients import (
     Canvas,
     KernelEquations,
     Mask,
@@ -38,7 +38,8 @@ from lensmodel.estimation.steps.gradients import (
     pruned,
     shock_filtered,
 )
-from lensmodel.estimation.steps.pyramid import Image, Level, LevelResult, Tick, View
+from lensmodel.lab.blind.steps.pyramid import Image, Level, LevelResult, Tick, View
+from lensmodel.lab.blind.steps.starting_from import StartingFrom
 
 _WINDOW = 5
 _OFFSET = 0.5

@@ -9,8 +9,8 @@ from scipy import signal
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import as_kernel, delta, distance, gaussian, second_moments
 from lensmodel.core.types import Kernel, NoiseModel, Plane
-from lensmodel.estimation.methods.edges import Edges, profiles, projection
-from lensmodel.estimation.steps.pyramid import View
+from lensmodel.lab.blind.methods.edges import Edges, profiles, projection
+from lensmodel.lab.blind.steps.pyramid import View
 
 SIGMA = 0.005
 OVAL = gaussian(13, [[2.4, 0.9], [0.9, 1.2]])

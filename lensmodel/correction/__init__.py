@@ -15,11 +15,8 @@ from lensmodel.correction.limits.bounds import Bounds
 from lensmodel.correction.limits.chroma import StoredColour
 from lensmodel.correction.methods.catalogue import deconvolvers
 from lensmodel.correction.methods.direct import DirectFilter
-from lensmodel.correction.methods.epll import Epll
-from lensmodel.correction.methods.krishnan_fergus import KrishnanFergus
 from lensmodel.correction.methods.richardson_lucy import RichardsonLucy, SaturationAwareRichardsonLucy
 from lensmodel.correction.methods.sparse_gradient import SparseGradient
-from lensmodel.correction.methods.wiener import Wiener
 from lensmodel.correction.tiles.lattice import Roi
 from lensmodel.correction.whole_photo import Corrected, PsfError, correct_planes
 
@@ -29,8 +26,6 @@ __all__ = [
     "Corrected",
     "Deconvolver",
     "DirectFilter",
-    "Epll",
-    "KrishnanFergus",
     "PsfError",
     "Restored",
     "RichardsonLucy",
@@ -40,7 +35,6 @@ __all__ = [
     "SparseGradient",
     "StoredColour",
     "WarpableMethod",
-    "Wiener",
     "ZoneReport",
     "correct_planes",
     "deconvolvers",

@@ -1,59 +1,28 @@
-"""One-pass Wiener filter with the spectrum of natural images."""
+"""The spectrum of natural images, and the linear estimate with it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from lensmodel.core.types import Plane, StepHook, ignore_step
-from lensmodel.correction.blur import BlurOperator
-from lensmodel.correction.deconvolver import Restored, Sensor, uniform
-from lensmodel.correction.tiles.canvas import Canvas
-
 SLOPE = 2.2
 """Exponent of the power spectrum of natural images, S(f) = c |f|^-2.2."""
 
 
-@dataclass(frozen=True, slots=True)
-class Wiener:
-    """Linear minimum-mean-square-error filter for a natural image in white noise.
+def wiener_spectrum(
+    data: NDArray[np.float32], K: NDArray[np.complex64], noise: float, variance: float
+) -> NDArray[np.complex64]:
+    """Spectrum of the Wiener estimate on a periodic canvas, given the variances of noise and data.
 
     In the Fourier domain::
 
         X = conj(K) Y / ( |K|² + var / S(f) ),   S(f) = c |f|^-2.2
 
     where c is fitted so that the blurred prior has the variance of the data.
-
-    Parameters
-    ----------
-    caution : float
-        Factor on the noise variance; above 1 the result is smoother.
     """
-
-    caution: float = 1.0
-
-    def deconvolve(
-        self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step
-    ) -> Restored:
-        """Deconvolve one plane; see `Deconvolver`."""
-        kernel = uniform(blur, "wiener")
-        canvas = Canvas(blurred.shape[0], blurred.shape[1], kernel.reach)
-        noise = self.caution * float(sensor.variance(blurred).mean())
-        K = kernel.spectrum(canvas.shape)
-        spectrum = wiener_spectrum(canvas.fill(blurred), K, noise, float(blurred.var()))
-        latent = np.asarray(fft.irfft2(spectrum, canvas.shape), dtype=np.float32)
-        on_step(1, 1)
-        return Restored(np.ascontiguousarray(canvas.cut(latent)), steps=1)
-
-
-def wiener_spectrum(
-    data: NDArray[np.float32], K: NDArray[np.complex64], noise: float, variance: float
-) -> NDArray[np.complex64]:
-    """Spectrum of the Wiener estimate on a periodic canvas, given the variances of noise and data."""
     power = K.real**2 + K.imag**2
     decay, likely = prior((data.shape[0], data.shape[1]))
     shown = float(np.vdot(likely, power))

@@ -18,7 +18,7 @@ from scipy import fft
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import Kernel, Plane
-from lensmodel.correction.methods.mixture import shipped_mixture
+from lensmodel.lab.correction.methods.mixture import shipped_mixture
 
 BORDER: Final = 28
 """Pixels along the rim that do not count: light from outside the patch reaches so far."""

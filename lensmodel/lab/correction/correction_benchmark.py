@@ -20,10 +20,11 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfField, gaussian
 from lensmodel.core.types import Channel, FieldPosition, Kernel, NoiseModel, Planes, StepHook, ignore_step
-from lensmodel.correction import Roi, SaturationAwareRichardsonLucy, Sensor, correct_planes
+from lensmodel.correction import Deconvolver, Roi, SaturationAwareRichardsonLucy, Sensor, correct_planes
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.blur.uniform import fast_shape
 from lensmodel.correction.engine import compiled
+from lensmodel.lab.correction.methods import compared
 from lensmodel.lab.peers import Peer
 from lensmodel.quality.images import to_srgb
 
@@ -74,7 +75,7 @@ def run_correct_benchmark(
     field : PsfField or None
         The lens; None takes `SoftCorners`.
     methods : sequence of str
-        Names in `deconvolvers`.
+        Names in `methods.compared`.
     workers : int
         Threads.
     repeats : int
@@ -117,13 +118,14 @@ def run_correct_benchmark(
     results: dict[str, dict[str, float]] = {}
     small = np.ascontiguousarray(photo[:, :200, :200])
     for done, method in enumerate(methods, start=1):
+        chosen = compared.create(method)
         # Compiling and first-use tables stay out of the figures.
-        correct_planes(small, lens, Frame(small.shape[1], small.shape[2]), noise=noise, method=method)
+        correct_planes(small, lens, Frame(small.shape[1], small.shape[2]), noise=noise, method=chosen)
         counts = [workers] if beside is None else [workers, beside]
 
-        def run(threads: int, name: str = method) -> tuple[float, float]:
+        def run(threads: int, solver: Deconvolver = chosen) -> tuple[float, float]:
             wall, cpu = time.perf_counter(), time.process_time()
-            correct_planes(photo, lens, frame, noise=noise, method=name, workers=threads, roi=roi)
+            correct_planes(photo, lens, frame, noise=noise, method=solver, workers=threads, roi=roi)
             return time.process_time() - cpu, time.perf_counter() - wall
 
         runs = np.array([[run(count) for count in counts] for _ in range(repeats)])

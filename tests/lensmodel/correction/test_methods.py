@@ -24,10 +24,11 @@ from lensmodel.correction.blur import Drift, EfficientFilterFlow, UniformBlur
 from lensmodel.correction.engine import Engine
 from lensmodel.correction.lights.saturation import Lights
 from lensmodel.correction.methods.shrinkage import Shrinkage
+from lensmodel.lab.correction.methods import compared
 from lensmodel.lab.correction.quality import Constant
 
 CLEAN = Sensor(NoiseModel(1e-7, 1e-8))
-METHODS = list(deconvolvers)
+METHODS = list(compared)  # those of the laboratory keep the same contract
 
 
 def scene(rows: int = 96, cols: int = 110, seed: int = 0) -> np.ndarray:
@@ -49,7 +50,7 @@ def rmse(a: np.ndarray, b: np.ndarray) -> float:
 def test_method_keeps_a_constant(name: str) -> None:
     flat = np.full((60, 64), 0.4, dtype=np.float32)
 
-    restored = deconvolvers.create(name).deconvolve(flat, UniformBlur(gaussian(9, np.eye(2))), sensor=CLEAN)
+    restored = compared.create(name).deconvolve(flat, UniformBlur(gaussian(9, np.eye(2))), sensor=CLEAN)
 
     np.testing.assert_allclose(restored.plane, 0.4, atol=2e-3)
 
@@ -58,7 +59,7 @@ def test_method_keeps_a_constant(name: str) -> None:
 def test_method_changes_nothing_without_blur_and_noise(name: str) -> None:
     plane = scene()
 
-    restored = deconvolvers.create(name).deconvolve(plane, UniformBlur(delta(5)), sensor=CLEAN)
+    restored = compared.create(name).deconvolve(plane, UniformBlur(delta(5)), sensor=CLEAN)
 
     assert rmse(restored.plane, plane) < 1e-3
 
@@ -70,7 +71,7 @@ def test_method_brings_a_scene_blurred_without_noise_nearer_to_the_truth(name: s
     blurred = blur.forward(sharp)
     truth = blur.frame(sharp)
 
-    restored = deconvolvers.create(name).deconvolve(blurred, blur, sensor=CLEAN)
+    restored = compared.create(name).deconvolve(blurred, blur, sensor=CLEAN)
 
     slow = name in {"richardson-lucy", "paper", "whyte"}  # multiplicative steps creep, MAP solves
     assert rmse(restored.plane, truth) < (0.9 if slow else 0.6) * rmse(blurred, truth)
@@ -80,7 +81,7 @@ def test_method_brings_a_scene_blurred_without_noise_nearer_to_the_truth(name: s
 def test_method_answers_float32_of_the_frame_and_counts_its_steps(name: str) -> None:
     blurred, seen = scene(40, 50), []
 
-    restored = deconvolvers.create(name).deconvolve(
+    restored = compared.create(name).deconvolve(
         blurred,
         UniformBlur(gaussian(7, np.eye(2))),
         sensor=CLEAN,
@@ -188,7 +189,7 @@ def test_method_beats_richardson_lucy_around_lamps_that_the_lens_spread(name: st
     def errors(method: Deconvolver) -> tuple[float, float]:
         return error_and_ring(method.deconvolve(photo, blur, sensor=sensor).plane, truth, near)
 
-    error, ring = errors(deconvolvers.create(name))
+    error, ring = errors(compared.create(name))
     rivals = [errors(SaturationAwareRichardsonLucy(steps)) for steps in (8, 15, 25)]
 
     assert error < min(rival[0] for rival in rivals)
@@ -217,8 +218,8 @@ def test_method_is_repeatable_and_leaves_its_input_alone(name: str) -> None:
     before = blurred.copy()
     blur = UniformBlur(gaussian(7, np.eye(2)))
 
-    first = deconvolvers.create(name).deconvolve(blurred, blur, sensor=CLEAN).plane
-    second = deconvolvers.create(name).deconvolve(blurred, blur, sensor=CLEAN).plane
+    first = compared.create(name).deconvolve(blurred, blur, sensor=CLEAN).plane
+    second = compared.create(name).deconvolve(blurred, blur, sensor=CLEAN).plane
 
     np.testing.assert_array_equal(first, second)
     np.testing.assert_array_equal(blurred, before)
@@ -229,7 +230,7 @@ def test_method_of_one_kernel_says_what_to_use_for_a_field(name: str) -> None:
     flow = EfficientFilterFlow(40, 40, ((delta(3),),))
 
     with pytest.raises(InvalidInputError, match="correct_planes"):
-        deconvolvers.create(name).deconvolve(scene(40, 40), flow, sensor=CLEAN)
+        compared.create(name).deconvolve(scene(40, 40), flow, sensor=CLEAN)
 
 
 def test_unknown_method_lists_the_known_ones() -> None:

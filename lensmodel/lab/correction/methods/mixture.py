@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-_SHIPPED = Path(__file__).parents[1] / "data" / "epll.npz"
+_SHIPPED = Path(__file__).parents[2] / "data" / "epll.npz"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

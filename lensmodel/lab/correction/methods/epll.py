@@ -10,8 +10,8 @@ from scipy import fft
 from lensmodel.core.types import Plane, StepHook, ignore_step
 from lensmodel.correction.blur import BlurOperator
 from lensmodel.correction.deconvolver import Restored, Sensor, uniform
-from lensmodel.correction.methods.mixture import shipped_mixture
 from lensmodel.correction.tiles.canvas import Canvas
+from lensmodel.lab.correction.methods.mixture import shipped_mixture
 
 _WHITE = 0.9
 

@@ -1,0 +1,23 @@
+"""Deconvolution methods to compare with: for `lensmodel bench correct`, not for users.
+
+`compared` knows them beside those of the product.
+"""
+
+from typing import Final
+
+from lensmodel.core.registry import Registry
+from lensmodel.correction import Deconvolver, SaturationAwareRichardsonLucy, deconvolvers
+from lensmodel.lab.correction.methods.epll import Epll
+from lensmodel.lab.correction.methods.krishnan_fergus import KrishnanFergus
+from lensmodel.lab.correction.methods.wiener import Wiener
+
+
+def _whyte(iterations: int = 50) -> SaturationAwareRichardsonLucy:
+    return SaturationAwareRichardsonLucy(iterations=iterations, accelerated=False)
+
+
+compared: Final[Registry[Deconvolver]] = deconvolvers.extended(
+    epll=Epll, krishnan_fergus=KrishnanFergus, whyte=_whyte, wiener=Wiener
+)
+
+__all__ = ["Epll", "KrishnanFergus", "Wiener", "compared"]

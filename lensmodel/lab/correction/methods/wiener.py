@@ -1,0 +1,42 @@
+"""One-pass Wiener filter with the spectrum of natural images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft
+
+from lensmodel.core.types import Plane, StepHook, ignore_step
+from lensmodel.correction.blur import BlurOperator
+from lensmodel.correction.deconvolver import Restored, Sensor, uniform
+from lensmodel.correction.methods.wiener import wiener_spectrum
+from lensmodel.correction.tiles.canvas import Canvas
+
+
+@dataclass(frozen=True, slots=True)
+class Wiener:
+    """Linear minimum-mean-square-error filter for a natural image in white noise.
+
+    See `wiener_spectrum`.
+
+    Parameters
+    ----------
+    caution : float
+        Factor on the noise variance; above 1 the result is smoother.
+    """
+
+    caution: float = 1.0
+
+    def deconvolve(
+        self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step
+    ) -> Restored:
+        """Deconvolve one plane; see `Deconvolver`."""
+        kernel = uniform(blur, "wiener")
+        canvas = Canvas(blurred.shape[0], blurred.shape[1], kernel.reach)
+        noise = self.caution * float(sensor.variance(blurred).mean())
+        K = kernel.spectrum(canvas.shape)
+        spectrum = wiener_spectrum(canvas.fill(blurred), K, noise, float(blurred.var()))
+        latent = np.asarray(fft.irfft2(spectrum, canvas.shape), dtype=np.float32)
+        on_step(1, 1)
+        return Restored(np.ascontiguousarray(canvas.cut(latent)), steps=1)

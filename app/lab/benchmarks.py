@@ -23,7 +23,7 @@ from lensmodel.core.codec import to_json
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from lensmodel.lab.blind.blind_benchmark import BlindBenchmark, BlindReport
+    from lensmodel.lab.blind.results import BlindBenchmark, BlindReport
 
 NOISE: Final = "0.01,0.003"
 ESTIMATORS: Final = "default,michaeli-irani,whittle"
@@ -74,7 +74,7 @@ def default(context: typer.Context, quiet: Quiet = False, verbose: Verbose = 0) 
     shown = display.of(context, quiet=quiet, verbose=verbose)
     context.obj = shown
     if context.invoked_subcommand is None:
-        from lensmodel.lab.blind.blind_benchmark import BlindBenchmark  # noqa: PLC0415 - see the top of the module
+        from lensmodel.lab.blind.results import BlindBenchmark  # noqa: PLC0415 - see the top of the module
         from lensmodel.lab.blind.tables import markdown_table  # noqa: PLC0415 - same
         from lensmodel.lab.correction.correction_benchmark import correct_table  # noqa: PLC0415 - same
         from lensmodel.lab.model.model_benchmark import table  # noqa: PLC0415 - same
@@ -126,7 +126,7 @@ def blind(
 
     Exit status: 0 measured, 1 something failed, 2 called wrongly.
     """
-    from lensmodel.lab.blind.blind_benchmark import BlindBenchmark  # noqa: PLC0415 - see the top of the module
+    from lensmodel.lab.blind.results import BlindBenchmark  # noqa: PLC0415 - see the top of the module
     from lensmodel.lab.blind.tables import markdown_table, write_report  # noqa: PLC0415 - same
 
     shown = display.of(context, quiet=quiet, verbose=verbose)

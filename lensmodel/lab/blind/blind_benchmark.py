@@ -12,201 +12,29 @@ already has an ER of 2 to 4, so each case also tells whether the method beats do
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
 import math
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from lensmodel.core import psf
-from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
+from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import Kernel, StepHook, ignore_step
 from lensmodel.estimation import PsfEstimator
 from lensmodel.lab.blind.judges import Judge, judges, squared_error
 from lensmodel.lab.blind.methods import compared
-from lensmodel.lab.cases import (
-    CHOICES,
-    HALVES,
-    VARIANTS,
-    Case,
-    Choice,
-    Half,
-    Variant,
-    list_photos,
-    load_psfs,
-    make_cases,
-    observe,
-)
+from lensmodel.lab.blind.results import UNTOUCHED, BlindBenchmark, BlindReport, CaseResult, summarised
+from lensmodel.lab.blind.store import Store
+from lensmodel.lab.cases import Case, list_photos, load_psfs, make_cases, observe
 
 logger = logging.getLogger(__name__)
-
-PROTOCOL = 2
-"""Part of every cache key; raised when cases or metrics change."""
-
-UNTOUCHED = "none"
-"""The method that does nothing: the baseline of every table."""
-
-
-@dataclass(frozen=True, slots=True)
-class BlindBenchmark:
-    """What to run.
-
-    Parameters
-    ----------
-    photos : Path or None
-        Folder of sharp photographs; None means those of the library.
-    psfs : Path or None
-        .npz file with `psf` (n, k, k); None means the library's twelve.
-    noise : tuple of float
-        Standard deviations as shares of full range.
-    methods : tuple of str
-        Names of blind estimators; "none" is always added.
-    half : {"dev", "test", "all"}
-        Which half of photos and PSFs.
-    cases : int or None
-        At most so many, spread over photos and PSFs.
-    patch, kernel_size : int
-        Sides in pixels; the kernel's is odd.
-    pool : int
-        Patches of different photos that share one kernel.
-    variant : {"gaussian", "bayer", "jpeg"}
-        The camera.
-    judge : str
-        Non-blind deconvolution: "hyper-laplacian" or "epll".
-    seed : int
-        For windows, noise and the choice of cases.
-    selection : {"random", "r-map", "good-regions"}
-        Who chooses the windows: chance among the better half, or a selector on the blurred photograph.
-    """
-
-    photos: Path | None = None
-    psfs: Path | None = None
-    noise: tuple[float, ...] = (0.01,)
-    methods: tuple[str, ...] = ("default",)
-    half: Half = "test"
-    cases: int | None = None
-    patch: int = 256
-    kernel_size: int = 31
-    pool: int = 1
-    variant: Variant = "gaussian"
-    judge: str = "hyper-laplacian"
-    seed: int = 0
-    selection: Choice = "random"
-
-    def __post_init__(self) -> None:
-        checks = {
-            f"half must be one of {', '.join(HALVES)}, got {self.half!r}": self.half in HALVES,
-            f"variant must be one of {', '.join(VARIANTS)}, got {self.variant!r}": self.variant in VARIANTS,
-            f"selection must be one of {', '.join(CHOICES)}, got {self.selection!r}": (
-                self.selection in CHOICES
-            ),
-            f"patch must be a multiple of 4 of at least 128, got {self.patch}": self.patch >= 128
-            and self.patch % 4 == 0,
-            f"kernel size must be odd and at least 5, got {self.kernel_size}": self.kernel_size >= 5
-            and self.kernel_size % 2 == 1,
-            f"pool must be at least 1, got {self.pool}": self.pool >= 1,
-            f"noise must lie in 0.0001..0.2, got {self.noise}": all(1e-4 <= s <= 0.2 for s in self.noise),
-        }
-        for text, holds in checks.items():
-            if not holds:
-                raise InvalidInputError(text)
-
-
-@dataclass(frozen=True, slots=True)
-class CaseResult:
-    """One method on one case.
-
-    Parameters
-    ----------
-    case, method : str
-    noise : float
-    error_ratio, untouched_ratio : float
-        ER with the estimated kernel, and of the blurred patch as it is.
-    ncc, rel_l2, mtf_rmse : float
-        Against the true kernel after sub-pixel alignment; see `psf.distance`.
-    width_px, true_width_px : float
-        RMS widths.
-    confidence, predicted_error : float
-        What the estimator says of itself; NaN for "none".
-    declined : bool
-        The estimator gave no answer; the patch then stays as it is.
-    seconds : float
-        Of the estimate alone.
-    """
-
-    case: str
-    method: str
-    noise: float
-    error_ratio: float
-    untouched_ratio: float
-    ncc: float
-    rel_l2: float
-    mtf_rmse: float
-    width_px: float
-    true_width_px: float
-    confidence: float
-    predicted_error: float
-    declined: bool
-    seconds: float
-
-    @property
-    def improved(self) -> bool:
-        """Whether deblurring with the estimate beats doing nothing."""
-        return self.error_ratio < self.untouched_ratio
-
-
-@dataclass(frozen=True, slots=True)
-class MethodSummary:
-    """One method at one noise level; shares are of all cases, the rest are medians.
-
-    `moment_bias` is the median of the difference of mean second moments, estimated minus true, in
-    px²; `width_ratio` the median of RMS width over the true one, NaN for points; `er_p90` a percentile.
-    """
-
-    method: str
-    noise: float
-    cases: int
-    improved: float
-    er_lt_3: float
-    er_lt_2: float
-    er_median: float
-    er_p90: float
-    ncc: float
-    rel_l2: float
-    mtf_rmse: float
-    moment_bias: float
-    width_ratio: float
-    declined: int
-    seconds: float
-
-
-@dataclass(frozen=True, slots=True)
-class BlindReport:
-    """Outcome of a run: the settings, one row a method and noise level, and every case."""
-
-    settings: BlindBenchmark
-    summary: tuple[MethodSummary, ...]
-    results: tuple[CaseResult, ...]
-
-    def to_json(self) -> dict[str, object]:
-        """Return settings, summary and cases as plain values; NaN becomes None."""
-        settings = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(self.settings).items()}
-        return {
-            "benchmark": "blind",
-            "protocol": PROTOCOL,
-            "settings": settings,
-            "summary": [_plain(asdict(row)) for row in self.summary],
-            "cases": [{**_plain(asdict(row)), "improved": row.improved} for row in self.results],
-        }
 
 
 def run_blind_benchmark(
@@ -264,7 +92,7 @@ def run_blind_benchmark(
         )
         if only is None or case.photos[0].stem in only
     ]
-    store = _Store(cache, photos, settings, judge)
+    store = Store(cache, photos, settings, judge)
     jobs = []
     for case in cases:
         kernel = kernels[case.psf_number]
@@ -288,38 +116,6 @@ def run_blind_benchmark(
     ]
     results = tuple(result for result in found if result is not None)
     return BlindReport(settings, summarised(results), results)
-
-
-def summarised(results: Sequence[CaseResult]) -> tuple[MethodSummary, ...]:
-    """One row a method and noise level, in the order of first appearance."""
-    groups: dict[tuple[float, str], list[CaseResult]] = {}
-    for result in results:
-        groups.setdefault((result.noise, result.method), []).append(result)
-    return tuple(_summary(noise, method, rows) for (noise, method), rows in groups.items())
-
-
-def _summary(noise: float, method: str, rows: Sequence[CaseResult]) -> MethodSummary:
-    def median(of: Callable[[CaseResult], float]) -> float:
-        return float(np.median([of(row) for row in rows]))
-
-    ratios = np.array([row.error_ratio for row in rows])
-    return MethodSummary(
-        method=method,
-        noise=noise,
-        cases=len(rows),
-        improved=float(np.mean([row.improved for row in rows])),
-        er_lt_3=float((ratios < 3.0).mean()),
-        er_lt_2=float((ratios < 2.0).mean()),
-        er_median=float(np.median(ratios)),
-        er_p90=float(np.percentile(ratios, 90.0)),
-        ncc=median(lambda row: row.ncc),
-        rel_l2=median(lambda row: row.rel_l2),
-        mtf_rmse=median(lambda row: row.mtf_rmse),
-        moment_bias=median(lambda row: row.width_px**2 - row.true_width_px**2),
-        width_ratio=median(lambda row: row.width_px / row.true_width_px if row.true_width_px else math.nan),
-        declined=sum(row.declined for row in rows),
-        seconds=median(lambda row: row.seconds),
-    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -391,62 +187,3 @@ def _run_job(job: _Job) -> list[CaseResult]:
             )
         )
     return results
-
-
-class _Store:
-    """Finished results by the content they came from; one file of JSON lines, only ever appended."""
-
-    def __init__(
-        self, folder: Path | None, photos: Sequence[Path], settings: BlindBenchmark, judge: Judge
-    ) -> None:
-        self._content = {photo: hashlib.sha256(photo.read_bytes()).hexdigest() for photo in photos}
-        self._settings, self._judge = settings, judge
-        self._known: dict[str, CaseResult] = {}
-        self._file: Path | None = None
-        if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-            self._file = folder / "blind.jsonl"
-            self._known = dict(_stored(self._file)) if self._file.exists() else {}
-
-    def find(self, case: Case, kernel: Kernel, name: str, method: PsfEstimator | None) -> CaseResult | None:
-        """Return the stored result, or None."""
-        return self._known.get(self._key(case, kernel, name, method))
-
-    def add(self, case: Case, kernel: Kernel, method: PsfEstimator | None, result: CaseResult) -> None:
-        """Keep a result, and write it out at once."""
-        key = self._key(case, kernel, result.method, method)
-        self._known[key] = result
-        if self._file is not None:
-            with self._file.open("a", encoding="utf-8") as out:
-                out.write(json.dumps({"key": key, **_plain(asdict(result))}) + "\n")
-
-    def _key(self, case: Case, kernel: Kernel, name: str, method: PsfEstimator | None) -> str:
-        described = repr(method) if is_dataclass(method) else type(method).__qualname__
-        parts = (
-            PROTOCOL,
-            [self._content[photo] for photo in case.photos],
-            # The window is drawn by the photo's name.
-            [photo.stem for photo in case.photos],
-            hashlib.sha256(np.ascontiguousarray(kernel).tobytes()).hexdigest(),
-            (case.psf_number, case.noise, case.patch, case.variant, case.seed),
-            (name, getattr(method, "version", 0), described, self._settings.kernel_size),
-            repr(self._judge),
-            *(() if case.choice == "random" else (case.choice,)),
-        )
-        return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
-
-
-def _stored(file: Path) -> Iterator[tuple[str, CaseResult]]:
-    names = [field.name for field in fields(CaseResult)]
-    for line in file.read_text(encoding="utf-8").splitlines():
-        try:
-            row = json.loads(line)
-            values: dict[str, Any] = {name: math.nan if row[name] is None else row[name] for name in names}
-            yield row["key"], CaseResult(**values)
-        except (ValueError, KeyError, TypeError):
-            # The last line of a run that was killed while writing.
-            logger.warning("skipped a damaged line of %s", file)
-
-
-def _plain(row: Mapping[str, object]) -> dict[str, object]:
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}

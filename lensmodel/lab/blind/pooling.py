@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lensmodel.lab.blind.blind_benchmark import UNTOUCHED, BlindBenchmark, run_blind_benchmark
+from lensmodel.lab.blind.blind_benchmark import run_blind_benchmark
+from lensmodel.lab.blind.results import UNTOUCHED, BlindBenchmark
 
 
 def main() -> None:

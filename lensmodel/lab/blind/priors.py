@@ -20,14 +20,9 @@ import numpy as np
 
 from lensmodel.estimation.spectra.local_spectra import SpectrumMixture
 from lensmodel.estimation.spectra.scene_spectra import ScenePrior
-from lensmodel.lab.blind.blind_benchmark import (
-    UNTOUCHED,
-    BlindBenchmark,
-    CaseResult,
-    run_blind_benchmark,
-    summarised,
-)
+from lensmodel.lab.blind.blind_benchmark import run_blind_benchmark
 from lensmodel.lab.blind.confidence import told
+from lensmodel.lab.blind.results import UNTOUCHED, BlindBenchmark, CaseResult, summarised
 from lensmodel.lab.cases import list_photos, photo_half
 from lensmodel.lab.training import make_local_spectra, make_scene_spectra
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from lensmodel.lab.blind.blind_benchmark import UNTOUCHED, BlindReport, CaseResult
+from lensmodel.lab.blind.results import UNTOUCHED, BlindReport, CaseResult
 from lensmodel.report.drawing import COLOURS, GREY, PALE, Label, Line, svg
 
 WIDTH: Final = 640

@@ -20,10 +20,11 @@ from lensmodel.estimation import measure
 from lensmodel.estimation.measure.edges import Edges, constrained
 from lensmodel.estimation.measure.page import TargetPage
 from lensmodel.estimation.measure.pair import Pair
+from lensmodel.estimation.measure.placed_page import PlacedPage
 from lensmodel.estimation.measure.point_detection import find_lights, isolated
 from lensmodel.estimation.measure.points import Points
 from lensmodel.estimation.measure.solve import solve
-from lensmodel.estimation.measure.target import PlacedPage, Target
+from lensmodel.estimation.measure.target import Target
 from lensmodel.estimation.measure.warp import homography_of, match
 from lensmodel.lab.measured import scenes
 from lensmodel.model import LensModel

@@ -18,14 +18,8 @@ from lensmodel.core.registry import Registry
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
 from lensmodel.estimation import PsfEstimate
 from lensmodel.lab.blind import judges
-from lensmodel.lab.blind.blind_benchmark import (
-    UNTOUCHED,
-    BlindBenchmark,
-    BlindReport,
-    CaseResult,
-    run_blind_benchmark,
-    summarised,
-)
+from lensmodel.lab.blind.blind_benchmark import run_blind_benchmark
+from lensmodel.lab.blind.results import UNTOUCHED, BlindBenchmark, BlindReport, CaseResult, summarised
 from lensmodel.lab.blind.tables import (
     csv_table,
     cumulative,

@@ -189,14 +189,6 @@ def _kernels(store: Store) -> Iterator[Finding]:
         last = rows[-1][0]
 
 
-def _exists(storage: Storage, key: str) -> bool:
-    try:
-        storage.info(key)
-    except FileNotFoundError:
-        return False
-    return True
-
-
 def _photos(store: Store, storage: Storage) -> Iterator[Finding]:
     with store.database.reading() as session:
         rows = session.execute(

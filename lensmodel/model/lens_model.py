@@ -150,15 +150,6 @@ class LensModel:
         fit = judged.warmed(self.samples, on_step)
         return LensModel(self.samples, self.settings, fit, prior=prior)
 
-    def without_photo(self, photo: str) -> LensModel:
-        """Return the model without the samples of one photo."""
-        return self.refitted([s for s in self.samples if s.photo != photo])
-
-    def excluding(self, *photos: str) -> LensModel:
-        """Return the model in which these photos stay listed but do not vote."""
-        names = tuple(sorted({*self.settings.excluded, *photos}))
-        return LensModel.fit(self.samples, replace(self.settings, excluded=names), prior=self.prior)
-
     def answering(self, *, mode: str | None = None, unit: str | None = None) -> LensModel:
         """Return the model of the same samples in another mode or unit; None keeps what it has."""
         chosen = replace(self.settings, mode=mode or self.settings.mode, unit=unit or self.settings.unit)
@@ -169,11 +160,6 @@ class LensModel:
         if mode == WAVEFRONT and self._fit.physical is None:
             return None
         return LensModel(self.samples, self.settings, replace(self._fit, mode=mode), prior=self.prior)
-
-    def including(self, *photos: str) -> LensModel:
-        """Return the model in which these photos vote again."""
-        names = tuple(name for name in self.settings.excluded if name not in photos)
-        return LensModel.fit(self.samples, replace(self.settings, excluded=names), prior=self.prior)
 
     def with_prior(
         self, source: PsfField | AnsweringModel | None, strength: float = 2.0, name: str = "other copies"

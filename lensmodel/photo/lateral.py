@@ -91,20 +91,6 @@ class LateralColour:
                 f"not a lateral colour: {values!r}; expected what to_json writes"
             ) from error
 
-    def to_hugin(self, frame: Frame) -> tuple[Polynomial, Polynomial]:
-        """Return red and blue (a, b, c, v) as tca_correct prints and fulla reads them.
-
-        There the radius is 1 at half the shorter side.
-        """
-        scale = min(frame.height, frame.width) / 2.0 / frame.half_diagonal
-        return _rescaled(self.red, scale), _rescaled(self.blue, scale)
-
-    @classmethod
-    def from_hugin(cls, red: Polynomial, blue: Polynomial, frame: Frame) -> LateralColour:
-        """Take over what tca_correct printed for photos of this frame."""
-        scale = frame.half_diagonal / (min(frame.height, frame.width) / 2.0)
-        return cls(_rescaled(red, scale), _rescaled(blue, scale), frame.half_diagonal)
-
 
 def estimate_lateral(planes: Planes, frame: Frame, *, clip: float | Sequence[float] = 1.0) -> LateralColour:
     """Estimate lateral colour from corners and edges of the photo.
@@ -305,11 +291,6 @@ def _huber(
         residual = np.asarray(shift - columns @ solution, dtype=np.float64)
     size = np.minimum(np.abs(residual), 3.0 * scale)  # gross outliers count once, not squared
     return solution, float(np.mean(size**2)) + 1e-8
-
-
-def _rescaled(terms: Polynomial, scale: float) -> Polynomial:
-    a, b, c, v = terms
-    return (a * scale**3, b * scale**2, c * scale, v)
 
 
 def _polynomial(value: object) -> Polynomial:

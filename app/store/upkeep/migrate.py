@@ -44,11 +44,6 @@ def current(database: Database) -> str | None:
         return MigrationContext.configure(connection).get_current_revision()
 
 
-def is_current(database: Database) -> bool:
-    """Say whether the schema is what this program needs."""
-    return current(database) == head()
-
-
 def upgrade(database: Database) -> bool:
     """Run the missing steps; return whether there were any.
 

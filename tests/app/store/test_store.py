@@ -16,7 +16,7 @@ from app.store import NewPatch, Store
 from app.store.corrections import Result
 from app.store.database import Database
 from app.store.tables import Base, EventRow, LensRow, OwnerRow, PatchRow, PhotoRow, SampleRow
-from app.store.upkeep.migrate import current, downgrade, head, is_current, upgrade
+from app.store.upkeep.migrate import current, downgrade, head, upgrade
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import gaussian
 
@@ -394,7 +394,7 @@ def test_migrations_go_up_and_down_and_match_the_tables(settings: Settings) -> N
     database = Database(settings.database)
     downgrade(database, "base")
     assert upgrade(database)
-    assert is_current(database)
+    assert current(database) == head()
     assert not upgrade(database)
     with database.writer.connect() as connection:
         assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []

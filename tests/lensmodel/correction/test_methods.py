@@ -20,10 +20,11 @@ from lensmodel.correction import (
     deconvolvers,
     restore_planes,
 )
-from lensmodel.correction.blur import Drift, EfficientFilterFlow, UniformBlur
+from lensmodel.correction.blur import Drift, UniformBlur
 from lensmodel.correction.engine import Engine
 from lensmodel.correction.lights.saturation import Lights
 from lensmodel.correction.methods.shrinkage import Shrinkage
+from lensmodel.lab.correction.filter_flow import EfficientFilterFlow
 from lensmodel.lab.correction.methods import compared
 from lensmodel.lab.correction.quality import Constant
 

@@ -13,12 +13,12 @@ from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import gaussian
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, NoiseModel, Planes
 from lensmodel.correction import Bounds, Corrected, Roi, correct_planes
-from lensmodel.correction.blur import EfficientFilterFlow
 from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.engine import compiled
 from lensmodel.correction.expected_gain import plan
 from lensmodel.correction.limits.bounds import allowance, limited
 from lensmodel.correction.tiles.lattice import cells
+from lensmodel.lab.correction.filter_flow import EfficientFilterFlow
 
 FRAME = Frame(200, 260)
 BASE = (NoiseModel(1 / 50_000, 1e-6),) * 3

@@ -165,15 +165,6 @@ def test_older_model_is_untouched_by_samples_added_later() -> None:
     )
 
 
-def test_model_without_a_photo_is_the_model_that_never_saw_it() -> None:
-    samples = photos(4)
-    model = LensModel.fit(samples).without_photo("p3")
-    other = LensModel.fit([s for s in samples if s.photo != "p3"])
-
-    where = FieldPosition(0.4, 2.0)
-    assert np.array_equal(model.query(where, GREEN, SIZE).kernel, other.query(where, GREEN, SIZE).kernel)
-
-
 def test_unknown_aperture_takes_no_part_in_distances() -> None:
     unknown = [PsfSample(s.kernel, s.position, LensSettings(), photo=s.photo) for s in photos(2)]
     model, where = LensModel.fit(unknown), FieldPosition(0.5, 1.0)

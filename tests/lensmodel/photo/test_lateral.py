@@ -2,8 +2,6 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy import ndimage
 
 from lensmodel.core.errors import InvalidInputError
@@ -111,20 +109,6 @@ def test_displacement_is_outwards_where_v_is_above_one() -> None:
     assert lateral.displacement(1.0, "r") == pytest.approx(1.0)
     assert lateral.displacement(0.5, "b") == pytest.approx(-0.5)
     assert lateral.displacement(0.5, "g") == 0.0
-
-
-@given(terms=st.tuples(*[st.floats(-0.01, 0.01)] * 3, st.floats(0.95, 1.05)))
-@settings(deadline=None)
-def test_conversion_to_hugin_keeps_the_curve_and_comes_back(terms: tuple[float, float, float, float]) -> None:
-    lateral = LateralColour(terms, IDENTITY, FRAME.half_diagonal)
-
-    a, b, c, v = lateral.to_hugin(FRAME)[0]
-    back = LateralColour.from_hugin(*lateral.to_hugin(FRAME), FRAME)
-
-    r = 0.7 * FRAME.half_diagonal / 320.0  # the same place in half shorter sides
-    there = r * (v - 1 + c * r + b * r**2 + a * r**3) * 320.0
-    assert there == pytest.approx(lateral.displacement(0.7, "r"), abs=1e-9)
-    assert back.red == pytest.approx(lateral.red, abs=1e-12)
 
 
 def test_lateral_colour_survives_json() -> None:

@@ -1,4 +1,7 @@
-"""A field of kernels: the efficient filter flow."""
+"""A field of kernels: the efficient filter flow, by which tests blur pictures.
+
+A correction solves in cells of one kernel instead.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +16,8 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfField
 from lensmodel.core.types import Channel, Kernel, Plane
-from lensmodel.correction.blur.uniform import UniformBlur
-from lensmodel.correction.blur.windows import partition
+from lensmodel.correction.blur import UniformBlur
+from lensmodel.lab.correction.windows import partition
 
 
 class _Window(NamedTuple):

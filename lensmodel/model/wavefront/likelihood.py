@@ -2,8 +2,7 @@
 
 The power spectrum of a patch is that of its scene times |OTF|^2 (`scene_spectrum`). With the scene's few
 unknowns fitted to each patch, the better kernel leaves the smaller rest. No kernel that was estimated from
-the patch takes part, so that a model is not judged by the mistakes that it shares with the estimator. Where
-samples have no spectra, their kernels are all there is to judge by.
+the patch takes part, so that a model is not judged by the mistakes that it shares with the estimator.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.core.psf import PsfSample, distance
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.spectrum import SECTORS
 from lensmodel.core.types import Kernel
 from lensmodel.model.wavefront.from_spectra import fit_scene
@@ -24,17 +23,14 @@ from lensmodel.optics.transfer import BINS, bin_frequencies
 _TAILS, _PATCH_TAILS = 6.0, 3.0  # degrees of freedom of a bin, and of a patch in units of its bins
 _FLOOR = (-6.5, 3.0)  # logarithm of what is added to |OTF|^2: whoever sees none may have none
 _INSIDE = (-1.0 / 3.0, 0.0, 1.0 / 3.0)  # where a bin is sampled, in parts of its width
-_LEAST_ERROR = 1e-3
 
 
 def surprise(sample: PsfSample, kernel: Kernel, share: float = 1.0) -> float:
-    """Negative logarithm of the likelihood of a patch behind a kernel, up to a constant.
+    """Negative logarithm of the likelihood of a patch with a spectrum behind a kernel, up to a constant.
 
-    Where the patch has a spectrum, `share` narrows the kernel to that part of its width.
+    `share` narrows the kernel to that part of its width.
     """
-    if sample.spectrum is None:
-        error = max(distance(kernel, sample.kernel).rel_l2, _LEAST_ERROR)
-        return BINS * math.log(error)
+    assert sample.spectrum is not None
     view = SceneView.of({sample.settings.channel: sample.spectrum}).with_floor(*_FLOOR)
     unknowns, residual, _ = fit_scene(view, _power(kernel, share)[:, None])
     squared = np.einsum("bi,bij,bj->b", residual, view.precision, residual)

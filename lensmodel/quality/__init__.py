@@ -12,13 +12,8 @@ from lensmodel.quality.images import (
     shifted,
     ssim,
     to_srgb,
-    zone_masks,
-    zone_psnr,
 )
 from lensmodel.quality.kernels import (
-    encircled_energy,
-    encircled_radius,
-    lp_per_mm,
     lp_per_ph,
     mtf50_from_kernel,
     mtf_from_kernel,
@@ -33,11 +28,8 @@ __all__ = [
     "by_zone",
     "crossing",
     "edge_gains",
-    "encircled_energy",
-    "encircled_radius",
     "find_edges",
     "flat_noise",
-    "lp_per_mm",
     "lp_per_ph",
     "measure_edges",
     "mtf50_from_kernel",
@@ -51,6 +43,4 @@ __all__ = [
     "ssim",
     "tangential_sagittal_mtf50",
     "to_srgb",
-    "zone_masks",
-    "zone_psnr",
 ]

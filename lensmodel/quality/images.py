@@ -77,53 +77,6 @@ def ssim(image: NDArray[np.floating], reference: NDArray[np.floating], *, srgb: 
     return float(np.mean(values))
 
 
-def zone_masks(frame: Frame) -> dict[Zone, NDArray[np.bool_]]:
-    """Pixels of each zone, `(H, W)`: center r < 0.3, corner r > 0.75, mid between."""
-    r = frame.radius_map()
-    center, corner = r < CENTER_ZONE_R, r > CORNER_ZONE_R
-    return {"center": center, "mid": ~(center | corner), "corner": corner}
-
-
-def zone_psnr(
-    image: NDArray[np.floating],
-    reference: NDArray[np.floating],
-    frame: Frame,
-    *,
-    srgb: bool = False,
-    border: int = 0,
-) -> dict[Zone, float]:
-    """PSNR in dB of each zone, after the best global shift of the picture is removed.
-
-    Blind methods leave the position of the picture free; a shift of a tenth of a pixel would
-    otherwise count as blur. The shift is found to sub-pixel precision and the same for all planes
-    and zones.
-
-    Parameters
-    ----------
-    image, reference : ndarray, shape (..., H, W)
-        Linear light.
-    frame : Frame
-        (H, W).
-    srgb : bool
-        See `psnr`.
-    border : int
-        Pixels along the border that do not count.
-    """
-    _same_shape(image, reference)
-    if image.shape[-2:] != (frame.height, frame.width):
-        raise InvalidInputError(f"the pictures {image.shape} do not have the size of {frame}")
-    aligned = shifted(image, *best_shift(image, reference))
-    inside = np.zeros((frame.height, frame.width), dtype=bool)
-    edge = max(border, 2)  # the shift mirrors at the border
-    inside[edge : frame.height - edge, edge : frame.width - edge] = True
-    masks = zone_masks(frame)
-    return {
-        zone: psnr(aligned, reference, mask=masks[zone] & inside, srgb=srgb)
-        for zone in ZONES
-        if (masks[zone] & inside).any()
-    }
-
-
 def registered_zone_psnr(
     image: NDArray[np.floating],
     reference: NDArray[np.floating],
@@ -137,7 +90,7 @@ def registered_zone_psnr(
 
     A PSF is centred on its centre of mass, and where it has long faint wings on one side that lies
     a pixel or two beside its core. Neither a blind method nor an eye can tell: it is a smooth
-    distortion of the picture, not blur. `zone_psnr` would count it, block by block it is taken out.
+    distortion of the picture, not blur. Block by block it is taken out.
 
     Parameters
     ----------

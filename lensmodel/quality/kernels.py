@@ -1,4 +1,4 @@
-"""What a kernel says about sharpness: MTF along a direction, MTF50, encircled energy."""
+"""What a kernel says about sharpness: MTF along a direction, MTF50."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import as_kernel, centroid
+from lensmodel.core.psf import as_kernel
 from lensmodel.core.types import Kernel
 from lensmodel.quality.edge import crossing
 
 _FREQUENCIES: Final = 513
-_FINE: Final = 8
 
 
 def mtf_from_kernel(kernel: Kernel, angle: float, frequencies: ArrayLike) -> NDArray[np.float64]:
@@ -54,45 +53,6 @@ def mtf50_from_kernel(kernel: Kernel, angle: float) -> float:
 def tangential_sagittal_mtf50(kernel: Kernel, phi: float) -> tuple[float, float]:
     """MTF50 along u and along v of a kernel at field angle `phi`, cycles/pixel."""
     return mtf50_from_kernel(kernel, phi), mtf50_from_kernel(kernel, phi + math.pi / 2.0)
-
-
-def encircled_energy(kernel: Kernel, radii: ArrayLike) -> NDArray[np.float64]:
-    """Share of the light within a radius of the centre of mass; pixels are taken as even squares.
-
-    Parameters
-    ----------
-    kernel : Kernel, shape (k, k)
-    radii : array_like, shape (n,)
-        Pixels.
-
-    Returns
-    -------
-    ndarray, shape (n,), 0..1
-    """
-    k = as_kernel(kernel)
-    side = k.shape[0]
-    row, col = centroid(k)
-    t = (np.arange(side * _FINE) + 0.5) / _FINE - side / 2.0
-    distance = np.hypot((t - row)[:, None], (t - col)[None, :]).ravel()
-    light = np.repeat(np.repeat(k, _FINE, axis=0), _FINE, axis=1).ravel() / _FINE**2
-    order = np.argsort(distance)
-    total = np.cumsum(light[order])
-    return np.interp(np.asarray(radii, dtype=np.float64), distance[order], total, left=0.0, right=1.0)
-
-
-def encircled_radius(kernel: Kernel, share: float) -> float:
-    """Radius in pixels around the centre of mass that holds a share of the light, e.g. 0.5 or 0.8."""
-    if not 0.0 < share < 1.0:
-        raise InvalidInputError(f"the share of light must lie between 0 and 1, got {share}")
-    radii = np.linspace(0.0, kernel.shape[0] / math.sqrt(2.0), 2001)
-    return float(np.interp(share, encircled_energy(kernel, radii), radii))
-
-
-def lp_per_mm(cycles_per_pixel: float, pitch_um: float) -> float:
-    """Convert cycles/pixel to line pairs per millimetre on the sensor."""
-    if not pitch_um > 0:
-        raise InvalidInputError(f"pixel pitch must be positive micrometres, got {pitch_um}")
-    return cycles_per_pixel * 1000.0 / pitch_um
 
 
 def lp_per_ph(cycles_per_pixel: float, picture_height: int) -> float:

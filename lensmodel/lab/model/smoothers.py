@@ -147,7 +147,7 @@ COMPARED: Final[dict[str, Callable[..., Smoother]]] = {
     "transport-local-linear": lambda **params: LocalLinear(transport=True, **params),
     "transport-gaussian-process": lambda **params: GaussianProcess(transport=True, **params),
 }
-"""By the names of docs/lens-model.md."""
+"""By the names of docs/lab/lens-model.md."""
 
 
 def make_known() -> None:

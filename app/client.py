@@ -69,13 +69,15 @@ class Client(LensCalls):
         focal_length_mm: float | None = None,
         focus_distance_m: float | None = None,
         pixel_pitch_um: float | None = None,
+        model: s.PsfModel | None = None,
         kind: s.MeasurementKind | None = None,
         reference_id: str | None = None,
         on_progress: Callable[[int, int], None] | None = None,
     ) -> s.PhotoOut:
         """Send a photo, streamed from its file; the same bytes give the photo that is there already.
 
-        `on_progress(sent, total)` is called in bytes after each mebibyte.
+        `on_progress(sent, total)` is called in bytes after each mebibyte. With `model` the photo founds a
+        lens that is learned so; of a lens that is there and has another it is refused, see `choose_model`.
 
         With `kind` it was made to measure the lens; of a pair it is the open photo, and `reference_id` is the
         closed one, sent before with `calibrate=False`.
@@ -98,6 +100,7 @@ class Client(LensCalls):
             "focal_length_mm": focal_length_mm,
             "focus_distance_m": focus_distance_m,
             "pixel_pitch_um": pixel_pitch_um,
+            "model": model,
             "kind": kind,
             "reference_id": reference_id,
         }

@@ -81,6 +81,7 @@ class AsyncClient:
     lenses = _in_thread(Client.lenses)
     lens = _in_thread(Client.lens)
     rename_lens = _in_thread(Client.rename_lens)
+    choose_model = _in_thread(Client.choose_model)
     merge_lens = _in_thread(Client.merge_lens)
     go_back = _in_thread(Client.go_back)
     save_profile = _in_thread(Client.save_profile)

@@ -71,6 +71,13 @@ class LensCalls(Connection):
         """Call a lens by a name of its owner's; None takes the name away."""
         return self._change_lens(lens_id, {"label": label})
 
+    def choose_model(self, lens_id: str, model: s.PsfModel) -> s.LensOut:
+        """Learn a lens by default or the paper's own way; its photos are estimated anew in the background.
+
+        It answers with `answering_model` until they are, and from then on with `psf_model`.
+        """
+        return self._change_lens(lens_id, {"model": model})
+
     def merge_lens(self, lens_id: str, into: str) -> s.LensOut:
         """Let a lens become a part of another, which is returned; it is forgotten itself."""
         return self._change_lens(lens_id, {"merge_into": into})

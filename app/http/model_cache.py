@@ -19,12 +19,14 @@ from typing import Final, TypeAlias
 from app.blobs.storage import Storage
 from app.errors import ConflictError, UnknownLensError
 from app.runtime import metrics
+from app.schemas import PsfModel
 from app.store import Store, StoredSample
 from app.store.samples import Family, LensState
 from app.store.versions import learned_key
 from lensmodel.core.errors import InvalidInputError, NoSamplesError
 from lensmodel.core.psf import PsfSample
 from lensmodel.model import LensModel, ModelSettings, Prior
+from lensmodel.workflow.ways import WAYS
 
 log = logging.getLogger(__name__)
 
@@ -57,6 +59,11 @@ class Fitted:
     family: Family = ()
     own: LensModel | None = None
 
+    @property
+    def way(self) -> PsfModel:
+        """The way that answers: also that of the paper where the service answers so for all lenses."""
+        return "paper" if self.model.settings.mode == WAYS["paper"].mode else "default"
+
 
 class ModelCache:
     """Least recently used models of one process.
@@ -72,7 +79,8 @@ class ModelCache:
     family : bool
         Whether lenses lean on other copies at all.
     settings : ModelSettings, optional
-        Of all models; must be those of the workers, or what they learn is of no use here.
+        Of the models of lenses that are learned in the default way, and but for the mode of the others; must
+        be those of the workers, or what they learn is of no use here.
     """
 
     def __init__(
@@ -153,7 +161,7 @@ class ModelCache:
                 others = self._store.samples.of_family(family)
                 if not others:  # removed while we looked
                     return own
-                source = LensModel.fit([stored.sample for stored in others], self._settings)
+                source = LensModel.fit([stored.sample for stored in others], self._settings_of(own.state))
                 prior = Prior(source, name=family_name(family))
             leaning = own.model.with_prior(prior.source, name=prior.name)
             size = own.size_bytes
@@ -182,7 +190,7 @@ class ModelCache:
     def _build(self, lens_id: str, old: Fitted | None) -> Fitted:
         if old is not None:
             state, samples = self._store.samples.of_lens(lens_id, after_version=old.state.version)
-            if state.rebuild_epoch == old.state.rebuild_epoch:
+            if (state.rebuild_epoch, state.way) == (old.state.rebuild_epoch, old.state.way):
                 model = old.model.added([stored.sample for stored in samples]) if samples else old.model
                 size = old.size_bytes + _size(samples)
                 return Fitted(lens_id, state, model, model.pitch_um, size, learned=False)
@@ -197,7 +205,7 @@ class ModelCache:
             if found is not None and found.state.rebuild_epoch == state.rebuild_epoch:
                 return found
             _, samples = self._store.samples.of_lens(lens_id, up_to_version=version)
-            return self._keep(key, self._fit(lens_id, LensState(version, state.rebuild_epoch), samples))
+            return self._keep(key, self._fit(lens_id, replace(state, version=version), samples))
 
     def _fit(self, lens_id: str, state: LensState, samples: Sequence[StoredSample]) -> Fitted:
         if not samples:
@@ -208,15 +216,21 @@ class ModelCache:
         values = [stored.sample for stored in samples]
         model = self._restored(lens_id, state, values)
         learned = model is not None
-        model = model or LensModel.fit(values, self._settings)
+        model = model or LensModel.fit(values, self._settings_of(state))
         return Fitted(lens_id, state, model, model.pitch_um, _size(samples), learned)
+
+    def _settings_of(self, state: LensState) -> ModelSettings:
+        """How the model of a lens is made; where it was learned in a way of its own, in the mode of that."""
+        return (
+            self._settings if state.way == "default" else replace(self._settings, mode=WAYS[state.way].mode)
+        )
 
     def _restored(self, lens_id: str, state: LensState, samples: Sequence[PsfSample]) -> LensModel | None:
         if self._storage is None:
             return None
         try:
             stored = self._storage.get(learned_key(lens_id, state.version, state.rebuild_epoch))
-            return LensModel.restored(samples, stored, self._settings)
+            return LensModel.restored(samples, stored, self._settings_of(state))
         except FileNotFoundError:
             return None
         except InvalidInputError as error:

@@ -45,6 +45,7 @@ def describe(
             extrapolated=answer.extrapolated,
             beyond=list(answer.beyond),
             predicted_error=error if np.isfinite(error) else None,
+            model=fitted.way,
             mode=answer.mode,
             family=FamilyOut(lenses=len(fitted.family), weight=float(answer.prior_share))
             if fitted.family

@@ -28,6 +28,7 @@ from app.store.photo_steps import settings_of
 from app.store.samples import LensState, Relative
 from app.store.tables import CorrectionRow
 from app.store.versions import learned_key, report_key
+from app.ways import of_models
 from lensmodel.correction import Bounds
 
 log = logging.getLogger(__name__)
@@ -80,10 +81,9 @@ class CorrectionWork:
             memory_mb=limits.memory_mb + THREAD_MB * settings.worker_slots,
             cpu_s=math.ceil(settings.correct_seconds) * settings.worker_slots,
         )
-        arguments = {
+        arguments: dict[str, Any] = {
             "developed": str(developed),
             "settings": params.get("settings") or settings_of(photo),  # those of the moment of the wish
-            "model": settings.of_models,
             "lateral": photo.lateral,
             "method": params["method"],
             "strength": params["strength"],
@@ -98,6 +98,7 @@ class CorrectionWork:
         with self._bench.sandbox.folder() as folder:
             lens_id, version = plan.lens.public_id, plan.correction.lens_version
             state = self._samples(lens_id, version, folder)
+            arguments["model"] = of_models(settings, state.way)
             known = (folder / LEARNED).is_file()
             leaning = self._family(params.get("family", []), folder)
             done = self._bench.attempt(
@@ -190,12 +191,13 @@ class CorrectionWork:
         try:
             with self._bench.sandbox.folder() as folder:
                 state = self._samples(lens_id, version, folder)
-                model = self._bench.settings.of_models
+                model = of_models(self._bench.settings, state.way)
                 metrics = self._bench.attempt(
                     "measure", {"model": model}, folder=folder, limits=limits, wanted=wanted, compiles=True
                 )
                 self._keep_learned(lens_id, version, state, folder / LEARNED)
-                self._report(lens_id, report_key(lens_id, version, state.rebuild_epoch), folder, wanted)
+                key = report_key(lens_id, version, state.rebuild_epoch)
+                self._report(lens_id, key, model, folder, wanted)
         except NotWantedError:
             return
         except JobFailedError as error:
@@ -203,11 +205,13 @@ class CorrectionWork:
             metrics = {"error": None, "coverage": None, "problem": error.code}
         lenses.record_metrics(lens_id, version, metrics)
 
-    def _report(self, lens_id: str, key: str, folder: Path, wanted: Callable[[], bool]) -> None:
+    def _report(
+        self, lens_id: str, key: str, model: dict[str, str], folder: Path, wanted: Callable[[], bool]
+    ) -> None:
         """Test the lens whose samples lie in a folder; a version is measured without a report too."""
         settings = self._bench.settings
         limits = Limits(memory_mb=2 * SPARE_MB, wall_s=settings.correct_seconds)
-        arguments = {"model": settings.of_models, "about": self._about(lens_id)}
+        arguments = {"model": model, "about": self._about(lens_id)}
         try:
             self._bench.attempt(
                 "report", arguments, folder=folder, limits=limits, wanted=wanted, compiles=True

@@ -14,6 +14,7 @@ from app.jobs.task_files import KERNELS
 from app.store import NewPatch, NewSample
 from app.store.photo_steps import settings_of
 from app.store.tables import PhotoRow
+from app.ways import way_of
 from lensmodel.core.errors import InvalidInputError, InvalidKernelError
 from lensmodel.core.psf import as_kernel
 from lensmodel.core.types import CHANNELS, FieldPosition
@@ -51,7 +52,7 @@ class MeasurementWork:
             "developed": [str(folder) for folder in folders],
             "photo": photo.public_id,
             "settings": settings_of(photo),
-            "size": settings.kernel_size,
+            "size": way_of(settings, photo.way).kernel_size,
         }
         limits = self._bench.limits(photo, settings.correct_seconds, _BYTES_A_PIXEL)
         with self._bench.sandbox.folder() as folder:

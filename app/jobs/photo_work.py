@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import Counter
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,17 +19,17 @@ from app.jobs.body_keys import body_key
 from app.jobs.context import SPARE_MB, JobFailedError, NotWantedError, Workbench
 from app.jobs.glance_work import keep_glance
 from app.jobs.measurement_work import MeasurementWork
+from app.jobs.patch_plans import described, patch_of, plan_of, why_not
 from app.jobs.queue import Job, JobEngine
 from app.jobs.task_files import KERNELS
 from app.sandbox.outcome import Limits
-from app.store import LensName, NewPatch, NewSample
+from app.store import LensName, NewSample
 from app.store.photo_steps import settings_of
-from app.store.tables import PHOTO_RUNNING, PatchRow, PhotoRow
+from app.store.tables import PHOTO_RUNNING, LensRow, PatchRow, PhotoRow
+from app.ways import way_of
 from lensmodel.core.errors import InvalidInputError, InvalidKernelError, NoUsablePatchesError
 from lensmodel.core.psf import as_kernel
 from lensmodel.core.spectrum import PatchSpectrum
-from lensmodel.core.types import FieldPosition
-from lensmodel.estimation.patches import Patch
 from lensmodel.workflow import pipeline
 
 log = logging.getLogger(__name__)
@@ -147,6 +146,7 @@ class PhotoWork:
                 photo.public_id, ("inspecting",), "stored", epoch=photo.epoch, finished_at=datetime.now(UTC)
             )
             return False
+        _require_model(photo, lens)
         missing = _missing(photo, lens_known=lens is not None)
         if missing:
             photos.set_state(
@@ -181,7 +181,7 @@ class PhotoWork:
                 raise JobFailedError("no_usable_patches", text) from error
         if found["lateral"] is not None:
             self._store.photos.record_lateral(photo.public_id, found["lateral"])
-        self._store.patches.add(photo.public_id, photo.epoch, _plan(found))
+        self._store.patches.add(photo.public_id, photo.epoch, plan_of(found))
 
     def _estimate(self, photo: PhotoRow, wanted: Callable[[], bool]) -> None:
         """Hand out the cells and wait until each is done, rejected or given up."""
@@ -229,7 +229,7 @@ class PhotoWork:
             if version is not None:
                 log.info("photo %s counted, lens version %d", photo.public_id, version)
             return
-        raise JobFailedError(*_why_not(tried, good))
+        raise JobFailedError(*why_not(tried, good))
 
     def _finish_measured(self, photo: PhotoRow) -> None:
         """Count a measurement: it says itself how good it is, and one place is enough."""
@@ -242,7 +242,7 @@ class PhotoWork:
         if not done:
             return
         try:
-            pipeline.require_spread([_place(row) for row in done], count=self._bench.settings.patches)
+            pipeline.require_spread([patch_of(row) for row in done], count=self._bench.settings.patches)
         except NoUsablePatchesError as error:
             raise JobFailedError(error.code, str(error)) from error
 
@@ -272,15 +272,16 @@ class PhotoWork:
             return self._store.photos.is_live(photo.public_id, photo.epoch)
 
         settings = self._bench.settings
+        way = way_of(settings, photo.way)
         developed = self._bench.developed(photo, wanted)
         arguments = {
             "developed": str(developed),
             "photo": photo.public_id,
-            "patches": [_patch(row) for row in rows],
+            "patches": [described(row) for row in rows],
             "numbers": [row.idx for row in rows],
             "settings": settings_of(photo),
-            "estimator": settings.estimator,
-            "size": settings.kernel_size,
+            "estimator": way.estimator,
+            "size": way.kernel_size,
             "seed": rows[0].idx,
         }
         limits = self._bench.limits(photo, settings.patch_seconds, 24)
@@ -323,6 +324,17 @@ def _sample(folder: Path, number: int, entry: dict[str, Any]) -> NewSample:
     )
 
 
+def _require_model(photo: PhotoRow, lens: LensRow | None) -> None:
+    """Refuse a photo that asked for another model than its lens has."""
+    wish = photo.given.get("model")
+    if lens is not None and wish not in {None, lens.way}:
+        text = (
+            f"the photo was sent with model={wish}, and its lens has the model {lens.way}: PATCH /v1/lenses/"
+            f'{lens.public_id} with {{"model": "{wish}"}} and retry, or send it again with model={lens.way}'
+        )
+        raise JobFailedError("conflict", text)
+
+
 def _missing(photo: PhotoRow, *, lens_known: bool) -> str:
     """Say what the owner must tell before the photo can count; empty if nothing."""
     if not lens_known:
@@ -334,61 +346,3 @@ def _missing(photo: PhotoRow, *, lens_known: bool) -> str:
     if photo.aperture is None:
         return "the photo does not say its aperture: give the f-number"
     return ""
-
-
-def _plan(found: dict[str, Any]) -> list[NewPatch]:
-    chosen = [
-        NewPatch(
-            idx=number,
-            row=patch["row"],
-            col=patch["col"],
-            size=patch["size"],
-            r=patch["position"]["r"],
-            phi=patch["position"]["phi"],
-            cell=patch["cell"],
-            score=patch["score"],
-        )
-        for number, patch in enumerate(found["patches"])
-    ]
-    rejected = [
-        NewPatch(
-            idx=len(chosen) + number,
-            row=window["row"],
-            col=window["col"],
-            size=window["size"],
-            r=window["r"],
-            phi=window["phi"],
-            rejected=window["reason"],
-        )
-        for number, window in enumerate(found["rejected"])
-    ]
-    return chosen + rejected
-
-
-def _patch(row: PatchRow) -> dict[str, Any]:
-    place = {"r": row.r, "phi": row.phi}
-    score = row.score or 0.0
-    return {
-        "row": row.row,
-        "col": row.col,
-        "size": row.size,
-        "position": place,
-        "score": score,
-        "cell": row.cell,
-    }
-
-
-def _place(row: PatchRow) -> Patch:
-    return Patch(row.row, row.col, row.size, FieldPosition(row.r, row.phi), row.score or 0.0, row.cell or 0)
-
-
-def _why_not(tried: list[PatchRow], good: int) -> tuple[str, str]:
-    failures = Counter(row.reason for row in tried if row.state == "failed")
-    if failures and good == 0:
-        reason, count = failures.most_common(1)[0]
-        text = f"{count} of {len(tried)} patches ended with {reason}; retry, or report the file"
-        return reason or "internal_error", text
-    return (
-        "no_usable_patches",
-        f"{good} of {len(tried)} patches gave a PSF: use a photo with more fine detail in focus",
-    )

@@ -51,6 +51,7 @@ def lens_page(lens_id: str, call: CallDep) -> HTMLResponse:
         "lens.html",
         lens=lens,
         counting=shown.counting(call, lens_id),
+        anew=shown.anew(call, lens_id),
         history=history,
         versions=[e.version for e in reversed(history) if e.version >= max(gone, 1) and e.samples],
         names={photo.id: photo.filename for photo in photos},

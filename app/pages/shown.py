@@ -47,6 +47,11 @@ def counting(call: Call, lens_id: str) -> bool:
     return lens.sample_count > 0 and any(event.metrics is None for event in newest)
 
 
+def anew(call: Call, lens_id: str) -> int:
+    """How many photos of a lens that changes its model are still to be measured."""
+    return call.store.lenses.learned_anew(lens_routes.find_lens(call, lens_id))
+
+
 def waiting(call: Call) -> list[Group]:
     """Group the photos that wait for their owner to say which lens it was."""
     rows = call.store.photos.page(call.owner, before=None, limit=MOST_WAITING, state="needs_lens")

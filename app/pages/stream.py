@@ -86,7 +86,8 @@ def _correction(call: Call, correction_id: str) -> Fragments:
 
 def _lens(call: Call, lens_id: str) -> Fragments:
     lens = lens_routes.read_lens(lens_id, call)
-    return {"lens-state": fragment("_lens_state.html", lens=lens, counting=shown.counting(call, lens_id))}
+    known = {"counting": shown.counting(call, lens_id), "anew": shown.anew(call, lens_id)}
+    return {"lens-state": fragment("_lens_state.html", lens=lens, **known)}
 
 
 _DRAWERS: Final[Mapping[Page, Callable[[Call, str], Fragments]]] = {

@@ -213,12 +213,34 @@ EVENTS: Final[Mapping[str, str]] = {
     "photo_excluded": "left a photo out",
     "photo_removed": "a photo was deleted",
     "photo_changed": "your details of a photo were taken over",
+    "model_changed": "learned anew from all photos",
 }
 
 
 def event_words(event: CalibrationOut) -> str:
     """Say what made a version."""
-    return EVENTS.get(event.kind, event.kind)
+    words = EVENTS.get(event.kind, event.kind)
+    return f"{words}, model {event.model}" if event.kind == "model_changed" else words
+
+
+def model_words(lens: LensOut) -> str:
+    """Say what the models of a lens are, and what it costs to change that of this one."""
+    words = (
+        'The model "paper" is the method of the paper that this program grew from, to compare with: its '
+        "kernels and its correction alone, without what guards photos from errors."
+    )
+    if lens.samples:
+        words += " A change measures all photos of the lens anew; until then it answers as before."
+    return words
+
+
+def changing_words(lens: LensOut, left: int) -> str:
+    """Say what is going on while a lens changes its model; `left` photos are still to be measured."""
+    answers = f"it answers with the model {lens.answering_model}"
+    if left:
+        photos = counted(left, "photo")
+        return f"Being measured anew for the model {lens.psf_model}: {photos} to go. Until then {answers}."
+    return f"None of its photos could be measured for the model {lens.psf_model}, so {answers} still."
 
 
 def centring_verdict(found: Decentring) -> str:
@@ -347,6 +369,8 @@ FILTERS: Final[Mapping[str, Callable[..., object]]] = {
         centring_verdict,
         centring_words,
         event_words,
+        model_words,
+        changing_words,
         unit_name,
         photo_state,
         state_class,

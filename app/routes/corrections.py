@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from typing import Final
 from urllib.parse import quote
@@ -30,6 +29,7 @@ from app.store.corrections import CorrectionPlan
 from app.store.photo_steps import settings_of
 from app.store.samples import LensState
 from app.store.tables import LensRow, PhotoRow
+from app.ways import way_of
 from lensmodel.core.errors import MetadataMissingError, NoSamplesError, UnknownMethodError
 from lensmodel.correction import deconvolvers
 
@@ -54,13 +54,14 @@ def create_correction(wish: CorrectionIn, call: CallDep, once: OnceDep) -> Corre
 def create(wish: CorrectionIn, call: Call) -> CorrectionOut:
     """Write down what is wished, or find the same wish."""
     photo = find_photo(call, wish.photo_id)
-    if wish.method not in deconvolvers:
+    if wish.method is not None and wish.method not in deconvolvers:
         raise UnknownMethodError(f"no method {wish.method!r}; known: {', '.join(deconvolvers)}")
     _check_read(photo)
     _check_region(photo, wish)
     lens = _lens_for(call, photo, wish.lens_id)
     version = _version_for(call, lens, wish.lens_version)
-    params = wish.model_dump(mode="json", include={"method", "strength", "output", "roi"})
+    params = wish.model_dump(mode="json", include={"strength", "output", "roi"})
+    params["method"] = wish.method or way_of(call.settings, lens.answering_way).method
     # with other settings the same wish is another one
     params["settings"] = settings_of(photo)
     # only where asked for: a wish of before there were bounds is still the same wish
@@ -70,7 +71,7 @@ def create(wish: CorrectionIn, call: Call) -> CorrectionOut:
     if wish.family and wish.lens_version is None and call.settings.family:
         # the copies and versions of this moment: the same wish after one of them learned is another one
         leaning = call.store.samples.family_of(lens.public_id)
-        params |= {"family": [dataclasses.asdict(one) for one in leaning]} if leaning else {}
+        params |= {"family": [one.named() for one in leaning]} if leaning else {}
     row, made = call.store.corrections.create(photo, lens, version, params)
     finished = not made and row.state == "succeeded"
     call.response.status_code = status.HTTP_200_OK if finished else status.HTTP_202_ACCEPTED

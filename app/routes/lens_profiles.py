@@ -9,14 +9,16 @@ from typing import Final
 from fastapi import APIRouter, Response
 from starlette.concurrency import run_in_threadpool
 
-from app.errors import BusyError, MalformedUploadError, TooLargeError, UnknownLensError
+from app.errors import BusyError, ConflictError, MalformedUploadError, TooLargeError, UnknownLensError
 from app.http.bodies import CLOSE, Pace
 from app.http.dependencies import Call, CallDep
 from app.routes.common import problems
 from app.routes.lenses import find_lens, read_lens
 from app.schemas import LensOut
 from app.store.profile_intake import take_in
+from app.ways import way_of
 from lensmodel.core.errors import InvalidInputError
+from lensmodel.model.answer import PAPER
 from lensmodel.model.profile import LensProfile, read_profile, write_profile
 
 router = APIRouter(tags=["lenses"])
@@ -59,13 +61,13 @@ def read_lens_profile(lens_id: str, call: CallDep) -> Response:
 @router.put(
     "/lenses/{lens_id}/profile",
     operation_id="addLensProfile",
-    responses=problems(400, 404, 408, 413, 422),
+    responses=problems(400, 404, 408, 409, 413, 422),
     openapi_extra={"requestBody": {"required": True, "content": _FILE}},
 )
 async def add_lens_profile(lens_id: str, call: CallDep) -> LensOut:
     """Let what a profile knows join a lens; each of its photos counts as one, without its file.
 
-    The same profile a second time changes nothing.
+    The same profile a second time changes nothing. It must have been learned with the model of the lens.
     """
     await run_in_threadpool(find_lens, call, lens_id)
     many = BusyError("too many files are being received: try again in a few seconds", headers=CLOSE)
@@ -93,6 +95,16 @@ def _add(lens_id: str, data: bytes, call: Call) -> LensOut:
         profile = read_profile(io.BytesIO(data), "This file")
     except InvalidInputError as error:
         raise MalformedUploadError(str(error)) from error
+    lens = find_lens(call, lens_id)
+    own, theirs = (
+        mode == PAPER for mode in (way_of(call.settings, lens.way).mode, profile.model.settings.mode)
+    )
+    if own != theirs or lens.way != lens.answering_way:
+        raise ConflictError(
+            f"the profile was learned with the model {'paper' if theirs else 'default'}, lens {lens_id} has "
+            f"{lens.way} and answers with {lens.answering_way}: PATCH /v1/lenses/{lens_id} with "
+            '{"model"}, or wait until it has changed'
+        )
     names = {key: name for key, name in profile.photos.items() if name.isprintable()}
     if take_in(call.store.database, lens_id, call.owner, profile.model.samples, names) is None:
         raise UnknownLensError(f"there is no lens {lens_id[:60]}: it may be deleted already")

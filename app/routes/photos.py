@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Final
 
 from fastapi import APIRouter, Response, status
 from starlette.concurrency import run_in_threadpool
@@ -31,7 +31,7 @@ from app.store import LensName
 from app.store.access.accounts import Quota
 from app.store.ids import new_id
 from app.store.photo_steps import GIVEN_SETTINGS, folder_of
-from app.store.tables import PhotoRow
+from app.store.tables import LensRow, PhotoRow
 
 router = APIRouter(tags=["photos"])
 GIB = 1024 * MIB
@@ -49,6 +49,7 @@ _UPLOAD_BODY = {
                     "calibrate": {"type": "boolean", "default": True},
                     "kind": {"enum": ["target", "pair", "points", "edges"]},
                     "reference_id": {"type": "string"},
+                    "model": {"enum": ["default", "paper"]},
                     "lens_id": {"type": "string"},
                     "lens_serial": {"type": "string"},
                     "lens_model": {"type": "string"},
@@ -64,25 +65,18 @@ _UPLOAD_BODY = {
     },
 }
 
+_REFUSED: Final = (400, 403, 404, 408, 409, 413, 415, 422, 429, 507)
+_RECEIVED: Final = problems(
+    *_REFUSED, also={200: {"model": PhotoOut, "description": "The same bytes are known"}}
+)
+
 
 @router.post(
     "/photos",
     operation_id="createPhoto",
     status_code=status.HTTP_202_ACCEPTED,
     response_model=PhotoOut,
-    responses=problems(
-        400,
-        403,
-        404,
-        408,
-        409,
-        413,
-        415,
-        422,
-        429,
-        507,
-        also={200: {"model": PhotoOut, "description": "The same bytes are known"}},
-    ),
+    responses=_RECEIVED,
     openapi_extra={"requestBody": _UPLOAD_BODY},
 )
 async def create_photo(once: OnceDep) -> PhotoOut | Response:
@@ -91,6 +85,8 @@ async def create_photo(once: OnceDep) -> PhotoOut | Response:
     The fields may stand in the form or in the query. What they say goes before the file's own
     metadata. With `kind` the photo was made to measure the lens: a `target`, `points`, `edges`, or the open
     photo of a `pair`, whose closed one was sent before with `calibrate=false` and is its `reference_id`.
+    With `model` it founds a lens that is learned so; of a lens with another model it is refused, or fails
+    with `conflict` where only the file says which lens it was: `PATCH /v1/lenses/{id}` changes the model.
     """
     return await _received(once)
 
@@ -100,19 +96,7 @@ async def create_photo(once: OnceDep) -> PhotoOut | Response:
     operation_id="createMeasurement",
     status_code=status.HTTP_202_ACCEPTED,
     response_model=PhotoOut,
-    responses=problems(
-        400,
-        403,
-        404,
-        408,
-        409,
-        413,
-        415,
-        422,
-        429,
-        507,
-        also={200: {"model": PhotoOut, "description": "The same bytes are known"}},
-    ),
+    responses=_RECEIVED,
     openapi_extra={"requestBody": _UPLOAD_BODY},
 )
 async def create_measurement(lens_id: str, call: CallDep, once: OnceDep) -> PhotoOut | Response:
@@ -234,8 +218,13 @@ def _record(
 ) -> tuple[PhotoOut, bool]:
     fields = uploaded.fields
     given = fields.model_dump(exclude={"calibrate"}, exclude_none=True)
-    if fields.lens_id is not None and call.store.lenses.get(fields.lens_id, call.owner) is None:
-        raise UnknownLensError(f"lens_id {fields.lens_id}: there is no such lens; GET /v1/lenses lists them")
+    if fields.lens_id is not None:
+        lens = call.store.lenses.get(fields.lens_id, call.owner)
+        if lens is None:
+            raise UnknownLensError(
+                f"lens_id {fields.lens_id}: there is no such lens; GET /v1/lenses lists them"
+            )
+        _check_model(fields, lens)
     received = call.store.photos.receive(
         call.owner,
         public_id=public_id,
@@ -250,12 +239,23 @@ def _record(
         may_be_new=call.who.key_id is None,
     )
     if received.photo.public_id != public_id:
+        if not received.fresh:
+            _check_model(fields, call.store.photos.lens_of(received.photo))
         if received.wants_file:  # it was given up: this is the same one
             key = f"{folder_of(received.photo)}original-{public_id}"
             call.storage.rename(f"{prefix}original", key)
             call.store.photos.restore_file(received.photo.public_id, key, where, again=received.fresh)
         call.storage.delete(prefix)  # the same bytes are there already
     return describe(call, find_photo(call, received.photo.public_id)), received.fresh
+
+
+def _check_model(fields: UploadFields, lens: LensRow | None) -> None:
+    """Refuse a photo of a lens that is learned in another way than the photo asks for."""
+    if lens is not None and fields.model not in {None, lens.way}:
+        raise ConflictError(
+            f"model={fields.model}: lens {lens.public_id} has the model {lens.way}; PATCH /v1/lenses/"
+            f'{lens.public_id} with {{"model": "{fields.model}"}}, or leave model out'
+        )
 
 
 def describe(call: Call, photo: PhotoRow) -> PhotoOut:
@@ -340,6 +340,7 @@ def change_photo(photo_id: str, change: PhotoChange, call: CallDep) -> PhotoOut:
         raise InvalidParameterError("calibrate=false: send excluded=true to take a photo out of its lens")
     if change.calibrate and photo.file_gone_at is not None:
         raise ConflictError(f"the file of photo {photo_id} is no longer kept: {SEND_AGAIN}")
+    counts = photo.state in {"counted", "excluded"}
     done = call.store.photos.change(
         photo_id,
         call.owner,
@@ -349,6 +350,11 @@ def change_photo(photo_id: str, change: PhotoChange, call: CallDep) -> PhotoOut:
         calibrate=bool(change.calibrate),
     )
     photo = find_photo(call, photo_id)
+    if not done and counts and photo.file_gone_at is not None:
+        raise ConflictError(
+            f"photo {photo_id} was learned from for another model than that of the lens, and its file is no "
+            f"longer kept: {SEND_AGAIN}"
+        )
     if not done:
         raise ConflictError(
             f"excluded={change.excluded}: a photo in state {photo.state} does not count; "

@@ -151,7 +151,10 @@ class Settings(BaseSettings):
         default=31, ge=3, le=55, description="Side of the estimated kernels in pixels, odd."
     )
     estimator: str = Field(default="default", description="Name in the registry of blind estimators.")
-    selector: str = Field(default="r-map", description="Name in the registry of patch selectors.")
+    selector: str = Field(
+        default="r-map",
+        description="Who chooses patches: r-map, good-regions, or another of the registry of selectors.",
+    )
     assume_single_copy: bool = Field(
         default=False, description="Photos without a serial belong to the one lens of that model."
     )
@@ -295,11 +298,6 @@ class Settings(BaseSettings):
     def storage(self) -> str:
         """Address of the blobs."""
         return self.storage_url or f"file://{self.data_dir.resolve() / 'blobs'}"
-
-    @property
-    def of_models(self) -> dict[str, str]:
-        """How all lens models of the service are made: arguments of `ModelSettings`."""
-        return {"mode": self.model_mode, "unit": self.model_unit}
 
     @property
     def max_upload_bytes(self) -> int:

@@ -28,6 +28,7 @@ from app.schemas.fields import (
     OptionalName,
     PixelPitch,
     Problem,
+    PsfModel,
     Question,
 )
 from app.schemas.jobs import JobLinks, JobOut, JobPage, JobState, Progress, RetriedOut
@@ -108,6 +109,7 @@ __all__ = [
     "PixelPitch",
     "Problem",
     "Progress",
+    "PsfModel",
     "PsfOut",
     "PsfQuery",
     "QueryOut",

@@ -41,7 +41,12 @@ class CorrectionIn(Question):
     photo_id: Id
     lens_id: Id | None = Field(None, description="default: the lens of the photo")
     lens_version: int | None = Field(None, ge=1, le=MAX_VERSION, description="default: the newest")
-    method: str = Field("standard", min_length=1, max_length=60)
+    method: str | None = Field(
+        None,
+        min_length=1,
+        max_length=60,
+        description="default: standard, and paper where the model of the lens is that of the paper",
+    )
     strength: float = Field(1.0, ge=0, le=1, allow_inf_nan=False)
     halo: float | None = Field(
         None,

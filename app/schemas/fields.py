@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Final, get_args
+from typing import Annotated, Final, Literal, get_args
 
 from pydantic import (
     AfterValidator,
@@ -38,6 +38,10 @@ def _odd(value: int) -> int:
     if value % 2 == 0:
         raise ValueError(f"must be odd, so that there is a middle pixel: {value - 1} or {value + 1}")
     return value
+
+
+PsfModel = Literal["default", "paper"]
+"""How a lens is learned and its photos are corrected: names of `lensmodel.workflow.ways`."""
 
 
 Name = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_printable)]

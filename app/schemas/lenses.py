@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from app.schemas.fields import Model
+from app.schemas.fields import Model, PsfModel
 
 SerialSource = Literal["exif", "makernote", "xmp", "user", "none"]
 
@@ -32,6 +32,14 @@ class LensOut(Model):
     serial: str | None
     serial_source: SerialSource
     label: str | None
+    psf_model: PsfModel = Field(
+        default="default",
+        description="how it is learned and its photos are corrected, as `PATCH` with `model` chooses",
+    )
+    answering_model: PsfModel = Field(
+        default="default",
+        description="the one that answers now: that of before until all photos are estimated anew",
+    )
     version: int
     photos: int
     samples: int
@@ -50,6 +58,7 @@ class CalibrationOut(Model):
     samples_added: int
     samples: int
     photos: int
+    model: PsfModel = Field(default="default", description="the one that this version answers with")
     error: dict[str, Any] | float | None = Field(description="held-out error; null until it is measured")
     coverage: dict[str, Any] | None
     created_at: datetime

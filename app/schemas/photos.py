@@ -18,6 +18,7 @@ from app.schemas.fields import (
     OptionalName,
     PixelPitch,
     Problem,
+    PsfModel,
     Question,
     blank_is_none,
 )
@@ -46,6 +47,11 @@ class UploadFields(Question):
         default=None, description="what a photo made to measure the lens shows; nothing for ordinary photos"
     )
     reference_id: OptionalId = Field(default=None, description="of a pair: the photo closed to about f/8")
+    model: Annotated[PsfModel | None, BeforeValidator(blank_is_none)] = Field(
+        default=None,
+        description="of a new lens: how it is learned, default or the paper's own way; a lens that is there "
+        "must have it already",
+    )
     lens_id: OptionalId = None
     lens_serial: OptionalName = None
     lens_model: OptionalName = None

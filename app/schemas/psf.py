@@ -14,6 +14,7 @@ from app.schemas.fields import (
     FocusDistance,
     KernelSize,
     Model,
+    PsfModel,
     Question,
 )
 from lensmodel.core.types import Channel
@@ -88,7 +89,8 @@ class Support(Model):
         default_factory=list, description="in which variables it lies outside the samples"
     )
     predicted_error: float | None
-    mode: str
+    model: PsfModel = Field(default="default", description="the model of the lens that answered")
+    mode: str = Field(description="what that made of the samples")
     family: FamilyOut | None = None
 
 

@@ -106,7 +106,9 @@ def _mark_of_owner(session: Session, owner: str, newest: int) -> Hashable:
         for query in (
             photos.with_only_columns(*_PHOTO_MARK),
             corrections.with_only_columns(*_CORRECTION_MARK),
-            lenses.with_only_columns(LensRow.public_id, LensRow.version, LensRow.label),
+            lenses.with_only_columns(
+                LensRow.public_id, LensRow.version, LensRow.label, LensRow.way, LensRow.answering_way
+            ),
             measured,
         )
     )

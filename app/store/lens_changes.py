@@ -6,9 +6,10 @@ from sqlalchemy import select
 
 from app.store.access.owners import find_to_change
 from app.store.database import Database
-from app.store.lenses import move, switch
+from app.store.lens_ways import choose
 from app.store.removal import forget
 from app.store.tables import EventRow, LensRow, PhotoRow
+from app.store.teaching import move, switch
 
 LEARNING = ("received", "inspecting", "developing", "selecting", "estimating")
 
@@ -28,16 +29,28 @@ class LensChanges:
             lens.label = label
             return True
 
+    def choose_way(self, lens_id: str, owner: str, way: str) -> int | None:
+        """Learn a lens in another way from now on, its photos of before too; see `app.store.lens_ways`.
+
+        Returns how many of these keep it from that, since their files are gone; None if there is no lens.
+        """
+        with self._db.writing(durable=True) as session:
+            lens = find_to_change(session, LensRow, lens_id, owner)
+            return None if lens is None else choose(session, lens, way)
+
     def merge(self, lens_id: str, into: str, owner: str) -> bool:
         """Give all photos of a lens to another one and forget it: they were one copy all along.
 
-        False if one of them is not there, or photos of the first are still being learned from.
+        False if one of them is not there, photos of the first are still being learned from, or the two are
+        not learned in the same way.
         """
         with self._db.writing() as session:
             # in one order, whoever asks: two merges at once must not wait for each other
             rows = {key: find_to_change(session, LensRow, key, owner) for key in sorted((lens_id, into))}
             lens, target = rows[lens_id], rows[into]
             if lens is None or target is None or lens.id == target.id:
+                return False
+            if len({lens.way, lens.answering_way, target.way, target.answering_way}) > 1:
                 return False
             photos = list(
                 session.scalars(
@@ -59,11 +72,11 @@ class LensChanges:
     def go_back(self, lens_id: str, owner: str, version: int) -> int | None:
         """Leave out of a lens the photos that joined it after a version; return how many, None without lens.
 
-        They stay, and can be counted again one by one.
+        They stay, and can be counted again one by one. None as well while the lens changes its way.
         """
         with self._db.writing() as session:
             lens = find_to_change(session, LensRow, lens_id, owner)
-            if lens is None:
+            if lens is None or lens.way != lens.answering_way:
                 return None
             events = session.scalars(
                 select(EventRow).where(EventRow.lens_id == lens.id).order_by(EventRow.version)

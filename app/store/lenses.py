@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final
 
-from sqlalchemy import delete, func, select, update
+from sqlalchemy import and_, delete, func, or_, select, update
 from sqlalchemy.orm import Session
 
 from app.store.access.owners import find, now, owned
 from app.store.database import Database, insert_new
 from app.store.ids import new_id
 from app.store.kinds import identity_key, kind_key
-from app.store.tables import CorrectionRow, EventRow, GarbageRow, LensRow, PhotoRow
-from app.store.versions import drop_samples, new_version, take_samples
+from app.store.tables import PHOTO_RUNNING, CorrectionRow, EventRow, GarbageRow, LensRow, PhotoRow
+
+TEACHES: Final = and_(
+    or_(PhotoRow.state == "counted", PhotoRow.relearning.is_(True)), PhotoRow.deleted_at.is_(None)
+)
+"""Photos that count, also while they are estimated anew."""
 
 TRIES: Final = 10
 """How often to look again for a lens that was deleted when we looked."""
@@ -52,6 +56,7 @@ def lens_of_photo(session: Session, photo: PhotoRow, *, single_copy: bool) -> Le
         model=photo.lens_model,
         serial=photo.lens_serial,
         source=photo.lens_serial_source or "none",
+        way=photo.given.get("model"),
     )
     for _ in range(TRIES):
         if photo.calibrate:
@@ -70,7 +75,14 @@ def lens_of_photo(session: Session, photo: PhotoRow, *, single_copy: bool) -> Le
 
 
 def _new_lens(
-    owner_id: int, key: str, *, maker: str | None, model: str | None, serial: str | None, source: str
+    owner_id: int,
+    key: str,
+    *,
+    maker: str | None,
+    model: str | None,
+    serial: str | None,
+    source: str,
+    way: str | None,
 ) -> dict[str, Any]:
     return {
         "public_id": new_id(),
@@ -81,6 +93,8 @@ def _new_lens(
         "kind_key": kind_key(maker, model),
         "serial": serial,
         "serial_source": source if serial else "none",
+        "way": way or "default",
+        "answering_way": way or "default",
         "created_at": now(),
         "version": 0,
         "rebuild_epoch": 0,
@@ -89,11 +103,20 @@ def _new_lens(
     }
 
 
-def named(session: Session, owner_id: int, name: LensName) -> LensRow:
-    """Find or make the lens that its owner names: by its serial, or always a new one by its label."""
+def named(session: Session, owner_id: int, name: LensName, *, way: str | None = None) -> LensRow:
+    """Find or make the lens that its owner names: by its serial, or always a new one by its label.
+
+    A new one is learned in the way that is given.
+    """
     key = f"label|{new_id()}" if name.label else identity_key(name.maker, name.model, name.serial)
     fresh = _new_lens(
-        owner_id, key, maker=name.maker, model=name.model, serial=name.serial, source=name.serial_source
+        owner_id,
+        key,
+        maker=name.maker,
+        model=name.model,
+        serial=name.serial,
+        source=name.serial_source,
+        way=way,
     )
     if name.label:
         fresh |= {"label": name.label, "serial_source": "user"}
@@ -103,84 +126,6 @@ def named(session: Session, owner_id: int, name: LensName) -> LensRow:
             LensRow.owner_id == owner_id, LensRow.identity_key == key, LensRow.deleted_at.is_(None)
         )
     ).one()
-
-
-def record_event(
-    session: Session, lens_id: int, version: int, kind: str, photo: PhotoRow | None, *, samples_added: int
-) -> None:
-    """Write one line of the lens's history."""
-    counts = session.execute(
-        select(LensRow.sample_count, LensRow.photo_count).where(LensRow.id == lens_id)
-    ).one()
-    session.add(
-        EventRow(
-            lens_id=lens_id,
-            version=version,
-            kind=kind,
-            photo_public_id=None if photo is None else photo.public_id,
-            epoch=0 if photo is None else photo.epoch,
-            samples_added=samples_added,
-            samples=counts[0],
-            photos=counts[1],
-            created_at=now(),
-        )
-    )
-
-
-def give_back(session: Session, photo: PhotoRow, kind: str) -> None:
-    """Take a counted photo out of its lens: a new version that must be fitted anew."""
-    assert photo.lens_id is not None
-    version = new_version(session, photo.lens_id, rebuild=True)
-    dropped = drop_samples(session, photo)
-    record_event(session, photo.lens_id, version, kind, photo, samples_added=-dropped)
-
-
-def bring_in(session: Session, photo: PhotoRow, kind: str) -> None:
-    """Let the finished samples of a photo join its lens again."""
-    assert photo.lens_id is not None
-    version = new_version(session, photo.lens_id, rebuild=True)
-    added = take_samples(session, photo, version)
-    record_event(session, photo.lens_id, version, kind, photo, samples_added=added)
-
-
-def switch(session: Session, photo: PhotoRow, after: Literal["counted", "excluded"]) -> bool:
-    """Take a counted photo out of its lens's model, or bring it back; False if it is in another state."""
-    if photo.state != ("counted" if after == "excluded" else "excluded"):
-        return False
-    photo.state, photo.stage_at = after, now()
-    session.flush()
-    if after == "excluded":
-        give_back(session, photo, "photo_excluded")
-    else:
-        bring_in(session, photo, "photo_included")
-    return True
-
-
-def move(session: Session, photo: PhotoRow, lens: LensRow) -> None:
-    """Give a finished photo to another lens; both get a new version if it counts."""
-    if photo.lens_id == lens.id:
-        return
-    counted = photo.state == "counted"
-    if counted:
-        give_back(session, photo, "photo_removed")
-    photo.lens_id = lens.id
-    photo.given = {**photo.given, "lens_id": lens.public_id}
-    session.flush()
-    if counted:
-        bring_in(session, photo, "photo_included")
-
-
-def change_settings(
-    session: Session, photo: PhotoRow, given: Mapping[str, Any], columns: Mapping[str, Any]
-) -> None:
-    """Correct the settings of a finished photo; a counted one renews its lens's model."""
-    photo.given = {**photo.given, **given}
-    for column, value in columns.items():
-        setattr(photo, column, value)
-    session.flush()
-    if photo.state == "counted" and photo.lens_id is not None:
-        version = new_version(session, photo.lens_id, rebuild=True)
-        record_event(session, photo.lens_id, version, "photo_changed", photo, samples_added=0)
 
 
 def delete_corrections(session: Session, photo: PhotoRow) -> None:
@@ -249,7 +194,7 @@ class LensStore:
         keys = [row.id for row in lens]
         query = (
             select(PhotoRow.lens_id, PhotoRow.aperture, PhotoRow.focal_mm)
-            .where(PhotoRow.lens_id.in_(keys), PhotoRow.state == "counted", PhotoRow.deleted_at.is_(None))
+            .where(PhotoRow.lens_id.in_(keys), TEACHES)
             .distinct()
         )
         apertures: dict[int, set[float]] = {key: set() for key in keys}
@@ -261,11 +206,16 @@ class LensStore:
                 focals[key] |= set() if focal is None else {focal}
         return {key: (sorted(apertures[key]), sorted(focals[key])) for key in keys}
 
+    def learned_anew(self, lens: LensRow) -> int:
+        """Return how many photos of a lens that changes its way are still on their way there."""
+        anew = (PhotoRow.relearning.is_(True), PhotoRow.state.in_(("received", *PHOTO_RUNNING)))
+        query = select(func.count()).where(PhotoRow.lens_id == lens.id, *anew, PhotoRow.deleted_at.is_(None))
+        with self._db.reading() as session:
+            return session.scalar(query) or 0
+
     def lateral_of(self, lens: LensRow) -> list[dict[str, Any]]:
         """Return the lateral colour of each counted photo of a lens that shows it."""
-        query = select(PhotoRow.lateral).where(
-            PhotoRow.lens_id == lens.id, PhotoRow.state == "counted", PhotoRow.deleted_at.is_(None)
-        )
+        query = select(PhotoRow.lateral).where(PhotoRow.lens_id == lens.id, TEACHES)
         with self._db.reading() as session:
             return [lateral for lateral in session.scalars(query) if lateral]
 
@@ -276,8 +226,7 @@ class LensStore:
             select(PhotoRow.height, PhotoRow.width)
             .where(
                 PhotoRow.lens_id == lens.id,
-                PhotoRow.state == "counted",
-                PhotoRow.deleted_at.is_(None),
+                TEACHES,
                 PhotoRow.width.is_not(None),
                 PhotoRow.height.is_not(None),
             )

@@ -76,28 +76,39 @@ def empty(photo: PhotoRow) -> None:
         setattr(photo, column, None)
 
 
-def let_go(session: Session, photo_id: str) -> None:
+def let_go(session: Session, photo_id: str) -> PhotoRow:
     """Forget the lens that only a photo without a result speaks of: its serial is nobody's business now."""
     photo = session.scalars(
         select(PhotoRow).where(PhotoRow.public_id == photo_id).execution_options(populate_existing=True)
     ).one()
     forget_if_empty(session, photo)
+    return photo
 
 
 def drop_patches(session: Session, photo: PhotoRow) -> None:
-    """Forget the patches of an epoch with their samples."""
-    session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
+    """Forget the patches of an epoch with their samples.
+
+    With those of earlier epochs, unless they count still.
+    """
+    of_photo = [PatchRow.photo_id == photo.id, *([PatchRow.epoch == photo.epoch] if photo.relearning else [])]
+    session.execute(delete(PatchRow).where(*of_photo))
     insert_new(session, GarbageRow, [{"prefix": statistics_of(photo), "not_before": now() + LATE}])
 
 
 def restart(session: Session, photo: PhotoRow) -> None:
-    """Begin a new epoch of a photo that does not count: work of the old one, if any still runs, is void."""
-    drop_patches(session, photo)
+    """Begin a new epoch of a photo: work of the old one, if any still runs, is void.
+
+    Its samples go, but for those that count while the photo is `relearning`.
+    """
+    begins = photo.relearning and photo.state == "counted"
+    if not begins:  # the patches of this epoch are those that count
+        drop_patches(session, photo)
     photo.epoch += 1
     photo.state, photo.stage_at = "received", now()
     photo.error_code = photo.error_detail = photo.started_at = photo.finished_at = photo.counted_at = None
     photo.attempt = photo.patches_total = photo.patches_done = photo.patches_rejected = 0
-    photo.windows, photo.windows_rejected = None, 0
+    if not photo.relearning:  # else the same ones are found again
+        photo.windows, photo.windows_rejected = None, 0
 
 
 def move(

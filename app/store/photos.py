@@ -11,7 +11,7 @@ from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session
 
 from app.errors import BusyError
-from app.store import lenses
+from app.store import lens_ways, lenses, teaching
 from app.store.access.idempotency import forget_answers
 from app.store.access.owners import ensure_owner, find, find_to_change, now
 from app.store.database import insert_new
@@ -40,7 +40,6 @@ from app.store.tables import (
     PhotoRow,
     SampleRow,
 )
-from app.store.versions import new_version, take_samples
 
 TRIES: Final = 100
 """How often an upload looks again for the photo of the same bytes that was deleted when it looked."""
@@ -228,8 +227,10 @@ class PhotoStore(PhotoReads):
                 return None
             lens = lenses.lens_of_photo(session, photo, single_copy=single_copy)
             if lens is not None:
-                photo.lens_id = lens.id
+                photo.lens_id, photo.way = lens.id, lens.way
                 widen(lens, photo)
+                if photo.calibrate and photo.given.get("model") == lens.way:  # what was asked for is so
+                    photo.given = {name: said for name, said in photo.given.items() if name != "model"}
             return lens
 
     def change(
@@ -255,23 +256,23 @@ class PhotoStore(PhotoReads):
                 return False
             if excluded is not None:
                 wish: Final = "excluded" if excluded else "counted"
-                if photo.state != wish and not lenses.switch(session, photo, wish):
+                if photo.state != wish and not teaching.switch(session, photo, wish):
                     return False
             chosen = _chosen(session, photo, lens, owner)
             begins = calibrate and not photo.calibrate
             if begins and photo.file_gone_at is not None:
                 return False
+            if chosen is not None and not teaching.may_move(photo, chosen):
+                return False
+            columns = {GIVEN_SETTINGS[name]: value for name, value in given.items()}
             photo.calibrate |= begins
             if photo.state in {"counted", "stored", "excluded"} and not begins:
                 if given:
-                    columns = {GIVEN_SETTINGS[name]: value for name, value in given.items()}
-                    lenses.change_settings(session, photo, given, columns)
+                    teaching.change_settings(session, photo, given, columns)
                 if chosen is not None:
-                    lenses.move(session, photo, chosen)
+                    teaching.move(session, photo, chosen)
             elif begins or given or chosen is not None:
-                named = {} if chosen is None else {"lens_id": chosen.public_id}
-                photo.given = {**photo.given, **given, **named}
-                restart(session, photo)
+                teaching.begin_again(session, photo, given, columns, chosen)
             return True
 
     def fail(self, photo_id: str, epoch: int, code: str, detail: str) -> bool:
@@ -280,7 +281,7 @@ class PhotoStore(PhotoReads):
             fields = {"error_code": code, "error_detail": detail, "finished_at": now()}
             failed = move(session, photo_id, ("received", *PHOTO_RUNNING), "failed", epoch=epoch, **fields)
             if failed:
-                let_go(session, photo_id)
+                _ended(session, photo_id)
             return failed
 
     def retry(self, photo_id: str, owner: str | None = None) -> bool:
@@ -302,14 +303,15 @@ class PhotoStore(PhotoReads):
             if photo is None or not move(session, photo_id, UNFINISHED, "cancelled", finished_at=now()):
                 return False
             drop_patches(session, photo)
-            let_go(session, photo_id)
+            _ended(session, photo_id)
             return True
 
     def finish(self, photo_id: str, epoch: int) -> int | None:
         """Count a photo: its samples join the model and the lens's version grows by one.
 
         Returns the new version, or None if the photo was counted, cancelled or started anew
-        meanwhile. One transaction: it happens wholly and once, however often it is tried.
+        meanwhile, or waits until its lens has changed its way. One transaction: it happens wholly
+        and once, however often it is tried.
         """
         with self._db.writing() as session:
             done = {"finished_at": now(), "counted_at": now()}
@@ -318,10 +320,10 @@ class PhotoStore(PhotoReads):
             photo = session.scalars(select(PhotoRow).where(PhotoRow.public_id == photo_id)).one()
             if photo.lens_id is None:
                 raise ValueError(f"photo {photo_id} has no lens: assign one before it is counted")
-            version = new_version(session, photo.lens_id)
-            added = take_samples(session, photo, version)
-            lenses.record_event(session, photo.lens_id, version, "photo_added", photo, samples_added=added)
-            return version
+            if photo.way != lens_ways.locked(session, photo.lens_id).way:
+                restart(session, photo)
+                return None
+            return lens_ways.join(session, photo, "photo_added")
 
     def delete(self, photo_id: str, owner: str) -> str | None:
         """Forget a photo, its patches and samples; return the prefix of its blobs.
@@ -332,8 +334,9 @@ class PhotoStore(PhotoReads):
             photo = find_to_change(session, PhotoRow, photo_id, owner)
             if photo is None:
                 return None
-            if photo.state == "counted":
-                lenses.give_back(session, photo, "photo_removed")
+            lens_id = photo.lens_id
+            if lens_ways.teaches(session, photo):
+                teaching.give_back(session, photo, "photo_removed")
             session.execute(delete(SampleRow).where(SampleRow.photo_id == photo.id))
             session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
             lenses.delete_corrections(session, photo)
@@ -343,6 +346,8 @@ class PhotoStore(PhotoReads):
             empty(photo)
             photo.windows, photo.windows_rejected = None, 0
             forget_if_empty(session, photo)
+            if lens_id is not None:
+                lens_ways.settle(session, lens_id)
             prefix = folder_of(photo)
             insert_new(session, GarbageRow, [{"prefix": prefix, "not_before": now() + LATE}])
             return prefix
@@ -369,8 +374,15 @@ def _known(session: Session, owner_key: int, sha256: str) -> PhotoRow | None:
     )
 
 
+def _ended(session: Session, photo_id: str) -> None:
+    """Do what is due when a photo has come to nothing: its lens goes, or waits for it no longer."""
+    photo = let_go(session, photo_id)
+    if photo.relearning and photo.lens_id is not None:
+        lens_ways.settle(session, photo.lens_id)
+
+
 def _chosen(session: Session, photo: PhotoRow, lens: LensName | str | None, owner: str) -> LensRow | None:
     """Find the lens that an owner names, or whose id they give; none where they do neither."""
     if isinstance(lens, LensName):
-        return lenses.named(session, photo.owner_id, lens)
+        return lenses.named(session, photo.owner_id, lens, way=photo.given.get("model", photo.way))
     return None if lens is None else find(session, LensRow, lens, owner)

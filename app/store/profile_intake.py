@@ -16,10 +16,9 @@ from app.schemas import distances
 from app.store.access.owners import find_to_change, now
 from app.store.database import Database, insert_new
 from app.store.ids import new_id
-from app.store.lenses import record_event
 from app.store.patches import DTYPE, FORMAT_VERSION
 from app.store.tables import LensRow, PatchRow, PhotoRow, SampleRow
-from app.store.versions import new_version, take_samples
+from app.store.versions import new_version, record_event, take_samples
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings
 
@@ -70,6 +69,7 @@ def _photo(
         "blob_key": f"photos/{public_id}/original",
         "calibrate": True,
         "given": {"lens_id": lens.public_id},
+        "way": lens.way,
         "aperture": settings.aperture,
         "focal_mm": settings.focal_mm,
         "focus_m": distances.written(settings.focus_m),

@@ -59,7 +59,7 @@ def forget_if_empty(session: Session, photo: PhotoRow) -> None:
 
     A lens that the owner named himself stays as long as there is any photo of it, a failed one too.
     """
-    if photo.lens_id is None:
+    if photo.lens_id is None or photo.relearning:
         return
     lens = session.scalar(select(LensRow).where(LensRow.id == photo.lens_id).with_for_update())
     session.flush()
@@ -68,7 +68,7 @@ def forget_if_empty(session: Session, photo: PhotoRow) -> None:
     )
     named = lens is not None and (lens.label is not None or lens.serial_source == "user")
     if not named:
-        others = others.where(PhotoRow.state.not_in(NO_RESULT))
+        others = others.where(PhotoRow.state.not_in(NO_RESULT) | PhotoRow.relearning.is_(True))
     keeps = named and photo.deleted_at is None
     if lens is None or lens.deleted_at is not None or keeps or session.scalar(others.limit(1)) is not None:
         return
@@ -84,7 +84,7 @@ def _unlearn(session: Session, photo: PhotoRow) -> None:
     elif photo.state in {"counted", "excluded"}:
         photo.state, photo.calibrate = "stored", False
     photo.stage_at = now()
-    photo.lens_id, photo.counted_at = None, None
+    photo.lens_id, photo.counted_at, photo.relearning = None, None, False
     photo.given = {name: value for name, value in photo.given.items() if name != "lens_id"}
     photo.patches_total = photo.patches_done = photo.patches_rejected = 0
     photo.windows, photo.windows_rejected = None, 0

@@ -22,7 +22,7 @@ from lensmodel.core.psf import PsfSample
 from lensmodel.core.spectrum import PatchSpectrum
 from lensmodel.core.types import Channel, FieldPosition, LensSettings
 
-_STATE = select(LensRow.version, LensRow.rebuild_epoch).where(
+_STATE = select(LensRow.version, LensRow.rebuild_epoch, LensRow.answering_way).where(
     LensRow.public_id == bindparam("lens"), LensRow.deleted_at.is_(None)
 )
 _ME, _OTHER = aliased(LensRow), aliased(LensRow)
@@ -38,6 +38,8 @@ _MAY_BE_RELATED = and_(
     _OTHER.deleted_at.is_(None),
     _OTHER.sample_count > 0,
     _OTHER.kind_key == _ME.kind_key,
+    _ME.answering_way == "default",  # the paper's way leans on nothing
+    _OTHER.answering_way == "default",
 )
 _THIS = and_(_ME.public_id == bindparam("lens"), _ME.deleted_at.is_(None))
 _OTHERS = (
@@ -48,7 +50,9 @@ _OTHERS = (
     .order_by(_OTHER.public_id.desc())
 )
 _KNOWN = (
-    select(_ME.version.label("my_version"), _ME.rebuild_epoch.label("my_epoch"), *_RELATIVES)
+    select(
+        _ME.version.label("my_version"), _ME.rebuild_epoch.label("my_epoch"), _ME.answering_way, *_RELATIVES
+    )
     .select_from(_ME)
     .join(OwnerRow, OwnerRow.id == _ME.owner_id)
     .outerjoin(_OTHER, _MAY_BE_RELATED)
@@ -67,10 +71,11 @@ class CorruptSampleError(LensModelError):
 
 @dataclass(frozen=True, slots=True)
 class LensState:
-    """What tells whether a fitted model is up to date."""
+    """What tells whether a fitted model is up to date, and in which way it was learned."""
 
     version: int
     rebuild_epoch: int
+    way: str = "default"
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +84,11 @@ class Relative:
 
     lens_id: str
     state: LensState
+
+    def named(self) -> dict[str, Any]:
+        """Return what tells it from others in what is wished of a correction."""
+        state = {"version": self.state.version, "rebuild_epoch": self.state.rebuild_epoch}
+        return {"lens_id": self.lens_id, "state": state}
 
 
 Family: TypeAlias = tuple[Relative, ...]
@@ -103,7 +113,7 @@ class SampleStore:
         """Return the version of a lens by one read through its key; None if there is no such lens."""
         with self._db.reader.connect() as connection:
             row = connection.execute(_STATE, {"lens": lens_id}).one_or_none()
-            return None if row is None else LensState(row[0], row[1])
+            return None if row is None else LensState(row[0], row[1], row[2])
 
     def family_of(self, lens_id: str) -> Family:
         """Return the other copies of a lens: same owner, maker and model, with samples that count.
@@ -121,7 +131,7 @@ class SampleStore:
             rows = connection.execute(_KNOWN, {"lens": lens_id, "owner": owner}).all()
         if not rows:
             return None
-        state = LensState(rows[0].my_version, rows[0].my_epoch)
+        state = LensState(rows[0].my_version, rows[0].my_epoch, rows[0].answering_way)
         return state, _family([row for row in rows if row.public_id is not None])
 
     def of_family(self, family: Iterable[Relative]) -> list[StoredSample]:
@@ -171,11 +181,13 @@ class SampleStore:
             query = query.where(SampleRow.version_added <= up_to_version)
         with self._db.reading() as session:
             state = session.execute(
-                select(LensRow.version, LensRow.rebuild_epoch).where(LensRow.public_id == lens_id)
+                select(LensRow.version, LensRow.rebuild_epoch, LensRow.answering_way).where(
+                    LensRow.public_id == lens_id
+                )
             ).one_or_none()
             if state is None:
                 return LensState(0, 0), []
-            return LensState(state[0], state[1]), [_stored(row) for row in session.execute(query)]
+            return LensState(state[0], state[1], state[2]), [_stored(row) for row in session.execute(query)]
 
 
 def _family(rows: Iterable[Row[*tuple[Any, ...]]]) -> Family:

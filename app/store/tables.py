@@ -7,7 +7,7 @@ updates give every effect exactly once, however often a step is repeated.
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any, ClassVar, Final, get_args
 
 from sqlalchemy import (
@@ -15,21 +15,20 @@ from sqlalchemy import (
     BigInteger,
     CheckConstraint,
     DateTime,
-    Dialect,
     ForeignKey,
     Index,
-    Integer,
     LargeBinary,
     MetaData,
     String,
     Text,
-    TypeDecorator,
     UniqueConstraint,
+    false,
     text,
 )
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 from app.schemas import CorrectionState, PhotoState
+from app.store.columns import BigKey, UtcTime
 from app.store.kinds import kind_key
 
 PHOTO_STATES: Final[tuple[str, ...]] = get_args(PhotoState)
@@ -38,29 +37,10 @@ PHOTO_FINAL: Final = ("counted", "stored", "excluded", "failed", "cancelled")
 
 PATCH_STATES: Final = ("pending", "running", "done", "rejected", "failed", "cancelled")
 CORRECTION_STATES: Final[tuple[str, ...]] = get_args(CorrectionState)
-EVENT_KINDS: Final = ("photo_added", "photo_included", "photo_excluded", "photo_removed", "photo_changed")
-
-
-class UtcTime(TypeDecorator[datetime]):
-    """Points in time: aware in Python, UTC in the table, also where SQL knows no zones."""
-
-    impl = DateTime(timezone=True)
-    cache_ok = True
-
-    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
-        """Bring to UTC; naive times are a programming error."""
-        del dialect
-        if value is not None and value.tzinfo is None:
-            raise ValueError(f"time without a zone: {value}")
-        return None if value is None else value.astimezone(UTC)
-
-    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
-        """Give back with the zone that SQLite forgets."""
-        del dialect
-        return value.replace(tzinfo=UTC) if value is not None and value.tzinfo is None else value
-
-
-BigKey = BigInteger().with_variant(Integer, "sqlite")  # SQLite counts rows only in INTEGER keys
+EVENT_KINDS: Final = (
+    *("photo_added", "photo_included", "photo_excluded", "photo_removed", "photo_changed"),
+    "model_changed",
+)
 
 
 def _one_of(column: str, values: tuple[str, ...]) -> str:
@@ -125,6 +105,12 @@ class LensRow(Base):
     serial_source: Mapped[str] = mapped_column(String(20))
     identity_key: Mapped[str]
     label: Mapped[str | None]
+    way: Mapped[str] = mapped_column(String(20), default="default", server_default="default")
+    """How its photos are learned from, of `PsfModel`; `model` is what its maker calls it."""
+
+    answering_way: Mapped[str] = mapped_column(String(20), default="default", server_default="default")
+    """The way of the samples that count: another one than `way` until photos are estimated anew."""
+
     version: Mapped[int] = mapped_column(default=0)
     rebuild_epoch: Mapped[int] = mapped_column(default=0)
     photo_count: Mapped[int] = mapped_column(default=0)
@@ -196,6 +182,12 @@ class PhotoRow(Base):
     """Lateral colour that this photo shows: radial polynomials of red and blue."""
 
     epoch: Mapped[int] = mapped_column(default=1)
+    way: Mapped[str] = mapped_column(String(20), default="default", server_default="default")
+    """That of its lens when this epoch began."""
+
+    relearning: Mapped[bool] = mapped_column(default=False, server_default=false())
+    """Its samples of an epoch before count until all photos of its lens are estimated in another way."""
+
     attempt: Mapped[int] = mapped_column(default=0)
     state: Mapped[str] = mapped_column(String(20))
     error_code: Mapped[str | None] = mapped_column(String(40))
@@ -313,6 +305,7 @@ class EventRow(Base):
     samples_added: Mapped[int]
     samples: Mapped[int]
     photos: Mapped[int]
+    way: Mapped[str] = mapped_column(String(20), default="default", server_default="default")
     metrics: Mapped[dict[str, Any] | None]
     created_at: Mapped[datetime]
 

@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 
 from app.store.access.owners import now
 from app.store.database import insert_new
-from app.store.tables import GarbageRow, LensRow, PhotoRow, SampleRow
+from app.store.tables import EventRow, GarbageRow, LensRow, PatchRow, PhotoRow, SampleRow
 
 STILL_WRITTEN: Final = timedelta(minutes=30)
 """A worker may be learning from the version before while the next one comes."""
@@ -55,12 +55,13 @@ def report_key(lens_id: str, version: int, epoch: int) -> str:
 
 
 def take_samples(session: Session, photo: PhotoRow, version: int) -> int:
-    """Let the samples of a photo join its lens in `version`; return how many."""
+    """Let the samples of this epoch of a photo join its lens in `version`; return how many."""
+    newest = select(PatchRow.id).where(PatchRow.photo_id == photo.id, PatchRow.epoch == photo.epoch)
     joined = (
         session.connection()
         .execute(
             update(SampleRow)
-            .where(SampleRow.photo_id == photo.id)
+            .where(SampleRow.photo_id == photo.id, SampleRow.patch_id.in_(newest))
             .values(lens_id=photo.lens_id, version_added=version)
         )
         .rowcount
@@ -91,4 +92,27 @@ def recount(session: Session, lens_id: int) -> None:
     ).one()
     session.execute(
         update(LensRow).where(LensRow.id == lens_id).values(sample_count=samples, photo_count=photos)
+    )
+
+
+def record_event(
+    session: Session, lens_id: int, version: int, kind: str, photo: PhotoRow | None, *, samples_added: int
+) -> None:
+    """Write one line of the lens's history."""
+    counts = session.execute(
+        select(LensRow.sample_count, LensRow.photo_count, LensRow.answering_way).where(LensRow.id == lens_id)
+    ).one()
+    session.add(
+        EventRow(
+            lens_id=lens_id,
+            version=version,
+            kind=kind,
+            photo_public_id=None if photo is None else photo.public_id,
+            epoch=0 if photo is None else photo.epoch,
+            samples_added=samples_added,
+            samples=counts[0],
+            photos=counts[1],
+            way=counts[2],
+            created_at=now(),
+        )
     )

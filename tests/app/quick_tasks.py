@@ -59,7 +59,7 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: Progress) -> lis
         save_array(file, np.stack([gaussian(5, np.eye(2))] * 3))
     common = {
         "weight": 1.0,
-        "estimator": "quick/1",
+        "estimator": f"quick-{arguments['estimator']}-{arguments['size']}",
         "predicted_error": 0.1,
         "diagnostics": {"worker": float(os.getppid())},  # its fork server: one of each worker
         "spectrum": None,

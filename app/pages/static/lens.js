@@ -195,6 +195,10 @@ export function setUpLensActions() {
       await send("PATCH", lens, { label: fields.get("label").trim() || null });
       location.reload();
     },
+    model: async (fields) => {
+      await send("PATCH", lens, { model: fields.get("model") });
+      location.reload();
+    },
     merge: async (fields) => {
       const into = fields.get("lens");
       if (!into) throw new Error("Choose the lens that this one is to be merged into.");

@@ -13,16 +13,24 @@ from typing import Final, TypeAlias
 from sqlalchemy import ColumnElement, Select, and_, exists, func, or_, select, text
 from sqlalchemy.orm import Session
 
-from app.store import lenses
+from app.store.lens_ways import forget_before, join, settle, teaches
 from app.store.patches import recount as recount_patches
+from app.store.photo_steps import WORKED_ON
 from app.store.tables import CorrectionRow, EventRow, LensRow, PatchRow, PhotoRow, SampleRow
+from app.store.teaching import give_back
 from app.store.versions import recount
 
 Find: TypeAlias = Callable[[Session], Sequence[str]]
 Mend: TypeAlias = Callable[[Session, str], None]
 
 _ALIVE: Final = PhotoRow.deleted_at.is_(None)
-_COUNTS: Final = and_(PhotoRow.state == "counted", _ALIVE)
+_ANSWERING: Final = (
+    select(LensRow.answering_way).where(LensRow.id == PhotoRow.lens_id).correlate(PhotoRow).scalar_subquery()
+)
+_COUNTS: Final = and_(PhotoRow.state == "counted", PhotoRow.way == func.coalesce(_ANSWERING, ""), _ALIVE)
+"""What joined its lens; others wait until that has changed its way."""
+
+_RELEARNS: Final = and_(PhotoRow.relearning.is_(True), _ALIVE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,14 +140,18 @@ def _votes() -> Select[str]:
         SampleRow.version_added.is_not(None),
         SampleRow.version_added <= LensRow.version,
     )
+    must: ColumnElement[bool] = or_(
+        and_(_COUNTS, PatchRow.epoch == PhotoRow.epoch), and_(_RELEARNS, PatchRow.epoch != PhotoRow.epoch)
+    )
     return (
         select(PhotoRow.public_id)
         .join(SampleRow, SampleRow.photo_id == PhotoRow.id)
+        .join(PatchRow, PatchRow.id == SampleRow.patch_id)
         .outerjoin(LensRow, LensRow.id == SampleRow.lens_id)
         .where(
             or_(
-                and_(_COUNTS, or_(SampleRow.lens_id.is_(None), ~rightly)),
-                and_(~_COUNTS, SampleRow.lens_id.is_not(None)),
+                and_(must, or_(SampleRow.lens_id.is_(None), ~rightly)),
+                and_(~must, SampleRow.lens_id.is_not(None)),
             )
         )
         .distinct()
@@ -153,11 +165,17 @@ def _vote_anew(session: Session, photo_id: str) -> None:
     for lens_id in sorted({key for key in session.scalars(held.distinct()) if key is not None}):
         own, photo.lens_id = photo.lens_id, lens_id
         session.flush()
-        lenses.give_back(session, photo, "photo_removed")
+        give_back(session, photo, "photo_removed")
         photo.lens_id = own
         session.flush()
-    if photo.state == "counted" and photo.deleted_at is None and photo.lens_id is not None:
-        lenses.bring_in(session, photo, "photo_included")
+    if photo.relearning:  # what counted until now does no more
+        forget_before(session, photo)
+    if photo.lens_id is None or photo.deleted_at is not None:
+        return
+    if teaches(session, photo):
+        join(session, photo, "photo_included")
+    else:
+        settle(session, photo.lens_id)
 
 
 def _sampled() -> Select[str]:
@@ -220,6 +238,22 @@ def _ended() -> Select[str]:
     )
 
 
+def _unsettled() -> Select[str]:
+    """Lenses that could answer in the way that was chosen, and do not."""
+    photo = select(PhotoRow.id).where(PhotoRow.lens_id == LensRow.id, _ALIVE).correlate(LensRow)
+    anew = photo.where(PhotoRow.relearning.is_(True), PhotoRow.state.in_(WORKED_ON))
+    ready = photo.where(PhotoRow.state == "counted", PhotoRow.way == LensRow.way)
+    return select(LensRow.public_id).where(
+        LensRow.deleted_at.is_(None),
+        LensRow.way != LensRow.answering_way,
+        or_(and_(~exists(anew), exists(ready)), LensRow.sample_count == 0),
+    )
+
+
+def _settle(session: Session, lens_id: str) -> None:
+    settle(session, session.scalars(select(LensRow.id).where(LensRow.public_id == lens_id)).one())
+
+
 def _forgotten() -> Select[str]:
     sample = select(SampleRow.id).where(SampleRow.photo_id == PhotoRow.id).correlate(PhotoRow)
     patch = select(PatchRow.id).where(PatchRow.photo_id == PhotoRow.id).correlate(PhotoRow)
@@ -261,6 +295,7 @@ INVARIANTS: Final = (
     Invariant("samples", "patches are done exactly if they have samples", _ids(_sampled())),
     Invariant("progress", "photos count their patches rightly", _ids(_progress()), _recount_photo),
     Invariant("endings", "counted photos have a lens, failed ones a reason", _ids(_ended())),
+    Invariant("models", "lenses answer with their model as soon as they can", _ids(_unsettled()), _settle),
     Invariant("forgotten photos", "nothing is kept of deleted photos", _ids(_forgotten())),
     Invariant("forgotten lenses", "nothing is kept of deleted lenses", _ids(_forgotten_lenses())),
     Invariant("owners of lenses", "photos teach lenses of their owner", _ids(_own_lens())),

@@ -631,6 +631,53 @@ def test_a_photographers_bounds_reach_the_correction_and_its_tag(
     assert told[1]["description"].endswith("strength 1, halo 0.2, denoised 0.5")
 
 
+def test_the_model_of_a_lens_decides_how_its_photos_are_estimated(
+    work: PhotoWork, bench: Workbench, sandbox: Scripted, steps: Any
+) -> None:
+    told = []
+    for photo in (received(bench, steps), received(bench, steps, model="paper", lens_serial="other")):
+        work.photo(photo.public_id, 1)
+        assert steps.fresh(photo).state == "counted"
+        told.append((sandbox.seen["estimate"]["estimator"], sandbox.seen["estimate"]["size"]))
+
+    assert told == [("default", 31), ("michaeli-irani", 55)]
+
+
+def test_a_photo_that_asks_for_another_model_than_its_lens_has_says_what_to_do(
+    work: PhotoWork, bench: Workbench, photo: PhotoRow, steps: Any
+) -> None:
+    work.photo(photo.public_id, 1)
+    asking = received(bench, steps, model="paper")
+    work.photo(asking.public_id, 1)
+
+    refused = steps.fresh(asking)
+    assert (refused.state, refused.error_code) == ("failed", "conflict")
+    assert f"PATCH /v1/lenses/{steps.lens_id(photo)}" in refused.error_detail
+    bench.store.lens_changes.choose_way(steps.lens_id(photo), "local", "paper")
+    assert bench.store.photos.retry(asking.public_id)
+    for one in (photo, asking):
+        work.photo(one.public_id, 2)
+    assert [steps.fresh(one).state for one in (photo, asking)] == ["counted", "counted"]
+
+
+def test_the_model_of_a_lens_decides_how_it_is_measured_and_its_photos_are_corrected(
+    bench: Workbench, sandbox: Scripted, steps: Any
+) -> None:
+    photo = received(bench, steps, model="paper")
+    steps.inspect(photo)
+    steps.plan(photo)
+    steps.estimate(photo)
+    assert bench.store.photos.finish(photo.public_id, 1) == 1
+    sandbox.answers["measure"] = [ok({"error": {}, "coverage": {}})]
+    sandbox.answers["correct"] = [write_result]
+
+    CorrectionWork(bench).measure(steps.lens_id(photo), 1)
+    CorrectionWork(bench).correction(ask(bench, photo, steps, method="paper"))
+
+    wanted = {"mode": "paper", "unit": "micrometre"}
+    assert [sandbox.seen[task]["model"] for task in ("measure", "report", "correct")] == [wanted] * 3
+
+
 def test_a_correction_with_a_version_without_samples_fails(
     bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
 ) -> None:

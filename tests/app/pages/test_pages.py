@@ -584,6 +584,26 @@ def test_a_lens_is_renamed_merged_and_its_profile_taken_along(
     page.wait_for_url("**/")
 
 
+def test_a_lens_page_changes_the_model_and_back(page: Page, service: Service, tmp_path: Path) -> None:
+    lens = service.calibrated(write_photo(tmp_path / "w.dng", 71, serial="W-1"))["lens_id"]
+    page.goto(f"/lenses/{lens}")
+    expect(page.locator(".facts").first).to_contain_text("Model: default")
+    choice = page.locator("#lens-actions [data-act=model]")
+    choice.get_by_label("Model").select_option("paper")
+    choice.get_by_role("button", name="Change").click()
+    expect(page.locator("#lens-state")).to_contain_text(
+        "Being measured anew for the model paper: 1 photo to go"
+    )
+    expect(page.locator(".facts").first).to_contain_text("Model: default")
+    assert service.get(f"/v1/lenses/{lens}")["psf_model"] == "paper"
+
+    choice.get_by_label("Model").select_option("default")
+    choice.get_by_role("button", name="Change").click()
+    expect(page.locator("#lens-state")).not_to_contain_text("measured anew")
+    assert service.get(f"/v1/lenses/{lens}")["psf_model"] == "default"
+    assert service.get(f"/v1/lenses/{lens}")["version"] == 1  # nothing was lost, nothing done twice
+
+
 def test_a_page_says_when_the_service_is_away(visitor: Visitor, page: Page) -> None:
     page.goto("/")
     expect(page.locator("#away")).to_be_hidden()

@@ -240,3 +240,36 @@ def test_a_lens_page_shows_the_newest_of_many_versions(
 
     assert "<td>202</td>" in page
     assert "77 places" in page
+
+
+def test_the_page_of_a_lens_says_which_model_answers_and_how_far_a_change_is(
+    client: TestClient, steps: Steps, store: Store
+) -> None:
+    photos = [steps.counted() for _ in range(2)]
+    lens = steps.lens_id(photos[0])
+
+    def shown() -> str:
+        answer = client.get(f"/lenses/{lens}")
+        assert answer.status_code == 200, answer.text
+        return answer.text
+
+    assert "<li>Model: default</li>" in shown()
+    assert "to compare with" in shown()
+    assert "measured anew" not in shown()
+    client.patch(f"/v1/lenses/{lens}", json={"model": "paper"})
+    page = shown()
+    assert "Being measured anew for the model paper: 2 photos to go." in page
+    assert ("<li>Model: default</li>" in page, '<option value="paper" selected>' in page) == (True, True)
+    for photo in photos:
+        store.photos.fail(photo.public_id, 2, "no_usable_patches", "nothing there")
+    assert "None of its photos could be measured for the model paper, so it answers" in shown()
+    assert store.photos.retry(photos[0].public_id)
+    again = steps.fresh(photos[0])
+    steps.inspect(again)
+    steps.plan(again)
+    steps.estimate(again)
+    store.photos.finish(again.public_id, again.epoch)
+    assert "<li>Model: paper</li>" in shown()
+    assert "learned anew from all photos, model paper" in shown()
+    photo_page = client.get(f"/photos/{photos[0].public_id}").text
+    assert '<option value="paper" selected>Paper: Richardson-Lucy</option>' in photo_page

@@ -45,9 +45,38 @@ def reproduce(
     lenses: Annotated[
         int | None,
         typer.Option(
-            "--lenses", metavar="N", min=1, help="Only the first N lenses; a later run adds others."
+            "--lenses",
+            metavar="N",
+            min=1,
+            help="Only the first N lenses of each family; a later run adds others.",
         ),
     ] = None,
+    grids: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE",
+            help="PSFs of a ray-traced lens, made by `python -m lensmodel.lab.traced make`; again for more. "
+            "Default: the two of the repository.",
+        ),
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Only lenses whose name begins so: 1003, heliar; again for more."),
+    ] = None,
+    results: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Where figures of each lens and number of photos are kept and taken from, so that several "
+            "runs on several machines make one page. Default: cache in the output folder.",
+        ),
+    ] = None,
+    no_paper: Annotated[
+        bool, typer.Option("--no-paper", help="Leave out the paper's own way from end to end, which is slow.")
+    ] = False,
+    no_figures: Annotated[
+        bool, typer.Option("--no-figures", help="Leave Figs. 2 and 4 to a later run.")
+    ] = False,
     direct: Annotated[
         bool, typer.Option("--direct", help="Use the library in this process, not a service.")
     ] = False,
@@ -79,6 +108,8 @@ def reproduce(
 
         lensmodel reproduce --json reproduction.json
 
+        lensmodel reproduce --only 1003 --results figures-so-far --no-figures -o sitting
+
     Exit status: 0 the page is written, 1 something failed, 2 called wrongly.
     """
     shown = display.of(context, quiet=quiet, verbose=verbose)
@@ -95,20 +126,31 @@ def reproduce(
     )
 
     size: Size = "quick" if quick else "full" if full else "default"
-    plan = planned(size, scenes=scenes or _external(), estimator=estimator, hard=hard, lenses=lenses)
+    plan = planned(
+        size,
+        scenes=scenes or _external(),
+        estimator=estimator,
+        hard=hard,
+        lenses=lenses,
+        grids=grids or None,
+        only=only or (),
+        paper=not no_paper,
+    )
     result = run_reproduction(
         plan,
         _direct(estimator) if direct else ServiceRoutes(estimator),
         output,
         route="in the library" if direct else "by the service",
         code=() if direct else CODE,
+        with_figures=not no_figures,
+        results=results,
         on_work=Progress(quiet=shown.quiet),
     )
     result["figures"]["fig1"] = collected(benchmark, output / "pictures")
     written = [*write_page(result, output)]
     if json_output is not None:
         written.append(write_json(result, json_output))
-    shown.result("Written: " + ", ".join(str(path) for path in written))
+    shown.result(f"Code {result['code']}. Written: " + ", ".join(str(path) for path in written))
 
 
 class Progress:

@@ -15,9 +15,9 @@ from app.demo.service_tasks import corrected, follow, planes_of
 from app.schemas import PhotoOut
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.psf import as_kernel
-from lensmodel.core.types import LensSettings, Planes
-from lensmodel.lab.reproduce import Answer, Case, Place
-from lensmodel.simulate import SimulatedLens
+from lensmodel.core.types import LensSettings
+from lensmodel.lab.reproduce import Answer, Case, CorrectedPhoto, Place
+from lensmodel.simulate import CameraLens
 
 log = logging.getLogger(__name__)
 
@@ -35,11 +35,11 @@ class ServiceRoute:
     client : Client
     work : Path
         Folder for downloads; each is removed as soon as it has been read.
-    lens : SimulatedLens or None
+    lens : CameraLens or None
         Which lens it is, said with photos that do not say it themselves.
     """
 
-    def __init__(self, client: Client, work: Path, lens: SimulatedLens | None = None) -> None:
+    def __init__(self, client: Client, work: Path, lens: CameraLens | None = None) -> None:
         self._client, self._work, self._lens = client, work, lens
         self._lens_id: str | None = None
 
@@ -70,7 +70,7 @@ class ServiceRoute:
             found.append(Answer(as_kernel(psf.psf.data), np.nan if error is None else error))
         return found
 
-    def corrected(self, photo: Path, method: str) -> Planes:
+    def corrected(self, photo: Path, method: str) -> CorrectedPhoto:
         """Have a photo corrected that the lens does not learn from; see `Route`."""
         uploaded = self._upload(photo, calibrate=False)
         follow(self._client, uploaded, log.info)
@@ -84,8 +84,9 @@ class ServiceRoute:
             lens_id=self._known(),
         )
         planes = planes_of(path)
+        zones = (self._client.correction(path.stem).report or {}).get("zones", {})
         path.unlink()
-        return planes
+        return CorrectedPhoto(planes, {zone: row.get("expected_gain_db") for zone, row in zones.items()})
 
     def _upload(self, photo: Path, *, calibrate: bool) -> PhotoOut:
         """Send a photo; a TIFF or JPEG has no lens serial, so its lens is named as its owner would."""

@@ -90,7 +90,8 @@ def without_lateral(lens: SimulatedLens) -> SimulatedLens:
 
 def shoot(case: Case, files: Sequence[Path], folder: Path, how: str) -> Shot:
     """Take all photos of a lens in one of the ways of `FILES`."""
-    lens = without_lateral(case.lens) if how == "no lateral colour" else case.lens
+    drawn = draw_lens(case.seed)
+    lens = without_lateral(drawn) if how == "no lateral colour" else drawn
     frames = case.photos[-1] + 1
     order = case.order(len(files) * case.layout.pieces)
     paths, sharp = [], np.empty(0, dtype=np.float32)

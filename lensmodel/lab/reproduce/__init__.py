@@ -3,12 +3,13 @@
 from lensmodel.lab.reproduce.cases import Case, Reproduction, Size, planned
 from lensmodel.lab.reproduce.pages.blind_curve import collected
 from lensmodel.lab.reproduce.pages.page import write_json, write_page
-from lensmodel.lab.reproduce.routes import Answer, DirectRoute, OpenRoute, Place, Route
+from lensmodel.lab.reproduce.routes import Answer, CorrectedPhoto, DirectRoute, OpenRoute, Place, Route
 from lensmodel.lab.reproduce.run import run_reproduction
 
 __all__ = [
     "Answer",
     "Case",
+    "CorrectedPhoto",
     "DirectRoute",
     "OpenRoute",
     "Place",

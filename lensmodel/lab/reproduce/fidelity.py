@@ -21,6 +21,7 @@ EVERY: Final = 120
 """Up to so many blocks all are looked at, of more every second one, as on a chessboard."""
 
 _LARGEST_SHIFT = 3.0
+_CORE = (slice(BORDER, -BORDER), slice(BORDER, -BORDER))
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +73,34 @@ def fidelity(image: Planes, reference: Planes, frame: Frame) -> dict[str, dict[s
     }
 
 
+def linear_psnr(image: Planes, reference: Planes, frame: Frame) -> dict[Zone, float]:
+    """PSNR in dB of linear light by zone, over the blocks of `fidelity`, each at its best shift.
+
+    Parameters
+    ----------
+    image, reference : Planes, shape (3, H, W)
+        Linear light.
+    frame : Frame
+        (H, W).
+    """
+    radius = frame.radius_map()
+    errors, counts = dict.fromkeys(ZONES, 0.0), dict.fromkeys(ZONES, 0)
+
+    def compared(corner: tuple[int, int]) -> dict[Zone, tuple[float, int]]:
+        rows, cols = (slice(start, start + BLOCK) for start in corner)
+        moved = _registered(*(p[:, rows, cols].astype(np.float64) for p in (image, reference)))
+        error = np.square(moved - reference[:, rows, cols]).mean(axis=0)[_CORE]
+        masks = _zones(radius[rows, cols][_CORE])
+        return {zone: (float(error[mask].sum()), int(mask.sum())) for zone, mask in masks.items()}
+
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        for part in pool.map(compared, blocks(frame)):
+            for zone, (error, count) in part.items():
+                errors[zone] += error
+                counts[zone] += count
+    return {z: float(-10.0 * np.log10(max(errors[z] / counts[z], 1e-30))) for z in ZONES if counts[z]}
+
+
 def blocks(frame: Frame) -> list[tuple[int, int]]:
     """Top left pixels of the blocks that are looked at."""
     rows, cols = _starts(frame.height), _starts(frame.width)
@@ -88,23 +117,31 @@ def _compared(
     found: NDArray[np.float64], wanted: NDArray[np.float64], radius: NDArray[np.floating]
 ) -> dict[Zone, _Sum]:
     """Compare one block at its best shift."""
-    shift = quality.best_shift(found, wanted)
-    if max(map(abs, shift)) > _LARGEST_SHIFT:
-        shift = (0.0, 0.0)  # nothing in the block says where it lies
-    moved = quality.shifted(found, *shift)
-    core = (slice(BORDER, -BORDER), slice(BORDER, -BORDER))
-    error = np.square(moved - wanted).mean(axis=0)[core]
+    moved = _registered(found, wanted)
+    error = np.square(moved - wanted).mean(axis=0)[_CORE]
     maps = [
         structural_similarity(  # type: ignore[no-untyped-call]  # scikit-image ships no types
             a, b, data_range=1.0, gaussian_weights=True, use_sample_covariance=False, full=True
         )[1]
         for a, b in zip(moved, wanted, strict=True)
     ]
-    likeness = np.mean(maps, axis=0)[core]
-    r = radius[core]
-    masks: dict[Zone, NDArray[np.bool_]] = {"center": r < CENTER_ZONE_R, "corner": r > CORNER_ZONE_R}
-    masks["mid"] = ~(masks["center"] | masks["corner"])
+    likeness = np.mean(maps, axis=0)[_CORE]
     return {
         zone: _Sum(float(error[mask].sum()), float(likeness[mask].sum()), int(mask.sum()))
-        for zone, mask in masks.items()
+        for zone, mask in _zones(radius[_CORE]).items()
     }
+
+
+def _registered(found: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shift one block to where it lies best."""
+    shift = quality.best_shift(found, wanted)
+    if max(map(abs, shift)) > _LARGEST_SHIFT:
+        shift = (0.0, 0.0)  # nothing in the block says where it lies
+    return quality.shifted(found, *shift)
+
+
+def _zones(r: NDArray[np.floating]) -> dict[Zone, NDArray[np.bool_]]:
+    """Pixels of each zone."""
+    masks: dict[Zone, NDArray[np.bool_]] = {"center": r < CENTER_ZONE_R, "corner": r > CORNER_ZONE_R}
+    masks["mid"] = ~(masks["center"] | masks["corner"])
+    return masks

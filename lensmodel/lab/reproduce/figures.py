@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -17,16 +17,15 @@ from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfField, PsfSample, distance, rms_width
 from lensmodel.core.types import FieldPosition, Plane
 from lensmodel.estimation.patches import r_map
-from lensmodel.lab.model.model_benchmark import patch_places, predictor, run_model_benchmark
+from lensmodel.lab.reproduce import interpolation
 from lensmodel.lab.reproduce.cases import Case, Reproduction
+from lensmodel.lab.reproduce.conditions import BASE
 from lensmodel.lab.reproduce.shots import take
 from lensmodel.model import LensModel
 from lensmodel.photo import develop
 from lensmodel.report.photo_crops import as_shown, kernel_tile
-from lensmodel.simulate import draw_lens
 from lensmodel.workflow import pipeline
 
-COMPARED: Final = ("eff-linear", "paper", "blended")
 _SHOWN: Final = (FieldPosition(0.5, 2.5), FieldPosition(0.8, 0.55), FieldPosition(0.95, -2.6))
 _SIZE: Final = 31
 _WIDTH: Final = 720
@@ -34,42 +33,52 @@ _GRID: Final = (6, 9)
 
 
 def version() -> str:
-    """Hash of this file: drawings of another version are drawn again."""
-    return hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:8]
+    """Hash of the code: drawings of another version are drawn again."""
+    total = hashlib.sha256()
+    for path in (Path(__file__), Path(interpolation.__file__)):
+        total.update(path.read_bytes())
+    return total.hexdigest()[:8]
 
 
 def draw(plan: Reproduction, case: Case, folder: Path, *, workers: int | None = None) -> dict[str, Any]:
     """Draw both figures into a folder and return their names and figures."""
-    seeds = sorted({c.seed for c in plan.cases})
-    return {"fig2": _fig2(seeds, folder), "fig4": _fig4(plan, case, folder, workers)}
+    whole = {c.name: c for c in plan.cases if c.condition == BASE and c.stops < 0.1 and c.photos[0] <= 2}
+    return {"fig2": _fig2(list(whole.values()), folder), "fig4": _fig4(plan, case, folder, workers)}
 
 
-def _fig2(seeds: Sequence[int], folder: Path) -> dict[str, Any]:
-    """True PSFs at the patches of one photo; asked in between: error of each way, and a picture."""
-    table = run_model_benchmark(seeds=seeds, photos=(1,), methods=COMPARED)
+def names(drawn: Mapping[str, Any]) -> list[str]:
+    """Pictures of the figures."""
+    return [
+        name
+        for figure in drawn.values()
+        for name in (*([figure["picture"]] if "picture" in figure else ()), *figure.get("pictures", ()))
+    ]
+
+
+def _fig2(cases: Sequence[Case], folder: Path) -> dict[str, Any]:
+    """True PSFs of as many patches as one photo has; asked in between: error of each way, and a picture."""
+    families = {c.family: [one for one in cases if one.family == c.family] for c in cases}
     # the lens whose corner is worst is the one where it matters
-    worst = max(seeds, key=lambda seed: rms_width(draw_lens(seed).kernel(_SHOWN[-1], None, _SIZE)))
-    lens = draw_lens(worst)
-    rng = np.random.default_rng(worst)
-    samples = [PsfSample(lens.kernel(p, None, _SIZE), p, photo="photo0") for p in patch_places(rng)]
-    rows, errors = [], []
-    truth = [lens.kernel(place, None, _SIZE) for place in _SHOWN]
-    rows.append([kernel_tile(k) for k in truth])
-    for name in COMPARED:
-        predict = predictor(name, samples)
+    worst = max(cases, key=lambda one: rms_width(one.truth().kernel_at(_SHOWN[-1], "g", _SIZE)))
+    field = worst.truth()
+    truth = [field.kernel_at(place, "g", _SIZE) for place in _SHOWN]
+    rows, errors = [[kernel_tile(k) for k in truth]], {}
+    for name, predict in interpolation.predictors(worst).items():
         found = [predict(place) for place in _SHOWN]
-        errors.append([distance(a, b).rel_l2 for a, b in zip(found, truth, strict=True)])
+        errors[name] = [distance(a, b).rel_l2 for a, b in zip(found, truth, strict=True)]
         rows.append([kernel_tile(k) for k in found])
-    sheet = _sheet(rows)
-    Image.fromarray(sheet).save(folder / "fig2.png", optimize=True)
+    Image.fromarray(_sheet(rows)).save(folder / "fig2.png", optimize=True)
     return {
         "picture": "fig2.png",
-        "lens": lens.model,
-        "rows": ["truth", *COMPARED],
+        "lens": worst.title,
+        "rows": ["truth", *errors],
         "places": [[p.r, p.phi] for p in _SHOWN],
-        "errors": dict(zip(COMPARED, errors, strict=True)),
-        "table": table["rows"],
-        "seeds": list(seeds),
+        "errors": errors,
+        "table": [
+            {"family": family, "lenses": len(lenses), **row}
+            for family, lenses in families.items()
+            for row in interpolation.compared(lenses)
+        ],
     }
 
 

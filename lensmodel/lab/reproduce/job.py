@@ -17,11 +17,14 @@ from lensmodel.core.psf import PsfField
 from lensmodel.core.types import Planes
 from lensmodel.lab.reproduce import measure, programs
 from lensmodel.lab.reproduce.cases import Case, Reproduction
+from lensmodel.lab.reproduce.general import general_field
 from lensmodel.lab.reproduce.measured import measured_field, photograph_target
 from lensmodel.lab.reproduce.progress import (
     CORRECT,
     LEARN,
     MEASURE,
+    PAPER_CORRECT,
+    PAPER_LEARN,
     PROGRAM,
     RIVAL,
     SHOT,
@@ -32,9 +35,11 @@ from lensmodel.lab.reproduce.progress import (
     programs_of,
     rivals_of,
     weight_of,
+    with_paper,
 )
 from lensmodel.lab.reproduce.routes import (
     Answer,
+    DirectRoute,
     OpenRoute,
     PointField,
     Remembered,
@@ -46,8 +51,10 @@ from lensmodel.lab.reproduce.store import Unit, read, stored
 from lensmodel.lab.rivals import rivals
 from lensmodel.photo import LinearPhoto, develop
 from lensmodel.report import photo_crops
+from lensmodel.workflow.ways import WAYS
 
 CROP_PX = 128
+_ALONE = ("truth", "measured", "general")
 CONTROL = "standard"
 """Method whose denoising alone is the control."""
 
@@ -61,6 +68,7 @@ class Job:
     plan: Reproduction
     open_route: OpenRoute
     folder: Path
+    work: Path
     shown: Path
     progress: Progress
     workers: int
@@ -73,47 +81,62 @@ class Job:
 
     def run(self) -> Unit:
         """Compute what is missing, and return all of it."""
-        case, learned = self.case, {n: self.folder / f"learned-{n}.json" for n in self.case.photos}
-        truth, work = self.folder / "truth.json", self.folder / "work"
-        measured = [self.folder / "measured.json"] if is_measured(case) else []
-        rival = {
-            name: self.folder / f"rival-{name}-{self.rival_code}.json" for name in rivals_of(case, self.plan)
-        }
-        version = programs.version()
-        program = {
-            name: self.folder / f"program-{programs.label_of(name)}-{version}.json"
-            for name in programs_of(case, self.plan)
-        }
-        files = (truth, *measured, *learned.values(), *rival.values(), *program.values())
-        if all(path.exists() for path in files):
+        case, files = self.case, self._files()
+        every = [path for part in files.values() for path in part.values()]
+        if all(path.exists() for path in every):
             self.progress.tell(f"{case.title}: stored", weight_of(case, self.plan), fresh=False)
         else:
-            shots = self._shots(work / "photos")
-            self._truth(truth, shots)
-            for path in measured:
-                self._target(path, shots, work)
-            if all(path.exists() for path in learned.values()):
+            shots = self._shots(self.work / "photos")
+            for path in files["truth"].values():
+                self._truth(path, shots)
+            for path in files["measured"].values():
+                self._target(path, shots)
+            if all(path.exists() for path in files["learned"].values()):
                 self.progress.tell(f"{case.title}: learned before", self._learning(), fresh=False)
             else:
-                with self.open_route(case, work) as route:
-                    self._learned(route, shots, learned)
-            self._beside(rival, shots)
-            self._programs(program, shots)
-            shutil.rmtree(work)
+                with self.open_route(case, self.work) as route:
+                    self._learned(route, shots, files["learned"])
+            self._paper(shots, files["paper"])
+            for path in files["general"].values():
+                self._general(path, shots)
+            self._beside(files["rivals"], shots)
+            self._programs(files["programs"], shots)
+            shutil.rmtree(self.work)
+        units = {part: {name: read(path) for name, path in paths.items()} for part, paths in files.items()}
         return {
             "name": case.name,
             "title": case.title,
+            "family": case.family,
+            "unseen": case.unseen,
+            "source": case.source,
             "kind": case.lens.model.split()[1].lower(),
             "condition": case.condition,
             "condition_title": case.conditions.title,
-            "settings": {key: value for key, value in asdict(case).items() if key != "layout"},
+            "settings": {k: v for k, v in asdict(case).items() if k not in {"layout", "grid"}},
             "stops": case.stops,
             "frames": case.layout.words(),
-            "truth": read(truth),
-            "measured": read(measured[0]) if measured else None,
-            "learned": {str(n): read(path) for n, path in learned.items()},
-            "rivals": {name: read(path) for name, path in rival.items()},
-            "programs": {name: read(path) for name, path in program.items()},
+            **{name: units[name][""] if units[name] else None for name in _ALONE},
+            **{name: units[name] for name in units if name not in _ALONE},
+        }
+
+    def _files(self) -> dict[str, dict[str, Path]]:
+        """Where each unit of the case is stored, by part of the result and name in it."""
+        case, plan, folder = self.case, self.plan, self.folder
+        program = programs.version()
+        counts = [str(n) for n in case.photos]
+        return {
+            "truth": {"": folder / "truth.json"},
+            "measured": {"": folder / "measured.json"} if is_measured(case) else {},
+            "general": {"": folder / "general.json"} if plan.general and is_measured(case) else {},
+            "learned": {n: folder / f"learned-{n}.json" for n in counts},
+            "paper": {n: folder / f"paper-{n}.json" for n in counts} if with_paper(case, plan) else {},
+            "rivals": {
+                name: folder / f"rival-{name}-{self.rival_code}.json" for name in rivals_of(case, plan)
+            },
+            "programs": {
+                name: folder / f"program-{programs.label_of(name)}-{program}.json"
+                for name in programs_of(case, plan)
+            },
         }
 
     def _learning(self) -> float:
@@ -138,22 +161,31 @@ class Job:
         _, fresh = stored(path, lambda: self._measured_truth(shots))
         self.progress.tell(f"{self.case.title}: with the true PSF", weight, fresh=fresh)
 
-    def _target(self, path: Path, shots: Shots, work: Path) -> None:
+    def _target(self, path: Path, shots: Shots) -> None:
         weight = MEASURE + corrections(self.case, self.plan)
-        _, fresh = stored(path, lambda: self._measured_by_target(shots, work))
+        _, fresh = stored(path, lambda: self._measured_by_target(shots))
         self.progress.tell(f"{self.case.title}: measured with a target", weight, fresh=fresh)
 
-    def _measured_by_target(self, shots: Shots, work: Path) -> Unit:
+    def _measured_by_target(self, shots: Shots) -> Unit:
         """What a photo of the printed target makes of the lens: the paper's non-blind calibration."""
-        page = work / "target.dng"
-        began = time.monotonic()
+        page = self.work / "target.dng"
         try:
             photograph_target(self.case, page)
             began = time.monotonic()
-            field = Remembered(measured_field(self.case, page))
+            field = measured_field(self.case, page)
         except LensModelError as error:  # frames too small for a page: the row is left out
             return {"refused": str(error), "psf": None, "methods": {}, "pictures": {}}
-        seconds = time.monotonic() - began
+        return self._by_field(field, time.monotonic() - began, shots, "measured")
+
+    def _general(self, path: Path, shots: Shots) -> None:
+        weight = MEASURE + corrections(self.case, self.plan)
+        make = partial(self._by_field, general_field(self.case), 0.0, shots, "general")
+        _, fresh = stored(path, make)
+        self.progress.tell(f"{self.case.title}: with a general profile", weight, fresh=fresh)
+
+    def _by_field(self, psfs: PsfField, seconds: float, shots: Shots, label: str) -> Unit:
+        """Errors of a PSF field, and what corrections with it come to."""
+        field = Remembered(psfs)
         answers = [Answer(field.kernel_at(*place, measure.PSF_SIZE), np.nan) for place in measure.places()]
         unit: Unit = {
             "refused": "",
@@ -165,7 +197,7 @@ class Job:
         chart = None if shots.chart is None else develop(shots.chart)
         photo = develop(shots.held_out)
         for method in self.methods:
-            unit["methods"][method], made = self._corrected(chart, photo, field, method, shots, "measured")
+            unit["methods"][method], made = self._corrected(chart, photo, field, method, shots, label)
             unit["pictures"] |= made
         return unit
 
@@ -173,8 +205,9 @@ class Job:
         case = self.case
         chart = None if shots.chart is None else develop(shots.chart)
         photo = develop(shots.held_out)
+        before = measure.state(None if chart is None else chart.planes, photo.planes, shots, case)
         unit: Unit = {
-            "before": measure.state(None if chart is None else chart.planes, photo.planes, shots, case),
+            "before": {**before, "light": measure.light(photo.planes, shots, case)} if self._raw else before,
             "true": {},
             "pictures": {
                 "before": self._picture("before", photo.planes),
@@ -205,7 +238,7 @@ class Job:
 
     def _as_photo(self, planes: Planes) -> Planes:
         """Planes of the sensor as the photo's file has them: white-balanced where it is not raw."""
-        if self.case.conditions.container == "dng":
+        if self._raw:
             return planes
         return planes * np.asarray(self.case.camera.white_balance, dtype=np.float32)[:, None, None]
 
@@ -219,26 +252,12 @@ class Job:
         """What a rival makes of the first photo, corrected by our methods."""
         began = time.monotonic()
         try:
-            field = Remembered(rivals.create(name).field([develop(shots.learn[0])]))
+            field = rivals.create(name).field([develop(shots.learn[0])])
         except LensModelError as error:
             before = read(self.folder / "truth.json")["before"]
             unit: Unit = {"refused": str(error), "psf": None, "pictures": {}}
             return {**unit, "methods": dict.fromkeys(self.methods, before)}
-        seconds = time.monotonic() - began
-        answers = [Answer(field.kernel_at(*place, measure.PSF_SIZE), np.nan) for place in measure.places()]
-        unit = {
-            "refused": "",
-            "learning_seconds": round(seconds, 1),
-            "psf": measure.psf_errors(answers, self.truth),
-            "methods": {},
-            "pictures": {},
-        }
-        chart = None if shots.chart is None else develop(shots.chart)
-        photo = develop(shots.held_out)
-        for method in self.methods:
-            unit["methods"][method], made = self._corrected(chart, photo, field, method, shots, name)
-            unit["pictures"] |= made
-        return unit
+        return self._by_field(field, time.monotonic() - began, shots, name)
 
     def _programs(self, targets: Mapping[str, Path], shots: Shots) -> None:
         for name, path in targets.items():
@@ -259,23 +278,41 @@ class Job:
             "pictures": {label: self._picture(label, after)},
         }
 
-    def _learned(self, route: Route, shots: Shots, targets: Mapping[int, Path]) -> None:
+    def _paper(self, shots: Shots, targets: Mapping[str, Path]) -> None:
+        """Learn and correct the paper's own way from end to end, in the library."""
+        weight = self.case.photos[-1] * PAPER_LEARN + len(targets) * PAPER_CORRECT
+        if all(path.exists() for path in targets.values()):
+            self.progress.tell(
+                f"{self.case.title}: the paper's way, stored", weight * bool(targets), fresh=False
+            )
+            return
+        route = DirectRoute(self.work / "paper", workers=self.workers, way=WAYS["paper"])
+        self._learned(route, shots, targets, own_way=True)
+
+    def _learned(
+        self, route: Route, shots: Shots, targets: Mapping[str, Path], *, own_way: bool = False
+    ) -> None:
         refused: list[str] = []
-        weight, seen = corrections(self.case, self.plan), 0
-        for n, path in targets.items():
-            began = time.monotonic()
+        learn = PAPER_LEARN if own_way else LEARN
+        weight = PAPER_CORRECT if own_way else corrections(self.case, self.plan)
+        said, seen = "the paper's way, " if own_way else "", 0
+        for number, path in targets.items():
+            n, began = int(number), time.monotonic()
             for photo in shots.learn[seen:n]:
                 if reason := route.learn(photo):
                     refused.append(f"{photo.stem}: {reason}")
-                self.progress.tell(f"{self.case.title}: learned from {photo.stem}", LEARN)
+                self.progress.tell(f"{self.case.title}: {said}learned from {photo.stem}", learn)
             seconds = time.monotonic() - began
-            make = partial(self._measured, route, shots, n, tuple(refused), seconds)
+            make = partial(self._measured, route, shots, n, tuple(refused), seconds, own_way)
             _, fresh = stored(path, make)
-            self.progress.tell(f"{self.case.title}: measured after {n}", weight, fresh=fresh)
+            self.progress.tell(f"{self.case.title}: {said}measured after {n}", weight, fresh=fresh)
             seen = n
 
-    def _measured(self, route: Route, shots: Shots, n: int, refused: Sequence[str], seconds: float) -> Unit:
-        case = self.case
+    def _measured(
+        self, route: Route, shots: Shots, n: int, refused: Sequence[str], seconds: float, own_way: bool
+    ) -> Unit:
+        case, methods = self.case, (WAYS["paper"].method,) if own_way else self.methods
+        label = f"way-paper-n{n}" if own_way else f"n{n}"
         unit: Unit = {
             "photos": n,
             "counted": n - len(refused),
@@ -283,26 +320,33 @@ class Job:
             "learning_seconds": round(seconds, 1),
             "pictures": {},
         }
+        before = read(self.folder / "truth.json")["before"]
         if n == len(refused):
             # no model: a user gets no correction, so the photos stay as they are
-            before = read(self.folder / "truth.json")["before"]
-            return {**unit, "psf": None, "methods": dict.fromkeys(self.methods, before)}
+            return {**unit, "psf": None, "methods": dict.fromkeys(methods, before)}
         unit["methods"] = {}
         chart = None if shots.chart is None else develop(shots.chart).planes
-        for method in self.methods:
+        for method in methods:
             after = route.corrected(shots.held_out, method)
-            edges = None if shots.chart is None else route.corrected(shots.chart, method)
-            unit["methods"][method] = measure.state(edges, after, shots, case, before=chart)
-            unit["pictures"][f"n{n}-{method}"] = self._picture(f"n{n}-{method}", after)
+            edges = None if shots.chart is None else route.corrected(shots.chart, method).planes
+            state = measure.state(edges, after.planes, shots, case, before=chart)
+            if self._raw:
+                told = measure.forecast(before["light"], after.planes, after.expected_db, shots, case)
+                state["forecast"] = told
+            unit["methods"][method] = state
+            unit["pictures"][f"{label}-{method}"] = self._picture(f"{label}-{method}", after.planes)
         # not before: until a correction, or its own leisure, has fitted the model, a service answers in part
         answers = route.answers(measure.places(), case.settings, measure.PSF_SIZE)
         unit["psf"] = measure.psf_errors(answers, self.truth)
         return unit
 
+    @property
+    def _raw(self) -> bool:
+        return self.case.conditions.container == "dng"
+
     def _picture(self, label: str, planes: Planes) -> str:
         name = f"{self.folder.name}-{label}.png"
-        raw = self.case.conditions.container == "dng"
-        gains = self.case.camera.white_balance if raw else (1.0, 1.0, 1.0)
+        gains = self.case.camera.white_balance if self._raw else (1.0, 1.0, 1.0)
         crops = photo_crops.strip(photo_crops.as_shown(planes, gains), CROP_PX)
         Image.fromarray(crops).save(self.shown / name, optimize=True)
         return name

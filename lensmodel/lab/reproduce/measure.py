@@ -15,7 +15,7 @@ from lensmodel.core.psf import PsfField, distance
 from lensmodel.core.types import CHANNELS, ZONES, Planes
 from lensmodel.lab.model.model_benchmark import asked_places
 from lensmodel.lab.reproduce.cases import Case
-from lensmodel.lab.reproduce.fidelity import fidelity
+from lensmodel.lab.reproduce.fidelity import fidelity, linear_psnr
 from lensmodel.lab.reproduce.routes import Answer, Place
 from lensmodel.lab.reproduce.shots import Shots, guard_of
 from lensmodel.simulate import edge_chart
@@ -90,6 +90,33 @@ def pictures(photo: Planes, shots: Shots, case: Case) -> dict[str, dict[str, flo
     gains = np.asarray(case.camera.white_balance, dtype=np.float32)[:, None, None]
     seen = photo * gains if case.conditions.container == "dng" else photo
     return fidelity(seen, shots.truth() * gains, case.camera.frame)
+
+
+def forecast(
+    before: Mapping[str, float], after: Planes, expected: Mapping[str, float | None], shots: Shots, case: Case
+) -> dict[str, dict[str, float | None]]:
+    """Gain in PSNR of linear light that a correction expected of itself in each zone, beside the true one.
+
+    Parameters
+    ----------
+    before : mapping
+        `light` of the photo as it was.
+    after : Planes
+        Corrected, of the raw path.
+    expected : mapping
+        Decibels by zone; None where the correction does not tell.
+    """
+    found = light(after, shots, case)
+    return {
+        zone: {"expected": expected[zone], "true": found[zone] - before[zone]}
+        for zone in found
+        if zone in expected
+    }
+
+
+def light(photo: Planes, shots: Shots, case: Case) -> dict[str, float]:
+    """PSNR in dB of linear light by zone of the held-out photo of the raw path, camera's colours."""
+    return dict(linear_psnr(photo, shots.truth(), case.camera.frame).items())
 
 
 def state(

@@ -36,6 +36,8 @@ CORRECT: Final = 1.0
 MEASURE: Final = 4.0
 RIVAL: Final = 4.0
 PROGRAM: Final = 4.0
+PAPER_LEARN: Final = 20.0
+PAPER_CORRECT: Final = 2.0
 FIGURES: Final = 12.0
 """Rough shares of the time."""
 
@@ -60,6 +62,11 @@ def is_measured(case: Case) -> bool:
     return case.condition == BASE and case.photos[0] <= 2
 
 
+def with_paper(case: Case, plan: Reproduction) -> bool:
+    """Whether the lens of a case is also learned the paper's own way: once, like the rivals."""
+    return plan.paper and is_measured(case)
+
+
 def corrections(case: Case, plan: Reproduction) -> float:
     """Weight of correcting and measuring chart and photo by every method."""
     return (2 if case.conditions.with_chart else 1) * len(methods_of(case, plan)) * CORRECT
@@ -69,6 +76,8 @@ def weight_of(case: Case, plan: Reproduction) -> float:
     """Weight of a whole case."""
     shots = (case.photos[-1] + 2) * SHOT
     each = corrections(case, plan)
-    target = MEASURE + each if is_measured(case) else 0.0
+    target = (MEASURE + each) * (1 + plan.general) if is_measured(case) else 0.0
+    if with_paper(case, plan):
+        target += case.photos[-1] * PAPER_LEARN + len(case.photos) * PAPER_CORRECT
     rest = target + len(rivals_of(case, plan)) * (RIVAL + each) + len(programs_of(case, plan)) * PROGRAM
     return shots + each + 2 * CORRECT + case.photos[-1] * LEARN + len(case.photos) * each + rest

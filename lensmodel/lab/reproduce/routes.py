@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
 from pathlib import Path
 from typing import Protocol, TypeAlias
@@ -17,10 +17,11 @@ from lensmodel.core.psf import PsfField
 from lensmodel.core.types import Channel, FieldPosition, Kernel, LensSettings, Planes
 from lensmodel.correction import correct_planes
 from lensmodel.lab.reproduce.cases import Case
-from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
+from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
 from lensmodel.photo import LinearPhoto, develop
 from lensmodel.photo.lateral import LateralColour, resample
 from lensmodel.workflow import pipeline
+from lensmodel.workflow.ways import WAYS, Way
 
 Place: TypeAlias = tuple[FieldPosition, Channel]
 
@@ -38,6 +39,23 @@ class Answer:
 
     kernel: Kernel
     predicted_error: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CorrectedPhoto:
+    """A photo as the route corrects it.
+
+    Parameters
+    ----------
+    planes : Planes
+        In the camera's colours, linear, not white-balanced.
+    expected_db : mapping of str to float or None
+        Gain in PSNR of linear light that the correction expects of itself, by zone; None where it is not
+        sure enough to tell.
+    """
+
+    planes: Planes
+    expected_db: Mapping[str, float | None] = dataclass_field(default_factory=dict)
 
 
 class Route(Protocol):
@@ -58,14 +76,8 @@ class Route(Protocol):
             If no photo has counted yet.
         """
 
-    def corrected(self, photo: Path, method: str) -> Planes:
-        """Correct a photo that takes no part in learning, with what is known now.
-
-        Returns
-        -------
-        Planes
-            In the camera's colours, linear, not white-balanced.
-        """
+    def corrected(self, photo: Path, method: str) -> CorrectedPhoto:
+        """Correct a photo that takes no part in learning, with what is known now."""
 
 
 OpenRoute: TypeAlias = Callable[[Case, Path], AbstractContextManager[Route]]
@@ -79,15 +91,25 @@ class DirectRoute:
     ----------
     folder : Path
         Where models are kept between runs.
-    estimator : str
-        Name in the registry of blind estimators.
+    estimator : str or None
+        Name in the registry of blind estimators; None takes that of the way.
     workers : int or None
         Processes; None takes all cores.
+    way : Way
+        How the lens is learned.
     """
 
-    def __init__(self, folder: Path, estimator: str = "default", workers: int | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        estimator: str | None = None,
+        workers: int | None = None,
+        *,
+        way: Way = WAYS["default"],
+    ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        self._folder, self._estimator, self._workers = folder, estimator, workers
+        self._folder, self._workers = folder, workers
+        self._way = way if estimator is None else replace(way, estimator=estimator)
         self._seen: list[str] = []
         self._model: LensModel | None = None
 
@@ -97,6 +119,7 @@ class DirectRoute:
         if name in self._seen:
             return ""
         self._seen.append(name)
+        chosen = ModelSettings(mode=self._way.mode)
         stored = self._folder / f"{name}.lensprofile"
         refused = self._folder / f"{name}.json"
         if refused.exists():
@@ -106,13 +129,18 @@ class DirectRoute:
         else:
             try:
                 samples = tuple(
-                    pipeline.samples_of_photo(photo, estimator=self._estimator, workers=self._workers)
+                    pipeline.samples_of_photo(
+                        photo,
+                        estimator=self._way.estimator,
+                        kernel_size=self._way.kernel_size,
+                        workers=self._workers,
+                    )
                 )
             except LensModelError as error:
                 refused.write_text(json.dumps(str(error)), encoding="utf-8")
                 return str(error)
-            save_profile(stored, LensProfile(LensModel.fit(samples)))
-        model = LensModel.fit(samples) if self._model is None else self._model.added(samples)
+            save_profile(stored, LensProfile(LensModel.fit(samples, chosen)))
+        model = LensModel.fit(samples, chosen) if self._model is None else self._model.added(samples)
         self._model = model.warmed()
         return ""
 
@@ -122,17 +150,20 @@ class DirectRoute:
         found = [model.query(place, settings.with_channel(channel), size) for place, channel in places]
         return [Answer(answer.kernel, answer.predicted_error) for answer in found]
 
-    def corrected(self, photo: Path, method: str) -> Planes:
+    def corrected(self, photo: Path, method: str) -> CorrectedPhoto:
         """Correct a photo; see `Route`."""
         developed = develop(photo)
-        return pipeline.correct_photo(
+        done = pipeline.correct_photo(
             developed,
             self._known(),
             pipeline.settings_of(developed),
             method=method,
             lateral=pipeline.lateral_of(developed),
             workers=self._workers or os.cpu_count() or 1,
-        ).planes
+        )
+        return CorrectedPhoto(
+            done.planes, {zone: report.expected_gain_db for zone, report in done.zones.items()}
+        )
 
     def _known(self) -> LensModel:
         if self._model is None:

@@ -4,10 +4,14 @@ Stored for each case, one JSON file each, under a name that hashes all that it d
 
     <key>/truth.json                  as photographed, with the true PSF, denoised only
     <key>/learned-<n>.json            after n photos
+    <key>/paper-<n>.json              the same the paper's own way from end to end
+    <key>/measured.json               with PSFs measured on a target
+    <key>/general.json                with a general profile of the lens model
     <key>/rival-<name>-<version>.json corrected with the PSFs of a rival, from the first photo
     <key>/program-<name>-<version>.json  corrected by a program of others
 
-The folder `<key>/work` holds photos and models while a case is unfinished.
+They hold figures only, some ten kilobytes a lens: carried to another machine they serve a run there. Photos
+and models of an unfinished case lie in `work` of the output folder, pictures in `pictures`.
 """
 
 from __future__ import annotations
@@ -15,6 +19,8 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Sequence
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +45,7 @@ def run_reproduction(
     code: Sequence[Path] = (),
     workers: int | None = None,
     with_figures: bool = True,
+    results: Path | None = None,
     on_work: OnWork,
 ) -> dict[str, Any]:
     """Run what is missing and return everything.
@@ -49,7 +56,7 @@ def run_reproduction(
     open_route : OpenRoute
         What is under test.
     folder : Path
-        Results go to `cache` and `pictures` in it.
+        Pictures go to `pictures` in it.
     route : str
         Name of the route: part of the keys and of the report.
     code : sequence of Path
@@ -58,6 +65,8 @@ def run_reproduction(
         Processes that take photos; None means all cores.
     with_figures : bool
         Whether to draw Fig. 2 and Fig. 4 too.
+    results : Path, optional
+        Where results are stored and taken from; by default `cache` in `folder`.
     on_work : OnWork
         Called after each piece of work.
 
@@ -68,13 +77,13 @@ def run_reproduction(
         hurt), `figures`.
     """
     version = fingerprint(code)
-    cache, shown = folder / "cache", folder / "pictures"
+    cache, shown = results or folder / "cache", folder / "pictures"
     shown.mkdir(parents=True, exist_ok=True)
     keys = [key_of(case, plan, route, version) for case in plan.cases]
     weights = sum(weight_of(case, plan) for case in plan.cases)
     rival_code = rivals_version()
     progress = Progress(on_work, weights + (FIGURES if with_figures else 0.0))
-    results = []
+    done = []
     for case, key in zip(plan.cases, keys, strict=True):
         job = Job(
             case,
@@ -82,16 +91,21 @@ def run_reproduction(
             plan,
             open_route,
             cache / key,
+            folder / "work" / key,
             shown,
             progress,
             workers or os.cpu_count() or 1,
             rival_code,
         )
-        results.append(job.run())
+        done.append(_with_pictures_there(job.run(), shown))
+    with suppress(OSError):  # not there, or another run's work is in it
+        (folder / "work").rmdir()
     drawn: Unit = {}
     if with_figures:
         path = cache / keys[0] / f"figures-{figures.version()}.json"
-        drawn, fresh = stored(path, lambda: figures.draw(plan, plan.cases[0], shown, workers=workers))
+        drawn, fresh = stored(path, partial(figures.draw, plan, plan.cases[0], shown, workers=workers))
+        if not fresh and not all((shown / name).exists() for name in figures.names(drawn)):
+            drawn, fresh = figures.draw(plan, plan.cases[0], shown, workers=workers), True
         progress.tell("figures 2 and 4", FIGURES, fresh=fresh)
     files = plan.files()
     return {
@@ -104,13 +118,26 @@ def run_reproduction(
             "rivals": {name: rivals.create(name).source for name in plan.rivals},
             "programs": list(plan.programs),
             "own_scenes": plan.scenes is None,
+            "paper": plan.paper,
         },
         "scenes": [path.stem for path in files],
         "developed_on": [path.stem for path in files if photo_half(path.stem) == "dev"],
-        "cases": [one for one in results if one["condition"] == BASE],
-        "hard": [one for one in results if one["condition"] != BASE],
+        "cases": [one for one in done if one["condition"] == BASE],
+        "hard": [one for one in done if one["condition"] != BASE],
         "figures": drawn,
     }
+
+
+def _with_pictures_there(case: Unit, shown: Path) -> Unit:
+    """Leave out the names of pictures that another run made and that were not carried along."""
+
+    def there(unit: Unit) -> Unit:
+        kept = {key: there(value) if isinstance(value, dict) else value for key, value in unit.items()}
+        if "pictures" in kept:
+            kept["pictures"] = {k: v for k, v in kept["pictures"].items() if (shown / v).exists()}
+        return kept
+
+    return there(case)
 
 
 def rivals_version() -> str:

@@ -103,7 +103,9 @@ def test_quick_and_full_exclude_each_other() -> None:
 @pytest.mark.slow
 def test_lens_is_learned_and_corrected_by_a_real_service(tmp_path: Path) -> None:
     one = replace(planned("quick").cases[0], height=480, width=640, photos=(1,))
-    chosen = Reproduction((one,), estimator="whittle", methods=("standard",), size="quick")
+    chosen = Reproduction(
+        (one,), estimator="whittle", methods=("standard",), size="quick", paper=False, general=False
+    )
     told: list[str] = []
 
     def on_work(words: str, done: float, total: float, *, fresh: bool) -> None:

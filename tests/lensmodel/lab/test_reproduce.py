@@ -51,7 +51,9 @@ def case(**changes: Any) -> Case:
 
 
 def plan(*cases: Case) -> Reproduction:
-    return Reproduction(cases or (case(),), estimator="whittle", rivals=(), size="quick")
+    return Reproduction(
+        cases or (case(),), estimator="whittle", rivals=(), size="quick", paper=False, general=False
+    )
 
 
 def photographs(folder: Path, count: int) -> tuple[Path, ...]:
@@ -69,13 +71,13 @@ def photographs(folder: Path, count: int) -> tuple[Path, ...]:
 
 
 def test_default_size_has_eight_kinds_of_lenses_on_reported_seeds() -> None:
-    cases = [one for one in planned("default").cases if one.condition == BASE]
+    cases = [one for one in planned("default", grids=()).cases if one.condition == BASE]
     assert len({one.lens.model.split()[1] for one in cases}) == len(LENS_KINDS) == 8
     assert min(one.seed for one in cases) >= FIRST_SEED
 
 
 def test_full_size_takes_every_lens_at_two_apertures() -> None:
-    cases = [one for one in planned("full").cases if one.condition == BASE]
+    cases = [one for one in planned("full", grids=()).cases if one.condition == BASE]
     for seed in {one.seed for one in cases}:
         apertures = {one.aperture for one in cases if one.seed == seed}
         assert max(apertures) == pytest.approx(2 * min(apertures))
@@ -98,13 +100,13 @@ def test_scenes_that_hurt_are_taken_when_asked_for_and_in_full(size: Size, hard:
 
 
 def test_fewer_lenses_are_the_first_ones_and_their_results_serve_more() -> None:
-    some, every = planned("default", lenses=3), planned("default")
+    some, every = planned("default", lenses=3, grids=()), planned("default", grids=())
     base = [one for one in some.cases if one.condition == BASE]
 
     assert base == [one for one in every.cases if one.condition == BASE][:3]
     assert {one.seed for one in some.cases} == {1000, 1001, 1002}
     assert key_of(base[0], some, "direct", "abc") == key_of(every.cases[0], every, "direct", "abc")
-    assert len(planned("quick", lenses=1).cases) == 1
+    assert len(planned("quick", lenses=1, grids=()).cases) == 1
     with pytest.raises(InvalidInputError, match="at least one lens"):
         planned("quick", lenses=0)
 
@@ -218,6 +220,9 @@ def result(*lenses: tuple[float, float]) -> dict[str, Any]:
         {
             "name": f"lens{i}",
             "title": f"Lens <{i}>",
+            "family": "third order",
+            "unseen": True,
+            "source": f"drawn, seed {1000 + i}",
             "kind": "coma",
             "condition": "base",
             "condition_title": "raw",
@@ -314,7 +319,7 @@ def test_summary_takes_the_mean_over_lenses_and_counts_zones_that_fell() -> None
     }
     assert found["ssim_kept"]["paper"]["1"]["mid"] == pytest.approx((0.5 - 0.005 - 0.25) / 3)
     assert found["halo"]["paper"]["1"]["mid"] == pytest.approx(0.0)
-    assert found["psf_rivals"]["kee"]["corner"] == pytest.approx(0.5)
+    assert found["psf_others"]["kee, n = 1"]["corner"] == pytest.approx(0.5)
     assert found["share"]["paper"]["1"]["mid"] == pytest.approx(1 / 3)
     assert found["psnr_control"]["center"] == pytest.approx(0.5)
 
@@ -326,23 +331,111 @@ def test_gain_that_the_lens_does_not_allow_is_not_missed() -> None:
 
 
 def test_bars_are_two_sided() -> None:
-    name = "share of the true-PSF gain in MTF50, method paper, n = 1"
+    name = "share of the true-PSF gain in MTF50"
     for mtf50, met in ((180, False), (190, True), (210, False)):
-        found = {(bar.name, bar.place): bar for bar in bars(result((mtf50, 33.0)))}
-        assert found[name, "corner"].met is met
-        assert found[name.replace("n = 1", "n = 5"), "corner"].met is None  # this run has no n = 5
+        found = {(bar.name, bar.place, bar.n): bar for bar in bars(result((mtf50, 33.0)))}
+        assert found[name, "corner", "1"].met is met
+        assert found[name, "corner", "5"].met is None  # this run has no n = 5
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "limits"),
+    [
+        ("relative L2 of the PSF, green", "center", (0.25, 0.20, 0.15)),
+        ("relative L2 of the PSF, green", "corner", (0.40, 0.32, 0.25)),
+        ("relative L2 of the PSF, red", "center", (0.30, 0.25, 0.20)),
+        ("relative L2 of the PSF, blue", "corner", (0.45, 0.38, 0.30)),
+        ("highest corrected MTF", "mid", (1.25, 1.15, 1.10)),
+        ("share of the true-PSF gain in PSNR", "corner", (0.55, 0.70, 0.80)),
+        ("zones where PSNR falls by more than 0.05 dB", "of 3 zones", (0, 0, 0)),
+        ("share of PSF errors told right within a factor of 1.5", "field", (0.8, 0.8, 0.8)),
+        ("what the forecast of the gain by zone is off by, dB", "all zones", (0.5, 0.5, 0.5)),
+    ],
+)
+def test_bars_of_each_number_of_photos_are_those_that_were_set(
+    name: str, place: str, limits: tuple[float, ...]
+) -> None:
+    found = {bar.n: bar for bar in bars(result((190, 33.0))) if (bar.name, bar.place) == (name, place)}
+    at_least = "share" in name
+    assert [found[n].low if at_least else found[n].high for n in ("1", "2", "5")] == list(limits)
+
+
+def test_forecast_is_judged_by_the_mean_of_what_its_zones_are_off_by() -> None:
+    made = result((190, 33.0))
+    methods = made["cases"][0]["learned"]["1"]["methods"]
+    methods["paper"]["forecast"] = {
+        "center": {"expected": 2.0, "true": 1.0},
+        "mid": {"expected": None, "true": 1.0},
+        "corner": {"expected": 1.0, "true": 1.5},
+    }
+    (bar,) = [bar for bar in bars(made) if bar.name.startswith("what the forecast") and bar.n == "1"]
+    assert (bar.value, bar.met) == (pytest.approx(0.75), False)
+
+
+def traced_too(made: dict[str, Any]) -> dict[str, Any]:
+    """Make the last lens a ray-traced one."""
+    made["cases"][-1] |= {"family": "ray-traced", "unseen": False, "title": "Traced Heliar"}
+    return made
+
+
+def test_families_are_judged_and_shown_apart(tmp_path: Path) -> None:
+    made = traced_too(result((190, 33.0), (120, 29.0)))
+    falls = [b for b in bars(made) if b.name.startswith("zones where PSNR falls") and b.n == "1"]
+    assert {bar.family: bar.value for bar in falls} == {"third order": 0, "ray-traced": 3}
+    assert [name.partition(",")[0] for name in groups(made)] == ["third order", "ray-traced"]
+    text = write_page(made, tmp_path)[0].read_text(encoding="utf-8")
+    assert "| ray-traced | Traced Heliar | drawn, seed 1001 | looked at during development |" in text
+    assert "| third order | Lens <0> | drawn, seed 1000 | unseen |" in text
+    assert "### Third order" in text
+    assert "### Ray-traced" in text
+
+
+def with_paper(made: dict[str, Any]) -> dict[str, Any]:
+    """Add the paper's own way, a general profile and a measured lens to every lens."""
+    for number, one in enumerate(made["cases"]):
+        unit = one["learned"]["1"]
+        worse = {"rel_l2": {c: dict.fromkeys(ZONES, 0.6 + number) for c in "rgb"}, "predicted_right": 0.0}
+        pictures = {"way-paper-n1-paper": "way.png"}
+        one["paper"] = {
+            "1": {**unit, "psf": worse, "methods": {"paper": state(140, 31.5)}, "pictures": pictures}
+        }
+        one["general"] = {"psf": worse, "methods": {"paper": state(145, 31.6)}, "pictures": {}}
+        one["measured"] = {"psf": worse, "methods": {"paper": state(195, 33.9)}, "pictures": {}}
+    return made
+
+
+def test_the_papers_own_way_is_a_row_of_each_table(tmp_path: Path) -> None:
+    made = with_paper(result((160, 32.0)))
+    found = summary(made)
+    assert [row["state"] for row in found["mtf"]["paper"]][-5:] == [
+        "general profile of the lens model",
+        "the paper's own way, n = 1",
+        "n = 1",
+        "measured with a target",
+        "true PSF",
+    ]
+    rows = {row["state"]: row for row in found["psnr"]["paper"]}
+    assert rows["the paper's own way, n = 1"]["corner"] == 31.5
+    assert found["psf_others"]["the paper's own way, n = 1"]["center"] == pytest.approx(0.6)
+    text = write_page(made, tmp_path)[0].read_text(encoding="utf-8")
+    assert "| the paper's own way, n = 1 | 140 |" in text
+    assert "| the paper's own way, n = 1 | 0.600 |" in text
+    assert "| the paper's own way, n = 1 | 31.50 |" in text
+    assert "corrected blindly, the paper's own way, n = 1" in text
+    assert "### Deconvolution: Richardson-Lucy" in text
+    assert not re.search(r"[Mm]ethod paper", text)
 
 
 def test_bars_compare_with_rivals_at_equal_overshoot() -> None:
     made = result((120, 30.5))
-    place = "MTF50 ahead of kee at equal overshoot, LP/PH, method paper, n = 1", "center"
+    place = "MTF50 ahead of kee at equal overshoot, LP/PH", "center"
     assert {(b.name, b.place): b for b in bars(made)}[place].met is False
     for zone in ZONES:  # the rival's 130 were bought by overshoot
         made["cases"][0]["rivals"]["kee"]["methods"]["paper"]["edges"][zone]["mtf50_fair"] = 115
     found = {(b.name, b.place): b for b in bars(made)}
     assert found[place].value == pytest.approx(5)
     assert found[place].met is True
-    assert found["PSNR ahead of kee, dB, method paper, n = 1", "mid"].met is False
+    assert found["PSNR ahead of kee, dB", "mid"].met is False
 
 
 def test_bars_count_what_holds() -> None:
@@ -375,7 +468,7 @@ def test_page_needs_nothing_from_outside_and_escapes_names(tmp_path: Path) -> No
     assert "Lens &lt;0&gt;" in text
     assert "developed on 1 of them" in text
     text = markdown.read_text(encoding="utf-8")
-    assert "| n = 1 | 160 |" in text
+    assert "| default, n = 1 | 160 |" in text
     assert "| kee, n = 1 | 130 |" in text
     assert "| G'MIC Richardson-Lucy | 120 |" in text
     assert "corrected by G'MIC Richardson-Lucy, its best setting 5" in text
@@ -385,7 +478,7 @@ def test_page_needs_nothing_from_outside_and_escapes_names(tmp_path: Path) -> No
 def test_json_holds_results_and_summary(tmp_path: Path) -> None:
     path = write_json(result((160, 32.0)), tmp_path / "all.json")
     stored = json.loads(path.read_text(encoding="utf-8"))
-    assert stored["summary"]["wide open, frames of 640 x 480"]["share"]["paper"]["1"][
+    assert stored["summary"]["third order, wide open, frames of 640 x 480"]["share"]["paper"]["1"][
         "corner"
     ] == pytest.approx(0.6)
     assert stored["cases"][0]["learned"]["1"]["methods"]["paper"]["psnr"]["mid"] == 32.0
@@ -567,7 +660,8 @@ def quick_photos(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         made: dict[str, Any] = result((160, 32.0))["cases"][0]["truth"]
         return made
 
-    def by_target(self: Any, shots: Shots, work: Path) -> dict[str, Any]:
+    def by_target(self: Any, shots: Shots) -> dict[str, Any]:
+        del self, shots
         return {"refused": "no page was photographed", "psf": None, "methods": {}, "pictures": {}}
 
     monkeypatch.setattr(job, "take", made_up)
@@ -629,7 +723,7 @@ class Killed(Nothing):
 def test_run_that_was_killed_keeps_what_it_has_and_ends_as_if_it_had_not_been(
     tmp_path: Path, quick_photos: list[str]
 ) -> None:
-    second = replace(planned("quick").cases[1], height=480, width=640, photos=(1, 2))
+    second = replace(planned("quick", grids=()).cases[1], height=480, width=640, photos=(1, 2))
     chosen = plan(case(photos=(1, 2)), second)
     with pytest.raises(KeyboardInterrupt):
         reproduced(tmp_path / "killed", Killed(), chosen)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from lensmodel.core.types import ZONES
+from lensmodel.lab.reproduce.families import FAMILIES
 from lensmodel.lab.reproduce.pages.tables import (
     BEFORE,
     DENOISED,
@@ -19,15 +20,23 @@ from lensmodel.lab.reproduce.pages.tables import (
 
 PLACES: Final = ("center", "corner")
 
-_SHARE = {"1": (0.85, 1.05), "5": (0.93, 1.04)}
-_SHARE_STRETCH = {"5": (0.97, 1.02)}
-_HIGHEST_MTF = (1.10, 1.05)
-_HALO_PERCENT = 3.0
-_PSF = {"1": (0.22, 0.36), "5": (0.16, 0.26)}
-_PSF_STRETCH = {"5": (0.10, 0.17)}
-_MORE_HELPS = (0.75, 0.6)
-_PREDICTED = 0.8
-_KEPT = (0.80, 0.92)
+COUNTS: Final = ("1", "2", "5")
+"""Numbers of photos that bars are of."""
+
+DECONVOLUTION: Final = "standard"
+"""What a user gets who chooses nothing; bars are of its corrections."""
+
+_PSF: Final = {
+    "g": ((0.25, 0.40), (0.20, 0.32), (0.15, 0.25)),
+    "rb": ((0.30, 0.45), (0.25, 0.38), (0.20, 0.30)),
+}
+_HIGHEST_MTF: Final = (1.25, 1.15, 1.10)
+_KEPT: Final = (0.55, 0.70, 0.80)
+_PREDICTED: Final = 0.8
+_FORECAST_DB: Final = 0.5
+_SHARE: Final = {"1": (0.85, 1.05), "5": (0.93, 1.04)}
+_HALO_PERCENT: Final = 3.0
+_MORE_HELPS: Final = 0.75
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +53,10 @@ class Bar:
         What was measured; None where this run does not tell.
     low, high : float or None
         The band in which it has to lie.
-    stretch : tuple or None
-        The narrower band that is aimed at.
+    n : str
+        How many photos the lens was learned from.
+    family : str
+        Family of the lenses; empty for scenes and paths that hurt.
     """
 
     name: str
@@ -53,29 +64,25 @@ class Bar:
     value: float | None
     low: float | None = None
     high: float | None = None
-    stretch: tuple[float | None, float | None] | None = None
+    n: str = "1"
+    family: str = ""
 
     @property
     def met(self) -> bool | None:
         """Whether it holds; None where this run does not tell."""
         return _within(self.value, self.low, self.high)
 
-    @property
-    def stretched(self) -> bool | None:
-        """Whether the narrower band holds; None where there is none, or no value."""
-        return None if self.stretch is None else _within(self.value, *self.stretch)
-
     def plain(self) -> dict[str, Any]:
         """As values for JSON."""
         return {
+            "family": self.family,
+            "n": self.n,
             "name": self.name,
             "place": self.place,
             "value": self.value,
             "low": self.low,
             "high": self.high,
             "met": self.met,
-            "stretch": None if self.stretch is None else list(self.stretch),
-            "stretch_met": self.stretched,
         }
 
 
@@ -86,124 +93,92 @@ def _within(value: float | None, low: float | None, high: float | None) -> bool 
 
 
 def bars(result: Mapping[str, Any]) -> list[Bar]:
-    """Evaluate every bar on the lenses wide open, raw, at base ISO, and on what hurts.
+    """Evaluate every bar on each family's lenses wide open, raw, at base ISO, and on what hurts.
 
     Parameters
     ----------
     result : mapping
         What `run_reproduction` returned.
     """
-    found = groups(result)
-    if not found:
-        return []
-    # the first group: lenses wide open on the frames that all sizes of a run have
-    group = next(iter(found.values()))
-    return [*_mtf(group), *_psf(group), *_photos(group), *_peers(group), *_hard(result)]
+    found: list[Bar] = []
+    methods = result["plan"]["methods"]
+    method = DECONVOLUTION if DECONVOLUTION in methods else methods[0]
+    for family in FAMILIES:
+        cases = [case for case in result["cases"] if case["family"] == family]
+        if not cases:
+            continue
+        # the first group: lenses wide open on the frames that all sizes of a run have
+        made = summary(next(iter(groups({**result, "cases": cases}).values())))
+        parts = (_psf(made), _mtf(made, method), _photos(made, method), _peers(made, method))
+        found += [replace(bar, family=family) for part in parts for bar in part]
+    return [*found, *_hard(result)]
 
 
-def _mtf(group: Mapping[str, Any]) -> Iterator[Bar]:
-    made = summary(group)
-    method = "paper" if "paper" in made["mtf"] else next(iter(made["mtf"]))
-    for n, (low, high) in _SHARE.items():
-        for zone in PLACES:
-            yield Bar(
-                f"share of the true-PSF gain in MTF50, method {method}, n = {n}",
-                zone,
-                made["share"][method].get(n, {}).get(zone),
-                low,
-                high,
-                _SHARE_STRETCH.get(n),
-            )
-    for name, rows in made["mtf"].items():
-        last = [row for row in rows if row["state"].startswith("n = ")][-1]
-        for zone in PLACES:
-            value = last[zone]["mtf_max"]
-            yield Bar(
-                f"highest corrected MTF, method {name}, {last['state']}",
-                zone,
-                value,
-                high=_HIGHEST_MTF[0],
-                stretch=(None, _HIGHEST_MTF[1]),
-            )
-        n = last["state"].removeprefix("n = ")
-        for zone in PLACES:
-            yield Bar(
-                f"overshoot beyond the true PSF's, percent of the step, method {name}, n = {n}",
-                zone,
-                made["halo"][name][n][zone],
-                high=_HALO_PERCENT,
-            )
-
-
-def _psf(group: Mapping[str, Any]) -> Iterator[Bar]:
-    made = summary(group)
-    for n, limits in _PSF.items():
-        for zone, limit in zip(PLACES, limits, strict=True):
-            stretch = _PSF_STRETCH.get(n)
-            yield Bar(
-                f"relative L2 of the PSF, green, n = {n}",
-                zone,
-                made["psf"].get(n, {}).get(zone),
-                high=limit,
-                stretch=None if stretch is None else (None, stretch[PLACES.index(zone)]),
-            )
+def _psf(made: Mapping[str, Any]) -> Iterator[Bar]:
+    for channel, word in (("g", "green"), ("r", "red"), ("b", "blue")):
+        limits = _PSF["g" if channel == "g" else "rb"]
+        for i, zone in enumerate(PLACES):
+            for n, limit in zip(COUNTS, limits, strict=True):
+                value = made["psf_by_channel"][channel].get(n, {}).get(zone)
+                yield Bar(f"relative L2 of the PSF, {word}", zone, value, high=limit[i], n=n)
     for zone in PLACES:
         one, five = (made["psf"].get(n, {}).get(zone) for n in ("1", "5"))
+        ratio = None if one is None or five is None else five / one
+        yield Bar("relative L2 over that after n = 1", zone, ratio, high=_MORE_HELPS, n="5")
+    for n in COUNTS:
+        value = made["predicted_right"].get(n)
         yield Bar(
-            "relative L2 after n = 5 over that after n = 1",
-            zone,
-            None if one is None or five is None else five / one,
-            high=_MORE_HELPS[0],
-            stretch=(None, _MORE_HELPS[1]),
+            "share of PSF errors told right within a factor of 1.5", "field", value, low=_PREDICTED, n=n
         )
-    for n, value in made["predicted_right"].items():
-        yield Bar(f"prediction right within a factor of 1.5, n = {n}", "field", value, low=_PREDICTED)
 
 
-def _photos(group: Mapping[str, Any]) -> Iterator[Bar]:
-    made = summary(group)
-    for method, table in made["worse"].items():
-        for n, row in table.items():
-            yield Bar(
-                f"zones where PSNR or SSIM does not rise despite measurable blur, method {method}, n = {n}",
-                f"of {row['zones']}",
-                row["unimproved"],
-                high=0,
-            )
-            yield Bar(
-                f"zones where PSNR falls by more than 0.05 dB, method {method}, n = {n}",
-                f"of {row['zones']}",
-                row["clearly_worse"],
-                high=0,
-            )
+def _mtf(made: Mapping[str, Any], method: str) -> Iterator[Bar]:
+    rows = {row["state"].removeprefix("n = "): row for row in made["mtf"][method]}
     for zone in ZONES:
-        for method, table in made["psnr_kept"].items():
-            yield Bar(
-                f"share of the true-PSF gain in PSNR, method {method}, n = 5",
-                zone,
-                table.get("5", {}).get(zone),
-                low=_KEPT[0],
-                stretch=(_KEPT[1], None),
-            )
+        for n, limit in zip(COUNTS, _HIGHEST_MTF, strict=True):
+            value = rows[n][zone]["mtf_max"] if n in rows else None
+            yield Bar("highest corrected MTF", zone, value, high=limit, n=n)
+    for zone in PLACES:
+        for n, (low, high) in _SHARE.items():
+            value = made["share"][method].get(n, {}).get(zone)
+            yield Bar("share of the true-PSF gain in MTF50", zone, value, low, high, n=n)
+        beyond = made["halo"][method].get("5", {}).get(zone)
+        words = "overshoot beyond the true PSF's, percent of the step"
+        yield Bar(words, zone, beyond, high=_HALO_PERCENT, n="5")
 
 
-def _peers(group: Mapping[str, Any]) -> Iterator[Bar]:
+def _photos(made: Mapping[str, Any], method: str) -> Iterator[Bar]:
+    for zone in ZONES:
+        for n, limit in zip(COUNTS, _KEPT, strict=True):
+            value = made["psnr_kept"][method].get(n, {}).get(zone)
+            yield Bar("share of the true-PSF gain in PSNR", zone, value, low=limit, n=n)
+    zones = next((f"of {row['zones']} zones" for row in made["worse"][method].values()), "zones")
+    for name, key in (
+        ("zones where PSNR falls by more than 0.05 dB", "clearly_worse"),
+        ("zones where PSNR or SSIM does not rise despite measurable blur", "unimproved"),
+    ):
+        for n in COUNTS:
+            yield Bar(name, zones, made["worse"][method].get(n, {}).get(key), high=0, n=n)
+    for n in COUNTS:
+        off = made["forecast_off"][method].get(n)
+        words = "what the forecast of the gain by zone is off by, dB"
+        yield Bar(words, "all zones", off, high=_FORECAST_DB, n=n)
+
+
+def _peers(made: Mapping[str, Any], method: str) -> Iterator[Bar]:
     """Ahead of each peer: PSNR in every zone, and MTF50 at equal overshoot."""
-    made = summary(group)
-    for method, rows in made["psnr"].items():
-        psnr = {row["state"]: row for row in rows}
-        edges = {row["state"]: row for row in made["mtf"][method]}
-        for name in psnr:
-            if name in {BEFORE, DENOISED, MEASURED, TRUE} or name.startswith("n = "):
-                continue
-            peer = name.removesuffix(", n = 1")
-            for zone in ZONES:
-                ahead = _minus(psnr["n = 1"][zone], psnr[name][zone])
-                yield Bar(f"PSNR ahead of {peer}, dB, method {method}, n = 1", zone, ahead, low=0.0)
-            for zone in PLACES:
-                ahead = _minus(edges["n = 1"][zone]["mtf50_fair"], edges[name][zone]["mtf50_fair"])
-                what = f"MTF50 ahead of {peer} at equal overshoot, LP/PH, method {method}, n = 1"
-                yield Bar(what, zone, ahead, low=0.0)
+    psnr = {row["state"]: row for row in made["psnr"][method]}
+    edges = {row["state"]: row for row in made["mtf"][method]}
+    for name in psnr:
+        peer = name.removesuffix(", n = 1")
+        if name in {BEFORE, DENOISED, MEASURED, TRUE} or "n = " in peer or "n = 1" not in psnr:
+            continue
+        for zone in ZONES:
+            ahead = _minus(psnr["n = 1"][zone], psnr[name][zone])
+            yield Bar(f"PSNR ahead of {peer}, dB", zone, ahead, low=0.0)
+        for zone in PLACES:
+            ahead = _minus(edges["n = 1"][zone]["mtf50_fair"], edges[name][zone]["mtf50_fair"])
+            yield Bar(f"MTF50 ahead of {peer} at equal overshoot, LP/PH", zone, ahead, low=0.0)
 
 
 def _minus(a: float | None, b: float | None) -> float | None:

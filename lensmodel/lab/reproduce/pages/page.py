@@ -29,6 +29,7 @@ def write_page(result: Mapping[str, Any], folder: Path) -> tuple[Path, Path]:
     page = Page()
     page.title("The paper's figures with this software", 1)
     page.text(_conditions(result))
+    page_tables.which_lenses(page, result)
     page_tables.bars_table(page, bars(result))
     for label, group in groups(result).items():
         found = summary(group)
@@ -60,7 +61,6 @@ def write_json(result: Mapping[str, Any], path: Path) -> Path:
 
 def _conditions(result: Mapping[str, Any]) -> str:
     plan, cases = result["plan"], result["cases"]
-    seeds = sorted({case["settings"]["seed"] for case in cases})
     frames = sorted({(c["settings"]["width"], c["settings"]["height"]) for c in cases})
     sizes = ", ".join(f"{w} x {h} ({w * h / 1e6:.1f} MP)" for w, h in frames)
     whose = "the library's own" if plan["own_scenes"] else "given from outside"
@@ -68,12 +68,21 @@ def _conditions(result: Mapping[str, Any]) -> str:
     unseen = f"methods were developed on {len(seen)} of them" if seen else "nothing was developed on them"
     scenes = f"The scenes are {len(result['scenes'])} photographs, {whose}; {unseen}"
     made = "; ".join(sorted({c["frames"] for c in cases}))
+    families = ", ".join(
+        f"{sum(c['family'] == name for c in cases)} {name}"
+        for name in dict.fromkeys(c["family"] for c in cases)
+    )
+    paper = (
+        "The paper's own way from end to end (Michaeli and Irani's kernels up to 55 pixels, its regression, "
+        "Richardson-Lucy deconvolution alone) stands beside the default; it runs in the library. "
+        if plan.get("paper")
+        else ""
+    )
     return (
-        f"Size {plan['size']}: {len(cases)} simulated lenses, each at one setting, seeds "
-        f"{_listed(seeds)}; no parameter was chosen on seeds from 1000 on. {scenes}; {made}; no part of any "
-        f"photograph serves twice for one lens. Frames of {sizes}. The photos are Bayer DNG files of a "
-        "14-bit sensor at base ISO with shot and read noise, clipping and lateral colour. "
-        f"{_rivals(plan['rivals'])}{_programs(plan.get('programs', ()))}"
+        f"Size {plan['size']}: {len(cases)} simulated lenses ({families}), each at one setting. {scenes}; "
+        f"{made}; no part of any photograph serves twice for one lens. Frames of {sizes}. The photos are "
+        "Bayer DNG files of a 14-bit sensor at base ISO with shot and read noise, clipping and lateral "
+        f"colour. {paper}{_rivals(plan['rivals'])}{_programs(plan.get('programs', ()))}"
         f"Calibrated and corrected {result['route']}, estimator {plan['estimator']}; "
         "the true PSF and the control go through the same correction in the library. "
         f"Code {result['code']}."
@@ -94,7 +103,3 @@ def _programs(names: Sequence[str]) -> str:
         f"Beside it the programs {', '.join(names)}, each at the best of its settings, chosen against the "
         "truth. "
     )
-
-
-def _listed(seeds: Sequence[int]) -> str:
-    return ", ".join(str(seed) for seed in seeds)

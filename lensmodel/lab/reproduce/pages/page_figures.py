@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lensmodel.core.types import ZONES
 from lensmodel.lab.reproduce import programs
 from lensmodel.lab.reproduce.pages.sheet import Page
-from lensmodel.lab.reproduce.pages.tables import number
+from lensmodel.lab.reproduce.pages.tables import GENERAL, PAPER_WAY, deconvolution, number
 
 
 def fig1(page: Page, fig: Mapping[str, Any] | None) -> None:
@@ -45,13 +45,20 @@ def fig2(page: Page, fig: Mapping[str, Any] | None) -> None:
         return
     page.title("Fig. 2: interpolation against regression")
     page.text(
-        "True PSFs at the 24 patches of one photo; asked in between. Linear interpolation of PSFs in the "
-        "image frame is what efficient filter flow does. Relative L2, mean over lenses of seeds "
-        f"{fig['seeds'][0]} to {fig['seeds'][-1]}:"
+        "Ways to answer between 24 true PSFs of one lens: of a regular grid of windows, blurred by the "
+        "operator of efficient filter flow (half overlap, Bartlett-Hann windows), and regressions of one PSF "
+        "at a random place of each window. Relative L2, mean over the lenses of a family:"
     )
     page.table(
-        ["", *ZONES],
-        [[row["method"], *(number(row["errors"].get(zone), 3) for zone in ZONES)] for row in fig["table"]],
+        ["family", "", *ZONES],
+        [
+            [
+                f"{row['family']} ({row['lenses']})",
+                row["method"],
+                *(number(row["errors"].get(zone), 3) for zone in ZONES),
+            ]
+            for row in fig["table"]
+        ],
     )
     places = "; ".join(f"r = {r:g}, phi = {phi:g}" for r, phi in fig["places"])
     page.picture(
@@ -86,35 +93,53 @@ def before_after(page: Page, result: Mapping[str, Any]) -> None:
         "1:1 crops of the photo never used for calibration: center, upper left, upper right, lower left, "
         "lower right."
     )
+    absent = sum(not case["truth"]["pictures"] for case in result["cases"])
+    if absent:
+        page.text(f"Crops of {absent} lenses were made by other runs and are not here.")
     for case in result["cases"]:
-        page.title(case["title"], 3)
-        seen = {**case["truth"]["pictures"]}
-        n = max(int(n) for n in case["learned"])
-        others = case.get("programs", {})
-        for unit in (*case["learned"].values(), *case["rivals"].values(), *others.values()):
-            seen |= unit["pictures"]
-        labels = {"before": "as photographed"}
-        labels |= {f"n{n}-{m}": f"corrected blindly, n = {n}, method {m}" for m in result["plan"]["methods"]}
-        labels |= {
-            f"{name}-{m}": f"corrected with the PSFs of {source}, method {m}"
-            for name, source in result["plan"]["rivals"].items()
-            for m in result["plan"]["methods"]
-        }
-        labels |= {
-            programs.label_of(name): f"corrected by {name}, its best setting {unit['setting']:g}"
-            for name, unit in others.items()
-        }
-        labels |= {f"true-{m}": f"corrected with the true PSF, method {m}" for m in result["plan"]["methods"]}
-        labels["scene"] = "the scene itself"
-        for label, words in labels.items():
-            if label in seen:
-                page.picture(seen[label], words)
-    hard = result.get("hard", ())
-    if hard:
+        names = _pictures(case)
+        if names:
+            page.title(case["title"], 3)
+        for label, words in _labels(case, result["plan"]).items():
+            if label in names:
+                page.picture(names[label], words)
+    _hard(page, [case for case in result.get("hard", ()) if "before" in case["truth"]["pictures"]])
+
+
+def _hard(page: Page, cases: Sequence[Mapping[str, Any]]) -> None:
+    if cases:
         page.title("Scenes and paths that hurt")
-    for case in hard:
+    for case in cases:
         page.title(f"{case['condition_title']}: {case['title']}", 3)
-        unit = next(iter(case["learned"].values()))
         page.picture(case["truth"]["pictures"]["before"], "as photographed")
-        for name in unit["pictures"].values():
+        for name in next(iter(case["learned"].values()))["pictures"].values():
             page.picture(name, "corrected blindly, learned from one photo of this kind")
+
+
+def _pictures(case: Mapping[str, Any]) -> dict[str, str]:
+    """Files of all pictures of a lens by label."""
+    units = [case["truth"], *(case[part] for part in ("general", "measured") if case.get(part))]
+    units += [
+        unit for part in ("learned", "paper", "rivals", "programs") for unit in case.get(part, {}).values()
+    ]
+    return {label: name for unit in units for label, name in unit["pictures"].items()}
+
+
+def _labels(case: Mapping[str, Any], plan: Mapping[str, Any]) -> dict[str, str]:
+    """Pictures of a lens in their order, with what they show."""
+
+    def each(label: str, words: str) -> dict[str, str]:
+        return {f"{label}-{m}": f"{words}, deconvolution {deconvolution(m)}" for m in plan["methods"]}
+
+    n = max(int(n) for n in case["learned"])
+    found = {"before": "as photographed", **each(f"n{n}", f"corrected blindly by default, n = {n}")}
+    found[f"way-paper-n{n}-paper"] = f"corrected blindly, {PAPER_WAY}, n = {n}"
+    for name, source in plan["rivals"].items():
+        found |= each(name, f"corrected with the PSFs of {source}")
+    found |= {
+        programs.label_of(name): f"corrected by {name}, its best setting {unit['setting']:g}"
+        for name, unit in case.get("programs", {}).items()
+    }
+    found |= each("general", f"corrected with a {GENERAL} (in place of a commercial one)")
+    found |= each("measured", "corrected with PSFs measured with a target (non-blind)")
+    return {**found, **each("true", "corrected with the true PSF"), "scene": "the scene itself"}

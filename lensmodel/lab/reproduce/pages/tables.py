@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
 
-from lensmodel.core.types import ZONES
+from lensmodel.core.types import CHANNELS, ZONES
 
 Result = Mapping[str, Any]
 
@@ -30,17 +30,32 @@ MEASURABLE: Final = {"psnr": 0.2, "ssim": 0.002}
 
 BEFORE: Final = "without correction"
 DENOISED: Final = "denoised only"
+GENERAL: Final = "general profile of the lens model"
+PAPER_WAY: Final = "the paper's own way"
 MEASURED: Final = "measured with a target"
 TRUE: Final = "true PSF"
 
+DECONVOLUTIONS: Final = {"paper": "Richardson-Lucy", "standard": "standard"}
+"""How pages call non-blind methods: `paper` is one of them, and the paper's own way another thing."""
+
+
+def deconvolution(method: str) -> str:
+    """Name of a non-blind method on pages."""
+    return DECONVOLUTIONS.get(method, method)
+
+
+def shown(state: str) -> str:
+    """Name of a state on pages: what was learned by default says so."""
+    return f"default, {state}" if state.startswith("n = ") else state
+
 
 def groups(result: Result) -> dict[str, Result]:
-    """Split the lenses by aperture and frame: means over different ones would compare nothing."""
+    """Split the lenses by family, aperture and frame: means over different ones would compare nothing."""
     found: dict[str, list[Result]] = {}
     for case in result["cases"]:
         settings = case["settings"]
         stops = "wide open" if case["stops"] < 0.1 else f"{case['stops']:.0f} stops down"
-        label = f"{stops}, frames of {settings['width']} x {settings['height']}"
+        label = f"{case['family']}, {stops}, frames of {settings['width']} x {settings['height']}"
         found.setdefault(label, []).append(case)
     return {label: {**result, "cases": cases} for label, cases in found.items()}
 
@@ -65,7 +80,9 @@ def summary(result: Result) -> dict[str, Any]:
         `mtf`, `psnr`, `ssim`: rows of states by method, with the mean over the lenses that have it;
         `share`: share of the true-PSF gain in MTF50; `halo`: overshoot beyond that of the true PSF;
         `psnr_kept`, `ssim_kept`: share of its gain; `psnr_control`: gain by denoising alone;
-        `worse`: zones that fell; `psf`, `psf_all_channels`, `psf_rivals`; `predicted_right`.
+        `worse`: zones that fell; `psf` (green), `psf_by_channel`, `psf_others` (rivals, a general profile,
+        the paper's own way, measured); `predicted_right`; `forecast_off`: mean absolute error of the gain
+        that a correction expects of itself in a zone, dB.
     """
     methods = result["plan"]["methods"]
     return {
@@ -89,19 +106,50 @@ def summary(result: Result) -> dict[str, Any]:
             method: _by_count(result, partial(kept, method=method, of="ssim")) for method in methods
         },
         "worse": {method: worse(result, method) for method in methods},
-        "psf_rivals": {
-            name: _zones(
-                partial(_column_mean, [_rel_l2(c["rivals"][name]["psf"], "g") for c in _with(result, name)])
-            )
-            for name in result["plan"].get("rivals", {})
-        },
+        "psf_others": _psf_of_others(result),
         "psf": _by_count(result, partial(_psf, channel="g")),
-        "psf_all_channels": _by_count(result, _psf_mean),
+        "psf_by_channel": {c: _by_count(result, partial(_psf, channel=c)) for c in CHANNELS},
         "predicted_right": {
             str(n): mean(_get(c["learned"][str(n)]["psf"], "predicted_right") for c in _having(result, n))
             for n in counts(result)
         },
+        "forecast_off": {method: _forecast_off(result, method) for method in methods},
     }
+
+
+def _forecast_off(result: Result, method: str) -> dict[str, float | None]:
+    """Mean over zones of lenses of what the expected gain is off by, for each number of photos."""
+    found: dict[str, float | None] = {}
+    for n in counts(result):
+        zones = [
+            zone
+            for case in _having(result, n)
+            for zone in case["learned"][str(n)]["methods"][method].get("forecast", {}).values()
+        ]
+        found[str(n)] = mean(abs(z["expected"] - z["true"]) for z in zones if z["expected"] is not None)
+    return found
+
+
+def _psf_of_others(result: Result) -> dict[str, dict[str, float | None]]:
+    """Error of green PSFs that are not the default's, by the names of their states."""
+    found: dict[str, list[Result]] = {}
+    for case in result["cases"]:
+        for name, unit in others(case).items():
+            if unit["psf"] is not None:
+                found.setdefault(name, []).append(_rel_l2(unit["psf"], "g"))
+    return {name: _zones(partial(_column_mean, found[name])) for name in _names([found])}
+
+
+def others(case: Result) -> dict[str, Result]:
+    """Units of a lens whose PSFs are not the default's, by the names of their states."""
+    found = {f"{name}, n = 1": unit for name, unit in case["rivals"].items()}
+    if case.get("general"):
+        found[GENERAL] = case["general"]
+    for n, unit in sorted(case.get("paper", {}).items(), key=lambda item: int(item[0])):
+        found[f"{PAPER_WAY}, n = {n}"] = unit
+    if case.get("measured"):
+        found[MEASURED] = case["measured"]
+    return found
 
 
 def shares(case: Result, n: int, method: str, edge: str = "mtf50") -> dict[str, float | None]:
@@ -220,22 +268,20 @@ def states(case: Result, method: str) -> dict[str, Mapping[str, Any]]:
         f"n = {n}": unit["methods"][method]
         for n, unit in sorted(case["learned"].items(), key=lambda item: int(item[0]))
     }
-    rival = {f"{name}, n = 1": unit["methods"][method] for name, unit in case["rivals"].items()}
     return {
         BEFORE: case["truth"]["before"],
         DENOISED: case["truth"]["control"],
         **{name: unit["state"] for name, unit in case.get("programs", {}).items()},
-        **rival,
         **learned,
-        **_by_target(case, method),
+        **{name: found for name, unit in others(case).items() if (found := _of(unit, name, method))},
         TRUE: case["truth"]["true"][method],
     }
 
 
-def _by_target(case: Result, method: str) -> dict[str, Mapping[str, Any]]:
-    """The state with PSFs measured on a target; empty where there was none or it could not be measured."""
-    methods = (case.get("measured") or {}).get("methods", {})
-    return {MEASURED: methods[method]} if method in methods else {}
+def _of(unit: Result, name: str, method: str) -> Mapping[str, Any] | None:
+    """Corrected with a method; what is done the paper's own way has none but its own."""
+    methods: Mapping[str, Mapping[str, Any]] = unit["methods"]
+    return next(iter(methods.values())) if name.startswith(PAPER_WAY) else methods.get(method)
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -250,14 +296,16 @@ def number(value: float | None, digits: int = 0) -> str:
 
 
 def _names(every: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Names of all states: untouched, denoised, rivals, photos ascending, measured, the true PSF."""
+    """Names of all states: untouched, denoised, others, the paper's way, photos ascending, the true PSF."""
     found = dict.fromkeys(name for one in every for name in one)
 
     def place(name: str) -> tuple[int, int]:
-        fixed = {BEFORE: 0, DENOISED: 1, MEASURED: 4, TRUE: 5}
+        fixed = {BEFORE: 0, DENOISED: 1, GENERAL: 3, MEASURED: 6, TRUE: 7}
         if name in fixed:
             return fixed[name], 0
-        return (3, int(name[4:])) if name.startswith("n = ") else (2, 0)
+        if name.startswith(PAPER_WAY):
+            return 4, int(name.rpartition(" = ")[2])
+        return (5, int(name[4:])) if name.startswith("n = ") else (2, 0)
 
     return sorted(found, key=place)
 
@@ -307,21 +355,12 @@ def _having(result: Result, n: int) -> list[Result]:
     return [case for case in result["cases"] if str(n) in case["learned"]]
 
 
-def _with(result: Result, rival: str) -> list[Result]:
-    return [case for case in result["cases"] if rival in case["rivals"]]
-
-
 def _psf(case: Result, n: int, channel: str) -> dict[str, float | None]:
     return _rel_l2(case["learned"][str(n)]["psf"], channel)
 
 
 def _rel_l2(found: Result | None, channel: str) -> dict[str, float | None]:
     return {zone: None if found is None else found["rel_l2"][channel].get(zone) for zone in ZONES}
-
-
-def _psf_mean(case: Result, n: int) -> dict[str, float | None]:
-    every = [_psf(case, n, channel) for channel in ("r", "g", "b")]
-    return {zone: mean(one[zone] for one in every) for zone in ZONES}
 
 
 def _edge(state: Result, zone: str, name: str) -> float | None:

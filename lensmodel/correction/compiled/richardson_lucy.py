@@ -154,6 +154,27 @@ def _errors(light: Real, data: Real, base: float, clip: float, bend: Real, first
 
 
 @jit
+def _measured_alpha(start: Real, work: Real, share: Real, change: Real) -> np.float32:
+    """Measure alpha of Biggs and Andrews; `change` holds the change of the step before, then that of this one."""
+    rows, cols = start.shape
+    norm = 0.0
+    product = 0.0
+    for i in range(rows):
+        across, own = np.float64(0.0), np.float64(0.0)
+        for j in range(cols):
+            light = max(start[i, j] * max(ONE + work[i, j] * share[i, j], ZERO), _EPS)
+            now, before = light - start[i, j], change[i, j]
+            across += now * before
+            own += before * before
+            change[i, j] = now
+        product += across
+        norm += own
+    if not norm > 0.0:
+        return ZERO
+    return np.float32(min(max(product / norm, 0.0), 1.0))
+
+
+@jit
 def richardson_lucy(  # noqa: C901 - one pass over memory per loop
     latent: Real,
     data: Real,
@@ -165,14 +186,16 @@ def richardson_lucy(  # noqa: C901 - one pass over memory per loop
     first: float,
     last: float,
     alphas: Real,
+    adaptive: bool,
     width: int,
     lights: bool,
 ) -> None:
     """Accelerated saturation-aware steps; `latent` is start and result.
 
     The transforms live on the grid of `K`, `width` columns wide; the latent plane stands in its
-    first corner, the data in the middle of the latent plane. `bend`, `first` and `last` are those of
-    `_errors`.
+    first corner, the data in the middle of the latent plane. With `adaptive` the extrapolation of each
+    step is measured on the changes of the two before it, and `alphas` only tells how many there are.
+    `bend`, `first` and `last` are those of `_errors`.
     """
     rows, cols = latent.shape
     high, wide = data.shape
@@ -187,6 +210,7 @@ def richardson_lucy(  # noqa: C901 - one pass over memory per loop
     share = ONE / reach
     clean = np.empty_like(data)
     soft = np.empty_like(latent)
+    change = np.zeros_like(latent) if adaptive else soft
     for step in range(steps):
         through(work, P, K, FORWARD, 0, rows, top, bottom)
         for i in range(high):
@@ -206,6 +230,8 @@ def richardson_lucy(  # noqa: C901 - one pass over memory per loop
                 for j in range(cols):
                     work[i, j] = calm[i, j] + (work[i, j] - calm[i, j]) * soft[i, j]
         alpha = alphas[step + 1] if step + 1 < steps else ZERO
+        if adaptive:
+            alpha = _measured_alpha(start, work, share, change)
         for i in range(rows):
             for j in range(cols):
                 light = max(start[i, j] * max(ONE + work[i, j] * share[i, j], ZERO), _EPS)

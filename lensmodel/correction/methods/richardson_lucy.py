@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Final, Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +17,13 @@ from lensmodel.correction.blur.uniform import fast_shape
 from lensmodel.correction.deconvolver import LEAST_PREDICTED, TINY, Restored, Sensor
 from lensmodel.correction.engine import Engine, compiled
 
+Acceleration: TypeAlias = Literal["fixed", "adaptive", "none"]
+"""How far the estimate is extrapolated before a step, see `SaturationAwareRichardsonLucy`."""
+
+ACCELERATIONS: Final = get_args(Acceleration)
+
 ALPHA_MAX = 0.9
-"""Cap of the extrapolation; above it the noise is accelerated as well."""
+"""Cap of the fixed extrapolation; above it the noise is accelerated as well."""
 
 SHARPNESS = 50.0
 """a of the sensor's answer, per clipping level: how sharply it bends where it clips."""
@@ -83,8 +89,12 @@ class SaturationAwareRichardsonLucy:
         u_U = 1 + F^T(e V),   u_S = 1 + F^T e,   x <- x max( u_U + (u_S - u_U) w, 0 )
 
     with V = 0 wherever a pixel of S reaches and w the softened S. Before each step the estimate
-    is extrapolated, x + alpha_k (x_k - x_{k-1}), with alpha_k = (k - 1)/(k + 2) up to 0.9: the
-    schedule is fixed because a scalar measured tile by tile would show as seams.
+    is extrapolated, y_k = x_k + alpha_k (x_k - x_{k-1}), by one of two schedules::
+
+        fixed      alpha_k = (k - 1) / (k + 2), at most 0.9
+        adaptive   alpha_k = <g_{k-1}, g_{k-2}> / <g_{k-2}, g_{k-2}>, within 0..1,   g_k = x_{k+1} - y_k
+
+    The second is that of Biggs and Andrews [2]_. Each tile measures its own there.
 
     Parameters
     ----------
@@ -92,8 +102,8 @@ class SaturationAwareRichardsonLucy:
         Number of steps.
     sharpness : float
         a, per clipping level.
-    accelerated : bool
-        Whether to extrapolate.
+    acceleration : {"fixed", "adaptive", "none"}
+        How to extrapolate, or not at all.
     warped : bool
         Whether lateral colour is to be removed by resampling before: see `WarpableMethod`.
     engine : {"auto", "numpy"}
@@ -109,12 +119,16 @@ class SaturationAwareRichardsonLucy:
 
     iterations: int = 25
     sharpness: float = SHARPNESS
-    accelerated: bool = True
+    acceleration: Acceleration = "fixed"
     warped: bool = False
     engine: Engine = "auto"
 
     def __post_init__(self) -> None:
         _check(self.iterations)
+        if self.acceleration not in ACCELERATIONS:
+            raise InvalidInputError(
+                f"acceleration must be one of {', '.join(ACCELERATIONS)}, got {self.acceleration!r}"
+            )
 
     def deconvolve(
         self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step
@@ -130,7 +144,7 @@ class SaturationAwareRichardsonLucy:
             sensor,
             steps=self.iterations,
             sharpness=self.sharpness,
-            accelerated=self.accelerated,
+            acceleration=self.acceleration,
             lights=lights,
             engine=self.engine,
             on_step=on_step,
@@ -152,7 +166,7 @@ def climbed(
     *,
     steps: int,
     sharpness: float = SHARPNESS,
-    accelerated: bool = True,
+    acceleration: Acceleration = "fixed",
     lights: bool = False,
     engine: Engine = "auto",
     on_step: StepHook = ignore_step,
@@ -167,7 +181,7 @@ def climbed(
         What was seen.
     reach : Plane
         Normaliser of each pixel of the latent plane.
-    blur, sensor, steps, sharpness, accelerated, engine, on_step
+    blur, sensor, steps, sharpness, acceleration, engine, on_step
         As there.
     lights : bool
         Whether to keep what is poorly known about lights out of the update of everybody else.
@@ -175,7 +189,8 @@ def climbed(
     base = background(sensor)
     data: Plane = np.ascontiguousarray(np.maximum(blurred, 0.0) + base, dtype=np.float32)
     count = np.arange(1, steps + 1)
-    alphas = (np.minimum((count - 1) / (count + 2), ALPHA_MAX) * accelerated).astype(np.float32)
+    fixed = np.minimum((count - 1) / (count + 2), ALPHA_MAX) * (acceleration == "fixed")
+    alphas, adaptive = fixed.astype(np.float32), acceleration == "adaptive"
     loops = compiled(engine) if isinstance(blur, UniformBlur) else None
     if loops is not None and isinstance(blur, UniformBlur):
         shape = fast_shape(latent.shape)
@@ -189,12 +204,13 @@ def climbed(
             np.float32(sensor.clip),
             *_bend(sharpness),
             alphas,
+            adaptive,
             shape[1],
             lights,
         )
         on_step(steps, steps)
         return latent
-    previous = latent
+    previous, change = latent, np.zeros_like(latent)
     for step, alpha in enumerate(alphas, start=1):
         start = np.maximum(latent + alpha * (latent - previous), TINY)
         predicted = np.maximum(blur.forward(start), 0.0)
@@ -205,8 +221,18 @@ def climbed(
         if lights:
             update = _split(update, error, start, blur=blur, reach=reach, clip=sensor.clip)
         previous, latent = latent, np.maximum(start * np.maximum(update, 0.0), TINY)
+        if adaptive:
+            before, change = change, latent - start
+            alphas[step : step + 1] = _measured_alpha(change, before)
         on_step(step, steps)
     return latent
+
+
+def _measured_alpha(change: Plane, before: Plane) -> float:
+    """Measure alpha of Biggs and Andrews from the last two changes g; 0 while there is but one."""
+    norm = float(np.vdot(before, before.astype(np.float64)))
+    share = float(np.vdot(change, before.astype(np.float64))) / norm if norm > 0.0 else 0.0
+    return min(max(share, 0.0), 1.0)
 
 
 @lru_cache(maxsize=8)

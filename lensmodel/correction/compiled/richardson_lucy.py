@@ -155,7 +155,7 @@ def _errors(light: Real, data: Real, base: float, clip: float, bend: Real, first
 
 @jit
 def _measured_alpha(start: Real, work: Real, share: Real, change: Real) -> np.float32:
-    """Measure alpha of Biggs and Andrews; `change` holds the change of the step before, then that of this one."""
+    """Measure alpha of Biggs and Andrews; `change` holds that of the step before, then that of this one."""
     rows, cols = start.shape
     norm = 0.0
     product = 0.0

@@ -5,10 +5,10 @@ r"""Three schedules of Richardson-Lucy at equal quality: none, a fixed one, and 
 Windows of 256 pixels of photographs of the development half are blurred with the true PSFs of simulated
 lenses in the middle and the corner of the field, with the noise of a sensor of 50,000 electrons (base ISO),
 2,500 (high ISO), or hardly any, and deconvolved with the same PSF by `SaturationAwareRichardsonLucy`. For
-each number of steps the PSNR against the sharp window is measured. Equal quality is, window by window, the PSNR
-that the worst of the three reaches at its best, less 0.05 dB: printed are the steps and the CPU time that
-each takes to get there, over those of the fixed schedule (geometric means over pairs), the best PSNR, and
-that after the 25 steps of the method `paper`.
+each number of steps the PSNR against the sharp window is measured. Equal quality is, of each window, the
+PSNR that the worst of the three reaches at its best, less 0.05 dB: printed are the steps and the CPU time
+that each takes to get there, over those of the fixed schedule (geometric means over pairs), the best PSNR,
+and that after the 25 steps of the method `paper`.
 """
 
 from __future__ import annotations

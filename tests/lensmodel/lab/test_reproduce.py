@@ -18,6 +18,7 @@ from scipy import ndimage
 from lensmodel import quality
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame, zone_of
+from lensmodel.core.psf import distance, gaussian
 from lensmodel.core.types import CHANNELS, ZONES, FieldPosition, LensSettings, Planes
 from lensmodel.lab.reproduce import (
     Answer,
@@ -26,6 +27,7 @@ from lensmodel.lab.reproduce import (
     Place,
     Reproduction,
     collected,
+    families,
     job,
     measure,
     planned,
@@ -37,13 +39,17 @@ from lensmodel.lab.reproduce import (
 from lensmodel.lab.reproduce.cases import FIRST_SEED, Size, fingerprint, key_of
 from lensmodel.lab.reproduce.conditions import BASE, CONDITIONS, PATHS, SCENES_THAT_HURT
 from lensmodel.lab.reproduce.fidelity import EVERY, blocks, fidelity
+from lensmodel.lab.reproduce.general import MeanField, SymmetricField, general_field
+from lensmodel.lab.reproduce.interpolation import Flow
 from lensmodel.lab.reproduce.pages.bars import bars, held
 from lensmodel.lab.reproduce.pages.tables import groups, hard_rows, kept, shares, summary
 from lensmodel.lab.reproduce.scenes import centred_cut, frame_scene, layout_for, scene_files
 from lensmodel.lab.reproduce.shots import Shots, guard_of, take
+from lensmodel.lab.traced import read_grid
 from lensmodel.photo import develop
 from lensmodel.report.photo_crops import as_shown, strip
 from lensmodel.simulate import LENS_KINDS, edge_chart
+from lensmodel.workflow.ways import Way
 
 
 def case(**changes: Any) -> Case:
@@ -124,6 +130,104 @@ def test_names_of_cases_are_unique() -> None:
 def test_case_refuses_numbers_of_photos_that_do_not_ascend() -> None:
     with pytest.raises(InvalidInputError, match="ascend"):
         case(photos=(2, 1))
+
+
+# --- ray-traced lenses -------------------------------------------------------------------------
+
+
+HELIAR, TELEPHOTO = families.repository_grids()
+
+
+def traced(path: Path = HELIAR, **changes: Any) -> Case:
+    (one,) = [c for c in planned("quick", lenses=1, grids=[path]).cases if c.grid is not None]
+    return replace(one, height=480, width=640, **changes)
+
+
+def test_plan_has_lenses_of_both_families_and_says_which_were_looked_at() -> None:
+    cases = planned("quick").cases
+    assert [one.family for one in cases] == ["third order"] * 2 + ["ray-traced"] * 2
+    assert [one.unseen for one in cases] == [True, True, False, False]
+    assert {one.name.partition("-")[0] for one in cases} == {"1000", "1004", "heliar", "reverse"}
+    assert len({one.seed for one in cases}) == 4
+
+
+def test_traced_case_has_the_pitch_the_aperture_and_the_truth_of_its_grid() -> None:
+    one, grid = traced(), read_grid(HELIAR)
+    assert (one.aperture, one.stops, one.camera.pitch_um) == (3.5, 0.0, grid.pitch_um)
+    place = FieldPosition(0.7, 2.0)
+    expected = grid.kernel_at(place, "b", 31)
+    np.testing.assert_array_equal(one.truth().kernel_at(place, "b", 31), expected)
+
+
+def test_key_of_a_traced_lens_follows_the_content_of_its_grid(tmp_path: Path) -> None:
+    moved = tmp_path / "elsewhere.npz"
+    moved.write_bytes(HELIAR.read_bytes())
+    assert traced(moved).seed == traced().seed
+    assert key_of(traced(moved), plan(), "a", "1") == key_of(traced(), plan(), "a", "1")
+    assert key_of(traced(TELEPHOTO), plan(), "a", "1") != key_of(traced(), plan(), "a", "1")
+    with pytest.raises(InvalidInputError, match="one design"):
+        planned("quick", grids=[HELIAR, moved])
+
+
+def test_only_lenses_that_are_named_are_run() -> None:
+    assert [c.seed for c in planned("default", only=["1003"]).cases if c.condition == BASE] == [1003]
+    assert {c.family for c in planned("quick", only=["heliar"]).cases} == {"ray-traced"}
+    with pytest.raises(InvalidInputError, match="no lens's name begins with 'sonnar'"):
+        planned("quick", only=["sonnar"])
+
+
+@pytest.mark.slow
+def test_traced_lens_is_photographed(tmp_path: Path) -> None:
+    files = photographs(tmp_path, 4)
+    one = replace(traced(), photos=(1,), height=32, width=64, layout=layout_for(files, 2, (32, 64)))
+    shots = take(one, files, tmp_path / "photos", first=1)
+    seen = develop(shots.learn[0])
+    assert seen.info.metadata.aperture == pytest.approx(3.5)
+    assert seen.info.metadata.pixel_pitch_um == pytest.approx(4.5)
+
+
+class EvenField:
+    """A field that is the same under every turn of the frame about its middle, and under its mirror."""
+
+    def kernel_at(self, position: FieldPosition, channel: str, size: int) -> np.ndarray:
+        del channel
+        u = np.array([-np.sin(position.phi), np.cos(position.phi)])  # (row, col)
+        across = np.array([u[1], -u[0]])
+        return gaussian(size, 4.0 * position.r * np.outer(u, u) + np.outer(across, across))
+
+
+def test_even_lens_is_its_own_general_profile_and_an_uneven_one_is_not() -> None:
+    place = FieldPosition(0.8, 0.6)
+    even = EvenField()
+    found = SymmetricField(even).kernel_at(place, "g", 21)
+    np.testing.assert_allclose(found, even.kernel_at(place, "g", 21), atol=1e-12)
+    one = traced()
+    assert (
+        distance(general_field(one).kernel_at(place, "g", 25), one.truth().kernel_at(place, "g", 25)).rel_l2
+        > 0.02
+    )
+
+
+def test_general_profile_of_a_drawn_lens_is_the_mean_of_development_lenses_of_its_kind() -> None:
+    one, place = case(), FieldPosition(0.5, 1.0)
+    field = general_field(one)
+    assert isinstance(field, MeanField)
+    lenses = [each.lens for each in field.fields]  # type: ignore[attr-defined]  # simulated fields
+    assert {lens.model.split()[1] for lens in lenses} == {one.lens.model.split()[1]}
+    assert max(int(lens.serial.removeprefix("SIM")) for lens in lenses) < 100
+    mean = np.mean([each.kernel_at(place, "g", 21) for each in field.fields], axis=0)
+    np.testing.assert_allclose(field.kernel_at(place, "g", 21), mean / mean.sum())
+
+
+def test_flow_gives_the_psfs_of_its_windows_in_their_middles_and_their_mean_between() -> None:
+    field, frame = EvenField(), Frame(96, 144)
+    flow = Flow(field, frame, 15)
+    middles = [frame.position(11.5, 59.5), frame.position(11.5, 83.5)]
+    left, right = (field.kernel_at(place, "g", 15) for place in middles)
+    between = frame.position(12.0, 72.0)  # half a pixel beyond the middle of the two
+    assert distance(flow(middles[0]), left).rel_l2 < 0.03  # the pixel that is nearest lies half a pixel away
+    assert distance(flow(between), 0.5 * (left + right)).rel_l2 < 0.03
+    assert distance(left, right).rel_l2 > 0.1
 
 
 # --- scenes ------------------------------------------------------------------------------------
@@ -670,7 +774,9 @@ def quick_photos(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return taken
 
 
-def reproduced(folder: Path, route: Nothing, chosen: Reproduction) -> dict[str, Any]:
+def reproduced(
+    folder: Path, route: Nothing, chosen: Reproduction, results: Path | None = None
+) -> dict[str, Any]:
     told: list[tuple[float, float]] = []
 
     @contextmanager
@@ -684,7 +790,14 @@ def reproduced(folder: Path, route: Nothing, chosen: Reproduction) -> dict[str, 
         told.append((done, total))
 
     made = run_reproduction(
-        chosen, opened, folder, route="test", workers=1, with_figures=False, on_work=on_work
+        chosen,
+        opened,
+        folder,
+        route="test",
+        workers=1,
+        with_figures=False,
+        results=results,
+        on_work=on_work,
     )
     assert told[-1][0] == pytest.approx(told[-1][1])  # all the work that was announced is over
     return made
@@ -698,6 +811,45 @@ def test_second_run_computes_nothing(tmp_path: Path, quick_photos: list[str]) ->
     assert again.learned == []
     assert len(quick_photos) == 1
     assert not list(tmp_path.rglob("work"))
+
+
+def test_results_of_another_sitting_are_taken_and_their_pictures_left_out(
+    tmp_path: Path, quick_photos: list[str]
+) -> None:
+    chosen = plan(case(photos=(1,)))
+    first = reproduced(tmp_path / "one", Nothing(), chosen, results=tmp_path / "results")
+    assert not (tmp_path / "one" / "cache").exists()
+    kept_files = [path for path in (tmp_path / "results").rglob("*") if path.is_file()]
+    assert {path.suffix for path in kept_files} == {".json"}
+    again = Nothing()
+    made = reproduced(tmp_path / "other", again, chosen, results=tmp_path / "results")
+    assert again.learned == []
+    assert len(quick_photos) == 1
+    assert made["cases"][0]["learned"] == first["cases"][0]["learned"]
+    assert made["cases"][0]["truth"]["pictures"] == {}
+    assert "were made by other runs" in write_page(made, tmp_path)[0].read_text(encoding="utf-8")
+
+
+def test_papers_own_way_is_learned_beside_the_default_and_taken_up_again(
+    tmp_path: Path, quick_photos: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    del quick_photos
+    opened: list[tuple[str, int]] = []
+
+    class Paper(Nothing):
+        def __init__(self, folder: Path, *, workers: int, way: Way) -> None:
+            super().__init__()
+            del folder, workers
+            opened.append((way.estimator, way.kernel_size))
+
+    monkeypatch.setattr(job, "DirectRoute", Paper)
+    chosen = replace(plan(case(photos=(1, 2))), paper=True)
+    made = reproduced(tmp_path, Nothing(), chosen)
+    assert set(made["cases"][0]["paper"]) == {"1", "2"}
+    assert list(made["cases"][0]["paper"]["1"]["methods"]) == ["paper"]
+    next(tmp_path.rglob("paper-2.json")).unlink()
+    reproduced(tmp_path, Nothing(), chosen)
+    assert opened == [("michaeli-irani", 55)] * 2
 
 
 def test_stopped_run_goes_on_where_it_was(tmp_path: Path, quick_photos: list[str]) -> None:

@@ -3,8 +3,9 @@
     python -m lensmodel.lab.reproduce.pages.publish reproduction figures.json --lenses 3 --seed 1002
 
 `reproduction` is the output folder of the run, `figures.json` what `--json` wrote. Written are
-`docs/lab/results/reproduction.md`, a table of means first, with its pictures (those of the first lenses only,
-crops as JPEG), and the picture `docs/images/before-after.jpg`.
+`docs/lab/results/reproduction.md`, a table of means of each family first, with its pictures (of each family those
+of the first lenses only that have any, crops as JPEG), and the picture `docs/images/before-after.jpg` if the run
+made crops of its lens.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import json
 import re
 import shutil
 import textwrap
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ _QUALITY = 90
 _LABEL_PX = 96
 
 
-def page(folder: Path, kept: set[str], summary: str) -> int:
+def page(folder: Path, names: set[str], kept: set[str], summary: str) -> int:
     """Copy the page, a summary under its title, with some of the pictures; return how many pictures."""
     shown = PAGE / "pictures"
     shutil.rmtree(PAGE, ignore_errors=True)
@@ -44,7 +45,7 @@ def page(folder: Path, kept: set[str], summary: str) -> int:
             blocks.append(block)
             continue
         words, name = found.groups()
-        own = re.match(r"\d{4}-", name)
+        own = any(name.startswith(f"{case}-") for case in names)
         if own and not any(name.startswith(f"{case}-") for case in kept):
             blocks.pop()  # the line that tells what it would show
             continue
@@ -113,22 +114,46 @@ def table(cases: list[Mapping[str, Any]]) -> str:
                 lambda case, n=n: case["learned"][n]["methods"][METHOD],  # type: ignore[misc]
             )
         )
+    for n in sorted(cases[0]["paper"], key=int):
+        lines.append(
+            line(
+                f"the paper's own way, n = {n}",
+                lambda case, n=n: next(iter(case["paper"][n]["methods"].values())),  # type: ignore[misc]
+            )
+        )
     lines.append(line("corrected with the true PSF", lambda case: case["truth"]["true"][METHOD]))
     return "\n".join(lines)
 
 
+def by_family(result: Mapping[str, Any]) -> str:
+    """Write the table of each family's lenses wide open, and say what it is of."""
+    whole = [case for case in result["cases"] if case["stops"] < 0.1 and "1" in case["learned"]]
+    parts = []
+    for family in dict.fromkeys(case["family"] for case in whole):
+        cases = [case for case in whole if case["family"] == family]
+        unseen = sum(case["unseen"] for case in cases)
+        parts += [f"Means over {len(cases)} {family} lenses, {unseen} of them unseen:", table(cases)]
+    return "\n\n".join([*parts, words(result)])
+
+
 def words(result: Mapping[str, Any]) -> str:
-    """Say what the table is of."""
-    cases, held = result["cases"], result["bars_held"]
-    seeds = sorted(case["settings"]["seed"] for case in cases)
+    """Say what the tables are of."""
+    held = result["bars_held"]
     said = (
-        f"MTF50 in line pairs per picture height, PSNR in dB: means over {len(cases)} simulated lenses, as "
-        "unlike each other as lenses are, and photographs that nothing was tuned on (lens seeds "
-        f"{seeds[0]} to {seeds[-1]}, raw files at base ISO). The last column is the worst zone of any lens. "
-        "`lensmodel reproduce` made it; of the bars that were set before measuring "
-        f"{held['held']} hold and {held['missed']} are missed."
+        "MTF50 in line pairs per picture height, PSNR in dB, photographs that nothing was tuned on, raw files at "
+        "base ISO. The last column is the worst zone of any lens. `lensmodel reproduce` made it; of the bars "
+        f"that were set before measuring {held['held']} hold and {held['missed']} are missed."
     )
     return textwrap.fill(said, 110, break_long_words=False, break_on_hyphens=False)
+
+
+def shown_lenses(cases: Sequence[Mapping[str, Any]], count: int) -> set[str]:
+    """Names of the first lenses of each family that have pictures."""
+    found: dict[str, list[str]] = {}
+    for case in cases:
+        if case["truth"]["pictures"]:
+            found.setdefault(case["family"], []).append(case["name"])
+    return {name for names in found.values() for name in names[:count]}
 
 
 def main() -> None:
@@ -138,15 +163,18 @@ def main() -> None:
     )
     parser.add_argument("folder", type=Path)
     parser.add_argument("figures", type=Path)
-    parser.add_argument("--lenses", type=int, default=3, help="so many lenses keep their pictures")
+    parser.add_argument("--lenses", type=int, default=3, help="so many lenses of a family keep pictures")
     parser.add_argument("--seed", type=int, default=1000, help="of the lens whose crops README shows")
     asked = parser.parse_args()
     result = json.loads(asked.figures.read_text(encoding="utf-8"))
     cases = result["cases"]
-    kept = {case["name"] for case in cases[: asked.lenses]}
-    count = page(asked.folder, kept, f"{table(cases)}\n\n{words(result)}")
-    picture(asked.folder, next(case for case in cases if case["settings"]["seed"] == asked.seed))
-    print(f"{count} pictures; {PAGE / 'reproduction.md'}, {PICTURE}")
+    names = {case["name"] for case in (*cases, *result["hard"])}
+    count = page(asked.folder, names, shown_lenses(cases, asked.lenses), by_family(result))
+    print(f"{count} pictures; {PAGE / 'reproduction.md'}")
+    for case in cases:
+        if case["settings"]["seed"] == asked.seed and case["truth"]["pictures"]:
+            picture(asked.folder, case)
+            print(PICTURE)
 
 
 if __name__ == "__main__":

@@ -816,7 +816,7 @@ def test_second_run_computes_nothing(tmp_path: Path, quick_photos: list[str]) ->
 def test_results_of_another_sitting_are_taken_and_their_pictures_left_out(
     tmp_path: Path, quick_photos: list[str]
 ) -> None:
-    chosen = plan(case(photos=(1,)))
+    chosen = replace(plan(case(photos=(1,))), methods=("paper",))
     first = reproduced(tmp_path / "one", Nothing(), chosen, results=tmp_path / "results")
     assert not (tmp_path / "one" / "cache").exists()
     kept_files = [path for path in (tmp_path / "results").rglob("*") if path.is_file()]

@@ -94,7 +94,8 @@ class SaturationAwareRichardsonLucy:
         fixed      alpha_k = (k - 1) / (k + 2), at most 0.9
         adaptive   alpha_k = <g_{k-1}, g_{k-2}> / <g_{k-2}, g_{k-2}>, within 0..1,   g_k = x_{k+1} - y_k
 
-    The second is that of Biggs and Andrews [2]_. Each tile measures its own there.
+    The second is that of Biggs and Andrews [2]_. Each tile measures its own there, so that what comes out
+    depends a little on where tiles lie.
 
     Parameters
     ----------

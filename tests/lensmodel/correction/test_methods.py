@@ -460,3 +460,9 @@ def test_a_frame_behind_a_point_moved_by_a_part_of_a_pixel_does_not_run_away(eng
     )
 
     assert np.abs(restored).max() < 100.0  # steps of the tile ring; without a bound nothing is a number
+
+
+def test_paper_takes_its_acceleration_as_a_parameter() -> None:
+    chosen = deconvolvers.create("paper", acceleration="adaptive", iterations=7)
+    assert (chosen.acceleration, chosen.iterations, chosen.warped) == ("adaptive", 7, True)  # type: ignore[attr-defined]
+    assert deconvolvers.create("paper").acceleration == "fixed"  # type: ignore[attr-defined]

@@ -4,8 +4,8 @@
 
 `reproduction` is the output folder of the run, `figures.json` what `--json` wrote. Written are
 `docs/lab/results/reproduction.md`, a table of means of each family first, with its pictures (of each family
-those of the first lenses only that have any, crops as JPEG), and the picture `docs/images/before-after.jpg` if
-the run made crops of its lens.
+those of the first lenses only that have any, crops as JPEG), and the picture `docs/images/before-after.jpg`
+if the run made crops of its lens.
 """
 
 from __future__ import annotations
@@ -140,9 +140,9 @@ def words(result: Mapping[str, Any]) -> str:
     """Say what the tables are of."""
     held = result["bars_held"]
     said = (
-        "MTF50 in line pairs per picture height, PSNR in dB, photographs that nothing was tuned on, raw files "
-        "at base ISO. The last column is the worst zone of any lens. `lensmodel reproduce` made it; of the bars "
-        f"that were set before measuring {held['held']} hold and {held['missed']} are missed."
+        "MTF50 in line pairs per picture height, PSNR in dB, photographs that nothing was tuned on, raw "
+        "files at base ISO. The last column is the worst zone of any lens. `lensmodel reproduce` made it; of "
+        f"the bars that were set before measuring {held['held']} hold and {held['missed']} are missed."
     )
     return textwrap.fill(said, 110, break_long_words=False, break_on_hyphens=False)
 

@@ -74,6 +74,9 @@ def reproduce(
     no_paper: Annotated[
         bool, typer.Option("--no-paper", help="Leave out the paper's own way from end to end, which is slow.")
     ] = False,
+    no_target: Annotated[
+        bool, typer.Option("--no-target", help="Leave out the lens measured with a target, which is slow.")
+    ] = False,
     no_figures: Annotated[
         bool, typer.Option("--no-figures", help="Leave Figs. 2 and 4 to a later run.")
     ] = False,
@@ -135,6 +138,7 @@ def reproduce(
         grids=grids or None,
         only=only or (),
         paper=not no_paper,
+        target=not no_target,
     )
     result = run_reproduction(
         plan,

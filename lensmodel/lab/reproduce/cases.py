@@ -198,6 +198,8 @@ class Reproduction:
         Whether each lens is learned and corrected the paper's own way from end to end too.
     general : bool
         Whether a general profile of the lens model is compared with, see `general.general_field`.
+    target : bool
+        Whether each lens is measured with a printed target too.
     """
 
     cases: tuple[Case, ...]
@@ -209,6 +211,7 @@ class Reproduction:
     size: Size = "default"
     paper: bool = True
     general: bool = True
+    target: bool = True
 
     def files(self) -> tuple[Path, ...]:
         """Return the photographs."""
@@ -225,6 +228,7 @@ def planned(
     grids: Sequence[Path] | None = None,
     only: Sequence[str] = (),
     paper: bool = True,
+    target: bool = True,
 ) -> Reproduction:
     """Plan a run of one of three sizes.
 
@@ -248,7 +252,7 @@ def planned(
         Grids of ray-traced lenses, one lens each; None takes those of the repository.
     only : sequence of str
         Only lenses whose name begins so, such as "1003" or "heliar"; for sittings on several machines.
-    paper : bool
+    paper, target : bool
         See `Reproduction`.
 
     Raises
@@ -287,7 +291,13 @@ def planned(
         frame = _QUICK_FRAME if size == "quick" else _HARD_FRAME
         cases += tuple(replace(_case(seed, (1,), files, frame), condition=name) for seed in chosen)
     return Reproduction(
-        _chosen(cases, only), scenes, estimator, programs=programs.installed(), size=size, paper=paper
+        _chosen(cases, only),
+        scenes,
+        estimator,
+        programs=programs.installed(),
+        size=size,
+        paper=paper,
+        target=target,
     )
 
 

@@ -30,12 +30,13 @@ from lensmodel.lab.reproduce.progress import (
     SHOT,
     Progress,
     corrections,
-    is_measured,
     methods_of,
     programs_of,
     rivals_of,
     weight_of,
+    with_general,
     with_paper,
+    with_target,
 )
 from lensmodel.lab.reproduce.routes import (
     Answer,
@@ -126,8 +127,8 @@ class Job:
         counts = [str(n) for n in case.photos]
         return {
             "truth": {"": folder / "truth.json"},
-            "measured": {"": folder / "measured.json"} if is_measured(case) else {},
-            "general": {"": folder / "general.json"} if plan.general and is_measured(case) else {},
+            "measured": {"": folder / "measured.json"} if with_target(case, plan) else {},
+            "general": {"": folder / "general.json"} if with_general(case, plan) else {},
             "learned": {n: folder / f"learned-{n}.json" for n in counts},
             "paper": {n: folder / f"paper-{n}.json" for n in counts} if with_paper(case, plan) else {},
             "rivals": {
@@ -280,11 +281,11 @@ class Job:
 
     def _paper(self, shots: Shots, targets: Mapping[str, Path]) -> None:
         """Learn and correct the paper's own way from end to end, in the library."""
+        if not targets:
+            return
         weight = self.case.photos[-1] * PAPER_LEARN + len(targets) * PAPER_CORRECT
         if all(path.exists() for path in targets.values()):
-            self.progress.tell(
-                f"{self.case.title}: the paper's way, stored", weight * bool(targets), fresh=False
-            )
+            self.progress.tell(f"{self.case.title}: the paper's way, stored", weight, fresh=False)
             return
         route = DirectRoute(self.work / "paper", workers=self.workers, way=WAYS["paper"])
         self._learned(route, shots, targets, own_way=True)

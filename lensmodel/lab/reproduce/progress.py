@@ -49,7 +49,7 @@ def methods_of(case: Case, plan: Reproduction) -> tuple[str, ...]:
 
 def rivals_of(case: Case, plan: Reproduction) -> tuple[str, ...]:
     """Rivals of a case; one of n = 10, 20 is a lens that another case has from its first photo on."""
-    return plan.rivals if case.condition == BASE and case.photos[0] <= 2 else ()
+    return plan.rivals if is_whole(case) else ()
 
 
 def programs_of(case: Case, plan: Reproduction) -> tuple[str, ...]:
@@ -57,14 +57,24 @@ def programs_of(case: Case, plan: Reproduction) -> tuple[str, ...]:
     return plan.programs if rivals_of(case, plan) else ()
 
 
-def is_measured(case: Case) -> bool:
-    """Whether the lens of a case is also measured with a target: once, from the first photo on."""
+def is_whole(case: Case) -> bool:
+    """Whether a case is that of a lens from its first photo on, which is compared with most: one for each."""
     return case.condition == BASE and case.photos[0] <= 2
+
+
+def with_target(case: Case, plan: Reproduction) -> bool:
+    """Whether the lens of a case is also measured with a target."""
+    return plan.target and is_whole(case)
+
+
+def with_general(case: Case, plan: Reproduction) -> bool:
+    """Whether a general profile of the lens model is compared with."""
+    return plan.general and is_whole(case)
 
 
 def with_paper(case: Case, plan: Reproduction) -> bool:
     """Whether the lens of a case is also learned the paper's own way: once, like the rivals."""
-    return plan.paper and is_measured(case)
+    return plan.paper and is_whole(case)
 
 
 def corrections(case: Case, plan: Reproduction) -> float:
@@ -76,7 +86,7 @@ def weight_of(case: Case, plan: Reproduction) -> float:
     """Weight of a whole case."""
     shots = (case.photos[-1] + 2) * SHOT
     each = corrections(case, plan)
-    target = (MEASURE + each) * (1 + plan.general) if is_measured(case) else 0.0
+    target = (MEASURE + each) * (with_target(case, plan) + with_general(case, plan))
     if with_paper(case, plan):
         target += case.photos[-1] * PAPER_LEARN + len(case.photos) * PAPER_CORRECT
     rest = target + len(rivals_of(case, plan)) * (RIVAL + each) + len(programs_of(case, plan)) * PROGRAM

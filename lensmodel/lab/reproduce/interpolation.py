@@ -2,7 +2,7 @@
 
 The flow's PSFs stand on a regular grid of 4 x 6 windows with half overlap and Bartlett-Hann slopes, as the
 paper has it; the regressions see as many, one at a random place of each window. What the flow applies at a
-pixel is its answer to a point of light there, from the very operator that corrections are made with.
+pixel is the answer of its operator to a point of light there.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.psf import PsfField, PsfSample, as_kernel, distance
 from lensmodel.core.types import ZONES, FieldPosition, Kernel, LensSettings
-from lensmodel.correction.blur import EfficientFilterFlow
+from lensmodel.lab.correction.filter_flow import EfficientFilterFlow
 from lensmodel.lab.model.model_benchmark import PATCHES, asked_places, patch_places, predictor
 from lensmodel.lab.reproduce.cases import Case
 

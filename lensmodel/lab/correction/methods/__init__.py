@@ -13,7 +13,7 @@ from lensmodel.lab.correction.methods.wiener import Wiener
 
 
 def _whyte(iterations: int = 50) -> SaturationAwareRichardsonLucy:
-    return SaturationAwareRichardsonLucy(iterations=iterations, accelerated=False)
+    return SaturationAwareRichardsonLucy(iterations=iterations, acceleration="none")
 
 
 compared: Final[Registry[Deconvolver]] = deconvolvers.extended(

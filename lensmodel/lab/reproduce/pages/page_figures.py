@@ -95,7 +95,9 @@ def before_after(page: Page, result: Mapping[str, Any]) -> None:
     )
     absent = sum(not case["truth"]["pictures"] for case in result["cases"])
     if absent:
-        page.text(f"Crops of {absent} lenses were made by other runs and are not here.")
+        page.text(
+            f"Crops of {absent} of {len(result['cases'])} lenses were made by other runs and are not here."
+        )
     for case in result["cases"]:
         names = _pictures(case)
         if names:

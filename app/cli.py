@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
 
 # Before NumPy is imported: the work is parallel over processes, and linear algebra libraries that
 # start threads of their own in each of them only get in one another's way.
@@ -14,15 +15,93 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 import typer
 
-from app.commands import checking, demonstration, keys, measurement, photos, report, service, upkeep
 from app.commands.console import display, extras, interrupt
 from app.commands.console.failure import InterruptedByUser, UsageError
-from app.lab import benchmarks, reproduce
+from app.commands.console.on_demand import Entry, OnDemand
 from lensmodel.core.errors import LensModelError
 
 interrupt.workers_ignore_it()
 
+
+class Commands(OnDemand):
+    """The commands as `--help` lists them; a test holds each against its own help."""
+
+    entries: ClassVar[Mapping[str, Entry]] = {
+        "calibrate": Entry(
+            "app.commands.photos:calibrate", "Learn the blur of one lens from photos, into a profile."
+        ),
+        "correct": Entry("app.commands.photos:correct", "Remove the blur of the lens from photos."),
+        "check": Entry(
+            "app.commands.checking:check",
+            "Find where a photo corrected by any program shows what the original cannot have contained.",
+        ),
+        "psf": Entry(
+            "app.commands.photos:psf",
+            "Show what the lens makes of a point of light at one place in the picture.",
+        ),
+        "measure": Entry(
+            "app.commands.measurement:measure",
+            "Measure the blur of a lens from photos made for the purpose, into a profile.",
+        ),
+        "target": Entry(
+            "app.commands.measurement:target", "Write the page to print for `lensmodel measure target`."
+        ),
+        "report": Entry(
+            "app.commands.report:report",
+            "Say how sharp a lens is, whether it is centred, and which photo would help most.",
+        ),
+        "export": Entry(
+            "app.commands.report:export_psfs",
+            "Write PSFs for other programs: a grid over the picture, or a single place with --r and --phi.",
+        ),
+        "serve": Entry(
+            "app.commands.service:serve",
+            "Run the whole service: the API, a worker, and a guard that restarts them.",
+        ),
+        "api": Entry(
+            "app.commands.service:api",
+            "Run only the API process, for installations on many machines.",
+            hidden=True,
+        ),
+        "worker": Entry(
+            "app.commands.service:worker",
+            "Run only a worker process, for installations on many machines.",
+            hidden=True,
+        ),
+        "config": Entry(
+            "app.commands.service:config",
+            "Print the effective settings as environment variables; secrets are masked.",
+        ),
+        "doctor": Entry(
+            "app.commands.upkeep:doctor",
+            "Check an installation, running or not: tables, blobs, and whether a worker is running.",
+        ),
+        "backup": Entry(
+            "app.commands.upkeep:backup",
+            "Copy all rows and blobs of an installation into a folder, even while it runs.",
+        ),
+        "restore": Entry("app.commands.upkeep:restore", "Fill an empty installation from a backup."),
+        "migrate": Entry(
+            "app.commands.upkeep:migrate",
+            "Move a stopped installation to another database, and to another storage.",
+        ),
+        "demo": Entry(
+            "app.commands.demonstration:demo",
+            "Run the whole process on a real RAW file and on a simulated lens whose true blur is known.",
+        ),
+        "reproduce": Entry(
+            "app.lab.reproduce:reproduce",
+            "Make the paper's figures and its Table 1 on simulated lenses that nothing was tuned on.",
+        ),
+        "keys": Entry(
+            "app.commands.keys:keys", "Make, list, renew and end the keys of a service that others can reach."
+        ),
+        "bench": Entry("app.lab.benchmarks:bench", "Measure quality and speed."),
+    }
+
+
 app = typer.Typer(
+    cls=Commands,
     name="lensmodel",
     help="Learn the blur of one copy of a lens from ordinary photos, and remove it.",
     epilog="""Start with: lensmodel calibrate PHOTO... --profile my-lens.lensprofile
@@ -33,26 +112,6 @@ Exit status: 0 done, 1 something failed, 2 called wrongly, 130 stopped by Ctrl-C
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command()(photos.calibrate)
-app.command()(photos.correct)
-app.command()(checking.check)
-app.command()(photos.psf)
-app.command()(measurement.measure)
-app.command()(measurement.target)
-app.command()(report.report)
-app.command(name="export")(report.export_psfs)
-app.command()(service.serve)
-app.command(hidden=True)(service.api)
-app.command(hidden=True)(service.worker)
-app.command()(service.config)
-app.command()(upkeep.doctor)
-app.command()(upkeep.backup)
-app.command()(upkeep.restore)
-app.command()(upkeep.migrate)
-app.command()(demonstration.demo)
-app.command()(reproduce.reproduce)
-app.add_typer(keys.keys, name="keys")
-app.add_typer(benchmarks.bench, name="bench")
 
 
 def _show_version(wanted: bool) -> None:

@@ -12,7 +12,8 @@ import typer
 
 from app.commands.console import display, files
 from app.commands.console.failure import UsageError
-from app.commands.console.options import Estimator, Quiet, Verbose
+from app.commands.console.method_options import Estimator
+from app.commands.console.options import Quiet, Verbose
 from lensmodel import estimation
 
 MARKER: Final = ".lensmodel-demo.json"

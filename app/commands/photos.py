@@ -13,20 +13,19 @@ import typer
 from app.commands import answer, calibration, correction, folder, remote
 from app.commands.console import display
 from app.commands.console.failure import UsageError
+from app.commands.console.method_options import Estimator, Selector
 from app.commands.console.options import (
     ANGLE,
     RADIUS,
     AnyLens,
     Aperture,
     Channel,
-    Estimator,
     Force,
     Json,
     Photos,
     Profile,
     ProfileFile,
     Quiet,
-    Selector,
     Size,
     Verbose,
     Workers,

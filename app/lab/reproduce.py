@@ -14,7 +14,8 @@ import typer
 from app.commands.console import display
 from app.commands.console.failure import UsageError
 from app.commands.console.files import refuse_existing
-from app.commands.console.options import Estimator, Force, Quiet, Verbose
+from app.commands.console.method_options import Estimator
+from app.commands.console.options import Force, Quiet, Verbose
 
 if TYPE_CHECKING:
     from lensmodel.lab.reproduce import Case, DirectRoute, OpenRoute, Size

@@ -11,9 +11,7 @@ from typing import Annotated, Any, get_args
 import typer
 
 from app.commands.console.failure import UsageError
-from lensmodel import estimation
 from lensmodel.core import types
-from lensmodel.estimation.patches import selectors
 
 
 def choice(name: str, kinds: Iterable[str], words: str) -> Any:  # noqa: ANN401 - what `typer.Option` returns
@@ -64,12 +62,6 @@ ProfileFile = Annotated[Path, typer.Argument(metavar="FILE", help="The lens prof
 Aperture = Annotated[float | None, aperture_option("f-number, where a photo does not say its own.")]
 AnyLens = Annotated[
     bool, typer.Option("--any-lens", help="Also use photos that seem to be from a different lens.")
-]
-Estimator = Annotated[
-    str, typer.Option(metavar="NAME", help=f"Blind estimator: {', '.join(estimation.estimators)}.")
-]
-Selector = Annotated[
-    str, typer.Option(metavar="NAME", help=f"How patches of a photo are chosen: {', '.join(selectors)}.")
 ]
 Channel = Annotated[types.Channel, choice("--channel", get_args(types.Channel), "Colour channel.")]
 RADIUS = typer.Option(

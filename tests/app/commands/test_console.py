@@ -55,6 +55,14 @@ def test_times_are_those_of_a_clock(seconds: float, words: str) -> None:
     assert clock(seconds) == words
 
 
+def test_commands_of_the_service_and_the_list_of_commands_do_not_wait_for_scipy() -> None:
+    modules = "app.cli", "app.commands.keys", "app.commands.service", "app.commands.upkeep"
+    script = f"import sys, {', '.join(modules)}\nprint(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+
+    assert not {"scipy", "skimage", "lensmodel.model", "sqlalchemy"} & set(done.stdout.split())
+
+
 def test_one_command_installs_the_completion_of_a_shell(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "lensmodel", "--install-completion", "bash"],

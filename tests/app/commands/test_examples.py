@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import json
 import os
 import re
@@ -24,6 +25,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from app.blobs.storage import Storage
 from app.cli import app
+from app.commands.console.on_demand import OnDemand
 from app.runtime.backup import backup
 from app.runtime.settings import Settings
 from app.store import Store
@@ -44,13 +46,14 @@ sys.path.remove(str(HERE))
 
 PATIENCE_S = 240.0
 LONG_S = 3600.0
-ROOT = typer.main.get_command(app)
+ROOT: Any = typer.main.get_command(app)
 
 
 def commands(group: Any, names: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
     """Walk over all commands that `--help` shows."""
     assert isinstance(group, TyperGroup)
-    for name, command in group.commands.items():
+    for name, listed in group.commands.items():
+        command: Any = group.imported(name) if isinstance(group, OnDemand) else listed
         assert isinstance(command, TyperCommand | TyperGroup)
         if not command.hidden:
             yield " ".join((*names, name)), command
@@ -82,6 +85,14 @@ def test_each_example_is_understood_by_its_command(line: str) -> None:
 
     with contextlib.suppress(typer.Exit):  # `--help` ends the reading
         assert COMMANDS[name].make_context(name, words).params
+
+
+@pytest.mark.parametrize("name", ROOT.entries)
+def test_the_list_of_commands_says_of_each_what_its_own_help_begins_with(name: str) -> None:
+    listed, command = ROOT.commands[name], ROOT.imported(name)
+
+    assert (command.name, command.hidden) == (listed.name, listed.hidden)
+    assert inspect.cleandoc(command.help or "").splitlines()[0] == listed.help
 
 
 def test_an_option_that_does_not_exist_would_be_noticed() -> None:

@@ -8,7 +8,7 @@ plane seen through a perfect lens does not have: distortion, and the small turns
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -58,16 +58,19 @@ class Warp:
         below = h[2, 0] * r + h[2, 1] * c + h[2, 2]
         out = [(h[i, 0] * r + h[i, 1] * c + h[i, 2]) / below for i in range(2)]
         if self.bend.any():
-            for power, terms in zip(_powers(DEGREE), self.bend, strict=True):
-                value = self._basis(r, c, power)
+            for value, terms in zip(self._basis(r, c), self.bend, strict=True):
                 out = [axis + term * value for axis, term in zip(out, terms, strict=True)]
         return out[0], out[1]
 
-    def _basis(
-        self, rows: NDArray[np.float64], cols: NDArray[np.float64], power: tuple[int, int]
-    ) -> NDArray[np.float64]:
+    def _basis(self, rows: NDArray[np.float64], cols: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
+        """X^i Y^j for each of `_powers(DEGREE)`, one after the other."""
         middle, unit = self.frame.center, self.frame.half_diagonal
-        return ((rows - middle[0]) / unit) ** power[0] * ((cols - middle[1]) / unit) ** power[1]
+        x, y = ((place - m) / unit for place, m in zip((rows, cols), middle, strict=True))
+        raised: list[list[NDArray[np.float64]]] = [[np.ones_like(axis)] for axis in (x, y)]
+        for axis, powers in zip((x, y), raised, strict=True):
+            for _ in range(DEGREE):
+                powers.append(powers[-1] * axis)  # several times as fast as axis**k
+        return (raised[0][i] * raised[1][j] for i, j in _powers(DEGREE))
 
     def scale(self, row: float, col: float) -> float:
         """How many units of the reference a pixel takes, along the axis where it takes most."""
@@ -96,7 +99,7 @@ class Warp:
         wanted = np.stack(self(*(pixels - shifts).T), axis=-1) - np.stack(self(*pixels.T), axis=-1)
         powers = _powers(DEGREE)
         used = [i for i, power in enumerate(powers) if sum(power) <= degree]
-        basis = np.stack([self._basis(pixels[:, 0], pixels[:, 1], powers[i]) for i in used], axis=-1)
+        basis = np.stack(list(self._basis(*pixels.T)), axis=-1)[:, used]
         unit = self.scale(*self.frame.center)
         good = np.ones(len(pixels), dtype=bool)
         terms = np.zeros((len(used), 2))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import inspect
 import json
+import logging
 import os
 import re
 import shlex
@@ -12,7 +13,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from sqlalchemy import update
 from typer.core import TyperCommand, TyperGroup
 
 from app.blobs.storage import Storage
-from app.cli import app
+from app.cli import app, main
 from app.commands.console.on_demand import OnDemand
 from app.runtime.backup import backup
 from app.runtime.settings import Settings
@@ -100,7 +101,7 @@ def test_an_option_that_does_not_exist_would_be_noticed() -> None:
         COMMANDS["demo"].make_context("demo", ["--outputs", "x"])
 
 
-# --- each example, in a process of its own -----------------------------------------------------
+# --- each example ------------------------------------------------------------------------------
 
 SHORTER = {
     "calibrate": ["--estimator", "whittle"],
@@ -117,9 +118,7 @@ KEPT = {
 
 QUICK = {
     "correct one.dng --profile my-24mm.lensprofile -o linear --format dng --method fast --json",
-    "calibrate scan.tif --aperture 2.8 --profile old-lens.lensprofile",
     "psf my-24mm.lensprofile --r 0.9 --channel b --output corner.npy",
-    "report my-24mm.lensprofile --aperture 2 -o my-24mm-report",
     "check scan.tif scan-sharpened.tif --profile my-24mm.lensprofile --map faults.png",
     "export my-24mm.lensprofile --format json --r 0.9 --phi 0.6 -o corner-for-art.json",
     "config --json",
@@ -127,9 +126,14 @@ QUICK = {
     "backup my-backup",
     "restore my-backup --data restored",
     "migrate --to sqlite:///elsewhere.db",
-    "serve",
 }
-"""One of each command that does not take minutes; the others are run among the slow tests."""
+"""One of each command that takes a second at most; the others are run among the slow tests."""
+
+ALONE = {
+    "correct one.dng --profile my-24mm.lensprofile -o linear --format dng --method fast --json",
+    "config --json",
+}
+"""Of the quick ones, those that have a process of their own, as all slow ones do: it takes a second."""
 
 
 def marked(lines: Iterable[str]) -> list[Any]:
@@ -137,7 +141,7 @@ def marked(lines: Iterable[str]) -> list[Any]:
 
 
 def test_the_quick_examples_are_examples() -> None:
-    assert set(EXAMPLES) >= QUICK
+    assert set(EXAMPLES) >= QUICK >= ALONE
 
 
 @pytest.fixture(scope="session")
@@ -198,21 +202,35 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("finished")
 
 
-def environment(folder: Path) -> dict[str, str]:
-    kept = {k: v for k, v in os.environ.items() if not k.startswith(("LENS_", "LENSMODEL_"))}
-    return {**kept, "PYTHONPATH": str(HERE.parents[1]), "HOME": str(folder)}
+@pytest.fixture
+def in_this_process(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Iterator[Callable[[list[str]], tuple[int, str, str]]]:
+    """Run `main` in the folder of the examples; what it does to this process is undone."""
+    root = logging.getLogger()
+    handlers, level = list(root.handlers), root.level
+    signals = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for name in set(os.environ) - set(environment(folder)):
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("HOME", str(folder))
+    monkeypatch.chdir(folder)
+
+    def run(words: list[str]) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["lensmodel", *words])
+        status = 0
+        try:
+            main()
+        except SystemExit as end:
+            status = int(end.code or 0)
+        return status, *capsys.readouterr()
+
+    yield run
+    root.handlers[:], root.level = handlers, level
+    for number, handler in signals.items():
+        signal.signal(number, handler)
 
 
-@pytest.mark.parametrize(  # what needs a running service is walked in test_remote.py
-    "line", marked(k for k in EXAMPLES if EXAMPLES[k] != "serve" and "--server" not in k)
-)
-def test_example_runs(line: str, folder: Path, finished: Path) -> None:
-    words = [*shlex.split(line), *SHORTER.get(EXAMPLES[line], [])]
-    if "auto" in words:
-        words += ["--estimator", "whittle", "--learn-from", "1"]
-    kept = KEPT.get(EXAMPLES[line])
-    if kept is not None and (finished / kept).is_dir():
-        shutil.copytree(finished / kept, folder / kept)
+def in_a_process(words: list[str], folder: Path) -> tuple[int, str, str]:
     done = subprocess.run(
         [sys.executable, "-m", "app.cli", *words],
         cwd=folder,
@@ -222,9 +240,34 @@ def test_example_runs(line: str, folder: Path, finished: Path) -> None:
         check=False,
         timeout=LONG_S,
     )
+    return done.returncode, done.stdout, done.stderr
 
-    assert done.returncode == 0, done.stderr
-    assert done.stdout
+
+def environment(folder: Path) -> dict[str, str]:
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("LENS_", "LENSMODEL_"))}
+    return {**kept, "PYTHONPATH": str(HERE.parents[1]), "HOME": str(folder)}
+
+
+@pytest.mark.parametrize(  # what needs a running service is walked in test_remote.py
+    "line", marked(k for k in EXAMPLES if EXAMPLES[k] != "serve" and "--server" not in k)
+)
+def test_example_runs(
+    line: str,
+    folder: Path,
+    finished: Path,
+    in_this_process: Callable[[list[str]], tuple[int, str, str]],
+) -> None:
+    words = [*shlex.split(line), *SHORTER.get(EXAMPLES[line], [])]
+    if "auto" in words:
+        words += ["--estimator", "whittle", "--learn-from", "1"]
+    kept = KEPT.get(EXAMPLES[line])
+    if kept is not None and (finished / kept).is_dir():
+        shutil.copytree(finished / kept, folder / kept)
+    quick = line in QUICK and line not in ALONE
+    status, said, errors = in_this_process(words) if quick else in_a_process(words, folder)
+
+    assert status == 0, errors
+    assert said
     if kept is not None and (folder / kept).is_dir():
         shutil.copytree(folder / kept, finished / kept, dirs_exist_ok=True)
     for flag in ("-o", "--output", "--profile", "--json"):
@@ -233,10 +276,11 @@ def test_example_runs(line: str, folder: Path, finished: Path) -> None:
         ):
             assert (folder / words[at + 1]).exists(), flag
     if "--json" in words and (words[-1] == "--json"):
-        json.loads(done.stdout)
+        json.loads(said)
 
 
-@pytest.mark.parametrize("line", marked(k for k in EXAMPLES if EXAMPLES[k] == "serve"))
+@pytest.mark.slow
+@pytest.mark.parametrize("line", [k for k in EXAMPLES if EXAMPLES[k] == "serve"])
 def test_example_serves_until_it_is_told_to_stop(line: str, folder: Path) -> None:
     words = [word.replace("~", str(folder)) for word in shlex.split(line)]
     with subprocess.Popen(

@@ -28,8 +28,9 @@ install: $(STAMP) ## make the virtual environment with locked versions
 demo: install ## photos in, lens calibrated, corrected photo out: see demo-output/report.md
 	@$(BIN)/lensmodel demo --output demo-output
 
+# a file at a time: its services and photos are made once, not once for each of the two processes
 test: install ## the tests that need nothing but this repository
-	@$(BIN)/python -m pytest -q -n 2 -m "not slow"
+	@$(BIN)/python -m pytest -q -n 2 --dist loadfile -m "not slow"
 
 test-all: install ## every test, the slow ones included
 	@$(BIN)/python -m pytest -q -n 2

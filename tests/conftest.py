@@ -6,6 +6,8 @@ import os
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 # Services of tests keep their data for a moment only: what is compiled is kept longer, once for all tests.
@@ -18,16 +20,30 @@ settings.register_profile("tests", deadline=None)  # that others use the machine
 settings.load_profile("tests")
 
 
-@pytest.fixture
-def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fit wavefronts to spectra from a few beginnings, where a test asks what is made of the best of them.
+@contextmanager
+def _searching_shortly() -> Iterator[None]:
+    from lensmodel.model.wavefront import joint_kernels  # noqa: PLC0415 - not for tests of the service
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name, count in {"_STARTS": 2, "_RANDOM": 0, "_KEPT": 2, "_REFINED": 1}.items():
+            patch.setattr(joint_kernels, name, count)
+        yield
+
+
+@pytest.fixture(scope="session")
+def searching_shortly() -> Callable[[], AbstractContextManager[None]]:
+    """Fits wavefronts to spectra from a few beginnings, where a test asks what is made of the best of them.
 
     That takes seconds instead of twenty. Whether the lens itself is found is asked with the whole search.
     """
-    from lensmodel.model.wavefront import joint_kernels  # noqa: PLC0415 - not for tests of the service
+    return _searching_shortly
 
-    for name, count in {"_STARTS": 2, "_RANDOM": 0, "_KEPT": 2, "_REFINED": 1}.items():
-        monkeypatch.setattr(joint_kernels, name, count)
+
+@pytest.fixture
+def short_search() -> Iterator[None]:
+    """Search so during a whole test."""
+    with _searching_shortly():
+        yield
 
 
 @pytest.fixture(scope="session")

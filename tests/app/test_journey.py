@@ -64,6 +64,14 @@ def additions(service: Service, lens_id: str, photo_id: str) -> list[dict[str, A
     return [event for event in history if event["photo_id"] == photo_id]
 
 
+def pids_of(service: Service) -> list[int]:
+    return [service.info()[name] for name in ("worker_pid", "api_pid")]
+
+
+def alive(pids: list[int]) -> list[int]:
+    return [pid for pid in pids if Path(f"/proc/{pid}").exists()]
+
+
 def test_a_photo_calibrates_the_lens_that_it_names(service: Service, first: dict[str, Any]) -> None:
     lens = lens_of(service, first)
 
@@ -156,7 +164,7 @@ def test_a_stored_photo_is_corrected_and_the_result_is_sharper(
     job = service.job(made.json()["id"])
     again = service.http.post("/v1/corrections", json=wish)
     correction = again.json()
-    plain = service.http.post("/v1/corrections", json=wish | {"strength": 0.0}).json()
+    plain = service.http.post("/v1/corrections", json=wish | {"strength": 0.0, "method": "fast"}).json()
     service.job(plain["id"])
     result = service.http.get(correction["links"]["result"])
     sharp, soft = (
@@ -177,7 +185,8 @@ def test_a_stored_photo_is_corrected_and_the_result_is_sharper(
 
 def test_a_region_is_corrected_to_jpeg(service: Service, first: dict[str, Any]) -> None:
     roi = {"x": 100, "y": 50, "width": 200, "height": 120}
-    wish = {"photo_id": first["id"], "output": {"format": "jpeg", "color_space": "srgb"}, "roi": roi}
+    output = {"format": "jpeg", "color_space": "srgb"}
+    wish = {"photo_id": first["id"], "output": output, "roi": roi, "method": "fast"}
     made = service.http.post("/v1/corrections", json=wish).json()
     job = service.job(made["id"])
     picture = Image.open(io.BytesIO(service.http.get(f"/v1/corrections/{made['id']}/result").content))
@@ -226,24 +235,36 @@ def test_a_killed_api_is_replaced_and_callers_wait_meanwhile(service: Service, f
     assert service.info()["api_pid"] != api
 
 
-def test_work_that_a_stop_interrupted_goes_on_at_the_next_start(photos: Path, tmp_path: Path) -> None:
+def test_work_that_a_stop_interrupted_goes_on_at_the_next_start_and_a_killed_supervisor_leaves_no_process(
+    photos: Path, tmp_path: Path
+) -> None:
     data = tmp_path / "data"
     with running(data) as before:
         photo = before.upload(photos / "sixth.dng")
         before.job(photo["id"], until=lambda job: job["stage"] == "estimating")
-        pids = [before.info()[name] for name in ("worker_pid", "api_pid")]
-    left = [pid for pid in pids if Path(f"/proc/{pid}").exists()]
+        pids = pids_of(before)
+    left = alive(pids)
     file_left = (data / "service.json").exists()
 
-    with running(data) as after:
+    after = Service(data)
+    try:
+        after.start()
         job = after.job(photo["id"])
         lens_id = after.get(f"/v1/photos/{photo['id']}")["lens_id"]
         events = additions(after, lens_id, photo["id"])
+        pids = pids_of(after)
+        os.kill(after.info()["pid"], signal.SIGKILL)
+        deadline = Deadline(20)
+        while alive(pids) and not deadline.passed():
+            time.sleep(0.1)
+    finally:
+        after.close()
 
     assert left == []
     assert not file_left
     assert job["state"] == "succeeded", job
     assert len(events) == 1
+    assert alive(pids) == []
 
 
 def test_a_second_service_on_the_same_data_is_refused(service: Service) -> None:
@@ -258,22 +279,7 @@ def test_a_second_service_on_the_same_data_is_refused(service: Service) -> None:
     assert "another service already works on" in second.stderr
 
 
-def test_killing_the_supervisor_leaves_no_process(photos: Path, tmp_path: Path) -> None:
-    service = Service(tmp_path / "data")
-    try:
-        service.start()
-        info = service.info()
-        os.kill(info["pid"], signal.SIGKILL)
-        deadline = Deadline(20)
-        pids = [info["worker_pid"], info["api_pid"]]
-        while any(Path(f"/proc/{pid}").exists() for pid in pids) and not deadline.passed():
-            time.sleep(0.1)
-
-        assert [pid for pid in pids if Path(f"/proc/{pid}").exists()] == []
-    finally:
-        service.close()
-
-
+@pytest.mark.slow
 def test_the_parts_run_alone_for_installations_on_many_machines(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "app.cli"]
     data = ["--data", str(tmp_path / "data")]
@@ -304,6 +310,7 @@ def test_the_parts_run_alone_for_installations_on_many_machines(tmp_path: Path) 
     assert statuses == [0, 0]
 
 
+@pytest.mark.slow
 def test_a_second_copy_leans_on_the_first_and_says_so(
     service: Service, first: dict[str, Any], tmp_path: Path
 ) -> None:

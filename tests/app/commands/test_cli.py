@@ -614,9 +614,8 @@ def write_jpeg(path: Path, seed: int) -> None:
     Image.fromarray(np.dstack([picture] * 3)).save(path, quality=95, exif=exif)
 
 
-@pytest.mark.parametrize(
-    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)], ids=str
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=str)
 def test_stopped_calibration_keeps_finished_photos_and_goes_on(
     number: signal.Signals, folder: Path, here: Here
 ) -> None:
@@ -637,7 +636,7 @@ def test_stopped_calibration_keeps_finished_photos_and_goes_on(
     assert [result["state"] for result in again["results"]] == ["known", "counted"]
 
 
-def test_stopped_correction_leaves_whole_files_only_and_goes_on(folder: Path, made: Path) -> None:
+def test_stopped_correction_leaves_whole_files_only_and_goes_on(folder: Path, made: Path, here: Here) -> None:
     shutil.copy(made / "b.dng", folder / "two.dng")
     words = ("correct", "one.dng", "two.dng", "-p", PROFILE, "-o", "out", "--method", "paper")
     process = start(*words, cwd=folder)
@@ -649,7 +648,7 @@ def test_stopped_correction_leaves_whole_files_only_and_goes_on(folder: Path, ma
 
     assert process.returncode == 130
     assert [path.name for path in (folder / "out").iterdir()] == ["one-corrected.tif"]
-    again = lensmodel(*words, cwd=folder)
+    again = here(*words)
     assert again.stdout.splitlines() == [str(Path("out/two-corrected.tif"))]
     assert first.stat().st_mtime_ns == stamp
 
@@ -685,6 +684,7 @@ def test_progress_with_time_left_is_on_a_terminal_and_results_are_in_the_pipe(fo
     assert "one.dng" in seen
 
 
+@pytest.mark.slow
 def test_a_benchmark_of_the_lens_model_says_how_far_it_is(folder: Path) -> None:
     said, seen = on_a_terminal(
         folder, "bench", "model", "--seeds", "1000:1003", "--photos", "1", "--methods", "eff-linear"
@@ -709,7 +709,7 @@ def _read(terminal: int) -> bytes:
         return b""
 
 
-def test_without_a_terminal_standard_error_stays_empty(folder: Path) -> None:
-    done = lensmodel("correct", "one.dng", "-p", PROFILE, "-o", "out", "--method", "fast", cwd=folder)
+def test_without_a_terminal_standard_error_stays_empty(folder: Path, here: Here) -> None:
+    done = here("correct", "one.dng", "-p", PROFILE, "-o", "out", "--method", "fast")
 
     assert done.stderr == ""

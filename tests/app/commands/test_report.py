@@ -130,7 +130,10 @@ def test_unknown_formats_and_channels_are_refused_and_nothing_is_written(folder:
     assert [p.name for p in folder.iterdir()] == [NAME]
 
 
-def test_lateral_colour_is_measured_on_a_photo_of_the_lens(folder: Path) -> None:
+def test_lateral_colour_is_measured_on_a_photo_of_the_lens(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lensmodel.report.bootstrap.DRAWS", 2)
     rng = np.random.default_rng(4)
     rows, cols = 400, 600
     scene = np.full((rows, cols), 0.3)

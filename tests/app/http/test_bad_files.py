@@ -174,6 +174,7 @@ def test_each_file_of_the_collection_is_refused_or_processed_and_none_is_stuck(
     assert "started again" not in service.log.read_text()
 
 
+@pytest.mark.slow
 def test_a_thumbnail_and_detail_in_one_place_do_not_count(tmp_path: Path) -> None:
     # the fewest patches of which as much evidence is asked as of the default
     with running(tmp_path / "data", LENS_PATCHES="18") as strict:

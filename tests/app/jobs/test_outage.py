@@ -330,6 +330,7 @@ def test_photos_outlast_a_storage_that_is_away(settings: Settings, store: Store,
     check_counted_once(store, 4)
 
 
+@pytest.mark.slow
 def test_workers_that_start_while_the_storage_is_away_wait_for_it(settings: Settings, store: Store) -> None:
     settings = settings.model_copy(update={"worker_slots": 2, "sweep_seconds": 0.1})
     storage = Storage(settings.storage)

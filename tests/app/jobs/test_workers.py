@@ -184,6 +184,7 @@ def test_blobs_that_cannot_be_deleted_keep_no_others(
     assert store.workers.garbage(at=datetime.now(UTC) + timedelta(hours=1)) == [stuck]
 
 
+@pytest.mark.slow
 def test_another_worker_takes_over_from_one_that_died_for_ever(
     crew: Crew, store: Store, send: Callable[[int], list[PhotoRow]]
 ) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 
@@ -280,10 +282,12 @@ def known() -> list[PsfSample]:
 
 
 @pytest.fixture(scope="module")
-def warm(known: list[PsfSample]) -> LensModel:
-    return LensModel.fit(known, MIXED).warmed()
+def warm(known: list[PsfSample], searching_shortly: Callable[[], AbstractContextManager[None]]) -> LensModel:
+    with searching_shortly():
+        return LensModel.fit(known, MIXED).warmed()
 
 
+@pytest.mark.slow
 def test_blur_that_no_wavefront_makes_is_left_to_the_kernels() -> None:
     blur, rng = gaussian(41, 1.3**2 * np.eye(2)), np.random.default_rng(4)
     known = [

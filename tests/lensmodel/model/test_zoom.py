@@ -72,6 +72,7 @@ def test_terms_follow_a_straight_line_over_octaves() -> None:
     assert distance(twice, unknown).rel_l2 > 0.05
 
 
+@pytest.mark.slow
 def test_few_samples_at_one_end_of_a_zoom_lean_on_those_of_the_other(
     many: list[PsfSample], few: list[PsfSample]
 ) -> None:

@@ -124,15 +124,16 @@ def test_cells_hold_every_patch_once_largest_first() -> None:
     assert sorted(p.row for group in groups for p in group) == list(range(6))
 
 
+@pytest.mark.parametrize("method", ["fast", pytest.param("standard", marks=pytest.mark.slow)])
 def test_calibrated_lens_makes_another_photo_sharper(
-    photos: dict[str, tuple[Path, SimulatedPhoto]], tmp_path: Path, short_search: None
+    method: str, photos: dict[str, tuple[Path, SimulatedPhoto]], tmp_path: Path, short_search: None
 ) -> None:
     events: list[pipeline.CalibrationEvent] = []
     model = pipeline.calibrate([photos["city"][0]], count=12, workers=1, on_event=events.append)
     path, shot = photos["lake"]
     output = tmp_path / "corrected.tif"
 
-    corrected = pipeline.correct(path, model, output)
+    corrected = pipeline.correct(path, model, output, method=method)
 
     before = quality.registered_zone_psnr(photo.develop(path).planes, shot.sharp, CAMERA.frame)
     after = quality.registered_zone_psnr(corrected.planes, shot.sharp, CAMERA.frame)

@@ -49,6 +49,7 @@ def measured(model: LensModel) -> LensModel:
     return LensModel.fit([replace(sample, error=0.05) for sample in model.samples])
 
 
+@pytest.mark.slow
 def test_corrected_chart_has_a_measured_gain_in_each_zone_and_its_part_in_the_zones_of_the_part(
     measured: LensModel,
 ) -> None:

@@ -3,9 +3,10 @@ r"""What the witnesses' prior is worth, and what it would be worth with each of 
     LENSMODEL_TEST_DATA=... python -m lensmodel.lab.model.belief_prior --seeds 0:10 [--grids FILE.npz ...]
 
 Each lens takes two photos as in `lensmodel.lab.chain.blind_gain`, and is learned by default settings from
-each and from both. At sixteen places the patches say how likely each alternative to the kernels is
-(`model/trust/witness.py`), and what a belief of them is worth is the gain of the linear filter that it asks
-for, behind the true PSF, at frequencies of a scene that falls off with 1/f^2 and noise of base ISO::
+each and from both; with `--photos 1 2 5`, from the first one, two and five of five. At sixteen places the
+patches say how likely each alternative to the kernels is (`model/trust/witness.py`), and what a belief of
+them is worth is the gain of the linear filter that it asks for, behind the true PSF, at frequencies of a
+scene that falls off with 1/f^2 and noise of base ISO::
 
     G = E[H]* S / ( (|E[H]|^2 + v Var[H]) S + n ),      gain = E0 / sum S |1 - H G|^2 + n |G|^2
 
@@ -123,18 +124,19 @@ def places(lens: Lens, samples: Sequence[PsfSample]) -> Iterator[Place]:
         yield Place(true, made, costs, photos)
 
 
-def learned(lens: Lens, folder: Path) -> Iterator[list[PsfSample]]:
-    """Samples of either photo of a lens, and of both."""
+def learned(lens: Lens, folder: Path, counts: Sequence[int] = ()) -> Iterator[list[PsfSample]]:
+    """Samples of the first photos of a lens, `counts` of them, or of either of two and of both."""
     photos: list[list[PsfSample]] = []
-    for number in range(2):
+    for number in range(max(counts, default=2)):
         path = written(folder / f"{lens.number}-{number}.dng", shot(lens, number), tiff=False)
         try:
             photos.append(pipeline.samples_of_photo(path, settings=lens.settings, workers=1))
         except NotEnoughEvidenceError:
-            continue
-    yield from photos
-    if len(photos) > 1:
-        yield [sample for own in photos for sample in own]
+            photos.append([])
+    parts = [photos[:count] for count in counts] or [[own] for own in photos] + [photos] * all(photos)
+    for part in parts:
+        if samples := [sample for own in part for sample in own]:
+            yield samples
 
 
 def judged(seen: Sequence[Place], rule: Rule) -> tuple[float, float, float]:
@@ -181,12 +183,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=seed_range, default=[])
     parser.add_argument("--grids", type=Path, nargs="*", default=[])
+    parser.add_argument("--photos", type=int, nargs="*", default=[], help="how many photos to learn from")
     parser.add_argument("--search", type=int, default=0, help="random changes to try")
     wanted = parser.parse_args()
     seen: list[Place] = []
     with tempfile.TemporaryDirectory() as name:
         for lens in lenses(wanted.seeds, wanted.grids, CAMERA.full_well_electrons):
-            for samples in learned(lens, Path(name)):
+            for samples in learned(lens, Path(name), wanted.photos):
                 seen += places(lens, samples)
     rule = Rule.of_product()
     print(f"{len(seen)} places\n\n| prior | mean gain, dB | lose | least |\n|---|---|---|---|")

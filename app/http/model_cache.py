@@ -191,7 +191,7 @@ class ModelCache:
         if old is not None:
             state, samples = self._store.samples.of_lens(lens_id, after_version=old.state.version)
             if (state.rebuild_epoch, state.way) == (old.state.rebuild_epoch, old.state.way):
-                model = old.model.added([stored.sample for stored in samples]) if samples else old.model
+                model = old.model.grown([stored.sample for stored in samples])
                 size = old.size_bytes + _size(samples)
                 return Fitted(lens_id, state, model, model.pitch_um, size, learned=False)
         state, samples = self._store.samples.of_lens(lens_id)

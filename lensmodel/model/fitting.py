@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,10 @@ from lensmodel.model.field.transport import WidthField
 from lensmodel.model.wavefront.physical_mean import Physics
 from lensmodel.model.wavefront.zoom import End, ends_of, nearest
 
-_INCREMENT = 0.05
+INCREMENT: Final = 0.05
+"""Growth after which all is fitted anew: eq. (8) moves bandwidths by a hundredth until then (chosen)."""
+GROWTH: Final = 1.0
+"""The same for answers that only bridge the time until a whole fit is there (chosen)."""
 _MOSTLY = 0.5
 
 
@@ -148,11 +152,11 @@ class Fit:
         image = self.judgement.image
         return self.local.nbytes + (0 if image is None else image.rest.nbytes)
 
-    def takes(self, samples: Sequence[PsfSample]) -> bool:
-        """Whether so few samples can join without fitting everything anew."""
+    def takes(self, samples: Sequence[PsfSample], increment: float) -> bool:
+        """Whether samples can join without fitting everything anew: they have room, and are few."""
         total = len(self.roster.photo) + len(samples)
         sides = [pitches.side_at(s, self.pixel, self.unit) for s in samples]
-        return total <= (1.0 + _INCREMENT) * self.size and max(sides) <= self.local.side
+        return total <= (1.0 + increment) * self.size and max(sides) <= self.local.side
 
     def extended(self, samples: Sequence[PsfSample], settings: ModelSettings) -> Fit:
         """Return it with more samples; widths, bandwidths and the other experts stay as they were fitted."""

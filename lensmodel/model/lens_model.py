@@ -28,7 +28,7 @@ from lensmodel.model import variables as va
 from lensmodel.model.answer import MICROMETRE, MIXED, WAVEFRONT, ModelSettings, PsfAnswer
 from lensmodel.model.answering import AnsweringModel, ModelField
 from lensmodel.model.field.robust import Flag
-from lensmodel.model.fitting import Fit
+from lensmodel.model.fitting import GROWTH, INCREMENT, Fit
 from lensmodel.model.predictor import Predictor
 from lensmodel.model.prior import Prior
 from lensmodel.model.trust.expected_error import Evidence, expected_error, with_prior
@@ -85,10 +85,21 @@ class LensModel:
         factors stay until the model has grown by a twentieth; then all is fitted anew, and wants to be
         `warmed` again.
         """
+        return self._with(samples, INCREMENT)
+
+    def grown(self, samples: Sequence[PsfSample]) -> LensModel:
+        """Return the model with more samples in place, for answers until it has been fitted anew elsewhere.
+
+        As `added`, but up to twice the samples that it was fitted to: from the second photo on only the trees
+        and the store of kernels grow.
+        """
+        return self._with(samples, GROWTH)
+
+    def _with(self, samples: Sequence[PsfSample], increment: float) -> LensModel:
         new = tuple(samples)
         if not new:
             return self
-        if not self._fit.takes(new):
+        if not self._fit.takes(new, increment):
             return self.refitted((*self.samples, *new))
         fit = self._fit.extended(new, self.settings)
         return LensModel((*self.samples, *new), self.settings, fit, prior=self.prior)

@@ -26,6 +26,7 @@ from lensmodel.model import LensModel, ModelSettings
 
 SIDE, NEAREST = 31, 200
 _DRAWN = 5000
+PER_PHOTO = 24
 GRID = (20, 30)
 SETTINGS = LensSettings(aperture=2.8, channel="g")
 
@@ -40,7 +41,7 @@ def lens(count: int) -> list[PsfSample]:
     for i in range(count):
         if i >= _DRAWN:
             before = found[i % _DRAWN]
-            found.append(replace(before, photo=f"p{i // 24}"))
+            found.append(replace(before, photo=f"p{i // PER_PHOTO}"))
             continue
         r = math.sqrt(rng.uniform(0.0, 0.95))
         along, across = 0.8 + 1.2 * r * r, 1.0 + 2.0 * r * r
@@ -49,7 +50,7 @@ def lens(count: int) -> list[PsfSample]:
         u, v = np.array([-s, c]), np.array([-c, -s])
         kernel = gaussian(SIDE, along**2 * np.outer(u, u) + across**2 * np.outer(v, v))
         settings = SETTINGS.with_channel(CHANNELS[i % 3])
-        found.append(PsfSample(kernel, FieldPosition(r, phi), settings, photo=f"p{i // 24}"))
+        found.append(PsfSample(kernel, FieldPosition(r, phi), settings, photo=f"p{i // PER_PHOTO}"))
     return found
 
 
@@ -77,6 +78,16 @@ def growth(model: LensModel, samples: list[PsfSample]) -> float:
         model = model.added([sample])
         found.append(time.process_time() - start)
     return statistics.median(found)
+
+
+def joining(photos: int) -> tuple[float, float, float]:
+    """CPU seconds of a whole fit and of growth by a photo, and the largest relative L2 between both."""
+    samples = lens(PER_PHOTO * (photos + 1))
+    old, new = LensModel.fit(samples[: PER_PHOTO * photos]), samples[PER_PHOTO * photos :]
+    fit, grow = cpu(lambda: old.refitted(samples), 3), cpu(lambda: old.grown(new), 3)
+    kernels = (model.kernels(asked(12), SETTINGS, SIDE) for model in (old.grown(new), old.refitted(samples)))
+    pairs = zip(*kernels, strict=True)
+    return fit, grow, max(float(np.linalg.norm(a - b) / np.linalg.norm(b)) for a, b in pairs)
 
 
 def points(samples: list[PsfSample], scale: np.ndarray) -> np.ndarray:
@@ -135,6 +146,10 @@ def main() -> None:
                 f"| {grid:.2f} | {1e3 * add:.1f} | {size / 2**20:.0f} |",
                 flush=True,
             )
+    print("\n| photos | fitted anew s | grown ms | apart |\n|---|---|---|---|")
+    for photos in (1, 2, 5, 10):
+        fit, grow, apart = joining(photos)
+        print(f"| {photos} and one more | {fit:.3f} | {1e3 * grow:.1f} | {apart:.3f} |", flush=True)
 
 
 if __name__ == "__main__":

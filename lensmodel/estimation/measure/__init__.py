@@ -1,4 +1,8 @@
-"""PSFs measured on photos made for it, instead of estimated from ordinary ones."""
+"""PSFs measured on photos made for it, instead of estimated from ordinary ones.
+
+There are more than fifteen modules because the four ways (points, edges, a target, a pair of apertures) share
+windows, light, warps and the solver, one step to a module.
+"""
 
 from lensmodel.estimation.measure.catalogue import methods
 from lensmodel.estimation.measure.measurer import MeasuredPsf, Measurer, estimator_of, is_measured, samples_of

@@ -1,4 +1,7 @@
-"""The paper's figures and its Table 1, with our software, on lenses whose truth is known."""
+"""The paper's figures and its Table 1, with our software, on lenses whose truth is known.
+
+There are more than fifteen modules because each figure, kind of lens and step of the experiment has one.
+"""
 
 from lensmodel.lab.reproduce.cases import Case, Reproduction, Size, planned
 from lensmodel.lab.reproduce.pages.blind_curve import collected

@@ -1,6 +1,6 @@
 """Several answers to one question, mixed by how wrong they were near the place.
 
-With e the relative L2 of samples that an expert had not seen, weighed as the question weighs them,
+With e the relative L2 of samples that an estimate was not fitted to, weighed as the question weighs them,
 its share is proportional to e^-4: where one is much worse than the others it loses its say by itself.
 
 A wavefront fitted to the spectra of all patches (`from_spectra`) makes other mistakes than kernels that were
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from lensmodel.core.psf import rms_width
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import variables as va
-from lensmodel.model.field.cross_validation import Judgement
+from lensmodel.model.field.cross_validation import CrossValidation
 from lensmodel.model.field.kriging import as_kernels, field_vector
 from lensmodel.model.field.local_frame import Answers
 from lensmodel.model.wavefront.physical_mean import Physics
@@ -59,7 +59,7 @@ class Mixture:
     squared : ndarray, shape (q,)
         Squared held-out errors near the places.
     usual : float
-        The same of the best expert, all over the field.
+        The same of the best estimate, all over the field.
     shares : ndarray, shape (q, 3)
         Weights of the local frame, the image frame and the wavefront.
     averaged : ndarray, shape (q,)
@@ -77,12 +77,12 @@ class Mixture:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Experts:
-    """Experts besides the regression in the local frame.
+class Estimates:
+    """Estimates besides the regression in the local frame.
 
     Parameters
     ----------
-    judgement : Judgement
+    validation : CrossValidation
         With the image frame, if that takes part.
     scale : ndarray, shape (7,)
         Bandwidths.
@@ -90,7 +90,7 @@ class Experts:
         The wavefront; None if it takes no part.
     """
 
-    judgement: Judgement
+    validation: CrossValidation
     scale: NDArray[np.float64]
     physical: Physics | None
 
@@ -110,15 +110,15 @@ class Experts:
         near : Answers
             Samples near the places, and weights that say how near.
         """
-        judgement, size = self.judgement, kernels.shape[1]
+        validation, size = self.validation, kernels.shape[1]
         squared, usual = np.full((len(positions), 3), math.inf), np.full(3, math.inf)
-        told_of = [judgement.errors, judgement.image_errors, None]
+        errors_of = [validation.errors, validation.image_errors, None]
         if self.physical is not None:
-            told_of[2] = self.physical.extended_errors(len(judgement.votes))
-        for expert, errors in enumerate(told_of):
+            errors_of[2] = self.physical.extended_errors(len(validation.votes))
+        for index, errors in enumerate(errors_of):
             if errors is not None:
-                squared[:, expert] = near.mean(errors**2)
-                usual[expert] = float(errors @ errors) / len(errors)
+                squared[:, index] = near.mean(errors**2)
+                usual[index] = float(errors @ errors) / len(errors)
         agreed = self.physical is not None and self.physical.agreed
         parts = np.maximum(squared, 1e-15) ** -2.0
         if agreed:
@@ -129,14 +129,14 @@ class Experts:
         shares /= shares.sum(axis=1, keepdims=True)
         averaged, apart = squared[:, 0].copy(), np.zeros(len(positions))
         light = shares[:, 0, None, None] * kernels
-        told = np.flatnonzero(shares[:, 1])
-        if judgement.image is not None and told.size:
-            vectors = np.array([field_vector(positions[int(i)]) for i in told])
-            rows = judgement.image.rows(vectors, va.point(positions[0], settings), self.scale)
-            light[told] += shares[told, 1, None, None] * as_kernels(rows, size)
-        told = np.flatnonzero(shares[:, 2]) if not agreed else np.arange(len(positions))
-        if self.physical is not None and told.size:
-            rows = as_kernels(self.physical.rows([positions[int(i)] for i in told], settings), size)
+        mixed = np.flatnonzero(shares[:, 1])
+        if validation.image is not None and mixed.size:
+            vectors = np.array([field_vector(positions[int(i)]) for i in mixed])
+            rows = validation.image.rows(vectors, va.point(positions[0], settings), self.scale)
+            light[mixed] += shares[mixed, 1, None, None] * as_kernels(rows, size)
+        mixed = np.flatnonzero(shares[:, 2]) if not agreed else np.arange(len(positions))
+        if self.physical is not None and mixed.size:
+            rows = as_kernels(self.physical.rows([positions[int(i)] for i in mixed], settings), size)
             if agreed:
                 light = light / light.sum(axis=(1, 2), keepdims=True)
                 width = np.sqrt(
@@ -150,8 +150,8 @@ class Experts:
                 shares[:, 2] = share
                 light = light * (1.0 - share)[:, None, None]
                 squared[:, :2] = kernel_error(width)[:, None] ** 2
-            apart[told] = shares[told, 2] * relative_l2(rows, kernels[told])
-            light[told] += shares[told, 2, None, None] * rows
+            apart[mixed] = shares[mixed, 2] * relative_l2(rows, kernels[mixed])
+            light[mixed] += shares[mixed, 2, None, None] * rows
         error = np.where(shares > 0, shares * np.where(shares > 0, squared, 0.0), 0.0).sum(axis=1)
         made = light / light.sum(axis=(1, 2), keepdims=True)
         return Mixture(made, error, float(usual.min()), shares, averaged, apart)

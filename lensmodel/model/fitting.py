@@ -1,4 +1,4 @@
-"""What is made of samples before the first question: kernels, widths, bandwidths, votes, experts."""
+"""What is made of samples before the first question: kernels, widths, bandwidths, votes, estimates."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lensmodel.core.types import LensSettings, StepHook, ignore_step
 from lensmodel.model import pitch as pitches
 from lensmodel.model import variables as va
 from lensmodel.model.answer import KERNELS, MICROMETRE, ModelSettings
-from lensmodel.model.field.cross_validation import Judgement, bandwidth, held_together, judge
+from lensmodel.model.field.cross_validation import CrossValidation, bandwidth, cross_validate, held_together
 from lensmodel.model.field.index import SampleIndex
 from lensmodel.model.field.local_frame import LocalKernels
 from lensmodel.model.field.smoothers import smoothers
@@ -64,8 +64,8 @@ class Fit:
     index : SampleIndex
         Points of the samples.
     roster : Roster
-    judgement : Judgement
-    told : ndarray, shape (n,)
+    validation : CrossValidation
+    expected : ndarray, shape (n,)
         Squared errors that the estimators expect of their samples; 0 where they expect nothing.
     rule, bandwidth : dict
         Bandwidths of eq. (8), and those in use.
@@ -85,8 +85,8 @@ class Fit:
     local: LocalKernels
     index: SampleIndex
     roster: Roster
-    judgement: Judgement
-    told: NDArray[np.float64]
+    validation: CrossValidation
+    expected: NDArray[np.float64]
     rule: dict[str, float]
     bandwidth: dict[str, float]
     physical: Physics | None = None
@@ -118,16 +118,17 @@ class Fit:
         where = index.points
         widths = WidthField.fit(common, base) if smoother.transport else WidthField()
         local = LocalKernels.of(common, where, widths)
-        judgement = judge(common, settings, local, where, base, blend=smoother.blend)
-        if smoother.transport and any(flag.sample is None for flag in judgement.flags):
+        validation = cross_validate(common, settings, local, where, base, blend=smoother.blend)
+        if smoother.transport and any(flag.sample is None for flag in validation.flags):
             # a spoilt photo has bent the widths too: fit them again without its voice
-            widths = WidthField.fit(common, judgement.votes)
+            widths = WidthField.fit(common, validation.votes)
             local = local.rescaled(where, widths)
-            judgement = judge(common, settings, local, where, base, blend=smoother.blend)
+            validation = cross_validate(common, settings, local, where, base, blend=smoother.blend)
         rule = va.bandwidths(where)
-        used = bandwidth(rule, settings, judgement.choice)
+        used = bandwidth(rule, settings, validation.choice)
         return cls(
-            *(pixel, len(samples), widths, local, index, roster, judgement, told_errors(samples), rule, used),
+            *(pixel, len(samples), widths, local, index, roster, validation),
+            *(expected_errors(samples), rule, used),
             mode=settings.mode,
             unit=settings.unit,
         )
@@ -136,7 +137,7 @@ class Fit:
         """Return it with the wavefront of its samples; the steps of each end of a zoom begin anew."""
         groups = held_together(samples, self.roster.photo)
         common, scale = pitches.at_pixel(samples, self.pixel, self.unit), va.scales(self.bandwidth)
-        votes = self.judgement.votes
+        votes = self.validation.votes
         physical = Physics.fit(common, votes, groups, scale, on_step)
         ends = () if physical is None else ends_of(common, votes, groups, scale, physical, on_step)
         return replace(self, physical=physical, ends=ends)
@@ -149,7 +150,7 @@ class Fit:
     @property
     def nbytes(self) -> int:
         """Bytes of stored kernels."""
-        image = self.judgement.image
+        image = self.validation.image
         return self.local.nbytes + (0 if image is None else image.rest.nbytes)
 
     def takes(self, samples: Sequence[PsfSample], increment: float) -> bool:
@@ -159,7 +160,7 @@ class Fit:
         return total <= (1.0 + increment) * self.size and max(sides) <= self.local.side
 
     def extended(self, samples: Sequence[PsfSample], settings: ModelSettings) -> Fit:
-        """Return it with more samples; widths, bandwidths and the other experts stay as they were fitted."""
+        """Return it with more samples; widths, bandwidths and other estimates stay as they were fitted."""
         common = pitches.at_pixel(samples, self.pixel, self.unit)
         where = va.points(common)
         return replace(
@@ -167,12 +168,12 @@ class Fit:
             local=self.local.extended(common, where, self.widths),
             index=self.index.extended(where),
             roster=self.roster.extended(common),
-            judgement=self.judgement.extended(_claimed(samples, settings)),
-            told=np.concatenate([self.told, told_errors(samples)]),
+            validation=self.validation.extended(_claimed(samples, settings)),
+            expected=np.concatenate([self.expected, expected_errors(samples)]),
         )
 
 
-def told_errors(samples: Sequence[PsfSample]) -> NDArray[np.float64]:
+def expected_errors(samples: Sequence[PsfSample]) -> NDArray[np.float64]:
     """Squared errors that the estimators expect, shape (n,)."""
     return np.array([0.0 if s.error is None else min(s.error, 1.0) ** 2 for s in samples])
 

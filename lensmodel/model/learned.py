@@ -22,14 +22,14 @@ from lensmodel.core.psf import PsfSample
 from lensmodel.model import pitch as pitches
 from lensmodel.model import variables as va
 from lensmodel.model.answer import MODES, ModelSettings
-from lensmodel.model.field.cross_validation import Judgement
+from lensmodel.model.field.cross_validation import CrossValidation
 from lensmodel.model.field.index import SampleIndex
 from lensmodel.model.field.kriging import ImageFrame
 from lensmodel.model.field.leave_one_out import Choice
 from lensmodel.model.field.local_frame import LocalKernels
 from lensmodel.model.field.robust import Flag
 from lensmodel.model.field.transport import WidthField
-from lensmodel.model.fitting import Fit, Roster, told_errors
+from lensmodel.model.fitting import Fit, Roster, expected_errors
 from lensmodel.model.wavefront.physical_mean import Physics
 from lensmodel.model.wavefront.zoom import End
 from lensmodel.optics.wavefront import NAMES, Wavefront
@@ -59,11 +59,11 @@ Arrays = dict[str, NDArray[np.float64]]
 
 def dump(fit: Fit, samples: Sequence[PsfSample], settings: ModelSettings) -> bytes:
     """Write what was learned from samples with settings."""
-    judgement, image, physical = fit.judgement, fit.judgement.image, fit.physical
+    validation, image, physical = fit.validation, fit.validation.image, fit.physical
     arrays: Arrays = {
-        "votes": judgement.votes,
-        "errors": judgement.errors,
-        "noise": judgement.noise,
+        "votes": validation.votes,
+        "errors": validation.errors,
+        "noise": validation.noise,
     }
     document: dict[str, Any] = {
         "version": VERSION,
@@ -72,14 +72,14 @@ def dump(fit: Fit, samples: Sequence[PsfSample], settings: ModelSettings) -> byt
         "mode": fit.mode,
         "rule": fit.rule,
         "bandwidth": fit.bandwidth,
-        "choice": asdict(judgement.choice),
-        "flags": [asdict(flag) for flag in judgement.flags],
+        "choice": asdict(validation.choice),
+        "flags": [asdict(flag) for flag in validation.flags],
         "widths": {k: v for k, v in _scalars(fit.widths).items() if k != "slopes"},
     }
     if fit.widths.slopes is not None:
         arrays["widths.slopes"] = fit.widths.slopes
-    if image is not None and judgement.image_errors is not None:
-        arrays |= {"image_errors": judgement.image_errors, **_arrays("image", image)}
+    if image is not None and validation.image_errors is not None:
+        arrays |= {"image_errors": validation.image_errors, **_arrays("image", image)}
         document["image"] = _scalars(image)
     if physical is not None:
         document["physical"] = []
@@ -205,7 +205,7 @@ def _fit(
         ends = tuple(
             End(float(octaves), other) for octaves, other in zip(document["ends"], others, strict=True)
         )
-    judgement = Judgement(
+    validation = CrossValidation(
         votes=arrays["votes"],
         errors=arrays["errors"],
         noise=arrays["noise"],
@@ -222,7 +222,7 @@ def _fit(
     scales = np.concatenate([va.scales(rule), va.scales(used)])
     if not (np.isfinite(scales).all() and scales.min() > 0):
         raise ValueError("a bandwidth is not positive")
-    if not judgement.votes.any():
+    if not validation.votes.any():
         raise ValueError("no sample may vote")
     return Fit(
         pixel=pixel,
@@ -231,8 +231,8 @@ def _fit(
         local=local,
         index=SampleIndex.of(where),
         roster=Roster.of(common),
-        judgement=judgement,
-        told=told_errors(samples),
+        validation=validation,
+        expected=expected_errors(samples),
         rule=rule,
         bandwidth=used,
         physical=physical,

@@ -227,12 +227,12 @@ class LensModel:
         per_photo = np.bincount(fit.roster.photo[rows], weight)
         nearest, beyond = support(fit.index.points[rows], va.point(position, settings), fit.rule)
         evidence = Evidence(
-            scatter=float(weight @ fit.judgement.noise[rows]),
-            expected=float(weight @ fit.told[rows]),
+            scatter=float(weight @ fit.validation.noise[rows]),
+            expected=float(weight @ fit.expected[rows]),
             independent=1.0 / float((per_photo**2).sum()),
             nearest=nearest,
             extrapolated=bool(beyond),
-            usual=float(np.mean(fit.judgement.errors**2)),
+            usual=float(np.mean(fit.validation.errors**2)),
         )
         physical = fit.physical_at(settings)
         alone = fit.mode in {MIXED, WAVEFRONT} and physical is not None and physical.agreed
@@ -345,11 +345,11 @@ class LensModel:
     @property
     def votes(self) -> NDArray[np.float64]:
         """Votes of the samples after robust weighting, shape (n,); 0 of photos that are excluded."""
-        return self._fit.judgement.votes
+        return self._fit.validation.votes
 
     def flags(self) -> tuple[Flag, ...]:
         """Photos and samples that count less than they claim, with reasons."""
-        return self._fit.judgement.flags
+        return self._fit.validation.flags
 
     def coverage(self) -> dict[Zone, int]:
         """Number of green samples in each zone."""
@@ -364,7 +364,7 @@ class LensModel:
         if len(self._fit.roster.numbers) < 2:
             return {}
         found: dict[Zone, list[float]] = {zone: [] for zone in ZONES}
-        for sample, error in zip(self.samples, self._fit.judgement.errors, strict=True):
+        for sample, error in zip(self.samples, self._fit.validation.errors, strict=True):
             if sample.settings.channel == "g" and sample.photo not in self.settings.excluded:
                 found[zone_of(sample.position.r)].append(float(error))
         return {zone: float(np.median(values)) for zone, values in found.items() if values}

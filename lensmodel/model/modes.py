@@ -25,14 +25,14 @@ from numpy.typing import NDArray
 
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model.answer import MIXED, WAVEFRONT
-from lensmodel.model.combination import Experts, Mixture, relative_l2
+from lensmodel.model.combination import Estimates, Mixture, relative_l2
 from lensmodel.model.field.kriging import as_kernels
 from lensmodel.model.field.local_frame import Answers, LocalKernels
 
 
 def answered(
     mode: str,
-    experts: Experts,
+    estimates: Estimates,
     local: LocalKernels,
     near: Answers,
     positions: Sequence[FieldPosition],
@@ -51,18 +51,18 @@ def answered(
     widths : ndarray, shape (q, 2)
         Scales of the places.
     """
-    angles, mirror = np.array([p.phi for p in positions]), experts.judgement.choice.mirror
-    physical = experts.physical
+    angles, mirror = np.array([p.phi for p in positions]), estimates.validation.choice.mirror
+    physical = estimates.physical
     kernels = local.kernels(near, angles, widths, size, mirror)
     if mode == WAVEFRONT and physical is not None:
         rows = as_kernels(physical.rows(positions, settings), size)
-        errors = physical.extended_errors(len(experts.judgement.votes))
+        errors = physical.extended_errors(len(estimates.validation.votes))
         alone = _alone(rows, near, errors, 2)
-        averaged, apart = near.mean(experts.judgement.errors**2), relative_l2(rows, kernels)
+        averaged, apart = near.mean(estimates.validation.errors**2), relative_l2(rows, kernels)
         return replace(alone, averaged=averaged, apart=apart)
     if mode == MIXED:
-        return experts.mixed(kernels, near, positions, settings)
-    return _alone(kernels, near, experts.judgement.errors, 0)
+        return estimates.mixed(kernels, near, positions, settings)
+    return _alone(kernels, near, estimates.validation.errors, 0)
 
 
 def _alone(kernels: NDArray[np.float64], near: Answers, errors: NDArray[np.float64], expert: int) -> Mixture:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import variables as va
-from lensmodel.model.combination import Experts, Mixture
+from lensmodel.model.combination import Estimates, Mixture
 from lensmodel.model.field.local_frame import Answers
 from lensmodel.model.field.neighbourhood import Neighbourhood
 from lensmodel.model.field.smoothers import Smoother, smoothers
@@ -41,8 +41,8 @@ class Predictor:
         self.fit = fit
         self.prior = prior
         self.pixels = Pixels(fit.unit, fit.pixel)
-        self._neighbourhood = Neighbourhood(fit.index, fit.judgement.votes, scale, smoothers.create(method))
-        self._experts = Experts(fit.judgement, scale, fit.physical)
+        self._neighbourhood = Neighbourhood(fit.index, fit.validation.votes, scale, smoothers.create(method))
+        self._estimates = Estimates(fit.validation, scale, fit.physical)
 
     @property
     def smoother(self) -> Smoother:
@@ -72,12 +72,12 @@ class Predictor:
         widths = fit.widths.over(np.array([va.point(p, settings) for p in positions]))
         end, share = nearest(fit.ends, settings)
 
-        def mixed(experts: Experts) -> Mixture:
-            return answered(fit.mode, experts, fit.local, near, positions, settings, widths, size)
+        def mixed(estimates: Estimates) -> Mixture:
+            return answered(fit.mode, estimates, fit.local, near, positions, settings, widths, size)
 
-        mixture = mixed(self._experts) if end is None or share < 1.0 else None
+        mixture = mixed(self._estimates) if end is None or share < 1.0 else None
         if end is not None:
-            own = mixed(replace(self._experts, physical=end.physical))
+            own = mixed(replace(self._estimates, physical=end.physical))
             mixture = own if mixture is None else between(own, mixture, share)
         assert mixture is not None
         shares = np.zeros(len(positions))
@@ -95,6 +95,6 @@ class Predictor:
         self, positions: Sequence[FieldPosition], settings: LensSettings
     ) -> NDArray[np.float64]:
         """How many samples speak of each place."""
-        points, votes, scale = self.fit.index.points, self.fit.judgement.votes, va.scales(_AROUND)
+        points, votes, scale = self.fit.index.points, self.fit.validation.votes, va.scales(_AROUND)
         gaps = [va.squared_distances(points, va.point(place, settings), scale) for place in positions]
         return np.array([float(votes @ np.exp(-0.5 * gap)) for gap in gaps])

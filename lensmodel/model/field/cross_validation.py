@@ -22,14 +22,14 @@ from lensmodel.model.wavefront.from_kernels import ONE_FOCAL_LENGTH
 
 _CV_PHOTOS = 3
 _CV_SAMPLES = 300
-_JUDGED = 800
+_SCORED = 800
 _ROTATIONAL = 10.0
 _UNKNOWN_ERROR = 0.5
 _FEWEST = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Judgement:
+class CrossValidation:
     """What the samples say of each other.
 
     Parameters
@@ -52,8 +52,8 @@ class Judgement:
     image: ImageFrame | None = None
     image_errors: NDArray[np.float64] | None = None
 
-    def extended(self, votes: NDArray[np.float64]) -> Judgement:
-        """Return it with samples that were not judged: the usual errors, the votes that they claim."""
+    def extended(self, votes: NDArray[np.float64]) -> CrossValidation:
+        """Return it with samples that were not scored: the usual errors, the votes that they claim."""
 
         def longer(values: NDArray[np.float64]) -> NDArray[np.float64]:
             return np.concatenate([values, np.full(len(votes), float(np.median(values)))])
@@ -98,7 +98,7 @@ def held_together(samples: Sequence[PsfSample], photo: NDArray[np.intp]) -> NDAr
     return groups
 
 
-def judge(
+def cross_validate(
     samples: Sequence[PsfSample],
     settings: ModelSettings,
     local: LocalKernels,
@@ -106,7 +106,7 @@ def judge(
     base: NDArray[np.float64],
     *,
     blend: bool,
-) -> Judgement:
+) -> CrossValidation:
     """Choose bandwidths by cross-validation, weigh robustly, note held-out errors.
 
     Parameters
@@ -149,15 +149,15 @@ def judge(
         )
         return found if settings.mirror is None else replace(found, mirror=settings.mirror)
 
-    judged = _thinned(voting, _JUDGED)
+    scored = _thinned(voting, _SCORED)
     votes, errors = base.copy(), np.full(len(samples), _UNKNOWN_ERROR)
     noise = np.zeros(len(samples))
-    if len(judged) < _FEWEST:
-        return Judgement(votes, errors, noise, choice)
+    if len(scored) < _FEWEST:
+        return CrossValidation(votes, errors, noise, choice)
     choice = chosen(votes)
-    prepared = held(judged, base)
-    _, own_photo = np.unique(photo[judged], return_inverse=True)
-    known = names[np.unique(photo[judged])]
+    prepared = held(scored, base)
+    _, own_photo = np.unique(photo[scored], return_inverse=True)
+    known = names[np.unique(photo[scored])]
     by_sample, by_photo, found = robust.factors(
         prepared, own_photo, r=choice.r, phi=choice.phi, mirror=choice.mirror
     )
@@ -165,28 +165,28 @@ def judge(
     if settings.robust and several:
         own = {str(name): factor for name, factor in zip(known, by_photo, strict=True)}
         votes = base * np.array([own.get(s.photo, 1.0) for s in samples])
-        votes[judged] *= by_sample
+        votes[scored] *= by_sample
         flags = robust.flags(
-            [samples[i] for i in judged], by_sample, by_photo, found, [str(n) for n in known]
+            [samples[i] for i in scored], by_sample, by_photo, found, [str(n) for n in known]
         )
-        flags = tuple(f if f.sample is None else replace(f, sample=int(judged[f.sample])) for f in flags)
+        flags = tuple(f if f.sample is None else replace(f, sample=int(scored[f.sample])) for f in flags)
         if not (votes > 0).any():
             votes, flags = base.copy(), ()
         if flags:
             choice = chosen(votes)
     scatter = np.minimum(prepared.noise(prepared.weights(choice.r, choice.phi)), found**2)
     errors[:], noise[:] = float(np.median(found)), float(np.median(scatter))
-    errors[judged], noise[judged] = found, scatter
+    errors[scored], noise[scored] = found, scatter
     if not blend:
-        return Judgement(votes, errors, noise, choice, flags)
-    trusted = judged[votes[judged] > 0]
+        return CrossValidation(votes, errors, noise, choice, flags)
+    trusted = scored[votes[scored] > 0]
     scale = va.scales(bandwidth(rule, settings, choice))
     image, seen = ImageFrame.fit(
         [samples[i] for i in trusted], where[trusted], votes[trusted], scale, groups[trusted]
     )
     image_errors = np.full(len(samples), float(np.median(seen)))
     image_errors[trusted] = seen
-    return Judgement(votes, errors, noise, choice, flags, image, image_errors)
+    return CrossValidation(votes, errors, noise, choice, flags, image, image_errors)
 
 
 def _judging_channel(wavelengths: NDArray[np.float64]) -> float:

@@ -43,7 +43,7 @@ REASON: Final = "with its kernels the patches of the other photos are less likel
 def without_misleading(fit: Fit, samples: Sequence[PsfSample], settings: ModelSettings) -> Fit:
     """Return a fit in which photos that make the patches of others less likely do not vote."""
     names = list(fit.roster.numbers)
-    voting = {s.photo for s, vote in zip(samples, fit.judgement.votes, strict=True) if vote > 0.0}
+    voting = {s.photo for s, vote in zip(samples, fit.validation.votes, strict=True) if vote > 0.0}
     order = [name for name in names if name in voting]
     asked = {name: _asked(samples, name) for name in order}
     if not settings.robust or len(order) <= _FIRST or not any(asked.values()):
@@ -54,16 +54,16 @@ def without_misleading(fit: Fit, samples: Sequence[PsfSample], settings: ModelSe
         mean = float(np.mean(rises)) if len(rises) else 0.0
         error = float(np.std(rises)) / max(len(rises), 1) ** 0.5
         if mean > max(_LEAST, _SIGNIFICANT * error):
-            own = fit.judgement.errors[[s.photo == name for s in samples]]
+            own = fit.validation.errors[[s.photo == name for s in samples]]
             flags.append(Flag(name, None, 0.0, float(np.median(own)), REASON))
         else:
             accepted.append(name)
     if not flags:
         return fit
     left = {flag.photo for flag in flags}
-    votes = fit.judgement.votes * np.array([s.photo not in left for s in samples])
-    kept = tuple(flag for flag in fit.judgement.flags if flag.photo not in left)
-    return replace(fit, judgement=replace(fit.judgement, votes=votes, flags=(*flags, *kept)))
+    votes = fit.validation.votes * np.array([s.photo not in left for s in samples])
+    kept = tuple(flag for flag in fit.validation.flags if flag.photo not in left)
+    return replace(fit, validation=replace(fit.validation, votes=votes, flags=(*flags, *kept)))
 
 
 def _asked(samples: Sequence[PsfSample], photo: str) -> list[int]:
@@ -102,7 +102,7 @@ def _predicted(
 ) -> Kernel | None:
     """Kernel at the place of a sample, from the samples of some photos alone."""
     sample = samples[index]
-    votes = fit.judgement.votes * np.array([s.photo in photos for s in samples])
+    votes = fit.validation.votes * np.array([s.photo in photos for s in samples])
     if not (votes > 0.0).any():
         return None
     near = Neighbourhood(fit.index, votes, va.scales(fit.bandwidth), smoothers.create(settings.method)).near(
@@ -110,6 +110,6 @@ def _predicted(
     )
     widths = fit.widths.over(np.array([va.point(sample.position, sample.settings)]))
     angles, side = np.array([sample.position.phi]), sample.kernel.shape[0]
-    kernels = fit.local.kernels(near, angles, widths, side, fit.judgement.choice.mirror)
+    kernels = fit.local.kernels(near, angles, widths, side, fit.validation.choice.mirror)
     kernel = np.maximum(kernels[0], 0.0)
     return np.asarray(kernel / kernel.sum())

@@ -15,7 +15,7 @@ from lensmodel.core.psf import PsfSample, delta, distance, gaussian, rms_width
 from lensmodel.core.spectrum import RINGS, SECTORS, PatchSpectrum
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensSettings
 from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
-from lensmodel.model.combination import Experts, agreed_share, kernel_error
+from lensmodel.model.combination import Estimates, agreed_share, kernel_error
 from lensmodel.model.field.local_frame import Answers
 from lensmodel.model.wavefront.aberration_prior import BALANCE, corner_ratio, unlikeliness
 from lensmodel.model.wavefront.from_spectra import PatchView, PooledFit, fit_spectra
@@ -305,10 +305,10 @@ def test_blur_that_no_wavefront_makes_is_left_to_the_kernels() -> None:
 
 def test_kernels_that_end_in_a_point_neither_silence_the_wavefront_nor_pass_for_sure(warm: LensModel) -> None:
     fit = warm._fit
-    experts = Experts(fit.judgement, np.ones(7), fit.physical)
+    estimates = Estimates(fit.validation, np.ones(7), fit.physical)
     near = Answers(np.array([0]), np.array([1.0]), np.array([0, 1]))
 
-    wide = experts.mixed(delta(31)[None], near, [FieldPosition(0.9, 0.3)], SETTINGS)
+    wide = estimates.mixed(delta(31)[None], near, [FieldPosition(0.9, 0.3)], SETTINGS)
 
     assert wide.shares[0, 2] > 0.9
     assert rms_width(wide.kernels[0]) > 1.0

@@ -12,7 +12,7 @@ from lensmodel.core.psf import PsfSample, gaussian, rms_width
 from lensmodel.core.spectrum import RING_LIMITS, RINGS, SECTORS, PatchSpectrum
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, ModelSettings
-from lensmodel.model.field.cross_validation import Judgement
+from lensmodel.model.field.cross_validation import CrossValidation
 from lensmodel.model.fitting import Fit
 from lensmodel.model.trust.misleading_photos import REASON, without_misleading
 
@@ -44,15 +44,15 @@ def taken(name: str, estimated: float, *, true: float = 1.2, count: int = 20) ->
     return samples
 
 
-def judged(*photos: list[PsfSample], robust: bool = True) -> Judgement:
+def judged(*photos: list[PsfSample], robust: bool = True) -> CrossValidation:
     """What is thought of photos whose kernels alone have condemned none."""
     samples = [s for photo in photos for s in photo]
     fit = Fit.of(samples, ModelSettings(robust=False))
-    return without_misleading(fit, samples, ModelSettings(robust=robust)).judgement
+    return without_misleading(fit, samples, ModelSettings(robust=robust)).validation
 
 
-def wrongs(judgement: Judgement) -> list[str]:
-    return [flag.photo for flag in judgement.flags if flag.reason == REASON]
+def wrongs(validation: CrossValidation) -> list[str]:
+    return [flag.photo for flag in validation.flags if flag.reason == REASON]
 
 
 def test_photo_with_kernels_too_wide_loses_its_vote_and_stays_listed() -> None:

@@ -14,7 +14,7 @@ from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_ste
 from lensmodel.estimation.estimator import PsfEstimate, is_no_blur, usable
 from lensmodel.estimation.methods.patch_recurrence import PatchRecurrence
 from lensmodel.estimation.methods.whittle import Whittle
-from lensmodel.estimation.spectra.kernel_choice import Judgement
+from lensmodel.estimation.spectra.kernel_choice import SpectralLikelihood
 from lensmodel.estimation.spectra.local_wavefront import AberrationFit
 from lensmodel.estimation.spectra.scene_spectra import SceneSpectra
 from lensmodel.estimation.steps.finish import signal_share
@@ -139,11 +139,11 @@ class Cautious:
     ) -> PsfEstimate:
         """Kernel of few patches, the one that their spectra speak for."""
         disagreement = distance(found.kernel, gaussian.kernel).mtf_rmse
-        judgement = Judgement.of(kept)
+        likelihood = SpectralLikelihood.of(kept)
         fit = AberrationFit(
-            weight=self.trust, temper=judgement.temper, starts=starts, kept=max(starts // 5, 2)
+            weight=self.trust, temper=likelihood.temper, starts=starts, kept=max(starts // 5, 2)
         )
-        fitted = fit.fit(judgement.whole, found.kernel, _half(on_step, 1), judgement.local)
+        fitted = fit.fit(likelihood.whole, found.kernel, _half(on_step, 1), likelihood.local)
         options = {
             "gaussian": gaussian.kernel,
             "recurrence": found.kernel,
@@ -151,7 +151,7 @@ class Cautious:
             "wavefront": fitted.kernel(size),
         }
         costs = {
-            name: judgement.cost(kernel) + _PER_WIDTH * math.log(max(rms_width(kernel), _PIXEL_SIGMA))
+            name: likelihood.cost(kernel) + _PER_WIDTH * math.log(max(rms_width(kernel), _PIXEL_SIGMA))
             for name, kernel in options.items()
         }
         costs["wavefront"] += fitted.unusual

@@ -19,7 +19,7 @@ _ROUNDS = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Judgement:
+class SpectralLikelihood:
     """Spectra of the patches, whole and in small tiles, and how much either counts.
 
     Parameters
@@ -38,7 +38,7 @@ class Judgement:
     parts: float = 0.07
 
     @classmethod
-    def of(cls, kept: Sequence[tuple[Plane, NoiseModel]]) -> Judgement:
+    def of(cls, kept: Sequence[tuple[Plane, NoiseModel]]) -> SpectralLikelihood:
         """Measure patches."""
         return cls(SceneSpectra.of(kept), LocalSpectra.of(kept))
 

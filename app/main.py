@@ -78,9 +78,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
                 loop.call_soon_threadsafe(each.nudge)
 
         notices = Notices(store.database, look_soon)
-        watch = Watch(rows.marks, hears=notices.hears)
+        watch = Watch(rows.marks, announced=notices.connected)
         newest = partial(rows.marks_of_owners, newest=shown.PHOTOS)
-        owners = Watch(newest, every_s=LOOK_S, hears=notices.hears)
+        owners = Watch(newest, every_s=LOOK_S, announced=notices.connected)
         notices.start()
         app.state.services = Services(
             chosen,

@@ -44,7 +44,7 @@ class Watch:
         Returns the marks of these keys; called in a thread.
     every_s : float
         How often it is called at most, in seconds.
-    hears : callable
+    announced : callable
         Whether `nudge` is called after each change: then one looks only then, and every `CALM_S`.
     """
 
@@ -53,9 +53,9 @@ class Watch:
         look: Callable[[list[str]], Marks],
         *,
         every_s: float = LOOK_S,
-        hears: Callable[[], bool] = lambda: False,
+        announced: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._look, self._every_s, self._hears = look, every_s, hears
+        self._look, self._every_s, self._announced = look, every_s, announced
         self._waiting: defaultdict[str, set[asyncio.Event]] = defaultdict(set)
         self._marks: dict[str, Hashable] = {}
         self._counts: defaultdict[str, int] = defaultdict(int)
@@ -98,7 +98,7 @@ class Watch:
     async def _run(self) -> None:
         while self._waiting:
             await asyncio.sleep(self._every_s)
-            if self._hears():
+            if self._announced():
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(self._nudged.wait(), CALM_S)
             self._nudged.clear()  # before the look: what changes during it is looked at again

@@ -4,8 +4,8 @@ All functions take and give public ids. Rows are returned detached: plain values
 talk to the database. State changes are conditional updates that say whether they happened, so a
 step that runs twice, or loses a race against a cancel, changes nothing the second time.
 
-There are more than fifteen modules because there is one for each thing that is stored: a folder for the
-few that belong to photos, or to lenses, would part what one transaction changes together.
+There are more than fifteen modules, one for each thing that is stored: folders for photos and for lenses
+would separate what one transaction changes together.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ __all__ = ["LensName", "NewPatch", "NewSample", "Store", "StoredSample"]
 
 
 class Store:
-    """All tables of the service, grouped by what they are about."""
+    """All tables of the service, one store for each subject."""
 
     def __init__(self, settings: Settings) -> None:
         self.database = Database(settings.database, synchronous=settings.sqlite_synchronous)

@@ -1,4 +1,4 @@
-"""Corrections: the same request once, each state change once."""
+"""Corrections: each request is stored once, each change of state happens once."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ACTIVE = ("queued", "running")
 
 @dataclass(frozen=True, slots=True)
 class CorrectionPlan:
-    """A correction with the public ids of what it needs: everything a worker has to know."""
+    """A correction with its photo and its lens: everything that a worker needs."""
 
     correction: CorrectionRow
     photo: PhotoRow
@@ -68,7 +68,7 @@ class CorrectionStore:
     def create(
         self, photo: PhotoRow, lens: LensRow, version: int, params: Mapping[str, Any]
     ) -> tuple[CorrectionRow, bool]:
-        """Ask for a correction; the same request finds the one that is there. True if new."""
+        """Create a correction, or return the one of the same request; True if it is new."""
         fresh = {
             "public_id": new_id(),
             "owner_id": photo.owner_id,
@@ -84,14 +84,14 @@ class CorrectionStore:
             "created_at": now(),
         }
         with self._db.writing(durable=True) as session:
-            there = owned(PhotoRow, None).where(PhotoRow.public_id == photo.public_id)
-            still = session.scalar(there.with_for_update())
-            # by its public id: the key of a photo that is gone may be that of another by now
-            if still is None or (still.id, still.owner_id) != (photo.id, photo.owner_id):
+            query = owned(PhotoRow, None).where(PhotoRow.public_id == photo.public_id)
+            current = session.scalar(query.with_for_update())
+            # by its public id: SQLite may have given the key of a deleted photo to another one
+            if current is None or (current.id, current.owner_id) != (photo.id, photo.owner_id):
                 raise UnknownPhotoError(f"photo {photo.public_id} was deleted meanwhile: send it again")
-            if still.file_gone_at is not None:
+            if current.file_gone_at is not None:
                 raise ConflictError(f"the file of photo {photo.public_id} is no longer kept: send it again")
-            made = insert_new(session, CorrectionRow, [fresh]) == 1
+            created = insert_new(session, CorrectionRow, [fresh]) == 1
             row = session.scalars(
                 select(CorrectionRow).where(
                     CorrectionRow.photo_id == photo.id,
@@ -101,7 +101,7 @@ class CorrectionStore:
                     CorrectionRow.state.not_in(("failed", "cancelled")),
                 )
             ).one()
-            return row, made
+            return row, created
 
     def get(self, correction_id: str, owner: str | None = None) -> CorrectionRow | None:
         """Return one correction, or None."""
@@ -181,7 +181,7 @@ class CorrectionStore:
     def retry(self, correction_id: str, owner: str | None = None) -> bool:
         """Start a failed or cancelled correction anew; False if it is in another state.
 
-        Also where the same correction was asked for again meanwhile: there is nothing left to do.
+        False as well if the same correction was requested again meanwhile: that one will do.
         """
         with self._db.writing() as session:
             row = find_to_change(session, CorrectionRow, correction_id, owner)
@@ -214,7 +214,7 @@ class CorrectionStore:
             return [row.public_id for row in session.scalars(query)]
 
     def progress(self, correction_id: str, done: int, total: int, stage: str = "correcting") -> None:
-        """Say how far a running correction is."""
+        """Record how far a running correction is."""
         self.set_state(
             correction_id, ("running",), "running", progress_done=done, progress_total=total, stage=stage
         )

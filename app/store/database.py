@@ -1,7 +1,7 @@
 """Connections: who may write, who only reads, and what a transaction means on each database.
 
-On SQLite the driver's own habit is to open a transaction at the first write, so that two
-processes that read, add one and write lose updates silently. Here every writing transaction
+By default the SQLite driver opens a transaction at the first write, so that two processes
+which read, add one and write lose updates silently. Here every writing transaction
 begins with BEGIN IMMEDIATE: one writer at a time, waiting rather than failing. Readers see a
 consistent snapshot (WAL) and cannot write at all.
 """
@@ -21,6 +21,9 @@ from sqlalchemy.orm import Session
 from app.store.tables import Base
 
 BUSY_TIMEOUT_MS = 30_000
+"""How long a transaction of SQLite waits for the one writer (chosen): a transaction takes milliseconds, so
+whoever waits longer would wait for ever."""
+
 SERVER_DEADLINES: Final = {
     "connect_timeout": 5,
     "tcp_user_timeout": 15_000,
@@ -28,8 +31,8 @@ SERVER_DEADLINES: Final = {
     "keepalives_interval": 5,
     "keepalives_count": 3,
 }
-"""Of libpq, in s and ms. A server whose network is cut sends no end of a connection: without these a worker
-waits for it for a quarter of an hour, longer than any lease."""
+"""Settings of libpq in seconds, `tcp_user_timeout` in ms (chosen). When the network is cut no connection is
+ever closed: without these a worker waits for a quarter of an hour, longer than any lease."""
 
 
 class Database:
@@ -69,7 +72,7 @@ class Database:
         """Give a session whose changes are committed together at the end, or not at all.
 
         `durable` also survives loss of power: for what a caller may rely on afterwards, such as
-        an accepted upload whose card he now formats.
+        an accepted upload whose memory card is formatted next.
         """
         engine = self.durable if durable else self.writer
         with Session(engine, expire_on_commit=False) as session, session.begin():
@@ -116,7 +119,7 @@ def insert_new(session: Session, table: type[Base], rows: Sequence[dict[str, Any
     key = table.__mapper__.primary_key[0]
     inserted = 0
     for row in rows:
-        # RETURNING tells what went in on both; the row count does not on PostgreSQL
+        # RETURNING shows on both databases what went in; on PostgreSQL the row count does not
         statement = insert(table).values(**row).on_conflict_do_nothing().returning(key)
         inserted += len(session.connection().execute(statement).all())
     return inserted

@@ -1,4 +1,4 @@
-"""What the workers ask of the tables beyond what the API asks."""
+"""Queries and changes that only workers need."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from app.store.database import Database
 from app.store.tables import CorrectionRow, EventRow, LensRow, OwnerRow, PatchRow, PhotoRow
 
 AT_ONCE: Final = 500
-"""Ids in one question: SQLite allows for some thousand."""
+"""Ids in one query: SQLite before 3.32 takes at most 999 variables in a statement."""
 
 _PHOTO_MARK: Final = (
     *(PhotoRow.public_id, PhotoRow.state, PhotoRow.epoch, PhotoRow.attempt, PhotoRow.lens_id),
@@ -33,10 +33,10 @@ class JobStore:
         self._db = database
 
     def begin_cell(self, photo_id: str, epoch: int, cell: int) -> list[PatchRow]:
-        """Take up the open patches of one cell; empty if there are none, or nobody wants them.
+        """Take up the open patches of one cell; empty if there are none or the photo needs them no more.
 
-        The attempt is noted before it is made; that a patch which kills its workers is given up is
-        the engine's part.
+        The attempt is counted before it is made; giving up a patch that kills its workers is the job
+        engine's part.
         """
         query = (
             select(PatchRow)
@@ -59,8 +59,8 @@ class JobStore:
             return rows
 
     def marks(self, job_ids: Sequence[str]) -> dict[str, Hashable]:
-        """Return for each job what changes whenever something happens to it; see `app.http.job_watch`."""
-        found: dict[str, Hashable] = {}
+        """Return a value for each job that changes with its state; see `app.http.job_watch`."""
+        marks: dict[str, Hashable] = {}
         with self._db.reading() as session:
             for first in range(0, len(job_ids), AT_ONCE):
                 ids = job_ids[first : first + AT_ONCE]
@@ -69,19 +69,19 @@ class JobStore:
                 )
                 corrections = select(*_CORRECTION_MARK).where(CorrectionRow.public_id.in_(ids))
                 for query in (photos, corrections):
-                    found |= {row[0]: tuple(row[1:]) for row in session.execute(query)}
-        return found
+                    marks |= {row[0]: tuple(row[1:]) for row in session.execute(query)}
+        return marks
 
     def marks_of_owners(self, owners: Sequence[str], newest: int) -> dict[str, Hashable]:
-        """Return for each owner what changes with his newest photos, lenses or corrections.
+        """Return a value for each owner that changes with his newest photos, lenses or corrections.
 
-        Whether 200 pages of an owner are open, or one, costs the same.
+        The cost does not depend on how many pages an owner has open.
         """
         with self._db.reading() as session:
             return {owner: _mark_of_owner(session, owner, newest) for owner in owners}
 
     def existing_photos(self, photo_ids: Iterable[str]) -> set[str]:
-        """Return which of these photos are not deleted, and have their file still."""
+        """Return which of these photos are not deleted and still have their file."""
         query = select(PhotoRow.public_id).where(
             PhotoRow.public_id.in_(list(photo_ids)),
             PhotoRow.deleted_at.is_(None),

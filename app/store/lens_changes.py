@@ -1,4 +1,4 @@
-"""What an owner does with a lens as a whole: names it, joins it with another, goes back to what it knew."""
+"""Changes of a whole lens by its owner: rename it, merge it into another, go back to an earlier version."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class LensChanges:
         self._db = database
 
     def rename(self, lens_id: str, owner: str, label: str | None) -> bool:
-        """Give a lens a name of its owner's, or take it away; False if there is no such lens."""
+        """Set or remove the name that an owner gives a lens; False if there is no such lens."""
         with self._db.writing() as session:
             lens = find_to_change(session, LensRow, lens_id, owner)
             if lens is None:
@@ -30,9 +30,9 @@ class LensChanges:
             return True
 
     def choose_way(self, lens_id: str, owner: str, way: str) -> int | None:
-        """Learn a lens in another way from now on, its photos of before too; see `app.store.lens_ways`.
+        """Learn a lens in another way from now on, also from its earlier photos; see `app.store.lens_ways`.
 
-        Returns how many of these keep it from that, since their files are gone; None if there is no lens.
+        Returns how many of these prevent it because their files are gone; None if there is no such lens.
         """
         with self._db.writing(durable=True) as session:
             lens = find_to_change(session, LensRow, lens_id, owner)
@@ -41,11 +41,11 @@ class LensChanges:
     def merge(self, lens_id: str, into: str, owner: str) -> bool:
         """Give all photos of a lens to another one and forget it: they were one copy all along.
 
-        False if one of them is not there, photos of the first are still being learned from, or the two are
-        not learned in the same way.
+        False if one of the two does not exist, photos of the first are still being learned from, or the two
+        are not learned in the same way.
         """
         with self._db.writing() as session:
-            # in one order, whoever asks: two merges at once must not wait for each other
+            # always locked in the same order: two merges at once must not wait for each other
             rows = {key: find_to_change(session, LensRow, key, owner) for key in sorted((lens_id, into))}
             lens, target = rows[lens_id], rows[into]
             if lens is None or target is None or lens.id == target.id:
@@ -70,9 +70,9 @@ class LensChanges:
             return True
 
     def go_back(self, lens_id: str, owner: str, version: int) -> int | None:
-        """Leave out of a lens the photos that joined it after a version; return how many, None without lens.
+        """Exclude the photos that joined a lens after a version; return how many, None without a lens.
 
-        They stay, and can be counted again one by one. None as well while the lens changes its way.
+        They stay, and can be included again one by one. None as well while the lens changes its way.
         """
         with self._db.writing() as session:
             lens = find_to_change(session, LensRow, lens_id, owner)

@@ -1,9 +1,9 @@
-"""A lens that changes its way: photos are estimated anew beside the samples that count, which go then.
+"""A lens that changes its way: its photos are estimated anew while the old samples still count.
 
 A lens answers from samples of one way, its `answering_way`. When its owner chooses another `way`, each
-counted photo begins a new epoch and is `relearning`: its samples of before go on to count. Once no such photo
-is being worked on any more, one transaction replaces all samples. So those of two ways never count together,
-whatever dies when, and until then nothing is lost: the way before can be chosen again at any moment.
+counted photo begins a new epoch and is `relearning`: its earlier samples still count. Once no such photo is
+being worked on any more, one transaction replaces all samples. So samples of two ways never count together,
+whichever process dies when, and until then nothing is lost: the old way can be chosen again at any moment.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from app.store.versions import new_version, record_event, recount, take_samples
 
 
 def locked(session: Session, lens_id: int) -> LensRow:
-    """Return a lens as it is now, which nobody else changes until the transaction ends."""
+    """Return the present row of a lens, locked until the transaction ends."""
     query = select(LensRow).where(LensRow.id == lens_id).with_for_update()
     return session.scalars(query.execution_options(populate_existing=True)).one()
 
 
 def teaches(session: Session, photo: PhotoRow) -> bool:
-    """Whether samples of a photo count: those of this epoch, or those that it had before."""
+    """Whether samples of a photo count: those of this epoch, or those of an earlier one."""
     if photo.relearning:
         return True
     if photo.state != "counted" or photo.lens_id is None:
@@ -58,7 +58,7 @@ def _add(session: Session, photo: PhotoRow, kind: str) -> int:
 def choose(session: Session, lens: LensRow, way: str) -> int:
     """Choose the way of a lens; its counted photos start again, and so do those that are being estimated.
 
-    Returns how many photos cannot, since their files are gone; then nothing changes.
+    Returns how many photos cannot because their files are gone; then nothing changes.
     """
     if lens.way == way:
         return 0
@@ -70,11 +70,11 @@ def choose(session: Session, lens: LensRow, way: str) -> int:
             .with_for_update()
         )
     )
-    back = way == lens.answering_way
+    returns = way == lens.answering_way
     counted = [photo for photo in photos if photo.state == "counted" and photo.way != way]
-    lost = sum(photo.file_gone_at is not None for photo in counted)
-    if lost:
-        return lost
+    missing = sum(photo.file_gone_at is not None for photo in counted)
+    if missing:
+        return missing
     lens.way = way
     if lens.sample_count == 0:
         lens.answering_way = way
@@ -82,7 +82,7 @@ def choose(session: Session, lens: LensRow, way: str) -> int:
         if photo.relearning:
             _take_back(session, photo, way)
         elif photo in counted:
-            photo.relearning = not back  # else it has waited to join in the way that is given up
+            photo.relearning = not returns  # else it was waiting to join in the way that is given up
             photo.given = {**photo.given, "lens_id": lens.public_id}
             restart(session, photo)
         elif photo.state in PHOTO_RUNNING:
@@ -92,10 +92,10 @@ def choose(session: Session, lens: LensRow, way: str) -> int:
 
 
 def settle(session: Session, lens_id: int) -> int | None:
-    """Let a lens answer in the way that was chosen, if no photo is on its way there any more.
+    """Let a lens answer in the way that was chosen, once no photo is being estimated in it any more.
 
     Returns the new version of the lens, None where nothing changes. Where no photo could be estimated in the
-    new way, the lens goes on to answer in the old one.
+    new way, the lens still answers in the old one.
     """
     lens = locked(session, lens_id)
     if lens.deleted_at is not None or lens.way == lens.answering_way:
@@ -111,25 +111,27 @@ def settle(session: Session, lens_id: int) -> int | None:
     ready = [photo for photo in photos if photo.state == "counted" and photo.way == lens.way]
     if not ready or any(photo.relearning and photo.state in WORKED_ON for photo in photos):
         return None
-    before, lens.answering_way = lens.sample_count, lens.way
-    again = [photo for photo in ready if photo.relearning]
+    samples_before, lens.answering_way = lens.sample_count, lens.way
+    relearned = [photo for photo in ready if photo.relearning]
     version = new_version(session, lens.id, rebuild=True)
     for photo in photos:
         if photo.relearning:
             forget_before(session, photo)
-    for photo in again:
+    for photo in relearned:
         take_samples(session, photo, version)
     recount(session, lens.id)
     session.refresh(lens)
-    record_event(session, lens.id, version, "model_changed", None, samples_added=lens.sample_count - before)
+    record_event(
+        session, lens.id, version, "model_changed", None, samples_added=lens.sample_count - samples_before
+    )
     for photo in ready:
-        if photo not in again:
+        if photo not in relearned:
             version = _add(session, photo, "photo_included" if _has_joined(session, photo) else "photo_added")
     return version
 
 
 def _has_joined(session: Session, photo: PhotoRow) -> bool:
-    """Whether a photo of this epoch was added before: to this lens until it was left out, or to another."""
+    """Whether this epoch of a photo was added before: to this lens until it was excluded, or to another."""
     event = select(EventRow.id).where(
         EventRow.photo_public_id == photo.public_id,
         EventRow.epoch == photo.epoch,
@@ -139,7 +141,7 @@ def _has_joined(session: Session, photo: PhotoRow) -> bool:
 
 
 def _take_back(session: Session, photo: PhotoRow, way: str) -> None:
-    """Let a photo be what it was before it began anew; its samples of then never ceased to count."""
+    """Undo the restart of a photo; its earlier samples never ceased to count."""
     drop_patches(session, photo)
     photo.epoch += 1  # work of the epoch that is given up is void
     session.execute(update(PatchRow).where(PatchRow.photo_id == photo.id).values(epoch=photo.epoch))

@@ -1,4 +1,4 @@
-"""Lenses: which copy it is, what it knows, how it came to know it."""
+"""Lenses: which copy it is, what was learned of it, and when."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from app.store.tables import PHOTO_RUNNING, CorrectionRow, EventRow, GarbageRow,
 TEACHES: Final = and_(
     or_(PhotoRow.state == "counted", PhotoRow.relearning.is_(True)), PhotoRow.deleted_at.is_(None)
 )
-"""Photos that count, also while they are estimated anew."""
+"""Photos that count, including those that are being estimated anew."""
 
 TRIES: Final = 10
-"""How often to look again for a lens that was deleted when we looked."""
+"""How often to look again for a lens that was deleted between insert and select (chosen, not measured)."""
 
 
 @dataclass(frozen=True, slots=True)
 class LensName:
-    """Which copy of which lens: told by its serial, or by a label that its owner gives it."""
+    """Which copy of which lens: identified by its serial, or by a label that its owner gives it."""
 
     maker: str | None
     model: str | None
@@ -36,16 +36,16 @@ class LensName:
 
 
 def lens_of_photo(session: Session, photo: PhotoRow, *, single_copy: bool) -> LensRow | None:
-    """Find, or for a calibrating photo make, the lens of an inspected photo."""
-    named = photo.given.get("lens_id")
-    if named is not None:
-        lens = session.scalar(
+    """Return the lens of an inspected photo; a photo that calibrates creates it where there is none."""
+    lens_id = photo.given.get("lens_id")
+    if lens_id is not None:
+        chosen = session.scalar(
             select(LensRow).where(
-                LensRow.public_id == named, LensRow.owner_id == photo.owner_id, LensRow.deleted_at.is_(None)
+                LensRow.public_id == lens_id, LensRow.owner_id == photo.owner_id, LensRow.deleted_at.is_(None)
             )
         )
-        if lens is not None:
-            return lens
+        if chosen is not None:
+            return chosen
     if photo.lens_serial is None and not (single_copy and photo.lens_model):
         return None
     key = identity_key(photo.lens_maker, photo.lens_model, photo.lens_serial)
@@ -61,16 +61,16 @@ def lens_of_photo(session: Session, photo: PhotoRow, *, single_copy: bool) -> Le
     for _ in range(TRIES):
         if photo.calibrate:
             insert_new(session, LensRow, [fresh])
-        # locked: on PostgreSQL the last other photo of it may be going, and the lens with it
-        found = session.scalar(
+        # locked: on PostgreSQL its last photo may be deleted at this moment, and the lens with it
+        lens = session.scalar(
             select(LensRow)
             .where(
                 LensRow.owner_id == photo.owner_id, LensRow.identity_key == key, LensRow.deleted_at.is_(None)
             )
             .with_for_update()
         )
-        if found is not None or not photo.calibrate:
-            return found
+        if lens is not None or not photo.calibrate:
+            return lens
     return None
 
 
@@ -104,9 +104,9 @@ def _new_lens(
 
 
 def named(session: Session, owner_id: int, name: LensName, *, way: str | None = None) -> LensRow:
-    """Find or make the lens that its owner names: by its serial, or always a new one by its label.
+    """Return the lens of a serial, creating it if need be; a label always creates a new lens.
 
-    A new one is learned in the way that is given.
+    `way` is how a new lens is learned.
     """
     key = f"label|{new_id()}" if name.label else identity_key(name.maker, name.model, name.serial)
     fresh = _new_lens(
@@ -176,7 +176,7 @@ class LensStore:
             return list(session.scalars(query.order_by(LensRow.public_id.desc()).limit(limit)))
 
     def by_identity(self, photo: PhotoRow) -> LensRow | None:
-        """Return the lens whose identity an inspected photo carries, if there is one by now."""
+        """Return the lens that the serial of an inspected photo identifies, if it exists by now."""
         if photo.lens_serial is None:
             return None
         key = identity_key(photo.lens_maker, photo.lens_model, photo.lens_serial)
@@ -189,9 +189,9 @@ class LensStore:
                 )
             )
 
-    def coverage_of(self, lens: Sequence[LensRow]) -> dict[int, tuple[list[float], list[float]]]:
+    def coverage_of(self, lenses: Sequence[LensRow]) -> dict[int, tuple[list[float], list[float]]]:
         """Return the apertures and focal lengths of the counted photos of lenses, by key."""
-        keys = [row.id for row in lens]
+        keys = [row.id for row in lenses]
         query = (
             select(PhotoRow.lens_id, PhotoRow.aperture, PhotoRow.focal_mm)
             .where(PhotoRow.lens_id.in_(keys), TEACHES)
@@ -207,7 +207,7 @@ class LensStore:
         return {key: (sorted(apertures[key]), sorted(focals[key])) for key in keys}
 
     def learned_anew(self, lens: LensRow) -> int:
-        """Return how many photos of a lens that changes its way are still on their way there."""
+        """Return how many photos of a lens that changes its way are still being estimated anew."""
         anew = (PhotoRow.relearning.is_(True), PhotoRow.state.in_(("received", *PHOTO_RUNNING)))
         query = select(func.count()).where(PhotoRow.lens_id == lens.id, *anew, PhotoRow.deleted_at.is_(None))
         with self._db.reading() as session:
@@ -220,7 +220,7 @@ class LensStore:
             return [lateral for lateral in session.scalars(query) if lateral]
 
     def shape_of(self, lens: LensRow) -> tuple[int, int] | None:
-        """Return height and width in pixels of most photos of a lens, as the sensor has them."""
+        """Return the commonest height and width of the photos of a lens in pixels, in sensor orientation."""
         count = func.count()
         query = (
             select(PhotoRow.height, PhotoRow.width)
@@ -250,7 +250,7 @@ class LensStore:
             return list(session.scalars(query))
 
     def record_metrics(self, lens_id: str, version: int, metrics: dict[str, Any]) -> None:
-        """Add what was measured of one version, once: held-out `error`, `coverage`, `bandwidth`."""
+        """Store the metrics of one version, once: held-out `error`, `coverage`, `bandwidth`."""
         with self._db.writing() as session:
             lens = find(session, LensRow, lens_id, None)
             if lens is not None:

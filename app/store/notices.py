@@ -1,7 +1,7 @@
-"""What PostgreSQL tells of changes by itself, so that nobody has to ask again and again.
+"""Notifications of changes by PostgreSQL, in place of frequent polling.
 
 Triggers (migration 0007) notify a channel whenever a transaction that changed photos, corrections, lenses or
-their history commits. Notices carry nothing: who hears one looks at the tables, once for all that wait.
+their history commits. A notice has no content: the listener then reads the tables, once for all that wait.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ log = logging.getLogger(__name__)
 
 CHANNEL: Final = "lensmodel_changes"
 RETRY_S: Final = 1.0
-"""How long it waits before it connects anew, and how long it listens before it asks whether to stop."""
+"""Seconds before a new attempt to connect, and between two looks at whether to stop (chosen)."""
 
 
 class Notices:
-    """Listens in a thread of its own, where the database can tell; SQLite cannot.
+    """Listens for notices in a thread of its own; SQLite has none.
 
     Parameters
     ----------
@@ -36,20 +36,20 @@ class Notices:
         self._on_change = on_change
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
-        self.heard = False
+        self._connected = False
 
-    def hears(self) -> bool:
-        """Whether changes are told of at present."""
-        return self.heard
+    def connected(self) -> bool:
+        """Whether the database announces changes at present."""
+        return self._connected
 
     def start(self) -> None:
-        """Begin to listen."""
+        """Start listening."""
         if self._address:
             self._thread = threading.Thread(target=self._run, name="notices", daemon=True)
             self._thread.start()
 
     def stop(self) -> None:
-        """Listen no more; returns once the connection is closed."""
+        """Stop listening; returns once the connection is closed."""
         self._stopping.set()
         if self._thread is not None:
             self._thread.join()
@@ -61,15 +61,15 @@ class Notices:
             try:
                 with psycopg.connect(self._address, autocommit=True) as connection:
                     connection.execute(f"LISTEN {CHANNEL}")
-                    self.heard = True
-                    self._on_change()  # what happened while nobody listened
+                    self._connected = True
+                    self._on_change()  # something may have changed before the connection stood
                     while not self._stopping.is_set():
                         for _ in connection.notifies(timeout=RETRY_S, stop_after=1):
                             self._on_change()
             except psycopg.Error as error:
                 log.info("no notices of changes, the tables are looked at instead: %s", type(error).__name__)
             finally:
-                self.heard = False
+                self._connected = False
             self._stopping.wait(RETRY_S)
 
 

@@ -20,6 +20,8 @@ from lensmodel.core.types import Channel, Kernel
 
 DTYPE: Final = "<f4"
 FORMAT_VERSION: Final = 1
+"""Raised when the layout of a stored kernel changes."""
+
 OPEN: Final = ("pending", "running")
 
 
@@ -38,7 +40,7 @@ class NewSample:
 
 
 class PatchStore:
-    """Patches and the samples that come of them."""
+    """Patches and the samples that are estimated from them."""
 
     def __init__(self, database: Database) -> None:
         self._db = database
@@ -46,7 +48,7 @@ class PatchStore:
     def add(self, photo_id: str, epoch: int, patches: Sequence[NewPatch]) -> int:
         """Write the plan of a photo once; return how many patches are to be estimated.
 
-        A second call, by a worker that repeats the step, finds the rows there and adds nothing.
+        A second call, by a worker that repeats the step, adds nothing.
         """
         with self._db.writing() as session:
             photo = _live(session, photo_id, epoch)
@@ -77,12 +79,12 @@ class PatchStore:
             return recount(session, photo)
 
     def all_of(self, photo_id: str, epoch: int | None = None) -> list[PatchRow]:
-        """Return the patches of a photo that were to be estimated, in the order of their numbers."""
+        """Return the patches of a photo that were chosen for estimation, in the order of their numbers."""
         with self._db.reading() as session:
             return list(session.scalars(_of_photo(photo_id, epoch).order_by(PatchRow.idx)))
 
     def listed(self, photo_id: str) -> list[PatchRow]:
-        """Return the patches of a photo, and after them the windows that were rejected at sight."""
+        """Return the patches of a photo, followed by the windows that were rejected before estimation."""
         with self._db.reading() as session:
             rows = list(session.scalars(_of_photo(photo_id).order_by(PatchRow.idx)))
             stored = session.scalar(select(PhotoRow.windows).where(PhotoRow.public_id == photo_id))
@@ -92,8 +94,8 @@ class PatchStore:
         """Return the numbers of the cells that still have patches to estimate."""
         query = _of_photo(photo_id, epoch).where(PatchRow.state.in_(OPEN))
         with self._db.reading() as session:
-            found = session.scalars(query.with_only_columns(PatchRow.cell).distinct())
-            return sorted(cell for cell in found if cell is not None)
+            cells = session.scalars(query.with_only_columns(PatchRow.cell).distinct())
+            return sorted(cell for cell in cells if cell is not None)
 
     def of_cell(self, photo_id: str, epoch: int, cell: int) -> list[PatchRow]:
         """Return the patches of one cell that are still to be estimated."""
@@ -102,7 +104,7 @@ class PatchStore:
             return list(session.scalars(query.order_by(PatchRow.idx)))
 
     def finish(self, photo_id: str, epoch: int, samples: Sequence[NewSample]) -> int:
-        """Store the samples of some patches and mark these done; return how many samples went in.
+        """Store the samples of some patches and mark these done; return how many samples were new.
 
         Nothing happens if the photo was cancelled, deleted or started anew meanwhile. A repeated
         call stores nothing twice: patch and channel are a unique key.
@@ -112,12 +114,12 @@ class PatchStore:
             if photo is None:
                 return 0
             numbers = {sample.idx for sample in samples}
-            found = session.scalars(
+            of_numbers = session.scalars(
                 select(PatchRow).where(
                     PatchRow.photo_id == photo.id, PatchRow.epoch == epoch, PatchRow.idx.in_(numbers)
                 )
             )
-            patches = {patch.idx: patch for patch in found}
+            patches = {patch.idx: patch for patch in of_numbers}
             rows = [_sample_row(photo, patches[s.idx], s) for s in samples if s.idx in patches]
             stored = insert_new(session, SampleRow, rows)
             for patch in patches.values():
@@ -129,7 +131,7 @@ class PatchStore:
     def fail(
         self, photo_id: str, epoch: int, indices: Sequence[int], reason: str, *, rejected: bool = False
     ) -> None:
-        """Mark patches as of no use: `rejected` for their quality, else failed."""
+        """Mark patches as useless: `rejected` for their quality, else failed."""
         with self._db.writing() as session:
             photo = _live(session, photo_id, epoch)
             if photo is None:

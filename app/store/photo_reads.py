@@ -1,4 +1,4 @@
-"""What is asked of photos without changing them."""
+"""Photos as they are: queries that change nothing."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from app.store.database import Database
 from app.store.photo_steps import WORKED_ON
 from app.store.tables import PHOTO_FINAL, PHOTO_RUNNING, CorrectionRow, LensRow, OwnerRow, PhotoRow
 
-STILL_ASKED: Final = timedelta(days=1)
-"""How long the file of a photo is there for a first correction, or for another try after an outage."""
+FILE_KEPT: Final = timedelta(days=1)
+"""How long the file of a photo is kept for a first correction, or for a retry after an outage (chosen)."""
 
 GRACE: Final = timedelta(hours=1)
-"""How long, with `corrections`, one may ask to correct a photo that has just calibrated its lens."""
+"""With `keep_photos=corrections`: how long a photo that has just calibrated its lens can still be corrected
+(chosen)."""
 
 
 class PhotoReads:
@@ -74,7 +75,7 @@ class PhotoReads:
             return {row.id: row.public_id for row in rows}
 
     def load_of(self, owner: str) -> tuple[int, int, int]:
-        """Return of an owner how many photos are unfinished, the bytes of files, the number of all."""
+        """Return `(unfinished photos, bytes of stored files, all photos)` of an owner."""
         with self._db.reading() as session:
             row = session.execute(
                 select(
@@ -109,23 +110,23 @@ class PhotoReads:
     def unneeded(self, policy: str, limit: int = 100) -> list[str]:
         """Return photos whose file is to be given up, as the setting `keep_photos` says.
 
-        Never one that is worked on, waits for its lens, or was ended by an outage and may be retried.
+        Never one that is being worked on, waits for its lens, or failed in an outage and may be retried.
         """
         if policy == "always":
             return []
         jobs = select(CorrectionRow.id).where(CorrectionRow.photo_id == PhotoRow.id)
         busy = jobs.where(CorrectionRow.state.in_(("queued", "running"))).exists()
-        ended, day = PhotoRow.finished_at, now() - STILL_ASKED
+        ended, day = PhotoRow.finished_at, now() - FILE_KEPT
         learned = PhotoRow.state.in_(("counted", "excluded", "cancelled")) | (
             (PhotoRow.state == "failed") & ((PhotoRow.error_code != "outage") | (ended < day))
         )
         if policy == "never":
-            wanted = learned | ((PhotoRow.state == "stored") & (jobs.exists() | (ended < day)))
+            disposable = learned | ((PhotoRow.state == "stored") & (jobs.exists() | (ended < day)))
         else:
-            wanted = learned & ~jobs.exists() & (ended < now() - GRACE)
+            disposable = learned & ~jobs.exists() & (ended < now() - GRACE)
         query = (
             select(PhotoRow.public_id)
-            .where(PhotoRow.deleted_at.is_(None), PhotoRow.file_gone_at.is_(None), wanted, ~busy)
+            .where(PhotoRow.deleted_at.is_(None), PhotoRow.file_gone_at.is_(None), disposable, ~busy)
             .limit(limit)
         )
         with self._db.reading() as session:

@@ -1,4 +1,4 @@
-"""What transactions about photos share: their states, their blobs, the way from state to state."""
+"""Shared by all transactions on photos: states, blobs, and moves from one state to another."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from app.store.removal import forget_if_empty, statistics_of
 from app.store.tables import PHOTO_RUNNING, GarbageRow, LensRow, PatchRow, PhotoRow
 
 WORKED_ON = ("received", *PHOTO_RUNNING)
-"""What takes the service's time; a photo that waits for its owner's word takes room only."""
+"""States that cost computing time; a photo that waits for its owner costs space only."""
 
 UNFINISHED = (*WORKED_ON, "needs_lens")
 GIVEN_SETTINGS = {
@@ -24,15 +24,14 @@ GIVEN_SETTINGS = {
     "focus_distance_m": "focus_m",
     "pixel_pitch_um": "pixel_pitch_um",
 }
-"""Fields that the owner may give, by the column that they fill."""
+"""Fields that the owner may give, with the column that each fills."""
 
-
-SAID: Final = (
+DESCRIPTION: Final = (
     *("lens_maker", "lens_model", "lens_serial", "lens_serial_source", "camera_maker", "camera_model"),
     *("aperture", "focal_mm", "focus_m", "pixel_pitch_um", "iso", "exposure_s", "taken_at", "lateral"),
     *("width", "height", "orientation", "location", "error_detail", "body_key"),
 )
-"""Columns of what is known of a photo."""
+"""Columns that describe a photo; all are emptied when it is deleted."""
 
 
 class Identity(Protocol):
@@ -56,7 +55,7 @@ class Identity(Protocol):
 
 
 LATE = timedelta(minutes=10)
-"""Blobs of what is deleted are deleted again after this time: a worker may have written one more."""
+"""Deleted blobs are deleted once more after this time (chosen): a worker may have written another one."""
 
 
 def folder_of(photo: PhotoRow) -> str:
@@ -65,19 +64,19 @@ def folder_of(photo: PhotoRow) -> str:
 
 
 def settings_of(photo: PhotoRow) -> dict[str, Any]:
-    """Return how the lens was set, as tasks read it."""
+    """Return the lens settings of a photo, as tasks read them."""
     return {"aperture": photo.aperture, "focal_mm": photo.focal_mm, "focus_m": photo.focus_m}
 
 
 def empty(photo: PhotoRow) -> None:
-    """Take from a deleted photo all that the file and its owner said."""
+    """Erase all that the file and its owner said of a deleted photo."""
     photo.given, photo.filename, photo.sha256 = {}, "", ""
-    for column in SAID:
+    for column in DESCRIPTION:
         setattr(photo, column, None)
 
 
 def let_go(session: Session, photo_id: str) -> PhotoRow:
-    """Forget the lens that only a photo without a result speaks of: its serial is nobody's business now."""
+    """Forget a lens that only a photo without a result refers to, and with it its serial."""
     photo = session.scalars(
         select(PhotoRow).where(PhotoRow.public_id == photo_id).execution_options(populate_existing=True)
     ).one()
@@ -86,28 +85,25 @@ def let_go(session: Session, photo_id: str) -> PhotoRow:
 
 
 def drop_patches(session: Session, photo: PhotoRow) -> None:
-    """Forget the patches of an epoch with their samples.
-
-    With those of earlier epochs, unless they count still.
-    """
+    """Delete the patches of a photo with their samples; earlier epochs stay while they still count."""
     of_photo = [PatchRow.photo_id == photo.id, *([PatchRow.epoch == photo.epoch] if photo.relearning else [])]
     session.execute(delete(PatchRow).where(*of_photo))
     insert_new(session, GarbageRow, [{"prefix": statistics_of(photo), "not_before": now() + LATE}])
 
 
 def restart(session: Session, photo: PhotoRow) -> None:
-    """Begin a new epoch of a photo: work of the old one, if any still runs, is void.
+    """Begin a new epoch of a photo: work of the old one that still runs is void.
 
-    Its samples go, but for those that count while the photo is `relearning`.
+    Its samples are deleted, except those that count while the photo is `relearning`.
     """
     begins = photo.relearning and photo.state == "counted"
-    if not begins:  # the patches of this epoch are those that count
+    if not begins:  # else the patches of this epoch are those that count
         drop_patches(session, photo)
     photo.epoch += 1
     photo.state, photo.stage_at = "received", now()
     photo.error_code = photo.error_detail = photo.started_at = photo.finished_at = photo.counted_at = None
     photo.attempt = photo.patches_total = photo.patches_done = photo.patches_rejected = 0
-    if not photo.relearning:  # else the same ones are found again
+    if not photo.relearning:  # else the same windows are rejected again
         photo.windows, photo.windows_rejected = None, 0
 
 
@@ -135,5 +131,5 @@ def move(
 
 
 def widen(lens: LensRow, photo: PhotoRow) -> None:
-    """Take over what a photo knows of its lens and others did not."""
+    """Complete the maker and model of a lens from a photo."""
     lens.complete(photo.lens_maker, photo.lens_model)

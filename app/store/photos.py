@@ -42,24 +42,25 @@ from app.store.tables import (
 )
 
 TRIES: Final = 100
-"""How often an upload looks again for the photo of the same bytes that was deleted when it looked."""
+"""How often an upload looks again for the photo of the same bytes that was deleted between insert and select
+(chosen: 80 simultaneous uploads and deletions of the same bytes on PostgreSQL all end)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """What an upload became: the photo, and whether there is work to do for it."""
+    """Result of an upload: the photo, and whether there is work to do for it."""
 
     photo: PhotoRow
     fresh: bool
     wants_file: bool = False
-    """Whether the photo is there without its file, which has now come again."""
+    """Whether the photo is known without its file, which has now come again."""
 
 
 class PhotoStore(PhotoReads):
     """Photos of all owners. `owner=None` asks as the service itself."""
 
     def expect(self, prefix: str) -> None:
-        """Say that blobs will come below `prefix`: garbage in an hour unless a photo claims them."""
+        """Announce blobs below `prefix`: garbage in an hour (chosen) unless a photo claims them."""
         with self._db.writing() as session:
             due = now() + timedelta(hours=1)
             insert_new(session, GarbageRow, [{"prefix": prefix, "not_before": due}])
@@ -81,8 +82,8 @@ class PhotoStore(PhotoReads):
     ) -> Received:
         """Store an upload, or find the photo with the same bytes.
 
-        A known photo starts again where that makes sense: it had failed or was cancelled, it shall
-        calibrate its lens and until now should not, or it waits to be told what it is told now.
+        A known photo starts again where that makes sense: it had failed or was cancelled, it is now to
+        calibrate its lens and was not before, or it waited for settings that are now given.
         """
         with self._db.writing(durable=True) as session:
             owner_key = ensure_owner(session, owner, may_be_new=may_be_new)
@@ -102,36 +103,36 @@ class PhotoStore(PhotoReads):
                 "location": location,
                 **{column: given.get(field) for field, column in GIVEN_SETTINGS.items()},
             }
-            known, made = _insert_or_find(session, fresh)
-            if made:
+            known, created = _insert_or_find(session, fresh)
+            if created:
                 prefix = f"{blob_key.rpartition('/')[0]}/"
                 session.execute(delete(GarbageRow).where(GarbageRow.prefix == prefix))
                 return Received(known, fresh=True)
-            told = {**known.given, **given}
+            merged = {**known.given, **given}
             again = (
                 known.state in {"failed", "cancelled"}
                 or (calibrate and not known.calibrate)
-                or (known.state == "needs_lens" and told != known.given)
+                or (known.state == "needs_lens" and merged != known.given)
             )
             if again:
                 known.calibrate = calibrate
-                known.given = told
-                if known.file_gone_at is None:  # else once it is there: a worker would look for it
+                known.given = merged
+                if known.file_gone_at is None:  # else once the file is stored: a worker would look for it
                     restart(session, known)
             return Received(known, fresh=again, wants_file=known.file_gone_at is not None)
 
     def give_up_file(self, photo_id: str, names: Sequence[str]) -> bool:
-        """Give up the file of a photo and pictures of it; False if it is wanted, or gone already.
+        """Give up the file of a photo and pictures of it; False if it is still needed, or gone already.
 
-        The row says so before the blobs go, and their keys are written down: nothing of them stays.
+        The row says so before the blobs are deleted, and their keys become garbage: no blob is left behind.
         """
         with self._db.writing() as session:
             photo = find_to_change(session, PhotoRow, photo_id, None)
             busy = CorrectionRow.state.in_(("queued", "running"))
             if photo is None or photo.file_gone_at is not None or photo.state in UNFINISHED:
                 return False
-            asked = select(CorrectionRow.id).where(CorrectionRow.photo_id == photo.id, busy)
-            if session.scalar(asked.limit(1)) is not None:
+            unfinished = select(CorrectionRow.id).where(CorrectionRow.photo_id == photo.id, busy)
+            if session.scalar(unfinished.limit(1)) is not None:
                 return False
             photo.file_gone_at = now()
             keys = [photo.blob_key, *(f"{folder_of(photo)}{name}" for name in names)]
@@ -141,7 +142,7 @@ class PhotoStore(PhotoReads):
     def restore_file(
         self, photo_id: str, blob_key: str, location: str | None, *, again: bool = False
     ) -> None:
-        """Say that the file of a photo is there again, under a key of its own; begin `again` with it."""
+        """Record that the file of a photo was stored again under a new key; with `again` start it anew."""
         with self._db.writing(durable=True) as session:
             photo = find_to_change(session, PhotoRow, photo_id, None)
             if photo is None:
@@ -161,8 +162,8 @@ class PhotoStore(PhotoReads):
     ) -> bool:
         """Move a photo from one of `from_states` to `to`; False where it was in none of them.
 
-        With `epoch` only if the photo was not started anew since: a worker that was away too
-        long changes nothing.
+        With `epoch` only if the photo was not started anew since: a worker that lost its lease changes
+        nothing.
         """
         with self._db.writing() as session:
             return move(session, photo_id, from_states, to, epoch=epoch, **fields)
@@ -186,8 +187,8 @@ class PhotoStore(PhotoReads):
         exposure_s: float | None = None,
         taken_at: datetime | None = None,
     ) -> None:
-        """Store what the header says; what the owner gave stays as he gave it."""
-        read = {
+        """Store what the header says; values that the owner gave take precedence."""
+        header = {
             "aperture": aperture,
             "focal_mm": focal_mm,
             "focus_m": focus_m,
@@ -199,7 +200,7 @@ class PhotoStore(PhotoReads):
                 return
             for field, column in GIVEN_SETTINGS.items():
                 value = photo.given.get(field)
-                setattr(photo, column, read[column] if value is None else value)
+                setattr(photo, column, header[column] if value is None else value)
             serial = photo.given.get("lens_serial")
             photo.width, photo.height, photo.orientation = width, height, orientation
             photo.camera_maker, photo.camera_model, photo.body_key = camera_maker, camera_model, body_key
@@ -215,11 +216,11 @@ class PhotoStore(PhotoReads):
             session.execute(update(PhotoRow).where(PhotoRow.public_id == photo_id).values(lateral=lateral))
 
     def assign_lens(self, photo_id: str, *, single_copy: bool = False) -> LensRow | None:
-        """Find or make the lens of an inspected photo; None if nothing says which copy it was.
+        """Return the lens of an inspected photo, created if need be; None if its copy is unknown.
 
-        Order: the lens that the owner named, then the serial (his or the file's), then, only
-        with `single_copy`, the model alone. Photos that are merely stored join a lens that
-        exists but make none.
+        Order: the lens that the owner named, then the serial (given by the owner, else of the file), then,
+        only with `single_copy`, the model alone. Photos that are merely stored join a lens that exists
+        but create none.
         """
         with self._db.writing() as session:
             photo = find_to_change(session, PhotoRow, photo_id, None)
@@ -229,8 +230,8 @@ class PhotoStore(PhotoReads):
             if lens is not None:
                 photo.lens_id, photo.way = lens.id, lens.way
                 widen(lens, photo)
-                if photo.calibrate and photo.given.get("model") == lens.way:  # what was asked for is so
-                    photo.given = {name: said for name, said in photo.given.items() if name != "model"}
+                if photo.calibrate and photo.given.get("model") == lens.way:  # the request is fulfilled
+                    photo.given = {name: value for name, value in photo.given.items() if name != "model"}
             return lens
 
     def change(
@@ -243,20 +244,20 @@ class PhotoStore(PhotoReads):
         excluded: bool | None = None,
         calibrate: bool = False,
     ) -> bool:
-        """Take over what the owner says now: settings, the lens or its id, whether the photo counts.
+        """Apply what the owner changes: settings, the lens or its id, whether the photo counts.
 
         With `calibrate` a photo that was merely stored starts again, to teach its lens.
 
-        All of it, or nothing and False where the photo cannot be excluded or included. A photo that has
-        a result changes its lens's model at once, any other starts again.
+        All of it or nothing; False where the photo cannot be excluded or included. A photo that has a
+        result changes its lens's model at once, any other starts again.
         """
         with self._db.writing() as session:
             photo = find_to_change(session, PhotoRow, photo_id, owner)
             if photo is None:
                 return False
             if excluded is not None:
-                wish: Final = "excluded" if excluded else "counted"
-                if photo.state != wish and not teaching.switch(session, photo, wish):
+                wanted_state: Final = "excluded" if excluded else "counted"
+                if photo.state != wanted_state and not teaching.switch(session, photo, wanted_state):
                     return False
             chosen = _chosen(session, photo, lens, owner)
             begins = calibrate and not photo.calibrate
@@ -296,7 +297,7 @@ class PhotoStore(PhotoReads):
     def cancel(self, photo_id: str, owner: str | None = None) -> bool:
         """Cancel an unfinished photo; False if it was finished already.
 
-        The state is the truth: whatever still runs finds the photo cancelled and changes nothing.
+        Work that still runs sees the state and changes nothing.
         """
         with self._db.writing() as session:
             photo = find_to_change(session, PhotoRow, photo_id, owner)
@@ -310,8 +311,8 @@ class PhotoStore(PhotoReads):
         """Count a photo: its samples join the model and the lens's version grows by one.
 
         Returns the new version, or None if the photo was counted, cancelled or started anew
-        meanwhile, or waits until its lens has changed its way. One transaction: it happens wholly
-        and once, however often it is tried.
+        meanwhile, or waits until its lens has changed its way. One transaction: it happens entirely and
+        once, however often it is tried.
         """
         with self._db.writing() as session:
             done = {"finished_at": now(), "counted_at": now()}
@@ -328,7 +329,7 @@ class PhotoStore(PhotoReads):
     def delete(self, photo_id: str, owner: str) -> str | None:
         """Forget a photo, its patches and samples; return the prefix of its blobs.
 
-        The row stays, emptied, so that the lens's history can name it.
+        The row stays, emptied, because the lens's history refers to it.
         """
         with self._db.writing() as session:
             photo = find_to_change(session, PhotoRow, photo_id, owner)
@@ -356,13 +357,13 @@ class PhotoStore(PhotoReads):
 def _insert_or_find(session: Session, fresh: dict[str, Any]) -> tuple[PhotoRow, bool]:
     """Insert a photo, or find the one with the same bytes; True if inserted.
 
-    On PostgreSQL another transaction may delete that one after it kept ours out, and before we see it.
+    On PostgreSQL another transaction may delete that one after it blocked our insert and before our select.
     """
     for _ in range(TRIES):
-        made = insert_new(session, PhotoRow, [fresh]) == 1
+        created = insert_new(session, PhotoRow, [fresh]) == 1
         known = _known(session, fresh["owner_id"], fresh["sha256"])
         if known is not None:
-            return known, made
+            return known, created
     raise BusyError(f"{TRIES} times the photo of the same bytes came and went: send it again")
 
 
@@ -375,14 +376,14 @@ def _known(session: Session, owner_key: int, sha256: str) -> PhotoRow | None:
 
 
 def _ended(session: Session, photo_id: str) -> None:
-    """Do what is due when a photo has come to nothing: its lens goes, or waits for it no longer."""
+    """Clean up after a photo without a result: its lens is deleted if empty, or no longer waits for it."""
     photo = let_go(session, photo_id)
     if photo.relearning and photo.lens_id is not None:
         lens_ways.settle(session, photo.lens_id)
 
 
 def _chosen(session: Session, photo: PhotoRow, lens: LensName | str | None, owner: str) -> LensRow | None:
-    """Find the lens that an owner names, or whose id they give; none where they do neither."""
+    """Return the lens that an owner describes or whose id is given; None where neither is."""
     if isinstance(lens, LensName):
         return lenses.named(session, photo.owner_id, lens, way=photo.given.get("model", photo.way))
     return None if lens is None else find(session, LensRow, lens, owner)

@@ -1,4 +1,4 @@
-"""The samples of a profile, taken in as if their photos had been sent, which are not there."""
+"""Import of a profile: its samples count as if their photos, which the service lacks, had been sent."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ KIND = "profile"
 def take_in(
     database: Database, lens_id: str, owner: str, samples: Sequence[PsfSample], names: dict[str, str]
 ) -> int | None:
-    """Let the samples of a profile join a lens; return how many photos they are of, None without lens.
+    """Let the samples of a profile join a lens; return the number of their photos, None without a lens.
 
-    Each photo of the profile becomes a counted photo without a file, which can be left out or deleted as
-    any other. What was taken in before is not taken in again.
+    Each photo of the profile becomes a counted photo without a file, which can be excluded or deleted as
+    any other. What was imported before is not imported again.
     """
     groups: defaultdict[tuple[str, LensSettings], list[PsfSample]] = defaultdict(list)
     for sample in samples:
@@ -40,17 +40,17 @@ def take_in(
         lens = find_to_change(session, LensRow, lens_id, owner)
         if lens is None:
             return None
-        taken = 0
-        for (photo, settings), own in groups.items():
-            row = _photo(session, lens, photo, settings, own[0], names.get(photo, photo or "profile"))
+        imported = 0
+        for (photo, settings), of_photo in groups.items():
+            row = _photo(session, lens, photo, settings, of_photo[0], names.get(photo, photo or "profile"))
             if row is None:
                 continue
-            _samples(session, row, own)
+            _samples(session, row, of_photo)
             version = new_version(session, lens.id)
             added = take_samples(session, row, version)
             record_event(session, lens.id, version, "photo_added", row, samples_added=added)
-            taken += 1
-        return taken
+            imported += 1
+        return imported
 
 
 def _photo(

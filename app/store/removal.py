@@ -1,7 +1,7 @@
-"""Lenses that go: because their owner says so, or because no photo is left that speaks of them.
+"""Deleting lenses: because their owner says so, or because no photo refers to them any more.
 
-What is personal about a lens, its serial and the name that its owner gave it, goes with it. The row stays,
-emptied, as what finished corrections name.
+What is personal about a lens, its serial and the name that its owner gave it, is deleted too. The row stays,
+emptied, because finished corrections refer to it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class RemovalStore:
         self._db = database
 
     def lens(self, lens_id: str, owner: str | None = None) -> bool:
-        """Delete a lens with all that was learned of it; its photos stay, to be corrected with another.
+        """Delete a lens with all that was learned of it; its photos stay and can be corrected with another.
 
         Work on photos that would teach it is cancelled. False if there is no such lens.
         """
@@ -55,9 +55,9 @@ class RemovalStore:
 
 
 def forget_if_empty(session: Session, photo: PhotoRow) -> None:
-    """Take a photo that teaches nothing from its lens; delete the lens if no other photo speaks of it.
+    """Detach a photo that teaches nothing from its lens; delete the lens if no other photo refers to it.
 
-    A lens that the owner named himself stays as long as there is any photo of it, a failed one too.
+    A lens that the owner named stays as long as there is any photo of it, even a failed one.
     """
     if photo.lens_id is None or photo.relearning:
         return
@@ -94,12 +94,12 @@ def _unlearn(session: Session, photo: PhotoRow) -> None:
 
 
 def statistics_of(photo: PhotoRow) -> str:
-    """Return the prefix of what earlier versions kept of the patches of a photo besides their kernels."""
+    """Return the prefix under which earlier versions of the program stored statistics of patches."""
     return f"{photo.blob_key.rpartition('/')[0]}/statistics/"
 
 
 def forget(session: Session, lens: LensRow) -> None:
-    """Empty the row of a lens that no photo belongs to any more; what workers kept of it becomes garbage."""
+    """Empty the row of a lens that no photo belongs to any more; its fitted models become garbage."""
     session.execute(delete(EventRow).where(EventRow.lens_id == lens.id))
     lens.serial = lens.label = None
     lens.serial_source = "none"

@@ -38,7 +38,7 @@ _MAY_BE_RELATED = and_(
     _OTHER.deleted_at.is_(None),
     _OTHER.sample_count > 0,
     _OTHER.kind_key == _ME.kind_key,
-    _ME.answering_way == "default",  # the paper's way leans on nothing
+    _ME.answering_way == "default",  # the paper's way uses no other copies
     _OTHER.answering_way == "default",
 )
 _THIS = and_(_ME.public_id == bindparam("lens"), _ME.deleted_at.is_(None))
@@ -59,8 +59,8 @@ _KNOWN = (
     .where(_THIS, OwnerRow.name == bindparam("owner"))
     .order_by(_OTHER.public_id.desc())
 )
-MOST_OF_FAMILY: Final = 2000
-"""So many samples of other copies are enough to lean on; more would only take time to fit."""
+MAX_FAMILY_SAMPLES: Final = 2000
+"""Most samples of other copies that a model leans on (chosen, not measured): more take longer to fit."""
 
 
 class CorruptSampleError(LensModelError):
@@ -71,7 +71,7 @@ class CorruptSampleError(LensModelError):
 
 @dataclass(frozen=True, slots=True)
 class LensState:
-    """What tells whether a fitted model is up to date, and in which way it was learned."""
+    """Version of a lens: shows whether a fitted model is up to date, and in which way it was learned."""
 
     version: int
     rebuild_epoch: int
@@ -80,13 +80,13 @@ class LensState:
 
 @dataclass(frozen=True, slots=True)
 class Relative:
-    """Another copy of a lens model, of the same owner, and what it knew at some moment."""
+    """Another copy of a lens model, of the same owner, at one of its versions."""
 
     lens_id: str
     state: LensState
 
     def named(self) -> dict[str, Any]:
-        """Return what tells it from others in what is wished of a correction."""
+        """Return it as the parameters of a correction store it."""
         state = {"version": self.state.version, "rebuild_epoch": self.state.rebuild_epoch}
         return {"lens_id": self.lens_id, "state": state}
 
@@ -96,7 +96,7 @@ Family: TypeAlias = tuple[Relative, ...]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredSample:
-    """A sample with the key by which later ones are told apart."""
+    """A sample with its key and the version at which it joined."""
 
     id: int
     version_added: int
@@ -118,7 +118,7 @@ class SampleStore:
     def family_of(self, lens_id: str) -> Family:
         """Return the other copies of a lens: same owner, maker and model, with samples that count.
 
-        The newest first, as many as it takes to have `MOST_OF_FAMILY` samples.
+        The newest first, as many as are needed for `MAX_FAMILY_SAMPLES` samples.
         """
         with self._db.reader.connect() as connection:
             return _family(connection.execute(_OTHERS, {"lens": lens_id}).all())
@@ -127,7 +127,9 @@ class SampleStore:
         """Return `state_of` and `family_of` by one read; None if the owner has no such lens."""
         if not is_id(lens_id):
             return None
-        with self._db.reader.connect() as connection:  # no session: this is part of every warm request
+        with (
+            self._db.reader.connect() as connection
+        ):  # no session, which costs time: part of every request that a cached model answers
             rows = connection.execute(_KNOWN, {"lens": lens_id, "owner": owner}).all()
         if not rows:
             return None
@@ -135,11 +137,11 @@ class SampleStore:
         return state, _family([row for row in rows if row.public_id is not None])
 
     def of_family(self, family: Iterable[Relative]) -> list[StoredSample]:
-        """Return the samples of other copies as of the versions named; what was removed since is gone."""
+        """Return the samples of other copies at the given versions, without those removed since."""
         return [
             stored
-            for one in family
-            for stored in self.of_lens(one.lens_id, up_to_version=one.state.version)[1]
+            for relative in family
+            for stored in self.of_lens(relative.lens_id, up_to_version=relative.state.version)[1]
         ]
 
     def of_lens(
@@ -191,14 +193,14 @@ class SampleStore:
 
 
 def _family(rows: Iterable[Row[*tuple[Any, ...]]]) -> Family:
-    """Those that it takes to have enough samples."""
-    found: list[Relative] = []
+    """Return the first relatives that together have `MAX_FAMILY_SAMPLES` samples."""
+    relatives: list[Relative] = []
     samples = 0
     for row in rows:
-        if samples < MOST_OF_FAMILY:
-            found.append(Relative(row.public_id, LensState(row.version, row.rebuild_epoch)))
+        if samples < MAX_FAMILY_SAMPLES:
+            relatives.append(Relative(row.public_id, LensState(row.version, row.rebuild_epoch)))
             samples += row.sample_count
-    return tuple(found)
+    return tuple(relatives)
 
 
 def _stored(row: Row[*tuple[Any, ...]]) -> StoredSample:

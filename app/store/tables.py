@@ -48,7 +48,7 @@ def _one_of(column: str, values: tuple[str, ...]) -> str:
 
 
 class Base(DeclarativeBase):
-    """Common to all tables."""
+    """Base of all tables."""
 
     metadata = MetaData(
         naming_convention={  # batch migrations must know the names of what they replace
@@ -70,12 +70,12 @@ class OwnerRow(Base):
     id: Mapped[int] = mapped_column(primary_key=True)
     name: Mapped[str] = mapped_column(String(200), unique=True)
     quota_bytes: Mapped[int | None] = mapped_column(BigInteger)
-    """Of photos; None where the setting holds for him as for others, as with the next."""
+    """Limit of the bytes of photos; None where the setting applies, as for `quota_photos`."""
 
     quota_photos: Mapped[int | None]
     created_at: Mapped[datetime]
     erased_at: Mapped[datetime | None]
-    """When he asked that all of his be erased; the row goes last."""
+    """When erasure of everything was requested; the row is deleted last."""
 
 
 class LensRow(Base):
@@ -106,10 +106,10 @@ class LensRow(Base):
     identity_key: Mapped[str]
     label: Mapped[str | None]
     way: Mapped[str] = mapped_column(String(20), default="default", server_default="default")
-    """How its photos are learned from, of `PsfModel`; `model` is what its maker calls it."""
+    """How its photos are learned from, a value of `PsfModel`; `model` is what its maker calls it."""
 
     answering_way: Mapped[str] = mapped_column(String(20), default="default", server_default="default")
-    """The way of the samples that count: another one than `way` until photos are estimated anew."""
+    """The way of the samples that count; differs from `way` until its photos are estimated anew."""
 
     version: Mapped[int] = mapped_column(default=0)
     rebuild_epoch: Mapped[int] = mapped_column(default=0)
@@ -119,7 +119,7 @@ class LensRow(Base):
     deleted_at: Mapped[datetime | None]
 
     def complete(self, maker: str | None, model: str | None) -> None:
-        """Take over what is not known yet of the maker and the model."""
+        """Fill in the maker and the model where they are not known yet."""
         self.maker, self.model = self.maker or maker, self.model or model
         self.kind_key = kind_key(self.maker, self.model)
 
@@ -153,7 +153,7 @@ class PhotoRow(Base):
     blob_key: Mapped[str]
     calibrate: Mapped[bool]
     given: Mapped[dict[str, Any]]
-    """What the owner said about the photo; it goes before what the file says."""
+    """What the owner said about the photo; takes precedence over what the file says."""
 
     width: Mapped[int | None]
     height: Mapped[int | None]
@@ -161,7 +161,7 @@ class PhotoRow(Base):
     camera_maker: Mapped[str | None]
     camera_model: Mapped[str | None]
     body_key: Mapped[str | None] = mapped_column(String(16))
-    """Digest of the camera and its serial: tells bodies apart without naming one."""
+    """Digest of the camera and its serial: distinguishes bodies without identifying one."""
 
     lens_maker: Mapped[str | None]
     lens_model: Mapped[str | None]
@@ -176,17 +176,17 @@ class PhotoRow(Base):
     iso: Mapped[float | None]
     exposure_s: Mapped[float | None]
     taken_at: Mapped[datetime | None] = mapped_column(DateTime())
-    """By the camera's clock, whose zone nobody knows."""
+    """By the camera's clock, whose zone is unknown."""
 
     lateral: Mapped[dict[str, Any] | None] = mapped_column("lateral_colour")  # LATERAL is a word of SQL
     """Lateral colour that this photo shows: radial polynomials of red and blue."""
 
     epoch: Mapped[int] = mapped_column(default=1)
     way: Mapped[str] = mapped_column(String(20), default="default", server_default="default")
-    """That of its lens when this epoch began."""
+    """The way of its lens when this epoch began."""
 
     relearning: Mapped[bool] = mapped_column(default=False, server_default=false())
-    """Its samples of an epoch before count until all photos of its lens are estimated in another way."""
+    """Its samples of an earlier epoch count until all photos of its lens are estimated in another way."""
 
     attempt: Mapped[int] = mapped_column(default=0)
     state: Mapped[str] = mapped_column(String(20))
@@ -199,7 +199,7 @@ class PhotoRow(Base):
     """How many windows were rejected before anything was estimated in them."""
 
     windows: Mapped[dict[str, Any] | None] = mapped_column(deferred=True)
-    """Those windows, as `app.store.windows` writes them: thousands, which nobody asks for one by one."""
+    """Those windows, as `app.store.windows` writes them: thousands, never queried one by one."""
 
     received_at: Mapped[datetime]
     started_at: Mapped[datetime | None]
@@ -210,10 +210,10 @@ class PhotoRow(Base):
     counted_at: Mapped[datetime | None]
     deleted_at: Mapped[datetime | None]
     location: Mapped[str | None] = mapped_column(String(10))
-    """Whether the file said where it was taken: a word of `app.blobs.location`; None of old ones."""
+    """Whether the file said where it was taken: a word of `app.blobs.location`; None for old photos."""
 
     file_gone_at: Mapped[datetime | None]
-    """When the file was given up, see the setting `keep_photos`."""
+    """When the file was deleted, see the setting `keep_photos`."""
 
 
 class PatchRow(Base):
@@ -245,8 +245,8 @@ class PatchRow(Base):
 class SampleRow(Base):
     """One PSF estimate: the kernel of one channel of one patch.
 
-    `lens_id` and `version_added` are set together when the photo is counted, and taken away
-    when it is excluded: what carries them is exactly what the model reads.
+    `lens_id` and `version_added` are set together when the photo is counted, and cleared when
+    it is excluded: the model reads exactly the samples that have them.
     """
 
     __tablename__ = "psf_sample"
@@ -273,7 +273,7 @@ class SampleRow(Base):
     crc32: Mapped[int] = mapped_column(BigInteger)
     psf: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)
     spectrum: Mapped[bytes | None] = mapped_column(LargeBinary)
-    statistics_key: Mapped[str | None]  # of earlier versions: a blob that nothing reads any more
+    statistics_key: Mapped[str | None]  # a blob of earlier versions of the program, no longer read
     estimator: Mapped[str]
     diagnostics: Mapped[dict[str, Any]]
     created_at: Mapped[datetime]
@@ -359,7 +359,7 @@ class CorrectionRow(Base):
 
 
 class WorkerRow(Base):
-    """One worker process and when it was last heard of."""
+    """One worker process and the time of its last heartbeat."""
 
     __tablename__ = "worker"
     __table_args__ = (CheckConstraint(_one_of("state", ("live", "dead")), name="state"),)
@@ -374,11 +374,11 @@ class WorkerRow(Base):
     started_at: Mapped[datetime]
     heartbeat_at: Mapped[datetime]
     confined: Mapped[str] = mapped_column(String(200), server_default="")
-    """What its children are confined by: names of `app.sandbox.confine.MEASURES`, with spaces between."""
+    """Measures that confine its children: names of `app.sandbox.confine.MEASURES`, separated by spaces."""
 
 
 class GarbageRow(Base):
-    """Blobs to delete once nothing can still be reading them; all keys that begin so."""
+    """Blobs to delete once nothing can still be reading them: all keys with this prefix."""
 
     __tablename__ = "blob_garbage"
 

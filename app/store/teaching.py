@@ -1,4 +1,4 @@
-"""What a photo teaches its lens: its samples join it, leave it, and go with the photo to another one."""
+"""The samples of a photo: they join its lens, leave it, and move with the photo to another one."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from app.store.versions import drop_samples, new_version, record_event
 
 
 def give_back(session: Session, photo: PhotoRow, kind: str) -> None:
-    """Take a photo that teaches out of its lens: a new version that must be fitted anew.
+    """Take the samples of a photo out of its lens, which gets a new version that must be fitted anew.
 
-    Of one that is estimated anew, or was and waits for the others, what counted until now is deleted.
+    The earlier samples of a photo that is `relearning` are deleted.
     """
     assert photo.lens_id is not None
     version = new_version(session, photo.lens_id, rebuild=True)
@@ -28,9 +28,9 @@ def give_back(session: Session, photo: PhotoRow, kind: str) -> None:
 
 
 def switch(session: Session, photo: PhotoRow, after: Literal["counted", "excluded"]) -> bool:
-    """Take a counted photo out of its lens's model, or bring it back; False if it is in another state.
+    """Exclude a counted photo from its lens's model, or include it again; False if it is in another state.
 
-    What was left out before its lens changed its way starts again; False if its file is gone.
+    A photo that was excluded before its lens changed its way starts again; False if its file is gone.
     """
     if photo.state != ("counted" if after == "excluded" else "excluded"):
         return False
@@ -55,7 +55,7 @@ def switch(session: Session, photo: PhotoRow, after: Literal["counted", "exclude
 
 
 def may_move(photo: PhotoRow, lens: LensRow) -> bool:
-    """Whether a photo can be given to a lens: what counts in another way has to be estimated anew."""
+    """Whether a photo can be given to a lens: in a lens of another way a counted photo is estimated anew."""
     return photo.state != "counted" or photo.way == lens.way or photo.file_gone_at is None
 
 
@@ -81,7 +81,7 @@ def move(session: Session, photo: PhotoRow, lens: LensRow) -> None:
 def change_settings(
     session: Session, photo: PhotoRow, given: Mapping[str, Any], columns: Mapping[str, Any]
 ) -> None:
-    """Correct the settings of a photo; one that teaches renews its lens's model."""
+    """Correct the settings of a photo; if it counts its lens's model is fitted anew."""
     photo.given = {**photo.given, **given}
     for column, value in columns.items():
         setattr(photo, column, value)
@@ -99,7 +99,7 @@ def begin_again(
     columns: Mapping[str, Any],
     chosen: LensRow | None,
 ) -> None:
-    """Start a photo anew with what its owner says of its settings and its lens."""
+    """Start a photo anew with the settings and the lens that its owner gives."""
     before = photo.lens_id
     leaves = chosen is not None and chosen.id != before
     if photo.relearning and leaves:
@@ -107,7 +107,7 @@ def begin_again(
     elif photo.relearning and given:
         change_settings(session, photo, given, columns)
     photo.given = {**photo.given, **given}
-    if chosen is not None:  # the lens has a way: a wish of before is met, or forgotten
+    if chosen is not None:  # the lens has its way: an earlier request for a model no longer applies
         kept = {name: value for name, value in photo.given.items() if name != "model"}
         photo.given = {**kept, "lens_id": chosen.public_id}
     restart(session, photo)

@@ -13,7 +13,7 @@ from app.store.database import insert_new
 from app.store.tables import EventRow, GarbageRow, LensRow, PatchRow, PhotoRow, SampleRow
 
 STILL_WRITTEN: Final = timedelta(minutes=30)
-"""A worker may be learning from the version before while the next one comes."""
+"""How long the previous version is kept (chosen): a worker may still be learning from it."""
 
 
 def new_version(session: Session, lens_id: int, *, rebuild: bool = False) -> int:
@@ -40,17 +40,17 @@ LEARNED_ROOT: Final = "models/"
 
 
 def learned_prefix(lens_id: str, version: int, epoch: int) -> str:
-    """Where workers keep what they have learned from the samples of one version of a lens."""
+    """Return the prefix of the models that workers fit to the samples of one version of a lens."""
     return f"{LEARNED_ROOT}{lens_id}/{version}-{epoch}/"
 
 
 def learned_key(lens_id: str, version: int, epoch: int) -> str:
-    """Key of the blob in `learned_prefix`."""
+    """Return the key of the fitted models in `learned_prefix`."""
     return f"{learned_prefix(lens_id, version, epoch)}learned.npz"
 
 
 def report_key(lens_id: str, version: int, epoch: int) -> str:
-    """Key of the report of that version, beside what was learned."""
+    """Return the key of the report of that version, in `learned_prefix`."""
     return f"{learned_prefix(lens_id, version, epoch)}report.json"
 
 

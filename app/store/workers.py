@@ -1,4 +1,4 @@
-"""Workers and their leases, and the blobs that wait to be deleted."""
+"""Workers and their leases, and blobs that are due for deletion."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from app.store.tables import GarbageRow, WorkerRow
 
 
 class WorkerStore:
-    """Who works, and who was not heard of for too long."""
+    """Live workers, and those whose lease has expired."""
 
     def __init__(self, database: Database) -> None:
         self._db = database
@@ -53,14 +53,14 @@ class WorkerStore:
             return session.connection().execute(statement).rowcount == 1
 
     def live(self, lease_seconds: float) -> list[WorkerRow]:
-        """Return the workers that were heard of within the lease."""
+        """Return the workers whose last heartbeat is within the lease."""
         with self._db.reading() as session:
             since = self._now(session) - timedelta(seconds=lease_seconds)
             query = select(WorkerRow).where(WorkerRow.state == "live", WorkerRow.heartbeat_at > since)
             return list(session.scalars(query))
 
     def all(self) -> list[WorkerRow]:
-        """Return every worker that is not forgotten."""
+        """Return every worker that has a row, dead ones too."""
         with self._db.reading() as session:
             return list(session.scalars(select(WorkerRow)))
 
@@ -76,7 +76,7 @@ class WorkerStore:
             return list(session.scalars(select(WorkerRow.id).where(WorkerRow.state == "dead")))
 
     def bury(self, worker_id: str) -> None:
-        """Declare one worker dead: it said good-bye, or its process is known to be gone."""
+        """Declare one worker dead: it has stopped, or its process is known to be gone."""
         with self._db.writing() as session:
             session.execute(update(WorkerRow).where(WorkerRow.id == worker_id).values(state="dead"))
 
@@ -93,6 +93,6 @@ class WorkerStore:
             return list(session.scalars(query))
 
     def forget_garbage(self, prefix: str) -> None:
-        """Say that the blobs of a prefix are gone."""
+        """Record that the blobs of a prefix are deleted."""
         with self._db.writing() as session:
             session.execute(delete(GarbageRow).where(GarbageRow.prefix == prefix))

@@ -1,4 +1,4 @@
-"""Who may ask: keys, signed-in browsers, and answers that were given already. See `app.store.tables`."""
+"""Access: keys, browser sessions, and stored answers by Idempotency-Key. See `app.store.tables`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from app.store.tables import Base
 
 
 class KeyRow(Base):
-    """One key of an owner; what it consists of is nowhere, only its hash."""
+    """One key of an owner; only its hash is stored."""
 
     __tablename__ = "api_key"
     __table_args__ = (Index("ix_api_key_owner_id", "owner_id"),)
@@ -23,7 +23,7 @@ class KeyRow(Base):
     key_hash: Mapped[str] = mapped_column(String(200), unique=True)
     label: Mapped[str | None]
     scopes: Mapped[str] = mapped_column(String(60))
-    """Words of `app.access.keys.SCOPES`, by blanks."""
+    """Words of `app.access.keys.SCOPES`, separated by spaces."""
 
     created_at: Mapped[datetime]
     last_used_at: Mapped[datetime | None]
@@ -43,7 +43,7 @@ class SessionRow(Base):
 
 
 class IdempotencyRow(Base):
-    """What was answered to a request that may be sent again."""
+    """The answer to a request that may be sent again."""
 
     __tablename__ = "idempotency_key"
     __table_args__ = (Index("ix_idempotency_key_created_at", "created_at"),)
@@ -57,6 +57,6 @@ class IdempotencyRow(Base):
     location: Mapped[str | None]
     response: Mapped[dict[str, Any] | None]
     resource: Mapped[str | None] = mapped_column(String(40))
-    """What the answer speaks of; it goes with that."""
+    """The photo that the answer describes; both are deleted together."""
 
     created_at: Mapped[datetime]

@@ -1,4 +1,4 @@
-"""Owners as a whole: what they may have, what they have, and how all of it goes."""
+"""Owners as a whole: quotas, what they store, export and erasure of all of it."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from app.store.tables import (
 )
 
 AT_ONCE: Final = 50
-"""Photos that one transaction erases, each with some hundred samples: a few milliseconds."""
+"""Photos that one transaction erases (chosen): each with some hundred samples, a few milliseconds."""
 
 REMEMBERED: Final = timedelta(days=1)
-"""How long the emptied row of something deleted stays: nothing that still runs can then mean it."""
+"""How long the emptied row of what was deleted is kept (chosen): no work that refers to it runs so long."""
 
 
 @dataclass(frozen=True, slots=True)
 class Quota:
-    """What an owner may have where that differs from the settings."""
+    """Limits of an owner that differ from the settings; None where they do not."""
 
     stored_bytes: int | None = None
     photos: int | None = None
@@ -44,7 +44,7 @@ class Quota:
 
 @dataclass(frozen=True, slots=True)
 class Holdings:
-    """What an owner has."""
+    """How much an owner stores."""
 
     photos: int
     stored_bytes: int
@@ -60,69 +60,72 @@ class AccountStore:
         self._db = database
 
     def quota_of(self, owner: str) -> Quota:
-        """Return what an owner may have."""
+        """Return the limits of an owner."""
         query = select(OwnerRow.quota_bytes, OwnerRow.quota_photos).where(OwnerRow.name == owner)
         with self._db.reading() as session:
             row = session.execute(query).one_or_none()
             return Quota() if row is None else Quota(row[0], row[1])
 
     def holdings_of(self, owner: str) -> Holdings:
-        """Count what an owner has."""
+        """Return how much an owner stores."""
         with self._db.reading() as session:
-            found = session.scalar(select(OwnerRow).where(OwnerRow.name == owner))
-            if found is None:
+            row = session.scalar(select(OwnerRow).where(OwnerRow.name == owner))
+            if row is None:
                 return Holdings(0, 0, 0, 0, None)
-            mine = (PhotoRow.owner_id == found.id) & PhotoRow.deleted_at.is_(None)
+            photo = (PhotoRow.owner_id == row.id) & PhotoRow.deleted_at.is_(None)
             kept = func.sum(PhotoRow.byte_size).filter(PhotoRow.file_gone_at.is_(None))
             photos, stored = session.execute(
-                select(func.count(), func.coalesce(kept, 0)).select_from(PhotoRow).where(mine)
+                select(func.count(), func.coalesce(kept, 0)).select_from(PhotoRow).where(photo)
             ).one()
-            lens = (LensRow.owner_id == found.id) & LensRow.deleted_at.is_(None)
+            lens = (LensRow.owner_id == row.id) & LensRow.deleted_at.is_(None)
             return Holdings(
                 photos,
                 int(stored),
                 _count(session, LensRow, lens),
-                _count(session, CorrectionRow, CorrectionRow.owner_id == found.id),
-                found.created_at,
+                _count(session, CorrectionRow, CorrectionRow.owner_id == row.id),
+                row.created_at,
             )
 
-    # --- all of it, to take away --------------------------------------------------------------
+    # --- export ---------------------------------------------------------------------------------
 
     def rows(self, table: type[Base], owner: str, *, at_once: int = 200) -> Iterator[dict[str, Any]]:
-        """Yield the rows of an owner, a few at a time: photos, lenses, and what hangs on them."""
+        """Yield the rows of an owner, a few at a time: photos, lenses, and what belongs to them."""
         cells: Table = table.__table__  # type: ignore[assignment]  # of a declared table it is one
         last = 0
         while True:
             with self._db.reading() as session:
                 key = owner_id(session, owner)
                 query = select(cells).where(cells.c.id > last, _of_owner(table, key or 0))
-                found = session.execute(query.order_by(cells.c.id).limit(at_once)).mappings().all()
-            if not found:
+                page = session.execute(query.order_by(cells.c.id).limit(at_once)).mappings().all()
+            if not page:
                 return
-            last = found[-1]["id"]
-            yield from (dict(row) for row in found)
+            last = page[-1]["id"]
+            yield from (dict(row) for row in page)
 
-    # --- all of it, to erase ------------------------------------------------------------------
+    # --- erasure --------------------------------------------------------------------------------
 
     def begin_erasing(self, owner: str) -> int | None:
-        """Take an owner's keys and name, before what is his is erased. None if there is no such owner."""
+        """Remove the name and keys of an owner whose data are to be erased; return the row's key.
+
+        None if there is no such owner.
+        """
         with self._db.writing(durable=True) as session:
-            found = session.scalar(select(OwnerRow).where(OwnerRow.name == owner).with_for_update())
-            if found is None:
+            row = session.scalar(select(OwnerRow).where(OwnerRow.name == owner).with_for_update())
+            if row is None:
                 return None
-            found.name, found.erased_at = f"erased|{new_id()}", now()
-            mine = select(KeyRow.id).where(KeyRow.owner_id == found.id)
-            session.execute(delete(SessionRow).where(SessionRow.key_id.in_(mine)))
+            row.name, row.erased_at = f"erased|{new_id()}", now()
+            keys = select(KeyRow.id).where(KeyRow.owner_id == row.id)
+            session.execute(delete(SessionRow).where(SessionRow.key_id.in_(keys)))
             session.execute(
                 update(KeyRow)
-                .where(KeyRow.owner_id == found.id, KeyRow.revoked_at.is_(None))
+                .where(KeyRow.owner_id == row.id, KeyRow.revoked_at.is_(None))
                 .values(revoked_at=now())
             )
-            session.execute(delete(IdempotencyRow).where(IdempotencyRow.owner_id == found.id))
-            return found.id
+            session.execute(delete(IdempotencyRow).where(IdempotencyRow.owner_id == row.id))
+            return row.id
 
     def to_erase(self) -> list[int]:
-        """Return the owners of whom something is left though they asked that all be erased."""
+        """Return the owners whose erasure has begun and is not complete."""
         with self._db.reading() as session:
             return list(session.scalars(select(OwnerRow.id).where(OwnerRow.erased_at.is_not(None))))
 
@@ -193,7 +196,7 @@ def _erase_photos(session: Session, photos: list[PhotoRow]) -> list[str]:
 
 
 def _garbage(session: Session, prefixes: list[str]) -> list[str]:
-    """Have blobs deleted again later: a worker may be writing one more."""
+    """Have blobs deleted once more later: a worker may be writing another one."""
     due = now() + LATE
     insert_new(session, GarbageRow, [{"prefix": prefix, "not_before": due} for prefix in prefixes])
     return prefixes

@@ -1,4 +1,4 @@
-"""Answers that were given already: the same request, sent again, is not done again."""
+"""Answers by Idempotency-Key: the same request, sent again, is not carried out again."""
 
 from __future__ import annotations
 
@@ -16,14 +16,16 @@ from app.store.database import Database, insert_new
 from app.store.tables import PhotoRow
 
 KEEP: Final = timedelta(hours=24)
+"""How long an answer is kept (chosen): a client that tries again does so within minutes."""
+
 LOST: Final = timedelta(seconds=60)
-"""What is not answered after this time never will be: its process was killed. Answers take far less, since
-bodies have arrived before one begins."""
+"""A request without an answer after this time will get none: its process was killed (chosen). Answers take
+far less, since the body has arrived before one begins."""
 
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """An answer that was given."""
+    """A stored answer."""
 
     status: int
     location: str | None
@@ -37,7 +39,7 @@ class IdempotencyStore:
         self._db = database
 
     def begin(self, owner: str, key: str, request_hash: str) -> Given | None:
-        """Take up a request; return what was answered to it before, None if it is to be done now.
+        """Begin a request; return its stored answer, None if it is to be carried out now.
 
         Raises
         ------
@@ -62,7 +64,7 @@ class IdempotencyStore:
             )
             if insert_new(session, IdempotencyRow, [fresh]):
                 return None
-            row = session.scalars(_one(owner_key, key).with_for_update()).one()
+            row = session.scalars(_of_key(owner_key, key).with_for_update()).one()
             if row.request_hash != request_hash:
                 raise InvalidParameterError(
                     f"Idempotency-Key {key[:60]!r} came with another request before: use a new one for each"
@@ -78,13 +80,13 @@ class IdempotencyStore:
             return None
 
     def finish(self, owner: str, key: str, given: Given, resource: str | None) -> None:
-        """Keep an answer."""
+        """Store an answer."""
         self._change(
             owner, key, status=given.status, location=given.location, response=given.body, resource=resource
         )
 
     def forget(self, owner: str, key: str) -> None:
-        """Say that a request was refused: it may be sent again."""
+        """Remove a request that was refused: it may be sent again."""
         with self._db.writing() as session:
             session.execute(
                 delete(IdempotencyRow).where(
@@ -100,13 +102,13 @@ class IdempotencyStore:
             session.execute(update(IdempotencyRow).where(mine, IdempotencyRow.key == key).values(**values))
 
     def tidy(self) -> None:
-        """Forget what nobody will send again."""
+        """Delete answers older than `KEEP`."""
         with self._db.writing() as session:
             session.execute(delete(IdempotencyRow).where(IdempotencyRow.created_at < now() - KEEP))
 
 
 def forget_answers(session: Session, photo: PhotoRow) -> None:
-    """Forget the answers that speak of a photo."""
+    """Delete the answers that describe a photo."""
     session.execute(
         delete(IdempotencyRow).where(
             IdempotencyRow.owner_id == photo.owner_id, IdempotencyRow.resource == photo.public_id
@@ -114,5 +116,5 @@ def forget_answers(session: Session, photo: PhotoRow) -> None:
     )
 
 
-def _one(owner_key: int, key: str) -> Any:  # noqa: ANN401 - a select, whose type says nothing more
+def _of_key(owner_key: int, key: str) -> Any:  # noqa: ANN401 - a select, whose type says nothing more
     return select(IdempotencyRow).where(IdempotencyRow.owner_id == owner_key, IdempotencyRow.key == key)

@@ -1,4 +1,4 @@
-"""Keys and sessions as rows: made, found, ended."""
+"""Keys and sessions as rows: create, look up, end."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from app.store.access.owners import ensure_owner, now
 from app.store.database import Database
 from app.store.tables import OwnerRow
 
-USED: Final = timedelta(minutes=10)
-"""How exactly it is noted when a key was used: each note is a write."""
+USE_PRECISION: Final = timedelta(minutes=10)
+"""Precision of `last_used_at` (chosen): each update is a write."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,43 +57,43 @@ class KeyStore:
         quota_bytes: int | None = None,
         quota_photos: int | None = None,
     ) -> NewKey:
-        """Make a key for an owner, who is made too if he is new; quotas that are given replace his."""
-        made = keys.make()
+        """Create a key for an owner, and the owner if new; quotas that are given replace the present ones."""
+        key = keys.make()
         with self._db.writing(durable=True) as session:
             owner_key = ensure_owner(session, owner)
             quotas = {"quota_bytes": quota_bytes, "quota_photos": quota_photos}
             given = {name: value for name, value in quotas.items() if value is not None}
             if given:
                 session.execute(update(OwnerRow).where(OwnerRow.id == owner_key).values(**given))
-            _add(session, owner_key, made, " ".join(scopes), label, lasts)
-        return made
+            _add(session, owner_key, key, " ".join(scopes), label, lasts)
+        return key
 
     def rotate(self, prefix: str, *, keep: timedelta) -> NewKey | None:
-        """Make a key in place of another: same owner, scopes and span; the old one ends after `keep`.
+        """Create a key in place of another: same owner, scopes and span; the old one ends after `keep`.
 
         None if there is no such key, or it is no longer valid.
         """
-        made = keys.make()
+        key = keys.make()
         with self._db.writing(durable=True) as session:
             old = session.scalar(select(KeyRow).where(KeyRow.prefix == prefix, _valid()).with_for_update())
             if old is None:
                 return None
             lasts = None if old.expires_at is None else old.expires_at - old.created_at
-            _add(session, old.owner_id, made, old.scopes, old.label, lasts)
+            _add(session, old.owner_id, key, old.scopes, old.label, lasts)
             ends = now() + keep
             if keep <= timedelta(0):
                 _end(session, old)
             elif old.expires_at is None or old.expires_at > ends:
                 old.expires_at = ends
-        return made
+        return key
 
     def revoke(self, prefix: str) -> bool:
         """End a key and all sessions that began with it; False if there is no such key."""
         with self._db.writing(durable=True) as session:
-            found = session.scalar(select(KeyRow).where(KeyRow.prefix == prefix).with_for_update())
-            if found is None:
+            key = session.scalar(select(KeyRow).where(KeyRow.prefix == prefix).with_for_update())
+            if key is None:
                 return False
-            _end(session, found)
+            _end(session, key)
             return True
 
     def listed(self, owner: str | None = None) -> list[Listed]:
@@ -105,7 +105,7 @@ class KeyStore:
             return [Listed(row[0], row[1]) for row in session.execute(query.order_by(KeyRow.id))]
 
     def any_made(self) -> bool:
-        """Say whether a key was ever made, be it valid or not."""
+        """Say whether a key was ever created, valid or not."""
         with self._db.reading() as session:
             return session.scalar(select(KeyRow.id).limit(1)) is not None
 
@@ -123,7 +123,7 @@ class KeyStore:
         return self._holder(_holders().where(KeyRow.key_hash == key_hash))
 
     def by_session(self, token_hash: str) -> Holder | None:
-        """Return the valid key with which a browser signed in that is still so."""
+        """Return the valid key of a browser session that has not ended."""
         query = _holders().join(SessionRow, SessionRow.key_id == KeyRow.id)
         return self._holder(query.where(SessionRow.token_hash == token_hash, SessionRow.expires_at > now()))
 
@@ -137,14 +137,14 @@ class KeyStore:
         return Holder(key.id, key.key_hash, owner, scopes, key.expires_at, key.last_used_at)
 
     def note_use(self, holder: Holder) -> None:
-        """Note that a key is in use, if that was not noted lately."""
-        if holder.last_used_at is not None and now() - holder.last_used_at < USED:
+        """Record the time at which a key is used, to within `USE_PRECISION`."""
+        if holder.last_used_at is not None and now() - holder.last_used_at < USE_PRECISION:
             return
         with self._db.writing() as session:
             session.execute(update(KeyRow).where(KeyRow.id == holder.key_id).values(last_used_at=now()))
 
     def sign_in(self, key_id: int, token_hash: str, lasts: timedelta) -> None:
-        """Begin a session; those that are over are forgotten."""
+        """Begin a session; expired ones are deleted."""
         with self._db.writing() as session:
             session.execute(delete(SessionRow).where(SessionRow.expires_at <= now()))
             session.add(
@@ -170,13 +170,13 @@ def _holders() -> Select[KeyRow, str]:
 
 
 def _add(
-    session: Session, owner_key: int, made: NewKey, scopes: str, label: str | None, lasts: timedelta | None
+    session: Session, owner_key: int, key: NewKey, scopes: str, label: str | None, lasts: timedelta | None
 ) -> None:
     session.add(
         KeyRow(
             owner_id=owner_key,
-            prefix=made.prefix,
-            key_hash=made.key_hash,
+            prefix=key.prefix,
+            key_hash=key.key_hash,
             label=label,
             scopes=scopes,
             created_at=now(),

@@ -1,4 +1,4 @@
-"""Whose rows these are: every question about a user's data goes through here."""
+"""Whose rows these are: every query of a user's data goes through here."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from app.store.database import insert_new
 from app.store.tables import CorrectionRow, LensRow, OwnerRow, PhotoRow
 
 LOCAL: Final = "local"
-"""The one owner of a service that asks nobody who he is."""
+"""The one owner in a service without sign-in."""
 
 Owned = TypeVar("Owned", PhotoRow, LensRow, CorrectionRow)
 
@@ -24,26 +24,26 @@ def now() -> datetime:
 
 
 def owner_id(session: Session, name: str) -> int | None:
-    """Return the key of an owner, None if there is no such."""
+    """Return the key of an owner, None if there is no such owner."""
     return session.scalar(select(OwnerRow.id).where(OwnerRow.name == name))
 
 
 def ensure_owner(session: Session, name: str, *, may_be_new: bool = True) -> int:
-    """Return the key of an owner, made on first sight.
+    """Return the key of an owner, created if new.
 
     Raises
     ------
     NotSignedInError
-        If he is not there and may not be new: he was erased while he asked.
+        If there is no such owner and `may_be_new` is false: the account was erased during the request.
     """
-    found = owner_id(session, name)
-    if found is None:
+    key = owner_id(session, name)
+    if key is None:
         if not may_be_new:
             raise NotSignedInError("this account was erased: nothing is kept of it")
         insert_new(session, OwnerRow, [{"name": name, "created_at": now()}])
-        found = owner_id(session, name)
-    assert found is not None
-    return found
+        key = owner_id(session, name)
+    assert key is not None
+    return key
 
 
 def owned(table: type[Owned], owner: str | None) -> Select[Owned]:
@@ -58,7 +58,7 @@ def owned(table: type[Owned], owner: str | None) -> Select[Owned]:
 
 def find(session: Session, table: type[Owned], public_id: str, owner: str | None) -> Owned | None:
     """Return one row by its public id if it is this owner's."""
-    return None if not is_id(public_id) else session.scalar(_one(table, public_id, owner))
+    return None if not is_id(public_id) else session.scalar(_by_id(table, public_id, owner))
 
 
 def find_to_change(session: Session, table: type[Owned], public_id: str, owner: str | None) -> Owned | None:
@@ -68,7 +68,7 @@ def find_to_change(session: Session, table: type[Owned], public_id: str, owner: 
     """
     if not is_id(public_id):
         return None
-    return session.scalar(_one(table, public_id, owner).with_for_update(of=table))
+    return session.scalar(_by_id(table, public_id, owner).with_for_update(of=table))
 
 
 def is_id(text: str) -> bool:
@@ -76,5 +76,5 @@ def is_id(text: str) -> bool:
     return text.isascii() and text.isalnum()
 
 
-def _one(table: type[Owned], public_id: str, owner: str | None) -> Select[Owned]:
+def _by_id(table: type[Owned], public_id: str, owner: str | None) -> Select[Owned]:
     return owned(table, owner).where(table.public_id == public_id)

@@ -1,1 +1,1 @@
-"""What keeps the tables sound: migrations, invariants, transfer, an operator's questions."""
+"""Upkeep of the tables: migrations, invariants, transfer, an operator's queries."""

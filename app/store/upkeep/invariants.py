@@ -1,7 +1,7 @@
-"""What must hold in the tables at every moment, whatever died when: the same for tests and for operators.
+"""What must hold in the tables at every moment, whichever process dies when; for tests and for operators.
 
-Each check is one question whose answer is the rows that break it; none on a sound installation. Some know
-how to mend what they find, by the same steps as the service itself: a mended lens gets a new version.
+Each check is one query that returns the rows which break it: none on a sound installation. Some can repair
+them by the same steps as the service itself: a repaired lens gets a new version.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _ANSWERING: Final = (
     select(LensRow.answering_way).where(LensRow.id == PhotoRow.lens_id).correlate(PhotoRow).scalar_subquery()
 )
 _COUNTS: Final = and_(PhotoRow.state == "counted", PhotoRow.way == func.coalesce(_ANSWERING, ""), _ALIVE)
-"""What joined its lens; others wait until that has changed its way."""
+"""Photos that have joined their lens; others wait until it has changed its way."""
 
 _RELEARNS: Final = and_(PhotoRow.relearning.is_(True), _ALIVE)
 
@@ -40,15 +40,15 @@ class Invariant:
     Parameters
     ----------
     name : str
-        A word for it.
+        Its name.
     sentence : str
         What holds.
     find : callable
         Returns the public ids of what breaks it.
     mend : callable, optional
-        Puts one of these right, in the transaction of the session.
+        Repairs one of these, in the transaction of the session.
     remedy : str
-        What to do where nothing mends it.
+        What to do where `mend` is not given.
     """
 
     name: str
@@ -66,12 +66,12 @@ def _ids(query: Select[str]) -> Find:
 
 
 def _integrity(session: Session) -> Sequence[str]:
-    """Let SQLite read its whole file; a server checks its own pages."""
+    """Let SQLite check its whole file; a database server checks its own pages."""
     if session.get_bind().dialect.name != "sqlite":
         return []
-    said = [str(row[0]) for row in session.execute(text("PRAGMA integrity_check"))]
+    messages = [str(row[0]) for row in session.execute(text("PRAGMA integrity_check"))]
     foreign = [f"{row[0]} row {row[1]}" for row in session.execute(text("PRAGMA foreign_key_check"))]
-    return [line for line in said if line != "ok"] + foreign
+    return [line for line in messages if line != "ok"] + foreign
 
 
 def _events() -> Select[str]:
@@ -134,7 +134,7 @@ def _joined() -> Select[str]:
 
 
 def _votes() -> Select[str]:
-    """Photos of which a sample counts that must not, or does not count that must."""
+    """Photos with a sample that counts and must not, or that must count and does not."""
     rightly: ColumnElement[bool] = and_(
         SampleRow.lens_id == PhotoRow.lens_id,
         SampleRow.version_added.is_not(None),
@@ -163,12 +163,12 @@ def _vote_anew(session: Session, photo_id: str) -> None:
     photo = session.scalars(select(PhotoRow).where(PhotoRow.public_id == photo_id).with_for_update()).one()
     held = select(SampleRow.lens_id).where(SampleRow.photo_id == photo.id, SampleRow.lens_id.is_not(None))
     for lens_id in sorted({key for key in session.scalars(held.distinct()) if key is not None}):
-        own, photo.lens_id = photo.lens_id, lens_id
+        true_lens_id, photo.lens_id = photo.lens_id, lens_id
         session.flush()
         give_back(session, photo, "photo_removed")
-        photo.lens_id = own
+        photo.lens_id = true_lens_id
         session.flush()
-    if photo.relearning:  # what counted until now does no more
+    if photo.relearning:  # its earlier samples no longer count
         forget_before(session, photo)
     if photo.lens_id is None or photo.deleted_at is not None:
         return
@@ -239,7 +239,7 @@ def _ended() -> Select[str]:
 
 
 def _unsettled() -> Select[str]:
-    """Lenses that could answer in the way that was chosen, and do not."""
+    """Lenses that could answer in the way that was chosen but do not."""
     photo = select(PhotoRow.id).where(PhotoRow.lens_id == LensRow.id, _ALIVE).correlate(LensRow)
     anew = photo.where(PhotoRow.relearning.is_(True), PhotoRow.state.in_(WORKED_ON))
     ready = photo.where(PhotoRow.state == "counted", PhotoRow.way == LensRow.way)
@@ -270,7 +270,7 @@ def _forgotten_lenses() -> Select[str]:
     )
 
 
-def _own_lens() -> Select[str]:
+def _foreign_lens() -> Select[str]:
     return (
         select(PhotoRow.public_id)
         .join(LensRow, LensRow.id == PhotoRow.lens_id)
@@ -278,7 +278,7 @@ def _own_lens() -> Select[str]:
     )
 
 
-def _own_photo() -> Select[str]:
+def _foreign_photo() -> Select[str]:
     return (
         select(CorrectionRow.public_id)
         .join(PhotoRow, PhotoRow.id == CorrectionRow.photo_id)
@@ -298,6 +298,6 @@ INVARIANTS: Final = (
     Invariant("models", "lenses answer with their model as soon as they can", _ids(_unsettled()), _settle),
     Invariant("forgotten photos", "nothing is kept of deleted photos", _ids(_forgotten())),
     Invariant("forgotten lenses", "nothing is kept of deleted lenses", _ids(_forgotten_lenses())),
-    Invariant("owners of lenses", "photos teach lenses of their owner", _ids(_own_lens())),
-    Invariant("owners of photos", "corrections are of photos of their owner", _ids(_own_photo())),
+    Invariant("owners of lenses", "photos teach lenses of their owner", _ids(_foreign_lens())),
+    Invariant("owners of photos", "corrections are of photos of their owner", _ids(_foreign_photo())),
 )

@@ -21,11 +21,11 @@ _LOCK = 0x1E45  # any number that only this program uses
 
 
 def config(connection: Connection | None = None) -> Config:
-    """Return Alembic's configuration for the steps that lie beside this package."""
-    found = Config()
-    found.set_main_option("script_location", str(Path(migrations.__file__).parent).replace("%", "%%"))
-    found.attributes["connection"] = connection
-    return found
+    """Return Alembic's configuration for the steps in `migrations/`."""
+    alembic = Config()
+    alembic.set_main_option("script_location", str(Path(migrations.__file__).parent).replace("%", "%%"))
+    alembic.attributes["connection"] = connection
+    return alembic
 
 
 def head() -> str | None:

@@ -1,4 +1,4 @@
-"""What an operator asks: how much waits and for how long, how much there is."""
+"""Numbers for an operator: jobs that wait and for how long, rows in the tables."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _WAITING: Final = {"photo": "received", "correction": "queued"}
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """What waits and what there is at one moment.
+    """Waiting jobs and numbers of rows at one moment.
 
     Parameters
     ----------
     jobs : mapping of (kind, state) to int
         Unfinished jobs.
     oldest_s : mapping of kind to float
-        Seconds that the oldest job has waited to be begun; 0 where none waits.
+        Seconds for which the oldest job has waited; 0 where none waits.
     garbage : int
         Prefixes of blobs that wait to be deleted.
     rows : mapping of table to int

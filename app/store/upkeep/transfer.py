@@ -1,4 +1,4 @@
-"""All rows of one database into another, empty one: from SQLite to a server, into a backup and out of it."""
+"""Copy all rows of a database into an empty one: from SQLite to a server, into a backup and out of it."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from app.store.upkeep import migrate
 from lensmodel.core.errors import InvalidInputError
 
 AT_ONCE: Final = 200
-"""Rows in one statement; with kernels these are some megabytes."""
+"""Rows in one statement (chosen): with kernels they are some megabytes."""
 
 _OF_PROCESSES: Final = {WorkerRow.__tablename__}
-"""Tables about processes that run elsewhere."""
+"""Tables of running processes, which are not copied."""
 
 
 @contextmanager
 def snapshot(database: Database) -> Iterator[Connection]:
     """Give a connection that sees one moment of all tables, while others go on to write."""
     reader = database.reader
-    if not database.is_sqlite:  # a reading transaction of SQLite is such a moment already
+    if not database.is_sqlite:  # a reading transaction of SQLite is a snapshot already
         reader = reader.execution_options(isolation_level="REPEATABLE READ")
     with reader.begin() as connection:
         yield connection
@@ -70,16 +70,16 @@ def check_schema(database: Database) -> None:
     InvalidInputError
         If not.
     """
-    found, wanted = migrate.current(database), migrate.head()
-    if found != wanted:
+    present, wanted = migrate.current(database), migrate.head()
+    if present != wanted:
         raise InvalidInputError(
-            f"{database.url.render_as_string()} has schema {found}, this program needs {wanted}: "
+            f"{database.url.render_as_string()} has schema {present}, this program needs {wanted}: "
             "start the service of this version on it once"
         )
 
 
 def _tables() -> list[Table]:
-    """Return all tables, those referred to first; nothing in a JSON column stays NULL, and no JSON null."""
+    """Return all tables, referenced ones first; NULL in a JSON column does not become a JSON null."""
     copies = MetaData()
     for table in Base.metadata.sorted_tables:
         for column in table.to_metadata(copies).columns:
@@ -102,7 +102,7 @@ def _copy(source: Connection, target: Connection, table: Table) -> int:
 
 
 def _count_on(connection: Connection, table: Table) -> None:
-    """Let a server's sequence go on behind the keys that were copied."""
+    """Set a server's sequence to continue after the keys that were copied."""
     key, *more = table.primary_key.columns
     if connection.dialect.name != "postgresql" or more:
         return

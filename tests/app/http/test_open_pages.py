@@ -75,7 +75,7 @@ def test_where_changes_are_told_the_tables_are_looked_at_only_then(monkeypatch: 
         return {key: len(looks) for key in keys}
 
     async def run() -> None:
-        watch = Watch(look, every_s=0.001, hears=lambda: True)
+        watch = Watch(look, every_s=0.001, announced=lambda: True)
         with watch.of("a job") as waiting:
             await waiting.changed(3600)  # the first look
             await asyncio.sleep(0.1)

@@ -132,4 +132,4 @@ def test_postgresql_tells_of_changes_by_itself_and_again_after_it_was_away(
         assert hears_of(busy.receive)
     finally:
         notices.stop()
-    assert not notices.hears()
+    assert not notices.connected()

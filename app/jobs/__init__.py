@@ -1,1 +1,1 @@
-"""Durable work: what must be done, by whom, in which child process, and how it ends."""
+"""Durable jobs: the queue, the workers that run them, and their tasks in child processes."""

@@ -1,4 +1,4 @@
-"""What tells camera bodies apart without naming one."""
+"""Digests that distinguish camera bodies without identifying one."""
 
 from __future__ import annotations
 
@@ -11,5 +11,5 @@ def body_key(maker: str | None, model: str | None, serial: str | None) -> str | 
     """Return a digest of a camera's name and serial; None without a serial."""
     if not serial:
         return None
-    said = "|".join((name_key(maker), name_key(model), serial_key(serial)))
-    return hashlib.sha256(said.encode()).hexdigest()[:16]
+    identity = "|".join((name_key(maker), name_key(model), serial_key(serial)))
+    return hashlib.sha256(identity.encode()).hexdigest()[:16]

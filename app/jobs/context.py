@@ -1,4 +1,4 @@
-"""What every job works with: the tables, the blobs, the sandbox, and the rules of trying again."""
+"""What every job uses: the tables, the blobs, the sandbox, and the rules for retries."""
 
 from __future__ import annotations
 
@@ -36,15 +36,17 @@ from lensmodel.core.types import ignore_step
 log = logging.getLogger(__name__)
 
 CRASHES: Final = 3
-"""A child that dies by a signal so often is not started again."""
+"""Deaths of a child by a signal before its job fails (chosen): more would not help, one may be chance."""
 
 BACKOFF_S: Final = 0.5
+"""Seconds before the second attempt, four times as long before each further one (chosen)."""
+
 SPARE_MB: Final = 768
-"""Address space of a task besides its picture."""
+"""Address space in MiB of a task besides its picture (chosen, not measured)."""
 
 
 class JobFailedError(Exception):
-    """A job cannot be done, whatever is tried: a fixed code and a sentence for its owner."""
+    """A job cannot be done, and a retry would not help: a fixed code and a sentence for its owner."""
 
     def __init__(self, code: str, detail: str) -> None:
         super().__init__(detail)
@@ -82,10 +84,10 @@ class Workbench:
         compiles: bool = False,
         on_progress: Progress = ignore_step,
     ) -> Any:  # noqa: ANN401 - JSON of any shape
-        """Run a task; try again where that can help; return what it returned.
+        """Run a task, with retries where they can help; return its result.
 
-        A death by signal is tried again after a pause, too little memory once with twice as
-        much. Whatever the library refused with a reason would be refused again.
+        After a death by signal the task is retried after a pause, after too little memory once with twice
+        as much. What the library refuses with a reason would be refused again.
 
         Raises
         ------
@@ -94,7 +96,7 @@ class Workbench:
         JobFailedError
             If the task cannot be done.
         OutageError
-            If the machine could not do it: no room, or no memory.
+            If the machine lacks disk space or memory.
         """
         wanted = _patient(wanted)
         crashes = 0
@@ -117,9 +119,9 @@ class Workbench:
                 self._give_way()
             if outcome.ending == "outage":
                 raise OutageError(f"task {task}: {outcome.detail}")
-            twice = min(2 * limits.memory_mb, self.sandbox.budget.memory_mb)
-            if outcome.ending == "memory_limit" and not enlarged and twice > limits.memory_mb:
-                enlarged, limits = True, limits.with_memory(twice)
+            doubled_mb = min(2 * limits.memory_mb, self.sandbox.budget.memory_mb)
+            if outcome.ending == "memory_limit" and not enlarged and doubled_mb > limits.memory_mb:
+                enlarged, limits = True, limits.with_memory(doubled_mb)
             elif outcome.code == "crashed":
                 crashes += 1
                 self._pause_after(outcome, task, crashes, wanted)
@@ -138,10 +140,10 @@ class Workbench:
             time.sleep(0.05)
 
     def _give_way(self) -> NoReturn:
-        """Leave a job: for good if nobody wants it, else until another worker takes it up.
+        """Leave a job: for good if it was cancelled, else until another worker takes it over.
 
-        While this process shuts down the job must not seem finished to the engine, so its
-        thread stays here until the process is gone.
+        While this process shuts down the job must not look finished to the engine, so its
+        thread waits here until the process ends.
         """
         while self.sandbox.stopping:
             time.sleep(1.0)
@@ -155,7 +157,7 @@ class Workbench:
 
     @contextmanager
     def original(self, photo: PhotoRow) -> Iterator[Path]:
-        """Give the file of a photo."""
+        """Provide the file of a photo."""
         with self.sandbox.folder() as folder:
             try:
                 # another account reads a copy, not the blob
@@ -167,7 +169,7 @@ class Workbench:
                 raise JobFailedError("unknown_photo", text) from error
 
     def developed_folder(self, photo_id: str) -> Path:
-        """Return where the developed photo lies, or shall lie: a cache of this machine."""
+        """Return the folder of the developed photo, in a cache of this machine."""
         return self.settings.data_dir.resolve() / "developed" / photo_id
 
     def developed(self, photo: PhotoRow, wanted: Callable[[], bool]) -> Path:
@@ -175,7 +177,7 @@ class Workbench:
         target = self.developed_folder(photo.public_id)
         with self._locks[photo.public_id]:
             if (target / "planes.npy").is_file():
-                (target / "planes.npy").touch()  # the cache drops what was not used for long
+                (target / "planes.npy").touch()  # the cache drops the least recently used
                 return target
             target.parent.mkdir(parents=True, exist_ok=True)
             limits = self.limits(photo, self.settings.develop_seconds, 120)
@@ -186,12 +188,12 @@ class Workbench:
                     if (folder / name).is_file():
                         self.storage.put_file(f"{folder_of(photo)}{name}", folder / name)
                 shutil.rmtree(target, ignore_errors=True)
-                folder.rename(target)  # complete or not there
+                folder.rename(target)  # complete, or absent
             return target
 
 
 def _patient(wanted: Callable[[], bool]) -> Callable[[], bool]:
-    """Ask on while the database is away: hours of work are not thrown away for a restart of it."""
+    """Treat the job as wanted while the database is away: its restart must not discard hours of work."""
 
     def ask() -> bool:
         try:

@@ -1,4 +1,4 @@
-"""Corrections, and the measuring of lens models."""
+"""Jobs of corrections, and of measuring lens models."""
 
 from __future__ import annotations
 
@@ -39,9 +39,12 @@ MEDIA_TYPE: Final = {
     ".jpg": "image/jpeg",
     ".dng": "image/x-adobe-dng",
 }
-TELL_S: Final = 0.5
+PROGRESS_S: Final = 0.5
+"""Seconds between two writes of the progress (chosen): each is a transaction."""
+
 THREAD_MB: Final = 136
-"""Address space that a thread reserves for its stack and its heap, most of it never touched."""
+"""Address space in MiB that a thread reserves: 8 of stack and 128 that glibc maps for the heap of an arena,
+most of it never touched."""
 
 
 class CorrectionWork:
@@ -83,7 +86,8 @@ class CorrectionWork:
         )
         arguments: dict[str, Any] = {
             "developed": str(developed),
-            "settings": params.get("settings") or settings_of(photo),  # those of the moment of the wish
+            "settings": params.get("settings")
+            or settings_of(photo),  # as they were when the correction was requested
             "lateral": photo.lateral,
             "method": params["method"],
             "strength": params["strength"],
@@ -109,16 +113,16 @@ class CorrectionWork:
                 wanted=wanted,
                 reads=[developed],
                 compiles=True,
-                on_progress=self._teller(key),
+                on_progress=self._progress_of(key),
             )
             if not known and self._is_newest(lens_id, version):
                 self._keep_learned(lens_id, version, state, folder / LEARNED)
             report = done["report"] | ({"family": {"lenses": leaning}} if leaning else {})
-            self._hand_in(plan, folder / Path(done["file"]).name, report)
+            self._store_result(plan, folder / Path(done["file"]).name, report)
 
-    def _family(self, listed: list[dict[str, Any]], folder: Path) -> int:
-        """Hand over what other copies of the lens say; return how many of them still say something."""
-        family = [Relative(one["lens_id"], LensState(**one["state"])) for one in listed]
+    def _family(self, relatives: list[dict[str, Any]], folder: Path) -> int:
+        """Pass the samples of other copies of the lens to the task; return the number of copies."""
+        family = [Relative(entry["lens_id"], LensState(**entry["state"])) for entry in relatives]
         stored = self._bench.store.samples.of_family(family)
         if not stored:
             return 0
@@ -133,23 +137,23 @@ class CorrectionWork:
             raise JobFailedError("no_samples", text)
         write_samples(folder, stored)
         key = learned_key(lens_id, version, state.rebuild_epoch)
-        with suppress(FileNotFoundError):  # not learned yet: the task does it
+        with suppress(FileNotFoundError):  # not fitted yet: the task does it
             (folder / LEARNED).write_bytes(self._bench.storage.get(key))
         return state
 
-    def _teller(self, correction_id: str) -> Progress:
+    def _progress_of(self, correction_id: str) -> Progress:
         last = 0.0
 
         def tell(done: int, total: int) -> None:
             nonlocal last
-            if time.monotonic() - last > TELL_S or done == total:
+            if time.monotonic() - last > PROGRESS_S or done == total:
                 last = time.monotonic()
                 with missable():
                     self._corrections.progress(correction_id, done, total)
 
         return tell
 
-    def _hand_in(self, plan: CorrectionPlan, path: Path, report: dict[str, Any]) -> None:
+    def _store_result(self, plan: CorrectionPlan, path: Path, report: dict[str, Any]) -> None:
         if path.suffix != SUFFIX[plan.correction.params["output"]["format"]] or not path.is_file():
             raise JobFailedError("internal_error", "the correction wrote no file; retry, or report the photo")
         with path.open("rb") as file:
@@ -174,13 +178,13 @@ class CorrectionWork:
     def _drop_unless_done(self, correction: CorrectionRow) -> None:
         """Delete the files of a correction that was cancelled or deleted while they were stored."""
         row = self._corrections.get(correction.public_id)
-        if row is None or row.state != "succeeded":  # another worker may have handed it in
+        if row is None or row.state != "succeeded":  # another worker may have finished it
             self._bench.storage.delete(folder_of(correction))
 
     def measure(self, lens_id: str, version: int, _again: int = 0) -> None:
-        """Measure how well one version of a lens predicts photos that it was not shown, and test the lens.
+        """Measure how well one version of a lens predicts held-out photos, and write its report.
 
-        Again, for the sake of its report, it leaves the figures that were measured first.
+        When repeated for a missing report it keeps the figures that were measured first.
         """
         lenses = self._bench.store.lenses
 
@@ -208,7 +212,7 @@ class CorrectionWork:
     def _report(
         self, lens_id: str, key: str, model: dict[str, str], folder: Path, wanted: Callable[[], bool]
     ) -> None:
-        """Test the lens whose samples lie in a folder; a version is measured without a report too."""
+        """Write the report of the lens whose samples lie in a folder; a failure is only logged."""
         settings = self._bench.settings
         limits = Limits(memory_mb=2 * SPARE_MB, wall_s=settings.correct_seconds)
         arguments = {"model": model, "about": self._about(lens_id)}
@@ -221,27 +225,27 @@ class CorrectionWork:
             log.warning("lens %s has no report: %s", lens_id, error)
 
     def _about(self, lens_id: str) -> dict[str, Any]:
-        """Return what the samples of a lens do not say of it: its name, the shape of its photos."""
+        """Return what the report needs besides the samples: name, shape of the photos, lateral colour."""
         lenses = self._bench.store.lenses
         lens = lenses.get(lens_id)
         if lens is None:
             raise NotWantedError
-        named = " ".join(word for word in (lens.maker, lens.model) if word)
+        full_name = " ".join(word for word in (lens.maker, lens.model) if word)
         height, width = lenses.shape_of(lens) or (2, 3)
         return {
-            "name": lens.label or named or "Unnamed lens",
+            "name": lens.label or full_name or "Unnamed lens",
             "aspect": width / height,
             "height_px": height if height > 2 else None,
             "lateral": lenses.lateral_of(lens),
         }
 
     def _is_newest(self, lens_id: str, version: int) -> bool:
-        """Whether a version counts; what was learned of an earlier one has been deleted."""
+        """Whether a version is the current one; fitted models of earlier ones have been deleted."""
         lens = self._bench.store.lenses.get(lens_id)
         return lens is not None and lens.version == version
 
     def _keep_learned(self, lens_id: str, version: int, state: LensState, path: Path) -> None:
-        """Keep what was learned of the newest version for every process that answers questions."""
+        """Store the fitted model of the newest version for all processes that answer requests."""
         if path.is_file():
             key = learned_key(lens_id, version, state.rebuild_epoch)
             self._bench.storage.put_file(key, path)
@@ -253,8 +257,8 @@ def _bounds(params: dict[str, Any]) -> dict[str, float]:
 
 def _description(plan: CorrectionPlan) -> str:
     params = plan.correction.params
-    named = " ".join(word for word in (plan.lens.maker, plan.lens.model) if word)
-    lens = plan.lens.label or named or "unknown lens"
+    full_name = " ".join(word for word in (plan.lens.maker, plan.lens.model) if word)
+    lens = plan.lens.label or full_name or "unknown lens"
     return (
         f"lens blur corrected by lensmodel: {lens}, version {plan.correction.lens_version}, "
         f"method {params['method']}, strength {params['strength']:g}"

@@ -1,4 +1,4 @@
-"""Developed photos are kept on disk while their photos are worked on, and no longer."""
+"""The cache of developed photos on disk, bounded in size."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ from pathlib import Path
 from typing import Final
 
 KEEP_BYTES: Final = 20 << 30
+"""Size of the cache at most (chosen), or half of the free disk if that is less."""
 
 
 def drop_developed(base: Path, existing: Callable[[Iterable[str]], set[str]], idle_s: float) -> None:
-    """Bound the cache in `base`; developed photos that do not exist any more go first.
+    """Bound the cache in `base`; developed photos whose photo was deleted are removed first.
 
     Parameters
     ----------
     base : Path
         A folder for each photo.
     existing : callable
-        Says which of some photos exist.
+        Returns which of some photos exist.
     idle_s : float
         Folders used within so many seconds may be in use.
     """

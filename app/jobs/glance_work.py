@@ -1,4 +1,4 @@
-"""The small picture of a photo that is not developed yet."""
+"""The small picture of a photo that has not been developed yet."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from app.store.tables import PhotoRow
 def keep_glance(
     bench: Workbench, photo: PhotoRow, info: dict[str, Any], path: Path, wanted: Callable[[], bool]
 ) -> None:
-    """Keep the photo at `path` in small; one that cannot be shown goes on without."""
+    """Store a small picture of the photo at `path`; none where it cannot be rendered."""
     limits = Limits(memory_mb=2 * SPARE_MB, wall_s=bench.settings.inspect_seconds)
     arguments = {"path": str(path), "kind": info["kind"], "orientation": info["metadata"]["orientation"]}
     with bench.sandbox.folder() as folder:

@@ -1,4 +1,4 @@
-"""Of each job: which log lines are its, how long it took, how it ended."""
+"""Logging and metrics of each job: its ids in the log lines, its duration, how it ended."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ _SUBJECT: Final = {
 
 @dataclass
 class Account:
-    """What became of one job."""
+    """Kind and ending of one job."""
 
     kind: str
     ending: str = "done"
 
     def retries(self, error: BaseException) -> None:
-        """Say that the job is tried again after an error."""
+        """Count a retry of the job after an error."""
         metrics.RETRIES.labels(self.kind, "outage" if is_outage(error) else "unforeseen").inc()
 
 
 @contextmanager
 def accounted(kind: str, arguments: Sequence[str | int]) -> Iterator[Account]:
-    """Give the account of a job; inside, each log line names the job and what it is about."""
+    """Provide the account of a job; inside, each log line carries the ids of the job and its subject."""
     account = Account(kind)
     ids = {"job_id": "/".join([kind, *map(str, arguments)])}
     if kind in _SUBJECT:

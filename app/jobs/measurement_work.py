@@ -1,4 +1,4 @@
-"""The way of a photo made to measure a lens: one task, whose places and kernels are checked and kept."""
+"""Photos that were made to measure a lens: one task, whose positions and kernels are checked and stored."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from lensmodel.core.errors import InvalidInputError, InvalidKernelError
 from lensmodel.core.psf import as_kernel
 from lensmodel.core.types import CHANNELS, FieldPosition
 
-MOST_PLACES: Final = 1000
-"""More places than any way of measuring has cells; a child that names more is broken."""
+MAX_PLACES: Final = 1000
+"""Most places of a measurement (chosen): no method has so many cells, a child that returns more is broken."""
 
 WAIT_S: Final = 60.0
-"""How long a pair waits for its closed photo to be looked at."""
+"""How long the open photo of a pair waits until the closed one is inspected (chosen)."""
 
 _UNREAD: Final = ("received", "inspecting")
-_BYTES_A_PIXEL: Final = 96  # two photos mapped, one plane of each in doubles, and what is made of them
+_BYTES_A_PIXEL: Final = 96  # chosen, not measured: two mapped photos, a float64 plane of each, intermediates
 
 
 class MeasurementWork:
@@ -38,12 +38,12 @@ class MeasurementWork:
     def measure(self, photo: PhotoRow, developed: Path, wanted: Callable[[], bool]) -> None:
         """Measure the PSF all over a photo and store it as patches with samples.
 
-        A repeated call finds what is there, and adds nothing twice.
+        A repeated call adds nothing twice.
 
         Raises
         ------
         JobFailedError
-            If the photo cannot be measured, or the child answered nonsense.
+            If the photo cannot be measured, or the result of the child is invalid.
         """
         folders = [developed, *self._reference(photo, wanted)]
         settings = self._bench.settings
@@ -87,17 +87,17 @@ class MeasurementWork:
 
 
 def _checked(listed: Any, folder: Path) -> tuple[list[NewPatch], list[NewSample]]:  # noqa: ANN401 - a child's JSON
-    """Check what a child measured as if a stranger had sent it."""
+    """Validate the measurements of a child as untrusted input."""
     try:
         kernels = np.load(folder / KERNELS, allow_pickle=False, mmap_mode="r")
-        if not 0 < len(listed) == len(kernels) <= MOST_PLACES * len(CHANNELS):
+        if not 0 < len(listed) == len(kernels) <= MAX_PLACES * len(CHANNELS):
             raise InvalidInputError(f"{len(listed)} samples and {len(kernels)} kernels")
         patches: dict[int, NewPatch] = {}
         samples = []
         for kernel, entry in zip(kernels, listed, strict=True):
             position = FieldPosition(float(entry["r"]), float(entry["phi"]))
             number, channel, error = int(entry["idx"]), entry["channel"], float(entry["error"])
-            if channel not in CHANNELS or not 0.0 <= error <= 1.0 or not 0 <= number < MOST_PLACES:
+            if channel not in CHANNELS or not 0.0 <= error <= 1.0 or not 0 <= number < MAX_PLACES:
                 raise InvalidInputError(f"a sample of channel {channel!r} with error {error}")
             patches.setdefault(
                 number,
@@ -124,7 +124,7 @@ def _checked(listed: Any, folder: Path) -> tuple[list[NewPatch], list[NewSample]
             )
     except (
         *(InvalidKernelError, InvalidInputError, OSError),
-        *(ValueError, TypeError, LookupError),  # not the JSON that was agreed on
+        *(ValueError, TypeError, LookupError),  # not the expected JSON
     ) as error:
         raise JobFailedError("internal_error", f"the measurement gave no kernels: {error}") from error
     return list(patches.values()), samples

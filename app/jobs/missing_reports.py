@@ -1,4 +1,4 @@
-"""Reports for lenses that were measured before there were reports, or whose report was lost."""
+"""Reports for lenses that were measured before reports existed, or whose report was lost."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from app.store.versions import LEARNED_ROOT, report_key
 log = logging.getLogger(__name__)
 
 AGAIN: Final = 1
-"""Makes the job another one than that which measured the version first: a job that ended is not run again."""
+"""Argument that makes this a new job: the one that measured the version has ended and is not run again."""
 
 
 def ask_for_reports(store: Store, storage: Storage, engine: JobEngine) -> int:
-    """Ask for the report of each lens whose newest version was measured and has none; return how many."""
-    there = {key for key, _ in storage.listed(LEARNED_ROOT)}
-    asked = 0
+    """Enqueue the report of each lens whose newest version was measured and has none; return how many."""
+    stored = {key for key, _ in storage.listed(LEARNED_ROOT)}
+    enqueued = 0
     for lens_id, version, epoch in store.lenses.measured():
-        if report_key(lens_id, version, epoch) not in there:
+        if report_key(lens_id, version, epoch) not in stored:
             engine.enqueue(Job("measure", (lens_id, version, AGAIN)))
-            asked += 1
-    if asked:
-        log.info("%d lenses have no report yet: asked for", asked)
-    return asked
+            enqueued += 1
+    if enqueued:
+        log.info("%d lenses have no report yet: asked for", enqueued)
+    return enqueued

@@ -1,4 +1,4 @@
-"""The patches of a photo between rows, tasks and the library."""
+"""Conversion of patches between rows, tasks and the library."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from lensmodel.core.types import FieldPosition
 from lensmodel.estimation.patches import Patch
 
 
-def plan_of(found: dict[str, Any]) -> list[NewPatch]:
-    """Return what the task `select` found, as rows to be."""
+def plan_of(selection: dict[str, Any]) -> list[NewPatch]:
+    """Return the patches and windows of the task `select` as rows to insert."""
     chosen = [
         NewPatch(
             idx=number,
@@ -24,7 +24,7 @@ def plan_of(found: dict[str, Any]) -> list[NewPatch]:
             cell=patch["cell"],
             score=patch["score"],
         )
-        for number, patch in enumerate(found["patches"])
+        for number, patch in enumerate(selection["patches"])
     ]
     rejected = [
         NewPatch(
@@ -36,13 +36,13 @@ def plan_of(found: dict[str, Any]) -> list[NewPatch]:
             phi=window["phi"],
             rejected=window["reason"],
         )
-        for number, window in enumerate(found["rejected"])
+        for number, window in enumerate(selection["rejected"])
     ]
     return chosen + rejected
 
 
 def described(row: PatchRow) -> dict[str, Any]:
-    """Return a patch as tasks read it."""
+    """Return a patch as JSON for a task."""
     place = {"r": row.r, "phi": row.phi}
     score = row.score or 0.0
     return {
@@ -56,12 +56,12 @@ def described(row: PatchRow) -> dict[str, Any]:
 
 
 def patch_of(row: PatchRow) -> Patch:
-    """Return a patch as the library has it."""
+    """Return a patch as a value of the library."""
     return Patch(row.row, row.col, row.size, FieldPosition(row.r, row.phi), row.score or 0.0, row.cell or 0)
 
 
 def why_not(tried: list[PatchRow], good: int) -> tuple[str, str]:
-    """Say why a photo of so many good patches does not count: a code and a sentence."""
+    """Return why a photo with `good` useful patches does not count: a code and a sentence."""
     failures = Counter(row.reason for row in tried if row.state == "failed")
     if failures and good == 0:
         reason, count = failures.most_common(1)[0]

@@ -1,7 +1,7 @@
-"""The way of a photo: inspected, its lens known, developed, patches chosen, PSFs estimated, counted.
+"""The job of a photo: inspect, identify the lens, develop, choose patches, estimate PSFs, count.
 
-Each step looks at the tables first and does only what is not done yet. So the whole may be
-begun again at any time, by any worker, and still every effect happens once.
+Each step reads the tables first and does only what is not done yet. So the job may be started
+again at any time, by any worker, and still every effect happens once.
 """
 
 from __future__ import annotations
@@ -35,7 +35,10 @@ from lensmodel.workflow import pipeline
 log = logging.getLogger(__name__)
 
 WAIT_S: Final = 0.2
+"""Seconds between two looks at the open cells of a photo (chosen)."""
+
 LOOK_AFTER_S: Final = 5.0
+"""Seconds between two checks that each open cell still has a job (chosen): only dead workers lose one."""
 
 
 class PhotoWork:
@@ -47,7 +50,7 @@ class PhotoWork:
         self._measurements = MeasurementWork(bench)
 
     def photo(self, photo_id: str, epoch: int) -> None:
-        """Bring a photo as far as it can get."""
+        """Take a photo through all steps, as far as it can get."""
 
         def wanted() -> bool:
             return self._store.photos.is_live(photo_id, epoch)
@@ -94,7 +97,7 @@ class PhotoWork:
         return self._get(photo_id)
 
     def _move(self, photo: PhotoRow, before: tuple[str, ...], to: str) -> None:
-        """Go on to the next state; a photo that is further already stays there."""
+        """Move to the next state; a photo that is already further stays there."""
         if not self._store.photos.set_state(photo.public_id, before, to, epoch=photo.epoch):
             state = self._get(photo.public_id).state
             if state not in {"developing", "selecting", "estimating"}:
@@ -114,29 +117,31 @@ class PhotoWork:
         return self._get(photo.public_id)
 
     def _record(self, photo: PhotoRow, info: dict[str, Any]) -> None:
-        seen, lens = info["metadata"], info["metadata"]["lens"]
-        taken = seen["taken_at"]
+        metadata, lens = info["metadata"], info["metadata"]["lens"]
+        taken = metadata["taken_at"]
         self._store.photos.record_inspection(
             photo.public_id,
             width=info["width"],
             height=info["height"],
             identity=LensName(lens["maker"], lens["model"], lens["serial"], lens["serial_source"]),
-            aperture=seen["aperture"],
-            focal_mm=seen["focal_mm"],
-            focus_m=seen["focus_m"],
-            pixel_pitch_um=seen["pixel_pitch_um"],
-            orientation=seen["orientation"],
-            camera_maker=seen["camera_maker"],
-            camera_model=seen["camera_model"],
-            body_key=body_key(seen["camera_maker"], seen["camera_model"], seen.get("body_serial")),
-            iso=seen["iso"],
-            exposure_s=seen["exposure_s"],
+            aperture=metadata["aperture"],
+            focal_mm=metadata["focal_mm"],
+            focus_m=metadata["focus_m"],
+            pixel_pitch_um=metadata["pixel_pitch_um"],
+            orientation=metadata["orientation"],
+            camera_maker=metadata["camera_maker"],
+            camera_model=metadata["camera_model"],
+            body_key=body_key(
+                metadata["camera_maker"], metadata["camera_model"], metadata.get("body_serial")
+            ),
+            iso=metadata["iso"],
+            exposure_s=metadata["exposure_s"],
             # Cameras write local time without a zone; as UTC it at least sorts.
             taken_at=None if taken is None else datetime.fromisoformat(taken).replace(tzinfo=UTC),
         )
 
     def _identify(self, photo: PhotoRow) -> bool:
-        """Find the lens; say whether to go on to calibrate it."""
+        """Assign the lens; return whether to go on and calibrate it."""
         if photo.state != "inspecting":
             return True
         photos, single = self._store.photos, self._bench.settings.assume_single_copy
@@ -170,7 +175,7 @@ class PhotoWork:
         }
         with self._bench.sandbox.folder() as folder:
             try:
-                found = self._bench.attempt(
+                selection = self._bench.attempt(
                     "select", arguments, folder=folder, limits=limits, wanted=wanted, reads=[developed]
                 )
             except JobFailedError as error:
@@ -179,9 +184,9 @@ class PhotoWork:
                 size = f"{photo.width}x{photo.height}"
                 text = f"the photo of {size} pixels is too small to tell about its lens; send it in full size"
                 raise JobFailedError("no_usable_patches", text) from error
-        if found["lateral"] is not None:
-            self._store.photos.record_lateral(photo.public_id, found["lateral"])
-        self._store.patches.add(photo.public_id, photo.epoch, plan_of(found))
+        if selection["lateral"] is not None:
+            self._store.photos.record_lateral(photo.public_id, selection["lateral"])
+        self._store.patches.add(photo.public_id, photo.epoch, plan_of(selection))
 
     def _estimate(self, photo: PhotoRow, wanted: Callable[[], bool]) -> None:
         """Hand out the cells and wait until each is done, rejected or given up."""
@@ -208,7 +213,7 @@ class PhotoWork:
         return f"owner-{photo.owner_id}"
 
     def _look_after(self, photo: PhotoRow, cell: int, job: Job | None) -> None:
-        """Deal with a cell whose job the engine lost, or gave up after it killed its workers."""
+        """Repair a cell whose job the engine lost, or gave up after it killed its workers."""
         if job is None:
             return
         status = self._engine.status(job)
@@ -232,13 +237,13 @@ class PhotoWork:
         raise JobFailedError(*why_not(tried, good))
 
     def _finish_measured(self, photo: PhotoRow) -> None:
-        """Count a measurement: it says itself how good it is, and one place is enough."""
+        """Count a measurement: it states its own error, and one place is enough."""
         version = self._store.photos.finish(photo.public_id, photo.epoch)
         if version is not None:
             log.info("measurement %s counted, lens version %d", photo.public_id, version)
 
     def _require_spread(self, done: list[PatchRow]) -> None:
-        """Refuse a photo whose patches, as far as they gave a PSF, tell of one place only."""
+        """Refuse a photo if all patches that gave a PSF lie in one place."""
         if not done:
             return
         try:
@@ -299,7 +304,7 @@ class PhotoWork:
 
 
 def _sample(folder: Path, number: int, entry: dict[str, Any]) -> NewSample:
-    """Check one result of a child as if a stranger had sent it."""
+    """Validate one result of a child as untrusted input."""
     try:
         kernels = np.load(folder / KERNELS, allow_pickle=False, mmap_mode="r")
         kernel = as_kernel(kernels[number])
@@ -309,7 +314,7 @@ def _sample(folder: Path, number: int, entry: dict[str, Any]) -> NewSample:
             PatchSpectrum.from_bytes(spectrum)
     except (
         *(InvalidKernelError, InvalidInputError, OSError),
-        *(ValueError, TypeError, LookupError),  # not the JSON that was agreed on
+        *(ValueError, TypeError, LookupError),  # not the expected JSON
     ) as error:
         raise JobFailedError("internal_error", f"the estimator gave no kernel: {error}") from error
     return NewSample(
@@ -325,18 +330,19 @@ def _sample(folder: Path, number: int, entry: dict[str, Any]) -> NewSample:
 
 
 def _require_model(photo: PhotoRow, lens: LensRow | None) -> None:
-    """Refuse a photo that asked for another model than its lens has."""
-    wish = photo.given.get("model")
-    if lens is not None and wish not in {None, lens.way}:
+    """Refuse a photo that was sent for another model than its lens has."""
+    requested = photo.given.get("model")
+    if lens is not None and requested not in {None, lens.way}:
         text = (
-            f"the photo was sent with model={wish}, and its lens has the model {lens.way}: PATCH /v1/lenses/"
-            f'{lens.public_id} with {{"model": "{wish}"}} and retry, or send it again with model={lens.way}'
+            f"the photo was sent with model={requested}, and its lens has the model {lens.way}: PATCH "
+            f'/v1/lenses/{lens.public_id} with {{"model": "{requested}"}} and retry, or send it again with '
+            f"model={lens.way}"
         )
         raise JobFailedError("conflict", text)
 
 
 def _missing(photo: PhotoRow, *, lens_known: bool) -> str:
-    """Say what the owner must tell before the photo can count; empty if nothing."""
+    """Return what the owner must supply before the photo can count; empty if nothing."""
     if not lens_known:
         model = photo.lens_model or "unknown model"
         return (

@@ -1,9 +1,9 @@
-"""The durable queue behind a small protocol: what was asked for is run, after any crash too.
+"""The durable queue behind a small protocol: every job that is enqueued is run, even after a crash.
 
-The engine is DBOS Transact, a library that keeps its queue in SQLite or PostgreSQL. Nothing
-else of the program knows it. A job is a name and a few ids and numbers; the truth about what it
-did lies in our own tables, so that running a job twice is harmless and the engine can be
-replaced, or its database lost, without losing a photo.
+The engine is DBOS Transact, a library that keeps its queue in SQLite or PostgreSQL. No other
+module uses it. A job is a name with a few ids and numbers; what it did is recorded in our own
+tables, so that running a job twice is harmless and the engine can be replaced, or its database
+lost, without losing a photo.
 """
 
 from __future__ import annotations
@@ -41,18 +41,20 @@ QUEUE_OF: Final[Mapping[Kind, str]] = {
     "measure": "patches",
 }
 MAX_STARTS: Final[Mapping[Kind, int]] = {"photo": 50, "cell": 5, "correction": 5, "measure": 3}
-"""How often a job is started again after the death of a worker, before it is given up."""
+"""Restarts of a job after deaths of its worker, before it is given up (chosen): a photo mostly waits for its
+cells, so that many deaths are not its fault."""
 
 POLL_S: Final[Mapping[str, float]] = {"photos": 0.25, "patches": 0.1, "corrections": 0.25}
-"""How often each queue is looked at: three looks a tenth of a second cost a tenth of a core."""
+"""Seconds between two polls of each queue (chosen): three polls every 0.1 s take a tenth of a core."""
+
 _WAITING: Final = ("ENQUEUED", "PENDING", "DELAYED")
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Something to do: the kind, the ids and numbers that say what, and for whom.
+    """One job: its kind, the ids and numbers of its subject, and the owner for whom it runs.
 
-    The id is made of kind and arguments: asking twice is asking once.
+    The id is made of kind and arguments: enqueuing a job twice runs it once.
     """
 
     kind: Kind
@@ -69,29 +71,29 @@ class JobEngine(Protocol):
     """A durable queue with its workers."""
 
     def start(self, handlers: Mapping[Kind, Handler]) -> None:
-        """Begin to run jobs: `handlers[kind](*arguments)`."""
+        """Start running jobs: `handlers[kind](*arguments)`."""
 
     def enqueue(self, job: Job) -> None:
-        """Ask for a job; a second time does nothing, even after it ended."""
+        """Enqueue a job; a second call does nothing, even after the job ended."""
 
     def status(self, job: Job) -> Status:
-        """Say whether a job waits or runs, ended, was given up, or was never asked for."""
+        """Return whether a job waits or runs, ended, was given up, or was never enqueued."""
 
     def take_over(self, executor_id: str) -> int:
         """Put the running jobs of a dead worker back into the queue; return how many it still holds."""
 
     def holders(self) -> set[str]:
-        """Return the workers that jobs are running on, as far as the engine knows."""
+        """Return the workers that run jobs, as far as the engine knows."""
 
     def forget(self, before: datetime) -> int:
-        """Remove what is known of jobs that ended before a time; return how many."""
+        """Delete the records of jobs that ended before a time; return how many."""
 
     def stop(self) -> None:
-        """Run no more jobs. Those that run already are not waited for."""
+        """Run no more jobs, without waiting for those that are running."""
 
 
 class _Json(DBOSSerializer):
-    """Ids and numbers only: a changed row of the engine's tables must not run code here."""
+    """JSON rather than pickle: a manipulated row of the engine's tables must not run code here."""
 
     def serialize(self, data: object) -> str:
         return json.dumps(data, default=repr)
@@ -111,9 +113,9 @@ class DbosEngine:
     url : str
         SQLAlchemy address of the engine's own tables.
     executor_id : str
-        A fresh id for each process: two processes of one id would run the same jobs.
+        A new id for each process: two processes of one id would run the same jobs.
     slots : int
-        Children at once; one more job is fetched ahead, so that none waits for the poll.
+        Children at once; one more job is fetched ahead, so that no slot idles until the next poll.
     photos : int
         Photos at once; they only wait for their cells.
     """
@@ -121,11 +123,11 @@ class DbosEngine:
     def __init__(self, url: str, executor_id: str, *, slots: int, photos: int = 8) -> None:
         self._url, self._executor_id = url, executor_id
         self._concurrency = {"photos": photos, "patches": slots + 1, "corrections": 2}
-        self._asked: set[str] = set()
+        self._enqueued: set[str] = set()
         self._guard = threading.Lock()
 
     def start(self, handlers: Mapping[Kind, Handler]) -> None:
-        """Open the tables, declare the queues, take up work. See `JobEngine`."""
+        """Open the tables, declare the queues, start running jobs. See `JobEngine`."""
         _switch_on_wal(self._url)
         config: DBOSConfig = {
             "name": "lensmodel",
@@ -152,7 +154,7 @@ class DbosEngine:
     def enqueue(self, job: Job) -> None:
         """Put a job into its queue. See `JobEngine`."""
         with self._guard:
-            if job.id in self._asked:
+            if job.id in self._enqueued:
                 return
         options: EnqueueOptions = {
             "workflow_name": job.kind,
@@ -163,30 +165,30 @@ class DbosEngine:
         }
         _outside(DBOS.enqueue_workflow_with_options, options, *job.arguments)
         with self._guard:
-            self._asked.add(job.id)
+            self._enqueued.add(job.id)
 
     def status(self, job: Job) -> Status:
         """Look a job up. See `JobEngine`."""
-        found = _outside(DBOS.get_workflow_status, job.id)
-        if found is None:
+        record = _outside(DBOS.get_workflow_status, job.id)
+        if record is None:
             with self._guard:
-                self._asked.discard(job.id)
+                self._enqueued.discard(job.id)
             return "unknown"
-        if found.status in _WAITING:
+        if record.status in _WAITING:
             return "waiting"
-        return "lost" if found.status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED" else "done"
+        return "lost" if record.status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED" else "done"
 
     def take_over(self, executor_id: str) -> int:
-        """Requeue what a dead worker ran. See `JobEngine`.
+        """Requeue the running jobs of a dead worker. See `JobEngine`.
 
-        The library's call is private and swallows errors of single jobs; what still names the
-        dead worker afterwards is counted, so that the caller can try again.
+        The library's call is private and swallows errors of single jobs; jobs that
+        still name the dead worker afterwards are counted, so that the caller can try again.
         """
         DBOS._recover_pending_workflows([executor_id])  # noqa: SLF001 - contract-tested; no public way
         return sum(holder == executor_id for holder in self._running())
 
     def holders(self) -> set[str]:
-        """Return who runs something. See `JobEngine`."""
+        """Return the workers that run jobs. See `JobEngine`."""
         return set(self._running())
 
     def _running(self) -> list[str]:
@@ -200,7 +202,7 @@ class DbosEngine:
         return [row.executor_id for row in rows if row.executor_id is not None]
 
     def forget(self, before: datetime) -> int:
-        """Delete old rows. See `JobEngine`."""
+        """Delete old records. See `JobEngine`."""
         ended = _outside(
             DBOS.list_workflows,
             status=["SUCCESS", "ERROR", "CANCELLED", "MAX_RECOVERY_ATTEMPTS_EXCEEDED"],
@@ -213,7 +215,7 @@ class DbosEngine:
         if ids:
             _outside(DBOS.delete_workflows, ids)
         with self._guard:
-            self._asked.difference_update(ids)
+            self._enqueued.difference_update(ids)
         return len(ids)
 
     def stop(self) -> None:
@@ -231,7 +233,7 @@ def _plain(handler: Handler) -> Handler:
 
 
 def _outside(call: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:
-    """Call the library as from outside of any job.
+    """Call the library as if outside of any job.
 
     Inside a job it would record the call as one of the job's steps and replay it after a crash;
     our jobs look at our tables instead.
@@ -240,7 +242,7 @@ def _outside(call: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T
 
 
 def _switch_on_wal(url: str) -> None:
-    """Let readers and one writer work at once; the library does not, and the file remembers it."""
+    """Let readers and one writer work at once (WAL): the library does not set it, and the file keeps it."""
     parsed = make_url(url)
     if parsed.get_backend_name() == "sqlite" and parsed.database:
         with closing(sqlite3.connect(parsed.database, timeout=30)) as connection:

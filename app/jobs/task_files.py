@@ -1,4 +1,4 @@
-"""How workers and their tasks hand things to each other: names of files."""
+"""Names of the files that workers and their tasks exchange."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ KERNELS: Final = "kernels.npy"
 """Kernels, one a row: `(n, k, k)`."""
 
 SAMPLES: Final = "samples.json"
-"""What else belongs to each of the kernels."""
+"""Position, settings, weight and origin of each kernel."""
 
 FAMILY: Final = "family"
-"""Folder of the samples of other copies that the model leans on; not there without any."""
+"""Folder of the samples of other copies that the model leans on; absent without any."""
 
 LEARNED: Final = "learned.npz"
-"""What a model has learned from the samples."""
+"""The model fitted to the samples."""
 
 REPORT: Final = "report.json"
-"""What a lens test found of a model."""
+"""The report of a lens test."""
 
 PREVIEW: Final = "preview.jpg"
 R_MAP: Final = "r-map.png"
-"""What `app.blobs.previews` makes of a developed photo."""
+"""Pictures of a developed photo, by `app.blobs.previews`."""
 
 GLANCE: Final = "glance.jpg"
-"""What `app.blobs.glances` makes of a photo that is not developed yet."""
+"""Small picture of a photo that is not developed yet, by `app.blobs.glances`."""
 
 SHOWN: Final = "shown.jpg"
-"""The developed photo in full size, as a screen shows it, in sensor orientation."""
+"""The developed photo in full size, sRGB, in sensor orientation."""
 
 BEFORE: Final = "before.jpg"
 AFTER: Final = "after.jpg"
-"""What a corrected file shows, as it was before and as it is, for the screen, in sensor orientation."""
+"""The part of the photo in a corrected file, before and after correction: sRGB, sensor orientation."""
 
 LAYERS: Final = ("smooth.png", "clean.png")
-"""A part of a photo corrected without its faint texture, and without its grain: what sliders mix."""
+"""A part of a photo corrected without its faint texture, and without its grain: layers for sliders."""
 
 SUFFIX: Final[Mapping[str, str]] = {
     "tiff16": ".tif",

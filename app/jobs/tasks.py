@@ -1,7 +1,7 @@
-"""What runs inside children: the library's functions, fed with JSON and files.
+"""Tasks that run in child processes: functions of the library, called with JSON and files.
 
 A task takes JSON and its own empty folder, and returns JSON. Arrays go in and out as npy files
-in the folder. Nothing here knows of databases or of other photos.
+in the folder. No task accesses the database or other photos.
 """
 
 from __future__ import annotations
@@ -57,13 +57,13 @@ def inspect(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
     """Read the header of `path`: size, kind, camera, lens, settings."""
     del folder, progress
     info = photo.inspect(Path(arguments["path"]), photo.Limits(max_megapixels=arguments["max_megapixels"]))
-    found: dict[str, Any] = codec.to_json(info)
-    found["metadata"]["focus_m"] = distances.written(info.metadata.focus_m)
-    return found
+    header: dict[str, Any] = codec.to_json(info)
+    header["metadata"]["focus_m"] = distances.written(info.metadata.focus_m)
+    return header
 
 
 def glance(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
-    """Render the photo at `path` in small."""
+    """Render a small picture of the photo at `path`."""
     del progress
     picture = glances.glance(Path(arguments["path"]), arguments["kind"], arguments["orientation"] or 1)
     (folder / GLANCE).write_bytes(picture)
@@ -87,11 +87,11 @@ def select(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[
     """Choose the patches of the photo developed in `developed`, and measure its lateral colour."""
     del folder
     developed = pipeline.load_developed(Path(arguments["developed"]))
-    found = pipeline.find_patches(
+    selection = pipeline.find_patches(
         developed, count=arguments["count"], selector=arguments["selector"], on_step=progress
     )
     rejected = []
-    for window in found.rejected:
+    for window in selection.rejected:
         centre = (window.row + (window.size - 1) / 2, window.col + (window.size - 1) / 2)
         position = developed.frame.position(*centre)
         place = {"row": window.row, "col": window.col, "size": window.size}
@@ -101,7 +101,7 @@ def select(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[
     except LensModelError as error:
         log.info("no lateral colour: %s", error)
         lateral = None
-    return {"patches": codec.to_json(found.patches), "rejected": rejected, "lateral": lateral}
+    return {"patches": codec.to_json(selection.patches), "rejected": rejected, "lateral": lateral}
 
 
 def estimate(arguments: dict[str, Any], folder: Path, progress: Progress) -> list[dict[str, Any]]:
@@ -142,7 +142,7 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: Progress) -> lis
 def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
     """Correct the photo in `developed` with the samples in the folder; write the result there.
 
-    What the model has learned of them is written there as well, where it was not known before.
+    The fitted model is written there as well, unless it was given.
     """
     _log_compiling()
     developed = pipeline.load_developed(Path(arguments["developed"]))
@@ -150,10 +150,10 @@ def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
     lateral = _lateral(developed) if stored is None else codec.from_json(LateralColour, stored)
     output = arguments["output"]
     roi = arguments["roi"]
-    model = _leaning(folder, ModelSettings(**arguments["model"]))
+    model = _with_family(folder, ModelSettings(**arguments["model"]))
     settings = _settings(arguments["settings"])
-    seen = pipeline.load_seen(Path(arguments["developed"]))
-    known = pipeline.psfs_for(developed, model, settings, method=arguments["method"], seen=seen)
+    patches = pipeline.load_seen(Path(arguments["developed"]))
+    psfs = pipeline.psfs_for(developed, model, settings, method=arguments["method"], seen=patches)
     bounds = correction.Bounds(**arguments["bounds"])
     extremes = (replace(bounds, texture=0.0), replace(bounds, texture=1.0, denoise=1.0))
     corrected = pipeline.correct_photo(
@@ -161,7 +161,7 @@ def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
         model,
         settings,
         method=arguments["method"],
-        known=known,
+        known=psfs,
         strength=arguments["strength"],
         bounds=bounds,
         layers=extremes if arguments.get("layers") else (),
@@ -198,9 +198,9 @@ def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
 
 
 def measure(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
-    """Say how well the model of the samples in the folder predicts photos that it was not shown.
+    """Return how well the model of the samples in the folder predicts held-out photos.
 
-    What the model has learned, the wavefront of the lens included, is written to the folder.
+    The fitted model, including the wavefront of the lens, is written to the folder.
     """
     model = _model(folder, ModelSettings(**arguments["model"])).warmed(progress)
     (folder / LEARNED).write_bytes(model.learned())
@@ -209,11 +209,11 @@ def measure(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
 
 
 def report(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
-    """Test the lens of the samples in the folder; its name and the shape of its photos are handed over."""
+    """Write the report of the lens of the samples in the folder; `about` has its name and photo shape."""
     model = _model(folder, ModelSettings(**arguments["model"])).warmed()
     about = arguments["about"]
     lateral = [codec.from_json(LateralColour, stored) for stored in about["lateral"]]
-    found = lens_test(
+    result = lens_test(
         model,
         about["name"],
         aspect=about["aspect"],
@@ -221,7 +221,7 @@ def report(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[
         lateral=lateral,
         on_step=progress,
     )
-    (folder / REPORT).write_text(json.dumps(_numbers(codec.to_json(found))), encoding="utf-8")
+    (folder / REPORT).write_text(json.dumps(_numbers(codec.to_json(result))), encoding="utf-8")
     return {}
 
 
@@ -229,23 +229,23 @@ def measure_lens(arguments: dict[str, Any], folder: Path, progress: Progress) ->
     """Measure the PSF on photos made for it, in `developed`; kernels go to the folder."""
     photos = [pipeline.load_developed(Path(name)) for name in arguments["developed"]]
     method = lens_measure.methods.create(arguments["kind"])
-    found = method.measure(photos, size=arguments["size"], on_step=progress)
+    measurements = method.measure(photos, size=arguments["size"], on_step=progress)
     with (folder / KERNELS).open("wb") as file:
-        save_array(file, np.stack([np.asarray(one.kernel) for one in found]))
+        save_array(file, np.stack([np.asarray(measured.kernel) for measured in measurements]))
     numbers: dict[tuple[float, float], int] = {}
     return [
         {
-            "idx": numbers.setdefault(one.pixel, len(numbers)),
-            "row": round(one.pixel[0] - (one.side - 1) / 2),
-            "col": round(one.pixel[1] - (one.side - 1) / 2),
-            "side": one.side,
-            "r": one.position.r,
-            "phi": one.position.phi,
-            "channel": one.channel,
-            "error": min(one.error, 1.0),
+            "idx": numbers.setdefault(measured.pixel, len(numbers)),
+            "row": round(measured.pixel[0] - (measured.side - 1) / 2),
+            "col": round(measured.pixel[1] - (measured.side - 1) / 2),
+            "side": measured.side,
+            "r": measured.position.r,
+            "phi": measured.position.phi,
+            "channel": measured.channel,
+            "error": min(measured.error, 1.0),
             "estimator": lens_measure.estimator_of(method),
         }
-        for one in found
+        for measured in measurements
     ]
 
 
@@ -262,16 +262,16 @@ TASKS: Final[Mapping[str, Task]] = {
 }
 
 for _registry in (estimators, selectors, correction.deconvolvers):
-    _registry.load_installed()  # here, in the fork server: a confined child may not read their files any more
+    _registry.load_installed()  # in the fork server: a confined child may no longer read their files
 
 
 def _show(path: Path, planes: Planes, developed: photo.LinearPhoto) -> None:
-    """Write planes as a screen shows them."""
+    """Write planes as an sRGB JPEG."""
     photo.write_image(path, planes, developed.encoding, format="jpeg", color_space="srgb", quality=95)
 
 
 def _log_compiling() -> None:
-    """Write to the service's log when loops are compiled: a child logs nothing else below warnings."""
+    """Log the compilation of loops: a child otherwise logs warnings only."""
     if not first_use.handlers:
         handler = logging.StreamHandler()
         handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s task %(name)s: %(message)s"))
@@ -299,8 +299,8 @@ def _model(folder: Path, settings: ModelSettings) -> LensModel:
     return LensModel.fit(samples, settings)
 
 
-def _leaning(folder: Path, settings: ModelSettings) -> LensModel:
-    """Build the whole model of the samples in a folder; it leans on other copies if they are handed over."""
+def _with_family(folder: Path, settings: ModelSettings) -> LensModel:
+    """Fit the model of the samples in a folder, with other copies as its prior if they are given."""
     model, family = _model(folder, settings), folder / FAMILY
     if not (folder / LEARNED).is_file():
         model = model.warmed()
@@ -350,7 +350,7 @@ def _finite(value: float | None) -> float | None:
 
 
 def _numbers(value: Any) -> Any:  # noqa: ANN401 - JSON of any shape
-    """Replace numbers that JSON cannot write by null."""
+    """Replace numbers that JSON cannot represent by null."""
     if isinstance(value, dict):
         return {key: _numbers(item) for key, item in value.items()}
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""A worker process: takes up what the tables ask for, and what dead workers left behind."""
+"""A worker process: runs the jobs that the tables ask for, and takes over those of dead workers."""
 
 from __future__ import annotations
 
@@ -46,12 +46,19 @@ from app.store.ids import new_id
 log = logging.getLogger(__name__)
 
 EXIT_FENCED: Final = 70
-"""Exit status of a worker that was declared dead, or whose database was replaced under it."""
+"""Exit status of a worker that was declared dead or whose database was replaced: EX_SOFTWARE (sysexits.h)."""
 
 RECONCILE_S: Final = 10.0
+"""Seconds between two comparisons of the tables with the engine (chosen): the longest wait of a lost job."""
+
 TIDY_S: Final = 60.0
+"""Seconds between two rounds of deletion (chosen): nobody waits for it."""
+
 REPORTS_S: Final = 6 * 3600.0
+"""Seconds between two searches for missing reports (chosen): each lists all fitted models."""
+
 KEEP_JOBS: Final = timedelta(days=2)
+"""How long the engine remembers ended jobs (chosen): long enough to examine a failure."""
 
 _OURS: Final = "an error of ours; the log of the worker has it; retry later, or report the file"
 _LATER: Final = "retry once its operator has mended that"
@@ -66,7 +73,7 @@ class Ending:
 
     @classmethod
     def of(cls, error: BaseException) -> Ending:
-        """Return the ending of a job whose last try failed so."""
+        """Return the ending of a job whose last attempt failed with this error."""
         if is_outage(error):
             return cls(
                 OUTAGE, f"the service waited in vain for what it needs ({type(error).__name__}): {_LATER}"
@@ -87,7 +94,7 @@ class Worker:
         self._store = Store(settings)
         data = settings.data_dir.resolve()
         self._confined = [
-            name for name, is_so in confine.available(settings.task_user, data).items() if is_so
+            name for name, in_force in confine.available(settings.task_user, data).items() if in_force
         ]
         self._scratch = data / "scratch"
         self._sandbox = Sandbox(
@@ -109,19 +116,19 @@ class Worker:
         self._files = {path: _identity(path) for path in self._database_files()}
 
     def _task_account(self, data: Path) -> account.Account | None:
-        """Return the account that children change to; let it reach their folders, and nothing beside them."""
+        """Return the account that children change to, with access to their folders and to nothing else."""
         if "account" not in self._confined:
             return None
-        found = account.find(self._settings.task_user)
-        if found is not None:
-            own = [data / "developed", self._scratch, data / "cache"]
-            account.close_to_others(data, {path.name for path in own})
-            for folder in [data, *own]:
-                found.lets_through(folder)
-        return found
+        task_account = account.find(self._settings.task_user)
+        if task_account is not None:
+            folders = [data / "developed", self._scratch, data / "cache"]
+            account.close_to_others(data, {path.name for path in folders})
+            for folder in [data, *folders]:
+                task_account.lets_through(folder)
+        return task_account
 
     def run(self) -> None:
-        """Work until told to stop."""
+        """Work until `stop` is called."""
         log.info("children are confined by: %s", ", ".join(self._confined) or "nothing that the kernel has")
         host = socket.gethostname()
         began = started_at(os.getpid())
@@ -132,7 +139,7 @@ class Worker:
         )
         self._last_beat = time.monotonic()
         beat_s = min(self._settings.lease_seconds / 4, 5.0)
-        # in a thread of its own: nothing may delay the lease, neither what follows nor any duty
+        # in a thread of its own: nothing below, and no duty, may delay the lease
         lease = self._start_thread(beat_s, self._keep_lease)
         self._insist(lambda: settle(self._store, self._bench.storage))
         photos, corrections = PhotoWork(self._bench, self._engine), CorrectionWork(self._bench)
@@ -146,7 +153,7 @@ class Worker:
         )
         self._bury_the_gone(host)
         self._start_thread(TIDY_S, self._tidy)  # deleting may take long
-        self._start_thread(REPORTS_S, self._ask_for_reports)  # and so may asking what is there
+        self._start_thread(REPORTS_S, self._ask_for_reports)  # so may listing the blobs
         duties = (
             (self._settings.sweep_seconds, self._sweep),
             (beat_s, self._bury_the_silent),
@@ -160,7 +167,7 @@ class Worker:
                     self._do(duty)
                     due[number] = time.monotonic() + period
             self._stop.wait(max(min(due) - time.monotonic(), 0.01))
-        lease.join(beat_s)  # or it would find our row dead, and take that for the word of others
+        lease.join(beat_s)  # or it would see our row dead and conclude that others had taken over
         self._leave()
 
     def _start_thread(self, period: float, duty: Callable[[], None]) -> threading.Thread:
@@ -174,7 +181,7 @@ class Worker:
         return thread
 
     def stop(self) -> None:
-        """Stop soon: what runs is left to the next worker."""
+        """Stop soon: running jobs are left to the next worker."""
         self._sandbox.stop()
         self._stop.set()
 
@@ -194,7 +201,7 @@ class Worker:
     # --- jobs ---------------------------------------------------------------------------------
 
     def _insist(self, call: Callable[[], object]) -> None:
-        """Do something that needs the database, however long that is away."""
+        """Do something that needs the database, and wait for the database as long as it takes."""
         patience = Patience(math.inf)
         while not self._stop.is_set():
             try:
@@ -209,7 +216,7 @@ class Worker:
                 return
 
     def _safe(self, handler: Handler, broke: Broke) -> Handler:
-        """Wrap a job: what went wrong is tried again, and in the end has a reason."""
+        """Wrap a job: failures are retried, and the last one ends the job with a reason."""
 
         def run(*arguments: str | int) -> None:
             with accounted(handler.__name__, arguments) as account:
@@ -240,7 +247,7 @@ class Worker:
         return run
 
     def _rest(self, seconds: float) -> None:
-        """Wait; while this process ends, until it is gone, since the job must not seem finished."""
+        """Wait; during shutdown until the process ends, since the job must not look finished."""
         if self._stop.wait(seconds):
             time.sleep(LONGEST_PAUSE_S)
 
@@ -248,7 +255,7 @@ class Worker:
         self._store.photos.fail(photo_id, epoch, ending.code, ending.detail)
 
     def _cell_broke(self, ending: Ending, photo_id: str, epoch: int, cell: int) -> None:
-        if ending.code == OUTAGE:  # nothing is known of the patches: the photo can be tried again as a whole
+        if ending.code == OUTAGE:  # this says nothing about the patches: the photo can be retried as a whole
             self._photo_broke(ending, photo_id, epoch)
             return
         rows = self._store.patches.of_cell(photo_id, epoch, cell)
@@ -264,7 +271,7 @@ class Worker:
     # --- duties -------------------------------------------------------------------------------
 
     def _sweep(self) -> None:
-        """Put into the queue what the tables ask for; what is there already stays as it is."""
+        """Enqueue the jobs that the tables ask for; those already queued stay as they are."""
         for photo_id, epoch, owner in self._store.photos.to_do():
             self._engine.enqueue(Job("photo", (photo_id, epoch), owner))
         for correction_id, epoch, owner in self._store.corrections.to_do():
@@ -276,11 +283,11 @@ class Worker:
         ask_for_reports(self._store, self._bench.storage, self._engine)
 
     def _leave_metrics(self) -> None:
-        with contextlib.suppress(OSError):  # a full disk: numbers are no reason to stop
+        with contextlib.suppress(OSError):  # a full disk: metrics are no reason to stop
             metrics.leave(self._settings.data_dir.resolve(), self.id)
 
     def _keep_lease(self) -> None:
-        """Say that this worker lives; stop at once if others think otherwise."""
+        """Renew the lease; stop at once if this worker was declared dead."""
         for path, identity in self._files.items():
             if _identity(path) != identity:
                 self._die(f"{path} was replaced while this worker ran")
@@ -295,7 +302,7 @@ class Worker:
         self._last_beat = time.monotonic()
 
     def _bury_the_silent(self) -> None:
-        """Take over from workers that were not heard of for a whole lease."""
+        """Take over from workers whose lease has expired."""
         for dead in self._store.workers.bury_stale(self._settings.lease_seconds):
             self._take_over(dead)
 
@@ -314,14 +321,14 @@ class Worker:
                 self._take_over(row.id)
 
     def _reconcile(self) -> None:
-        """End what the engine lost or gave up: no job stays unfinished for ever."""
+        """End jobs that the engine lost or gave up, so that none stays unfinished for ever."""
         known = {row.id for row in self._store.workers.all()}
         for holder in self._engine.holders() - known:
             self._engine.take_over(holder)
         photos, corrections = self._store.photos, self._store.corrections
         for photo_id, epoch, owner in [*photos.to_do(), *photos.running()]:
             ended = self._lost(Job("photo", (photo_id, epoch), owner))
-            if ended:  # and only if it is still so: it may have come to its end meanwhile
+            if ended:  # changes nothing if it has ended meanwhile
                 photos.fail(photo_id, epoch, ended.code, ended.detail)
         for correction_id, epoch, owner in [*corrections.to_do(), *corrections.running()]:
             ended = self._lost(_correction_job(correction_id, epoch, owner))
@@ -341,7 +348,7 @@ class Worker:
         return Ending("internal_error", _OURS) if status == "done" else None
 
     def _tidy(self) -> None:
-        """Delete what nobody needs any more."""
+        """Delete data that are no longer needed."""
         for owner_key in self._store.accounts.to_erase():
             self._do(partial(erase, self._store.accounts, self._bench.storage, owner_key))
         for photo_id in self._store.photos.unneeded(self._settings.keep_photos):
@@ -349,7 +356,7 @@ class Worker:
         self._do(self._store.accounts.purge)
         self._do(self._store.idempotency.tidy)
         for prefix in self._store.workers.garbage():
-            self._do(partial(self._delete, prefix))  # what cannot be deleted keeps nothing else
+            self._do(partial(self._delete, prefix))  # one failure does not prevent the others
         self._do(lambda: self._engine.forget(datetime.now(UTC) - KEEP_JOBS))
         developed = self._bench.developed_folder("x").parent
         drop_developed(developed, self._bench.jobs.existing_photos, self._settings.correct_seconds)
@@ -373,16 +380,16 @@ class Worker:
 
 
 def _correction_job(correction_id: str, epoch: int, owner: str) -> Job:
-    """Name the job; the first try has no number, as in jobs that an older program asked for."""
+    """Return the job; the first epoch has no number, as in jobs of older versions of the program."""
     return Job("correction", (correction_id,) if epoch == 1 else (correction_id, epoch), owner)
 
 
 def _identity(path: Path) -> tuple[int, int]:
     try:
-        found = path.stat()
+        status = path.stat()
     except FileNotFoundError:
         return (0, 0)
-    return (found.st_dev, found.st_ino)
+    return (status.st_dev, status.st_ino)
 
 
 def main() -> None:

@@ -1,1 +1,1 @@
-"""The processes of the service: settings, start, supervision, logs, metrics, backup, examination."""
+"""The processes of the service: settings, start, supervision, logs, metrics, backup, checks."""

@@ -1,12 +1,12 @@
-"""A copy of an installation while it works, and an installation from a copy.
+"""Back up a running installation, restore it, and move it.
 
 A backup is a folder: `rows-....db`, a SQLite file with all rows of one moment, whatever database the service
 uses; `blobs/`, at least what these rows name; and `backup.json`, which names the first and is replaced last.
-So a folder is a whole backup at every moment, also while the next one is being written into it.
+So the folder is a complete backup at every moment, also while the next one is being written into it.
 
-Blobs are immutable and come before the rows that name them, and they are deleted some time after these. So
-copying blobs, then taking the rows, then copying what is new is enough; what was deleted in between these
-steps shows as a missing blob, and then newer rows are taken.
+Blobs are immutable; they are written before the rows that name them and deleted some time after these. So it
+is enough to copy blobs, then the rows, then the new blobs; a blob that was deleted in between is missing
+then, and newer rows are taken.
 """
 
 from __future__ import annotations
@@ -38,21 +38,23 @@ from lensmodel.core.types import StepHook, ignore_step
 MANIFEST: Final = "backup.json"
 BLOBS: Final = "blobs"
 FORMAT: Final = 1
+"""Raised when an older program could not read the backup."""
+
 TRIES: Final = 5
-"""Snapshots until one has all its blobs; each try needs a deletion in just these moments."""
+"""Snapshots until one has all its blobs (chosen): each failure needs a deletion in just these moments."""
 
 _LEFT_OUT: Final = ("probe/",)
 
 
 class BackupError(LensModelError):
-    """A backup cannot be made, or is not what it was."""
+    """A backup cannot be made, or is damaged."""
 
     code = "backup_failed"
 
 
 @dataclass(frozen=True, slots=True)
 class Backup:
-    """What a backup holds."""
+    """Contents of a backup."""
 
     made_at: str
     rows: dict[str, int]
@@ -61,7 +63,7 @@ class Backup:
 
 
 def backup(database: Database, storage: Storage, folder: Path, on_step: StepHook = ignore_step) -> Backup:
-    """Bring a folder up to date with an installation, which may be at work.
+    """Bring a backup folder up to date with an installation, which may be running.
 
     Raises
     ------
@@ -73,7 +75,7 @@ def backup(database: Database, storage: Storage, folder: Path, on_step: StepHook
     target = Storage(f"file://{(folder / BLOBS).resolve()}")
     have = dict(target.listed())
     _fetch(storage, target, _differing(storage, have), on_step)
-    part, lost = folder / "rows.part", list[str]()
+    part, missing = folder / "rows.part", list[str]()
     for _ in range(TRIES):
         part.unlink(missing_ok=True)
         moment = datetime.now(UTC)
@@ -81,14 +83,14 @@ def backup(database: Database, storage: Storage, folder: Path, on_step: StepHook
         stored, have = dict(storage.listed()), dict(target.listed())
         fresh = sorted(key for key in named & stored.keys() if have.get(key) != stored[key])
         _fetch(storage, target, fresh, on_step)
-        lost = sorted(named - dict(target.listed()).keys())
-        if not lost:
-            made = _finish(folder, part, moment, rows, named)
+        missing = sorted(named - dict(target.listed()).keys())
+        if not missing:
+            result = _finish(folder, part, moment, rows, named)
             for key in dict(target.listed()).keys() - named - stored.keys():
-                (folder / BLOBS / key).unlink(missing_ok=True)  # what is deleted is deleted here too
-            return made
+                (folder / BLOBS / key).unlink(missing_ok=True)  # deleted in the installation, so deleted here
+            return result
     part.unlink(missing_ok=True)
-    raise BackupError(f"{len(lost)} blobs are named and missing, {lost[0]} first: run lensmodel doctor")
+    raise BackupError(f"{len(missing)} blobs are named and missing, {missing[0]} first: run lensmodel doctor")
 
 
 def _differing(storage: Storage, have: dict[str, int]) -> list[str]:
@@ -100,7 +102,7 @@ def _fetch(source: Storage, target: Storage, keys: Iterable[str], on_step: StepH
     for done, key in enumerate(wanted, start=1):
         try:
             source.copy_to(target, key)
-        except FileNotFoundError:  # deleted since: rows that are taken later do not name it
+        except FileNotFoundError:  # deleted since: rows taken later do not name it
             continue
         on_step(done, len(wanted))
 
@@ -119,7 +121,7 @@ def _rows(database: Database, part: Path) -> tuple[dict[str, int], set[str]]:
 
 
 def _named(rows: Connection) -> set[str]:
-    """Return the blobs without which the rows are worth less; what is missing of others is made again."""
+    """Return the blobs that cannot be made again: photos, and results of corrections."""
     alive = select(PhotoRow.blob_key).where(PhotoRow.deleted_at.is_(None))
     results = select(CorrectionRow.result_key).where(
         CorrectionRow.state == "succeeded", CorrectionRow.result_key.is_not(None)
@@ -133,14 +135,14 @@ def _finish(folder: Path, part: Path, moment: datetime, rows: dict[str, int], na
     name = f"rows-{digest[:16]}.db"
     part.replace(folder / name)
     kept = dict(Storage(f"file://{(folder / BLOBS).resolve()}").listed())
-    made = Backup(moment.isoformat(), rows, len(named), sum(kept[key] for key in named))
+    result = Backup(moment.isoformat(), rows, len(named), sum(kept[key] for key in named))
     manifest = {
         "format": FORMAT,
         "program": version("lensmodel"),
         "schema": migrate.head(),
         "rows_file": name,
         "sha256": digest,
-        "made_at": made.made_at,
+        "made_at": result.made_at,
         "rows": rows,
         "blobs": {key: kept[key] for key in sorted(named)},
     }
@@ -149,7 +151,7 @@ def _finish(folder: Path, part: Path, moment: datetime, rows: dict[str, int], na
     for path in folder.glob("rows*.db*"):
         if path.name != name:
             path.unlink()
-    return made
+    return result
 
 
 def restore(
@@ -157,7 +159,7 @@ def restore(
 ) -> dict[str, int]:
     """Fill an empty installation from a backup; return how many rows, by table.
 
-    Blobs come first and the rows in one transaction: what was cut off is begun again.
+    Blobs come first and the rows in one transaction, so an interrupted restore can be repeated.
 
     Raises
     ------
@@ -168,8 +170,8 @@ def restore(
     """
     manifest = _manifest(folder)
     source = Storage(f"file://{(folder / BLOBS).resolve()}")
-    have = dict(source.listed())
-    damaged = [key for key, size in manifest["blobs"].items() if have.get(key) != size]
+    kept = dict(source.listed())
+    damaged = [key for key, size in manifest["blobs"].items() if kept.get(key) != size]
     if damaged:
         raise BackupError(f"{len(damaged)} blobs of the backup are missing or cut off: {damaged[0]} first")
     migrate.upgrade(database)
@@ -179,15 +181,15 @@ def restore(
             if any(transfer.counts(connection).values()):
                 raise InvalidInputError("the installation is not empty: restore into an empty one")
         storage.create()
-        there = dict(storage.listed())
-        _fetch(source, storage, [key for key in sorted(have) if there.get(key) != have[key]], on_step)
+        stored = dict(storage.listed())
+        _fetch(source, storage, [key for key in sorted(kept) if stored.get(key) != kept[key]], on_step)
         with transfer.snapshot(rows) as moment:
             return transfer.copy(moment, database)
 
 
 @contextmanager
 def _readable(path: Path) -> Iterator[Database]:
-    """Open a copy of the rows: opening a database changes its file, and a backup must stay as it is."""
+    """Open a copy of the rows: opening a database changes its file, and a backup must not change."""
     with tempfile.TemporaryDirectory(prefix="lensmodel-") as scratch:
         copy = Path(shutil.copy(path, scratch))
         with closing(Database(f"sqlite:///{copy}")) as rows:
@@ -222,8 +224,8 @@ def move(
     """
     migrate.upgrade(source[0])
     migrate.upgrade(target[0])
-    there = dict(target[1].listed())
-    _fetch(source[1], target[1], _differing(source[1], there), on_step)
+    stored = dict(target[1].listed())
+    _fetch(source[1], target[1], _differing(source[1], stored), on_step)
     with transfer.snapshot(source[0]) as moment:
         copied = transfer.copy(moment, target[0])
     with target[0].reader.connect() as connection:

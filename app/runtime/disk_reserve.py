@@ -1,4 +1,4 @@
-"""Room on the disk for what makes room: deleting writes to the database, and must work on a full disk."""
+"""Disk space in reserve for deletions, which write to the database and must work on a full disk."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ T = TypeVar("T")
 
 
 class Reserve:
-    """A file of no use but its size, given up where the disk is full and made again once there is room.
+    """A placeholder file, deleted when the disk is full and created again once there is space.
 
     Parameters
     ----------
     path : Path or None
-        Where it lies: beside the database. None where that is a server's, which has its own.
+        Where it lies: beside the database. None with a database server, which has its own disk.
     size : int
         In bytes.
     """
@@ -38,19 +38,19 @@ class Reserve:
         self.fill()
 
     def fill(self) -> None:
-        """Make the file where it is not, and where it leaves as much room again."""
+        """Create the file if it is missing and leaves at least as much space free."""
         if self._path is None or self._path.exists():
             return
-        with self._guard, contextlib.suppress(OSError):  # a full disk has no room for it: later, then
+        with self._guard, contextlib.suppress(OSError):  # on a full disk: later
             if shutil.disk_usage(self._path.parent).free < 2 * self._size:
                 return
             with self._path.open("wb") as file:
                 os.posix_fallocate(file.fileno(), 0, self._size)
 
     def spend(self, work: Callable[[], T]) -> T:
-        """Do something that makes room; on a full disk, in the room of the reserve."""
+        """Do something that frees space; on a full disk, give up the reserve for it."""
         try:
-            found = work()
+            result = work()
         except Exception as error:
             if self._path is None or not is_no_room(error):
                 raise
@@ -59,4 +59,4 @@ class Reserve:
                 self._path.unlink(missing_ok=True)
             return work()
         self.fill()
-        return found
+        return result

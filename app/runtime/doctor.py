@@ -1,7 +1,7 @@
-"""Examine an installation, running or not: whether all holds that must hold, and the blobs are there.
+"""Examine an installation, running or not: whether its invariants hold and its blobs are complete.
 
 The tables are examined by `app.store.upkeep.invariants`, the same checks that end the tests with random
-deaths. Here the blobs are compared with what the tables say of them.
+deaths. Here the blobs are compared with the tables.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from app.store.tables import CorrectionRow, GarbageRow, LensRow, PhotoRow, Sampl
 from app.store.upkeep.invariants import INVARIANTS
 
 STILL_COMING: Final = timedelta(minutes=30)
-"""What is written now may be named in the tables a moment later: nothing is deleted sooner."""
+"""Age of a blob without a row before it is deleted (chosen): its row may still be written."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that is not as it must be."""
+    """One violation of a check."""
 
     check: str
     subject: str
@@ -41,14 +41,14 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What was examined, and what was found."""
+    """The checks that ran, and their findings."""
 
     checks: tuple[str, ...]
     findings: tuple[Finding, ...]
 
     @property
     def open(self) -> tuple[Finding, ...]:
-        """What is still not as it must be."""
+        """Findings that were not mended."""
         return tuple(finding for finding in self.findings if not finding.mended)
 
 
@@ -62,7 +62,7 @@ def examine(
     settings, store, storage
         The installation.
     repair : bool
-        Mend what can be mended; each finding in a transaction of its own.
+        Mend findings where possible, each in a transaction of its own.
     deep : bool
         Read every photo and every kernel again and compare them with their checksums.
     """
@@ -90,7 +90,7 @@ def _tables(store: Store, *, repair: bool) -> Iterator[Finding]:
                 yield Finding(invariant.name, subject, f"not so: {invariant.sentence}", remedy)
                 continue
             with store.database.writing() as session:
-                if subject in invariant.find(session):  # nobody else has mended it meanwhile
+                if subject in invariant.find(session):  # not mended by another process meanwhile
                     invariant.mend(session, subject)
             yield Finding(invariant.name, subject, f"was not so: {invariant.sentence}", "", mended=True)
 
@@ -103,7 +103,7 @@ def _work(settings: Settings, store: Store) -> Iterator[Finding]:
 
 
 def _blobs(store: Store, storage: Storage, *, repair: bool) -> Iterator[Finding]:
-    """Compare what is stored with what the tables name; these are read last, since blobs come first."""
+    """Compare the stored blobs with the tables, which are read last, since blobs are written first."""
     if not storage.is_there:
         where = str(storage.folder)
         yield Finding("blobs", where, "the folder of the blobs is away", "mount its disk, or restore it")
@@ -128,9 +128,9 @@ def _blobs(store: Store, storage: Storage, *, repair: bool) -> Iterator[Finding]
     newer = dict(storage.listed()) if any(key not in sizes for _, key, _ in photos) else sizes
     for public_id, key, size in photos:
         if newer.get(key) != size:
-            said = "missing" if key not in newer else f"{newer[key]} bytes instead of {size}"
+            problem = "missing" if key not in newer else f"{newer[key]} bytes instead of {size}"
             yield Finding(
-                "blobs", public_id, f"the file of the photo is {said}", "restore it, or delete the photo"
+                "blobs", public_id, f"the file of the photo is {problem}", "restore it, or delete the photo"
             )
     for correction_id, result, length in results:
         if result is None or sizes.get(result) == length:
@@ -202,6 +202,6 @@ def _photos(store: Store, storage: Storage) -> Iterator[Finding]:
             for piece in storage.stream(key, 0, size):
                 digest.update(piece)
         except FileNotFoundError:
-            continue  # said already
+            continue  # a finding of `_blobs`
         if digest.hexdigest() != sha256:
             yield Finding("photos", public_id, "the file differs from what was sent", "restore the blobs")

@@ -1,4 +1,4 @@
-"""Connections on which nobody says anything are closed; the server itself waits for ever for a first word."""
+"""Close idle connections: the server itself waits for ever for the head of a request."""
 
 from __future__ import annotations
 
@@ -9,43 +9,43 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 
 class Impatient(H11Protocol):
-    """Waits for the head of a request only so long, from the first byte to its last."""
+    """HTTP protocol that closes a connection whose request head takes longer than `patience_s` in all."""
 
     patience_s: ClassVar[float] = 30.0
-    _waiting: asyncio.TimerHandle | None = None
+    _timer: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to wait."""
+        """Start the timer."""
         super().connection_made(transport)
-        self._look()
+        self._update_timer()
 
     def data_received(self, data: bytes) -> None:
-        """Go on to wait, unless a request has begun."""
+        """Stop the timer once a request has begun."""
         super().data_received(data)
-        self._look()
+        self._update_timer()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Wait no more."""
-        self._enough()
+        """Stop the timer."""
+        self._stop_timer()
         super().connection_lost(exc)
 
     @property
     def _idle(self) -> bool:
         return self.cycle is None or self.cycle.response_complete
 
-    def _look(self) -> None:
+    def _update_timer(self) -> None:
         if not self._idle:
-            self._enough()
-        elif self._waiting is None:  # never put off: a head that comes byte by byte is late, too
-            self._waiting = self.loop.call_later(self.patience_s, self._close)
+            self._stop_timer()
+        elif self._timer is None:  # never extended: a head that comes byte by byte is late, too
+            self._timer = self.loop.call_later(self.patience_s, self._close)
 
-    def _enough(self) -> None:
-        if self._waiting is not None:
-            self._waiting.cancel()
-            self._waiting = None
+    def _stop_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
 
     def _close(self) -> None:
-        self._waiting = None
+        self._timer = None
         if self._idle and not self.transport.is_closing():
             self.transport.close()
 

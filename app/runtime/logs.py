@@ -1,7 +1,7 @@
-"""How the service's processes log: one record begins one line, whatever its text holds.
+"""Logging of the service's processes: each record begins a line, whatever its text contains.
 
 People read lines of text; collectors read one JSON object a line (`LENS_LOG_FORMAT=json`). Both name the
-request, the job and the photo that a record belongs to, from wherever in the program it came.
+request, the job and the photo of a record, wherever in the program it was logged.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import structlog
 Format: TypeAlias = Literal["text", "json"]
 
 CONTINUED: Final = "\n    | "
-"""Before each further line of a record: no text from outside can look like a record of its own."""
+"""Prefix of each further line of a record: no text from outside can imitate a record."""
 
 FIELDS: Final = (
     "request_id",
@@ -30,20 +30,20 @@ FIELDS: Final = (
     "status",
     "ms",
 )
-"""What a record may carry besides its text; the same names in the context of a thread and in `extra`."""
+"""Fields of a record besides its text; the same names in the context of a thread and in `extra`."""
 
 _CONTROL: Final = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
 
 
 class OneRecord(logging.Formatter):
-    """Writes a record so that neither a new line, nor an escape sequence for the terminal can be forged."""
+    """Formatter that escapes control characters: neither lines nor terminal sequences can be forged."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the text of a record with the ids of its context, its control characters made visible."""
+        """Return the text of a record with the ids of its context and control characters escaped."""
         context = structlog.contextvars.get_contextvars()
         ids = "".join(f" {name}={context[name]}" for name in FIELDS if name in context)
         head, end, rest = super().format(record).partition("\n")
-        text = _CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", f"{head}{ids}{end}{rest}")
+        text = _CONTROL.sub(lambda match: f"\\x{ord(match[0]):02x}", f"{head}{ids}{end}{rest}")
         return text.replace("\n", CONTINUED)
 
 
@@ -73,12 +73,12 @@ def as_json(part: str) -> logging.Formatter:
 
 
 def begin(part: str, level: str, form: Format = "text") -> None:
-    """Log to the standard error from now on, as the named part of the service."""
+    """Log to standard error from now on, as the named part of the service."""
     handler = logging.StreamHandler(sys.stderr)
     text = OneRecord(f"%(asctime)s %(levelname)s {part} %(name)s: %(message)s")
     handler.setFormatter(as_json(part) if form == "json" else text)
-    # in place of what the command line set up
+    # replaces the handlers of the command line
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
-    logging.getLogger("alembic").setLevel(logging.WARNING)  # it tells of every look at the schema
-    engine = logging.getLogger("dbos")  # it brings a handler with lines of its own, unless it finds one
+    logging.getLogger("alembic").setLevel(logging.WARNING)  # it logs every check of the schema
+    engine = logging.getLogger("dbos")  # it adds a handler with its own format unless there is one
     engine.handlers, engine.propagate = [logging.NullHandler()], True

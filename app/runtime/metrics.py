@@ -1,9 +1,9 @@
-"""What the service measures of itself, in the text format of Prometheus.
+"""Metrics of the service, in the text format of Prometheus.
 
 The API measures requests and models, a worker its jobs. A worker has no address of its own unless
-`LENS_METRICS_PORT` gives it one, so it also leaves its numbers in a file, and `/metrics` of an API with the
-same data folder tells them together with its own. What waits and who works is read from the tables when it is
-asked for, so that any API tells it for all machines. No label holds an id or a name of anybody.
+`LENS_METRICS_PORT` gives it one, so it also writes its metrics to a file, and `/metrics` of an API with the
+same data folder serves them with its own. Queues and workers are read from the tables at each request, so
+that any API reports them for all machines. No label holds an id or the name of a person.
 """
 
 from __future__ import annotations
@@ -34,11 +34,12 @@ from app.store import Store
 CONTENT_TYPE: Final = CONTENT_TYPE_PLAIN_1_0_0
 FOLDER: Final = "metrics"
 KEEP_S: Final = 86400.0
-"""So long the numbers of a worker that is gone still count, lest sums fall with each restart."""
+"""How long the metrics of a worker that has ended still count (chosen), lest sums fall with each restart."""
 
 _QUICK: Final = (0.001, 0.0025, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 10.0)
 _LONG: Final = (0.1, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0)
-"""Bounds of the buckets in seconds: the goals of 5, 20 and 100 ms are among them; chosen besides."""
+"""Upper bounds of the buckets in seconds, of requests and of jobs: the goals of 5, 20 and 100 ms are among
+them, the others are chosen, about evenly on a logarithmic scale."""
 
 API: Final = CollectorRegistry()
 WORKER: Final = CollectorRegistry()
@@ -81,13 +82,13 @@ TAKEN_OVER: Final = Counter(
 
 
 class Tables(Collector):
-    """What waits, for how long, and who works: read from the tables when it is asked for."""
+    """Queues, their age and the live workers, read from the tables at each request."""
 
     def __init__(self, store: Store, lease_s: float) -> None:
         self._store, self._lease_s = store, lease_s
 
     def collect(self) -> Iterator[Metric]:
-        """Give the numbers of this moment."""
+        """Yield the present values."""
         load = self._store.operation.load()
         depth = GaugeMetricFamily("lensmodel_queue_jobs", "Unfinished jobs.", labels=("kind", "state"))
         for (kind, state), count in load.jobs.items():
@@ -108,20 +109,20 @@ class Tables(Collector):
 
 
 class Written(Collector):
-    """What workers have left in files of a folder, added up."""
+    """Sums of the metrics that workers have written to files of a folder."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def collect(self) -> Iterator[Metric]:
-        """Give each family once, with the sums over all files."""
+        """Yield each family once, with the sums over all files."""
         families: dict[str, Metric] = {}
         sums: dict[str, dict[tuple[str, tuple[tuple[str, str], ...]], float]] = {}
         for family in self._families():
             families.setdefault(family.name, Metric(family.name, family.documentation, family.type))
             added = sums.setdefault(family.name, {})
             for sample in family.samples:
-                if not sample.name.endswith("_created"):  # points in time add up to nothing
+                if not sample.name.endswith("_created"):  # times of creation cannot be added
                     key = (sample.name, tuple(sorted(sample.labels.items())))
                     added[key] = added.get(key, 0.0) + sample.value
         for name, family in families.items():
@@ -131,20 +132,20 @@ class Written(Collector):
 
     def _families(self) -> Iterable[Metric]:
         for path in sorted(self._folder.glob("*.prom")):
-            with contextlib.suppress(OSError, ValueError):  # gone or torn since it was listed
+            with contextlib.suppress(OSError, ValueError):  # deleted, or half written
                 yield from text_string_to_metric_families(path.read_text(encoding="utf-8"))
 
 
 def of_service(store: Store, lease_s: float, data_dir: Path) -> bytes:
-    """Return what an API tells: its own numbers, those of the tables and those of its folder's workers."""
-    asked = CollectorRegistry()
-    asked.register(Tables(store, lease_s))
-    asked.register(Written(data_dir / FOLDER))
-    return generate_latest(API) + generate_latest(asked)
+    """Return the metrics of an API: its own, those of the tables and those of its folder's workers."""
+    collected = CollectorRegistry()
+    collected.register(Tables(store, lease_s))
+    collected.register(Written(data_dir / FOLDER))
+    return generate_latest(API) + generate_latest(collected)
 
 
 def leave(data_dir: Path, worker_id: str) -> None:
-    """Write the numbers of this worker where an API finds them; remove those of workers long gone."""
+    """Write the metrics of this worker where an API finds them; remove those of workers long ended."""
     folder = data_dir / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
     for path in folder.glob("*.prom*"):
@@ -155,7 +156,7 @@ def leave(data_dir: Path, worker_id: str) -> None:
 
 
 def publish(port: int, host: str, data_dir: Path) -> None:
-    """Serve the numbers of the workers of this folder under an address of their own."""
-    told = CollectorRegistry()
-    told.register(Written(data_dir / FOLDER))
-    start_http_server(port, addr=host, registry=told)
+    """Serve the metrics of the workers of this folder on a port of their own."""
+    collected = CollectorRegistry()
+    collected.register(Written(data_dir / FOLDER))
+    start_http_server(port, addr=host, registry=collected)

@@ -1,9 +1,9 @@
-"""Errors of what surrounds a photo, not of the photo: told apart, and waited for until they end.
+"""Errors of the machinery rather than of a photo: recognised, and waited for until they end.
 
 A database that restarts, an object store that is away, a full disk, a child that the kernel
-killed for memory: none of them says anything about the photo. So such a job is tried again, with
-pauses that grow, until hours have passed; only then it ends, with a code by which its owner can
-have all such jobs done again in one call.
+killed for memory: none of them says anything about the photo. So such a job is retried with growing
+pauses for hours; only then it fails, with a code by which its owner can retry all such jobs in one
+call.
 """
 
 from __future__ import annotations
@@ -22,20 +22,27 @@ from sqlalchemy import exc
 log = logging.getLogger(__name__)
 
 CODE: Final = "outage"
-"""With what a job ends that waited in vain."""
+"""Error code of a job that waited in vain."""
 
 FIRST_PAUSE_S: Final = 1.0
 LONGEST_PAUSE_S: Final = 60.0
+"""Shortest and longest pause before a retry (chosen): a restart takes seconds, and after a long outage work
+resumes within a minute."""
+
 BUGS: Final = 3
-"""Tries of a job that fails in a way that nobody foresaw."""
+"""Attempts at a job that fails with an unforeseen error (chosen): not more, it is hardly chance."""
 
 _SQLITE_FULL: Final = 13
+"""SQLITE_FULL of sqlite3.h."""
+
 _POSTGRES_FULL: Final = "53100"
+"""SQLSTATE disk_full (PostgreSQL documentation, appendix A)."""
+
 _FULL: Final = ("os error 28", "os error 122")
-"""How the storage says that the disk, or the share of its user, is full."""
+"""How the storage reports ENOSPC and EDQUOT of Linux: the disk, or the quota of its user, is full."""
 
 _SQLITE_ERROR: Final = 1
-"""SQLite's code for a statement that is wrong; everything else it reports is the machine's."""
+"""SQLITE_ERROR of sqlite3.h, an invalid statement; every other code is a fault of the machine."""
 
 NO_ROOM: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 _MACHINE: Final = NO_ROOM | {
@@ -51,15 +58,15 @@ _OF_THE_REQUEST: Final = (
     stored.NotSupportedError,
     stored.PreconditionError,
 )
-"""What a store says that works; the rest, wrong credentials included, can be mended under way."""
+"""Errors of a working store; all others, including wrong credentials, can be mended while jobs wait."""
 
 
 class OutageError(Exception):
-    """The machinery could not do it: try again later."""
+    """The machinery failed: try again later."""
 
 
 def is_outage(error: BaseException) -> bool:
-    """Say whether an error is of the machinery: the same job can succeed once that is mended."""
+    """Say whether an error is a fault of the machinery: the same job can succeed once it is mended."""
     if isinstance(error, exc.DBAPIError):
         code = getattr(error.orig, "sqlite_errorcode", None)
         away = isinstance(error, exc.OperationalError | exc.InterfaceError) or error.connection_invalidated
@@ -68,25 +75,25 @@ def is_outage(error: BaseException) -> bool:
         return not isinstance(error, _OF_THE_REQUEST)
     if isinstance(error, OSError):
         if error.errno is None and not isinstance(error, FileNotFoundError | PermissionError):
-            return True  # the writer of the storage has no better words
+            return True  # how the writer of the storage reports any error
         return isinstance(error, ConnectionError | TimeoutError) or error.errno in _MACHINE
     return isinstance(error, OutageError | exc.TimeoutError | MemoryError | EOFError)
 
 
 def is_no_room(error: BaseException) -> bool:
-    """Say whether a disk, or the share of its user, is full."""
+    """Say whether a disk, or the quota of its user, is full."""
     if isinstance(error, exc.DBAPIError):
         return (
             getattr(error.orig, "sqlite_errorcode", None) == _SQLITE_FULL
             or getattr(error.orig, "sqlstate", None) == _POSTGRES_FULL
         )
-    said = isinstance(error, OSError | stored.BaseError) and any(sign in str(error) for sign in _FULL)
-    return said or (isinstance(error, OSError) and error.errno in NO_ROOM)
+    reported = isinstance(error, OSError | stored.BaseError) and any(sign in str(error) for sign in _FULL)
+    return reported or (isinstance(error, OSError) and error.errno in NO_ROOM)
 
 
 @contextmanager
 def missable() -> Iterator[None]:
-    """Let an outage pass unnoticed: what is inside is said again soon, or not needed."""
+    """Ignore an outage in the block, whose effect is repeated soon or not essential."""
     try:
         yield
     except Exception as error:

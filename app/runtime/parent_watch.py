@@ -1,4 +1,4 @@
-"""A pipe that ends with the supervisor: what it started stops when it is gone, however it went."""
+"""A pipe by which a process notices that its parent, the supervisor, has ended, however it ended."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import threading
 from collections.abc import Callable
 from typing import Final
 
-VARIABLE: Final = "LENSMODEL_LIFELINE"
-"""Name in the environment of the number of the pipe's reading end."""
+VARIABLE: Final = "LENSMODEL_PARENT_PIPE"
+"""Environment variable with the file descriptor of the pipe's reading end."""
 
 
-def on_parents_end(call: Callable[[], None]) -> None:
-    """Call something once the supervisor is gone; nothing happens without a supervisor."""
+def on_parents_end(stop: Callable[[], None]) -> None:
+    """Call a function once the supervisor has ended; do nothing without a supervisor."""
     number = os.environ.pop(VARIABLE, None)
     if number is None:
         return
@@ -21,6 +21,6 @@ def on_parents_end(call: Callable[[], None]) -> None:
     def wait() -> None:
         with contextlib.suppress(OSError):
             os.read(int(number), 1)
-        call()
+        stop()
 
-    threading.Thread(target=wait, name="lifeline", daemon=True).start()
+    threading.Thread(target=wait, name="parent-watch", daemon=True).start()

@@ -1,4 +1,4 @@
-"""Whether a process that is known by its number is still the same process."""
+"""Identify a process by its id and start time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 def started_at(pid: int) -> float:
     """Return when a process began, in clock ticks since the machine started; 0 where unknown.
 
-    Numbers of processes are used again; number and beginning together are not.
+    Process ids are reused; id and start time together are not.
     """
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
@@ -19,7 +19,7 @@ def started_at(pid: int) -> float:
 
 
 def is_running(pid: int, began: float) -> bool:
-    """Say whether the process `pid` that began at `began` still runs; where in doubt, yes."""
+    """Say whether the process `pid` that began at `began` still runs; True if in doubt."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

@@ -1,4 +1,4 @@
-"""One API process: uvicorn on a socket of its own, or on the one that the supervisor holds."""
+"""One API process: uvicorn on a socket of its own, or on that of the supervisor."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from app.runtime.signals import on_signals
 from app.sandbox import confine
 
 SOCKET: Final = "LENSMODEL_SOCKET"
-"""Name in the environment of the number of the listening socket."""
+"""Environment variable with the file descriptor of the listening socket."""
 
 GRACE_S: Final = 5
-"""How long open requests may take after the order to stop."""
+"""How long open requests may take after the order to stop (chosen): less than `supervisor.STOP_S`."""
 
 
 def run(settings: Settings, listener: socket.socket) -> None:
@@ -33,7 +33,7 @@ def run(settings: Settings, listener: socket.socket) -> None:
     config = uvicorn.Config(
         create_app(settings),
         log_level=settings.log_level,
-        log_config=None,  # its lines go where ours go
+        log_config=None,  # its records go to our handlers
         access_log=False,  # the application writes its own, without serials
         timeout_graceful_shutdown=GRACE_S,
         limit_concurrency=settings.max_connections,
@@ -49,7 +49,7 @@ def run(settings: Settings, listener: socket.socket) -> None:
 
 
 class _Server(uvicorn.Server):
-    """Ends its process well when told to: uvicorn would raise the signal again afterwards."""
+    """Exits with status 0 on a signal: uvicorn would raise the signal again afterwards."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -64,7 +64,7 @@ def listen(host: str, port: int) -> socket.socket:
     Raises
     ------
     OSError
-        If the address is taken, or not one of this machine.
+        If the address is in use, or not one of this machine.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)

@@ -1,4 +1,4 @@
-"""What can be configured, read once from the environment (prefix `LENS_`).
+"""Settings, read once from the environment (prefix `LENS_`).
 
 Every setting has a default that works on one machine without anything else installed. A second
 machine needs other addresses for the database, the jobs and the storage, and nothing else.
@@ -19,7 +19,7 @@ from lensmodel.core.errors import UnknownMethodError
 
 PREFIX = "LENS_"
 CLIENT_KEY = "LENS_API_KEY"
-"""No setting of the service: where its clients look for the key that they send."""
+"""Not a setting of the service: the key that its clients send."""
 
 MIB = 1024 * 1024
 LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
@@ -28,8 +28,8 @@ LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
 class Settings(BaseSettings):
     """Configuration of one process; frozen, passed on, never looked up again.
 
-    Names of the environment that begin with `LENS_` and mean nothing are an error: most likely
-    somebody mistyped a setting that he now believes to be in force.
+    Unknown names in the environment that begin with `LENS_` are an error: most likely a mistyped
+    setting that the operator believes to be in force.
     """
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, extra="forbid", frozen=True)

@@ -1,4 +1,4 @@
-"""What to do when a process is told to stop."""
+"""Handle the signals that stop a process."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def on_signals(stop: Callable[[signal.Signals], None], numbers: Sequence[int] = 
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
 
-    def told(number: int, frame: FrameType | None) -> None:
+    def handle(number: int, frame: FrameType | None) -> None:
         del frame
-        with contextlib.suppress(BlockingIOError):  # thousands of signals wait already
+        with contextlib.suppress(BlockingIOError):  # the pipe is full of signals already
             os.write(writing, bytes([number]))
 
     def listen() -> None:
@@ -34,4 +34,4 @@ def on_signals(stop: Callable[[signal.Signals], None], numbers: Sequence[int] = 
 
     threading.Thread(target=listen, name="signals", daemon=True).start()
     for number in numbers:
-        signal.signal(number, told)
+        signal.signal(number, handle)

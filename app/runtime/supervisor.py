@@ -1,7 +1,7 @@
 """`lensmodel serve`: one API process and one worker process, restarted whenever one dies.
 
-The supervisor holds the listening socket, so that while the API restarts callers wait instead of
-being refused; and a pipe whose end tells its children, however it ends itself, that it is gone.
+The supervisor holds the listening socket, so that callers wait while the API restarts instead of
+being refused; and a pipe by which its children notice that it has ended, however it ended.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from typing import Final
 
 from app.commands.console.failure import UsageError
 from app.runtime import server
-from app.runtime.parent_watch import VARIABLE as LIFELINE
+from app.runtime.parent_watch import VARIABLE as PARENT_PIPE
 from app.runtime.settings import PREFIX, Settings
 from app.runtime.signals import on_signals
 from app.sandbox import confine
@@ -38,14 +38,22 @@ from lensmodel.core.errors import InvalidInputError
 log = logging.getLogger(__name__)
 
 POLL_S: Final = 0.1
+"""Seconds between two looks at the members (chosen): two calls of waitpid."""
+
 READY_POLL_S: Final = 0.25
+"""Seconds between two questions whether the API is ready (chosen): it starts in seconds."""
+
 STOP_S: Final = 15.0
+"""How long members may take to stop before they are killed (chosen): longer than `server.GRACE_S`."""
+
 STEADY_S: Final = 20.0
-"""A process that lived so long is restarted at once, and its earlier deaths are forgotten."""
+"""A process that ran so long is restarted at once, and its earlier deaths are forgotten (chosen)."""
 
 MAX_EARLY_DEATHS: Final = 6
+"""Deaths in a row before `STEADY_S` that end the service (chosen): the pauses between them grow to 8 s."""
+
 WORKER, API = "app.runtime.worker_main", "app.runtime.api_main"
-"""Modules of the members; tests put in workers of their own."""
+"""Modules of the members; tests replace the worker."""
 
 ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
@@ -58,9 +66,9 @@ def serve(settings: Settings) -> int:
     UsageError
         If another service works on the same data.
     UsageError
-        If others could reach it, and nobody use it: there is no key.
+        If others can reach it and there is no valid key.
     InvalidInputError
-        If the address cannot be listened on, or the database is of a newer program.
+        If the address cannot be listened on, or a newer program made the database.
     """
     confine.keep_private()
     settings.data_dir.mkdir(parents=True, exist_ok=True)
@@ -78,7 +86,7 @@ def run_api(settings: Settings) -> None:
 
 
 def run_worker(settings: Settings) -> None:
-    """Become one worker process.
+    """Replace this process by a worker.
 
     A new program rather than a call: children import the main module of their parent again, and
     that of a worker is small for this reason.
@@ -90,7 +98,7 @@ def run_worker(settings: Settings) -> None:
 
 
 def _prepare(settings: Settings) -> None:
-    """Bring the schema up to date, and make sure that somebody could use what others can reach.
+    """Bring the schema up to date, and check that there is a key if one is needed.
 
     Raises
     ------
@@ -100,10 +108,10 @@ def _prepare(settings: Settings) -> None:
     _migrate(settings)
     database = Database(settings.database)
     try:
-        somebody = not settings.needs_keys or KeyStore(database).any_valid()
+        usable = not settings.needs_keys or KeyStore(database).any_valid()
     finally:
         database.close()
-    if somebody:
+    if usable:
         return
     raise UsageError(
         f"the service asks for keys (LENS_HOST={settings.host}, LENS_PUBLIC={str(settings.public).lower()}, "
@@ -113,7 +121,7 @@ def _prepare(settings: Settings) -> None:
 
 
 def _migrate(settings: Settings) -> None:
-    """Bring the schema up to date; of several processes that try, one does it."""
+    """Bring the schema up to date; one of several simultaneous processes does it."""
     database = Database(settings.database)
     try:
         migrate.upgrade(database)
@@ -172,10 +180,10 @@ class _Supervisor:
     _stopping: threading.Event = field(default_factory=threading.Event)
 
     def run(self) -> int:
-        """Watch until told to stop; return the exit status."""
+        """Watch until stopped; return the exit status."""
         members = [_Member("worker", WORKER), _Member("api", API)]
         reading, writing = os.pipe()
-        on_signals(self._told)
+        on_signals(self._on_signal)
         threading.Thread(target=self._announce, daemon=True).start()
         try:
             while not self._stopping.is_set():
@@ -190,7 +198,7 @@ class _Supervisor:
             self._file.unlink(missing_ok=True)
         return 0
 
-    def _told(self, number: signal.Signals) -> None:
+    def _on_signal(self, number: signal.Signals) -> None:
         log.info("%s: stopping", number.name)
         self._stopping.set()
 
@@ -204,8 +212,8 @@ class _Supervisor:
         host, port = self.listener.getsockname()[:2]
         return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
-    def _keep(self, member: _Member, lifeline: int, members: list[_Member]) -> bool:
-        """Start a member that does not run; False if it dies again and again right at its start."""
+    def _keep(self, member: _Member, parent_pipe: int, members: list[_Member]) -> bool:
+        """Start a member that does not run; False if it keeps dying right after its start."""
         now = time.monotonic()
         if member.process is not None:
             status = member.process.poll()
@@ -222,23 +230,23 @@ class _Supervisor:
                 return False
             member.due = now + (0.0 if member.early_deaths <= 1 else 0.25 * 2**member.early_deaths)
         if now >= member.due:
-            self._start(member, lifeline)
+            self._start(member, parent_pipe)
             self._write(members)
         return True
 
-    def _start(self, member: _Member, lifeline: int) -> None:
-        inherited = {LIFELINE: str(lifeline), server.SOCKET: str(self.listener.fileno())}
+    def _start(self, member: _Member, parent_pipe: int) -> None:
+        inherited = {PARENT_PIPE: str(parent_pipe), server.SOCKET: str(self.listener.fileno())}
         member.process = subprocess.Popen(  # noqa: S603 - our own interpreter, our own modules
             [sys.executable, "-m", member.module],
             env=os.environ | environment(self.settings) | ONE_THREAD | inherited,
-            pass_fds=(lifeline, self.listener.fileno()),
+            pass_fds=(parent_pipe, self.listener.fileno()),
             stdin=subprocess.DEVNULL,
-            start_new_session=True,  # a Ctrl-C reaches us alone, and we tell them
+            start_new_session=True,  # a Ctrl-C reaches the supervisor alone, which stops them
         )
         member.started = time.monotonic()
 
     def _write(self, members: list[_Member]) -> None:
-        """Say in a file where the service is and which processes it consists of."""
+        """Write the address of the service and the ids of its processes to a file."""
         pids = {f"{m.name}_pid": m.process.pid if m.process else None for m in members}
         text = json.dumps({"url": self.url, "pid": os.getpid(), **pids}, indent=2)
         part = self._file.with_suffix(".part")
@@ -261,7 +269,7 @@ class _Supervisor:
         print(f"lensmodel is ready: {self.url}  (data in {self.settings.data_dir.resolve()})", flush=True)  # noqa: T201
 
     def _end(self, members: list[_Member]) -> None:
-        """Tell all members to stop; kill those that do not."""
+        """Terminate all members; kill those that do not stop in time."""
         running = [m.process for m in members if m.process is not None and m.process.poll() is None]
         for process in running:
             process.terminate()

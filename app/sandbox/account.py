@@ -1,9 +1,9 @@
-"""Another account for what decodes the files of strangers, where a worker may change to one.
+"""A separate account for processes that decode untrusted files, where a worker may change to one.
 
-A child that a hostile file took over then owns no file of the service, and may signal none of its
-processes, whether or not the kernel has the measures of `app.sandbox.confine`. It reaches its task's
-folder because that belongs to a group of the account; the folders above let it through and show it
-nothing; all else in the data folder is closed to it.
+A child that was taken over by a hostile file then owns no file of the service, and may signal none of
+its processes, whether or not the kernel has the measures of `app.sandbox.confine`. It reaches its
+task's folder because that belongs to the group of the account; it may pass the folders above without
+listing them; everything else in the data folder is closed to it.
 
 References
 ----------
@@ -24,16 +24,17 @@ from pathlib import Path
 from typing import Final
 
 AUTO, NONE = "auto", "none"
-"""What `LENS_TASK_USER` may be besides a name: the first of `USUAL` that there is; and no other account."""
+"""Special values of `LENS_TASK_USER`: the first of `USUAL` that exists; no separate account."""
 
 USUAL: Final = ("lens-task", "nobody")
 THROUGH: Final = 0o710
-"""Mode of a folder that the account may pass, if it knows what lies there, and not list."""
+"""Mode of a folder that the account may pass through but not list."""
 
 _NEEDED: Final = 1 << 5 | 1 << 6 | 1 << 7
-"""CAP_KILL, for a child must be ended, CAP_SETGID, CAP_SETUID."""
+"""CAP_KILL, to end children, CAP_SETGID and CAP_SETUID (linux/capability.h)."""
 
 _CAPABILITY_VERSION: Final = 0x20080522
+"""_LINUX_CAPABILITY_VERSION_3 of linux/capability.h: two words of 32 bits for each set."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +45,12 @@ class Account:
     gid: int
 
     def become(self) -> None:
-        """Change this process to the account; nothing of what it might do before is left to it.
+        """Change this process to the account, and give up all capabilities.
 
         Raises
         ------
         OSError
-            If it may not.
+            If this process may not change to it.
         """
         os.setgroups([])
         os.setresgid(self.gid, self.gid, self.gid)
@@ -57,62 +58,62 @@ class Account:
         _give_up_capabilities()
 
     def lets_through(self, folder: Path) -> None:
-        """Make a folder if it is not there; let the account pass it."""
+        """Create a folder if it is missing; let the account pass through it."""
         folder.mkdir(parents=True, exist_ok=True)
         self._grant(folder, THROUGH)
 
     def may_change(self, folder: Path) -> None:
-        """Give the account a folder to write to, with all in it."""
+        """Let the account write to a folder and everything in it."""
         for path in _inside(folder):
             self._grant(path, 0o2770 if path.is_dir() else 0o660)
 
     def may_read(self, path: Path) -> None:
-        """Let the account read a file, or a folder with all in it."""
+        """Let the account read a file, or a folder and everything in it."""
         for part in _inside(path):
             self._grant(part, 0o750 if part.is_dir() else 0o640)
 
     def _grant(self, path: Path, mode: int) -> None:
-        found = path.stat()
-        if found.st_uid == self.uid:  # made by a task
+        status = path.stat()
+        if status.st_uid == self.uid:  # created by a task
             return
-        if found.st_gid != self.gid:
+        if status.st_gid != self.gid:
             os.chown(path, -1, self.gid)
-        if stat.S_IMODE(found.st_mode) != mode:
+        if stat.S_IMODE(status.st_mode) != mode:
             path.chmod(mode)
 
     def is_of_use(self, data: Path) -> bool:
-        """Say whether children may change to it, find the program then, and reach a data folder.
+        """Say whether children may change to it, and can then read the program and reach a data folder.
 
-        Tried in a process of its own: call it while this one has one thread.
+        Tried in a forked process: call it while this one has a single thread.
         """
         if not may_change():
             return False
         program = [Path(entry) for entry in [*sys.path, sys.prefix, sys.base_prefix] if entry]
-        there = [path for path in [*program, Path(__file__).parents[2]] if path.exists()]
-        above = [path for path in data.resolve().parents if path.exists()]
+        program_paths = [path for path in [*program, Path(__file__).parents[2]] if path.exists()]
+        parents = [path for path in data.resolve().parents if path.exists()]
         pid = os.fork()
         if pid == 0:
             status = 1
             with contextlib.suppress(OSError):
                 self.become()
-                reads = all(os.access(path, os.R_OK) for path in there)
-                status = 0 if reads and all(os.access(path, os.X_OK) for path in above) else 1
+                reads = all(os.access(path, os.R_OK) for path in program_paths)
+                status = 0 if reads and all(os.access(path, os.X_OK) for path in parents) else 1
             os._exit(status)
         return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
 
 
 def may_change() -> bool:
-    """Say whether this process may change to other accounts, and end what runs under them."""
+    """Say whether this process may change to other accounts, and end their processes."""
     return _effective() & _NEEDED == _NEEDED
 
 
 def find(name: str) -> Account | None:
-    """Return an account by its name, or the usual one; None if there is none, or none is wanted.
+    """Return an account by its name, or the usual one; None if there is none, or with `NONE`.
 
     Raises
     ------
     ValueError
-        If a name is given that no account has, or that of the superuser.
+        If there is no account of that name, or it is the superuser's.
     """
     if name == NONE:
         return None
@@ -128,7 +129,7 @@ def find(name: str) -> Account | None:
 
 
 def close_to_others(data: Path, open_folders: set[str]) -> None:
-    """Close what lies in a data folder to other accounts, but for the folders of these names."""
+    """Close everything in a data folder to other accounts, except the folders of these names."""
     for path in data.iterdir():
         mode = stat.S_IMODE(path.lstat().st_mode)
         if path.name not in open_folders and not path.is_symlink() and mode & 0o077:
@@ -136,7 +137,7 @@ def close_to_others(data: Path, open_folders: set[str]) -> None:
 
 
 def _inside(path: Path) -> Iterator[Path]:
-    """Give a file or folder and all below it, but for symbolic links."""
+    """Yield a file or folder and everything below it, except symbolic links."""
     yield path
     for folder, folders, files in os.walk(path):
         for name in [*folders, *files]:
@@ -158,7 +159,7 @@ class _Header(ctypes.Structure):
 
 
 def _give_up_capabilities() -> None:
-    """Only the superuser loses them by the change itself."""
+    """Clear all capabilities: a change of account by itself clears only the superuser's."""
     header, none = _Header(_CAPABILITY_VERSION, 0), (ctypes.c_uint32 * 6)()
     if ctypes.CDLL(None, use_errno=True).capset(ctypes.byref(header), none) != 0:
         number = ctypes.get_errno()

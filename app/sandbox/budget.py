@@ -1,4 +1,4 @@
-"""How many children run at once, and how much memory they take together."""
+"""Limits on the number of children at once and on their memory together."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from collections.abc import Callable, Iterator
 from typing import Final
 
 POLL_S: Final = 0.25
+"""Seconds between two questions whether a task is still wanted (chosen): each reads a row."""
 
 
 class Budget:
-    """How many children run at once, and how much memory they may take together; first come, first served."""
+    """Slots and memory that children share, first come, first served."""
 
     def __init__(self, slots: int, memory_mb: int) -> None:
         self._changed = threading.Condition()
@@ -22,9 +23,9 @@ class Budget:
 
     @contextlib.contextmanager
     def share(self, memory_mb: int, wanted: Callable[[], bool]) -> Iterator[bool]:
-        """Wait for a slot and memory; give False if nobody wants it any more.
+        """Wait for a slot and memory; yield False if the task is no longer wanted.
 
-        A task that asks for more than there is at all runs alone.
+        A task that needs more memory than the whole budget runs alone.
         """
         memory = min(memory_mb, self.memory_mb)
         ticket = object()

@@ -1,4 +1,4 @@
-"""The inside of a child process: contain it, run one task, say how it ended.
+"""The code of a child process: confine it, run one task, report how it ended.
 
 This module is what a fresh child imports first, so it imports next to nothing itself.
 """
@@ -33,13 +33,19 @@ Task: TypeAlias = Callable[[dict[str, Any], Path, Progress], Any]
 
 RESULT: Final = "result.json"
 MAX_TEXT: Final = 4000
+"""Characters of an error text at most (chosen): a traceback in less than `runner.MAX_MESSAGE` bytes."""
+
 _MIB: Final = 1024 * 1024
 NICENESS: Final = 10
-"""Of tasks above that of the worker, unless the operator says otherwise: a tenth of the weight of a process
-at 0 (sched(7)); chosen."""
+"""Default niceness of tasks above that of the worker (chosen): a tenth of the weight of a process at 0
+(sched(7))."""
 
 _PROGRESS_S: Final = 0.1
+"""Seconds between two messages of progress (chosen)."""
+
 _PR_SET_PDEATHSIG: Final = 1
+"""Of linux/prctl.h."""
+
 _KEPT_ENVIRONMENT: Final = (
     *("LANG", "LC_ALL", "NUMBA_CACHE_DIR", "SYSTEMROOT"),
     "TMPDIR",  # where the fork server listens; a task has a folder of its own instead
@@ -49,18 +55,18 @@ _ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREAD
 
 
 def main(order: dict[str, Any], line: Connection) -> None:
-    """Carry out one order: `module`, `task`, `arguments` (JSON), `folder`, `limits`, `niceness`, its reach.
+    """Run one order: `module`, `task`, `arguments` (JSON), `folder`, `limits`, `niceness`, permissions.
 
     `reads` are files and folders that it may read, `writes` folders that it may write besides its own;
     None in place of `reads` leaves the file system, the network and other programs open to it. `account`
-    are the numbers of what it changes to, if any.
+    holds the uid and gid that it changes to, if any.
     """
     folder = Path(order["folder"])
-    tasks = importlib.import_module(order["module"])  # our own code: it may still be read
+    tasks = importlib.import_module(order["module"])  # our own code, not readable after this
     contain(folder, order["limits"], order["niceness"])
     if order["reads"] is not None:
         _confine(folder, order)
-    # no thread before this line: it would keep what the others gave up
+    # no thread before this line: it would keep the permissions that the others gave up
     threading.Thread(target=_end_with_parent, args=(line,), daemon=True).start()
     last = 0.0
 
@@ -86,7 +92,7 @@ def main(order: dict[str, Any], line: Connection) -> None:
             _tell(line, end="memory_limit")
         else:
             _tell(line, end="bug", code=type(error).__name__, text=_last_lines())
-    except Exception as error:  # noqa: BLE001 - whatever it is, the parent must hear of it
+    except Exception as error:  # noqa: BLE001 - the parent must learn of any failure
         _tell(line, end="bug", code=type(error).__name__, text=_last_lines())
     finally:
         sys.stdout.flush()
@@ -96,26 +102,26 @@ def _confine(folder: Path, order: dict[str, Any]) -> None:
     writes = [folder, *map(Path, order["writes"])]
     account = Account(*order["account"]) if order["account"] else None
     if account is not None:
-        os.umask(0o007)  # its worker reads what it writes, as one of its group
+        os.umask(0o007)  # the worker reads its files as a member of its group
     confine.confine(writes, map(Path, order["reads"]), account)
-    _die_with_parent()  # again: the kernel forgets it when a process changes what it may
+    _die_with_parent()  # again: the kernel clears it when credentials change
 
 
 def clean_environment() -> dict[str, str]:
-    """Return what of this process's environment a child needs: no address, no password, no key."""
+    """Return the part of the environment that a child needs: no address, no password, no key."""
     kept = {name: os.environ[name] for name in _KEPT_ENVIRONMENT if name in os.environ}
     return {**kept, "PATH": os.defpath, **dict.fromkeys(_ONE_THREAD, "1")}
 
 
 def contain(folder: Path, limits: dict[str, int], niceness: int) -> None:
-    """Take away what a task does not need; it cannot be had back.
+    """Give up for good what a task does not need.
 
-    The memory limit counts from what the process takes already: libraries and thread stacks of
-    the program are not the task's fault.
+    The memory limit counts from the address space that the process has already: libraries and
+    thread stacks of the program are not the task's.
     """
     _close_fork_server_line()
     with contextlib.suppress(OSError):
-        os.setsid()  # a Ctrl-C at the terminal is for the parent; a kill reaches the whole group
+        os.setsid()  # Ctrl-C at the terminal reaches only the parent; a kill reaches the whole group
     give_way(niceness)
     _die_with_parent()
     os.umask(0o077)
@@ -127,15 +133,15 @@ def contain(folder: Path, limits: dict[str, int], niceness: int) -> None:
     _limit(resource.RLIMIT_NOFILE, limits["open_files"])
     _limit(resource.RLIMIT_FSIZE, limits["file_mb"] * _MIB)
     _limit(resource.RLIMIT_CPU, limits["cpu_s"], slack=2)
-    if sys.platform != "darwin":  # there the limit is accepted and ignored
+    if sys.platform != "darwin":  # which accepts the limit and ignores it
         _limit(resource.RLIMIT_AS, _address_space() + limits["memory_mb"] * _MIB)
 
 
 def give_way(niceness: int) -> None:
-    """Let whoever waits for an answer go first: requests take milliseconds, tasks minutes.
+    """Lower the priority of a task below that of requests, which take milliseconds rather than minutes.
 
-    Where the kernel shares processors out by sessions (sched(7), autogroup), a nice value counts only inside
-    of one, and the new session of a task began at that of all others; so it gets the same value.
+    Where the kernel schedules by sessions (autogroup, sched(7)), a nice value counts only within a session,
+    and a task has a session of its own; so the session gets the same value.
     """
     with contextlib.suppress(OSError):
         os.nice(niceness)
@@ -157,10 +163,10 @@ def _address_space() -> int:
 
 
 def _close_fork_server_line() -> None:
-    """Close the pipe whose end tells the fork server that its parent lives.
+    """Close the pipe by which the fork server notices that its parent has ended.
 
     Every child inherits it, so that the server would outlive a killed parent for as long as one
-    child runs. Without it the server ends with the parent, and its end kills the children.
+    child runs. Closed here, the server ends with the parent, and its end kills the children.
     """
     server = getattr(forkserver, "_forkserver", None)
     inherited = getattr(server, "_forkserver_alive_fd", None)
@@ -174,11 +180,11 @@ def _die_with_parent() -> None:
         parent = os.getppid()
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:
-            os._exit(70)  # it died before we asked to die with it
+            os._exit(70)  # the parent died before prctl took effect
 
 
 def _end_with_parent(line: Connection) -> None:
-    """Exit when the parent's end of the line closes: portable, where the kernel does not help."""
+    """Exit when the parent's end of the connection closes: portable, unlike PR_SET_PDEATHSIG."""
     with contextlib.suppress(OSError, EOFError):
         line.recv_bytes()
     os._exit(70)
@@ -190,7 +196,7 @@ def _tell(line: Connection, **message: object) -> None:
     try:
         line.send_bytes(json.dumps(message).encode())
     except OSError:
-        os._exit(70)  # nobody listens any more
+        os._exit(70)  # the parent is gone
 
 
 def _last_lines() -> str:

@@ -1,10 +1,10 @@
-"""Take from a process what the kernel lets it give up: files, network, other programs, other processes.
+"""Confine a process by means of the kernel: files, network, other programs, other processes.
 
-What a child decodes comes from strangers. Should one of them take it over, there must be little to
-take: no secret in its environment, no file but those of its task, no network, no program to start.
-Each measure here is of the kernel and cannot be undone by the process. Only the change to another
-account needs privileges; which of the others there are depends on the kernel and on what a container
-allows, so each says whether it is in force, and the service tells it under `/readyz`.
+A child decodes untrusted files. Should one of them take it over, there must be little to gain: no
+secret in its environment, no files but those of its task, no network, no program to start. Each
+measure is enforced by the kernel and cannot be undone by the process. Only the change to another
+account needs privileges; which other measures exist depends on the kernel and on what a container
+allows, so each reports whether it is in force, and the service shows it under `/readyz`.
 
 References
 ----------
@@ -30,17 +30,18 @@ from app.sandbox import seccomp
 from app.sandbox.account import Account
 
 MEASURES: Final = ("account", "no_new_privs", "namespaces", "files", "system_calls")
-"""`account`: one of its own; `namespaces`: a network without interfaces and a count of processes of its own;
+"""`account`: a separate one; `namespaces`: a network without interfaces and a separate count of processes;
 `files`: Landlock; `system_calls`: seccomp."""
 
 MAX_PROCESSES: Final = 128
-"""Threads of one task; chosen, far above what a machine's corrections start."""
+"""Threads of one task at most (chosen): far more than a correction starts."""
 
+# linux/prctl.h, linux/sched.h
 _PR_SET_DUMPABLE: Final = 4
 _PR_SET_NO_NEW_PRIVS: Final = 38
 _CLONE_NEWUSER, _CLONE_NEWNET, _CLONE_NEWIPC = 0x10000000, 0x40000000, 0x08000000
 
-# Landlock, from linux/landlock.h: what each version of it added to the rights over files
+# linux/landlock.h; `_HANDLED`: the file rights that each version of Landlock added
 _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446
 _READ: Final = 1 << 2 | 1 << 3  # READ_FILE, READ_DIR
 _FILE_RIGHTS: Final = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 14  # EXECUTE, WRITE_FILE, READ_FILE, TRUNCATE
@@ -55,7 +56,7 @@ _PATH_BENEATH: Final = 1
 _DEVICES: Final = ("/dev/null", "/dev/zero", "/dev/urandom", "/dev/random")
 _MACHINE: Final = ("/usr", "/lib", "/lib64", "/etc/ld.so.cache", "/etc/localtime", "/sys/devices/system/cpu")
 _PROC: Final = ("/proc/self", "/proc/cpuinfo", "/proc/meminfo")
-"""The loader, the libraries, and what numerical libraries ask of the machine."""
+"""The loader, the libraries, and files from which numerical libraries learn about the machine."""
 
 _libc = ctypes.CDLL(None, use_errno=True)
 
@@ -70,18 +71,18 @@ class _Beneath(ctypes.Structure):
 
 
 def confine(writes: Sequence[Path], reads: Iterable[Path] = (), account: Account | None = None) -> list[str]:
-    """Give up all but the program itself, `reads`, and `writes`; return which measures are in force.
+    """Give up access to all but the program itself, `reads`, and `writes`; return the measures in force.
 
-    Call it while the process has one thread: the others would keep what this one gives up.
+    Call it while the process has a single thread: others would keep their permissions.
 
     Parameters
     ----------
     writes : sequence of Path
-        Folders where files may be made, changed and removed; the first is the task's own.
+        Folders where files may be created, changed and removed; the first is the task's own.
     reads : iterable of Path
         Files and folders that may be read besides the libraries.
     account : Account, optional
-        What to change to; OSError if that is refused.
+        Account to change to; OSError if that is refused.
     """
     in_force = []
     if account is not None:
@@ -103,7 +104,7 @@ def confine(writes: Sequence[Path], reads: Iterable[Path] = (), account: Account
 
 
 def keep_private() -> None:
-    """Keep other accounts from what this process writes, and others of its own from its memory."""
+    """Close files that this process writes to other accounts, and its memory to other processes."""
     os.umask(0o077)
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
@@ -111,7 +112,7 @@ def keep_private() -> None:
 
 
 def available(user: str, data: Path) -> dict[str, bool]:
-    """Say which measures children of this machine have: tried out, once, in a process of its own.
+    """Return which measures are available on this machine, tried once in a separate process.
 
     Parameters
     ----------
@@ -121,21 +122,23 @@ def available(user: str, data: Path) -> dict[str, bool]:
         The data folder, which another account has to reach.
     """
     changes = user != accounts.NONE and accounts.may_change()
-    in_force = _tried(user, str(data.resolve())) if changes else _tried(accounts.NONE, "")
+    in_force = (
+        _measures_in_force(user, str(data.resolve())) if changes else _measures_in_force(accounts.NONE, "")
+    )
     return {name: name in in_force for name in MEASURES}
 
 
 @functools.cache
-def _tried(user: str, data: str) -> list[str]:
+def _measures_in_force(user: str, data: str) -> list[str]:
     try:
-        said = subprocess.run(  # noqa: S603 - ourselves
+        output = subprocess.run(  # noqa: S603 - ourselves
             [sys.executable, "-m", "app.sandbox.confine", user, data],
             check=True,
             capture_output=True,
             timeout=60,
             cwd=Path(__file__).parents[2],
         ).stdout
-        in_force: list[str] = json.loads(said)
+        in_force: list[str] = json.loads(output)
     except (OSError, ValueError, subprocess.SubprocessError):
         return []
     return in_force
@@ -153,9 +156,9 @@ def _check(result: int) -> int:
 
 
 def _separate() -> None:
-    """Enter a network without interfaces, and a user namespace: whoever was root is nobody there."""
+    """Enter a network namespace without interfaces, and a user namespace, where root has no privileges."""
     _check(_libc.unshare(_CLONE_NEWUSER | _CLONE_NEWNET | _CLONE_NEWIPC))
-    # Only here: elsewhere the kernel counts all processes of the account, those of others with it.
+    # Only in a user namespace: elsewhere the kernel counts all processes of the account.
     resource.setrlimit(resource.RLIMIT_NPROC, (MAX_PROCESSES, MAX_PROCESSES))
 
 
@@ -167,7 +170,7 @@ def _restrict_files(writes: Sequence[Path], reads: Iterable[Path]) -> None:
         _TCP if version >= _NETWORK_SINCE else 0,
         _SCOPES if version >= _SCOPE_SINCE else 0,
     )
-    # older kernels refuse a structure that is longer than theirs, unless the rest is zero
+    # older kernels refuse a longer structure than theirs unless the rest is zero
     rules = _check(
         _libc.syscall(_CREATE_RULESET, ctypes.byref(ruleset), ctypes.c_size_t(ctypes.sizeof(ruleset)), 0)
     )
@@ -183,13 +186,13 @@ def _restrict_files(writes: Sequence[Path], reads: Iterable[Path]) -> None:
         os.close(rules)
 
 
-def _program(own: Path) -> list[Path]:
-    """Return what the program itself reads: libraries and modules; nothing that holds the task's folder."""
+def _program(task_folder: Path) -> list[Path]:
+    """Return the libraries and modules that the program reads, but no parent of the task's folder."""
     packages = [Path(__file__).parents[1], Path(json.__file__).parents[1]]
     library = Path(__file__).parents[2] / "lensmodel"
     entries = [*sys.path, sys.prefix, sys.base_prefix, *_MACHINE, *_PROC]
     listed = [*(Path(entry) for entry in entries if entry), *packages, library]
-    inside = own.resolve()
+    inside = task_folder.resolve()
     return [path for path in listed if path.exists() and not inside.is_relative_to(path.resolve())]
 
 

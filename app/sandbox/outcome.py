@@ -1,4 +1,4 @@
-"""What a child may take, and what to make of how it ended."""
+"""Limits of a child process, and its outcome from the way it ended."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ log = logging.getLogger(__name__)
 Ending: TypeAlias = Literal["ok", "error", "memory_limit", "time_limit", "outage", "crashed", "cancelled"]
 
 MAX_RESULT: Final = 16 * 1024 * 1024
+"""Bytes of JSON that are read from a task at most (chosen): far more than any returns, arrays are files."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What one task may take.
+    """Resources that one task may use.
 
     Parameters
     ----------
@@ -70,20 +71,20 @@ class Outcome:
     detail: str = ""
 
 
-def outcome_of(ended: dict[str, Any] | None, status: int, folder: Path, limits: Limits) -> Outcome:
-    """Judge a child by its last message, if any, and its exit status (minus the signal's number)."""
-    ending = None if ended is None else ended.get("end")
+def outcome_of(message: dict[str, Any] | None, status: int, folder: Path, limits: Limits) -> Outcome:
+    """Return the outcome from the last message of a child, if any, and its exit status (or -signal)."""
+    ending = None if message is None else message.get("end")
     if ending == "ok" and status == 0:
         return _result(folder / child.RESULT)
-    if ending in _SAID:
-        code, text = (str((ended or {}).get(key, "")) for key in ("code", "text"))
-        return _SAID[ending](code, text, limits)
+    if ending in _OUTCOMES:
+        code, text = (str((message or {}).get(key, "")) for key in ("code", "text"))
+        return _OUTCOMES[ending](code, text, limits)
     if -status == signal.SIGXCPU:
         detail = f"took more than {limits.cpu_s or limits.wall_s:g} s of processor time; give a smaller photo"
         return Outcome("time_limit", code="time_limit", detail=detail)
     why = f"signal {-status} ({_signal_name(-status)})" if status < 0 else f"exit status {status}"
     detail = f"the process that did the work died: {why}"
-    if -status == signal.SIGKILL:  # neither by itself nor by us: the kernel does so for want of memory
+    if -status == signal.SIGKILL:  # not by itself nor by us: by the kernel, out of memory
         return Outcome("outage", code="outage", detail=detail)
     return Outcome("crashed", code="crashed", detail=detail)
 
@@ -111,13 +112,13 @@ def _bug(code: str, text: str, limits: Limits) -> Outcome:
     return Outcome("crashed", code="internal_error", detail=why)
 
 
-_SAID: Final[Mapping[object, Callable[[str, str, Limits], Outcome]]] = {
+_OUTCOMES: Final[Mapping[object, Callable[[str, str, Limits], Outcome]]] = {
     "error": _refused,
     "memory_limit": _swollen,
     "no_room": _no_room,
     "bug": _bug,
 }
-"""What to make of the last words of a child, by how it says that it ended."""
+"""Outcomes by the `end` of the last message of a child."""
 
 
 def _result(path: Path) -> Outcome:
@@ -134,5 +135,5 @@ def _signal_name(number: int) -> str:
 
 
 def cancelled() -> Outcome:
-    """Say that nobody wanted the result any more."""
+    """Return the outcome of a task whose result is no longer wanted."""
     return Outcome("cancelled", code="cancelled", detail="the work was cancelled")

@@ -1,9 +1,9 @@
-"""Run one task in a child process that can do no harm, and learn how it ended.
+"""Run one task in a confined child process, and report how it ended.
 
 Photos come from anywhere, and the libraries that decode them are large. So each piece of work
 runs in a child of a fork server: limited in memory, processor time, wall time, file size and
-open files, without the service's environment, killed when nobody wants the result any more or
-when the parent is gone. What comes back is JSON and files, never a pickle: a child that was
+open files, without the service's environment, killed when the result is no longer wanted
+or the parent is gone. What comes back is JSON and files, never a pickle: a child that was
 taken over by a hostile file cannot run code in its parent; nor, where the kernel has the means of
 `app.sandbox.confine`, read what is not its task's, reach a network, or start a program.
 """
@@ -36,13 +36,15 @@ from app.sandbox.outcome import Limits, Outcome, cancelled, outcome_of
 from lensmodel.core.types import ignore_step
 
 MAX_MESSAGE: Final = 64 * 1024
+"""Bytes of one message from a child at most (chosen): `child.MAX_TEXT` characters fit, escaped or not."""
+
 TASKS_MODULE = "app.jobs.tasks"
-"""Default module of the tasks; tests of the workers put in another."""
+"""Default module of the tasks; tests of the workers replace it."""
 
 
 @dataclass(slots=True)
 class _Watched:
-    """One running child: its process, the line to it, when it must be done, what it said last."""
+    """One running child: its process, the connection to it, its deadline, its last message."""
 
     process: ForkServerProcess
     line: Connection
@@ -51,7 +53,7 @@ class _Watched:
 
 
 class Sandbox:
-    """Starts children, one a task.
+    """Starts child processes, one for each task.
 
     Parameters
     ----------
@@ -66,10 +68,10 @@ class Sandbox:
     confined : bool
         Whether children are kept from files, network and programs; see `app.sandbox.confine`.
     cache : Path, optional
-        Where tasks that decode nothing of strangers keep what they compiled, unless the environment names
-        another place; that one an `account` might not reach.
+        Where tasks that decode no untrusted file keep compiled code, unless the environment names another
+        folder, which is ignored with an `account` that might not reach it.
     account : Account, optional
-        What confined children change to; None leaves them that of this process.
+        Account of confined children; None keeps that of this process.
     niceness : int, optional
         How far the children give way to this process, see nice(2); 0 = not at all.
     """
@@ -89,8 +91,8 @@ class Sandbox:
         self._niceness = niceness
         self.account = account if confined else None
         self.scratch, self.budget, self._confined = scratch, budget, confined
-        kept = os.environ.get("NUMBA_CACHE_DIR")
-        self._cache = Path(kept).resolve() if kept and self.account is None else cache
+        configured = os.environ.get("NUMBA_CACHE_DIR")
+        self._cache = Path(configured).resolve() if configured and self.account is None else cache
         self._module = module or TASKS_MODULE
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload(["numpy", self._module] if preload is None else list(preload))
@@ -107,10 +109,10 @@ class Sandbox:
         self._serve()
 
     def _serve(self) -> None:
-        """Start the fork server where none runs: children have its environment, which holds no secret.
+        """Start the fork server unless it runs: children inherit its environment, which holds no secret.
 
-        The environment changes under the whole process for that moment. So this is done once, before
-        there are threads, and else only after the server died.
+        The environment of the whole process changes meanwhile. So this is done once, before there are
+        threads, and again only after the server died.
         """
         with self._alone:
             server = getattr(forkserver._forkserver, "_forkserver_pid", None)  # noqa: SLF001 - no public way
@@ -129,7 +131,7 @@ class Sandbox:
 
     @contextlib.contextmanager
     def folder(self) -> Iterator[Path]:
-        """Give an empty folder that only one task sees, removed afterwards."""
+        """Provide an empty folder for one task, removed afterwards."""
         path = Path(tempfile.mkdtemp(dir=self.scratch))
         if self.account is not None:
             self.account.lets_through(path)
@@ -172,11 +174,11 @@ class Sandbox:
         reads : sequence of Path
             Files and folders that the task may read besides its own.
         compiles : bool
-            Whether it may add to what all tasks share of compiled code: not if it decodes a stranger's file.
+            Whether it may add to the shared cache of compiled code: not if it decodes an untrusted file.
         wanted : callable
-            Asked every quarter of a second; once it says no, the child is killed.
+            Called every `POLL_S`; once it returns False, the child is killed.
         on_progress : callable
-            Called with `(done, total)` as the task tells.
+            Called with the `(done, total)` that the task reports.
         """
 
         def still_wanted() -> bool:
@@ -232,8 +234,8 @@ class Sandbox:
     def _watch(
         self, watched: _Watched, limits: Limits, wanted: Callable[[], bool], on_progress: child.Progress
     ) -> Outcome | None:
-        """Listen until the child is gone; or return why it must not go on."""
-        asked = 0.0
+        """Read messages until the child has ended; or return the outcome if it must be killed."""
+        last_check = 0.0
         waiting: list[Any] = [watched.line, watched.process.sentinel]
         while True:
             ready = wait(waiting, timeout=POLL_S)
@@ -247,8 +249,8 @@ class Sandbox:
                     on_progress(int(message.get("done", 0)), int(message.get("total", 0)))
             elif watched.process.sentinel in ready:
                 return None
-            if time.monotonic() - asked > POLL_S:
-                asked = time.monotonic()
+            if time.monotonic() - last_check > POLL_S:
+                last_check = time.monotonic()
                 if not wanted():
                     return cancelled()
             if time.monotonic() > watched.deadline:
@@ -261,7 +263,7 @@ class Sandbox:
             return process.exitcode or 0
 
     def _end(self, process: ForkServerProcess) -> None:
-        """Make sure that the child, and whatever it started, is gone."""
+        """Kill the child and all processes that it started, if they still run."""
         assert process.pid is not None
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, signal.SIGKILL)
@@ -273,19 +275,19 @@ class Sandbox:
 
 
 def _leave_plain_files(folder: Path) -> None:
-    """Remove what a child left that is no file of its own: a link would have us read what it could not."""
+    """Remove all but plain files of a child: by a link we would read what the child could not."""
     for place, folders, files in os.walk(folder):
         for name in [*folders, *files]:
             path = Path(place, name)
-            found = path.lstat()
-            if stat.S_ISREG(found.st_mode) and found.st_nlink == 1:
+            status = path.lstat()
+            if stat.S_ISREG(status.st_mode) and status.st_nlink == 1:
                 continue
-            if not stat.S_ISDIR(found.st_mode):
+            if not stat.S_ISDIR(status.st_mode):
                 path.unlink()
 
 
 def _lives(pid: int) -> bool:
-    """Say whether a child process still runs, and leave its exit status to whoever waits for it."""
+    """Say whether a child process still runs, without reaping it."""
     try:
         return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
     except ChildProcessError:
@@ -293,7 +295,7 @@ def _lives(pid: int) -> bool:
 
 
 def _read(line: Connection) -> dict[str, Any] | None:
-    """Return the next message; None at the end of the line, or where the child breaks the rules."""
+    """Return the next message; None at the end of the connection, or if the message is invalid."""
     try:
         message = json.loads(line.recv_bytes(MAX_MESSAGE))
     except (EOFError, OSError, ValueError):

@@ -1,4 +1,4 @@
-"""A filter of system calls: a task computes; it neither connects, nor starts programs, nor looks into others.
+"""A filter of system calls: a task may compute, but not connect, start programs or inspect processes.
 
 Written out for the two processors that servers have, since the libraries that would write it need a
 system package besides their wheel. On another processor there is no filter, and the service says so.
@@ -17,11 +17,12 @@ import platform
 from dataclasses import dataclass
 from typing import Final
 
+# linux/prctl.h, linux/seccomp.h, linux/sched.h
 _PR_SET_SECCOMP, _MODE_FILTER = 22, 2
 _ALLOW, _REFUSE, _KILL = 0x7FFF0000, 0x00050000, 0x80000000
 _CLONE_THREAD: Final = 0x00010000
 _X32: Final = 0x40000000
-"""Bit of the calls of x86's third interface, which nothing uses."""
+"""__X32_SYSCALL_BIT of asm/unistd.h: marks calls of the x32 interface, which nothing uses."""
 
 # linux/bpf_common.h
 _LOAD, _EQUAL, _AT_LEAST, _ANY_OF, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
@@ -39,7 +40,7 @@ REFUSED: Final = (
     *("swapon", "swapoff", "settimeofday", "clock_settime", "sethostname", "setdomainname", "acct"),
     *("fanotify_init", "shmget", "msgget", "semget", "mq_open", "personality", "syslog"),
 )
-"""What a task has no use for; all answer "not permitted"."""
+"""Calls that a task does not need; all fail with "not permitted"."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +54,7 @@ def _table(text: str) -> dict[str, int]:
     return {name: int(number) for name, number in (entry.split("=") for entry in text.split())}
 
 
-_CLONE3: Final = 435
+_CLONE3: Final = 435  # the same on both processors
 _COMMON: Final = _table(
     "pidfd_open=434 pidfd_getfd=438 io_uring_setup=425 io_uring_enter=426 io_uring_register=427 "
     "open_tree=428 move_mount=429 fsopen=430"

@@ -72,7 +72,7 @@ def test_a_job_runs_once_however_often_it_is_asked_for(engine: DbosEngine, ran: 
     for _ in range(3):
         engine.enqueue(job)
     until(lambda: engine.status(job) == "done")
-    engine._asked.clear()  # another process would not know that it was asked for
+    engine._enqueued.clear()  # another process would not know that it was enqueued
     engine.enqueue(job)
     engine.enqueue(Job("photo", ("p1", 2)))
 

@@ -1,4 +1,4 @@
-"""What the service refuses, and with which status; `app.http.errors` turns it into answers."""
+"""Errors of the service with their HTTP status; `app.http.errors` turns them into responses."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class ServiceError(LensModelError):
 
 
 class MalformedUploadError(ServiceError):
-    """The body is not what an upload looks like."""
+    """The body has not the form of an upload."""
 
     code = "malformed_upload"
 
@@ -53,7 +53,7 @@ class UnknownPhotoError(ServiceError):
 
 
 class UnknownPictureError(ServiceError):
-    """No part of a picture there."""
+    """No such part of a picture."""
 
     status, code = 404, "unknown_photo"
 
@@ -77,19 +77,19 @@ class UnknownJobError(ServiceError):
 
 
 class NotSignedInError(ServiceError):
-    """Nobody knows who asks."""
+    """No valid key or session."""
 
     status, code = 401, "not_signed_in"
 
 
 class ForbiddenError(ServiceError):
-    """Who asks is known, and may not do this."""
+    """The key does not allow this."""
 
     status, code = 403, "forbidden"
 
 
 class NotReadyError(ServiceError):
-    """What was asked for is still being made."""
+    """The result is not finished yet."""
 
     status, code = 409, "not_ready"
 
@@ -101,7 +101,7 @@ class ConflictError(ServiceError):
 
 
 class NotAcceptableError(ServiceError):
-    """None of the formats that the caller accepts exists."""
+    """None of the accepted formats is available."""
 
     status, code = 406, "not_acceptable"
 
@@ -113,13 +113,13 @@ class TooLargeError(ServiceError):
 
 
 class SlowBodyError(ServiceError):
-    """A body that does not come, or hardly."""
+    """A body that arrives too slowly or not at all."""
 
     status, code = 408, "too_slow"
 
 
 class BusyError(ServiceError):
-    """Too much is being done already."""
+    """Too much is in progress already."""
 
     status, code = 503, "busy"
 

@@ -60,7 +60,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         store = Store(chosen)
         storage = Storage(chosen.storage, patience_s=chosen.storage_seconds, create=False)
-        with missable():  # /readyz tries it again
+        with missable():  # /readyz tries again
             settle(store, storage)
         cache = ModelCache(
             store,
@@ -105,7 +105,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         version=version("lensmodel"),
         summary="Learns the blur of one copy of a lens from ordinary photos and removes it.",
         lifespan=lifespan,
-        docs_url=None,  # it would load scripts from elsewhere: the pages have their own
+        docs_url=None,  # it would load scripts from another site: the pages have their own
         redoc_url=None,
     )
     app.add_middleware(Heads)
@@ -130,7 +130,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         health,
     )
     for resource in resources:
-        # the dependency stands here and not only in each route: one that forgot it would be open to all
+        # also here, not only in each route: a route without it would be open to all
         app.include_router(
             resource.router,
             prefix="/v1",

@@ -1,4 +1,4 @@
-"""What the service does with lenses of each model: the settings say it of the default one."""
+"""How the service learns lenses of each model; the settings define the default one."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from lensmodel.workflow.ways import WAYS, Way
 
 
 def way_of(settings: Settings, name: str) -> Way:
-    """Return how kernels are estimated for a lens of a model, what is made of them, how it corrects.
+    """Return the estimator, kernel size, model mode and correction method of a model.
 
-    The model `default` is what the settings of the service make of it; all others are what they are.
+    The settings of the service define the model `default`; all others are fixed.
     """
     if name != "default":
         return WAYS[name]
@@ -17,5 +17,5 @@ def way_of(settings: Settings, name: str) -> Way:
 
 
 def of_models(settings: Settings, name: str) -> dict[str, str]:
-    """Return how such lens models are made: arguments of `ModelSettings`."""
+    """Return the arguments of `ModelSettings` for lenses of a model."""
     return {"mode": way_of(settings, name).mode, "unit": settings.model_unit}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 NYQUIST: Final = 0.5
-"""Cycles/pixel: finer detail than this no grid of pixels can hold."""
+"""Cycles/pixel: the Nyquist frequency, the finest detail that a grid of pixels can hold."""
 
 
 def mtf50_words(frequency: float) -> str:

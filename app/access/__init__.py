@@ -1,1 +1,1 @@
-"""Who asks, and what he may: keys, sessions of browsers, how often."""
+"""Authentication and authorisation: keys, browser sessions, rate limits."""

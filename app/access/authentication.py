@@ -1,4 +1,4 @@
-"""Who asks: the owner of a key, of a signed-in browser, or the one owner of a service on loopback."""
+"""Identify who asks: the owner of a key or browser session, or the one owner of a service on loopback."""
 
 from __future__ import annotations
 
@@ -29,12 +29,15 @@ log = logging.getLogger(__name__)
 
 COOKIE: Final = "lens_session"
 FRESH_S: Final = 1.0
-"""How long a process goes by what it has read of a key: a revoked one works no longer than that."""
+"""Seconds for which a process trusts what it has read of a key (chosen): a revoked key works no longer."""
 
-KEPT: Final = 10_000
+MAX_CACHED: Final = 10_000
+"""Keys and sessions that a process remembers at most (chosen, not measured)."""
+
 HASHES_AT_ONCE: Final = 2
 HASHES_WAIT_S: Final = 5.0
-"""Each hash takes 19 MiB and some 20 ms; who waits longer than this is sent away."""
+"""Hashes computed at once, and seconds to wait for one before a request is refused (chosen): each takes
+19 MiB and some 20 ms."""
 
 HOW: Final = (
     "send a key in the header `Authorization: Bearer lpk_...`, or sign in at /sign-in; "
@@ -45,23 +48,23 @@ CHALLENGE: Final = {"WWW-Authenticate": "Bearer"}
 
 @dataclass(frozen=True, slots=True)
 class Who:
-    """Who asks, and what he may.
+    """Who asks, and which scopes he has.
 
-    `key_id` is None for the one owner of a service that asks nobody who he is.
+    `key_id` is None for the one owner of a service without sign-in.
     """
 
     owner: str
     scopes: tuple[str, ...]
     key_id: int | None = None
     token: str | None = None
-    """Digest of what he showed, by which he is asked for again while an answer goes on."""
+    """Digest of the key or session token, by which a long response checks again that it is still valid."""
 
 
 EVERYBODY: Final = Who(LOCAL, SCOPES)
 
 
 class Gate:
-    """Tells one process who asks, and sends away those who may not.
+    """Identifies who asks, and refuses those who may not.
 
     Blocking: it reads the database, and hashes keys that it does not know yet.
     """
@@ -77,7 +80,7 @@ class Gate:
         self._hashing = threading.BoundedSemaphore(HASHES_AT_ONCE)
 
     def is_closed(self) -> bool:
-        """Whether one must say who he is: always, or since there is a key."""
+        """Whether a key is required: always, or since one was created."""
         if self._closed or self._settings.auth == "none":
             return self._closed
         if time.monotonic() - self._looked > FRESH_S:
@@ -86,7 +89,7 @@ class Gate:
         return self._closed
 
     def quick(self, request: Request) -> Who | None:
-        """Return who asks if that can be told without the database; None where it must be looked up."""
+        """Return who asks if that is known without the database; None where it must be looked up."""
         if not self._closed:
             fresh = self._settings.auth == "none" or time.monotonic() - self._looked <= FRESH_S
             return EVERYBODY if fresh else None
@@ -99,23 +102,23 @@ class Gate:
         Raises
         ------
         NotSignedInError
-            If he shows no key and no session, or none that is valid.
+            If there is no key and no session, or no valid one.
         """
         if not self.is_closed():
             return EVERYBODY
         shown = shown_by(request)
         if shown is None:
             raise NotSignedInError(f"this service answers only those it knows: {HOW}", headers=CHALLENGE)
-        found = self._look_up(shown)
-        if found is None:
+        who = self._look_up(shown)
+        if who is None:
             raise NotSignedInError(
                 f"this key or sign-in is not valid, or no longer: {HOW}",
                 headers={**CHALLENGE, "Set-Cookie": f"{COOKIE}=; Path=/; Max-Age=0"},
             )
-        return found
+        return who
 
     def admit(self, who: Who, method: str) -> None:
-        """Refuse what the scopes do not allow, and more requests than there may be.
+        """Refuse what the scopes do not allow, and requests beyond the rate limit.
 
         Raises
         ------
@@ -146,20 +149,20 @@ class Gate:
             )
 
     def is_still(self, who: Who) -> bool:
-        """Say whether who began to ask may go on: long answers are asked for again."""
+        """Say whether access is still valid: long responses check it repeatedly."""
         if who.token is None:
             return not self.is_closed()
         with self._guard:
             entry = self._known.get(who.token)
         if entry is not None and time.monotonic() - entry[0] <= FRESH_S:
             return entry[1] is not None
-        # of a session this digest is what is stored; a key was proven when the answer began
+        # a session is stored by this digest; a key was verified when the response began
         again = self._by_digest(who.token)
         self._remember(who.token, again)
         return again is not None
 
     def sign_in(self, text: str) -> tuple[Who, str]:
-        """Begin a session with a key; return whose it is, and what the browser is to show.
+        """Begin a session with a key; return its owner, and the token for the browser.
 
         Raises
         ------
@@ -201,12 +204,12 @@ class Gate:
         who = None if holder is None else Who(holder.owner, holder.scopes, holder.key_id, digest)
         if holder is not None:
             self._remember(digest, who)
-            with contextlib.suppress(Exception):  # a full disk or a busy database keeps nobody out
+            with contextlib.suppress(Exception):  # a full disk or a busy database must not refuse access
                 self._store.note_use(holder)
         return who
 
     def _is_proven(self, shown: str, digest: str, holder: Holder) -> bool:
-        """Compare a key with its hash, once in this process: the hash takes its time on purpose."""
+        """Verify a key against its hash, once per process: the hash is slow on purpose."""
         with self._guard:
             if self._proven.get(digest) == holder.key_hash:
                 return True
@@ -221,7 +224,7 @@ class Gate:
         if right:
             with self._guard:
                 self._proven[digest] = holder.key_hash
-                while len(self._proven) > KEPT:
+                while len(self._proven) > MAX_CACHED:
                     self._proven.popitem(last=False)
         return right
 
@@ -235,7 +238,7 @@ class Gate:
         with self._guard:
             self._known[digest] = (time.monotonic(), who)
             self._known.move_to_end(digest)
-            while len(self._known) > KEPT:
+            while len(self._known) > MAX_CACHED:
                 self._known.popitem(last=False)
 
 
@@ -248,5 +251,5 @@ def shown_by(request: Request) -> str | None:
 
 
 def _digest(shown: str) -> str:
-    # tokens have 256 random bits: there is nothing to guess that a slow hash would protect
+    # tokens have 256 random bits: a slow hash would add nothing
     return hashlib.sha256(shown.encode("utf-8", "replace")).hexdigest()

@@ -1,4 +1,4 @@
-"""How often somebody may ask: a bucket of requests that fills at an even rate."""
+"""Rate limits by token buckets: each refills at an even rate."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import time
 from collections import OrderedDict
 from typing import Final
 
-MOST: Final = 10_000
-"""Buckets that are kept; the one used least recently goes first, and would have been full by then."""
+MAX_BUCKETS: Final = 10_000
+"""Buckets that are kept (chosen); the one used least recently is dropped first, and is full again by then."""
 
 
 class Rates:
@@ -17,8 +17,8 @@ class Rates:
     Parameters
     ----------
     per_minute : int
-        Requests that come back to each bucket in a minute, and that it holds for ten seconds of haste: a
-        sixth of them. 0 = no limit.
+        Requests that refill each bucket in a minute; it holds those of ten seconds, a sixth of them. 0 = no
+        limit.
     """
 
     def __init__(self, per_minute: int) -> None:
@@ -28,7 +28,7 @@ class Rates:
         self._guard = threading.Lock()
 
     def wait_of(self, name: str) -> float:
-        """Take one request out of a bucket; return 0, or the seconds until there is one where it is empty."""
+        """Take one request from a bucket; return 0, or the seconds until there is one if it is empty."""
         if self._rate <= 0:
             return 0.0
         now = time.monotonic()
@@ -37,6 +37,6 @@ class Rates:
             left = min(left + (now - since) * self._rate, self._size)
             allowed = left >= 1.0
             self._left[name] = (left - 1.0 if allowed else left, now)
-            if len(self._left) > MOST:
+            if len(self._left) > MAX_BUCKETS:
                 self._left.popitem(last=False)
         return 0.0 if allowed else (1.0 - left) / self._rate

@@ -1,1 +1,1 @@
-"""Files beside the tables: photos, previews, results; all of an owner, to take away or to erase."""
+"""Files beside the tables: photos, previews, results; export and erasure of an owner."""

@@ -1,4 +1,4 @@
-"""All of an owner goes: begun by his word, ended by whoever comes to it first."""
+"""Erase an owner: begun at his request, completed by any process."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from app.store.access.accounts import AccountStore
 
 
 def erase(accounts: AccountStore, storage: Storage, owner_key: int) -> None:
-    """Erase what is left of an owner, rows before blobs. Killed in between, it goes on where it was."""
+    """Erase what is left of an owner, rows before blobs. If killed, a later call continues."""
     while (prefixes := accounts.erase_some(owner_key)) is not None:
         for prefix in prefixes:
             storage.delete(prefix)

@@ -1,4 +1,4 @@
-"""All that is kept of an owner as one ZIP file, written while it is read: never whole in memory."""
+"""All data of an owner as one ZIP file, written while it is sent: never whole in memory."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TABLES: Final[Mapping[str, type[Base]]] = {
     "keys": KeyRow,
 }
 INSIDE: Final = frozenset({"owner_id", "key_hash"})
-"""What says nothing of the owner, or must not leave the service."""
+"""Columns that say nothing about the owner, or must not leave the service."""
 
 README: Final = """What lensmodel keeps of one owner.
 
@@ -38,7 +38,7 @@ corrections/   corrected photos.
 
 
 class _Pipe:
-    """Takes what a ZIP file writes, until it is fetched."""
+    """Buffers what a ZIP file writes until it is fetched."""
 
     def __init__(self) -> None:
         self._pieces: list[bytes] = []
@@ -48,7 +48,7 @@ class _Pipe:
         return len(data)
 
     def flush(self) -> None:
-        """Do nothing: what was written is fetched soon."""
+        """Do nothing: the buffer is fetched soon."""
 
     def fetch(self) -> bytes:
         joined = b"".join(self._pieces)
@@ -57,7 +57,7 @@ class _Pipe:
 
 
 def exported(store: Store, storage: Storage, owner: str) -> Iterator[bytes]:
-    """Give the ZIP file of an owner piece by piece."""
+    """Yield the ZIP file of an owner piece by piece."""
     pipe = _Pipe()
     missing: list[str] = []
     with zipfile.ZipFile(pipe, "w", zipfile.ZIP_DEFLATED) as archive:  # type: ignore[call-overload]  # it only writes
@@ -80,7 +80,7 @@ def _named(name: str, method: int) -> zipfile.ZipInfo:
 def _files(
     store: Store, storage: Storage, owner: str, missing: list[str]
 ) -> Iterator[tuple[str, Iterable[bytes], int]]:
-    packed, as_is = zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED  # photos are packed already
+    packed, as_is = zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED  # photos are compressed already
     yield "README.txt", [README.encode()], packed
     for name, table in TABLES.items():
         lines = (_line(row) for row in store.accounts.rows(table, owner))
@@ -106,7 +106,7 @@ def _blob(
 ) -> Iterator[tuple[str, Iterable[bytes], int]]:
     try:
         size = storage.info(key).size
-    except FileNotFoundError:  # deleted while we write
+    except FileNotFoundError:  # deleted meanwhile
         missing.append(name)
         return
     yield name, storage.stream(key, 0, size), method

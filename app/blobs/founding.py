@@ -1,4 +1,4 @@
-"""Whether a place for blobs is new, or holds what the tables name and is only away."""
+"""Create the folder of the blobs if it is new, but not if it is only unmounted."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from app.store import Store
 
 
 def settle(store: Store, storage: Storage) -> None:
-    """Make the folder of the blobs where it is new; leave one that is away as it is.
+    """Create the folder of the blobs if it is new; leave one that is unmounted as it is.
 
-    It is new as long as no row names a file. One from before there were marks holds the file of the
-    newest photo.
+    It is new as long as no row names a file. A folder that is older than the mark file is recognised by
+    the file of the newest photo.
     """
     if storage.is_there or storage.folder is None:
         return

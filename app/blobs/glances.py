@@ -1,4 +1,4 @@
-"""A photo in small, before it is developed: by its picture an owner knows which lens it was."""
+"""A small picture of a photo before it is developed, by which its owner recognises it."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from PIL import Image, ImageOps
 from app.blobs.previews import upright
 
 SIDE: Final = 480
-"""The longer side of a glance in pixels, at most: sharp at 240 of a fine screen."""
+"""Longer side of a glance in pixels at most (chosen): sharp at 240 CSS pixels on a high-density screen."""
 
 _EXIF_OF_FLIP: Final = {3: 3, 5: 8, 6: 6}
-"""LibRaw's words for how to turn a picture, as EXIF orientations."""
+"""LibRaw's `flip` as EXIF orientation."""
 
 _PLAIN: Final = frozenset({"jpeg", "png"})
-_ORIENTATION: Final = 0x0112
+_ORIENTATION: Final = 0x0112  # EXIF 2.3, tag Orientation
 
 
 def glance(path: Path, kind: str, orientation: int) -> bytes:
     """Render a photo file as a small upright JPEG, as cheaply as its kind allows.
 
-    Of RAW files the camera's own small picture is taken, or where there is none half of the pixels.
+    Of RAW files the camera's embedded preview is used, or where there is none every second pixel.
 
     Parameters
     ----------
@@ -57,11 +57,11 @@ def glance(path: Path, kind: str, orientation: int) -> bytes:
         return _small(Image.fromarray(np.ascontiguousarray(upright(thumb.data, flip))))
 
 
-def _turned(image: Image.Image, otherwise: int) -> Image.Image:
-    """Turn a picture upright as it says itself, or as is said of it."""
+def _turned(image: Image.Image, orientation: int) -> Image.Image:
+    """Turn a picture upright by its own EXIF orientation, else by the given one."""
     if image.getexif().get(_ORIENTATION):
         return ImageOps.exif_transpose(image)
-    return Image.fromarray(np.ascontiguousarray(upright(np.asarray(image.convert("RGB")), otherwise)))
+    return Image.fromarray(np.ascontiguousarray(upright(np.asarray(image.convert("RGB")), orientation)))
 
 
 def _eight_bits(pixels: np.ndarray) -> np.ndarray:

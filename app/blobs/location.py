@@ -1,4 +1,4 @@
-"""Where photos were taken is not kept: it is overwritten in the stored file before anybody can see that."""
+"""Remove the location of a photo: it is overwritten in the stored file before anybody can read it."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from lensmodel.photo.tags.location import FoundLocation, Overwrite, find_locatio
 log = logging.getLogger(__name__)
 
 Location: TypeAlias = Literal["none", "removed", "unknown"]
-"""What a file said of its place: nothing known, something that was removed, or more than is looked at."""
+"""Whether a file had a location: none, one that was removed, or unknown where it was not searched wholly."""
 
 CIFF: Final = b"HEAPCCDR"
-"""Canon's CRW, at byte 6: no TIFF structure, and of cameras without GPS."""
+"""Signature of Canon's CRW at byte 6: not TIFF, and from cameras without GPS."""
 
 
 def remove(storage: Storage, key: str) -> Location:
-    """Remove from a stored photo where it was taken; say what there was.
+    """Remove the location from a stored photo; return whether it had one.
 
-    In a folder the file is changed in place. An object of a store cannot be: it is fetched, and sent again if
-    there was anything in it.
+    In a folder the file is changed in place. An object of an object store cannot be: it is fetched, and
+    stored again if it had a location.
     """
     with tempfile.TemporaryDirectory() as scratch, storage.as_file(key, Path(scratch)) as path:
-        found = _of_file(path)
-        if found.overwrites:
-            _apply(path, found.overwrites)
+        location = _of_file(path)
+        if location.overwrites:
+            _apply(path, location.overwrites)
             if storage.folder is None:
                 storage.put_file(key, path)
-    if not found.complete:
+    if not location.complete:
         return "unknown"
-    return "removed" if found.overwrites else "none"
+    return "removed" if location.overwrites else "none"
 
 
 def _of_file(path: Path) -> FoundLocation:
@@ -47,8 +47,8 @@ def _of_file(path: Path) -> FoundLocation:
 
 def _apply(path: Path, overwrites: tuple[Overwrite, ...]) -> None:
     with path.open("r+b") as file:
-        for one in overwrites:
-            file.seek(one.start)
-            file.write(one.data)
+        for overwrite in overwrites:
+            file.seek(overwrite.start)
+            file.write(overwrite.data)
         file.flush()
         os.fsync(file.fileno())

@@ -1,4 +1,4 @@
-"""A developed photo in small, upright, as the pages show it; made once, when it is developed."""
+"""Previews of a developed photo, upright, for the pages; made once, when it is developed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lensmodel.estimation.patches import r_map
 from lensmodel.photo import LinearPhoto, shown
 
 SIDE: Final = 1600
-"""The longer side of a preview in pixels, at most."""
+"""Longer side of a preview in pixels at most (chosen)."""
 
 _TURN: dict[int, Callable[[NDArray[np.generic]], NDArray[np.generic]]] = {
     1: lambda a: a,
@@ -26,7 +26,7 @@ _TURN: dict[int, Callable[[NDArray[np.generic]], NDArray[np.generic]]] = {
     7: lambda a: a[::-1, ::-1].swapaxes(0, 1),
     8: lambda a: a.swapaxes(0, 1)[::-1],
 }
-"""Arrays in sensor orientation to upright ones, by EXIF orientation."""
+"""From sensor orientation to upright, by EXIF orientation (EXIF 2.3, tag Orientation)."""
 
 
 def upright(pixels: NDArray[np.generic], orientation: int) -> NDArray[np.generic]:
@@ -45,7 +45,7 @@ def preview(developed: LinearPhoto) -> bytes:
 
 
 def confidence_map(developed: LinearPhoto) -> bytes:
-    """Render the r-map of the green plane as a PNG of the preview's shape: bright where edges tell."""
+    """Render the r-map of the green plane as a PNG of the preview's shape: bright at informative edges."""
     step = _step(developed)
     values = r_map(np.ascontiguousarray(developed.planes[1][::step, ::step]))
     scaled = (255 * np.clip(values / max(float(np.quantile(values, 0.99)), 1e-6), 0, 1)).astype(np.uint8)
@@ -55,7 +55,7 @@ def confidence_map(developed: LinearPhoto) -> bytes:
 
 def _step(developed: LinearPhoto) -> int:
     short, long = sorted((developed.frame.height, developed.frame.width))
-    return min(-(-long // SIDE), short // 2)  # a panorama keeps two rows at least
+    return min(-(-long // SIDE), short // 2)  # at least two rows of a panorama
 
 
 def _encoded(picture: NDArray[np.uint8], developed: LinearPhoto, kind: str, **options: Any) -> bytes:  # noqa: ANN401 - of PIL

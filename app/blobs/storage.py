@@ -1,7 +1,7 @@
 """Blobs: photos, statistics and results, in a local folder or in an object store.
 
-Keys are made of our own ids only, never of a name that somebody sent. A blob appears under its
-key when it is complete, and not before.
+Keys are made of our own ids only, never of a name that a client sent. A blob appears under its
+key only when it is complete.
 """
 
 from __future__ import annotations
@@ -28,17 +28,20 @@ if TYPE_CHECKING:
     from obstore.store import ClientConfig
 
 CHUNK = 1 << 20
+"""Bytes that are read at once (chosen)."""
+
 PATIENCE_S: Final = 20.0
-"""One request moves 8 MiB at most: 20 s are 0.4 MiB/s."""
+"""Seconds for one request to an object store (chosen): it moves at most 8 MiB, at 0.4 MiB/s."""
 
 CONNECT_S: Final = 5.0
+"""Seconds to connect (chosen, not measured)."""
 
 MARK: Final = "lensmodel-blobs"
-"""A file that lies in each folder of blobs: a disk that is not mounted leaves a folder without it."""
+"""A file in each folder of blobs: the empty mount point of a missing disk has none."""
 
 
 class AsyncBlobWriter(Protocol):
-    """Where the bytes of a blob go, piece by piece."""
+    """Takes the bytes of a blob, piece by piece."""
 
     async def write(self, data: bytes) -> object:
         """Take the next piece."""
@@ -46,13 +49,13 @@ class AsyncBlobWriter(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class BlobInfo:
-    """What can be told of a blob without reading it."""
+    """Properties of a blob, without its content."""
 
     size: int
 
 
 def _client_options(patience_s: float) -> ClientConfig:
-    """Return the deadlines, and what the environment says besides: options replace those of AWS_... there."""
+    """Return the deadlines and the AWS_... options of the environment, which these options would override."""
     options: ClientConfig = {
         "connect_timeout": f"{min(CONNECT_S, patience_s):g}s",
         "timeout": f"{patience_s:g}s",
@@ -76,11 +79,11 @@ class Storage:
     url : str
         ``file:///folder``, ``s3://bucket/prefix`` or another address that obstore knows.
     patience_s : float
-        How long one request to an object store may take. It is tried once more, quickly; jobs wait for
-        longer outages, and callers are told of them.
+        How long one request to an object store may take. It is retried once, quickly; jobs wait for
+        longer outages, and requests are answered with an error.
     create : bool
-        Whether to make a folder that is not there. Whoever cannot know that it is new leaves it to
-        `app.blobs.founding`: a folder that is made while its disk is away hides that from everybody.
+        Whether to create a missing folder. Where it may be unmounted rather than new use
+        `app.blobs.founding`: a folder that is created while its disk is missing hides that.
     """
 
     def __init__(self, url: str, *, patience_s: float = PATIENCE_S, create: bool = True) -> None:
@@ -99,14 +102,14 @@ class Storage:
             )
 
     def create(self) -> None:
-        """Make the folder and mark it as one of blobs; an object store is made by its owner."""
+        """Create the folder with its mark; an object store is created by its owner."""
         if self.folder is not None:
             self.folder.mkdir(parents=True, exist_ok=True)
             (self.folder / MARK).write_text("Without this file the folder counts as not mounted.\n")
 
     @property
     def is_there(self) -> bool:
-        """Whether the folder is there, mark and all; of an object store only its answers tell."""
+        """Whether the folder and its mark exist; always true for an object store, which fails when used."""
         return self.folder is None or (self.folder / MARK).is_file()
 
     @property
@@ -116,7 +119,7 @@ class Storage:
         Raises
         ------
         OSError
-            If the folder is away: an error of the machine, not of the blob that is asked for.
+            If the folder is missing: a fault of the machine, not of a blob.
         """
         if not self.is_there:
             raise OSError(errno.ENODEV, "the folder of the blobs is away", str(self.folder))
@@ -147,7 +150,7 @@ class Storage:
         obstore.rename(self._store, key, to)
 
     def remove(self, key: str) -> None:
-        """Delete one blob; that there is none is no error."""
+        """Delete one blob; a missing one is no error."""
         with contextlib.suppress(FileNotFoundError):
             obstore.delete(self._store, key)
 
@@ -166,13 +169,13 @@ class Storage:
         return BlobInfo(size=int(obstore.head(self._store, key)["size"]))
 
     def stream(self, key: str, start: int, end: int) -> Iterator[bytes]:
-        """Give the bytes `start` to `end`, the last one excluded, in pieces."""
+        """Yield the bytes `start` to `end`, the last one excluded, in pieces."""
         for low in range(start, end, 4 * CHUNK):
             yield bytes(obstore.get_range(self._store, key, start=low, end=min(end, low + 4 * CHUNK)))
 
     @contextmanager
     def as_file(self, key: str, scratch: Path, *, copied: bool = False) -> Iterator[Path]:
-        """Give a blob as a file to read: itself where it is one, else, or if wanted, a copy in `scratch`."""
+        """Provide a blob as a file: itself where it is one, else, or if `copied`, a copy in `scratch`."""
         store = self._store
         if self.folder is not None and not copied:
             path = self.folder / key
@@ -182,7 +185,7 @@ class Storage:
             return
         copy = scratch / new_id()
         with copy.open("wb") as out:
-            for piece in self._found(store, key).stream(min_chunk_size=CHUNK):
+            for piece in self._get(store, key).stream(min_chunk_size=CHUNK):
                 out.write(piece)
         try:
             yield copy
@@ -190,8 +193,8 @@ class Storage:
             copy.unlink(missing_ok=True)
 
     @staticmethod
-    def _found(store: ObjectStore, key: str) -> GetResult:
-        """Return a blob; tell one that is gone from a bucket that is, which answers the same."""
+    def _get(store: ObjectStore, key: str) -> GetResult:
+        """Return a blob; raise OSError if the bucket is missing, reported like a missing blob."""
         try:
             return obstore.get(store, key)
         except FileNotFoundError as error:
@@ -202,38 +205,37 @@ class Storage:
             raise
 
     def delete(self, prefix: str) -> None:
-        """Delete all blobs below a prefix that ends in a slash; none there is no error."""
+        """Delete all blobs below a prefix that ends in a slash; none is no error."""
         if not prefix.endswith("/") or prefix.count("/") < 2:
             raise ValueError(f"refusing to delete everything below {prefix!r}")
         for page in obstore.list(self._store, prefix):
             obstore.delete(self._store, [entry["path"] for entry in page])
         if self.folder is not None:
-            shutil.rmtree(self.folder / prefix, ignore_errors=True)  # the empty folders, and torn writes
+            shutil.rmtree(self.folder / prefix, ignore_errors=True)  # empty folders and partial files
 
     def listed(self, prefix: str = "") -> Iterator[tuple[str, int]]:
-        """Give key and size in bytes of each blob below a prefix, or of all; torn writes are none."""
+        """Yield key and size in bytes of each blob below a prefix, or of all, without partial files."""
         for page in obstore.list(self._store, prefix or None):
             for entry in page:
                 if entry["path"] != MARK:
                     yield str(entry["path"]), int(entry["size"])
 
-    def copy_to(self, other: Storage, key: str) -> None:
+    def copy_to(self, target: Storage, key: str) -> None:
         """Copy a blob to another storage, piece by piece; raises as `get`."""
         pieces = obstore.get(self._store, key).stream(min_chunk_size=8 * CHUNK)
-        with obstore.open_writer(other._store, key, buffer_size=8 * CHUNK) as sink:
-            for (
-                piece
-            ) in pieces:  # not handed over as an iterator: obstore cannot read inside of its own writing
+        with obstore.open_writer(target._store, key, buffer_size=8 * CHUNK) as sink:
+            # a loop, not an iterator as the source: obstore cannot read while it writes
+            for piece in pieces:
                 sink.write(bytes(piece))
 
     def check_writable(self) -> None:
-        """Write and delete a small blob; raises what went wrong."""
+        """Write and delete a small blob; raise the error if that fails."""
         prefix = f"probe/{new_id()}/"
         self.put(f"{prefix}x", b"x")
         self.delete(prefix)
 
     def free_bytes(self) -> int | None:
-        """Return the room left on the disk; None where the store does not say."""
+        """Return the free bytes of the disk; None for an object store."""
         if self.folder is None or not self.is_there:
             return None
         return shutil.disk_usage(self.folder).free

@@ -1,1 +1,1 @@
-"""Around every request, and between routes and the rest: bodies, errors, uploads, answers."""
+"""What HTTP needs besides the routes: middleware, bodies, errors, uploads, formats of answers."""

@@ -1,6 +1,6 @@
-"""What a request may send: JSON of a size that a person could have written, in a time that a network needs.
+"""Limits on the size and the speed of JSON bodies.
 
-Photos are another matter: `app.http.upload` streams them, with limits of their own.
+Photos are streamed by `app.http.upload`, with limits of their own.
 """
 
 from __future__ import annotations
@@ -19,28 +19,29 @@ from app.errors import SlowBodyError
 from app.http.errors import respond
 
 MAX_JSON_BYTES: Final = 64 * 1024
-"""Far more than any question of the interface; parsed, it takes some ten times as much memory."""
+"""Longest JSON body (chosen): far longer than any request; parsed, it takes some ten times as much memory."""
 
 FLOOR_BYTES_PER_S: Final = 4096
-"""A body that comes more slowly is not waited for: a bad mobile connection sends ten times as fast."""
+"""Slowest body that is accepted (chosen): a bad mobile connection sends ten times as fast."""
 
 UPLOADS: Final = re.compile(r"/v1/photos|/v1/lenses/[^/]+/measurements")
 PROFILES: Final = re.compile(r"/v1/lenses/[^/]+/profile")
-"""Paths whose POST streams its body into storage, and watches it there."""
+"""Paths of uploads by POST and of profiles by PUT: their routes read the body themselves, with a `Pace`."""
+
 SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS", "TRACE"})
 CLOSE: Final = {"Connection": "close"}
-"""With a refusal before the body is read: what is still on its way is not waited for."""
+"""Header of a refusal before the body is read: the rest of it is not waited for."""
 
 
 class Pace:
-    """Watches how fast a body comes; only the time that we wait for it counts.
+    """Enforces the speed of a body; only the time spent waiting for it counts.
 
     Parameters
     ----------
     patience_s : float
-        How long nothing may come, and how long a body may take before its rate counts.
+        Longest pause within a body, and time before its average rate counts.
     within_s : float
-        How long all of it may take, however fast it comes.
+        Longest time for the whole body, whatever its rate.
     """
 
     def __init__(self, patience_s: float, within_s: float = math.inf) -> None:
@@ -54,7 +55,7 @@ class Pace:
         Raises
         ------
         SlowBodyError
-            If it does not come in time, or all of the body so far came too slowly.
+            If it does not come in time, or the body so far came too slowly.
         """
         began = time.monotonic()
         try:
@@ -77,7 +78,7 @@ class Pace:
 
 
 class JsonBodies:
-    """Refuses bodies that are no JSON, too long or too slow, before anything else sees them."""
+    """Middleware that refuses bodies that are not JSON, too long or too slow."""
 
     def __init__(self, app: ASGIApp, patience_s: float) -> None:
         self._app, self._patience_s = app, patience_s
@@ -100,7 +101,7 @@ class JsonBodies:
             await answer(scope, receive, send)
             return
         except ClientDisconnect:
-            return  # nobody is there to be answered
+            return  # the client is gone
         if body is None:
             await respond(request, 413, "body_too_large", _TOO_LONG, headers=CLOSE)(scope, receive, send)
             return
@@ -128,7 +129,7 @@ def _is_upload(scope: Scope) -> bool:
 
 
 def _refusal(headers: Headers) -> tuple[int, str, str] | None:
-    """Say by the head alone why a body cannot be taken."""
+    """Return why a body is refused by its headers alone: status, code, detail; None if it is not."""
     declared = headers.get("content-length", "0")
     if not declared.isdecimal() or len(declared) > 18:
         return 400, "invalid_request", f"Content-Length {declared[:40]!r} is no number"

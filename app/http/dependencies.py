@@ -1,4 +1,4 @@
-"""What routes need, handed to them: the parts of the application and who is asking."""
+"""Dependencies of the routes: the parts of the application, and who is asking."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from app.store import Store
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """Everything that one application is made of."""
+    """The parts of one application."""
 
     settings: Settings
     store: Store
@@ -39,13 +39,13 @@ class Services:
 
 
 class Places:
-    """How many of something there may be at once, counted in the event loop."""
+    """A limit on how many of something run at once, counted in the event loop."""
 
     def __init__(self, free: int) -> None:
         self.free = free
 
     @contextmanager
-    def one(self, refusal: Exception) -> Iterator[None]:
+    def take(self, refusal: Exception) -> Iterator[None]:
         """Take a place; raise the refusal where none is free."""
         if self.free <= 0:
             raise refusal
@@ -58,7 +58,7 @@ class Places:
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """One request: what serves it, who asks, and the head of its answer."""
+    """One request: the services, who asks, and the head of the response."""
 
     request: Request
     response: Response
@@ -67,12 +67,12 @@ class Call:
 
     @property
     def owner(self) -> str:
-        """Whose data it is about."""
+        """Owner of the data that the request concerns."""
         return self.who.owner
 
     @property
     def settings(self) -> Settings:
-        """What is configured."""
+        """The settings."""
         return self.services.settings
 
     @property
@@ -92,7 +92,7 @@ class Call:
 
 
 BEARER = HTTPBearer(auto_error=False, description="A key that `lensmodel keys create` made.")
-"""For the description of the interface; who asks is told by `Gate`."""
+"""For the OpenAPI description only; `Gate` identifies who asks."""
 
 NOBODY = Who("", ())
 
@@ -102,10 +102,10 @@ async def call_of(
     response: Response,
     described: Annotated[HTTPAuthorizationCredentials | None, Security(BEARER)] = None,
 ) -> Call:
-    """Put together what a route needs, for those who may ask it."""
+    """Return the `Call` of a route, after checking who asks."""
     del described
     services: Services = request.app.state.services
-    # async: a plain function would cost each request a trip to a thread, which only new keys are worth
+    # async: a plain function would run in a thread for each request, which only unknown keys need
     who = services.gate.quick(request)
     if who is None:
         who = await run_in_threadpool(services.gate.who, request)
@@ -114,7 +114,7 @@ async def call_of(
 
 
 async def probe_of(request: Request, response: Response) -> Call:
-    """Put together what a probe needs, which anybody may ask: it owns nothing."""
+    """Return the `Call` of a probe, which anybody may ask: it has no owner."""
     return Call(request, response, request.app.state.services, NOBODY)
 
 

@@ -1,7 +1,7 @@
-"""Exceptions to answers: one table, one shape (`application/problem+json`, RFC 9457).
+"""Exceptions as responses: one table, one format (`application/problem+json`, RFC 9457).
 
-A route raises and contains no `try`. What is not in the table is our own fault: status 500,
-the cause goes to the log and not to the caller.
+A route raises and contains no `try`. An exception that is not in the table is our own bug: status
+500, the cause goes to the log and not to the caller.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ HEADERS: Final[Mapping[str, str]] = {
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-"""On every answer, unless it says otherwise: nothing of it runs, is guessed at, or is shown elsewhere."""
+"""Headers of every response unless it sets its own: no scripts, no sniffing, no embedding elsewhere."""
 
 
 STATUS: Final[Mapping[type[Exception], int]] = {
@@ -75,7 +75,7 @@ STATUS_OF_CODE: Final[Mapping[str, int]] = {
     "crashed_repeatedly": 500,
     "outage": 503,
 }
-"""Codes that a job can end with, by the status that the same error has as an answer."""
+"""Codes that a job can end with, with the status of the same error as a response."""
 
 CODE_OF_STATUS: Final[Mapping[int, str]] = {
     404: "not_found",
@@ -98,7 +98,7 @@ def status_of(error: Exception) -> int:
 
 
 def problem_of(code: str, detail: str | None, *, candidates: Sequence[str] = ()) -> Problem:
-    """Describe why a job ended, in the words of an answer."""
+    """Return the error of a job as the problem of a response."""
     status = STATUS_OF_CODE.get(code, 500)
     return Problem(
         type=f"urn:lensmodel:{code}",
@@ -119,7 +119,7 @@ def respond(
     errors: Sequence[FieldError] = (),
     headers: Mapping[str, str] | None = None,
 ) -> Response:
-    """Build the answer for a problem."""
+    """Build the response for a problem."""
     request_id = getattr(request.state, "request_id", None)
     problem = Problem(
         type=f"urn:lensmodel:{code}",
@@ -131,43 +131,47 @@ def respond(
         errors=list(errors),
         request_id=request_id,
     )
-    every = {**HEADERS, **(headers or {})}
+    all_headers = {**HEADERS, **(headers or {})}
     if request_id is not None:
-        every[REQUEST_ID] = request_id  # here too: what nobody foresaw is answered outside of RequestLog
-    return Response(problem.model_dump_json(exclude_none=True), status, media_type=MEDIA_TYPE, headers=every)
+        all_headers[REQUEST_ID] = request_id  # here too: unforeseen errors are answered outside of RequestLog
+    return Response(
+        problem.model_dump_json(exclude_none=True), status, media_type=MEDIA_TYPE, headers=all_headers
+    )
 
 
 def _title(code: str) -> str:
     return code.replace("_", " ").capitalize()
 
 
-def field_errors(found: Sequence[Any]) -> list[FieldError]:
-    """Turn pydantic's findings into ours: where, what was sent, what is allowed."""
+def field_errors(errors: Sequence[Any]) -> list[FieldError]:
+    """Convert pydantic's errors to ours: the field, the value sent, what is allowed."""
     return [
         FieldError(
             field=".".join(_writable(part) for part in error["loc"]) or "body",
             value=_shortened(error.get("input")),
             message=_writable(error["msg"]),
         )
-        for error in found
+        for error in errors
     ]
 
 
 def _shortened(value: object) -> str | None:
     if value is None or isinstance(value, dict | list | bytes):
-        return None  # a whole document is no value to quote
+        return None  # too long to quote
     text = _writable(value)
     return text if len(text) <= 100 else f"{text[:100]}…"
 
 
 def _writable(value: object) -> str:
-    """Return a value as text that UTF-8 can hold: JSON may name halves of signs, which it cannot."""
+    """Return a value as text that UTF-8 can encode: JSON may contain lone surrogates."""
     return str(value).encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def _sentence(errors: Sequence[FieldError]) -> str:
-    said = (f"{e.field}: {e.message}" + (f", got {e.value!r}" if e.value is not None else "") for e in errors)
-    return "; ".join(said)
+    sentences = (
+        f"{e.field}: {e.message}" + (f", got {e.value!r}" if e.value is not None else "") for e in errors
+    )
+    return "; ".join(sentences)
 
 
 def install(app: FastAPI) -> None:
@@ -184,8 +188,8 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(RequestValidationError)
     @app.exception_handler(ValidationError)
     async def _invalid(request: Request, error: RequestValidationError | ValidationError) -> Response:
-        found = field_errors(error.errors())
-        return respond(request, 422, "invalid_parameter", _sentence(found), errors=found)
+        errors = field_errors(error.errors())
+        return respond(request, 422, "invalid_parameter", _sentence(errors), errors=errors)
 
     @app.exception_handler(HTTPException)
     async def _framework(request: Request, error: HTTPException) -> Response:
@@ -217,7 +221,7 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(Exception)
     async def _bug(request: Request, error: Exception) -> Response:
-        request_id = getattr(request.state, "request_id", None)  # here the context has it no more
+        request_id = getattr(request.state, "request_id", None)  # no longer in the logging context here
         log.error(
             "unexpected error, request_id=%s",
             request_id,

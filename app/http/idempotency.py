@@ -1,7 +1,7 @@
-"""Requests that may be sent again: `Idempotency-Key` gives the same answer without doing the same twice.
+"""Requests that may be sent again: `Idempotency-Key` repeats the answer without repeating the work.
 
-As the IETF's draft "The Idempotency-Key HTTP Header Field": the same key with another request is refused with
-422, with one that is being answered with 409. What was refused is not kept, and may be tried again.
+As in the IETF draft "The Idempotency-Key HTTP Header Field": the same key with another request is refused
+with 422, and with 409 while the first is being answered. Refusals are not stored, and may be tried again.
 """
 
 from __future__ import annotations
@@ -24,44 +24,46 @@ REPLAYED = "Idempotency-Replayed"
 
 @dataclass(frozen=True, slots=True)
 class Once:
-    """One request and the key that it came with, if it came with one."""
+    """One request and its idempotency key, if it has one."""
 
     call: Call
     key: str | None
 
     def answer(
-        self, asked: str, work: Callable[[], M], *, status: int, resource: str | None = None
+        self, request_body: str, work: Callable[[], M], *, status: int, resource: str | None = None
     ) -> M | Response:
-        """Do the work, or give the answer again that was given to the same request.
+        """Do the work, or repeat the answer to the same request.
 
         Parameters
         ----------
-        asked : str
-            What tells this request from others at the same address: its body.
+        request_body : str
+            The body, which distinguishes this request from others at the same address.
         work : callable
-            Answers; sets status and headers of the response as in any route.
+            Returns the answer, and sets status and headers of the response as in any route.
         status : int
             Of the answer, where the work sets none.
         resource : str, optional
-            Id of what the answer speaks of, where that is not the answer's own `id`.
+            Id of the photo that the answer describes, where that is not the answer's own `id`.
         """
         if self.key is None:
             return work()
         request, answers, owner = self.call.request, self.call.store.idempotency, self.call.owner
-        said = f"{request.method} {request.url.path}?{request.url.query}\n{asked}"
-        before = answers.begin(owner, self.key, hashlib.sha256(said.encode()).hexdigest())
-        if before is not None:
-            headers = {REPLAYED: "true"} | ({} if before.location is None else {"Location": before.location})
-            return JSONResponse(before.body, before.status, headers)
+        fingerprint = f"{request.method} {request.url.path}?{request.url.query}\n{request_body}"
+        stored = answers.begin(owner, self.key, hashlib.sha256(fingerprint.encode()).hexdigest())
+        if stored is not None:
+            headers = {REPLAYED: "true"} | ({} if stored.location is None else {"Location": stored.location})
+            return JSONResponse(stored.body, stored.status, headers)
         try:
-            made = work()
+            result = work()
         except BaseException:
             answers.forget(owner, self.key)
             raise
         head = self.call.response
-        given = Given(head.status_code or status, head.headers.get("Location"), made.model_dump(mode="json"))
-        answers.finish(owner, self.key, given, resource or getattr(made, "id", None))
-        return made
+        given = Given(
+            head.status_code or status, head.headers.get("Location"), result.model_dump(mode="json")
+        )
+        answers.finish(owner, self.key, given, resource or getattr(result, "id", None))
+        return result
 
 
 async def once_of(
@@ -76,7 +78,7 @@ async def once_of(
         ),
     ] = None,
 ) -> Once:
-    """Take the key of a request."""
+    """Return the request with its key."""
     return Once(call, idempotency_key)
 
 

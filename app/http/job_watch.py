@@ -1,4 +1,4 @@
-"""Who waits for changes: one look at the tables for all of them, however many they are."""
+"""Wait for changes: one poll of the tables for all who wait, however many they are."""
 
 from __future__ import annotations
 
@@ -15,37 +15,37 @@ from starlette.concurrency import run_in_threadpool
 log = logging.getLogger(__name__)
 
 LOOK_S: Final = 0.1
-"""How often the tables are looked at while anybody waits: one or two reads of some 0.1 ms."""
+"""Seconds between two polls of the tables while anybody waits (chosen): one or two reads of 0.1 ms."""
 
 CALM_S: Final = 5.0
-"""How often nevertheless where the database tells of changes by itself."""
+"""Seconds between two polls where the database announces changes (chosen, not measured)."""
 
 Marks = Mapping[str, Hashable]
-"""What tells two states of each key apart; what is gone is not there."""
+"""A value for each key that changes with its state; deleted keys are missing."""
 
 
 @dataclass(frozen=True, slots=True)
 class Waiting:
-    """Somebody who waits for changes of one key."""
+    """Changes of one key, for somebody who waits."""
 
     changed: Callable[[float], Awaitable[None]]
-    """`await changed(seconds)` ends with a change, or with that time."""
+    """`await changed(seconds)` returns after a change, or after that time."""
 
     count: Callable[[], int]
-    """How many changes were seen of this key: what is read after it holds at least that many."""
+    """Number of changes so far: what is read afterwards includes at least these."""
 
 
 class Watch:
-    """Tells those that wait for jobs, or for owners, of one process when theirs has changed.
+    """Wakes those that wait for jobs, or for owners, in one process when these change.
 
     Parameters
     ----------
     look : callable
         Returns the marks of these keys; called in a thread.
     every_s : float
-        How often it is called at most, in seconds.
+        Least time between two calls, in seconds.
     announced : callable
-        Whether `nudge` is called after each change: then one looks only then, and every `CALM_S`.
+        Whether `nudge` is called after each change: then the tables are polled only then, and every `CALM_S`.
     """
 
     def __init__(
@@ -64,9 +64,9 @@ class Watch:
 
     @contextlib.contextmanager
     def of(self, key: str) -> Iterator[Waiting]:
-        """Let somebody wait for changes of one key.
+        """Provide the changes of one key.
 
-        The first look at it counts as a change: nothing is missed between reading it and waiting.
+        The first poll counts as a change: nothing is missed between reading the key and waiting.
         """
         event = asyncio.Event()
         self._waiting[key].add(event)
@@ -92,7 +92,7 @@ class Watch:
                 self._counts.pop(key, None)
 
     def nudge(self) -> None:
-        """Look soon: something may have changed. To be called in the loop's thread."""
+        """Poll soon: something may have changed. To be called in the loop's thread."""
         self._nudged.set()
 
     async def _run(self) -> None:
@@ -101,11 +101,11 @@ class Watch:
             if self._announced():
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(self._nudged.wait(), CALM_S)
-            self._nudged.clear()  # before the look: what changes during it is looked at again
+            self._nudged.clear()  # before the poll: changes during it cause another one
             keys = list(self._waiting)
             try:
                 marks = await run_in_threadpool(self._look, keys)
-            except Exception as error:  # noqa: BLE001 - those who wait ask again, and hear of it then
+            except Exception as error:  # noqa: BLE001 - the next poll tries again
                 log.warning("the tables could not be looked at: %s", error)
                 self.nudge()
                 continue
@@ -118,6 +118,6 @@ class Watch:
                         event.set()
 
     def stop(self) -> None:
-        """Look no more."""
+        """Stop polling."""
         if self._task is not None:
             self._task.cancel()

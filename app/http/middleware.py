@@ -1,4 +1,4 @@
-"""Around every request: its id, one line in the log, the names that the service answers to, who may ask."""
+"""Middleware of every request: its id and log line, allowed host names, same-site checks, HEAD."""
 
 from __future__ import annotations
 
@@ -21,14 +21,16 @@ from app.store.ids import new_id
 log = logging.getLogger("app.access")
 
 MAX_LOGGED: Final = 500
+"""Characters of a path in the log at most (chosen): no path of the interface has as many."""
+
 ONLY_HEAD: Final = "lensmodel.only_head"
-"""In the scope of a request whose answer needs no body."""
+"""Key in the scope of a request whose response needs no body."""
 
 _ACCEPTED: Final = re.compile(r"[A-Za-z0-9._-]{1,64}", re.ASCII)
 
 
 class RequestLog:
-    """Gives each request its id and writes what became of it; sets the headers that each answer has.
+    """Gives each request an id, logs its outcome, and sets the headers of every response.
 
     The query is not logged: it may hold a serial, which is personal data.
     """
@@ -41,7 +43,7 @@ class RequestLog:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        clear_contextvars()  # a connection that is kept runs in the context of its first request
+        clear_contextvars()  # a keep-alive connection runs in the context of its first request
         sent = Headers(scope=scope).get(REQUEST_ID, "")
         request_id = sent if _ACCEPTED.fullmatch(sent) else new_id()
         scope.setdefault("state", {})["request_id"] = request_id
@@ -66,7 +68,7 @@ class RequestLog:
             metrics.REQUEST_SECONDS.labels(_known(scope["method"]), _route(scope), str(status)).observe(
                 seconds
             )
-            path = quote(scope["path"][:MAX_LOGGED], safe="/:@!$&'()*+,;=~")  # as it came: in one line
+            path = quote(scope["path"][:MAX_LOGGED], safe="/:@!$&'()*+,;=~")  # escaped, on one line
             ids = {
                 name: text[:60] for name, text in scope.get("path_params", {}).items() if name in logs.FIELDS
             }
@@ -85,10 +87,10 @@ class RequestLog:
 
 
 class OwnNames:
-    """Refuses requests for names that anybody can register, unless they are ours.
+    """Refuses requests for registrable host names that are not ours (DNS rebinding).
 
-    A page of a stranger may let its own name point to this machine, and would then be allowed by the
-    browser to read everything here. It cannot do so with an address or a local name.
+    A foreign page may let its own name resolve to this machine, and the browser would then allow it
+    to read everything here. It cannot do so with an address or a local name.
     """
 
     def __init__(self, app: ASGIApp, allowed: frozenset[str]) -> None:
@@ -108,10 +110,10 @@ class OwnNames:
 
 
 class SameSite:
-    """Refuses changes that the page of another site asks a browser for; programs are no browsers.
+    """Refuses changes that a page of another site makes a browser send; programs are not affected.
 
-    A browser sends such requests with whatever the user may do here, and without asking him. It says
-    of each where it comes from (Fetch Metadata, W3C; Origin, RFC 6454), which a page cannot forge.
+    A browser sends such requests with the user's permissions, and without asking. It states the origin of
+    each (Fetch Metadata, W3C; Origin, RFC 6454), which a page cannot forge.
     """
 
     def __init__(self, app: ASGIApp, allowed: frozenset[str]) -> None:
@@ -119,7 +121,7 @@ class SameSite:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on, or refuse it."""
-        if scope["type"] != "http" or scope["method"] in SAFE or self._is_own(Headers(scope=scope)):
+        if scope["type"] != "http" or scope["method"] in SAFE or self._same_site(Headers(scope=scope)):
             await self._app(scope, receive, send)
             return
         origin = Headers(scope=scope).get("origin", "")[:100]
@@ -129,7 +131,7 @@ class SameSite:
         )
         await respond(Request(scope), 403, "cross_site", detail, headers=CLOSE)(scope, receive, send)
 
-    def _is_own(self, headers: Headers) -> bool:
+    def _same_site(self, headers: Headers) -> bool:
         if headers.get("sec-fetch-site", "none") not in {"same-origin", "none"}:
             return False
         origin = headers.get("origin")
@@ -150,7 +152,7 @@ class Heads:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on; of the answer, only the head."""
+        """Pass the request on; return only the head of the response."""
         if scope["type"] != "http" or scope["method"] != "HEAD" or scope["path"].endswith("/events"):
             await self._app(scope, receive, send)
             return
@@ -162,7 +164,7 @@ class Heads:
 
 
 def _known(method: str) -> str:
-    """Return a method as a label: of what a stranger makes up there is no end."""
+    """Return a method as a label; unknown ones share a label, lest strangers create any number of them."""
     return method if method in {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"} else "other"
 
 

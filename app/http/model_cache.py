@@ -1,8 +1,8 @@
 """Fitted lens models in memory: always current, fitted once, bounded.
 
 Each request compares the lens's version in the table (one primary-key read, microseconds) with
-that of the model in memory. So a new sample is seen by the very next request in every process,
-without messages between processes and without waiting for something to expire.
+that of the model in memory. So the very next request in every process uses a new sample, without
+messages between processes and without waiting for an entry to expire.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from lensmodel.workflow.ways import WAYS
 log = logging.getLogger(__name__)
 
 LOOK_S = 1.0
-"""How often to look whether a worker has learned more."""
+"""Seconds between two looks for the fit of a worker (chosen): each is a request to the storage."""
 
 BYTES_FACTOR = 4
-"""A fitted model keeps its samples as splines besides: some copies of each."""
+"""Size of a fitted model over that of its kernels (chosen, not measured): it also holds splines of them."""
 
 
 _Key: TypeAlias = tuple[str, int | str | None]
@@ -43,9 +43,9 @@ _LEANING: Final = "leaning"
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
-    """A model and the state of the lens that it belongs to.
+    """A model and the state of its lens.
 
-    `learned` says that a worker has fitted it wholly. Until then requests are answered by a model
+    `learned` means that a worker has fitted it completely. Until then requests are answered by a model
     without the wavefront of the lens, which takes seconds to fit. `family` are the other copies that
     `model` leans on; `own` is then the model without them.
     """
@@ -61,7 +61,7 @@ class Fitted:
 
     @property
     def way(self) -> PsfModel:
-        """The way that answers: also that of the paper where the service answers so for all lenses."""
+        """The way of the answers; `paper` also where the service is configured so for all lenses."""
         return "paper" if self.model.settings.mode == WAYS["paper"].mode else "default"
 
 
@@ -73,14 +73,14 @@ class ModelCache:
     store : Store
         Where the samples are.
     max_bytes : int
-        Bound of what is kept, by estimate; the model in use is kept in any case.
+        Estimated size at most; the model in use is kept in any case.
     storage : Storage, optional
-        Where workers keep what they have learned from samples.
+        Where workers store fitted models.
     family : bool
         Whether lenses lean on other copies at all.
     settings : ModelSettings, optional
-        Of the models of lenses that are learned in the default way, and but for the mode of the others; must
-        be those of the workers, or what they learn is of no use here.
+        Settings of models of the default way, and except for the mode of the others; must be those of the
+        workers, whose fitted models cannot be used otherwise.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class ModelCache:
     ) -> None:
         self._store, self._max_bytes, self._storage = store, max_bytes, storage
         self._family, self._settings = family, settings or ModelSettings()
-        self._asked: dict[str, float] = {}
+        self._looked_at: dict[str, float] = {}
         self._models: OrderedDict[_Key, Fitted] = OrderedDict()
         self._guard = threading.Lock()
         self._building: dict[str, threading.Lock] = {}
@@ -110,9 +110,9 @@ class ModelCache:
     ) -> Fitted:
         """Return the model of a lens, current or of an earlier version.
 
-        `state` and `relatives` are what the caller has just read of the lens, if he did. Where no version is
-        named, the model leans on the owner's other copies of the lens as they are now, unless `family` says
-        no; a named version is what the photos of that lens said, and stays so.
+        `state` and `relatives` are those of the lens if the caller has just read them. Without a version the
+        model leans on the owner's other copies of the lens as they are now, unless `family` is false; the
+        model of a given version rests on the photos of that lens alone, and never changes.
 
         Raises
         ------
@@ -123,43 +123,45 @@ class ModelCache:
         ConflictError
             If samples of that version were removed since.
         """
-        own = self._own(lens_id, version, state)
+        own = self._of_lens(lens_id, version, state)
         if not (self._family and family and version is None):
             return own
-        return self._leaning(own, self._store.samples.family_of(lens_id) if relatives is None else relatives)
+        return self._with_family(
+            own, self._store.samples.family_of(lens_id) if relatives is None else relatives
+        )
 
-    def _own(self, lens_id: str, version: int | None, state: LensState | None) -> Fitted:
+    def _of_lens(self, lens_id: str, version: int | None, state: LensState | None) -> Fitted:
         state = self._store.samples.state_of(lens_id) if state is None else state
         if state is None:
             raise UnknownLensError(f"there is no lens {lens_id}: GET /v1/lenses lists those there are")
         if version is not None and version != state.version:
             return self._earlier(lens_id, version, state)
-        found = self._recall((lens_id, None))
-        if found is not None and found.state == state and not self._outdone(found):
+        fitted = self._recall((lens_id, None))
+        if fitted is not None and fitted.state == state and not self._superseded(fitted):
             metrics.MODELS.labels("known").inc()
-            return found
+            return fitted
         with self._lock_of(lens_id):  # one thread fits, the others wait for its result
-            found = self._recall((lens_id, None))
-            same = found is not None and found.state == self._store.samples.state_of(lens_id)
-            if found is not None and same and not self._outdone(found):
-                return found
-            metrics.MODELS.labels("fitted" if found is None or same else "extended").inc()
-            return self._keep((lens_id, None), self._build(lens_id, None if same else found))
+            fitted = self._recall((lens_id, None))
+            same = fitted is not None and fitted.state == self._store.samples.state_of(lens_id)
+            if fitted is not None and same and not self._superseded(fitted):
+                return fitted
+            metrics.MODELS.labels("fitted" if fitted is None or same else "extended").inc()
+            return self._keep((lens_id, None), self._build(lens_id, None if same else fitted))
 
-    def _leaning(self, own: Fitted, family: Family) -> Fitted:
+    def _with_family(self, own: Fitted, family: Family) -> Fitted:
         """Let a model lean on the other copies of its lens, if there are any."""
         if not family:
             return own
         key: _Key = (own.lens_id, _LEANING)
-        found = self._recall(key)
-        if found is not None and found.family == family and found.own is own.model:
-            return found
+        cached = self._recall(key)
+        if cached is not None and cached.family == family and cached.own is own.model:
+            return cached
         with self._lock_of(own.lens_id):
-            found = self._recall(key)
-            prior = None if found is None or found.family != family else found.model.prior
+            cached = self._recall(key)
+            prior = None if cached is None or cached.family != family else cached.model.prior
             if prior is None:
                 others = self._store.samples.of_family(family)
-                if not others:  # removed while we looked
+                if not others:  # removed meanwhile
                     return own
                 source = LensModel.fit([stored.sample for stored in others], self._settings_of(own.state))
                 prior = Prior(source, name=family_name(family))
@@ -169,22 +171,22 @@ class ModelCache:
                 size += BYTES_FACTOR * sum(sample.kernel.nbytes for sample in prior.source.samples)
             return self._keep(key, replace(own, model=leaning, size_bytes=size, family=family, own=own.model))
 
-    def _outdone(self, fitted: Fitted) -> bool:
-        """Whether a worker has learned more of these samples; looked up now and then."""
+    def _superseded(self, fitted: Fitted) -> bool:
+        """Whether a worker has stored its fit of these samples; looked up every `LOOK_S`."""
         if fitted.learned or self._storage is None:
             return False
         key = learned_key(fitted.lens_id, fitted.state.version, fitted.state.rebuild_epoch)
         now = time.monotonic()
         with self._guard:
-            if now - self._asked.get(key, -math.inf) < LOOK_S:
+            if now - self._looked_at.get(key, -math.inf) < LOOK_S:
                 return False
-            self._asked = {key: now, **{k: t for k, t in self._asked.items() if now - t < LOOK_S}}
+            self._looked_at = {key: now, **{k: t for k, t in self._looked_at.items() if now - t < LOOK_S}}
         try:
             self._storage.info(key)
         except FileNotFoundError:
             return False
         with self._guard:
-            self._asked.pop(key, None)
+            self._looked_at.pop(key, None)
         return True
 
     def _build(self, lens_id: str, old: Fitted | None) -> Fitted:
@@ -201,9 +203,9 @@ class ModelCache:
         check_version(self._store, lens_id, version, state)
         key = (lens_id, version)
         with self._lock_of(lens_id):
-            found = self._recall(key)
-            if found is not None and found.state.rebuild_epoch == state.rebuild_epoch:
-                return found
+            fitted = self._recall(key)
+            if fitted is not None and fitted.state.rebuild_epoch == state.rebuild_epoch:
+                return fitted
             _, samples = self._store.samples.of_lens(lens_id, up_to_version=version)
             return self._keep(key, self._fit(lens_id, replace(state, version=version), samples))
 
@@ -220,7 +222,7 @@ class ModelCache:
         return Fitted(lens_id, state, model, model.pitch_um, _size(samples), learned)
 
     def _settings_of(self, state: LensState) -> ModelSettings:
-        """How the model of a lens is made; where it was learned in a way of its own, in the mode of that."""
+        """Return the settings of the model of a lens, with the mode of its way unless that is the default."""
         return (
             self._settings if state.way == "default" else replace(self._settings, mode=WAYS[state.way].mode)
         )
@@ -262,12 +264,12 @@ class ModelCache:
 
 
 def family_name(family: Family) -> str:
-    """Say what a model leans on."""
+    """Return a phrase for the copies that a model leans on."""
     return "another copy" if len(family) == 1 else f"{len(family)} other copies"
 
 
 def check_version(store: Store, lens_id: str, version: int, state: LensState) -> None:
-    """Make sure that an earlier version can still be had.
+    """Check that the samples of an earlier version are still complete.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What open pages show, drawn once for all who look at the same page of the same owner."""
+"""Fragments of open pages, rendered once for all viewers of the same page of the same owner."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from starlette.concurrency import run_in_threadpool
 from app.http.job_watch import Watch
 
 FRESH_S: Final = 5.0
-"""How long what was drawn serves others though nothing happened; estimates of the time left change."""
+"""Seconds for which fragments are reused while nothing happens (chosen): estimates of time left change."""
 
 LOOK_S: Final = 0.5
-"""How often the tables are looked at for open pages: some milliseconds of reading an owner."""
+"""Seconds between two polls of the tables for open pages (chosen): some milliseconds for each owner."""
 
 Fragments: TypeAlias = Mapping[str, str]
-"""HTML by the id of the element that it belongs into."""
+"""HTML by the id of the element that it replaces."""
 
 
 @dataclass(slots=True)
@@ -41,10 +41,10 @@ class View:
     """One open page."""
 
     changed: Callable[[float], Awaitable[None]]
-    """`await changed(seconds)` ends when something of the owner changes, or with that time."""
+    """`await changed(seconds)` returns when something of the owner changes, or after that time."""
 
     parts: Callable[[], Awaitable[Fragments]]
-    """What the page shows by now."""
+    """Returns the present fragments of the page."""
 
 
 class OpenPages:
@@ -53,7 +53,7 @@ class OpenPages:
     Parameters
     ----------
     watch : Watch
-        Tells when something of an owner changes.
+        Watch of the owners.
     """
 
     def __init__(self, watch: Watch) -> None:
@@ -80,10 +80,10 @@ async def _parts(page: _Page, change: int, draw: Callable[[], Fragments]) -> Fra
     last = page.drawing
     if last.task is None or last.change != change or now - last.at > FRESH_S or _failed(last.task):
         task = asyncio.ensure_future(run_in_threadpool(draw))
-        task.add_done_callback(_failed)  # looks at its error: all who waited may be gone by then
+        task.add_done_callback(_failed)  # retrieves its error: all viewers may be gone by then
         page.drawing = last = _Drawing(change, now, task)
     assert last.task is not None
-    return await asyncio.shield(last.task)  # who leaves does not take it from the others
+    return await asyncio.shield(last.task)  # a viewer who leaves does not cancel it for the others
 
 
 def _failed(task: asyncio.Task[Fragments]) -> bool:

@@ -1,4 +1,4 @@
-"""Pictures that were drawn, by the tag of what they show: drawn once, however many ask at once."""
+"""Cache of rendered pictures by tag: rendered once, however many ask at once."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from collections.abc import Callable
 from typing import Final
 
 MAX_BYTES: Final = 32 << 20
-"""Chosen: some hundred maps of a field."""
+"""Memory of the cache (chosen): some hundred maps of a field."""
 
 
 class Drawn:
     """The least recently used pictures of one process.
 
-    A tag names the version of the lens and the whole question, so that a picture is never out of date.
+    A tag contains the version of the lens and the whole query, so that a picture is never out of date.
     """
 
     def __init__(self, max_bytes: int = MAX_BYTES) -> None:
@@ -24,7 +24,7 @@ class Drawn:
         self._drawing: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
 
     def get(self, tag: str, draw: Callable[[], bytes]) -> bytes:
-        """Return the picture of a tag; draw it if it is not there, and one at a time."""
+        """Return the picture of a tag; render it if it is missing, once for simultaneous calls."""
         with self._guard:
             alone = self._drawing[tag]
         with alone:

@@ -19,19 +19,22 @@ from lensmodel.core.types import Channel, Kernel
 from lensmodel.model import PsfAnswer
 
 SIDE: Final = 1000
-"""Height of the frame that a map is drawn in; only its shape plays a part."""
+"""Height of the frame of a map in pixels (chosen): only its aspect ratio matters."""
 
 View: TypeAlias = tuple[float, float, float, float]
-"""Part of a picture: left, top, width and height as shares of it."""
+"""Part of a picture: left, top, width and height as fractions of it."""
 
 DIGITS: Final = 10
+"""Decimals of kernels, whose sum is 1, in JSON (chosen, not measured)."""
+
 GAP_PX: Final = 2
+"""Pixels between the kernels of a map (chosen for looks)."""
 
 
 def describe(
     lens_id: str, fitted: Fitted, question: QueryOut, answer: PsfAnswer, pixel_pitch_um: float | None
 ) -> PsfOut:
-    """Say what an answer rests on, with an empty kernel for formats that carry it themselves."""
+    """Describe an answer and its support, without the kernel, which most formats carry themselves."""
     size = answer.kernel.shape[0]
     error = float(answer.predicted_error)
     return PsfOut(
@@ -59,7 +62,7 @@ def describe(
 def psf(
     form: Literal["json", "png", "npy", "tiff"], kernel: Kernel, described: PsfOut
 ) -> tuple[bytes, Mapping[str, str]]:
-    """Encode a kernel; return the bytes and headers that explain them."""
+    """Encode a kernel; return the bytes and the headers that describe them."""
     if form == "json":
         values = np.round(kernel, DIGITS).tolist()
         full = described.model_copy(update={"psf": described.psf.model_copy(update={"data": values})})
@@ -70,7 +73,7 @@ def psf(
         return buffer.getvalue(), _named(described, "npy")
     if form == "tiff":
         buffer = io.BytesIO()
-        text = described.model_dump_json(exclude={"psf"})  # tifffile takes a "shape" in it for its own
+        text = described.model_dump_json(exclude={"psf"})  # tifffile would interpret a "shape" in it
         tifffile.imwrite(
             buffer, kernel.astype(np.float32), photometric="minisblack", description=text, metadata=None
         )

@@ -1,7 +1,7 @@
-"""A question in the address, read by its schema in one go.
+"""Query parameters, validated by their schema in one call.
 
-FastAPI reads a schema of query parameters field by field, which costs as much as the answer itself where that
-is quick. What `/openapi.json` says of them stays the same; see `Asked.described`.
+FastAPI validates query parameters field by field, which takes as long as a quick answer. `/openapi.json`
+describes them in the same way; see `QueryModel.described`.
 """
 
 from __future__ import annotations
@@ -15,34 +15,36 @@ from pydantic import ValidationError
 
 from app.schemas.fields import Question
 
-_HERE: Final = "query"
+_IN: Final = "query"
 
 Q = TypeVar("Q", bound=Question)
 
 
 @dataclass(frozen=True, slots=True)
-class Asked(Generic[Q]):
-    """A dependency that reads a question of some kind; of a name that is given twice the last one counts."""
+class QueryModel(Generic[Q]):
+    """A dependency that reads query parameters; the last value of a repeated name counts."""
 
     kind: type[Q]
 
     async def __call__(self, request: Request) -> Q:
-        """Read it; `RequestValidationError` as FastAPI raises it."""
+        """Read the parameters; raise `RequestValidationError` as FastAPI does."""
         try:
             return self.kind.model_validate(dict(request.query_params))
         except ValidationError as error:
-            found = error.errors(include_url=False)
-            raise RequestValidationError([{**one, "loc": (_HERE, *one["loc"])} for one in found]) from None
+            errors = error.errors(include_url=False)
+            raise RequestValidationError(
+                [{**entry, "loc": (_IN, *entry["loc"])} for entry in errors]
+            ) from None
 
     @property
     def described(self) -> dict[str, Any]:
-        """Parameters for `openapi_extra`, as FastAPI describes those that it reads itself."""
+        """Parameters for `openapi_extra`, described as FastAPI describes its own."""
         schema = self.kind.model_json_schema()
         required = schema.get("required", ())
-        found = []
-        for name, of in schema["properties"].items():
-            one: dict[str, Any] = {"name": name, "in": _HERE, "required": name in required, "schema": of}
-            if "description" in of:
-                one["description"] = of["description"]
-            found.append(one)
-        return {"parameters": found}
+        parameters = []
+        for name, field in schema["properties"].items():
+            entry: dict[str, Any] = {"name": name, "in": _IN, "required": name in required, "schema": field}
+            if "description" in field:
+                entry["description"] = field["description"]
+            parameters.append(entry)
+        return {"parameters": parameters}

@@ -1,7 +1,7 @@
-"""Receiving a photo: parsed while it streams, hashed while it is stored, refused as early as can be.
+"""Receiving a photo: parsed while it streams, hashed while it is stored, refused as early as possible.
 
 The body goes straight into storage: no copy in memory, none in a temporary folder. Its type is
-told by its first bytes; the name and the media type that the client sends decide nothing.
+determined by its first bytes; the name and the media type that the client sends are ignored.
 """
 
 from __future__ import annotations
@@ -26,7 +26,11 @@ from lensmodel import photo
 
 SNIFF_BYTES: Final = photo.HEAD_BYTES
 MAX_FORM_BYTES: Final = 64 * 1024
+"""Bytes of all form fields at most (chosen): far more than the fields of an upload can have."""
+
 MAX_PARTS: Final = 32
+"""Parts of a form at most (chosen): more than an upload has fields."""
+
 FILE_FIELD: Final = "file"
 REMEDY: Final = (
     "send multipart/form-data with one part `file`, or the bytes of the photo as the body "
@@ -36,7 +40,7 @@ REMEDY: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Uploaded:
-    """What has arrived and lies in storage."""
+    """An upload that is complete and stored."""
 
     sha256: str
     size: int
@@ -46,7 +50,7 @@ class Uploaded:
 
 
 def safe_name(name: str | None) -> str:
-    """Return a name to show: no folders, no control signs, not too long. It never becomes a path."""
+    """Return a name for display: no folders, no control characters, not too long. It never becomes a path."""
     text = unicodedata.normalize("NFC", name or "")
     last = text.replace("\\", "/").rpartition("/")[2]
     shown = "".join(sign for sign in last if sign.isprintable()).strip(" .")
@@ -57,7 +61,7 @@ def safe_name(name: str | None) -> str:
 
 
 class _Sink:
-    """Takes the bytes of the photo: looks at the first, counts and hashes all, stores them."""
+    """Stores the bytes of the photo, counts and hashes them, and determines the type by the first."""
 
     def __init__(self, blob: AsyncBlobWriter, limit: int) -> None:
         self._blob, self._limit = blob, limit
@@ -78,14 +82,14 @@ class _Sink:
         await self._blob.write(data)
 
     def finish(self) -> tuple[str, str]:
-        """Return hash and kind once all is there."""
+        """Return hash and kind once the photo is complete."""
         if self.size == 0:
             raise MalformedUploadError(f"the photo is empty: {REMEDY}")
         return self._hash.hexdigest(), self.kind or photo.sniff(self._head)
 
 
 def too_large(limit: int) -> TooLargeError:
-    """Say how large an upload may be."""
+    """Return the error for an upload that is too large."""
     return TooLargeError(
         f"the photo is larger than {limit} bytes: send a smaller one, "
         "or raise LENS_MAX_UPLOAD_MB where you run the service"
@@ -130,7 +134,7 @@ class _Form:
         self._value += data[start:end]
 
     def on_header_end(self) -> None:
-        # latin-1 keeps the bytes: the options come back as such, and are UTF-8
+        # latin-1 preserves the bytes: the options are returned as bytes, and are UTF-8
         self._headers[self._name.decode("latin-1").lower()] = self._value.decode("latin-1")
         self._name, self._value = bytearray(), bytearray()
 
@@ -205,18 +209,18 @@ async def receive(
     Raises
     ------
     MalformedUploadError
-        If the body is not what an upload looks like.
+        If the body has not the form of an upload.
     TooLargeError
-        If it has more than `limit` bytes of photo.
+        If the photo has more than `limit` bytes.
     UnreadablePhotoError
-        If the first bytes are no image that we read.
+        If the first bytes are of no supported image type.
     SlowBodyError
-        If nothing comes for `patience_s`, hardly anything for longer, or not all of it `within_s`.
+        If nothing arrives for `patience_s`, the rate stays too low, or the body takes longer than `within_s`.
     pydantic.ValidationError
         If a form or query field is out of range.
     """
     query = {name: value for name, value in request.query_params.items() if name != "filename"}
-    UploadFields.model_validate(query)  # before the body: what is wrong already need not be sent
+    UploadFields.model_validate(query)  # before the body: a wrong query need not send it
     if declared_length(request) > limit + 2 * MAX_FORM_BYTES:
         raise too_large(limit)
     media_type, options = parse_options_header(request.headers.get("content-type", ""))
@@ -238,7 +242,7 @@ async def receive(
 
 
 def declared_length(request: Request) -> int:
-    """Return how many bytes are said to come; 0 where nothing is said."""
+    """Return the declared length of the body in bytes; 0 where none is declared."""
     declared = request.headers.get("content-length", "0")
     if not declared.isdecimal() or len(declared) > 18:
         raise MalformedUploadError(f"Content-Length {declared[:40]!r} is no number: send the number of bytes")

@@ -1,4 +1,4 @@
-"""Rows to answers."""
+"""Convert rows to the schemas of responses."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ JOB_STATES: Final[dict[str, s.JobState]] = {
     "failed": "failed",
     "cancelled": "cancelled",
 }
-"""Where the work stands, by the state of the photo."""
+"""State of the job, by the state of the photo."""
 
 
 def photo_out(row: PhotoRow, lens_id: str | None, candidates: Sequence[str] = ()) -> s.PhotoOut:
@@ -228,7 +228,7 @@ def calibration_out(row: EventRow) -> s.CalibrationOut:
 
 
 def _eta(since: datetime, done: int, total: int) -> float | None:
-    """Seconds left, if the rest goes on at the pace so far; None before the first is done."""
+    """Return the seconds left at the average pace so far; None before the first is done."""
     if done <= 0 or total <= done:
         return None if done <= 0 else 0.0
     return round((now() - since).total_seconds() / done * (total - done), 1)

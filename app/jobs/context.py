@@ -36,7 +36,7 @@ from lensmodel.core.types import ignore_step
 log = logging.getLogger(__name__)
 
 CRASHES: Final = 3
-"""Deaths of a child by a signal before its job fails (chosen): more would not help, one may be chance."""
+"""Deaths of a child by a signal before its job fails (chosen, not measured)."""
 
 BACKOFF_S: Final = 0.5
 """Seconds before the second attempt, four times as long before each further one (chosen)."""

@@ -41,8 +41,7 @@ QUEUE_OF: Final[Mapping[Kind, str]] = {
     "measure": "patches",
 }
 MAX_STARTS: Final[Mapping[Kind, int]] = {"photo": 50, "cell": 5, "correction": 5, "measure": 3}
-"""Restarts of a job after deaths of its worker, before it is given up (chosen): a photo mostly waits for its
-cells, so that many deaths are not its fault."""
+"""Restarts of a job after deaths of its worker, before it is given up (chosen, not measured)."""
 
 POLL_S: Final[Mapping[str, float]] = {"photos": 0.25, "patches": 0.1, "corrections": 0.25}
 """Seconds between two polls of each queue (chosen): three polls every 0.1 s take a tenth of a core."""

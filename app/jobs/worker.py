@@ -58,7 +58,7 @@ REPORTS_S: Final = 6 * 3600.0
 """Seconds between two searches for missing reports (chosen): each lists all fitted models."""
 
 KEEP_JOBS: Final = timedelta(days=2)
-"""How long the engine remembers ended jobs (chosen): long enough to examine a failure."""
+"""How long the engine remembers ended jobs (chosen, not measured)."""
 
 _OURS: Final = "an error of ours; the log of the worker has it; retry later, or report the file"
 _LATER: Final = "retry once its operator has mended that"

@@ -21,7 +21,7 @@ OnlyName = Annotated[OptionalName, Query()]
 
 
 class HasPublicId(Protocol):
-    """A row that the outside knows."""
+    """A row with a public id."""
 
     public_id: str
 
@@ -35,11 +35,11 @@ Answers: TypeAlias = dict[int | str, dict[str, Any]]
 def problems(*statuses: int, also: Answers | None = None) -> Answers:
     """Return the OpenAPI entries of the problems that an endpoint may answer with, and of `also`."""
     schema = {"schema": {"$ref": "#/components/schemas/Problem"}}
-    found: Answers = {
+    answers: Answers = {
         status: {"model": Problem, "description": "Problem", "content": {MEDIA_TYPE: schema}}
         for status in (*statuses, 500, 503)
     }
-    return found | (also or {})
+    return answers | (also or {})
 
 
 def cut(rows: Sequence[Row], limit: int) -> tuple[list[Row], str | None]:
@@ -49,7 +49,7 @@ def cut(rows: Sequence[Row], limit: int) -> tuple[list[Row], str | None]:
 
 
 def next_link(call: Call, cursor: str | None) -> str | None:
-    """Return the address of the next page, and say it in the Link header too."""
+    """Return the address of the next page, and set the Link header."""
     if cursor is None:
         return None
     query = {**call.request.query_params, "cursor": cursor}

@@ -46,41 +46,43 @@ _RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.ASCII)
         404, 409, 422, also={200: {"model": CorrectionOut, "description": "The same correction is finished"}}
     ),
 )
-def create_correction(wish: CorrectionIn, call: CallDep, once: OnceDep) -> CorrectionOut | Response:
+def create_correction(options: CorrectionIn, call: CallDep, once: OnceDep) -> CorrectionOut | Response:
     """Correct a photo with the model of its lens, or of another."""
-    return once.answer(wish.model_dump_json(), lambda: create(wish, call), status=202, resource=wish.photo_id)
+    return once.answer(
+        options.model_dump_json(), lambda: create(options, call), status=202, resource=options.photo_id
+    )
 
 
-def create(wish: CorrectionIn, call: Call) -> CorrectionOut:
-    """Write down what is wished, or find the same wish."""
-    photo = find_photo(call, wish.photo_id)
-    if wish.method is not None and wish.method not in deconvolvers:
-        raise UnknownMethodError(f"no method {wish.method!r}; known: {', '.join(deconvolvers)}")
+def create(options: CorrectionIn, call: Call) -> CorrectionOut:
+    """Create a correction, or return the one of the same request."""
+    photo = find_photo(call, options.photo_id)
+    if options.method is not None and options.method not in deconvolvers:
+        raise UnknownMethodError(f"no method {options.method!r}; known: {', '.join(deconvolvers)}")
     _check_read(photo)
-    _check_region(photo, wish)
-    lens = _lens_for(call, photo, wish.lens_id)
-    version = _version_for(call, lens, wish.lens_version)
-    params = wish.model_dump(mode="json", include={"strength", "output", "roi"})
-    params["method"] = wish.method or way_of(call.settings, lens.answering_way).method
-    # with other settings the same wish is another one
+    _check_region(photo, options)
+    lens = _lens_for(call, photo, options.lens_id)
+    version = _version_for(call, lens, options.lens_version)
+    params = options.model_dump(mode="json", include={"strength", "output", "roi"})
+    params["method"] = options.method or way_of(call.settings, lens.answering_way).method
+    # with other settings of the photo the same request is a new correction
     params["settings"] = settings_of(photo)
-    # only where asked for: a wish of before there were bounds is still the same wish
-    params |= wish.model_dump(
+    # only values other than the defaults: requests stored before there were bounds stay the same
+    params |= options.model_dump(
         mode="json", include={"halo", "texture", "denoise", "layers"}, exclude_defaults=True
     )
-    if wish.family and wish.lens_version is None and call.settings.family:
-        # the copies and versions of this moment: the same wish after one of them learned is another one
-        leaning = call.store.samples.family_of(lens.public_id)
-        params |= {"family": [one.named() for one in leaning]} if leaning else {}
-    row, made = call.store.corrections.create(photo, lens, version, params)
-    finished = not made and row.state == "succeeded"
+    if options.family and options.lens_version is None and call.settings.family:
+        # the present copies and versions: after one of them learned the same request is a new correction
+        relatives = call.store.samples.family_of(lens.public_id)
+        params |= {"family": [relative.named() for relative in relatives]} if relatives else {}
+    row, created = call.store.corrections.create(photo, lens, version, params)
+    finished = not created and row.state == "succeeded"
     call.response.status_code = status.HTTP_200_OK if finished else status.HTTP_202_ACCEPTED
     call.response.headers["Location"] = f"{views.V1}/corrections/{row.public_id}"
     return views.correction_out(CorrectionPlan(row, photo, lens))
 
 
 def _check_read(photo: PhotoRow) -> None:
-    """Make sure that the file was looked into: its size and settings are part of the wish."""
+    """Check that the file was inspected: its size and settings are part of the request."""
     if photo.file_gone_at is not None:
         raise ConflictError(f"the file of photo {photo.public_id} is no longer kept: {SEND_AGAIN}")
     if photo.width is not None:
@@ -93,8 +95,8 @@ def _check_read(photo: PhotoRow) -> None:
     raise ConflictError(f"photo {photo.public_id} could not be read ({photo.state}): send it again")
 
 
-def _check_region(photo: PhotoRow, wish: CorrectionIn) -> None:
-    roi = wish.roi
+def _check_region(photo: PhotoRow, options: CorrectionIn) -> None:
+    roi = options.roi
     if roi is None:
         return
     assert photo.width is not None
@@ -219,12 +221,12 @@ def read_result(correction_id: str, call: CallDep) -> Response:
         "Content-Disposition": _disposition(row.result_name or "corrected"),
         "X-Content-Type-Options": "nosniff",
     }
-    known = {one.strip() for one in call.request.headers.get("if-none-match", "").split(",")}
-    if known & {tag, f"W/{tag}", "*"}:
+    cached_tags = {entry.strip() for entry in call.request.headers.get("if-none-match", "").split(",")}
+    if cached_tags & {tag, f"W/{tag}", "*"}:
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
     part = call.request.headers.get("range")
     if call.request.headers.get("if-range", tag) != tag:
-        part = None  # the file is another one than the caller has begun: all of it
+        part = None  # the file has changed since the first part: send all of it
     start, end = byte_range(part, row.result_bytes)
     headers["Content-Length"] = str(end - start)
     code = status.HTTP_200_OK

@@ -34,7 +34,7 @@ from lensmodel.estimation import estimators
 from lensmodel.estimation.patches import selectors
 
 READY_S: Final = 3.0
-"""How long an answer may take: less than who asks waits, such as a container's engine, 5 s."""
+"""Seconds for all checks (chosen): less than the 5 s that container engines usually wait."""
 
 probes = APIRouter(tags=["service"])
 router = APIRouter(tags=["service"])
@@ -59,25 +59,25 @@ def readyz(call: ProbeDep) -> Readiness:
         "storage": lambda: _storage(call),
         "worker": lambda: confined.update(_worker(call)),
     }
-    running = {name: _begun(probe) for name, probe in tried.items()}
+    running = {name: _start(probe) for name, probe in tried.items()}
     end = time.monotonic() + READY_S
-    checks = {name: _said(check, max(end - time.monotonic(), 0.0)) for name, check in running.items()}
-    if call.settings.needs_keys:  # strangers hear what is wrong, not where it lies
-        checks = {name: said.partition(":")[0] for name, said in checks.items()}
-    ready = all(said == "ok" for said in checks.values())
+    checks = {name: _outcome(check, max(end - time.monotonic(), 0.0)) for name, check in running.items()}
+    if call.settings.needs_keys:  # strangers learn what is wrong, but no addresses
+        checks = {name: outcome.partition(":")[0] for name, outcome in checks.items()}
+    ready = all(outcome == "ok" for outcome in checks.values())
     if not ready:
         call.response.status_code = status.HTTP_503_SERVICE_UNAVAILABLE
     return Readiness(status="ready" if ready else "not ready", checks=checks, sandbox=confined)
 
 
-def _begun(probe: Callable[[], None]) -> Future[None]:
-    """Run a probe in a thread that nobody waits for: what hangs must not hang the answer, nor the exit."""
+def _start(probe: Callable[[], None]) -> Future[None]:
+    """Run a probe in a daemon thread: one that hangs must delay neither the response nor the exit."""
     check: Future[None] = Future()
 
     def run() -> None:
         try:
             probe()
-        except Exception as error:  # noqa: BLE001 - whatever is wrong is what the probe has to tell
+        except Exception as error:  # noqa: BLE001 - every error is a result of the probe
             check.set_exception(error)
         else:
             check.set_result(None)
@@ -86,7 +86,7 @@ def _begun(probe: Callable[[], None]) -> Future[None]:
     return check
 
 
-def _said(check: Future[None], seconds: float) -> str:
+def _outcome(check: Future[None], seconds: float) -> str:
     try:
         error = check.exception(seconds)
     except TimeoutError:
@@ -121,8 +121,8 @@ def _worker(call: Call) -> dict[str, bool]:
 def read_metrics(call: CallDep) -> Response:
     """Return the numbers of this service for Prometheus."""
     settings = call.settings
-    told = metrics.of_service(call.store, settings.lease_seconds, settings.data_dir)
-    return Response(told, media_type=metrics.CONTENT_TYPE)
+    text = metrics.of_service(call.store, settings.lease_seconds, settings.data_dir)
+    return Response(text, media_type=metrics.CONTENT_TYPE)
 
 
 @router.get("/version", operation_id="getVersion", responses=problems())

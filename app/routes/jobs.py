@@ -23,7 +23,7 @@ from app.schemas import JobOut, JobPage, RetriedOut
 router = APIRouter(tags=["jobs"])
 
 LOOK_AGAIN_S: Final = 15.0
-"""How often a job is read that did not change: its estimate of the time left does."""
+"""Seconds after which an unchanged job is read again (chosen): its estimate of the time left changes."""
 
 FINAL = {"succeeded", "failed", "cancelled"}
 
@@ -41,7 +41,7 @@ def find_job(call: Call, job_id: str) -> JobOut:
 
 
 def fingerprint(job: JobOut) -> str:
-    """Return what changes when something happens to a job: its estimate of time left does not count."""
+    """Return a digest of a job, without its estimate of the time left."""
     return hashlib.sha256(job.model_dump_json(exclude={"eta_seconds"}).encode()).hexdigest()[:16]
 
 
@@ -55,11 +55,11 @@ def list_jobs(
     photos = call.store.photos.page(call.owner, before=cursor, limit=limit + 1)
     plans = call.store.corrections.page(call.owner, before=cursor, limit=limit + 1)
     lenses = call.store.photos.lens_ids(photos)
-    found: list[tuple[str, JobOut]] = [
+    jobs: list[tuple[str, JobOut]] = [
         *((row.public_id, views.photo_job(row, lenses.get(row.lens_id or 0))) for row in photos),
         *((plan.correction.public_id, views.correction_job(plan)) for plan in plans),
     ]
-    newest = sorted(found, key=lambda entry: entry[0], reverse=True)
+    newest = sorted(jobs, key=lambda entry: entry[0], reverse=True)
     page = [job for _, job in newest[:limit]]
     following = page[-1].id if len(newest) > limit else None
     return JobPage(items=page, next=next_link(call, following))
@@ -82,19 +82,19 @@ async def read_job(
     that nothing is missed between two requests.
     """
     job = await run_in_threadpool(find_job, call, job_id)
-    seen = call.request.headers.get("if-none-match", "").strip('W/"')
-    before = seen or fingerprint(job)
+    known_tag = call.request.headers.get("if-none-match", "").strip('W/"')
+    previous = known_tag or fingerprint(job)
     deadline = time.monotonic() + min(wait, call.settings.long_poll_seconds)
     if wait > 0:
         with call.services.watch.of(job_id) as waiting:
-            while fingerprint(job) == before and job.state not in FINAL and time.monotonic() < deadline:
+            while fingerprint(job) == previous and job.state not in FINAL and time.monotonic() < deadline:
                 await waiting.changed(max(deadline - time.monotonic(), 0.0))
                 job = await run_in_threadpool(find_job, call, job_id)
     tag = fingerprint(job)
     headers = {"ETag": f'W/"{tag}"', "Cache-Control": "no-cache"}
     if job.state not in FINAL:
         headers["Retry-After"] = "1"
-    if seen == tag:
+    if known_tag == tag:
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
     call.response.headers.update(headers)
     return job
@@ -168,9 +168,9 @@ def retry_jobs(
 
 def _retry_all(call: Call, code: str, limit: int) -> RetriedOut:
     photos, corrections = call.store.photos, call.store.corrections
-    again = sum(photos.retry(key, call.owner) for key in photos.failed_by(call.owner, code, limit))
-    rest = corrections.failed_by(call.owner, code, limit - again) if again < limit else []
-    return RetriedOut(retried=again + sum(corrections.retry(key, call.owner) for key in rest))
+    retried = sum(photos.retry(key, call.owner) for key in photos.failed_by(call.owner, code, limit))
+    rest = corrections.failed_by(call.owner, code, limit - retried) if retried < limit else []
+    return RetriedOut(retried=retried + sum(corrections.retry(key, call.owner) for key in rest))
 
 
 @router.get(
@@ -207,7 +207,7 @@ async def _events(call: Call, job: JobOut) -> AsyncIterator[ServerSentEvent]:
             await waiting.changed(LOOK_AGAIN_S)
             try:
                 if not await run_in_threadpool(call.services.gate.is_still, call.who):
-                    return  # his key was revoked while he watched
+                    return  # the key was revoked meanwhile
                 job = await run_in_threadpool(find_job, call, job.id)
             except UnknownJobError:  # deleted while watched
                 return

@@ -72,9 +72,10 @@ def change_lens(lens_id: str, change: LensChange, call: CallDep) -> LensOut:
 def _change_model(lens: LensRow, model: PsfModel | None, call: Call) -> None:
     if model is None:
         raise InvalidParameterError("model=null: send default or paper")
-    lost = call.store.lens_changes.choose_way(lens.public_id, call.owner, model)
-    if lost:
+    missing = call.store.lens_changes.choose_way(lens.public_id, call.owner, model)
+    if missing:
         raise ConflictError(
-            f"{lost} of the photos that lens {lens.public_id} counts cannot be estimated anew: their files "
-            "are not kept; send them again, or leave them out (PATCH /v1/photos/{id} with excluded=true)"
+            f"{missing} of the photos that lens {lens.public_id} counts cannot be estimated anew: their "
+            "files are not kept; send them again, or leave them out (PATCH /v1/photos/{id} with "
+            "excluded=true)"
         )

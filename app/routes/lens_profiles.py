@@ -1,4 +1,4 @@
-"""The profile of a lens as a file: taken along, and brought back."""
+"""Export and import of the profile of a lens as a file."""
 
 from __future__ import annotations
 
@@ -24,9 +24,11 @@ from lensmodel.model.profile import LensProfile, read_profile, write_profile
 router = APIRouter(tags=["lenses"])
 
 MAX_BYTES: Final = 64 << 20
-"""Of a profile that is sent (chosen): twenty times one of a hundred photos."""
+"""Largest profile that is accepted (chosen): twenty times that of a hundred photos."""
 
 _PAGE: Final = 200
+"""Photos that are read at once (chosen)."""
+
 _FILE: Final = {"application/zip": {"schema": {"type": "string", "format": "binary"}}}
 
 
@@ -71,12 +73,12 @@ async def add_lens_profile(lens_id: str, call: CallDep) -> LensOut:
     """
     await run_in_threadpool(find_lens, call, lens_id)
     many = BusyError("too many files are being received: try again in a few seconds", headers=CLOSE)
-    with call.services.uploads.one(many):
+    with call.services.uploads.take(many):
         return await run_in_threadpool(_add, lens_id, await _received(call), call)
 
 
 async def _received(call: Call) -> bytes:
-    """Return the body, no longer and no slower than a profile is."""
+    """Return the body, if it is neither too long nor too slow."""
     data, more = bytearray(), True
     pace = Pace(call.settings.stall_seconds, call.settings.upload_seconds)
     while more:
@@ -96,13 +98,14 @@ def _add(lens_id: str, data: bytes, call: Call) -> LensOut:
     except InvalidInputError as error:
         raise MalformedUploadError(str(error)) from error
     lens = find_lens(call, lens_id)
-    own, theirs = (
+    paper_lens, paper_profile = (
         mode == PAPER for mode in (way_of(call.settings, lens.way).mode, profile.model.settings.mode)
     )
-    if own != theirs or lens.way != lens.answering_way:
+    if paper_lens != paper_profile or lens.way != lens.answering_way:
         raise ConflictError(
-            f"the profile was learned with the model {'paper' if theirs else 'default'}, lens {lens_id} has "
-            f"{lens.way} and answers with {lens.answering_way}: PATCH /v1/lenses/{lens_id} with "
+            f"the profile was learned with the model {'paper' if paper_profile else 'default'}, "
+            f"lens {lens_id} has {lens.way} and answers with {lens.answering_way}: "
+            f"PATCH /v1/lenses/{lens_id} with "
             '{"model"}, or wait until it has changed'
         )
     names = {key: name for key, name in profile.photos.items() if name.isprintable()}
@@ -113,11 +116,11 @@ def _add(lens_id: str, data: bytes, call: Call) -> LensOut:
 
 def _photos(call: Call, lens_id: str, wanted: set[str]) -> dict[str, str]:
     """Return the file names of the photos that a lens learned from, by id."""
-    found: dict[str, str] = {}
+    filenames: dict[str, str] = {}
     before = None
     while True:
         rows = call.store.photos.page(call.owner, before=before, limit=_PAGE, lens_id=lens_id)
-        found |= {row.public_id: row.filename for row in rows if row.public_id in wanted}
+        filenames |= {row.public_id: row.filename for row in rows if row.public_id in wanted}
         if len(rows) < _PAGE:
-            return found
+            return filenames
         before = rows[-1].public_id

@@ -1,4 +1,4 @@
-"""Reports of lenses, which workers make of each version, in the forms that people and programs read."""
+"""Reports of lenses, which workers make of each version, in the formats that people and programs read."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ MEDIA_TYPES: Final[dict[Form, str]] = {
     "pdf": "application/pdf",
 }
 POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'self'"
-"""A report is one file: it loads nothing, and runs nothing."""
+"""Content security policy of a report: one file that loads and runs nothing."""
 
 _CONTENT: Final = {kind.partition(";")[0]: {"schema": {"type": "string"}} for kind in MEDIA_TYPES.values()}
 
@@ -47,9 +47,9 @@ def stored_report(call: Call, lens: LensRow) -> LensTest:
     Raises
     ------
     NoSamplesError
-        If nothing was learned of it yet.
+        If the lens has no samples yet.
     NotReadyError
-        If a worker has yet to make it.
+        If no worker has made it yet.
     """
     if lens.sample_count == 0:
         raise NoSamplesError(f"lens {lens.public_id} has no samples yet: upload photos taken with it")
@@ -90,8 +90,9 @@ def read_report(
     lens = find_lens(call, lens_id)
     test = stored_report(call, lens)
     compared = against is not None or against_aperture is not None
-    other = lens if against in {None, lens_id} else find_lens(call, str(against))
-    question = f"{form} {other.public_id} {other.version} {other.rebuild_epoch} {aperture} {against_aperture}"
+    second_lens = lens if against in {None, lens_id} else find_lens(call, str(against))
+    second_state = f"{second_lens.public_id} {second_lens.version} {second_lens.rebuild_epoch}"
+    question = f"{form} {second_state} {aperture} {against_aperture}"
     digest = hashlib.sha256(f"{question} {channel} {compared}".encode()).hexdigest()[:12]
     tag = f'"{lens.public_id}-v{lens.version}-e{lens.rebuild_epoch}-r-{digest}"'
     headers = {
@@ -104,8 +105,8 @@ def read_report(
     if tag in call.request.headers.get("if-none-match", ""):
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
     if compared:
-        second = test if other is lens else stored_report(call, other)
-        body = _compared(test, second, aperture, against_aperture, channel, form)
+        second_test = test if second_lens is lens else stored_report(call, second_lens)
+        body = _compared(test, second_test, aperture, against_aperture, channel, form)
     else:
         body = _written(test, form)
     return Response(body, media_type=MEDIA_TYPES[form], headers=headers)
@@ -123,26 +124,29 @@ def _compared(
     first: LensTest,
     second: LensTest,
     aperture: float | None,
-    other: float | None,
+    second_aperture: float | None,
     channel: Channel,
     form: Form,
 ) -> bytes:
-    one, two = first.at(aperture, channel), second.at(other if other is not None else aperture, channel)
-    found = compare(
-        Side(_named(first, one.report.settings.aperture, second), one),
-        Side(_named(second, two.report.settings.aperture, first), two),
+    first_curves, second_curves = (
+        first.at(aperture, channel),
+        second.at(second_aperture if second_aperture is not None else aperture, channel),
+    )
+    comparison = compare(
+        Side(_named(first, first_curves.report.settings.aperture, second), first_curves),
+        Side(_named(second, second_curves.report.settings.aperture, first), second_curves),
     )
     if form == "html":
-        return comparison_html(found).encode()
+        return comparison_html(comparison).encode()
     if form == "pdf":
-        return comparison_pdf(found)
+        return comparison_pdf(comparison)
     if form == "json":
-        return json.dumps(_figures(found)).encode()
+        return json.dumps(_figures(comparison)).encode()
     rows = ["zone,first_c_px,second_c_px,difference,standard_error"]
     rows += [
         f"{c.zone},{c.first:.6g},{c.second:.6g},{c.second - c.first:.6g},"
         f"{'' if c.error is None else f'{c.error:.6g}'}"
-        for c in found.zones
+        for c in comparison.zones
     ]
     return ("\n".join(rows) + "\n").encode()
 
@@ -154,12 +158,12 @@ def _named(test: LensTest, aperture: float | None, other: LensTest) -> str:
     return f"{test.name} {at}".strip()
 
 
-def _figures(found: Comparison) -> dict[str, Any]:
+def _figures(comparison: Comparison) -> dict[str, Any]:
     return {
-        "first": found.first.name,
-        "second": found.second.name,
-        "verdict": found.verdict,
-        "zones": to_json(found.zones),
+        "first": comparison.first.name,
+        "second": comparison.second.name,
+        "verdict": comparison.verdict,
+        "zones": to_json(comparison.zones),
     }
 
 

@@ -1,4 +1,4 @@
-"""Lenses: what is known of each copy, and how it came to be known."""
+"""Lenses: what is known of each copy, and its history."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def list_lenses(
     """List lenses, newest first, optionally of one model or serial."""
     rows = call.store.lenses.page(call.owner, before=cursor, limit=limit + 1, model=model, serial=serial)
     page, following = cut(rows, limit)
-    seen = call.store.lenses.coverage_of(page)
-    items = [views.lens_out(row, *seen[row.id]) for row in page]
+    coverage = call.store.lenses.coverage_of(page)
+    items = [views.lens_out(row, *coverage[row.id]) for row in page]
     return LensPage(items=items, next=next_link(call, following))
 
 
@@ -102,9 +102,9 @@ def read_lateral_colour(lens_id: str, call: CallDep) -> LateralOut:
     )
 
 
-def _measured(seen: list[dict[str, Any]], colour: str) -> list[list[float]]:
-    """Return the polynomials of photos that could tell; the others say "no shift" without knowing."""
-    return [entry[colour] for entry in seen if entry[f"{colour}_points"] > 0]
+def _measured(entries: list[dict[str, Any]], colour: str) -> list[list[float]]:
+    """Return the polynomials of photos with measured points; those of the others are zero by default."""
+    return [entry[colour] for entry in entries if entry[f"{colour}_points"] > 0]
 
 
 def _middle(polynomials: list[list[float]]) -> tuple[float, float, float, float]:

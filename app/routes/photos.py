@@ -107,14 +107,14 @@ async def create_measurement(lens_id: str, call: CallDep, once: OnceDep) -> Phot
 
 
 async def _received(once: Once, lens_id: str | None = None) -> PhotoOut | Response:
-    """Take an upload; with a lens, it must be a measurement of that lens."""
+    """Receive an upload; with a lens, it must be a measurement of that lens."""
     call = once.call
     limits = call.settings
     many = BusyError(
         f"{limits.max_uploads} photos are being received, more may not be: try again in a few seconds",
         headers={"Retry-After": "5", **CLOSE},
     )
-    with call.services.uploads.one(many):
+    with call.services.uploads.take(many):
         await run_in_threadpool(_admit, call)
         public_id = new_id()
         bind_contextvars(photo_id=public_id)
@@ -138,7 +138,7 @@ async def _received(once: Once, lens_id: str | None = None) -> PhotoOut | Respon
 def _take(
     once: Once, public_id: str, uploaded: upload.Uploaded, prefix: str, measured: bool
 ) -> PhotoOut | Response:
-    """Make a photo of what has arrived, unless this very request was answered before."""
+    """Create a photo from an upload, unless the same request was answered before."""
     call = once.call
 
     def record() -> PhotoOut:
@@ -149,19 +149,19 @@ def _take(
         call.response.headers["Location"] = photo.links.self
         return photo
 
-    asked = f"{uploaded.sha256} {uploaded.filename} {uploaded.fields.model_dump_json()}"
+    request_body = f"{uploaded.sha256} {uploaded.filename} {uploaded.fields.model_dump_json()}"
     try:
-        answer = once.answer(asked, record, status=202)
+        answer = once.answer(request_body, record, status=202)
     except ServiceError:
-        call.storage.delete(prefix)  # refused before there was a photo; after that nothing is refused
+        call.storage.delete(prefix)  # refused before a photo was created; afterwards nothing is refused
         raise
     if isinstance(answer, Response):
-        call.storage.delete(prefix)  # answered as before: what it speaks of is there
+        call.storage.delete(prefix)  # answered as before: the photo exists
     return answer
 
 
 def _check_kind(call: Call, fields: UploadFields, *, measured: bool) -> None:
-    """Refuse what contradicts itself about a photo made to measure a lens."""
+    """Refuse contradictory fields of a photo made to measure a lens."""
     if measured and fields.kind is None:
         raise InvalidParameterError("kind is missing: send target, pair, points or edges")
     if fields.kind is not None and not fields.calibrate:
@@ -176,7 +176,7 @@ def _check_kind(call: Call, fields: UploadFields, *, measured: bool) -> None:
 
 
 def _admit(call: Call) -> None:
-    """Refuse before the body is read what cannot be taken anyway."""
+    """Refuse an upload before its body is read: no disk space, or a quota is used up."""
     limits = call.settings
     free = call.storage.free_bytes()
     coming = min(upload.declared_length(call.request), limits.max_upload_bytes)
@@ -241,16 +241,16 @@ def _record(
     if received.photo.public_id != public_id:
         if not received.fresh:
             _check_model(fields, call.store.photos.lens_of(received.photo))
-        if received.wants_file:  # it was given up: this is the same one
+        if received.wants_file:  # its file was given up: this is the same one
             key = f"{folder_of(received.photo)}original-{public_id}"
             call.storage.rename(f"{prefix}original", key)
             call.store.photos.restore_file(received.photo.public_id, key, where, again=received.fresh)
-        call.storage.delete(prefix)  # the same bytes are there already
+        call.storage.delete(prefix)  # the same bytes are stored already
     return describe(call, find_photo(call, received.photo.public_id)), received.fresh
 
 
 def _check_model(fields: UploadFields, lens: LensRow | None) -> None:
-    """Refuse a photo of a lens that is learned in another way than the photo asks for."""
+    """Refuse a photo that was sent for another model than its lens has."""
     if lens is not None and fields.model not in {None, lens.way}:
         raise ConflictError(
             f"model={fields.model}: lens {lens.public_id} has the model {lens.way}; PATCH /v1/lenses/"
@@ -259,7 +259,7 @@ def _check_model(fields: UploadFields, lens: LensRow | None) -> None:
 
 
 def describe(call: Call, photo: PhotoRow) -> PhotoOut:
-    """Describe a photo with its lens, or with the lenses that may be its."""
+    """Return a photo with its lens, or with the candidates."""
     lens = call.store.photos.lens_of(photo)
     return views.photo_out(photo, None if lens is None else lens.public_id, candidates(call, photo))
 

@@ -13,7 +13,7 @@ from app.errors import InvalidParameterError, NotAcceptableError, UnknownLensErr
 from app.http import psf_formats
 from app.http.dependencies import Call, CallDep
 from app.http.model_cache import Fitted
-from app.http.questions import Asked
+from app.http.questions import QueryModel
 from app.routes.common import Answers, problems
 from app.runtime import metrics
 from app.schemas import FieldQuery, PsfOut, PsfQuery, QueryOut
@@ -32,11 +32,13 @@ MEDIA_TYPES: Final[dict[Format, str]] = {
     "tiff": "image/tiff",
 }
 MAX_GRID: Final = 25
-MAX_FIELD_PIXELS: Final = 2_000_000
-"""A picture of 25 x 25 kernels of 55 pixels; one of 255 pixels each took 8.5 s."""
+"""Columns and rows of a map at most (chosen, not measured)."""
 
-_PSF: Final = Asked(PsfQuery)
-_FIELD: Final = Asked(FieldQuery)
+MAX_FIELD_PIXELS: Final = 2_000_000
+"""Pixels of all kernels of a map (chosen): 25 x 25 kernels of 55 pixels; with 255 pixels a map took 8.5 s."""
+
+_PSF: Final = QueryModel(PsfQuery)
+_FIELD: Final = QueryModel(FieldQuery)
 
 _CONTENT = {
     name: {"schema": {"type": "string", "format": "binary"}}
@@ -81,19 +83,19 @@ def read_psf_as(
 
 
 def accepted(header: str) -> Format:
-    """Choose the format that a caller likes best.
+    """Return the format that an Accept header prefers.
 
     Raises
     ------
     NotAcceptableError
-        If he likes none that there is.
+        If it names none that is available.
     """
-    wishes: list[tuple[float, str]] = []
-    for entry in header.split(","):
-        media, *parameters = (part.strip().lower() for part in entry.split(";"))
+    preferences: list[tuple[float, str]] = []
+    for preference in header.split(","):
+        media, *parameters = (part.strip().lower() for part in preference.split(";"))
         quality = next((p.removeprefix("q=") for p in parameters if p.startswith("q=")), "1")
-        wishes.append((float(quality) if quality.replace(".", "", 1).isdecimal() else 0.0, media))
-    for weight, media in sorted(wishes, key=lambda wish: -wish[0]):
+        preferences.append((float(quality) if quality.replace(".", "", 1).isdecimal() else 0.0, media))
+    for weight, media in sorted(preferences, key=lambda preference: -preference[0]):
         for name, kind in MEDIA_TYPES.items():
             if weight > 0 and media in {"*/*", kind, f"{kind.partition('/')[0]}/*"}:
                 return name
@@ -148,19 +150,21 @@ def _known(call: Call, lens_id: str) -> tuple[LensState, Family]:
 
 
 def etag(fitted: Fitted, question: str) -> str:
-    """Return a strong tag: the same question to the same model of the same samples has the same answer.
+    """Return a strong tag: the same query to the same model of the same samples has the same answer.
 
     The samples are those of the lens and of the other copies that it leans on.
     """
-    leaning = [(one.lens_id, one.state.version, one.state.rebuild_epoch) for one in fitted.family]
-    digest = hashlib.sha256(f"{question}{leaning}".encode()).hexdigest()[:12]
+    relatives = [
+        (relative.lens_id, relative.state.version, relative.state.rebuild_epoch) for relative in fitted.family
+    ]
+    digest = hashlib.sha256(f"{question}{relatives}".encode()).hexdigest()[:12]
     state, sort = fitted.state, "l" if fitted.learned else "p"
     return f'"{fitted.lens_id}-v{state.version}-e{state.rebuild_epoch}-{sort}-{digest}"'
 
 
 def _matches(call: Call, tag: str) -> bool:
     sent = call.request.headers.get("if-none-match", "")
-    return sent.strip() == "*" or tag in {one.strip().removeprefix("W/") for one in sent.split(",")}
+    return sent.strip() == "*" or tag in {entry.strip().removeprefix("W/") for entry in sent.split(",")}
 
 
 @router.get(

@@ -22,10 +22,10 @@ HTTPS: Final = "https"
 @router.post(
     "/session", operation_id="signIn", status_code=status.HTTP_201_CREATED, responses=problems(401, 422, 429)
 )
-async def sign_in(said: SignIn, call: ProbeDep) -> SessionOut:
+async def sign_in(credentials: SignIn, call: ProbeDep) -> SessionOut:
     """Sign a browser in with a key; it is given a cookie that ends with the key, or some hours later."""
     gate = call.services.gate
-    who, token = await run_in_threadpool(gate.sign_in, said.key.strip())
+    who, token = await run_in_threadpool(gate.sign_in, credentials.key.strip())
     call.response.set_cookie(
         COOKIE,
         token,

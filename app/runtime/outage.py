@@ -26,11 +26,10 @@ CODE: Final = "outage"
 
 FIRST_PAUSE_S: Final = 1.0
 LONGEST_PAUSE_S: Final = 60.0
-"""Shortest and longest pause before a retry (chosen): a restart takes seconds, and after a long outage work
-resumes within a minute."""
+"""Shortest and longest pause before a retry (chosen, not measured)."""
 
 BUGS: Final = 3
-"""Attempts at a job that fails with an unforeseen error (chosen): not more, it is hardly chance."""
+"""Attempts at a job that fails with an unforeseen error (chosen, not measured)."""
 
 _SQLITE_FULL: Final = 13
 """SQLITE_FULL of sqlite3.h."""

@@ -41,7 +41,7 @@ POLL_S: Final = 0.1
 """Seconds between two looks at the members (chosen): two calls of waitpid."""
 
 READY_POLL_S: Final = 0.25
-"""Seconds between two questions whether the API is ready (chosen): it starts in seconds."""
+"""Seconds between two requests of `/readyz` during the start (chosen)."""
 
 STOP_S: Final = 15.0
 """How long members may take to stop before they are killed (chosen): longer than `server.GRACE_S`."""

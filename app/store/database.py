@@ -21,8 +21,7 @@ from sqlalchemy.orm import Session
 from app.store.tables import Base
 
 BUSY_TIMEOUT_MS = 30_000
-"""How long a transaction of SQLite waits for the one writer (chosen): a transaction takes milliseconds, so
-whoever waits longer would wait for ever."""
+"""How long a transaction of SQLite waits for the one writer (chosen, not measured)."""
 
 SERVER_DEADLINES: Final = {
     "connect_timeout": 5,

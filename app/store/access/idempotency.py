@@ -16,7 +16,7 @@ from app.store.database import Database, insert_new
 from app.store.tables import PhotoRow
 
 KEEP: Final = timedelta(hours=24)
-"""How long an answer is kept (chosen): a client that tries again does so within minutes."""
+"""How long an answer is kept (chosen, not measured)."""
 
 LOST: Final = timedelta(seconds=60)
 """A request without an answer after this time will get none: its process was killed (chosen). Answers take

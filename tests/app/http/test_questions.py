@@ -10,11 +10,11 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.testclient import TestClient
 
-from app.http.questions import Asked
+from app.http.questions import QueryModel
 from app.schemas import FieldQuery, PsfQuery
 from app.schemas.fields import Question
 
-ASKED = Asked(PsfQuery)
+ASKED = QueryModel(PsfQuery)
 
 
 def application(reads: Any) -> FastAPI:
@@ -69,4 +69,4 @@ def test_the_description_is_that_of_fastapi() -> None:
 @pytest.mark.parametrize("kind", [PsfQuery, FieldQuery])
 def test_no_schema_refers_to_another(kind: type[Question]) -> None:
     """References would point into the schema itself, where a document has nothing."""
-    assert "$ref" not in str(Asked(kind).described)
+    assert "$ref" not in str(QueryModel(kind).described)

@@ -37,7 +37,10 @@ __all__ = [
 ]
 
 LONG_POLL_SECONDS: Final = 20
+"""Longest wait of one request for a job: the default of LENS_LONG_POLL_SECONDS."""
+
 PAUSE_SECONDS: Final = 0.1
+"""Pause between two requests for a job (chosen): a service may be set to answer at once."""
 
 
 class JobEndedError(LensModelError):
@@ -213,9 +216,9 @@ class Client(LensCalls):
             return None, tag
         return read(s.JobOut, answer), answer.headers.get("ETag")
 
-    def correct(self, /, photo_id: str, **wish: object) -> s.CorrectionOut:
+    def correct(self, /, photo_id: str, **options: object) -> s.CorrectionOut:
         """Ask for a correction: fields of `CorrectionIn`."""
-        body = s.CorrectionIn.model_validate({"photo_id": photo_id, **wish}).model_dump(mode="json")
+        body = s.CorrectionIn.model_validate({"photo_id": photo_id, **options}).model_dump(mode="json")
         return read(s.CorrectionOut, self._http.post("/v1/corrections", json=body))
 
     def correction(self, correction_id: str) -> s.CorrectionOut:

@@ -28,9 +28,10 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 POLL_SECONDS: Final = 2.0
-"""A task that is cancelled leaves its thread behind for so long at most (chosen)."""
+"""Longest wait of one request for a job (chosen): the thread of a cancelled task runs on for so long."""
 
 PAUSE_SECONDS: Final = 0.1
+"""As in `app.client`."""
 
 
 def _in_thread(

@@ -22,6 +22,7 @@ Query: TypeAlias = Mapping[str, str | int | float | bool | None]
 
 DEFAULT_URL: Final = "http://127.0.0.1:8000"
 ANSWER_SECONDS: Final = 60.0
+"""Longest wait for a response (chosen): longer than a long poll of 20 s."""
 
 
 class ServiceProblemError(LensModelError):

@@ -10,7 +10,8 @@ import httpx2
 
 RETRIES: Final = 3
 FIRST_PAUSE_S: Final = 0.5
-"""Doubled each time (chosen): three pauses of together 3.5 s bridge the restart of an API process."""
+"""Number of retries, and the first pause, doubled each time (chosen): three pauses of together 3.5 s bridge
+the restart of an API process."""
 
 LONGEST_PAUSE_S: Final = 30.0
 """Where the service asks for a longer pause, its refusal is handed on (chosen)."""
@@ -50,11 +51,11 @@ class Retrying(httpx2.BaseTransport):
                 if request.method not in _SAFE and not isinstance(error, httpx2.ConnectError):
                     raise
             else:
-                asked = _seconds(answer.headers.get("Retry-After"))
-                if not _again(request, answer.status_code) or (asked or 0.0) > LONGEST_PAUSE_S:
+                requested_s = _seconds(answer.headers.get("Retry-After"))
+                if not _again(request, answer.status_code) or (requested_s or 0.0) > LONGEST_PAUSE_S:
                     return answer
                 answer.close()
-                pause = pause if asked is None else asked
+                pause = pause if requested_s is None else requested_s
             self._sleep(pause)
         return self._transport.handle_request(request)
 

@@ -37,7 +37,7 @@ class Question:
 
 
 def run(
-    source: Path, asked: Question, output: Path | None, display: Display, *, force: bool, as_json: bool
+    source: Path, question: Question, output: Path | None, display: Display, *, force: bool, as_json: bool
 ) -> None:
     """Answer in words, as JSON, or into a file.
 
@@ -47,21 +47,21 @@ def run(
         If the question or the file is refused.
     """
     with files.as_usage():
-        place = FieldPosition(asked.r, asked.phi)
-        settings = LensSettings(aperture=asked.aperture, channel=asked.channel)
+        place = FieldPosition(question.r, question.phi)
+        settings = LensSettings(aperture=question.aperture, channel=question.channel)
     if output is not None and output.suffix.lower() not in WRITTEN:
         raise UsageError(f"no format for {output.name}; give a name that ends in {', '.join(WRITTEN)}")
     files.refuse_existing(output, force=force)
     with display.busy("asking the lens"):
-        answer = files.profile_at(source).model.query(place, settings, asked.size)
+        answer = files.profile_at(source).model.query(place, settings, question.size)
     tangential, sagittal = quality.tangential_sagittal_mtf50(answer.kernel, place.phi)
     document = {
         "query": {
             "r": place.r,
             "phi": place.phi,
-            "aperture": asked.aperture,
-            "channel": asked.channel,
-            "size": asked.size,
+            "aperture": question.aperture,
+            "channel": question.channel,
+            "size": question.size,
         },
         "support": {
             "effective_samples": answer.effective_samples,

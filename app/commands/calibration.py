@@ -31,12 +31,12 @@ from lensmodel.workflow.lens import Lens
 from lensmodel.workflow.ways import Way, way_named, way_of
 
 _ZIP: Final = b"PK"
-"""How a profile begins, damaged or not."""
+"""First bytes of a profile, damaged or not: the signature of a ZIP file."""
 
 
 @dataclass(frozen=True, slots=True)
-class Wishes:
-    """What the options said."""
+class Options:
+    """The options of the command."""
 
     aperture: float | None
     estimator: str | None
@@ -53,7 +53,7 @@ class Wishes:
     kernel_size: int | None = None
 
 
-def run(names: Sequence[str], target: Path, wishes: Wishes, display: Display, *, as_json: bool) -> None:
+def run(names: Sequence[str], target: Path, options: Options, display: Display, *, as_json: bool) -> None:
     """Add photos to a profile, one after the other, and save it after each.
 
     Raises
@@ -64,16 +64,16 @@ def run(names: Sequence[str], target: Path, wishes: Wishes, display: Display, *,
         With 1 if a photo could not be used.
     """
     paths = files.photos(names)
-    _refuse(target, paths, wishes)
+    _refuse(target, paths, options)
     with files.as_usage():
-        chosen = _chosen(wishes)
-        settings = LensSettings(aperture=wishes.aperture)
-        family = None if wishes.family is None else files.profile_at(wishes.family)
-    calibration = Calibration(target, wishes, settings, chosen, family)
+        chosen = _chosen(options)
+        settings = LensSettings(aperture=options.aperture)
+        family = None if options.family is None else files.profile_at(options.family)
+    calibration = Calibration(target, options, settings, chosen, family)
     results: list[dict[str, Any]] = []
     with display.progress() as bars:
         task = bars.add_task("", total=len(paths))
-        for number, (path, samples) in enumerate(cluster.estimated(wishes.scheduler, paths, calibration)):
+        for number, (path, samples) in enumerate(cluster.estimated(options.scheduler, paths, calibration)):
             try:
                 result = calibration.add(path, partial(_show, bars, task, number), samples)
             except (LensModelError, OSError) as error:
@@ -109,30 +109,30 @@ def run(names: Sequence[str], target: Path, wishes: Wishes, display: Display, *,
         raise typer.Exit(1)
 
 
-def _chosen(wishes: Wishes) -> ModelSettings:
-    """Choose the model of a new profile; make sure that everything that was named is there."""
-    way = way_named(wishes.model or "default")
-    estimation.estimators.create(wishes.estimator or way.estimator)
-    require_size(wishes.kernel_size or way.kernel_size)
-    selectors.create(wishes.selector)
-    return ModelSettings(mode=wishes.mode or way.mode, unit=wishes.unit or MICROMETRE)
+def _chosen(options: Options) -> ModelSettings:
+    """Return the settings of a new profile's model, after checking that everything named exists."""
+    way = way_named(options.model or "default")
+    estimation.estimators.create(options.estimator or way.estimator)
+    require_size(options.kernel_size or way.kernel_size)
+    selectors.create(options.selector)
+    return ModelSettings(mode=options.mode or way.mode, unit=options.unit or MICROMETRE)
 
 
-def _refuse(target: Path, photos: Sequence[Path], wishes: Wishes) -> None:
-    """Make sure that no photo is replaced, and that the options do not contradict each other."""
+def _refuse(target: Path, photos: Sequence[Path], options: Options) -> None:
+    """Refuse to replace a photo, and options that contradict each other."""
     if target.is_dir():
         raise UsageError(f"{target} is a folder; give the file of a lens profile")
-    # of `--profile holiday/*.dng` a shell makes a profile and photos
+    # a shell expands `--profile holiday/*.dng` to a profile and photos
     if target.suffix.lower() in ENDINGS or any(files.same(target, path) for path in photos):
         raise UsageError(
             f"{target.name} is a photo; name a new file after --profile, for example my-24mm.lensprofile"
         )
-    if wishes.model is not None and wishes.mode is not None:
+    if options.model is not None and options.mode is not None:
         raise UsageError("--model and --mode exclude each other: a model has its own mode; give one of them")
-    if wishes.family is not None and wishes.no_family:
+    if options.family is not None and options.no_family:
         raise UsageError("--family and --no-family exclude each other; give one of them")
-    if wishes.family is not None and files.same(target, wishes.family):
-        raise UsageError(f"{wishes.family} is the profile itself; give that of another copy after --family")
+    if options.family is not None and files.same(target, options.family):
+        raise UsageError(f"{options.family} is the profile itself; give that of another copy after --family")
 
 
 def _show(bars: Progress, task: TaskID, number: int, event: pipeline.CalibrationEvent) -> None:
@@ -141,48 +141,50 @@ def _show(bars: Progress, task: TaskID, number: int, event: pipeline.Calibration
 
 
 class Calibration:
-    """A profile that grows, and the file that keeps up with it.
+    """A profile that grows, and its file.
 
-    Another run may add to the same file meanwhile: before each look at the profile it is read again
-    if it changed, so that no run drops what another one learned.
+    Another run may add to the same file meanwhile: the profile is read again whenever the file has
+    changed, so that no run drops what another one learned.
     """
 
     def __init__(
         self,
         target: Path,
-        wishes: Wishes,
+        options: Options,
         settings: LensSettings,
         chosen: ModelSettings,
         family: LensProfile | None,
     ) -> None:
         self.profile: LensProfile | None = None
-        self._target, self._wishes, self._settings, self._chosen = target, wishes, settings, chosen
-        self._family, self._grown = family, False
-        self._seen = _stamp(target) if wishes.force else None
+        self._target, self._options, self._settings, self._chosen = target, options, settings, chosen
+        self._family, self._changed = family, False
+        self._stamp_read = _stamp(target) if options.force else None
         self._follow()
 
     def finish(self, on_step: StepHook) -> None:
-        """Fit what takes long and need be done only once, when all photos are in."""
+        """Do the slow fits, once, after all photos."""
         self._follow()
-        if self.profile is not None and self._grown:
+        if self.profile is not None and self._changed:
             whole = replace(self.profile, model=self.profile.model.warmed(on_step))
-            if _stamp(self._target) == self._seen:  # else another run goes on, and fits it at its own end
+            if (
+                _stamp(self._target) == self._stamp_read
+            ):  # else another run is adding photos, and does this at its end
                 self._save(whole)
 
     def order(self, path: Path) -> tuple[Any, ...] | None:
-        """Return what a cluster needs to estimate a photo; None where nothing is to be estimated of it."""
+        """Return what a cluster needs to estimate a photo; None if there is nothing to estimate."""
         if path.stem.endswith(files.CORRECTED) or self._has(pipeline.photo_id(path)):
             return None
         if self._settings.aperture is None and not files.says_aperture(path):
             return None
-        wishes, count = self._wishes, pipeline.DEFAULT_PATCHES
-        settings = (self._settings, self._estimator, count, wishes.selector, self._kernel_size)
+        options, count = self._options, pipeline.DEFAULT_PATCHES
+        settings = (self._settings, self._estimator, count, options.selector, self._kernel_size)
         return path.name, path.read_bytes(), *settings
 
     def add(
         self, path: Path, on_event: pipeline.EventHook, estimated: Future[list[PsfSample]] | None = None
     ) -> dict[str, Any]:
-        """Learn from one photo, whose samples may come from elsewhere; say what became of it."""
+        """Learn from one photo, whose samples may come from a cluster; return what became of it."""
         if path.stem.endswith(files.CORRECTED):
             raise InvalidInputError(
                 "it was corrected already and says nothing about the lens; give the original"
@@ -190,8 +192,8 @@ class Calibration:
         key = pipeline.photo_id(path)
         if self._has(key):
             return {"state": "known"}
-        seen = files.identity(path)
-        self._refuse_other_lens(seen)
+        identity = files.identity(path)
+        self._refuse_other_lens(identity)
         if self._settings.aperture is None and not files.says_aperture(path):
             raise MetadataMissingError("it does not say its aperture; add it, for example --aperture 2.8")
         samples = (
@@ -199,9 +201,9 @@ class Calibration:
                 path,
                 settings=self._settings,
                 estimator=self._estimator,
-                selector=self._wishes.selector,
+                selector=self._options.selector,
                 kernel_size=self._kernel_size,
-                workers=self._wishes.workers,
+                workers=self._options.workers,
                 on_event=on_event,
             )
             if estimated is None
@@ -209,56 +211,56 @@ class Calibration:
         )
         if self._has(key):
             return {"state": "known"}
-        self._refuse_other_lens(seen)
+        self._refuse_other_lens(identity)
         if self.profile is None:
-            lens, model = None, self._leaning(LensModel.fit(samples, self._chosen))
+            lens, model = None, self._with_family(LensModel.fit(samples, self._chosen))
         else:
             lens, model = Lens(self.profile), self.profile.model.added(samples)
-        grown = Lens.grown(lens, model, {key: path.name}, [seen], any_lens=self._wishes.any_lens)
+        grown = Lens.grown(lens, model, {key: path.name}, [identity], any_lens=self._options.any_lens)
         self._save(grown.profile)
-        self._grown = True
+        self._changed = True
         return {"state": "counted", "samples": len(samples)}
 
     @property
     def _way(self) -> Way:
-        """The way the lens is learned: as was wished, or as it was before."""
-        if self._wishes.model is not None or self.profile is None:
-            return way_named(self._wishes.model or "default")
+        """The way the lens is learned: as the options say, else as before."""
+        if self._options.model is not None or self.profile is None:
+            return way_named(self._options.model or "default")
         return way_of(self.profile.model)
 
     @property
     def _estimator(self) -> str:
-        return self._wishes.estimator or self._way.estimator
+        return self._options.estimator or self._way.estimator
 
     @property
     def _kernel_size(self) -> int:
-        return self._wishes.kernel_size or self._way.kernel_size
+        return self._options.kernel_size or self._way.kernel_size
 
     def _has(self, photo: str) -> bool:
         self._follow()
         return self.profile is not None and photo in self.profile.photos
 
-    def _refuse_other_lens(self, seen: Identity) -> None:
-        if self.profile is None or self._wishes.any_lens:
+    def _refuse_other_lens(self, identity: Identity) -> None:
+        if self.profile is None or self._options.any_lens:
             return
-        why = difference(self.profile.lens, self.profile.cameras, seen)
+        why = difference(self.profile.lens, self.profile.cameras, identity)
         if why is not None:
             raise InvalidInputError(f"{why}; give it a profile of its own, or add --any-lens")
 
     def _follow(self) -> None:
-        """Read the profile if it is not as this run left it, and make it answer as was wished."""
+        """Read the profile if another run changed it, and apply the options to it."""
         stamp = _stamp(self._target)
-        if stamp in {None, self._seen}:
+        if stamp in {None, self._stamp_read}:
             return
         profile = _opened(self._target)
-        mode = self._wishes.mode if self._wishes.model is None else way_named(self._wishes.model).mode
-        model = self._leaning(profile.model.answering(mode=mode, unit=self._wishes.unit))
-        self.profile, self._seen = replace(profile, model=model), stamp
-        self._grown = self._grown or model is not profile.model
+        mode = self._options.mode if self._options.model is None else way_named(self._options.model).mode
+        model = self._with_family(profile.model.answering(mode=mode, unit=self._options.unit))
+        self.profile, self._stamp_read = replace(profile, model=model), stamp
+        self._changed = self._changed or model is not profile.model
 
-    def _leaning(self, model: LensModel) -> LensModel:
-        """Start from the profile of another copy where this one has seen little, if that was wished."""
-        if self._wishes.no_family:
+    def _with_family(self, model: LensModel) -> LensModel:
+        """Add the profile of another copy as a prior, as the options say."""
+        if self._options.no_family:
             return model.with_prior(None)
         if self._family is None:
             return model
@@ -269,7 +271,7 @@ class Calibration:
     def _save(self, profile: LensProfile) -> None:
         self._target.parent.mkdir(parents=True, exist_ok=True)
         save_profile(self._target, profile)
-        self.profile, self._seen = profile, _stamp(self._target)
+        self.profile, self._stamp_read = profile, _stamp(self._target)
 
 
 def _opened(target: Path) -> LensProfile:
@@ -283,9 +285,9 @@ def _opened(target: Path) -> LensProfile:
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:
-    """What changes when a file is replaced; None where there is none."""
+    """Return inode, size and time of a file, which change when it is replaced; None without file."""
     try:
-        found = path.stat()
+        status = path.stat()
     except FileNotFoundError:
         return None
-    return found.st_ino, found.st_size, found.st_mtime_ns
+    return status.st_ino, status.st_size, status.st_mtime_ns

@@ -21,7 +21,7 @@ from lensmodel.correction.audit import AuditReport
 from lensmodel.workflow import checking
 
 _GREY: Final = 0.5
-"""Brightness of the photo on the map, so that the red of what was held back stands out."""
+"""Brightness of the photo on the map (chosen), so that the red of what was held back stands out."""
 
 
 def check(
@@ -80,18 +80,18 @@ def check(
     model = None if profile is None else files.profile_at(profile).model
     with shown.progress() as bars:
         task = bars.add_task(corrected.name, total=None)
-        found = checking.check(
+        checked = checking.check(
             original, corrected, model=model, settings=settings, on_step=partial(_show, bars, task)
         )
     if picture is not None:
         with display.atomic(picture) as part:
-            Image.fromarray(_map(found)).save(part)
+            Image.fromarray(_map(checked)).save(part)
     if json_output:
         document: dict[str, Any] = {"original": str(original), "corrected": str(corrected)}
-        document |= {"held_back": found.audit.report.held_back, "report": found.audit.report}
+        document |= {"held_back": checked.audit.report.held_back, "report": checked.audit.report}
         shown.document(document)
         return
-    shown.result("\n".join(_words(found.audit.report)))
+    shown.result("\n".join(_words(checked.audit.report)))
     if picture is not None:
         shown.result(f"written: {picture}")
 
@@ -111,10 +111,10 @@ def _words(report: AuditReport) -> list[str]:
     return lines
 
 
-def _map(found: checking.Checked) -> NDArray[np.uint8]:
+def _map(checked: checking.Checked) -> NDArray[np.uint8]:
     """Draw the photo in grey and what is held back of its correction in red, in sensor orientation."""
-    light = photo.shown(found.original.planes, found.original.encoding).mean(axis=-1) * _GREY
-    fault = (1.0 - found.audit.keep)[..., None]
+    light = photo.shown(checked.original.planes, checked.original.encoding).mean(axis=-1) * _GREY
+    fault = (1.0 - checked.audit.keep)[..., None]
     red = np.array([255.0, 30.0, 30.0], dtype=np.float32)
     drawn = light[..., None] * (1.0 - fault) + red * fault
     return np.asarray(np.rint(drawn), dtype=np.uint8)

@@ -14,6 +14,7 @@ from lensmodel.core.psf import PsfSample
 from lensmodel.workflow import pipeline
 
 CONNECT_S = 10.0
+"""Seconds to reach the scheduler of a cluster (chosen, not measured)."""
 
 
 class Orders(Protocol):

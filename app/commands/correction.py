@@ -34,12 +34,12 @@ EXTENSION: Final[dict[OutputFormat, str]] = {
 
 
 FOLDER: Final = "corrected"
-"""Beside the photos, where nothing else is said."""
+"""Default folder of results, beside the photos."""
 
 
 @dataclass(frozen=True, slots=True)
-class Wishes:
-    """What the options said."""
+class Options:
+    """The options of the command."""
 
     aperture: float | None
     method: str | None
@@ -57,7 +57,7 @@ def run(
     names: Sequence[str],
     source: Path,
     output: Path | None,
-    wishes: Wishes,
+    options: Options,
     display: Display,
     *,
     as_json: bool,
@@ -71,13 +71,13 @@ def run(
     typer.Exit
         With 1 if a photo could not be corrected.
     """
-    targets = targets_of(files.photos(names), output, EXTENSION[wishes.file_format])
+    targets = targets_of(files.photos(names), output, EXTENSION[options.file_format])
     with files.as_usage():
-        if wishes.method is not None:
-            correction.deconvolvers.create(wishes.method)
-        settings = LensSettings(aperture=wishes.aperture)
+        if options.method is not None:
+            correction.deconvolvers.create(options.method)
+        settings = LensSettings(aperture=options.aperture)
     lens = Lens(files.profile_at(source))
-    lens = lens.warmed()  # once for all photos, where a run that was stopped left it undone
+    lens = lens.warmed()  # once for all photos, if an interrupted run left it undone
     results: list[dict[str, Any]] = []
     with display.progress() as bars:
         task = bars.add_task("", total=len(targets))
@@ -85,7 +85,7 @@ def run(
             bars.update(task, description=path.name)
             try:
                 result = correct_one(
-                    path, target, lens, settings, wishes, display, partial(_show, bars, task, number)
+                    path, target, lens, settings, options, display, partial(_show, bars, task, number)
                 )
             except (LensModelError, OSError) as error:
                 code = error.code if isinstance(error, LensModelError) else "unreadable"
@@ -107,26 +107,26 @@ def run(
 
 
 def targets_of(paths: Sequence[Path], output: Path | None, extension: str) -> dict[Path, Path]:
-    """Name the file that each photo becomes; no two may become the same.
+    """Return the photos by the file that each becomes; no two may become the same.
 
     Raises
     ------
     UsageError
         If two would, or if a folder for them cannot be one.
     """
-    found: dict[Path, Path] = {}
+    targets: dict[Path, Path] = {}
     for path in paths:
         folder = path.parent / FOLDER if output is None else output
         if folder.exists() and not folder.is_dir():
             raise UsageError(f"{folder} is a file; give a folder to -o")
         target = folder / f"{path.stem}{files.CORRECTED}{extension}"
-        if target in found:
+        if target in targets:
             raise UsageError(
-                f"{found[target]} and {path} would both become {target}; "
+                f"{targets[target]} and {path} would both become {target}; "
                 "name each by itself, and correct them into different folders"
             )
-        found[target] = path
-    return found
+        targets[target] = path
+    return targets
 
 
 def correct_one(
@@ -134,11 +134,11 @@ def correct_one(
     target: Path,
     lens: Lens,
     settings: LensSettings,
-    wishes: Wishes,
+    options: Options,
     display: Display,
     on_step: StepHook,
 ) -> dict[str, Any]:
-    """Correct one photo; say what became of it: `corrected`, `kept` or `left`.
+    """Correct one photo; return what became of it: `corrected`, `kept` or `left`.
 
     Raises
     ------
@@ -147,15 +147,15 @@ def correct_one(
     """
     if path.stem.endswith(files.CORRECTED):
         raise InvalidInputError("it was corrected already; give the original")
-    if target.exists() and not wishes.force:
+    if target.exists() and not options.force:
         return {"state": "kept"}
-    seen = files.identity(path)
-    why = difference(lens.profile.lens, lens.profile.cameras, seen)
-    if why is not None and not (wishes.any_lens or wishes.force):
+    identity = files.identity(path)
+    why = difference(lens.profile.lens, lens.profile.cameras, identity)
+    if why is not None and not (options.any_lens or options.force):
         raise InvalidInputError(f"{why}; use the profile of its own lens, or add --any-lens")
     if why is not None:
         display.note(f"{path}: {why}; it is corrected all the same, as you asked")
-    elif not seen.names_lens:
+    elif not identity.names_lens:
         display.note(f"{path} does not name its lens; it is taken for a photo of the profile's lens")
     if settings.aperture is None and not files.says_aperture(path):
         display.note(f"{path} does not say its aperture; all apertures of the profile are taken together")
@@ -165,17 +165,17 @@ def correct_one(
         lens,
         target,
         aperture=settings.aperture,
-        method=wishes.method,
-        strength=wishes.strength,
-        bounds=wishes.bounds,
-        file_format=wishes.file_format,
-        least_gain_db=wishes.least_gain_db,
-        sidecar=wishes.sidecar,
-        workers=wishes.workers,
+        method=options.method,
+        strength=options.strength,
+        bounds=options.bounds,
+        file_format=options.file_format,
+        least_gain_db=options.least_gain_db,
+        sidecar=options.sidecar,
+        workers=options.workers,
         on_step=on_step,
     )
     gain = corrected.expected_gain_db
-    left = wishes.least_gain_db is not None and gain < wishes.least_gain_db
+    left = options.least_gain_db is not None and gain < options.least_gain_db
     return {
         "state": "left" if left else "corrected",
         "expected_gain_db": gain,
@@ -187,7 +187,7 @@ def correct_one(
 
 
 def remarks(result: Mapping[str, Any]) -> list[str]:
-    """What is worth saying of a corrected photo, in words."""
+    """Return remarks on a corrected photo."""
     if result["nothing_to_correct"]:
         return ["nothing to correct: its pixels stayed as they were"]
     return [*measured(result["zones"]), *audited(result["audit"]), *colour(result["chroma_step"])]
@@ -206,12 +206,12 @@ def colour(step: tuple[int, int]) -> list[str]:
 def measured(zones: Mapping[Zone, correction.ZoneReport]) -> list[str]:
     """Tell in words what the edges of a chart gained; nothing of any other photo."""
     return [
-        f"{ZONE_WORDS[zone]} of the chart: MTF50 from {mtf50_words(seen.mtf50_before)} "
-        f"to {mtf50_words(seen.mtf50_after)} cycles/pixel, {seen.gain:.1f} times "
-        f"(median of {seen.edges} edges), overshoot {seen.overshoot_after:.1f} %; "
+        f"{ZONE_WORDS[zone]} of the chart: MTF50 from {mtf50_words(edges.mtf50_before)} "
+        f"to {mtf50_words(edges.mtf50_after)} cycles/pixel, {edges.gain:.1f} times "
+        f"(median of {edges.edges} edges), overshoot {edges.overshoot_after:.1f} %; "
         f"predicted for a usual scene {gain_words(report.expected_gain_db)}"
         for zone, report in zones.items()
-        if (seen := report.measured) is not None
+        if (edges := report.measured) is not None
     ]
 
 

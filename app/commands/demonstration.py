@@ -104,10 +104,10 @@ def _mark(folder: Path, before: dict[str, str]) -> None:
 
 def _marked(folder: Path) -> dict[str, str]:
     try:
-        found = json.loads((folder / MARKER).read_text(encoding="utf-8"))
+        digests = json.loads((folder / MARKER).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return digests if isinstance(digests, dict) else {}
 
 
 def _digests(folder: Path) -> dict[str, str]:

@@ -74,7 +74,7 @@ class Row:
 def run(
     names: Sequence[str],
     output: Path | None,
-    wishes: correction.Wishes,
+    options: correction.Options,
     learning: Learning,
     display: Display,
     *,
@@ -90,24 +90,24 @@ def run(
         With 1 if a photo could not be read or corrected.
     """
     paths = files.photos(names)
-    targets = correction.targets_of(paths, output, correction.EXTENSION[wishes.file_format])
+    targets = correction.targets_of(paths, output, correction.EXTENSION[options.file_format])
     with files.as_usage():
         estimation.estimators.create(learning.estimator)
         estimation.patches.selectors.create(learning.selector)
-        if wishes.method is not None:
-            corrections.deconvolvers.create(wishes.method)
-        LensSettings(aperture=wishes.aperture)
+        if options.method is not None:
+            corrections.deconvolvers.create(options.method)
+        LensSettings(aperture=options.aperture)
     base = output or paths[0].parent / correction.FOLDER
-    wishes = replace(wishes, least_gain_db=WORTH_DB)
-    work = _Folder(base, learning.profiles or base / PROFILES, wishes, learning, display)
+    options = replace(options, least_gain_db=WORTH_DB)
+    work = _Folder(base, learning.profiles or base / PROFILES, options, learning, display)
     shots, results = _read(paths, display)
-    found = groups(shots)
+    lens_groups = groups(shots)
     by_path = {path: target for target, path in targets.items()}
     with display.progress() as bars:
-        for group in found:
+        for group in lens_groups:
             work.learn(group, bars)
         work.finish(bars)
-        rows = [work.correct(group, by_path, bars, results, as_json=as_json) for group in found]
+        rows = [work.correct(group, by_path, bars, results, as_json=as_json) for group in lens_groups]
     if as_json:
         display.document({"groups": [_document(row) for row in rows], "results": results})
     else:
@@ -117,7 +117,7 @@ def run(
 
 
 def _read(paths: Sequence[Path], display: Display) -> tuple[list[Shot], list[dict[str, Any]]]:
-    """Read what the files say; those that cannot be read are results already."""
+    """Read the headers of the files; those that cannot be read become results."""
     shots: list[Shot] = []
     results: list[dict[str, Any]] = []
     for path in paths:
@@ -135,17 +135,17 @@ def _failed(error: LensModelError | OSError) -> dict[str, Any]:
 
 
 class _Folder:
-    """The work on one folder, and what is remembered of it."""
+    """The work on one folder, and its journal."""
 
     def __init__(
         self,
         output: Path,
         profiles: Path,
-        wishes: correction.Wishes,
+        options: correction.Options,
         learning: Learning,
         display: Display,
     ) -> None:
-        self._profiles, self._wishes, self._learning = profiles, wishes, learning
+        self._profiles, self._options, self._learning = profiles, options, learning
         self._display = display
         self._journal = Journal(output)
         self._learned: Counter[tuple[str, str]] = Counter()
@@ -156,7 +156,7 @@ class _Folder:
         return self._profiles / f"{group.name}{ENDING}"
 
     def learn(self, group: Group, bars: Progress) -> None:
-        """Learn a group's lens from as many of its photos as are wished and can be used."""
+        """Learn a group's lens from its usable photos, at most as many as the options say."""
         target = self.profile_of(group)
         if target not in self._calibrations:
             self._calibrations[target] = self._calibration(target)
@@ -182,11 +182,11 @@ class _Folder:
         bars.remove_task(task)
 
     def _calibration(self, target: Path) -> calibration.Calibration:
-        asked = calibration.Wishes(
-            aperture=self._wishes.aperture,
+        options = calibration.Options(
+            aperture=self._options.aperture,
             estimator=self._learning.estimator,
-            workers=self._wishes.workers,
-            any_lens=self._wishes.any_lens,
+            workers=self._options.workers,
+            any_lens=self._options.any_lens,
             force=False,
             family=None,
             no_family=False,
@@ -194,15 +194,15 @@ class _Folder:
             unit=None,
             selector=self._learning.selector,
         )
-        settings = LensSettings(aperture=self._wishes.aperture)
-        return calibration.Calibration(target, asked, settings, ModelSettings(), None)
+        settings = LensSettings(aperture=self._options.aperture)
+        return calibration.Calibration(target, options, settings, ModelSettings(), None)
 
     def _learns(self, calibrated: calibration.Calibration, shot: Shot, on_event: pipeline.EventHook) -> bool:
-        """Learn from one photo; tell whether it counts, now or from an earlier run."""
+        """Learn from one photo; return whether it counts, now or from an earlier run."""
         photo = pipeline.photo_id(shot.path)
-        learning, wishes = self._learning, self._wishes
+        learning, options = self._learning, self._options
         under = (
-            f"{learning.estimator}, {learning.selector}, aperture {wishes.aperture}, any {wishes.any_lens}"
+            f"{learning.estimator}, {learning.selector}, aperture {options.aperture}, any {options.any_lens}"
         )
         refused = self._journal.verdict("not learned from", photo, under)
         if refused is not None:
@@ -228,7 +228,7 @@ class _Folder:
         *,
         as_json: bool,
     ) -> Row:
-        """Correct the photos of a group that gain by it; leave the others."""
+        """Correct the photos of a group that gain from it; leave the others."""
         profile = self.profile_of(group)
         lens = Lens(files.profile_at(profile)).warmed() if profile.exists() else None
         states: Counter[str] = Counter()
@@ -237,7 +237,7 @@ class _Folder:
         for number, shot in enumerate(group.shots):
             bars.update(task, description=f"correcting {shot.path.name}")
             target = targets[shot.path]
-            result = self._one(shot, target, lens, partial(_correcting, bars, task, number))
+            result = self._correct_shot(shot, target, lens, partial(_correcting, bars, task, number))
             states[result["state"]] += 1
             self._say(shot.path, target, result, as_json=as_json)
             if result["state"] == "corrected":
@@ -247,25 +247,25 @@ class _Folder:
         bars.remove_task(task)
         return Row(group, profile, self._learned[group.name, group.focal], states, tuple(gains))
 
-    def _one(
+    def _correct_shot(
         self, shot: Shot, target: Path, lens: Lens | None, on_step: Callable[[int, int], None]
     ) -> dict[str, Any]:
         if lens is None:
             return {"state": "left", "reason": "its lens could not be learned from these photos"}
         photo = pipeline.photo_id(shot.path)
         samples = len(lens.profile.model.samples)
-        wishes = self._wishes
+        options = self._options
         under = (
-            f"{target.name}, {samples} samples, {wishes.method or 'standard'}, strength {wishes.strength:g}, "
-            f"{wishes.bounds}, aperture {wishes.aperture}"
+            f"{target.name}, {samples} samples, {options.method or 'standard'}, "
+            f"strength {options.strength:g}, {options.bounds}, aperture {options.aperture}"
         )
         known = self._journal.verdict("left", photo, under)
-        if known is not None and not self._wishes.force:
+        if known is not None and not self._options.force:
             return {"state": "left", "reason": known}
-        settings = LensSettings(aperture=self._wishes.aperture)
+        settings = LensSettings(aperture=self._options.aperture)
         try:
             result = correction.correct_one(
-                shot.path, target, lens, settings, self._wishes, self._display, on_step
+                shot.path, target, lens, settings, self._options, self._display, on_step
             )
         except (LensModelError, OSError) as error:
             return _failed(error)

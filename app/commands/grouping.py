@@ -113,7 +113,7 @@ def groups(shots: Iterable[Shot]) -> list[Group]:
     owners: dict[tuple[str, ...], list[Shot]] = {}
     for shot in shots:
         owners.setdefault(shot.owner, []).append(shot)
-    found: list[Group] = []
+    all_groups: list[Group] = []
     names: set[str] = set()
     for owner in sorted(owners):
         runs = _by_focal(owners[owner])
@@ -121,8 +121,8 @@ def groups(shots: Iterable[Shot]) -> list[Group]:
         for run in runs:
             name = shared or _free(_name(run[0], with_focal=True), names)
             names.add(name)
-            found.append(Group(tuple(sorted(run, key=lambda shot: shot.path)), name))
-    return found
+            all_groups.append(Group(tuple(sorted(run, key=lambda shot: shot.path)), name))
+    return all_groups
 
 
 def _by_focal(shots: Sequence[Shot]) -> list[list[Shot]]:

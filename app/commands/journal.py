@@ -21,23 +21,23 @@ class Journal:
         self._path = folder / NAME
         self._verdicts: dict[str, list[str]] = {}
         try:
-            found = json.loads(self._path.read_text(encoding="utf-8"))
-        except (OSError, ValueError):  # none yet, or damaged: what it said is found out anew
+            stored = json.loads(self._path.read_text(encoding="utf-8"))
+        except (OSError, ValueError):  # none yet, or damaged: every verdict is determined anew
             return
-        if isinstance(found, dict):
+        if isinstance(stored, dict):
             self._verdicts = {
                 key: [str(text) for text in value]
-                for key, value in found.items()
+                for key, value in stored.items()
                 if isinstance(value, list) and len(value) == 2  # a condition and a verdict
             }
 
     def verdict(self, kind: str, photo: str, under: str) -> str | None:
-        """Return what was found of a photo under the same conditions, or None."""
+        """Return the verdict on a photo under the same conditions, or None."""
         given, text = self._verdicts.get(f"{kind} {photo}", ["", ""])
         return text if given == under and text else None
 
     def note(self, kind: str, photo: str, under: str, text: str) -> None:
-        """Keep what was found of a photo."""
+        """Store the verdict on a photo."""
         self._verdicts[f"{kind} {photo}"] = [under, text]
         self._path.parent.mkdir(parents=True, exist_ok=True)
         with atomic(self._path) as file:

@@ -34,6 +34,8 @@ Exit status: 0 done, 1 it could not be, 2 called wrongly.""",
 
 SPAN: Final = re.compile(r"(\d{1,6})(h|d|w|y)", re.ASCII)
 HOURS: Final = {"h": 1, "d": 24, "w": 24 * 7, "y": 24 * 365}
+"""Hours of each unit of a span."""
+
 GIB: Final = 1 << 30
 
 
@@ -119,7 +121,7 @@ def create(
         )
     lasts = _span_or_none(expires)
     with _opened(data) as store:
-        made = store.create(
+        new_key = store.create(
             name,
             [scope],  # type: ignore[list-item]  # the option takes no other
             label=label,
@@ -127,7 +129,7 @@ def create(
             quota_bytes=None if quota_gb is None else int(quota_gb * GIB),
             quota_photos=quota_photos,
         )
-    _show(made.text)
+    _show(new_key.text)
 
 
 @keys.command(name="list")
@@ -147,7 +149,7 @@ def listed(
     Exit status: 0 listed, 1 it could not be, 2 called wrongly.
     """
     with _opened(data) as store:
-        rows = [_described(one) for one in store.listed(owner)]
+        rows = [_described(key) for key in store.listed(owner)]
     if json_output:
         typer.echo(json.dumps(rows, indent=2))
         return
@@ -158,12 +160,12 @@ def listed(
         typer.echo("no keys: lensmodel keys create makes one", err=True)
 
 
-def _described(one: Listed) -> dict[str, str | None]:
-    key, now = one.key, datetime.now(UTC)
+def _described(listed_key: Listed) -> dict[str, str | None]:
+    key, now = listed_key.key, datetime.now(UTC)
     ended = key.expires_at is not None and key.expires_at <= now
     return {
         "prefix": key.prefix,
-        "owner": one.owner,
+        "owner": listed_key.owner,
         "state": "revoked" if key.revoked_at else "expired" if ended else "valid",
         "scope": key.scopes,
         "label": key.label,
@@ -202,10 +204,10 @@ def rotate(
     Exit status: 0 made, 1 there is no such valid key, 2 called wrongly.
     """
     with _opened(data) as store:
-        made = store.rotate(_prefix(prefix), keep=_span(keep))
-    if made is None:
+        new_key = store.rotate(_prefix(prefix), keep=_span(keep))
+    if new_key is None:
         raise InvalidInputError(f"no valid key begins with {_prefix(prefix)}: lensmodel keys list shows them")
-    _show(made.text)
+    _show(new_key.text)
 
 
 @keys.command()

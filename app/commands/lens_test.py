@@ -44,21 +44,21 @@ def write(folder: Path, test: LensTest) -> list[str]:
 
 def write_comparison(folder: Path, first: LensTest, second: LensTest, aperture: float | None) -> list[str]:
     """Write two lens tests beside each other; return as `write`."""
-    found = compare(Side(first.name, first.at(aperture)), Side(second.name, second.at(aperture)))
+    comparison = compare(Side(first.name, first.at(aperture)), Side(second.name, second.at(aperture)))
     return _written(
         folder,
         {
-            "comparison.html": lambda: comparison_html(found).encode(),
-            "comparison.pdf": lambda: comparison_pdf(found),
+            "comparison.html": lambda: comparison_html(comparison).encode(),
+            "comparison.pdf": lambda: comparison_pdf(comparison),
         },
     )
 
 
 def _written(folder: Path, writers: dict[str, Callable[[], bytes]]) -> list[str]:
     missing = []
-    for name, made in writers.items():
+    for name, write_bytes in writers.items():
         try:
-            data = made()
+            data = write_bytes()
         except ModuleNotFoundError:
             missing.append(name)
             continue

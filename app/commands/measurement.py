@@ -32,11 +32,12 @@ from lensmodel.workflow.identity import difference
 
 PAPERS: Final = ("a2", "a3", "a4")
 USUAL_DETAIL: Final = 4000
+"""Default of `target --detail` (chosen, not measured)."""
 
 
 @dataclass(frozen=True, slots=True)
-class Wishes:
-    """What the options said."""
+class Options:
+    """The options of the command."""
 
     kind: str
     aperture: float | None
@@ -93,18 +94,18 @@ def measure(
         raise UsageError(f"measure one of {', '.join(get_args(MeasurementKind))}, not {kind!r}")
     if size % 2 == 0:
         raise UsageError(f"--size must be odd, got {size}; a PSF has one middle pixel")
-    wishes = Wishes(kind, aperture, size, replace_blind, any_lens)
-    _run(photos, profile, wishes, shown, as_json=json_output)
+    options = Options(kind, aperture, size, replace_blind, any_lens)
+    _run(photos, profile, options, shown, as_json=json_output)
 
 
-def _run(names: list[str], target: Path, wishes: Wishes, shown: Display, *, as_json: bool) -> None:
+def _run(names: list[str], target: Path, options: Options, shown: Display, *, as_json: bool) -> None:
     from lensmodel.workflow import measuring  # noqa: PLC0415 - half of SciPy, which `--help` should not wait for
 
     paths = files.photos(names)
     if target.is_dir() or target.suffix.lower() in ENDINGS:
         raise UsageError(f"{target} is no lens profile; name one, for example my-24mm.lensprofile")
     with files.as_usage():
-        groups = measuring.measurements_of(wishes.kind, paths)
+        groups = measuring.measurements_of(options.kind, paths)
     results: list[dict[str, Any]] = []
     with shown.progress() as bars:
         task = bars.add_task("", total=len(groups))
@@ -114,7 +115,7 @@ def _run(names: list[str], target: Path, wishes: Wishes, shown: Display, *, as_j
                 bars.update(task, description=f"{name}: measuring", completed=number + done / total)
 
             try:
-                result = _add(group, target, wishes, on_step)
+                result = _add(group, target, options, on_step)
             except (LensModelError, OSError) as error:
                 result = {"state": "failed", "reason": files.reason(error)}
                 shown.error(f"{group[0]}: {result['reason']}")
@@ -134,7 +135,7 @@ def _run(names: list[str], target: Path, wishes: Wishes, shown: Display, *, as_j
         raise typer.Exit(1)
 
 
-def _add(group: tuple[Path, ...], target: Path, wishes: Wishes, on_step: Any) -> dict[str, Any]:  # noqa: ANN401
+def _add(group: tuple[Path, ...], target: Path, options: Options, on_step: Any) -> dict[str, Any]:  # noqa: ANN401
     """Measure on the photos of one measurement and save the profile; say what became of it."""
     from lensmodel.workflow import measuring  # noqa: PLC0415 - see `_run`
     from lensmodel.workflow.joining import joined  # noqa: PLC0415 - see `_run`
@@ -143,23 +144,23 @@ def _add(group: tuple[Path, ...], target: Path, wishes: Wishes, on_step: Any) ->
     known = load_profile(target) if target.exists() else None
     if known is not None and key in known.photos:
         return {"state": "known"}
-    seen = files.identity(path)
-    if known is not None and not wishes.any_lens:
-        why = difference(known.lens, known.cameras, seen)
+    identity = files.identity(path)
+    if known is not None and not options.any_lens:
+        why = difference(known.lens, known.cameras, identity)
         if why is not None:
             raise InvalidInputError(f"{why}; give it a profile of its own, or add --any-lens")
-    given = None if files.says_aperture(path) else LensSettings(aperture=wishes.aperture)
+    given = None if files.says_aperture(path) else LensSettings(aperture=options.aperture)
     samples = measuring.samples_of_measurement(
-        wishes.kind, group, settings=given, size=wishes.size, on_step=on_step
+        options.kind, group, settings=given, size=options.size, on_step=on_step
     )
     if target.exists():  # another run may have added to it meanwhile
         known = load_profile(target)
-    model: LensModel = joined(None if known is None else known.model, samples, replace=wishes.replace)
-    cameras = () if seen.camera is None else (seen.camera,)
+    model: LensModel = joined(None if known is None else known.model, samples, replace=options.replace)
+    cameras = () if identity.camera is None else (identity.camera,)
     if known is None:
-        grown = LensProfile(model, dict(seen.lens), {key: path.name}, cameras)
+        grown = LensProfile(model, dict(identity.lens), {key: path.name}, cameras)
     else:
-        lens = known.lens if wishes.any_lens else {**seen.lens, **known.lens}
+        lens = known.lens if options.any_lens else {**identity.lens, **known.lens}
         more = tuple(camera for camera in cameras if camera not in known.cameras)
         photos = {name: label for name, label in known.photos.items() if _counts(name, model)}
         grown = replace(

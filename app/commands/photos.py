@@ -126,7 +126,7 @@ def calibrate(
     calibration.run(
         photos,
         profile,
-        calibration.Wishes(
+        calibration.Options(
             aperture,
             estimator,
             workers,
@@ -264,7 +264,7 @@ def correct(
     shown = display.of(context, quiet=quiet, verbose=verbose)
     if halo is not None and not halo >= 0.0:
         raise UsageError(f"--halo must not be negative, got {halo:g}")
-    wishes = correction.Wishes(
+    options = correction.Options(
         aperture,
         method,
         strength,
@@ -278,19 +278,19 @@ def correct(
     if server is not None:
         if profile is not None:
             raise UsageError("--server has lenses of its own; leave out --profile, or give --lens ID")
-        remote.run(photos, server, lens or remote.AUTO, output, wishes, shown, as_json=json_output)
+        remote.run(photos, server, lens or remote.AUTO, output, options, shown, as_json=json_output)
         return
     if (profile is None) == (lens is None):
         raise UsageError(
             "give --profile FILE, or --lens auto to learn the lens from these photos; one of them"
         )
     if profile is not None:
-        correction.run(photos, profile, output, wishes, shown, as_json=json_output)
+        correction.run(photos, profile, output, options, shown, as_json=json_output)
         return
     if lens != "auto":
         raise UsageError(f"--lens must be auto, got {lens!r}; for a profile of yours use --profile FILE")
     learning = folder.Learning(profiles, learn_from, estimator, selector)
-    folder.run(photos, output, wishes, learning, shown, as_json=json_output)
+    folder.run(photos, output, options, learning, shown, as_json=json_output)
 
 
 def psf(

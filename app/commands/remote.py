@@ -31,7 +31,7 @@ def run(
     url: str,
     lens: str,
     output: Path | None,
-    wishes: correction.Wishes,
+    options: correction.Options,
     display: Display,
     *,
     as_json: bool,
@@ -46,7 +46,7 @@ def run(
         Where the service listens; its key is LENS_API_KEY of the environment.
     lens : str
         "auto": learn from these photos too; else the id of a lens of the service.
-    output, wishes, display, as_json
+    output, options, display, as_json
         As of `correction.run`.
 
     Raises
@@ -60,13 +60,13 @@ def run(
 
     from app.client import Client  # noqa: PLC0415 - same
 
-    targets = correction.targets_of(files.photos(names), output, correction.EXTENSION[wishes.file_format])
-    if wishes.sidecar:
+    targets = correction.targets_of(files.photos(names), output, correction.EXTENSION[options.file_format])
+    if options.sidecar:
         raise UsageError("--sidecar is for corrections made here; leave it out with --server")
     results: list[dict[str, Any]] = []
     try:
         with Client(url) as client, display.progress() as bars:
-            work = _Remote(client, lens, wishes, display, bars)
+            work = _Remote(client, lens, options, display, bars)
             task = bars.add_task("sending", total=len(targets))
             sent = {}
             for number, (target, path) in enumerate(targets.items()):
@@ -90,21 +90,21 @@ def run(
 
 
 class _Remote:
-    """What is asked of the service, photo by photo."""
+    """The requests to the service, photo by photo."""
 
     def __init__(
-        self, client: Client, lens: str, wishes: correction.Wishes, display: Display, bars: Progress
+        self, client: Client, lens: str, options: correction.Options, display: Display, bars: Progress
     ) -> None:
-        self._client, self._wishes, self._display, self._bars = client, wishes, display, bars
+        self._client, self._options, self._display, self._bars = client, options, display, bars
         self._lens = None if lens == AUTO else lens
 
     def sent(self, path: Path, target: Path) -> dict[str, Any] | str:
-        """Send a photo; return its id, or what became of it."""
-        if target.exists() and not self._wishes.force:
+        """Send a photo; return its id, or its result if it is not sent."""
+        if target.exists() and not self._options.force:
             return {"state": "kept"}
         try:
             return self._client.upload(
-                path, calibrate=self._lens is None, lens_id=self._lens, aperture=self._wishes.aperture
+                path, calibrate=self._lens is None, lens_id=self._lens, aperture=self._options.aperture
             ).id
         except (LensModelError, OSError) as error:
             return _failed(error)
@@ -129,7 +129,7 @@ class _Remote:
                     raise
                 # it taught nothing; other photos may have, and it may be corrected all the same
                 self._display.detail(f"{path}: {ended}")
-            wanted = self._client.correct(sent, **self._wish())
+            wanted = self._client.correct(sent, **self._request())
             self._client.wait(wanted, on_change=partial(on_change, f"correcting {path.name}"))
             report = self._client.correction(wanted.id).report or {}
             if report.get("nothing_to_correct"):
@@ -140,21 +140,21 @@ class _Remote:
             return _failed(error)
         return {"state": "corrected", "lens_id": wanted.lens_id, "report": report}
 
-    def _wish(self) -> dict[str, Any]:
-        bounds = self._wishes.bounds
-        wish = {
-            "method": self._wishes.method or "standard",
-            "strength": self._wishes.strength,
+    def _request(self) -> dict[str, Any]:
+        bounds = self._options.bounds
+        request = {
+            "method": self._options.method or "standard",
+            "strength": self._options.strength,
             "texture": bounds.texture,
             "denoise": bounds.denoise,
-            "output": {"format": self._wishes.file_format},
+            "output": {"format": self._options.file_format},
         }
         if bounds.halo is not None and math.isfinite(bounds.halo):
-            wish["halo"] = bounds.halo
-        return wish if self._lens is None else {**wish, "lens_id": self._lens}
+            request["halo"] = bounds.halo
+        return request if self._lens is None else {**request, "lens_id": self._lens}
 
     def say(self, path: Path, target: Path, result: dict[str, Any], *, as_json: bool) -> None:
-        """Tell what became of a photo."""
+        """Print the result of a photo."""
         if result["state"] == "failed":
             self._display.error(f"{path}: {result['reason']}")
         elif result["state"] == "kept":

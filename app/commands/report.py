@@ -110,18 +110,18 @@ def report(
         raise UsageError(f"{option} needs --output: what it adds is written to files")
     with shown.busy("asking the lens at 200 places"):
         model = files.profile_at(profile).model
-        found = lens_report(model, _settings(model, aperture, channel), ReportSettings(aspect=aspect))
-        wish = advice(model)
-    document = json.dumps({"report": to_json(found), "advice": to_json(wish)}, indent=2)
+        measured = lens_report(model, _settings(model, aperture, channel), ReportSettings(aspect=aspect))
+        recommended = advice(model)
+    document = json.dumps({"report": to_json(measured), "advice": to_json(recommended)}, indent=2)
     if output is not None:
         texts = {
             "report.json": document + "\n",
-            "mtf.csv": _map_csv(found),
-            "mtf-map.svg": mtf_map_svg(found),
-            "mtf-curves.svg": curves_svg(found),
+            "mtf.csv": _map_csv(measured),
+            "mtf-map.svg": mtf_map_svg(measured),
+            "mtf-curves.svg": curves_svg(measured),
         }
-        if len(found.apertures) > 1:
-            texts["apertures.svg"] = apertures_svg(found)
+        if len(measured.apertures) > 1:
+            texts["apertures.svg"] = apertures_svg(measured)
         output.mkdir(parents=True, exist_ok=True)
         for name, text in texts.items():
             write_atomically(output / name, text.encode())
@@ -131,7 +131,7 @@ def report(
     if json_output:
         typer.echo(document)
     else:
-        shown.result(_words(found, wish, output))
+        shown.result(_words(measured, recommended, output))
 
 
 def _tested(
@@ -220,19 +220,19 @@ def export_psfs(
 def _format(output: Path, named: str | None) -> str:
     """Tell the format by the option and by the ending of the file; they must not contradict each other."""
     ending = format_of(output)
-    found = named or ending
-    if found is None:
+    chosen = named or ending
+    if chosen is None:
         raise UsageError(
             f"no format for {output.name}; add --format, or give a name that ends in "
             + ", ".join(f".{name}" for name in exporters)
         )
     with files.as_usage():
-        exporters.create(found)
-    if ending not in {None, found}:
+        exporters.create(chosen)
+    if ending not in {None, chosen}:
         raise UsageError(
-            f"{output.name} ends as {ending} does, but --format says {found}; change one of them"
+            f"{output.name} ends as {ending} does, but --format says {chosen}; change one of them"
         )
-    return found
+    return chosen
 
 
 def _settings(model: LensModel, aperture: float | None, channel: Channel) -> LensSettings:
@@ -241,26 +241,26 @@ def _settings(model: LensModel, aperture: float | None, channel: Channel) -> Len
     return chosen.with_channel(channel)
 
 
-def _words(found: LensReport, wish: Advice, output: Path | None) -> str:
-    settings = found.settings
+def _words(measured: LensReport, recommended: Advice, output: Path | None) -> str:
+    settings = measured.settings
     at = "unknown aperture" if settings.aperture is None else f"f/{settings.aperture:g}"
-    photos = "1 photo" if found.photos == 1 else f"{found.photos} photos"
-    lines = [f"{photos}, {found.samples} samples; {at}, channel {settings.channel}"]
-    lines += [f"- {line}" for line in found.summary]
-    lines.append(f"- {wish.text}")
+    photos = "1 photo" if measured.photos == 1 else f"{measured.photos} photos"
+    lines = [f"{photos}, {measured.samples} samples; {at}, channel {settings.channel}"]
+    lines += [f"- {line}" for line in measured.summary]
+    lines.append(f"- {recommended.text}")
     if output is not None:
         lines.append(f"written: {output}")
     return "\n".join(lines)
 
 
-def _map_csv(found: LensReport) -> str:
+def _map_csv(measured: LensReport) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(
         ["row", "col", "r", "phi", "mtf50_tangential", "mtf50_sagittal", "predicted_error", "extrapolated"]
     )
-    for i, point in enumerate(found.field):
+    for i, point in enumerate(measured.field):
         values = (point.position.r, point.position.phi, point.tangential, point.sagittal)
         numbers = (f"{value:.6f}" for value in (*values, point.predicted_error))
-        writer.writerow([*divmod(i, found.cols), *numbers, int(point.extrapolated)])
+        writer.writerow([*divmod(i, measured.cols), *numbers, int(point.extrapolated)])
     return out.getvalue()

@@ -37,12 +37,12 @@ def settings_from(data: Path | None, host: str | None = None, port: int | None =
     try:
         return Settings(**{name: value for name, value in given.items() if value is not None})  # type: ignore[arg-type]  # checked by pydantic
     except ValidationError as error:
-        said = [str(found["msg"]).removeprefix("Value error, ") for found in error.errors()]
-        places = [".".join(str(part) for part in found["loc"]) for found in error.errors()]
+        messages = [str(problem["msg"]).removeprefix("Value error, ") for problem in error.errors()]
+        places = [".".join(str(part) for part in problem["loc"]) for problem in error.errors()]
         raise UsageError(
             "; ".join(
                 f"LENS_{place.upper()}: {text}" if place else text
-                for place, text in zip(places, said, strict=True)
+                for place, text in zip(places, messages, strict=True)
             )
         ) from error
 

@@ -94,17 +94,17 @@ def backup(
     settings = _existing(data)
     with _opened(settings) as (store, storage), shown.progress() as bars:
         task = bars.add_task("blobs", total=None)
-        made = copies.backup(
+        result = copies.backup(
             store.database,
             storage,
             folder,
             lambda done, total: bars.update(task, completed=done, total=total),
         )
     if json_output:
-        shown.document(asdict(made))
+        shown.document(asdict(result))
     else:
-        rows = sum(made.rows.values())
-        shown.result(f"{folder}: {rows} rows and {made.blobs} blobs of {made.made_at}")
+        rows = sum(result.rows.values())
+        shown.result(f"{folder}: {rows} rows and {result.blobs} blobs of {result.made_at}")
 
 
 def restore(

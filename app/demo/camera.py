@@ -22,7 +22,7 @@ from lensmodel.simulate import (
     write_photo,
 )
 
-LENS_SEED = 2024
+LENS_SEED = 2024  # chosen: any number, fixed so that the demo is reproducible
 LENS_KIND = "soft-fast"
 LEARN_FROM = ("city", "lake", "tea-gardens")
 HELD_OUT = "colosseum"

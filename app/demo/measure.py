@@ -17,6 +17,7 @@ from lensmodel.core.types import ZONES, FieldPosition, Planes, Zone
 from lensmodel.photo import develop
 
 _BORDER = 8
+"""Pixels at the edge of the picture that are left out (chosen, not measured)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,14 +42,14 @@ def positions() -> list[FieldPosition]:
 def psf_error(client: Client, lens_id: str, version: int) -> dict[Zone, float]:
     """Median relative L2 error of the served green PSFs in each zone, after sub-pixel alignment."""
     lens, settings = camera.demo_lens(), camera.demo_settings()
-    found: dict[Zone, list[float]] = {zone: [] for zone in ZONES}
+    errors: dict[Zone, list[float]] = {zone: [] for zone in ZONES}
     for place in positions():
         kernel = client.kernel(
             lens_id, r=place.r, phi=place.phi, aperture=settings.aperture, size=55, version=version
         )
         truth = lens.kernel(place, settings, 55, pitch_um=camera.demo_camera().pitch_um)
-        found[zone_of(place.r)].append(distance(kernel.astype(np.float64), truth).rel_l2)
-    return {zone: float(np.median(values)) for zone, values in found.items()}
+        errors[zone_of(place.r)].append(distance(kernel.astype(np.float64), truth).rel_l2)
+    return {zone: float(np.median(values)) for zone, values in errors.items()}
 
 
 def developed(shot: camera.Shot) -> Planes:
@@ -67,8 +68,8 @@ def psnr(planes: Planes, shot: camera.Shot) -> dict[Zone, float]:
 def sharpness(planes: Planes) -> dict[Zone, Sharpness]:
     """MTF50 and maximum of the MTF on the green edges of the chart, by zone."""
     boxes = [edge.box for edge in camera.chart_edges()]
-    found = quality.by_zone(quality.measure_edges(planes[1], boxes))
-    return {zone: Sharpness(row.mtf50, row.mtf_max, row.overshoot) for zone, row in found.items()}
+    by_zone = quality.by_zone(quality.measure_edges(planes[1], boxes))
+    return {zone: Sharpness(row.mtf50, row.mtf_max, row.overshoot) for zone, row in by_zone.items()}
 
 
 def improved(before: dict[Zone, float], after: dict[Zone, float], zones: Sequence[Zone]) -> bool:

@@ -19,6 +19,7 @@ from lensmodel.core.errors import LensModelError
 
 _START_SECONDS = 90.0
 _STOP_SECONDS = 40.0
+"""Longest waits for the service to start and to stop (chosen): it kills its members after 15 s."""
 
 
 class ServiceDidNotStartError(LensModelError):

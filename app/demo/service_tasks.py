@@ -19,6 +19,7 @@ OnJob = Callable[[str, JobOut], None]
 """Takes the same line, and the job that it tells of."""
 
 PATIENCE_SECONDS = 900.0
+"""Longest wait for one job (chosen, not measured)."""
 
 
 def follow(
@@ -57,10 +58,10 @@ def corrected(
     *,
     on_job: OnJob | None = None,
     output: dict[str, str] | None = None,
-    **wish: object,
+    **options: object,
 ) -> Path:
-    """Have a photo corrected into a 16-bit TIFF and download it; `wish` is the rest of `CorrectionIn`."""
-    correction = client.correct(photo.id, output={"format": "tiff16", **(output or {})}, **wish)
+    """Have a photo corrected into a 16-bit TIFF and download it; `options` are the rest of `CorrectionIn`."""
+    correction = client.correct(photo.id, output={"format": "tiff16", **(output or {})}, **options)
     follow(client, correction, say, on_job=on_job)
     return client.download(correction.id, folder / f"{correction.id}.tif")
 

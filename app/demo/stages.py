@@ -29,7 +29,7 @@ WEIGHTS: Final[Mapping[str, float]] = {
 """Seconds of each stage on a machine of two cores; only their ratios count once some are over."""
 
 _TRUST_S: Final = 10.0
-"""So many seconds of `WEIGHTS` are believed before this machine has shown its own speed."""
+"""Seconds of `WEIGHTS` that are trusted before this machine has shown its own speed (chosen)."""
 
 
 class Stages:

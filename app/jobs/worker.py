@@ -48,15 +48,10 @@ log = logging.getLogger(__name__)
 EXIT_FENCED: Final = 70
 """Exit status of a worker that was declared dead or whose database was replaced: EX_SOFTWARE (sysexits.h)."""
 
-RECONCILE_S: Final = 10.0
-"""Seconds between two comparisons of the tables with the engine (chosen): the longest wait of a lost job."""
-
-TIDY_S: Final = 60.0
-"""Seconds between two rounds of deletion (chosen): nobody waits for it."""
-
-REPORTS_S: Final = 6 * 3600.0
-"""Seconds between two searches for missing reports (chosen): each lists all fitted models."""
-
+# seconds between two rounds of a duty, all chosen
+RECONCILE_S: Final = 10.0  # of the tables with the engine: the longest wait of a lost job
+TIDY_S: Final = 60.0  # of deletion: nobody waits for it
+REPORTS_S: Final = 6 * 3600.0  # of the search for missing reports: it lists all fitted models
 KEEP_JOBS: Final = timedelta(days=2)
 """How long the engine remembers ended jobs (chosen, not measured)."""
 

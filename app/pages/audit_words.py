@@ -1,4 +1,4 @@
-"""What the audit of a correction held back, in words and in places of the upright photo."""
+"""What the audit of a correction held back: in words, and as places of the upright photo."""
 
 from __future__ import annotations
 
@@ -21,16 +21,18 @@ CHECKS: Final[Mapping[str, str]] = {
     "grain": "grain beyond that of the photo",
 }
 LEAST: Final = 0.005
-"""Share below which nothing is said of a check: less than can be seen."""
+"""Share below which a check is not mentioned (chosen): less than can be seen."""
 
-NAMED: Final = 6
+MAX_PLACES: Final = 6
+"""Places that are listed (chosen): the worst ones."""
+
 SQUARE: Final = 96
-"""Least side of a square in photo pixels, where the tiles are too few to tell their own."""
+"""Side of a square in photo pixels for audits without `tile_side` (chosen, not measured)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A place of the upright photo in its pixels, and what to say of it."""
+    """A place of the upright photo in its pixels, with a caption."""
 
     x: int
     y: int
@@ -39,7 +41,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """What was held back: in a sentence, why, and where most."""
+    """What was held back: a sentence, the reasons, and the worst places."""
 
     words: str
     reasons: list[str]
@@ -47,12 +49,12 @@ class Held:
 
 
 def check_words(name: str) -> str:
-    """Say what a check objects to."""
+    """Return what a check objects to, in words."""
     return CHECKS.get(name, name)
 
 
 def held_places(audit: Mapping[str, Any], height: int, width: int, orientation: int) -> Held | None:
-    """Say what was held back of a correction; None where nothing was checked."""
+    """Return what was held back of a correction; None where nothing was checked."""
     zones = audit.get("zones") or {}
     tiles = sum(zone["tiles"] for zone in zones.values())
     if not tiles:
@@ -70,17 +72,17 @@ def held_places(audit: Mapping[str, Any], height: int, width: int, orientation: 
         else f"{share:.0%} of the correction was held back over the whole photo."
     )
     places = []
-    worst = audit.get("worst", []) if share >= LEAST else []  # less is not worth a look
-    for found in worst[:NAMED]:
-        y, x = upright_point(found["row"], found["col"], height, width, orientation)
-        places.append(Place(x, y, f"{found['held_back']:.0%}: {check_words(found['check'])}"))
+    worst = audit.get("worst", []) if share >= LEAST else []  # less cannot be seen
+    for place in worst[:MAX_PLACES]:
+        y, x = upright_point(place["row"], place["col"], height, width, orientation)
+        places.append(Place(x, y, f"{place['held_back']:.0%}: {check_words(place['check'])}"))
     return Held(words, reasons, places)
 
 
 def held_squares(
     audit: Mapping[str, Any], height: int, width: int, orientation: int
 ) -> dict[str, Any] | None:
-    """Return the tiles of which something was held back, as squares of the upright photo."""
+    """Return the tiles with something held back as squares of the upright photo."""
     tiles = audit.get("tiles") or []
     if not tiles:
         return None

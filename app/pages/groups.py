@@ -37,10 +37,10 @@ class Group:
 
     @property
     def key(self) -> str:
-        """What stays the same while photos join and leave."""
+        """A key that stays the same while photos join and leave."""
         first = self.photos[0]
-        said = f"{self.camera}|{first.body_key}|{self.focal_mm}|{self.lens_model}"
-        return hashlib.sha256(said.encode()).hexdigest()[:12]
+        identity = f"{self.camera}|{first.body_key}|{self.focal_mm}|{self.lens_model}"
+        return hashlib.sha256(identity.encode()).hexdigest()[:12]
 
 
 def camera_name(maker: str | None, model: str | None) -> str:
@@ -52,7 +52,7 @@ def camera_name(maker: str | None, model: str | None) -> str:
 
 
 def grouped(rows: Sequence[PhotoRow]) -> list[Group]:
-    """Group photos by body, focal length and what they call the lens."""
+    """Group photos by body, focal length and lens name."""
     groups: defaultdict[tuple[str, str, float, str], list[PhotoRow]] = defaultdict(list)
     for row in rows:
         camera = camera_name(row.camera_maker, row.camera_model)
@@ -67,8 +67,8 @@ def grouped(rows: Sequence[PhotoRow]) -> list[Group]:
             body=bodies[camera].index(body) + 1 if len(bodies[camera]) > 1 else None,
             focal_mm=focal or None,
             lens_model=model or None,
-            needs_aperture=any(row.aperture is None for row in found),
-            photos=found,
+            needs_aperture=any(row.aperture is None for row in photos),
+            photos=photos,
         )
-        for (camera, body, focal, model), found in sorted(groups.items())
+        for (camera, body, focal, model), photos in sorted(groups.items())
     ]

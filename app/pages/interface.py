@@ -1,4 +1,4 @@
-"""The description of the HTTP interface, arranged for people."""
+"""The description of the HTTP interface for people."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class Operation:
-    """One thing that programs can ask."""
+    """One operation of the interface."""
 
     method: str
     path: str
     summary: str
     description: str
     parameters: list[tuple[str, str, str]]
-    """Name, where it stands, what it means."""
+    """Name, location and meaning of each."""
 
     body: list[str]
     answers: list[str]
@@ -47,7 +47,7 @@ def _operation(method: str, path: str, entry: Mapping[str, Any]) -> Operation:
 
 def _meaning(parameter: Mapping[str, Any]) -> str:
     schema = parameter.get("schema", {})
-    said = parameter.get("description") or schema.get("description", "")
+    description = parameter.get("description") or schema.get("description", "")
     choice = f"one of {', '.join(map(str, schema['enum']))}" if "enum" in schema else ""
     default = f"default {schema['default']}" if schema.get("default") is not None else ""
-    return "; ".join(part for part in (said, choice, default) if part)
+    return "; ".join(part for part in (description, choice, default) if part)

@@ -28,7 +28,11 @@ from lensmodel.report.lens_test import LensTest
 from lensmodel.report.units import Unit
 
 SHOWN_VERSIONS: Final = 200
+"""Versions of the history on the page (chosen): the newest of them."""
+
 DEFAULT_ASPECT: Final = 1.5
+"""Width over height before there are photos: that of a full-frame sensor, 36 x 24 mm."""
+
 _APERTURE: Final = TypeAdapter[float](Aperture)
 
 router = APIRouter(include_in_schema=False)
@@ -42,7 +46,7 @@ def lens_page(lens_id: str, call: CallDep) -> HTMLResponse:
     before = max(lens.version - SHOWN_VERSIONS, 0)  # the newest are shown
     history = lens_routes.list_calibrations(lens_id, call, limit=SHOWN_VERSIONS, cursor=before).items
     photos, more = shown.photos(call, lens_id)
-    seen = _seen(call, photos)
+    positions = _positions(call, photos)
     newest = next((event.coverage for event in reversed(history) if event.coverage), None)
     aspect = _aspect(call, row)
     test = _test(call, row)
@@ -56,9 +60,9 @@ def lens_page(lens_id: str, call: CallDep) -> HTMLResponse:
         versions=[e.version for e in reversed(history) if e.version >= max(gone, 1) and e.samples],
         names={photo.id: photo.filename for photo in photos},
         coverage=words.coverage_bars(newest),
-        seen=seen,
+        seen=positions,
         aspect=aspect,
-        spots=_spots(seen, aspect),
+        spots=_spots(positions, aspect),
         photos=photos,
         more=more,
         others=[other for other in shown.lenses(call) if other.id != lens_id],
@@ -84,17 +88,19 @@ def lens_charts(
     if not against or with_itself:
         return page("_charts.html", **_charts(test, chosen, unit))
     if against.startswith("at "):
-        other = test
-        other_aperture = _aperture(against.removeprefix("at "))
+        second_test = test
+        second_aperture = _aperture(against.removeprefix("at "))
         query = {"aperture": aperture, "against_aperture": against.removeprefix("at ")}
     else:
-        other = stored_report(call, lens_routes.find_lens(call, against))
-        other_aperture = chosen if chosen in other.apertures else None
+        second_test = stored_report(call, lens_routes.find_lens(call, against))
+        second_aperture = chosen if chosen in second_test.apertures else None
         query = {"aperture": aperture, "against": against}
-    one, two = test.at(chosen), other.at(other_aperture)
+    first_tested, second_tested = test.at(chosen), second_test.at(second_aperture)
     sides = [
-        Side(name if other is not test else words.f_stop(tested.report.settings.aperture or 0.0), tested)
-        for name, tested in ((test.name, one), (other.name, two))
+        Side(
+            name if second_test is not test else words.f_stop(tested.report.settings.aperture or 0.0), tested
+        )
+        for name, tested in ((test.name, first_tested), (second_test.name, second_tested))
     ]
     return page(
         "_charts.html",
@@ -140,24 +146,24 @@ def _test(call: Call, lens: LensRow) -> LensTest | None:
 
 
 def _aspect(call: Call, lens: LensRow) -> float:
-    """Width over height of most photos of a lens, as the sensor has them."""
+    """Return the commonest width over height of the photos of a lens, in sensor orientation."""
     shape = call.store.lenses.shape_of(lens)
     return DEFAULT_ASPECT if shape is None else round(shape[1] / shape[0], 4)
 
 
-def _spots(seen: list[FieldPosition], aspect: float) -> list[tuple[float, float]]:
-    """Return where places lie in a picture, as shares of its width and height from the top left."""
+def _spots(positions: list[FieldPosition], aspect: float) -> list[tuple[float, float]]:
+    """Return field positions as fractions of the width and height of a picture, from the top left."""
     corner = math.hypot(aspect, 1.0)
     return [
         (
             0.5 + corner * p.r * math.cos(p.phi) / (2.0 * aspect),
             0.5 - corner * p.r * math.sin(p.phi) / 2.0,
         )
-        for p in seen
+        for p in positions
     ]
 
 
-def _seen(call: Call, photos: list[PhotoOut]) -> list[FieldPosition]:
+def _positions(call: Call, photos: list[PhotoOut]) -> list[FieldPosition]:
     """Return where patches of counted photos gave a PSF."""
     return [
         FieldPosition(patch.r, patch.phi)

@@ -30,16 +30,16 @@ PLACES: Final = tuple(
     for above, row in ROWS
     for beside, col in COLUMNS
 )
-"""Nine places of a picture with their shares of its height and width."""
+"""Nine places of a picture, with their fractions of its height and width."""
 
-MOST_PREVIEWED: Final = 1_500_000
-"""Pixels of a part that is corrected while somebody waits (chosen): a second or two of work."""
+MAX_PREVIEW_PIXELS: Final = 1_500_000
+"""Pixels of a preview at most (chosen): a second or two of work while the user waits."""
 
 router = APIRouter(include_in_schema=False)
 
 
 def _upright(photo: PhotoOut, row: PhotoRow) -> PhotoOut:
-    """Give the size of a photo as it is looked at."""
+    """Return a photo with its size in upright orientation."""
     if (row.orientation or 1) <= 4:
         return photo
     return photo.model_copy(update={"width": row.height, "height": row.width})
@@ -58,7 +58,7 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
     candidates = []
     if photo.lens_id is None:
         candidates = [lens for lens in shown.lenses(call) if lens.samples or photo.state == "needs_lens"]
-    mine = correction_routes.list_corrections(call, limit=50, photo_id=photo_id).items
+    corrections = correction_routes.list_corrections(call, limit=50, photo_id=photo_id).items
     return page(
         "photo.html",
         photo=_upright(photo, row),
@@ -69,7 +69,7 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
         reasons=left_out.most_common(),
         candidates=candidates,
         lens=None if photo.lens_id is None else lens_routes.read_lens(photo.lens_id, call),
-        corrections=[one for one in mine if one.roi is None],
+        corrections=[correction for correction in corrections if correction.roi is None],
         places=PLACES,
     )
 
@@ -85,25 +85,25 @@ class PreviewIn(Region):
 
 
 @router.post("/ui/photos/{photo_id}/preview", status_code=202)
-def preview(photo_id: str, wish: PreviewIn, call: CallDep) -> dict[str, str]:
+def preview(photo_id: str, part: PreviewIn, call: CallDep) -> dict[str, str]:
     """Begin to correct a part of a photo."""
     row = photo_routes.find_photo(call, photo_id)
     if not row.width or not row.height:
         raise InvalidParameterError("the photo is not read yet: wait a moment")
-    if wish.width * wish.height > MOST_PREVIEWED:
+    if part.width * part.height > MAX_PREVIEW_PIXELS:
         raise InvalidParameterError("the part is too large for a preview: zoom in")
-    turned = pictures.in_sensor(wish, row.height, row.width, row.orientation or 1)
-    asked = CorrectionIn.model_validate(
+    turned = pictures.in_sensor(part, row.height, row.width, row.orientation or 1)
+    request = CorrectionIn.model_validate(
         {
             "photo_id": photo_id,
-            "lens_id": wish.lens_id,
+            "lens_id": part.lens_id,
             "roi": turned.model_dump(),
-            "layers": wish.layers,
+            "layers": part.layers,
             "output": {"format": "png8", "color_space": "srgb"},
         }
     )
-    made = correction_routes.create(asked, call)
-    return {"id": made.id}
+    correction = correction_routes.create(request, call)
+    return {"id": correction.id}
 
 
 @router.get("/corrections/{correction_id}")

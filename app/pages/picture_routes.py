@@ -18,18 +18,18 @@ from app.store.photo_steps import folder_of
 
 Share = Annotated[float, Query(ge=0, le=1, allow_inf_nan=False)]
 Side = Annotated[int, Query(ge=16, le=2000)]
-Half = Annotated[int, Path(ge=0, le=12)]
+Half = Annotated[int, Path(ge=0, le=12)]  # 2^12 tiles of 512 pixels: more than any photo
 Number = Annotated[int, Path(ge=0, le=10_000)]
 Which = Literal["before", "after"]
 
 WHOLE: Final = 1600
-"""Longer side in pixels of the picture that is shown until tiles are there."""
+"""Longer side in pixels of the picture that is shown until the tiles are loaded (chosen)."""
 
 NOTHING: Final = (
     '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 3 2">'
     '<rect width="3" height="2" fill="#8882"/></svg>'
 )
-"""Stands where there is no picture yet."""
+"""Placeholder until there is a picture."""
 
 _OF: Final = {"before": BEFORE, "after": AFTER, "smooth": LAYERS[0], "clean": LAYERS[1]}
 

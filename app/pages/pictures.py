@@ -24,7 +24,7 @@ TILE: Final = 512
 
 
 def upright_patch(patch: PatchOut, height: int, width: int, orientation: int) -> PatchOut:
-    """Move a window to where it lies in the upright picture."""
+    """Return a window in the coordinates of the upright picture."""
     row, col = patch.row, patch.col
     below, right = height - row - patch.size, width - col - patch.size
     moved = {
@@ -41,7 +41,7 @@ def upright_patch(patch: PatchOut, height: int, width: int, orientation: int) ->
 
 
 def upright_point(row: float, col: float, height: int, width: int, orientation: int) -> tuple[int, int]:
-    """Move a point, `(row, col)`, to where it lies in the upright picture."""
+    """Return a point, `(row, col)`, in the coordinates of the upright picture."""
     below, right = height - 1 - row, width - 1 - col
     moved = {
         1: (row, col),
@@ -57,11 +57,11 @@ def upright_point(row: float, col: float, height: int, width: int, orientation: 
 
 
 _BACK: Final = {6: 8, 8: 6}
-"""Orientations that undo others, where they are not their own."""
+"""EXIF orientations whose inverse differs from them, with that inverse."""
 
 
 def in_sensor(part: Region, height: int, width: int, orientation: int) -> Region:
-    """Move a part of the upright picture to where it lies on the sensor.
+    """Return a part of the upright picture in the coordinates of the sensor.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def in_sensor(part: Region, height: int, width: int, orientation: int) -> Region
 
 
 def exists(storage: Storage, key: str) -> bool:
-    """Whether a picture is there."""
+    """Say whether a picture is stored."""
     try:
         storage.info(key)
     except FileNotFoundError:
@@ -146,6 +146,7 @@ def decoded(storage: Storage, key: str, media_type: str, orientation: int) -> Pi
 
 
 _DECODING: Final = tuple(threading.RLock() for _ in range(16))
+"""Locks by the hash of the key (16 chosen): one picture is decoded once, different ones at the same time."""
 
 
 @lru_cache(maxsize=12)
@@ -189,7 +190,7 @@ def tile(picture: Picture, col: int, row: int) -> bytes:
 
 
 def jpeg(picture: Picture) -> bytes:
-    """Encode as JPEG that shows each pixel: fine, and no colour shared between pixels."""
+    """Encode as JPEG of high quality without chroma subsampling."""
     out = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(picture)).save(out, "JPEG", quality=92, subsampling=0)
     return out.getvalue()

@@ -38,15 +38,15 @@ Handler: TypeAlias = Callable[[Request, Any], Any]
 
 
 def _for_people(answer: Handler) -> Handler:
-    """Show what an exception handler answers as a page, where a person asked for one."""
+    """Turn the response of an exception handler into a page where a browser requested one."""
 
     async def handle(request: Request, error: Exception) -> Response:
         waited = answer(request, error)
         plain: Response = await waited if isinstance(waited, Awaitable) else waited
-        if plain.status_code == 401 and _asked_for_page(request):
-            asked = quote(request.url.path, safe="/")
-            return RedirectResponse(f"/sign-in?next={asked}", 303)
-        if plain.status_code < 400 or not _asked_for_page(request):
+        if plain.status_code == 401 and _wants_page(request):
+            path = quote(request.url.path, safe="/")
+            return RedirectResponse(f"/sign-in?next={path}", 303)
+        if plain.status_code < 400 or not _wants_page(request):
             return plain
         title, detail = words.refusal(plain.status_code, str(error))
         return page("missing.html", plain.status_code, title=title, detail=detail)
@@ -54,7 +54,7 @@ def _for_people(answer: Handler) -> Handler:
     return handle
 
 
-def _asked_for_page(request: Request) -> bool:
+def _wants_page(request: Request) -> bool:
     wanted = "text/html" in request.headers.get("accept", "")
     return (
         request.method == "GET" and wanted and not request.url.path.startswith(("/v1/", "/ui/", "/static/"))

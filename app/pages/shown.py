@@ -1,4 +1,4 @@
-"""What pages and their streams show of the tables, through the same routes as others use."""
+"""Data of the pages and their streams, by the same routes as the API."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ PHOTOS: Final = 60
 
 HOPELESS: Final = frozenset({"failed", "cancelled"})
 
-MOST_WAITING: Final = 1000
-"""Waiting photos that are asked about at once, as many as one answer may name."""
+MAX_WAITING: Final = 1000
+"""Waiting photos on the page at most: as many as one request can change."""
 
 
 def photos(call: Call, lens_id: str | None = None) -> tuple[list[PhotoOut], bool]:
@@ -31,7 +31,7 @@ def lenses(call: Call) -> list[LensOut]:
 
 
 def lenses_with_photos(call: Call) -> list[LensOut]:
-    """Return the newest lenses, but for those of which nothing is known and no photo can tell."""
+    """Return the newest lenses, except those without samples whose photos all failed or were cancelled."""
     return [lens for lens in lenses(call) if lens.samples or _hopeful(call, lens)]
 
 
@@ -54,5 +54,5 @@ def anew(call: Call, lens_id: str) -> int:
 
 def waiting(call: Call) -> list[Group]:
     """Group the photos that wait for their owner to say which lens it was."""
-    rows = call.store.photos.page(call.owner, before=None, limit=MOST_WAITING, state="needs_lens")
+    rows = call.store.photos.page(call.owner, before=None, limit=MAX_WAITING, state="needs_lens")
     return grouped([row for row in rows if row.lens_id is None])

@@ -1,4 +1,4 @@
-"""What changes on an open page, sent to it as it happens: one stream, silent while nothing does."""
+"""Changes of an open page, sent to it in one event stream."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from app.routes import photos as photo_routes
 router = APIRouter(include_in_schema=False)
 
 REDRAW_S: Final = 15.0
-"""How often a page is drawn anew though nothing happened: estimates of the time left change."""
+"""Seconds after which an unchanged page is rendered anew (chosen): estimates of time left change."""
 
 Page = Literal["home", "photo", "correction", "lens"]
 
@@ -36,7 +36,7 @@ async def events(
 ) -> EventSourceResponse:
     """Send the parts of a page now and whenever they change."""
     draw = _DRAWERS[page]
-    await run_in_threadpool(draw, call, id)  # what is not there is refused before the stream begins
+    await run_in_threadpool(draw, call, id)  # a missing object is refused before the stream begins
     return EventSourceResponse(_changes(call, page, id), ping=15)
 
 
@@ -46,7 +46,7 @@ async def _changes(call: Call, page: Page, key: str) -> AsyncIterator[ServerSent
     with call.services.pages.view(call.owner, page, key, draw) as view:
         while True:
             if not await run_in_threadpool(call.services.gate.is_still, call.who):
-                return  # his key was revoked while he watched
+                return  # the key was revoked meanwhile
             try:
                 parts = await view.parts()
             except (UnknownPhotoError, UnknownLensError, UnknownCorrectionError):  # deleted while watched

@@ -43,7 +43,11 @@ FILES: Final[Mapping[str, str]] = {
     "dng": "Linear DNG",
 }
 ENOUGH_PLACES: Final = 20
+"""Places in a zone from which it counts as well covered (chosen, not measured)."""
+
 SHOWN_PLACES: Final = 3
+"""Places that an advice names at most (chosen)."""
+
 ACTIVE: Final = frozenset({"received", "inspecting", "developing", "selecting", "estimating"})
 UNDEVELOPED: Final = frozenset({"received", "inspecting", "developing", "needs_lens", "failed", "cancelled"})
 REASONS: Final[Mapping[str, str]] = {
@@ -243,16 +247,16 @@ def changing_words(lens: LensOut, left: int) -> str:
     return f"None of its photos could be measured for the model {lens.psf_model}, so {answers} still."
 
 
-def centring_verdict(found: Decentring) -> str:
+def centring_verdict(decentring: Decentring) -> str:
     """Say in a word or two whether a lens is centred."""
     return {"centred": "Yes, as far as can be told.", "decentred": "No.", "unknown": "Undecided."}[
-        found.verdict
+        decentring.verdict
     ]
 
 
-def centring_words(found: Decentring) -> str:
+def centring_words(decentring: Decentring) -> str:
     """Write why, with its error."""
-    return f"{found.text[:1].upper()}{found.text[1:]}."
+    return f"{decentring.text[:1].upper()}{decentring.text[1:]}."
 
 
 def unit_name(unit: Unit) -> str:
@@ -266,10 +270,10 @@ def history_words(history: Sequence[CalibrationOut]) -> str:
     """Say in words what a curve cannot show: fewer than two versions with an error."""
     tested = [event for event in history if event.error]
     if tested:
-        found = tested[-1].error
-        zones = found if isinstance(found, Mapping) else dict.fromkeys(ZONES, found)
-        said = ", ".join(f"{ZONES[zone].lower()} {percent(zones.get(zone))}" for zone in ZONES)
-        return f"With {counted(tested[-1].photos, 'photo')}: {said}. The curve starts with the next photo."
+        error = tested[-1].error
+        zones = error if isinstance(error, Mapping) else dict.fromkeys(ZONES, error)
+        errors = ", ".join(f"{ZONES[zone].lower()} {percent(zones.get(zone))}" for zone in ZONES)
+        return f"With {counted(tested[-1].photos, 'photo')}: {errors}. The curve starts with the next photo."
     if history and history[-1].photos > 1:
         return "The photos are being tested on one another."
     return "One photo so far. Once there are more, they are tested on one another."
@@ -300,7 +304,7 @@ def coverage_bars(coverage: Mapping[str, Any] | None) -> list[ZoneBar]:
     return [ZoneBar(zone, ZONES[zone], round(100 * count / most), count) for zone, count in counts.items()]
 
 
-def coverage_advice(bars: Sequence[ZoneBar], seen: Sequence[FieldPosition]) -> str:
+def coverage_advice(bars: Sequence[ZoneBar], positions: Sequence[FieldPosition]) -> str:
     """Say which photo would teach most.
 
     Parameters
@@ -313,7 +317,7 @@ def coverage_advice(bars: Sequence[ZoneBar], seen: Sequence[FieldPosition]) -> s
     if not bars:
         return "Not counted yet."
     few = [bar.words.lower() for bar in bars if bar.count < ENOUGH_PLACES]
-    few = few or [place_in_words(place) for place in little_seen(seen)[:SHOWN_PLACES]]
+    few = few or [place_in_words(place) for place in little_seen(positions)[:SHOWN_PLACES]]
     if not few:
         return "Every part of the picture has been seen well."
     return f"Little seen so far: {', '.join(few)}. A photo with fine detail there, in focus, would help most."

@@ -15,12 +15,13 @@ from pydantic import (
 )
 
 MAX_PSF_SIZE = 255
+"""Side of a kernel in pixels at most (chosen, not measured)."""
 
 
 MAX_VERSION: Final = 2**31 - 1
 
 
-"""The largest that a column holds."""
+"""The largest number of an INTEGER column of PostgreSQL."""
 
 
 def blank_is_none(value: object) -> object:

@@ -50,9 +50,9 @@ class Display:
 
     def more(self, *, quiet: bool, verbose: int) -> Display:
         """Return the display after the options of a subcommand; they add to those of the program."""
-        made = Display(self.quiet or quiet, max(self.verbose, verbose))
-        made.configure()
-        return made
+        display = Display(self.quiet or quiet, max(self.verbose, verbose))
+        display.configure()
+        return display
 
     def configure(self) -> None:
         """Let the log lines of this process through to standard error."""

@@ -30,7 +30,7 @@ def photos(names: Iterable[str]) -> list[Path]:
     UsageError
         If a name matches nothing.
     """
-    found: dict[Path, None] = {}
+    unique: dict[Path, None] = {}
     for name in names:
         path = Path(name).expanduser()
         if path.is_dir():
@@ -47,19 +47,19 @@ def photos(names: Iterable[str]) -> list[Path]:
             matches = _sources(p for p in every if p.is_file())
             if not matches:
                 raise UsageError(f"no photo called {name}; check the name and the folder")
-        found.update(dict.fromkeys(matches))
-    return list(found)
+        unique.update(dict.fromkeys(matches))
+    return list(unique)
 
 
-def _sources(found: Iterable[Path]) -> list[Path]:
-    given = sorted(p for p in found if not p.stem.endswith(CORRECTED))
+def _sources(paths: Iterable[Path]) -> list[Path]:
+    given = sorted(p for p in paths if not p.stem.endswith(CORRECTED))
     raw = {p.with_suffix("") for p in given if p.suffix.lower() in RAW_ENDINGS}
     return [p for p in given if p.suffix.lower() in RAW_ENDINGS or p.with_suffix("") not in raw]
 
 
-def same(one: Path, other: Path) -> bool:
+def same(first: Path, second: Path) -> bool:
     """Tell whether two names are of one file."""
-    return one.exists() and other.exists() and one.samefile(other)
+    return first.exists() and second.exists() and first.samefile(second)
 
 
 def profile_at(path: Path) -> LensProfile:

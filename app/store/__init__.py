@@ -4,8 +4,8 @@ All functions take and give public ids. Rows are returned detached: plain values
 talk to the database. State changes are conditional updates that say whether they happened, so a
 step that runs twice, or loses a race against a cancel, changes nothing the second time.
 
-There are more than fifteen modules, one for each thing that is stored: folders for photos and for lenses
-would separate what one transaction changes together.
+There are more than fifteen modules because each thing that is stored has one: folders for photos and for
+lenses would separate what one transaction changes together.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ FAMILIES: Final[tuple[Family, ...]] = ("third order", "ray-traced")
 FIRST_SEED: Final = 1000
 """Seeds of third-order lenses below are for development; nothing is ever chosen on those from here on."""
 
-LOOKED_AT: Final = frozenset({"heliar", "reverse-telephoto"})
+LOOKED_AT: Final = frozenset({"heliar", "reverse-telephoto", "tronnier", "retrofocus"})
 """Designs of ray-traced lenses that were looked at during development; no other was."""
 
 _TRACED_FROM: Final = 2000

@@ -67,6 +67,14 @@ copies: Final = MappingProxyType(
             sensor_tilt_um=(-8.0, 6.0),
             corner_light=0.3,
         ),
+        "noct": Copy(
+            "noct",
+            1.2,
+            half_diagonal_mm=19.3,
+            faults=(Fault(2, (12.0, -9.0), (0.02, -0.03)),),
+            sensor_tilt_um=(6.0, 9.0),
+            corner_light=0.3,
+        ),
     }
 )
 """Copies by name."""

@@ -92,8 +92,12 @@ class TracedLens:
 
     @cached_property
     def rims(self) -> tuple[int, ...]:
-        """Surfaces whose clear apertures vignette: the first and the last."""
-        return (0, len(self.design.surfaces) - 1)
+        """Surfaces whose clear apertures vignette: the first and the last curved ones.
+
+        A plane cover glass is left out: there the axial light is far narrower than the image.
+        """
+        curved = [i for i, surface in enumerate(self.design.surfaces) if math.isfinite(surface.radius)]
+        return (curved[0], curved[-1])
 
     @cached_property
     def _perfect(self) -> Tracer:

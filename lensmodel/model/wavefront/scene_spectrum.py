@@ -20,17 +20,14 @@ cycles/pixel. Without b and d, sharp lenses came out half as wide again as they 
 patch's own: the blur changes within it, so that no zero of the OTF is seen as one. The same floor for all
 patches makes lenses of even blur likelier than the true ones.
 
-The numbers were measured on simulated photographs of the development half (lens seeds 0..30, Bayer DNG
-files): `python -m lensmodel.lab.model.scene_spectra` prints their like, but for d. That was fitted behind
-`Transfer` in turns with the scenes, by a script that is not kept: it is larger than what the aliases lack by
-themselves, and was kept for the lenses that it makes. Channels are tied to each other less closely than
-measured there: what is seen of red and blue errs alike in all bins of a patch, which no scatter of bins
-tells, and held together closely they outvoted green for wrong lenses.
+The numbers lie in `data/scene_spectrum.json`, with the command that measures them beside it.
 """
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -56,46 +53,22 @@ SHAPES: Final = np.stack(
 )
 """Values of the polynomial's terms in the bins, shape (BINS, 15)."""
 
-_USUAL = (0.0, -2.11, -0.25, -0.19, 0.0, 0.09, 0.03) + (0.0,) * 8
-_SPREAD = (1e-3, 0.5, 0.3, 0.45, 0.32, 0.16, 0.15, 0.24, 0.15, 0.25, 0.25, 0.2, 0.2, 0.13, 0.13)
-_AMPLITUDE = (-4.0, 6.0)  # of each channel: usual, spread
-_CHANNEL_SPREAD = (0.25, 0.25)  # of its slope and curvature about those of the patch
-_FLOOR = (-4.8, 1.3)  # logarithm of what fills the zeros of |OTF|^2: usual, spread
-PHOTO_SPREAD: Final = np.array([0.37, 0.2])
+_FITTED = json.loads((Path(__file__).parent / "data" / "scene_spectrum.json").read_text(encoding="utf-8"))
+"""What was fitted to photographs behind known lenses; `data/README.md` says what each entry is."""
+
+_USUAL, _SPREAD = _FITTED["usual"], _FITTED["spread"]
+_AMPLITUDE, _CHANNEL_SPREAD, _FLOOR = (_FITTED[name] for name in ("amplitude", "channel_spread", "floor"))
+
+PHOTO_SPREAD: Final = np.array(_FITTED["photo_spread"])
 """Standard deviations of what all patches of a photo share: slope and curvature."""
 
-_BIAS = (0.17, -0.07, -0.12, -0.07, -0.01, 0.02, 0.06, 0.07, 0.01, -0.15, -0.3)
-# Of each ring what its bins next to the axes, next to the diagonals, and those between have beyond that.
-_PATTERN = (
-    (-0.25, 0.09, 0.21),
-    (-0.14, -0.04, 0.19),
-    (-0.07, 0.06, 0.02),
-    (0.04, 0.0, -0.03),
-    (0.04, -0.02, -0.01),
-    (0.0, 0.06, -0.06),
-    (-0.04, 0.06, -0.06),
-    (-0.14, 0.03, -0.04),
-    (-0.17, -0.06, -0.06),
-    (-0.12, -0.04, -0.02),
-    (0.10, 0.0, 0.05),
-)
-_WITH_POWER = (
-    *(((0.0, 0.0, 0.0),) * 7),
-    (0.1, 0.35, 0.45),
-    (0.0, 1.4, 0.05),
-    (0.05, 0.65, 0.05),
-    (-0.1, -0.8, -0.3),
-)
-_ROUGHNESS = (0.42, 0.36, 0.31, 0.30, 0.27, 0.25, 0.24, 0.24, 0.24, 0.28, 0.4)
-_OWN, _NOISY = 0.22, 0.35
-# Demosaicing borrows the finest detail of red and blue from green, and smooths their noise.
-_BORROWED = (0.0, 0.0, 0.0, 0.0, 0.05, 0.1, 0.2, 0.5) + (1e3,) * BORROWED_RINGS
-_NOISE_GREEN = (1.0,) * 9 + (0.81, 0.68)
-_NOISE_OTHER = (1.0,) * 8 + (0.95, 0.68, 0.46)
-_SMALLEST = 1e-15
+_ROUGHNESS, _OWN, _NOISY = (_FITTED[name] for name in ("roughness", "own_scatter", "noisy_scatter"))
+_BORROWED = _FITTED["borrowed"] + [1e3] * BORROWED_RINGS  # rings that only green tells of have no say
+_NOISE_GREEN, _NOISE_OTHER = _FITTED["noise_green"], _FITTED["noise_other"]
+_SMALLEST = 1e-15  # power of a bin: keeps its logarithm finite, far below any noise
 
 
-def _rings(values: tuple[float, ...]) -> Floats:
+def _rings(values: list[float]) -> Floats:
     return np.repeat(np.asarray(values, dtype=np.float64), SECTORS)
 
 
@@ -103,14 +76,14 @@ ORBITS: Final = np.array((0, 2, 1, 1, 2, 0) * 2)
 """Which sectors are alike on a square lattice, shape (SECTORS,): at its axes 0, diagonals 1, between 2."""
 
 
-def _angles(values: tuple[tuple[float, float, float], ...]) -> Floats:
+def _angles(values: list[list[float]]) -> Floats:
     return np.asarray(values, dtype=np.float64)[:, ORBITS].ravel()
 
 
-BIAS: Final = _rings(_BIAS) + _angles(_PATTERN)
+BIAS: Final = _rings(_FITTED["bias"]) + _angles(_FITTED["pattern"])
 """Mean of the log power about the polynomial and ln |OTF|^2, shape (BINS,)."""
 
-WITH_POWER: Final = _angles(_WITH_POWER)
+WITH_POWER: Final = _angles(_FITTED["with_power"])
 """What is seen beyond that behind `Transfer`, per |OTF|^4, shape (BINS,)."""
 
 

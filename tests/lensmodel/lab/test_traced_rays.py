@@ -213,3 +213,14 @@ def test_designs_say_how_far_they_open() -> None:
         Tracer(designs.create("tronnier")).marginal(0.6)
     with pytest.raises(InvalidInputError, match="elements"):
         Tracer(designs.create("tronnier"), (Fault(9),))
+
+
+def test_light_of_the_corner_passes_a_cover_glass_before_the_sensor() -> None:
+    lens = TracedLens(copies["noct"])
+    last = lens.design.surfaces[lens.rims[-1]]
+
+    assert math.isfinite(last.radius)
+    assert lens.rims[-1] < len(lens.design.surfaces) - 1
+    pupils = lens.pupils((1.0, 0.0), "g", 1.2)
+    assert len(pupils) == lens.copy.wavelengths
+    assert sum(weight for _, _, weight in pupils) == pytest.approx(1.0)

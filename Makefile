@@ -8,6 +8,8 @@ STAMP := $(VENV)/.installed
 # threads of their own only fight with it.
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
+# Tests start hundreds of processes: whatever the surroundings say, each module is compiled once.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: help install demo test test-all serve check security torture fuzz format bench docs notebooks \
   wheel-check gallery lock \

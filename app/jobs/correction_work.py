@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 import math
 import time
+from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -47,12 +49,17 @@ THREAD_MB: Final = 136
 most of it never touched."""
 
 
+FAMILIES: Final = 8
+"""Fitted families in memory (chosen): those of the lenses whose previews are being looked at."""
+
+
 class CorrectionWork:
     """Jobs of corrections and of lens versions."""
 
     def __init__(self, bench: Workbench) -> None:
         self._bench = bench
         self._corrections = bench.store.corrections
+        self._families: OrderedDict[str, bytes] = OrderedDict()
 
     def correction(self, correction_id: str, epoch: int = 1) -> None:
         """Make the corrected file."""
@@ -104,7 +111,7 @@ class CorrectionWork:
             state = self._samples(lens_id, version, folder)
             arguments["model"] = of_models(settings, state.way)
             known = (folder / LEARNED).is_file()
-            leaning = self._family(params.get("family", []), folder)
+            leaning, fitted = self._family(params.get("family", []), arguments["model"], folder)
             done = self._bench.attempt(
                 "correct",
                 arguments,
@@ -117,18 +124,41 @@ class CorrectionWork:
             )
             if not known and self._is_newest(lens_id, version):
                 self._keep_learned(lens_id, version, state, folder / LEARNED)
+            self._keep_family(fitted, folder / FAMILY / LEARNED)
             report = done["report"] | ({"family": {"lenses": leaning}} if leaning else {})
             self._store_result(plan, folder / Path(done["file"]).name, report)
 
-    def _family(self, relatives: list[dict[str, Any]], folder: Path) -> int:
-        """Pass the samples of other copies of the lens to the task; return the number of copies."""
+    def _family(
+        self, relatives: list[dict[str, Any]], model: dict[str, str], folder: Path
+    ) -> tuple[int, str]:
+        """Pass the samples of other copies of the lens to the task, and their fit if it is in memory.
+
+        Returns
+        -------
+        copies : int
+        key : str
+            Of the fit: the copies with their versions, and the settings of the model.
+        """
         family = [Relative(entry["lens_id"], LensState(**entry["state"])) for entry in relatives]
         stored = self._bench.store.samples.of_family(family)
         if not stored:
-            return 0
+            return 0, ""
         (folder / FAMILY).mkdir()
         write_samples(folder / FAMILY, stored)
-        return len(family)
+        key = json.dumps([relatives, model], sort_keys=True)
+        fitted = self._families.get(key)
+        if fitted is not None:
+            (folder / FAMILY / LEARNED).write_bytes(fitted)
+        return len(family), key
+
+    def _keep_family(self, key: str, path: Path) -> None:
+        """Keep the fit of a family for the next correction: previews come in rows."""
+        if not path.is_file():
+            return
+        self._families.pop(key, None)
+        self._families[key] = path.read_bytes()
+        while len(self._families) > FAMILIES:
+            self._families.popitem(last=False)
 
     def _samples(self, lens_id: str, version: int, folder: Path) -> LensState:
         state, stored = self._bench.store.samples.of_lens(lens_id, up_to_version=version)

@@ -296,16 +296,25 @@ def _model(folder: Path, settings: ModelSettings) -> LensModel:
             return LensModel.restored(samples, learned.read_bytes(), settings)
         except InvalidInputError as error:
             log.info("the model is fitted anew: %s", error)
+            learned.unlink()
     return LensModel.fit(samples, settings)
 
 
 def _with_family(folder: Path, settings: ModelSettings) -> LensModel:
-    """Fit the model of the samples in a folder, with other copies as its prior if they are given."""
+    """Fit the model of the samples in a folder, with other copies as its prior if they are given.
+
+    Fits that were not given are written beside their samples.
+    """
     model, family = _model(folder, settings), folder / FAMILY
     if not (folder / LEARNED).is_file():
         model = model.warmed()
         (folder / LEARNED).write_bytes(model.learned())
-    return model.with_prior(_model(family, settings)) if family.is_dir() else model
+    if not family.is_dir():
+        return model
+    prior = _model(family, settings)
+    if not (family / LEARNED).is_file():
+        (family / LEARNED).write_bytes(prior.learned())
+    return model.with_prior(prior)
 
 
 def _samples(folder: Path) -> list[PsfSample]:

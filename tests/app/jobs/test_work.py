@@ -19,7 +19,7 @@ from app.jobs.correction_work import CorrectionWork
 from app.jobs.missing_reports import ask_for_reports
 from app.jobs.photo_work import PhotoWork
 from app.jobs.queue import Handler, Job, Kind, Status
-from app.jobs.task_files import KERNELS, LEARNED, PREVIEW, SAMPLES
+from app.jobs.task_files import FAMILY, KERNELS, LEARNED, PREVIEW, SAMPLES
 from app.runtime.settings import Settings
 from app.sandbox.budget import Budget
 from app.sandbox.child import Progress
@@ -611,6 +611,32 @@ def test_what_a_correction_learned_of_an_earlier_version_is_not_kept(
     assert bench.store.samples.of_lens(lens_id)[0].version == 2
     with pytest.raises(FileNotFoundError):
         bench.storage.get(learned_key(lens_id, 1, state.rebuild_epoch))
+
+
+def test_a_family_is_fitted_once_until_one_of_its_copies_changes(
+    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+) -> None:
+    given: list[bytes | None] = []
+
+    def lean(arguments: dict[str, Any], folder: Path) -> Outcome:
+        fitted = folder / FAMILY / LEARNED
+        given.append(fitted.read_bytes() if fitted.exists() else None)
+        fitted.write_bytes(f"fit {len(given)}".encode())
+        return write_result(arguments, folder)
+
+    def relatives() -> list[dict[str, Any]]:
+        family = bench.store.samples.family_of(steps.lens_id(counted))
+        return [relative.named() for relative in family]
+
+    sandbox.answers["correct"] = [lean]
+    work = CorrectionWork(bench)
+    steps.counted(serial="old")
+    for strength in (1.0, 0.5):
+        work.correction(ask(bench, counted, steps, strength=strength, family=relatives()))
+    steps.counted(serial="old")
+    work.correction(ask(bench, counted, steps, family=relatives()))
+
+    assert given == [None, b"fit 1", None]
 
 
 def test_a_photographers_bounds_reach_the_correction_and_its_tag(

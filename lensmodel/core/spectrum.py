@@ -154,15 +154,15 @@ def tail_of(patch: Plane, width_px: float) -> tuple[float, float]:
     square = across**2 + up**2
     spectrum = scipy.fft.rfft2((values - values.mean()) * window) * np.exp(-0.5 * _TAIL_SOFT_PX**2 * square)
     skew = float(np.clip(width_px, *_TAIL_SIGMA)) ** 3 / 6.0
-    found = []
+    asymmetries = []
     for along in (across, up):
         phase = np.clip(skew * along * square, -_TAIL_PHASE, _TAIL_PHASE)
         towards, away = (
             _sparsity(scipy.fft.irfft2(spectrum * np.exp(sign * 1j * phase), s=patch.shape))
             for sign in (-1, 1)
         )
-        found.append((away - towards) / max(away + towards, 1e-12))
-    return found[0], found[1]
+        asymmetries.append((away - towards) / max(away + towards, 1e-12))
+    return asymmetries[0], asymmetries[1]
 
 
 def _sparsity(image: NDArray[np.float64]) -> float:

@@ -195,9 +195,9 @@ def restore_cell(job: CorrectionJob, cell: Cell) -> RestoredCell:
         ]
         return blurs, restore_planes(job.method, tile.photo, blurs, tile.sensors)
 
-    found = _within(job, tile, job.bounds, solved)
+    restored = _within(job, tile, job.bounds, solved)
     layers = tuple(_within(job, tile, bounds, solved).planes for bounds in job.layers)
-    return replace(found, layers=layers) if layers else found
+    return replace(restored, layers=layers) if layers else restored
 
 
 def _within(

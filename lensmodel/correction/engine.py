@@ -48,19 +48,19 @@ def tell_of_compiling() -> None:
     """Log once when Numba compiles; loading what was compiled before is no such event."""
     event = importlib.import_module("numba.core.event")
 
-    class Teller(event.Listener):  # type: ignore[misc, name-defined] # Numba has no types
-        told = False
+    class CompilationLog(event.Listener):  # type: ignore[misc, name-defined] # Numba has no types
+        logged = False
 
         def on_start(self, event: object) -> None:
             del event
-            if not self.told:
-                self.told = True
+            if not self.logged:
+                self.logged = True
                 first_use.info("compiling the inner loops, once on this machine: about %d s", COMPILE_S)
 
         def on_end(self, event: object) -> None:
             """Nothing is said of the end: the progress shows it."""
 
-    event.register("numba:compile", Teller())
+    event.register("numba:compile", CompilationLog())
 
 
 def keep_freed_memory() -> None:

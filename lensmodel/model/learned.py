@@ -118,7 +118,7 @@ def load(data: bytes, samples: Sequence[PsfSample], settings: ModelSettings) -> 
 
 def _belongs(samples: Sequence[PsfSample], settings: ModelSettings) -> str:
     """Checksum of settings and of what names the samples: their pixels are rounded when they are stored."""
-    found = zlib.crc32(json.dumps(asdict(settings), sort_keys=True).encode())
+    checksum = zlib.crc32(json.dumps(asdict(settings), sort_keys=True).encode())
     for s in samples:
         named = (
             s.photo,
@@ -128,8 +128,8 @@ def _belongs(samples: Sequence[PsfSample], settings: ModelSettings) -> str:
             s.kernel.shape[0],
             s.settings,
         )
-        found = zlib.crc32(f"{named} {s.position.r:.6f} {s.position.phi:.6f}".encode(), found)
-    return f"{len(samples)}-{found:08x}"
+        checksum = zlib.crc32(f"{named} {s.position.r:.6f} {s.position.phi:.6f}".encode(), checksum)
+    return f"{len(samples)}-{checksum:08x}"
 
 
 def _scalars(value: Any) -> dict[str, Any]:  # noqa: ANN401 - any of the frozen values here
@@ -147,7 +147,7 @@ def _arrays(prefix: str, value: Any) -> Arrays:  # noqa: ANN401 - likewise
 
 
 def _checked(arrays: Mapping[str, NDArray[Any]], count: int) -> Arrays:
-    found: Arrays = {}
+    checked: Arrays = {}
     for name, values in arrays.items():
         numbers = np.asarray(values, dtype=np.float64)
         # an unknown setting is NaN, and only points have settings
@@ -156,13 +156,13 @@ def _checked(arrays: Mapping[str, NDArray[Any]], count: int) -> Arrays:
             raise ValueError(f"{name} is not finite")
         if name.endswith(("votes", "errors", "noise")) and numbers.min(initial=0.0) < 0:
             raise ValueError(f"{name} is negative")
-        told = name.startswith("physical") and name.endswith(".errors")
-        if (told or name in {"votes", "errors", "noise", "image_errors"}) and len(numbers) != count:
+        per_sample = name.startswith("physical") and name.endswith(".errors")
+        if (per_sample or name in {"votes", "errors", "noise", "image_errors"}) and len(numbers) != count:
             raise ValueError(f"{name} has {len(numbers)} entries for {count} samples")
         if numbers.ndim and len(numbers) > max(count, _MOST_NODES):
             raise ValueError(f"{name} has {len(numbers)} entries")
-        found[name] = numbers
-    return found
+        checked[name] = numbers
+    return checked
 
 
 def _of(arrays: Arrays, prefix: str) -> dict[str, Any]:
@@ -175,12 +175,16 @@ def _physical(document: Mapping[str, Any], lines: dict[str, Any], arrays: dict[s
     scalars, front = dict(document), dict(document["front"])
     del scalars["front"]
     wavefront = Wavefront(**lines, **{**front, "eye": tuple(front["eye"])})
-    found = Physics(front=wavefront, **scalars, **arrays)
-    if not 0.0 <= found.turned <= 1.0:
+    physics = Physics(front=wavefront, **scalars, **arrays)
+    if not 0.0 <= physics.turned <= 1.0:
         raise ValueError("a probability lies outside 0..1")
-    if found.side < 1 or found.side % 2 == 0 or found.rest.shape != (len(found.vectors), found.side**2):
+    if (
+        physics.side < 1
+        or physics.side % 2 == 0
+        or physics.rest.shape != (len(physics.vectors), physics.side**2)
+    ):
         raise ValueError("a wavefront and the rest of its samples do not fit together")
-    return found
+    return physics
 
 
 def _fit(

@@ -143,8 +143,8 @@ class LensModel:
         """Whether answers need a wavefront, or patches can judge it as a second opinion."""
         if self.settings.mode == WAVEFRONT:
             return True
-        heard = self.settings.mode == MIXED or any(s.spectrum is not None for s in self.samples)
-        return heard and self._predictor.smoother.physical
+        informed = self.settings.mode == MIXED or any(s.spectrum is not None for s in self.samples)
+        return informed and self._predictor.smoother.physical
 
     def warmed(self, on_step: StepHook = ignore_step) -> LensModel:
         """Return the model with the wavefront fitted to its samples, if its method or mode has one.
@@ -286,14 +286,14 @@ class LensModel:
 
     def kernel_of(self, sample: PsfSample) -> Kernel:
         """Return the PSF at the place and settings of a sample, in its pixels and of its size."""
-        found = self.kernels(
+        kernels = self.kernels(
             [sample.position],
             sample.settings,
             sample.kernel.shape[0],
             pitch_um=sample.pixel_pitch_um,
             half_diagonal_px=sample.half_diagonal_px,
         )
-        return np.asarray(found[0])
+        return np.asarray(kernels[0])
 
     def weights(
         self, position: FieldPosition, settings: LensSettings
@@ -363,11 +363,11 @@ class LensModel:
         """
         if len(self._fit.roster.numbers) < 2:
             return {}
-        found: dict[Zone, list[float]] = {zone: [] for zone in ZONES}
+        errors: dict[Zone, list[float]] = {zone: [] for zone in ZONES}
         for sample, error in zip(self.samples, self._fit.validation.errors, strict=True):
             if sample.settings.channel == "g" and sample.photo not in self.settings.excluded:
-                found[zone_of(sample.position.r)].append(float(error))
-        return {zone: float(np.median(values)) for zone, values in found.items() if values}
+                errors[zone_of(sample.position.r)].append(float(error))
+        return {zone: float(np.median(values)) for zone, values in errors.items() if values}
 
     @property
     def nbytes(self) -> int:

@@ -113,8 +113,8 @@ def rescaled(kernel: Kernel, own: float, wanted: float, size: int) -> Kernel:
     into = _wave(frequency, side, -1.0) / period
     out = _wave(frequency, size, ratio)
     along = (out.T * pixel) @ into  # what is done on one axis; the spectrum itself may be huge
-    found = (along @ kernel @ along.T).real
-    return as_kernel(np.maximum(found, 0.0))
+    resampled = (along @ kernel @ along.T).real
+    return as_kernel(np.maximum(resampled, 0.0))
 
 
 def _wave(frequency: NDArray[np.floating], size: int, step: float) -> NDArray[np.complex128]:

@@ -209,8 +209,8 @@ def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> 
         model = _model(samples, _settings(document["model"]), learned)
         if family is not None:
             other = _read(io.BytesIO(family), f"the family in {name}", alone=True)
-            told = document["family"]
-            model = model.with_prior(other.model, float(told["strength"]), str(told["name"])[:200])
+            leaning = document["family"]
+            model = model.with_prior(other.model, float(leaning["strength"]), str(leaning["name"])[:200])
         cameras = tuple(_camera(_texts(camera)) for camera in document.get("cameras", []))
         return LensProfile(model, _texts(document["lens"]), _texts(document["photos"]), cameras)
     except LensModelError:

@@ -85,7 +85,7 @@ def bandwidths(where: NDArray[np.float64]) -> dict[str, float]:
     spread = {column: float(np.nanstd(_known(where[:, column]))) for column in varying}
     d = 2 + sum(value > _SAME for value in spread.values())
     n = int(counts.max())
-    found = {
+    bandwidths = {
         "r": max(_PLACE_SHARE * rule_of_thumb(float(where[:, 0].std()), d, n), _FLOOR_R),
         "phi": max(_PLACE_SHARE * rule_of_thumb(math.sqrt(0.5), d, n), _FLOOR_PHI),
         **FALLBACK,
@@ -93,8 +93,8 @@ def bandwidths(where: NDArray[np.float64]) -> dict[str, float]:
     for column, sigma in spread.items():
         name = COLUMNS[column]
         if sigma > _SAME:
-            found[name] = min(FALLBACK[name], rule_of_thumb(sigma, d, n))
-    return found
+            bandwidths[name] = min(FALLBACK[name], rule_of_thumb(sigma, d, n))
+    return bandwidths
 
 
 def support(widths: Mapping[str, float]) -> dict[str, float]:
@@ -111,9 +111,9 @@ def gaps(
     where: NDArray[np.float64], asked: NDArray[np.float64], scale: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Differences of points `(n, d)` from one point `(d,)` in bandwidths; 0 where either is unknown."""
-    found = (where - asked) / scale
-    found[np.isnan(found)] = 0.0
-    return np.asarray(found)
+    gaps = (where - asked) / scale
+    gaps[np.isnan(gaps)] = 0.0
+    return np.asarray(gaps)
 
 
 def squared_distances(

@@ -125,14 +125,14 @@ class PupilGrid:
         wave = unit * amplitude
         field = self._field(wave)
         factor = np.complex64(1j * math.pi / self.q)
-        found = []
+        derivatives = []
         for term in self.terms:
             change = self._field(wave * term) * factor
-            found.append(self._binned(2.0 * (field.real * change.real + field.imag * change.imag)))
+            derivatives.append(self._binned(2.0 * (field.real * change.real + field.imag * change.imag)))
         for other in others:
             change = self._field(unit * other)
-            found.append(self._binned(2.0 * (field.real * change.real + field.imag * change.imag)))
-        return self._binned(field.real**2 + field.imag**2), np.stack(found)
+            derivatives.append(self._binned(2.0 * (field.real * change.real + field.imag * change.imag)))
+        return self._binned(field.real**2 + field.imag**2), np.stack(derivatives)
 
     def centre(self, g: NDArray[np.float64], amplitude: NDArray[np.float32]) -> tuple[float, float]:
         """Where the rays' centre of mass lies, (right, up) pixels, tilts left out."""
@@ -183,7 +183,7 @@ def _pixels(fine: int, across: int, size: int, away: float) -> NDArray[np.float3
     )
     taps = np.convolve(cubic, np.ones(fine))
     first = (across - size) // 2 * fine + whole - 1
-    found = np.zeros((size, fine * across + 2 * _RIM), dtype=np.float32)
+    matrix = np.zeros((size, fine * across + 2 * _RIM), dtype=np.float32)
     cols = first + _RIM + fine * np.arange(size)[:, None] + np.arange(len(taps))
-    found[np.arange(size)[:, None], cols] = taps
-    return found[:, _RIM:-_RIM]
+    matrix[np.arange(size)[:, None], cols] = taps
+    return matrix[:, _RIM:-_RIM]

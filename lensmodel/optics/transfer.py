@@ -154,11 +154,11 @@ class Transfer:
         eye = np.array([radius, *shift], dtype=np.float32)
         out = np.zeros((self.pixel.size, COLUMNS), dtype=np.float32)
         _engine()(*self.points, *self.shifts, turns, eye, np.float32(self.steep), out)
-        found = out.astype(np.float64) / area
-        otf: Waves = found[:, 0] + 1j * found[:, 1]
-        by_blur: Waves = (found[:, 2:8] + 1j * found[:, 8:14]) * complex(math.pi / self.q)
+        sums = out.astype(np.float64) / area
+        otf: Waves = sums[:, 0] + 1j * sums[:, 1]
+        by_blur: Waves = (sums[:, 2:8] + 1j * sums[:, 8:14]) * complex(math.pi / self.q)
         loss = [2.0 * float((open_ * open_ * alone * own).sum()) / area for own in alone_by]
-        by_eye: Waves = found[:, 14:17] + 1j * found[:, 17:20] - otf[:, None] * np.array(loss)
+        by_eye: Waves = sums[:, 14:17] + 1j * sums[:, 17:20] - otf[:, None] * np.array(loss)
         return otf, by_blur, by_eye
 
     def _centre(

@@ -54,14 +54,14 @@ def design(position: FieldPosition, settings: LensSettings) -> NDArray[np.float6
     x, y = position.r * math.cos(position.phi), position.r * math.sin(position.phi)
     r2, t = position.r**2, (WAVELENGTH_NM[settings.channel] - WAVELENGTH_NM["g"]) / 100.0
     xx, xy = x * x - y * y, 2.0 * x * y
-    found = np.zeros((6, len(NAMES)))
-    found[0, :2] = 1.0, r2
-    found[1, 2:6] = x, 1.0, 0.0, r2 * x
-    found[2, 2:6] = y, 0.0, 1.0, r2 * y
-    found[3, 6:13] = 1.0, x, y, r2, r2 * r2, t, t * t
-    found[4, 13:] = xx, x, -y, 1.0, 0.0, r2 * xx
-    found[5, 13:] = xy, y, x, 0.0, 1.0, r2 * xy
-    return found
+    rows = np.zeros((6, len(NAMES)))
+    rows[0, :2] = 1.0, r2
+    rows[1, 2:6] = x, 1.0, 0.0, r2 * x
+    rows[2, 2:6] = y, 0.0, 1.0, r2 * y
+    rows[3, 6:13] = 1.0, x, y, r2, r2 * r2, t, t * t
+    rows[4, 13:] = xx, x, -y, 1.0, 0.0, r2 * xx
+    rows[5, 13:] = xy, y, x, 0.0, 1.0, r2 * xy
+    return rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,12 +126,12 @@ class Wavefront:
 
     def blur(self, position: FieldPosition, settings: LensSettings) -> NDArray[np.float64]:
         """Blur of the terms of `pupil` in pixels, tilts zero, shape (8,)."""
-        found = np.zeros(8)
+        blur = np.zeros(8)
         terms = self.terms
         if self.slopes is not None:
             terms = terms + self.slopes * self.octaves(settings)
-        found[:6] = stopped(design(position, settings), self.stop(settings)) @ terms
-        return found
+        blur[:6] = stopped(design(position, settings), self.stop(settings)) @ terms
+        return blur
 
     def octaves(self, settings: LensSettings) -> float:
         """Focal length from `focal_octaves` on; an unknown one counts as that."""
@@ -172,8 +172,8 @@ class Wavefront:
             for _ in range(_MOVES):
                 # where light is narrower than the fine grid, a cubic between its samples dips below zero
                 light = np.maximum(grid.binned(fine, size, away), 0.0)
-                found = np.array(centroid(light))
-                gap, away = math.hypot(*found), away + found
+                offset = np.array(centroid(light))
+                gap, away = math.hypot(*offset), away + offset
                 if gap < _CENTRED_PX or np.abs(away).max() > _SPARE:
                     break
             g[6:] += -away[1], away[0]

@@ -46,8 +46,8 @@ def curves_of(transfer: Transfer, icc: bytes | None = None) -> tuple[Curve, Curv
     codes = np.linspace(0.0, 1.0, CODES)
     if transfer == "linear":
         return (codes.astype(np.float32),) * 3
-    if transfer == "icc" and icc is not None and (found := icc_curves(icc)):
-        return found
+    if transfer == "icc" and icc is not None and (curves := icc_curves(icc)):
+        return curves
     return (srgb_to_linear(codes).astype(np.float32),) * 3
 
 

@@ -88,7 +88,7 @@ def _coding_noise(planes: Planes, coarseness: float) -> NoiseModel | None:
     """
     if not coarseness:
         return None
-    levels = [found for plane in planes if (found := stored_levels(plane)) is not None]
+    levels = [count for plane in planes if (count := stored_levels(plane)) is not None]
     return coding_noise(coarseness, max(levels, key=len)) if levels else None
 
 

@@ -1,4 +1,4 @@
-"""What can be told of a photo without decoding it."""
+"""What is known of a photo without decoding it."""
 
 from __future__ import annotations
 

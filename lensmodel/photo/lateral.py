@@ -188,9 +188,9 @@ def _points(green: Plane, frame: Frame) -> Iterator[tuple[int, int]]:
         for j in range(_CELLS):
             top, left = i * rows // _CELLS, j * cols // _CELLS
             part = (slice(top, (i + 1) * rows // _CELLS), slice(left, (j + 1) * cols // _CELLS))
-            found = np.argwhere(peak[part])
-            strength = weaker[part][tuple(found.T)]
-            for row, col in found[np.argsort(-strength, kind="stable")[:_POINTS]]:
+            peaks = np.argwhere(peak[part])
+            strength = weaker[part][tuple(peaks.T)]
+            for row, col in peaks[np.argsort(-strength, kind="stable")[:_POINTS]]:
                 yield int((top + row) * bin_by), int((left + col) * bin_by)
 
 
@@ -286,8 +286,8 @@ def _huber(
         if columns is None:
             break
         root = np.sqrt(weight)
-        found = np.linalg.lstsq(columns * root[:, None], shift * root, rcond=None)[0]
-        solution = np.asarray(found, dtype=np.float64)
+        coefficients = np.linalg.lstsq(columns * root[:, None], shift * root, rcond=None)[0]
+        solution = np.asarray(coefficients, dtype=np.float64)
         residual = np.asarray(shift - columns @ solution, dtype=np.float64)
     size = np.minimum(np.abs(residual), 3.0 * scale)  # gross outliers count once, not squared
     return solution, float(np.mean(size**2)) + 1e-8

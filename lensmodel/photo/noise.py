@@ -127,8 +127,8 @@ def graininess(plane: Plane, noise: NoiseModel, clip: float = 1.0) -> float:
     levels = np.quantile(fine[::GRAIN, ::GRAIN], _GRAIN_LEVELS)
     single = noise.variance(levels)
     several = estimate_noise(blocks.mean(axis=(1, 3), dtype=np.float32), clip).variance(levels)
-    told = (single > 0.0) & (several > 0.0)
-    return float(np.exp(np.log(GRAIN**2 * several[told] / single[told]).mean())) if told.any() else 1.0
+    usable = (single > 0.0) & (several > 0.0)
+    return float(np.exp(np.log(GRAIN**2 * several[usable] / single[usable]).mean())) if usable.any() else 1.0
 
 
 def _sampled(plane: Plane) -> Plane:
@@ -162,15 +162,15 @@ def _levels(
         return nothing
     mean, texture, high_blocks = mean[usable], texture[usable], high_blocks[usable]
     order = np.argsort(mean)
-    found = []
+    rows = []
     for part in np.array_split(order, max(1, min(_BINS, len(order) // (4 * _MIN_BLOCKS)))):
         keep = max(_MIN_BLOCKS, int(_FLAT_SHARE * len(part)))
         flat = part[np.argsort(texture[part])[:keep]]
         values = high_blocks[flat]
         sigma = _scale(values)
         if sigma > 0:  # else most differences are exactly 0: rounding or compression ate the noise
-            found.append((float(mean[flat].mean()), sigma * sigma, float(values.size)))
-    table = np.array(found).reshape(-1, 3)
+            rows.append((float(mean[flat].mean()), sigma * sigma, float(values.size)))
+    table = np.array(rows).reshape(-1, 3)
     return table[:, 0], table[:, 1], table[:, 2]
 
 

@@ -113,7 +113,7 @@ class PhotoMetadata:
 
 @dataclass(frozen=True, slots=True)
 class PhotoInfo:
-    """What can be told of a photo without decoding it.
+    """What is known of a photo without decoding it.
 
     Parameters
     ----------

@@ -104,7 +104,7 @@ def measure_edges(
         If no edge can be measured.
     """
     frame = Frame(*plane.shape)
-    found = []
+    measured = []
     for box in boxes:
         row, col, height, width = box
         if row < 0 or col < 0 or row + height > frame.height or col + width > frame.width:
@@ -116,7 +116,7 @@ def measure_edges(
             continue
         position = frame.position(row + (height - 1) / 2.0, col + (width - 1) / 2.0)
         along_u = abs(math.cos(response.normal - position.phi)) >= math.sqrt(0.5)
-        found.append(
+        measured.append(
             EdgeMeasurement(
                 box=box,
                 position=position,
@@ -124,9 +124,9 @@ def measure_edges(
                 response=response.compensated() if rendered else response,
             )
         )
-    if not found:
+    if not measured:
         raise NotEnoughEvidenceError(f"none of the {len(boxes)} boxes holds a measurable edge")
-    return tuple(found)
+    return tuple(measured)
 
 
 def by_zone(measurements: Sequence[EdgeMeasurement]) -> dict[Zone, ZoneSharpness]:

@@ -95,12 +95,12 @@ def find_edges(
     taken: list[Box] = []
     upright: list[bool] = []
     tried: dict[tuple[int, int], tuple[int, int]] = {}
-    found, looked = dict.fromkeys(ZONES, 0), dict.fromkeys(ZONES, 0)
+    accepted, looked = dict.fromkeys(ZONES, 0), dict.fromkeys(ZONES, 0)
     with np.errstate(all="ignore"):  # light beyond what float32 can square is no edge
         candidates = _candidates(_means(plane))
     for row, col in candidates:
         zone = zone_of(frame.position(origin[0] + row, origin[1] + col).r)
-        if found[zone] == _ENOUGH or looked[zone] == _TRIED or _near(row, col, tried):
+        if accepted[zone] == _ENOUGH or looked[zone] == _TRIED or _near(row, col, tried):
             continue
         looked[zone] += 1
         tried[row // _APART, col // _APART] = row, col
@@ -116,7 +116,7 @@ def find_edges(
         if best is not None:
             taken.append(best[0])
             upright.append(abs(math.cos(best[1].normal)) > math.sqrt(0.5))
-            found[zone] += 1
+            accepted[zone] += 1
     chart = len(taken) >= LEAST_ON_A_CHART and any(upright) and not all(upright)
     return tuple(taken) if chart else ()
 

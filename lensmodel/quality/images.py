@@ -111,7 +111,7 @@ def registered_zone_psnr(
     if min(frame.height, frame.width) < block or block <= 2 * border:
         raise InvalidInputError(f"{frame} is too small for blocks of {block} with a border of {border}")
     radius = frame.radius_map()
-    wanted, found = (to_srgb(reference), to_srgb(image)) if srgb else (reference, image)
+    wanted, tested = (to_srgb(reference), to_srgb(image)) if srgb else (reference, image)
     total = dict.fromkeys(ZONES, 0.0)
     count = dict.fromkeys(ZONES, 0)
     core = (..., slice(border, -border), slice(border, -border))
@@ -119,10 +119,10 @@ def registered_zone_psnr(
     for row in _starts(frame.height, block, step):
         for col in _starts(frame.width, block, step):
             window = (..., slice(row, row + block), slice(col, col + block))
-            shift = best_shift(found[window], wanted[window])
+            shift = best_shift(tested[window], wanted[window])
             if max(map(abs, shift)) > _LARGEST_SHIFT:
                 shift = (0.0, 0.0)  # nothing in the block says where it lies
-            error = np.square(shifted(found[window], *shift) - wanted[window])[core]
+            error = np.square(shifted(tested[window], *shift) - wanted[window])[core]
             zones = radius[window][core]
             for zone in ZONES:
                 inside = np.broadcast_to(_in_zone(zones, zone), error.shape)

@@ -104,14 +104,14 @@ def advice(model: LensModel, settings: LensSettings | None = None) -> Advice:
         The same for the same model, whatever the order of its samples.
     """
     wanted = _settings(model) if settings is None else [replace(settings, channel="g")]
-    found = [
+    shots = [
         _wish(model, place, each.with_channel(channel))
         for each in wanted
         for channel in CHANNELS
         for place in landmarks()
     ]
     # green before red and blue, near before far, right before left: ties must not depend on anything else
-    found.sort(
+    shots.sort(
         key=lambda w: (
             -round(w.gain, 6),
             w.settings.channel != "g",
@@ -122,7 +122,7 @@ def advice(model: LensModel, settings: LensSettings | None = None) -> Advice:
         )
     )
     best: list[Wish] = []
-    for wish in found:
+    for wish in shots:
         known = {(w.position, w.settings.aperture) for w in best}
         if len(best) < 3 and (wish.position, wish.settings.aperture) not in known:
             best.append(wish)
@@ -130,7 +130,7 @@ def advice(model: LensModel, settings: LensSettings | None = None) -> Advice:
     dark = little_seen(_seen(model)) if satisfied else []
     enough = satisfied and not dark
     if dark:
-        first = next(w for w in found if w.position == dark[0])
+        first = next(w for w in shots if w.position == dark[0])
         text = f"Most useful next: a photo of {first.text}. Little fine detail was seen there yet."
     elif enough:
         text = (

@@ -92,14 +92,14 @@ def spreads_of(
     channel = reports[0].settings.channel
     excluded = model.settings.excluded
     samples = [s for s in model.samples if s.photo not in excluded and s.settings.channel == channel]
-    found: dict[int, Spread | None] = {}
+    by_report: dict[int, Spread | None] = {}
     kinds: tuple[Drawn, ...] = ("photos", "patches")
     for drawn in kinds:
         those = [i for i, report in enumerate(reports) if _drawn(samples, report) == drawn]
         if those:
             spreads = _spreads(model, [reports[i] for i in those], samples, drawn, size, rng, draws)
-            found |= dict(zip(those, spreads, strict=True))
-    return [found[i] for i in range(len(reports))]
+            by_report |= dict(zip(those, spreads, strict=True))
+    return [by_report[i] for i in range(len(reports))]
 
 
 def _drawn(samples: Sequence[PsfSample], report: LensReport) -> Drawn:
@@ -121,17 +121,17 @@ def _spreads(
     groups = _groups(samples, drawn)
     if len(groups) < FEWEST_PHOTOS:
         return [None] * len(reports)
-    found: list[list[_Draw]] = [[] for _ in reports]
+    drawn_maps: list[list[_Draw]] = [[] for _ in reports]
     for _ in range(draws):
         chosen = rng.integers(0, len(groups), len(groups))
         try:
             replica = LensModel.fit([s for k in chosen for s in groups[k]], model.settings)
         except LensModelError:
             continue
-        for own, report in zip(found, reports, strict=True):
+        for own, report in zip(drawn_maps, reports, strict=True):
             with contextlib.suppress(LensModelError):  # a draw may lack the very samples that are asked for
                 own.append(_ask(replica, report, size))
-    return [_spread(drawn, own, draws) for own in found]
+    return [_spread(drawn, own, draws) for own in drawn_maps]
 
 
 _Draw = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -147,14 +147,14 @@ def _ask(replica: LensModel, report: LensReport, size: int) -> _Draw:
     return _map(kernels[:count], places), _curves(kernels[count:], rings, frequencies)
 
 
-def _spread(drawn: Drawn, found: Sequence[_Draw], draws: int) -> Spread | None:
-    if len(found) < max(draws // 2, 2):
+def _spread(drawn: Drawn, drawings: Sequence[_Draw], draws: int) -> Spread | None:
+    if len(drawings) < max(draws // 2, 2):
         return None
-    maps, curves = ([draw[k] for draw in found] for k in (0, 1))
+    maps, curves = ([draw[k] for draw in drawings] for k in (0, 1))
     spread, over = np.std(maps, axis=0, ddof=1), np.std(curves, axis=0, ddof=1)
     return Spread(
         drawn,
-        len(found),
+        len(drawings),
         tuple(spread[:, 0].tolist()),
         tuple(spread[:, 1].tolist()),
         tuple(CurveSpread(tuple(t.tolist()), tuple(s.tolist())) for t, s in over),
@@ -163,17 +163,17 @@ def _spread(drawn: Drawn, found: Sequence[_Draw], draws: int) -> Spread | None:
 
 def _groups(samples: Sequence[PsfSample], drawn: Drawn) -> list[list[PsfSample]]:
     """Samples that are drawn together: those of a photo, or those of a patch in all colours."""
-    found: defaultdict[Hashable, list[PsfSample]] = defaultdict(list)
+    groups: defaultdict[Hashable, list[PsfSample]] = defaultdict(list)
     for sample in samples:
         patch = (sample.photo, sample.position)
-        found[sample.photo if drawn == "photos" else patch].append(sample)
-    return list(found.values())
+        groups[sample.photo if drawn == "photos" else patch].append(sample)
+    return list(groups.values())
 
 
 def _map(kernels: NDArray[np.float64], places: Sequence[FieldPosition]) -> NDArray[np.float64]:
     """MTF50 along u and v, `(place, 2)`, none beyond what a sensor shows."""
-    found = [tangential_sagittal_mtf50(k, p.phi) for k, p in zip(kernels, places, strict=False)]
-    return np.minimum(np.array(found), NYQUIST)
+    pairs = [tangential_sagittal_mtf50(k, p.phi) for k, p in zip(kernels, places, strict=False)]
+    return np.minimum(np.array(pairs), NYQUIST)
 
 
 def _curves(
@@ -186,8 +186,8 @@ def _curves(
         own = kernels[at : at + len(places)]
         at += len(places)
         for row, turn in enumerate((0.0, math.pi / 2.0)):
-            found = [mtf_from_kernel(k, p.phi + turn, frequencies) for k, p in zip(own, places, strict=True)]
-            out[:, row, column] = np.mean(found, axis=0)
+            mtf = [mtf_from_kernel(k, p.phi + turn, frequencies) for k, p in zip(own, places, strict=True)]
+            out[:, row, column] = np.mean(mtf, axis=0)
         if len(places) == 1:
             out[:, :, column] = out[:, :, column].mean(axis=1, keepdims=True)  # u has no direction there
     return out

@@ -132,14 +132,14 @@ def curves_chart(tested: Tested) -> Chart:
 
 def colours_chart(test: LensTest, aperture: float | None) -> Chart:
     """Draw contrast of red, green and blue over the radius, mean of tangential and sagittal."""
-    found = [one for one in test.tested if one.report.settings.aperture == aperture]
+    matching = [one for one in test.tested if one.report.settings.aperture == aperture]
     axes = _axes(1.0)
-    second = min(1, len(found[0].report.curves) - 1)
-    curve = found[0].report.curves[second]
+    second = min(1, len(matching[0].report.curves) - 1)
+    curve = matching[0].report.curves[second]
     name = f"{curve.frequency:.3g} c/px" if curve.lp_mm is None else f"{curve.lp_mm:.3g} lp/mm"
-    parts: list[Part] = [Label(_LEFT, 24, f"Contrast by colour at {name}{_at(found[0])}")]
+    parts: list[Part] = [Label(_LEFT, 24, f"Contrast by colour at {name}{_at(matching[0])}")]
     parts += axes.grid(_RADII_TICKS, _RADII_TICKS, "r: 0 centre, 1 corner")
-    for i, one in enumerate(found):
+    for i, one in enumerate(matching):
         channel = one.report.settings.channel
         own = one.report.curves[second]
         mean = [(t + s) / 2.0 for t, s in zip(own.tangential, own.sagittal, strict=True)]
@@ -189,7 +189,7 @@ def apertures_chart(test: LensTest, unit: Unit = "c/px") -> Chart | None:
 
 def centring_chart(tested: Tested) -> Chart:
     """Draw towards which side the lens is softer, with the circle of twice its error."""
-    found, aspect = tested.report.decentring, tested.report.aspect
+    centring, aspect = tested.report.decentring, tested.report.aspect
     high = 260
     wide = high * aspect
     left, top = (WIDTH - wide) / 2, _TOP
@@ -198,22 +198,22 @@ def centring_chart(tested: Tested) -> Chart:
     parts: list[Part] = [Label(_GAP, 24, f"Centring{_at(tested)}"), Line(frame, GREY)]
     parts.append(Line(((x - 6, y), (x + 6, y)), GREY))
     parts.append(Line(((x, y - 6), (x, y + 6)), GREY))
-    if found.softer is not None:
+    if centring.softer is not None:
         scale = high / 2 / 0.7  # sides that differ by a factor of two reach the edge
         end = (
-            x + scale * found.softer.amount * math.cos(found.softer.direction),
-            y - scale * found.softer.amount * math.sin(found.softer.direction),
+            x + scale * centring.softer.amount * math.cos(centring.softer.direction),
+            y - scale * centring.softer.amount * math.sin(centring.softer.direction),
         )
         end = (min(max(end[0], left), left + wide), min(max(end[1], top), top + high))
-        radius = min(2.0 * found.softer.error * scale, high / 2)
+        radius = min(2.0 * centring.softer.error * scale, high / 2)
         around = [(end[0] + radius * math.cos(t), end[1] + radius * math.sin(t)) for t in _TURNS]
         circle = tuple(
             (min(max(across, left), left + wide), min(max(down, top), top + high)) for across, down in around
         )
         parts.append(Area(circle, COLOURS[0]))
         parts.append(Line(((x, y), end), COLOURS[1], 3.0))
-        sides = 100.0 * math.expm1(found.softer.amount)
-        error = 100.0 * math.expm1(2.0 * found.softer.error)
+        sides = 100.0 * math.expm1(centring.softer.amount)
+        error = 100.0 * math.expm1(2.0 * centring.softer.error)
         text = f"opposite sides differ by {sides:.0f} %, give or take {error:.0f} % (two standard errors)"
         parts.append(Label(WIDTH / 2, top + high + 22, text, INK, "middle"))
     note = (
@@ -245,7 +245,7 @@ def lateral_chart(test: LensTest) -> Chart | None:
 def charts_of(test: LensTest, aperture: float | None, unit: Unit = "c/px") -> list[Chart]:
     """All charts of one aperture, in the order of a report."""
     tested = test.at(aperture)
-    found = [
+    charts = [
         map_chart(tested, test.sensor, unit),
         error_chart(tested, test.sensor),
         curves_chart(tested),
@@ -253,7 +253,7 @@ def charts_of(test: LensTest, aperture: float | None, unit: Unit = "c/px") -> li
         field_chart(tested),
         centring_chart(tested),
     ]
-    return [chart for chart in found if chart is not None]
+    return [chart for chart in charts if chart is not None]
 
 
 def _axes(top: float) -> Axes:

@@ -213,9 +213,9 @@ def _difference(first: Side, second: Side) -> Chart | None:
 
 
 def _place_error(first: Tested, place: int, second: Tested) -> float | None:
-    found = []
+    errors = []
     for tested in (first, second):
         if tested.spread is None:
             return None
-        found.append((tested.spread.tangential[place] + tested.spread.sagittal[place]) / 2.0)
-    return math.hypot(*found)
+        errors.append((tested.spread.tangential[place] + tested.spread.sagittal[place]) / 2.0)
+    return math.hypot(*errors)

@@ -144,7 +144,7 @@ def decentring(model: LensModel, settings: LensSettings) -> Decentring:
     if len(inner) >= _FEWEST // 2:
         third = np.array([_third_moment(samples[i]) for i in inner])
         coma = _asymmetry(_constant(h[inner], third, weight[inner]), groups[inner], 1.0)
-    beyond = {zone: found.amount for zone, found in zones.items() if found.significant}
+    beyond = {zone: zone_result.amount for zone, zone_result in zones.items() if zone_result.significant}
     part = max(beyond.items(), key=lambda item: item[1])[0] if beyond else None
     verdict, text = _verdict(softer, coma, photos)
     if verdict == "centred":
@@ -156,7 +156,7 @@ def _voters(model: LensModel, settings: LensSettings) -> list[PsfSample]:
     """Samples near the settings, without those that the model has flagged."""
     flagged = {flag.sample for flag in model.flags() if flag.sample is not None}
     spoilt = {flag.photo for flag in model.flags() if flag.sample is None} | set(model.settings.excluded)
-    found = []
+    voters = []
     for i, sample in enumerate(model.samples):
         own = sample.settings
         if own.channel != settings.channel or sample.weight <= 0 or i in flagged or sample.photo in spoilt:
@@ -166,8 +166,8 @@ def _voters(model: LensModel, settings: LensSettings) -> list[PsfSample]:
             continue
         if own.focal_mm and settings.focal_mm and abs(math.log2(own.focal_mm / settings.focal_mm)) > 0.25:
             continue
-        found.append(sample)
-    return found
+        voters.append(sample)
+    return voters
 
 
 def _field(samples: Sequence[PsfSample]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -276,7 +276,7 @@ def _jackknife(fit: _Fit, groups: NDArray[np.intp]) -> tuple[float, int]:
 
 
 def _verdict(softer: Asymmetry, coma: Asymmetry | None, photos: int) -> tuple[Verdict, str]:
-    told = "one photo" if photos == 1 else f"{photos} photos"
+    photographs = "one photo" if photos == 1 else f"{photos} photos"
     signs = []
     if softer.significant and softer.amount > _SOFTER:
         ratio, more = math.exp(softer.amount), math.exp(softer.amount + softer.error)
@@ -293,17 +293,17 @@ def _verdict(softer: Asymmetry, coma: Asymmetry | None, photos: int) -> tuple[Ve
         sides = 100.0 * math.expm1(softer.amount)
         if sides + spread > _UNSURE_PERCENT:
             return "unknown", (
-                f"{told} cannot tell whether the lens is centred: opposite sides differ by "
+                f"{photographs} cannot tell whether the lens is centred: opposite sides differ by "
                 f"{sides:.0f} %, give or take {spread:.0f} %"
             )
         return "centred", (
-            f"well centred within what {told} can tell: the blur of opposite sides differs by "
+            f"well centred within what {photographs} can tell: the blur of opposite sides differs by "
             f"{sides:.0f} %, give or take {spread:.0f} %"
         )
-    found = "; ".join(signs)
+    described = "; ".join(signs)
     if photos == 1:
         return "unknown", (
-            f"perhaps decentred: {found}; one photo cannot tell this from a subject at a slant; "
+            f"perhaps decentred: {described}; one photo cannot tell this from a subject at a slant; "
             "a second one can"
         )
-    return "decentred", f"decentred: {found}"
+    return "decentred", f"decentred: {described}"

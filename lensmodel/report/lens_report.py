@@ -249,8 +249,8 @@ def lens_report(
 
 def apertures(model: LensModel) -> tuple[float, ...]:
     """The f-numbers that photos had, ascending; the twelve with most samples."""
-    found = [s.settings.aperture for s in model.samples if s.settings.aperture is not None]
-    ranked = sorted(set(found), key=lambda n: (-found.count(n), n))
+    known = [s.settings.aperture for s in model.samples if s.settings.aperture is not None]
+    ranked = sorted(set(known), key=lambda n: (-known.count(n), n))
     return tuple(sorted(ranked[:_MOST_APERTURES]))
 
 
@@ -360,10 +360,10 @@ def _aperture_row(
             np.mean([map_point(model, p, asked, options.size).mean for p in ring(r, 1, options.aspect)])
         )
 
-    found = {zone: sharpness(r) for zone, r in _ZONE_RADIUS.items()}
+    by_zone = {zone: sharpness(r) for zone, r in _ZONE_RADIUS.items()}
     # shares of a 3:2 picture's area: r < 0.3, between, r > 0.75
-    whole = 0.15 * found["center"] + 0.65 * found["mid"] + 0.2 * found["corner"]
-    return ApertureRow(aperture, found["center"], found["mid"], found["corner"], whole)
+    whole = 0.15 * by_zone["center"] + 0.65 * by_zone["mid"] + 0.2 * by_zone["corner"]
+    return ApertureRow(aperture, by_zone["center"], by_zone["mid"], by_zone["corner"], whole)
 
 
 def _best(rows: tuple[ApertureRow, ...], zone: str) -> float:

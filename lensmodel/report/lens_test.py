@@ -205,16 +205,16 @@ def _lateral(seen: Sequence[LateralColour]) -> LateralShift | None:
 
 def zone_means(report: LensReport) -> dict[Zone, float]:
     """Mean MTF50 of the places of a map in each zone, cycles/pixel."""
-    found: dict[Zone, list[float]] = {zone: [] for zone in ZONES}
+    by_zone: dict[Zone, list[float]] = {zone: [] for zone in ZONES}
     for point in report.field:
-        found[zone_of(point.position.r)].append(point.mean)
-    return {zone: float(np.mean(values)) if values else math.nan for zone, values in found.items()}
+        by_zone[zone_of(point.position.r)].append(point.mean)
+    return {zone: float(np.mean(values)) if values else math.nan for zone, values in by_zone.items()}
 
 
 def verdict(report: LensReport) -> str:
     """Say in one sentence what a photographer wants to know of a lens."""
-    found = zone_means(report)
-    center, corner = found["center"], found["corner"]
+    means = zone_means(report)
+    center, corner = means["center"], means["corner"]
     aperture = report.settings.aperture
     at = "" if aperture is None else f"At f/{aperture:g} "
     sharpness = f"{at}this copy is {_level(center)} in the centre, and {_fall(corner / center)}."
@@ -228,8 +228,8 @@ def verdict(report: LensReport) -> str:
         "unknown": " It is not yet possible to say whether it is centred.",
     }[report.decentring.verdict]
     error = float(np.mean([point.predicted_error for point in report.field]))
-    doubt = " Much of this is still a guess; more photos will help." if not error < _GUESSED else ""
-    return f"{sharpness}{best}{centring}{doubt}"
+    caution = " Much of this is still a guess; more photos will help." if not error < _GUESSED else ""
+    return f"{sharpness}{best}{centring}{caution}"
 
 
 def _level(center: float) -> str:

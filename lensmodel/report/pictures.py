@@ -34,9 +34,9 @@ def mtf_map_svg(report: LensReport) -> str:
         share = 0.5 if top <= low else (point.mean - low) / (top - low)
         fill = colour(share)
         parts.append(Box(x, y, cell[0] - 1, cell[1] - 1, rgb(fill)))
-        doubt = "?" if point.extrapolated else ""
+        mark = "?" if point.extrapolated else ""
         middle = x + cell[0] / 2
-        text = f"{point.mean:.3f}".removeprefix("0") + doubt
+        text = f"{point.mean:.3f}".removeprefix("0") + mark
         parts.append(Label(middle, y + cell[1] / 2 + 4, text, ink(fill), "middle"))
     notes = [f"from {low:.3f} (red) to {top:.3f} (blue)"]
     if any(point.extrapolated for point in report.field):

@@ -81,13 +81,13 @@ def grid(rows: int, cols: int, aspect: float) -> tuple[FieldPosition, ...]:
     if not (1 <= rows <= 100 and 1 <= cols <= 100):
         raise InvalidInputError(f"a grid has 1..100 rows and columns, got {rows} x {cols}")
     width, height = half_sides(aspect)
-    found = []
+    places = []
     for i in range(rows):
         y = height * (1.0 - (2 * i + 1) / rows)
         for j in range(cols):
             x = width * ((2 * j + 1) / cols - 1.0)
-            found.append(FieldPosition(min(math.hypot(x, y), 1.0), math.atan2(y, x)))
-    return tuple(found)
+            places.append(FieldPosition(min(math.hypot(x, y), 1.0), math.atan2(y, x)))
+    return tuple(places)
 
 
 def ring(r: float, count: int, aspect: float) -> tuple[FieldPosition, ...]:

@@ -129,7 +129,7 @@ def calibrate(
         kernel_size=kernel_size or way.kernel_size,
         workers=workers,
         executor=executor,
-        on_event=grown.heard,
+        on_event=grown.record,
     )
     return Lens.grown(lens, fitted, grown.photos, grown.seen, any_lens=any_lens)
 
@@ -161,7 +161,7 @@ class _Growing:
         except LensModelError:
             return None
 
-    def heard(self, event: CalibrationEvent) -> None:
+    def record(self, event: CalibrationEvent) -> None:
         """Remember a photo that counted, and pass the event on."""
         if event.stage == "counted":
             seen = _identity(event.photo)
@@ -276,9 +276,9 @@ def correct(
 
 
 def _format_of(output: Path) -> photo.OutputFormat:
-    found = FORMATS.get(output.suffix.lower())
-    if found is None:
+    known = FORMATS.get(output.suffix.lower())
+    if known is None:
         raise InvalidInputError(
             f"no format for {output.name}; give a name that ends in {', '.join(FORMATS)}, or file_format"
         )
-    return found
+    return known

@@ -105,7 +105,7 @@ def samples_of_photo(
     groups = cells(find_patches(developed, count=count, selector=selector))
     total = sum(len(group) for group in groups)
     on_event(CalibrationEvent(path, "estimating", 0, total))
-    found: dict[int, list[CellSample]] = {}
+    by_cell: dict[int, list[CellSample]] = {}
     done = 0
     with tempfile.TemporaryDirectory(prefix="lensmodel-") as folder:
         save_developed(developed, Path(folder))
@@ -119,7 +119,7 @@ def samples_of_photo(
                 for job in as_completed(jobs):
                     index = jobs[job]
                     try:
-                        found[index] = job.result()
+                        by_cell[index] = job.result()
                     except NotEnoughEvidenceError as error:
                         log.info("a cell of %s was dropped: %s", path.name, error)
                     done += len(groups[index])
@@ -128,13 +128,13 @@ def samples_of_photo(
                 for job in jobs:
                     job.cancel()  # leaving `with` waits only for what runs
                 raise
-    samples = [cell.sample for index in sorted(found) for cell in found[index]]
+    samples = [cell.sample for index in sorted(by_cell) for cell in by_cell[index]]
     if not samples:
         raise NoUsablePatchesError(
             f"none of the {total} patches of {path.name} determines a PSF; "
             "use a photo with more fine detail in focus"
         )
-    determined = [cell.patch for index in sorted(found) for cell in found[index] if cell.channel == "g"]
+    determined = [cell.patch for index in sorted(by_cell) for cell in by_cell[index] if cell.channel == "g"]
     require_spread(determined, count=count)
     return samples
 
@@ -234,7 +234,7 @@ def calibrate(
             on_event(CalibrationEvent(path, "skipped", detail="its samples are in the model already"))
             continue
         try:
-            found = (
+            learned = (
                 samples_of_photo(
                     path,
                     settings=settings,
@@ -252,9 +252,9 @@ def calibrate(
             reasons.append(f"{path.name}: {error}")
             on_event(CalibrationEvent(path, "skipped", detail=str(error)))
             continue
-        samples.extend(found)
+        samples.extend(learned)
         known.add(key)
-        on_event(CalibrationEvent(path, "counted", len(found), len(found)))
+        on_event(CalibrationEvent(path, "counted", len(learned), len(learned)))
     if model is not None:
         return (model.added(samples) if samples else model).warmed()
     if not samples:

@@ -258,8 +258,8 @@ class Lens:
         places = [
             FieldPosition(float(a), float(b)) for a, b in zip(radii.ravel(), angles.ravel(), strict=True)
         ]
-        found = self.model.kernels(places, LensSettings(aperture, channel=channel), size)
-        return found.reshape(*radii.shape, size, size)
+        flat = self.model.kernels(places, LensSettings(aperture, channel=channel), size)
+        return flat.reshape(*radii.shape, size, size)
 
     def mtf(
         self,
@@ -394,7 +394,7 @@ def _each(values: ArrayLike, n: int, name: str) -> list[float]:
 
 
 def _named(values: str | Sequence[str], n: int, name: str) -> list[Any]:
-    found = [values] * n if isinstance(values, str) else list(values)
-    if len(found) != n:
-        raise InvalidInputError(f"{name} must be one or {n}, one for each kernel, got {len(found)}")
-    return found
+    names = [values] * n if isinstance(values, str) else list(values)
+    if len(names) != n:
+        raise InvalidInputError(f"{name} must be one or {n}, one for each kernel, got {len(names)}")
+    return names

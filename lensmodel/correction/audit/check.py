@@ -169,13 +169,13 @@ class Severity:
 
     def part(self, inner: tuple[slice, slice], shape: tuple[int, int]) -> tuple[slice, slice]:
         """Places of the grid that lie in a part of a tile of `shape`; the nearest one if none does."""
-        found = []
+        slices = []
         for part, extent, count in zip(inner, shape, self.values.shape, strict=True):
             start, stop, _ = part.indices(extent)
             low = int(np.clip(np.ceil((start - self.first) / self.step), 0, count - 1))
             high = int(np.clip(np.floor((stop - 1 - self.first) / self.step), low, count - 1))
-            found.append(slice(low, high + 1))
-        return found[0], found[1]
+            slices.append(slice(low, high + 1))
+        return slices[0], slices[1]
 
 
 @dataclass(frozen=True, slots=True)

@@ -100,5 +100,5 @@ def _colours(pair: Pair) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]
         low, high = nearby.lowest(before, _SIDE), nearby.highest(before, _SIDE)
         beyond = np.maximum(after - high, low - after) - np.float32(_NOISE) * sigma / made
         pair.memo["colours"] = list(zip(np.maximum(beyond, np.float32(0.0)), high - low, strict=True))
-    found: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = pair.memo["colours"]
-    return found
+    colours: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = pair.memo["colours"]
+    return colours

@@ -42,12 +42,12 @@ def mean(planes: Real, side: int) -> Real:
 def neighbours(planes: Real) -> tuple[Real, Real]:
     """Least and largest of the eight neighbours of each pixel, `(..., rows, cols)`; rims repeat."""
     wide = padded(planes, 1)
-    found = []
+    extremes = []
     for choose in _CHOICES.values():
         rows = choose(wide[..., :-2], choose(wide[..., 1:-1], wide[..., 2:]))
         beside = choose(wide[..., 1:-1, :-2], wide[..., 1:-1, 2:])
-        found.append(choose(choose(rows[..., :-2, :], rows[..., 2:, :]), beside))
-    return found[0], found[1]
+        extremes.append(choose(choose(rows[..., :-2, :], rows[..., 2:, :]), beside))
+    return extremes[0], extremes[1]
 
 
 def _extreme(which: str, planes: Real, side: int) -> Real:

@@ -35,9 +35,9 @@ class CompiledBlur(UniformBlur):
         if self.loops is None or self.offset != (0.0, 0.0) or self.kernel.shape[0] > min(shape):
             return UniformBlur.spectrum(self, shape)
         if shape not in self._spectra:
-            found = np.empty((shape[0], shape[1] // 2 + 1), dtype=np.complex64)
-            self.loops.transfer(self.kernel.astype(np.float32), found, shape[1])
-            self._spectra[shape] = found
+            transfer = np.empty((shape[0], shape[1] // 2 + 1), dtype=np.complex64)
+            self.loops.transfer(self.kernel.astype(np.float32), transfer, shape[1])
+            self._spectra[shape] = transfer
         return self._spectra[shape]
 
     def forward(self, latent: Plane) -> Plane:

@@ -215,7 +215,7 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
                     for j in range(half):
                         k = K[c, i, j]
                         power = k.real * k.real + k.imag * k.imag
-                        found = power * X[c, i, j] + np.conj(k) * D[i, j]
-                        P[i, j] = (found + weight * P[i, j]) * (ONE / (power + weight * smooth[i, j]))
+                        wanted = power * X[c, i, j] + np.conj(k) * D[i, j]
+                        P[i, j] = (wanted + weight * P[i, j]) * (ONE / (power + weight * smooth[i, j]))
                 X[c] = P
             to_plane(P, x[c])

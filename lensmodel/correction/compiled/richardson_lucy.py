@@ -61,17 +61,17 @@ def _lights(  # noqa: C901, PLR0912 - a few passes over one small tile
     """
     rows, cols = latent.shape
     hard = np.zeros((rows, cols), np.float32)
-    found = False
+    any_light = False
     for i in range(rows):
         for j in range(cols):
             if latent[i, j] >= level:
-                found = True
+                any_light = True
                 for di in range(-3, 4):
                     for dj in range(-3, 4):
                         a, b = i + di, j + dj
                         if di * di + dj * dj <= 9 and 0 <= a < rows and 0 <= b < cols:
                             hard[a, b] = ONE
-    if not found:
+    if not any_light:
         return False
     # A square of the operator's reach covers the kernel without knowing its shape. One pass each
     # way with the place of the last mark seen costs the same for any reach.

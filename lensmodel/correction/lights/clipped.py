@@ -55,14 +55,14 @@ def regions(clipped: NDArray[np.bool_], reach: int) -> list[Region]:
     """
     if not clipped.any():
         return []
-    told = _blocks(~clipped)
-    if not told.any():
+    unclipped = _blocks(~clipped)
+    if not unclipped.any():
         return []
     near = 2 * (-(-2 * reach // _BLOCK)) + 1
-    active = _blocks(clipped) & ndimage.binary_dilation(told, np.ones((near, near), dtype=np.bool_))
+    active = _blocks(clipped) & ndimage.binary_dilation(unclipped, np.ones((near, near), dtype=np.bool_))
     everything = ((0, active.shape[0]), (0, active.shape[1]))
-    found = _cut(active, everything, 6 * reach)[1]
-    return [_region(piece, tight, clipped.shape, active.shape, reach) for piece, tight in found]
+    pieces = _cut(active, everything, 6 * reach)[1]
+    return [_region(piece, tight, clipped.shape, active.shape, reach) for piece, tight in pieces]
 
 
 def around(marked: NDArray[np.bool_], axis: int, reach: int) -> slice:

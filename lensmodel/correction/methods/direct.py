@@ -169,15 +169,15 @@ def _filtered(
     Y = fft.rfft2(y)
     decay = prior(shape)[0] * np.float32(seen / y[0].size)
     data = np.conj(K) * Y / noise[:, None, None]
-    found = []
+    filtered = []
     for luma, chroma in levels:
         D = (power + np.float32(floor)) / noise[:, None, None] + decay / np.float32(chroma)
         z = data / D
         g = decay * np.float32((1.0 / luma - 1.0 / chroma) / 3.0)
         X = z - (g * z.sum(axis=0) / (1.0 + g * (1.0 / D).sum(axis=0))) / D
         X[:, 0, 0] = Y[:, 0, 0]  # the mean is kept
-        found.append(fft.irfft2(X, shape).astype(np.float32))
-    return np.asarray(found[1] + busy * (found[0] - found[1]), dtype=np.float32)
+        filtered.append(fft.irfft2(X, shape).astype(np.float32))
+    return np.asarray(filtered[1] + busy * (filtered[0] - filtered[1]), dtype=np.float32)
 
 
 @lru_cache(maxsize=8)

@@ -163,7 +163,7 @@ class SparseGradient:
         if any(sensor.measured is not None for sensor in sensors):
             weight = self.mosaic_weight
         elif glow is None:  # what is left beside lights is no natural scene, and the prior holds it back
-            weight *= _reliance(_told(K[one], canvas.shape, noise[one], variance[one]))
+            weight *= _reliance(_determined_share(K[one], canvas.shape, noise[one], variance[one]))
         weights = np.full(len(blurred), weight)
         weights[1:] *= self.chroma
         y = np.empty((len(blurred), *canvas.shape), dtype=np.float32)
@@ -212,7 +212,7 @@ class SparseGradient:
 _RAMP = 0.1  # of the jump of the shrinkage: see `Shrinkage`
 _TYPICAL_CONTRAST = np.float32(0.02)  # variance over squared light of a scene for which kappa is `weight`
 _SCENE = 0.2  # variance over squared light of a cell of an average scene
-_OPEN, _TOLD, _LEAST = 0.25, 0.87, 0.4  # chosen on lenses of development seeds: see `_reliance`
+_OPEN, _SLOPE, _LEAST = 0.25, 0.87, 0.4  # chosen on lenses of development seeds: see `_reliance`
 _BUSIEST, _CALMEST = 0.7, 50.0
 _DARK = np.float32(0.02)  # share of a tile's mean light below which the prior follows it no further
 
@@ -238,7 +238,9 @@ class _Problem:
     prox: Shrinkage
 
 
-def _told(K: NDArray[np.complex64], shape: tuple[int, int], noise: np.float32, variance: np.float32) -> float:
+def _determined_share(
+    K: NDArray[np.complex64], shape: tuple[int, int], noise: np.float32, variance: np.float32
+) -> float:
     """Share of the power of a natural scene's gradients that the data tell: sum |F|² S W / sum |F|² S.
 
     S is the scene's spectrum, in a flat cell that of an average one, and
@@ -252,13 +254,13 @@ def _told(K: NDArray[np.complex64], shape: tuple[int, int], noise: np.float32, v
     return float((gradients * (shown / (shown + level))).sum() / gradients.sum())
 
 
-def _reliance(told: float) -> float:
-    """Factor on kappa where the data tell a share of the gradients.
+def _reliance(share: float) -> float:
+    """Factor on kappa where the data determine this share of the gradients.
 
     The most probable picture is not the mean of the probable ones: gradients that the data leave open
     all come out as zero, so where the blur is wide and the noise strong the prior must weigh less.
     """
-    return float(np.clip(_OPEN + _TOLD * told, _LEAST, 1.0))
+    return float(np.clip(_OPEN + _SLOPE * share, _LEAST, 1.0))
 
 
 def _known(sensors: Sequence[Sensor], canvas: Canvas) -> NDArray[np.bool_]:

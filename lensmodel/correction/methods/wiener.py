@@ -50,9 +50,9 @@ def prior(shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float
 
 def counts(shape: tuple[int, int]) -> NDArray[np.float32]:
     """How often each column of the half spectrum stands in the whole; the mean stands nowhere."""
-    found = np.full((shape[0], shape[1] // 2 + 1), 2.0, dtype=np.float32)
-    found[:, 0] = 1.0
+    counts = np.full((shape[0], shape[1] // 2 + 1), 2.0, dtype=np.float32)
+    counts[:, 0] = 1.0
     if shape[1] % 2 == 0:
-        found[:, -1] = 1.0
-    found[0, 0] = 0.0
-    return found
+        counts[:, -1] = 1.0
+    counts[0, 0] = 0.0
+    return counts

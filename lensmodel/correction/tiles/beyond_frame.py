@@ -90,7 +90,7 @@ def _wider(
     """Data, and light wherever it reaches them from beyond a side of the frame: wider by the reach."""
     wide = blur.reach
     depth, both = _DEPTH * wide + _MORE, 2 * wide
-    found = np.pad(plane, wide, mode="symmetric" if wide <= min(plane.shape) else "edge")
+    wider = np.pad(plane, wide, mode="symmetric" if wide <= min(plane.shape) else "edge")
     plain = replace(sensor, clip=float("inf"), measured=None)
 
     def light_of(part: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -100,11 +100,11 @@ def _wider(
 
     top, bottom, left, right = sensor.edges
     if left:
-        found[:, :both] = light_of(plane[:, :depth])[:, :both]
+        wider[:, :both] = light_of(plane[:, :depth])[:, :both]
     if right:
-        found[:, -both:] = light_of(plane[:, -depth:])[:, -both:]
+        wider[:, -both:] = light_of(plane[:, -depth:])[:, -both:]
     if top:
-        found[:both] = light_of(plane[:depth])[:both]
+        wider[:both] = light_of(plane[:depth])[:both]
     if bottom:
-        found[-both:] = light_of(plane[-depth:])[-both:]
-    return found
+        wider[-both:] = light_of(plane[-depth:])[-both:]
+    return wider

@@ -119,7 +119,7 @@ def cells(frame: Frame, pitch: int | None = None) -> tuple[Cell, ...]:
     pitch = usual_pitch(frame) if pitch is None else pitch
     down, across = _pieces(frame.height, pitch), _pieces(frame.width, pitch)
     rows, cols = [piece[2] for piece in down], [piece[2] for piece in across]
-    found = []
+    cells = []
     for i, (top, rise, row) in enumerate(down):
         above, below = rows[max(i - 1, 0)], rows[min(i + 1, len(rows) - 1)]
         for j, (left, run, col) in enumerate(across):
@@ -128,8 +128,8 @@ def cells(frame: Frame, pitch: int | None = None) -> tuple[Cell, ...]:
                 (frame.position(above, col), frame.position(below, col), below - above),
                 (frame.position(row, before), frame.position(row, after), after - before),
             )
-            found.append(Cell(top, left, rise, run, frame.position(row, col), (row, col), beside))
-    return tuple(found)
+            cells.append(Cell(top, left, rise, run, frame.position(row, col), (row, col), beside))
+    return tuple(cells)
 
 
 def _pieces(extent: int, pitch: int) -> list[tuple[int, NDArray[np.float32], float]]:

@@ -64,12 +64,12 @@ def _taps(blurs: Sequence[UniformBlur], *, drifting: bool) -> NDArray[np.float32
 
 
 def _rates(blurs: Sequence[UniformBlur], shape: tuple[int, int], reach: float) -> NDArray[np.complex64]:
-    found = []
+    damped = []
     for blur in blurs:
         if blur.drift is None:
             return np.zeros((0, 2, 0, 0), dtype=np.complex64)
         rates = blur.drift.spectra(shape)
         change = np.float32(reach) * np.abs(rates).sum(axis=0)
         allowed = np.float32(0.5) * np.abs(blur.spectrum(shape))
-        found.append(rates * np.minimum(allowed / np.maximum(change, np.float32(1e-9)), np.float32(1.0)))
-    return np.stack(found).astype(np.complex64)
+        damped.append(rates * np.minimum(allowed / np.maximum(change, np.float32(1e-9)), np.float32(1.0)))
+    return np.stack(damped).astype(np.complex64)

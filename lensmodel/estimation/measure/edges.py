@@ -80,16 +80,16 @@ class Edges:
                 f"{len(boxes)} edges are seen, but no two that cross near one another; use a chart with "
                 "edges along rows and columns everywhere"
             )
-        found = []
+        measured_psfs = []
         for done, pair in enumerate(pairs, start=1):
             for channel in channels:
                 one = _pair_psf(photo, channel, pair, size)
                 if one is not None:
-                    found.append(one)
+                    measured_psfs.append(one)
             on_step(done, len(pairs))
-        if not found:
+        if not measured_psfs:
             raise NotEnoughEvidenceError("no edge could be measured; is the photo in focus and unclipped?")
-        return found
+        return measured_psfs
 
 
 def _crossing_pairs(photo: LinearPhoto, boxes: Sequence[Box]) -> list[tuple[Box, Box]]:

@@ -1,4 +1,4 @@
-"""The light that falls on a window of the page, told from the detail of the page itself.
+"""The light that falls on a window of the page, separated from the detail of the page itself.
 
 The mean of noise over a part of a window is not quite that of the page: a quadratic fitted to the photo
 alone follows the slow waves of the noise itself, and a hundredth of wrong light over a window becomes a tenth

@@ -92,19 +92,19 @@ class Pair:
         opened, closed = with_bounded_noise(list(photos))
         warp = self.register(opened, closed)
         corners = _detailed(opened, closed, self.side, self.across, self.down, size // 2 + _SPARE)
-        found = []
+        psfs = []
         for done, corner in enumerate(corners, start=1):
             for channel in channels:
                 one = self._window(opened, closed, warp, corner, size, channel)
                 if one is not None:
-                    found.append(one)
+                    psfs.append(one)
             on_step(done, len(corners))
-        if not found:
+        if not psfs:
             raise NotEnoughEvidenceError(
                 "no part of the pair determines a PSF; photograph a scene with fine detail everywhere, flat "
                 "and in focus"
             )
-        return found
+        return psfs
 
     def register(self, opened: LinearPhoto, closed: LinearPhoto) -> Warp:
         """Lay the closed photo under the open one.
@@ -319,7 +319,7 @@ def _detailed(
     fine[ndimage.maximum_filter(clipped, 5)] = 0.0
     energy = ndimage.uniform_filter(np.minimum(fine, 20.0 * float(fine.mean())), side, mode="constant")
     height, width = plane.shape
-    found = []
+    corners = []
     for i in range(down):
         for j in range(across):
             rows = np.arange(max(i * height // down - side // 4, margin), (i + 1) * height // down, step)
@@ -328,8 +328,8 @@ def _detailed(
             if rows.size and cols.size:
                 here = energy[np.ix_(rows + side // 2, cols + side // 2)]
                 k, l = np.unravel_index(int(here.argmax()), here.shape)
-                found.append((int(rows[k]), int(cols[l])))
-    return list(dict.fromkeys(found))
+                corners.append((int(rows[k]), int(cols[l])))
+    return list(dict.fromkeys(corners))
 
 
 def _shrunk(plane: NDArray[np.floating]) -> NDArray[np.float64]:

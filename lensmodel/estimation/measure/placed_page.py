@@ -161,17 +161,17 @@ def tones_of(
     laid over a window. What windows say of (q, c) is joined by its precision, and with the prior: behind much
     blur, z, z² and z³ look alike, and nothing is known.
     """
-    precision, told = np.eye(2) / TONE_SPREAD**2, np.zeros(2)
+    precision, weighted = np.eye(2) / TONE_SPREAD**2, np.zeros(2)
     seen = 0
     for corner in corners:
         try:
             own, bent = _tones_in(photo, placed, corner, side)
         except NotEnoughEvidenceError:
             continue
-        precision, told, seen = precision + own, told + own @ bent, seen + 1
+        precision, weighted, seen = precision + own, weighted + own @ bent, seen + 1
     if seen < 2:
         raise NotEnoughEvidenceError("the page is too blurred to be measured; focus on it")
-    q, c = np.linalg.solve(precision, told)
+    q, c = np.linalg.solve(precision, weighted)
     return float(1.0 - 2.0 * q * MEAN + 3.0 * c * MEAN**2), float(q - 3.0 * c * MEAN), float(c)
 
 

@@ -88,12 +88,12 @@ def find_lights(plane: NDArray[np.floating], detector: str = "auto") -> list[Lig
         if detector not in {"auto", name}:
             continue
         try:
-            found = way(importlib.import_module(module), clean, scatter)
+            lights = way(importlib.import_module(module), clean, scatter)
         except ImportError as error:
             if detector == name:
                 raise InvalidInputError(f"{name} is not installed; {REMEDY}") from error
             continue
-        return sorted(found, key=lambda light: -light.peak)
+        return sorted(lights, key=lambda light: -light.peak)
     if detector == "auto":
         logger.info("lights are found by our own search; %s", REMEDY)
     return sorted(_by_maxima(clean, scatter), key=lambda light: -light.peak)
@@ -138,16 +138,16 @@ def _by_maxima(clean: NDArray[np.float64], scatter: float) -> list[Light]:
     )
     peaks[:2] = peaks[-2:] = False
     peaks[:, :2] = peaks[:, -2:] = False
-    found = []
+    lights = []
     t = np.arange(-2, 3)
     for row, col in np.argwhere(peaks):
         part = np.maximum(smooth[row - 2 : row + 3, col - 2 : col + 3], 0.0)
         total = float(part.sum())
-        found.append(
+        lights.append(
             Light(
                 row + float((part.sum(axis=1) * t).sum()) / total,
                 col + float((part.sum(axis=0) * t).sum()) / total,
                 float(clean[row - 1 : row + 2, col - 1 : col + 2].max()),
             )
         )
-    return found
+    return lights

@@ -90,16 +90,16 @@ class Points:
         skies = {
             c: sky_of(np.asarray(photo.planes[CHANNELS.index(c)], dtype=np.float64))[0] for c in channels
         }
-        found = []
+        psfs = []
         for done, cell in enumerate(good, start=1):
             for channel in channels:
                 one = _cell_psf(photo, channel, cell[:_MOST], size, skies[channel])
                 if one is not None:
-                    found.append(one)
+                    psfs.append(one)
             on_step(done, len(good))
-        if not found:
+        if not psfs:
             raise NotEnoughEvidenceError("the points of light are too faint; expose longer")
-        return found
+        return psfs
 
 
 def _whole(light: Light, photo: LinearPhoto, size: int) -> bool:

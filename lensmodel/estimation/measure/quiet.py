@@ -34,13 +34,13 @@ def with_bounded_noise(photos: list[LinearPhoto]) -> list[LinearPhoto]:
     Photos of one camera at one ISO share the bound, since they share the sensor's noise.
     """
     bounds = [[quietest(photo, channel) for channel in range(len(CHANNELS))] for photo in photos]
-    found = []
+    bounded = []
     for photo in photos:
         alike = [bounds[i] for i, other in enumerate(photos) if _one_sensitivity(photo, other)]
         least = np.min(alike, axis=0)
         sensor = None if photo.sensor_noise is None else _all_bounded(photo.sensor_noise, least)
-        found.append(replace(photo, noise=_all_bounded(photo.noise, least), sensor_noise=sensor))
-    return found
+        bounded.append(replace(photo, noise=_all_bounded(photo.noise, least), sensor_noise=sensor))
+    return bounded
 
 
 def quietest(photo: LinearPhoto, channel: int) -> float:

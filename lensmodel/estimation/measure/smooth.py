@@ -60,8 +60,8 @@ class Smooth:
         gram = np.einsum("rci,rc,rcj->ij", terms, weight, terms, optimize=True)
         # where few pixels count, what cannot be told apart is left in
         values, vectors = np.linalg.eigh(gram)
-        told = values > 1e-9 * values[-1]
-        basis = terms @ (vectors[:, told] / np.sqrt(values[told]))
+        determined = values > 1e-9 * values[-1]
+        basis = terms @ (vectors[:, determined] / np.sqrt(values[determined]))
         weighted = basis * weight[..., None]
         of_x = np.empty((basis.shape[-1], size, size))
         for i in range(size):

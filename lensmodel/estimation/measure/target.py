@@ -94,13 +94,13 @@ class Target:
             )
         middle = sorted(corners, key=lambda c: np.hypot(*(np.add(c, self.side / 2) - photo.frame.center)))
         placed = replace(placed, tones=tones_of(photo, placed, middle[:_TONE_WINDOWS], self.side))
-        found = []
+        psfs = []
         for done, corner in enumerate(corners, start=1):
-            found += self._window(photo, placed, corner, size, channels)
+            psfs += self._window(photo, placed, corner, size, channels)
             on_step(done, len(corners))
-        if not found:
+        if not psfs:
             raise NotEnoughEvidenceError("no window of the page determines a PSF; is the photo in focus?")
-        return found
+        return psfs
 
     def find(self, photo: LinearPhoto) -> PlacedPage:
         """Find the page in a photo and register it to a fraction of a pixel.
@@ -136,7 +136,7 @@ class Target:
         size: int,
         channels: Iterable[Channel],
     ) -> list[MeasuredPsf]:
-        found = []
+        psfs = []
         for channel in channels:
             try:
                 at, window = self._explained(photo, placed, channel, corner, size)
@@ -146,8 +146,8 @@ class Target:
             if error < _SURE:
                 pixel = at[0] + (window.side - 1) / 2.0, at[1] + (window.side - 1) / 2.0
                 position = photo.frame.position(*pixel)
-                found.append(MeasuredPsf(window.kernel, position, channel, error, pixel, window.side))
-        return found
+                psfs.append(MeasuredPsf(window.kernel, position, channel, error, pixel, window.side))
+        return psfs
 
     def _explained(
         self, photo: LinearPhoto, placed: PlacedPage, channel: Channel, corner: tuple[int, int], size: int

@@ -79,26 +79,26 @@ def solve_varying(
     a, b, power = _normal_equations(observed, latent, weight, size)
     prior = 1.0 / prior_width(size) ** 2
     count, misfit = int(measured.sum()), 1.0
-    found = np.zeros(size * size)
+    values = np.zeros(size * size)
     for _ in range(2):  # the second time with the residuals of the first
         eq = _without_change(a / misfit, b / misfit, power / misfit, prior)
-        found = bounded(eq.a + np.diag(prior), eq.b, found)
-        rest = eq.power - 2.0 * float(eq.b @ found) + float(found @ eq.a @ found)
+        values = bounded(eq.a + np.diag(prior), eq.b, values)
+        rest = eq.power - 2.0 * float(eq.b @ values) + float(values @ eq.a @ values)
         misfit = max(misfit * rest / count, 1.0)
     eq = _without_change(a / misfit, b / misfit, power / misfit, prior)
-    found, moved = _on_its_grid(eq, prior, found, size)
-    light = float(found.sum())
+    values, moved = _on_its_grid(eq, prior, values, size)
+    light = float(values.sum())
     if not light > 0.0:
         raise NotEnoughEvidenceError("no kernel explains this window; the latent picture does not match it")
-    kernel = as_kernel(found.reshape(size, size))
+    kernel = as_kernel(values.reshape(size, size))
     off = centroid(kernel)
-    offset = weighted_mean(observed, weight) - float(means_of_latent(latent, weight, size) @ found)
+    offset = weighted_mean(observed, weight) - float(means_of_latent(latent, weight, size) @ values)
     return Solved(
         kernel=kernel,
         light=light,
         offset=offset,
         shift=(off[0] + moved[0], off[1] + moved[1]),
-        error=error_of(eq.a + np.diag(prior), found),
+        error=error_of(eq.a + np.diag(prior), values),
         misfit=misfit,
     )
 

@@ -88,11 +88,11 @@ def window_psf(
     _, shift = roughly(observed, measured, variance, latent, min(SMALL, size))
     sharp = latent(shift, size // 2)
     if latent_noise is None:
-        found = solve_varying(observed, sharp, measured, variance, size)
-        return found.kernel, found, shift
+        solved = solve_varying(observed, sharp, measured, variance, size)
+        return solved.kernel, solved, shift
     # less its noise a latent picture says too little of how the kernel changes, and of the best grid
-    found = solve(observed, sharp, measured, variance, size, latent_noise)
-    return centred(found.kernel), found, shift
+    solved = solve(observed, sharp, measured, variance, size, latent_noise)
+    return centred(solved.kernel), solved, shift
 
 
 def roughly(

@@ -75,13 +75,13 @@ class Cautious:
         if len(kept) >= self.pooled:
             inner, models = [_middle(patch) for patch, _ in kept], [model for _, model in kept]
             recurrence = PatchRecurrence(support=min(_POOLED_SUPPORT, size), iterations=_POOLED_ITERATIONS)
-            found = recurrence.estimate(inner, models, size=size, on_step=_half(on_step, 0))
-            return self._agreed(kept, found, began, size, on_step)
+            from_recurrence = recurrence.estimate(inner, models, size=size, on_step=_half(on_step, 0))
+            return self._agreed(kept, from_recurrence, began, size, on_step)
         gaussian = Whittle().estimate(patches, noise, size=size)
         support = min(max(2 * round(3.0 * gaussian.diagnostics["width"] + 3.0) + 1, 15), 31, size)
         recurrence = PatchRecurrence(support=support, search=QUICK)
-        found = recurrence.estimate(patches, noise, size=size, on_step=_half(on_step, 0))
-        return self._chosen(kept, gaussian, found, began, size, on_step, _STARTS)
+        from_recurrence = recurrence.estimate(patches, noise, size=size, on_step=_half(on_step, 0))
+        return self._chosen(kept, gaussian, from_recurrence, began, size, on_step, _STARTS)
 
     def estimate_channel(
         self,
@@ -102,52 +102,52 @@ class Cautious:
             return self._agreed(kept, same_phase, began, size, on_step)
         support = int(reference.diagnostics.get("support", 21.0))
         recurrence = PatchRecurrence(support=support, iterations=3, search=QUICK)
-        found = recurrence.estimate_channel(
+        from_recurrence = recurrence.estimate_channel(
             patches, noise, reference, reference_patches, size=size, on_step=_half(on_step, 0)
         )
         gaussian = Whittle().estimate(patches, noise, size=size)
-        return self._chosen(kept, gaussian, found, began, size, on_step, _STARTS_OF_CHANNEL)
+        return self._chosen(kept, gaussian, from_recurrence, began, size, on_step, _STARTS_OF_CHANNEL)
 
     def _agreed(
         self,
         kept: Sequence[tuple[Plane, NoiseModel]],
-        found: PsfEstimate,
+        from_recurrence: PsfEstimate,
         began: float,
         size: int,
         on_step: StepHook,
     ) -> PsfEstimate:
         """Kernel of the wavefront that many patches agree on."""
-        fitted = AberrationFit().fit(SceneSpectra.of(kept), found.kernel, _half(on_step, 1))
+        fitted = AberrationFit().fit(SceneSpectra.of(kept), from_recurrence.kernel, _half(on_step, 1))
         kernel = fitted.kernel(size)
         error = min(max(_POOLED_ERROR / math.sqrt(len(kept)), 0.05), 1.0)
         more = {
             "width": rms_width(kernel),
-            "disagreement": distance(found.kernel, kernel).mtf_rmse,
+            "disagreement": distance(from_recurrence.kernel, kernel).mtf_rmse,
             "cost": fitted.cost,
         }
-        return _told(found, kernel, error, more, began)
+        return _reported(from_recurrence, kernel, error, more, began)
 
     def _chosen(
         self,
         kept: Sequence[tuple[Plane, NoiseModel]],
         gaussian: PsfEstimate,
-        found: PsfEstimate,
+        from_recurrence: PsfEstimate,
         began: float,
         size: int,
         on_step: StepHook,
         starts: int,
     ) -> PsfEstimate:
         """Kernel of few patches, the one that their spectra speak for."""
-        disagreement = distance(found.kernel, gaussian.kernel).mtf_rmse
+        disagreement = distance(from_recurrence.kernel, gaussian.kernel).mtf_rmse
         likelihood = SpectralLikelihood.of(kept)
         fit = AberrationFit(
             weight=self.trust, temper=likelihood.temper, starts=starts, kept=max(starts // 5, 2)
         )
-        fitted = fit.fit(likelihood.whole, found.kernel, _half(on_step, 1), likelihood.local)
+        fitted = fit.fit(likelihood.whole, from_recurrence.kernel, _half(on_step, 1), likelihood.local)
         options = {
             "gaussian": gaussian.kernel,
-            "recurrence": found.kernel,
-            "mean": as_kernel(0.5 * (gaussian.kernel + found.kernel)),
+            "recurrence": from_recurrence.kernel,
+            "mean": as_kernel(0.5 * (gaussian.kernel + from_recurrence.kernel)),
             "wavefront": fitted.kernel(size),
         }
         costs = {
@@ -156,12 +156,14 @@ class Cautious:
         }
         costs["wavefront"] += fitted.unusual
         if rms_width(gaussian.kernel) <= self.trusted_px:
-            ran = rms_width(found.kernel) > self.apart * max(rms_width(gaussian.kernel), _PIXEL_SIGMA)
+            ran = rms_width(from_recurrence.kernel) > self.apart * max(
+                rms_width(gaussian.kernel), _PIXEL_SIGMA
+            )
             costs["gaussian" if ran else "mean"] -= self.sure
         chosen = min(costs, key=lambda name: costs[name])
         kernel = options[chosen]
         on_step(1, 1)
-        apart = distance(found.kernel, options["wavefront"]).rel_l2
+        apart = distance(from_recurrence.kernel, options["wavefront"]).rel_l2
         more = {
             "gaussian_width": gaussian.diagnostics["width"],
             "slope": gaussian.diagnostics["slope"],
@@ -173,19 +175,19 @@ class Cautious:
         error = predicted_error(
             apart, disagreement, rms_width(gaussian.kernel), gaussian.diagnostics["slope"]
         )
-        return _told(found, kernel, error, more, began)
+        return _reported(from_recurrence, kernel, error, more, began)
 
 
-def _told(
-    found: PsfEstimate, kernel: Kernel, error: float, more: Mapping[str, float], began: float
+def _reported(
+    from_recurrence: PsfEstimate, kernel: Kernel, error: float, more: Mapping[str, float], began: float
 ) -> PsfEstimate:
     """Return the result of patch recurrence with another kernel, its expected error, and why."""
     return replace(
-        found,
+        from_recurrence,
         kernel=kernel,
         confidence=1.0 / (1.0 + (error / 0.4) ** 2),
         predicted_error=error,
-        diagnostics={**found.diagnostics, **more},
+        diagnostics={**from_recurrence.diagnostics, **more},
         seconds=time.process_time() - began,
         no_blur=is_no_blur(kernel),
     )

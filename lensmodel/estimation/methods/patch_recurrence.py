@@ -163,13 +163,13 @@ class PatchRecurrence:
         final = resized(centred(state.kernel), size)
         apart = self._disagreement(state, views, latent)
         error = min(_ERROR[0] + _ERROR[1] * apart, 1.0)
-        told = {"width": rms_width(final), "support": float(widest), "levels": float(levels)}
+        of_scale = {"width": rms_width(final), "support": float(widest), "levels": float(levels)}
         return PsfEstimate(
             kernel=final,
             confidence=confidence_of(error),
             reliability=reliability(kept),
             predicted_error=error,
-            diagnostics={**told, "disagreement": apart},
+            diagnostics={**of_scale, "disagreement": apart},
             seconds=time.process_time() - began,
             no_blur=is_no_blur(final),
         )
@@ -200,7 +200,7 @@ class PatchRecurrence:
 
         1 where the halves are too narrow for a kernel.
         """
-        begin, found = np.asarray(state.kernel), []
+        begin, halves = np.asarray(state.kernel), []
         if latent[0].shape[1] // 2 < 2 * (_BORDER + begin.shape[0] // 2) + begin.shape[0]:
             return 1.0
         middle = latent[0].shape[1] // 2
@@ -210,10 +210,10 @@ class PatchRecurrence:
                 for x, view, response in zip(latent, views, state.responses, strict=True)
             ]
             try:
-                found.append(centred(self._solved(parts, views, begin)))
+                halves.append(centred(self._solved(parts, views, begin)))
             except NotEnoughEvidenceError:
                 return 1.0
-        return min(distance(*found).rel_l2, 1.0)
+        return min(distance(*halves).rel_l2, 1.0)
 
 
 Part: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64]]

@@ -140,11 +140,11 @@ def directional_slopes(patch: Plane) -> Floats:
     row, col = (ndimage.gaussian_filter(scaled, _PROBE_PX, order=order) for order in ((1, 0), (0, 1)))
     clipped = scaled > _SATURATED
     angles = np.pi * np.arange(_ANGLES) / _ANGLES
-    found = []
+    slopes = []
     for angle in angles:
         slope = np.where(clipped, 0.0, np.abs(math.cos(angle) * row + math.sin(angle) * col))
-        found.append(float(np.mean(np.partition(slope, -_STEEPEST, axis=None)[-_STEEPEST:])))
-    return np.maximum(found, 1e-6)
+        slopes.append(float(np.mean(np.partition(slope, -_STEEPEST, axis=None)[-_STEEPEST:])))
+    return np.maximum(slopes, 1e-6)
 
 
 def _interpolated(slopes: Floats) -> Floats:

@@ -90,11 +90,11 @@ class Whittle:
             for s in spectra:
                 start += [float(np.log(np.median(s.power) + 1e-12)), _SLOPE, 0.0, 0.0]
             options = {"maxiter": 80}
-            found = scipy.optimize.minimize(
+            solution = scipy.optimize.minimize(
                 _cost, start, args=(spectra, band), jac=True, method="L-BFGS-B", options=options
             )
-            if best is None or found.fun < best.fun:
-                best = found
+            if best is None or solution.fun < best.fun:
+                best = solution
             on_step(done, len(_STARTS_PX))
         if best is None or not np.isfinite(best.x).all():
             raise NotEnoughEvidenceError("the spectrum of the patches fits no blur; choose other parts")

@@ -70,8 +70,8 @@ def periodograms(patch: Plane, stride: int = _STRIDE) -> Floats:
     tiles = sliding_window_view(patch.astype(np.float64), (SIDE, SIDE))[::stride, ::stride]
     tiles = tiles.reshape(-1, SIDE, SIDE)
     means = (tiles * _WINDOW).sum(axis=(1, 2), keepdims=True) / _WINDOW.sum()
-    found = fft.rfft2((tiles - means) * _WINDOW, axes=(1, 2))[:, _TAKEN]
-    return np.asarray(found.real**2 + found.imag**2, dtype=np.float64) / float((_WINDOW**2).sum())
+    transform = fft.rfft2((tiles - means) * _WINDOW, axes=(1, 2))[:, _TAKEN]
+    return np.asarray(transform.real**2 + transform.imag**2, dtype=np.float64) / float((_WINDOW**2).sum())
 
 
 def _leaked(power: Floats) -> Floats:
@@ -89,8 +89,8 @@ _OPEN = _leaked(np.ones((SIDE, SIDE // 2 + 1)))
 
 def local_power(kernel: Floats) -> Floats:
     """|K|² at the frequencies of a tile, shape (FREQUENCIES,), of a kernel of at most 64 x 64."""
-    found = fft.rfft2(kernel, (2 * SIDE, 2 * SIDE))[::2, ::2]
-    return np.maximum(_leaked(found.real**2 + found.imag**2) / _OPEN, 0.0) + _FAINTEST
+    transform = fft.rfft2(kernel, (2 * SIDE, 2 * SIDE))[::2, ::2]
+    return np.maximum(_leaked(transform.real**2 + transform.imag**2) / _OPEN, 0.0) + _FAINTEST
 
 
 def log_local_power(kernel: Floats, changes: Floats) -> tuple[Floats, Floats]:
@@ -103,8 +103,8 @@ def log_local_power(kernel: Floats, changes: Floats) -> tuple[Floats, Floats]:
     changes : ndarray, shape (n, k, k)
         Derivatives of the kernel.
     """
-    found = fft.rfft2(np.concatenate([kernel[None], changes]), (2 * SIDE, 2 * SIDE))[:, ::2, ::2]
-    crossed = found.real * found[0].real + found.imag * found[0].imag
+    transform = fft.rfft2(np.concatenate([kernel[None], changes]), (2 * SIDE, 2 * SIDE))[:, ::2, ::2]
+    crossed = transform.real * transform[0].real + transform.imag * transform[0].imag
     power = _leaked(crossed) / _OPEN
     value = np.maximum(power[0], 0.0) + _FAINTEST
     return np.log(value), (2.0 * power[1:] / value).T

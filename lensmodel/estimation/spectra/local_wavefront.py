@@ -75,7 +75,7 @@ class AberrationFit:
     def fit(
         self,
         spectra: SceneSpectra,
-        found: Kernel,
+        first: Kernel,
         on_step: StepHook = ignore_step,
         local: LocalSpectra | None = None,
     ) -> LocalWavefront:
@@ -91,9 +91,9 @@ class AberrationFit:
         local : LocalSpectra, optional
             Spectra of small tiles of the same patches.
         """
-        wide = max(rms_width(found), 0.3)
+        wide = max(rms_width(first), 0.3)
         pupil = Pupil.of(_SIDES[wide > _WIDE_PX])
-        aim = resized(found, pupil.size)
+        aim = resized(first, pupil.size)
         rng = np.random.default_rng(_SEED)
         total = self.starts + self.kept + 1
         fits = []

@@ -108,8 +108,8 @@ def log_power(kernel: Floats, changes: Floats) -> tuple[Floats, Floats]:
     value : ndarray, shape (BINS,)
     derivatives : ndarray, shape (BINS, n)
     """
-    found = fft.rfft2(np.concatenate([kernel[None], changes]), (_SIDE, _SIDE))
-    crossed = found.real * found[0].real + found.imag * found[0].imag
+    transform = fft.rfft2(np.concatenate([kernel[None], changes]), (_SIDE, _SIDE))
+    crossed = transform.real * transform[0].real + transform.imag * transform[0].imag
     power = _leaked(crossed) / _OPEN
     value = power[0] + _FAINTEST
     return np.log(value), (2.0 * power[1:] / value).T

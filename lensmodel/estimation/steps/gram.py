@@ -62,9 +62,9 @@ def _of_rows(windows: NDArray[np.float32], lag: int, n: int) -> NDArray[np.float
     shared = inner.T @ windows[starts - 1 + lag : n + lag].reshape(-1, side)
     tops = np.matmul(windows[: starts - 1].transpose(0, 2, 1), windows[lag : starts - 1 + lag])
     ends = np.matmul(windows[n : n + starts - 1].transpose(0, 2, 1), windows[n + lag : n + lag + starts - 1])
-    found = np.empty((starts, side, side))
-    found[:] = shared
+    sums = np.empty((starts, side, side))
+    sums[:] = shared
     # From the first row of a sum on, down to the rows that all sums share; and beyond those.
-    found[:-1] += np.add.accumulate(tops[::-1].astype(np.float64), axis=0)[::-1]
-    found[1:] += np.add.accumulate(ends.astype(np.float64), axis=0)
-    return found
+    sums[:-1] += np.add.accumulate(tops[::-1].astype(np.float64), axis=0)[::-1]
+    sums[1:] += np.add.accumulate(ends.astype(np.float64), axis=0)
+    return sums

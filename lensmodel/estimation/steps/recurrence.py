@@ -108,13 +108,13 @@ def recur(x: Image, noise: float, bandwidth: float, search: Search = THOROUGH) -
     mean = wanted.mean(axis=1, keepdims=True)
     wanted = (wanted - mean).astype(np.float32)
     textured = (wanted**2).mean(axis=1) > flat
-    found = np.zeros_like(wanted)
+    matches = np.zeros_like(wanted)
     if examples.shape[0] > 4 * _NEIGHBOURS and textured.any():
-        found[textured] = _matches(wanted[textured], examples, bandwidth, search)
-    found += mean
+        matches[textured] = _matches(wanted[textured], examples, bandwidth, search)
+    matches += mean
 
     total, count = np.zeros_like(x), np.zeros_like(x)
-    patches = found.reshape(rows, cols, SIDE, SIDE)
+    patches = matches.reshape(rows, cols, SIDE, SIDE)
     for i in range(SIDE):
         for j in range(SIDE):
             place = (slice(i, i + stride * rows, stride), slice(j, j + stride * cols, stride))

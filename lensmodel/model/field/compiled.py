@@ -144,15 +144,15 @@ def near(
     rows, weights = np.empty(64, dtype=np.intp), np.empty(64)
     squared, taken = np.empty(len(points)), np.empty(len(points), dtype=np.intp)
     for question in range(len(asked)):
-        found = _within(points, votes, asked[question], 1.0 / scale, limit, squared, taken)
-        if found < few:
-            found = _fewest(squared, few, taken)
+        count = _within(points, votes, asked[question], 1.0 / scale, limit, squared, taken)
+        if count < few:
+            count = _fewest(squared, few, taken)
         at = starts[question]
-        if at + found > len(rows):
-            rows = np.concatenate((rows, np.empty(len(rows) + found, dtype=np.intp)))
-            weights = np.concatenate((weights, np.empty(len(weights) + found)))
+        if at + count > len(rows):
+            rows = np.concatenate((rows, np.empty(len(rows) + count, dtype=np.intp)))
+            weights = np.concatenate((weights, np.empty(len(weights) + count)))
         starts[question + 1] = at + _weigh(
-            squared, votes, taken[:found], dropped, rows[at : at + found], weights[at : at + found]
+            squared, votes, taken[:count], dropped, rows[at : at + count], weights[at : at + count]
         )
     return rows[: starts[-1]], weights[: starts[-1]], starts
 
@@ -168,7 +168,7 @@ def _within(
     taken: NDArray[np.intp],
 ) -> int:
     """Squared distances of all points, infinite without a vote, and those within the limit; how many."""
-    found = 0
+    count = 0
     for i in range(len(points)):
         total = 0.0
         for c in range(len(asked)):
@@ -177,9 +177,9 @@ def _within(
                 total += gap * gap
         squared[i] = total if votes[i] > 0.0 else math.inf
         if squared[i] <= limit:
-            taken[found] = i
-            found += 1
-    return found
+            taken[count] = i
+            count += 1
+    return count
 
 
 @jit
@@ -211,14 +211,14 @@ def _weigh(
 @jit
 def _fewest(squared: NDArray[np.float64], few: int, taken: NDArray[np.intp]) -> int:
     """The nearest few that vote, the nearest first; returns how many."""
-    found = 0
+    count = 0
     for i in range(len(squared)):
-        if squared[i] == math.inf or (found == few and squared[i] >= squared[taken[found - 1]]):
+        if squared[i] == math.inf or (count == few and squared[i] >= squared[taken[count - 1]]):
             continue
-        k = found if found < few else few - 1
+        k = count if count < few else few - 1
         while k > 0 and squared[taken[k - 1]] > squared[i]:
             taken[k] = taken[k - 1]
             k -= 1
         taken[k] = i
-        found = min(found + 1, few)
-    return found
+        count = min(count + 1, few)
+    return count

@@ -69,14 +69,14 @@ class CrossValidation:
 
 def bandwidth(rule: dict[str, float], settings: ModelSettings, choice: Choice) -> dict[str, float]:
     """Bandwidths of a rule, factors of cross-validation and the wishes of a user."""
-    found = rule = va.support(rule) if settings.mode == PAPER else dict(rule)
-    found["r"] = settings.r or rule["r"] * choice.r
+    bandwidths = rule = va.support(rule) if settings.mode == PAPER else dict(rule)
+    bandwidths["r"] = settings.r or rule["r"] * choice.r
     phi = rule["phi"] * choice.phi
     if settings.rotational is not None:
         phi = rule["phi"] ** (1.0 - settings.rotational) * _ROTATIONAL**settings.rotational
-    found["phi"] = settings.phi or phi
-    found["aperture_stops"] = settings.stops or rule["aperture_stops"]
-    return found
+    bandwidths["phi"] = settings.phi or phi
+    bandwidths["aperture_stops"] = settings.stops or rule["aperture_stops"]
+    return bandwidths
 
 
 def held_together(samples: Sequence[PsfSample], photo: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -141,13 +141,13 @@ def cross_validate(
     def chosen(votes: NDArray[np.float64]) -> Choice:
         if not automatic:
             return choice
-        found = choose(
+        factors = choose(
             held(_thinned(green, _CV_SAMPLES), votes),
             r=settings.r is None,
             phi=settings.phi is None and settings.rotational is None,
             mirror=settings.mirror is None,
         )
-        return found if settings.mirror is None else replace(found, mirror=settings.mirror)
+        return factors if settings.mirror is None else replace(factors, mirror=settings.mirror)
 
     scored = _thinned(voting, _SCORED)
     votes, errors = base.copy(), np.full(len(samples), _UNKNOWN_ERROR)
@@ -158,7 +158,7 @@ def cross_validate(
     prepared = held(scored, base)
     _, own_photo = np.unique(photo[scored], return_inverse=True)
     known = names[np.unique(photo[scored])]
-    by_sample, by_photo, found = robust.factors(
+    by_sample, by_photo, held_out = robust.factors(
         prepared, own_photo, r=choice.r, phi=choice.phi, mirror=choice.mirror
     )
     flags: tuple[Flag, ...] = ()
@@ -167,16 +167,16 @@ def cross_validate(
         votes = base * np.array([own.get(s.photo, 1.0) for s in samples])
         votes[scored] *= by_sample
         flags = robust.flags(
-            [samples[i] for i in scored], by_sample, by_photo, found, [str(n) for n in known]
+            [samples[i] for i in scored], by_sample, by_photo, held_out, [str(n) for n in known]
         )
         flags = tuple(f if f.sample is None else replace(f, sample=int(scored[f.sample])) for f in flags)
         if not (votes > 0).any():
             votes, flags = base.copy(), ()
         if flags:
             choice = chosen(votes)
-    scatter = np.minimum(prepared.noise(prepared.weights(choice.r, choice.phi)), found**2)
-    errors[:], noise[:] = float(np.median(found)), float(np.median(scatter))
-    errors[scored], noise[scored] = found, scatter
+    scatter = np.minimum(prepared.noise(prepared.weights(choice.r, choice.phi)), held_out**2)
+    errors[:], noise[:] = float(np.median(held_out)), float(np.median(scatter))
+    errors[scored], noise[scored] = held_out, scatter
     if not blend:
         return CrossValidation(votes, errors, noise, choice, flags)
     trusted = scored[votes[scored] > 0]

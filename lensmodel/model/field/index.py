@@ -51,8 +51,8 @@ class _Block:
             stretch = 1.0
         tree, built = stored
         # bandwidths shrink as samples come: an older tree is asked for a ball that surely holds ours
-        found = tree.query_ball_point((asked / built)[list(columns)], reach * stretch)
-        return np.asarray(found, dtype=np.intp) + self.start
+        inside = tree.query_ball_point((asked / built)[list(columns)], reach * stretch)
+        return np.asarray(inside, dtype=np.intp) + self.start
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,9 +90,9 @@ class SampleIndex:
     def near(self, asked: NDArray[np.float64], reach: float, scale: NDArray[np.float64]) -> NDArray[np.intp]:
         """Rows within `reach` bandwidths `scale` of the asked point, unknown variables left out."""
         done = self.blocks[-1].stop if self.blocks else 0
-        found = [block.near(self.points, asked, reach, scale) for block in self.blocks]
-        found.append(np.arange(done, len(self.points), dtype=np.intp))
-        rows = np.sort(np.concatenate(found))
+        parts = [block.near(self.points, asked, reach, scale) for block in self.blocks]
+        parts.append(np.arange(done, len(self.points), dtype=np.intp))
+        rows = np.sort(np.concatenate(parts))
         return rows[va.squared_distances(self.points[rows], asked, scale) <= reach * reach]
 
 

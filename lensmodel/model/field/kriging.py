@@ -154,11 +154,11 @@ def _run(rows: NDArray[np.intp]) -> bool:
 def as_kernels(rows: NDArray[np.float64], size: int) -> NDArray[np.float64]:
     """Rows of pixels as kernels of odd side `size`, shape (q, size, size); negative pixels become zero."""
     side = round(rows.shape[1] ** 0.5)
-    found = np.maximum(rows.reshape(-1, side, side), 0.0)
+    kernels = np.maximum(rows.reshape(-1, side, side), 0.0)
     cut, pad = max((side - size) // 2, 0), max((size - side) // 2, 0)
-    found = found[:, cut : side - cut, cut : side - cut]
-    found = found / np.maximum(found.sum(axis=(1, 2), keepdims=True), 1e-30)
-    return np.pad(found, ((0, 0), (pad, pad), (pad, pad))) if pad else found
+    kernels = kernels[:, cut : side - cut, cut : side - cut]
+    kernels = kernels / np.maximum(kernels.sum(axis=(1, 2), keepdims=True), 1e-30)
+    return np.pad(kernels, ((0, 0), (pad, pad), (pad, pad))) if pad else kernels
 
 
 def squared_gaps(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

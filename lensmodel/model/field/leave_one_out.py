@@ -102,8 +102,8 @@ class Held:
         whole = 1.0 + mirror
         linear = np.diag(direct + mirror * across) / whole
         square = ((1 + mirror**2) * direct + 2 * mirror * across) / whole**2
-        found = own - 2 * linear + np.einsum("ij,ij->i", square, weight)
-        relative = np.sqrt(np.maximum(found, 0.0) / np.maximum(own, 1e-30))
+        squared = own - 2 * linear + np.einsum("ij,ij->i", square, weight)
+        relative = np.sqrt(np.maximum(squared, 0.0) / np.maximum(own, 1e-30))
         return np.where(weight.sum(axis=1) > 0, relative, 1.0)
 
     def noise(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -151,16 +151,16 @@ def choose(held: Held, *, r: bool = True, phi: bool = True, mirror: bool = True)
     def at(r_: float, phi_: float, mirror_: float) -> Choice:
         return Choice(r_, phi_, mirror_, held.score(held.errors(r_, phi_, mirror_)))
 
-    found = at(1.0, 1.0, 0.0)
+    chosen = at(1.0, 1.0, 0.0)
     for _ in range(2):
-        now = found
+        now = chosen
         if r:
             now = best(MULTIPLES, lambda x, c=now: at(x, c.phi, c.mirror))  # type: ignore[misc] # mypy infers no default
         if phi:
             now = best(PHI_MULTIPLES, lambda x, c=now: at(c.r, x, c.mirror))  # type: ignore[misc] # same
         if mirror:
             now = best(MIRRORS, lambda x, c=now: at(c.r, c.phi, x))  # type: ignore[misc] # same
-        if (now.r, now.phi, now.mirror) == (found.r, found.phi, found.mirror):
+        if (now.r, now.phi, now.mirror) == (chosen.r, chosen.phi, chosen.mirror):
             break
-        found = now
-    return found
+        chosen = now
+    return chosen

@@ -60,8 +60,8 @@ class Answers:
     def mean(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
         """Weighted means of values `(n,)` of the samples, one for each question; weights below 0 are 0."""
         weight, first = np.maximum(self.weights, 0.0), self.starts[:-1]
-        found = np.add.reduceat(weight * values[self.rows], first) / np.add.reduceat(weight, first)
-        return np.asarray(found)
+        means = np.add.reduceat(weight * values[self.rows], first) / np.add.reduceat(weight, first)
+        return np.asarray(means)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,9 +111,9 @@ class LocalKernels:
 
         def rows() -> Iterator[NDArray[np.float32]]:  # one after the other: there may be very many
             for i, sample in enumerate(samples):
-                found = splines.coefficients(resized(sample.kernel, self.side), self.finer)
-                radii[i] = splines.light_radius(found)
-                yield found.astype(np.float32).ravel()
+                spline = splines.coefficients(resized(sample.kernel, self.side), self.finer)
+                radii[i] = splines.light_radius(spline)
+                yield spline.astype(np.float32).ravel()
 
         kept = self.splines.extended(rows(), len(samples))
         return replace(
@@ -153,7 +153,7 @@ class LocalKernels:
         maps, weights, rows, starts = self._seen(answers, angles, widths, mirror)
         for _ in range(_STEPS):
             part = _subset(starts, open_)
-            found = splines.sums(
+            kernels = splines.sums(
                 self.splines.rows,
                 self.radii,
                 rows[part],
@@ -164,10 +164,10 @@ class LocalKernels:
                 size,
                 engine=self.engine,
             )
-            found = _without_negatives(found, self.engine)
-            light[open_] = found
-            total = found.sum(axis=(1, 2))
-            row, col = found.sum(axis=2) @ t / total, found.sum(axis=1) @ t / total
+            kernels = _without_negatives(kernels, self.engine)
+            light[open_] = kernels
+            total = kernels.sum(axis=(1, 2))
+            row, col = kernels.sum(axis=2) @ t / total, kernels.sum(axis=1) @ t / total
             shifts[open_] -= np.stack([row, col], axis=1)
             open_ = open_[np.hypot(row, col) >= _CENTRED_PX]
             if not open_.size:
@@ -227,12 +227,12 @@ def affine_maps(
     """L_i' diag(scale) L for angles `own` of the samples and `here` of the questions, shape (m, 2, 2)."""
     c, s, d, t = np.cos(own), np.sin(own), np.cos(here), np.sin(here)
     u, v = scale[:, 0], scale[:, 1]
-    found = np.empty((len(own), 2, 2))
-    found[:, 0, 0] = s * u * t + c * v * d
-    found[:, 0, 1] = -s * u * d + c * v * t
-    found[:, 1, 0] = -c * u * t + s * v * d
-    found[:, 1, 1] = c * u * d + s * v * t
-    return found
+    maps = np.empty((len(own), 2, 2))
+    maps[:, 0, 0] = s * u * t + c * v * d
+    maps[:, 0, 1] = -s * u * d + c * v * t
+    maps[:, 1, 0] = -c * u * t + s * v * d
+    maps[:, 1, 1] = c * u * d + s * v * t
+    return maps
 
 
 def _subset(starts: NDArray[np.intp], questions: NDArray[np.intp]) -> NDArray[np.intp]:

@@ -56,25 +56,25 @@ class Neighbourhood:
             return Answers(
                 *module.near(self.index.points, self.votes, asked, self.scale, limit, _FEW, DROPPED)
             )
-        found = self._by_tree(asked) if len(asked) == 1 else self._by_table(asked)
-        counts = [len(weights) for _, weights in found]
+        neighbours = self._by_tree(asked) if len(asked) == 1 else self._by_table(asked)
+        counts = [len(weights) for _, weights in neighbours]
         return Answers(
-            np.concatenate([rows for rows, _ in found]),
-            np.concatenate([weights for _, weights in found]),
+            np.concatenate([rows for rows, _ in neighbours]),
+            np.concatenate([weights for _, weights in neighbours]),
             np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
         )
 
     def _by_tree(self, asked: NDArray[np.float64]) -> list[tuple[NDArray[np.intp], NDArray[np.float64]]]:
         """Cost of the neighbours, not of the samples."""
-        found = []
+        neighbours = []
         for point in asked:
             rows = self.index.near(point, self.smoother.reach, self.scale)
             rows = rows[self.votes[rows] > 0]
             if rows.size < _FEW:
                 rows = self._nearest(point)
             gaps = va.gaps(self.index.points[rows], point, self.scale)
-            found.append(self._weighed(rows, gaps))
-        return found
+            neighbours.append(self._weighed(rows, gaps))
+        return neighbours
 
     def _by_table(self, asked: NDArray[np.float64]) -> list[tuple[NDArray[np.intp], NDArray[np.float64]]]:
         """Many places of one setting: distances in settings are computed once, those of place in a table."""
@@ -83,7 +83,7 @@ class Neighbourhood:
         settings, limit = (apart * apart).sum(axis=1), self.smoother.reach**2
         rows = np.flatnonzero((settings <= limit) & (self.votes > 0))
         points, other = self.index.points[rows], settings[rows]
-        found = []
+        neighbours = []
         at_once = max(_PAIRS // max(len(rows), 1), 1)
         for first in range(0, len(asked), at_once):
             part = asked[first : first + at_once]
@@ -94,21 +94,21 @@ class Neighbourhood:
                 if near.size < _FEW:
                     nearest = self._nearest(point)
                     gaps = va.gaps(self.index.points[nearest], point, self.scale)
-                    found.append(self._weighed(nearest, gaps))
+                    neighbours.append(self._weighed(nearest, gaps))
                     continue
                 gaps = apart[rows[near]]
                 gaps[:, :3] = table[near]
-                found.append(self._weighed(rows[near], gaps))
-        return found
+                neighbours.append(self._weighed(rows[near], gaps))
+        return neighbours
 
     def _nearest(self, point: NDArray[np.float64]) -> NDArray[np.intp]:
         """The nearest few that vote, however far."""
         rows, reach = np.arange(len(self.index.points)), self.smoother.reach
         for _ in range(_WIDER if len(rows) > _MANY else 0):
             reach *= 2.0
-            found = self.index.near(point, reach, self.scale)
-            if np.count_nonzero(self.votes[found] > 0) >= _FEW:
-                rows = found
+            within = self.index.near(point, reach, self.scale)
+            if np.count_nonzero(self.votes[within] > 0) >= _FEW:
+                rows = within
                 break
         squared = va.squared_distances(self.index.points[rows], point, self.scale)
         squared[self.votes[rows] <= 0] = np.inf

@@ -98,24 +98,24 @@ def flags(
     names: Sequence[str],
 ) -> tuple[Flag, ...]:
     """List photos, then samples, whose votes were halved or worse."""
-    found = []
+    flags = []
     for p, name in enumerate(names):
         rows = [i for i, s in enumerate(samples) if s.photo == name]
         if by_photo[p] < _LISTED:
             others = [i for i, s in enumerate(samples) if s.photo != name]
             reason = _reason([samples[i] for i in rows], [samples[i] for i in others])
-            found.append(Flag(name, None, float(by_photo[p]), float(np.median(errors[rows])), reason))
-    whole = {flag.photo for flag in found}
+            flags.append(Flag(name, None, float(by_photo[p]), float(np.median(errors[rows])), reason))
+    whole = {flag.photo for flag in flags}
     for i, sample in enumerate(samples):
         if by_sample[i] < _LISTED and sample.photo not in whole:
             near = sorted(
                 (s for s in samples if s.photo != sample.photo),
                 key=lambda s, r=sample.position.r: abs(s.position.r - r),  # type: ignore[misc] # bound per round
             )[:12]
-            found.append(
+            flags.append(
                 Flag(sample.photo, i, float(by_sample[i]), float(errors[i]), _reason([sample], near))
             )
-    return tuple(found)
+    return tuple(flags)
 
 
 def _reason(these: Sequence[PsfSample], others: Sequence[PsfSample]) -> str:

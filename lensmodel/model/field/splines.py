@@ -53,9 +53,9 @@ def _refining(side: int, degree: int, finer: int) -> NDArray[np.float64]:
     through = scipy.interpolate.make_interp_spline(
         np.arange(-half - _MARGIN, half + _MARGIN + 1), pixels, k=degree
     )
-    found = _inverse(2 * reach + 1) @ through(np.arange(-reach, reach + 1) / finer)
-    found.setflags(write=False)
-    return np.asarray(found)
+    matrix = _inverse(2 * reach + 1) @ through(np.arange(-reach, reach + 1) / finer)
+    matrix.setflags(write=False)
+    return np.asarray(matrix)
 
 
 def _inverse(side: int) -> NDArray[np.float64]:
@@ -70,12 +70,12 @@ def coefficients(kernel: NDArray[np.floating], finer: int = FINER) -> NDArray[np
     contrast = max(abs(float(turns @ kernel.sum(axis=1))), abs(float(turns @ kernel.sum(axis=0))))
     low, high = _ALIASED
     narrow = min(max((contrast / float(kernel.sum()) - low) / (high - low), 0.0), 1.0)
-    found = np.zeros(())
+    spline = np.zeros(())
     for share, degree in ((1.0 - narrow, _SMOOTH), (narrow, _NARROW)):
         if share > 0:
             refining = _refining(kernel.shape[0], degree, finer)
-            found = found + share * (refining @ kernel @ refining.T)
-    return np.asarray(found, dtype=np.float64)
+            spline = spline + share * (refining @ kernel @ refining.T)
+    return np.asarray(spline, dtype=np.float64)
 
 
 def light_radius(kernel: NDArray[np.floating]) -> float:
@@ -157,7 +157,7 @@ def _sums(
             # two beyond the edge a spline is zero: further away is as good as there
             np.clip(read[0], -2.0, side + 1.0, out=read[0])
             read[0] += (np.arange(count) * step)[:, None, None]
-            found = ndimage.map_coordinates(
+            resampled = ndimage.map_coordinates(
                 sheet.reshape(-1, side),
                 read.reshape(2, -1),
                 output=np.float64,
@@ -165,5 +165,5 @@ def _sums(
                 mode="grid-constant",
                 prefilter=False,
             )
-            out[answer] += (weights[part] @ found.reshape(count, -1)).reshape(size, size)
+            out[answer] += (weights[part] @ resampled.reshape(count, -1)).reshape(size, size)
     return out

@@ -69,8 +69,8 @@ class WidthField:
         if self.slopes is None:
             return np.ones((len(where), 2))
         # no matrix product: how that rounds hangs on how many places are asked for at once
-        found = (self._features(where)[:, :, None] * self.slopes).sum(axis=1)
-        return np.clip(np.exp(found - self.reference), *_RANGE)
+        logarithms = (self._features(where)[:, :, None] * self.slopes).sum(axis=1)
+        return np.clip(np.exp(logarithms - self.reference), *_RANGE)
 
     def _features(self, where: NDArray[np.float64]) -> NDArray[np.float64]:
         r2 = where[:, 0] ** 2

@@ -34,7 +34,7 @@ def field_error(held_out: float, noise: float, independent: float) -> float:
     return math.sqrt(bias + noise / independent)
 
 
-def shared_error(told: float, noise: float) -> float:
+def shared_error(expected: float, noise: float) -> float:
     """Error that all samples share, from what their estimators expect of them.
 
     They expect bias and noise together, t^2 = b^2 + s^2, and s^2 is the scatter that neighbours show::
@@ -45,10 +45,10 @@ def shared_error(told: float, noise: float) -> float:
 
     Parameters
     ----------
-    told, noise : float
+    expected, noise : float
         t^2 and s^2 near the place.
     """
-    return math.sqrt(max(told - noise, told / 4.0))
+    return math.sqrt(max(expected - noise, expected / 4.0))
 
 
 def support(

@@ -1,9 +1,9 @@
 """What patches say of the kernels of a model, place by place.
 
 A global fit does not know where it does not fit, and a regression of kernels does not know what all of
-them have wrong. Kernels that are too wide ruin a photo. So two opinions are heard at each place, the kernels
-of the regression and those of the lens's wavefront, each as it is, narrower, and mixed with a point; and the
-patches of the lens and of the very photo that is to be corrected say which of them makes their spectra likely
+them have wrong. Kernels that are too wide ruin a photo. So two opinions are weighed at each place, the
+kernels of the regression and those of the lens's wavefront, each as it is, narrower, and mixed with a point;
+the patches of the lens and of the photo to be corrected say which of them makes their spectra likely
 (`likelihood.surprise`). With c_ia the negative log likelihood of patch i behind alternative a, bounded so
 that no patch speaks for all,
 
@@ -58,7 +58,7 @@ _AGAINST, _FOR = 12.0, 6.0  # bounds of what one patch says, from the first alte
 _RADIUS: Final = 0.3  # half-diagonals
 _FEWEST: Final = 5.0  # patches whose mean counts in full; one alone overrules nothing
 TEMPER, HALF = 2.0, 2.0  # t of many photos, and how many photos halve it
-_HEARD: Final = 0.5  # patches below which nobody has spoken
+_FEWEST_VOTES: Final = 0.5  # patches; with fewer near a place the witness says nothing (chosen)
 _MOST: Final = 96  # patches of a model that are asked
 _TINY: Final = 1e-12
 _ALIKE: Final = 0.05  # least weight by settings
@@ -106,19 +106,19 @@ class Witness:
             Of that photo; only place, settings, pixels and spectrum count. Those without a spectrum, of JPEG
             files, say nothing.
         """
-        heard = [*_own(opinions[0], settings), *((p, 1.0) for p in patches if p.spectrum is not None)]
-        costs = [[_costs(patch, model.kernel_of(patch)) for model in opinions] for patch, _ in heard]
+        voters = [*_own(opinions[0], settings), *((p, 1.0) for p in patches if p.spectrum is not None)]
+        costs = [[_costs(patch, model.kernel_of(patch)) for model in opinions] for patch, _ in voters]
         table = np.array(costs).reshape(-1, len(opinions), len(NARROWINGS))
         return cls(
-            np.array([field_vector(patch.position) for patch, _ in heard]).reshape(-1, 2),
-            np.array([vote for _, vote in heard]),
-            np.unique([patch.photo for patch, _ in heard], return_inverse=True)[1].astype(np.intp),
+            np.array([field_vector(patch.position) for patch, _ in voters]).reshape(-1, 2),
+            np.array([vote for _, vote in voters]),
+            np.unique([patch.photo for patch, _ in voters], return_inverse=True)[1].astype(np.intp),
             np.clip(table - table[:, :1, :1], -_AGAINST, _FOR),
             _prior(opinions),
         )
 
-    def heard(self, position: FieldPosition) -> float:
-        """How many patches speak about a place."""
+    def votes_at(self, position: FieldPosition) -> float:
+        """Sum of the weights of the patches near a place."""
         return float(self._weights(position).sum())
 
     def evidence(self, position: FieldPosition) -> tuple[NDArray[np.float64], float]:
@@ -157,7 +157,7 @@ class WitnessedField:
     Parameters
     ----------
     opinions : sequence of LensModel
-        As the witness heard them.
+        As the witness weighed them.
     fields : sequence of PsfField
         Theirs, for the photo that is to be corrected.
     witness : Witness
@@ -201,8 +201,8 @@ class WitnessedField:
             answer.shared_error == 0.0
         ):  # the estimator said nothing of itself: it shares the error that is usual
             expected = math.hypot(expected, _USUAL_ERROR)
-        if self.witness.heard(position) < _HEARD:
-            return self._unheard(position, answer.kernel, expected)
+        if self.witness.votes_at(position) < _FEWEST_VOTES:
+            return self._without_votes(position, answer.kernel, expected)
         kernels = [answer.kernel, *(field.kernel_at(position, channel, size) for field in self.fields[1:])]
         spread = SPREAD_OF_BOTH if len(kernels) > 1 else _SPREAD_OF_ONE
         shares = self.witness.shares(position, expected)
@@ -220,7 +220,7 @@ class WitnessedField:
         physical = self.opinions[0].physical
         return 0.0 if physical is None else physical.turned
 
-    def _unheard(self, position: FieldPosition, kernel: Kernel, expected: float) -> Belief:
+    def _without_votes(self, position: FieldPosition, kernel: Kernel, expected: float) -> Belief:
         """What is thought of a kernel about which no patch speaks: the prior stays, no surer than it expects.
 
         So with lenses that were learned from JPEG files alone. The mean of the alternatives keeps more at the

@@ -82,10 +82,10 @@ def corner_ratio(terms: Floats) -> tuple[float, Floats]:
 
 def _precision() -> Floats:
     """Inverse covariance of the lens's unknowns."""
-    found = np.diag(1.0 / np.concatenate([_SPREAD_PX, _EYE_SPREAD]) ** 2)
+    precision = np.diag(1.0 / np.concatenate([_SPREAD_PX, _EYE_SPREAD]) ** 2)
     balanced = np.zeros(_LENS)
     balanced[[NAMES.index("focus"), NAMES.index("spherical")]] = 1.0, -BALANCE
-    return np.asarray(found + np.outer(balanced, balanced) / _BALANCE_SPREAD_PX**2)
+    return np.asarray(precision + np.outer(balanced, balanced) / _BALANCE_SPREAD_PX**2)
 
 
 _PRECISION = _precision()
@@ -102,11 +102,11 @@ def _spots() -> tuple[Floats, Floats]:
     rays = np.array([right, up])[:, :, rho2 <= 1.0]
     rays = rays - rays.mean(axis=2, keepdims=True)
     gram = np.einsum("akp,alp->kl", rays, rays) / (2.0 * rays.shape[2])
-    found = []
+    matrices = []
     for r in (0.0, 1.0):
         angles = np.arange(_ANGLES) * 2.0 * math.pi / _ANGLES - math.pi
         designs = np.stack(
             [design(FieldPosition(r, float(phi)), LensSettings(channel="g")) for phi in angles]
         )
-        found.append(np.einsum("qki,kl,qlj->ij", designs, gram, designs) / _ANGLES)
-    return found[0], found[1]
+        matrices.append(np.einsum("qki,kl,qlj->ij", designs, gram, designs) / _ANGLES)
+    return matrices[0], matrices[1]

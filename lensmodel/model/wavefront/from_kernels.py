@@ -75,22 +75,22 @@ def fit_wavefront(samples: Sequence[PsfSample], start: Wavefront | None = None) 
         coarse = Problem(tuple(few), size, log_q, vague, _BLUR_PX)
         tried = [coarse.solve(front, _COARSE_ROUNDS) for front in _starts(many, usual)]
         # the best fit of few blurred samples need not lead to the best of all sharp ones
-        begins = [front for front, _, _ in sorted(tried, key=lambda found: found[1])[:_REFINED]]
+        begins = [front for front, _, _ in sorted(tried, key=lambda fit: fit[1])[:_REFINED]]
     fine = Problem(tuple(many), size, log_q, vague, 0.0)
     fitted = [fine.solve(replace(begin, size=size, f_number=widest), _FINE_ROUNDS) for begin in begins]
-    found, cost, errors = min(fitted, key=lambda one: one[1])
+    likeliest, cost, errors = min(fitted, key=lambda fit: fit[1])
     if vague > _GUESSED:
         # the width of diffraction was a guess: blur alone leads to minima at either side of it
         for guess in (log_q - 0.5, log_q + 0.5):
-            other, other_cost, other_errors = fine.solve(replace(found, log_q=guess), _FINE_ROUNDS)
+            other, other_cost, other_errors = fine.solve(replace(likeliest, log_q=guess), _FINE_ROUNDS)
             if other_cost < cost:
-                found, cost, errors = other, other_cost, other_errors
+                likeliest, cost, errors = other, other_cost, other_errors
     if zoom:
         # turned by 180 degrees at one end only, spots without coma stay as they are
-        other, other_cost, other_errors = fine.solve(_turned_at_one_end(found, kept), _FINE_ROUNDS)
+        other, other_cost, other_errors = fine.solve(_turned_at_one_end(likeliest, kept), _FINE_ROUNDS)
         if other_cost < cost:
-            found, errors = other, other_errors
-    return replace(found, error=float(np.median(errors)))
+            likeliest, errors = other, other_errors
+    return replace(likeliest, error=float(np.median(errors)))
 
 
 def refined(front: Wavefront, samples: Sequence[PsfSample]) -> Wavefront:
@@ -123,8 +123,8 @@ def _starts(samples: Sequence[PsfSample], usual: Wavefront) -> list[Wavefront]:
         return [replace(usual, terms=terms) for terms in starts(samples, designs, PRIOR_PX, q, _STARTS)]
     octaves = np.array([usual.octaves(s.settings) for s in samples])
     both = np.concatenate([designs, designs * octaves[:, None, None]], axis=2)
-    found = starts(samples, both, np.concatenate([PRIOR_PX, SLOPE_PX]), q, 2 * _STARTS)
-    return [replace(usual, terms=terms[:count], slopes=terms[count:]) for terms in found]
+    vectors = starts(samples, both, np.concatenate([PRIOR_PX, SLOPE_PX]), q, 2 * _STARTS)
+    return [replace(usual, terms=terms[:count], slopes=terms[count:]) for terms in vectors]
 
 
 def _turned_at_one_end(front: Wavefront, samples: Sequence[PsfSample]) -> Wavefront:

@@ -194,7 +194,7 @@ class _Problem:
         """Cost with its normal equations; `scenes` are the patches' unknowns to begin with."""
         count = _LENS + shared.size
         normal, gradient = np.zeros((count, count)), np.zeros(count)
-        cost, found, trust = 0.0, [], []
+        cost, scenes_after, trust = 0.0, [], []
         for i, patch in enumerate(self.patches):
             at = _LENS + len(PHOTO_SPREAD) * self.photos[patch.photo]
             seen, by_lens = self._lens(lens, patch)
@@ -211,7 +211,7 @@ class _Problem:
             places = [*range(_LENS), *range(at, at + own_count - _LENS)]
             normal[np.ix_(places, places)] += weight * own_normal
             gradient[places] += weight * own_gradient
-            found.append(fitted.z)
+            scenes_after.append(fitted.z)
             trust.append(trusted)
         unusual, curvature, pull = unlikeliness(lens)
         vote = np.tile(1.0 / PHOTO_SPREAD**2, len(self.photos))
@@ -219,7 +219,7 @@ class _Problem:
         normal[:_LENS, :_LENS] += curvature
         normal[range(_LENS, count), range(_LENS, count)] += vote
         gradient -= np.concatenate([pull, vote * shared.ravel()])
-        return _State(cost, normal, gradient, found, np.array(trust))
+        return _State(cost, normal, gradient, scenes_after, np.array(trust))
 
     def _lens(self, lens: Floats, patch: PatchView) -> tuple[Floats, Floats]:
         """Return |OTF|^2 in the bins, shape (BINS, c), and the derivatives of its logarithm (BINS, c, 21)."""

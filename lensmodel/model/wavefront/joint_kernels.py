@@ -118,12 +118,12 @@ class Pooled:
         lens = np.concatenate([self.front.terms, self.front.eye])
         values, vectors = np.linalg.eigh(self.fit.covariance)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
-        found = np.zeros(len(few))
+        squared = np.zeros(len(few))
         right = [self.front.kernel(s.position, s.settings, _TAIL_SIDE) for s in few]
         for _ in range(_DRAWS):
             drawn = lens + root @ rng.standard_normal(len(lens))
             other = replace(self.front, terms=drawn[:-2], eye=open_eye(drawn[-2:]))
-            found += [
+            squared += [
                 distance(other.kernel(s.position, s.settings, _TAIL_SIDE), k).rel_l2 ** 2
                 for s, k in zip(few, right, strict=True)
             ]
@@ -131,7 +131,7 @@ class Pooled:
         there = np.array([_vector(s) for s in few])
         apart = ((here[:, None] - there[None]) ** 2).sum(axis=-1)
         weight = np.exp(-0.5 * apart / 0.15**2) + 1e-9
-        drawn_here = weight @ np.sqrt(found / _DRAWS) / weight.sum(axis=1)
+        drawn_here = weight @ np.sqrt(squared / _DRAWS) / weight.sum(axis=1)
         least = _LEAST_ERROR * np.exp([_RISE * s.position.r for s in samples])
         share = _DRAWN * max(1.0 / max(len({s.photo for s in samples}), 1), _LEAST_DRAWN)
         return np.hypot(share * drawn_here, least)
@@ -238,15 +238,15 @@ def _random_fronts(first: Wavefront, width: float) -> list[Wavefront]:
     Kernels that were estimated one by one have the widths of the lens, not always its character: where
     spherical aberration is balanced by focus, their moments lead elsewhere.
     """
-    rng, found = np.random.default_rng(_SEED), []
+    rng, fronts = np.random.default_rng(_SEED), []
     for _ in range(_RANDOM):
         terms = np.zeros(len(NAMES))
         for name, usual in _USUAL_SHAPE.items():
             terms[NAMES.index(name)] = rng.normal(0.0, usual)
         balance = BALANCE * terms[NAMES.index("spherical")]
         terms[NAMES.index("focus")] = balance + rng.normal(0.0, _FOCUS_SPREAD)
-        found.append(replace(first, terms=width * terms, eye=USUAL_EYE))
-    return found
+        fronts.append(replace(first, terms=width * terms, eye=USUAL_EYE))
+    return fronts
 
 
 def _negative(front: Wavefront) -> Wavefront:
@@ -292,11 +292,11 @@ def _apart(terms: NDArray[np.float64], others: NDArray[np.float64]) -> float:
 
 def _places(samples: Sequence[PsfSample]) -> list[dict[Channel, PsfSample]]:
     """Samples of one patch in its channels."""
-    found: dict[tuple[str, float, float], dict[Channel, PsfSample]] = {}
+    places: dict[tuple[str, float, float], dict[Channel, PsfSample]] = {}
     for sample in samples:
         key = (sample.photo, sample.position.r, sample.position.phi)
-        found.setdefault(key, {})[sample.settings.channel] = sample
-    return list(found.values())
+        places.setdefault(key, {})[sample.settings.channel] = sample
+    return list(places.values())
 
 
 def _view(group: dict[Channel, PsfSample]) -> PatchView:

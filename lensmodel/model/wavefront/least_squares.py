@@ -82,12 +82,12 @@ class Problem:
         )
 
     def _tilts(self, front: Wavefront) -> NDArray[np.float64]:
-        found = []
+        tilts = []
         for s in self.samples:
             grid = front.grid(s.settings)
             amplitude = front.amplitude(grid, s.position, s.settings, front.eye)
-            found.append(-np.array(grid.centre(front.blur(s.position, s.settings), amplitude)))
-        return np.array(found)
+            tilts.append(-np.array(grid.centre(front.blur(s.position, s.settings), amplitude)))
+        return np.array(tilts)
 
     def _linearised(
         self,
@@ -151,14 +151,14 @@ class Problem:
         further = front.amplitude(grid, position, settings, (radius, shift + 0.02)) - amplitude
         g = front.blur(position, settings)
         g[6:] = tilt
-        light, found = grid.with_derivatives(g, amplitude, (wider / 0.02, further / 0.02))
+        light, derivatives = grid.with_derivatives(g, amplitude, (wider / 0.02, further / 0.02))
         softer = replace(front, log_q=front.log_q + 0.05).grid(settings)
         broad = softer.light(g, front.amplitude(softer, position, settings, front.eye))
         by_q = (broad / broad.sum() * light.sum() - light) / 0.05
-        stack = self._soft(np.concatenate([found, by_q[None], light[None]]))
+        stack = self._soft(np.concatenate([derivatives, by_q[None], light[None]]))
         flat = stack.reshape(len(stack), -1)
         total = light.sum()
-        sums = np.concatenate([found.sum(axis=(1, 2)), [by_q.sum()]])
+        sums = np.concatenate([derivatives.sum(axis=(1, 2)), [by_q.sum()]])
         kernel = flat[-1] / total
         normalised = flat[:-1] / total - np.outer(sums / total, kernel)
         terms = stopped(linear, front.stop(settings)).T @ normalised[:6]

@@ -42,8 +42,8 @@ def surprise(sample: PsfSample, kernel: Kernel, share: float = 1.0) -> float:
 def _power(kernel: Kernel, share: float) -> NDArray[np.float64]:
     """Mean of |OTF|^2 in each bin, shape (BINS,), of a kernel narrowed to a share of its width."""
     rows, cols = _waves(kernel.shape[0], share)
-    found = np.abs(((rows @ kernel) * cols).sum(axis=1)) ** 2
-    return np.asarray(found.reshape(-1, BINS).mean(axis=0))
+    power = np.abs(((rows @ kernel) * cols).sum(axis=1)) ** 2
+    return np.asarray(power.reshape(-1, BINS).mean(axis=0))
 
 
 @lru_cache(maxsize=8)

@@ -145,16 +145,16 @@ class Physics:
 
     def rows(self, positions: Sequence[FieldPosition], settings: LensSettings) -> NDArray[np.float64]:
         """Kernels of the image frame as flat rows, shape (q, side^2)."""
-        found = np.stack([_rendered(self.front, self.side, place, settings) for place in positions])
+        rendered = np.stack([_rendered(self.front, self.side, place, settings) for place in positions])
         if self.agreed:
-            return found
+            return rendered
         alike = np.exp(-0.5 * settings_gap(self.where, va.point(positions[0], settings), self.scale))
         near = np.flatnonzero(alike > _ALIKE)
         if near.size:
             vectors = np.array([field_vector(position) for position in positions])
             towards = matern(np.sqrt(squared_gaps(vectors, self.vectors[near]))) * alike[near]
-            found += towards @ self.rest[near]
-        return found
+            rendered += towards @ self.rest[near]
+        return rendered
 
     def extended_errors(self, count: int) -> NDArray[np.float64]:
         """Held-out errors of the first `count` samples; the usual one of those added later."""

@@ -46,15 +46,15 @@ def starts(
     second, third = _moments(samples, q)
     scale = float(max(np.median(second[:, 0] + second[:, 1]) / 2.0, 0.05))
     rng = np.random.default_rng(_SEED)
-    found = []
+    ranked = []
     for _ in range(_TRIES):
         terms = rng.normal(0.0, 0.4 * np.sqrt(scale), len(prior_px)) * prior_px / prior_px.max()
-        found.append(
+        ranked.append(
             _descended(terms, designs, across, up, second / scale, third / scale**1.5, scale, prior_px)
         )
-    found.sort(key=lambda pair: pair[0])
+    ranked.sort(key=lambda pair: pair[0])
     kept: list[NDArray[np.float64]] = []
-    for _, terms in found:
+    for _, terms in ranked:
         if all(np.abs(terms - other).max() > 0.1 * np.sqrt(scale) for other in kept):
             kept.append(terms)
     return kept[:count]

@@ -85,7 +85,7 @@ def ends_of(
     """
     if shared.front.slopes is None:
         return ()
-    found = []
+    ends = []
     for rows in _one_by_one(samples, votes):
         own = Physics.fit(samples, _only(rows, votes), groups, scale, on_step)
         if own is None:
@@ -95,8 +95,8 @@ def ends_of(
         here = float(np.median([_octaves(samples[i]) for i in rows.tolist()]))
         inside = np.abs(octaves - here) <= ONE_FOCAL_LENGTH / 2.0
         if own.agreed or not _better_together(own.front, shared.front, voting, inside):
-            found.append(End(here, own))
-    return tuple(found)
+            ends.append(End(here, own))
+    return tuple(ends)
 
 
 def _octaves(sample: PsfSample) -> float:
@@ -105,9 +105,9 @@ def _octaves(sample: PsfSample) -> float:
 
 
 def _only(rows: NDArray[np.intp], votes: NDArray[np.float64]) -> NDArray[np.float64]:
-    found = np.zeros(len(votes))
-    found[rows] = votes[rows]
-    return found
+    kept = np.zeros(len(votes))
+    kept[rows] = votes[rows]
+    return kept
 
 
 def _one_by_one(samples: Sequence[PsfSample], votes: NDArray[np.float64]) -> list[NDArray[np.intp]]:

@@ -156,8 +156,8 @@ class _Records:
         value = self.values.get(tag, b"")[index * size : (index + 1) * size]
         if len(value) < size:
             return None
-        found = float(struct.unpack(self.order + code, value)[0])
-        return found if math.isfinite(found) else None
+        as_float = float(struct.unpack(self.order + code, value)[0])
+        return as_float if math.isfinite(as_float) else None
 
 
 def _shot(records: _Records) -> CiffShot:

@@ -131,10 +131,10 @@ class _Exif:
         block = 0
         for index, reader in enumerate(header.tiff):
             main, _ = reader.directory(reader.first)
-            found = {**main, **reader.below(main.get(0x8769))}
-            if 0x927C in found:
+            directory = {**main, **reader.below(main.get(0x8769))}
+            if 0x927C in directory:
                 block = index
-            tags = {**found, **tags}
+            tags = {**directory, **tags}
         return cls(tags, block)
 
     def text(self, tag: int) -> str | None:

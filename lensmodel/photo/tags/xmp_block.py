@@ -115,7 +115,7 @@ def xmp_packet(
 
 def _taken(metadata: PhotoMetadata, lens: str) -> dict[str, str]:
     named = lens or metadata.lens.model
-    found = {
+    values = {
         "xmp:CreatorTool": SOFTWARE,
         "tiff:Make": metadata.camera_maker,
         "tiff:Model": metadata.camera_model,
@@ -126,7 +126,7 @@ def _taken(metadata: PhotoMetadata, lens: str) -> dict[str, str]:
         "exif:FocalLength": _rational(metadata.focal_mm),
         "exif:DateTimeOriginal": None if metadata.taken_at is None else metadata.taken_at.isoformat(),
     }
-    return {name: value for name, value in found.items() if value}
+    return {name: value for name, value in values.items() if value}
 
 
 def _rational(value: float | None) -> str | None:

@@ -183,10 +183,10 @@ def test_patches_of_another_aperture_and_of_excluded_photos_do_not_speak() -> No
     )
     stopped_down = LensSettings(aperture=8.0)
 
-    assert believed(known).witness.heard(RIGHT) > 1.0
+    assert believed(known).witness.votes_at(RIGHT) > 1.0
     without = LensModel.fit(known.samples, ModelSettings(excluded=("bad",)))
-    assert believed(without).witness.heard(RIGHT) == 0.0
-    assert WitnessedField.of(known, stopped_down).witness.heard(RIGHT) < 0.1
+    assert believed(without).witness.votes_at(RIGHT) == 0.0
+    assert WitnessedField.of(known, stopped_down).witness.votes_at(RIGHT) < 0.1
 
 
 def test_question_outside_the_samples_is_answered_with_the_error_of_the_model() -> None:

@@ -29,7 +29,7 @@ GRID: Final = (64, 64)
 """Shape of the grid whose `rfft2` frequencies variances are given on."""
 WIDEST: Final = 63
 """Largest side of a kernel that the grid holds."""
-_LEAST: Final = 1e-30
+_LEAST: Final = 1e-30  # keeps divisions finite, far below any power
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,15 +23,16 @@ SECTORS: Final = 12
 RING_LIMITS: Final = (0.03, 0.5)
 """Frequencies of the innermost and outermost ring, cycles/pixel; rings are equally wide in log."""
 
-_TILE = 64
+_TILE = 64  # pixels of a tile (chosen)
+# Pixels: no derivative is taken finer than the pixel or wider than kernels are (chosen)
 _TAIL_SIGMA = (0.5, 3.0)
 _TAIL_POWER = 0.8  # of the gradients: photographs are about as sparse as that
 _TAIL_PHASE = 1.5  # radians at most: beyond, frequencies hold little but noise
-_TAIL_SOFT_PX = 0.3
-_TAIL_RIM = 16
+_TAIL_SOFT_PX = 0.3  # pixels: keeps noise next to Nyquist out of the third derivative (chosen)
+_TAIL_RIM = 16  # pixels of the patch's rim that its window fades (chosen)
 _CORE_PX = (2, 4)  # nearer than this neighbours are alike: for the valley, for the peak
 _REPEATS = (-0.4, 0.9)  # correlation at the valley and the peak of what repeats
-_BYTES = 4 * (RINGS * SECTORS + 3)
+_BYTES = 4 * (RINGS * SECTORS + 3)  # single precision: the bins, the noise and two asymmetries
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -42,7 +42,7 @@ _SLOPES: Final = (2.0, 5.0)
 _BLOCKS: Final = 3  # along a side are enough
 _GRID: Final = GRID
 _EVERY: Final = 3  # of the rows and columns suffice for a mean; odd: all colours of a mosaic are met
-_LEAST: Final = 1e-30
+_LEAST: Final = 1e-30  # keeps divisions finite, far below any power
 _MOST: Final = 0.7  # of the error before is the most that a change is thought to have taken away (chosen)
 
 

@@ -40,7 +40,7 @@ PsfError = Callable[[FieldPosition, Channel], float] | float
 """Relative L2 error that the PSF is expected to have, everywhere or by place and channel."""
 
 
-KERNEL_SIZE = 55
+KERNEL_SIZE = 55  # pixels: the largest kernel that the paper estimates
 
 
 @dataclass(frozen=True, slots=True, eq=False)

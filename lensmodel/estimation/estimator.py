@@ -17,9 +17,9 @@ from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_ste
 NO_BLUR_PX2 = 0.3
 """Below this mean second moment a kernel cannot be told from the pixel and the scene's own softness."""
 
-_MIN_SIDE = 64
-_CONTRAST_IN_NOISE = 3.0
-_CLIPPED_SHARE = 0.02
+_MIN_SIDE = 64  # pixels: one tile of a patch's spectrum
+_CONTRAST_IN_NOISE = 3.0  # standard deviations: less contrast is noise (chosen)
+_CLIPPED_SHARE = 0.02  # of the pixels: a few clipped ones spoil no estimate (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

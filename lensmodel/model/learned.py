@@ -37,8 +37,8 @@ from lensmodel.optics.wavefront import NAMES, Wavefront
 VERSION: Final = 14
 """Raised whenever the same samples would be fitted otherwise."""
 
-_MOST_BYTES = 1 << 27
-_MOST_NODES = 4096
+_MOST_BYTES = 1 << 27  # unpacked: against files made to fill the memory
+_MOST_NODES = 4096  # of arrays that do not grow with the samples
 _DAMAGED = (
     OSError,
     ValueError,

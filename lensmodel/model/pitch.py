@@ -25,8 +25,8 @@ from lensmodel.core.psf import PsfSample, as_kernel
 from lensmodel.core.types import Kernel
 from lensmodel.model.answer import HALF_DIAGONAL
 
-_SAME = 0.005
-_PADDED = 2
+_SAME = 0.005  # of the pitch: what rounding in metadata changes
+_PADDED = 2  # times the kernel, so that its images do not overlap
 _WIDEST = 8192  # pixels of the samples
 
 

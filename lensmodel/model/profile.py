@@ -37,10 +37,10 @@ from lensmodel.model.answer import FORMER_MODES, KERNELS, ModelSettings
 from lensmodel.model.field.smoothers import FORMER_METHODS
 from lensmodel.model.lens_model import LensModel
 
-FORMAT = 1
-_MAX_BYTES = 1 << 30
-_MAX_SAMPLES = 200_000
-_MAX_SIDE = 255
+FORMAT = 1  # raised when older programs could not read a profile any more
+_MAX_BYTES = 1 << 30  # unpacked: against files made to fill the memory
+_MAX_SAMPLES = 200_000  # some 2,700 photos of 24 patches in three colours
+_MAX_SIDE = 255  # pixels (chosen)
 _INFINITY = "infinity"
 _LEARNED = "learned.npz"
 _SPECTRA = "spectra.npy"

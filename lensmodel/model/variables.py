@@ -30,8 +30,8 @@ FALLBACK: Final[Mapping[str, float]] = {
 }
 """Bandwidths of settings that do not vary among the samples, and upper limits of those that do."""
 
-_CENTER_R = 0.25
-_FLOOR_R, _FLOOR_PHI = 0.02, 0.12
+_CENTER_R = 0.25  # half-diagonals: inside, directions fade, since at the centre there is none (chosen)
+_FLOOR_R, _FLOOR_PHI = 0.02, 0.12  # least bandwidths: blur does not change faster over the field (chosen)
 _SAME = 1e-6  # equal values have a spread of rounding errors, not of zero
 _PLACE_SHARE = 0.45  # of eq. 8: the rule is for densities, a smooth regression wants less
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lensmodel.core.jit import jit
 
+# In single precision, so that no sum is made in double.
 _HALF, _ONE, _TWO = np.float32(0.5), np.float32(1.0), np.float32(2.0)
 # Of sin(pi x) and cos(pi x) for |x| <= 1/2, by least squares: within 2e-6.
 _S1, _S3, _S5, _S7 = (np.float32(v) for v in (3.1415847, -5.16724542, 2.54284755, -0.55707962))

@@ -28,12 +28,12 @@ from numpy.typing import NDArray
 TERMS = 8
 """Number of wavefront terms; the last two are the tilts, which move the kernel."""
 
-_MIN_ACROSS, _MAX_ACROSS = 40, 176
+_MIN_ACROSS, _MAX_ACROSS = 40, 176  # samples across the transform: aliasing below, memory above (chosen)
 _ALONE = 1.05  # period over the side of a kernel, at least
 _PERIOD = 1.25  # of the discrete pupil over the side of the kernel
 _SAMPLING = 0.9  # light is band limited to 1 / q cycles/pixel; its last tenth may alias, the pixel kills it
-_MIN_FINE, _MAX_FINE = 3, 8
-_RIM = 4
+_MIN_FINE, _MAX_FINE = 3, 8  # samples per pixel (chosen)
+_RIM = 4  # samples: the pixel's box with its rounded edges
 
 
 def largest_side(q: float) -> int:

@@ -48,7 +48,7 @@ _SMOOTH = 5  # rings in which one sample does: nothing has zeros at such low fre
 BORROWED_RINGS: Final = 3
 """Outermost rings that say nothing of red and blue: demosaicing takes them from green."""
 _HIGHEST = 0.75  # cycles/pixel; beyond, lens and pixel pass too little to count
-_LEAST = 1e-7
+_LEAST = 1e-7  # |OTF|^2 at least: keeps its logarithm finite where the lens passes nothing
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]

@@ -33,7 +33,7 @@ XYZ_TO_SRGB: Final = (
 
 _BYTE, _ASCII, _SHORT, _LONG, _RATIONAL, _UNDEFINED, _SRATIONAL = 1, 2, 3, 4, 5, 7, 10
 _SIZES: Final = {_BYTE: 1, _ASCII: 1, _SHORT: 2, _LONG: 4, _RATIONAL: 8, _UNDEFINED: 1, _SRATIONAL: 8}
-_EXIF_IFD: Final = 34665
+_EXIF_IFD: Final = 34665  # tags and values of TIFF 6.0, TIFF/EP and DNG 1.6 from here on
 _STRIP_OFFSETS: Final = 273
 _MAX_UINT32: Final = 2**32 - 1
 _CFA, _LINEAR_RAW = 32803, 34892

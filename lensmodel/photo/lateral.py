@@ -15,15 +15,15 @@ from lensmodel.core.geometry import Frame
 from lensmodel.core.types import Channel, Plane, Planes
 
 Polynomial = tuple[float, float, float, float]
-IDENTITY: Polynomial = (0.0, 0.0, 0.0, 1.0)
+IDENTITY: Polynomial = (0.0, 0.0, 0.0, 1.0)  # r -> r
 
 _CELLS = 10  # cells per side that each give a few points: corners must not be outvoted by the middle
-_POINTS = 5
-_WINDOW = 48
+_POINTS = 5  # of each block of the frame: its strongest corners (chosen)
+_WINDOW = 48  # pixels that are correlated: more than any lateral colour, of one shift (chosen)
 _SEARCH = 8  # largest shift looked for, pixels
-_MIN_CORRELATION = 0.8
-_MIN_POINTS = 30
-_BAND = 1024
+_MIN_CORRELATION = 0.8  # of two channels: below, colours differ and edges do not match (chosen)
+_MIN_POINTS = 30  # that a polynomial of four terms is fitted to (chosen)
+_BAND = 1024  # rows at once: memory (chosen)
 
 
 @dataclass(frozen=True, slots=True)

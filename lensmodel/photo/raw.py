@@ -51,7 +51,7 @@ method, its power at low frequencies is about 3.7 times that of the sensor in re
 1.9 times in green, and at the highest it is about half.
 """
 
-_FULL: Final = 65535.0
+_FULL: Final = 65535.0  # 16 bits
 
 _FEW_CODES: Final = 1024
 """Levels of a plane that make rounding the larger part of its noise; sensors count 4096 and more."""

@@ -44,8 +44,8 @@ _ROWS: Final = 256
 _PNG_OPTIONS: Final = {"level": 2, "strategy": 3, "filter": 128}
 """Paeth filter and run lengths: on photos as small as the default search, three times faster."""
 
-XMP_TAG: Final = 700
-_PLACE_OF_POINTER: Final = exif_block.EXIF_POINTER - 1
+XMP_TAG: Final = 700  # XMP specification, part 3
+_PLACE_OF_POINTER: Final = exif_block.EXIF_POINTER - 1  # keeps the pointer's place among the ascending tags
 
 Pixels: TypeAlias = NDArray[Any]
 """Numbers of a file, `(row, col, channel)`, uint8 or uint16."""

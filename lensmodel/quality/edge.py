@@ -32,11 +32,11 @@ from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 OVERSAMPLING: Final = 4
 """Bins a pixel of the edge spread function."""
 
-_MIN_SIDE: Final = 16
-_MIN_ROWS: Final = 10
+_MIN_SIDE: Final = 16  # pixels (chosen): over it an edge of 2 degrees moves by half a pixel
+_MIN_ROWS: Final = 10  # that a line is fitted to (chosen)
 _REACH: Final = 48.0  # pixels of edge spread on each side; more only adds noise
 _MAX_CORRECTION: Final = 10.0  # ISO 12233: limit of the division by the difference's response
-_MIN_STEP_OVER_NOISE: Final = 3.0
+_MIN_STEP_OVER_NOISE: Final = 3.0  # standard deviations: weaker steps are noise (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

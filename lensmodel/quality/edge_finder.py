@@ -43,11 +43,12 @@ LEAST_ON_A_CHART: Final = 4
 """Edges that a photo must have, along its rows and along its columns: other scenes have one or two."""
 
 _MEAN: Final = 4  # pixels along the side of a mean
-_WINDOW: Final = SIDES[0] // _MEAN
-_STRIDE: Final = _WINDOW // 4
+_WINDOW: Final = SIDES[0] // _MEAN  # of the smallest crop, in means of pixels
+_STRIDE: Final = _WINDOW // 4  # a quarter of a window: no edge is missed between two (chosen)
 _STRIP: Final = 1024  # rows at once: no copy of the frame is made
 _LEAST_STEP: Final = 0.02  # of full scale
-_LEAST_COHERENCE: Final = 0.9
+_LEAST_COHERENCE: Final = 0.9  # of the structure tensor: one straight edge and nothing else (chosen)
+# ISO 12233 wants slants; along pixels and diagonals the super-sampling fails
 _LEAST_SLANT, _MOST_SLANT = math.radians(2.0), math.radians(43.0)
 _NARROW: Final = 0.2  # scatter of the gradients across the edge, in sides of a window
 _BESIDE: Final = 0.05  # of the squared gradients, further from the edge than a quarter of a window

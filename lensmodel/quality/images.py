@@ -14,11 +14,11 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import CENTER_ZONE_R, CORNER_ZONE_R, Frame
 from lensmodel.core.types import ZONES, Zone
 
-_SSIM_WINDOW: Final = 11
-_SHIFT_STEPS: Final = 6
-_SHIFT_PAD: Final = 8
-_LARGEST_SHIFT = 3.0
-_SHIFT_WINDOW: Final = 1024
+_SSIM_WINDOW: Final = 11  # pixels: that of Wang et al. 2004
+_SHIFT_STEPS: Final = 6  # of Newton (chosen)
+_SHIFT_PAD: Final = 8  # pixels: more than any shift that is looked for
+_LARGEST_SHIFT = 3.0  # pixels: larger ones are no shift but another picture (chosen)
+_SHIFT_WINDOW: Final = 1024  # pixels: the middle says as much as the whole
 
 
 def to_srgb(linear: NDArray[np.floating]) -> NDArray[np.float64]:

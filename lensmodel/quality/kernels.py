@@ -13,7 +13,7 @@ from lensmodel.core.psf import as_kernel
 from lensmodel.core.types import Kernel
 from lensmodel.quality.edge import crossing
 
-_FREQUENCIES: Final = 513
+_FREQUENCIES: Final = 513  # from 0 to 1 cycle/pixel: steps of 1/512
 
 
 def mtf_from_kernel(kernel: Kernel, angle: float, frequencies: ArrayLike) -> NDArray[np.float64]:

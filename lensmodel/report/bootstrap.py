@@ -33,7 +33,7 @@ DRAWS: Final = 16
 FEWEST_PHOTOS: Final = 3
 """With fewer, patches are drawn instead of photos, which share their photo's focus: too small an error."""
 
-_RING: Final = 2
+_RING: Final = 2  # places of a ring, as many as tell its mean
 
 Drawn = Literal["photos", "patches"]
 

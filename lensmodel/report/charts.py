@@ -12,6 +12,7 @@ from lensmodel.report.lens_test import LensTest, Tested
 from lensmodel.report.palette import colour, ink, rgb
 from lensmodel.report.units import NYQUIST, Sensor, Unit
 
+# Layout in points of the picture; axes have five steps.
 WIDTH: Final = 640
 HEIGHT: Final = 380
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 160, 40, 52

@@ -41,14 +41,14 @@ Verdict = Literal["centred", "decentred", "unknown"]
 EDGE_R: Final = 0.85
 """Field radius at which opposite sides are compared."""
 
-_MIDDLE_R: Final = 0.5
-_NEAR_STOPS: Final = 0.7
-_FEWEST: Final = 12
+_MIDDLE_R: Final = 0.5  # half-diagonals: inside, opposite sides are next to each other (chosen)
+_NEAR_STOPS: Final = 0.7  # stops: photos of one aperture as far as blur is concerned (chosen)
+_FEWEST: Final = 12  # patches: a plane through fewer is chance (chosen)
 _SOFTER: Final = 0.10  # less is not seen between two sides of a print
 _COMATIC: Final = 0.15  # third moment over width cubed, at the middle of the picture
 _UNSURE_PERCENT: Final = 40.0  # sides that may differ by more, error and all, are not called alike
-_CHANCE: Final = 0.01
-_WING: Final = 0.01
+_CHANCE: Final = 0.01  # one sound lens in a hundred is called decentred (chosen)
+_WING: Final = 0.01  # of the peak: fainter pixels are noise to a second moment (chosen)
 
 _Fit = Callable[[NDArray[np.intp]], NDArray[np.float64]]
 

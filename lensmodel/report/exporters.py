@@ -32,8 +32,8 @@ from lensmodel.report.places import DEFAULT_ASPECT, grid
 FREQUENCIES: Final = tuple(round(0.05 * i, 2) for i in range(1, 11))
 """Cycles/pixel of the MTF table, up to the Nyquist frequency."""
 
-_MOST_BYTES: Final = 1 << 29
-_GAP: Final = 2
+_MOST_BYTES: Final = 1 << 29  # of one file: against questions that fill the memory
+_GAP: Final = 2  # pixels between two kernels of a sheet
 _ABOUT: Final = "point spread functions by lensmodel; row 0 at the top, each sums to 1"
 
 

@@ -20,8 +20,8 @@ from lensmodel.report.lens_report import LensReport, ReportSettings, apertures, 
 from lensmodel.report.places import DEFAULT_ASPECT
 from lensmodel.report.units import Sensor
 
-MOST_APERTURES: Final = 4
-ROWS: Final = 7
+MOST_APERTURES: Final = 4  # a reader compares no more at once (chosen)
+ROWS: Final = 7  # of the grid of places (chosen)
 
 _EVEN, _NEARLY, _SOFTER = 0.95, 0.8, 0.5
 """Shares of the centre's MTF50 above which corners are called as good, nearly as good, and clearly softer
@@ -34,7 +34,7 @@ a little soft (chosen: an ideal pixel behind an ideal lens reaches .6, a demosai
 _GUESSED: Final = 0.5
 """Mean expected error of the kernels from which on a verdict is called a guess: half of them may be wrong."""
 
-_LATERAL_R: Final = tuple(round(0.1 * k, 1) for k in range(11))
+_LATERAL_R: Final = tuple(round(0.1 * k, 1) for k in range(11))  # half-diagonals
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from lensmodel.report.drawing import INK
 
 Colour = tuple[int, int, int]
 
+# sRGB; chosen so that lightness rises and falls once, for the colour-blind and for print.
 _SOFT: Final[Colour] = (127, 29, 29)
 _MIDDLE: Final[Colour] = (253, 246, 227)
 _SHARP: Final[Colour] = (11, 110, 153)

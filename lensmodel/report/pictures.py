@@ -11,6 +11,7 @@ from lensmodel.report.drawing import COLOURS, GREY, Axes, Box, Label, Part, svg
 from lensmodel.report.lens_report import LensReport
 from lensmodel.report.palette import colour, ink, rgb
 
+# Layout in points of the picture; axes have five steps.
 WIDTH: Final = 640
 HEIGHT: Final = 400
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 170, 40, 52

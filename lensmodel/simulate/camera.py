@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 PATTERNS: Final = ("RGGB", "BGGR", "GRBG", "GBRG")
 
-_BITS: Final = (8, 16)
+_BITS: Final = (8, 16)  # of the raw files that cameras write
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,8 +25,8 @@ _LUMA: Final = (0.299, 0.587, 0.114)
 """Weights of r, g, b in luma: ITU-R BT.601, as JFIF 1.02 asks."""
 
 _BLUE, _RED = 1.772, 1.402  # Cb = (B - Y) / 1.772, Cr = (R - Y) / 1.402: JFIF 1.02
-_SUBSAMPLINGS: Final = MappingProxyType({"4:4:4": 0, "4:2:2": 1, "4:2:0": 2})
-_CURVE: Final = np.linspace(0.0, 1.0, 4097)
+_SUBSAMPLINGS: Final = MappingProxyType({"4:4:4": 0, "4:2:2": 1, "4:2:0": 2})  # Pillow's numbers
+_CURVE: Final = np.linspace(0.0, 1.0, 4097)  # light at which the tone curve is read
 
 # Gradient-corrected linear interpolation: H. S. Malvar, L. He, R. Cutler, "High-quality linear interpolation
 # for demosaicing of Bayer-patterned color images", ICASSP 2004, figure 2.

@@ -15,8 +15,9 @@ from lensmodel.core.types import FieldPosition, Planes, Zone
 
 Direction = Literal["tangential", "sagittal"]
 
+# Degrees: about the 5 of ISO 12233, both ways
 _SLANTS_DEG: Final = (5.0, -5.0, 7.0, -7.0, 4.0, -4.0, 9.0, -9.0)
-_MIN_TILE: Final = 72
+_MIN_TILE: Final = 72  # pixels: the crop of an edge and the blur around it
 
 
 @dataclass(frozen=True, slots=True)

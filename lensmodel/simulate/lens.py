@@ -14,8 +14,8 @@ from lensmodel.core.types import WAVELENGTH_NM, Channel, FieldPosition, Kernel, 
 from lensmodel.simulate import pupil
 from lensmodel.simulate.aberrations import SMALLEST_F, Aberrations, CatsEye, WaveError, ray_statistics
 
-DEFAULT_PITCH_UM: Final = 4.5
-DEFAULT_SIZE: Final = 55
+DEFAULT_PITCH_UM: Final = 4.5  # micrometres: a full-frame sensor of 42 megapixels
+DEFAULT_SIZE: Final = 55  # pixels: the largest kernel that the paper estimates
 
 _BAND_UM: Final = 0.035  # half the distance between the outer wavelengths of one colour channel
 

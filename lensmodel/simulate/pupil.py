@@ -36,9 +36,9 @@ REFERENCE_UM: Final = 0.54
 """Wavelength in micrometres in which wavefront errors are counted."""
 
 _MIN_SAMPLES: Final = 96  # across the pupil, to draw its edge well
-_MAX_SAMPLES: Final = 640
+_MAX_SAMPLES: Final = 640  # across the transform: memory (chosen)
 _WRAP_MARGIN: Final = 1.2  # period of the discrete transform over the extent of the light
-_CENTRED_PX: Final = 5e-4
+_CENTRED_PX: Final = 5e-4  # pixels: far below what any test asks
 _DETAILED_CUTOFF: Final = 3.5  # cycles/pixel
 
 Wavefront = Callable[[NDArray[np.float32], NDArray[np.float32], float], NDArray[np.float32]]

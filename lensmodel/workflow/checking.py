@@ -24,9 +24,9 @@ from lensmodel.model import LensModel
 from lensmodel.photo import LinearPhoto
 from lensmodel.workflow.pipeline import settings_of
 
-_KERNEL: Final = 55
-_BLOCK: Final = 8
-_UNCLIPPED: Final = 0.95
+_KERNEL: Final = 55  # pixels: the largest kernel that the paper estimates
+_BLOCK: Final = 8  # pixels: means over it keep what noise hides in one (chosen)
+_UNCLIPPED: Final = 0.95  # of white: above, light may be missing (chosen)
 _CUT: Final = 0.25  # of the blocks, those that a rendering fits worst: edges, and what was clipped
 
 

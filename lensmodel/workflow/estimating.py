@@ -33,9 +33,9 @@ log = logging.getLogger(__name__)
 DEFAULT_PATCHES: Final = 24
 """Patches asked for in one photo: enough for every ring and octant of the field to get one."""
 
-DEFAULT_KERNEL_SIZE: Final = 31
-_PATCH_SIZE: Final = 192
-_SMALLEST_PATCH: Final = 64
+DEFAULT_KERNEL_SIZE: Final = 31  # pixels (chosen); the paper's largest has 55
+_PATCH_SIZE: Final = 192  # pixels: room for a kernel, few enough for one blur (chosen)
+_SMALLEST_PATCH: Final = 64  # pixels: one tile of a patch's spectrum
 
 
 @dataclass(frozen=True, slots=True)

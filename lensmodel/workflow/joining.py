@@ -12,7 +12,7 @@ from lensmodel.model import LensModel, ModelSettings
 SAME_STOPS: Final = 1.0 / 3.0
 """Apertures nearer than this are one setting: cameras set thirds of a stop."""
 
-_SAME_FOCAL: Final = 0.02
+_SAME_FOCAL: Final = 0.02  # of the focal length: what rounding in metadata changes
 
 
 def joined(

@@ -13,7 +13,7 @@ from lensmodel.estimation import measure
 from lensmodel.photo import LinearPhoto, develop, inspect
 from lensmodel.workflow import pipeline
 
-DEFAULT_SIZE: Final = 31
+DEFAULT_SIZE: Final = 31  # pixels: that of an estimate
 
 
 def samples_of_measurement(

@@ -19,8 +19,8 @@ _WHITE, _BESIDE = 0.95, 5
 """Share of saturation from which on light is white, and side of the square around it that is beside it."""
 _FREE_WHITE, _SHARE_WHITE = 0.04, 0.5
 """Chosen: a fifth of one colour of white away is -0.07, what the limit of 1.8 leaves free."""
-_NOISE: Final = 4.0
-_FLOOR: Final = 12.0
+_NOISE: Final = 4.0  # standard deviations (chosen): noise alone passes them once in 16,000
+_FLOOR: Final = 12.0  # standard deviations of light below which hue is noise (chosen)
 
 
 def foreign_spots(pair: Pair) -> Severity:

@@ -11,10 +11,12 @@ from lensmodel.correction.audit import blocks, nearby
 from lensmodel.correction.audit.check import Pair, Severity
 from lensmodel.correction.audit.tolerances import LIMITS
 
+# Sides in pixels: of a place that should be flat, and of where its edge may lie (chosen)
 _SMALL, _WIDE = 5, 15
-_FLAT: Final = 0.08
+_FLAT: Final = 0.08  # share of the step nearby up to which a place passes for flat (chosen)
+# Standard deviations between the extremes of 25 pixels of noise, with some to spare (chosen)
 _NOISE: Final = 8.0
-_STRONG: Final = 40.0
+_STRONG: Final = 40.0  # standard deviations of a step that can ring visibly (chosen)
 
 
 def swing(pair: Pair) -> Severity:

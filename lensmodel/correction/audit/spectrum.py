@@ -28,8 +28,8 @@ _LIMIT: Final = 0.29
 """Frequency along an axis beyond which lines are looked for: periods below 3.5 pixels."""
 _SHARES: Final = tuple(np.float32((sum(band) / sum(_LOW)) ** -SLOPE) for band in _HIGHER)
 """Power that is foretold in each of the higher ones, over that in the low one."""
-_SECTORS: Final = 4
-_NOISE: Final = 4.0
+_SECTORS: Final = 4  # directions: along, across and both diagonals
+_NOISE: Final = 4.0  # times the noise's power, below which no slope is seen (chosen)
 
 
 def overcorrected(pair: Pair) -> Severity:

@@ -16,6 +16,7 @@ from lensmodel.core.jit import jit
 Real = NDArray[np.float32]
 Complex = NDArray[np.complex64]
 
+# In single precision, so that no sum is made in double.
 ONE: Final = np.float32(1.0)
 ZERO: Final = np.float32(0.0)
 FORWARD: Final = True

@@ -20,8 +20,9 @@ from lensmodel.correction.compiled.common import (
 )
 from lensmodel.correction.deconvolver import LEAST_PREDICTED
 
-_EPS: Final = np.float32(1e-6)
+_EPS: Final = np.float32(1e-6)  # keeps quotients finite in the dark
 _LEAST: Final = np.float32(LEAST_PREDICTED)
+# Of the clipping level: from here on a pixel may belong to a clipped light (chosen)
 _LIGHT: Final = np.float32(0.9)
 
 

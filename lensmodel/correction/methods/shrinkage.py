@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
 
+# of the polynomial that stands for the shrinkage function (chosen)
 DEGREE = 9
-_REACH = 24.0
+_REACH = 24.0  # largest argument, in widths of the shrinkage; beyond it hardly anything is taken off (chosen)
 _SHARP = 1e-6  # share of a jump that float32 resolves
 
 

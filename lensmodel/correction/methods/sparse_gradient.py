@@ -213,6 +213,7 @@ _RAMP = 0.1  # of the jump of the shrinkage: see `Shrinkage`
 _TYPICAL_CONTRAST = np.float32(0.02)  # variance over squared light of a scene for which kappa is `weight`
 _SCENE = 0.2  # variance over squared light of a cell of an average scene
 _OPEN, _SLOPE, _LEAST = 0.25, 0.87, 0.4  # chosen on lenses of development seeds: see `_reliance`
+# Range of the weight of the prior between texture and flat places (chosen on development lenses)
 _BUSIEST, _CALMEST = 0.7, 50.0
 _DARK = np.float32(0.02)  # share of a tile's mean light below which the prior follows it no further
 

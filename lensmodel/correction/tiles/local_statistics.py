@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lensmodel.core.types import Planes
 from lensmodel.correction.tiles.canvas import Canvas
 
-BLOCK = 4
+BLOCK = 4  # pixels: coarser than detail, finer than objects (chosen)
 _UNSURE = np.float32(0.1)  # share of the noise that a variance over so few pixels cannot tell from signal
 
 

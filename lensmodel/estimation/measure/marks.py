@@ -17,9 +17,9 @@ _DARK: Final = 0.45  # of the surroundings' mean level, which is grey as the noi
 _ROUND: Final = 0.85  # area of a filled ellipse over that of the ellipse of its second moments
 _LEAST_PX: Final = 20  # area of a disc
 _MOST_SHARE: Final = 0.004  # same, of the picture
-_CANDIDATES: Final = 14
+_CANDIDATES: Final = 14  # largest discs that are looked at for the four marks (chosen)
 _ALIKE: Final = 4.0  # the largest disc over the smallest in area: a page seen very much aslant
-_PAPER_OVER_DISC: Final = 2.0
+_PAPER_OVER_DISC: Final = 2.0  # least ratio of the light of paper and print (chosen)
 
 
 def find_marks(plane: NDArray[np.floating]) -> NDArray[np.float64]:

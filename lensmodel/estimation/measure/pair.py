@@ -54,8 +54,8 @@ _RINGS: Final = 16
 _ALIASED: Final = 0.03
 """Share of its alias that a demosaiced colour of a mosaic holds: of 0.03, 0.06 and 0.1 the one with the least
 error for the lens of development (third order, 4)."""
-_SMOOTH_PX: Final = 6.0
-_FEWEST: Final = 64
+_SMOOTH_PX: Final = 6.0  # pixels: slower changes are light, not detail (chosen)
+_FEWEST: Final = 64  # points that a fit of brightness takes (chosen)
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,7 @@ REMEDY: Final = "pip install 'lensmodel[stars]' finds faint and crowded lights b
 
 _SIGMAS: Final = 8.0  # of the sky's scatter, that a light stands out by
 _NEIGHBOUR: Final = 0.1  # of its flux, that another light beside it may have
-_SKY_CELL: Final = 64
+_SKY_CELL: Final = 64  # pixels of a cell in which the sky is one value, as SExtractor's default
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,14 +21,15 @@ from lensmodel.core.psf import centred, gaussian, resized
 from lensmodel.core.types import NoiseModel, Plane, StepHook, ignore_step
 from lensmodel.estimation.estimator import PsfEstimate, is_no_blur, usable
 
-_TILE = 64
-_BAND = (0.05, 0.5)
+_TILE = 64  # pixels: neighbouring bins are nearly independent, blur nearly the same (chosen)
+_BAND = (0.05, 0.5)  # cycles/pixel: below, few bins and uneven light (chosen)
 # Scenes fall off with 2.0 to 4.0; a prior that expects too little makes kernels too wide.
 _SLOPE, _SLOPE_SD = 2.5, 0.25
-_ORIENTATION_SD = 0.5
+_ORIENTATION_SD = 0.5  # of how much a scene prefers a direction (chosen)
+# Of the priors against a patch's likelihood, whose bins are not independent (chosen)
 _PRIOR_WEIGHT = 1.0 / 100.0
-_STARTS_PX = (0.7, 1.5, 3.0)
-_PER_PATCH = 4
+_STARTS_PX = (0.7, 1.5, 3.0)  # widths to begin with, pixels: sharp, usual, soft (chosen)
+_PER_PATCH = 4  # unknowns: amplitude, slope, two of direction
 
 Floats = NDArray[np.float64]
 

@@ -25,10 +25,10 @@ QUARTER_ALLOWANCE: Final = 1.2
 """A quarter of a window has fewer edges, its width a larger error."""
 SHARP_PX: Final = 0.6
 """Edges of a sharp photo measure about this wide; below it the width says nothing."""
-MIN_IN_RING: Final = 4
+MIN_IN_RING: Final = 4  # windows (chosen): fewer have no median worth the name
 
 MOTION_LIMIT: Final = 0.45
-MIN_FOR_MOTION: Final = 6
+MIN_FOR_MOTION: Final = 6  # windows (chosen)
 
 
 def width_envelope(windows: Windows) -> NDArray[np.float64]:

@@ -14,9 +14,9 @@ from lensmodel.core.spectrum import repeats
 from lensmodel.core.types import Plane
 from lensmodel.estimation.patches.blocks import CLIP_SHARE
 
-SECTORS: Final = 8
-BAND_EDGES: Final = (0.03, 0.1, 0.2, 0.35)
-BANDS: Final = len(BAND_EDGES) - 1
+SECTORS: Final = 8  # of 22.5 degrees: a line lies in one or two
+BAND_EDGES: Final = (0.03, 0.1, 0.2, 0.35)  # cycles/pixel (chosen): coarse, middle and fine detail
+BANDS: Final = len(BAND_EDGES) - 1  # the intervals between them
 
 EVIDENCE_EDGES: Final = (0.1, 0.2, 0.3, 0.4)
 """Bands of the frequencies that blur takes away: below 0.1 cycles/pixel lenses leave nearly all, above 0.4
@@ -33,9 +33,9 @@ DYNAMIC_RANGE: Final = 2.0**14.8
 """Full level over the noise of darkness of the best camera sensors; noise said to be less was eaten by
 rounding or denoising."""
 
-_JPEG_BLOCK = 8
-_MAIN_LOBE_PX = 8
-_ON_THE_WAY = 24
+_JPEG_BLOCK = 8  # pixels: ITU-T T.81
+_MAIN_LOBE_PX = 8  # pixels: nearer peaks of the autocorrelation are the blur itself (chosen)
+_ON_THE_WAY = 24  # points between a peak and the middle (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

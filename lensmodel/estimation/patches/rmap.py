@@ -18,10 +18,10 @@ SMOOTHING_PX: Final = 1.0
 FLAT_CONSTANT: Final = 0.5
 """Suppresses flat regions, for intensities of 0..1 and a window of 25 px."""
 
-FLAT_WINDOW: Final = 25
+FLAT_WINDOW: Final = 25  # pixels: the window for which Xu and Jia's 0.5 was chosen, see `FLAT_CONSTANT`
 
-R_BINS: Final = 16
-GROUPS: Final = 4
+R_BINS: Final = 16  # of the histogram of r (chosen)
+GROUPS: Final = 4  # of gradient directions: Xu and Jia 2010, sec. 3.1
 
 
 def smoothed_gradients(plane: Plane) -> tuple[Plane, Plane, Plane]:

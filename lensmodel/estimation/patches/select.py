@@ -39,7 +39,8 @@ JPEG_WEIGHT: Final = 0.3
 EVIDENCE_FLOOR: Final = 0.25
 """Bits a frequency between 0.1 and 0.4 cycles/pixel that a patch needs: signal as strong as the noise over a
 quarter of them, or 1.4 times as strong over the lowest fifth, which is all that a soft corner leaves."""
-SHORTLIST_A_SECTOR: Final = 8
+SHORTLIST_A_SECTOR: Final = 8  # windows that the costlier scores look at (chosen)
+# Of the logarithm of the width over the envelope: where the weight is 1/e (chosen)
 FOCUS_SOFTNESS: Final = 0.33
 
 _ADVICE: Final[dict[str, str]] = {

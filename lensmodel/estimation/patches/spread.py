@@ -16,9 +16,9 @@ PATCHES_A_CELL: Final = 3
 """Of all that were asked for, on average."""
 MOST_A_CELL: Final = 4
 """Pooling the normal equations of four patches is worth most of what twelve give."""
-CELL_R: Final = 0.12
-CELL_ANGLE: Final = math.radians(24.0)
-MOST_APART: Final = 3.0
+CELL_R: Final = 0.12  # half-diagonals (chosen): nearer windows tell of the same PSF
+CELL_ANGLE: Final = math.radians(24.0)  # the same around the centre (chosen)
+MOST_APART: Final = 3.0  # window sides: farther ones are never of one cell (chosen)
 
 SPREAD_STEP: Final = 1.0
 MOST_STEPS: Final = 4

@@ -13,9 +13,9 @@ from lensmodel.core.types import Kernel, NoiseModel, Plane
 from lensmodel.estimation.spectra.local_spectra import LocalSpectra, local_power
 from lensmodel.estimation.spectra.scene_spectra import SceneSpectra, log_power
 
-_SIDE = 47
-_TAILS = 6.0
-_ROUNDS = 8
+_SIDE = 47  # pixels: holds the widest kernel that a patch's spectra tell of (chosen)
+_TAILS = 6.0  # degrees of freedom of Student's t of a bin, as in `model.wavefront.from_spectra`
+_ROUNDS = 8  # of Gauss and Newton (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

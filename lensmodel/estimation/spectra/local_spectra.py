@@ -36,10 +36,11 @@ COUPLED: Final = 0.5
 """t above."""
 
 _DATA = Path(__file__).parents[1] / "data" / "local_spectra.npz"
-_LOWEST, _HIGHEST = 0.04, 0.5
-_STRIDE = 16
+_LOWEST, _HIGHEST = 0.04, 0.5  # cycles/pixel: below, a tile holds no whole period to speak of
+_STRIDE = 16  # half a tile: Welch's overlap
+# Natural logarithms of a scene's contrast over the usual (chosen)
 _LOG_GAINS: Final = np.linspace(-2.5, 2.5, 11)
-_SCENE_FALL = 2.3
+_SCENE_FALL = 2.3  # exponent of a scene's power, about 2: Field 1987
 _FAINTEST = 1e-4  # of |K|^2: leakage and rounding hide what lies below
 
 Floats = NDArray[np.float64]
@@ -53,9 +54,9 @@ _TAKEN = (
 FREQUENCIES: Final = int(_TAKEN.sum())
 """How many frequencies of a tile count."""
 
-_HANN = 0.5 - 0.5 * np.cos(2.0 * np.pi * (np.arange(SIDE) + 0.5) / SIDE)
+_HANN = 0.5 - 0.5 * np.cos(2.0 * np.pi * (np.arange(SIDE) + 0.5) / SIDE)  # von Hann's window
 _WINDOW = _HANN[:, None] * _HANN
-_FALL = 1.0 / np.maximum(_MODULUS, 1.0 / SIDE) ** _SCENE_FALL
+_FALL = 1.0 / np.maximum(_MODULUS, 1.0 / SIDE) ** _SCENE_FALL  # power of the usual scene
 
 
 def periodograms(patch: Plane, stride: int = _STRIDE) -> Floats:
@@ -84,7 +85,7 @@ def _leaked(power: Floats) -> Floats:
     return np.asarray(mixed[..., _TAKEN], dtype=np.float64)
 
 
-_OPEN = _leaked(np.ones((SIDE, SIDE // 2 + 1)))
+_OPEN = _leaked(np.ones((SIDE, SIDE // 2 + 1)))  # what leaks where the transfer function is 1 everywhere
 
 
 def local_power(kernel: Floats) -> Floats:

@@ -28,18 +28,19 @@ from lensmodel.estimation.spectra.local_spectra import LocalSpectra, log_local_p
 from lensmodel.estimation.spectra.scene_spectra import SceneSpectra, log_power
 from lensmodel.optics.local_pupil import COMA, TERMS, Pupil
 
+# Expected spread of each term, pixels of blur (chosen, not measured).
 _USUAL_PX = np.array([3.0, 2.0, 2.0, 3.0, 1.5, 1.5, 3.0, 3.0])
-_TAILS = 6.0
-_STRIDE_PX = 1.0
-_ENOUGH = 0.05
-_TRIES = 4
-_SIDES: Final = (31, 47)
-_WIDE_PX = 2.8
+_TAILS = 6.0  # degrees of freedom of Student's t, as in `kernel_choice`
+_STRIDE_PX = 1.0  # pixels of blur: no term changes by more in one step (chosen)
+_ENOUGH = 0.05  # of the cost: less gained in a step ends the fit (chosen)
+_TRIES = 4  # steps with more damping before the fit ends (chosen)
+_SIDES: Final = (31, 47)  # pixels of the kernel: for usual and for wide blur (chosen)
+_WIDE_PX = 2.8  # RMS width from which on the larger one is taken (chosen)
 
 _USUAL_SHAPE = (0.4, 0.6, 0.6, 0.8, 0.6, 0.6)
 """Spread of the terms of a random wavefront, in widths of the kernel found; no tilts."""
 
-_SEED = 0
+_SEED = 0  # any number: fits repeat to the bit
 
 Floats = NDArray[np.float64]
 

@@ -31,13 +31,13 @@ FIRST_RING: Final = 2
 BINS: Final = (RINGS - FIRST_RING) * SECTORS
 
 _DATA = Path(__file__).parents[1] / "data" / "scene_spectra.npz"
-_SIDE = 64
-_EDGE = np.geomspace(*RING_LIMITS, RINGS + 1)
+_SIDE = 64  # pixels: one tile of a patch's spectrum
+_EDGE = np.geomspace(*RING_LIMITS, RINGS + 1)  # cycles/pixel between the rings
 _OWN, _NOISY = 0.13, 0.35  # scatter of log power: of scene alone, of noise alone
-_LEAST = 1e-15
+_LEAST = 1e-15  # keeps logarithms finite, far below any noise
 _FAINTEST = 1e-5  # of |K|²: beyond, leakage and rounding hide the zeros
-_LARGEST_RESIDUAL = 3.0
-_SCENE_FALL = 2.3
+_LARGEST_RESIDUAL = 3.0  # of a natural logarithm: beyond it no fit is linear (chosen)
+_SCENE_FALL = 2.3  # exponent of a scene's power, about 2: Field 1987
 
 Floats = NDArray[np.float64]
 
@@ -72,6 +72,7 @@ _PLACES, _BEGIN, _COUNT = _bins_of_grid()
 SHAPES: Final = _polynomial()
 """Values of the polynomial's terms in the bins, shape (BINS, 9)."""
 
+# Power of the usual scene
 _FALL = 1.0 / np.maximum(np.hypot(fft.fftfreq(_SIDE)[:, None], fft.rfftfreq(_SIDE)), 1 / _SIDE) ** _SCENE_FALL
 
 
@@ -90,7 +91,7 @@ def _leaked(power: Floats) -> Floats:
     return np.asarray(np.add.reduceat(flat, _BEGIN, axis=-1) / _COUNT, dtype=np.float64)
 
 
-_OPEN = _leaked(np.ones((_SIDE, _SIDE // 2 + 1)))
+_OPEN = _leaked(np.ones((_SIDE, _SIDE // 2 + 1)))  # what leaks where the transfer function is 1 everywhere
 
 
 def log_power(kernel: Floats, changes: Floats) -> tuple[Floats, Floats]:

@@ -22,9 +22,10 @@ from lensmodel.core.psf import otf
 ALPHA = 4.0 / 3.0
 """Ratio between levels: smaller and copies are hardly sharper, larger and patches do not recur."""
 
-SIDE = 5
+SIDE = 5  # pixels: Michaeli and Irani 2014, sec. 5
+# Principal ones by which neighbours are found; they hold nearly all of a patch's power (chosen)
 _COMPONENTS = 10
-_NEIGHBOURS = 5
+_NEIGHBOURS = 5  # per patch: with more the prior blurs, with fewer it is noisy (chosen)
 
 Image = NDArray[np.float64]
 

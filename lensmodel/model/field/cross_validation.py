@@ -20,12 +20,12 @@ from lensmodel.model.field.local_frame import LocalKernels
 from lensmodel.model.field.robust import Flag
 from lensmodel.model.wavefront.from_kernels import ONE_FOCAL_LENGTH
 
-_CV_PHOTOS = 3
-_CV_SAMPLES = 300
-_SCORED = 800
-_ROTATIONAL = 10.0
-_UNKNOWN_ERROR = 0.5
-_FEWEST = 2
+_CV_PHOTOS = 3  # photos from which on leaving one out tells of bandwidths (chosen)
+_CV_SAMPLES = 300  # that the search looks at: its cost grows with their square (chosen)
+_SCORED = 800  # samples whose held-out error is found, for the same reason (chosen)
+_ROTATIONAL = 10.0  # chords of the circle: so wide that phi does not count
+_UNKNOWN_ERROR = 0.5  # of samples that no other one foretells (chosen: halfway to no knowledge)
+_FEWEST = 2  # one sample cannot be left out
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from lensmodel.model import variables as va
 
-_BLOCK = 64
-_TIGHT, _LOOSE = 0.6, 1.6
+_BLOCK = 64  # samples of the smallest tree: fewer are searched one by one faster (chosen)
+_TIGHT, _LOOSE = 0.6, 1.6  # stretch of the scale within which a built tree is still used (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

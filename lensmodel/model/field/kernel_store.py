@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-_GROWTH = 1.5
+_GROWTH = 1.5  # factor by which the store grows, so that each kernel is copied twice or so on average
 _ROOM = 0.06  # a model grows by a twentieth before it is fitted anew
 
 

@@ -28,9 +28,9 @@ from lensmodel.model import variables as va
 NUGGETS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
 """Variances of a sample of vote 1, over that of the field, that cross-validation chooses from."""
 
-_SETTINGS = (3, 4, 5, 6)
-_CAP = 1.5
-_ALIKE = 1e-7
+_SETTINGS = (3, 4, 5, 6)  # columns of `variables.COLUMNS` that are no place
+_CAP = 1.5  # relative errors beyond count no more than this: one outlier chooses nothing (chosen)
+_ALIKE = 1e-7  # covariance below which a sample is left out of an answer
 _KNOWN = 32  # settings that are remembered
 
 Alike = tuple[NDArray[np.float64], NDArray[np.float64], slice | NDArray[np.intp]]

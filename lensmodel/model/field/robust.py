@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from lensmodel.core.psf import PsfSample, second_moments
 from lensmodel.model.field.leave_one_out import Held
 
-_TUKEY = 4.685
-_ROUNDS = 4
-_MIN_PHOTOS = 3
-_LISTED = 0.5
+_TUKEY = 4.685  # 95 % efficiency for normal errors (Tukey's biweight)
+_ROUNDS = 4  # of reweighting (chosen)
+_MIN_PHOTOS = 3  # with two nobody knows which one is wrong
+_LISTED = 0.5  # weight below which a photo is named (chosen)
 
 
 @dataclass(frozen=True, slots=True)

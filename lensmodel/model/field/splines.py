@@ -30,9 +30,9 @@ from lensmodel.core.loops import compiled
 Engine = Literal["auto", "scipy"]
 
 _GAP = 4  # zeros between two kernels of one sheet: a spline reaches two beyond its last coefficient
-_LIGHT = 1e-6
+_LIGHT = 1e-6  # of the peak: fainter pixels do not widen the spline
 _REACH = 2.0 * 2.0**0.5  # of a coefficient, along the diagonal
-_SHEET = 1 << 21
+_SHEET = 1 << 21  # pixels at once: 16 MB of doubles (chosen)
 
 
 FINER = 2
@@ -40,7 +40,7 @@ FINER = 2
 
 _SMOOTH, _NARROW = 7, 3  # degrees
 _ALIASED = (0.05, 0.2)  # contrast at the Nyquist frequency: below, above
-_MARGIN = 8
+_MARGIN = 8  # pixels: the spline's response has fallen to 3e-5 there
 
 
 @lru_cache(maxsize=16)

@@ -24,13 +24,14 @@ from lensmodel.core.psf import PsfSample, second_moments
 from lensmodel.core.types import WAVELENGTH_NM, FieldPosition, LensSettings
 from lensmodel.model import variables as va
 
+# Of 1, r, r^2, then the rest: weak, only against too few samples (chosen)
 _PLACE_RIDGE = np.array([1e-6, 1e-3, 1e-2, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05])
-_SETTING_RIDGE = 0.05
-_RANGE = (0.45, 2.5)
-_HUBER = 0.15
-_MIN_SAMPLES = 6
-_MOST = 3000
-_ROUNDS = 4
+_SETTING_RIDGE = 0.05  # of the terms of the settings (chosen)
+_RANGE = (0.45, 2.5)  # factors by which a kernel is scaled at most: beyond, its shape is another one (chosen)
+_HUBER = 0.15  # of a logarithm of the width: the scatter of estimates (chosen)
+_MIN_SAMPLES = 6  # below, widths are carried nowhere (chosen)
+_MOST = 3000  # samples: the cost of the fit grows with them (chosen)
+_ROUNDS = 4  # of reweighting (chosen)
 
 Scale = tuple[float, float]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lensmodel.model import variables as va
 
-_FAR = 2.5
+_FAR = 2.5  # bandwidths: a Gaussian has fallen to 0.04 there
 
 
 def field_error(held_out: float, noise: float, independent: float) -> float:

@@ -39,7 +39,7 @@ _CORNER, _CORNER_SPREAD = 1.0, 0.5
 _PIXEL_PX2 = 0.15
 """Squared width of the pixel and of diffraction, which no aberration takes away."""
 
-_ACROSS, _ANGLES = 41, 8
+_ACROSS, _ANGLES = 41, 8  # rays across the pupil, and directions of the field (chosen)
 
 
 def unlikeliness(lens: Floats) -> tuple[float, Floats, Floats]:

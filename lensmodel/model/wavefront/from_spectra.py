@@ -45,13 +45,14 @@ _TEMPER = 0.1
 """Share of the likelihood that counts: neighbouring bins and patches of one motif err alike."""
 
 _FLOOR_RANGE = (-12.0, -1.0)  # of its logarithm
-_LARGEST_RESIDUAL = 3.0
+_LARGEST_RESIDUAL = 3.0  # of a natural logarithm: beyond it no fit is linear (chosen)
 _TAILS = 6.0  # degrees of freedom of Student's t of a bin
 _PATCH_TAILS = 3.0  # of a patch, in units of its bins
+# Of Gauss and Newton: at first, and from where the last step left a scene (chosen)
 _SCENE_ROUNDS, _SCENE_ROUNDS_AGAIN = 3, 2
-_TRIES = 5
-_STRIDE_PX = 1.5
-_ENOUGH = 0.2
+_TRIES = 5  # steps with more damping before the fit ends (chosen)
+_STRIDE_PX = 1.5  # pixels of blur: no term changes by more in one step (chosen)
+_ENOUGH = 0.2  # of the cost: less gained in a step ends the fit; minima differ by more (chosen)
 _SMALLEST_EYE, _FARTHEST_EYE = 0.5, 1.0  # the two circles of the pupil have to overlap all over the field
 
 

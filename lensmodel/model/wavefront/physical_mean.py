@@ -38,13 +38,13 @@ from lensmodel.model.wavefront.joint_kernels import Pooled, pool
 from lensmodel.model.wavefront.likelihood import surprise
 from lensmodel.optics.wavefront import Wavefront
 
-_MOST = 240
+_MOST = 240  # samples of the remainder's process: its cost grows with their cube (chosen)
 _AROUND = 6  # pixels beyond the side that was fitted, for corners wider than every sample
-_NOTHING_LEFT = 1e3
-_WORST = 1.5
-_ALIKE = 1e-7
+_NOTHING_LEFT = 1e3  # a nugget so large that the wavefront answers alone
+_WORST = 1.5  # relative errors beyond count no more than this: one outlier chooses nothing (chosen)
+_ALIKE = 1e-7  # covariance below which a sample is left out of an answer
 _CLEARLY = 2.0  # standard errors
-_STEPS = 2
+_STEPS = 2  # of the progress: the fit, the remainder
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -40,7 +40,7 @@ from lensmodel.optics.transfer import BINS, BORROWED_RINGS, FIRST_RING, bin_freq
 Floats = NDArray[np.float64]
 
 _MODULUS, _ANGLE = bin_frequencies()
-_L = np.log(_MODULUS / 0.1)
+_L = np.log(_MODULUS / 0.1)  # L of the docstring
 
 SHAPES: Final = np.stack(
     [

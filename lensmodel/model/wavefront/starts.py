@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from lensmodel.core.psf import PsfSample, second_moments
 
-_RAYS = 11
-_TRIES, _ROUNDS = 24, 25
-_SEED = 0
-_LEVEL = 0.01
+_RAYS = 11  # across the pupil (chosen)
+_TRIES, _ROUNDS = 24, 25  # random beginnings, and steps of each (chosen)
+_SEED = 0  # any number: fits repeat to the bit
+_LEVEL = 0.01  # of the peak: fainter pixels are noise to a second moment (chosen)
 
 
 def starts(

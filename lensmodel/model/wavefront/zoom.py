@@ -22,9 +22,9 @@ from lensmodel.model.wavefront.from_kernels import MIN_SAMPLES, ONE_FOCAL_LENGTH
 from lensmodel.model.wavefront.physical_mean import Physics
 from lensmodel.optics.wavefront import Wavefront
 
-_REACH_OCTAVES, _SILENT = 0.15, 1e-3
-_HALVES = 2
-_CLEARLY = 0.9
+_REACH_OCTAVES, _SILENT = 0.15, 1e-3  # Gaussian width of an end's say, and a say that is none (chosen)
+_HALVES = 2  # of the samples, each foretold by the other
+_CLEARLY = 0.9  # of the error alone: others must help by a tenth (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

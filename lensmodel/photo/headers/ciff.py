@@ -21,7 +21,7 @@ from typing import Final
 from lensmodel.photo.headers.ifd import Buffer
 
 MAGIC: Final = b"HEAPCCDR"
-MAGIC_AT: Final = 6
+MAGIC_AT: Final = 6  # offsets, masks and tags of CIFF 1.0 from here on
 
 MAX_RECORDS: Final = 1024
 """Records read of one file; cameras write below 100."""

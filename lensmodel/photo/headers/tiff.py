@@ -19,7 +19,7 @@ from lensmodel.photo.headers.ifd import MAX_DIRECTORIES, Buffer, Directory, Tiff
 from lensmodel.photo.headers.jpeg import read_jpeg
 from lensmodel.photo.values import Limits
 
-_DNG_VERSION: Final = 0xC612
+_DNG_VERSION: Final = 0xC612  # DNG 1.6
 
 _RAW_PHOTOMETRIC: Final = {32803, 34892}
 """Colour filter array and linear RAW."""

@@ -18,7 +18,7 @@ from typing import Final
 from lensmodel.photo.values import PhotoMetadata
 
 SOFTWARE: Final = "lensmodel"
-SOFTWARE_TAG: Final = 0x0131
+SOFTWARE_TAG: Final = 0x0131  # tags and types of Exif 2.32 from here on
 EXIF_POINTER: Final = 0x8769
 
 _ASCII, _SHORT, _LONG, _RATIONAL, _UNDEFINED = 2, 3, 4, 5, 7

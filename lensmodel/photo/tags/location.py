@@ -19,7 +19,7 @@ from typing import Final
 
 from lensmodel.photo.headers.ifd import MAX_DIRECTORIES, Buffer, TiffReader
 
-GPS: Final = 0x8825
+GPS: Final = 0x8825  # tags of Exif 2.32 and TIFF/EP from here on
 EXIF: Final = 0x8769
 SUB_DIRECTORIES: Final = 0x014A
 

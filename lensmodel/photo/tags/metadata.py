@@ -40,13 +40,13 @@ _SENSOR_WIDTHS_MM: Final = (
 """One inch, Four Thirds, APS-C, APS-H, 24 x 36 and medium format."""
 
 _LARGEST_SENSOR_MM: Final = max(high for _, high in _SENSOR_WIDTHS_MM)
-_FILM_DIAGONAL_MM: Final = math.hypot(36.0, 24.0)
+_FILM_DIAGONAL_MM: Final = math.hypot(36.0, 24.0)  # 36 x 24 mm
 _CROP_FACTORS: Final = (0.5, 15.0)  # from medium format to the smallest phones
-_PITCHES_UM: Final = (0.3, 60.0)
-_APERTURES: Final = (0.5, 128.0)
-_FOCALS_MM: Final = (0.1, 20000.0)
-_SPEEDS: Final = (1.0, 1e7)
-_EXPOSURES_S: Final = (1e-7, 1e6)
+_PITCHES_UM: Final = (0.3, 60.0)  # micrometres: what sensors have, with room on either side
+_APERTURES: Final = (0.5, 128.0)  # what lenses have, with room on either side
+_FOCALS_MM: Final = (0.1, 20000.0)  # the same
+_SPEEDS: Final = (1.0, 1e7)  # the same
+_EXPOSURES_S: Final = (1e-7, 1e6)  # the same, seconds
 
 
 def read_metadata(path: Path | str) -> PhotoMetadata:

@@ -16,8 +16,8 @@ from xml.parsers import expat
 
 log = logging.getLogger(__name__)
 
-MAX_XMP_BYTES: Final = 1 << 20
-MAX_ELEMENTS: Final = 20_000
+MAX_XMP_BYTES: Final = 1 << 20  # against files made to fill the memory; real ones are some kilobytes
+MAX_ELEMENTS: Final = 20_000  # the same; real ones have some hundred
 
 _PREFIXES: Final[Mapping[str, str]] = MappingProxyType(
     {

@@ -163,8 +163,8 @@ class Settings(BaseSettings):
         default=True,
         description="A lens that has seen little leans on its owner's other copies of the same model.",
     )
-    model_mode: Literal["kernels", "mixed", "wavefront", "paper"] = Field(
-        default="kernels", description="What lens models make of their samples."
+    model_mode: Literal["both", "kernels", "mixed", "wavefront", "paper"] = Field(
+        default="both", description="What lens models make of their samples."
     )
     model_unit: Literal["micrometre", "half-diagonal"] = Field(
         default="micrometre", description="In what the kernels of bodies with different pixels agree."

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.types import Kernel
 
+BOTH: Final = "both"
 KERNELS: Final = "kernels"
 MIXED: Final = "mixed"
 WAVEFRONT: Final = "wavefront"
 PAPER: Final = "paper"
-MODES: Final = (KERNELS, MIXED, WAVEFRONT, PAPER)
+MODES: Final = (BOTH, KERNELS, MIXED, WAVEFRONT, PAPER)
 """What can be made of the neighbours of a question; `modes` tells what they are."""
 
 FORMER_MODES: Final = frozenset({"evidence", "likeliest"})
@@ -62,7 +63,7 @@ class ModelSettings:
     mirror: float | None = None
     robust: bool = True
     excluded: tuple[str, ...] = ()
-    mode: str = KERNELS
+    mode: str = BOTH
     unit: str = MICROMETRE
 
     def __post_init__(self) -> None:
@@ -125,7 +126,7 @@ class PsfAnswer:
     image_frame_share : float
         Weight of the regression in the image frame, 0..1, by held-out errors near the place.
     wavefront_share : float
-        Weight of the fitted wavefront with the rest of the samples, 0..1, likewise.
+        Weight of the fitted wavefront, 0..1.
     mode : str
         Which of `MODES` answered.
     scatter : callable
@@ -145,7 +146,7 @@ class PsfAnswer:
     prior_share: float = 0.0
     image_frame_share: float = 0.0
     wavefront_share: float = 0.0
-    mode: str = KERNELS
+    mode: str = BOTH
     scatter: Callable[[], NDArray[np.float64]] | None = field(default=None, repr=False)
 
     @property

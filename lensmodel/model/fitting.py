@@ -14,7 +14,7 @@ from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings, StepHook, ignore_step
 from lensmodel.model import pitch as pitches
 from lensmodel.model import variables as va
-from lensmodel.model.answer import KERNELS, MICROMETRE, ModelSettings
+from lensmodel.model.answer import BOTH, MICROMETRE, ModelSettings
 from lensmodel.model.field.cross_validation import CrossValidation, bandwidth, cross_validate, held_together
 from lensmodel.model.field.index import SampleIndex
 from lensmodel.model.field.local_frame import LocalKernels
@@ -90,7 +90,7 @@ class Fit:
     rule: dict[str, float]
     bandwidth: dict[str, float]
     physical: Physics | None = None
-    mode: str = KERNELS
+    mode: str = BOTH
     unit: str = MICROMETRE
     ends: tuple[End, ...] = ()
 

@@ -9,7 +9,7 @@ from typing import Final
 
 from lensmodel.core.errors import UnknownMethodError
 from lensmodel.model import LensModel
-from lensmodel.model.answer import KERNELS, PAPER
+from lensmodel.model.answer import BOTH, PAPER
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Way:
 
 WAYS: Final[Mapping[str, Way]] = MappingProxyType(
     {
-        "default": Way("default", 31, KERNELS, "standard"),
+        "default": Way("default", 31, BOTH, "standard"),
         "paper": Way("michaeli-irani", 55, PAPER, "paper"),
     }
 )

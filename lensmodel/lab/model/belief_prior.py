@@ -110,9 +110,8 @@ def _shifted(truth: Spectrum, towards: Spectrum) -> Spectrum:
     return min(moved, key=lambda one: float((_TIMES * _SCENE * np.abs(one - towards) ** 2).sum()))
 
 
-def places(lens: Lens, samples: Sequence[PsfSample]) -> Iterator[Place]:
-    """Places of a lens that was learned from samples; none where it has no wavefront."""
-    model = LensModel.fit(samples, ModelSettings()).warmed()
+def places(lens: Lens, model: LensModel) -> Iterator[Place]:
+    """Places of a lens by a fitted model; none where it has no wavefront."""
     field, truth = WitnessedField.of(model, lens.settings), lens.lens.field(lens.settings)
     if len(field.opinions) == 1:
         return
@@ -190,7 +189,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         for lens in lenses(wanted.seeds, wanted.grids, CAMERA.full_well_electrons):
             for samples in learned(lens, Path(name), wanted.photos):
-                seen += places(lens, samples)
+                seen += places(lens, LensModel.fit(samples, ModelSettings()).warmed())
     rule = Rule.of_product()
     print(f"{len(seen)} places\n\n| prior | mean gain, dB | lose | least |\n|---|---|---|---|")
     for words, variant in variants(rule):

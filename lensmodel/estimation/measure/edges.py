@@ -83,9 +83,9 @@ class Edges:
         measured_psfs = []
         for done, pair in enumerate(pairs, start=1):
             for channel in channels:
-                one = _pair_psf(photo, channel, pair, size)
-                if one is not None:
-                    measured_psfs.append(one)
+                psf = _pair_psf(photo, channel, pair, size)
+                if psf is not None:
+                    measured_psfs.append(psf)
             on_step(done, len(pairs))
         if not measured_psfs:
             raise NotEnoughEvidenceError("no edge could be measured; is the photo in focus and unclipped?")
@@ -216,11 +216,11 @@ def _middle(box: Box) -> tuple[float, float]:
     return box[0] + (box[2] - 1) / 2.0, box[1] + (box[3] - 1) / 2.0
 
 
-def _apart(one: Box, other: Box) -> float:
-    return math.dist(_middle(one), _middle(other))
+def _apart(first: Box, second: Box) -> float:
+    return math.dist(_middle(first), _middle(second))
 
 
-def _angle_between(one: float, other: float) -> float:
+def _angle_between(first: float, second: float) -> float:
     """Angle between two normals, whichever side is bright: 0 to pi/2."""
-    folded = abs(one - other) % math.pi
+    folded = abs(first - second) % math.pi
     return min(folded, math.pi - folded)

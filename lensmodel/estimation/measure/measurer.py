@@ -100,17 +100,17 @@ def samples_of(
     """
     return [
         PsfSample(
-            kernel=one.kernel,
-            position=one.position,
-            settings=settings.with_channel(one.channel),
+            kernel=psf.kernel,
+            position=psf.position,
+            settings=settings.with_channel(psf.channel),
             weight=1.0,
             photo=photo_id,
             pixel_pitch_um=photo.info.metadata.pixel_pitch_um,
             estimator=estimator_of(method),
-            error=one.error,
+            error=psf.error,
             half_diagonal_px=photo.frame.half_diagonal,
         )
-        for one in measured
+        for psf in measured
     ]
 
 

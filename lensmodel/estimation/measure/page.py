@@ -34,9 +34,9 @@ ASPECT: Final = 2**0.5
 DETAILS: Final = (1000, 1400, 2000, 2800, 4000, 5600)
 """Samples along the long side that pages are made with; a photo is compared with each of them."""
 
-PAPER: Final = 1.0
-INK: Final = 0.0
-MEAN: Final = 0.5
+PAPER: Final = 1.0  # reflectance, that of white by definition
+INK: Final = 0.0  # reflectance
+MEAN: Final = 0.5  # of the noise: halfway between ink and paper
 CONTRAST: Final = 0.17
 """Standard deviation of the noise as a share of the paper's white: 3 of them reach ink and paper."""
 
@@ -129,10 +129,10 @@ class TargetPage:
     def at(self, rows: NDArray[np.floating], cols: NDArray[np.floating]) -> NDArray[np.float32]:
         """Reflectance at places of the page, in samples; white beyond it."""
         places = np.stack([np.asarray(rows), np.asarray(cols)]) * DOTS
-        seen = ndimage.map_coordinates(
+        reflectance = ndimage.map_coordinates(
             self._spline, places, order=3, prefilter=False, mode="constant", cval=PAPER, output=np.float32
         )
-        return np.asarray(seen, dtype=np.float32)
+        return np.asarray(reflectance, dtype=np.float32)
 
     def holds_noise(self, rows: NDArray[np.floating], cols: NDArray[np.floating]) -> bool:
         """Whether noise, and nothing else, lies at all of these places."""

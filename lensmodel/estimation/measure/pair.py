@@ -41,16 +41,18 @@ diffraction at pixels of 4.5 um."""
 USUAL_F_NUMBER: Final = 8.0
 """Aperture of the closed photo where it does not say: the sharpest of most lenses."""
 
-_USUAL_PITCH_UM: Final = 4.5
+_USUAL_PITCH_UM: Final = 4.5  # where the photo does not say; as for `FLOOR`
 _CLEAR: Final = 8.0  # see `target`
-_SIDE: Final = 160
+_SIDE: Final = 160  # pixels of a window (chosen, not measured)
 _SPARE: Final = 24  # pixels around a window: deconvolution and interpolation spoil the rim
 _DAMPING: Final = 0.004  # of the squared transfer function: noise is not raised more than eightfold
-_STOPS_APART: Final = 2.0
-_SURE: Final = 0.3
-_COARSE: Final = 4
-_NOISE_GRID: Final = 128
-_RINGS: Final = 16
+_STOPS_APART: Final = 2.0  # least difference of the apertures (chosen, not measured)
+_SURE: Final = 0.3  # expected relative L2 from which on a window is dropped (chosen, not measured)
+_COARSE: Final = 4  # factor by which photos are shrunk for the first match (chosen, not measured)
+_NOISE_GRID: Final = (
+    128  # frequencies along an axis (chosen, not measured); its lags have to hold two kernels
+)
+_RINGS: Final = 16  # of frequency, 0 to 0.5 cycles/pixel (chosen, not measured)
 _ALIASED: Final = 0.03
 """Share of its alias that a demosaiced colour of a mosaic holds: of 0.03, 0.06 and 0.1 the one with the least
 error for the lens of development (third order, 4)."""
@@ -95,9 +97,9 @@ class Pair:
         psfs = []
         for done, corner in enumerate(corners, start=1):
             for channel in channels:
-                one = self._window(opened, closed, warp, corner, size, channel)
-                if one is not None:
-                    psfs.append(one)
+                psf = self._window(opened, closed, warp, corner, size, channel)
+                if psf is not None:
+                    psfs.append(psf)
             on_step(done, len(corners))
         if not psfs:
             raise NotEnoughEvidenceError(
@@ -114,8 +116,8 @@ class Pair:
         NotEnoughEvidenceError
             If they do not show the same scene.
         """
-        one, other = (np.asarray(photo.planes[1]) for photo in (opened, closed))
-        coarse = match(_shrunk(one), _shrunk(other))
+        plane, reference = (np.asarray(photo.planes[1]) for photo in (opened, closed))
+        coarse = match(_shrunk(plane), _shrunk(reference))
         if coarse.clarity < _CLEAR:
             raise NotEnoughEvidenceError(
                 "the two photos do not show the same scene; take them from a tripod, one after the other"
@@ -130,12 +132,12 @@ class Pair:
                     *(at + np.arange(float(n)) for at, n in zip(corner, shape, strict=True)), indexing="ij"
                 )
             )
-            return np.asarray(ndimage.map_coordinates(other, places, order=3, mode="mirror"))
+            return np.asarray(ndimage.map_coordinates(reference, places, order=3, mode="mirror"))
 
         half = self.side // 2
-        corners = grid(one.shape, self.side, one.shape[1] // half, one.shape[0] // half, 8)
+        corners = grid(plane.shape, self.side, plane.shape[1] // half, plane.shape[0] // half, 8)
         for degree in (1, 1, 3):
-            warp, _ = matched(warp, shown, one, corners, self.side, least_clarity=_CLEAR, degree=degree)
+            warp, _ = matched(warp, shown, plane, corners, self.side, least_clarity=_CLEAR, degree=degree)
         return warp
 
     def _window(
@@ -234,8 +236,8 @@ class _Scene:
         """Return the picture moved down and right by `shift` pixels."""
         rows, cols = self._places(shift)
         places = np.stack([rows - self._corner[0], cols - self._corner[1]])
-        seen = ndimage.map_coordinates(self._spline, places, order=5, prefilter=False, mode="mirror")
-        return np.asarray(seen, dtype=np.float64)
+        picture = ndimage.map_coordinates(self._spline, places, order=5, prefilter=False, mode="mirror")
+        return np.asarray(picture, dtype=np.float64)
 
     def noise(self, size: int) -> NDArray[np.float64]:
         """Autocovariance of what noise the deconvolution leaves in it, shape (2 size - 1, 2 size - 1)."""
@@ -326,8 +328,8 @@ def _detailed(
             cols = np.arange(max(j * width // across - side // 4, margin), (j + 1) * width // across, step)
             rows, cols = rows[rows + side + margin <= height], cols[cols + side + margin <= width]
             if rows.size and cols.size:
-                here = energy[np.ix_(rows + side // 2, cols + side // 2)]
-                k, l = np.unravel_index(int(here.argmax()), here.shape)
+                nearby = energy[np.ix_(rows + side // 2, cols + side // 2)]
+                k, l = np.unravel_index(int(nearby.argmax()), nearby.shape)
                 corners.append((int(rows[k]), int(cols[l])))
     return list(dict.fromkeys(corners))
 

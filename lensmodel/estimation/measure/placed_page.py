@@ -64,8 +64,8 @@ class PlacedPage:
         high, wide = (fft.next_fast_len(n + 2 * _SPARE, real=True) for n in shape)
         rows = row - _SPARE + np.arange(high * _FINE) / _FINE
         cols = col - _SPARE + np.arange(wide * _FINE) / _FINE
-        seen = self._toned(self.page.at(*self.warp(*np.meshgrid(rows, cols, indexing="ij"))))
-        spectrum = fft.rfft2((seen - MEAN) * _taper(high * _FINE)[:, None] * _taper(wide * _FINE))
+        light = self._toned(self.page.at(*self.warp(*np.meshgrid(rows, cols, indexing="ij"))))
+        spectrum = fft.rfft2((light - MEAN) * _taper(high * _FINE)[:, None] * _taper(wide * _FINE))
         coarse = np.zeros((high, wide // 2 + 1), dtype=spectrum.dtype)
         up, down, across = (high + 1) // 2, (high - 1) // 2, (wide + 1) // 2
         coarse[:up, :across] = spectrum[:up, :across]
@@ -162,14 +162,14 @@ def tones_of(
     blur, z, z² and z³ look alike, and nothing is known.
     """
     precision, weighted = np.eye(2) / TONE_SPREAD**2, np.zeros(2)
-    seen = 0
+    windows = 0
     for corner in corners:
         try:
-            own, bent = _tones_in(photo, placed, corner, side)
+            information, bent = _tones_in(photo, placed, corner, side)
         except NotEnoughEvidenceError:
             continue
-        precision, weighted, seen = precision + own, weighted + own @ bent, seen + 1
-    if seen < 2:
+        precision, weighted, windows = precision + information, weighted + information @ bent, windows + 1
+    if windows < 2:
         raise NotEnoughEvidenceError("the page is too blurred to be measured; focus on it")
     q, c = np.linalg.solve(precision, weighted)
     return float(1.0 - 2.0 * q * MEAN + 3.0 * c * MEAN**2), float(q - 3.0 * c * MEAN), float(c)
@@ -202,5 +202,5 @@ def _tones_in(
     left = float(np.square(observed - basis @ terms).sum()) / max(observed.size - terms.size, 1)
     # what of the two columns the others cannot explain is what tells of q and c
     others = np.delete(basis, (1, 2), axis=1)
-    own = basis[:, 1:3] - others @ np.linalg.lstsq(others, basis[:, 1:3], rcond=None)[0]
-    return own.T @ own * terms[0] ** 2 / max(left, _TINY), np.asarray(terms[1:3] / terms[0])
+    separable = basis[:, 1:3] - others @ np.linalg.lstsq(others, basis[:, 1:3], rcond=None)[0]
+    return separable.T @ separable * terms[0] ** 2 / max(left, _TINY), np.asarray(terms[1:3] / terms[0])

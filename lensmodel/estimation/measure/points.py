@@ -93,9 +93,9 @@ class Points:
         psfs = []
         for done, cell in enumerate(good, start=1):
             for channel in channels:
-                one = _cell_psf(photo, channel, cell[:_MOST], size, skies[channel])
-                if one is not None:
-                    psfs.append(one)
+                psf = _cell_psf(photo, channel, cell[:_MOST], size, skies[channel])
+                if psf is not None:
+                    psfs.append(psf)
             on_step(done, len(good))
         if not psfs:
             raise NotEnoughEvidenceError("the points of light are too faint; expose longer")
@@ -200,15 +200,15 @@ def _refined(stamp: _Stamp, kernel: NDArray[np.float64]) -> _Stamp:
     size = kernel.shape[0]
     step = 0.05
 
-    def seen(row: float, col: float) -> NDArray[np.float64]:
+    def rendered(row: float, col: float) -> NDArray[np.float64]:
         moved = replace(stamp, place=(stamp.place[0] + row, stamp.place[1] + col))
         return np.asarray(scipy.signal.fftconvolve(moved.latent(size), kernel, mode="valid"))
 
-    here = seen(0.0, 0.0)
-    by_row = (seen(step, 0.0) - seen(-step, 0.0)) / (2 * step)
-    by_col = (seen(0.0, step) - seen(0.0, -step)) / (2 * step)
+    predicted = rendered(0.0, 0.0)
+    by_row = (rendered(step, 0.0) - rendered(-step, 0.0)) / (2 * step)
+    by_col = (rendered(0.0, step) - rendered(0.0, -step)) / (2 * step)
     good = stamp.measured
-    basis = np.stack([here[good], by_row[good], by_col[good], np.ones(int(good.sum()))], axis=-1)
+    basis = np.stack([predicted[good], by_row[good], by_col[good], np.ones(int(good.sum()))], axis=-1)
     terms, *_ = np.linalg.lstsq(basis, stamp.observed[good], rcond=None)
     if not terms[0] > 0.0:
         return stamp

@@ -20,7 +20,7 @@ from lensmodel.core.types import CHANNELS, NoiseModel
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import PlaneNoise
 
-_BLOCK: Final = 64
+_BLOCK: Final = 64  # pixels, side of a place (chosen, not measured)
 _FINE: Final = (0.4, 0.5)
 """Frequencies in cycles/pixel: above them grids of pixels hold nothing, below them lenses leave more."""
 
@@ -88,6 +88,6 @@ def _bounded(noise: NoiseModel, shot: float) -> NoiseModel:
     return NoiseModel(shot, noise.read * shot / noise.shot)
 
 
-def _one_sensitivity(one: LinearPhoto, other: LinearPhoto) -> bool:
-    a, b = one.info.metadata, other.info.metadata
+def _one_sensitivity(first: LinearPhoto, second: LinearPhoto) -> bool:
+    a, b = first.info.metadata, second.info.metadata
     return (a.camera_model, a.iso) == (b.camera_model, b.iso)

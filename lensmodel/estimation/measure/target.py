@@ -170,8 +170,8 @@ def _pixels(photo: LinearPhoto, channel: Channel, side: int) -> float:
     """How many pixels of a window the sensor measures in a channel."""
     if photo.cfa is None:
         return float(side * side)
-    own = sum(row.count(CHANNELS.index(channel)) for row in photo.cfa)
-    return side * side * own / 4.0
+    sites = sum(row.count(CHANNELS.index(channel)) for row in photo.cfa)
+    return side * side * sites / 4.0
 
 
 def _light(
@@ -198,9 +198,9 @@ def _identified(
             if not 0.3 < warp.scale(*middle) < 3.0:
                 break  # no turn makes noise visible that pixels do not resolve
             placed = PlacedPage(page, warp)
-            seen = match(window, placed.window(*corner, (side, side)))
-            if best is None or seen.clarity > best[0]:
-                best = seen.clarity, placed
+            matching = match(window, placed.window(*corner, (side, side)))
+            if best is None or matching.clarity > best[0]:
+                best = matching.clarity, placed
     if best is None or best[0] < _CLEAR:
         raise NotEnoughEvidenceError(
             "four discs are seen, but between them not the noise of a target that is known; print it with "

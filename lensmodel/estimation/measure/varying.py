@@ -46,10 +46,10 @@ CHANGE: Final = 0.3
 CENTRED_PX: Final = 0.3
 """How far from the middle the centre of mass is expected, where the misfit does not tell (chosen)."""
 
-_ROWS: Final = 2048
-_STEPS_PX: Final = (0.25, 0.1, 0.04)
-_MOST_PX: Final = 1.0
-_MOST_MOVES: Final = 24
+_ROWS: Final = 2048  # of the design matrix at once, to bound memory (chosen, not measured)
+_STEPS_PX: Final = (0.25, 0.1, 0.04)  # of the search for the phase, coarse to fine (chosen, not measured)
+_MOST_PX: Final = 1.0  # largest phase along an axis (chosen, not measured)
+_MOST_MOVES: Final = 24  # with one step, at most (chosen, not measured)
 _SEARCHED: Final = 100
 """Steps from one phase to the next, whose kernels are alike."""
 

@@ -198,10 +198,10 @@ def matched(
     pixels, shifts = [], []
     for row, col in corners:
         shown = render(warp, (row, col), (side, side))
-        seen = match(plane[row : row + side, col : col + side], shown)
-        if seen.clarity >= least_clarity:
+        matching = match(plane[row : row + side, col : col + side], shown)
+        if matching.clarity >= least_clarity:
             pixels.append((row + (side - 1) / 2.0, col + (side - 1) / 2.0))
-            shifts.append(seen.shift)
+            shifts.append(matching.shift)
     if len(pixels) < _FEWEST:
         raise NotEnoughEvidenceError(
             f"only {len(pixels)} of {len(corners)} windows of the photo match the reference; photograph it "

@@ -20,9 +20,10 @@ from lensmodel.estimation.spectra.scene_spectra import SceneSpectra
 from lensmodel.estimation.steps.finish import signal_share
 from lensmodel.estimation.steps.recurrence import QUICK
 
+# Side of the kernel, alternations, side of the patches, where many are pooled (chosen, not measured)
 _POOLED_SUPPORT, _POOLED_ITERATIONS, _POOLED_SIDE = 21, 3, 160
-_STARTS, _STARTS_OF_CHANNEL = 10, 6
-_PIXEL_SIGMA = 0.29
+_STARTS, _STARTS_OF_CHANNEL = 10, 6  # random wavefronts for few patches (chosen, not measured)
+_PIXEL_SIGMA = 0.29  # pixels: standard deviation of a uniform pixel, 1/sqrt(12)
 _PER_WIDTH = 40.0
 """Cost of a kernel e times as wide: in doubt the narrower one, which does less harm."""
 

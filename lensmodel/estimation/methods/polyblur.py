@@ -154,11 +154,11 @@ def _interpolated(slopes: Floats) -> Floats:
     for i in range(_FINE_ANGLES):
         at, t = divmod(i, step)
         x = t / step
-        before, here, after, far = (slopes[(at + d) % _ANGLES] for d in (-1, 0, 1, 2))
+        before, value, after, far = (slopes[(at + d) % _ANGLES] for d in (-1, 0, 1, 2))
         cubic = (
-            -before + 3 * here - 3 * after + far,
-            2 * before - 5 * here + 4 * after - far,
+            -before + 3 * value - 3 * after + far,
+            2 * before - 5 * value + 4 * after - far,
             after - before,
         )
-        fine[i] = here + 0.5 * x * (cubic[2] + x * (cubic[1] + x * cubic[0]))
+        fine[i] = value + 0.5 * x * (cubic[2] + x * (cubic[1] + x * cubic[0]))
     return fine

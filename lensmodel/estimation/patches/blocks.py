@@ -31,15 +31,15 @@ WIDTH_BINS: Final = 28
 WIDTH_STEP_PX: Final = 0.2
 """Histogram of edge widths, 0 to 5.6 px."""
 
-EDGE_SIGMAS: Final = 4.0
-WIDTH_SIGMAS: Final = 10.0
-CLIP_SHARE: Final = 0.98
+EDGE_SIGMAS: Final = 4.0  # of a gradient's noise, above which a pixel is an edge (chosen, not measured)
+WIDTH_SIGMAS: Final = 10.0  # the same where a width is measured (chosen, not measured)
+CLIP_SHARE: Final = 0.98  # of the clipping level, above which a pixel is clipped (chosen, not measured)
 DARK_SNR: Final = 5.0
 """A pixel below this ratio of level to noise counts as dark. One percent of full range is the noise of
 the published lens-blur benchmark; ten times that level would already throw out half a photo there."""
 
 _MARGIN = 18  # half an r-map window and the smoothing
-_STRIP_PIXELS = 2_000_000  # at once: 16 MB of doubles (chosen)
+_STRIP_PIXELS = 2_000_000  # pixels at once, 8 MB a plane of float32 (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,12 +171,12 @@ def _measure_strip(
 
 def _ridge(along_rows: Plane, along_cols: Plane, modulus: Plane) -> NDArray[np.bool_]:
     """Where no neighbour across the edge is steeper; the rim has one neighbour only and is let through."""
-    here, inside = modulus[1:-1, 1:-1], (slice(1, -1), slice(1, -1))
+    center, inside = modulus[1:-1, 1:-1], (slice(1, -1), slice(1, -1))
     ridge = np.ones(modulus.shape, dtype=np.bool_)
     ridge[inside] = np.where(
         np.abs(along_rows[inside]) > np.abs(along_cols[inside]),
-        (here >= modulus[:-2, 1:-1]) & (here >= modulus[2:, 1:-1]),
-        (here >= modulus[1:-1, :-2]) & (here >= modulus[1:-1, 2:]),
+        (center >= modulus[:-2, 1:-1]) & (center >= modulus[2:, 1:-1]),
+        (center >= modulus[1:-1, :-2]) & (center >= modulus[1:-1, 2:]),
     )
     return ridge
 

@@ -11,23 +11,23 @@ from numpy.typing import NDArray
 from lensmodel.estimation.patches.blocks import BLOCKS_A_SIDE
 from lensmodel.estimation.patches.windows import Windows
 
-RINGS: Final = 8
-ENVELOPE_PERCENTILE: Final = 15.0
-ENVELOPE_RATIO: Final = 1.25
+RINGS: Final = 8  # of equal width in r (chosen, not measured)
+ENVELOPE_PERCENTILE: Final = 15.0  # of a ring's widths, see `width_envelope` (chosen, not measured)
+ENVELOPE_RATIO: Final = 1.25  # of width to envelope, above which a window is defocused (chosen, not measured)
 CORNER_ALLOWANCE: Final = 0.2
 """The allowed ratio grows with r²: copies of a lens differ, and a decentred one is not out of focus."""
-GROWTH: Final = 4.0
-SURFACE_LIMIT: Final = 0.19
-JUMP_SHARE: Final = 0.5
-SURFACE_STEPS: Final = 12
-MIN_FOR_SURFACE: Final = 40
+GROWTH: Final = 4.0  # of the envelope with r², see `width_envelope` (chosen, not measured)
+SURFACE_LIMIT: Final = 0.19  # of the log width, see `smooth_widths` (chosen, not measured)
+JUMP_SHARE: Final = 0.5  # of the range of log widths, see `smooth_widths` (chosen, not measured)
+SURFACE_STEPS: Final = 12  # of reweighting (chosen, not measured)
+MIN_FOR_SURFACE: Final = 40  # windows, for six coefficients (chosen, not measured)
 QUARTER_ALLOWANCE: Final = 1.2
 """A quarter of a window has fewer edges, its width a larger error."""
 SHARP_PX: Final = 0.6
 """Edges of a sharp photo measure about this wide; below it the width says nothing."""
 MIN_IN_RING: Final = 4  # windows (chosen): fewer have no median worth the name
 
-MOTION_LIMIT: Final = 0.45
+MOTION_LIMIT: Final = 0.45  # relative elongation above which `select` warns (chosen, not measured)
 MIN_FOR_MOTION: Final = 6  # windows (chosen)
 
 

@@ -126,7 +126,7 @@ class TreeEnsemble:
     def predict(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
         """Evaluate at rows of features, `(n,)`; all trees of all rows go down one step at a time."""
         n, trees = len(features), np.arange(len(self.feature))
-        asked = features.astype(np.float32)
+        values = features.astype(np.float32)
         node = np.zeros((n, len(trees)), dtype=np.intp)
         rows = np.arange(n)[:, None]
         while True:
@@ -134,7 +134,7 @@ class TreeEnsemble:
             inner = column >= 0
             if not inner.any():
                 return self.start + self.value[trees, node].sum(axis=1, dtype=np.float64)
-            goes_left = asked[rows, np.maximum(column, 0)] <= self.threshold[trees, node]
+            goes_left = values[rows, np.maximum(column, 0)] <= self.threshold[trees, node]
             node = np.where(goes_left, self.left[trees, node], self.right[trees, node]).astype(np.intp)
 
 

@@ -23,17 +23,19 @@ from lensmodel.estimation.patches.windows import Windows, windows_of
 
 logger = logging.getLogger(__name__)
 
-SMALLEST_PATCH: Final = 64
-CLIPPED_LIMIT: Final = 0.005
-BLOB_LIMIT: Final = 20
-DARK_LIMIT: Final = 0.5
-FLAT_CONTRAST: Final = 4.0
+SMALLEST_PATCH: Final = 64  # pixels: the least that estimators take
+CLIPPED_LIMIT: Final = 0.005  # share of a window's pixels (chosen, not measured)
+BLOB_LIMIT: Final = 20  # connected clipped pixels (chosen, not measured)
+DARK_LIMIT: Final = 0.5  # share of a window's pixels (chosen, not measured)
+FLAT_CONTRAST: Final = 4.0  # variance of signal over that of noise (chosen, not measured)
 FLAT_EIGENVALUE: Final = 10.0
 """Smaller eigenvalue of the structure tensor over that of noise."""
-ONE_DIRECTION_RATIO: Final = 0.05
-SECTOR_INFORMATION: Final = float(np.log(2.0))
-PERIOD_LIMIT: Final = 0.8
-BLOCKINESS_LIMIT: Final = 1.8
+ONE_DIRECTION_RATIO: Final = (
+    0.05  # smaller eigenvalue of the structure tensor over the larger (chosen, not measured)
+)
+SECTOR_INFORMATION: Final = float(np.log(2.0))  # power twice that of noise, signal as strong as noise
+PERIOD_LIMIT: Final = 0.8  # see `Details.period` (chosen, not measured)
+BLOCKINESS_LIMIT: Final = 1.8  # see `Details.blockiness` (chosen, not measured)
 JPEG_WEIGHT: Final = 0.3
 """JPEG files were sharpened and gamma-coded: their patches count for less."""
 EVIDENCE_FLOOR: Final = 0.25

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from lensmodel.estimation.patches.windows import Windows
 
-RINGS: Final = 8
-OCTANTS: Final = 8
+RINGS: Final = 8  # of equal width in r (chosen, not measured)
+OCTANTS: Final = 8  # eighths of a turn, by definition
 PATCHES_A_CELL: Final = 3
 """Of all that were asked for, on average."""
 MOST_A_CELL: Final = 4
@@ -20,7 +20,7 @@ CELL_R: Final = 0.12  # half-diagonals (chosen): nearer windows tell of the same
 CELL_ANGLE: Final = math.radians(24.0)  # the same around the centre (chosen)
 MOST_APART: Final = 3.0  # window sides: farther ones are never of one cell (chosen)
 
-SPREAD_STEP: Final = 1.0
+SPREAD_STEP: Final = 1.0  # window sides
 MOST_STEPS: Final = 4
 """Distances to the nearest seed count in steps of one window, up to four."""
 

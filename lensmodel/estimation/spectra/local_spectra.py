@@ -140,14 +140,14 @@ class LocalSpectra:
 
     Parameters
     ----------
-    seen : tuple of ndarray of float32, each (tiles, FREQUENCIES)
+    periodograms : tuple of ndarray of float32, each (tiles, FREQUENCIES)
         Periodograms of each patch, over the variance of its signal.
     noise : tuple of float
         Power of the noise of each patch in the same units.
     mixture : SpectrumMixture
     """
 
-    seen: tuple[NDArray[np.float32], ...]
+    periodograms: tuple[NDArray[np.float32], ...]
     noise: tuple[float, ...]
     mixture: SpectrumMixture
 
@@ -156,24 +156,24 @@ class LocalSpectra:
         cls, kept: Sequence[tuple[Plane, NoiseModel]], mixture: SpectrumMixture | None = None
     ) -> LocalSpectra:
         """Measure patches."""
-        seen, floors = [], []
+        power, floors = [], []
         for patch, model in kept:
             noise = model.sigma_at(float(patch.mean())) ** 2
             scale = max(float(patch.var(dtype=np.float64)) - noise, 1e-12)
-            seen.append((periodograms(patch) / scale).astype(np.float32))
+            power.append((periodograms(patch) / scale).astype(np.float32))
             floors.append(max(noise / scale, 1e-9))
-        return cls(tuple(seen), tuple(floors), mixture or SpectrumMixture.load())
+        return cls(tuple(power), tuple(floors), mixture or SpectrumMixture.load())
 
     def likelihood(self, power: Floats) -> float:
         """Ln L behind a blur of this power, summed over patches, each at its likeliest gain."""
         scaled = [self.mixture.power * (gain * power).astype(np.float32) for gain in np.exp(_LOG_GAINS)]
-        return sum(max(self._patch(i, signal) for signal in scaled) for i in range(len(self.seen)))
+        return sum(max(self._patch(i, signal) for signal in scaled) for i in range(len(self.periodograms)))
 
     def _patch(self, i: int, signal: NDArray[np.float32]) -> float:
         """Ln L of one patch with components of these powers."""
         inverse = 1.0 / (signal + np.float32(self.noise[i]))
         logs = np.log(self.mixture.share) + COUPLED * np.log(inverse).sum(axis=1)
-        scores = logs - COUPLED * (self.seen[i] @ inverse.T)
+        scores = logs - COUPLED * (self.periodograms[i] @ inverse.T)
         most = scores.max(axis=1, keepdims=True)
         return float((most + np.log(np.exp(scores - most).sum(axis=1, keepdims=True))).sum(dtype=np.float64))
 
@@ -191,13 +191,13 @@ class LocalSpectra:
         signal = self.mixture.power * np.exp(log_power).astype(np.float32)
         inverse = 1.0 / (signal + np.float32(self.noise[i]))
         logs = np.log(self.mixture.share) + COUPLED * np.log(inverse).sum(axis=1)
-        scores = logs - COUPLED * (self.seen[i] @ inverse.T)
+        scores = logs - COUPLED * (self.periodograms[i] @ inverse.T)
         most = scores.max(axis=1, keepdims=True)
-        own = np.exp(scores - most)
-        total = own.sum(axis=1, keepdims=True)
+        responsibilities = np.exp(scores - most)
+        total = responsibilities.sum(axis=1, keepdims=True)
         value = float((most + np.log(total)).sum(dtype=np.float64))
-        own /= total
-        count, power = own.sum(axis=0)[:, None], own.T @ self.seen[i]
+        responsibilities /= total
+        count, power = responsibilities.sum(axis=0)[:, None], responsibilities.T @ self.periodograms[i]
         part = signal * inverse
         slope = COUPLED * (part * (power * inverse - count)).sum(axis=0, dtype=np.float64)
         curvature = COUPLED * (count * part**2).sum(axis=0, dtype=np.float64)
@@ -206,5 +206,8 @@ class LocalSpectra:
     def gains(self, log_power: Floats) -> Floats:
         """Log gain of each patch, the likeliest of a few, behind a blur of this log power."""
         scaled = [self.mixture.power * np.exp(log_power + step).astype(np.float32) for step in _LOG_GAINS]
-        best = [int(np.argmax([self._patch(i, signal) for signal in scaled])) for i in range(len(self.seen))]
+        best = [
+            int(np.argmax([self._patch(i, signal) for signal in scaled]))
+            for i in range(len(self.periodograms))
+        ]
         return np.asarray(_LOG_GAINS[best], dtype=np.float64)

@@ -1,13 +1,13 @@
-"""One local wavefront fitted to the spectra of all patches of a position, and to a kernel found before.
+"""One local wavefront fitted to the spectra of all patches of a position, and to a kernel estimated before.
 
 Power says how wide the blur is in every direction, the better the more patches share it, and nothing of
-its phase; a kernel found by other means knows the phase and has a width of its own bias. The eight
-numbers of a wavefront have to please both, so that this is least::
+its phase; a kernel estimated otherwise, the reference, knows the phase, but its width is biased. The eight
+terms of the wavefront have to suit both, so they minimise::
 
     temper * sum t(residuals of log power)  -  parts * ln L(local spectra)
-        +  weight |k(g) - k_found|² / |k_found|²  +  |g / usual|²
+        +  weight |k(g) - k_ref|² / |k_ref|²  +  |g / usual|²
 
-found by Levenberg-Marquardt from random wavefronts about as wide as the kernel. t is the log-likelihood of
+by Levenberg-Marquardt from random wavefronts about as wide as the reference. t is the log-likelihood of
 Student's t: scenes have stripes that no polynomial follows. L is that of `local_spectra`, where such spectra
 are given; its curvature in the normal equations is Fisher's information with the components of the tiles
 known. For the true wavefront the likelihood is best where the scene's prior holds
@@ -38,7 +38,7 @@ _SIDES: Final = (31, 47)  # pixels of the kernel: for usual and for wide blur (c
 _WIDE_PX = 2.8  # RMS width from which on the larger one is taken (chosen)
 
 _USUAL_SHAPE = (0.4, 0.6, 0.6, 0.8, 0.6, 0.6)
-"""Spread of the terms of a random wavefront, in widths of the kernel found; no tilts."""
+"""Spread of the terms of a random wavefront, in widths of the reference; no tilts."""
 
 _SEED = 0  # any number: fits repeat to the bit
 
@@ -47,16 +47,16 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class AberrationFit:
-    """How to weigh spectra against the kernel found, and how long to search.
+    """How to weigh spectra against the reference kernel, and how long to search.
 
     Parameters
     ----------
     weight : float
-        Of the kernel found.
+        Of the reference kernel.
     temper : float
         Share of the spectra's likelihood that counts: neighbouring bins err alike.
     starts : int
-        Random wavefronts, each moved `approach` steps towards the kernel alone and `first` steps with
+        Random wavefronts, each moved `approach` steps towards the reference alone and `first` steps with
         the spectra.
     kept, rounds : int
         So many of the best go on for at most `rounds` steps; only these see local spectra.
@@ -76,7 +76,7 @@ class AberrationFit:
     def fit(
         self,
         spectra: SceneSpectra,
-        first: Kernel,
+        reference: Kernel,
         on_step: StepHook = ignore_step,
         local: LocalSpectra | None = None,
     ) -> LocalWavefront:
@@ -85,40 +85,42 @@ class AberrationFit:
         Parameters
         ----------
         spectra : SceneSpectra
-        found : Kernel
+        reference : Kernel
             Centred.
         on_step : StepHook
             Progress; raising `CancelledError` there stops the work.
         local : LocalSpectra, optional
             Spectra of small tiles of the same patches.
         """
-        wide = max(rms_width(first), 0.3)
-        pupil = Pupil.of(_SIDES[wide > _WIDE_PX])
-        aim = resized(first, pupil.size)
+        width = max(rms_width(reference), 0.3)
+        pupil = Pupil.of(_SIDES[width > _WIDE_PX])
+        target = resized(reference, pupil.size)
         rng = np.random.default_rng(_SEED)
         total = self.starts + self.kept + 1
         fits = []
         for done in range(self.starts):
             start = np.zeros(TERMS)
-            start[: len(_USUAL_SHAPE)] = rng.standard_normal(len(_USUAL_SHAPE)) * _USUAL_SHAPE * wide
-            near = self._descend(pupil, aim, start, _Seen(None), self.approach)
-            fits.append(self._descend(pupil, aim, near.terms, _Seen(spectra), self.first))
+            start[: len(_USUAL_SHAPE)] = rng.standard_normal(len(_USUAL_SHAPE)) * _USUAL_SHAPE * width
+            approached = self._descend(pupil, target, start, _Evidence(None), self.approach)
+            fits.append(self._descend(pupil, target, approached.terms, _Evidence(spectra), self.first))
             on_step(done + 1, total)
-        seen = _Seen(spectra, local)
+        evidence = _Evidence(spectra, local)
         refined = []
         for done, fit in enumerate(sorted(fits, key=_cost)[: self.kept]):
-            refined.append(self._descend(pupil, aim, fit.terms, seen, self.rounds))
+            refined.append(self._descend(pupil, target, fit.terms, evidence, self.rounds))
             on_step(self.starts + done + 1, total)
         best = min(refined, key=_cost)
-        # The spectra of a kernel and of its turned copy are equal: only the kernel found tells.
+        # The spectra of a kernel and of its turned copy are equal: only the reference tells them apart.
         turned = best.terms.copy()
         turned[[*COMA, -2, -1]] *= -1.0
-        best = min(best, self._descend(pupil, aim, turned, seen, self.rounds // 2), key=_cost)
+        best = min(best, self._descend(pupil, target, turned, evidence, self.rounds // 2), key=_cost)
         on_step(total, total)
         return best
 
-    def _descend(self, pupil: Pupil, aim: Kernel, terms: Floats, seen: _Seen, rounds: int) -> LocalWavefront:
-        state = self._state(pupil, aim, terms, seen, None)
+    def _descend(
+        self, pupil: Pupil, target: Kernel, terms: Floats, evidence: _Evidence, rounds: int
+    ) -> LocalWavefront:
+        state = self._state(pupil, target, terms, evidence, None)
         damping = 1e-2
         for _ in range(rounds):
             better = None
@@ -126,9 +128,11 @@ class AberrationFit:
                 lifted = state.normal + np.diag(damping * np.diag(state.normal))
                 step = np.linalg.solve(lifted, state.gradient)
                 step *= min(1.0, _STRIDE_PX / max(float(np.abs(step[:TERMS]).max()), 1e-9))
-                after = self._state(pupil, aim, state.terms + step[:TERMS], seen, state.levels + step[TERMS:])
-                if after.cost < state.cost:
-                    better = after
+                candidate = self._state(
+                    pupil, target, state.terms + step[:TERMS], evidence, state.levels + step[TERMS:]
+                )
+                if candidate.cost < state.cost:
+                    better = candidate
                     break
                 damping *= 6.0
             if better is None:
@@ -139,10 +143,12 @@ class AberrationFit:
                 break
         return LocalWavefront(state.terms, state.kernel, state.cost)
 
-    def _state(self, pupil: Pupil, aim: Kernel, terms: Floats, seen: _Seen, levels: Floats | None) -> _State:
+    def _state(
+        self, pupil: Pupil, target: Kernel, terms: Floats, evidence: _Evidence, levels: Floats | None
+    ) -> _State:
         kernel, changes = pupil.kernel(terms)
-        off, flat = (kernel - aim).ravel(), changes.reshape(TERMS, -1)
-        weight = self.weight / float((aim**2).sum())
+        off, flat = (kernel - target).ravel(), changes.reshape(TERMS, -1)
+        weight = self.weight / float((target**2).sum())
         usual = terms / _USUAL_PX
         state = _State(
             terms,
@@ -152,12 +158,14 @@ class AberrationFit:
             np.diag(1.0 / _USUAL_PX**2) + weight * (flat @ flat.T),
             -usual / _USUAL_PX - weight * (flat @ off),
         )
-        if seen.whole is not None:
-            count = len(seen.whole.seen)
-            state = self._with_whole(state, changes, seen.whole, None if levels is None else levels[:count])
-            if seen.local is not None:
+        if evidence.whole is not None:
+            count = len(evidence.whole.log_power)
+            state = self._with_whole(
+                state, changes, evidence.whole, None if levels is None else levels[:count]
+            )
+            if evidence.local is not None:
                 state = self._with_local(
-                    state, changes, seen.local, None if levels is None else levels[count:]
+                    state, changes, evidence.local, None if levels is None else levels[count:]
                 )
         return state
 
@@ -208,7 +216,7 @@ class LocalWavefront:
 
     @property
     def unusual(self) -> float:
-        """What speaks against a wavefront before anything is seen, |g / usual|²."""
+        """How unusual the wavefront is before any data, |g / usual|²."""
         return float(np.square(self.terms / _USUAL_PX).sum())
 
     def kernel(self, size: int) -> Kernel:
@@ -221,8 +229,8 @@ def _cost(fit: LocalWavefront) -> float:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Seen:
-    """Which spectra a descent looks at."""
+class _Evidence:
+    """Spectra that a descent fits; without any it fits the reference alone."""
 
     whole: SceneSpectra | None
     local: LocalSpectra | None = None

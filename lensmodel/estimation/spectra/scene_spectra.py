@@ -155,7 +155,7 @@ class SceneSpectra:
 
     Parameters
     ----------
-    seen : ndarray, shape (n, BINS)
+    log_power : ndarray, shape (n, BINS)
         Log power, noise included.
     noise : ndarray, shape (n,)
         Power of the noise.
@@ -165,7 +165,7 @@ class SceneSpectra:
         See `ScenePrior`.
     """
 
-    seen: Floats
+    log_power: Floats
     noise: Floats
     whitening: Floats
     usual: Floats
@@ -174,23 +174,23 @@ class SceneSpectra:
     def of(cls, kept: Sequence[tuple[Plane, NoiseModel]]) -> SceneSpectra:
         """Measure patches."""
         prior = ScenePrior.load()
-        seen, floors, whitening = [], [], []
+        log_powers, floors, whitening = [], [], []
         for patch, model in kept:
             spectrum, floor = binned_spectrum(patch, model)
             power = np.maximum(spectrum[FIRST_RING:].astype(np.float64), _LEAST)
             share = np.repeat(np.clip(1.0 - floor / power.mean(axis=1), 0.0, 1.0), SECTORS)
             shapes = SHAPES * share[:, None]
             covariance = shapes @ prior.spread @ shapes.T
-            own = (prior.roughness * share) ** 2 + _OWN**2 + (_NOISY * (1.0 - share)) ** 2
-            covariance[np.diag_indices_from(covariance)] += own
+            scatter = (prior.roughness * share) ** 2 + _OWN**2 + (_NOISY * (1.0 - share)) ** 2
+            covariance[np.diag_indices_from(covariance)] += scatter
             whitening.append(np.linalg.inv(np.linalg.cholesky(covariance)))
-            seen.append(np.log(power).ravel())
+            log_powers.append(np.log(power).ravel())
             floors.append(floor)
-        return cls(np.array(seen), np.array(floors), np.array(whitening), prior.usual)
+        return cls(np.array(log_powers), np.array(floors), np.array(whitening), prior.usual)
 
     def begin(self, blur: Floats) -> Floats:
         """Amplitudes of the scenes to begin with, shape (n,), behind a blur of log power `blur`."""
-        return np.asarray(np.median(self.seen - self.usual - blur, axis=1), dtype=np.float64)
+        return np.asarray(np.median(self.log_power - self.usual - blur, axis=1), dtype=np.float64)
 
     def residuals(self, blur: Floats, by_blur: Floats, amplitudes: Floats) -> tuple[Floats, Floats]:
         """Whitened residuals of all bins of all patches, and their derivatives.
@@ -208,13 +208,13 @@ class SceneSpectra:
         residuals : ndarray, shape (n * BINS,)
         derivatives : ndarray, shape (n * BINS, m + n)
         """
-        count, unknowns = len(self.seen), by_blur.shape[1]
+        count, unknowns = len(self.log_power), by_blur.shape[1]
         left = np.zeros((count, BINS))
         change = np.zeros((count, BINS, unknowns + count))
         for i in range(count):
             scene = np.exp(np.clip(amplitudes[i] + self.usual + blur, -60.0, 60.0))
             power = scene + self.noise[i]
-            off = np.clip(self.seen[i] - np.log(power), -_LARGEST_RESIDUAL, _LARGEST_RESIDUAL)
+            off = np.clip(self.log_power[i] - np.log(power), -_LARGEST_RESIDUAL, _LARGEST_RESIDUAL)
             share = scene / power
             moved = self.whitening[i] @ np.column_stack([off, by_blur * share[:, None], share])
             left[i] = moved[:, 0]

@@ -106,7 +106,7 @@ def test_the_likeliest_gain_is_that_of_the_scene() -> None:
 def test_a_scene_of_more_contrast_is_as_likely_with_another_gain() -> None:
     truth = power_of(kernel_of(LENS))
     spectra = drawn(kernel_of(LENS), 200)
-    louder = LocalSpectra((spectra.seen[0] * np.float32(np.e),), (NOISE * np.e,), spectra.mixture)
+    louder = LocalSpectra((spectra.periodograms[0] * np.float32(np.e),), (NOISE * np.e,), spectra.mixture)
 
     less = spectra.likelihood(truth) - louder.likelihood(truth)
     assert less == pytest.approx(0.5 * FREQUENCIES * 200, rel=1e-4)  # of the unit alone
@@ -116,5 +116,5 @@ def test_brightness_of_a_photograph_changes_nothing() -> None:
     scene = dead_leaves(128, 128, np.random.default_rng(2), largest=40.0)[1].astype(np.float32)
     one, two = (LocalSpectra.of([(g * scene, NoiseModel.white(g * 0.01))]) for g in (1.0, 0.25))
 
-    np.testing.assert_allclose(one.seen[0], two.seen[0], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(one.periodograms[0], two.periodograms[0], rtol=1e-4, atol=1e-6)
     assert one.noise[0] == pytest.approx(two.noise[0], rel=1e-4)

@@ -15,7 +15,7 @@ from lensmodel.core.spectrum import repeats
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
 
 NO_BLUR_PX2 = 0.3
-"""Below this mean second moment a kernel cannot be told from the pixel and the scene's own softness."""
+"""Below this mean second moment the pixel and the scene's own softness hide a kernel."""
 
 _MIN_SIDE = 64  # pixels: one tile of a patch's spectrum
 _CONTRAST_IN_NOISE = 3.0  # standard deviations: less contrast is noise (chosen)
@@ -24,7 +24,7 @@ _CLIPPED_SHARE = 0.02  # of the pixels: a few clipped ones spoil no estimate (ch
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PsfEstimate:
-    """One estimated PSF and what speaks for it.
+    """One estimated PSF and the evidence for it.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ LARGEST: Final = 55
 
 
 def require_size(size: int) -> None:
-    """Refuse sides of kernels that nobody can estimate.
+    """Refuse kernel sizes that cannot be estimated.
 
     Raises
     ------

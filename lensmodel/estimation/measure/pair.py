@@ -149,7 +149,7 @@ class Pair:
         size: int,
         channel: Channel,
     ) -> MeasuredPsf | None:
-        """PSF of one window, or None where it tells nothing."""
+        """PSF of one window, or None where it does not determine one."""
         around = size // 2
         scene = _Scene(closed, warp, corner, self.side, around, channel)
         try:

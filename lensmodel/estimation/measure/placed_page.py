@@ -94,7 +94,7 @@ def _taper(length: int) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolvedWindow:
-    """A window that is solved: the kernel, how it was found, how far the page was moved, and its light."""
+    """A solved window: kernel, the solution it came from, how far the page was moved, and its light."""
 
     kernel: NDArray[np.float64]
     solved: Solved
@@ -200,7 +200,7 @@ def _tones_in(
     if not terms[0] > 0.0:
         raise NotEnoughEvidenceError("a window shows a negative of the page")
     left = float(np.square(observed - basis @ terms).sum()) / max(observed.size - terms.size, 1)
-    # what of the two columns the others cannot explain is what tells of q and c
+    # only the part of the two columns that the others cannot explain determines q and c
     others = np.delete(basis, (1, 2), axis=1)
     separable = basis[:, 1:3] - others @ np.linalg.lstsq(others, basis[:, 1:3], rcond=None)[0]
     return separable.T @ separable * terms[0] ** 2 / max(left, _TINY), np.asarray(terms[1:3] / terms[0])

@@ -1,15 +1,15 @@
 """PSFs from photos of points: stars, pinholes, sparks on a steel ball.
 
-A point at a place between pixels is, to whoever sees no finer than pixels, a sinc there. The kernel k of a
-cell of the field is what makes of all its points, each at its own phase, the pixels that were measured:
+Sampled at the pixels, a point between them is a sinc centred on its place. The kernel k of a cell of the
+field turns all its points, each at its own phase, into the pixels that were measured:
 
     y_i(p) = f_i sum_u k(u) sinc(p - u - c_i) + b_i
 
 So points at many phases are stacked without interpolating a photo, and pixels of a mosaic that saw another
 colour are left out. Places c_i and fluxes f_i are refined between two solutions for k. A point with one
-saturated pixel is refused whole: its neighbours hold what ran over. Each pixel counts by its own noise, of
-the sky and of the light that the kernel before predicts there: of a point most pixels are dark, and their
-mean is the noise of none of them.
+saturated pixel is refused whole: its neighbours hold what ran over. Each pixel is weighted by its own noise,
+from the sky and the light that the previous kernel predicts there: most pixels of a point are dark, so that
+the mean noise is right for none of them.
 """
 
 from __future__ import annotations

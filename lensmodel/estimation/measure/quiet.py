@@ -25,7 +25,7 @@ _FINE: Final = (0.4, 0.5)
 """Frequencies in cycles/pixel: above them grids of pixels hold nothing, below them lenses leave more."""
 
 _DARK: Final = 0.02
-"""Of saturation; darker blocks tell of the black level rather than of light (chosen)."""
+"""Of saturation; darker blocks show the black level rather than light (chosen)."""
 
 
 def with_bounded_noise(photos: list[LinearPhoto]) -> list[LinearPhoto]:

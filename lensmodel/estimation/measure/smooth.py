@@ -77,12 +77,12 @@ class Smooth:
     def out_of_y(
         self, values: NDArray[np.floating], part: tuple[NDArray[np.intp], NDArray[np.intp]]
     ) -> NDArray[np.float32]:
-        """Return what is left of observed values at some pixels."""
+        """Return the residual of observed values at some pixels."""
         rest = np.asarray(values, dtype=np.float64) - self.basis[part] @ self.of_y
         return np.asarray(rest, dtype=np.float32)
 
     def out_of_x(
         self, rows: NDArray[np.floating], part: tuple[NDArray[np.intp], NDArray[np.intp]]
     ) -> NDArray[np.float32]:
-        """Return what is left of rows of X, shape (n, k²), at some pixels."""
+        """Return the residual of rows of X, shape (n, k²), at some pixels."""
         return np.asarray(rows - self.basis[part] @ self.of_x.astype(np.float32), dtype=np.float32)

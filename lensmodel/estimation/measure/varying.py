@@ -1,4 +1,4 @@
-"""The PSF of a window in which it changes, at the phase between pixels that suits it.
+"""The PSF of a window in which it changes, at the phase between pixels that fits best.
 
 Within a window the kernel is linear in the place, with u and v from -1 to 1 over its rows and columns:
 
@@ -72,7 +72,7 @@ def solve_varying(
 ) -> Solved:
     """Find the kernel in the middle of a window; parameters, result and errors are those of `solve`.
 
-    The latent picture has no noise. The kernel needs no centring: it lies on the grid that suits it.
+    The latent picture has no noise. The kernel needs no centring: it lies on the grid that fits best.
     """
     require_fit(observed, latent, measured, size)
     weight = weights_of(measured, variance)

@@ -25,7 +25,7 @@ _POOLED_SUPPORT, _POOLED_ITERATIONS, _POOLED_SIDE = 21, 3, 160
 _STARTS, _STARTS_OF_CHANNEL = 10, 6  # random wavefronts for few patches (chosen, not measured)
 _PIXEL_SIGMA = 0.29  # pixels: standard deviation of a uniform pixel, 1/sqrt(12)
 _PER_WIDTH = 40.0
-"""Cost of a kernel e times as wide: in doubt the narrower one, which does less harm."""
+"""Cost of a kernel e times as wide: with equal evidence the narrower one wins, which does less harm."""
 
 _POOLED_ERROR = 0.7
 """Relative error of a wavefront agreed on by n patches, times the root of n."""
@@ -138,7 +138,7 @@ class Cautious:
         on_step: StepHook,
         starts: int,
     ) -> PsfEstimate:
-        """Kernel of few patches, the one that their spectra speak for."""
+        """Kernel of few patches, the likeliest by their spectra."""
         disagreement = distance(from_recurrence.kernel, gaussian.kernel).mtf_rmse
         likelihood = SpectralLikelihood.of(kept)
         fit = AberrationFit(

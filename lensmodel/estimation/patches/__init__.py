@@ -1,4 +1,4 @@
-"""Find the regions of a photo that tell about the PSF."""
+"""Find the regions of a photo that are informative about the PSF."""
 
 from lensmodel.estimation.patches.enough import LEAST_PARTS, LEAST_PATCHES, require_enough
 from lensmodel.estimation.patches.rmap import r_map

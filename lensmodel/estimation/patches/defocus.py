@@ -24,7 +24,7 @@ MIN_FOR_SURFACE: Final = 40  # windows, for six coefficients (chosen, not measur
 QUARTER_ALLOWANCE: Final = 1.2
 """A quarter of a window has fewer edges, its width a larger error."""
 SHARP_PX: Final = 0.6
-"""Edges of a sharp photo measure about this wide; below it the width says nothing."""
+"""Edges of a sharp photo measure about this wide; a smaller width carries no information."""
 MIN_IN_RING: Final = 4  # windows (chosen): fewer have no median worth the name
 
 MOTION_LIMIT: Final = 0.45  # relative elongation above which `select` warns (chosen, not measured)
@@ -63,7 +63,7 @@ def smooth_widths(windows: Windows) -> NDArray[np.float64]:
 
     Such a lens is soft on one side, which the rings of `width_envelope` would take for defocus.
     But its blur changes smoothly over the field, while a scene has depth steps. So the logarithm
-    of the width is fitted by a quadratic surface, robustly. The surface is believed if four
+    of the width is fitted by a quadratic surface, robustly. The surface is accepted if four
     windows in five follow it to within 19 percent, and if the width does not jump: over a sixth
     of the frame, 95 of 100 changes stay below half of the range that it has in the photo.
 

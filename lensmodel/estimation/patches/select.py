@@ -232,7 +232,7 @@ def second_reasons(looked: Details) -> NDArray[np.str_]:
 
 
 def _focus_weight(excess: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Fall from 1 at the envelope to a third at the limit: in doubt the sharper window wins."""
+    """Fall from 1 at the envelope to a third at the limit: of equal windows the sharper wins."""
     over = np.maximum(excess * defocus.ENVELOPE_RATIO - 1.0, 0.0)
     return np.exp(-np.square(over / FOCUS_SOFTNESS))
 

@@ -1,4 +1,4 @@
-"""Which of several kernels the spectra of the patches speak for."""
+"""Which of several kernels is likeliest by the spectra of the patches."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class SpectralLikelihood:
         return self.temper * self._misfit(cut) - self.parts * local
 
     def _misfit(self, kernel: NDArray[np.float64]) -> float:
-        """Sum of the t-likelihoods of all residuals, with the amplitudes of the scenes that suit best."""
+        """Sum of the t-likelihoods of all residuals, with the amplitudes of the scenes that fit best."""
         blur, none = log_power(kernel, np.zeros((0, *kernel.shape)))
         amplitudes = self.whole.begin(blur)
         left, change = self.whole.residuals(blur, none, amplitudes)

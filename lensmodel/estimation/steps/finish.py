@@ -41,7 +41,7 @@ def finished(
     diagnostics: Mapping[str, float],
     began: float,
 ) -> PsfEstimate:
-    """Centre a kernel and say what speaks for it.
+    """Centre a kernel and gather the evidence for it.
 
     Parameters
     ----------

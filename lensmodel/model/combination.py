@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,9 @@ from lensmodel.model.field.cross_validation import CrossValidation
 from lensmodel.model.field.kriging import as_kernels, field_vector
 from lensmodel.model.field.local_frame import Answers
 from lensmodel.model.wavefront.physical_mean import Physics
+
+WAVEFRONT_SHARE: Final = 0.75
+"""Of the wavefront in the mode `both`: `python -m lensmodel.lab.model.joint_answer`."""
 
 _SILENT = 1e-3
 _KERNEL_ERROR, _LEAST_KERNEL_ERROR, _NARROW_PX = 0.35, 0.1, 0.8

@@ -25,13 +25,13 @@ from lensmodel.core.types import ZONES, FieldPosition, Kernel, LensSettings, Ste
 from lensmodel.model import learned as memory
 from lensmodel.model import pitch as pitches
 from lensmodel.model import variables as va
-from lensmodel.model.answer import MICROMETRE, MIXED, WAVEFRONT, ModelSettings, PsfAnswer
+from lensmodel.model.answer import BOTH, MICROMETRE, MIXED, WAVEFRONT, ModelSettings, PsfAnswer
 from lensmodel.model.answering import AnsweringModel, ModelField
 from lensmodel.model.field.robust import Flag
 from lensmodel.model.fitting import GROWTH, INCREMENT, Fit
 from lensmodel.model.predictor import Predictor
 from lensmodel.model.prior import Prior
-from lensmodel.model.trust.expected_error import Evidence, expected_error, with_prior
+from lensmodel.model.trust.expected_error import Evidence, expected_error, joint_error, with_prior
 from lensmodel.model.trust.misleading_photos import without_misleading
 from lensmodel.model.trust.support import standard_error, support
 from lensmodel.model.wavefront.physical_mean import Physics
@@ -236,7 +236,10 @@ class LensModel:
         )
         physical = fit.physical_at(settings)
         alone = fit.mode in {MIXED, WAVEFRONT} and physical is not None and physical.agreed
-        error = expected_error(evidence, mixture, wavefront_alone=alone)
+        if fit.mode == BOTH:
+            error = joint_error(evidence, mixture, position.r)
+        else:
+            error = expected_error(evidence, mixture, wavefront_alone=alone)
         share = float(prior_shares[0])
         if self.prior is not None and share > _LISTED:
             error = with_prior(error, share, self.prior.error(position, settings))

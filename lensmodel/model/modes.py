@@ -22,20 +22,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model.answer import BOTH, MIXED, WAVEFRONT
-from lensmodel.model.combination import Estimates, Mixture, relative_l2
+from lensmodel.model.combination import WAVEFRONT_SHARE, Estimates, Mixture, relative_l2
 from lensmodel.model.field.kriging import as_kernels
 from lensmodel.model.field.local_frame import Answers, LocalKernels
+from lensmodel.model.trust.support import measured_share
 from lensmodel.model.wavefront.physical_mean import Physics
-
-WAVEFRONT_SHARE: Final = 0.75
-"""Of the wavefront in the mode `both`: `python -m lensmodel.lab.model.joint_answer`."""
 
 
 def answered(
@@ -47,6 +44,7 @@ def answered(
     settings: LensSettings,
     widths: NDArray[np.float64],
     size: int,
+    expected: NDArray[np.float64],
 ) -> Mixture:
     """Answer questions of one setting in one mode.
 
@@ -58,6 +56,8 @@ def answered(
         Neighbours of the places and their weights.
     widths : ndarray, shape (q, 2)
         Scales of the places.
+    expected : ndarray, shape (q,)
+        Relative L2 that estimators expect of the neighbours: where they were measured, a wavefront says less.
     """
     angles, mirror = np.array([p.phi for p in positions]), estimates.validation.choice.mirror
     physical = estimates.physical
@@ -69,25 +69,29 @@ def answered(
         averaged, apart = near.mean(estimates.validation.errors**2), relative_l2(rows, kernels)
         return replace(alone, averaged=averaged, apart=apart)
     if mode == BOTH and physical is not None and physical.agreed and physical.diffraction_known:
-        return _with_wavefront(
-            _alone(kernels, near, estimates.validation.errors, 0), physical, positions, settings
-        )
+        regression = _alone(kernels, near, estimates.validation.errors, 0)
+        share = WAVEFRONT_SHARE * (1.0 - measured_share(expected))
+        return _with_wavefront(regression, physical, share, positions, settings)
     if mode == MIXED:
         return estimates.mixed(kernels, near, positions, settings)
     return _alone(kernels, near, estimates.validation.errors, 0)
 
 
 def _with_wavefront(
-    averaged: Mixture, physical: Physics, positions: Sequence[FieldPosition], settings: LensSettings
+    averaged: Mixture,
+    physical: Physics,
+    share: NDArray[np.float64],
+    positions: Sequence[FieldPosition],
+    settings: LensSettings,
 ) -> Mixture:
-    """The mean of averaged kernels and of the wavefront's, turned as often as that may be."""
+    """The mean of averaged kernels and, by their shares `(q,)`, of the wavefront's, turned as may be."""
     rows = as_kernels(physical.rows(positions, settings), averaged.kernels.shape[1])
     if physical.turned > 0.0:
         rows = (1.0 - physical.turned) * rows + physical.turned * rows[:, ::-1, ::-1]
     return replace(
         averaged,
-        kernels=(1.0 - WAVEFRONT_SHARE) * averaged.kernels + WAVEFRONT_SHARE * rows,
-        shares=np.tile([1.0 - WAVEFRONT_SHARE, 0.0, WAVEFRONT_SHARE], (len(rows), 1)),
+        kernels=averaged.kernels + share[:, None, None] * (rows - averaged.kernels),
+        shares=np.stack([1.0 - share, np.zeros_like(share), share], axis=1),
         apart=relative_l2(rows, averaged.kernels),
     )
 

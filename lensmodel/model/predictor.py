@@ -19,6 +19,7 @@ from lensmodel.model.fitting import Fit
 from lensmodel.model.modes import answered, between
 from lensmodel.model.pixels import Pixels
 from lensmodel.model.prior import Prior
+from lensmodel.model.trust.support import USUAL_ERROR
 from lensmodel.model.wavefront.zoom import nearest
 
 _AROUND: Final = {**va.FALLBACK, "r": 0.15, "phi": 0.5}
@@ -72,8 +73,10 @@ class Predictor:
         widths = fit.widths.over(np.array([va.point(p, settings) for p in positions]))
         end, share = nearest(fit.ends, settings)
 
+        expected = np.sqrt(near.mean(np.where(fit.expected > 0.0, fit.expected, USUAL_ERROR**2)))
+
         def mixed(estimates: Estimates) -> Mixture:
-            return answered(fit.mode, estimates, fit.local, near, positions, settings, widths, size)
+            return answered(fit.mode, estimates, fit.local, near, positions, settings, widths, size, expected)
 
         mixture = mixed(self._estimates) if end is None or share < 1.0 else None
         if end is not None:

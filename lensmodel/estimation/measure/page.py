@@ -41,8 +41,8 @@ CONTRAST: Final = 0.17
 """Standard deviation of the noise as a share of the paper's white: 3 of them reach ink and paper."""
 
 _SEED: Final = 20120  # any number: printed pages depend on it, so it stays
-_LARGEST: Final = 8000  # samples along the long side: finer ones no printer holds (chosen)
-_SMALLEST: Final = 200  # samples along the long side: coarser ones tell nothing of a kernel (chosen)
+_LARGEST: Final = 8000  # samples along the long side (chosen)
+_SMALLEST: Final = 200  # samples along the long side (chosen)
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ REACH: Final = 2.5
 """D in pixels: light 10 px away is expected below 3 percent a pixel, ten times what wide halos have."""
 
 _ROWS: Final = 4096  # at once: the design matrix of a window would take hundreds of megabytes
-_STEPS: Final = 300  # of the projected gradient at most: it has converged long before (chosen)
+_STEPS: Final = 300  # of the projected gradient at most (chosen)
 _STILL: Final = 1e-7  # of the light: no value moves by more
 _WORST: Final = 1.0  # an error beyond it says that nothing was measured
 

@@ -25,7 +25,7 @@ ALPHA = 4.0 / 3.0
 SIDE = 5  # pixels: Michaeli and Irani 2014, sec. 5
 # Principal ones by which neighbours are found; they hold nearly all of a patch's power (chosen)
 _COMPONENTS = 10
-_NEIGHBOURS = 5  # per patch: with more the prior blurs, with fewer it is noisy (chosen)
+_NEIGHBOURS = 5  # per patch (chosen)
 
 Image = NDArray[np.float64]
 

@@ -1,7 +1,8 @@
 r"""What photos of the same lens stopped down add to what photos wide open tell of it.
 
     LENSMODEL_TEST_DATA=... python -m lensmodel.lab.chain.stopped_down --seeds 0 1 3 4 \
-        [--traced OPEN.npz:CLOSED.npz] [--aperture 8] [--open 1 2 5] [--stopped 0 1 2 5]
+        [--traced OPEN.npz:CLOSED.npz] [--aperture 8] [--open 1 2 5] [--stopped 0 1 2 5] \
+        [--samples FOLDER]
 
 A blind estimate cannot tell a soft scene from a soft lens. Photos at f/5.6 to f/11 are hardly blurred by the
 lens, so they show what its owner's scenes look like. Each lens takes photos as in
@@ -26,28 +27,15 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.core.errors import NotEnoughEvidenceError
-from lensmodel.core.psf import PsfSample, distance
-from lensmodel.lab.chain.blind_gain import CAMERA, PLACES, Lens, lenses, shot, written
+from lensmodel.core.psf import distance
+from lensmodel.lab.chain.blind_gain import CAMERA, PLACES, Lens, lenses
 from lensmodel.lab.model.belief_prior import SIZE, Rule, places
+from lensmodel.lab.model.joint_answer import samples_of
 from lensmodel.lab.traced import GridLens, read_grid
 from lensmodel.model import LensModel, ModelSettings, WitnessedField
-from lensmodel.workflow import pipeline
 
 _ZONES: Final = (slice(0, 4), slice(4, 12), slice(12, 16))
 """Of `PLACES`: center, mid field, corner."""
-
-
-def learned(lens: Lens, count: int, first: int, folder: Path) -> list[list[PsfSample]]:
-    """Samples of `count` photos of a lens as it is set, beginning with photograph `first`."""
-    photos: list[list[PsfSample]] = []
-    for number in range(first, first + count):
-        path = written(folder / f"{lens.number}-{number}.dng", shot(lens, number), tiff=False)
-        try:
-            photos.append(pipeline.samples_of_photo(path, settings=lens.settings, workers=1))
-        except NotEnoughEvidenceError:
-            photos.append([])
-    return photos
 
 
 def errors(lens: Lens, model: LensModel) -> NDArray[np.float64]:
@@ -66,13 +54,18 @@ def errors(lens: Lens, model: LensModel) -> NDArray[np.float64]:
 def pairs(seeds: Sequence[int], traced: Sequence[str], aperture: float) -> Iterator[tuple[Lens, Lens]]:
     """Each lens wide open and stopped down."""
     for lens in lenses(seeds, [], CAMERA.full_well_electrons):
-        yield lens, replace(lens, f_number=aperture)
+        yield lens, closed_to(lens, aperture)
     for number, names in enumerate(traced):
         open_, closed = (read_grid(Path(name)) for name in names.split(":"))
         lens = Lens(
             Path(names.split(":")[0]).stem, GridLens((open_, closed)), open_.f_number, 2000 + number, CAMERA
         )
-        yield lens, replace(lens, f_number=closed.f_number)
+        yield lens, closed_to(lens, closed.f_number)
+
+
+def closed_to(lens: Lens, aperture: float) -> Lens:
+    """Return a lens stopped down."""
+    return replace(lens, name=f"{lens.name}-f{aperture:g}", f_number=aperture)
 
 
 def main() -> None:
@@ -85,6 +78,7 @@ def main() -> None:
     parser.add_argument("--aperture", type=float, default=8.0, help="f-number of the stopped-down photos")
     parser.add_argument("--open", type=int, nargs="*", default=[1, 2, 5])
     parser.add_argument("--stopped", type=int, nargs="*", default=[0, 1, 2, 5])
+    parser.add_argument("--samples", type=Path, help="folder that keeps what patches gave")
     wanted = parser.parse_args()
     print(
         "| lens | open | stopped down | kernels | wavefront | belief | gain, dB | least |\n"
@@ -93,10 +87,12 @@ def main() -> None:
     )
     rule = Rule.of_product()
     with tempfile.TemporaryDirectory() as name:
+        folder = wanted.samples or Path(name)
+        folder.mkdir(parents=True, exist_ok=True)
         for lens, closed in pairs(wanted.seeds, wanted.traced, wanted.aperture):
             most = max(wanted.open)
-            wide = learned(lens, most, 0, Path(name))
-            narrow = learned(closed, max(wanted.stopped), most, Path(name))
+            wide = [samples_of(lens, number, folder) for number in range(most)]
+            narrow = [samples_of(closed, most + number, folder) for number in range(max(wanted.stopped))]
             for few in wanted.open:
                 for more in wanted.stopped:
                     samples = [s for photo in (*wide[:few], *narrow[:more]) for s in photo]

@@ -3,14 +3,14 @@ r"""How near averaged kernels, the wavefront and means of both are to the truth,
     LENSMODEL_TEST_DATA=... python -m lensmodel.lab.model.joint_answer --seeds 0 1 3 4 5 \
         --grids GRID.npz ... [--photos 1 2 5] [--samples FOLDER]
 
-Each lens takes photos as in `lensmodel.lab.chain.blind_gain` and is learned from the first n. At sixteen places
-the green PSF is asked of the regression, of the wavefront, and of their means with shares of the wavefront
-from a quarter to seven eighths. Printed is the relative L2 error by lens and zone (median of the places), its mean
-by family, and how often each answer is nearer than the worse and than the better of the two.
+Each lens takes photos as in `lensmodel.lab.chain.blind_gain` and is learned from the first n. At sixteen
+places the green PSF is asked of the regression, of the wavefront, and of their means with shares of the
+wavefront from a quarter to seven eighths. Printed is the relative L2 error by lens and zone (median of the
+places), its mean by family, and how often each answer is nearer than the worse and the better of the two.
 
 Then the error to tell: ln e = a + b r + c ln(d + 0.02), with d the relative L2 by which the two differ. The
-coefficients are those of `lensmodel.model.trust.expected_error.joint_error`; how often it is right within a factor
-of 1.5 is told for lenses that were left out of the fit, one after the other.
+coefficients are those of `lensmodel.model.trust.expected_error.joint_error`; how often it is right within a
+factor of 1.5 is told for lenses that were left out of the fit, one after the other.
 
 `--samples` keeps what patches gave, so that another run of the same code estimates nothing anew. Some twenty
 seconds a photo and a fit on one core.
@@ -100,7 +100,7 @@ def row_of(lens: Lens, photos: int, samples: Sequence[PsfSample]) -> Row | None:
         for place, k, w in zip(PLACES, averaged, rendered, strict=True)
     ]
     r = np.array([place.r for place in PLACES])
-    drawn = lens.number < 2000  # noqa: PLR2004 - ray-traced ones have numbers from there on
+    drawn = lens.number < 2000
     return Row(lens.name, drawn, photos, np.array(errors), relative_l2(rendered, averaged), r)
 
 

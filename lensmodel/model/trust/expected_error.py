@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lensmodel.model.combination import Mixture
+from lensmodel.model.combination import WAVEFRONT_SHARE, Mixture
 from lensmodel.model.trust.support import field_error, shared_error
 
 
@@ -75,6 +75,29 @@ def expected_error(evidence: Evidence, mixture: Mixture, *, wavefront_alone: boo
         averaged = evidence.usual if evidence.extrapolated else float(mixture.averaged[0])
         error = max(error, evidence.regression_error(averaged), float(mixture.apart[0]))
     return error
+
+
+_AT_CENTER, _BY_RADIUS, _BY_DISTANCE, _LEAST_APART = -1.15, 0.58, 0.38, 0.02
+"""Of `joint_error`: `python -m lensmodel.lab.model.joint_answer`, development lenses of both families."""
+
+
+def joint_error(evidence: Evidence, mixture: Mixture, r: float) -> float:
+    """Relative L2 that the first mean of averaged kernels and a wavefront's expects of itself.
+
+    With d the relative L2 by which the two differ, e = exp(a + b r + c ln(d + 0.02)). Held-out kernels share
+    their mistakes with all kernels of these photos; how far two kinds of estimates lie apart is nearer to
+    what both are off by. Without a wavefront the error is the regression's.
+
+    Parameters
+    ----------
+    r : float
+        Half-diagonals.
+    """
+    own = evidence.regression_error(float(mixture.usual if evidence.extrapolated else mixture.squared[0]))
+    share = float(mixture.shares[0, 2]) / WAVEFRONT_SHARE
+    apart = float(mixture.apart[0])
+    joint = math.exp(_AT_CENTER + _BY_RADIUS * r + _BY_DISTANCE * math.log(apart + _LEAST_APART))
+    return math.hypot(math.sqrt(1.0 - share) * own, math.sqrt(share) * joint * evidence.distance_factor)
 
 
 def with_prior(error: float, share: float, prior_error: float) -> float:

@@ -36,6 +36,7 @@ from lensmodel.core.types import Channel, FieldPosition, Kernel, LensSettings
 from lensmodel.model import variables as va
 from lensmodel.model.field.kriging import field_vector, settings_gap
 from lensmodel.model.lens_model import LensModel
+from lensmodel.model.trust.support import USUAL_ERROR, measured_share
 from lensmodel.model.wavefront.likelihood import surprise
 
 NARROWINGS: Final = (Narrowing(), Narrowing(width=0.7), Narrowing(width=0.55), Narrowing(share=0.45))
@@ -49,9 +50,6 @@ OF_BOTH: Final = ((0.02, 0.05, 0.05, 0.05), (0.20, 0.23, 0.30, 0.10))  # p of ke
 _OF_UNKNOWN: Final = ((0.20, 0.10, 0.10, 0.05), (0.15, 0.15, 0.15, 0.10))
 """p where aperture or pixels are not known: a wavefront cannot tell narrow blur from diffraction then."""
 _OF_ONE: Final = ((0.1, 0.3, 0.3, 0.3),)  # p where the samples have no wavefront
-_MEASURED, _BLIND = 0.08, 0.15
-"""Expected errors of kernels up to which, as of those measured on a target, they are believed more than
-patches are, and from which on they count as blind estimates do, none of which expects less (chosen)."""
 SPREAD_OF_BOTH, _SPREAD_OF_ONE = 1.5, 3.0
 """Factors on the variance: the true kernel is none of the alternatives."""
 _AGAINST, _FOR = 12.0, 6.0  # bounds of what one patch says, from the first alternative on
@@ -62,8 +60,6 @@ _FEWEST_VOTES: Final = 0.5  # patches; with fewer near a place the witness says 
 _MOST: Final = 96  # patches of a model that are asked
 _TINY: Final = 1e-12
 _ALIKE: Final = 0.05  # least weight by settings
-_USUAL_ERROR: Final = 0.4
-"""Relative L2 error that blind estimates share where they do not say (of simulated lenses, one photo)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,7 +135,7 @@ class Witness:
         """
         mean, photos = self.evidence(position)
         prior = np.array(self.prior)
-        measured = float(np.interp(error, (_MEASURED, _BLIND), (1.0, 0.0)))
+        measured = float(measured_share(error))
         shares = prior * np.exp(-TEMPER * photos / (photos + HALF) * (mean - mean.min()))
         shares *= (1.0 - measured) / shares.sum()
         shares[0, 0] += measured
@@ -200,7 +196,7 @@ class WitnessedField:
         if (
             answer.shared_error == 0.0
         ):  # the estimator said nothing of itself: it shares the error that is usual
-            expected = math.hypot(expected, _USUAL_ERROR)
+            expected = math.hypot(expected, USUAL_ERROR)
         if self.witness.votes_at(position) < _FEWEST_VOTES:
             return self._without_votes(position, answer.kernel, expected)
         kernels = [answer.kernel, *(field.kernel_at(position, channel, size) for field in self.fields[1:])]
@@ -226,7 +222,7 @@ class WitnessedField:
         So with lenses that were learned from JPEG files alone. The mean of the alternatives keeps more at the
         finest detail than the kernel does, which is what combs are made of where it is too wide.
         """
-        if expected <= _MEASURED or len(self.opinions) > 1:
+        if measured_share(expected) == 1.0 or len(self.opinions) > 1:
             return Belief.of_error(kernel, expected)
         belief = Belief.mixture([kernel], NARROWINGS, self.witness.shares(position, expected))
         if belief.error == 0.0:  # a point is as narrow as any

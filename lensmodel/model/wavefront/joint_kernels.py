@@ -38,6 +38,10 @@ Group: TypeAlias = dict[Channel, PsfSample]
 
 _COMA = slice(2, 6)  # the odd terms
 _COARSE_PLACES, _MEDIUM_PLACES, _FINE_PLACES = 24, 36, 48
+_NARROW_PLACES, _STOPPED_DOWN = (
+    int(__import__("os").environ.get("NARROW", "24")),
+    2.0,
+)  # patches of photos stopped down by two stops or more (chosen)
 _COARSE_ROUNDS, _MEDIUM_ROUNDS, _FINE_ROUNDS = 7, 6, 16
 _STARTS, _KEPT, _REFINED, _REFINED_OF_PAIR = 6, 12, 4, 2
 _FEWEST_PAIRED, _MOST_PAIRS = 3, 2  # photos, and pairs of them
@@ -173,8 +177,9 @@ def pool(samples: Sequence[PsfSample], on_step: StepHook = ignore_step) -> Poole
     ]
     begins += _random_fronts(first, float(np.median([rms_width(s.kernel) for s in heads])))
     at = {id(head): group for head, group in zip(heads, places, strict=True)}
-    chosen = [at[id(s)] for s in spread(heads, _FINE_PLACES)]
-    parts = [[at[id(s)] for s in spread(own, _FINE_PLACES)] for own in _pairs(heads)]
+    wide, narrow = _by_aperture(heads, widest)
+    chosen = [at[id(s)] for s in (*spread(wide, _FINE_PLACES), *spread(narrow, _NARROW_PLACES))]
+    parts = [[at[id(s)] for s in spread(own, _FINE_PLACES)] for own in _pairs(wide)]
     votes = [(_tail_vote(fit.front, heads), fit) for fit in _searched(chosen, parts, begins, on_step)]
     # a vote of z standard deviations is a likelihood too: z^2 beside a cost of chi^2
     tails, best = min(votes, key=lambda vote: vote[1].cost - vote[0] ** 2)
@@ -230,6 +235,23 @@ def _pairs(samples: Sequence[PsfSample]) -> list[list[PsfSample]]:
         return []
     pairs = [set(photos[i : i + 2]) for i in range(0, len(photos) - 1, 2)][:_MOST_PAIRS]
     return [[s for s in samples if s.photo in pair] for pair in pairs]
+
+
+def _by_aperture(
+    samples: Sequence[PsfSample], widest: float | None
+) -> tuple[Sequence[PsfSample], Sequence[PsfSample]]:
+    """Samples of photos near the widest aperture, and those of photos stopped down.
+
+    Stopped down, a lens hardly blurs: such patches tell what scenes look like, and little of the lens, so that
+    they do not take the places of others. Where too few others are left, all count alike.
+    """
+    if widest is None:
+        return samples, []
+    narrow = [s for s in samples if (s.settings.aperture or widest) >= _STOPPED_DOWN * widest]
+    if len(samples) - len(narrow) < MIN_PLACES:
+        return samples, []
+    closed = {id(s) for s in narrow}
+    return [s for s in samples if id(s) not in closed], narrow
 
 
 def _random_fronts(first: Wavefront, width: float) -> list[Wavefront]:

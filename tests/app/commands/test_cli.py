@@ -591,7 +591,7 @@ def test_a_lens_learned_the_papers_way_stays_so_and_is_corrected_so(
         assert "method paper" in str(written.tag_v2.get(270))
     assert here(*words, *quick, "--model", "default", "--mode", "kernels").returncode == 2
     assert here(*words, "--kernel-size", "57").returncode == 2
-    assert json.loads(here(*words, *quick, "--model", "default").stdout)["mode"] == "kernels"
+    assert json.loads(here(*words, *quick, "--model", "default").stdout)["mode"] == "both"
 
 
 def test_a_photo_that_says_little_is_corrected_with_a_word_of_warning(folder: Path, here: Here) -> None:

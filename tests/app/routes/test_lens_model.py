@@ -66,7 +66,7 @@ def test_every_answer_names_the_model_that_gave_it(client: TestClient, steps: St
     learn(steps, photo)
     after = support(client, lens)
     assert ((before["model"], before["mode"]), (after["model"], after["mode"])) == (
-        ("default", "kernels"),
+        ("default", "both"),
         ("paper", "paper"),
     )
     assert lens_of(client, lens) == ("paper", "paper")

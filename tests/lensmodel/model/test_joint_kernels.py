@@ -15,8 +15,9 @@ from lensmodel.core.psf import PsfSample, delta, distance, gaussian, rms_width
 from lensmodel.core.spectrum import RINGS, SECTORS, PatchSpectrum
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensSettings
 from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
-from lensmodel.model.combination import Estimates, agreed_share, kernel_error
+from lensmodel.model.combination import WAVEFRONT_SHARE, Estimates, Mixture, agreed_share, kernel_error
 from lensmodel.model.field.local_frame import Answers
+from lensmodel.model.trust.expected_error import Evidence, joint_error
 from lensmodel.model.wavefront.aberration_prior import BALANCE, corner_ratio, unlikeliness
 from lensmodel.model.wavefront.from_spectra import PatchView, PooledFit, fit_spectra
 from lensmodel.model.wavefront.joint_kernels import MIN_PLACES, Pooled, _pairs, pool
@@ -377,6 +378,49 @@ def test_wavefront_has_the_say_at_any_width_where_its_diffraction_is_known(
     assert warm.query(place, SETTINGS, 31).wavefront_share == 1.0
     unknown = [replace(s, pixel_pitch_um=None) for s in known]
     assert LensModel.fit(unknown, MIXED).warmed().query(place, SETTINGS, 31).wavefront_share < 1.0
+
+
+def test_kernels_and_wavefront_answer_together_where_diffraction_is_known(warm: LensModel) -> None:
+    both, place = warm.opinion("both"), FieldPosition(0.7, 0.4)
+    assert both is not None
+    kernels, wavefront = (
+        warm.opinion(mode).kernels([place], SETTINGS, 31) for mode in ("kernels", "wavefront")
+    )
+
+    answer = both.query(place, SETTINGS, 31)
+
+    assert (answer.mode, answer.wavefront_share) == ("both", WAVEFRONT_SHARE)
+    turned = warm.physical.turned  # no tail tells on which side of these kernels it lies
+    either = (1.0 - turned) * wavefront[0] + turned * wavefront[0][::-1, ::-1]
+    expected = (1.0 - WAVEFRONT_SHARE) * kernels[0] + WAVEFRONT_SHARE * either
+    np.testing.assert_allclose(answer.kernel, expected, atol=1e-9)
+
+
+def test_measured_kernels_leave_a_wavefront_no_say(known: list[PsfSample], warm: LensModel) -> None:
+    measured = [replace(s, error=0.05) for s in known]
+    learned = replace(LensModel.fit(measured)._fit, physical=warm._fit.physical)
+    model = LensModel(tuple(measured), ModelSettings(), learned)
+    plain = LensModel.fit(measured, ModelSettings(mode="kernels"))
+
+    answer, other = (m.query(FieldPosition(0.7, 0.4), SETTINGS, 31) for m in (model, plain))
+
+    assert answer.wavefront_share == 0.0
+    assert np.array_equal(answer.kernel, other.kernel)
+    assert answer.predicted_error == pytest.approx(other.predicted_error)
+
+
+def test_the_error_to_expect_grows_with_what_kernels_and_wavefront_differ_by() -> None:
+    evidence = Evidence(0.01, 0.16, 2.0, 0.3, extrapolated=False, usual=0.1)
+
+    def told(apart: float, r: float = 0.5) -> float:
+        one = np.ones(1)
+        shares = np.array([[1.0 - WAVEFRONT_SHARE, 0.0, WAVEFRONT_SHARE]])
+        mixture = Mixture(one[:, None, None], 0.1 * one, 0.1, shares, 0.1 * one, apart * one)
+        return joint_error(evidence, mixture, r)
+
+    assert told(0.05) < told(0.2) < told(0.8)
+    assert told(0.2, 0.1) < told(0.2, 0.9)
+    assert 0.05 < told(0.2) < 0.5
 
 
 def test_unknown_pitch_is_taken_as_a_usual_one_not_as_wide_kernels_suggest(

@@ -57,7 +57,8 @@ def noisy() -> list[PsfSample]:
     ("mode", "why"), [("guess", "not known"), ("likeliest", "gone"), ("evidence", "gone")]
 )
 def test_unknown_modes_are_refused_with_the_known_ones(mode: str, why: str) -> None:
-    with pytest.raises(UnknownMethodError, match=f"{why}; choose one of kernels, mixed, wavefront, paper"):
+    known = "both, kernels, mixed, wavefront, paper"
+    with pytest.raises(UnknownMethodError, match=f"{why}; choose one of {known}"):
         ModelSettings(mode=mode)
 
 

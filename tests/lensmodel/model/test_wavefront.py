@@ -167,13 +167,15 @@ class TestCombined:
         assert warm.query(FieldPosition(0.5, 0.2), LensSettings(), 21).wavefront_share > 0.0
         assert steps[-1][0] == steps[-1][1]
 
-    def test_default_mode_has_no_wavefront_and_is_warm_without_work(self) -> None:
+    def test_samples_without_spectra_are_answered_for_by_the_regression_and_are_warm_without_work(
+        self,
+    ) -> None:
         model = LensModel.fit(of_lens(4, 2))
 
         assert model.warm
         assert model.warmed() is model
         answer = model.query(FieldPosition(0.5, 0.2), LensSettings(), 21)
-        assert (answer.mode, answer.wavefront_share) == ("kernels", 0.0)
+        assert (answer.mode, answer.wavefront_share) == ("both", 0.0)
 
     def test_same_samples_give_the_same_wavefront(self, warm: LensModel) -> None:
         again = LensModel.fit(warm.samples, warm.settings).warmed()

@@ -1,4 +1,4 @@
-"""What every non-blind deconvolver takes and gives."""
+"""What every non-blind deconvolver takes and returns."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from lensmodel.core.types import NoiseModel, Plane, Planes, StepHook, ignore_ste
 from lensmodel.correction.blur import BlurOperator, UniformBlur
 
 TINY = 1e-6
-"""Smallest light that a quotient may have below the bar."""
+"""Least light that is divided by, in units of saturation (chosen, not measured)."""
 
 LEAST_PREDICTED = 0.1
-"""Share of a datum that Richardson-Lucy's prediction of it has at least, so that a step lifts light tenfold
-at most: a transfer function that belongs to no positive kernel, as of a point moved by a part of a pixel,
-predicts nothing or less here and there."""
+"""Least prediction in Richardson-Lucy, as a share of the datum, so that a step raises light tenfold at most
+(chosen): a transfer function that belongs to no positive kernel, such as that of a point moved by a part of a
+pixel, predicts zero or negative light here and there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,15 +31,15 @@ class Sensor:
     noise : NoiseModel
         Variance against level.
     clip : float
-        Level from which on a value is only a lower bound; infinity where nothing clips.
+        Level at and above which a value is only a lower bound; infinity where nothing clips.
     measured : ndarray of bool or None
         Where the sensor measured this plane; demosaicing filled in the rest. `None` for everywhere.
     surrounded : bool
-        Whether a rim as wide as the blur reaches will be cut off on all sides. What is beyond the plane
-        then need not be solved for.
+        Whether a rim as wide as the reach of the blur will be cut off on all sides. What lies beyond the
+        plane then need not be solved for.
     edges : tuple of bool
-        Which sides of the plane, top, bottom, left and right, are the frame's own. The others are cuts:
-        what is beyond them was measured, but not given.
+        Which sides of the plane (top, bottom, left, right) are sides of the frame. The others are cuts:
+        what lies beyond them was measured, but is not given.
     """
 
     noise: NoiseModel = field(default_factory=lambda: NoiseModel.white(0.005))
@@ -115,7 +115,7 @@ class WarpableMethod(Protocol):
     Attributes
     ----------
     warped : bool
-        Whether it does; else the shift is better left to the kernels, which spare the picture that.
+        Whether it does; otherwise the shift is part of the kernels, which avoids the resampling.
     """
 
     warped: bool
@@ -124,7 +124,7 @@ class WarpableMethod(Protocol):
 def restore_planes(
     method: Deconvolver, blurred: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor]
 ) -> Planes:
-    """Restore `(channel, row, col)` planes: together where the method can, else one by one."""
+    """Restore `(channel, row, col)` planes: together if the method can, else one by one."""
     if isinstance(method, ColourDeconvolver):
         return method.deconvolve_planes(blurred, blurs, sensors)
     restored = [

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lensmodel.core.jit import jit
 from lensmodel.correction.compiled.common import ONE, ZERO, Complex, Real, to_plane, to_spectrum
 
-_REACH: Final = np.float32(1.0 / 24.0)  # as `methods.shrinkage`
+_REACH: Final = np.float32(1.0 / 24.0)  # as in `methods.shrinkage`
 
 
 @jit
@@ -18,17 +18,17 @@ def _shrink(v: Any, scale: Any, edge: Any, steepness: Any, terms: Real) -> Any: 
     size = max(abs(v), np.float32(1e-20))
     below = scale / size
     inverse = min(max(below, _REACH), edge)
-    taken = terms[0]
-    taken = taken * inverse + terms[1]
-    taken = taken * inverse + terms[2]
-    taken = taken * inverse + terms[3]
-    taken = taken * inverse + terms[4]
-    taken = taken * inverse + terms[5]
-    taken = taken * inverse + terms[6]
-    taken = taken * inverse + terms[7]
-    taken = taken * inverse + terms[8]
-    taken = taken * inverse + terms[9]
-    kept = (size - scale * taken) * min(max((edge - below) * steepness, ZERO), ONE)
+    subtracted = terms[0]
+    subtracted = subtracted * inverse + terms[1]
+    subtracted = subtracted * inverse + terms[2]
+    subtracted = subtracted * inverse + terms[3]
+    subtracted = subtracted * inverse + terms[4]
+    subtracted = subtracted * inverse + terms[5]
+    subtracted = subtracted * inverse + terms[6]
+    subtracted = subtracted * inverse + terms[7]
+    subtracted = subtracted * inverse + terms[8]
+    subtracted = subtracted * inverse + terms[9]
+    kept = (size - scale * subtracted) * min(max((edge - below) * steepness, ZERO), ONE)
     return kept if v >= ZERO else -kept
 
 
@@ -99,18 +99,25 @@ def pull_of(  # noqa: C901 - loops over rows and colours, one pass over memory
 
 @jit
 def _wiener(
-    Y: Complex, K: Complex, decay: Real, likely: Real, size: int, noise: float, variance: float, P: Complex
+    Y: Complex,
+    K: Complex,
+    decay: Real,
+    prior_power: Real,
+    size: int,
+    noise: float,
+    variance: float,
+    P: Complex,
 ) -> None:
     """Spectrum of the Wiener estimate; see `wiener.wiener_spectrum`."""
     height, half = Y.shape
-    shown = np.float64(0.0)
+    blurred_prior = np.float64(0.0)
     for i in range(height):
         part = ZERO
         for j in range(half):
             k = K[i, j]
-            part += likely[i, j] * (k.real * k.real + k.imag * k.imag)
-        shown += part
-    scale = max(variance - noise, 0.005 * variance + 1e-12) / shown
+            part += prior_power[i, j] * (k.real * k.real + k.imag * k.imag)
+        blurred_prior += part
+    scale = max(variance - noise, 0.005 * variance + 1e-12) / blurred_prior
     ratio = np.float32(noise / (scale * size))
     for i in range(height):
         for j in range(half):
@@ -131,8 +138,8 @@ def _drifted(x: Real, drift: Complex, down: Real, across: Real, work: Real, D: C
         to_spectrum(work, D)
         for i in range(height):
             for j in range(D.shape[1]):
-                more = drift[way, i, j] * D[i, j]
-                E[i, j] = more if way == 0 else E[i, j] + more
+                term = drift[way, i, j] * D[i, j]
+                E[i, j] = term if way == 0 else E[i, j] + term
 
 
 @jit
@@ -144,7 +151,7 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
     K: Complex,
     smooth: Real,
     decay: Real,
-    likely: Real,
+    prior_power: Real,
     noise: Real,
     variance: Real,
     scale: Real,
@@ -161,10 +168,9 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
 ) -> None:
     """Wiener start and half-quadratic steps of `SparseGradient` on a canvas; the result goes into `x`.
 
-    `known` tells which pixels hold data; `whole` says that all do, so that none needs a prediction.
-    `drift` is how K changes per
-    pixel down and across, and empty where it does not; `down` and `across` are the distances from
-    where it is K. What it adds is found anew in the steps that `turns` names.
+    `known` marks the pixels that hold data; `whole` says that all do, so that none needs a prediction.
+    `drift` is the change of K per pixel down and across, empty where there is none; `down` and `across` are
+    the distances from where the kernel is K. Its contribution is recomputed in the steps marked in `turns`.
     """
     channels, height, width = x.shape
     half = width // 2 + 1
@@ -177,7 +183,7 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
     for c in range(channels):
         # Where the data are whole, X keeps their spectrum from here on, else that of the estimate.
         to_spectrum(y[c], X[c])
-        _wiener(X[c], K[c], decay, likely, height * width, noise[c], variance[c], P)
+        _wiener(X[c], K[c], decay, prior_power, height * width, noise[c], variance[c], P)
         if not whole:
             X[c] = P
         to_plane(P, x[c])
@@ -204,10 +210,10 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
                     for j in range(half):
                         k = K[c, i, j]
                         power = k.real * k.real + k.imag * k.imag
-                        seen = X[c, i, j]
+                        spectrum = X[c, i, j]
                         if drift.shape[0] > 0:
-                            seen -= E[c, i, j]
-                        P[i, j] = (np.conj(k) * seen + weight * P[i, j]) * (
+                            spectrum -= E[c, i, j]
+                        P[i, j] = (np.conj(k) * spectrum + weight * P[i, j]) * (
                             ONE / (power + weight * smooth[i, j])
                         )
             else:
@@ -215,7 +221,7 @@ def half_quadratic(  # noqa: C901, PLR0912 - one pass over memory per loop
                     for j in range(half):
                         k = K[c, i, j]
                         power = k.real * k.real + k.imag * k.imag
-                        wanted = power * X[c, i, j] + np.conj(k) * D[i, j]
-                        P[i, j] = (wanted + weight * P[i, j]) * (ONE / (power + weight * smooth[i, j]))
+                        data = power * X[c, i, j] + np.conj(k) * D[i, j]
+                        P[i, j] = (data + weight * P[i, j]) * (ONE / (power + weight * smooth[i, j]))
                 X[c] = P
             to_plane(P, x[c])

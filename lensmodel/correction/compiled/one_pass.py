@@ -15,19 +15,19 @@ def _restored(
     i: int,
     j: int,
     gain: tuple[np.float32, np.float32, np.float32],
-    seen: tuple[np.float32, np.float32, np.float32, np.float32, np.float32, np.float32],
+    rhs: tuple[np.float32, np.float32, np.float32, np.float32, np.float32, np.float32],
     luma: np.float32,
     chroma: np.float32,
 ) -> None:
-    """Solve (diag(gain + chroma) + (luma - chroma) / 3 1 1') x = seen of a frequency (Sherman, Morrison).
+    """Solve (diag(gain + chroma) + (luma - chroma) / 3 1 1') x = rhs at one frequency (Sherman, Morrison).
 
-    `out`, shape (3, rows, 2 cols), and `seen` hold real and imaginary parts in turn.
+    `out`, shape (3, rows, 2 cols), and `rhs` hold real and imaginary parts in turn.
     """
     g = (luma - chroma) / np.float32(3.0)
     u, v, w = ONE / (gain[0] + chroma), ONE / (gain[1] + chroma), ONE / (gain[2] + chroma)
     t = g / (ONE + g * (u + v + w))
     for part in range(2):
-        p, q, r = seen[part], seen[2 + part], seen[4 + part]
+        p, q, r = rhs[part], rhs[2 + part], rhs[4 + part]
         common = (p * u + q * v + r * w) * t
         out[0, i, j + part] = (p - common) * u
         out[1, i, j + part] = (q - common) * v
@@ -54,20 +54,20 @@ def one_pass(  # noqa: C901 - one pass over memory for both contrasts
     work = np.empty((height, width), np.float32)
     for c in range(3):
         to_spectrum(y[c], Y[c])
-    seen = np.float64(0.0)
+    blurred_prior = np.float64(0.0)
     for i in range(height):
         part = ZERO
         for c in range(3):
             for j in range(half):
                 k = K[c, i, j]
                 part += fine[i, j] * (k.real * k.real + k.imag * k.imag)
-        seen += part
-    seen /= 3.0
+        blurred_prior += part
+    blurred_prior /= 3.0
     n0, n1, n2 = ONE / noise[0], ONE / noise[1], ONE / noise[2]
     lumas, chromas = np.empty(2, np.float32), np.empty(2, np.float32)
     for level in range(2):
-        lumas[level] = np.float32(seen / (height * width) / levels[level, 0])
-        chromas[level] = np.float32(seen / (height * width) / levels[level, 1])
+        lumas[level] = np.float32(blurred_prior / (height * width) / levels[level, 0])
+        chromas[level] = np.float32(blurred_prior / (height * width) / levels[level, 1])
     k, yy, xx, zz = K.view(np.float32), Y.view(np.float32), X.view(np.float32), Z.view(np.float32)
     for i in range(height):
         for j in range(half):

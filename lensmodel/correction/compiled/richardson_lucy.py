@@ -56,7 +56,7 @@ def _blur_marks(hard: Real, soft: Real) -> None:
 def _lights(  # noqa: C901, PLR0912 - a few passes over one small tile
     latent: Real, level: np.float32, reach: int, clean: Real, soft: Real
 ) -> bool:
-    """Find bright sharp pixels: mark what they reach as unclean, and where they stand softly.
+    """Find bright sharp pixels: mark what they reach as unclean, and their own places softly.
 
     Returns whether there are any. `clean` has the size of the data, `soft` that of the latent plane.
     """
@@ -75,7 +75,7 @@ def _lights(  # noqa: C901, PLR0912 - a few passes over one small tile
     if not any_light:
         return False
     # A square of the operator's reach covers the kernel without knowing its shape. One pass each
-    # way with the place of the last mark seen costs the same for any reach.
+    # way that remembers the last mark costs the same for any reach.
     across = clean.shape[1]
     wide = np.zeros((rows, across), np.uint8)
     for i in range(rows):
@@ -102,8 +102,8 @@ def through(
 ) -> None:
     """Blur a plane on its canvas, or what is adjoint to that, in place.
 
-    Light stands in rows `first` to `last` alone, and only rows `begin` to `end` are made; the others hold
-    anything. Rows that are empty or will not be looked at are left out of the transforms along rows.
+    Light is in rows `first` to `last` only, and only rows `begin` to `end` are computed; the others hold
+    anything. Rows that are empty or not needed are left out of the transforms along rows.
     """
     height, half = K.shape
     down, across = np.array([0]), np.array([1])
@@ -128,8 +128,8 @@ def through(
 def _errors(light: Real, data: Real, base: float, clip: float, bend: Real, first: float, last: float) -> None:
     """Error of what a row of light predicts, in place: ( data / (R + base) - 1 ) R'.
 
-    `bend` holds R / clip and R' at even steps of light / clip from `first` to `last`; before, the sensor
-    answers light for light, beyond with `clip`. A logarithm and two exponentials for each pixel of
+    `bend` holds R / clip and R' at even steps of light / clip from `first` to `last`; below, the sensor
+    records the light itself, above it `clip`. A logarithm and two exponentials for each pixel of
     a blown area would take ten times as long as all transforms.
     """
     brightest = ZERO
@@ -144,14 +144,14 @@ def _errors(light: Real, data: Real, base: float, clip: float, bend: Real, first
     for j in range(light.size):
         predicted = max(light[j], ZERO)
         at = min((predicted * share - first) * steps, top)
-        if not at > ZERO:  # what is no number stays none
+        if not at > ZERO:  # a NaN stays one
             light[j] = data[j] / max(predicted + base, _LEAST * data[j], _EPS) - ONE
         else:
             k = min(np.int32(at), np.int32(bend.shape[1] - 2))
             part = at - np.float32(k)
-            seen = clip * (bend[0, k] + part * (bend[0, k + 1] - bend[0, k]))
+            recorded = clip * (bend[0, k] + part * (bend[0, k + 1] - bend[0, k]))
             slope = bend[1, k] + part * (bend[1, k + 1] - bend[1, k])
-            light[j] = (data[j] / max(seen + base, _LEAST * data[j], _EPS) - ONE) * slope
+            light[j] = (data[j] / max(recorded + base, _LEAST * data[j], _EPS) - ONE) * slope
 
 
 @jit
@@ -161,15 +161,15 @@ def _measured_alpha(start: Real, work: Real, share: Real, change: Real) -> np.fl
     norm = 0.0
     product = 0.0
     for i in range(rows):
-        across, own = np.float64(0.0), np.float64(0.0)
+        row_product, row_norm = np.float64(0.0), np.float64(0.0)
         for j in range(cols):
             light = max(start[i, j] * max(ONE + work[i, j] * share[i, j], ZERO), _EPS)
             now, before = light - start[i, j], change[i, j]
-            across += now * before
-            own += before * before
+            row_product += now * before
+            row_norm += before * before
             change[i, j] = now
-        product += across
-        norm += own
+        product += row_product
+        norm += row_norm
     if not norm > 0.0:
         return ZERO
     return np.float32(min(max(product / norm, 0.0), 1.0))
@@ -193,9 +193,9 @@ def richardson_lucy(  # noqa: C901 - one pass over memory per loop
 ) -> None:
     """Accelerated saturation-aware steps; `latent` is start and result.
 
-    The transforms live on the grid of `K`, `width` columns wide; the latent plane stands in its
+    The transforms live on the grid of `K`, `width` columns wide; the latent plane lies in its
     first corner, the data in the middle of the latent plane. With `adaptive` the extrapolation of each
-    step is measured on the changes of the two before it, and `alphas` only tells how many there are.
+    step is measured on the changes of the two before it, and `alphas` only gives their number.
     `bend`, `first` and `last` are those of `_errors`.
     """
     rows, cols = latent.shape

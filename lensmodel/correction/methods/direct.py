@@ -23,8 +23,8 @@ from lensmodel.correction.tiles.canvas import Canvas, seam
 from lensmodel.correction.tiles.local_statistics import BLOCK, Blocks, signal_variance, smoothed, spread
 from lensmodel.correction.tiles.transfers import transfers
 
-_FINE: Final = 1.0 / 16.0  # cycles per pixel above which a window of 13 pixels sees a frequency
-_LEAST_COLOUR: Final = 0.02  # variance of chroma over that of luma below which no scene is believed to be
+_FINE: Final = 1.0 / 16.0  # cycles per pixel: a window of 13 pixels sees frequencies above this
+_LEAST_COLOUR: Final = 0.02  # least variance of chroma over that of luma in a scene (chosen, not measured)
 
 
 def _steps() -> Deconvolver:
@@ -36,15 +36,15 @@ def _steps() -> Deconvolver:
 class DirectFilter:
     r"""Linear minimum-mean-square-error filter of three colours, for two contrasts of the scene.
 
-    The scene is natural in luma and in chroma, S_l = l |f|^-2.2 and S_c = c |f|^-2.2, so that its colours
-    tell of each other. With channels scaled to equal light, noise n_i and 1 a vector of ones::
+    The scene is natural in luma and in chroma, S_l = l |f|^-2.2 and S_c = c |f|^-2.2, so that each of its
+    colours informs the others. With channels scaled to equal light, noise n_i and 1 a vector of ones::
 
         M = diag( (|K_i|² + floor) / n_i + 1 / S_c ) + g 1 1',    g = ( 1 / S_l - 1 / S_c ) / 3
         X = M^-1 ( conj(K_i) Y_i / n_i )
 
-    solved by the Sherman-Morrison formula. It is made for a busy scene and for a calm one, and each
-    pixel mixes the two by the logarithm of the contrast around it. Mosaics, of which two colours of three
-    are to be filled in, are restored in a few half-quadratic steps instead.
+    solved by the Sherman-Morrison formula. It is solved for a busy scene and for a calm one, and
+    each pixel mixes the two by the logarithm of the contrast around it. Mosaics, where two colours of three
+    must be filled in, are restored in a few half-quadratic steps instead.
 
     Parameters
     ----------
@@ -54,9 +54,9 @@ class DirectFilter:
         Added to |K_i|² in M: the square of what a transfer function is expected to be off by within a
         cell. Without it strong frequencies of the scene come back as coloured ripples.
     light_steps : int
-        Steps by which the light of clipped pixels is found.
+        Steps that estimate the light of clipped pixels.
     outside_steps : int
-        Steps by which light from beyond the frame is found.
+        Steps that estimate the light from beyond the frame.
     engine : {"auto", "numpy"}
         "numpy" never uses compiled loops; the numbers are the same.
     """
@@ -165,9 +165,9 @@ def _filtered(
     """The pass in NumPy; `compiled.one_pass` is its twin."""
     shape = (y.shape[1], y.shape[2])
     power = np.abs(K) ** 2
-    seen = float((_fine(shape) * power.sum(axis=0)).sum()) / 3.0
+    blurred_prior = float((_fine(shape) * power.sum(axis=0)).sum()) / 3.0
     Y = fft.rfft2(y)
-    decay = prior(shape)[0] * np.float32(seen / y[0].size)
+    decay = prior(shape)[0] * np.float32(blurred_prior / y[0].size)
     data = np.conj(K) * Y / noise[:, None, None]
     filtered = []
     for luma, chroma in levels:
@@ -183,6 +183,6 @@ def _filtered(
 @lru_cache(maxsize=8)
 def _fine(shape: tuple[int, int]) -> NDArray[np.float32]:
     """The prior's power where a local window sees it, zero elsewhere."""
-    likely = prior(shape)[1] * (frequency_squared(shape) > _FINE**2)
-    likely.setflags(write=False)
-    return np.ascontiguousarray(likely, dtype=np.float32)
+    prior_power = prior(shape)[1] * (frequency_squared(shape) > _FINE**2)
+    prior_power.setflags(write=False)
+    return np.ascontiguousarray(prior_power, dtype=np.float32)

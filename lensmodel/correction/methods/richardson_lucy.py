@@ -23,10 +23,10 @@ Acceleration: TypeAlias = Literal["fixed", "adaptive", "none"]
 ACCELERATIONS: Final = get_args(Acceleration)
 
 ALPHA_MAX = 0.9
-"""Cap of the fixed extrapolation; above it the noise is accelerated as well."""
+"""Cap of the fixed extrapolation; above it the noise is accelerated as well (chosen)."""
 
 SHARPNESS = 50.0
-"""a of the sensor's answer, per clipping level: how sharply it bends where it clips."""
+"""a of the sensor response, per clipping level: how sharply it bends where it clips. Chosen, not measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +84,7 @@ class SaturationAwareRichardsonLucy:
         e    = ( (y + b) / (R(F x) + b) - 1 ) R'(F x)
 
     so a clipped pixel pulls the model up to t and no further. Sharp pixels S that shine above
-    0.9 t are poorly known, and blurred pixels that they reach are left out of everybody else's update::
+    0.9 t are poorly known, and blurred pixels that they reach are left out of the update of all others::
 
         u_U = 1 + F^T(e V),   u_S = 1 + F^T e,   x <- x max( u_U + (u_S - u_U) w, 0 )
 
@@ -94,8 +94,8 @@ class SaturationAwareRichardsonLucy:
         fixed      alpha_k = (k - 1) / (k + 2), at most 0.9
         adaptive   alpha_k = <g_{k-1}, g_{k-2}> / <g_{k-2}, g_{k-2}>, within 0..1,   g_k = x_{k+1} - y_k
 
-    The second is that of Biggs and Andrews [2]_. Each tile measures its own there, so that what comes out
-    depends a little on where tiles lie.
+    The second is that of Biggs and Andrews [2]_. It measures alpha tile by tile, so the result
+    depends a little on where the tiles lie.
 
     Parameters
     ----------
@@ -154,8 +154,9 @@ class SaturationAwareRichardsonLucy:
 
 
 _REACH_FLOOR = 0.05
+"""Least F^T 1, as a share of its largest value: see `first_guess` (chosen, not measured)."""
 _LIGHT = 0.9
-"""Share of the clipping level above which a sharp pixel counts as a light."""
+"""Share of the clipping level above which a sharp pixel counts as a light (chosen)."""
 
 
 def climbed(
@@ -179,13 +180,13 @@ def climbed(
     latent : Plane
         Start, wider than the data by the reach of the blur.
     blurred : Plane
-        What was seen.
+        The data.
     reach : Plane
         Normaliser of each pixel of the latent plane.
     blur, sensor, steps, sharpness, acceleration, engine, on_step
-        As there.
+        As in `SaturationAwareRichardsonLucy`.
     lights : bool
-        Whether to keep what is poorly known about lights out of the update of everybody else.
+        Whether to keep what is poorly known about lights out of the update of all other pixels.
     """
     base = background(sensor)
     data: Plane = np.ascontiguousarray(np.maximum(blurred, 0.0) + base, dtype=np.float32)
@@ -215,8 +216,8 @@ def climbed(
     for step, alpha in enumerate(alphas, start=1):
         start = np.maximum(latent + alpha * (latent - previous), TINY)
         predicted = np.maximum(blur.forward(start), 0.0)
-        seen, slope = response(predicted, sensor.clip, sharpness)
-        predictable = np.maximum(seen + base, LEAST_PREDICTED * data)
+        recorded, slope = response(predicted, sensor.clip, sharpness)
+        predictable = np.maximum(recorded + base, LEAST_PREDICTED * data)
         error = (data / np.maximum(predictable, TINY) - 1.0) * slope
         update = 1.0 + blur.adjoint(error) / reach
         if lights:
@@ -230,7 +231,7 @@ def climbed(
 
 
 def _measured_alpha(change: Plane, before: Plane) -> float:
-    """Measure alpha of Biggs and Andrews from the last two changes g; 0 while there is but one."""
+    """Measure alpha of Biggs and Andrews from the last two changes g; 0 while there is only one."""
     norm = float(np.vdot(before, before.astype(np.float64)))
     share = float(np.vdot(change, before.astype(np.float64))) / norm if norm > 0.0 else 0.0
     return min(max(share, 0.0), 1.0)
@@ -238,9 +239,9 @@ def _measured_alpha(change: Plane, before: Plane) -> float:
 
 @lru_cache(maxsize=8)
 def _bend(sharpness: float) -> tuple[NDArray[np.float32], np.float32, np.float32]:
-    """R and R' of `response` at even steps of light over clipping level, and the first and last of them.
+    """R and R' of `response` at even steps of light over clipping level, and the first and last step.
 
-    Before and beyond, R is the light and the clipping level to a millionth.
+    Below that range R equals the light and above it the clipping level, to a millionth.
     """
     first, last = max(1.0 - 15.0 / sharpness, 0.0), 1.0 + 25.0 / sharpness
     light = np.linspace(first, last, 4097)
@@ -277,15 +278,15 @@ def response(light: Plane, clip: float, sharpness: float) -> tuple[Plane, Plane]
     if not np.isfinite(clip):
         return light, np.ones_like(light)
     over = sharpness * (light / clip - 1.0)
-    seen = clip * (light / clip - np.logaddexp(0.0, over) / sharpness)
+    recorded = clip * (light / clip - np.logaddexp(0.0, over) / sharpness)
     slope = 0.5 * (1.0 - np.tanh(0.5 * over))  # the logistic function without overflow
-    return seen.astype(np.float32), slope.astype(np.float32)
+    return recorded.astype(np.float32), slope.astype(np.float32)
 
 
 def _split(
     update: Plane, error: Plane, latent: Plane, *, blur: BlurOperator, reach: Plane, clip: float
 ) -> Plane:
-    """Keep what is poorly known about lights out of the update of everybody else."""
+    """Keep what is poorly known about lights out of the update of all other pixels."""
     bright = latent >= _LIGHT * clip
     if not bright.any():
         return update

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
 
-# of the polynomial that stands for the shrinkage function (chosen)
-DEGREE = 9
+DEGREE = 9  # of the polynomial that stands for the shrinkage function (chosen)
 _REACH = 24.0  # largest argument, in widths of the shrinkage; beyond it hardly anything is taken off (chosen)
 _SHARP = 1e-6  # share of a jump that float32 resolves
 
@@ -24,8 +23,8 @@ class Shrinkage:
 
         prox_t(v) = s prox_1(v / s),      prox_1(v) = v - p(1 / v)  beyond the jump, else 0
 
-    What is taken off v is smooth in 1 / v, so a short polynomial p serves: unlike a table it runs
-    in vector registers. Beyond 24 s the subtraction is held constant.
+    What is subtracted from v is smooth in 1 / v, so a short polynomial p suffices: unlike a table it
+    runs in vector registers. Beyond 24 s the subtraction is held constant.
 
     Parameters
     ----------
@@ -76,11 +75,11 @@ class Shrinkage:
 
     @property
     def steepness(self) -> float:
-        """How fast the share of the answer that is given rises from there, per 1 / v."""
+        """Slope of the ramp that begins at `edge`, per 1 / v."""
         return self.jump / max(1.0 - 1.0 / (1.0 + self.ramp), _SHARP)
 
     def scale(self, threshold: NDArray[np.float32] | float) -> NDArray[np.float32]:
-        """S for a threshold t."""
+        """The scale s for a threshold t."""
         return np.asarray(np.power(threshold, 1.0 / (2.0 - self.alpha)), dtype=np.float32)
 
     def __call__(self, v: NDArray[np.float32], scale: NDArray[np.float32] | float) -> NDArray[np.float32]:
@@ -89,8 +88,8 @@ class Shrinkage:
         edge = np.float32(self.edge)
         below = scale / size
         inverse = np.clip(below, np.float32(1.0 / _REACH), edge)
-        taken = np.zeros_like(inverse)
+        subtracted = np.zeros_like(inverse)
         for term in self.terms:
-            taken = taken * inverse + term
+            subtracted = subtracted * inverse + term
         share = np.clip((edge - below) * np.float32(self.steepness), np.float32(0.0), np.float32(1.0))
-        return np.asarray(np.copysign((size - scale * taken) * share, v), dtype=np.float32)
+        return np.asarray(np.copysign((size - scale * subtracted) * share, v), dtype=np.float32)

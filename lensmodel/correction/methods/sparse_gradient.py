@@ -53,15 +53,15 @@ class SparseGradient:
     local light and contrast (gradients of a scene scale with both); chroma is shrunk harder than luma,
     because edges of all colours coincide; and unmeasured pixels take the model's own prediction as
     data, Y~ = F x, which maximises the likelihood of what was measured. Such a guess converges too
-    slowly for lights above the clipping level: see `Lights`, which takes them off before.
+    slowly for lights above the clipping level: see `Lights`, which removes them first.
 
     Parameters
     ----------
     weight : float
-        kappa of luma; the strength relative to the noise found in the data. Where the data tell little
-        of the gradients, down to 0.4 of it counts.
+        kappa of luma; the strength relative to the noise found in the data. Where the data say little
+        about the gradients, it is lowered to as little as 0.4 of that.
     mosaic_weight : float
-        The same where a mosaic was measured: the prior has to fill in two colours of three as well.
+        kappa of luma for a mosaic, where the prior must also fill in two colours of three.
     chroma : float
         kappa of chroma over that of luma.
     alpha : float
@@ -70,9 +70,9 @@ class SparseGradient:
         Half-quadratic steps.
     coupling, growth : float
         First b, in units of one over the squared light, and its factor per step.
-        What a kernel's change within the tile adds is found anew in the first step and half way.
+        What a kernel's change within the tile adds is recomputed in the first step and half way.
     light_steps : int
-        Steps by which the light of clipped pixels is found, and that from beyond the frame.
+        Steps that estimate the light of clipped pixels, and that from beyond the frame.
     engine : {"auto", "numpy"}
         "numpy" never uses compiled loops; the numbers are the same.
 
@@ -141,11 +141,11 @@ class SparseGradient:
         glow: Planes | None,
     ) -> _Problem:
         blocks = Blocks.of(blurred, light, loops)
-        seen = blocks if glow is None else Blocks.of(blurred + glow, light, loops)
+        recorded = blocks if glow is None else Blocks.of(blurred + glow, light, loops)
         var = np.stack(
             [
                 s.noise.variance(smoothed(b * bright)) / bright**2
-                for s, b, bright in zip(sensors, seen.planes, light, strict=True)
+                for s, b, bright in zip(sensors, recorded.planes, light, strict=True)
             ]
         ).astype(np.float32)
         noise = np.maximum(var.mean(axis=(1, 2)), np.float32(1e-9))
@@ -159,11 +159,11 @@ class SparseGradient:
         drift = blurs[0].drift
         K, rates = transfers(blurs, canvas.shape, max(blurred.shape[1:]) / 2.0, loops)
         variance = (blurred.reshape(len(blurred), -1).var(axis=1) / light**2).astype(np.float32)
-        weight, one = self.weight, len(blurred) // 2
+        weight, middle = self.weight, len(blurred) // 2
         if any(sensor.measured is not None for sensor in sensors):
             weight = self.mosaic_weight
-        elif glow is None:  # what is left beside lights is no natural scene, and the prior holds it back
-            weight *= _reliance(_determined_share(K[one], canvas.shape, noise[one], variance[one]))
+        elif glow is None:  # beside removed lights the rest is no natural scene: the prior keeps its weight
+            weight *= _reliance(_determined_share(K[middle], canvas.shape, noise[middle], variance[middle]))
         weights = np.full(len(blurred), weight)
         weights[1:] *= self.chroma
         y = np.empty((len(blurred), *canvas.shape), dtype=np.float32)
@@ -186,7 +186,7 @@ class SparseGradient:
             refilled(y, K, noise, variance, sensors, canvas)
 
         def ramp(axis: int) -> NDArray[np.float32]:
-            """Pixels from where the kernel is K; held at the ends of the data, beyond which lies no datum."""
+            """Distance in pixels from where the kernel is K; constant beyond the ends of the data."""
             at = np.clip(np.arange(canvas.shape[axis]) - canvas.margin, 0, blurred.shape[1 + axis] - 1)
             return (at - (drift.origin[axis] if drift else 0.0)).astype(np.float32)
 
@@ -209,13 +209,15 @@ class SparseGradient:
         )
 
 
-_RAMP = 0.1  # of the jump of the shrinkage: see `Shrinkage`
-_TYPICAL_CONTRAST = np.float32(0.02)  # variance over squared light of a scene for which kappa is `weight`
-_SCENE = 0.2  # variance over squared light of a cell of an average scene
+_RAMP = 0.1  # of the jump of the shrinkage: see `Shrinkage` (chosen, not measured)
+# Variance over squared light of a scene for which kappa is `weight` (chosen, not measured)
+_TYPICAL_CONTRAST = np.float32(0.02)
+_SCENE = 0.2  # variance over squared light of a cell of an average scene (chosen, not measured)
 _OPEN, _SLOPE, _LEAST = 0.25, 0.87, 0.4  # chosen on lenses of development seeds: see `_reliance`
 # Range of the weight of the prior between texture and flat places (chosen on development lenses)
 _BUSIEST, _CALMEST = 0.7, 50.0
-_DARK = np.float32(0.02)  # share of a tile's mean light below which the prior follows it no further
+# Share of a tile's mean light below which the prior stops following it (chosen, not measured)
+_DARK = np.float32(0.02)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -242,17 +244,19 @@ class _Problem:
 def _determined_share(
     K: NDArray[np.complex64], shape: tuple[int, int], noise: np.float32, variance: np.float32
 ) -> float:
-    """Share of the power of a natural scene's gradients that the data tell: sum |F|² S W / sum |F|² S.
+    """Share of the power of a natural scene's gradients that the data determine: sum |F|² S W / sum |F|² S.
 
-    S is the scene's spectrum, in a flat cell that of an average one, and
-    W = |K|² S / (|K|² S + noise) what of it Wiener's filter keeps.
+    S is the scene's spectrum (in a flat cell, that of an average scene), and
+    W = |K|² S / (|K|² S + noise) the share of it that Wiener's filter keeps.
     """
-    likely = prior(shape)[1]
-    shown = likely * (K.real**2 + K.imag**2)
+    prior_power = prior(shape)[1]
+    blurred_prior = prior_power * (K.real**2 + K.imag**2)
     signal = max(float(variance - noise), _SCENE)
-    level = np.float32(float(noise) * float(shown.sum(dtype=np.float64)) / (signal * shape[0] * shape[1]))
-    gradients = likely * _gradient_power(shape)
-    return float((gradients * (shown / (shown + level))).sum() / gradients.sum())
+    level = np.float32(
+        float(noise) * float(blurred_prior.sum(dtype=np.float64)) / (signal * shape[0] * shape[1])
+    )
+    gradients = prior_power * _gradient_power(shape)
+    return float((gradients * (blurred_prior / (blurred_prior + level))).sum() / gradients.sum())
 
 
 def _reliance(share: float) -> float:
@@ -267,8 +271,8 @@ def _reliance(share: float) -> float:
 def _known(sensors: Sequence[Sensor], canvas: Canvas) -> NDArray[np.bool_]:
     """Where the canvas holds data.
 
-    A margin of which nothing will be seen counts as such: its faded data are as good as any guess,
-    and where all is known, the steps need no prediction.
+    A margin that will be cut off counts as data: its faded pixels are as good as any guess,
+    and where everything is known the steps need no prediction.
     """
     known = np.full((len(sensors), *canvas.shape), all(s.surrounded for s in sensors), dtype=np.bool_)
     for plane, sensor in zip(known, sensors, strict=True):
@@ -293,15 +297,15 @@ def _half_quadratic(p: _Problem, on_step: StepHook) -> Planes:
         scales = p.factors[step][:, None, None] * p.scale
         for axis in (1, 2):
             slope = np.roll(x, -1, axis=axis) - x
-            kept = p.prox(np.einsum("ij,jrc->irc", p.rotation, slope), scales)
-            kept = np.einsum("ji,jrc->irc", p.rotation, kept)
-            pull += np.roll(kept, 1, axis=axis) - kept
+            shrunk = p.prox(np.einsum("ij,jrc->irc", p.rotation, slope), scales)
+            shrunk = np.einsum("ji,jrc->irc", p.rotation, shrunk)
+            pull += np.roll(shrunk, 1, axis=axis) - shrunk
         if p.drift.size and p.turns[step]:
             drifted = p.drift[:, 0] * fft.rfft2(x * p.down[:, None])
             drifted += p.drift[:, 1] * fft.rfft2(x * p.across)
         predicted = p.K * X + drifted if drifted.size else p.K * X
-        left = p.y - fft.irfft2(predicted, shape)
-        data = power * X + np.conj(p.K) * fft.rfft2(np.where(p.known, left, np.float32(0.0)))
+        residual = p.y - fft.irfft2(predicted, shape)
+        data = power * X + np.conj(p.K) * fft.rfft2(np.where(p.known, residual, np.float32(0.0)))
         strength = (coupling * p.noise)[:, None, None]
         X = (data + strength * fft.rfft2(pull)) / (power + strength * p.smooth)
         x = fft.irfft2(X, shape).astype(np.float32)
@@ -311,7 +315,7 @@ def _half_quadratic(p: _Problem, on_step: StepHook) -> Planes:
 
 def _compiled(p: _Problem, loops: ModuleType) -> Planes:
     """The same in compiled code."""
-    decay, likely = prior((p.y.shape[1], p.y.shape[2]))
+    decay, prior_power = prior((p.y.shape[1], p.y.shape[2]))
     x = np.empty_like(p.y)
     loops.half_quadratic(
         x,
@@ -321,7 +325,7 @@ def _compiled(p: _Problem, loops: ModuleType) -> Planes:
         p.K,
         p.smooth,
         decay,
-        likely,
+        prior_power,
         p.noise,
         p.variance,
         p.scale,
@@ -342,7 +346,7 @@ def _compiled(p: _Problem, loops: ModuleType) -> Planes:
 def _calm(
     blocks: Blocks, level: NDArray[np.float32], noise: NDArray[np.float32], alpha: float
 ) -> NDArray[np.float32]:
-    """How much smoother than an average scene it is here: the factor on kappa.
+    """How much smoother than an average scene each block is: the factor on kappa.
 
     The maximum-likelihood kappa of a hyper-Laplacian is proportional to E|g|^-alpha; gradients
     scale with the local contrast, so it is (typical over local variance of the signal)^(alpha / 2).

@@ -1,4 +1,4 @@
-"""Correct one cell of a photo: plan, restore, give back, hold, audit."""
+"""Correct one cell of a photo: plan, restore, return texture, limit, audit."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class LateralShift(Protocol):
     """Lateral colour of a lens: how far red and blue images lie from the green one."""
 
     def displacement(self, r: float, channel: Channel) -> float:
-        """Pixels outwards by which a channel's image of a point lies beyond the green one, at r."""
+        """Outward distance in pixels from the green image of a point at r to a channel's image of it."""
 
 
 MIN_HALO, MORE = 12, 6
@@ -70,9 +70,9 @@ class CorrectionJob:
     layers: tuple[Bounds, ...] = ()
 
     def __post_init__(self) -> None:
-        wanted = (len(CHANNELS), self.frame.height, self.frame.width)
-        if self.planes.shape != wanted:
-            raise InvalidInputError(f"planes must be {wanted} as the frame says, got {self.planes.shape}")
+        shape = (len(CHANNELS), self.frame.height, self.frame.width)
+        if self.planes.shape != shape:
+            raise InvalidInputError(f"planes must be {shape} as the frame says, got {self.planes.shape}")
         if not 0.0 <= self.strength <= 1.0:
             raise InvalidInputError(f"strength must lie in 0..1, got {self.strength}")
         if len(self.noise) != len(CHANNELS) or len(self.clip) != len(CHANNELS):
@@ -92,11 +92,11 @@ class CorrectionJob:
         """Lateral shift of a channel at a place, `(row, col)` in pixels."""
         if self.lateral is None or channel == "g":
             return 0.0, 0.0
-        out = self.lateral.displacement(position.r, channel)
-        return -out * math.sin(position.phi), out * math.cos(position.phi)
+        outwards = self.lateral.displacement(position.r, channel)
+        return -outwards * math.sin(position.phi), outwards * math.cos(position.phi)
 
     def blur(self, cell: Cell, channel: Channel, share: float, corner: tuple[int, int]) -> UniformBlur:
-        """Kernel of one channel in a cell, and how it changes there, on a tile that begins at `corner`."""
+        """Kernel of one channel in a cell, and its change within it, on a tile that begins at `corner`."""
 
         def blur_at(position: FieldPosition) -> UniformBlur:
             kernel = self.beliefs(position, channel).kernel
@@ -104,13 +104,13 @@ class CorrectionJob:
 
         middle = blur_at(cell.position)
         if self.cell_factor > 1:
-            return middle  # its spectra go with the cell
+            return middle  # used for this cell only
         down, across = ((blur_at(before), blur_at(after), pixels) for before, after, pixels in cell.beside)
         origin = (cell.middle[0] - corner[0], cell.middle[1] - corner[1])
         return UniformBlur(middle.kernel, middle.offset, Drift(down, across, origin))
 
     def weakened(self, photo: Planes, restored: Planes) -> Planes:
-        """Go from the photo as far to what was made of it as the strength says."""
+        """Blend the photo with its correction by the strength."""
         return restored if self.strength == 1.0 else photo + np.float32(self.strength) * (restored - photo)
 
     def reach(self, position: FieldPosition, channel: Channel) -> int:
@@ -120,9 +120,9 @@ class CorrectionJob:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RestoredCell:
-    """One cell as it leaves: its pixels, what they should have gained, and what the audit said of them.
+    """One restored cell: its pixels, the gain expected of them, and the verdict of the audit.
 
-    `layers` are the same within each of the job's other bounds.
+    `left` says that the cell was left as it was; `layers` are its pixels within the job's other bounds.
     """
 
     planes: Planes
@@ -134,7 +134,7 @@ class RestoredCell:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _CellTile:
-    """A cell with its halo, as the photo shows it, and what is known of it."""
+    """A cell with its halo, cut out of the photo, and what is known about it."""
 
     cell: Cell
     corner: tuple[int, int]
@@ -174,7 +174,7 @@ class _CellTile:
         return cls(cell, (top, left), tile, inner, beliefs, sensors)
 
     @property
-    def here(self) -> Planes:
+    def cell_pixels(self) -> Planes:
         """The cell without its halo."""
         return self.photo[self.inner]
 
@@ -187,7 +187,7 @@ def restore_cell(job: CorrectionJob, cell: Cell) -> RestoredCell:
     """Restore one cell, halo cut off again."""
     tile = _CellTile.of(job, cell)
 
-    @lru_cache  # what bounds allow seldom changes the kernels
+    @lru_cache  # different bounds seldom change the kernels' shares
     def solved(shares: tuple[float, ...]) -> Solution:
         blurs = [
             job.blur(cell, channel, share, tile.corner)
@@ -213,16 +213,16 @@ def _within(
     expected = plans.forecast
     worth = expected.gain_db >= WORTH_DB or bounds.denoise > 0.0
     if job.strength == 0.0 or not (worth or job.plain):
-        return RestoredCell(tile.here, replace(expected, after=expected.before), None, left=True)
+        return RestoredCell(tile.cell_pixels, replace(expected, after=expected.before), None, left=True)
     blurs, restored = solved((1.0,) * len(CHANNELS) if job.plain else plans.shares)
     if job.plain:
-        return RestoredCell(job.weakened(tile.here, restored[tile.inner]), expected, None)
+        return RestoredCell(job.weakened(tile.cell_pixels, restored[tile.inner]), expected, None)
     restored, audit = _checked(job, tile, bounds, blurs, restored)
-    if expected.changed(tile.here, restored).gain_db < WORTH_DB and bounds.denoise == 0.0:
-        # bounds and audit left so little that what remains is a photo smoothed, not one made sharper
-        return RestoredCell(tile.here, replace(expected, after=expected.before), audit, left=True)
-    restored = job.weakened(tile.here, restored)
-    return RestoredCell(restored, expected.changed(tile.here, restored), audit)
+    if expected.changed(tile.cell_pixels, restored).gain_db < WORTH_DB and bounds.denoise == 0.0:
+        # so little passed bounds and audit that the rest would smooth the photo, not sharpen it
+        return RestoredCell(tile.cell_pixels, replace(expected, after=expected.before), audit, left=True)
+    restored = job.weakened(tile.cell_pixels, restored)
+    return RestoredCell(restored, expected.changed(tile.cell_pixels, restored), audit)
 
 
 def _checked(
@@ -232,7 +232,7 @@ def _checked(
     blurs: Sequence[UniformBlur],
     restored: Planes,
 ) -> tuple[Planes, TileAudit | None]:
-    """Give texture back, hold what a lens cannot have hidden, audit; the cell without its halo."""
+    """Return texture, limit what a lens cannot have hidden, audit; the cell without its halo."""
     photo, sensors, errors = tile.photo, tile.sensors, [belief.error for belief in tile.beliefs]
     restored = texture_kept(photo, restored, blurs, sensors, texture=bounds.texture, denoise=bounds.denoise)
     restored = hue_held(photo, restored, blurs, sensors, errors)
@@ -242,7 +242,7 @@ def _checked(
     verdict: TileAudit | None = None
     if job.audited:
         evidence = Evidence(job.noise, job.clip, blurs, errors, [sensor.measured for sensor in sensors])
-        # before the bounds, which would hide what tells of a wrong kernel: light below black, foreign hues
+        # before the bounds, which would hide the signs of a wrong kernel: light below black, foreign hues
         restored, verdict = held_back(photo, restored, evidence, inner=tile.inner[1:])
     else:
         restored = restored[tile.inner]
@@ -251,7 +251,7 @@ def _checked(
     around = photo_around(job.planes, corner, restored, HUE_REACH)
     dark = [sensor.noise.sigma_at(0.0) for sensor in sensors]
     restored = hue_bounded(around, restored, job.clip, dark)
-    if bounds.halo is not None:  # a range that was asked for holds to the last bit
+    if bounds.halo is not None:  # a range that the user set holds to the last bit
         restored = bounds.hold(job.planes, corner, restored, errors, spread)
     return restored, None if verdict is None else verdict.without_map()
 
@@ -259,7 +259,8 @@ def _checked(
 def _mixed(kernel: Kernel, share: float) -> Kernel:
     """Mix a kernel with a point, s k + (1 - s) delta.
 
-    Too wide a kernel costs far more than too narrow a one. What a wrong kernel leaves is no noise: counted
-    as such, it would hand strong edges to the prior, which paints their colour over what lies beside them.
+    Too wide a kernel costs far more than one that is too narrow. The residual of a wrong kernel is not noise:
+    counted as noise, it would leave strong edges to the prior, which spreads their colour over what lies
+    beside them.
     """
     return kernel if share == 1.0 else as_kernel(share * kernel + (1.0 - share) * delta(kernel.shape[0]))

@@ -1,4 +1,4 @@
-"""Which engine runs the inner loops: compiled where it can, NumPy and SciPy elsewhere."""
+"""Which engine runs the inner loops: compiled where available, else NumPy and SciPy."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ import numpy as np
 Engine = Literal["auto", "numpy"]
 
 COMPILE_S: Final = 30
-"""Seconds that compiling takes on a usual machine."""
+"""Seconds that compiling takes on a usual machine (chosen, not measured)."""
 
 _KEPT: Final = 31 << 20
-"""Bytes of the largest block worth keeping."""
+"""Bytes of the block to free: just below the 32 MiB up to which glibc adapts (see `keep_freed_memory`)."""
 
 logger = logging.getLogger(__name__)
 first_use = logging.getLogger(f"{__name__}.first_use")
-"""Says when loops are compiled: a time in which nothing else is to be seen."""
+"""Says when loops are compiled, during which nothing else happens that a user could see."""
 
 _loading = threading.Lock()
 
 
 def compiled(engine: Engine) -> ModuleType | None:
-    """Return the compiled loops, or None where NumPy shall do or Numba is not installed."""
+    """Return the compiled loops, or None where NumPy is wanted or Numba is not installed."""
     if engine == "numpy":
         return None
     with _loading:  # threads that all start at once must not compile the same loop twice
@@ -45,7 +45,7 @@ def _load() -> ModuleType | None:
 
 
 def tell_of_compiling() -> None:
-    """Log once when Numba compiles; loading what was compiled before is no such event."""
+    """Log once when Numba compiles; loading from its cache does not count."""
     event = importlib.import_module("numba.core.event")
 
     class CompilationLog(event.Listener):  # type: ignore[misc, name-defined] # Numba has no types
@@ -58,7 +58,7 @@ def tell_of_compiling() -> None:
                 first_use.info("compiling the inner loops, once on this machine: about %d s", COMPILE_S)
 
         def on_end(self, event: object) -> None:
-            """Nothing is said of the end: the progress shows it."""
+            """The progress display shows the end."""
 
     event.register("numba:compile", CompilationLog())
 
@@ -66,9 +66,9 @@ def tell_of_compiling() -> None:
 def keep_freed_memory() -> None:
     """Let the C library keep what a cell frees for the next one.
 
-    The arrays of a cell are of some megabytes each. glibc gives such memory back as soon as it is freed, and
-    the system clears every page of it anew for the next cell, which took a quarter of the time of "fast". It
-    stops doing so for blocks smaller than the largest one of up to 32 MiB that it has seen freed; the
-    pages of this one are never touched. Elsewhere nothing happens.
+    The arrays of a cell take some megabytes each. glibc returns such memory to the system as soon as it is
+    freed, and the system clears every page again for the next cell, which took a quarter of the time of
+    "fast". It stops doing so for blocks smaller than the largest block, up to 32 MiB, that it has seen freed;
+    the pages of this one are never touched. Other C libraries are not affected.
     """
     np.empty(_KEPT, dtype=np.uint8)

@@ -27,23 +27,24 @@ WORTH_DB: Final = 0.1
 """Expected gain below which a place is left as it is: a tenth of a decibel is not seen (chosen)."""
 
 _UNKNOWN: Final = 1.0
-"""Expected error of a kernel from which on no gain is foretold: all of its power may be error (chosen)."""
+"""Expected error of a kernel at and above which no gain is predicted: all its power may be error (chosen)."""
 
 _SHARES: Final = (1.0, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.35, 0.2, 0.1)
-"""Shares of a kernel that are tried; finer steps change the expected error by less than a hundredth."""
+"""Shares of a kernel to try; finer steps change the expected error by less than a hundredth."""
 
 _EDGES: Final = (0.05, 0.08, 0.12, 0.17, 0.24)
 _MIDDLES: Final = np.sqrt(np.array(_EDGES[1:]) * _EDGES[:-1])
-"""Rings of frequencies that a scene's power is fitted to, cycles/pixel: above them demosaicing takes part."""
+"""Rings of frequencies to which a scene's power is fitted, cycles/pixel: above them demosaicing has a part in
+it (chosen)."""
 
 _SLOPES: Final = (2.0, 5.0)
-"""Least and greatest a: of sharp photographs of detail, and of what is out of focus."""
+"""Least and greatest slope a: of sharp photographs of detail, and of what is out of focus (chosen)."""
 
-_BLOCKS: Final = 3  # along a side are enough
+_BLOCKS: Final = 3  # along each side of a tile: enough for a mean (chosen)
 _GRID: Final = GRID
-_EVERY: Final = 3  # of the rows and columns suffice for a mean; odd: all colours of a mosaic are met
+_EVERY: Final = 3  # of the rows and columns suffices for a mean; odd, to meet all colours of a mosaic
 _LEAST: Final = 1e-30  # keeps divisions finite, far below any power
-_MOST: Final = 0.7  # of the error before is the most that a change is thought to have taken away (chosen)
+_MOST: Final = 0.7  # largest share of the error that a change is credited with removing (chosen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,10 +62,10 @@ class CellForecast:
         return _decibels(self.before, self.after)
 
     def changed(self, photo: Planes, result: Planes) -> CellForecast:
-        """The forecast of a cell that really became `result`, whatever held it back on the way.
+        """The forecast of a cell that became `result` after bounds and audit.
 
-        The error of a posterior mean is orthogonal to it, so that it is less than before by the mean square
-        of the change; no more than the forecast, since what a change adds beyond that is no scene.
+        The error of a posterior mean is orthogonal to it, so the error falls by the mean square of the
+        change; by no more than forecast, since what a change adds beyond that is not the scene.
         """
         change = float(np.square(result - photo).mean(axis=(1, 2)).sum()) * _GRID[0] * _GRID[1]
         after = self.before - min(change, _MOST * self.before)
@@ -81,17 +82,17 @@ class ZoneReport:
         Cells of the zone that were corrected.
     expected_gain_db : float or None
         Expected gain in PSNR of linear light against the sharp scene, decibels; may be negative. None where
-        the PSFs are too unsure to tell.
+        the PSFs are too uncertain.
     psf_error : float
         Mean expected relative error of the PSFs.
     measured : EdgeGain or None
-        What the edges of a chart gained, where the photo shows one; `pipeline.correct_photo` measures it.
+        Gain at the edges of a chart, if the photo shows one; `pipeline.correct_photo` measures it.
     left : int
-        Cells that stayed as they were, because nothing was to be gained.
+        Cells left as they were, because there was nothing to gain.
     held_back : float
         Mean share of the correction that the audit held back, 0 to 1.
     reasons : tuple of str
-        The checks that held something back, the one that held back most first.
+        The checks that held something back, the strictest first.
     """
 
     cells: int
@@ -105,7 +106,7 @@ class ZoneReport:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """The share of each channel's kernel to use in a cell, where the rest is a point, and what to expect."""
+    """The share of each channel's kernel to use in a cell (the rest is a point), and the expected error."""
 
     shares: tuple[float, ...]
     forecast: CellForecast
@@ -122,8 +123,8 @@ def plan(
     """Choose the share of each kernel that leaves the least expected error in this scene.
 
     With the scene's power S, the noise n, the mean K and the variance D of the transfer function, the share s
-    of the kernel where the rest is a point, and the part t of what a result leaves unexplained that it is
-    given back (`texture`)::
+    of the kernel (the rest is a point), and the part t of the unexplained residual that is added back
+    (`texture`)::
 
         K_s = s K + (1 - s),    W = K_s* S / (|K_s|² S + n),    G = W + t (1 - K_s W)
         before = sum_f S ( |1 - K|² + D ) + n,    after = sum_f S ( |1 - G K|² + |G|² D ) + |G|² n
@@ -145,16 +146,18 @@ def plan(
         n = float(sensor.noise.variance(plane[::_EVERY, ::_EVERY]).mean())
         S = scene_power(plane, power + D, n)
         before += float((times * (S * ((1.0 - K.real) ** 2 + K.imag**2 + D) + n)).sum())
-        left = []
+        remaining = []
         for share in _SHARES:
-            used = share * K + (1.0 - share) * point
-            W = np.conj(used) * S / np.maximum(S * (used.real**2 + used.imag**2) + n, _LEAST)
-            G = W + returned * (1.0 - used * W)
+            mixed = share * K + (1.0 - share) * point
+            W = np.conj(mixed) * S / np.maximum(S * (mixed.real**2 + mixed.imag**2) + n, _LEAST)
+            G = W + returned * (1.0 - mixed * W)
             kept, missed = G.real**2 + G.imag**2, 1.0 - G * K
-            left.append(float((times * (S * (missed.real**2 + missed.imag**2 + kept * D) + kept * n)).sum()))
-        least = int(np.argmin(left))
-        shares.append(_SHARES[least])
-        after += left[least]
+            remaining.append(
+                float((times * (S * (missed.real**2 + missed.imag**2 + kept * D) + kept * n)).sum())
+            )
+        best = int(np.argmin(remaining))
+        shares.append(_SHARES[best])
+        after += remaining[best]
     error = float(np.mean([belief.error for belief in beliefs]))
     return Plan(tuple(shares), CellForecast(zone_of(cell.position.r), before, after, error))
 
@@ -162,9 +165,9 @@ def plan(
 def scene_power(plane: Plane, transferred: NDArray[np.floating], noise: float) -> NDArray[np.float64]:
     """Power of the scene behind a blur, S = c |f|^-a, on the `rfft2` grid of `GRID`.
 
-    Of white noise it would be its variance. c and a are fitted to rings of the photo's own spectrum, where
-    blur and demosaicing leave it: a soft scene, or one without detail, has nothing that a correction could
-    bring back.
+    Scaled so that white noise has its variance as power. c and a are fitted to rings of the photo's own
+    spectrum that blur and demosaicing leave intact: a soft scene, or one without detail, has nothing that a
+    correction could restore.
 
     Parameters
     ----------
@@ -175,12 +178,12 @@ def scene_power(plane: Plane, transferred: NDArray[np.floating], noise: float) -
     noise : float
         Variance of its noise.
     """
-    seen = _ring_power(plane)
-    passed = _ring_means(transferred)
-    power = np.maximum(seen - noise, 0.1 * noise + 1e-12) / np.maximum(passed, 1e-3)
+    measured = _ring_power(plane)
+    transmitted = _ring_means(transferred)
+    power = np.maximum(measured - noise, 0.1 * noise + 1e-12) / np.maximum(transmitted, 1e-3)
     x, y = np.log(_MIDDLES), np.log(power)
-    # rings of more noise than scene tell the slope badly
-    weight = 1.0 / (0.05 + (noise / np.maximum(seen, 1e-12)) ** 2)
+    # rings with more noise than scene say little about the slope
+    weight = 1.0 / (0.05 + (noise / np.maximum(measured, 1e-12)) ** 2)
     mean_x, mean_y = np.average(x, weights=weight), np.average(y, weights=weight)
     slope = float(weight @ ((x - mean_x) * (y - mean_y)) / (weight @ (x - mean_x) ** 2))
     slope = min(max(-slope, _SLOPES[0]), _SLOPES[1])
@@ -215,7 +218,7 @@ def _ring_means(values: NDArray[np.floating]) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=1)
 def _rings() -> tuple[NDArray[np.float64], ...]:
-    """Weights of sum 1 of each ring's frequencies, as often as they count in the whole spectrum."""
+    """Weights of each ring's frequencies, by how often the whole spectrum holds them; their sum is 1."""
     modulus, times = np.sqrt(frequency_squared(_GRID)), counts(_GRID)
     rings = [times * ((modulus >= low) & (modulus < high)) for low, high in pairwise(_EDGES)]
     return tuple(ring / ring.sum() for ring in rings)
@@ -227,19 +230,19 @@ def zone_reports(
     """Pool the cells of each zone; zones without a cell are left out."""
     reports: dict[Zone, ZoneReport] = {}
     for zone in ZONES:
-        own = [f for f in forecasts if f.zone == zone]
-        if not own:
+        in_zone = [f for f in forecasts if f.zone == zone]
+        if not in_zone:
             continue
-        error = sum(f.psf_error for f in own) / len(own)
-        gain = _decibels(sum(f.before for f in own), sum(f.after for f in own))
-        seen = audit.zones.get(zone)
+        error = sum(f.psf_error for f in in_zone) / len(in_zone)
+        gain = _decibels(sum(f.before for f in in_zone), sum(f.after for f in in_zone))
+        held = audit.zones.get(zone)
         reports[zone] = ZoneReport(
-            len(own),
+            len(in_zone),
             gain if error < _UNKNOWN else None,
             error,
             left=left.get(zone, 0),
-            held_back=0.0 if seen is None else seen.held_back,
-            reasons=() if seen is None else tuple(sorted(seen.checks, key=lambda name: -seen.checks[name])),
+            held_back=0.0 if held is None else held.held_back,
+            reasons=() if held is None else tuple(sorted(held.checks, key=lambda name: -held.checks[name])),
         )
     return reports
 

@@ -50,16 +50,16 @@ class Corrected:
     Parameters
     ----------
     planes : Planes
-        The photo, or the part of it that was asked for.
+        The photo, or the requested part of it.
     zones : Mapping[Zone, ZoneReport]
         What the correction is expected to have gained in each zone of the field.
     audit : AuditReport
-        What was held back of it, why, and where most.
+        How much was held back, why, and where most.
     chroma_step : tuple of int
         Rows and columns of pixels that share one value of chroma in the photo's file; where that is more than
         one pixel, chroma was corrected no more finely.
     layers : tuple of Planes
-        The same within the other bounds that were asked for.
+        The same within the other requested bounds.
     """
 
     planes: Planes
@@ -77,7 +77,7 @@ class Corrected:
     def expected_gain_db(self) -> float:
         """Gain expected over the whole picture, decibels: the mean of its zones, each by its cells.
 
-        A zone whose PSFs are too unsure to tell counts as 0.
+        A zone whose PSFs are too uncertain counts as 0.
         """
         cells = sum(zone.cells for zone in self.zones.values())
         gained = sum(zone.cells * (zone.expected_gain_db or 0.0) for zone in self.zones.values())
@@ -124,33 +124,33 @@ def correct_planes(
     noise : sequence of NoiseModel
         One per channel.
     clip : sequence of float
-        Level per channel from which on a value is only a lower bound.
+        Level per channel at and above which a value is only a lower bound.
     method : str or Deconvolver
         A name in `deconvolvers`, or a method of your own.
     strength : float
         0 leaves the photo as it is, 1 applies what the noise allows.
     psf_error : float, callable or None
-        Expected relative L2 error of the PSF: the more, the more of a point is mixed into it, and the less
-        is allowed beside edges. None takes what an `UncertainField` says, and 0 for any other.
+        Expected relative L2 error of the PSF: the larger, the more of a point is mixed into it, and the less
+        is allowed beside edges. None takes the error of an `UncertainField`, and 0 for any other field.
     lateral : LateralShift or None
         Lateral colour to remove in the same step: it becomes part of the red and blue PSFs, so
         nothing is interpolated. Leave it out where the planes were resampled before.
     cfa : BayerPattern or None
-        The mosaic on which the planes were measured; what demosaicing filled in is then no datum, and
-        "standard" and "fast" demosaic and deblur in one. `noise` is that of the sensor then.
+        The mosaic on which the planes were measured; what demosaicing filled in is then not data, and
+        "standard" and "fast" demosaic and deblur in one step. `noise` is then that of the sensor.
     bounds : Bounds or None
         What to allow beside edges and in flat areas; None lets `psf_error` decide.
     layers : sequence of Bounds
-        Others to correct the photo within as well, for a preview: the solution is shared, which is a third
-        of the work.
+        Further bounds within which to correct the photo, for a preview: they share the solution, a third of
+        the work.
     audited : bool
         Whether to hold back what fails `lensmodel.correction.audit`; without it a method's own
         errors can be seen.
     plain : bool
-        Give what the method makes of the PSFs as they are: nothing is weighed, bounded, given back or
-        audited, as in a paper's own experiments. Not for photos that somebody wants to keep.
+        Return what the method makes of the PSFs as they are: nothing is weighed, bounded, added back or
+        audited, as in a paper's own experiments. Not for photos that anyone wants to keep.
     stored : StoredColour or None
-        How the photo's file stored chroma, if at less than full resolution.
+        How the photo's file stored chroma, if not at full resolution.
     roi : tuple of int or None
         `(top, left, height, width)`: return only this part, with the same pixels as the whole.
     workers : int
@@ -197,27 +197,27 @@ def correct_planes(
     window = Roi.of(frame, roi)
     keep_freed_memory()
     shape = (len(CHANNELS), window.height, window.width)
-    out, others = _zeroed(out, shape), tuple(_zeroed(None, shape) for _ in layers)
+    out, layer_planes = _zeroed(out, shape), tuple(_zeroed(None, shape) for _ in layers)
     if pitch is None:
         pitch = usual_pitch(frame, job.cell_factor)
-    wanted = [cell for cell in cells(frame, pitch) if cell.meets(window)]
+    window_cells = [cell for cell in cells(frame, pitch) if cell.meets(window)]
     forecasts, audits, left = [], [], Counter[Zone]()
-    for done, (cell, restored) in enumerate(_restored(job, wanted, workers), start=1):
+    for done, (cell, restored) in enumerate(_restored(job, window_cells, workers), start=1):
         _add(out, window, cell, restored.planes)
-        for other, planes_of_it in zip(others, restored.layers, strict=True):
-            _add(other, window, cell, planes_of_it)
+        for layer_out, layer in zip(layer_planes, restored.layers, strict=True):
+            _add(layer_out, window, cell, layer)
         forecasts.append(restored.forecast)
         left[restored.forecast.zone] += restored.left
         if restored.audit is not None:
             audits.append((zone_of(cell.position.r), (cell.top, cell.left), restored.audit))
-        on_step(done, len(wanted))
+        on_step(done, len(window_cells))
     report = pooled(audits, pitch)
     step = (1, 1) if stored is None else stored.step
-    return Corrected(out, zone_reports(forecasts, left, report), report, step, others)
+    return Corrected(out, zone_reports(forecasts, left, report), report, step, layer_planes)
 
 
 def _zeroed(out: Planes | None, shape: tuple[int, int, int]) -> Planes:
-    """What the caller gave to write to, or something new."""
+    """Zero the caller's array, or allocate one."""
     if out is None:
         return np.zeros(shape, dtype=np.float32)
     if out.shape != shape or out.dtype != np.float32:
@@ -229,16 +229,16 @@ def _zeroed(out: Planes | None, shape: tuple[int, int, int]) -> Planes:
 def _beliefs_of(
     field: PsfField | UncertainField, psf_error: PsfError | None
 ) -> Callable[[FieldPosition, Channel], Belief]:
-    """What is thought of the PSF of one channel at one place.
+    """The belief about the PSF of one channel at one place, cached.
 
-    Each serves its own cell and as a neighbour; three rows of cells of 100 megapixels fit.
+    Each serves its own cell and its neighbours; the cache holds three rows of cells of 100 megapixels.
     """
 
     @lru_cache(maxsize=640)
     def belief(position: FieldPosition, channel: Channel) -> Belief:
         if psf_error is None and isinstance(field, UncertainField):
-            known = field.belief_at(position, channel, KERNEL_SIZE)
-            return replace(known, kernel=crop_to_support(known.kernel))
+            uncropped = field.belief_at(position, channel, KERNEL_SIZE)
+            return replace(uncropped, kernel=crop_to_support(uncropped.kernel))
         error = psf_error(position, channel) if callable(psf_error) else psf_error or 0.0
         return Belief.of_error(crop_to_support(field.kernel_at(position, channel, KERNEL_SIZE)), float(error))
 
@@ -246,16 +246,16 @@ def _beliefs_of(
 
 
 def _restored(
-    job: CorrectionJob, wanted: Sequence[Cell], workers: int
+    job: CorrectionJob, cells_in_order: Sequence[Cell], workers: int
 ) -> Iterator[tuple[Cell, RestoredCell]]:
-    """Restore cells in order, a few ahead of the one that is being added."""
+    """Restore cells in order, a few ahead of the one that the caller adds."""
     if workers == 1:
-        for cell in wanted:
+        for cell in cells_in_order:
             yield cell, restore_cell(job, cell)
         return
     with ThreadPoolExecutor(workers) as pool:
         ahead: deque[tuple[Cell, Future[RestoredCell]]] = deque()
-        queue = iter(wanted)
+        queue = iter(cells_in_order)
         try:
             for cell in queue:
                 ahead.append((cell, pool.submit(restore_cell, job, cell)))
@@ -271,7 +271,7 @@ def _restored(
 
 
 def _add(out: Planes, window: Roi, cell: Cell, restored: Planes) -> None:
-    """Add a cell with its weights to the part of it that was asked for."""
+    """Add a cell with its weights to the requested window."""
     top, left = max(cell.top, window.top), max(cell.left, window.left)
     bottom = min(cell.bottom, window.top + window.height)
     right = min(cell.right, window.left + window.width)

@@ -23,7 +23,7 @@ Acceleration: TypeAlias = Literal["fixed", "adaptive", "none"]
 ACCELERATIONS: Final = get_args(Acceleration)
 
 ALPHA_MAX = 0.9
-"""Cap of the fixed extrapolation; above it the noise is accelerated as well (chosen)."""
+"""Cap of the fixed extrapolation; above it the noise is accelerated as well."""
 
 SHARPNESS = 50.0
 """a of the sensor response, per clipping level: how sharply it bends where it clips. Chosen, not measured."""

@@ -1,4 +1,4 @@
-"""Nothing beside clipped light is darker, lighter or of another hue than the photo around it allows."""
+"""Limit results beside clipped light to the range and the hues that the photo shows nearby."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from lensmodel.correction.lights.saturation import closed, compact, far, positiv
 from lensmodel.correction.limits.hue import of_known_hue
 
 _UNSURE, _NEAREST, _NEXT = 0.1, 2, 1
-"""Error of a kernel from which on the glow of a light is left alone, how many pixels count as nearby then,
-and how many for the most light: specks in a dark glow are seen, darker twigs are not (chosen). An error of .1
-of a light ten times beyond saturation is as bright as white."""
+"""Error of a kernel at and above which the glow of a light is left alone; how many pixels are then nearby for
+the least light, and for the most: specks in a dark glow are seen, darker twigs are not (chosen). An error of
+0.1 of a light ten times beyond saturation is as bright as white."""
 
 _EVEN: Final = 1.5
-"""Standard deviation in pixels of the means that tell where light comes from: pixel by pixel noise and the
-mosaic decide, and edges of clipped areas get ragged (chosen)."""
+"""Standard deviation in pixels of the means that decide where light comes from: pixel by pixel, noise and the
+mosaic would decide, and edges of clipped areas would get ragged (chosen)."""
 
 _BRIGHTER: Final = np.float32(4.0)
-"""Times saturation that a broad clipped area may shine: sunlit paint and white skies do (chosen)."""
+"""Brightness of a broad clipped area, in units of saturation: sunlit paint and white skies (chosen)."""
 
 _FADE: Final = 3
 """Pixels over which the bounds end (chosen)."""
@@ -43,18 +43,18 @@ def held_beside_clipped(
 ) -> Planes:
     """Hold a result within the photo's range and hues wherever clipped light reaches.
 
-    How much light a clipped pixel had is not known, and what a wrong guess of it does to its neighbours looks
-    like the worst of corrections: dark rings and pixels of another colour. So within the kernel's
-    reach of a clipped pixel each colour stays between the least and the most that the photo shows nearby, and
-    so does its share of the light of all colours. Nearby is the kernel's reach where the kernel is sure, so
-    that the glow of a lamp can be taken off, and where it is not two pixels for the least and one for the
-    most. Clipped areas too broad to be a light spread by the lens stay as they are, and where the kernel is
-    not sure so does as much of a pixel as its light comes from there.
+    How much light a clipped pixel had is not known, and a wrong guess does the worst that a correction can do
+    to its neighbours: dark rings and pixels of another colour. So within the kernel's reach of a clipped
+    pixel each colour stays between the least and the most that the photo shows nearby, and so does its share
+    of the light of all colours. Nearby means within the kernel's reach where the kernel is certain, so that
+    the glow of a lamp can be removed; where it is not, it means two pixels for the least and one for the
+    most. Clipped areas too broad to be a light spread by the lens stay as they are. Where the kernel is
+    uncertain, a pixel keeps its value to the extent that its light comes from such areas.
 
     Parameters
     ----------
     photo, restored : Planes, shape (channels, rows, cols)
-        A tile, and what was made of it.
+        A tile, and its correction.
     blurs, sensors : sequence
         By colour.
     errors : sequence of float
@@ -66,30 +66,30 @@ def held_beside_clipped(
     reach = max(far(blur) for blur in blurs)
     anywhere = np.asarray(clipped.any(axis=0))
     rows, cols = (around(anywhere, axis, 2 * reach + _FADE + 1) for axis in (0, 1))
-    here = (slice(None), rows, cols)
-    seen, made, lost = photo[here], restored[here].copy(), clipped[here]
+    box = (slice(None), rows, cols)
+    observed, corrected, lost = photo[box], restored[box].copy(), clipped[box]
     broad = np.stack([mask & ~compact(mask, reach) for mask in lost])
-    np.copyto(made, seen, where=broad)
+    np.copyto(corrected, observed, where=broad)
     near, next_to = (
         max(round(reach * (1.0 - max(errors) / _UNSURE)), min(n, reach)) for n in (_NEAREST, _NEXT)
     )
-    window, lit = ((1, 2 * n + 1, 2 * n + 1) for n in (near, next_to))
-    low = np.minimum(ndimage.minimum_filter(seen, window, mode="nearest"), seen)
-    high = np.where(lost, np.float32(np.inf), ndimage.maximum_filter(seen, lit, mode="nearest"))
-    held = np.clip(made, low, high)
-    if len(seen) > 1:
-        noise = np.stack([s.variance(p) for p, s in zip(seen, sensors, strict=True)])
-        held = np.clip(of_known_hue(seen, held, anywhere[rows, cols], noise, window), low, high)
-    trust = 1.0 - min(max(errors) / _UNSURE, 1.0) * _light_of(broad, seen, blurs, sensors)
-    held = np.where(broad, seen, seen + trust * (held - seen))
+    window, bright_window = ((1, 2 * n + 1, 2 * n + 1) for n in (near, next_to))
+    low = np.minimum(ndimage.minimum_filter(observed, window, mode="nearest"), observed)
+    high = np.where(lost, np.float32(np.inf), ndimage.maximum_filter(observed, bright_window, mode="nearest"))
+    held = np.clip(corrected, low, high)
+    if len(observed) > 1:
+        noise = np.stack([s.variance(p) for p, s in zip(observed, sensors, strict=True)])
+        held = np.clip(of_known_hue(observed, held, anywhere[rows, cols], noise, window), low, high)
+    trust = 1.0 - min(max(errors) / _UNSURE, 1.0) * _stray_share(broad, observed, blurs, sensors)
+    held = np.where(broad, observed, observed + trust * (held - observed))
     distance = ndimage.distance_transform_cdt(~anywhere[rows, cols], "chessboard")
     share = np.clip((reach + _FADE - distance) / np.float32(_FADE), 0.0, 1.0).astype(np.float32)
     result = restored.copy()
-    result[here] = restored[here] + share * (held - restored[here])
+    result[box] = restored[box] + share * (held - restored[box])
     return result
 
 
-def _light_of(
+def _stray_share(
     broad: NDArray[np.bool_], photo: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor]
 ) -> NDArray[np.float32]:
     """Share of each pixel's light that may come from broad clipped areas, the most of all colours, 0 to 1."""

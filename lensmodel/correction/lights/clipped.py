@@ -1,4 +1,4 @@
-"""Where in a tile the light of clipped pixels can be found, cut into regions that cost little."""
+"""Regions of a tile in which the light of clipped pixels can be estimated, cut so that they cost little."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 _BLOCK: Final = 8
-"""Side in pixels of the blocks of which regions are made."""
+"""Side in pixels of the blocks that make up regions (chosen, not measured)."""
 
 _FIXED: Final = 5000
-"""What a region costs beside its pixels, in pixels: calls on small arrays, tables of its own size."""
+"""Fixed cost of a region, in pixels: calls on small arrays, tables of its own size (chosen, not measured)."""
 
 Window = tuple[slice, slice]
 _Span = tuple[int, int]
@@ -21,17 +21,17 @@ _Span = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class Region:
-    """A part of a tile whose lights are found together.
+    """A part of a tile whose lights are estimated together.
 
     Parameters
     ----------
     seen : tuple of slice
-        The data that tell, in pixels of the tile.
+        The data to use, in pixels of the tile.
     own : tuple of slice
-        The light that this region alone answers for, in pixels of the latent plane, wider than `seen` by
+        The light that only this region estimates, in pixels of the latent plane, wider than `seen` by
         the reach of the blur on each side.
     answers : tuple of slice
-        The clipped pixels that it answers for, in pixels of `seen`.
+        The clipped pixels that it estimates, in pixels of `seen`.
     """
 
     seen: Window
@@ -42,7 +42,7 @@ class Region:
 def regions(clipped: NDArray[np.bool_], reach: int) -> list[Region]:
     """Cut clipped pixels into regions.
 
-    Light tells of itself on measured pixels only: those further inside a blown area than twice the blur's
+    Light shows on measured pixels only: clipped pixels further inside a blown area than twice the blur's
     reach are left as they are. The rest is cut along gaps, or in the middle, as long as the pieces
     with twice the reach around them are cheaper than the whole.
 
@@ -80,7 +80,7 @@ def _blocks(marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _cut(
     active: NDArray[np.bool_], piece: tuple[_Span, _Span], rim: int
 ) -> tuple[float, list[tuple[tuple[_Span, _Span], tuple[_Span, _Span]]]]:
-    """Cheapest pieces found, each with the least window around its active blocks, and what they cost."""
+    """Cost of the cheapest pieces, and each piece with the least window around its active blocks."""
     (top, bottom), (left, right) = piece
     part = active[top:bottom, left:right]
     rows, cols = np.flatnonzero(part.any(axis=1)), np.flatnonzero(part.any(axis=0))
@@ -94,22 +94,22 @@ def _cut(
     alone: tuple[float, list[tuple[tuple[_Span, _Span], tuple[_Span, _Span]]]] = (whole, [(piece, tight)])
     if whole <= 2 * _cost(((0, 1), (0, 1)), rim):
         return alone
-    # The widest gap, or the middle of the longer side: to try all cuts takes longer than to find the light.
+    # The widest gap, or the middle of the longer side: trying all cuts takes longer than solving the light.
     gaps = [int(np.diff(marks).max(initial=1)) for marks in (rows, cols)]
     lengths = [last - first for first, last in tight]
     axis = int(np.argmax(gaps if max(gaps) > 1 else lengths))
-    at = piece[axis][0] + _where((rows, cols)[axis])
-    one, two = (
+    at = piece[axis][0] + _cut_position((rows, cols)[axis])
+    before, after = (
         ((low, high), (left, right)) if axis == 0 else ((top, bottom), (low, high))
         for low, high in ((piece[axis][0], at), (at, piece[axis][1]))
     )
-    first, second = _cut(active, one, rim), _cut(active, two, rim)
-    if first[0] + second[0] < whole:
-        return first[0] + second[0], first[1] + second[1]
+    cut_before, cut_after = _cut(active, before, rim), _cut(active, after, rim)
+    if cut_before[0] + cut_after[0] < whole:
+        return cut_before[0] + cut_after[0], cut_before[1] + cut_after[1]
     return alone
 
 
-def _where(marks: NDArray[np.intp]) -> int:
+def _cut_position(marks: NDArray[np.intp]) -> int:
     """Where to cut: in the middle of the widest gap, or of the whole."""
     gaps = np.diff(marks)
     if gaps.size and gaps.max() > 1:
@@ -119,7 +119,7 @@ def _where(marks: NDArray[np.intp]) -> int:
 
 
 def _cost(tight: tuple[_Span, _Span], rim: int) -> float:
-    """Pixels of the plane on which a piece is solved, and what it costs beside."""
+    """Pixels of the plane on which a piece is solved, plus its fixed cost."""
     high, wide = (_BLOCK * (last - first) + rim for first, last in tight)
     return float(high * wide + _FIXED)
 
@@ -134,7 +134,7 @@ def _region(
     """The windows of a piece, in pixels."""
     seen, own, answers = [], [], []
     for (first, last), (low, high), extent, count in zip(piece, tight, shape, blocks, strict=True):
-        # A piece at the tile's rim answers for the light beyond it as well.
+        # A piece at the tile's rim also estimates the light beyond it.
         begin = low * _BLOCK - reach if first == 0 else max(low * _BLOCK - reach, first * _BLOCK)
         end = high * _BLOCK + reach if last == count else min(high * _BLOCK + reach, last * _BLOCK)
         start = max(low * _BLOCK - 2 * reach, 0)

@@ -1,4 +1,4 @@
-"""Light beyond saturation: how much of it there is, and the photo as it would be without."""
+"""Light beyond saturation: how much there is, and the photo as it would be without it."""
 
 from __future__ import annotations
 
@@ -19,17 +19,21 @@ from lensmodel.correction.engine import Engine, compiled
 from lensmodel.correction.lights.clipped import Region, around, regions
 from lensmodel.correction.methods.richardson_lucy import climbed, first_guess
 
-_LEAST_SEEN: Final = 0.02  # share of a point's light that counts as measured where less of it is
-_UNSEEN: Final = 1e-3  # share of a point's light below which nothing is known of it
+_LEAST_SEEN: Final = 0.02  # least share of a point's light that counts as measured (chosen, not measured)
+_UNSEEN: Final = 1e-3  # share of a point's light below which it is unknown (chosen, not measured)
+# Standard deviations of noise by which glow may exceed the photo (chosen, not measured)
 _SIGMAS: Final = np.float32(3.0)
-_ABSURD: Final = np.float32(2.0)  # times what was measured: more glow than steps that end anywhere leave
+# Times that bound: steps that converge leave less glow (chosen, not measured)
+_ABSURD: Final = np.float32(2.0)
 _ENERGY: Final = 0.98
-"""Share of a kernel's light within its reach: what is further out of a light at saturation is a fiftieth of
-it, and hardly seen (chosen)."""
-_DARKEST: Final = 0.9  # times what a kernel spreads: share of the darkest light nearby that must be left
-_DOUBT: Final = np.float32(0.25)  # share of the glow that may be none
-_GLARE: Final = np.float32(0.5)  # share of glow in the photo's light from which on the bound holds in full
-_NO_GLARE: Final = np.float32(0.02)  # of that: rounding errors of transforms are no glow
+"""Share of a kernel's light within its reach: of a light at saturation, a fiftieth falls further out and is
+hardly seen (chosen)."""
+# Least share of the darkest light nearby that remains, times what a kernel spreads (chosen, not measured)
+_DARKEST: Final = 0.9
+_DUBIOUS: Final = np.float32(0.25)  # share of the glow that may be scene light instead (chosen, not measured)
+# Share of glow in the photo's light at and above which the bound holds in full (chosen, not measured)
+_GLARE: Final = np.float32(0.5)
+_NO_GLARE: Final = np.float32(0.02)  # of `_GLARE`: less is rounding errors of transforms
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,17 +68,17 @@ class Lights:
     ) -> Lights | None:
         """Find the light above the clipping level of each colour; None where nothing is clipped.
 
-        How bright a clipped light is, only its glow on the pixels around it tells. Richardson-Lucy
-        steps find out, with clipped pixels as lower bounds, R and R' as in
-        `SaturationAwareRichardsonLucy`, and divided by what of a point's light was measured::
+        Only its glow on the pixels around it shows how bright a clipped light is. Richardson-Lucy steps
+        estimate that, with clipped pixels as lower bounds, R and R' as in `SaturationAwareRichardsonLucy`,
+        and divided by the share of a point's light that was measured::
 
             x <- x ( 1 + F^T e / F^T 1[y < t] ),     e = ( y / R(F x) - 1 ) R'(F x)
 
-        Divided by F^T 1 instead, lights of which little is measured take several times the steps; those of
-        which nothing is would grow without end otherwise. Only of lights that the lens may have spread
-        (`compact`), around clipped pixels near measured ones (`lensmodel.correction.lights.clipped.regions`).
-        Broad clipped areas are taken for light at saturation. Positive and unrestrained, x is a poor picture,
-        so only what lies above t is taken from it.
+        Divided by F^T 1 instead, lights of which little was measured take several times the steps; those of
+        which nothing was measured do use F^T 1, or they would grow without end. This is done only for lights
+        that the lens may have spread (`compact`), around clipped pixels near measured ones
+        (`lensmodel.correction.lights.clipped.regions`). Broad clipped areas count as light at saturation.
+        Positive and unregularised, x is a poor picture, so only what lies above t is taken from it.
         """
         if not any(
             plane.max() >= np.float32(sensor.clip) for plane, sensor in zip(tile, sensors, strict=True)
@@ -86,33 +90,33 @@ class Lights:
             clipped = blown(plane, sensor)
             quick = CompiledBlur.of(positive(blur), loops)
             for region in regions(compact(clipped, far(blur)), blur.reach):
-                _find(region, plane, clipped, quick, sensor, steps, engine, (rest[c], beyond[c], glow[c]))
+                _estimate(region, plane, clipped, quick, sensor, steps, engine, (rest[c], beyond[c], glow[c]))
             rest[c] -= np.where(clipped, np.float32(0.0), glow[c])
         return cls(rest, beyond, glow, np.array([_spread(blur) for blur in blurs], dtype=np.float32))
 
     def put_back(self, photo: Planes, restored: Planes) -> Planes:
-        """Add the light to what was made of the rest.
+        """Add the light to the restored rest.
 
-        Where most of what a pixel got was glow, an error of it is large beside the scene, and the more
-        the lens spreads the more of it comes back as a dark ring. So the result stays above a share of
-        the darkest light nearby there.
+        Where most of a pixel's light was glow, an error of the glow is large compared with the scene, and
+        the more the lens spreads, the more of it comes back as a dark ring. So there the result stays above
+        a share of the darkest light nearby.
         """
-        made = restored + self.beyond
+        result = restored + self.beyond
         shining: NDArray[np.bool_] = np.asarray(self.glow.any(axis=0))
         if not shining.any():
-            return np.asarray(made, dtype=np.float32)
-        # What the filters of 5 pixels see, and no more of the tile.
+            return np.asarray(result, dtype=np.float32)
+        # No more of the tile than the filters of 5 pixels need.
         rows, cols = (around(shining, axis, 4) for axis in (0, 1))
-        here = (slice(None), rows, cols)
-        glow = self.glow[here]
+        box = (slice(None), rows, cols)
+        glow = self.glow[box]
         near = ndimage.maximum_filter(glow, (1, 5, 5), mode="nearest")
-        likely = np.maximum(self.rest[here], np.float32(0.0)) + _DOUBT * glow
-        darkest = ndimage.minimum_filter(likely, (1, 5, 5), mode="nearest")
-        glare = np.minimum(near / (_GLARE * np.maximum(photo[here], np.float32(1e-6))), np.float32(1.0))
+        scene = np.maximum(self.rest[box], np.float32(0.0)) + _DUBIOUS * glow
+        darkest = ndimage.minimum_filter(scene, (1, 5, 5), mode="nearest")
+        glare = np.minimum(near / (_GLARE * np.maximum(photo[box], np.float32(1e-6))), np.float32(1.0))
         depth = (np.float32(_DARKEST) * self.spread)[:, None, None]
-        held = np.maximum(restored[here], depth * glare * darkest)
-        made[here] = np.where(glare > _NO_GLARE, held, restored[here]) + self.beyond[here]
-        return np.asarray(made, dtype=np.float32)
+        held = np.maximum(restored[box], depth * glare * darkest)
+        result[box] = np.where(glare > _NO_GLARE, held, restored[box]) + self.beyond[box]
+        return np.asarray(result, dtype=np.float32)
 
 
 def blown(plane: NDArray[np.float32], sensor: Sensor) -> NDArray[np.bool_]:
@@ -123,8 +127,8 @@ def blown(plane: NDArray[np.float32], sensor: Sensor) -> NDArray[np.bool_]:
 def compact(clipped: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
     """Clipped pixels of areas that a lamp may have made through a kernel of this reach.
 
-    An area with a clipped pixel further than the reach from all measured ones is broad: how bright it is
-    inside, nothing tells.
+    An area with a clipped pixel further than the reach from all measured ones is broad: nothing shows how
+    bright it is inside.
     """
     if not clipped.any():
         return clipped
@@ -172,7 +176,7 @@ def _spread(blur: UniformBlur) -> float:
     return 1.0 - float(blur.kernel[near, near].sum())
 
 
-def _find(
+def _estimate(
     region: Region,
     plane: NDArray[np.float32],
     clipped: NDArray[np.bool_],
@@ -182,47 +186,49 @@ def _find(
     engine: Engine,
     into: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
 ) -> None:
-    """Find the light of one region of one colour; add it to `into`: rest, light beyond saturation, glow."""
+    """Estimate the light of one region of one colour; update `into`: rest, light beyond saturation, glow."""
     rest, beyond, glow = into
-    here = region.seen
-    data, lost = plane[here], clipped[here]
+    window = region.seen
+    data, lost = plane[window], clipped[window]
     latent, reach = first_guess(data, blur)
-    seen = np.minimum(blur.adjoint((~lost).astype(np.float32)), reach)
-    most = float(reach.max())
-    seen = np.where(seen < _UNSEEN * most, reach, np.maximum(seen, np.float32(_LEAST_SEEN * most)))
-    latent = climbed(latent, data, seen, blur, sensor, steps=steps, engine=engine)
+    measured = np.minimum(blur.adjoint((~lost).astype(np.float32)), reach)
+    full = float(reach.max())
+    measured = np.where(
+        measured < _UNSEEN * full, reach, np.maximum(measured, np.float32(_LEAST_SEEN * full))
+    )
+    latent = climbed(latent, data, measured, blur, sensor, steps=steps, engine=engine)
     clip = np.float32(sensor.clip)
-    held = np.minimum(latent, clip)
-    # What shines too far off to reach a clipped pixel, or nearer to those of another region, is no concern.
-    own = np.zeros_like(latent)
-    own[region.own] = (latent - held)[region.own]
+    below_clip = np.minimum(latent, clip)
+    # Light too far off to reach a clipped pixel, or nearer to those of another region, is ignored.
+    excess = np.zeros_like(latent)
+    excess[region.own] = (latent - below_clip)[region.own]
     bound = np.maximum(data, np.float32(0.0)) + _SIGMAS * np.sqrt(sensor.variance(data))
-    own, shed = _believable(own, np.where(lost, np.float32(np.inf), bound), blur)
-    glow[here] += shed
-    beyond[here] += blur.frame(own)
-    answered = np.zeros_like(lost)
-    answered[region.answers] = lost[region.answers]
-    rest[here][answered] = np.maximum(blur.forward(held), np.float32(0.0))[answered]
+    excess, region_glow = _believable(excess, np.where(lost, np.float32(np.inf), bound), blur)
+    glow[window] += region_glow
+    beyond[window] += blur.frame(excess)
+    own_clipped = np.zeros_like(lost)
+    own_clipped[region.answers] = lost[region.answers]
+    rest[window][own_clipped] = np.maximum(blur.forward(below_clip), np.float32(0.0))[own_clipped]
 
 
 def _believable(
-    own: NDArray[np.float32], bound: NDArray[np.float32], blur: UniformBlur
+    excess: NDArray[np.float32], bound: NDArray[np.float32], blur: UniformBlur
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the light that was found and its glow, dimmed where that by far exceeds a bound.
+    """Return the estimated light and its glow, dimmed where the glow far exceeds a bound.
 
-    Where it still does then, none of it is left. Steps may run away: just below clipping the response
+    If it still does then, both are zero. Steps may run away: just below clipping the response
     hardly rises, and the transfer function of next to no blur, moved by a part of a pixel, belongs to no
-    kernel that is positive.
+    positive kernel.
     """
 
     def absurd(glow: NDArray[np.float32]) -> NDArray[np.bool_]:
         return np.asarray(~(np.abs(glow) <= _ABSURD * bound))
 
-    glow = blur.forward(own)
+    glow = blur.forward(excess)
     too_much = absurd(glow)
     if not too_much.any():
-        return own, glow
+        return excess, glow
     share = np.where(too_much, bound / np.where(too_much, np.abs(glow), np.float32(1.0)), np.float32(1.0))
-    own = own * ndimage.minimum_filter(np.pad(share, blur.reach, mode="edge"), 2 * blur.reach + 1)
-    glow = blur.forward(own)
-    return (np.zeros_like(own), np.zeros_like(glow)) if absurd(glow).any() else (own, glow)
+    excess = excess * ndimage.minimum_filter(np.pad(share, blur.reach, mode="edge"), 2 * blur.reach + 1)
+    glow = blur.forward(excess)
+    return (np.zeros_like(excess), np.zeros_like(glow)) if absurd(glow).any() else (excess, glow)

@@ -1,4 +1,4 @@
-"""A tile made ready, compiled: data on the canvas, kernels as transfer functions."""
+"""Preparation of a tile, compiled: data on the canvas, kernels as transfer functions."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def fill(planes: Real, gains: Real, margin: int, rows: Seam, cols: Seam, y: Real
                 a, b, t = rows[0][i - high], rows[1][i - high], rows[2][i - high]
                 for j in range(wide):
                     line[j] = (planes[c, a, j] * (ONE - t) + planes[c, b, j] * t) * gains[c]
-            to = (i + margin) % height
-            y[c, to, margin : margin + wide] = line
+            row = (i + margin) % height
+            y[c, row, margin : margin + wide] = line
             for j in range(wide, width):
                 t = cols[2][j - wide]
                 value = line[cols[0][j - wide]] * (ONE - t) + line[cols[1][j - wide]] * t
-                y[c, to, (j + margin) % width] = value
+                y[c, row, (j + margin) % width] = value
 
 
 @jit
@@ -117,11 +117,11 @@ def block_means(  # noqa: C901 - one pass over memory
 
 
 @jit
-def add(out: Real, rise: Real, run: Real, made: Real) -> None:
+def add(out: Real, rise: Real, run: Real, planes: Real) -> None:
     """Add planes times the product of a weight for each row and one for each column."""
-    channels, height, width = made.shape
+    channels, height, width = planes.shape
     for c in range(channels):
         for i in range(height):
             weight = rise[i]
             for j in range(width):
-                out[c, i, j] += weight * run[j] * made[c, i, j]
+                out[c, i, j] += weight * run[j] * planes[c, i, j]

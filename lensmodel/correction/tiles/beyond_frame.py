@@ -1,4 +1,4 @@
-"""Light from beyond the frame: what it makes of the pixels just outside, which nobody measured."""
+"""Light from beyond the frame: a prediction of the pixels just outside, which were not measured."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ from lensmodel.correction.engine import Engine, compiled
 from lensmodel.correction.methods.richardson_lucy import climbed, first_guess
 from lensmodel.correction.tiles.canvas import Canvas, seam
 
-_DEPTH, _MORE = 4, 8  # reaches of the blur, and pixels, of data that tell of what lies beyond a side
+_DEPTH, _MORE = 4, 8
+"""Depth of the strip of data that predicts what lies beyond a side: so many reaches of the blur, plus so many
+pixels (chosen, not measured)."""
 
 
 def fill_outside(
@@ -34,17 +36,17 @@ def fill_outside(
 ) -> None:
     """Predict the margin of a canvas along the sides of the frame, in place.
 
-    A mirror image of the frame is a poor guess: what is wrong with it comes back as ripples
-    inside, the stronger the less noise there is. Richardson-Lucy steps on a strip of the data find the
-    light on both sides of the border, each point divided by what of its light was measured, and that
-    light blurred is what a larger sensor would have seen.
+    A mirror image of the frame is a poor guess: its errors come back as ripples inside, stronger the less
+    noise there is. Richardson-Lucy steps on a strip of the data estimate the light on both sides of the
+    border, each point divided by the share of its light that was measured; that light, blurred, is what a
+    larger sensor would have recorded.
 
     Parameters
     ----------
     y : Planes
         The canvas, scaled by one over `light`.
     tile : Planes
-        The data, nothing of it beyond saturation.
+        The data, none of it beyond saturation.
     light : ndarray, shape (channels,)
         Mean light of each colour.
     K : ndarray, shape (channels, rows, cols)
@@ -58,7 +60,7 @@ def fill_outside(
     for c, (plane, blur, sensor) in enumerate(zip(tile, blurs, sensors, strict=True)):
         wide = blur.reach
         if wide > 0:
-            latent = _wider(plane, CompiledBlur.of(blur, loops), sensor, steps, engine)
+            latent = _extended(plane, CompiledBlur.of(blur, loops), sensor, steps, engine)
             np.copyto(
                 y[c], _predicted(latent, light[c], K[c], canvas, canvas.margin - wide, loops), where=outside
             )
@@ -72,22 +74,22 @@ def _predicted(
     margin: int,
     loops: ModuleType | None,
 ) -> NDArray[np.float32]:
-    """What a larger sensor would have seen of the light found, over `light`, on the canvas."""
+    """What a larger sensor would have recorded of the latent light, over `light`, on the canvas."""
     rows, cols = canvas.shape
     if loops is None:
         wide = Canvas.wrap(Canvas.wrap(latent, margin, rows).T, margin, cols).T
         return np.asarray(fft.irfft2(K * fft.rfft2(wide / light), canvas.shape), dtype=np.float32)
-    seen = np.empty((1, rows, cols), dtype=np.float32)
+    predicted = np.empty((1, rows, cols), dtype=np.float32)
     joints = seam(latent.shape[0], rows), seam(latent.shape[1], cols)
-    loops.fill(latent[None], np.ones(1, dtype=np.float32) / light, margin, *joints, seen)
-    loops.through(seen[0], np.empty_like(K), K, forward=True, first=0, last=rows, begin=0, end=rows)
-    return np.asarray(seen[0])
+    loops.fill(latent[None], np.ones(1, dtype=np.float32) / light, margin, *joints, predicted)
+    loops.through(predicted[0], np.empty_like(K), K, forward=True, first=0, last=rows, begin=0, end=rows)
+    return np.asarray(predicted[0])
 
 
-def _wider(
+def _extended(
     plane: NDArray[np.float32], blur: UniformBlur, sensor: Sensor, steps: int, engine: Engine
 ) -> NDArray[np.float32]:
-    """Data, and light wherever it reaches them from beyond a side of the frame: wider by the reach."""
+    """The data, extended by the reach; at the sides of the frame they are replaced by the latent light."""
     wide = blur.reach
     depth, both = _DEPTH * wide + _MORE, 2 * wide
     wider = np.pad(plane, wide, mode="symmetric" if wide <= min(plane.shape) else "edge")

@@ -15,7 +15,8 @@ from lensmodel.core.types import Planes
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.deconvolver import Sensor
 
-_JOINT: Final = 4  # pixels over which the ends of a tile fade into each other where its rim is cut off
+# Pixels over which the ends of a tile fade into each other where its rim is cut off (chosen, not measured)
+_JOINT: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,8 +91,8 @@ def seam(rows: int, length: int) -> tuple[NDArray[np.intp], NDArray[np.intp], ND
 def fitted_halo(cell: tuple[int, int], least: int) -> int:
     """Widest halo of a cell for which its canvas is no larger than for the least one.
 
-    Sizes that are quick to transform are few: what a canvas has more than it needs is better filled
-    with data than with a longer seam.
+    Sizes that are quick to transform are few: the pixels that a canvas has to spare are better filled with
+    data than with a longer seam.
     """
     spare = []
     for extent in cell:

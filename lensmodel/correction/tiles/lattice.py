@@ -13,10 +13,11 @@ from lensmodel.core.geometry import Frame
 from lensmodel.core.types import FieldPosition
 
 CELLS_PER_HALF_DIAGONAL = 18.0
+"""Half the frame's diagonal over the side of a cell (chosen, not measured)."""
 MIN_PITCH, MAX_PITCH = 96, 208
 """Bounds of a cell's side in pixels: smaller ones are all halo, larger ones blur the PSF's change."""
 RAMP = 16
-"""Width in pixels over which neighbouring cells fade into each other."""
+"""Width in pixels over which neighbouring cells fade into each other (chosen, not measured)."""
 
 
 _Beside = tuple[FieldPosition, FieldPosition, float]
@@ -52,12 +53,12 @@ class Roi:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cell:
-    """One cell: the part of the frame that it answers for, and its weight there.
+    """One cell: its part of the frame, and its weight there.
 
     Parameters
     ----------
     top, left : int
-        First pixel of the answer.
+        First pixel of that part.
     rise, run : ndarray
         Weights along rows and columns; those of all cells sum to one.
     position : FieldPosition
@@ -66,7 +67,7 @@ class Cell:
         The same as a pixel `(row, col)`.
     beside : tuple of (FieldPosition, FieldPosition, float)
         Centres of the cells above and below, and left and right, with the pixels between them; at the
-        border the cell itself stands in for the one that is not there.
+        border the cell itself stands in for the missing one.
     """
 
     top: int
@@ -106,7 +107,7 @@ def usual_pitch(frame: Frame, factor: int = 1) -> int:
 def cells(frame: Frame, pitch: int | None = None) -> tuple[Cell, ...]:
     """Cut a frame into cells, row by row.
 
-    The lattice depends on the frame only, never on the part asked for or on the memory given,
+    The lattice depends on the frame only, never on the requested part or on the available memory,
     so a preview shows the same pixels as the whole picture.
 
     Parameters
@@ -133,6 +134,7 @@ def cells(frame: Frame, pitch: int | None = None) -> tuple[Cell, ...]:
 
 
 def _pieces(extent: int, pitch: int) -> list[tuple[int, NDArray[np.float32], float]]:
+    """First pixel, weights and centre of each piece of an axis."""
     count = max(1, round(extent / pitch))
     edges = [round(i * extent / count) for i in range(count + 1)]
     half = min(RAMP // 2, (edges[1] - edges[0]) // 2)

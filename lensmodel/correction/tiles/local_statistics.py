@@ -1,4 +1,4 @@
-"""Local statistics of a picture on a coarse grid: what is signal, what is noise."""
+"""Local statistics of a picture on a coarse grid: signal and noise."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from lensmodel.core.types import Planes
 from lensmodel.correction.tiles.canvas import Canvas
 
 BLOCK = 4  # pixels: coarser than detail, finer than objects (chosen)
-_UNSURE = np.float32(0.1)  # share of the noise that a variance over so few pixels cannot tell from signal
+_UNSURE = np.float32(0.1)  # share of the noise that a variance over so few pixels cannot resolve (chosen)
 
 
 def coarse(plane: NDArray[np.float32]) -> NDArray[np.float32]:
     """Means over blocks of 4 pixels; blocks at the far ends hold what is left.
 
-    Light and contrast change slowly, so a sixteenth of the numbers tells as much.
+    Light and contrast change slowly, so a sixteenth of the numbers is enough.
     """
     rows, cols = (np.arange(0, extent, BLOCK) for extent in plane.shape)
     sums = np.add.reduceat(np.add.reduceat(plane, rows, axis=0), cols, axis=1)
@@ -29,7 +29,7 @@ def coarse(plane: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def smoothed(blocks: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Local mean of a coarse plane over some 13 pixels of the fine one."""
+    """Local mean of a coarse plane over about 13 pixels of the fine one."""
     for axis in (0, 1):
         sums = np.float32(4.0) * blocks
         # The same array seen along the other axis: sums are taken in place.

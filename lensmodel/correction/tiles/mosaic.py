@@ -15,16 +15,17 @@ from lensmodel.correction.methods.wiener import wiener_spectrum
 from lensmodel.correction.tiles.canvas import Canvas
 
 _WINDOW: Final = 2.0
-"""Standard deviation in pixels of the windows in which a colour is a straight line over green: some ten
+"""Standard deviation in pixels of the windows in which a colour is a straight line over green: about ten
 of red or blue, few enough for a line and enough against noise (chosen). Gaussian, because a square holds
-more of them or fewer by where it begins, which shows as the mosaic's own pattern beside coloured edges."""
+more or fewer of them depending on where it begins, which shows as the mosaic's pattern beside
+coloured edges."""
 
 _RIDGE: Final = 0.02
 """Share of the squared mean light of a window that is added to the variance of green in it: where green
 is flat, the slope is that of a constant hue (chosen)."""
 
 BETWEEN: Final = np.array([[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]], dtype=np.float32) / 16.0
-"""Bilinear interpolation over every second pixel, when it is divided by the same of the mask."""
+"""Bilinear interpolation over every second pixel, once divided by the same filter of the mask."""
 
 
 def refilled(
@@ -41,8 +42,8 @@ def refilled(
     soft in blue, as most are, that detail is sharper than blue light can be, and undoing blue's blur on
     it makes coloured edges of it. So the detail is blurred first as the colour itself is: with x_g Wiener's
     estimate of green, each colour is predicted from p = K_c x_g by residual interpolation [1]_, a line
-    y = a p + b in each window, and what is left at measured pixels is interpolated. No frequency of p is
-    stronger than in green itself: a blue that is thought to be sharper would get the mosaic's own pattern::
+    y = a p + b in each window, and the residual at measured pixels is interpolated. No frequency of p is
+    stronger than in green itself: a blue that is believed to be sharper would get the mosaic's own pattern::
 
         y_c = a p + b + interpolated( y_c - a p - b )
 
@@ -73,13 +74,13 @@ def refilled(
             continue
         known = np.zeros(shape, dtype=np.float32)
         known[canvas.data] = measured
-        led = K[c] * sharp
-        led /= np.maximum(np.abs(led) / light, np.float32(1.0))
-        p = np.asarray(fft.irfft2(led, shape), dtype=np.float32)
+        guide = K[c] * sharp
+        guide /= np.maximum(np.abs(guide) / light, np.float32(1.0))
+        p = np.asarray(fft.irfft2(guide, shape), dtype=np.float32)
         predicted = _lines(y[c], p, known)
-        left = known * (y[c] - predicted)
+        residual = known * (y[c] - predicted)
         share = ndimage.convolve(known, BETWEEN, mode="wrap")
-        predicted += ndimage.convolve(left, BETWEEN, mode="wrap") / np.maximum(share, np.float32(1e-3))
+        predicted += ndimage.convolve(residual, BETWEEN, mode="wrap") / np.maximum(share, np.float32(1e-3))
         np.copyto(y[c][canvas.data], predicted[canvas.data], where=~measured)
 
 

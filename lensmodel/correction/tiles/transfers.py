@@ -41,12 +41,12 @@ def transfers(
 
 def _taps(blurs: Sequence[UniformBlur], *, drifting: bool) -> NDArray[np.float32]:
     """Kernels and their changes per pixel down and across, `(channel, 1 or 3, k, k)`, centred alike."""
-    ways = [(blur.drift.down, blur.drift.across) for blur in blurs if blur.drift is not None]
-    drifting = drifting and len(ways) == len(blurs)
-    used = [blur.kernel for blur in blurs]
+    drifts = [(blur.drift.down, blur.drift.across) for blur in blurs if blur.drift is not None]
+    drifting = drifting and len(drifts) == len(blurs)
+    kernels = [blur.kernel for blur in blurs]
     if drifting:
-        used += [end.kernel for pair in ways for way in pair for end in way[:2]]
-    side = max(kernel.shape[0] for kernel in used)
+        kernels += [end.kernel for pair in drifts for ends in pair for end in ends[:2]]
+    side = max(kernel.shape[0] for kernel in kernels)
     taps = np.zeros((len(blurs), 3 if drifting else 1, side, side), dtype=np.float32)
 
     def place(channel: int, index: int, kernel: NDArray[np.float64], factor: float) -> None:
@@ -56,7 +56,7 @@ def _taps(blurs: Sequence[UniformBlur], *, drifting: bool) -> NDArray[np.float32
     for c, blur in enumerate(blurs):
         place(c, 0, blur.kernel, 1.0)
     if drifting:
-        for c, pair in enumerate(ways):
+        for c, pair in enumerate(drifts):
             for index, (before, after, pixels) in enumerate(pair, start=1):
                 place(c, index, before.kernel, -1.0 / max(pixels, 1.0))
                 place(c, index, after.kernel, 1.0 / max(pixels, 1.0))

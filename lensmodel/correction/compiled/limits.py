@@ -9,9 +9,9 @@ from lensmodel.correction.compiled.common import Real
 
 
 @jit
-def hold(photo: Real, share: float, dark: float, made: Real) -> None:
-    """Hold `made` within the range of `photo`, 2 pixels wider on each side; see `bounds.limited`."""
-    rows, cols = made.shape
+def hold(photo: Real, share: float, dark: float, corrected: Real) -> None:
+    """Hold `corrected` within the range of `photo`, 2 pixels wider on each side; see `bounds.limited`."""
+    rows, cols = corrected.shape
     wide = cols + 4
     low, high = np.empty(wide, np.float32), np.empty(wide, np.float32)
     for i in range(rows):
@@ -27,4 +27,4 @@ def hold(photo: Real, share: float, dark: float, made: Real) -> None:
                 least = min(least, low[j + k])
                 most = max(most, high[j + k])
             room = share * (most - least)
-            made[i, j] = min(max(made[i, j], least - room, dark * least), most + room)
+            corrected[i, j] = min(max(corrected[i, j], least - room, dark * least), most + room)

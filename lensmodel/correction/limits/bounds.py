@@ -17,13 +17,15 @@ from lensmodel.correction.engine import compiled
 from lensmodel.correction.limits.plateaus import plateau_reach, plateaus_held
 
 WINDOW: Final = 2
-"""Pixels around each one in which the photo is looked at."""
+"""Radius in pixels of the window of the photo that bounds a pixel (chosen, not measured)."""
 _SIDE: Final = 2 * WINDOW + 1
 _FREE: Final = 0.16
-"""Error of a kernel from which on a result may not leave the photo's range by more than it: the least that
+"""Error of a kernel at which a result may leave the photo's range by the width of that range: the least that
 costs no gain behind a lens that is known to a quarter (chosen)."""
-_WIDEST: Final = 4.0  # share of the range beyond which a bound would cut nothing but noise
-_DARKEST, _DARKER = 0.5, 0.2  # of the darkest light nearby where no room is left, and per room
+_WIDEST: Final = 4.0  # share of the range beyond which a bound would cut nothing but noise (chosen)
+# Least share of the darkest light nearby at no room beyond the range, and its decrease per room (chosen, not
+# measured)
+_DARKEST, _DARKER = 0.5, 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,14 +35,13 @@ class Bounds:
     Parameters
     ----------
     halo : float or None
-        By how much of the photo's range within 2 pixels the result may leave it: 0 not at all, infinity
-        without bound. None takes it from the expected error of the kernels, and holds clean steps between
-        their plateaus besides.
+        How far the result may leave the photo's range within 2 pixels, as a share of it: 0 not at all,
+        infinity without bound. None derives it from the expected error of the kernels, and also holds clean
+        steps between their plateaus.
     texture : float
-        0 to 1: how much of what the correction leaves unexplained the photo keeps, its faint texture and
-        its grain.
+        0 to 1: how much of what the correction leaves unexplained is added back: faint texture and grain.
     denoise : float
-        0 to 1: how much of that is taken away where it looks like noise alone.
+        0 to 1: how much of that is removed where it looks like noise alone.
     """
 
     halo: float | None = None
@@ -55,7 +56,7 @@ class Bounds:
 
     @property
     def described(self) -> str:
-        """What was asked for, for the tag of a corrected photo; nothing where nothing was."""
+        """The settings, for the tag of a corrected photo; empty for the defaults."""
         halo = "" if self.halo is None else f", halo {self.halo:g}"
         texture = f", texture {self.texture:g}" if self.texture < 1.0 else ""
         return halo + texture + (f", denoised {self.denoise:g}" if self.denoise > 0.0 else "")
@@ -68,7 +69,7 @@ class Bounds:
         errors: Sequence[float],
         spread: int,
     ) -> Planes:
-        """Hold what was made of the part of a photo that begins at `at` within these bounds.
+        """Hold the correction of the part of a photo that begins at `at` within these bounds.
 
         `spread` says how far the blur there spreads light, in pixels.
         """
@@ -82,7 +83,7 @@ class Bounds:
 
 
 def photo_around(planes: Planes, at: tuple[int, int], part: Planes, margin: int) -> Planes:
-    """Cut what lies around a part of a photo that begins at `at`; at the border its last pixels again."""
+    """Cut the part at `at` out of a photo, with a margin; beyond the border the last pixels repeat."""
     rows, cols = (
         np.clip(np.arange(first - margin, first + extent + margin), 0, end - 1)
         for first, extent, end in zip(at, part.shape[1:], planes.shape[1:], strict=True)
@@ -94,9 +95,9 @@ def photo_around(planes: Planes, at: tuple[int, int], part: Planes, margin: int)
 def allowance(error: float) -> float:
     """By how much of the photo's local range a result may leave it, for a kernel with a relative error.
 
-    Beside an edge the picture is all kernel: what a wrong one makes there leaves the range of light
-    that the photo shows around, in one colour more than in the others. A right one does so as well, on
-    details narrower than itself, so the bound is wide where the kernel is sure: ( 0.16 / error )².
+    Beside an edge the picture is all kernel: with a wrong one it leaves the range of light that the photo
+    shows nearby, in one colour more than in the others. With a right one it does so too, on details
+    narrower than the kernel, so the bound is wide where the kernel is certain: ( 0.16 / error )².
     """
     share = (_FREE / error) ** 2 if error > 0.0 else np.inf
     return float(share) if share <= _WIDEST else float("inf")
@@ -107,34 +108,34 @@ def limited(
 ) -> Planes:
     """Hold `restored` within the photo's range in windows of 5 pixels, widened by a share of it.
 
-    The less room, the less it may also fall below a share of the darkest light there.
+    The less room there is, the larger the share of the darkest light nearby below which nothing may fall.
 
     Parameters
     ----------
     photo : Planes, shape (channels, rows + 4, cols + 4)
-        With the pixels around.
+        With 2 pixels around.
     restored : Planes, shape (channels, rows, cols)
-        What was made of its middle.
+        The correction of its middle.
     allowances : sequence of float
         Share of the range by colour; infinite for no bound.
     loops : module or None
         Compiled loops; None for SciPy, with the same numbers.
     """
-    made = np.ascontiguousarray(restored).copy()
+    held = np.ascontiguousarray(restored).copy()
     for c, share in enumerate(allowances):
         if np.isfinite(share):
             if loops is None:
                 low = _middle(ndimage.minimum_filter(photo[c], _SIDE))
                 high = _middle(ndimage.maximum_filter(photo[c], _SIDE))
                 room = np.float32(share) * (high - low)
-                np.clip(made[c], np.maximum(low - room, _dark(share) * low), high + room, out=made[c])
+                np.clip(held[c], np.maximum(low - room, _dark(share) * low), high + room, out=held[c])
             else:
-                loops.hold(photo[c], np.float32(share), _dark(share), made[c])
-    return made
+                loops.hold(photo[c], np.float32(share), _dark(share), held[c])
+    return held
 
 
 def _middle(wide: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Cut off the pixels around."""
+    """Cut off the margin."""
     return wide[..., WINDOW:-WINDOW, WINDOW:-WINDOW]
 
 

@@ -1,4 +1,4 @@
-"""What a JPEG can hold: its finest detail is coarse, its chroma often at half the resolution of luma."""
+"""Limit a correction to what a JPEG can hold: coarse finest detail, chroma often at half resolution."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from lensmodel.photo import LinearPhoto
 from lensmodel.photo.colour import curves_of, decode, encode, inverse
 
 _LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
-"""Weights of r, g, b in luma: ITU-R BT.601, as JFIF 1.02 asks."""
+"""Weights of r, g, b in luma: ITU-R BT.601, as JFIF 1.02 requires."""
 
 _PAIRED: Final = np.array([1.0, 4.0, 6.0, 4.0, 1.0], dtype=np.float32) / np.float32(16.0)
-"""What storing two pixels as their mean, and interpolating linearly between such means, makes of one pixel:
-the mean over the two places that it can have in its pair."""
+"""Response to one pixel when pairs of pixels are stored as their mean and interpolated linearly: the mean
+over the two places that it can have in its pair."""
 
 _FINEST: Final = np.array([1.0, -6.0, 15.0, 44.0, 15.0, -6.0, 1.0], dtype=np.float32) / np.float32(64.0)
 """1 - sin^6(pi f) along an axis: 0.88 of a correction stays at 0.25 cycles/pixel, 0.50 at 0.35, none at 0.5.
@@ -41,7 +41,7 @@ class StoredColour:
     curves : tuple of ndarray of float32, shape (65536,)
         Linear light of evenly spaced file values, by channel.
     tables : tuple of ndarray of float32
-        The way back, of `photo.colour.inverse`.
+        The inverses, of `photo.colour.inverse`.
     """
 
     step: tuple[int, int]
@@ -50,7 +50,7 @@ class StoredColour:
 
     @classmethod
     def of(cls, step: tuple[int, int], curves: Sequence[NDArray[np.float32]]) -> StoredColour:
-        """Make one of the curves of a file.
+        """Make one from the curves of a file.
 
         Raises
         ------
@@ -65,27 +65,27 @@ class StoredColour:
 
     @classmethod
     def of_photo(cls, photo: LinearPhoto) -> StoredColour | None:
-        """How the file of a photo stores colour; `None` of a file that is no JPEG."""
+        """How the file of a photo stores colour; `None` for a file that is not a JPEG."""
         if photo.info.kind != "jpeg":
             return None
         return cls.of(photo.chroma_step, curves_of(photo.encoding.transfer, photo.encoding.icc))
 
     def held(self, photo: Planes, restored: Planes) -> Planes:
-        """Take from a correction as much as the file can show of luma and of chroma.
+        """Keep of a correction what the file can show of luma and of chroma.
 
         With Y and C luma and chroma of file values, F what is kept of the finest detail, and H what the
         file's resolution leaves of chroma::
 
             Y = Y(photo) + F ( Y(restored) - Y(photo) ),   C = C(photo) + H F ( C(restored) - C(photo) )
 
-        A correction takes each colour for measured at every pixel. In a JPEG that holds for luma alone: the
-        finest detail of red and blue is that of luma, and colour that a correction makes of it beyond that
-        comes of rounding and of errors of the kernels, and is seen as coloured pixels.
+        A correction assumes that each colour was measured at every pixel. In a JPEG that holds for luma
+        alone: the finest detail of red and blue is that of luma, and colour that a correction adds to it
+        comes from rounding and from errors of the kernels, and shows as coloured pixels.
 
         Parameters
         ----------
         photo, restored : Planes, shape (3, rows, cols)
-            Linear light of a tile, and what was made of it.
+            Linear light of a tile, and its correction.
 
         Returns
         -------

@@ -15,33 +15,34 @@ from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.lights.saturation import closed
 
 _UNSURE: Final = 0.1
-"""Error of the kernels from which on no new hue is allowed: that of one colour makes hues then (chosen)."""
+"""Error of the kernels at and above which no new hue is allowed: the error of one colour then makes hues
+(chosen)."""
 
 _NEAR: Final = 2
-"""Pixels around each one whose hues are known there (chosen)."""
+"""Radius in pixels of the window whose hues a pixel may have (chosen)."""
 
 _LEAST_LIGHT: Final = 3.0
 """Standard deviations of the noise below which light has no hue (chosen)."""
 
 _STILL_WHITE: Final = np.float32(0.8)
-"""Share of a clipped pixel's light from which on it counts as white: white balance makes what is missing of
-one colour invisible down to about there (chosen)."""
+"""Share of a clipped pixel's light at and above which it counts as white: white balance hides what is missing
+of one colour down to about there (chosen)."""
 
-_AMID: Final = 5  # pixels along a side of a window that is white all over: none saw the edge of the light
+_AMID: Final = 5  # side in pixels of a window that is white all over: too far from the light's edge (chosen)
 
-_SOME: Final = np.float32(0.5 / 49.0)  # of a window: less than one pixel of it is none
+_SOME: Final = np.float32(0.5 / 49.0)  # share of the window of 7 x 7: half a pixel, so less means none
 
 HUE_REACH: Final = 3
-"""Pixels around each one whose hues it may take in the end, whatever came before: as far as lateral colour
-moves them."""
+"""Radius in pixels of the window whose hues a pixel may have in the end, whatever came before: as far as
+lateral colour moves them."""
 
 _PURER: Final = np.float32(0.03)
-"""By how much a colour's share of the light may leave those nearby: what blur has washed out gets purer, and
-three times this is seen in a light grey (chosen)."""
+"""By how much a colour's share of the light may leave the range nearby: colours that blur has washed out get
+purer, and three times this shows in a light grey (chosen)."""
 
 _COLOURLESS: Final = np.float32(0.05)
-"""Share of the brightest light nearby that counts as grey in everything: what is darker by far has no colour
-that one sees beside it, and none that it could lend (chosen)."""
+"""Share of the brightest light nearby that is added as grey to every pixel: what is far darker shows no
+colour beside it, and has none to lend (chosen)."""
 
 
 def hue_held(
@@ -51,15 +52,15 @@ def hue_held(
     sensors: Sequence[Sensor],
     errors: Sequence[float],
 ) -> Planes:
-    """Hold the hue of a result within those of the photo nearby, the more the less the kernels are sure.
+    """Hold the hue of a result within those of the photo nearby, more so the less certain the kernels are.
 
     A green kernel that is too wide beside a red one that is too narrow gives every edge a coloured line. The
-    light of all colours together stays as it was found.
+    light of all colours together stays the same.
 
     Parameters
     ----------
     photo, restored : Planes, shape (channels, rows, cols)
-        A tile, and what was made of it.
+        A tile, and its correction.
     blurs, sensors : sequence
         By colour; a lateral shift widens what counts as nearby.
     errors : sequence of float
@@ -79,7 +80,7 @@ def hue_held(
 
 def of_known_hue(
     photo: Planes,
-    made: Planes,
+    corrected: Planes,
     clipped: NDArray[np.bool_],
     noise: NDArray[np.float32],
     window: tuple[int, int, int],
@@ -93,16 +94,16 @@ def of_known_hue(
     unknown = np.where(clipped, np.float32(np.inf), known), np.where(clipped, np.float32(-np.inf), known)
     low = np.minimum(ndimage.minimum_filter(unknown[0], window, mode="nearest"), known)
     high = np.maximum(ndimage.maximum_filter(unknown[1], window, mode="nearest"), known)
-    light = np.maximum(made, np.float32(0.0)).sum(axis=0) + floor
-    share = np.clip(_shares(made, floor), low, high)
+    light = np.maximum(corrected, np.float32(0.0)).sum(axis=0) + floor
+    share = np.clip(_shares(corrected, floor), low, high)
     share /= share.sum(axis=0)
-    return np.asarray(share * light - floor / len(made), dtype=np.float32)
+    return np.asarray(share * light - floor / len(corrected), dtype=np.float32)
 
 
-def hue_bounded(photo: Planes, made: Planes, clips: Sequence[float], noise: Sequence[float]) -> Planes:
+def hue_bounded(photo: Planes, corrected: Planes, clips: Sequence[float], noise: Sequence[float]) -> Planes:
     """Draw each pixel's hue towards the photo's until the photo has it nearby; light stays the same.
 
-    What bounds one colour at a time, or mixes two results, makes hues that neither has. With s the shares of
+    Bounding one colour at a time, or mixing two results, makes hues that neither has. With s the shares of
     the colours in the light, and s' those of the photo at the same place (where two are clipped, their mean
     nearby)::
 
@@ -114,50 +115,50 @@ def hue_bounded(photo: Planes, made: Planes, clips: Sequence[float], noise: Sequ
     photo : Planes, shape (channels, rows + 6, cols + 6)
         With `HUE_REACH` pixels around.
     made : Planes, shape (channels, rows, cols)
-        What was made of its middle.
+        The correction of its middle.
     clips, noise : sequence of float
         Level of saturation, and standard deviation of the noise in the dark, by colour.
     """
-    if len(made) != 3:
-        return made
+    if len(corrected) != 3:
+        return corrected
     side = 2 * HUE_REACH + 1
     dark = np.float32(_LEAST_LIGHT * float(np.sqrt(np.square(noise).sum())) + 1e-6)
     brightest = ndimage.maximum_filter(np.maximum(photo, np.float32(0.0)).sum(axis=0), side)
     floor = np.maximum(dark, _COLOURLESS * brightest)
     full = [closed(p >= np.float32(clip)) for p, clip in zip(photo, clips, strict=True)]
-    clipped = np.sum(full, axis=0) > 1  # of one colour alone the hue is the one that is seen: red paint
+    clipped = np.sum(full, axis=0) > 1  # one clipped colour leaves the hue that is seen: red paint
     shares = _shares(photo, floor)
     axes = _axes(shares)
     low = ndimage.minimum_filter(np.where(clipped, np.float32(np.inf), axes), (1, side, side))
     high = ndimage.maximum_filter(np.where(clipped, np.float32(-np.inf), axes), (1, side, side))
     inner = (slice(None), slice(HUE_REACH, -HUE_REACH), slice(HUE_REACH, -HUE_REACH))
-    low, high, own = low[inner] - _PURER, high[inner] + _PURER, shares[inner]
+    low, high, reference = low[inner] - _PURER, high[inner] + _PURER, shares[inner]
     lost = clipped[inner[1:]]
     if lost.any():
         known = ndimage.uniform_filter(np.asarray(~clipped, np.float32), side)
         mean = ndimage.uniform_filter(np.where(clipped, np.float32(0.0), shares), (0, side, side))
         near = np.where(known > _SOME, mean / np.maximum(known, _SOME), shares)[inner]
-        own = np.where(lost, near, own)
+        reference = np.where(lost, near, reference)
     floor = floor[inner[1:]]
-    light = np.maximum(made, np.float32(0.0)).sum(axis=0) + floor
-    change = _shares(made, floor) - own
-    start, step = _axes(own), _axes(change)
+    light = np.maximum(corrected, np.float32(0.0)).sum(axis=0) + floor
+    change = _shares(corrected, floor) - reference
+    start, step = _axes(reference), _axes(change)
     room = np.where(step > 0.0, high - start, start - low) / np.maximum(np.abs(step), np.float32(1e-6))
     t = np.clip(np.min(np.where(np.isfinite(room), room, np.float32(1.0)), axis=0), 0.0, 1.0)
-    bounded = (own + t * change) * light - floor / len(made)
+    bounded = (reference + t * change) * light - floor / len(corrected)
     saturated = np.stack([f[inner[1:]] for f in full])
     level = np.asarray(clips, dtype=np.float32)[:, None, None]
     # what was clipped and still is looks as it did; a pixel amid white that is hardly darker stays white:
     # with the hue of the glow around the light it would be a dot
-    same = lost & np.all(~saturated | (made >= level), axis=0)
+    same = lost & np.all(~saturated | (corrected >= level), axis=0)
     amid = ndimage.minimum_filter(clipped, _AMID)[inner[1:]]
-    white = amid & (made.sum(axis=0) >= _STILL_WHITE * photo[inner].sum(axis=0))
-    kept = np.where(white & saturated, np.maximum(made, np.minimum(photo[inner], level)), made)
+    white = amid & (corrected.sum(axis=0) >= _STILL_WHITE * photo[inner].sum(axis=0))
+    kept = np.where(white & saturated, np.maximum(corrected, np.minimum(photo[inner], level)), corrected)
     return np.where(white | same | (t == 1.0), kept, bounded).astype(np.float32)
 
 
 def _shares(planes: Planes, floor: NDArray[np.float32] | np.float32) -> Planes:
-    """Each colour's share of the light; of light that drowns in the noise the same of all."""
+    """Each colour's share of the light; equal shares where the light drowns in noise."""
     positive = np.maximum(planes, np.float32(0.0))
     return np.asarray((positive + floor / len(planes)) / (positive.sum(axis=0) + floor), dtype=np.float32)
 

@@ -12,36 +12,38 @@ from scipy import ndimage
 from lensmodel.core.types import Planes
 
 _BEYOND: Final = 0.06
-"""Share of a clean step by which a result may leave its plateaus: half of what is seen as a halo, so that
-grain and the mixture of colours in the picture have the other half (chosen)."""
+"""Share of a clean step by which a result may leave its plateaus: half of what shows as a halo, which leaves
+the other half for grain and the mixture of colours in the picture (chosen)."""
 
 _UNSURE: Final = 0.1
-"""Error of a kernel below which more is allowed: what a sure one finds beside an edge was there (chosen)."""
+"""Error of a kernel below which more is allowed: what a certain one shows beside an edge was there
+(chosen)."""
 
 _UNEVEN: Final = 0.4
 """Spread of a plateau, as a share of the step, at which a whole step is allowed: noise and a slope change
-little at a third of it, and texture, which spreads over 0.7, is as good as free (chosen)."""
+little at a third of it, and texture, which spreads over 0.7, is practically free (chosen)."""
 
 _GAMMA: Final = 2.2
-"""Steps are compared as they are seen: a dark line that is next to nothing of the light is not overlooked."""
+"""Steps are compared as they are seen, by about the power of sRGB (IEC 61966-2-1), so that a dark line,
+hardly any of the light, is not overlooked."""
 
 _NEAREST, _FURTHEST = 6, 16
 """Least and greatest reach of the windows in which plateaus are looked for, pixels (chosen)."""
 
 _DENSE: Final = 8
-"""Reach of windows up to which each of their pixels is looked at, beyond it every second along a side: a blur
-so wide leaves no line between them."""
+"""Reach of windows up to which every pixel is used, beyond it every second along a side: a blur so wide
+leaves no line between them (chosen)."""
 
 _ENDS: Final = (0.03, 0.18)
 """Quantiles between which a plateau lies: what is rarer than the first is a speck. Either side of an edge
 half a blur away has more than the second, and a line that is narrower than its blur less (chosen)."""
 
 _AT_ONCE: Final = 4096
-"""Windows in memory."""
+"""Windows in memory at once (chosen, not measured)."""
 
 
 def plateau_reach(spread: int) -> int:
-    """Pixels that `plateaus_held` must see around a tile behind a blur that spreads light so far."""
+    """Margin in pixels around a tile that `plateaus_held` needs for a blur that spreads light so far."""
     return _window(spread) + 1
 
 
@@ -55,21 +57,21 @@ def plateaus_held(photo: Planes, restored: Planes, errors: Sequence[float], spre
 
     A kernel that is too wide gives an edge a halo. The photo's range within two pixels bounds that by the
     step or more; but where an edge steps from one even level to another, beyond the reach of the blur on
-    both sides, light between them is all that there was. With q the quantiles of a window of the photo as
+    both sides, there was only light between them. With q the quantiles of a window of the photo as
     seen (the power 1 / 2.2 of its light, a mean of 3 x 3 pixels against noise)::
 
         step = q82 - q18,    u = max( q18 - q3, q97 - q82 ) / step
         q3 - ( s + (u / 0.4)⁴ ) step  <=  x  <=  q97 + ( s + (u / 0.4)⁴ ) step
 
     Where there is a line, a corner or texture in the window, u is large and the bound is wide: what blur
-    hid there must come back. Where noise makes up for the step, too.
+    hid there must come back. So it is where noise is as large as the step.
 
     Parameters
     ----------
     photo : Planes, shape (channels, rows + 2 m, cols + 2 m)
         With m = `plateau_reach` pixels around.
     restored : Planes, shape (channels, rows, cols)
-        What was made of its middle.
+        The correction of its middle.
     errors : sequence of float
         Expected relative L2 errors of the kernels; 0 for no bound.
     spread : int
@@ -88,10 +90,10 @@ def plateaus_held(photo: Planes, restored: Planes, errors: Sequence[float], spre
     return held
 
 
-def _hold(photo: NDArray[np.floating], made: NDArray[np.float32], share: float, reach: int) -> None:
+def _hold(photo: NDArray[np.floating], corrected: NDArray[np.float32], share: float, reach: int) -> None:
     """Hold a plane, in place."""
     level = ndimage.uniform_filter(_as_seen(photo), 3, mode="nearest")
-    shown = _as_seen(made)
+    shown = _as_seen(corrected)
     margin = reach + 1
     inner = (slice(margin, -margin), slice(margin, -margin))
     low, high = (f(level, 2 * reach + 1)[inner] for f in (ndimage.minimum_filter, ndimage.maximum_filter))
@@ -102,9 +104,9 @@ def _hold(photo: NDArray[np.floating], made: NDArray[np.float32], share: float, 
     steps = np.arange(0, 2 * reach + 1, 1 if reach <= _DENSE else 2) + 1
     down, across = (grid.ravel()[:, None] for grid in np.meshgrid(steps, steps, indexing="ij"))
     for first in range(0, rows.size, _AT_ONCE):
-        here = rows[first : first + _AT_ONCE], cols[first : first + _AT_ONCE]
-        bottom, top = _bounds(level[here[0] + down, here[1] + across], np.float32(share))
-        made[here] = np.clip(made[here], bottom, top)
+        pixels = rows[first : first + _AT_ONCE], cols[first : first + _AT_ONCE]
+        bottom, top = _bounds(level[pixels[0] + down, pixels[1] + across], np.float32(share))
+        corrected[pixels] = np.clip(corrected[pixels], bottom, top)
 
 
 def _bounds(window: NDArray[np.float32], share: np.float32) -> tuple[NDArray[np.float32], ...]:

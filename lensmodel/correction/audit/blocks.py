@@ -1,7 +1,7 @@
-"""Sums over blocks of 8 pixels, and the way from a block's figure back to smooth pixels.
+"""Sums over blocks of 8 pixels, and the interpolation of block figures back to pixels.
 
-All of them are linear along rows and along columns, so that each is two products with small matrices that
-depend on the size of the tile only: a few percent of the time that strided sums take.
+All are linear along rows and along columns, so each is two products with small matrices that depend on the
+size of the tile only: a few percent of the time of strided sums.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from lensmodel.core.types import Plane
 Real = NDArray[np.float32]
 
 SIDE: Final = 8
-"""Side of a block in pixels: the period of JPEG, and small beside what an eye takes for one place."""
+"""Side of a block in pixels: that of a JPEG block (ITU-T T.81), and small beside what an eye takes for one
+place."""
 _WEIGHTS: Final = (1.0, 2.0, 3.0, 4.0, 5.0, 4.0, 3.0, 2.0, 1.0)
-"""Weights of the blocks around one, along rows and columns: a window of 9 blocks that fades out. A wrong
-kernel is wrong all around; patches of different sharpness would show, and fewer pixels tell less."""
+"""Weights of the blocks around one, along rows and columns: a window of 9 blocks that fades out (chosen).
+A wrong kernel is wrong all around; patches of different sharpness would show, and fewer pixels say less."""
 
 
 def sums(values: NDArray[np.floating] | NDArray[np.bool_]) -> Real:
@@ -40,7 +41,7 @@ def sums(values: NDArray[np.floating] | NDArray[np.bool_]) -> Real:
 
 
 def around(totals: Real) -> Real:
-    """Weighted sum over the 9 x 9 blocks around each; outside there is nothing, so that ratios stay right."""
+    """Weighted sum over the 9 x 9 blocks around each; zeros outside, so that ratios stay right."""
     rows, cols = totals.shape[-2:]
     return np.asarray(_near(rows) @ totals @ _near(cols))
 
@@ -101,6 +102,6 @@ def _between(extent: int, count: int, first: float, step: int) -> Real:
 
 
 def _fixed(matrix: NDArray[np.generic]) -> Real:
-    made = np.ascontiguousarray(matrix, dtype=np.float32)
-    made.setflags(write=False)
-    return made
+    fixed = np.ascontiguousarray(matrix, dtype=np.float32)
+    fixed.setflags(write=False)
+    return fixed

@@ -1,4 +1,4 @@
-"""What the checks are given, and what comes out of them."""
+"""Inputs and results of the checks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lensmodel.correction.audit.engine import Engine, compiled
 from lensmodel.correction.blur import UniformBlur
 
 LEAST_VARIANCE: Final = 1e-12
-"""Variance that even black without read noise is given."""
+"""Least variance, given even to black without read noise: keeps divisions finite."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,11 +27,11 @@ class Evidence:
     Parameters
     ----------
     noise : sequence of NoiseModel
-        One per channel; of what was measured where `measured` says so, else of every pixel.
+        One per channel; that of the measured pixels if `measured` is given, else of every pixel.
     clip : sequence of float
-        Level per channel from which on a value of the photo is only a lower bound.
+        Level per channel at and above which a value of the photo is only a lower bound.
     blurs : sequence of UniformBlur or None
-        PSF of each channel, lateral shift included; None where it is not known, and nothing is re-blurred.
+        PSF of each channel, lateral shift included; None if unknown, and nothing is re-blurred.
     psf_errors : sequence of float
         Expected relative L2 error of each PSF.
     measured : sequence of (ndarray of bool or None)
@@ -59,7 +59,7 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """A tile of a photo and what was made of it, with what several checks need.
+    """A tile of a photo and its correction, with what several checks need.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class Pair:
     loops : module or None
         `lensmodel.correction.audit.compiled`, or None for NumPy.
     memo : dict
-        What one check made and another may use.
+        Results of one check that another may use.
     """
 
     original: Planes
@@ -89,12 +89,12 @@ class Pair:
     def of(cls, original: Planes, corrected: Planes, evidence: Evidence, *, engine: Engine = "auto") -> Pair:
         """Check that the planes belong together.
 
-        Light beyond the level at which the photo clips is written as that level: it is judged so too.
+        Light above the photo's clipping level is written as that level, so it is also judged as that.
 
         Raises
         ------
         InvalidInputError
-            If they are no three planes of one size.
+            If they are not three planes of one size.
         """
         if original.shape != corrected.shape or original.ndim != 3 or original.shape[0] != len(CHANNELS):
             raise InvalidInputError(
@@ -109,19 +109,23 @@ class Pair:
             np.sqrt(np.maximum(n.variance(y), LEAST_VARIANCE))
             for n, y in zip(evidence.noise, original, strict=True)
         ]
-        made = np.minimum(corrected, top)
+        written = np.minimum(corrected, top)
         third = np.float32(1.0 / 3.0)
-        luma = np.stack([(p[0] + p[1] + p[2]) * third for p in (original, made)])
-        return cls(original, made, np.asarray(sigma, dtype=np.float32), evidence, luma)
+        luma = np.stack([(p[0] + p[1] + p[2]) * third for p in (original, written)])
+        return cls(original, written, np.asarray(sigma, dtype=np.float32), evidence, luma)
 
     @classmethod
     def _compiled(cls, original: Planes, corrected: Planes, evidence: Evidence, loops: ModuleType) -> Pair:
         y, x = (np.ascontiguousarray(p, dtype=np.float32) for p in (original, corrected))
-        made, sigma, luma = np.empty_like(y), np.empty_like(y), np.empty((2, *y.shape[1:]), dtype=np.float32)
+        written, sigma, luma = (
+            np.empty_like(y),
+            np.empty_like(y),
+            np.empty((2, *y.shape[1:]), dtype=np.float32),
+        )
         noise = np.array([[n.shot, n.read] for n in evidence.noise])
         clip, luma_sigma = np.asarray(evidence.clip, dtype=np.float32), np.empty_like(luma[0])
-        loops.prepared(y, x, clip, noise, LEAST_VARIANCE, made, sigma, luma, luma_sigma)
-        pair = cls(y, made, sigma, evidence, luma, loops)
+        loops.prepared(y, x, clip, noise, LEAST_VARIANCE, written, sigma, luma, luma_sigma)
+        pair = cls(y, written, sigma, evidence, luma, loops)
         pair.memo["luma_sigma"] = luma_sigma
         return pair
 
@@ -141,7 +145,7 @@ class Pair:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Severity:
-    """How many times what is allowed a check found, on a grid of places; 1 and less is in order.
+    """How many times its limit a check found, on a grid of places; 1 and less is fine.
 
     Parameters
     ----------
@@ -164,7 +168,7 @@ class Severity:
 
     @classmethod
     def of_blocks(cls, values: NDArray[np.float32]) -> Severity:
-        """Figures of `blocks`, which stand in their middles."""
+        """Figures of `blocks`, each at the middle of its block."""
         return cls(values, blocks.SIDE, (blocks.SIDE - 1) / 2.0)
 
     def part(self, inner: tuple[slice, slice], shape: tuple[int, int]) -> tuple[slice, slice]:
@@ -191,7 +195,7 @@ class Finding:
     area : float
         Share of the pixels of which it would hold back more than a half.
     worst : float
-        The largest multiple of what is allowed.
+        The largest multiple of the limit.
     at : tuple of int
         Pixel `(row, col)` of the tile where that is.
     """
@@ -227,11 +231,11 @@ class TileAudit:
         return cls(keep, findings, float(1.0 - keep.mean(dtype=np.float64)))
 
     def without_map(self) -> TileAudit:
-        """Return the figures alone, for a report: the maps of a whole photo are as large as a plane of it."""
+        """Return the figures alone, for a report: the maps of all tiles are as large as a photo's plane."""
         return replace(self, keep=np.zeros((0, 0), dtype=np.float32))
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Names of the checks that held something back, the one that held back most first."""
+        """Names of the checks that held something back, the strictest first."""
         at_fault = [finding for finding in self.findings if finding.held_back > 0.0]
         return tuple(f.check for f in sorted(at_fault, key=lambda f: -f.held_back))

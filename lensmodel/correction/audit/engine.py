@@ -1,4 +1,4 @@
-"""Which loops audit: compiled ones where Numba and rocket-fft are installed, NumPy and SciPy elsewhere."""
+"""Which loops audit: compiled ones if Numba and rocket-fft are installed, else NumPy and SciPy."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _loading = threading.Lock()
 
 
 def compiled(engine: Engine) -> ModuleType | None:
-    """Return the compiled loops, or None where NumPy shall do or something is not installed."""
+    """Return the compiled loops, or None where NumPy is wanted or something is not installed."""
     if engine == "numpy":
         return None
     with _loading:  # threads that all start at once must not compile the same loop twice

@@ -1,4 +1,4 @@
-"""What the audit found in a whole photo, by zone of the field."""
+"""Findings of the audit in a whole photo, by zone of the field."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from lensmodel.core.types import ZONES, Zone
 from lensmodel.correction.audit.check import TileAudit
 
 HELD: Final = 0.1
-"""Share held back from which on a tile counts as held back."""
+"""Share of a correction; a tile of which more was held back counts as held back (chosen, not measured)."""
 MAPPED: Final = 0.01
-"""Share held back from which on a tile is on the map: less is not seen (chosen)."""
+"""Least share held back at which a tile is on the map: less is not seen (chosen)."""
 PLACES: Final = 12
-"""Worst places that are named."""
+"""Number of worst places to name (chosen)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class Place:
     zone : {"center", "mid", "corner"}
         Zone of the tile.
     severity : float
-        Multiple of what is allowed, above 1.
+        Multiple of the limit, above 1.
     held_back : float
         Mean share of the correction that the check alone holds back in its tile.
     """
@@ -67,7 +67,7 @@ class ZoneAudit:
     held_back : float
         Mean share of the correction that was held back, 0 to 1.
     checks : Mapping[str, float]
-        The same by check, each as if it were alone; those that held nothing back are left out.
+        The same by check, each as if alone; those that held nothing back are left out.
     """
 
     tiles: int
@@ -117,9 +117,9 @@ def pooled(audits: Iterable[tuple[Zone, tuple[int, int], TileAudit]], tile_side:
     listed = list(audits)
     zones: dict[Zone, ZoneAudit] = {}
     for zone in ZONES:
-        own = [audit for name, _, audit in listed if name == zone]
-        if own:
-            zones[zone] = _zone(own)
+        in_zone = [audit for name, _, audit in listed if name == zone]
+        if in_zone:
+            zones[zone] = _zone(in_zone)
     places = [
         Place(f.check, top + f.at[0], left + f.at[1], zone, f.worst, f.held_back)
         for zone, (top, left), audit in listed

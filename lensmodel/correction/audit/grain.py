@@ -13,21 +13,21 @@ from lensmodel.correction.audit.check import Pair, Severity
 from lensmodel.correction.audit.tolerances import LIMITS
 
 _CALM: Final = 1.5
-"""Standard deviation of a block over the noise's up to which it is flat: as `lensmodel.correction.limits`."""
+"""Standard deviation of a block over that of the noise, up to which it is flat (chosen, not measured)."""
 _SCALES: Final = (1, 2)
-"""Distances of the second differences: grain of a period of 2 pixels and of 4."""
+"""Distances of the second differences in pixels: grain of a period of 2 pixels and of 4."""
 
 
 def amplified(pair: Pair) -> Severity:
     """Severity of more grain in flat places than the photo has there: root of the ratio of powers.
 
-    Less is no fault of this kind: what a correction's own settings keep of it is up to the photographer.
+    Less grain is no fault of this kind: how much to keep is a setting of the photographer's.
     """
     noise, light, square, *detail = _sums(pair)
-    own = square - np.square(light) / np.float32(blocks.SIDE**2)
-    flat = (own < np.float32(_CALM**2) * noise).astype(np.float32)
+    energy = square - np.square(light) / np.float32(blocks.SIDE**2)
+    flat = (energy < np.float32(_CALM**2) * noise).astype(np.float32)
     worst: NDArray[np.float32] = np.zeros(noise.shape, dtype=np.float32)
-    # what rounding left without noise counts as if it had the noise that was stated
+    # places that rounding left without noise count as if they had the stated noise
     least = np.maximum(blocks.around(flat * noise), np.float32(1e-12))
     for scale in range(len(_SCALES)):
         was, now = (blocks.around(flat * sums) for sums in detail[2 * scale : 2 * scale + 2])

@@ -1,4 +1,4 @@
-"""Hue: no colour that is not in the neighbourhood."""
+"""Hue: no colour that the neighbourhood does not have."""
 
 from __future__ import annotations
 
@@ -12,14 +12,17 @@ from lensmodel.correction.audit import blocks, nearby
 from lensmodel.correction.audit.check import Pair, Severity
 from lensmodel.correction.audit.tolerances import limit
 
-_SIDE: Final = 7
-_LEAST: Final = 0.02
+_SIDE: Final = 7  # of the neighbourhood in pixels (chosen, not measured)
+_LEAST: Final = 0.02  # range of colours that every neighbourhood is given (chosen, not measured)
+# What a colour may leave the range nearby by: so much, and so many times the range (chosen, not measured)
 _FREE, _SHARE = 0.25, 2.0
 _WHITE, _BESIDE = 0.95, 5
-"""Share of saturation from which on light is white, and side of the square around it that is beside it."""
+"""Share of saturation at and above which light is white, and side in pixels of the square around it that is
+beside it (chosen, not measured)."""
 _FREE_WHITE, _SHARE_WHITE = 0.04, 0.5
-"""Chosen: a fifth of one colour of white away is -0.07, what the limit of 1.8 leaves free."""
-_NOISE: Final = 4.0  # standard deviations (chosen): noise alone passes them once in 16,000
+"""The same beside white. Chosen: a fifth of one colour of white missing is -0.07, which a limit of 1.8
+allows."""
+_NOISE: Final = 4.0  # standard deviations (chosen): noise alone exceeds them once in 16,000
 _FLOOR: Final = 12.0  # standard deviations of light below which hue is noise (chosen)
 
 
@@ -27,8 +30,8 @@ def foreign_spots(pair: Pair) -> Severity:
     """Severity of single colours beyond those that the photo shows within 3 pixels.
 
     Colour is (r - g) / (r + g + b) and (b - g) / (r + g + b) of the photo smoothed over 3 x 3 pixels, where
-    noise adds to the light, so that what is dark has no colour to speak of. Beside white, where all colours
-    are saturated, less is free: one that falls alone is seen at once.
+    noise adds to the light, so that dark places have hardly any colour. Beside white, where all colours
+    are saturated, less is allowed: a colour that falls alone is seen at once.
     """
     if pair.loops is not None:
         return Severity(
@@ -46,7 +49,7 @@ def foreign_spots(pair: Pair) -> Severity:
 
 
 def foreign_area(pair: Pair) -> Severity:
-    """Severity of colours beyond those of the photo over an area, in the measure of their range there."""
+    """Severity of colours beyond those of the photo over an area, relative to their range there."""
     if pair.loops is not None:
         return Severity.of_blocks(
             _compiled(pair, pair.loops)[1] / np.float32(limit("hue, area", mosaic=pair.evidence.mosaic))
@@ -69,7 +72,7 @@ def _beside_white(pair: Pair) -> NDArray[np.bool_]:
 
 
 def _compiled(pair: Pair, loops: ModuleType) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Figures of both checks before their limits, of pixels and of blocks; made once."""
+    """Figures of both checks before their limits, of pixels and of blocks; computed once."""
     if "hue" not in pair.memo:
         spots, sums = np.empty(pair.shape, dtype=np.float32), blocks.empty(4, pair.shape)
         limits = np.array([_FREE, _SHARE, _FREE_WHITE, _SHARE_WHITE, _NOISE, _FLOOR], dtype=np.float32)
@@ -85,20 +88,20 @@ def _compiled(pair: Pair, loops: ModuleType) -> tuple[NDArray[np.float32], NDArr
 
 
 def _colours(pair: Pair) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-    """How far each of two colours lies beyond its range in the photo, and that range; made once."""
+    """How far each of two colours lies beyond its range in the photo, and that range; computed once."""
     if "colours" not in pair.memo:
         sigma = (pair.sigma[0] + pair.sigma[1] + pair.sigma[2]) * np.float32(1.0 / 3.0)
         calm = nearby.mean(pair.original, 3)
         floor = np.float32(_FLOOR) * sigma
-        light, made = (
+        light_before, light_after = (
             np.maximum(p[0], 0.0) + np.maximum(p[1], 0.0) + np.maximum(p[2], 0.0) + floor
             for p in (calm, pair.corrected)
         )
-        before = np.stack([calm[0] - calm[1], calm[2] - calm[1]]) / light
+        before = np.stack([calm[0] - calm[1], calm[2] - calm[1]]) / light_before
         x = pair.corrected
-        after = np.stack([x[0] - x[1], x[2] - x[1]]) / made
+        after = np.stack([x[0] - x[1], x[2] - x[1]]) / light_after
         low, high = nearby.lowest(before, _SIDE), nearby.highest(before, _SIDE)
-        beyond = np.maximum(after - high, low - after) - np.float32(_NOISE) * sigma / made
+        beyond = np.maximum(after - high, low - after) - np.float32(_NOISE) * sigma / light_after
         pair.memo["colours"] = list(zip(np.maximum(beyond, np.float32(0.0)), high - low, strict=True))
     colours: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = pair.memo["colours"]
     return colours

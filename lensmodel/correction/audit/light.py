@@ -18,25 +18,26 @@ _NEAR: Final = 9
 lens's point falls within 4 pixels."""
 _SURE: Final = 4.0
 _SPIKE: Final = 12.0
-"""Standard deviations of noise that a value may move, and a pixel stand out, without a reason."""
+"""Standard deviations of noise by which a value may move, and a pixel stand out, in any case (chosen, not
+measured)."""
 _ROOM: Final = 1.25
-"""Room for the parts of a pixel by which a point lies beside its middle."""
+"""Factor for points that lie a part of a pixel beside the middle of theirs (chosen, not measured)."""
 _USUAL_GAIN: Final = 8.0
-"""Gain of a point behind a PSF of a standard deviation of 1 pixel, and the largest that is believed."""
+"""Gain of a point behind a PSF with a standard deviation of 1 pixel, and the largest gain to assume."""
 _NOTHING: Final = 2.0
-"""Standard deviations of noise that light may lie below nothing: half as many, since an estimate of black
-knows its bound."""
+"""Standard deviations of noise by which light may lie below zero: half as many as in `_SURE`, since an
+estimate of black knows its bound."""
 _POSSIBLE, _IMPOSSIBLE = 0.25, 3.0
-"""Weights of light below the photo's darkest and of light below nothing. No scene has the latter, while dark
-lines finer than the PSF are darker than all that the photo shows: with a weight of 1, pictures of slats and
-girders would need a limit 1.7 times that of others, with a quarter 1.1 times."""
+"""Weights of light below the photo's darkest and of light below zero. No scene has the latter, while dark
+lines finer than the PSF are darker than anything that the photo shows: with a weight of 1, pictures of slats
+and girders would need a limit 1.7 times that of others, with a quarter 1.1 times."""
 
 
 def too_dark(pair: Pair) -> Severity:
-    """Severity of light below the photo's darkest within 4 pixels, and below nothing.
+    """Severity of light below the photo's darkest within 4 pixels, and below zero.
 
-    A correction that takes the lens for worse than it is subtracts more light beside every edge than there
-    was. How much of what it changed is of this kind, with m the least y around::
+    A correction that assumes a worse lens subtracts more light beside every edge than there was. The share
+    of its change that is of this kind is, with m the least y nearby::
 
         s² = sum ( max(m - x - 4 sigma, 0)² / 4 + 3 max(-x - 2 sigma, 0)² ) / sum ( (x - y)² + sigma² )
     """
@@ -57,7 +58,7 @@ def too_dark(pair: Pair) -> Severity:
 def too_bright(pair: Pair) -> Severity:
     """Severity of light above the photo's brightest within 4 pixels, as a share of what was changed.
 
-    Details narrower than the PSF rise above it with good reason, so that more is allowed than below.
+    Details narrower than the PSF rightly rise above it, so more is allowed than below.
     """
     if pair.loops is not None:
         return _ratio(
@@ -71,7 +72,7 @@ def too_bright(pair: Pair) -> Severity:
 
 
 def _share(pair: Pair, power: NDArray[np.float32], allowed: float) -> Severity:
-    """Root of the share that something has in what was changed around each pixel, over a limit."""
+    """Root of the share of a power in that of the change around each pixel, over a limit."""
     if "change" not in pair.memo:
         change = np.square(pair.corrected - pair.original) + np.square(pair.sigma)
         pair.memo["change"] = blocks.windows(change).sum(axis=0)
@@ -83,7 +84,7 @@ def _ratio(part: NDArray[np.float32], whole: NDArray[np.float32], allowed: float
 
 
 def _compiled(pair: Pair, loops: ModuleType) -> NDArray[np.float32]:
-    """What is too dark, too bright and changed, around each block; made once."""
+    """What is too dark, too bright and changed, around each block; computed once."""
     if "light" not in pair.memo:
         sums = blocks.empty(3, pair.shape)
         sure, weights = (_SURE, _NOTHING), (_POSSIBLE, _IMPOSSIBLE)
@@ -93,11 +94,11 @@ def _compiled(pair: Pair, loops: ModuleType) -> NDArray[np.float32]:
 
 
 def isolated(pair: Pair) -> Severity:
-    """Severity of single pixels that stand out of their neighbours and not in the photo.
+    """Severity of single pixels that stand out of their neighbours, but do not in the photo.
 
     A point of light I stands out of the mean of the 5 x 5 pixels around it by (k_0 - mean k) I in the photo,
-    with k the PSF. So what a pixel stands out of its 8 neighbours is held against what the photo does there
-    over that share, and 12 times the noise, which a correction may have amplified.
+    with k the PSF. So how far a pixel stands out of its 8 neighbours is compared with how far the photo does
+    there, over that share, and with 12 times the noise, which a correction may have amplified.
     """
     gains = np.array([_point_gain(pair, c) for c in range(len(CHANNELS))], dtype=np.float32)
     if pair.loops is not None:

@@ -1,4 +1,4 @@
-"""Re-blur: the result, blurred again, has to be the photo but for its noise."""
+"""Re-blur: the result, blurred again, must equal the photo except for its noise."""
 
 from __future__ import annotations
 
@@ -17,18 +17,19 @@ from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.blur.uniform import fast_shape
 
 _COARSE: Final = 0.5
-"""Weight of what is left in the means over blocks: there are fewer of them, so that chance plays more."""
+"""Weight of the means of the residual over blocks: they are fewer, so chance plays a larger part (chosen)."""
 MODEL_ERROR: Final = 0.1
-"""Share of what the blur changes that may be left on top of the noise: PSFs change within a tile, and
-a prior gives way at edges."""
+"""Share of what the blur changes that may remain on top of the noise: PSFs change within a tile, and a prior
+gives way at edges (chosen)."""
 _CLIPPED: Final = 0.98
+"""Share of the clipping level at and above which a pixel counts as clipped (chosen, not measured)."""
 _GLOW: Final = 0.005
-"""Share of its light that a clipped pixel sends to another from which on that tells nothing: the file holds
-no more than white of a lamp, and a lamp is up to some hundred times brighter (chosen)."""
+"""Share of the light of a clipped pixel; a pixel that receives more of it does not count: of a lamp the file
+holds no more than white, and a lamp is up to a hundred times brighter or so (chosen)."""
 
 
 def misfit(pair: Pair) -> Severity:
-    """Severity of what is left of the photo y after the blurred result is taken off.
+    """Severity of the residual of the photo y less the blurred result.
 
     With k the PSF, whose relative error is e, and x the result::
 
@@ -36,18 +37,18 @@ def misfit(pair: Pair) -> Severity:
 
     where the photo was measured and did not clip. Two figures of it are judged around each place: the root
     mean square, and that of the means over blocks, which is as small only if r is white. Without PSFs
-    nothing can be said: zero everywhere.
+    it is zero everywhere.
     """
     evidence = pair.evidence
     if evidence.blurs is None:
         return Severity.none()
     worst: NDArray[np.float32] = np.zeros((1, 1), dtype=np.float32)
     for c, blur in enumerate(evidence.blurs):
-        square, left, number = _sums(pair, c, blur)
+        square, total, number = _sums(pair, c, blur)
         number = np.maximum(number, np.float32(1.0))
         count = np.maximum(blocks.around(number), np.float32(1.0))
         fine = np.sqrt(blocks.around(square) / count)
-        means = np.square(left) / number
+        means = np.square(total) / number
         coarse = np.sqrt(blocks.around(means.astype(np.float32)) / blocks.around(np.ones_like(number)))
         figures = np.maximum(fine, np.float32(_COARSE) * coarse)
         worst = np.maximum(worst, figures)
@@ -65,10 +66,10 @@ def _sums(pair: Pair, channel: int, blur: UniformBlur) -> NDArray[np.float32]:
         spectrum = _transfer(blur, shape, pair.loops)
         pair.loops.left_over(y, x, sigma, spectrum, shape[1], error, counted, blocks.SIDE, sums)
         return sums
-    again = reblurred(x, blur)
-    left = (y - again) / np.sqrt(np.square(sigma) + np.square(np.float32(error) * (x - again)))
-    left = np.where(counted, left, np.float32(0.0))
-    return np.stack([blocks.sums(values) for values in (np.square(left), left, counted)])
+    blurred = reblurred(x, blur)
+    residual = (y - blurred) / np.sqrt(np.square(sigma) + np.square(np.float32(error) * (x - blurred)))
+    residual = np.where(counted, residual, np.float32(0.0))
+    return np.stack([blocks.sums(values) for values in (np.square(residual), residual, counted)])
 
 
 def _grid(shape: tuple[int, ...], blur: UniformBlur) -> tuple[int, int]:
@@ -86,7 +87,7 @@ def _transfer(blur: UniformBlur, shape: tuple[int, int], loops: ModuleType) -> N
 
 
 def reblurred(plane: Plane, blur: UniformBlur) -> Plane:
-    """Blur a plane as if it went on at its other side: right but for a rim as wide as the blur reaches."""
+    """Blur a plane periodically: correct except for a rim as wide as the reach of the blur."""
     shape = _grid(plane.shape, blur)
     if blur.offset == (0.0, 0.0):
         kernel = np.zeros(shape, dtype=np.float32)

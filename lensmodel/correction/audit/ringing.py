@@ -11,7 +11,7 @@ from lensmodel.correction.audit import blocks, nearby
 from lensmodel.correction.audit.check import Pair, Severity
 from lensmodel.correction.audit.tolerances import LIMITS
 
-# Sides in pixels: of a place that should be flat, and of where its edge may lie (chosen)
+# Sides in pixels of a place that should be flat, and of the window in which its edge may lie (chosen)
 _SMALL, _WIDE = 5, 15
 _FLAT: Final = 0.08  # share of the step nearby up to which a place passes for flat (chosen)
 # Standard deviations between the extremes of 25 pixels of noise, with some to spare (chosen)
@@ -31,9 +31,9 @@ def swing(pair: Pair) -> Severity:
         pair.loops.flat_waves(y, x, sigma, (_SMALL // 2, _WIDE // 2), limits, blocks.SIDE, sums)
         return _severity(*blocks.around(sums))
     step = nearby.highest(y, _WIDE) - nearby.lowest(y, _WIDE)
-    own = nearby.highest(y, _SMALL) - nearby.lowest(y, _SMALL)
+    photo_range = nearby.highest(y, _SMALL) - nearby.lowest(y, _SMALL)
     wave = nearby.highest(x, _SMALL) - nearby.lowest(x, _SMALL)
-    flat = (own <= np.float32(_NOISE) * sigma + np.float32(_FLAT) * step) & (
+    flat = (photo_range <= np.float32(_NOISE) * sigma + np.float32(_FLAT) * step) & (
         step > np.float32(_STRONG) * sigma
     )
     part = blocks.windows(flat * np.square(wave))

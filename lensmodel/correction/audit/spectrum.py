@@ -20,20 +20,20 @@ SLOPE: Final = 2.2
 categories", Network 14, 2003: 1.9 to 2.6 by category."""
 
 SIDE, HOP = 32, 16
-"""Side of the windows in pixels, and the way from one to the next, so that each pixel lies in four."""
+"""Side of the windows in pixels, and the step between them, so that each pixel lies in four (chosen)."""
 _LOW: Final = (0.05, 0.11)
 _HIGHER: Final = ((0.18, 0.28), (0.3, 0.45))
-"""Bands in cycles/pixel. Lenses leave the first alone; it holds 2 to 3 periods of a window."""
+"""Bands in cycles/pixel (chosen). Lenses leave the first alone; it holds 2 to 3 periods of a window."""
 _LIMIT: Final = 0.29
-"""Frequency along an axis beyond which lines are looked for: periods below 3.5 pixels."""
+"""Frequency along an axis beyond which to look for lines, cycles/pixel: periods below 3.5 pixels (chosen)."""
 _SHARES: Final = tuple(np.float32((sum(band) / sum(_LOW)) ** -SLOPE) for band in _HIGHER)
-"""Power that is foretold in each of the higher ones, over that in the low one."""
+"""Power predicted in each of the higher bands, over that in the low one."""
 _SECTORS: Final = 4  # directions: along, across and both diagonals
 _NOISE: Final = 4.0  # times the noise's power, below which no slope is seen (chosen)
 
 
 def overcorrected(pair: Pair) -> Severity:
-    """Severity of power at higher frequencies beyond what the photo's lower ones foretell, by direction.
+    """Severity of power at higher frequencies beyond what the photo's lower ones predict, by direction.
 
     With the power Y of the photo, X of the result and n of the noise in windows of 32 pixels::
 
@@ -52,10 +52,10 @@ def overcorrected(pair: Pair) -> Severity:
 
 
 def comb(pair: Pair) -> Severity:
-    """Severity of lines near the limit of the grid that the photo has not.
+    """Severity of lines near the limit of the grid that the photo does not have.
 
     A line is a frequency that stands out of the geometric mean of its band, to which a few lines add
-    little; as far as it does so in the photo, it belongs to the scene.
+    little; to the extent that it does so in the photo, it belongs to the scene.
     """
     return _severity(_powers(pair).line, LIMITS["comb"])
 
@@ -81,7 +81,7 @@ class _Powers:
 
 
 def _powers(pair: Pair) -> _Powers:
-    """Powers of a pair, made once."""
+    """Powers of a pair, computed once."""
     if "powers" not in pair.memo:
         variance = blocks.sums(np.square(pair.luma_sigma))
         level = blocks.to_pixels(variance, pair.shape, first=(blocks.SIDE - 1) / 2.0, step=blocks.SIDE)
@@ -107,14 +107,14 @@ def _measured(pair: Pair, noise: NDArray[np.float32]) -> _Powers:
         for power in (was, now)
     ]
     before, after = was[..., edge], now[..., edge]
-    own = before / _level(before + noise[..., None])
-    made = after / _level(after + noise[..., None])
-    line = (made / np.maximum(own, np.float32(1.0))).max(axis=-1)
+    line_before = before / _level(before + noise[..., None])
+    line_after = after / _level(after + noise[..., None])
+    line = (line_after / np.maximum(line_before, np.float32(1.0))).max(axis=-1)
     return _Powers(means[0], means[1], noise, line)
 
 
 def _around(figures: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Sum over the 3 x 3 windows around each, the near ones twice: some 64 pixels, as wide as `blocks`'."""
+    """Sum over the 3 x 3 windows around each, the near ones twice: about 64 pixels, as wide as `blocks`'."""
     wide = np.pad(figures, [(0, 0)] * (figures.ndim - 2) + [(1, 1), (1, 1)])
     down = wide[..., :-2, :] + np.float32(2.0) * wide[..., 1:-1, :] + wide[..., 2:, :]
     return np.asarray(down[..., :-2] + np.float32(2.0) * down[..., 1:-1] + down[..., 2:])
@@ -136,12 +136,12 @@ def _power(plane: Plane) -> NDArray[np.float32]:
 
 
 def _beyond(extent: int) -> int:
-    """Pixels that are missing to whole windows."""
+    """Pixels missing to make whole windows."""
     return max(SIDE - extent, (SIDE - extent) % HOP)
 
 
 def _whole_windows(planes: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Planes on which windows end with the rim; what is missing is mirrored."""
+    """Planes whose last windows end at the rim; missing pixels are mirrored."""
     pads = [(0, _beyond(extent)) for extent in planes.shape[1:]]
     return np.pad(planes, [(0, 0), *pads], mode="symmetric") if any(after for _, after in pads) else planes
 

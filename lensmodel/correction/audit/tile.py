@@ -1,4 +1,4 @@
-"""The audit of one tile: every check, one smooth map of what is kept."""
+"""The audit of one tile: every check, and one smooth map of what is kept."""
 
 from __future__ import annotations
 
@@ -41,10 +41,11 @@ CHECKS: Final[Mapping[str, Check]] = MappingProxyType(
 """Every check by name."""
 
 _SOFTNESS: Final = 1.0
-"""Standard deviation in pixels of what makes the map smooth: a fault of one pixel leaves no edge."""
+"""Standard deviation in pixels of the Gaussian that smooths the map: a fault of one pixel leaves no edge
+(chosen)."""
 GROWN: Final = 5
-"""Side of the square over which the least that is kept spreads before: wide enough that of a faulty pixel
-itself nothing comes back when the map is smoothed."""
+"""Side in pixels of the square over which the least share kept spreads first: wide enough that smoothing
+restores nothing of a faulty pixel itself."""
 
 Inner: TypeAlias = tuple[slice, slice]
 
@@ -59,20 +60,20 @@ def audit_tile(
 ) -> TileAudit:
     """Audit the correction of a tile.
 
-    A check's severity s says how many times what is allowed was found: of a correction that is in order,
-    s <= 1, all is kept, of one twice beyond nothing, and 2 - s between.
+    A check's severity s is the multiple of its limit: of a correction within it, s <= 1, all is kept, from
+    s = 2 on nothing, and 2 - s between.
 
     Parameters
     ----------
     original, corrected : Planes, shape (3, rows, cols)
-        Linear light, saturation 1, with the pixels around if there are any: the more, the surer the
+        Linear light, saturation 1, with surrounding pixels if there are any: the more, the surer the
         verdict on the rim.
     evidence : Evidence
-        What is known besides.
+        What else is known.
     inner : tuple of slice or None
         The part that is judged; the rest is context. None for all.
     engine : {"auto", "numpy"}
-        Compiled loops where they can be had, or NumPy and SciPy: figures differ by rounding.
+        Compiled loops where available, or NumPy and SciPy: figures differ by rounding.
 
     Returns
     -------
@@ -116,7 +117,7 @@ def held_back(
     Returns
     -------
     planes : Planes, shape (3, rows, cols) of the inner part
-        original + keep (corrected - original); where all is kept, the very values of the correction.
+        original + keep (corrected - original); where all is kept, exactly the correction.
     audit : TileAudit
         Why.
     """
@@ -129,7 +130,7 @@ def held_back(
 
 
 def softened(keep: Plane) -> Plane:
-    """Spread the least that is kept over its neighbours and smooth it, so that it ends nowhere at once."""
+    """Spread the least share kept over its neighbours and smooth it, so that it changes nowhere abruptly."""
     grown = nearby.lowest(keep, GROWN)
     return np.clip(ndimage.gaussian_filter(grown, _SOFTNESS, mode="nearest"), 0.0, 1.0)
 

@@ -17,8 +17,8 @@ from lensmodel.correction.audit.tile import audit_tile
 
 TILE: Final = 192
 HALO: Final = 48
-"""Side of a tile in pixels and what is seen around it. Both are multiples of the step of the checks'
-windows, so that neighbouring tiles see the same windows and no seam shows."""
+"""Side of a tile in pixels, and the margin seen around it. Both are multiples of the step of the checks'
+windows, so that neighbouring tiles see the same windows and no seam shows (chosen)."""
 
 Window: TypeAlias = tuple[slice, slice]
 EvidenceAt: TypeAlias = Callable[[FieldPosition, Window], Evidence]
@@ -48,7 +48,7 @@ class PhotoAudit:
 def audit_photo(
     original: Planes, corrected: Planes, evidence: EvidenceAt, *, on_step: StepHook = ignore_step
 ) -> PhotoAudit:
-    """Audit what any program made of a photo.
+    """Audit any program's correction of a photo.
 
     Parameters
     ----------

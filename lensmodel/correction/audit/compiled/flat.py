@@ -18,21 +18,21 @@ def flat_waves(
     """
     rows, cols = y.shape
     noise, share, strong = limits
-    wide = (np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32))
-    own = (np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32))
-    made = (np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32))
-    extremes(y, reaches[1], wide[0], wide[1])
-    extremes(y, reaches[0], own[0], own[1])
-    extremes(x, reaches[0], made[0], made[1])
+    edge_extremes = (np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32))
+    photo_extremes = (np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32))
+    result_extremes = (np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32))
+    extremes(y, reaches[1], edge_extremes[0], edge_extremes[1])
+    extremes(y, reaches[0], photo_extremes[0], photo_extremes[1])
+    extremes(x, reaches[0], result_extremes[0], result_extremes[1])
     strip = np.empty((3, cols), np.float32)
     out[:] = np.float32(0.0)
     for block in range(out.shape[1]):
         strip[:] = np.float32(0.0)
         for i in range(block * side, min(block * side + side, rows)):
             for j in range(cols):
-                step = wide[1][i, j] - wide[0][i, j]
-                swing = own[1][i, j] - own[0][i, j]
-                wave = made[1][i, j] - made[0][i, j]
+                step = edge_extremes[1][i, j] - edge_extremes[0][i, j]
+                swing = photo_extremes[1][i, j] - photo_extremes[0][i, j]
+                wave = result_extremes[1][i, j] - result_extremes[0][i, j]
                 grain = sigma[i, j]
                 flat = np.float32((swing <= noise * grain + share * step) & (step > strong * grain))
                 strip[0, j] += flat * wave * wave

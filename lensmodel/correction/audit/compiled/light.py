@@ -21,7 +21,7 @@ def light(
 ) -> None:
     """Sums over blocks of `side` pixels of what is too dark, too bright, and changed: three planes.
 
-    `sure` and `weights` are for light beyond the photo's and for light below nothing.
+    `sure` and `weights` are for light beyond the photo's and for light below zero.
     """
     zero = np.float32(0.0)
     rows, cols = y.shape[1:]
@@ -36,11 +36,11 @@ def light(
             strip[:] = zero
             for i in range(block * side, min(block * side + side, rows)):
                 for j in range(cols):
-                    noise, made = sigma[c, i, j], x[c, i, j]
-                    below = max(low[i, j] - made - free * noise, zero)
-                    nothing = max(-made - free_below * noise, zero)
-                    beyond = max(made - high[i, j] - free * noise, zero)
-                    change = made - y[c, i, j]
+                    noise, result = sigma[c, i, j], x[c, i, j]
+                    below = max(low[i, j] - result - free * noise, zero)
+                    nothing = max(-result - free_below * noise, zero)
+                    beyond = max(result - high[i, j] - free * noise, zero)
+                    change = result - y[c, i, j]
                     strip[0, j] += possible * below * below + impossible * nothing * nothing
                     strip[1, j] += beyond * beyond
                     strip[2, j] += change * change + noise * noise
@@ -55,7 +55,7 @@ def isolated(y: Real, x: Real, sigma: Real, gains: Real, free: float, worst: Rea
     column = np.empty(cols + 4, np.float32)
     low, high = np.empty(cols + 2, np.float32), np.empty(cols + 2, np.float32)
     least, most = np.empty(cols, np.float32), np.empty(cols, np.float32)
-    before = np.empty(cols, np.float32)  # read there and written here, or it becomes a store under a mask
+    before = np.empty(cols, np.float32)  # a copy to read from, or writing `worst` becomes a masked store
     worst[:] = np.float32(-np.inf)
     for c in range(channels):
         gain = gains[c]
@@ -80,9 +80,9 @@ def isolated(y: Real, x: Real, sigma: Real, gains: Real, free: float, worst: Rea
             column[cols + 2] = column[cols + 3] = column[cols + 1]
             for j in range(cols):
                 mean = share * (column[j] + column[j + 1] + column[j + 2] + column[j + 3] + column[j + 4])
-                made = x[c, i, j]
+                result = x[c, i, j]
                 floor = min(least[j], low[j], low[j + 2])
                 top = max(most[j], high[j], high[j + 2])
-                spike = max(made - top, floor - made)
+                spike = max(result - top, floor - result)
                 spike /= gain * abs(y[c, i, j] - mean) + spared * sigma[c, i, j]
                 worst[i, j] = max(before[j], spike)

@@ -20,8 +20,8 @@ BACK: Final = False
 def _row_extremes(plane: Real, i: int, reach: int, low: Real, high: Real, spare: Real) -> None:
     """Extremes over the rows around row i, into the middle of buffers that are `reach` wider at both ends.
 
-    From one buffer into another, two rows at a time: a least value that is written where it was read
-    becomes a store under a mask, which takes five times as long.
+    From one buffer into another, two rows at a time: a minimum written where it was read becomes a masked
+    store, which takes five times as long.
     """
     rows, cols = plane.shape
     first, last = max(i - reach, 0), min(i + reach, rows - 1)
@@ -31,8 +31,8 @@ def _row_extremes(plane: Real, i: int, reach: int, low: Real, high: Real, spare:
     spare[1, :cols] = plane[first]
     now = 0
     for k in range(first + 1, last + 1, 2):
-        one, two = plane[k], plane[min(k + 1, last)]
-        _joined(spare[now], spare[now + 1], one, two, spare[2 - now], spare[3 - now])
+        row, next_row = plane[k], plane[min(k + 1, last)]
+        _joined(spare[now], spare[now + 1], row, next_row, spare[2 - now], spare[3 - now])
         now = 2 - now
     least[:] = spare[now, :cols]
     most[:] = spare[now + 1, :cols]
@@ -43,12 +43,12 @@ def _row_extremes(plane: Real, i: int, reach: int, low: Real, high: Real, spare:
 
 
 @jit
-def _joined(low: Real, high: Real, one: Real, two: Real, lower: Real, higher: Real) -> None:
-    """Extremes of what was found so far and of two more rows."""
-    for j in range(one.size):
-        lower[j] = min(low[j], one[j], two[j])
-    for j in range(one.size):
-        higher[j] = max(high[j], one[j], two[j])
+def _joined(low: Real, high: Real, row: Real, next_row: Real, lower: Real, higher: Real) -> None:
+    """Extremes of those so far and of two more rows."""
+    for j in range(row.size):
+        lower[j] = min(low[j], row[j], next_row[j])
+    for j in range(row.size):
+        higher[j] = max(high[j], row[j], next_row[j])
 
 
 @jit

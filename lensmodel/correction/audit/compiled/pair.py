@@ -16,7 +16,7 @@ def prepared(
     clip: Real,
     noise: NDArray[np.float64],
     least: float,
-    made: Real,
+    written_planes: Real,
     sigma: Real,
     luma: Real,
     luma_sigma: Real,
@@ -34,7 +34,7 @@ def prepared(
         for c in range(3):
             shot, read, floor = np.float32(noise[c, 0]), np.float32(noise[c, 1]), np.float32(least)
             top = clip[c]
-            photo, result, written, grain = y[c, i], x[c, i], made[c, i], sigma[c, i]
+            photo, result, written, grain = y[c, i], x[c, i], written_planes[c, i], sigma[c, i]
             before, after = luma[0, i], luma[1, i]
             for j in range(cols):
                 light = min(result[j], top)

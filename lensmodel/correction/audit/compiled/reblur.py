@@ -1,4 +1,4 @@
-"""What blurring a result again leaves of the photo, compiled; see `lensmodel.correction.audit.reblur`."""
+"""The residual of the photo less the re-blurred result, compiled; see `lensmodel.correction.audit.reblur`."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def left_over(
         for j in range(K.shape[1]):
             spectrum[i, j] *= K[i, j]
     rocket_fft.c2c(spectrum, spectrum, np.array([0]), BACK, 1.0, 1)
-    # rows that the photo does not show are not needed
+    # only rows of the photo are needed
     rocket_fft.c2r(spectrum[:rows], work[:rows], np.array([1]), BACK, 1.0 / work.size, 1)
     strip = np.empty((3, cols), np.float32)
     out[:] = zero
@@ -63,11 +63,11 @@ def left_over(
         strip[:] = zero
         for i in range(block * side, min(block * side + side, rows)):
             for j in range(cols):
-                again, noise = work[i, j], sigma[i, j]
-                blurred = x[i, j] - again
+                reblurred, noise = work[i, j], sigma[i, j]
+                blurred = x[i, j] - reblurred
                 number = np.float32(counted[i, j])
-                left = number * (y[i, j] - again) / np.sqrt(noise * noise + share * blurred * blurred)
-                strip[0, j] += left * left
-                strip[1, j] += left
+                residual = number * (y[i, j] - reblurred) / np.sqrt(noise * noise + share * blurred * blurred)
+                strip[0, j] += residual * residual
+                strip[1, j] += residual
                 strip[2, j] += number
         into_blocks(strip, side, out[:, block])

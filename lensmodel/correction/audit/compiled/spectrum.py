@@ -88,22 +88,22 @@ def powers(
     side, (down, across) = taper.shape[0], line.shape
     work = np.empty((2, across, side, side), np.float32)
     power = np.empty((2, across, side * (side // 2 + 1)), np.float32)
-    near_limit, one = np.empty((2, edge.size), np.float32), np.float32(1.0)
+    near_limit, unit = np.empty((2, edge.size), np.float32), np.float32(1.0)
     for i in range(down):
         _power(planes, i * hop, hop, taper, work, power)
         for j in range(across):
             for which in range(2):
-                own = power[which, j]
+                window_power = power[which, j]
                 for band in range(starts.size - 1):
                     total = np.float32(0.0)
                     for k in range(starts[band], starts[band + 1]):
-                        total += own[order[k]]
+                        total += window_power[order[k]]
                     bands[which, band, i, j] = total / np.float32(starts[band + 1] - starts[band])
                 for k in range(edge.size):
-                    near_limit[which, k] = own[edge[k]]
+                    near_limit[which, k] = window_power[edge[k]]
             was = np.float32(1.0 / _level(near_limit[0], noise[i, j]))
             now = np.float32(1.0 / _level(near_limit[1], noise[i, j]))
             most = np.float32(0.0)
             for k in range(edge.size):
-                most = max(most, now * near_limit[1, k] / max(was * near_limit[0, k], one))
+                most = max(most, now * near_limit[1, k] / max(was * near_limit[0, k], unit))
             line[i, j] = most

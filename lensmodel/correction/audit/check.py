@@ -117,11 +117,8 @@ class Pair:
     @classmethod
     def _compiled(cls, original: Planes, corrected: Planes, evidence: Evidence, loops: ModuleType) -> Pair:
         y, x = (np.ascontiguousarray(p, dtype=np.float32) for p in (original, corrected))
-        written, sigma, luma = (
-            np.empty_like(y),
-            np.empty_like(y),
-            np.empty((2, *y.shape[1:]), dtype=np.float32),
-        )
+        written, sigma = np.empty_like(y), np.empty_like(y)
+        luma = np.empty((2, *y.shape[1:]), dtype=np.float32)
         noise = np.array([[n.shot, n.read] for n in evidence.noise])
         clip, luma_sigma = np.asarray(evidence.clip, dtype=np.float32), np.empty_like(luma[0])
         loops.prepared(y, x, clip, noise, LEAST_VARIANCE, written, sigma, luma, luma_sigma)
@@ -163,7 +160,7 @@ class Severity:
 
     @classmethod
     def none(cls) -> Severity:
-        """Nothing found, anywhere."""
+        """No fault anywhere."""
         return cls.of_blocks(np.zeros((1, 1), dtype=np.float32))
 
     @classmethod

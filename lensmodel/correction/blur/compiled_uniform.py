@@ -31,7 +31,7 @@ class CompiledBlur(UniformBlur):
         return blur if loops is None else cls(blur.kernel, blur.offset, loops=loops)
 
     def spectrum(self, shape: tuple[int, int]) -> NDArray[np.complex64]:
-        """Transfer function on the `rfft2` grid of `shape`, kept for the next call."""
+        """Transfer function on the `rfft2` grid of `shape`, cached."""
         if self.loops is None or self.offset != (0.0, 0.0) or self.kernel.shape[0] > min(shape):
             return UniformBlur.spectrum(self, shape)
         if shape not in self._spectra:

@@ -43,7 +43,7 @@ class Drift:
 
 
 def _change(before: UniformBlur, after: UniformBlur, shape: tuple[int, int]) -> NDArray[np.complexfloating]:
-    """Difference of two transfer functions; one transform where no shift is in the way."""
+    """Difference of two transfer functions; one transform if neither blur is shifted."""
     if before.offset != (0.0, 0.0) or after.offset != (0.0, 0.0):
         return np.asarray(after.transfer(shape) - before.transfer(shape))
     side = max(before.kernel.shape[0], after.kernel.shape[0])
@@ -67,8 +67,8 @@ class UniformBlur:
     offset : tuple of float
         Shift `(row, col)` in pixels of the image of a point, on top of the kernel: lateral colour.
     drift : Drift or None
-        How the kernel changes around the place that it was taken at. The operator itself is uniform;
-        a method may use it to model what a uniform operator leaves out.
+        How the kernel changes around its place. The operator itself is uniform; a method may use the drift
+        to model what a uniform operator leaves out.
     """
 
     kernel: Kernel
@@ -83,18 +83,18 @@ class UniformBlur:
 
     @property
     def reach(self) -> int:
-        """By how many pixels the latent plane is wider than the frame on each side."""
+        """Pixels by which the latent plane is wider than the frame on each side."""
         beyond = max(abs(self.offset[0]), abs(self.offset[1]))
         return int(self.kernel.shape[0] // 2) + math.ceil(beyond) + (beyond != math.floor(beyond))
 
     def spectrum(self, shape: tuple[int, int]) -> NDArray[np.complex64]:
-        """Transfer function on the `rfft2` grid of `shape`, kept for the next call."""
+        """Transfer function on the `rfft2` grid of `shape`, cached."""
         if shape not in self._spectra:
             self._spectra[shape] = self.transfer(shape).astype(np.complex64)
         return self._spectra[shape]
 
     def transfer(self, shape: tuple[int, int]) -> NDArray[np.complex128]:
-        """Transfer function on the `rfft2` grid of `shape`, kept nowhere."""
+        """Transfer function on the `rfft2` grid of `shape`, not cached."""
         spectrum = otf(self.kernel, shape)
         return spectrum * _phase(self.offset, shape) if self.offset != (0.0, 0.0) else spectrum
 
@@ -120,8 +120,8 @@ class UniformBlur:
     def covered(self, shape: tuple[int, ...]) -> Plane:
         """Share of the light of each latent point that falls into a frame of `shape`: F^T 1.
 
-        A point sees a rectangle of the kernel, so that its sums from one corner on tell all, and no
-        transform is needed. A shift by parts of a pixel does need one.
+        A point sees a rectangle of the kernel, so cumulative sums suffice and no transform is needed,
+        except for a shift by parts of a pixel.
         """
         if self.offset != (0.0, 0.0):
             return self.adjoint(np.ones(shape, dtype=np.float32))
@@ -131,7 +131,7 @@ class UniformBlur:
         for extent in shape:
             start = side - 1 - np.arange(extent + side - 1)
             ends = np.clip(start, 0, side) * (side + 1) + np.clip(start + extent, 0, side)
-            # Points far from the rim all see the whole kernel: one of them is looked up for all.
+            # Points far from the rim all see the whole kernel: one lookup serves them all.
             distinct, kind = np.unique(ends, return_inverse=True)
             spans.append(np.divmod(distinct, side + 1))
             kinds.append(kind)
@@ -150,7 +150,7 @@ def _phase(offset: tuple[float, float], shape: tuple[int, int]) -> NDArray[np.co
     """Spectrum of a shift by `offset`, by Keys' cubic convolution (IEEE Trans. ASSP 29, 1981).
 
     A phase alone would be a sinc, whose tails cross the picture: where the kernel is next to a point, undoing
-    them drew nets of dots about every edge.
+    them drew nets of dots around every edge.
     """
     rows = _shifted(offset[0], fft.fftfreq(shape[0]))
     cols = _shifted(offset[1], fft.rfftfreq(shape[1]))
@@ -170,7 +170,7 @@ def _shifted(offset: float, frequency: NDArray[np.floating]) -> NDArray[np.compl
     spectrum = sum(
         tap * np.exp(-2j * np.pi * frequency * (whole - 1 + number)) for number, tap in enumerate(taps)
     )
-    at_nyquist = np.abs(frequency) == 0.5  # real there, as a real picture needs
+    at_nyquist = np.abs(frequency) == 0.5  # real there, because the picture is real
     return np.asarray(np.where(at_nyquist, np.real(spectrum), spectrum))
 
 

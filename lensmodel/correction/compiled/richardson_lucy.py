@@ -245,7 +245,7 @@ def richardson_lucy(  # noqa: C901 - one pass over memory per loop
 
 @jit
 def bare_transforms(plane: Real, pairs: int) -> None:
-    """Transform a plane to and fro, and nothing else: the floor that a benchmark compares with."""
+    """Transform a plane forth and back, and nothing else: the lower bound that a benchmark compares with."""
     spectrum = np.empty((plane.shape[0], plane.shape[1] // 2 + 1), np.complex64)
     for _ in range(pairs):
         to_spectrum(plane, spectrum)

@@ -19,7 +19,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -53,7 +52,6 @@ _PATCH_TAILS = 3.0  # of a patch, in units of its bins
 _SCENE_ROUNDS, _SCENE_ROUNDS_AGAIN = 3, 2
 _TRIES = 5  # steps with more damping before the fit ends (chosen)
 _STRIDE_PX = 1.5  # pixels of blur: no term changes by more in one step (chosen)
-_COMMON = float(__import__("os").environ.get("COMMON", "0"))
 _ENOUGH = 0.2  # of the cost: less gained in a step ends the fit; minima differ by more (chosen)
 _SMALLEST_EYE, _FARTHEST_EYE = 0.5, 1.0  # the two circles of the pupil have to overlap all over the field
 
@@ -157,16 +155,6 @@ def fit_spectra(
     return PooledFit(problem.front(lens), state.cost, covariance, state.trust)
 
 
-@lru_cache(maxsize=64)
-def _photo_precision(photos: int) -> Floats:
-    """Inverse covariance of what each photo's patches share, `(2 photos, 2 photos)`.
-
-    Photos of one lens are by one person, of like motifs: a part of the variance is common to them all.
-    """
-    alike = np.eye(photos) * (1.0 - _COMMON) + _COMMON
-    return np.asarray(np.kron(np.linalg.inv(alike), np.diag(1.0 / PHOTO_SPREAD**2)))
-
-
 def open_eye(eye: Floats) -> tuple[float, float]:
     """Nearest cat's eye, radius and shift, that leaves light everywhere in the field."""
     return max(float(eye[0]), _SMALLEST_EYE), float(np.clip(eye[1], -_FARTHEST_EYE, _FARTHEST_EYE))
@@ -227,12 +215,11 @@ class _Problem:
             scenes_after.append(fitted.z)
             trust.append(trusted)
         unusual, curvature, pull = unlikeliness(lens)
-        vote = _photo_precision(len(self.photos))
-        pulls = vote @ shared.ravel()
-        cost += unusual + float(shared.ravel() @ pulls)
+        vote = np.tile(1.0 / PHOTO_SPREAD**2, len(self.photos))
+        cost += unusual + float(vote @ shared.ravel() ** 2)
         normal[:_LENS, :_LENS] += curvature
-        normal[_LENS:, _LENS:] += vote
-        gradient -= np.concatenate([pull, pulls])
+        normal[range(_LENS, count), range(_LENS, count)] += vote
+        gradient -= np.concatenate([pull, vote * shared.ravel()])
         return _State(cost, normal, gradient, scenes_after, np.array(trust))
 
     def _lens(self, lens: Floats, patch: PatchView) -> tuple[Floats, Floats]:

@@ -38,10 +38,9 @@ Group: TypeAlias = dict[Channel, PsfSample]
 
 _COMA = slice(2, 6)  # the odd terms
 _COARSE_PLACES, _MEDIUM_PLACES, _FINE_PLACES = 24, 36, 48
-_NARROW_PLACES, _STOPPED_DOWN = (
-    int(__import__("os").environ.get("NARROW", "24")),
-    2.0,
-)  # patches of photos stopped down by two stops or more (chosen)
+_NARROW_PLACES, _STOPPED_DOWN = 24, 2.0
+"""Patches at most of photos stopped down, and the multiple of the widest f-number from which on they are (two
+stops). With all of them, five such photos take back what one adds (`lensmodel.lab.chain.stopped_down`)."""
 _COARSE_ROUNDS, _MEDIUM_ROUNDS, _FINE_ROUNDS = 7, 6, 16
 _STARTS, _KEPT, _REFINED, _REFINED_OF_PAIR = 6, 12, 4, 2
 _FEWEST_PAIRED, _MOST_PAIRS = 3, 2  # photos, and pairs of them
@@ -242,8 +241,8 @@ def _by_aperture(
 ) -> tuple[Sequence[PsfSample], Sequence[PsfSample]]:
     """Samples of photos near the widest aperture, and those of photos stopped down.
 
-    Stopped down, a lens hardly blurs: such patches tell what scenes look like, and little of the lens, so that
-    they do not take the places of others. Where too few others are left, all count alike.
+    Stopped down, a lens hardly blurs: such patches tell what scenes look like, and little of the lens, so
+    that they do not take the places of others. Where too few others are left, all count alike.
     """
     if widest is None:
         return samples, []

@@ -20,7 +20,7 @@ from lensmodel.model.field.local_frame import Answers
 from lensmodel.model.trust.expected_error import Evidence, joint_error
 from lensmodel.model.wavefront.aberration_prior import BALANCE, corner_ratio, unlikeliness
 from lensmodel.model.wavefront.from_spectra import PatchView, PooledFit, fit_spectra
-from lensmodel.model.wavefront.joint_kernels import MIN_PLACES, Pooled, _pairs, pool
+from lensmodel.model.wavefront.joint_kernels import MIN_PLACES, Pooled, _by_aperture, _pairs, pool
 from lensmodel.model.wavefront.scene_spectrum import BIAS, WITH_POWER, Floats, SceneView
 from lensmodel.optics.transfer import (
     BINS,
@@ -476,6 +476,19 @@ def test_wavefront_is_never_surer_than_the_kernels_nor_than_it_agrees_with_them(
     assert apart > 0.3
     assert answer.predicted_error >= min(apart, 1.0) - 1e-6
     assert answer.predicted_error >= other.predicted_error
+
+
+def test_photos_stopped_down_do_not_take_the_places_of_others() -> None:
+    def taken(aperture: float | None, count: int) -> list[PsfSample]:
+        settings = LensSettings(aperture)
+        return [PsfSample(gaussian(9, np.eye(2)), place, settings) for place in places(count)]
+
+    wide, nearly, narrow, unknown = taken(2.0, 6), taken(2.8, 3), taken(4.0, 30), taken(None, 2)
+    together = [*narrow, *wide, *nearly, *unknown]
+
+    assert _by_aperture(together, 2.0) == ([*wide, *nearly, *unknown], narrow)
+    assert _by_aperture([*wide, *narrow], 2.0) == ([*wide, *narrow], [])  # too few would be left
+    assert _by_aperture(together, None) == (together, [])
 
 
 def test_photos_are_paired_whatever_their_order_and_few_are_not() -> None:

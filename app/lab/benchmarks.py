@@ -96,6 +96,10 @@ def blind(
     ] = ESTIMATORS,
     patch: Annotated[int, typer.Option(help="Side of a patch.")] = 256,
     cases: Annotated[int | None, typer.Option(help="At most so many.")] = None,
+    scenes: Annotated[
+        int | None,
+        typer.Option(min=1, help="So many windows of the photographs in turn. Default: one of each."),
+    ] = None,
     pool: Annotated[int, typer.Option(help="Patches that share one kernel.")] = 1,
     half: Annotated[str, typer.Option(help="dev, test or all.")] = "test",
     variant: Annotated[str, typer.Option(help="gaussian, bayer or jpeg.")] = "gaussian",
@@ -124,6 +128,8 @@ def blind(
 
         lensmodel bench blind --photos sharp --psfs mine.npz --noise 0.01 --methods default -o mine
 
+        lensmodel bench blind --photos sharp --scenes 80 --half all --cases 200
+
     Exit status: 0 measured, 1 something failed, 2 called wrongly.
     """
     from lensmodel.lab.blind.results import BlindBenchmark  # noqa: PLC0415 - see the top of the module
@@ -145,6 +151,7 @@ def blind(
             judge=judge,
             seed=seed,
             selection=selection,  # type: ignore[arg-type]  # checked by the benchmark
+            scenes=scenes,
         )
     report = _blind(settings, workers, output, shown)
     written = write_report(report, output)

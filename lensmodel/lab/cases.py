@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -19,7 +20,7 @@ from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NoUsablePatchesError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import Kernel, NoiseModel, Plane, Planes, ignore_step
-from lensmodel.estimation.patches import select
+from lensmodel.estimation.patches import Patch, select
 from lensmodel.estimation.patches.blocks import BLOCKS_A_SIDE, measure_blocks
 from lensmodel.estimation.patches.select import edge_score, first_reasons
 from lensmodel.estimation.patches.windows import windows_of
@@ -62,6 +63,8 @@ class Case:
     choice : {"random", "r-map", "good-regions"}
         Who chooses the windows: chance, from the better half of them by the sharp scene; or a selector of
         `lensmodel.estimation.patches`, which sees the blurred and noisy photograph only.
+    window : int
+        Which window of each photograph: 0 is the best one that a selector finds, 1 the next beside it.
     """
 
     photos: tuple[Path, ...]
@@ -71,11 +74,13 @@ class Case:
     variant: Variant
     seed: int
     choice: Choice = "random"
+    window: int = 0
 
     @property
     def name(self) -> str:
-        """Short name of photo and PSF."""
-        return f"{self.photos[0].stem}/psf{self.psf_number:02d}"
+        """Short name of photo, window and PSF."""
+        which = f"+{self.window}" if self.window else ""
+        return f"{self.photos[0].stem}{which}/psf{self.psf_number:02d}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,28 +178,35 @@ def make_cases(
     seed: int,
     limit: int | None,
     choice: Choice = "random",
+    scenes: int | None = None,
 ) -> tuple[Case, ...]:
-    """Every photo with every PSF of a half; at most `limit`, spread over both by a seeded shuffle.
+    """Every scene with every PSF of a half; at most `limit`, spread over both by a seeded shuffle.
 
-    With `pool` > 1 the further windows come from the other photos of the half, in turn: photos
-    by the same lens, of other scenes.
+    A scene is a window of a photo: one of each, or `scenes` of all in turn. With `pool` > 1 the further
+    windows come from the other photos of the half, in turn: photos by the same lens, of other scenes.
 
     Raises
     ------
     InvalidInputError
-        If the half has no photo or no PSF.
+        If the half has no photo or no PSF, or `scenes` is below one.
     """
+    if scenes is not None and scenes < 1:
+        raise InvalidInputError(f"a benchmark takes at least one scene, not {scenes}")
     own = [p for p in photos if half in {"all", photo_half(p.stem)}]
     numbers = [n for n in range(psf_count) if half in {"all", psf_half(n)}]
     if not own or not numbers:
         raise InvalidInputError(
             f"half {half!r} has {len(own)} photos and {len(numbers)} PSFs; give more, or use half 'all'"
         )
-    pairs = [(i, n) for i in range(len(own)) for n in numbers]
+    pairs = [(i, n) for i in range(scenes or len(own)) for n in numbers]
     order = np.random.default_rng(seed).permutation(len(pairs))
     chosen = order if limit is None else _spread(pairs, order, limit)
     return tuple(
-        Case(tuple(own[(i + k) % len(own)] for k in range(pool)), n, noise, patch, variant, seed, choice)
+        Case(
+            tuple(own[(i + k) % len(own)] for k in range(pool)),
+            *(n, noise, patch, variant, seed, choice),
+            window=i // len(own),
+        )
         for i, n in (pairs[int(at)] for at in np.sort(chosen))
     )
 
@@ -249,7 +261,8 @@ def observe(case: Case, kernel: Kernel) -> Observation:
     patches = []
     sharp: Plane | None = None
     for turn, photo in enumerate(case.photos):
-        rng = np.random.default_rng([case.seed, case.psf_number, turn, _number(photo.stem)])
+        again = [case.window] if case.window else []
+        rng = np.random.default_rng([case.seed, case.psf_number, turn, _number(photo.stem), *again])
         scene, patch = (_drawn if case.choice == "random" else _chosen)(photo, kernel, case, rng)
         if turn == 0:
             sharp = np.ascontiguousarray(scene)
@@ -270,6 +283,7 @@ def _drawn(photo: Path, kernel: Kernel, case: Case, rng: np.random.Generator) ->
 def _chosen(photo: Path, kernel: Kernel, case: Case, rng: np.random.Generator) -> tuple[Plane, Plane]:
     """Sharp and photographed window, the best that a selector finds in the whole blurred photograph.
 
+    The next ones are the best that overlap none before them; where all others do, the best of those.
     Selectors take smaller windows where the frame has not four of them on its shorter side. Where nothing is
     usable the middle of the frame is taken, lest a method profits from the refusal.
     """
@@ -289,10 +303,21 @@ def _chosen(photo: Path, kernel: Kernel, case: Case, rng: np.random.Generator) -
     except NoUsablePatchesError:
         row, col = (height - size) // 2, (width - size) // 2
     else:
-        best = max(found.patches, key=lambda patch: patch.score)
+        best = _apart(sorted(found.patches, key=lambda patch: -patch.score), case.window)
         row, col, size = best.row, best.col, best.size
     sharp = scene[1, margin + row : margin + row + size, margin + col : margin + col + size]
     return sharp, np.ascontiguousarray(plane[row : row + size, col : col + size])
+
+
+def _apart(patches: Sequence[Patch], number: int) -> Patch:
+    """Return patch `number` of those that overlap none before them, and then of the rest in turn."""
+    apart: list[Patch] = []
+    for patch in patches:
+        gaps = [max(abs(patch.row - other.row), abs(patch.col - other.col)) for other in apart]
+        if all(gap >= patch.size for gap in gaps):
+            apart.append(patch)
+    rest = [patch for patch in patches if patch not in apart]
+    return [*apart, *rest][number % len(patches)]
 
 
 def _photographed(scene: Planes, kernel: Kernel, case: Case, rng: np.random.Generator) -> Plane:

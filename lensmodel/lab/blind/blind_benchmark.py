@@ -89,6 +89,7 @@ def run_blind_benchmark(
             seed=settings.seed,
             limit=settings.cases,
             choice=settings.selection,
+            scenes=settings.scenes,
         )
         if only is None or case.photos[0].stem in only
     ]

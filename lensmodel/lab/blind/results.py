@@ -49,6 +49,8 @@ class BlindBenchmark:
         For windows, noise and the choice of cases.
     selection : {"random", "r-map", "good-regions"}
         Who chooses the windows: chance among the better half, or a selector on the blurred photograph.
+    scenes : int or None
+        So many windows of the photographs in turn; None means one of each.
     """
 
     photos: Path | None = None
@@ -64,6 +66,7 @@ class BlindBenchmark:
     judge: str = "hyper-laplacian"
     seed: int = 0
     selection: Choice = "random"
+    scenes: int | None = None
 
     def __post_init__(self) -> None:
         checks = {

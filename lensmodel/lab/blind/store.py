@@ -61,6 +61,7 @@ class Store:
             (name, getattr(method, "version", 0), described, self._settings.kernel_size),
             repr(self._judge),
             *(() if case.choice == "random" else (case.choice,)),
+            *((case.window,) if case.window else ()),
         )
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 

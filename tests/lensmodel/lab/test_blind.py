@@ -15,8 +15,9 @@ from scipy import ndimage, signal
 from lensmodel.core import psf
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError, UnknownMethodError
 from lensmodel.core.registry import Registry
-from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
+from lensmodel.core.types import FieldPosition, Kernel, NoiseModel, Plane, StepHook, ignore_step
 from lensmodel.estimation import PsfEstimate
+from lensmodel.estimation.patches import Patch
 from lensmodel.lab.blind import judges
 from lensmodel.lab.blind.blind_benchmark import run_blind_benchmark
 from lensmodel.lab.blind.results import UNTOUCHED, BlindBenchmark, BlindReport, CaseResult, summarised
@@ -28,7 +29,16 @@ from lensmodel.lab.blind.tables import (
     markdown_table,
     write_report,
 )
-from lensmodel.lab.cases import list_photos, load_psfs, make_cases, observe, photo_half, psf_half, scene_of
+from lensmodel.lab.cases import (
+    _apart,
+    list_photos,
+    load_psfs,
+    make_cases,
+    observe,
+    photo_half,
+    psf_half,
+    scene_of,
+)
 
 SMALL = {"patch": 128, "cases": 3, "half": "all"}
 
@@ -239,6 +249,27 @@ def test_a_limit_spreads_over_photos_and_psfs() -> None:
 
     assert len({c.photos[0] for c in cases}) == 5
     assert len({c.psf_number for c in cases}) == 10
+
+
+def test_more_scenes_than_photos_are_further_windows_of_the_same_photos() -> None:
+    options = {"half": "all", "noise": 1e-3, "patch": 128, "variant": "gaussian", "pool": 1, "seed": 3}
+    cases = make_cases(list_photos(), 2, limit=None, choice="r-map", scenes=12, **options)
+
+    assert len(cases) == len({case.name for case in cases}) == 24
+    assert [len({c.photos[0] for c in cases if c.window == k}) for k in range(3)] == [5, 5, 2]
+    first = {c.window: c for c in cases if c.photos[0] == cases[0].photos[0] and c.psf_number == 0}
+    kernel = load_psfs()[4]
+    sharp = [observe(first[k], kernel).sharp for k in range(3)]
+    assert not any(np.array_equal(a, b) for a, b in zip(sharp, sharp[1:], strict=False))
+    with pytest.raises(InvalidInputError, match="at least one scene, not 0"):
+        make_cases(list_photos(), 2, limit=None, scenes=0, **options)
+
+
+def test_windows_overlap_none_before_them_as_long_as_there_are_such() -> None:
+    there = FieldPosition(0.5, 0.0)
+    best, beside, far = (Patch(0, col, 64, there, 1.0, 0) for col in (0, 32, 64))
+
+    assert [_apart([best, beside, far], k).col for k in range(4)] == [0, 64, 32, 0]
 
 
 def test_pooled_windows_come_from_different_photos() -> None:

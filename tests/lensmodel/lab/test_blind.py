@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -260,7 +261,7 @@ def test_more_scenes_than_photos_are_further_windows_of_the_same_photos() -> Non
     first = {c.window: c for c in cases if c.photos[0] == cases[0].photos[0] and c.psf_number == 0}
     kernel = load_psfs()[4]
     sharp = [observe(first[k], kernel).sharp for k in range(3)]
-    assert not any(np.array_equal(a, b) for a, b in zip(sharp, sharp[1:], strict=False))
+    assert not any(np.array_equal(a, b) for a, b in pairwise(sharp))
     with pytest.raises(InvalidInputError, match="at least one scene, not 0"):
         make_cases(list_photos(), 2, limit=None, scenes=0, **options)
 

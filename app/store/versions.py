@@ -38,6 +38,10 @@ def new_version(session: Session, lens_id: int, *, rebuild: bool = False) -> int
 
 LEARNED_ROOT: Final = "models/"
 
+LEARNED_VERSION: Final = 15
+"""That of `lensmodel.model.learned`, which takes seconds to import: what another version of the program fitted is
+not looked for, and fitted anew."""
+
 
 def learned_prefix(lens_id: str, version: int, epoch: int) -> str:
     """Return the prefix of the models that workers fit to the samples of one version of a lens."""
@@ -46,7 +50,7 @@ def learned_prefix(lens_id: str, version: int, epoch: int) -> str:
 
 def learned_key(lens_id: str, version: int, epoch: int) -> str:
     """Return the key of the fitted models in `learned_prefix`."""
-    return f"{learned_prefix(lens_id, version, epoch)}learned.npz"
+    return f"{learned_prefix(lens_id, version, epoch)}learned-{LEARNED_VERSION}.npz"
 
 
 def report_key(lens_id: str, version: int, epoch: int) -> str:

@@ -26,9 +26,10 @@ from app.sandbox.child import Progress
 from app.sandbox.outcome import Limits, Outcome
 from app.store import Store
 from app.store.tables import PhotoRow
-from app.store.versions import learned_key, report_key
+from app.store.versions import LEARNED_VERSION, learned_key, report_key
 from lensmodel.core.psf import gaussian
 from lensmodel.core.types import ignore_step
+from lensmodel.model import learned
 
 Answer = Callable[[dict[str, Any], Path], Outcome]
 LENS = {"maker": "Canon", "model": "EF24mm f/1.4L", "serial": "123", "serial_source": "exif"}
@@ -798,6 +799,11 @@ class Asked:
         self.jobs.append(job)
 
 
+def test_what_another_version_of_the_program_fitted_is_not_looked_for() -> None:
+    assert LEARNED_VERSION == learned.VERSION
+    assert str(LEARNED_VERSION) in learned_key("lens", 3, 0)
+
+
 def test_a_lens_that_was_measured_before_there_were_reports_gets_one(
     bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
 ) -> None:
@@ -816,4 +822,6 @@ def test_a_lens_that_was_measured_before_there_were_reports_gets_one(
     assert lens is not None
     assert bench.store.lenses.history(lens)[-1].metrics == first
     bench.storage.put(report_key(lens_id, 1, lens.rebuild_epoch), b"{}")
+    assert ask_for_reports(bench.store, bench.storage, engine) == 1
+    bench.storage.put(learned_key(lens_id, 1, lens.rebuild_epoch), b"fitted")
     assert ask_for_reports(bench.store, bench.storage, engine) == 0

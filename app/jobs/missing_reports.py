@@ -18,7 +18,7 @@ has ended and is not run again."""
 
 
 def ask_for_reports(store: Store, storage: Storage, engine: JobEngine) -> int:
-    """Enqueue the measuring of each lens whose newest version was measured and lacks something; return how many."""
+    """Enqueue the measuring of each measured lens whose newest version lacks something; return how many."""
     stored = {key for key, _ in storage.listed(LEARNED_ROOT)}
     enqueued = 0
     for lens_id, version, epoch in store.lenses.measured():

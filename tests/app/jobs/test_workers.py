@@ -207,6 +207,7 @@ def counting_estimators(store: Store) -> set[str]:
         return set(session.scalars(select(SampleRow.estimator).where(SampleRow.lens_id.is_not(None))))
 
 
+@pytest.mark.slow
 def test_a_lens_changes_its_model_whenever_workers_die(
     crew: Crew, store: Store, send: Callable[[int], list[PhotoRow]], steps: Any
 ) -> None:

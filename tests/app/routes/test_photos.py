@@ -101,17 +101,14 @@ def test_a_bad_page_is_refused(client: TestClient, query: str) -> None:
     assert (answer.status_code, answer.json()["code"]) == (422, "invalid_parameter")
 
 
-@pytest.mark.parametrize("bad", ["nothing", "..", "%2e%2e%2fetc", "a' OR 1=1 --", "💥", "x" * 3000, "%00"])
 @pytest.mark.parametrize("kind", ["photos", "jobs", "lenses", "corrections"])
-def test_an_unknown_id_is_a_plain_404(client: TestClient, kind: str, bad: str) -> None:
-    answer = client.get(f"/v1/{kind}/{bad}")
+def test_an_unknown_id_is_a_plain_404(client: TestClient, kind: str) -> None:
+    codes = {f"unknown_{kind.removesuffix('es').removesuffix('s')}", "unknown_lens", "not_found"}
+    for bad in ("nothing", "..", "%2e%2e%2fetc", "a' OR 1=1 --", "💥", "x" * 3000, "%00"):
+        answer = client.get(f"/v1/{kind}/{bad}")
 
-    assert answer.status_code == 404
-    assert answer.json()["code"] in {
-        f"unknown_{kind.removesuffix('es').removesuffix('s')}",
-        "unknown_lens",
-        "not_found",
-    }
+        assert (bad, answer.status_code) == (bad, 404)
+        assert answer.json()["code"] in codes, bad
 
 
 def test_a_photo_of_somebody_else_does_not_exist(client: TestClient, steps: Steps) -> None:

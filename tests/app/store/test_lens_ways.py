@@ -20,7 +20,7 @@ Steps = Any  # the fixture `steps` of conftest.py; test modules do not import ea
 BEFORE, AFTER = 1.0, 3.0
 """Widths of the kernels that the ways make: by them the tests tell whose samples count."""
 
-SEEDS = (1, 2, 3, 4, 26)
+SEEDS = (1, 26, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3, 4)))
 """Of which a lens changes at least once."""
 
 

@@ -180,8 +180,14 @@ def surface(clipped: int) -> np.ndarray:
     return np.where(label, 1.15 * colour[:, None, None], light).astype(np.float32)
 
 
-@pytest.mark.parametrize("method", ["standard", "fast", "paper"])
-@pytest.mark.parametrize("clipped", [1, 2, 3])
+@pytest.mark.parametrize(
+    ("method", "clipped"),
+    [
+        *(("standard", clipped) for clipped in (1, 2, 3)),
+        *((method, 2) for method in ("fast", "paper")),
+        *(pytest.param(m, c, marks=pytest.mark.slow) for m in ("fast", "paper") for c in (1, 3)),
+    ],
+)
 @pytest.mark.parametrize(
     ("width", "shift"), [(0.05, 1.0001), (0.5, 0.0), (0.5, 1.0001), (1.5, 0.3), (1.5, 3.0), (4.0, 1.0001)]
 )

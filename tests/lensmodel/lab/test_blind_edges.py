@@ -12,6 +12,8 @@ from lensmodel.core.types import Kernel, NoiseModel, Plane
 from lensmodel.lab.blind.methods.edges import Edges, profiles, projection
 from lensmodel.lab.blind.steps.pyramid import View
 
+pytestmark = pytest.mark.slow  # a method to compare with, of the laboratory
+
 SIGMA = 0.005
 OVAL = gaussian(13, [[2.4, 0.9], [0.9, 1.2]])
 

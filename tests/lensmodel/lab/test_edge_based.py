@@ -15,6 +15,8 @@ from lensmodel.estimation import PsfEstimator
 from lensmodel.lab.blind.methods import compared
 from lensmodel.simulate import dead_leaves, load_scene
 
+pytestmark = pytest.mark.slow  # a method to compare with, of the laboratory
+
 SIGMA = 0.005
 NOISE = NoiseModel.white(SIGMA)
 DATA = Path(__file__).parents[1] / "data" / "levin09.npz"

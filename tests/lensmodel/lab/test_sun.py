@@ -16,6 +16,8 @@ from lensmodel.lab.blind.steps.pyramid import View
 from lensmodel.lab.training import make_edge_patches
 from lensmodel.simulate import dead_leaves, edge_area
 
+pytestmark = pytest.mark.slow  # a method to compare with, of the laboratory
+
 SIGMA = 0.01
 OVAL = gaussian(13, [[2.0, 0.8], [0.8, 1.2]])
 

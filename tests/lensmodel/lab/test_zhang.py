@@ -12,6 +12,8 @@ from lensmodel.lab.blind.methods.zhang_model import Scene, pooled_kernel
 from lensmodel.lab.blind.steps.kernel_step import Grid, Term, least_squares_kernel
 from lensmodel.simulate import dead_leaves
 
+pytestmark = pytest.mark.slow  # a method to compare with, of the laboratory
+
 SIGMA = 0.01
 FLOOR = 1e-4 + 2 * SIGMA**2
 

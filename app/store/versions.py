@@ -39,8 +39,10 @@ def new_version(session: Session, lens_id: int, *, rebuild: bool = False) -> int
 LEARNED_ROOT: Final = "models/"
 
 LEARNED_VERSION: Final = 15
-"""That of `lensmodel.model.learned`, which takes seconds to import: what another version of the program fitted is
-not looked for, and fitted anew."""
+"""That of `lensmodel.model.learned`, which takes seconds to import.
+
+What another version of the program fitted is not looked for, and fitted anew.
+"""
 
 
 def learned_prefix(lens_id: str, version: int, epoch: int) -> str:

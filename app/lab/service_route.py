@@ -84,9 +84,13 @@ class ServiceRoute:
             lens_id=self._known(),
         )
         planes = planes_of(path)
-        zones = (self._client.correction(path.stem).report or {}).get("zones", {})
+        report = self._client.correction(path.stem).report or {}
         path.unlink()
-        return CorrectedPhoto(planes, {zone: row.get("expected_gain_db") for zone, row in zones.items()})
+        return CorrectedPhoto(
+            planes,
+            {zone: row.get("expected_gain_db") for zone, row in report.get("zones", {}).items()},
+            bool(report.get("nothing_to_correct")),
+        )
 
     def _upload(self, photo: Path, *, calibrate: bool) -> PhotoOut:
         """Send a photo; a TIFF or JPEG has no lens serial, so its lens is named as its owner would."""

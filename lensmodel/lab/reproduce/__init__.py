@@ -3,9 +3,10 @@
 There are more than fifteen modules because each figure, kind of lens and step of the experiment has one.
 """
 
-from lensmodel.lab.reproduce.cases import Case, Reproduction, Size, planned
+from lensmodel.lab.reproduce.cases import Case, Reproduction, Size
 from lensmodel.lab.reproduce.pages.blind_curve import collected
 from lensmodel.lab.reproduce.pages.page import write_json, write_page
+from lensmodel.lab.reproduce.planning import planned
 from lensmodel.lab.reproduce.routes import Answer, CorrectedPhoto, DirectRoute, OpenRoute, Place, Route
 from lensmodel.lab.reproduce.run import run_reproduction
 

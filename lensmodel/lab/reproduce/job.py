@@ -331,6 +331,7 @@ class Job:
             after = route.corrected(shots.held_out, method)
             edges = None if shots.chart is None else route.corrected(shots.chart, method).planes
             state = measure.state(edges, after.planes, shots, case, before=chart)
+            state["nothing_to_correct"] = after.nothing_to_correct
             if self._raw:
                 told = measure.forecast(before["light"], after.planes, after.expected_db, shots, case)
                 state["forecast"] = told

@@ -52,10 +52,13 @@ class CorrectedPhoto:
     expected_db : mapping of str to float or None
         Gain in PSNR of linear light that the correction expects of itself, by zone; None where it is not
         sure enough to tell.
+    nothing_to_correct : bool
+        Whether the correction said so, and left every pixel as it was.
     """
 
     planes: Planes
     expected_db: Mapping[str, float | None] = dataclass_field(default_factory=dict)
+    nothing_to_correct: bool = False
 
 
 class Route(Protocol):
@@ -161,9 +164,10 @@ class DirectRoute:
             lateral=pipeline.lateral_of(developed),
             workers=self._workers or os.cpu_count() or 1,
         )
-        return CorrectedPhoto(
-            done.planes, {zone: report.expected_gain_db for zone, report in done.zones.items()}
-        )
+        expected: dict[str, float | None] = {
+            zone: report.expected_gain_db for zone, report in done.zones.items()
+        }
+        return CorrectedPhoto(done.planes, expected, done.nothing_to_correct)
 
     def _known(self) -> LensModel:
         if self._model is None:

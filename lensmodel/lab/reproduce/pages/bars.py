@@ -15,8 +15,10 @@ from lensmodel.lab.reproduce.pages.tables import (
     TRUE,
     groups,
     hard_rows,
+    nothing_said,
     summary,
 )
+from lensmodel.lab.reproduce.pages.verdicts import MORE, more_photos
 
 PLACES: Final = ("center", "corner")
 
@@ -109,7 +111,14 @@ def bars(result: Mapping[str, Any]) -> list[Bar]:
             continue
         # the first group: lenses wide open on the frames that all sizes of a run have
         made = summary(next(iter(groups({**result, "cases": cases}).values())))
-        parts = (_psf(made), _mtf(made, method), _photos(made, method), _peers(made, method))
+        of_all = {**result, "cases": cases}
+        parts = (
+            _psf(made),
+            _mtf(made, method),
+            _photos(made, method),
+            _each_lens(of_all, method),
+            _peers(made, method),
+        )
         found += [replace(bar, family=family) for part in parts for bar in part]
     return [*found, *_hard(result)]
 
@@ -165,6 +174,25 @@ def _photos(made: Mapping[str, Any], method: str) -> Iterator[Bar]:
         yield Bar(words, "all zones", off, high=_FORECAST_DB, n=n)
 
 
+def _each_lens(result: Mapping[str, Any], method: str) -> Iterator[Bar]:
+    """Of every lens of a family, stopped down or not: verdicts that no mean can hide."""
+    said = nothing_said(result, method)
+    for name, key in (
+        ("lenses said to have nothing to correct though the true PSF gains 0.3 dB somewhere", "wrongly"),
+        ("lenses not said to, though the true PSF gains less in all zones", "unsaid"),
+    ):
+        for n in COUNTS:
+            row = said.get(n)
+            yield Bar(name, "lenses", None if row is None else row[key], high=0, n=n)
+    more = more_photos(result["cases"], method)
+    for name, key in (
+        ("zones where five photos give a PSF error above that of two by more than 0.01", "psf_worse"),
+        ("zones where five photos give a PSNR below that of two by more than 0.05 dB", "psnr_worse"),
+    ):
+        value = more[key] if more["zones"] else None
+        yield Bar(name, f"of {more['zones']} zones" if more["zones"] else "zones", value, high=0, n=MORE)
+
+
 def _peers(made: Mapping[str, Any], method: str) -> Iterator[Bar]:
     """Ahead of each peer: PSNR in every zone, and MTF50 at equal overshoot."""
     psnr = {row["state"]: row for row in made["psnr"][method]}
@@ -187,11 +215,18 @@ def _minus(a: float | None, b: float | None) -> float | None:
 
 def _hard(result: Mapping[str, Any]) -> Iterator[Bar]:
     for row in hard_rows(result):
-        counts = row["counts"]
+        title, counts = f"{row['title']}, {row['family']}", row["counts"]
         yield Bar(
-            f"{row['title']}: zones where PSNR falls by more than 0.05 dB",
-            f"of {counts['zones']}",
+            f"{title}: zones where PSNR falls by more than 0.05 dB",
+            f"of {counts['zones']} zones",
             counts["clearly_worse"],
+            high=0,
+        )
+        wrong = row["nothing"]["wrongly"] + row["nothing"]["unsaid"]
+        yield Bar(
+            f'{title}: lenses where "nothing to correct" was wrongly said or left out',
+            f"of {row['nothing']['lenses']} lenses",
+            wrong if row["nothing"]["lenses"] else None,
             high=0,
         )
 

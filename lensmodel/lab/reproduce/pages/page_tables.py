@@ -20,6 +20,7 @@ from lensmodel.lab.reproduce.pages.tables import (
     shown,
     states,
 )
+from lensmodel.lab.reproduce.pages.verdicts import NOTHING_DB, TOLERATED_DB, TOLERATED_L2
 
 _PAPER = [
     ("without correction", "613", "383"),
@@ -154,6 +155,39 @@ def photo_tables(page: Page, found: Mapping[str, Any], label: str) -> None:
             "What the gain that a correction expects of itself in a zone is off by, dB of linear light, mean "
             f"over zones of lenses: {off}."
         )
+        said = "; ".join(
+            f"n = {n}: {row['said']} of {row['lenses']}, {row['wrongly']} of them wrongly, "
+            f"and left out of {row['unsaid']}"
+            for n, row in found["nothing_said"][method].items()
+        )
+        page.text(
+            '"Nothing to correct" was said of so many lenses (right where the true PSF gains less than '
+            f"{NOTHING_DB:g} dB in every zone): {said}."
+        )
+        _more_table(page, found["more_photos"].get(method))
+
+
+def _more_table(page: Page, more: Mapping[str, Any] | None) -> None:
+    """Name the zones of lenses where more photos did harm."""
+    if more is None:
+        return
+    page.text(
+        f"Five photos beside two: of {more['zones']} zones of lenses the PSF error is larger by more than "
+        f"{TOLERATED_L2:g} in {more['psf_worse']} (the worst channel), PSNR of the corrected picture lower "
+        f"by more than {TOLERATED_DB:g} dB in {more['psnr_worse']}."
+    )
+    if more["rows"]:
+        page.table(
+            ["", "zone", "PSF error", "PSNR"],
+            [
+                [row["lens"], row["zone"], _from_to(row["psf"], 3), _from_to(row["psnr"], 2)]
+                for row in more["rows"]
+            ],
+        )
+
+
+def _from_to(pair: Sequence[float] | None, digits: int) -> str:
+    return "-" if pair is None else " to ".join(number(value, digits) for value in pair)
 
 
 def bars_table(page: Page, every: Sequence[Bar]) -> None:
@@ -212,6 +246,7 @@ def hard_table(page: Page, result: Mapping[str, Any]) -> None:
     page.table(
         [
             "",
+            "family",
             "lenses",
             "not learned from",
             "gain",
@@ -222,10 +257,12 @@ def hard_table(page: Page, result: Mapping[str, Any]) -> None:
             "PSF error",
             "worse zones",
             "by more than 0.05 dB",
+            "nothing to correct: said, wrongly, left out",
         ],
         [
             [
                 row["title"],
+                row["family"],
                 str(row["lenses"]),
                 str(row["refused"]),
                 _slashed(row["gain"], 2),
@@ -236,6 +273,7 @@ def hard_table(page: Page, result: Mapping[str, Any]) -> None:
                 _slashed(row["psf"], 2),
                 f"{row['counts']['worse']} of {row['counts']['zones']}",
                 str(row["counts"]["clearly_worse"]),
+                ", ".join(str(row["nothing"][name]) for name in ("said", "wrongly", "unsaid")),
             ]
             for row in rows
         ],

@@ -8,8 +8,17 @@ from functools import partial
 from typing import Any, Final
 
 from lensmodel.core.types import CHANNELS, ZONES
-
-Result = Mapping[str, Any]
+from lensmodel.lab.reproduce.pages.verdicts import (
+    FEWER,
+    MEASURABLE,
+    MORE,
+    Result,
+    counted,
+    gain,
+    get,
+    more_photos,
+    said_nothing,
+)
 
 SMALL_GAIN: Final = 0.05
 """Where the true PSF raises MTF50 by a smaller share, the share of its gain says nothing."""
@@ -22,11 +31,6 @@ EDGE_FIGURES: Final = (
     "overshoot",
     "mtf50_fair",
 )
-
-TOLERATED_DB: Final = 0.05
-
-MEASURABLE: Final = {"psnr": 0.2, "ssim": 0.002}
-"""Gains of the true PSF below these say nothing of a lens."""
 
 BEFORE: Final = "without correction"
 DENOISED: Final = "denoised only"
@@ -82,7 +86,8 @@ def summary(result: Result) -> dict[str, Any]:
         `psnr_kept`, `ssim_kept`: share of its gain; `psnr_control`: gain by denoising alone;
         `worse`: zones that fell; `psf` (green), `psf_by_channel`, `psf_others` (rivals, a general profile,
         the paper's own way, measured); `predicted_right`; `forecast_off`: mean absolute error of the gain
-        that a correction expects of itself in a zone, dB.
+        that a correction expects of itself in a zone, dB; `nothing_said`, see the function; `more_photos` of
+        `verdicts.more_photos`.
     """
     methods = result["plan"]["methods"]
     return {
@@ -110,10 +115,27 @@ def summary(result: Result) -> dict[str, Any]:
         "psf": _by_count(result, partial(_psf, channel="g")),
         "psf_by_channel": {c: _by_count(result, partial(_psf, channel=c)) for c in CHANNELS},
         "predicted_right": {
-            str(n): mean(_get(c["learned"][str(n)]["psf"], "predicted_right") for c in _having(result, n))
+            str(n): mean(get(c["learned"][str(n)]["psf"], "predicted_right") for c in _having(result, n))
             for n in counts(result)
         },
         "forecast_off": {method: _forecast_off(result, method) for method in methods},
+        "nothing_said": {method: nothing_said(result, method) for method in methods},
+        "more_photos": {
+            method: more_photos(_having(result, int(FEWER)), method)
+            for method in methods
+            if int(MORE) in counts(result)
+        },
+    }
+
+
+def nothing_said(result: Result, method: str) -> dict[str, dict[str, int]]:
+    """Count lenses said to have nothing to correct, by number of photos; see `said_nothing`."""
+    return {
+        str(n): said_nothing(
+            (case, case["learned"][str(n)]["methods"][method], case["truth"]["true"][method])
+            for case in _having(result, n)
+        )
+        for n in counts(result)
     }
 
 
@@ -208,47 +230,33 @@ def worse(result: Result, method: str) -> dict[str, dict[str, int]]:
     }
 
 
-def counted(rows: Iterable[tuple[Result, str, Result, Result]]) -> dict[str, int]:
-    """Count zones that fell, of rows `(case, zone, corrected, with the true PSF)`; see `worse`."""
-    found = dict.fromkeys(("zones", "worse", "clearly_worse", "ssim_worse", "unimproved"), 0)
-    for case, zone, after, true in rows:
-        psnr, ssim = gain(case, after, zone), gain(case, after, zone, "ssim")
-        possible = gain(case, true, zone)
-        if psnr is None or ssim is None or possible is None:
-            continue
-        found["zones"] += 1
-        found["worse"] += psnr < 0.0
-        found["clearly_worse"] += psnr < -TOLERATED_DB
-        found["ssim_worse"] += ssim < 0.0
-        found["unimproved"] += possible >= MEASURABLE["psnr"] and (psnr <= 0.0 or ssim <= 0.0)
-    return found
-
-
 def hard_rows(result: Result) -> list[dict[str, Any]]:
-    """One row a scene or path that hurts: gains in PSNR by zone, and zones that fell.
+    """One row a scene or path that hurts and family: gains in PSNR by zone, and zones that fell.
 
     Returns
     -------
     list of dict
-        `condition`, `title`, `lenses`, `refused` (photos that were not learned from); `gain`,
+        `condition`, `title`, `family`, `lenses`, `refused` (photos that were not learned from); `gain`,
         `control`, `true`: mean gain in dB by zone of the correction learned from such a photo, of
         denoising alone, and of the true PSF; `ssim`: mean gain in SSIM; `kept`; `share` of the true-PSF
-        gain in MTF50 where there was a chart; `psf`; `counts` of `counted`.
+        gain in MTF50 where there was a chart; `psf`; `counts` of `counted`; `nothing` of
+        `verdicts.said_nothing`.
     """
-    every: dict[str, list[Result]] = {}
+    every: dict[tuple[str, str], list[Result]] = {}
     for case in result.get("hard", ()):
-        every.setdefault(case["condition"], []).append(case)
-    return [_hard_row(name, cases) for name, cases in every.items()]
+        every.setdefault((case["condition"], case["family"]), []).append(case)
+    return [_hard_row(cases) for cases in every.values()]
 
 
-def _hard_row(name: str, cases: Sequence[Result]) -> dict[str, Any]:
+def _hard_row(cases: Sequence[Result]) -> dict[str, Any]:
     after = [(case, *case["learned"].values()) for case in cases]
     method = next(iter(after[0][1]["methods"]))
     done = [(case, unit["methods"][method]) for case, unit in after]
     rows = [(c, z, state, c["truth"]["true"][method]) for c, state in done for z in ZONES]
     return {
-        "condition": name,
+        "condition": cases[0]["condition"],
         "title": cases[0]["condition_title"],
+        "family": cases[0]["family"],
         "lenses": len(cases),
         "refused": sum(len(unit["refused"]) for _, unit in after),
         "gain": _zones(lambda z: mean(gain(c, state, z) for c, state in done)),
@@ -259,6 +267,7 @@ def _hard_row(name: str, cases: Sequence[Result]) -> dict[str, Any]:
         "share": _zones(partial(_column_mean, [shares(c, 1, method) for c in cases])),
         "psf": _zones(partial(_column_mean, [_rel_l2(unit["psf"], "g") for _, unit in after])),
         "counts": counted(rows),
+        "nothing": said_nothing((case, state, case["truth"]["true"][method]) for case, state in done),
     }
 
 
@@ -317,7 +326,7 @@ def _mtf(result: Result, method: str) -> list[dict[str, Any]]:
         row: dict[str, Any] = {"state": name}
         for zone in ZONES:
             here = [one[name]["edges"].get(zone, {}) for one in every if name in one]
-            row[zone] = {field: mean(_get(edge, field) for edge in here) for field in EDGE_FIGURES}
+            row[zone] = {field: mean(get(edge, field) for edge in here) for field in EDGE_FIGURES}
         rows.append(row)
     return rows
 
@@ -327,7 +336,7 @@ def _fidelity(result: Result, method: str, of: str) -> list[dict[str, Any]]:
     return [
         {
             "state": name,
-            **{zone: mean(_get(one[name][of], zone) for one in every if name in one) for zone in ZONES},
+            **{zone: mean(get(one[name][of], zone) for one in every if name in one) for zone in ZONES},
         }
         for name in _names(every)
     ]
@@ -364,15 +373,5 @@ def _rel_l2(found: Result | None, channel: str) -> dict[str, float | None]:
 
 
 def _edge(state: Result, zone: str, name: str) -> float | None:
-    value: float | None = _get(state["edges"].get(zone, {}), name)
+    value: float | None = get(state["edges"].get(zone, {}), name)
     return value
-
-
-def gain(case: Result, state: Result, zone: str, of: str = "psnr") -> float | None:
-    """Gain in PSNR (dB) or SSIM over the photo as it was; None where the zone is not there."""
-    before, after = _get(case["truth"]["before"][of], zone), _get(state[of], zone)
-    return None if before is None or after is None else after - before
-
-
-def _get(row: Mapping[str, Any] | None, name: str) -> float | None:
-    return None if row is None else row.get(name)

@@ -1,0 +1,170 @@
+"""Plan a run of `lensmodel reproduce`: which lenses, which of them behind other files and scenes too."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final, TypeVar
+
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.lab.reproduce import families, programs
+from lensmodel.lab.reproduce.cases import Case, Reproduction, Size
+from lensmodel.lab.reproduce.conditions import PATHS, SCENES_THAT_HURT
+from lensmodel.lab.reproduce.families import FIRST_SEED
+from lensmodel.lab.reproduce.scenes import layout_for, scene_files
+from lensmodel.simulate import draw_lens
+
+Lens = TypeVar("Lens")
+
+_QUICK_FRAME = (640, 960)
+_HARD_FRAME = (840, 1260)
+_STOPPED_DOWN = 2.0  # two stops
+
+_DRAWN_EACH: Final = {"quick": 1, "default": 2, "full": 4}
+_TRACED_EACH: Final = {"quick": 1, "default": 2, "full": 2}
+"""Lenses of a family behind each other kind of file, by size of the run (chosen: a night)."""
+
+
+def planned(
+    size: Size,
+    *,
+    scenes: Path | None = None,
+    estimator: str = "default",
+    hard: bool = False,
+    lenses: int | None = None,
+    grids: Sequence[Path] | None = None,
+    only: Sequence[str] = (),
+    paper: bool = True,
+    target: bool = True,
+) -> Reproduction:
+    """Plan a run of one of three sizes.
+
+    Parameters
+    ----------
+    size : {"quick", "default", "full"}
+        Two lenses, small photos, n = 1, 2; eight lenses of different kind, wide open, n = 1, 2, 5;
+        the same stopped down too, the zoom also at its long end, and n = 10, 20 on smaller frames.
+        The default size takes the other paths (high ISO, TIFF, JPEG) with two lenses of each family, the
+        full size takes them and the scenes that hurt with four of third order.
+    scenes : Path or None
+        See `Reproduction`.
+    estimator : str
+        See `Reproduction`.
+    hard : bool
+        Take the scenes that hurt too, each with two lenses of third order (quick: one).
+    lenses : int or None
+        Only so many of the lenses of each family, the first ones; results of a smaller run serve a larger
+        one.
+    grids : sequence of Path, optional
+        Grids of ray-traced lenses, one lens each; None takes those of the repository.
+    only : sequence of str
+        Only lenses whose name begins so, such as "1003" or "heliar"; for sittings on several machines.
+    paper, target : bool
+        See `Reproduction`.
+
+    Raises
+    ------
+    InvalidInputError
+        If `lenses` is below one, two grids are of one design and aperture, or no lens has such a name.
+
+    Notes
+    -----
+    With few photographs the largest n shrinks to what they allow without using one twice.
+    """
+    files = scene_files(scenes)
+    if lenses is not None and lenses < 1:
+        raise InvalidInputError(f"a reproduction takes at least one lens, not {lenses}")
+    seeds = range(FIRST_SEED, FIRST_SEED + 8)[:lenses]
+    paths = tuple(families.repository_grids() if grids is None else grids)[:lenses]
+    if size == "quick":
+        two = (FIRST_SEED, FIRST_SEED + 4)[:lenses]
+        cases = tuple(_case(seed, (1, 2), files, _QUICK_FRAME) for seed in two)
+        cases += tuple(_traced(path, (1, 2), files, _QUICK_FRAME) for path in paths)
+    else:
+        few = _allowed((1, 2, 5), len(files))
+        cases = tuple(_case(seed, few, files) for seed in seeds)
+        cases += tuple(_traced(path, few, files) for path in paths)
+    if size == "full":
+        zooms = [seed for seed in seeds if len(draw_lens(seed).focal_mm) > 1]
+        cases += tuple(_case(seed, few, files, focal=-1) for seed in zooms)
+        cases += tuple(_case(seed, few, files, stopped=_STOPPED_DOWN) for seed in seeds)
+        many = _allowed((10, 20), 2 * len(files))
+        cases += tuple(_case(seed, many, files) for seed in seeds if many != few)
+    names = (PATHS if size != "quick" or hard else ()) + (SCENES_THAT_HURT if hard or size == "full" else ())
+    frame = _QUICK_FRAME if size == "quick" else _HARD_FRAME
+    for number, name in enumerate(names):
+        cases += tuple(
+            replace(_case(seed, (1,), files, frame), condition=name)
+            for seed in in_turn(seeds, number, _DRAWN_EACH[size])
+        )
+        if name in PATHS:
+            cases += tuple(
+                replace(_traced(path, (1,), files, frame), condition=name)
+                for path in in_turn(paths, number, _TRACED_EACH[size])
+            )
+    return Reproduction(
+        _chosen(cases, only),
+        scenes,
+        estimator,
+        programs=programs.installed(),
+        size=size,
+        paper=paper,
+        target=target,
+    )
+
+
+def in_turn(lenses: Sequence[Lens], number: int, count: int) -> list[Lens]:
+    """Lenses of a condition: other ones for each, in turn, as unlike each other as they come."""
+    each = min(count, len(lenses))
+    return [lenses[(number + len(lenses) * i // each) % len(lenses)] for i in range(each)]
+
+
+def _chosen(cases: Sequence[Case], only: Sequence[str]) -> tuple[Case, ...]:
+    names = [case.name for case in cases]
+    if len(set(names)) < len(names):
+        raise InvalidInputError("two grids are of one design and aperture; give one of each")
+    unknown = [text for text in only if not any(name.startswith(text) for name in names)]
+    if unknown:
+        raise InvalidInputError(f"no lens's name begins with {unknown[0]!r}; they are {', '.join(names)}")
+    return tuple(case for case in cases if not only or case.name.startswith(tuple(only)))
+
+
+def _allowed(wanted: tuple[int, ...], parts: int) -> tuple[int, ...]:
+    """Numbers of photos that leave one frame over for the measurement."""
+    most = parts - 1
+    return tuple(sorted({min(n, most) for n in wanted}))
+
+
+def _case(
+    seed: int,
+    photos: tuple[int, ...],
+    files: Sequence[Path],
+    frame: tuple[int, int] | None = None,
+    *,
+    focal: int = 0,
+    stopped: float = 1.0,
+) -> Case:
+    lens = draw_lens(seed)
+    layout = layout_for(files, photos[-1] + 1, frame)
+    height, width = frame or layout.frame
+    mm = lens.focal_mm[focal]
+    return Case(seed, mm, lens.at_focal(mm).f_number * stopped, photos, height, width, layout)
+
+
+def _traced(
+    path: Path, photos: tuple[int, ...], files: Sequence[Path], frame: tuple[int, int] | None = None
+) -> Case:
+    lens = families.traced(path)
+    layout = layout_for(files, photos[-1] + 1, frame)
+    height, width = frame or layout.frame
+    return Case(
+        families.number(path),
+        lens.focal_mm[0],
+        lens.widest(),
+        photos,
+        height,
+        width,
+        layout,
+        grid=path,
+    )

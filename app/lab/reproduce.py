@@ -39,6 +39,9 @@ def reproduce(
     full: Annotated[
         bool, typer.Option("--full", help="Two apertures a lens, n up to 20: takes all night.")
     ] = False,
+    small: Annotated[
+        bool, typer.Option("--small", help="All lenses, photos of a megapixel, no rivals: some hours.")
+    ] = False,
     hard: Annotated[
         bool,
         typer.Option("--hard", help="Add difficult scenes: depth, motion, night, sky, snow, text, foliage."),
@@ -117,8 +120,8 @@ def reproduce(
     Exit status: 0 the page is written, 1 something failed, 2 called wrongly.
     """
     shown = display.of(context, quiet=quiet, verbose=verbose)
-    if quick and full:
-        raise UsageError("--quick and --full exclude each other; give one of them")
+    if quick + small + full > 1:
+        raise UsageError("--quick, --small and --full exclude each other; give one of them")
     refuse_existing(json_output, *(output / name for name in PAGE), force=force)
     from app.lab.service_route import CODE, ServiceRoutes  # noqa: PLC0415 - only this command needs them
     from lensmodel.lab.reproduce import (  # noqa: PLC0415 - as above: the simulation is slow to import
@@ -129,7 +132,7 @@ def reproduce(
         write_page,
     )
 
-    size: Size = "quick" if quick else "full" if full else "default"
+    size: Size = "quick" if quick else "small" if small else "full" if full else "default"
     plan = planned(
         size,
         scenes=scenes or _external(),

@@ -21,7 +21,7 @@ from lensmodel.lab.reproduce.families import FIRST_SEED, Family
 from lensmodel.lab.reproduce.scenes import Layout, content_of, scene_files
 from lensmodel.simulate import CameraLens, SimulatedCamera, SimulatedField, draw_lens
 
-Size: TypeAlias = Literal["quick", "default", "full"]
+Size: TypeAlias = Literal["quick", "small", "default", "full"]
 
 PROTOCOL: Final = 5
 """Part of every key of a stored result; raised when what is measured changes."""
@@ -188,7 +188,7 @@ class Reproduction:
         Blind methods of others, names in `lensmodel.lab.rivals`; each sees one photo.
     programs : tuple of str
         Programs of others that correct the same photos, names in `lensmodel.lab.peers`.
-    size : {"quick", "default", "full"}
+    size : {"quick", "small", "default", "full"}
         How it was planned, for the page.
     paper : bool
         Whether each lens is learned and corrected the paper's own way from end to end too.

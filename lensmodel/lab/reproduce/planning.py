@@ -9,7 +9,7 @@ from typing import Final, TypeVar
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.lab.reproduce import families, programs
-from lensmodel.lab.reproduce.cases import Case, Reproduction, Size
+from lensmodel.lab.reproduce.cases import RIVALS, Case, Reproduction, Size
 from lensmodel.lab.reproduce.conditions import PATHS, SCENES_THAT_HURT
 from lensmodel.lab.reproduce.families import FIRST_SEED
 from lensmodel.lab.reproduce.scenes import layout_for, scene_files
@@ -21,8 +21,8 @@ _QUICK_FRAME = (640, 960)
 _HARD_FRAME = (840, 1260)
 _STOPPED_DOWN = 2.0  # two stops
 
-_DRAWN_EACH: Final = {"quick": 1, "default": 2, "full": 4}
-_TRACED_EACH: Final = {"quick": 1, "default": 2, "full": 2}
+_DRAWN_EACH: Final = {"quick": 1, "small": 2, "default": 2, "full": 4}
+_TRACED_EACH: Final = {"quick": 1, "small": 2, "default": 2, "full": 2}
 """Lenses of a family behind each other kind of file, by size of the run (chosen: a night)."""
 
 
@@ -38,12 +38,13 @@ def planned(
     paper: bool = True,
     target: bool = True,
 ) -> Reproduction:
-    """Plan a run of one of three sizes.
+    """Plan a run of one of four sizes.
 
     Parameters
     ----------
-    size : {"quick", "default", "full"}
-        Two lenses, small photos, n = 1, 2; eight lenses of different kind, wide open, n = 1, 2, 5;
+    size : {"quick", "small", "default", "full"}
+        Two lenses, small photos, n = 1, 2; all lenses wide open on frames of a megapixel, n = 1, 2, 5,
+        without rivals; eight lenses of different kind, wide open, n = 1, 2, 5;
         the same stopped down too, the zoom also at its long end, and n = 10, 20 on smaller frames.
         The default size takes the other paths (high ISO, TIFF, JPEG) with two lenses of each family, the
         full size takes them and the scenes that hurt with four of third order.
@@ -82,16 +83,16 @@ def planned(
         cases = tuple(_case(seed, (1, 2), files, _QUICK_FRAME) for seed in two)
         cases += tuple(_traced(path, (1, 2), files, _QUICK_FRAME) for path in paths)
     else:
-        few = _allowed((1, 2, 5), len(files))
-        cases = tuple(_case(seed, few, files) for seed in seeds)
-        cases += tuple(_traced(path, few, files) for path in paths)
+        few, frame = _allowed((1, 2, 5), len(files)), _HARD_FRAME if size == "small" else None
+        cases = tuple(_case(seed, few, files, frame) for seed in seeds)
+        cases += tuple(_traced(path, few, files, frame) for path in paths)
     if size == "full":
         zooms = [seed for seed in seeds if len(draw_lens(seed).focal_mm) > 1]
         cases += tuple(_case(seed, few, files, focal=-1) for seed in zooms)
         cases += tuple(_case(seed, few, files, stopped=_STOPPED_DOWN) for seed in seeds)
         many = _allowed((10, 20), 2 * len(files))
         cases += tuple(_case(seed, many, files) for seed in seeds if many != few)
-    names = (PATHS if size != "quick" or hard else ()) + (SCENES_THAT_HURT if hard or size == "full" else ())
+    names = (PATHS if size not in {"quick", "small"} or hard else ()) + (SCENES_THAT_HURT if hard or size == "full" else ())
     frame = _QUICK_FRAME if size == "quick" else _HARD_FRAME
     for number, name in enumerate(names):
         cases += tuple(
@@ -107,6 +108,7 @@ def planned(
         _chosen(cases, only),
         scenes,
         estimator,
+        rivals=() if size == "small" else RIVALS,
         programs=programs.installed(),
         size=size,
         paper=paper,

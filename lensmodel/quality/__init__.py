@@ -1,4 +1,4 @@
-"""Sharpness and fidelity: slanted edges, MTF, PSNR, SSIM, noise gain."""
+"""Sharpness and fidelity: slanted edges, MTF, PSNR, noise gain."""
 
 from lensmodel.quality.charts import EdgeMeasurement, ZoneSharpness, by_zone, measure_edges
 from lensmodel.quality.edge import EdgeResponse, crossing, pixel_mtf, slanted_edge
@@ -10,7 +10,6 @@ from lensmodel.quality.images import (
     psnr,
     registered_zone_psnr,
     shifted,
-    ssim,
     to_srgb,
 )
 from lensmodel.quality.kernels import (
@@ -40,7 +39,6 @@ __all__ = [
     "registered_zone_psnr",
     "shifted",
     "slanted_edge",
-    "ssim",
     "tangential_sagittal_mtf50",
     "to_srgb",
 ]

@@ -1,4 +1,4 @@
-"""How close one picture is to another: PSNR and SSIM, also by zone and without a global shift."""
+"""How close one picture is to another: PSNR, also by zone and without a global shift."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 from typing import Final
 
 import numpy as np
-import skimage
 from numpy.typing import NDArray
 from scipy import fft
 
@@ -14,7 +13,6 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import CENTER_ZONE_R, CORNER_ZONE_R, Frame
 from lensmodel.core.types import ZONES, Zone
 
-_SSIM_WINDOW: Final = 11  # pixels: that of Wang et al. 2004
 _SHIFT_STEPS: Final = 6  # of Newton (chosen)
 _SHIFT_PAD: Final = 8  # pixels: more than any shift that is looked for
 _LARGEST_SHIFT = 3.0  # pixels: larger ones are no shift but another picture (chosen)
@@ -54,27 +52,6 @@ def psnr(
         error = error[..., mask]
     mean = float(error.mean())
     return math.inf if mean == 0.0 else -10.0 * math.log10(mean)
-
-
-def ssim(image: NDArray[np.floating], reference: NDArray[np.floating], *, srgb: bool = False) -> float:
-    """Structural similarity, mean over planes; Gaussian window of sigma 1.5, range 1.
-
-    Source: Z. Wang et al., "Image quality assessment: from error visibility to structural
-    similarity", IEEE TIP 13, 2004, with its constants.
-    """
-    _same_shape(image, reference)
-    if min(image.shape[-2:]) < _SSIM_WINDOW:
-        raise InvalidInputError(f"SSIM needs at least {_SSIM_WINDOW} pixels a side, got {image.shape}")
-    a = to_srgb(image) if srgb else np.asarray(image, dtype=np.float64)
-    b = to_srgb(reference) if srgb else np.asarray(reference, dtype=np.float64)
-    planes = zip(a.reshape(-1, *a.shape[-2:]), b.reshape(-1, *b.shape[-2:]), strict=True)
-    values = [
-        skimage.metrics.structural_similarity(  # type: ignore[no-untyped-call]  # scikit-image ships no types
-            x, y, data_range=1.0, gaussian_weights=True, use_sample_covariance=False
-        )
-        for x, y in planes
-    ]
-    return float(np.mean(values))
 
 
 def registered_zone_psnr(

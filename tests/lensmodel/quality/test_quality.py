@@ -15,6 +15,7 @@ from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import CORNER_ZONE_R, Frame
 from lensmodel.core.psf import delta, gaussian
 from lensmodel.core.types import LensSettings
+from lensmodel.lab.images import ssim
 from lensmodel.quality import (
     best_shift,
     by_zone,
@@ -30,7 +31,6 @@ from lensmodel.quality import (
     registered_zone_psnr,
     shifted,
     slanted_edge,
-    ssim,
     tangential_sagittal_mtf50,
     to_srgb,
 )

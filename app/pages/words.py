@@ -344,11 +344,6 @@ def held_words(zone: Mapping[str, Any]) -> str:
     return f", {held:.0%} held back ({', '.join(reasons[:3])})" if held > HELD else ""
 
 
-def figure(value: object) -> str:
-    """Write a number with what digits it deserves."""
-    return f"{value:.3g}" if isinstance(value, float) else str(value if value is not None else "")
-
-
 def active(photo: PhotoOut) -> bool:
     """Whether work on it goes on."""
     return photo.state in ACTIVE

@@ -63,13 +63,6 @@ def half_sides(aspect: float) -> tuple[float, float]:
     return aspect / diagonal, 1.0 / diagonal
 
 
-def inside(position: FieldPosition, aspect: float) -> bool:
-    """Whether a place lies on the picture."""
-    width, height = half_sides(aspect)
-    x, y = position.r * math.cos(position.phi), position.r * math.sin(position.phi)
-    return abs(x) <= width + 1e-9 and abs(y) <= height + 1e-9
-
-
 def grid(rows: int, cols: int, aspect: float) -> tuple[FieldPosition, ...]:
     """Centres of rows x cols equal cells of the picture, row by row from the top left.
 

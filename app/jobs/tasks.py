@@ -153,7 +153,7 @@ def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
     model = _with_family(folder, ModelSettings(**arguments["model"]))
     settings = _settings(arguments["settings"])
     patches = pipeline.load_seen(Path(arguments["developed"]))
-    psfs = pipeline.psfs_for(developed, model, settings, method=arguments["method"], seen=patches)
+    psfs = pipeline.psfs_for(developed, model, settings, method=arguments["method"], patches=patches)
     bounds = correction.Bounds(**arguments["bounds"])
     extremes = (replace(bounds, texture=0.0), replace(bounds, texture=1.0, denoise=1.0))
     corrected = pipeline.correct_photo(

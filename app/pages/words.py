@@ -311,7 +311,7 @@ def coverage_advice(bars: Sequence[ZoneBar], positions: Sequence[FieldPosition])
     ----------
     bars : sequence of ZoneBar
         How many places were seen in each zone.
-    seen : sequence of FieldPosition
+    positions : sequence of FieldPosition
         Those places: a zone with many may still have a corner with none.
     """
     if not bars:

@@ -17,11 +17,11 @@ import numpy as np
 
 from app.jobs.body_keys import body_key
 from app.jobs.context import SPARE_MB, JobContext, JobFailedError, NotWantedError
-from app.jobs.glance_work import keep_glance
 from app.jobs.measurement_work import MeasurementWork
 from app.jobs.patch_plans import described, patch_of, plan_of, why_not
 from app.jobs.queue import Job, JobEngine
 from app.jobs.task_files import KERNELS
+from app.jobs.thumbnail_work import keep_glance
 from app.sandbox.outcome import Limits
 from app.store import LensName, NewSample
 from app.store.photo_steps import settings_of

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from app.blobs import glances, previews
+from app.blobs import previews, thumbnails
 from app.jobs.task_files import (
     AFTER,
     BEFORE,
@@ -65,7 +65,7 @@ def inspect(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
 def glance(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
     """Render a small picture of the photo at `path`."""
     del progress
-    picture = glances.glance(Path(arguments["path"]), arguments["kind"], arguments["orientation"] or 1)
+    picture = thumbnails.glance(Path(arguments["path"]), arguments["kind"], arguments["orientation"] or 1)
     (folder / GLANCE).write_bytes(picture)
     return {}
 

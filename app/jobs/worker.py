@@ -20,7 +20,7 @@ from typing import Final, TypeAlias
 from sqlalchemy.exc import OperationalError
 
 from app.blobs.erasure import erase
-from app.blobs.founding import settle
+from app.blobs.folder_creation import settle
 from app.blobs.storage import Storage
 from app.jobs.context import JobContext
 from app.jobs.correction_work import CorrectionWork

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
@@ -16,6 +15,7 @@ from app import schemas as s
 from app.client_retries import RETRIES, Retrying
 from app.runtime.settings import CLIENT_KEY
 from lensmodel.core.errors import LensModelError
+from lensmodel.core.files import atomic
 
 M = TypeVar("M", bound=BaseModel)
 Query: TypeAlias = Mapping[str, str | int | float | bool | None]
@@ -86,14 +86,9 @@ class Connection:
             if answer.is_error:
                 answer.read()
             check(answer)
-            with tempfile.NamedTemporaryFile(dir=target.parent, suffix=".part", delete=False) as part:
-                try:
-                    for piece in answer.iter_bytes():
-                        part.write(piece)
-                except BaseException:
-                    Path(part.name).unlink()
-                    raise
-        Path(part.name).replace(target)
+            with atomic(target) as file:
+                for piece in answer.iter_bytes():
+                    file.write(piece)
         return target
 
     def _get(self, answer: type[M], path: str, query: Query | None = None) -> M:

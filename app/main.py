@@ -13,7 +13,7 @@ from starlette.concurrency import run_in_threadpool
 
 from app import pages
 from app.access.authentication import Gate
-from app.blobs.founding import settle
+from app.blobs.folder_creation import settle
 from app.blobs.storage import Storage
 from app.http import errors
 from app.http.bodies import JsonBodies

@@ -83,7 +83,7 @@ class Storage:
         longer outages, and requests are answered with an error.
     create : bool
         Whether to create a missing folder. Where it may be unmounted rather than new use
-        `app.blobs.founding`: a folder that is created while its disk is missing hides that.
+        `app.blobs.folder_creation`: a folder that is created while its disk is missing hides that.
     """
 
     def __init__(self, url: str, *, patience_s: float = PATIENCE_S, create: bool = True) -> None:

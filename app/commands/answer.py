@@ -12,11 +12,12 @@ import tifffile
 from PIL import Image
 
 from app.commands.console import files
-from app.commands.console.display import Display, atomic
+from app.commands.console.display import Display
 from app.commands.console.failure import UsageError
 from app.words import mtf50_words
 from lensmodel import quality
 from lensmodel.core.codec import to_json
+from lensmodel.core.files import replacing
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.psf import rms_width
 from lensmodel.core.types import ZONE_WORDS, Channel, FieldPosition, LensSettings
@@ -77,7 +78,7 @@ def run(
     }
     if output is not None:
         output.parent.mkdir(parents=True, exist_ok=True)
-        with atomic(output) as part:
+        with replacing(output) as part:
             _write(part, answer, document)
     if as_json:
         display.document(document)

@@ -16,6 +16,7 @@ from app.commands.console import display, files
 from app.commands.console.failure import UsageError
 from app.commands.console.options import Aperture, Force, Json, Quiet, Verbose
 from lensmodel import photo
+from lensmodel.core.files import replacing
 from lensmodel.core.types import ZONE_WORDS, LensSettings
 from lensmodel.correction.audit import AuditReport
 from lensmodel.workflow import checking
@@ -84,7 +85,7 @@ def check(
             original, corrected, model=model, settings=settings, on_step=partial(_show, bars, task)
         )
     if picture is not None:
-        with display.atomic(picture) as part:
+        with replacing(picture) as part:
             Image.fromarray(_map(checked)).save(part)
     if json_output:
         document: dict[str, Any] = {"original": str(original), "corrected": str(corrected)}

@@ -88,8 +88,7 @@ def run(
                     path, target, lens, settings, options, display, partial(_show, bars, task, number)
                 )
             except (LensModelError, OSError) as error:
-                code = error.code if isinstance(error, LensModelError) else "unreadable"
-                result = {"state": "failed", "code": code, "reason": files.reason(error)}
+                result = files.failed(error)
                 display.error(f"{path}: {result['reason']}")
             if result["state"] == "kept":
                 display.note(f"{target} is there already and was left alone; --force replaces it")

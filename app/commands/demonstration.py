@@ -15,6 +15,7 @@ from app.commands.console.failure import UsageError
 from app.commands.console.method_options import Estimator
 from app.commands.console.options import Quiet, Verbose
 from lensmodel import estimation
+from lensmodel.core.files import write_atomically
 
 MARKER: Final = ".lensmodel-demo.json"
 """Lists the files that a demo wrote into its folder, each with its SHA-256."""
@@ -98,8 +99,7 @@ def _mark(folder: Path, before: dict[str, str]) -> None:
         for name, digest in _digests(folder).items()
         if name in earlier or before.get(name) != digest
     }
-    with display.atomic(folder / MARKER) as part:
-        part.write_text(json.dumps(ours, indent=1) + "\n", encoding="utf-8")
+    write_atomically(folder / MARKER, (json.dumps(ours, indent=1) + "\n").encode())
 
 
 def _marked(folder: Path) -> dict[str, str]:

@@ -124,14 +124,9 @@ def _read(paths: Sequence[Path], display: Display) -> tuple[list[Shot], list[dic
         try:
             shots.append(Shot.of(path))
         except (LensModelError, OSError) as error:
-            results.append({"photo": str(path), "output": None, **_failed(error)})
+            results.append({"photo": str(path), "output": None, **files.failed(error)})
             display.error(f"{path}: {files.reason(error)}")
     return shots, results
-
-
-def _failed(error: LensModelError | OSError) -> dict[str, Any]:
-    code = error.code if isinstance(error, LensModelError) else "unreadable"
-    return {"state": "failed", "code": code, "reason": files.reason(error)}
 
 
 class _Folder:
@@ -268,7 +263,7 @@ class _Folder:
                 shot.path, target, lens, settings, self._options, self._display, on_step
             )
         except (LensModelError, OSError) as error:
-            return _failed(error)
+            return files.failed(error)
         if result["state"] == "left":
             result["reason"] = "next to nothing would be gained"
             self._journal.note("left", photo, under, result["reason"])

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Final
 
 from lensmodel.core.codec import to_json
+from lensmodel.core.files import write_atomically
 from lensmodel.model.profile import LensProfile
 from lensmodel.photo import develop
 from lensmodel.report import bootstrap
 from lensmodel.report.comparison import Side, compare
 from lensmodel.report.documents import comparison_html, to_html
-from lensmodel.report.exporters import write_atomically
 from lensmodel.report.lens_test import LensTest, lens_test
 from lensmodel.report.pdf import comparison_pdf, to_pdf
 from lensmodel.report.tables import to_csv

@@ -27,6 +27,7 @@ from app.commands.console.options import (
     aperture_option,
 )
 from lensmodel.core.codec import to_json
+from lensmodel.core.files import write_atomically
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel
 from lensmodel.report import (
@@ -43,7 +44,6 @@ from lensmodel.report import (
     mtf_map_svg,
     psf_grid,
 )
-from lensmodel.report.exporters import write_atomically
 from lensmodel.report.lens_report import widest
 
 Aperture = Annotated[float | None, aperture_option("f-number; default: the widest that a photo had.")]

@@ -58,8 +58,8 @@ class NotWantedError(Exception):
 
 
 @dataclass
-class Workbench:
-    """The parts of one worker."""
+class JobContext:
+    """What the jobs of one worker share: settings, rows, files, and a sandbox for their tasks."""
 
     settings: Settings
     store: Store

@@ -16,9 +16,9 @@ from typing import Any, Final
 
 from app.jobs.context import (
     SPARE_MB,
+    JobContext,
     JobFailedError,
     NotWantedError,
-    Workbench,
     write_samples,
 )
 from app.jobs.task_files import AFTER, BEFORE, FAMILY, LAYERS, LEARNED, REPORT, SUFFIX
@@ -56,9 +56,9 @@ FAMILIES: Final = 8
 class CorrectionWork:
     """Jobs of corrections and of lens versions."""
 
-    def __init__(self, bench: Workbench) -> None:
-        self._bench = bench
-        self._corrections = bench.store.corrections
+    def __init__(self, context: JobContext) -> None:
+        self._context = context
+        self._corrections = context.store.corrections
         self._families: OrderedDict[str, bytes] = OrderedDict()
 
     def correction(self, correction_id: str, epoch: int = 1) -> None:
@@ -82,10 +82,10 @@ class CorrectionWork:
     def _correct(self, plan: CorrectionPlan, wanted: Callable[[], bool]) -> None:
         key, photo, params = plan.correction.public_id, plan.photo, plan.correction.params
         self._corrections.progress(key, 0, 0, "developing")
-        developed = self._bench.developed(photo, wanted)
+        developed = self._context.developed(photo, wanted)
         self._corrections.progress(key, 0, 0, "correcting")
-        settings = self._bench.settings
-        limits = self._bench.limits(photo, settings.correct_seconds, 120)
+        settings = self._context.settings
+        limits = self._context.limits(photo, settings.correct_seconds, 120)
         limits = replace(
             limits,
             memory_mb=limits.memory_mb + THREAD_MB * settings.worker_slots,
@@ -106,13 +106,13 @@ class CorrectionWork:
             "description": _description(plan),
             "lens": plan.lens.label or "",
         }
-        with self._bench.sandbox.folder() as folder:
+        with self._context.sandbox.folder() as folder:
             lens_id, version = plan.lens.public_id, plan.correction.lens_version
             state = self._samples(lens_id, version, folder)
             arguments["model"] = of_models(settings, state.way)
             known = (folder / LEARNED).is_file()
             leaning, fitted = self._family(params.get("family", []), arguments["model"], folder)
-            done = self._bench.attempt(
+            done = self._context.attempt(
                 "correct",
                 arguments,
                 folder=folder,
@@ -140,7 +140,7 @@ class CorrectionWork:
             Of the fit: the copies with their versions, and the settings of the model.
         """
         family = [Relative(entry["lens_id"], LensState(**entry["state"])) for entry in relatives]
-        stored = self._bench.store.samples.of_family(family)
+        stored = self._context.store.samples.of_family(family)
         if not stored:
             return 0, ""
         (folder / FAMILY).mkdir()
@@ -161,14 +161,14 @@ class CorrectionWork:
             self._families.popitem(last=False)
 
     def _samples(self, lens_id: str, version: int, folder: Path) -> LensState:
-        state, stored = self._bench.store.samples.of_lens(lens_id, up_to_version=version)
+        state, stored = self._context.store.samples.of_lens(lens_id, up_to_version=version)
         if not stored:
             text = f"version {version} of lens {lens_id} has no samples any more; ask for the newest version"
             raise JobFailedError("no_samples", text)
         write_samples(folder, stored)
         key = learned_key(lens_id, version, state.rebuild_epoch)
         with suppress(FileNotFoundError):  # not fitted yet: the task does it
-            (folder / LEARNED).write_bytes(self._bench.storage.get(key))
+            (folder / LEARNED).write_bytes(self._context.storage.get(key))
         return state
 
     def _progress_of(self, correction_id: str) -> Progress:
@@ -190,10 +190,10 @@ class CorrectionWork:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         base = folder_of(plan.correction)
         key = f"{base}result{path.suffix}"
-        self._bench.storage.put_file(key, path)
+        self._context.storage.put_file(key, path)
         for shown in (BEFORE, AFTER, *LAYERS):
             if (path.parent / shown).is_file():
-                self._bench.storage.put_file(f"{base}{shown}", path.parent / shown)
+                self._context.storage.put_file(f"{base}{shown}", path.parent / shown)
         stem = PurePath(plan.photo.filename).stem or "photo"
         result = Result(
             key=key,
@@ -209,24 +209,24 @@ class CorrectionWork:
         """Delete the files of a correction that was cancelled or deleted while they were stored."""
         row = self._corrections.get(correction.public_id)
         if row is None or row.state != "succeeded":  # another worker may have finished it
-            self._bench.storage.delete(folder_of(correction))
+            self._context.storage.delete(folder_of(correction))
 
     def measure(self, lens_id: str, version: int, _again: int = 0) -> None:
         """Measure how well one version of a lens predicts held-out photos, and write its report.
 
         When repeated for a missing report it keeps the figures that were measured first.
         """
-        lenses = self._bench.store.lenses
+        lenses = self._context.store.lenses
 
         def wanted() -> bool:
             return self._is_newest(lens_id, version)
 
-        limits = Limits(memory_mb=2 * SPARE_MB, wall_s=self._bench.settings.patch_seconds)
+        limits = Limits(memory_mb=2 * SPARE_MB, wall_s=self._context.settings.patch_seconds)
         try:
-            with self._bench.sandbox.folder() as folder:
+            with self._context.sandbox.folder() as folder:
                 state = self._samples(lens_id, version, folder)
-                model = of_models(self._bench.settings, state.way)
-                metrics = self._bench.attempt(
+                model = of_models(self._context.settings, state.way)
+                metrics = self._context.attempt(
                     "measure", {"model": model}, folder=folder, limits=limits, wanted=wanted, compiles=True
                 )
                 self._keep_learned(lens_id, version, state, folder / LEARNED)
@@ -243,20 +243,20 @@ class CorrectionWork:
         self, lens_id: str, key: str, model: dict[str, str], folder: Path, wanted: Callable[[], bool]
     ) -> None:
         """Write the report of the lens whose samples lie in a folder; a failure is only logged."""
-        settings = self._bench.settings
+        settings = self._context.settings
         limits = Limits(memory_mb=2 * SPARE_MB, wall_s=settings.correct_seconds)
         arguments = {"model": model, "about": self._about(lens_id)}
         try:
-            self._bench.attempt(
+            self._context.attempt(
                 "report", arguments, folder=folder, limits=limits, wanted=wanted, compiles=True
             )
-            self._bench.storage.put_file(key, folder / REPORT)
+            self._context.storage.put_file(key, folder / REPORT)
         except (JobFailedError, FileNotFoundError) as error:
             log.warning("lens %s has no report: %s", lens_id, error)
 
     def _about(self, lens_id: str) -> dict[str, Any]:
         """Return what the report needs besides the samples: name, shape of the photos, lateral colour."""
-        lenses = self._bench.store.lenses
+        lenses = self._context.store.lenses
         lens = lenses.get(lens_id)
         if lens is None:
             raise NotWantedError
@@ -271,14 +271,14 @@ class CorrectionWork:
 
     def _is_newest(self, lens_id: str, version: int) -> bool:
         """Whether a version is the current one; fitted models of earlier ones have been deleted."""
-        lens = self._bench.store.lenses.get(lens_id)
+        lens = self._context.store.lenses.get(lens_id)
         return lens is not None and lens.version == version
 
     def _keep_learned(self, lens_id: str, version: int, state: LensState, path: Path) -> None:
         """Store the fitted model of the newest version for all processes that answer requests."""
         if path.is_file():
             key = learned_key(lens_id, version, state.rebuild_epoch)
-            self._bench.storage.put_file(key, path)
+            self._context.storage.put_file(key, path)
 
 
 def _bounds(params: dict[str, Any]) -> dict[str, float]:

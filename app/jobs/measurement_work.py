@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from app.jobs.context import JobFailedError, Workbench
+from app.jobs.context import JobContext, JobFailedError
 from app.jobs.task_files import KERNELS
 from app.store import NewPatch, NewSample
 from app.store.photo_steps import settings_of
@@ -32,8 +32,8 @@ _BYTES_A_PIXEL: Final = 96  # chosen, not measured: two mapped photos, a float64
 class MeasurementWork:
     """Measures a photo in the sandbox."""
 
-    def __init__(self, bench: Workbench) -> None:
-        self._bench = bench
+    def __init__(self, context: JobContext) -> None:
+        self._context = context
 
     def measure(self, photo: PhotoRow, developed: Path, wanted: Callable[[], bool]) -> None:
         """Measure the PSF all over a photo and store it as patches with samples.
@@ -46,7 +46,7 @@ class MeasurementWork:
             If the photo cannot be measured, or the result of the child is invalid.
         """
         folders = [developed, *self._reference(photo, wanted)]
-        settings = self._bench.settings
+        settings = self._context.settings
         arguments = {
             "kind": photo.given["kind"],
             "developed": [str(folder) for folder in folders],
@@ -54,13 +54,13 @@ class MeasurementWork:
             "settings": settings_of(photo),
             "size": way_of(settings, photo.way).kernel_size,
         }
-        limits = self._bench.limits(photo, settings.correct_seconds, _BYTES_A_PIXEL)
-        with self._bench.sandbox.folder() as folder:
-            listed = self._bench.attempt(
+        limits = self._context.limits(photo, settings.correct_seconds, _BYTES_A_PIXEL)
+        with self._context.sandbox.folder() as folder:
+            listed = self._context.attempt(
                 "measure-lens", arguments, folder=folder, limits=limits, wanted=wanted, reads=folders
             )
             patches, samples = _checked(listed, folder)
-        store = self._bench.store
+        store = self._context.store
         store.patches.add(photo.public_id, photo.epoch, patches)
         store.photos.set_state(photo.public_id, ("selecting",), "estimating", epoch=photo.epoch)
         store.patches.finish(photo.public_id, photo.epoch, samples)
@@ -70,11 +70,11 @@ class MeasurementWork:
         name = photo.given.get("reference_id")
         if name is None:
             return []
-        row = self._bench.store.photos.get(name)
+        row = self._context.store.photos.get(name)
         end = time.monotonic() + WAIT_S
         while row is not None and row.state in _UNREAD and time.monotonic() < end and wanted():
             time.sleep(0.2)
-            row = self._bench.store.photos.get(name)
+            row = self._context.store.photos.get(name)
         if row is None or row.owner_id != photo.owner_id:
             raise JobFailedError(
                 "unknown_photo", f"the reference photo {name} is not there any more; send both photos again"
@@ -83,7 +83,7 @@ class MeasurementWork:
             raise JobFailedError(
                 "not_ready", f"the reference photo {name} was not read yet; send the open photo again"
             )
-        return [self._bench.developed(row, wanted)]
+        return [self._context.developed(row, wanted)]
 
 
 def _checked(listed: Any, folder: Path) -> tuple[list[NewPatch], list[NewSample]]:  # noqa: ANN401 - a child's JSON

@@ -16,12 +16,12 @@ from typing import Any, Final
 import numpy as np
 
 from app.jobs.body_keys import body_key
-from app.jobs.context import SPARE_MB, JobFailedError, NotWantedError, Workbench
-from app.jobs.glance_work import keep_glance
+from app.jobs.context import SPARE_MB, JobContext, JobFailedError, NotWantedError
 from app.jobs.measurement_work import MeasurementWork
 from app.jobs.patch_plans import described, patch_of, plan_of, why_not
 from app.jobs.queue import Job, JobEngine
 from app.jobs.task_files import KERNELS
+from app.jobs.thumbnail_work import keep_glance
 from app.sandbox.outcome import Limits
 from app.store import LensName, NewSample
 from app.store.photo_steps import settings_of
@@ -44,10 +44,10 @@ LOOK_AFTER_S: Final = 5.0
 class PhotoWork:
     """Jobs of photos and of their cells."""
 
-    def __init__(self, bench: Workbench, engine: JobEngine) -> None:
-        self._bench, self._engine = bench, engine
-        self._store = bench.store
-        self._measurements = MeasurementWork(bench)
+    def __init__(self, context: JobContext, engine: JobEngine) -> None:
+        self._context, self._engine = context, engine
+        self._store = context.store
+        self._measurements = MeasurementWork(context)
 
     def photo(self, photo_id: str, epoch: int) -> None:
         """Take a photo through all steps, as far as it can get."""
@@ -63,7 +63,7 @@ class PhotoWork:
             if not self._identify(photo):
                 return
             self._move(photo, ("inspecting", "developing"), "developing")
-            developed = self._bench.developed(photo, wanted)
+            developed = self._context.developed(photo, wanted)
             self._move(photo, ("developing", "selecting"), "selecting")
             if photo.given.get("kind"):
                 self._measurements.measure(photo, developed, wanted)
@@ -106,13 +106,13 @@ class PhotoWork:
     def _inspect(self, photo: PhotoRow, wanted: Callable[[], bool]) -> PhotoRow:
         if photo.state != "inspecting":
             return photo
-        limits = Limits(memory_mb=SPARE_MB, wall_s=self._bench.settings.inspect_seconds)
-        with self._bench.original(photo) as path, self._bench.sandbox.folder() as folder:
-            arguments = {"path": str(path), "max_megapixels": self._bench.settings.max_megapixels}
-            info = self._bench.attempt(
+        limits = Limits(memory_mb=SPARE_MB, wall_s=self._context.settings.inspect_seconds)
+        with self._context.original(photo) as path, self._context.sandbox.folder() as folder:
+            arguments = {"path": str(path), "max_megapixels": self._context.settings.max_megapixels}
+            info = self._context.attempt(
                 "inspect", arguments, folder=folder, limits=limits, wanted=wanted, reads=[path]
             )
-            keep_glance(self._bench, photo, info, path, wanted)
+            keep_glance(self._context, photo, info, path, wanted)
         self._record(photo, info)
         return self._get(photo.public_id)
 
@@ -144,7 +144,7 @@ class PhotoWork:
         """Assign the lens; return whether to go on and calibrate it."""
         if photo.state != "inspecting":
             return True
-        photos, single = self._store.photos, self._bench.settings.assume_single_copy
+        photos, single = self._store.photos, self._context.settings.assume_single_copy
         lens = photos.assign_lens(photo.public_id, single_copy=single)
         if not photo.calibrate:
             photos.set_state(
@@ -167,15 +167,15 @@ class PhotoWork:
     def _select(self, photo: PhotoRow, developed: Path, wanted: Callable[[], bool]) -> None:
         if self._store.patches.all_of(photo.public_id, photo.epoch):
             return
-        limits = self._bench.limits(photo, self._bench.settings.develop_seconds, 120)
+        limits = self._context.limits(photo, self._context.settings.develop_seconds, 120)
         arguments = {
             "developed": str(developed),
-            "count": self._bench.settings.patches,
-            "selector": self._bench.settings.selector,
+            "count": self._context.settings.patches,
+            "selector": self._context.settings.selector,
         }
-        with self._bench.sandbox.folder() as folder:
+        with self._context.sandbox.folder() as folder:
             try:
-                selection = self._bench.attempt(
+                selection = self._context.attempt(
                     "select", arguments, folder=folder, limits=limits, wanted=wanted, reads=[developed]
                 )
             except JobFailedError as error:
@@ -229,7 +229,7 @@ class PhotoWork:
         tried = [row for row in rows if row.cell is not None]
         good = sum(row.state == "done" for row in tried)
         self._require_spread([row for row in tried if row.state == "done"])
-        if good >= self._bench.settings.min_good_patches:
+        if good >= self._context.settings.min_good_patches:
             version = self._store.photos.finish(photo.public_id, photo.epoch)
             if version is not None:
                 log.info("photo %s counted, lens version %d", photo.public_id, version)
@@ -247,13 +247,13 @@ class PhotoWork:
         if not done:
             return
         try:
-            pipeline.require_spread([patch_of(row) for row in done], count=self._bench.settings.patches)
+            pipeline.require_spread([patch_of(row) for row in done], count=self._context.settings.patches)
         except NoUsablePatchesError as error:
             raise JobFailedError(error.code, str(error)) from error
 
     def cell(self, photo_id: str, epoch: int, cell: int) -> None:
         """Estimate the PSF of one field cell of a photo."""
-        rows = self._bench.jobs.begin_cell(photo_id, epoch, cell)
+        rows = self._context.jobs.begin_cell(photo_id, epoch, cell)
         if not rows:
             return
         numbers = [row.idx for row in rows]
@@ -276,9 +276,9 @@ class PhotoWork:
         def wanted() -> bool:
             return self._store.photos.is_live(photo.public_id, photo.epoch)
 
-        settings = self._bench.settings
+        settings = self._context.settings
         way = way_of(settings, photo.way)
-        developed = self._bench.developed(photo, wanted)
+        developed = self._context.developed(photo, wanted)
         arguments = {
             "developed": str(developed),
             "photo": photo.public_id,
@@ -289,9 +289,9 @@ class PhotoWork:
             "size": way.kernel_size,
             "seed": rows[0].idx,
         }
-        limits = self._bench.limits(photo, settings.patch_seconds, 24)
-        with self._bench.sandbox.folder() as folder:
-            listed = self._bench.attempt(
+        limits = self._context.limits(photo, settings.patch_seconds, 24)
+        with self._context.sandbox.folder() as folder:
+            listed = self._context.attempt(
                 "estimate",
                 arguments,
                 folder=folder,

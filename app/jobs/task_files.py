@@ -25,7 +25,7 @@ R_MAP: Final = "r-map.png"
 """Pictures of a developed photo, by `app.blobs.previews`."""
 
 GLANCE: Final = "glance.jpg"
-"""Small picture of a photo that is not developed yet, by `app.blobs.glances`."""
+"""Small picture of a photo that is not developed yet, by `app.blobs.thumbnails`."""
 
 SHOWN: Final = "shown.jpg"
 """The developed photo in full size, sRGB, in sensor orientation."""

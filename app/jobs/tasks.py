@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from app.blobs import glances, previews
+from app.blobs import previews, thumbnails
 from app.jobs.task_files import (
     AFTER,
     BEFORE,
@@ -65,7 +65,7 @@ def inspect(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
 def glance(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
     """Render a small picture of the photo at `path`."""
     del progress
-    picture = glances.glance(Path(arguments["path"]), arguments["kind"], arguments["orientation"] or 1)
+    picture = thumbnails.glance(Path(arguments["path"]), arguments["kind"], arguments["orientation"] or 1)
     (folder / GLANCE).write_bytes(picture)
     return {}
 
@@ -153,7 +153,7 @@ def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
     model = _with_family(folder, ModelSettings(**arguments["model"]))
     settings = _settings(arguments["settings"])
     patches = pipeline.load_seen(Path(arguments["developed"]))
-    psfs = pipeline.psfs_for(developed, model, settings, method=arguments["method"], seen=patches)
+    psfs = pipeline.psfs_for(developed, model, settings, method=arguments["method"], patches=patches)
     bounds = correction.Bounds(**arguments["bounds"])
     extremes = (replace(bounds, texture=0.0), replace(bounds, texture=1.0, denoise=1.0))
     corrected = pipeline.correct_photo(

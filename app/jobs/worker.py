@@ -20,9 +20,9 @@ from typing import Final, TypeAlias
 from sqlalchemy.exc import OperationalError
 
 from app.blobs.erasure import erase
-from app.blobs.founding import settle
+from app.blobs.folder_creation import settle
 from app.blobs.storage import Storage
-from app.jobs.context import Workbench
+from app.jobs.context import JobContext
 from app.jobs.correction_work import CorrectionWork
 from app.jobs.developed_cache import drop_developed
 from app.jobs.job_log import Account, accounted
@@ -99,7 +99,7 @@ class Worker:
             account=self._task_account(data),
             niceness=settings.task_niceness,
         )
-        self._bench = Workbench(
+        self._context = JobContext(
             settings,
             self._store,
             Storage(settings.storage, patience_s=settings.storage_seconds, create=False),
@@ -136,8 +136,8 @@ class Worker:
         beat_s = min(self._settings.lease_seconds / 4, 5.0)
         # in a thread of its own: nothing below, and no duty, may delay the lease
         lease = self._start_thread(beat_s, self._keep_lease)
-        self._insist(lambda: settle(self._store, self._bench.storage))
-        photos, corrections = PhotoWork(self._bench, self._engine), CorrectionWork(self._bench)
+        self._insist(lambda: settle(self._store, self._context.storage))
+        photos, corrections = PhotoWork(self._context, self._engine), CorrectionWork(self._context)
         self._engine.start(
             {
                 "photo": self._safe(photos.photo, self._photo_broke),
@@ -275,7 +275,7 @@ class Worker:
             self._engine.enqueue(Job("measure", (lens_id, version)))
 
     def _ask_for_reports(self) -> None:
-        ask_for_reports(self._store, self._bench.storage, self._engine)
+        ask_for_reports(self._store, self._context.storage, self._engine)
 
     def _leave_metrics(self) -> None:
         with contextlib.suppress(OSError):  # a full disk: metrics are no reason to stop
@@ -345,7 +345,7 @@ class Worker:
     def _tidy(self) -> None:
         """Delete data that are no longer needed."""
         for owner_key in self._store.accounts.to_erase():
-            self._do(partial(erase, self._store.accounts, self._bench.storage, owner_key))
+            self._do(partial(erase, self._store.accounts, self._context.storage, owner_key))
         for photo_id in self._store.photos.unneeded(self._settings.keep_photos):
             self._do(partial(self._store.photos.give_up_file, photo_id, (GLANCE, PREVIEW, R_MAP, SHOWN)))
         self._do(self._store.accounts.purge)
@@ -353,14 +353,14 @@ class Worker:
         for prefix in self._store.workers.garbage():
             self._do(partial(self._delete, prefix))  # one failure does not prevent the others
         self._do(lambda: self._engine.forget(datetime.now(UTC) - KEEP_JOBS))
-        developed = self._bench.developed_folder("x").parent
-        drop_developed(developed, self._bench.jobs.existing_photos, self._settings.correct_seconds)
+        developed = self._context.developed_folder("x").parent
+        drop_developed(developed, self._context.jobs.existing_photos, self._settings.correct_seconds)
 
     def _delete(self, prefix: str) -> None:
         if prefix.endswith("/"):
-            self._bench.storage.delete(prefix)
+            self._context.storage.delete(prefix)
         else:
-            self._bench.storage.remove(prefix)
+            self._context.storage.remove(prefix)
         self._store.workers.forget_garbage(prefix)
 
     def _database_files(self) -> list[Path]:

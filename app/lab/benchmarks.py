@@ -19,6 +19,7 @@ from app.commands.console.files import as_usage, refuse_existing
 from app.commands.console.options import Force, Quiet, Verbose
 from app.lab.gallery import gallery
 from lensmodel.core.codec import to_json
+from lensmodel.core.files import write_atomically
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -355,5 +356,4 @@ def _tell(shown: Display, json_output: Path | None, result: object, words: str) 
     shown.result(words)
     if json_output is not None:
         json_output.parent.mkdir(parents=True, exist_ok=True)
-        with display.atomic(json_output) as part:
-            part.write_text(json.dumps(to_json(result), indent=1), encoding="utf-8")
+        write_atomically(json_output, json.dumps(to_json(result), indent=1).encode())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import threading
 from functools import lru_cache
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 import tifffile
@@ -18,6 +18,7 @@ from app.errors import NotReadyError, UnknownPictureError
 from app.schemas import PatchOut, Region
 
 Picture = NDArray[np.uint8]
+N = TypeVar("N", int, float)
 
 TILE: Final = 512
 """Side of a tile in pixels, as `static/tiles.js` has it."""
@@ -25,25 +26,20 @@ TILE: Final = 512
 
 def upright_patch(patch: PatchOut, height: int, width: int, orientation: int) -> PatchOut:
     """Return a window in the coordinates of the upright picture."""
-    row, col = patch.row, patch.col
-    below, right = height - row - patch.size, width - col - patch.size
-    moved = {
-        1: (row, col),
-        2: (row, right),
-        3: (below, right),
-        4: (below, col),
-        5: (col, row),
-        6: (col, below),
-        7: (right, below),
-        8: (right, row),
-    }.get(orientation, (row, col))
-    return patch.model_copy(update={"row": moved[0], "col": moved[1]})
+    row, col = _turned(patch.row, patch.col, height - patch.size, width - patch.size, orientation)
+    return patch.model_copy(update={"row": row, "col": col})
 
 
 def upright_point(row: float, col: float, height: int, width: int, orientation: int) -> tuple[int, int]:
     """Return a point, `(row, col)`, in the coordinates of the upright picture."""
-    below, right = height - 1 - row, width - 1 - col
-    moved = {
+    row, col = _turned(row, col, height - 1, width - 1, orientation)
+    return round(row), round(col)
+
+
+def _turned(row: N, col: N, last_row: int, last_col: int, orientation: int) -> tuple[N, N]:
+    """Turn a place that lies in rows 0..last_row and columns 0..last_col as an EXIF orientation says."""
+    below, right = last_row - row, last_col - col
+    return {
         1: (row, col),
         2: (row, right),
         3: (below, right),
@@ -53,7 +49,6 @@ def upright_point(row: float, col: float, height: int, width: int, orientation: 
         7: (right, below),
         8: (right, row),
     }.get(orientation, (row, col))
-    return round(moved[0]), round(moved[1])
 
 
 _BACK: Final = {6: 8, 8: 6}

@@ -311,7 +311,7 @@ def coverage_advice(bars: Sequence[ZoneBar], positions: Sequence[FieldPosition])
     ----------
     bars : sequence of ZoneBar
         How many places were seen in each zone.
-    seen : sequence of FieldPosition
+    positions : sequence of FieldPosition
         Those places: a zone with many may still have a corner with none.
     """
     if not bars:
@@ -342,11 +342,6 @@ def held_words(zone: Mapping[str, Any]) -> str:
     """Say where much of the correction was held back, and why."""
     held, reasons = zone.get("held_back") or 0.0, zone.get("reasons") or []
     return f", {held:.0%} held back ({', '.join(reasons[:3])})" if held > HELD else ""
-
-
-def figure(value: object) -> str:
-    """Write a number with what digits it deserves."""
-    return f"{value:.3g}" if isinstance(value, float) else str(value if value is not None else "")
 
 
 def active(photo: PhotoOut) -> bool:

@@ -11,7 +11,7 @@ from typing import Final, get_args
 
 from fastapi import APIRouter, Response, status
 
-from app.blobs.founding import settle
+from app.blobs.folder_creation import settle
 from app.http.dependencies import Call, CallDep, ProbeDep
 from app.routes.common import problems
 from app.routes.photos import GIB

@@ -86,8 +86,8 @@ def read_lateral_colour(lens_id: str, call: CallDep) -> LateralOut:
     the corners cannot spoil it.
     """
     lens = find_lens(call, lens_id)
-    seen = call.store.lenses.lateral_of(lens)
-    red, blue = (_measured(seen, colour) for colour in ("red", "blue"))
+    lateral = call.store.lenses.lateral_of(lens)
+    red, blue = (_measured(lateral, colour) for colour in ("red", "blue"))
     if not red or not blue:
         raise NoSamplesError(
             f"lens {lens_id} has no photo whose lateral colour could be measured: "

@@ -34,6 +34,7 @@ from app.store.access.keys import KeyStore
 from app.store.database import Database
 from app.store.upkeep import migrate
 from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.files import write_atomically
 
 log = logging.getLogger(__name__)
 
@@ -249,9 +250,7 @@ class _Supervisor:
         """Write the address of the service and the ids of its processes to a file."""
         pids = {f"{m.name}_pid": m.process.pid if m.process else None for m in members}
         text = json.dumps({"url": self.url, "pid": os.getpid(), **pids}, indent=2)
-        part = self._file.with_suffix(".part")
-        part.write_text(text + "\n", encoding="utf-8")
-        part.replace(self._file)
+        write_atomically(self._file, (text + "\n").encode())
 
     def _announce(self) -> None:
         """Print the address once the service can be used."""

@@ -8,8 +8,8 @@ from app.store.access.owners import find_to_change
 from app.store.database import Database
 from app.store.lens_ways import choose
 from app.store.removal import forget
+from app.store.sample_moves import move, switch
 from app.store.tables import EventRow, LensRow, PhotoRow
-from app.store.teaching import move, switch
 
 LEARNING = ("received", "inspecting", "developing", "selecting", "estimating")
 

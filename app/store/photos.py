@@ -11,7 +11,7 @@ from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session
 
 from app.errors import BusyError
-from app.store import lens_ways, lenses, teaching
+from app.store import lens_ways, lenses, sample_moves
 from app.store.access.idempotency import forget_answers
 from app.store.access.owners import ensure_owner, find, find_to_change, now
 from app.store.database import insert_new
@@ -257,23 +257,23 @@ class PhotoStore(PhotoReads):
                 return False
             if excluded is not None:
                 wanted_state: Final = "excluded" if excluded else "counted"
-                if photo.state != wanted_state and not teaching.switch(session, photo, wanted_state):
+                if photo.state != wanted_state and not sample_moves.switch(session, photo, wanted_state):
                     return False
             chosen = _chosen(session, photo, lens, owner)
             begins = calibrate and not photo.calibrate
             if begins and photo.file_gone_at is not None:
                 return False
-            if chosen is not None and not teaching.may_move(photo, chosen):
+            if chosen is not None and not sample_moves.may_move(photo, chosen):
                 return False
             columns = {GIVEN_SETTINGS[name]: value for name, value in given.items()}
             photo.calibrate |= begins
             if photo.state in {"counted", "stored", "excluded"} and not begins:
                 if given:
-                    teaching.change_settings(session, photo, given, columns)
+                    sample_moves.change_settings(session, photo, given, columns)
                 if chosen is not None:
-                    teaching.move(session, photo, chosen)
+                    sample_moves.move(session, photo, chosen)
             elif begins or given or chosen is not None:
-                teaching.begin_again(session, photo, given, columns, chosen)
+                sample_moves.begin_again(session, photo, given, columns, chosen)
             return True
 
     def fail(self, photo_id: str, epoch: int, code: str, detail: str) -> bool:
@@ -337,7 +337,7 @@ class PhotoStore(PhotoReads):
                 return None
             lens_id = photo.lens_id
             if lens_ways.teaches(session, photo):
-                teaching.give_back(session, photo, "photo_removed")
+                sample_moves.give_back(session, photo, "photo_removed")
             session.execute(delete(SampleRow).where(SampleRow.photo_id == photo.id))
             session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
             lenses.delete_corrections(session, photo)

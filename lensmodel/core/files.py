@@ -14,18 +14,30 @@ from numpy.typing import NDArray
 
 
 @contextmanager
-def atomic(path: Path) -> Iterator[BinaryIO]:
-    """Open a temporary neighbour that takes the name of `path` once it is written and on the disk."""
-    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+def replacing(path: Path) -> Iterator[Path]:
+    """Name a temporary neighbour with the same ending; once written it takes the name of `path`."""
+    part = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
     try:
-        with part.open("xb+") as file:
-            yield file
-            file.flush()
+        yield part
+        with part.open("rb+") as file:  # not "rb": Windows flushes only what may be written
             os.fsync(file.fileno())
         part.replace(path)
     except BaseException:
         part.unlink(missing_ok=True)
         raise
+
+
+@contextmanager
+def atomic(path: Path) -> Iterator[BinaryIO]:
+    """Open a temporary neighbour that takes the name of `path` once it is written and on the disk."""
+    with replacing(path) as part, part.open("xb+") as file:
+        yield file
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file that appears complete or not at all."""
+    with atomic(path) as file:
+        file.write(content)
 
 
 def save_array(file: BinaryIO, array: NDArray[Any]) -> None:

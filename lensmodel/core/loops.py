@@ -14,15 +14,16 @@ logger = logging.getLogger(__name__)
 _loading = threading.Lock()
 
 
-def compiled(name: str) -> ModuleType | None:
-    """Import a module of compiled loops; None where Numba is missing."""
+def compiled(name: str, *needs: str) -> ModuleType | None:
+    """Import a module of compiled loops; None where Numba, or what else it needs, is missing."""
     with _loading:  # threads that all start at once must not compile the same loop twice
-        return _load(name)
+        return _load(name, needs)
 
 
 @cache
-def _load(name: str) -> ModuleType | None:
-    if importlib.util.find_spec("numba") is None:
-        logger.info("numba is missing: lens models answer without %s, some times slower", name)
+def _load(name: str, needs: tuple[str, ...]) -> ModuleType | None:
+    missing = [need for need in ("numba", *needs) if importlib.util.find_spec(need) is None]
+    if missing:
+        logger.info("%s is missing: the work goes on without %s, some times slower", missing[0], name)
         return None
     return importlib.import_module(name)

@@ -141,11 +141,6 @@ def otf(kernel: npt.NDArray[np.float64], shape: tuple[int, int]) -> npt.NDArray[
     return scipy.fft.rfft2(np.roll(grid, (-(size // 2), -(size // 2)), axis=(0, 1)))
 
 
-def mtf(kernel: npt.NDArray[np.float64], size: int = 128) -> npt.NDArray[np.float64]:
-    """Modulus of the transfer function, `(size, size // 2 + 1)`, 1 at zero frequency."""
-    return np.abs(otf(kernel, (size, size))) / float(kernel.sum())
-
-
 @dataclass(frozen=True, slots=True)
 class KernelDistance:
     """How far one kernel is from another after the best sub-pixel shift.

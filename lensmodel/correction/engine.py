@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import logging
-import threading
 from functools import cache
 from types import ModuleType
 from typing import Final, Literal
 
 import numpy as np
+
+from lensmodel.core import loops
 
 Engine = Literal["auto", "numpy"]
 
@@ -20,30 +20,30 @@ COMPILE_S: Final = 30
 _KEPT: Final = 31 << 20
 """Bytes of the block to free: just below the 32 MiB up to which glibc adapts (see `keep_freed_memory`)."""
 
-logger = logging.getLogger(__name__)
 first_use = logging.getLogger(f"{__name__}.first_use")
 """Says when loops are compiled, during which nothing else happens that a user could see."""
 
-_loading = threading.Lock()
-
 
 def compiled(engine: Engine) -> ModuleType | None:
-    """Return the compiled loops, or None where NumPy is wanted or Numba is not installed."""
+    """Return the loops of the correction, or None where NumPy is wanted or Numba is not installed."""
+    return _loops(engine, "lensmodel.correction.compiled")
+
+
+def compiled_checks(engine: Engine) -> ModuleType | None:
+    """Return the loops of the audit, or None as `compiled` does."""
+    return _loops(engine, "lensmodel.correction.audit.compiled")
+
+
+def _loops(engine: Engine, name: str) -> ModuleType | None:
     if engine == "numpy":
         return None
-    with _loading:  # threads that all start at once must not compile the same loop twice
-        return _load()
+    module = loops.compiled(name, "rocket_fft")
+    if module is not None:
+        tell_of_compiling()
+    return module
 
 
 @cache
-def _load() -> ModuleType | None:
-    if importlib.util.find_spec("numba") is None or importlib.util.find_spec("rocket_fft") is None:
-        logger.info("numba or rocket-fft is missing: correcting with SciPy, about half as fast")
-        return None
-    tell_of_compiling()
-    return importlib.import_module("lensmodel.correction.compiled")
-
-
 def tell_of_compiling() -> None:
     """Log once when Numba compiles; loading from its cache does not count."""
     event = importlib.import_module("numba.core.event")

@@ -243,9 +243,9 @@ def _white_balance(raw: rawpy.RawPy, mosaic: Mosaic | None) -> tuple[float, floa
     if _sound(r, g, b):
         return r / g, 1.0, b / g
     table = np.asarray(raw.rgb_xyz_matrix, dtype=np.float64)[:3]
-    seen = balance_of_rendition(raw, mosaic, camera_to_srgb(table) if table.any() else None)
-    if seen is not None and _sound(seen[0], 1.0, seen[1]):
-        return seen[0], 1.0, seen[1]
+    balance = balance_of_rendition(raw, mosaic, camera_to_srgb(table) if table.any() else None)
+    if balance is not None and _sound(balance[0], 1.0, balance[1]):
+        return balance[0], 1.0, balance[1]
     r, g, b = (float(v) for v in raw.daylight_whitebalance[:3])
     if _sound(r, g, b):
         log.info("the RAW file does not say its white balance; daylight is assumed")

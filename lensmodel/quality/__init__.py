@@ -1,20 +1,15 @@
-"""Sharpness and fidelity: slanted edges, MTF, PSNR, SSIM, noise gain."""
+"""Sharpness and fidelity: slanted edges, MTF, PSNR by zone."""
 
 from lensmodel.quality.charts import EdgeMeasurement, ZoneSharpness, by_zone, measure_edges
 from lensmodel.quality.edge import EdgeResponse, crossing, pixel_mtf, slanted_edge
 from lensmodel.quality.edge_finder import edge_gains, find_edges
 from lensmodel.quality.images import (
     best_shift,
-    flat_noise,
-    noise_gain,
-    psnr,
     registered_zone_psnr,
     shifted,
-    ssim,
     to_srgb,
 )
 from lensmodel.quality.kernels import (
-    lp_per_ph,
     mtf50_from_kernel,
     mtf_from_kernel,
     tangential_sagittal_mtf50,
@@ -29,18 +24,13 @@ __all__ = [
     "crossing",
     "edge_gains",
     "find_edges",
-    "flat_noise",
-    "lp_per_ph",
     "measure_edges",
     "mtf50_from_kernel",
     "mtf_from_kernel",
-    "noise_gain",
     "pixel_mtf",
-    "psnr",
     "registered_zone_psnr",
     "shifted",
     "slanted_edge",
-    "ssim",
     "tangential_sagittal_mtf50",
     "to_srgb",
 ]

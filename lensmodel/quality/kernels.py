@@ -8,7 +8,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import as_kernel
 from lensmodel.core.types import Kernel
 from lensmodel.quality.edge import crossing
@@ -53,10 +52,3 @@ def mtf50_from_kernel(kernel: Kernel, angle: float) -> float:
 def tangential_sagittal_mtf50(kernel: Kernel, phi: float) -> tuple[float, float]:
     """MTF50 along u and along v of a kernel at field angle `phi`, cycles/pixel."""
     return mtf50_from_kernel(kernel, phi), mtf50_from_kernel(kernel, phi + math.pi / 2.0)
-
-
-def lp_per_ph(cycles_per_pixel: float, picture_height: int) -> float:
-    """Convert cycles/pixel to line pairs per picture height (line widths are twice as many)."""
-    if picture_height < 1:
-        raise InvalidInputError(f"picture height must be positive pixels, got {picture_height}")
-    return cycles_per_pixel * picture_height

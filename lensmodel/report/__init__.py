@@ -4,7 +4,7 @@ There are more than fifteen modules because each draws, counts or writes one thi
 one report, and none is of use to other rooms.
 """
 
-from lensmodel.report.advice import Advice, Wish, advice
+from lensmodel.report.advice import Advice, Suggestion, advice
 from lensmodel.report.decentring import Asymmetry, Decentring, decentring
 from lensmodel.report.exporters import Exporter, PsfGrid, export, exporters, format_of, psf_grid
 from lensmodel.report.lens_report import (
@@ -31,7 +31,7 @@ __all__ = [
     "MapPoint",
     "PsfGrid",
     "ReportSettings",
-    "Wish",
+    "Suggestion",
     "advice",
     "apertures_svg",
     "curves_svg",

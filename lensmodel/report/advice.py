@@ -34,7 +34,7 @@ _COLOURS: Final[dict[Channel, str]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class Suggestion:
     """One photo that would help.
 
     Parameters
@@ -76,7 +76,7 @@ class Advice:
     ----------
     text : str
         One sentence for people.
-    wishes : tuple of Wish
+    suggestions : tuple of Suggestion
         At most three, the most helpful first; different places or apertures.
     enough : bool
         True where no single photo would help much any more, and every part of the picture has patches
@@ -84,7 +84,7 @@ class Advice:
     """
 
     text: str
-    wishes: tuple[Wish, ...]
+    suggestions: tuple[Suggestion, ...]
     enough: bool
 
 
@@ -105,7 +105,7 @@ def advice(model: LensModel, settings: LensSettings | None = None) -> Advice:
     """
     wanted = _settings(model) if settings is None else [replace(settings, channel="g")]
     shots = [
-        _wish(model, place, each.with_channel(channel))
+        _suggestion(model, place, each.with_channel(channel))
         for each in wanted
         for channel in CHANNELS
         for place in landmarks()
@@ -121,13 +121,13 @@ def advice(model: LensModel, settings: LensSettings | None = None) -> Advice:
             w.position.phi,
         )
     )
-    best: list[Wish] = []
-    for wish in shots:
+    best: list[Suggestion] = []
+    for suggestion in shots:
         known = {(w.position, w.settings.aperture) for w in best}
-        if len(best) < 3 and (wish.position, wish.settings.aperture) not in known:
-            best.append(wish)
+        if len(best) < 3 and (suggestion.position, suggestion.settings.aperture) not in known:
+            best.append(suggestion)
     satisfied = best[0].gain < _SATISFIED
-    dark = little_seen(_seen(model)) if satisfied else []
+    dark = little_seen(_estimated_places(model)) if satisfied else []
     enough = satisfied and not dark
     if dark:
         first = next(w for w in shots if w.position == dark[0])
@@ -142,7 +142,7 @@ def advice(model: LensModel, settings: LensSettings | None = None) -> Advice:
     return Advice(text, tuple(best), enough)
 
 
-def _seen(model: LensModel) -> list[FieldPosition]:
+def _estimated_places(model: LensModel) -> list[FieldPosition]:
     """Where patches of photos that vote gave a PSF."""
     voting = (s for s in model.samples if s.photo not in model.settings.excluded)
     return [s.position for s in voting if s.settings.channel == "g"]
@@ -161,11 +161,11 @@ def _order(settings: LensSettings) -> tuple[float, float, float]:
     return settings.aperture or 0.0, settings.focal_mm or 0.0, settings.focus_m or 0.0
 
 
-def _wish(model: LensModel, place: FieldPosition, settings: LensSettings) -> Wish:
+def _suggestion(model: LensModel, place: FieldPosition, settings: LensSettings) -> Suggestion:
     answer = model.query(place, settings, _SIZE)
     photos = 0 if answer.extrapolated else answer.photos
     gain = answer.predicted_error * (1.0 - math.sqrt(photos / (photos + 1.0)))
-    return Wish(
+    return Suggestion(
         text=_text(place, settings),
         reason=_reason(answer, photos),
         position=place,

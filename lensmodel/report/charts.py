@@ -28,11 +28,11 @@ _NAMES: Final[dict[Channel, str]] = {"r": "red", "g": "green", "b": "blue"}
 def map_chart(tested: Tested, sensor: Sensor, unit: Unit = "c/px", top: float = NYQUIST) -> Chart:
     """Draw MTF50 maps, tangential and sagittal, on one scale from 0 to `top` cycles/pixel."""
     points = tested.report.field
-    doubts = [point.extrapolated for point in points]
+    guessed = [point.extrapolated for point in points]
     values = ([point.tangential for point in points], [point.sagittal for point in points])
-    parts = _two_maps(tested, values, top, sensor, unit, doubts)
+    parts = _two_maps(tested, values, top, sensor, unit, guessed)
     name = {"c/px": "cycles/pixel", "lp/ph": "line pairs per picture height", "lp/mm": "line pairs per mm"}
-    return _maps(tested, f"MTF50 in {name[unit]}", parts, any(doubts))
+    return _maps(tested, f"MTF50 in {name[unit]}", parts, any(guessed))
 
 
 def error_chart(tested: Tested, sensor: Sensor) -> Chart | None:
@@ -42,13 +42,13 @@ def error_chart(tested: Tested, sensor: Sensor) -> Chart | None:
         return None
     top = max(0.01, *spread.tangential, *spread.sagittal)
     parts = _two_maps(tested, (spread.tangential, spread.sagittal), top, sensor, "c/px", None, worse=True)
-    return _maps(tested, f"Standard error of MTF50, cycles/pixel, over {spread.drawn}", parts, doubts=False)
+    return _maps(tested, f"Standard error of MTF50, cycles/pixel, over {spread.drawn}", parts, guessed=False)
 
 
-def _maps(tested: Tested, title: str, parts: list[Part], doubts: bool) -> Chart:
+def _maps(tested: Tested, title: str, parts: list[Part], guessed: bool) -> Chart:
     report = tested.report
     high = _map_height(report.aspect)
-    note = "? no photo shows this place: guessed" if doubts else ""
+    note = "? no photo shows this place: guessed" if guessed else ""
     parts = [Label(_GAP, 24, f"{title}{_at(tested)}"), *parts]
     parts.append(Label(WIDTH - _GAP, _TOP + high + 58, note, GREY, "end"))
     return Chart(title, WIDTH, round(_TOP + high + 70), tuple(parts))
@@ -64,7 +64,7 @@ def _two_maps(
     top: float,
     sensor: Sensor,
     unit: Unit,
-    doubts: Sequence[bool] | None,
+    guessed: Sequence[bool] | None,
     *,
     worse: bool = False,
 ) -> list[Part]:
@@ -82,7 +82,7 @@ def _two_maps(
             fill = colour(1.0 - share if worse else share)
             parts.append(Box(x, y, cell[0] - 0.5, cell[1] - 0.5, rgb(fill)))
             text = _figure(value * factor, factor, capped=not worse and value >= NYQUIST)
-            text += "?" if doubts and doubts[i] else ""
+            text += "?" if guessed and guessed[i] else ""
             parts.append(Label(x + cell[0] / 2, y + cell[1] / 2 + 3, text, ink(fill), "middle", 8.5))
         parts.append(Label(left + wide / 2, _TOP + high + 16, name, GREY, "middle"))
     return parts + _scale(_TOP + high + 30, top, factor, worse=worse)

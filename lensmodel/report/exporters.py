@@ -11,7 +11,6 @@ import importlib
 import io
 import json
 import math
-import secrets
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.files import write_atomically
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel
@@ -299,17 +299,6 @@ def export(path: Path | str, psfs: PsfGrid, file_format: str) -> None:
         If the format needs a library that is not installed.
     """
     write_atomically(Path(path), exporters.create(file_format).encode(psfs))
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write beside the target, then rename: nobody sees half a file."""
-    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
-    try:
-        part.write_bytes(content)
-        part.replace(path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
 
 
 def document(psfs: PsfGrid, *, kernels: bool) -> dict[str, Any]:

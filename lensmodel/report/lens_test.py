@@ -188,16 +188,16 @@ def _height(model: LensModel, aspect: float) -> int | None:
     return None if half is None else round(2.0 * half / math.hypot(long, 1.0))
 
 
-def _lateral(seen: Sequence[LateralColour]) -> LateralShift | None:
+def _lateral(measured: Sequence[LateralColour]) -> LateralShift | None:
     """Median displacement over the photos that could tell: one without edges cannot spoil it."""
     columns: dict[Channel, list[LateralColour]] = {
-        "r": [one for one in seen if one.red_points > 0],
-        "b": [one for one in seen if one.blue_points > 0],
+        "r": [each for each in measured if each.red_points > 0],
+        "b": [each for each in measured if each.blue_points > 0],
     }
     if not columns["r"] or not columns["b"]:
         return None
     red, blue = (
-        tuple(median(one.displacement(r, channel) for one in columns[channel]) for r in _LATERAL_R)
+        tuple(median(each.displacement(r, channel) for each in columns[channel]) for r in _LATERAL_R)
         for channel in ("r", "b")
     )
     return LateralShift(_LATERAL_R, red, blue, min(len(columns["r"]), len(columns["b"])))

@@ -63,13 +63,6 @@ def half_sides(aspect: float) -> tuple[float, float]:
     return aspect / diagonal, 1.0 / diagonal
 
 
-def inside(position: FieldPosition, aspect: float) -> bool:
-    """Whether a place lies on the picture."""
-    width, height = half_sides(aspect)
-    x, y = position.r * math.cos(position.phi), position.r * math.sin(position.phi)
-    return abs(x) <= width + 1e-9 and abs(y) <= height + 1e-9
-
-
 def grid(rows: int, cols: int, aspect: float) -> tuple[FieldPosition, ...]:
     """Centres of rows x cols equal cells of the picture, row by row from the top left.
 
@@ -136,9 +129,9 @@ def little_seen(positions: Iterable[FieldPosition], least: int = ENOUGH_NEAR) ->
     least : int
         Patches within `NEAR_R` that are enough.
     """
-    seen = np.array([(p.r * math.cos(p.phi), p.r * math.sin(p.phi)) for p in positions]).reshape(-1, 2)
+    points = np.array([(p.r * math.cos(p.phi), p.r * math.sin(p.phi)) for p in positions]).reshape(-1, 2)
     counts = []
     for place in landmarks():
-        offset = seen - (place.r * math.cos(place.phi), place.r * math.sin(place.phi))
+        offset = points - (place.r * math.cos(place.phi), place.r * math.sin(place.phi))
         counts.append((int((np.hypot(*offset.T) <= NEAR_R).sum()), place))
     return [place for count, place in sorted(counts, key=lambda item: item[0]) if count < least]

@@ -131,7 +131,7 @@ def calibrate(
         executor=executor,
         on_event=grown.record,
     )
-    return Lens.grown(lens, fitted, grown.photos, grown.seen, any_lens=any_lens)
+    return Lens.grown(lens, fitted, grown.photos, grown.identities, any_lens=any_lens)
 
 
 class _Growing:
@@ -139,7 +139,7 @@ class _Growing:
 
     def __init__(self, lens: Lens | None, *, any_lens: bool, on_event: EventHook) -> None:
         self.photos: dict[str, str] = {}
-        self.seen: list[Identity] = []
+        self.identities: list[Identity] = []
         self._names = {} if lens is None else dict(lens.profile.lens)
         self._cameras = [] if lens is None else list(lens.profile.cameras)
         self._any_lens, self._on_event = any_lens, on_event
@@ -164,13 +164,13 @@ class _Growing:
     def record(self, event: CalibrationEvent) -> None:
         """Remember a photo that counted, and pass the event on."""
         if event.stage == "counted":
-            seen = _identity(event.photo)
+            identity = _identity(event.photo)
             self.photos[pipeline.photo_id(event.photo)] = event.photo.name
-            self.seen.append(seen)
+            self.identities.append(identity)
             self._known = True
-            self._names = {**seen.lens, **self._names}
-            if seen.camera is not None:
-                self._cameras.append(seen.camera)
+            self._names = {**identity.lens, **self._names}
+            if identity.camera is not None:
+                self._cameras.append(identity.camera)
         self._on_event(event)
 
 

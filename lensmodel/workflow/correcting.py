@@ -123,11 +123,11 @@ def psfs_for(
     settings: LensSettings,
     *,
     method: str | correction.Deconvolver | None = None,
-    seen: Sequence[SeenPatch] | None = None,
+    patches: Sequence[SeenPatch] | None = None,
 ) -> PsfField | UncertainField:
     """Return what a correction of a photo is to think of the PSFs of its lens, see `correct_photo`.
 
-    `seen` are the photo's `seen_patches` where they are known already.
+    `patches` are the photo's `seen_patches` where they are known already.
     """
     pitch_um, half_diagonal_px = developed.info.metadata.pixel_pitch_um, developed.frame.half_diagonal
     _, plain = _way(model, method)
@@ -136,7 +136,7 @@ def psfs_for(
     return WitnessedField.of(
         model.warmed(),
         settings,
-        witnesses_of(developed, settings, seen),
+        witnesses_of(developed, settings, patches),
         pitch_um=pitch_um,
         half_diagonal_px=half_diagonal_px,
     )

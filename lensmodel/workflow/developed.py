@@ -54,10 +54,10 @@ def load_developed(folder: Path) -> LinearPhoto:
     return codec.from_json(LinearPhoto, {**stored, "planes": planes})
 
 
-def save_seen(seen: Sequence[SeenPatch], folder: Path) -> None:
+def save_seen(patches: Sequence[SeenPatch], folder: Path) -> None:
     """Keep what `seen_patches` found in a developed photo beside it: seen.json."""
     with atomic(folder / "seen.json") as file:
-        file.write(json.dumps(codec.to_json(list(seen))).encode())
+        file.write(json.dumps(codec.to_json(list(patches))).encode())
 
 
 def load_seen(folder: Path) -> list[SeenPatch] | None:

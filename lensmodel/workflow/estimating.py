@@ -211,7 +211,7 @@ def seen_patches(developed: LinearPhoto) -> list[SeenPatch]:
 
 
 def witnesses_of(
-    developed: LinearPhoto, settings: LensSettings, seen: Sequence[SeenPatch] | None = None
+    developed: LinearPhoto, settings: LensSettings, patches: Sequence[SeenPatch] | None = None
 ) -> list[PsfSample]:
     """Samples of a photo's `seen_patches`, found if not handed over, without kernels of their own."""
     known, none = developed.info.metadata, delta(DEFAULT_KERNEL_SIZE)
@@ -224,7 +224,7 @@ def witnesses_of(
             half_diagonal_px=developed.frame.half_diagonal,
             spectrum=patch.spectrum,
         )
-        for patch in (seen_patches(developed) if seen is None else seen)
+        for patch in (seen_patches(developed) if patches is None else patches)
     ]
 
 

@@ -28,8 +28,8 @@ class Identity:
     @classmethod
     def of(cls, metadata: PhotoMetadata) -> Identity:
         """Take from a photo's metadata what tells of its lens and its camera."""
-        seen = metadata.lens
-        named = {"maker": seen.maker, "model": seen.model, "serial": seen.serial}
+        lens = metadata.lens
+        named = {"maker": lens.maker, "model": lens.model, "serial": lens.serial}
         camera = Camera(metadata.camera_maker, metadata.camera_model, metadata.body_serial)
         return cls({name: value for name, value in named.items() if value}, camera if camera.model else None)
 
@@ -39,7 +39,7 @@ class Identity:
         return _names_lens(self.lens)
 
 
-def difference(known: Mapping[str, str], cameras: Iterable[Camera], seen: Identity) -> str | None:
+def difference(known: Mapping[str, str], cameras: Iterable[Camera], identity: Identity) -> str | None:
     """Say why a photo cannot be, or need not be, of the lens of a profile.
 
     - What both name of the lens must agree.
@@ -57,7 +57,7 @@ def difference(known: Mapping[str, str], cameras: Iterable[Camera], seen: Identi
         Lens of the profile.
     cameras : iterable of Camera
         What its photos were taken with; none is known of older profiles.
-    seen : Identity
+    identity : Identity
         Of the photo.
 
     Returns
@@ -65,29 +65,30 @@ def difference(known: Mapping[str, str], cameras: Iterable[Camera], seen: Identi
     str or None
         A clause that begins with "it"; `None` where nothing speaks against one lens.
     """
-    for name, value in seen.lens.items():
+    for name, value in identity.lens.items():
         key = serial_key if name == "serial" else name_key
         if key(known.get(name, value)) != key(value):
             return (
                 f"it was taken with another lens, {name} {value}, and the profile is of {name} {known[name]}"
             )
     bodies = list(cameras)
-    if seen.names_lens and not _names_lens(known) and not known.get("label"):
-        return f"it names its lens, {_lens_words(seen.lens)}, and the profile's photos name none"
-    if seen.camera is None or not bodies:
+    if identity.names_lens and not _names_lens(known) and not known.get("label"):
+        return f"it names its lens, {_lens_words(identity.lens)}, and the profile's photos name none"
+    if identity.camera is None or not bodies:
         return None
-    alike = [body for body in bodies if _same_model(body, seen.camera)]
-    if not seen.names_lens and not alike:
+    alike = [body for body in bodies if _same_model(body, identity.camera)]
+    if not identity.names_lens and not alike:
         return (
-            f"it names no lens and was taken with another camera, {_camera_words(seen.camera)}, "
+            f"it names no lens and was taken with another camera, {_camera_words(identity.camera)}, "
             f"and the profile's photos with {', '.join(map(_camera_words, bodies))}"
         )
-    built_in = not _names_lens(known) if not seen.names_lens else _is_built_in(seen)
+    built_in = not _names_lens(known) if not identity.names_lens else _is_built_in(identity)
     serials = {serial_key(body.serial) for body in alike if body.serial}
-    if built_in and seen.camera.serial and serials and serial_key(seen.camera.serial) not in serials:
+    serial = identity.camera.serial
+    if built_in and serial and serials and serial_key(serial) not in serials:
         return (
-            f"it was taken with another copy of the camera, serial {seen.camera.serial}, and nothing says "
-            "that the lens is the same"
+            f"it was taken with another copy of the camera, serial {serial}, and nothing "
+            "says that the lens is the same"
         )
     return None
 
@@ -96,9 +97,9 @@ def _names_lens(lens: Mapping[str, str]) -> bool:
     return bool(lens.get("model") or lens.get("serial"))
 
 
-def _is_built_in(seen: Identity) -> bool:
-    camera = "" if seen.camera is None else name_key(seen.camera.model)
-    return bool(camera) and camera in name_key(seen.lens.get("model")) and not seen.lens.get("serial")
+def _is_built_in(identity: Identity) -> bool:
+    camera = "" if identity.camera is None else name_key(identity.camera.model)
+    return bool(camera) and camera in name_key(identity.lens.get("model")) and not identity.lens.get("serial")
 
 
 def _same_model(one: Camera, other: Camera) -> bool:

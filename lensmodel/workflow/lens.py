@@ -128,7 +128,7 @@ class Lens:
         lens: Lens | None,
         model: LensModel,
         photos: Mapping[str, str],
-        seen: Iterable[Identity],
+        identities: Iterable[Identity],
         *,
         any_lens: bool = False,
     ) -> Lens:
@@ -142,7 +142,7 @@ class Lens:
             What is known now.
         photos : mapping of str to str
             File names of the new photos, by their ids.
-        seen : iterable of Identity
+        identities : iterable of Identity
             What the new photos say of lens and camera.
         any_lens : bool
             The photos may be of other lenses, so they do not name this one.
@@ -150,11 +150,11 @@ class Lens:
         known = None if lens is None else lens.profile
         names = {} if known is None else dict(known.lens)
         cameras = [] if known is None else list(known.cameras)
-        for one in seen:
+        for identity in identities:
             if known is None or not any_lens:
-                names = {**one.lens, **names}
-            if one.camera is not None and one.camera not in cameras:
-                cameras.append(one.camera)
+                names = {**identity.lens, **names}
+            if identity.camera is not None and identity.camera not in cameras:
+                cameras.append(identity.camera)
         earlier = {} if known is None else known.photos
         return cls(LensProfile(model, names, {**earlier, **photos}, tuple(cameras)))
 

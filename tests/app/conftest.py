@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from app.blobs.founding import settle
+from app.blobs.folder_creation import settle
 from app.blobs.storage import Storage
 from app.runtime.settings import Settings
 from app.store import LensName, NewPatch, NewSample, Store

@@ -8,7 +8,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import typer
@@ -139,14 +138,3 @@ def of(context: typer.Context, *, quiet: bool = False, verbose: int = 0) -> Disp
     """Return the display of a subcommand."""
     base = context.find_object(Display) or Display()
     return base.more(quiet=quiet, verbose=verbose)
-
-
-@contextmanager
-def atomic(path: Path) -> Iterator[Path]:
-    """Give a neighbour to write to, which takes the name of `path` once all is written."""
-    part = path.with_name(f".{path.name}.part{path.suffix}")
-    try:
-        yield part
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)

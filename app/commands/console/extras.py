@@ -24,7 +24,7 @@ EXTRAS: Final = {
         "uvicorn",
     ),
     "report": ("reportlab",),
-    "lab": ("optiland",),
+    "lab": ("optiland", "skimage"),
     "train": ("sklearn",),
 }
 """Modules by extra, as far as commands import them."""

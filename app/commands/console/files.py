@@ -6,10 +6,10 @@ import glob
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from app.commands.console.failure import UsageError
-from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.model import LensProfile, load_profile
 from lensmodel.photo import inspect
 from lensmodel.photo.endings import ENDINGS, RAW_ENDINGS
@@ -120,3 +120,9 @@ def reason(error: Exception) -> str:
             f"{error.strerror[:1].lower()}{error.strerror[1:]}; check the file, its folder and their rights"
         )
     return str(error)
+
+
+def failed(error: LensModelError | OSError) -> dict[str, Any]:
+    """Say in a command's document that a photo could not be used, and why."""
+    code = error.code if isinstance(error, LensModelError) else "unreadable"
+    return {"state": "failed", "code": code, "reason": reason(error)}

@@ -16,8 +16,8 @@ from sqlalchemy.orm import Session
 from app.store.lens_ways import forget_before, join, settle, teaches
 from app.store.patches import recount as recount_patches
 from app.store.photo_steps import WORKED_ON
+from app.store.sample_moves import give_back
 from app.store.tables import CorrectionRow, EventRow, LensRow, PatchRow, PhotoRow, SampleRow
-from app.store.teaching import give_back
 from app.store.versions import recount
 
 Find: TypeAlias = Callable[[Session], Sequence[str]]

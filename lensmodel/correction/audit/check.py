@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import CHANNELS, NoiseModel, Plane, Planes
 from lensmodel.correction.audit import blocks
-from lensmodel.correction.audit.engine import Engine, compiled
 from lensmodel.correction.blur import UniformBlur
+from lensmodel.correction.engine import Engine, compiled_checks
 
 LEAST_VARIANCE: Final = 1e-12
 """Least variance, given even to black without read noise: keeps divisions finite."""
@@ -101,7 +101,7 @@ class Pair:
                 f"original and correction must be (3, rows, cols) of one size, got {original.shape} and "
                 f"{corrected.shape}"
             )
-        loops = compiled(engine)
+        loops = compiled_checks(engine)
         if loops is not None:
             return cls._compiled(original, corrected, evidence, loops)
         top = np.asarray(evidence.clip, dtype=np.float32)[:, None, None]

@@ -13,13 +13,13 @@ from scipy import ndimage
 from lensmodel.core.types import Plane, Planes
 from lensmodel.correction.audit import blocks, nearby
 from lensmodel.correction.audit.check import Evidence, Finding, Pair, Severity, TileAudit
-from lensmodel.correction.audit.engine import Engine
 from lensmodel.correction.audit.grain import amplified
 from lensmodel.correction.audit.hue import foreign_area, foreign_spots
 from lensmodel.correction.audit.light import isolated, too_bright, too_dark
 from lensmodel.correction.audit.reblur import misfit
 from lensmodel.correction.audit.ringing import swing
 from lensmodel.correction.audit.spectrum import comb, overcorrected
+from lensmodel.correction.engine import Engine
 
 Check: TypeAlias = Callable[[Pair], Severity]
 """Severity on a grid of places of a tile; above 1 is a fault."""

@@ -7,12 +7,11 @@ function has a NumPy twin that gives the same numbers.
 from lensmodel.correction.compiled.half_quadratic import half_quadratic, pull_of
 from lensmodel.correction.compiled.limits import hold
 from lensmodel.correction.compiled.one_pass import one_pass
-from lensmodel.correction.compiled.richardson_lucy import bare_transforms, richardson_lucy, through
+from lensmodel.correction.compiled.richardson_lucy import richardson_lucy, through
 from lensmodel.correction.compiled.tile import add, block_means, fill, spectra_of, transfer
 
 __all__ = [
     "add",
-    "bare_transforms",
     "block_means",
     "fill",
     "half_quadratic",

@@ -15,8 +15,6 @@ from lensmodel.correction.compiled.common import (
     ZERO,
     Complex,
     Real,
-    to_plane,
-    to_spectrum,
 )
 from lensmodel.correction.deconvolver import LEAST_PREDICTED
 
@@ -241,12 +239,3 @@ def richardson_lucy(  # noqa: C901 - one pass over memory per loop
                 start[i, j] = ahead
                 work[i, j] = ahead
             work[i, cols:] = ZERO
-
-
-@jit
-def bare_transforms(plane: Real, pairs: int) -> None:
-    """Transform a plane forth and back, and nothing else: the lower bound that a benchmark compares with."""
-    spectrum = np.empty((plane.shape[0], plane.shape[1] // 2 + 1), np.complex64)
-    for _ in range(pairs):
-        to_spectrum(plane, spectrum)
-        to_plane(spectrum, plane)

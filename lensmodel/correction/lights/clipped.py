@@ -25,16 +25,16 @@ class Region:
 
     Parameters
     ----------
-    seen : tuple of slice
+    data : tuple of slice
         The data to use, in pixels of the tile.
     own : tuple of slice
-        The light that only this region estimates, in pixels of the latent plane, wider than `seen` by
+        The light that only this region estimates, in pixels of the latent plane, wider than `data` by
         the reach of the blur on each side.
     answers : tuple of slice
-        The clipped pixels that it estimates, in pixels of `seen`.
+        The clipped pixels that it estimates, in pixels of `data`.
     """
 
-    seen: Window
+    data: Window
     own: Window
     answers: Window
 
@@ -132,7 +132,7 @@ def _region(
     reach: int,
 ) -> Region:
     """The windows of a piece, in pixels."""
-    seen, own, answers = [], [], []
+    data, own, answers = [], [], []
     for (first, last), (low, high), extent, count in zip(piece, tight, shape, blocks, strict=True):
         # A piece at the tile's rim also estimates the light beyond it.
         begin = low * _BLOCK - reach if first == 0 else max(low * _BLOCK - reach, first * _BLOCK)
@@ -140,7 +140,7 @@ def _region(
         start = max(low * _BLOCK - 2 * reach, 0)
         stop = min(high * _BLOCK + 2 * reach, extent)
         end = min(end, extent + reach)
-        seen.append(slice(start, stop))
+        data.append(slice(start, stop))
         own.append(slice(begin + reach - start, end + reach - start))
         answers.append(slice(max(begin - start, 0), end - start))
-    return Region((seen[0], seen[1]), (own[0], own[1]), (answers[0], answers[1]))
+    return Region((data[0], data[1]), (own[0], own[1]), (answers[0], answers[1]))

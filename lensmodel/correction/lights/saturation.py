@@ -188,7 +188,7 @@ def _estimate(
 ) -> None:
     """Estimate the light of one region of one colour; update `into`: rest, light beyond saturation, glow."""
     rest, beyond, glow = into
-    window = region.seen
+    window = region.data
     data, lost = plane[window], clipped[window]
     latent, reach = first_guess(data, blur)
     measured = np.minimum(blur.adjoint((~lost).astype(np.float32)), reach)

@@ -36,9 +36,9 @@ from lensmodel.core.psf import PsfSample, distance
 from lensmodel.core.types import ZONES, FieldPosition, LensSettings, Planes, Zone
 from lensmodel.lab.cases import list_photos, photo_half
 from lensmodel.lab.gallery.truth import Gains, gains
+from lensmodel.lab.images import psnr
 from lensmodel.lab.traced import GridLens, read_grid
 from lensmodel.model import LensModel, ModelSettings
-from lensmodel.quality import psnr
 from lensmodel.quality.images import to_srgb
 from lensmodel.simulate import (
     SimulatedCamera,

@@ -4,7 +4,7 @@ r"""What a camera's JPEG gains that is corrected by a lens known only from other
         --seeds 1000:1004 --photos 1 2 [--cameras usual]
 
 Each lens of third-order theory takes photos of 1.2 megapixels as in `blind_gain`, and a camera makes JPEG
-files of them by its own chain (`lensmodel.simulate.CameraJpeg`: tone curve, denoising, unsharp mask, half the
+files of them by its own chain (`lab.camera_jpeg.CameraJpeg`: tone curve, denoising, unsharp mask, half the
 chroma, compression). The lens is learned from the first n by default settings, and one that was not learned
 from is corrected by default settings.
 
@@ -30,6 +30,7 @@ from lensmodel import photo
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import ZONES, Planes, Zone
+from lensmodel.lab.camera_jpeg import CAMERA_JPEGS
 from lensmodel.lab.chain.blind_gain import (
     BLOCK,
     CAMERA,
@@ -42,7 +43,6 @@ from lensmodel.lab.chain.blind_gain import (
     shot,
 )
 from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
-from lensmodel.simulate import CAMERA_JPEGS
 from lensmodel.workflow import pipeline
 
 LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601, as JFIF asks

@@ -32,12 +32,12 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import fft, ndimage
 
-from lensmodel import quality
 from lensmodel.core import psf
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfSample, distance
 from lensmodel.core.types import Kernel, LensSettings, NoiseModel, Plane
 from lensmodel.estimation.patches import Patch
+from lensmodel.lab.images import flat_noise, noise_gain
 from lensmodel.model import LensModel
 from lensmodel.photo import LinearPhoto, develop
 from lensmodel.report.photo_crops import as_shown, crop_boxes
@@ -141,7 +141,7 @@ def log_likelihood(power: NDArray[np.float64], noise: float, kernel: Kernel, til
     rows, cols = fft.fftfreq(TILE)[:, None], fft.rfftfreq(TILE)[None, :]
     radius = np.hypot(rows, cols)
     used = (radius > 0.04) & (radius < 0.5)
-    transfer = np.square(psf.mtf(psf.resized(kernel, SIZE), TILE))[used] + FILL
+    transfer = np.square(np.abs(psf.otf(psf.resized(kernel, SIZE), (TILE, TILE))))[used] + FILL
     seen, f = power[used], radius[used]
     best = -np.inf
     for slope in SLOPES:
@@ -205,7 +205,7 @@ def halos(before: NDArray[np.floating], after: NDArray[np.floating]) -> dict[str
 def grain(before: NDArray[np.floating], after: NDArray[np.floating], side: int = 24) -> float | None:
     """Median noise gain over the ten flattest places."""
     places = [
-        (quality.flat_noise(before[r : r + side, c : c + side]), r, c)
+        (flat_noise(before[r : r + side, c : c + side]), r, c)
         for r in range(0, before.shape[0] - side, side)
         for c in range(0, before.shape[1] - side, side)
     ]
@@ -213,7 +213,7 @@ def grain(before: NDArray[np.floating], after: NDArray[np.floating], side: int =
     if not flat:
         return None
     cut = [(slice(r, r + side), slice(c, c + side)) for _, r, c in flat]
-    return float(np.median([quality.noise_gain(after[box], before[box]) for box in cut]))
+    return float(np.median([noise_gain(after[box], before[box]) for box in cut]))
 
 
 def corrected(seen: Seen, model: LensModel, method: str, out: Path | None) -> dict[str, object]:

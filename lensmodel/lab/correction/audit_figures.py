@@ -18,7 +18,7 @@ from lensmodel.correction.audit.findings import HELD
 from lensmodel.correction.audit.tile import GROWN
 from lensmodel.correction.blur import UniformBlur, crop_to_support
 from lensmodel.lab.correction.audit_trials import BLOCK, CHANGES, FAULTS, SOUND, Case, Exposure, Trial
-from lensmodel.quality import psnr
+from lensmodel.lab.images import psnr
 
 HALO: Final = 24
 """Pixels around each block that the audit sees besides: what a correction's tiles have at least."""

@@ -219,8 +219,10 @@ def _kernel_times() -> dict[str, float]:
     loops = compiled("auto")
     works = {"ours": ours, "scikit_image": theirs}
     if loops is not None:
+        from lensmodel.lab.compiled_transforms import bare_transforms  # noqa: PLC0415 - needs Numba
+
         canvas = np.zeros(fast_shape((_TILE, _TILE)), dtype=np.float32)
-        works["bare_transforms"] = lambda: loops.bare_transforms(canvas, 2 * steps)
+        works["bare_transforms"] = lambda: bare_transforms(canvas, 2 * steps)
     spent = _cpu(works)
     times = {
         "ours": spent["ours"] / steps / megapixels,

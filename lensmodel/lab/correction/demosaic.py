@@ -29,8 +29,8 @@ from lensmodel.core.psf import PsfField, as_kernel, distance
 from lensmodel.core.types import CHANNELS, ZONES, Channel, LensSettings, Plane, Planes
 from lensmodel.correction import Sensor, SparseGradient, correct_planes
 from lensmodel.correction.blur import UniformBlur, crop_to_support
+from lensmodel.lab.images import psnr
 from lensmodel.photo import Demosaic, LinearPhoto
-from lensmodel.quality import psnr
 from lensmodel.simulate import (
     LENS_KINDS,
     BlurOptions,

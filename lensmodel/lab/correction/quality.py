@@ -23,8 +23,9 @@ from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, Noise
 from lensmodel.correction import SaturationAwareRichardsonLucy, SparseGradient, correct_planes
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.deconvolver import Deconvolver
+from lensmodel.lab.images import psnr, ssim
 from lensmodel.lab.peers import Peer, read_picture, skimage_results
-from lensmodel.quality import psnr, slanted_edge, ssim
+from lensmodel.quality import slanted_edge
 from lensmodel.quality.images import to_srgb
 from lensmodel.simulate import load_scene, slanted_edge_scene
 

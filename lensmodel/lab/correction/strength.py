@@ -21,7 +21,7 @@ from lensmodel.core.types import ZONES, LensSettings, NoiseModel
 from lensmodel.correction import SparseGradient
 from lensmodel.lab.correction.quality import EXPOSURES, composed, corrected, exposed, view
 from lensmodel.lab.correction.quality_table import KINDS, PAIRS
-from lensmodel.quality import psnr
+from lensmodel.lab.images import psnr
 from lensmodel.simulate import draw_lens
 
 BETWEEN: Final = NoiseModel(1 / 11_000, 0.0017**2)

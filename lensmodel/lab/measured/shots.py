@@ -15,6 +15,7 @@ from lensmodel.core.psf import PsfField
 from lensmodel.core.types import LensSettings, Planes
 from lensmodel.estimation.measure import TargetPage
 from lensmodel.lab.measured import scenes
+from lensmodel.lab.scenes import dead_leaves
 from lensmodel.lab.traced import GridLens
 from lensmodel.simulate import (
     BlurOptions,
@@ -23,7 +24,6 @@ from lensmodel.simulate import (
     SimulatedField,
     SimulatedLens,
     SimulatedPhoto,
-    dead_leaves,
     draw_lens,
     photograph,
     write_photo,

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from lensmodel.core.errors import NoSamplesError
-from lensmodel.core.geometry import local_to_pixel, pixel_to_local
 from lensmodel.core.psf import PsfSample, centred
 from lensmodel.core.types import Channel, FieldPosition, Kernel, LensSettings
+from lensmodel.lab.local_frame import local_to_pixel, pixel_to_local
 from lensmodel.model import variables as va
 
 PAD = 4

@@ -18,9 +18,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from lensmodel.core.geometry import pixel_to_local
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
+from lensmodel.lab.local_frame import pixel_to_local
 from lensmodel.lab.model.smoothers import make_known
 from lensmodel.model import LensModel, ModelSettings
 

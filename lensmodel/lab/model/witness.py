@@ -34,9 +34,9 @@ from lensmodel.core.psf import PsfField, PsfSample, centred, delta, resized, rms
 from lensmodel.core.spectrum import PatchSpectrum
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensSettings, Planes
 from lensmodel.lab.cases import list_photos, photo_half
+from lensmodel.lab.images import psnr
 from lensmodel.model import LensModel, WitnessedField
 from lensmodel.photo import LinearPhoto
-from lensmodel.quality import psnr
 from lensmodel.simulate import SimulatedCamera, SimulatedField, draw_lens, load_scene, write_photo
 from lensmodel.simulate.blur import BlurOptions
 from lensmodel.simulate.camera import SimulatedPhoto, Truth

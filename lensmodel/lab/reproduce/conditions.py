@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import Planes
-from lensmodel.simulate import dead_leaves, out_of_focus
+from lensmodel.lab.scenes import dead_leaves, out_of_focus
 
 Container = Literal["dng", "tiff", "jpeg"]
 Scenery = Callable[[Planes, np.random.Generator], Planes]

@@ -17,13 +17,14 @@ from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfField, PsfSample, distance, rms_width
 from lensmodel.core.types import FieldPosition, Plane
 from lensmodel.estimation.patches import r_map
+from lensmodel.lab.figure_parts import kernel_tile
 from lensmodel.lab.reproduce import interpolation
 from lensmodel.lab.reproduce.cases import Case, Reproduction
 from lensmodel.lab.reproduce.conditions import BASE
 from lensmodel.lab.reproduce.shots import take
 from lensmodel.model import LensModel
 from lensmodel.photo import develop
-from lensmodel.report.photo_crops import as_shown, kernel_tile
+from lensmodel.report.photo_crops import as_shown
 from lensmodel.workflow import pipeline
 
 _SHOWN: Final = (FieldPosition(0.5, 2.5), FieldPosition(0.8, 0.55), FieldPosition(0.95, -2.6))

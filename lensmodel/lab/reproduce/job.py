@@ -15,6 +15,7 @@ from PIL import Image
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfField
 from lensmodel.core.types import Planes
+from lensmodel.lab.figure_parts import strip
 from lensmodel.lab.reproduce import measure, programs
 from lensmodel.lab.reproduce.cases import Case, Reproduction
 from lensmodel.lab.reproduce.general import general_field
@@ -349,6 +350,6 @@ class Job:
     def _picture(self, label: str, planes: Planes) -> str:
         name = f"{self.folder.name}-{label}.png"
         gains = self.case.camera.white_balance if self._raw else (1.0, 1.0, 1.0)
-        crops = photo_crops.strip(photo_crops.as_shown(planes, gains), CROP_PX)
+        crops = strip(photo_crops.as_shown(planes, gains), CROP_PX)
         Image.fromarray(crops).save(self.shown / name, optimize=True)
         return name

@@ -78,7 +78,7 @@ def edges(chart: Planes, case: Case, *, channel: int = 1) -> dict[str, Any]:
 def _in_lp_per_ph(row: dict[str, Any], height: int) -> dict[str, Any]:
     del row["zone"]
     for name in ("mtf50", "tangential_mtf50", "sagittal_mtf50"):
-        row[name] = None if math.isnan(row[name]) else quality.lp_per_ph(row[name], height)
+        row[name] = None if math.isnan(row[name]) else row[name] * height
     return row
 
 

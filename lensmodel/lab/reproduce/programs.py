@@ -16,8 +16,8 @@ import numpy as np
 
 from lensmodel.core.types import Planes
 from lensmodel.lab import peers
+from lensmodel.lab.images import psnr
 from lensmodel.photo.colour import srgb_to_linear
-from lensmodel.quality import psnr
 from lensmodel.quality.images import to_srgb
 
 _NAMES: Final = ("G'MIC Richardson-Lucy", "RawTherapee capture sharpening")

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.geometry import pixel_to_local
 from lensmodel.core.psf import as_kernel, centred, resized
 from lensmodel.core.types import Channel, FieldPosition, Kernel
+from lensmodel.lab.local_frame import pixel_to_local
 
 STORED: Final = Path(__file__).parent.parent / "data" / "rival_basis.npz"
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lensmodel.core.types import NoiseModel
 from lensmodel.lab.blind.steps.edge_patches import SIDE, edge_mask, steepness_of
 from lensmodel.lab.blind.steps.pyramid import View
-from lensmodel.simulate import dead_leaves
+from lensmodel.lab.scenes import dead_leaves
 
 COUNT: Final = 220
 ANGLES: Final = 32

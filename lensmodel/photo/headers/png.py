@@ -47,8 +47,8 @@ def read_png(buffer: Buffer, limits: Limits) -> Header:
 
 def _chunks(buffer: Buffer) -> Iterator[tuple[bytes, int, int]]:
     """Yield name, start and length of the chunks; of a run of image data only the first."""
-    at, seen, before = 33, 0, b"IHDR"
-    while seen < MAX_SEGMENTS:
+    at, count, before = 33, 0, b"IHDR"
+    while count < MAX_SEGMENTS:
         head = bytes(buffer[at : at + 8])
         if len(head) < 8:
             raise TruncatedImageError("the PNG ends before its end chunk; the upload was cut off")
@@ -58,7 +58,7 @@ def _chunks(buffer: Buffer) -> Iterator[tuple[bytes, int, int]]:
         if name == b"IEND":
             return
         if not name == before == b"IDAT":
-            seen += 1
+            count += 1
             yield name, at + 8, length
         before, at = name, at + 12 + length
 

@@ -130,12 +130,12 @@ def _places(buffer: Buffer, mark: bytes) -> Iterator[int]:
 
 def _of_tiff(buffer: Buffer, reader: TiffReader) -> Iterator[Overwrite]:
     """Yield the GPS directories of a TIFF structure: of its chain, and of what hangs on that."""
-    waiting, seen = [reader.first], set[int]()
-    while waiting and len(seen) < MAX_DIRECTORIES:
+    waiting, visited = [reader.first], set[int]()
+    while waiting and len(visited) < MAX_DIRECTORIES:
         offset = waiting.pop()
-        if offset in seen or offset <= 0:
+        if offset in visited or offset <= 0:
             continue
-        seen.add(offset)
+        visited.add(offset)
         entries, following = reader.directory(offset)
         waiting.append(following)
         for tag in (SUB_DIRECTORIES, EXIF):

@@ -37,7 +37,7 @@ class _Collector:
     """Gathers `prefix:name` -> text, from attributes and from elements without children."""
 
     def __init__(self) -> None:
-        self.found: dict[str, str] = {}
+        self.properties: dict[str, str] = {}
         self.elements = 0
         self.name: str | None = None
         self.text = ""
@@ -65,7 +65,7 @@ class _Collector:
     def _keep(self, qualified: str, value: str) -> None:
         space, _, local = qualified.rpartition("|")
         if space in _PREFIXES and value.strip():
-            self.found.setdefault(f"{_PREFIXES[space]}:{local}", value.strip()[:1024])
+            self.properties.setdefault(f"{_PREFIXES[space]}:{local}", value.strip()[:1024])
 
     def refuse(self, *_: object) -> None:
         raise _RefusedPacketError("a document type declaration")
@@ -102,4 +102,4 @@ def read_xmp(packet: bytes | None) -> Mapping[str, str]:
         return {}
     except (expat.ExpatError, ValueError) as damage:
         log.info("an XMP packet is damaged: %s", damage)
-    return MappingProxyType(collector.found)
+    return MappingProxyType(collector.properties)

@@ -59,7 +59,7 @@ def test_the_report_as_json_reads_back(folder: Path) -> None:
 
     report, advice = from_json(LensReport, stored["report"]), from_json(Advice, stored["advice"])
     assert report.settings.aperture == 5.6
-    assert advice.wishes
+    assert advice.suggestions
 
 
 def test_the_report_folder_holds_numbers_and_pictures_that_agree(

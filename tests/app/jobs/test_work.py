@@ -14,7 +14,7 @@ import pytest
 
 from app.blobs.storage import Storage
 from app.http import views
-from app.jobs.context import JobFailedError, NotWantedError, Workbench
+from app.jobs.context import JobContext, JobFailedError, NotWantedError
 from app.jobs.correction_work import CorrectionWork
 from app.jobs.missing_reports import ask_for_reports
 from app.jobs.photo_work import PhotoWork
@@ -186,11 +186,13 @@ def sandbox(tmp_path: Path) -> Scripted:
 
 
 @pytest.fixture
-def bench(settings: Settings, store: Store, sandbox: Scripted, monkeypatch: pytest.MonkeyPatch) -> Workbench:
+def context(
+    settings: Settings, store: Store, sandbox: Scripted, monkeypatch: pytest.MonkeyPatch
+) -> JobContext:
     monkeypatch.setattr("app.jobs.context.BACKOFF_S", 0.001)
     monkeypatch.setattr("app.jobs.photo_work.LOOK_AFTER_S", 0.0)
     monkeypatch.setattr("app.jobs.photo_work.WAIT_S", 0.001)
-    return Workbench(settings, store, Storage(settings.storage), sandbox)  # type: ignore[arg-type]  # scripted
+    return JobContext(settings, store, Storage(settings.storage), sandbox)  # type: ignore[arg-type]  # scripted
 
 
 @pytest.fixture
@@ -199,20 +201,20 @@ def engine() -> AtOnce:
 
 
 @pytest.fixture
-def work(bench: Workbench, engine: AtOnce) -> PhotoWork:
-    made = PhotoWork(bench, engine)
+def work(context: JobContext, engine: AtOnce) -> PhotoWork:
+    made = PhotoWork(context, engine)
     engine.start({"cell": made.cell})
     return made
 
 
 @pytest.fixture
-def photo(bench: Workbench, steps: Any) -> PhotoRow:
-    return received(bench, steps)
+def photo(context: JobContext, steps: Any) -> PhotoRow:
+    return received(context, steps)
 
 
-def received(bench: Workbench, steps: Any, **options: Any) -> PhotoRow:
+def received(context: JobContext, steps: Any, **options: Any) -> PhotoRow:
     photo: PhotoRow = steps.receive(**options)
-    bench.storage.put(photo.blob_key, b"the file")
+    context.storage.put(photo.blob_key, b"the file")
     return photo
 
 
@@ -220,11 +222,11 @@ def changed(photo: PhotoRow, **metadata: Any) -> Answer:
     return ok(INFO | {"metadata": INFO["metadata"] | metadata})  # type: ignore[operator]  # both are dicts
 
 
-def test_a_photo_goes_all_the_way(work: PhotoWork, bench: Workbench, photo: PhotoRow, steps: Any) -> None:
+def test_a_photo_goes_all_the_way(work: PhotoWork, context: JobContext, photo: PhotoRow, steps: Any) -> None:
     work.photo(photo.public_id, 1)
 
     done = steps.fresh(photo)
-    lens = bench.store.photos.lens_of(done)
+    lens = context.store.photos.lens_of(done)
     assert (done.state, done.patches_done, done.width, done.aperture) == ("counted", 2, 600, 2.8)
     assert lens is not None
     assert (lens.version, lens.sample_count, lens.serial) == (1, 6, "123")
@@ -238,24 +240,24 @@ def measured(arguments: dict[str, Any], folder: Path) -> Outcome:
 
 
 def test_a_photo_of_the_target_counts_with_what_was_measured_and_no_blind_estimate(
-    work: PhotoWork, bench: Workbench, sandbox: Scripted, steps: Any
+    work: PhotoWork, context: JobContext, sandbox: Scripted, steps: Any
 ) -> None:
     sandbox.answers["measure-lens"] = [measured]
-    photo = received(bench, steps, kind="target")
+    photo = received(context, steps, kind="target")
     work.photo(photo.public_id, 1)
 
     assert (steps.fresh(photo).state, "estimate" in sandbox.ran) == ("counted", False)
-    _, samples = bench.store.samples.of_lens(steps.lens_id(photo))
+    _, samples = context.store.samples.of_lens(steps.lens_id(photo))
     assert [(s.sample.estimator, s.sample.error) for s in samples] == [("measured-target/1", 0.04)] * 2
 
 
 def test_the_open_photo_of_a_pair_is_measured_beside_the_closed_one(
-    work: PhotoWork, bench: Workbench, sandbox: Scripted, steps: Any
+    work: PhotoWork, context: JobContext, sandbox: Scripted, steps: Any
 ) -> None:
     sandbox.answers["measure-lens"] = [measured]
-    closed = received(bench, steps, calibrate=False)
+    closed = received(context, steps, calibrate=False)
     work.photo(closed.public_id, 1)
-    opened = received(bench, steps, kind="pair", reference_id=closed.public_id)
+    opened = received(context, steps, kind="pair", reference_id=closed.public_id)
     work.photo(opened.public_id, 1)
 
     assert steps.fresh(opened).state == "counted"
@@ -263,8 +265,8 @@ def test_the_open_photo_of_a_pair_is_measured_beside_the_closed_one(
     assert names == [opened.public_id, closed.public_id]
 
 
-def test_a_pair_whose_closed_photo_is_gone_says_so(work: PhotoWork, bench: Workbench, steps: Any) -> None:
-    photo = received(bench, steps, kind="pair", reference_id="gone")
+def test_a_pair_whose_closed_photo_is_gone_says_so(work: PhotoWork, context: JobContext, steps: Any) -> None:
+    photo = received(context, steps, kind="pair", reference_id="gone")
     work.photo(photo.public_id, 1)
 
     row = steps.fresh(photo)
@@ -272,17 +274,17 @@ def test_a_pair_whose_closed_photo_is_gone_says_so(work: PhotoWork, bench: Workb
 
 
 def test_a_photo_focused_at_infinity_says_so_to_the_model(
-    work: PhotoWork, bench: Workbench, photo: PhotoRow, steps: Any
+    work: PhotoWork, context: JobContext, photo: PhotoRow, steps: Any
 ) -> None:
     work.photo(photo.public_id, 1)
 
-    _, samples = bench.store.samples.of_lens(steps.lens_id(photo))
+    _, samples = context.store.samples.of_lens(steps.lens_id(photo))
     assert {stored.sample.settings.focus_m for stored in samples} == {math.inf}
     assert views.photo_out(steps.fresh(photo), None).focus_distance_m is None
 
 
 def test_a_developed_photo_leaves_its_pictures_with_the_blobs(
-    work: PhotoWork, bench: Workbench, photo: PhotoRow, sandbox: Scripted
+    work: PhotoWork, context: JobContext, photo: PhotoRow, sandbox: Scripted
 ) -> None:
     def with_preview(arguments: dict[str, Any], folder: Path) -> Outcome:
         (folder / PREVIEW).write_bytes(b"a small picture")
@@ -291,18 +293,18 @@ def test_a_developed_photo_leaves_its_pictures_with_the_blobs(
     sandbox.answers["develop"] = [with_preview]
     work.photo(photo.public_id, 1)
 
-    assert bench.storage.get(f"photos/{photo.public_id}/{PREVIEW}") == b"a small picture"
+    assert context.storage.get(f"photos/{photo.public_id}/{PREVIEW}") == b"a small picture"
 
 
 def test_running_a_finished_photo_again_changes_nothing(
-    work: PhotoWork, bench: Workbench, photo: PhotoRow, sandbox: Scripted, steps: Any
+    work: PhotoWork, context: JobContext, photo: PhotoRow, sandbox: Scripted, steps: Any
 ) -> None:
     work.photo(photo.public_id, 1)
     ran = list(sandbox.ran)
 
     work.photo(photo.public_id, 1)
 
-    lens = bench.store.photos.lens_of(steps.fresh(photo))
+    lens = context.store.photos.lens_of(steps.fresh(photo))
     assert lens is not None
     assert lens.version == 1
     assert sandbox.ran == ran
@@ -359,9 +361,9 @@ def test_a_photo_without_aperture_waits_and_says_so(
 
 
 def test_a_photo_to_be_stored_only_is_not_developed(
-    work: PhotoWork, bench: Workbench, sandbox: Scripted, steps: Any
+    work: PhotoWork, context: JobContext, sandbox: Scripted, steps: Any
 ) -> None:
-    photo = received(bench, steps, calibrate=False)
+    photo = received(context, steps, calibrate=False)
 
     work.photo(photo.public_id, 1)
 
@@ -403,13 +405,13 @@ def test_a_photo_too_small_for_patches_is_told_so(
 
 
 def test_cells_without_evidence_are_rejected_and_the_others_count(
-    work: PhotoWork, bench: Workbench, photo: PhotoRow, sandbox: Scripted, steps: Any
+    work: PhotoWork, context: JobContext, photo: PhotoRow, sandbox: Scripted, steps: Any
 ) -> None:
     sandbox.answers["estimate"] = [refused("no_samples"), estimate]
 
     work.photo(photo.public_id, 1)
 
-    rows = bench.store.patches.all_of(photo.public_id)
+    rows = context.store.patches.all_of(photo.public_id)
     assert steps.fresh(photo).state == "counted"
     assert [(row.state, row.reason) for row in rows] == [("rejected", "not-enough-evidence"), ("done", None)]
 
@@ -437,13 +439,13 @@ def test_a_photo_whose_cells_all_time_out_says_so(
 
 
 def test_a_cell_that_the_engine_gave_up_does_not_keep_the_photo_waiting(
-    work: PhotoWork, bench: Workbench, engine: AtOnce, photo: PhotoRow, steps: Any
+    work: PhotoWork, context: JobContext, engine: AtOnce, photo: PhotoRow, steps: Any
 ) -> None:
     engine.lost.add(f"cell/{photo.public_id}/1/0")
 
     work.photo(photo.public_id, 1)
 
-    rows = bench.store.patches.all_of(photo.public_id)
+    rows = context.store.patches.all_of(photo.public_id)
     assert steps.fresh(photo).state == "counted"
     assert [(row.state, row.reason) for row in rows] == [("failed", "crashed_repeatedly"), ("done", None)]
 
@@ -466,10 +468,10 @@ def test_cancelling_in_the_middle_of_a_task_ends_the_photo_and_nothing_counts(
 
 
 def test_work_of_an_old_epoch_changes_nothing(
-    work: PhotoWork, bench: Workbench, photo: PhotoRow, sandbox: Scripted, steps: Any
+    work: PhotoWork, context: JobContext, photo: PhotoRow, sandbox: Scripted, steps: Any
 ) -> None:
     def restart(arguments: dict[str, Any], folder: Path) -> Outcome:
-        bench.store.photos.change(photo.public_id, "local", {"aperture": 4.0})
+        context.store.photos.change(photo.public_id, "local", {"aperture": 4.0})
         return ok({"patches": [patch(0)], "rejected": [], "lateral": None})(arguments, folder)
 
     sandbox.answers["select"].insert(0, restart)
@@ -482,74 +484,74 @@ def test_work_of_an_old_epoch_changes_nothing(
     assert (done.state, done.aperture, done.patches_total) == ("counted", 4.0, 2)
 
 
-def test_a_lost_file_is_told_of(work: PhotoWork, bench: Workbench, photo: PhotoRow, steps: Any) -> None:
-    bench.storage.delete(f"photos/{photo.public_id}/")
+def test_a_lost_file_is_told_of(work: PhotoWork, context: JobContext, photo: PhotoRow, steps: Any) -> None:
+    context.storage.delete(f"photos/{photo.public_id}/")
 
     work.photo(photo.public_id, 1)
 
     assert (steps.fresh(photo).state, steps.fresh(photo).error_code) == ("failed", "unknown_photo")
 
 
-def attempt(bench: Workbench, wanted: Callable[[], bool] = lambda: True) -> Any:
-    with bench.sandbox.folder() as folder:
-        return bench.attempt("task", {}, folder=folder, limits=Limits(500, 10), wanted=wanted)
+def attempt(context: JobContext, wanted: Callable[[], bool] = lambda: True) -> Any:
+    with context.sandbox.folder() as folder:
+        return context.attempt("task", {}, folder=folder, limits=Limits(500, 10), wanted=wanted)
 
 
-def test_a_crash_is_tried_again(bench: Workbench, sandbox: Scripted) -> None:
+def test_a_crash_is_tried_again(context: JobContext, sandbox: Scripted) -> None:
     sandbox.answers["task"] = [ended(CRASHED), ended(CRASHED), ok(7)]
 
-    assert attempt(bench) == 7
+    assert attempt(context) == 7
 
 
-def test_the_third_crash_is_the_last(bench: Workbench, sandbox: Scripted) -> None:
+def test_the_third_crash_is_the_last(context: JobContext, sandbox: Scripted) -> None:
     sandbox.answers["task"] = [ended(CRASHED)]
 
     with pytest.raises(JobFailedError, match="signal 11; tried 3 times") as caught:
-        attempt(bench)
+        attempt(context)
 
     assert caught.value.code == "crashed_repeatedly"
     assert sandbox.ran == ["task"] * 3
 
 
-def test_an_unforeseen_exception_is_not_tried_again(bench: Workbench, sandbox: Scripted) -> None:
+def test_an_unforeseen_exception_is_not_tried_again(context: JobContext, sandbox: Scripted) -> None:
     sandbox.answers["task"] = [ended(Outcome("crashed", code="internal_error", detail="a KeyError"))]
 
     with pytest.raises(JobFailedError, match="a KeyError"):
-        attempt(bench)
+        attempt(context)
 
     assert sandbox.ran == ["task"]
 
 
-def test_too_little_memory_is_doubled_once_within_the_budget(bench: Workbench, sandbox: Scripted) -> None:
+def test_too_little_memory_is_doubled_once_within_the_budget(context: JobContext, sandbox: Scripted) -> None:
     sandbox.answers["task"] = [ended(MEMORY)]
 
     with pytest.raises(JobFailedError, match="too little"):
-        attempt(bench)
+        attempt(context)
 
     assert [limits.memory_mb for limits in sandbox.limits] == [500, 1000]
 
 
-def test_nobody_waits_between_crashes_for_what_nobody_wants(bench: Workbench, sandbox: Scripted) -> None:
+def test_nobody_waits_between_crashes_for_what_nobody_wants(context: JobContext, sandbox: Scripted) -> None:
     asked = iter([True, False, False])
     sandbox.answers["task"] = [ended(CRASHED)]
 
     with pytest.raises(NotWantedError):
-        attempt(bench, lambda: next(asked))
+        attempt(context, lambda: next(asked))
 
 
 @pytest.fixture
-def counted(bench: Workbench, steps: Any) -> PhotoRow:
+def counted(context: JobContext, steps: Any) -> PhotoRow:
     photo: PhotoRow = steps.counted()
-    bench.storage.put(photo.blob_key, b"the file")
+    context.storage.put(photo.blob_key, b"the file")
     return photo
 
 
-def ask(bench: Workbench, photo: PhotoRow, steps: Any, version: int = 1, **params: Any) -> str:
-    lens = bench.store.lenses.get(steps.lens_id(photo))
+def ask(context: JobContext, photo: PhotoRow, steps: Any, version: int = 1, **params: Any) -> str:
+    lens = context.store.lenses.get(steps.lens_id(photo))
     assert lens is not None
     output = {"format": "jpeg", "color_space": "srgb", "quality": 90}
     wish = {"method": "standard", "strength": 1.0, "output": output, "roi": None, **params}
-    return bench.store.corrections.create(photo, lens, version, wish)[0].public_id
+    return context.store.corrections.create(photo, lens, version, wish)[0].public_id
 
 
 def write_result(arguments: dict[str, Any], folder: Path) -> Outcome:
@@ -560,23 +562,23 @@ def write_result(arguments: dict[str, Any], folder: Path) -> Outcome:
 
 
 def test_a_correction_ends_with_a_file(
-    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+    context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any
 ) -> None:
     sandbox.answers["correct"] = [write_result]
-    key = ask(bench, counted, steps)
+    key = ask(context, counted, steps)
 
-    CorrectionWork(bench).correction(key)
+    CorrectionWork(context).correction(key)
 
-    row = bench.store.corrections.get(key)
+    row = context.store.corrections.get(key)
     assert row is not None
     assert (row.state, row.result_media_type, row.result_bytes) == ("succeeded", "image/jpeg", 9)
     assert row.report == {"zones": {"center": {"expected_gain_db": 3.0}}}
-    assert bench.storage.get(row.result_key or "") == b"a picture"
+    assert context.storage.get(row.result_key or "") == b"a picture"
     assert sandbox.files >= {KERNELS, SAMPLES}
 
 
 def test_what_a_correction_learned_of_the_newest_version_is_kept(
-    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+    context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any
 ) -> None:
     def learn(arguments: dict[str, Any], folder: Path) -> Outcome:
         assert not (folder / LEARNED).exists()
@@ -588,34 +590,34 @@ def test_what_a_correction_learned_of_the_newest_version_is_kept(
         return write_result(arguments, folder)
 
     lens_id = steps.lens_id(counted)
-    state, _ = bench.store.samples.of_lens(lens_id)
+    state, _ = context.store.samples.of_lens(lens_id)
     sandbox.answers["correct"] = [learn, find]
     for strength in (1.0, 0.5):
-        CorrectionWork(bench).correction(ask(bench, counted, steps, strength=strength))
+        CorrectionWork(context).correction(ask(context, counted, steps, strength=strength))
 
-    assert bench.storage.get(learned_key(lens_id, 1, state.rebuild_epoch)) == b"fitted"
+    assert context.storage.get(learned_key(lens_id, 1, state.rebuild_epoch)) == b"fitted"
 
 
 def test_what_a_correction_learned_of_an_earlier_version_is_not_kept(
-    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+    context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any
 ) -> None:
     def learn(arguments: dict[str, Any], folder: Path) -> Outcome:
         (folder / LEARNED).write_bytes(b"fitted")
         return write_result(arguments, folder)
 
     lens_id = steps.lens_id(counted)
-    state, _ = bench.store.samples.of_lens(lens_id)
+    state, _ = context.store.samples.of_lens(lens_id)
     steps.counted()
     sandbox.answers["correct"] = [learn]
-    CorrectionWork(bench).correction(ask(bench, counted, steps, version=1))
+    CorrectionWork(context).correction(ask(context, counted, steps, version=1))
 
-    assert bench.store.samples.of_lens(lens_id)[0].version == 2
+    assert context.store.samples.of_lens(lens_id)[0].version == 2
     with pytest.raises(FileNotFoundError):
-        bench.storage.get(learned_key(lens_id, 1, state.rebuild_epoch))
+        context.storage.get(learned_key(lens_id, 1, state.rebuild_epoch))
 
 
 def test_a_family_is_fitted_once_until_one_of_its_copies_changes(
-    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+    context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any
 ) -> None:
     given: list[bytes | None] = []
 
@@ -626,22 +628,22 @@ def test_a_family_is_fitted_once_until_one_of_its_copies_changes(
         return write_result(arguments, folder)
 
     def relatives() -> list[dict[str, Any]]:
-        family = bench.store.samples.family_of(steps.lens_id(counted))
+        family = context.store.samples.family_of(steps.lens_id(counted))
         return [relative.named() for relative in family]
 
     sandbox.answers["correct"] = [lean]
-    work = CorrectionWork(bench)
+    work = CorrectionWork(context)
     steps.counted(serial="old")
     for strength in (1.0, 0.5):
-        work.correction(ask(bench, counted, steps, strength=strength, family=relatives()))
+        work.correction(ask(context, counted, steps, strength=strength, family=relatives()))
     steps.counted(serial="old")
-    work.correction(ask(bench, counted, steps, family=relatives()))
+    work.correction(ask(context, counted, steps, family=relatives()))
 
     assert given == [None, b"fit 1", None]
 
 
 def test_a_photographers_bounds_reach_the_correction_and_its_tag(
-    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+    context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any
 ) -> None:
     told: list[dict[str, Any]] = []
 
@@ -651,7 +653,7 @@ def test_a_photographers_bounds_reach_the_correction_and_its_tag(
 
     sandbox.answers["correct"] = [keep, keep]
     for bounds in ({}, {"halo": 0.2, "denoise": 0.5}):
-        CorrectionWork(bench).correction(ask(bench, counted, steps, **bounds))
+        CorrectionWork(context).correction(ask(context, counted, steps, **bounds))
 
     assert [one["bounds"] for one in told] == [{}, {"halo": 0.2, "denoise": 0.5}]
     assert told[0]["description"].endswith("strength 1")
@@ -659,10 +661,10 @@ def test_a_photographers_bounds_reach_the_correction_and_its_tag(
 
 
 def test_the_model_of_a_lens_decides_how_its_photos_are_estimated(
-    work: PhotoWork, bench: Workbench, sandbox: Scripted, steps: Any
+    work: PhotoWork, context: JobContext, sandbox: Scripted, steps: Any
 ) -> None:
     told = []
-    for photo in (received(bench, steps), received(bench, steps, model="paper", lens_serial="other")):
+    for photo in (received(context, steps), received(context, steps, model="paper", lens_serial="other")):
         work.photo(photo.public_id, 1)
         assert steps.fresh(photo).state == "counted"
         told.append((sandbox.seen["estimate"]["estimator"], sandbox.seen["estimate"]["size"]))
@@ -671,122 +673,122 @@ def test_the_model_of_a_lens_decides_how_its_photos_are_estimated(
 
 
 def test_a_photo_that_asks_for_another_model_than_its_lens_has_says_what_to_do(
-    work: PhotoWork, bench: Workbench, photo: PhotoRow, steps: Any
+    work: PhotoWork, context: JobContext, photo: PhotoRow, steps: Any
 ) -> None:
     work.photo(photo.public_id, 1)
-    asking = received(bench, steps, model="paper")
+    asking = received(context, steps, model="paper")
     work.photo(asking.public_id, 1)
 
     refused = steps.fresh(asking)
     assert (refused.state, refused.error_code) == ("failed", "conflict")
     assert f"PATCH /v1/lenses/{steps.lens_id(photo)}" in refused.error_detail
-    bench.store.lens_changes.choose_way(steps.lens_id(photo), "local", "paper")
-    assert bench.store.photos.retry(asking.public_id)
+    context.store.lens_changes.choose_way(steps.lens_id(photo), "local", "paper")
+    assert context.store.photos.retry(asking.public_id)
     for one in (photo, asking):
         work.photo(one.public_id, 2)
     assert [steps.fresh(one).state for one in (photo, asking)] == ["counted", "counted"]
 
 
 def test_the_model_of_a_lens_decides_how_it_is_measured_and_its_photos_are_corrected(
-    bench: Workbench, sandbox: Scripted, steps: Any
+    context: JobContext, sandbox: Scripted, steps: Any
 ) -> None:
-    photo = received(bench, steps, model="paper")
+    photo = received(context, steps, model="paper")
     steps.inspect(photo)
     steps.plan(photo)
     steps.estimate(photo)
-    assert bench.store.photos.finish(photo.public_id, 1) == 1
+    assert context.store.photos.finish(photo.public_id, 1) == 1
     sandbox.answers["measure"] = [ok({"error": {}, "coverage": {}})]
     sandbox.answers["correct"] = [write_result]
 
-    CorrectionWork(bench).measure(steps.lens_id(photo), 1)
-    CorrectionWork(bench).correction(ask(bench, photo, steps, method="paper"))
+    CorrectionWork(context).measure(steps.lens_id(photo), 1)
+    CorrectionWork(context).correction(ask(context, photo, steps, method="paper"))
 
     wanted = {"mode": "paper", "unit": "micrometre"}
     assert [sandbox.seen[task]["model"] for task in ("measure", "report", "correct")] == [wanted] * 3
 
 
 def test_a_correction_with_a_version_without_samples_fails(
-    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+    context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any
 ) -> None:
-    key = ask(bench, counted, steps)
-    bench.store.photos.change(counted.public_id, "local", {}, excluded=True)
+    key = ask(context, counted, steps)
+    context.store.photos.change(counted.public_id, "local", {}, excluded=True)
 
-    CorrectionWork(bench).correction(key)
+    CorrectionWork(context).correction(key)
 
-    row = bench.store.corrections.get(key)
+    row = context.store.corrections.get(key)
     assert row is not None
     assert (row.state, row.error_code) == ("failed", "no_samples")
 
 
 def test_a_cancelled_correction_stays_cancelled(
-    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+    context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any
 ) -> None:
-    key = ask(bench, counted, steps)
+    key = ask(context, counted, steps)
 
     def cancel(arguments: dict[str, Any], folder: Path) -> Outcome:
-        bench.store.corrections.cancel(key)
+        context.store.corrections.cancel(key)
         return write_result(arguments, folder)
 
     sandbox.answers["correct"] = [cancel]
-    CorrectionWork(bench).correction(key)
+    CorrectionWork(context).correction(key)
 
-    row = bench.store.corrections.get(key)
+    row = context.store.corrections.get(key)
     assert row is not None
     assert (row.state, row.result_key) == ("cancelled", None)
 
 
 def test_a_correction_cancelled_while_its_file_was_stored_leaves_no_file(
-    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any, monkeypatch: pytest.MonkeyPatch
+    context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    key, put_file = ask(bench, counted, steps), bench.storage.put_file
+    key, put_file = ask(context, counted, steps), context.storage.put_file
 
     def cancelled_meanwhile(blob: str, path: Path) -> None:
         put_file(blob, path)
-        bench.store.corrections.cancel(key)
+        context.store.corrections.cancel(key)
 
-    monkeypatch.setattr(bench.storage, "put_file", cancelled_meanwhile)
+    monkeypatch.setattr(context.storage, "put_file", cancelled_meanwhile)
     sandbox.answers["correct"] = [write_result]
-    CorrectionWork(bench).correction(key)
+    CorrectionWork(context).correction(key)
 
     with pytest.raises(FileNotFoundError):
-        bench.storage.info(f"corrections/{key}/result.tif")
+        context.storage.info(f"corrections/{key}/result.tif")
 
 
 def test_a_child_cannot_hand_in_a_file_from_elsewhere(
-    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+    context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any
 ) -> None:
     value = {"file": "../../../app.db", "report": {"zones": {}}}
     sandbox.answers["correct"] = [ok(value)]
-    key = ask(bench, counted, steps)
+    key = ask(context, counted, steps)
 
-    CorrectionWork(bench).correction(key)
+    CorrectionWork(context).correction(key)
 
-    row = bench.store.corrections.get(key)
+    row = context.store.corrections.get(key)
     assert row is not None
     assert (row.state, row.error_code) == ("failed", "internal_error")
 
 
 def test_a_version_is_measured_once_and_its_history_says_so(
-    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+    context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any
 ) -> None:
     sandbox.answers["measure"] = [ok({"error": {"mid": 0.2}, "coverage": {"mid": 4}})]
     lens_id = steps.lens_id(counted)
-    before = bench.store.lenses.unmeasured()
+    before = context.store.lenses.unmeasured()
 
-    CorrectionWork(bench).measure(lens_id, 1)
+    CorrectionWork(context).measure(lens_id, 1)
 
     assert before == [(lens_id, 1)]
-    assert bench.store.lenses.unmeasured() == []
+    assert context.store.lenses.unmeasured() == []
 
 
 def test_a_version_that_cannot_be_measured_is_not_tried_for_ever(
-    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+    context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any
 ) -> None:
     sandbox.answers["measure"] = [refused("no_samples")]
 
-    CorrectionWork(bench).measure(steps.lens_id(counted), 1)
+    CorrectionWork(context).measure(steps.lens_id(counted), 1)
 
-    assert bench.store.lenses.unmeasured() == []
+    assert context.store.lenses.unmeasured() == []
 
 
 class Asked:
@@ -805,23 +807,23 @@ def test_what_another_version_of_the_program_fitted_is_not_looked_for() -> None:
 
 
 def test_a_lens_that_was_measured_before_there_were_reports_gets_one(
-    bench: Workbench, sandbox: Scripted, counted: PhotoRow, steps: Any
+    context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any
 ) -> None:
     first = {"error": {"mid": 0.2}, "coverage": {"mid": 4}}
     sandbox.answers["measure"] = [ok(first), ok({"error": {"mid": 9.9}, "coverage": {"mid": 4}})]
     lens_id = steps.lens_id(counted)
-    work, engine = CorrectionWork(bench), cast("Any", Asked())
-    assert ask_for_reports(bench.store, bench.storage, engine) == 0  # not measured yet: that makes one
+    work, engine = CorrectionWork(context), cast("Any", Asked())
+    assert ask_for_reports(context.store, context.storage, engine) == 0  # not measured yet: that makes one
     work.measure(lens_id, 1)
-    assert ask_for_reports(bench.store, bench.storage, engine) == 1
+    assert ask_for_reports(context.store, context.storage, engine) == 1
     (job,) = engine.jobs
     assert job.id != Job("measure", (lens_id, 1)).id
 
     work.measure(*job.arguments)
-    lens = bench.store.lenses.get(lens_id)
+    lens = context.store.lenses.get(lens_id)
     assert lens is not None
-    assert bench.store.lenses.history(lens)[-1].metrics == first
-    bench.storage.put(report_key(lens_id, 1, lens.rebuild_epoch), b"{}")
-    assert ask_for_reports(bench.store, bench.storage, engine) == 1
-    bench.storage.put(learned_key(lens_id, 1, lens.rebuild_epoch), b"fitted")
-    assert ask_for_reports(bench.store, bench.storage, engine) == 0
+    assert context.store.lenses.history(lens)[-1].metrics == first
+    context.storage.put(report_key(lens_id, 1, lens.rebuild_epoch), b"{}")
+    assert ask_for_reports(context.store, context.storage, engine) == 1
+    context.storage.put(learned_key(lens_id, 1, lens.rebuild_epoch), b"fitted")
+    assert ask_for_reports(context.store, context.storage, engine) == 0

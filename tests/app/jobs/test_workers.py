@@ -175,7 +175,7 @@ def test_blobs_that_cannot_be_deleted_keep_no_others(
         if prefix == stuck:
             raise OSError("read-only")
 
-    monkeypatch.setattr(worker._bench.storage, "delete", delete)
+    monkeypatch.setattr(worker._context.storage, "delete", delete)
     monkeypatch.setattr(worker, "_engine", SimpleNamespace(forget=lambda _: 0))
     monkeypatch.setattr(worker._store.workers, "garbage", lambda: [stuck, other])
 

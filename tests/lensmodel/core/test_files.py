@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from lensmodel.core.files import save_array
+from lensmodel.core.files import atomic, replacing, save_array, write_atomically
 
 
 @given(
@@ -60,3 +60,17 @@ sys.exit("nothing was raised")
     )
 
     assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_a_file_is_replaced_whole_or_left_as_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "a.tar.txt"
+    write_atomically(path, b"first")
+    with pytest.raises(TypeError), atomic(path) as file:
+        file.write("no bytes")  # type: ignore[arg-type]
+
+    assert path.read_bytes() == b"first"
+    with replacing(path) as part:
+        part.write_bytes(b"second")
+        assert (part.parent, part.suffix) == (tmp_path, ".txt")
+    assert path.read_bytes() == b"second"
+    assert list(tmp_path.iterdir()) == [path]

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lensmodel.core import errors, psf
-from lensmodel.core.geometry import Frame, local_to_pixel, pixel_to_local, zone_of
+from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel
 
@@ -35,24 +35,6 @@ def test_pixel_and_position_are_inverse(r: float, phi: float) -> None:
     assert back.r == pytest.approx(r, abs=1e-9)
     if r > 1e-6:
         assert math.cos(back.phi - phi) == pytest.approx(1.0)
-
-
-@given(angles)
-def test_u_points_outwards(phi: float) -> None:
-    frame = Frame(300, 400)
-    near = np.array(frame.pixel(FieldPosition(0.3, phi)))
-    far = np.array(frame.pixel(FieldPosition(0.3 + 1 / frame.half_diagonal, phi)))
-
-    u, v = pixel_to_local(*(far - near), phi)
-
-    assert (float(u), float(v)) == (pytest.approx(1.0), pytest.approx(0.0, abs=1e-9))
-
-
-@given(angles, st.floats(-5, 5), st.floats(-5, 5))
-def test_local_frame_round_trip(phi: float, u: float, v: float) -> None:
-    back = pixel_to_local(*local_to_pixel(u, v, phi), phi)
-
-    assert np.allclose(np.array(back), (u, v))
 
 
 @given(angles)

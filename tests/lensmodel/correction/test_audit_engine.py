@@ -10,9 +10,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lensmodel.core import loops
 from lensmodel.core.psf import as_kernel, gaussian
 from lensmodel.core.types import NoiseModel, Planes
-from lensmodel.correction.audit import CHECKS, Evidence, audit_tile, engine
+from lensmodel.correction.audit import CHECKS, Evidence, audit_tile
 from lensmodel.correction.audit.check import Pair
 from lensmodel.correction.blur import UniformBlur
 
@@ -86,13 +87,13 @@ def test_parts_of_larger_planes_are_audited_alike() -> None:
 def test_the_audit_runs_where_numba_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     photo, made = pair_of((48, 48))
     monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
-    engine._load.cache_clear()
+    loops._load.cache_clear()
     try:
         pair = Pair.of(photo, made, evidence((48, 48)))
         found = audit_tile(photo, made, evidence((48, 48)))
     finally:
         monkeypatch.undo()
-        engine._load.cache_clear()
+        loops._load.cache_clear()
 
     assert pair.loops is None
     assert found.findings == audit_tile(photo, made, evidence((48, 48)), engine="numpy").findings

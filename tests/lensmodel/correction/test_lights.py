@@ -36,7 +36,7 @@ def answered(found: list[Region], shape: tuple[int, int]) -> np.ndarray:
     """How many regions answer for each pixel."""
     count = np.zeros(shape, dtype=int)
     for region in found:
-        count[region.seen][region.answers] += 1
+        count[region.data][region.answers] += 1
     return count
 
 
@@ -44,7 +44,7 @@ def owned(found: list[Region], shape: tuple[int, int]) -> np.ndarray:
     """How many regions own the light of each pixel of the latent plane."""
     count = np.zeros((shape[0] + 2 * REACH, shape[1] + 2 * REACH), dtype=int)
     for region in found:
-        wide = tuple(slice(part.start, part.stop + 2 * REACH) for part in region.seen)
+        wide = tuple(slice(part.start, part.stop + 2 * REACH) for part in region.data)
         count[wide][region.own] += 1
     return count
 
@@ -70,7 +70,7 @@ def test_lamps_far_apart_are_regions_of_their_own_and_cost_less() -> None:
     found = regions(clipped, REACH)
 
     assert len(found) == 2
-    pixels = sum((r.seen[0].stop - r.seen[0].start) * (r.seen[1].stop - r.seen[1].start) for r in found)
+    pixels = sum((r.data[0].stop - r.data[0].start) * (r.data[1].stop - r.data[1].start) for r in found)
     assert pixels < 0.05 * clipped.size
 
 

@@ -13,9 +13,9 @@ from lensmodel import photo
 from lensmodel.core.psf import as_kernel, delta, gaussian
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel
 from lensmodel.correction import correct_planes
+from lensmodel.lab.images import psnr
+from lensmodel.lab.scenes import dead_leaves
 from lensmodel.photo.dng import write_bayer_dng
-from lensmodel.quality import psnr
-from lensmodel.simulate import dead_leaves
 
 SIDES = (160, 224)
 BLACK, WHITE, ELECTRONS = 512, 15872, 20_000.0

@@ -12,7 +12,8 @@ from lensmodel.core.types import NoiseModel, Plane
 from lensmodel.estimation.methods.patch_recurrence import normal_equations
 from lensmodel.estimation.steps.recurrence import blend, recur
 from lensmodel.lab.blind.methods import compared
-from lensmodel.simulate import dead_leaves, demo_scene, edge_area
+from lensmodel.lab.scenes import dead_leaves
+from lensmodel.simulate import demo_scene, edge_area
 
 SIGMA = 0.01
 NAMES = sorted(compared)  # those of the laboratory keep the same contract

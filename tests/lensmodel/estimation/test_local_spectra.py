@@ -13,8 +13,8 @@ from lensmodel.estimation.spectra.local_spectra import (
     log_local_power,
     periodograms,
 )
+from lensmodel.lab.scenes import dead_leaves
 from lensmodel.optics.local_pupil import TERMS, Pupil
-from lensmodel.simulate import dead_leaves
 
 LENS = np.array([0.3, 0.9, -0.5, 0.6, 0.5, -0.3, 0.0, 0.0])
 NOISE = 1e-3

@@ -12,8 +12,8 @@ from lensmodel.core.psf import as_kernel, centred, centroid, distance, gaussian,
 from lensmodel.core.types import NoiseModel
 from lensmodel.estimation.spectra.local_wavefront import AberrationFit
 from lensmodel.estimation.spectra.scene_spectra import BINS, SHAPES, ScenePrior, SceneSpectra, log_power
+from lensmodel.lab.scenes import dead_leaves
 from lensmodel.optics.local_pupil import TERMS, Pupil
-from lensmodel.simulate import dead_leaves
 
 LENS = np.array([0.3, 0.9, -0.5, 0.6, 0.5, -0.3, 0.0, 0.0])
 NOISE = 1e-7

@@ -10,7 +10,8 @@ from scipy import signal
 from lensmodel.core.psf import delta, gaussian, second_moments
 from lensmodel.core.types import Kernel, NoiseModel, Plane
 from lensmodel.estimation.methods.polyblur import Polyblur, directional_slopes
-from lensmodel.simulate import dead_leaves, demo_scene
+from lensmodel.lab.scenes import dead_leaves
+from lensmodel.simulate import demo_scene
 
 SIGMA = 0.01
 NOISE = NoiseModel.white(SIGMA)

@@ -13,7 +13,8 @@ from lensmodel.core.psf import as_kernel, centred, delta, distance, gaussian, re
 from lensmodel.core.types import Kernel, NoiseModel, Plane
 from lensmodel.estimation import PsfEstimator
 from lensmodel.lab.blind.methods import compared
-from lensmodel.simulate import dead_leaves, load_scene
+from lensmodel.lab.scenes import dead_leaves
+from lensmodel.simulate import load_scene
 
 pytestmark = pytest.mark.slow  # a method to compare with, of the laboratory
 

@@ -20,6 +20,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.psf import as_kernel, distance
 from lensmodel.core.types import CHANNELS, ZONES, FieldPosition, LensSettings, Planes
+from lensmodel.lab.figure_parts import strip
 from lensmodel.lab.reproduce import (
     Answer,
     Case,
@@ -48,7 +49,7 @@ from lensmodel.lab.reproduce.scenes import centred_cut, frame_scene, layout_for,
 from lensmodel.lab.reproduce.shots import Shots, guard_of, take
 from lensmodel.lab.traced import read_grid
 from lensmodel.photo import develop
-from lensmodel.report.photo_crops import as_shown, strip
+from lensmodel.report.photo_crops import as_shown
 from lensmodel.simulate import LENS_KINDS, edge_chart
 from lensmodel.workflow.ways import Way
 

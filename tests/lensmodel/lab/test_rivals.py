@@ -17,7 +17,8 @@ from lensmodel.lab.rivals import BasisField, Kee, RadialBasis, Schuler, load_bas
 from lensmodel.lab.rivals.basis import save_basis
 from lensmodel.lab.rivals.kee import core_variance
 from lensmodel.lab.rivals.rival import Window, polynomial, powers
-from lensmodel.simulate import dead_leaves, draw_lens
+from lensmodel.lab.scenes import dead_leaves
+from lensmodel.simulate import draw_lens
 
 FRAME = Frame(2000, 3000)
 RADII = (0.0, 0.5, 1.0)

@@ -13,8 +13,9 @@ from lensmodel.lab.blind.methods.sun import Sun, edge_terms, image_step
 from lensmodel.lab.blind.steps.edge_patches import SIDE, default_prior, edge_mask, target
 from lensmodel.lab.blind.steps.kernel_step import least_squares_kernel
 from lensmodel.lab.blind.steps.pyramid import View
+from lensmodel.lab.scenes import dead_leaves
 from lensmodel.lab.training import make_edge_patches
-from lensmodel.simulate import dead_leaves, edge_area
+from lensmodel.simulate import edge_area
 
 pytestmark = pytest.mark.slow  # a method to compare with, of the laboratory
 

@@ -12,9 +12,10 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import centroid, distance, gaussian
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
+from lensmodel.lab.scenes import dead_leaves
 from lensmodel.lab.traced import GridField, GridLens, read_grid
 from lensmodel.photo import develop
-from lensmodel.simulate import BlurOptions, SimulatedCamera, blurred, dead_leaves, photograph, write_photo
+from lensmodel.simulate import BlurOptions, SimulatedCamera, blurred, photograph, write_photo
 
 DATA = Path(__file__).parents[1] / "data"
 GRIDS = sorted(DATA.glob("traced-*.npz"))

@@ -10,7 +10,7 @@ from lensmodel.core.types import Kernel, NoiseModel, Plane
 from lensmodel.lab.blind.methods.zhang import Zhang
 from lensmodel.lab.blind.methods.zhang_model import Scene, pooled_kernel
 from lensmodel.lab.blind.steps.kernel_step import Grid, Term, least_squares_kernel
-from lensmodel.simulate import dead_leaves
+from lensmodel.lab.scenes import dead_leaves
 
 pytestmark = pytest.mark.slow  # a method to compare with, of the laboratory
 

@@ -15,22 +15,19 @@ from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.geometry import CORNER_ZONE_R, Frame
 from lensmodel.core.psf import delta, gaussian
 from lensmodel.core.types import LensSettings
+from lensmodel.lab.images import psnr
+from lensmodel.lab.scenes import dead_leaves
 from lensmodel.quality import (
     best_shift,
     by_zone,
     crossing,
-    flat_noise,
-    lp_per_ph,
     measure_edges,
     mtf50_from_kernel,
     mtf_from_kernel,
-    noise_gain,
     pixel_mtf,
-    psnr,
     registered_zone_psnr,
     shifted,
     slanted_edge,
-    ssim,
     tangential_sagittal_mtf50,
     to_srgb,
 )
@@ -39,7 +36,6 @@ from lensmodel.simulate import (
     BlurOptions,
     SimulatedLens,
     blurred,
-    dead_leaves,
     edge_chart,
     slanted_edge_scene,
 )
@@ -206,12 +202,6 @@ def test_tangential_is_along_u_and_sagittal_along_v() -> None:
     assert sagittal == pytest.approx(theory(1.0, math.degrees(phi)), rel=0.01)
 
 
-def test_line_pairs_per_picture_height_count_the_picture() -> None:
-    assert lp_per_ph(0.163, 3753) == pytest.approx(612, abs=1)
-    with pytest.raises(InvalidInputError):
-        lp_per_ph(0.2, 0)
-
-
 @pytest.fixture(scope="module")
 def comatic() -> SimulatedLens:
     return SimulatedLens(
@@ -269,40 +259,10 @@ def test_measuring_skips_boxes_without_an_edge_and_says_when_none_is_left(
     )
 
 
-def test_psnr_is_that_of_the_mean_square_and_infinite_for_equal_pictures() -> None:
-    reference = np.full((3, 20, 30), 0.5)
-
-    assert psnr(reference + 0.1, reference) == pytest.approx(20.0)
-    assert psnr(reference, reference) == math.inf
-    mask = np.zeros((20, 30), dtype=bool)
-    mask[:, 0] = True
-    changed = reference.copy()
-    changed[:, :, 0] += 0.01
-    assert psnr(changed, reference, mask=mask) == pytest.approx(40.0)
-    assert psnr(reference * 0.9, reference, srgb=True) == pytest.approx(
-        -20 * math.log10(to_srgb(np.array(0.5)) - to_srgb(np.array(0.45)))
-    )
-    with pytest.raises(InvalidInputError, match="mask"):
-        psnr(reference, reference, mask=np.zeros((20, 30), dtype=bool))
-    with pytest.raises(InvalidInputError, match="same shape"):
-        psnr(reference, reference[:, 1:])
-
-
 def test_srgb_curve_has_its_known_values_and_clips() -> None:
     np.testing.assert_allclose(
         to_srgb(np.array([-1.0, 0.0, 0.0031308, 0.214041, 1.0, 2.0])), [0, 0, 0.04045, 0.5, 1, 1], atol=1e-4
     )
-
-
-def test_ssim_is_one_for_equal_pictures_and_falls_with_blur() -> None:
-    scene = dead_leaves(64, 96, np.random.default_rng(0))
-    soft, softer = (np.stack([ndimage.gaussian_filter(p, s) for p in scene]) for s in (0.7, 2.0))
-
-    assert ssim(scene, scene) == pytest.approx(1.0)
-    assert ssim(scene, scene) > ssim(soft, scene) > ssim(softer, scene)
-    assert ssim(soft, scene, srgb=True) < 1.0
-    with pytest.raises(InvalidInputError, match="11"):
-        ssim(scene[:, :8], scene[:, :8])
 
 
 def smooth_scene() -> NDArray[np.float64]:
@@ -329,19 +289,6 @@ def test_shift_moves_towards_growing_rows_and_columns() -> None:
 
 def test_best_shift_of_a_flat_picture_is_none() -> None:
     assert best_shift(np.full((40, 40), 0.3), np.full((40, 40), 0.3)) == (0.0, 0.0)
-
-
-def test_noise_gain_sees_through_shading() -> None:
-    rng = np.random.default_rng(2)
-    shading = np.linspace(0.2, 0.5, 64)[None, :] * np.linspace(1.0, 1.3, 64)[:, None]
-    noise = rng.normal(0.0, 0.01, (64, 64))
-
-    assert flat_noise(shading + noise) == pytest.approx(0.01, rel=0.05)
-    assert noise_gain(shading + 2.5 * noise, shading + noise) == pytest.approx(2.5, rel=0.02)
-    with pytest.raises(InvalidInputError, match="no noise"):
-        noise_gain(noise, np.zeros((64, 64)))
-    with pytest.raises(InvalidInputError, match="8 x 8"):
-        flat_noise(np.zeros((4, 40)))
 
 
 def test_delta_kernel_passes_everything() -> None:

@@ -82,8 +82,8 @@ def test_the_corner_that_no_photo_shows_is_asked_for(phi: float, corner: str) ->
 
     assert corner in found.text
     assert "at f/2" in found.text
-    assert found.wishes[0].extrapolated
-    assert found.wishes[0].photos == 0
+    assert found.suggestions[0].extrapolated
+    assert found.suggestions[0].photos == 0
 
 
 def test_the_aperture_that_few_photos_had_is_asked_for() -> None:
@@ -92,7 +92,7 @@ def test_the_aperture_that_few_photos_had_is_asked_for() -> None:
 
     found = advice(LensModel.fit(samples))
 
-    assert all(wish.settings.aperture == 8.0 for wish in found.wishes)
+    assert all(suggestion.settings.aperture == 8.0 for suggestion in found.suggestions)
     assert "at f/8" in found.text
 
 
@@ -102,7 +102,7 @@ def test_an_aperture_that_no_photo_had_is_asked_for_when_the_owner_names_it() ->
     found = advice(LensModel.fit(samples), LensSettings(aperture=1.4))
 
     assert "at f/1.4" in found.text
-    assert found.wishes[0].extrapolated
+    assert found.suggestions[0].extrapolated
 
 
 def test_unknown_apertures_are_not_named() -> None:
@@ -127,9 +127,9 @@ def test_advice_does_not_depend_on_the_order_of_samples() -> None:
     assert advice(LensModel.fit(samples)).text == advice(LensModel.fit(samples[::-1])).text
 
 
-def test_the_first_wish_has_the_largest_gain_and_the_wishes_differ() -> None:
+def test_the_first_suggestion_has_the_largest_gain_and_the_suggestions_differ() -> None:
     found = advice(LensModel.fit(photo("a", without=CORNER)))
 
-    gains = [wish.gain for wish in found.wishes]
+    gains = [suggestion.gain for suggestion in found.suggestions]
     assert gains == sorted(gains, reverse=True)
-    assert len({(wish.position, wish.settings.aperture) for wish in found.wishes}) == 3
+    assert len({(suggestion.position, suggestion.settings.aperture) for suggestion in found.suggestions}) == 3

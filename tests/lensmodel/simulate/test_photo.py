@@ -10,12 +10,14 @@ import exifread
 import numpy as np
 import pytest
 import rawpy
+from numpy.typing import NDArray
 from PIL import Image
 
 from lensmodel.core.errors import InvalidInputError, NotAnImageError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import centroid
 from lensmodel.core.types import LensSettings, Planes
+from lensmodel.lab.scenes import dead_leaves, disc_kernel, out_of_focus
 from lensmodel.simulate import (
     DEMO_SCENES,
     Aberrations,
@@ -23,18 +25,13 @@ from lensmodel.simulate import (
     SimulatedCamera,
     SimulatedLens,
     blurred,
-    constant,
-    dead_leaves,
     demo_data_path,
     demo_scene,
-    disc_kernel,
     draw_lens,
     edge_area,
     edge_chart,
     load_scene,
-    out_of_focus,
     photograph,
-    point_lights,
     shot_info,
     srgb_to_linear,
     write_photo,
@@ -45,6 +42,20 @@ SIZE = 31
 HALF = SIZE // 2
 COARSE = BlurOptions(size=SIZE, step=0.5, lateral=False)
 PERFECT = SimulatedLens((Aberrations(f_number=4.0),))
+
+
+def constant(height: int, width: int, level: float = 0.5) -> Planes:
+    return np.full((3, height, width), level, dtype=np.float32)
+
+
+def point_lights(height: int, width: int, spacing: int) -> tuple[Planes, NDArray[np.intp]]:
+    """Single bright pixels on a square grid over a black scene, and their rows and columns."""
+    rows = np.arange(spacing // 2, height, spacing)
+    cols = np.arange(spacing // 2, width, spacing)
+    places = np.stack(np.meshgrid(rows, cols, indexing="ij"), axis=-1).reshape(-1, 2)
+    scene = np.zeros((3, height, width), dtype=np.float32)
+    scene[:, places[:, 0], places[:, 1]] = 1.0
+    return scene, places
 
 
 @pytest.fixture(scope="module")

@@ -15,9 +15,9 @@ import pytest
 
 from lensmodel import photo, simulate
 from lensmodel.core.types import LensSettings, Planes
+from lensmodel.lab.images import psnr
 from lensmodel.lab.traced import GridLens, read_grid
 from lensmodel.model import LensModel
-from lensmodel.quality import psnr
 from lensmodel.workflow import pipeline
 
 pytestmark = pytest.mark.slow

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from lensmodel.core.jit import jit
-from lensmodel.correction.audit.compiled.nearby import Real, extremes, into_blocks
+from lensmodel.correction.audit.compiled.nearby import extremes, into_blocks
+from lensmodel.correction.compiled.common import Real
 
 
 @jit

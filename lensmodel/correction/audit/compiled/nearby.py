@@ -2,18 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
-from numpy.typing import NDArray
 
 from lensmodel.core.jit import jit
-
-Real = NDArray[np.float32]
-
-FORWARD: Final = True
-BACK: Final = False
-"""Directions of a transform."""
+from lensmodel.correction.compiled.common import Real
 
 
 @jit

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.jit import jit
-from lensmodel.correction.audit.compiled.nearby import Real
+from lensmodel.correction.compiled.common import Real
 
 
 @jit

@@ -7,25 +7,8 @@ import rocket_fft
 from numpy.typing import NDArray
 
 from lensmodel.core.jit import jit
-from lensmodel.correction.audit.compiled.nearby import BACK, FORWARD, Real, into_blocks
-
-Complex = NDArray[np.complex64]
-
-
-@jit
-def transfer(taps: Real, out: Complex, width: int) -> None:
-    """Spectrum of a small kernel around the first pixel: only its own rows go through the row transform."""
-    side, (height, half) = taps.shape[0], out.shape
-    lines = np.zeros((side, width), np.float32)
-    spectra = np.empty((side, half), np.complex64)
-    for i in range(side):
-        for j in range(side):
-            lines[i, (j - side // 2) % width] = taps[i, j]
-    rocket_fft.r2c(lines, spectra, np.array([1]), FORWARD, 1.0, 1)
-    out[:] = 0
-    for i in range(side):
-        out[(i - side // 2) % height] = spectra[i]
-    rocket_fft.c2c(out, out, np.array([0]), FORWARD, 1.0, 1)
+from lensmodel.correction.audit.compiled.nearby import into_blocks
+from lensmodel.correction.compiled.common import BACK, FORWARD, Complex, Real
 
 
 @jit

@@ -7,7 +7,7 @@ import rocket_fft
 from numpy.typing import NDArray
 
 from lensmodel.core.jit import jit
-from lensmodel.correction.audit.compiled.nearby import FORWARD, Real
+from lensmodel.correction.compiled.common import FORWARD, Real
 
 Index = NDArray[np.int64]
 

@@ -10,16 +10,9 @@ from scipy import special
 from lensmodel import photo
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import LensSettings, Planes
+from lensmodel.lab.camera_jpeg import CAMERA_JPEGS, CameraJpeg
 from lensmodel.photo.noise import estimate_noise
-from lensmodel.simulate import (
-    CAMERA_JPEGS,
-    BlurOptions,
-    CameraJpeg,
-    SimulatedCamera,
-    SimulatedPhoto,
-    Truth,
-    draw_lens,
-)
+from lensmodel.simulate import BlurOptions, SimulatedCamera, SimulatedPhoto, Truth, draw_lens
 
 CAMERA = SimulatedCamera(height=96, width=128, full_well_electrons=4000.0)
 PLAIN = CameraJpeg(amount=0.0, denoise=0.0, contrast=0.0, subsampling="4:4:4", quality=100)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from app.jobs.context import SPARE_MB, Workbench
+from app.jobs.context import SPARE_MB, JobContext
 from app.jobs.task_files import GLANCE
 from app.sandbox.outcome import Limits
 from app.store.photo_steps import folder_of
@@ -14,14 +14,14 @@ from app.store.tables import PhotoRow
 
 
 def keep_glance(
-    bench: Workbench, photo: PhotoRow, info: dict[str, Any], path: Path, wanted: Callable[[], bool]
+    context: JobContext, photo: PhotoRow, info: dict[str, Any], path: Path, wanted: Callable[[], bool]
 ) -> None:
     """Store a small picture of the photo at `path`; none where it cannot be rendered."""
-    limits = Limits(memory_mb=2 * SPARE_MB, wall_s=bench.settings.inspect_seconds)
+    limits = Limits(memory_mb=2 * SPARE_MB, wall_s=context.settings.inspect_seconds)
     arguments = {"path": str(path), "kind": info["kind"], "orientation": info["metadata"]["orientation"]}
-    with bench.sandbox.folder() as folder:
-        outcome = bench.sandbox.run(
+    with context.sandbox.folder() as folder:
+        outcome = context.sandbox.run(
             "glance", arguments, folder=folder, limits=limits, reads=[path], wanted=wanted
         )
         if outcome.ending == "ok" and (folder / GLANCE).is_file():
-            bench.storage.put_file(f"{folder_of(photo)}{GLANCE}", folder / GLANCE)
+            context.storage.put_file(f"{folder_of(photo)}{GLANCE}", folder / GLANCE)

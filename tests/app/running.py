@@ -46,6 +46,8 @@ OWN_ACCOUNT = {"LENS_TASK_USER": "none"}
 started by root compiles them anew, half a minute of it, into a folder of its own."""
 LIGHT = [sys.executable, str(Path(__file__).with_name("light_service.py"))]
 """The same whose workers estimate nothing."""
+BRIEF = [sys.executable, str(Path(__file__).with_name("brief_service.py"))]
+"""The same whose workers report on lenses in brief."""
 FINAL = {"succeeded", "failed", "cancelled"}
 
 

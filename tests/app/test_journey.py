@@ -26,7 +26,7 @@ from lensmodel.core.psf import rms_width
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 from deadline import Deadline, stretched  # noqa: E402 - beside this file
-from running import OWN_ACCOUNT, PATIENCE_S, PROGRAM, Service, running, write_photo  # noqa: E402 - beside this file
+from running import BRIEF, OWN_ACCOUNT, PATIENCE_S, PROGRAM, Service, running, write_photo  # noqa: E402 - beside this file
 
 sys.path.remove(str(HERE))
 
@@ -47,7 +47,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     # what a worker fits of a wavefront is asked for in test_lens_modes: here each of many versions would wait
     kernels = {"LENS_PATCHES": "4", "LENS_MODEL_MODE": "kernels"}
-    with running(tmp_path_factory.mktemp("journey") / "data", **OWN_ACCOUNT, **kernels) as made:
+    with running(tmp_path_factory.mktemp("journey") / "data", BRIEF, **OWN_ACCOUNT, **kernels) as made:
         yield made
 
 

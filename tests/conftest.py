@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import fcntl
 import os
+import threading
 
 # Before NumPy is imported: tests run in parallel processes, threads inside each only slow them down.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -9,6 +11,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import Any
 
 # Services of tests keep their data for a moment only: what is compiled is kept longer, once for all tests.
 os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "numba"))
@@ -18,6 +21,35 @@ from hypothesis import settings
 
 settings.register_profile("tests", deadline=None)  # that others use the machine too is no fault of ours
 settings.load_profile("tests")
+
+
+def pytest_sessionstart() -> None:
+    """Let the test processes take turns at compiling: what one of them has compiled the others only load."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        _take_turns_at_compiling(Path(os.environ["NUMBA_CACHE_DIR"]))
+
+
+def _take_turns_at_compiling(folder: Path) -> None:
+    try:
+        from numba.core.dispatcher import Dispatcher  # noqa: PLC0415 - an extra
+    except ImportError:
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    here, compile_one = threading.RLock(), Dispatcher.compile
+    depth = 0
+
+    def alone(self: Any, signature: Any) -> Any:
+        nonlocal depth
+        with here, (folder / "turn").open("w") as turn:
+            if depth == 0:  # a loop that calls others has them compiled during its own turn
+                fcntl.flock(turn, fcntl.LOCK_EX)
+            depth += 1
+            try:
+                return compile_one(self, signature)
+            finally:
+                depth -= 1
+
+    Dispatcher.compile = alone
 
 
 @contextmanager

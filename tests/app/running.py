@@ -34,15 +34,20 @@ SETTINGS = {
     "LENS_ESTIMATOR": "whittle",
     "LENS_PATCHES": "2",  # of so few no wavefront is fitted, which takes longer than all the rest
     "LENS_KERNEL_SIZE": "15",
-    "LENS_SWEEP_SECONDS": "0.1",
+    "LENS_SWEEP_SECONDS": "0.25",  # oftener, and a busy machine spends its time on looking
     "LENS_WORKER_SLOTS": "2",
     "LENS_MIN_FREE_MB": "0",
     "LENS_INSPECT_SECONDS": f"{stretched(20.0):.0f}",
     "LENS_TASK_NICENESS": "0",  # tests wait for photos too: beside other programs they would starve
 }
 PROGRAM = [sys.executable, "-m", "app.cli"]
+OWN_ACCOUNT = {"LENS_TASK_USER": "none"}
+"""Tasks with the account of the tests find the loops that were compiled before: each other service that is
+started by root compiles them anew, half a minute of it, into a folder of its own."""
 LIGHT = [sys.executable, str(Path(__file__).with_name("light_service.py"))]
 """The same whose workers estimate nothing."""
+BRIEF = [sys.executable, str(Path(__file__).with_name("brief_service.py"))]
+"""The same whose workers report on lenses in brief."""
 FINAL = {"succeeded", "failed", "cancelled"}
 
 
@@ -110,7 +115,7 @@ class Service:
             if "-l-" in answer.headers["etag"]:
                 return answer
             assert not deadline.passed(), self.log.read_text()[-4000:]
-            time.sleep(0.1)
+            time.sleep(0.25)
 
     def upload(self, path: Path, status: int = 202, **fields: str) -> dict[str, Any]:
         """Send a photo; return its description."""
@@ -128,7 +133,7 @@ class Service:
             if job["state"] in FINAL or (until is not None and until(job)):
                 return job
             assert not deadline.passed(), f"{job}\n{self.log.read_text()[-4000:]}"
-            time.sleep(0.1)
+            time.sleep(0.25 if until is None else 0.1)
 
     def calibrated(self, path: Path, **fields: str) -> dict[str, Any]:
         """Send a photo and wait until it counts; return it."""

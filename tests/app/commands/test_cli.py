@@ -412,10 +412,10 @@ def test_the_guide_says_the_same_of_the_exit_status(here: Here) -> None:
         assert codes in " ".join(text.split())
 
 
-def test_unknown_options_and_settings_are_wrong_usage(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    option = lensmodel("calibrate", "one.dng", "--profil", "x", cwd=folder)
-    monkeypatch.setitem(ENVIRONMENT, "LENS_PROT", "9000")
-    setting = lensmodel("serve", cwd=folder)
+def test_unknown_options_and_settings_are_wrong_usage(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
+    option = here("calibrate", "one.dng", "--profil", "x")
+    monkeypatch.setenv("LENS_PROT", "9000")
+    setting = here("serve")
 
     assert option.returncode == setting.returncode == 2
     assert "did you mean LENS_PORT" in one_sentence(setting.stderr)

@@ -118,14 +118,11 @@ def send_all(service: Service, files: dict[str, bytes]) -> dict[str, dict[str, A
         else:
             answers[name] = answer.json()
     deadline = Deadline(PATIENCE_S * 2)
-    while waiting:
-        for name, photo_id in list(waiting.items()):
-            photo = service.get(f"/v1/photos/{photo_id}")
-            if photo["state"] in ENDED:
-                answers[name] = photo["error"] or {"code": photo["state"], "detail": "done"}
-                del waiting[name]
-        assert not deadline.passed(), f"stuck: {waiting}\n{service.log.read_text()[-3000:]}"
-        time.sleep(0.1)
+    for name, photo_id in waiting.items():  # one after another: to ask for all of them again costs more
+        while (photo := service.get(f"/v1/photos/{photo_id}"))["state"] not in ENDED:
+            assert not deadline.passed(), f"stuck: {name}\n{service.log.read_text()[-3000:]}"
+            time.sleep(0.25)
+        answers[name] = photo["error"] or {"code": photo["state"], "detail": "done"}
     return answers
 
 
@@ -159,6 +156,7 @@ def test_a_good_photo_still_goes_through_afterwards_in_the_same_worker(
     assert "started again" not in service.log.read_text()
 
 
+@pytest.mark.slow  # each of them is read without a service in tests/lensmodel/photo/test_bad_files.py
 @pytest.mark.tools
 def test_each_file_of_the_collection_is_refused_or_processed_and_none_is_stuck(
     service: Service, shared_data: Path

@@ -27,7 +27,7 @@ from playwright.sync_api import (
 HERE = Path(__file__).parents[1]
 sys.path.insert(0, str(HERE))
 from deadline import stretched  # noqa: E402 - beside these files
-from running import Service, running, write_photo  # noqa: E402 - beside this file
+from running import BRIEF, OWN_ACCOUNT, Service, running, write_photo  # noqa: E402 - beside this file
 
 sys.path.remove(str(HERE))
 
@@ -86,7 +86,9 @@ def browser() -> Iterator[Browser]:
 @pytest.fixture(scope="module")
 def service(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     # with the other lenses of these tests, each picture would wait for what all of them have in common
-    with running(tmp_path_factory.mktemp("pages") / "data", LENS_FAMILY="false") as made:
+    with running(
+        tmp_path_factory.mktemp("pages") / "data", BRIEF, **OWN_ACCOUNT, LENS_FAMILY="false"
+    ) as made:
         yield made
 
 

@@ -124,12 +124,22 @@ def test_cells_hold_every_patch_once_largest_first() -> None:
     assert sorted(p.row for group in groups for p in group) == list(range(6))
 
 
-@pytest.mark.parametrize("method", ["fast", pytest.param("standard", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(  # of so few patches as the first no wavefront is fitted: that takes the longest
+    ("method", "estimator", "count"),
+    [("fast", "whittle", 7), pytest.param("standard", "default", 12, marks=pytest.mark.slow)],
+)
 def test_calibrated_lens_makes_another_photo_sharper(
-    method: str, photos: dict[str, tuple[Path, SimulatedPhoto]], tmp_path: Path, short_search: None
+    method: str,
+    estimator: str,
+    count: int,
+    photos: dict[str, tuple[Path, SimulatedPhoto]],
+    tmp_path: Path,
+    short_search: None,
 ) -> None:
     events: list[pipeline.CalibrationEvent] = []
-    model = pipeline.calibrate([photos["city"][0]], count=12, workers=1, on_event=events.append)
+    model = pipeline.calibrate(
+        [photos["city"][0]], estimator=estimator, count=count, workers=1, on_event=events.append
+    )
     path, shot = photos["lake"]
     output = tmp_path / "corrected.tif"
 

@@ -1,0 +1,13 @@
+"""`lensmodel` with the brief worker beside this file."""
+
+if __name__ == "__main__":
+    import os
+    from pathlib import Path
+
+    from app import cli
+    from app.runtime import supervisor
+
+    here = str(Path(__file__).parent)
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))
+    supervisor.WORKER = "brief_worker"
+    cli.main()

@@ -171,7 +171,7 @@ class PhotoWork:
         arguments = {
             "developed": str(developed),
             "count": self._bench.settings.patches,
-            "selector": self._bench.settings.selector,
+            "selector": photo.given.get("selector") or self._bench.settings.selector,
         }
         with self._bench.sandbox.folder() as folder:
             try:

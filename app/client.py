@@ -73,6 +73,7 @@ class Client(LensCalls):
         focus_distance_m: float | None = None,
         pixel_pitch_um: float | None = None,
         model: s.PsfModel | None = None,
+        selector: str | None = None,
         kind: s.MeasurementKind | None = None,
         reference_id: str | None = None,
         on_progress: Callable[[int, int], None] | None = None,
@@ -81,6 +82,7 @@ class Client(LensCalls):
 
         `on_progress(sent, total)` is called in bytes after each mebibyte. With `model` the photo founds a
         lens that is learned so; of a lens that is there and has another it is refused, see `choose_model`.
+        `selector` chooses its patches instead of the service's own.
 
         With `kind` it was made to measure the lens; of a pair it is the open photo, and `reference_id` is the
         closed one, sent before with `calibrate=False`.
@@ -104,6 +106,7 @@ class Client(LensCalls):
             "focus_distance_m": focus_distance_m,
             "pixel_pitch_um": pixel_pitch_um,
             "model": model,
+            "selector": selector,
             "kind": kind,
             "reference_id": reference_id,
         }

@@ -171,7 +171,7 @@ class PhotoWork:
         arguments = {
             "developed": str(developed),
             "count": self._context.settings.patches,
-            "selector": self._context.settings.selector,
+            "selector": photo.given.get("selector") or self._context.settings.selector,
         }
         with self._context.sandbox.folder() as folder:
             try:

@@ -32,6 +32,8 @@ from app.store.access.accounts import Quota
 from app.store.ids import new_id
 from app.store.photo_steps import GIVEN_SETTINGS, folder_of
 from app.store.tables import LensRow, PhotoRow
+from lensmodel.core.errors import UnknownMethodError
+from lensmodel.estimation.patches import selectors
 
 router = APIRouter(tags=["photos"])
 GIB = 1024 * MIB
@@ -50,6 +52,7 @@ _UPLOAD_BODY = {
                     "kind": {"enum": ["target", "pair", "points", "edges"]},
                     "reference_id": {"type": "string"},
                     "model": {"enum": ["default", "paper"]},
+                    "selector": {"type": "string"},
                     "lens_id": {"type": "string"},
                     "lens_serial": {"type": "string"},
                     "lens_model": {"type": "string"},
@@ -87,6 +90,8 @@ async def create_photo(once: OnceDep) -> PhotoOut | Response:
     photo of a `pair`, whose closed one was sent before with `calibrate=false` and is its `reference_id`.
     With `model` it founds a lens that is learned so; of a lens with another model it is refused, or fails
     with `conflict` where only the file says which lens it was: `PATCH /v1/lenses/{id}` changes the model.
+    `selector` names who chooses its patches, of those that `GET /v1/formats` lists; bytes that are known keep
+    the patches they have.
     """
     return await _received(once)
 
@@ -143,6 +148,7 @@ def _take(
 
     def record() -> PhotoOut:
         _check_kind(call, uploaded.fields, measured=measured)
+        _check_selector(uploaded.fields)
         where = location.remove(call.storage, f"{prefix}original")
         photo, fresh = _record(call, public_id, uploaded, prefix, where)
         call.response.status_code = status.HTTP_202_ACCEPTED if fresh else status.HTTP_200_OK
@@ -173,6 +179,20 @@ def _check_kind(call: Call, fields: UploadFields, *, measured: bool) -> None:
         )
     if fields.reference_id is not None:
         find_photo(call, fields.reference_id)
+
+
+def _check_selector(fields: UploadFields) -> None:
+    """Refuse a selector that is not there, or one for a photo whose patches nobody chooses."""
+    if fields.selector is None:
+        return
+    if fields.kind is not None:
+        raise InvalidParameterError(
+            f"selector={fields.selector} and kind exclude each other: leave one of them out"
+        )
+    try:
+        selectors.create(fields.selector)
+    except UnknownMethodError as error:
+        raise InvalidParameterError(str(error)) from error
 
 
 def _admit(call: Call) -> None:

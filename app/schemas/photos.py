@@ -52,6 +52,10 @@ class UploadFields(Question):
         description="of a new lens: how it is learned, default or the paper's own way; a lens that is there "
         "must have it already",
     )
+    selector: OptionalName = Field(
+        default=None,
+        description="who chooses its patches, one of GET /v1/formats; else whom the service has",
+    )
     lens_id: OptionalId = None
     lens_serial: OptionalName = None
     lens_model: OptionalName = None

@@ -66,6 +66,31 @@ def test_fields_of_the_form_go_before_those_of_the_query(client: TestClient) -> 
     assert answer.json()["calibrate"] is False
 
 
+@pytest.mark.parametrize("where", ["form", "query"])
+def test_a_photo_may_name_who_chooses_its_patches(client: TestClient, store: Store, where: str) -> None:
+    query, data = ("", {"selector": "good-regions"}) if where == "form" else ("?selector=good-regions", {})
+    answer = client.post(f"/v1/photos{query}", files={"file": ("p.tif", TIFF)}, data=data)
+
+    assert answer.status_code == 202, answer.text
+    row = store.photos.get(answer.json()["id"], "local")
+    assert row is not None
+    assert row.given == {"selector": "good-regions"}
+
+
+@pytest.mark.parametrize(
+    ("query", "said"),
+    [("selector=best", "good-regions"), ("selector=good-regions&kind=target", "leave one of them out")],
+)
+def test_a_selector_that_nobody_can_follow_is_refused(
+    client: TestClient, settings: Settings, query: str, said: str
+) -> None:
+    answer = client.post(f"/v1/photos?filename=p.tif&{query}", content=TIFF)
+
+    assert (answer.status_code, answer.json()["code"]) == (422, "invalid_parameter")
+    assert said in answer.json()["detail"]
+    assert blobs(settings) == []
+
+
 def test_a_body_in_small_pieces_arrives_whole(client: TestClient, settings: Settings) -> None:
     body = form(
         ('name="aperture"', b"1.4"), ('name="file"; filename="p.tif"', TIFF), ('name="lens_model"', b"x")

@@ -232,6 +232,15 @@ def test_a_photo_goes_all_the_way(work: PhotoWork, context: JobContext, photo: P
     assert (lens.version, lens.sample_count, lens.serial) == (1, 6, "123")
 
 
+@pytest.mark.parametrize(("given", "taken"), [({}, "r-map"), ({"selector": "good-regions"}, "good-regions")])
+def test_patches_are_chosen_by_whom_the_photo_names_else_by_the_services_own(
+    work: PhotoWork, bench: Workbench, sandbox: Scripted, steps: Any, given: dict[str, str], taken: str
+) -> None:
+    work.photo(received(bench, steps, **given).public_id, 1)
+
+    assert sandbox.seen["select"]["selector"] == taken
+
+
 def measured(arguments: dict[str, Any], folder: Path) -> Outcome:
     np.save(folder / KERNELS, np.stack([gaussian(15, np.eye(2))] * 2))
     entry = {"idx": 0, "row": 9, "col": 9, "side": 144, "r": 0.2, "phi": 0.1, "error": 0.04}

@@ -1,0 +1,105 @@
+"""Who chooses the patches of a photo: the library, `calibrate` and `correct FOLDER` pass the name on."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import lensmodel
+from app.cli import main
+from lensmodel.core.errors import NotEnoughEvidenceError, NoUsablePatchesError
+from lensmodel.workflow import calibrating
+
+HERE = Path(__file__).parents[1]
+sys.path.insert(0, str(HERE))
+from running import write_photo  # noqa: E402 - beside this file
+
+sys.path.remove(str(HERE))
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[object]:
+    """Selectors that were asked for the patches of a photo; they find none, which ends the work."""
+    selectors: list[object] = []
+
+    def find_patches(developed: object, *, selector: object, **_: object) -> Any:
+        del developed
+        selectors.append(selector)
+        raise NoUsablePatchesError("no patch was chosen")
+
+    monkeypatch.setattr(calibrating, "find_patches", find_patches)
+    return selectors
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    (tmp_path / "holiday").mkdir()
+    write_photo(tmp_path / "holiday" / "one.dng", 1)
+    monkeypatch.chdir(tmp_path)
+    root = logging.getLogger()
+    handlers, level = list(root.handlers), root.level
+    signals = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield tmp_path
+    root.handlers[:], root.level = handlers, level
+    for number, handler in signals.items():
+        signal.signal(number, handler)
+
+
+class Everywhere:
+    """A selector of one's own."""
+
+    name, version = "everywhere", 1
+
+
+def test_the_library_takes_a_name_or_an_object(folder: Path, asked: list[object]) -> None:
+    own = Everywhere()
+    for selector in ("good-regions", own):
+        with pytest.raises(NotEnoughEvidenceError, match="no patch was chosen"):
+            lensmodel.calibrate(folder / "holiday" / "one.dng", selector=selector, workers=1)  # type: ignore[arg-type]  # never asked to score
+
+    assert asked == ["good-regions", own]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("calibrate", "holiday/one.dng", "--profile", "new.lensprofile"),
+        ("correct", "holiday", "--lens", "auto", "--profiles", "lenses"),
+    ],
+    ids=lambda words: words[0],
+)
+@pytest.mark.parametrize(
+    ("option", "taken"), [(("--selector", "good-regions"), "good-regions"), ((), "r-map")]
+)
+def test_the_command_passes_its_option_on(
+    words: tuple[str, ...],
+    option: tuple[str, ...],
+    taken: str,
+    folder: Path,
+    asked: list[object],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["lensmodel", *words, *option, "--workers", "1"])
+    with pytest.raises(SystemExit):  # the photo did not count
+        main()
+
+    assert asked == [taken]
+
+
+def test_a_selector_that_is_not_there_is_refused_by_name(
+    folder: Path, asked: list[object], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("calibrate", "holiday/one.dng", "--profile", "new.lensprofile", "--selector", "best")
+    monkeypatch.setattr(sys, "argv", ["lensmodel", *words])
+    with pytest.raises(SystemExit) as ended:
+        main()
+
+    assert ended.value.code == 2
+    assert "good-regions" in capsys.readouterr().err
+    assert asked == []

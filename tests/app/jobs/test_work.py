@@ -234,9 +234,9 @@ def test_a_photo_goes_all_the_way(work: PhotoWork, context: JobContext, photo: P
 
 @pytest.mark.parametrize(("given", "taken"), [({}, "r-map"), ({"selector": "good-regions"}, "good-regions")])
 def test_patches_are_chosen_by_whom_the_photo_names_else_by_the_services_own(
-    work: PhotoWork, bench: Workbench, sandbox: Scripted, steps: Any, given: dict[str, str], taken: str
+    work: PhotoWork, context: JobContext, sandbox: Scripted, steps: Any, given: dict[str, str], taken: str
 ) -> None:
-    work.photo(received(bench, steps, **given).public_id, 1)
+    work.photo(received(context, steps, **given).public_id, 1)
 
     assert sandbox.seen["select"]["selector"] == taken
 

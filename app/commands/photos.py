@@ -86,8 +86,8 @@ def calibrate(
         choice(
             "--mode",
             MODES,
-            "What answers are made of: averaged kernels and a fitted wavefront (default), either alone, a "
-            "mixture by held-out errors, or kernels averaged as in the paper. Kept from then on.",
+            "What answers are made of: averaged kernels and a fitted wavefront (default), either alone, or "
+            "kernels averaged as in the paper. Kept from then on.",
         ),
     ] = None,
     unit: Annotated[

@@ -163,7 +163,7 @@ class Settings(BaseSettings):
         default=True,
         description="A lens that has seen little leans on its owner's other copies of the same model.",
     )
-    model_mode: Literal["both", "kernels", "mixed", "wavefront", "paper"] = Field(
+    model_mode: Literal["both", "kernels", "wavefront", "paper"] = Field(
         default="both", description="What lens models make of their samples."
     )
     model_unit: Literal["micrometre", "half-diagonal"] = Field(
@@ -199,10 +199,8 @@ class Settings(BaseSettings):
     @field_validator("model_mode", mode="before")
     @classmethod
     def _no_former_mode(cls, value: object) -> object:
-        if value in {"evidence", "likeliest"}:
-            raise ValueError(
-                f"the mode {value!r} is gone: leave LENS_MODEL_MODE out, or set it to kernels or mixed"
-            )
+        if value in {"evidence", "likeliest", "mixed"}:
+            raise ValueError(f"the mode {value!r} is gone: leave LENS_MODEL_MODE out, or set it to kernels")
         return value
 
     @model_validator(mode="after")

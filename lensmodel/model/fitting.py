@@ -118,12 +118,12 @@ class Fit:
         where = index.points
         widths = WidthField.fit(common, base) if smoother.transport else WidthField()
         local = LocalKernels.of(common, where, widths)
-        validation = cross_validate(common, settings, local, where, base, blend=smoother.blend)
+        validation = cross_validate(common, settings, local, where, base)
         if smoother.transport and any(flag.sample is None for flag in validation.flags):
             # a spoilt photo has bent the widths too: fit them again without its voice
             widths = WidthField.fit(common, validation.votes)
             local = local.rescaled(where, widths)
-            validation = cross_validate(common, settings, local, where, base, blend=smoother.blend)
+            validation = cross_validate(common, settings, local, where, base)
         rule = va.bandwidths(where)
         used = bandwidth(rule, settings, validation.choice)
         return cls(
@@ -150,8 +150,7 @@ class Fit:
     @property
     def nbytes(self) -> int:
         """Bytes of stored kernels."""
-        image = self.validation.image
-        return self.local.nbytes + (0 if image is None else image.rest.nbytes)
+        return self.local.nbytes
 
     def takes(self, samples: Sequence[PsfSample], increment: float) -> bool:
         """Whether samples can join without fitting everything anew: they have room, and are few."""

@@ -25,7 +25,7 @@ from lensmodel.core.types import ZONES, FieldPosition, Kernel, LensSettings, Ste
 from lensmodel.model import learned as memory
 from lensmodel.model import pitch as pitches
 from lensmodel.model import variables as va
-from lensmodel.model.answer import BOTH, MICROMETRE, MIXED, WAVEFRONT, ModelSettings, PsfAnswer
+from lensmodel.model.answer import BOTH, MICROMETRE, WAVEFRONT, ModelSettings, PsfAnswer
 from lensmodel.model.answering import AnsweringModel, ModelField
 from lensmodel.model.field.robust import Flag
 from lensmodel.model.fitting import GROWTH, INCREMENT, Fit
@@ -143,8 +143,7 @@ class LensModel:
         """Whether answers need a wavefront, or patches can judge it as a second opinion."""
         if self.settings.mode == WAVEFRONT:
             return True
-        informed = self.settings.mode == MIXED or any(s.spectrum is not None for s in self.samples)
-        return informed and self._predictor.smoother.physical
+        return self._predictor.smoother.physical and any(s.spectrum is not None for s in self.samples)
 
     def warmed(self, on_step: StepHook = ignore_step) -> LensModel:
         """Return the model with the wavefront fitted to its samples, if its method or mode has one.
@@ -235,7 +234,7 @@ class LensModel:
             usual=float(np.mean(fit.validation.errors**2)),
         )
         physical = fit.physical_at(settings)
-        alone = fit.mode in {MIXED, WAVEFRONT} and physical is not None and physical.agreed
+        alone = fit.mode == WAVEFRONT and physical is not None and physical.agreed
         if fit.mode == BOTH:
             error = joint_error(evidence, mixture, position.r)
         else:
@@ -260,8 +259,7 @@ class LensModel:
             nearest=nearest,
             prior="" if self.prior is None else self.prior.name,
             prior_share=share,
-            image_frame_share=float(mixture.shares[0, 1]),
-            wavefront_share=float(mixture.shares[0, 2]),
+            wavefront_share=float(mixture.shares[0]),
             scatter=scatter,
             mode=fit.mode,
         )

@@ -33,7 +33,7 @@ from lensmodel.core.files import atomic
 from lensmodel.core.psf import PsfSample, resized
 from lensmodel.core.spectrum import RINGS, SECTORS, PatchSpectrum
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model.answer import FORMER_MODES, KERNELS, ModelSettings
+from lensmodel.model.answer import FORMER_MODES, ModelSettings
 from lensmodel.model.field.smoothers import FORMER_METHODS
 from lensmodel.model.lens_model import LensModel
 
@@ -296,8 +296,8 @@ def _settings(values: dict[str, Any]) -> ModelSettings:
     # written until 0.2; it changed how finely kernels were kept, and no answer
     known = {key: value for key, value in values.items() if key != "oversampling"}
     if known.get("mode") in FORMER_MODES:
-        log.info("the mode %s of the profile is gone: its kernels are averaged", known["mode"])
-        known["mode"] = KERNELS
+        log.info("the mode %s of the profile is gone: the usual one answers", known["mode"])
+        del known["mode"]
     if known.get("method") in FORMER_METHODS:
         log.info("the regression %s of the profile is gone: the usual one answers", known["method"])
         del known["method"]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lensmodel.model.combination import WAVEFRONT_SHARE, Mixture
+from lensmodel.model.modes import WAVEFRONT_SHARE, Mixture
 from lensmodel.model.trust.support import field_error, shared_error
 
 
@@ -71,7 +71,7 @@ def expected_error(evidence: Evidence, mixture: Mixture, *, wavefront_alone: boo
         error = math.sqrt(own) * evidence.distance_factor
     else:
         error = evidence.regression_error(float(mixture.usual) if evidence.extrapolated else own)
-    if mixture.shares[0, 2] > 0.0:
+    if mixture.shares[0] > 0.0:
         averaged = evidence.usual if evidence.extrapolated else float(mixture.averaged[0])
         error = max(error, evidence.regression_error(averaged), float(mixture.apart[0]))
     return error
@@ -94,7 +94,7 @@ def joint_error(evidence: Evidence, mixture: Mixture, r: float) -> float:
         Half-diagonals.
     """
     own = evidence.regression_error(float(mixture.usual if evidence.extrapolated else mixture.squared[0]))
-    share = float(mixture.shares[0, 2]) / WAVEFRONT_SHARE
+    share = float(mixture.shares[0]) / WAVEFRONT_SHARE
     apart = float(mixture.apart[0])
     joint = math.exp(_AT_CENTER + _BY_RADIUS * r + _BY_DISTANCE * math.log(apart + _LEAST_APART))
     return math.hypot(math.sqrt(1.0 - share) * own, math.sqrt(share) * joint * evidence.distance_factor)

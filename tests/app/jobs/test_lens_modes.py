@@ -65,16 +65,16 @@ def test_what_a_worker_learned_in_a_mode_is_served_in_that_mode_alone(
     folder.mkdir()
     write_samples(folder, stored)
 
-    tasks.measure({"model": {"mode": "mixed", "unit": "micrometre"}}, folder, ignore_step)
+    tasks.measure({"model": {"mode": "wavefront", "unit": "micrometre"}}, folder, ignore_step)
     storage.put(learned_key(lens, state.version, state.rebuild_epoch), (folder / LEARNED).read_bytes())
 
-    with serve(settings, "mixed") as client:
-        assert psf(client, lens)["support"]["mode"] == "mixed"
+    with serve(settings, "wavefront") as client:
+        assert psf(client, lens)["support"]["mode"] == "wavefront"
         assert "-l-" in client.get(f"/v1/lenses/{lens}/psf", params=ASKED).headers["etag"]
     assert not ModelCache(store, 1 << 30, storage).get(lens).learned
 
 
-@pytest.mark.parametrize("mode", ["evidence", "likeliest"])
+@pytest.mark.parametrize("mode", ["evidence", "likeliest", "mixed"])
 def test_a_former_mode_is_refused_with_the_remedy(mode: str) -> None:
     with pytest.raises(ValueError, match="is gone: leave LENS_MODEL_MODE out"):
         Settings(model_mode=mode)  # type: ignore[arg-type] # what an environment may say

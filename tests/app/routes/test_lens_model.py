@@ -114,7 +114,7 @@ def test_the_settings_of_the_service_decide_for_the_default_model_only(
     learn(steps, papers, serial="2")
     lenses = [steps.lens_id(photo) for photo in (plain, papers)]
 
-    for mode, told in (("mixed", ("default", "mixed")), ("paper", ("paper", "paper"))):
+    for mode, told in (("kernels", ("default", "kernels")), ("paper", ("paper", "paper"))):
         chosen = settings.model_copy(update={"model_mode": mode, "family": False})
         with TestClient(create_app(chosen)) as client:
             said = [support(client, lens) for lens in lenses]

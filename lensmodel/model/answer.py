@@ -102,9 +102,9 @@ class PsfAnswer:
     kernel : Kernel, shape (size, size)
         In the image frame, centred, sum 1.
     effective_samples : float
-        (sum w)^2 / sum w^2 of the weights; samples of one photo count together in `photos`.
+        1 / sum W^2 of the samples' parts in the answer, see `provenance`.
     photos : int
-        Photos among the samples that were used.
+        Photos of these samples.
     extrapolated : bool
         True where no sample is near.
     predicted_error : float
@@ -124,8 +124,10 @@ class PsfAnswer:
         Weight of the prior in the kernel, 0..1; 0 without a prior.
     wavefront_share : float
         Weight of the fitted wavefront, 0..1.
-    mode : str
-        Which of `MODES` answered.
+    answered_by : str
+        Which model answered: "regression", "wavefront and regression", "wavefront" or "paper".
+    reason : str
+        Why that one.
     scatter : callable
         Computes `std`.
     """
@@ -142,7 +144,8 @@ class PsfAnswer:
     prior: str = ""
     prior_share: float = 0.0
     wavefront_share: float = 0.0
-    mode: str = BOTH
+    answered_by: str = ""
+    reason: str = ""
     scatter: Callable[[], NDArray[np.float64]] | None = field(default=None, repr=False)
 
     @property

@@ -67,6 +67,8 @@ class Fit:
     validation : CrossValidation
     expected : ndarray, shape (n,)
         Squared errors that the estimators expect of their samples; 0 where they expect nothing.
+    heard : ndarray of bool, shape (n,)
+        Which samples carry the spectrum of their patch.
     rule, bandwidth : dict
         Bandwidths of eq. (8), and those in use.
     physical : Physics or None
@@ -87,6 +89,7 @@ class Fit:
     roster: Roster
     validation: CrossValidation
     expected: NDArray[np.float64]
+    heard: NDArray[np.bool_]
     rule: dict[str, float]
     bandwidth: dict[str, float]
     physical: Physics | None = None
@@ -128,7 +131,7 @@ class Fit:
         used = bandwidth(rule, settings, validation.choice)
         return cls(
             *(pixel, len(samples), widths, local, index, roster, validation),
-            *(expected_errors(samples), rule, used),
+            *(expected_errors(samples), with_spectra(samples), rule, used),
             mode=settings.mode,
             unit=settings.unit,
         )
@@ -142,10 +145,15 @@ class Fit:
         ends = () if physical is None else ends_of(common, votes, groups, scale, physical, on_step)
         return replace(self, physical=physical, ends=ends)
 
+    def end_at(self, settings: LensSettings) -> End | None:
+        """The end of a zoom that has the larger say at settings, if one has."""
+        end, share = nearest(self.ends, settings)
+        return None if share < _MOSTLY else end
+
     def physical_at(self, settings: LensSettings) -> Physics | None:
         """The wavefront that has the larger say at settings."""
-        end, share = nearest(self.ends, settings)
-        return self.physical if end is None or share < _MOSTLY else end.physical
+        end = self.end_at(settings)
+        return self.physical if end is None else end.physical
 
     @property
     def nbytes(self) -> int:
@@ -169,12 +177,18 @@ class Fit:
             roster=self.roster.extended(common),
             validation=self.validation.extended(_claimed(samples, settings)),
             expected=np.concatenate([self.expected, expected_errors(samples)]),
+            heard=np.concatenate([self.heard, with_spectra(samples)]),
         )
 
 
 def expected_errors(samples: Sequence[PsfSample]) -> NDArray[np.float64]:
     """Squared errors that the estimators expect, shape (n,)."""
     return np.array([0.0 if s.error is None else min(s.error, 1.0) ** 2 for s in samples])
+
+
+def with_spectra(samples: Sequence[PsfSample]) -> NDArray[np.bool_]:
+    """Which samples carry the spectrum of their patch, shape (n,)."""
+    return np.array([s.spectrum is not None for s in samples], dtype=np.bool_)
 
 
 def _claimed(samples: Sequence[PsfSample], settings: ModelSettings) -> NDArray[np.float64]:

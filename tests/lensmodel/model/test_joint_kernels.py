@@ -300,6 +300,7 @@ def test_blur_that_no_wavefront_makes_is_left_to_the_kernels() -> None:
 
     answer = LensModel.fit(known).warmed().query(FieldPosition(0.5, 0.4), SETTINGS, 31)
 
+    assert (answer.answered_by, answer.reason) == ("regression", "no wavefront agrees with all patches")
     assert distance(answer.kernel, gaussian(31, 1.3**2 * np.eye(2))).rel_l2 < 0.05
 
 
@@ -358,7 +359,9 @@ def test_a_wavefront_takes_part_only_where_its_diffraction_is_known(
     assert warm.query(place, SETTINGS, 31).wavefront_share == WAVEFRONT_SHARE
     unknown = LensModel.fit([replace(s, pixel_pitch_um=None) for s in known]).warmed()
     assert unknown.physical is not None
-    assert unknown.query(place, SETTINGS, 31).wavefront_share == 0.0
+    answer = unknown.query(place, SETTINGS, 31)
+    assert (answer.wavefront_share, answer.answered_by) == (0.0, "regression")
+    assert answer.reason == "aperture or pixel pitch unknown"
 
 
 def test_kernels_and_wavefront_answer_together_where_diffraction_is_known(warm: LensModel) -> None:
@@ -369,7 +372,7 @@ def test_kernels_and_wavefront_answer_together_where_diffraction_is_known(warm: 
 
     answer = warm.query(place, SETTINGS, 31)
 
-    assert (answer.mode, answer.wavefront_share) == ("both", WAVEFRONT_SHARE)
+    assert (answer.answered_by, answer.wavefront_share) == ("wavefront and regression", WAVEFRONT_SHARE)
     turned = warm.physical.turned  # no tail tells on which side of these kernels it lies
     either = (1.0 - turned) * wavefront[0] + turned * wavefront[0][::-1, ::-1]
     expected = (1.0 - WAVEFRONT_SHARE) * kernels[0] + WAVEFRONT_SHARE * either
@@ -385,6 +388,7 @@ def test_measured_kernels_leave_a_wavefront_no_say(known: list[PsfSample], warm:
     answer, other = (m.query(FieldPosition(0.7, 0.4), SETTINGS, 31) for m in (model, plain))
 
     assert answer.wavefront_share == 0.0
+    assert (answer.answered_by, answer.reason) == ("regression", "kernels were measured")
     assert np.array_equal(answer.kernel, other.kernel)
     assert answer.predicted_error == pytest.approx(other.predicted_error)
 

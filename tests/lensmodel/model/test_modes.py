@@ -134,5 +134,5 @@ def test_the_papers_way_is_its_equations_and_nothing_else(noisy: list[PsfSample]
 
     answer = model.warmed().query(asked, SETTINGS, SIZE)
 
-    assert (answer.mode, answer.wavefront_share, model.flags()) == ("paper", 0.0, ())
+    assert (answer.answered_by, answer.wavefront_share, model.flags()) == ("paper", 0.0, ())
     assert distance(answer.kernel, wanted).rel_l2 < 0.02

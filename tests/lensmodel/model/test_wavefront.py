@@ -175,7 +175,8 @@ class TestWavefrontAlone:
         assert model.warm
         assert model.warmed() is model
         answer = model.query(FieldPosition(0.5, 0.2), LensSettings(), 21)
-        assert (answer.mode, answer.wavefront_share) == ("both", 0.0)
+        assert (answer.answered_by, answer.wavefront_share) == ("regression", 0.0)
+        assert answer.reason == "no patch has a spectrum"
 
     def test_same_samples_give_the_same_wavefront(self, warm: LensModel) -> None:
         again = LensModel.fit(warm.samples, warm.settings).warmed()

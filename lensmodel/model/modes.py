@@ -26,6 +26,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.core.files import fitted
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model.answer import BOTH, WAVEFRONT
 from lensmodel.model.field.kriging import as_kernels
@@ -34,8 +35,8 @@ from lensmodel.model.fitting import Fit
 from lensmodel.model.trust.support import measured_share
 from lensmodel.model.wavefront.physical_mean import Physics
 
-WAVEFRONT_SHARE: Final = 0.75
-"""Of the wavefront in the mode `both`: `python -m lensmodel.lab.model.joint_answer`."""
+WAVEFRONT_SHARE: Final = float(fitted("model")["wavefront_share"])
+"""Of the wavefront in the mode `both`; see `data/README.md`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -67,7 +67,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             chosen.model_cache_mb * MIB,
             storage,
             family=chosen.family,
-            settings=ModelSettings(mode=chosen.model_mode, unit=chosen.model_unit),
+            settings=ModelSettings(unit=chosen.model_unit),
         )
         reserve = Reserve(store.database.path.with_name("reserve") if store.database.is_sqlite else None)
         rows = JobStore(store.database)

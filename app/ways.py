@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from app.runtime.settings import Settings
 from lensmodel.workflow.ways import WAYS, Way
 
@@ -9,11 +11,11 @@ from lensmodel.workflow.ways import WAYS, Way
 def way_of(settings: Settings, name: str) -> Way:
     """Return the estimator, kernel size, model mode and correction method of a model.
 
-    The settings of the service define the model `default`; all others are fixed.
+    The settings of the service choose estimator and kernel size of the model `default`; all else is fixed.
     """
     if name != "default":
         return WAYS[name]
-    return Way(settings.estimator, settings.kernel_size, settings.model_mode, WAYS["default"].method)
+    return replace(WAYS[name], estimator=settings.estimator, kernel_size=settings.kernel_size)
 
 
 def of_models(settings: Settings, name: str) -> dict[str, str]:

@@ -71,6 +71,8 @@ def run(
             "predicted_error": answer.predicted_error,
             "prior": answer.prior,
             "prior_share": answer.prior_share,
+            "answered_by": answer.answered_by,
+            "reason": answer.reason,
         },
         "rms_width_px": rms_width(answer.kernel),
         "mtf50": {"tangential": tangential, "sagittal": sagittal},
@@ -94,7 +96,7 @@ def _words(place: FieldPosition, answer: PsfAnswer, tangential: float, sagittal:
         f"{ZONE_WORDS[zone_of(place.r)]}, r {place.r:g}: rms width {rms_width(answer.kernel):.2f} px, "
         f"MTF50 tangential {mtf50_words(tangential)}, sagittal {mtf50_words(sagittal)} cycles/px; {photos}, "
         f"{answer.effective_samples:.1f} effective samples, expected error "
-        f"{answer.predicted_error:.2f}{beyond}{prior}"
+        f"{answer.predicted_error:.2f}{beyond}{prior}; answered by {answer.answered_by}: {answer.reason}"
     )
 
 

@@ -45,7 +45,6 @@ class Options:
     force: bool
     family: Path | None
     no_family: bool
-    mode: str | None
     unit: str | None
     scheduler: str | None = None
     selector: str = "r-map"
@@ -93,7 +92,7 @@ def run(names: Sequence[str], target: Path, options: Options, display: Display, 
         "photos": len(profile.photos) if profile else 0,
         "samples": len(profile.model.samples) if profile else 0,
         "coverage": profile.model.coverage() if profile else {},
-        "mode": profile.model.mode if profile else None,
+        "model": way_of(profile.model).name if profile else None,
         "results": results,
     }
     if as_json:
@@ -115,7 +114,7 @@ def _chosen(options: Options) -> ModelSettings:
     estimation.estimators.create(options.estimator or way.estimator)
     require_size(options.kernel_size or way.kernel_size)
     selectors.create(options.selector)
-    return ModelSettings(mode=options.mode or way.mode, unit=options.unit or MICROMETRE)
+    return ModelSettings(mode=way.mode, unit=options.unit or MICROMETRE)
 
 
 def _refuse(target: Path, photos: Sequence[Path], options: Options) -> None:
@@ -127,8 +126,6 @@ def _refuse(target: Path, photos: Sequence[Path], options: Options) -> None:
         raise UsageError(
             f"{target.name} is a photo; name a new file after --profile, for example my-24mm.lensprofile"
         )
-    if options.model is not None and options.mode is not None:
-        raise UsageError("--model and --mode exclude each other: a model has its own mode; give one of them")
     if options.family is not None and options.no_family:
         raise UsageError("--family and --no-family exclude each other; give one of them")
     if options.family is not None and files.same(target, options.family):
@@ -253,7 +250,7 @@ class Calibration:
         if stamp in {None, self._stamp_read}:
             return
         profile = _opened(self._target)
-        mode = self._options.mode if self._options.model is None else way_named(self._options.model).mode
+        mode = None if self._options.model is None else way_named(self._options.model).mode
         model = self._with_family(profile.model.answering(mode=mode, unit=self._options.unit))
         self.profile, self._stamp_read = replace(profile, model=model), stamp
         self._changed = self._changed or model is not profile.model

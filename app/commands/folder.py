@@ -185,7 +185,6 @@ class _Folder:
             force=False,
             family=None,
             no_family=False,
-            mode=None,
             unit=None,
             selector=self._learning.selector,
         )

@@ -34,7 +34,7 @@ from app.commands.console.options import (
 )
 from lensmodel.correction import Bounds, deconvolvers
 from lensmodel.estimation import estimators
-from lensmodel.model.answer import MODES, UNITS
+from lensmodel.model.answer import UNITS
 from lensmodel.photo import OutputFormat
 from lensmodel.workflow.ways import WAYS
 
@@ -81,15 +81,6 @@ def calibrate(
         ),
     ] = None,
     no_family: Annotated[bool, typer.Option("--no-family", help="Stop borrowing from another copy.")] = False,
-    mode: Annotated[
-        str | None,
-        choice(
-            "--mode",
-            MODES,
-            "What answers are made of: averaged kernels and a fitted wavefront (default), either alone, a "
-            "mixture by held-out errors, or kernels averaged as in the paper. Kept from then on.",
-        ),
-    ] = None,
     unit: Annotated[
         str | None,
         choice(
@@ -134,7 +125,6 @@ def calibrate(
             force=force,
             family=family,
             no_family=no_family,
-            mode=mode,
             unit=unit,
             model=model,
             kernel_size=kernel_size,

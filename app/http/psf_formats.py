@@ -49,7 +49,8 @@ def describe(
             beyond=list(answer.beyond),
             predicted_error=error if np.isfinite(error) else None,
             model=fitted.way,
-            mode=answer.mode,
+            answered_by=answer.answered_by,
+            reason=answer.reason,
             family=FamilyOut(lenses=len(fitted.family), weight=float(answer.prior_share))
             if fitted.family
             else None,

@@ -15,23 +15,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
-import numpy as np
-
 from app.blobs.storage import Storage
-from app.jobs.task_files import KERNELS, PREVIEW, R_MAP, SAMPLES, SHOWN
+from app.jobs.task_files import KERNELS, PREVIEW, R_MAP, SAMPLES, SHOWN, SPECTRA
 from app.runtime import metrics
 from app.runtime.outage import OutageError, is_outage
 from app.runtime.settings import Settings
 from app.sandbox.child import Progress
 from app.sandbox.outcome import Limits, Outcome
 from app.sandbox.runner import Sandbox
-from app.schemas import distances
 from app.store import Store, StoredSample
 from app.store.jobs import JobStore
 from app.store.photo_steps import folder_of
 from app.store.tables import PhotoRow
 from lensmodel.core.files import save_array
 from lensmodel.core.types import ignore_step
+from lensmodel.model.sample_codec import pack_samples
 
 log = logging.getLogger(__name__)
 
@@ -207,35 +205,10 @@ def _patient(wanted: Callable[[], bool]) -> Callable[[], bool]:
 
 
 def write_samples(folder: Path, stored: Sequence[StoredSample]) -> None:
-    """Hand samples to a task: the kernels as one npy file, the rest as JSON."""
-    side = max(entry.sample.kernel.shape[0] for entry in stored)
-    kernels = np.zeros((len(stored), side, side), dtype=np.float32)
-    listed = []
-    for number, entry in enumerate(stored):
-        sample = entry.sample
-        size = sample.kernel.shape[0]
-        margin = (side - size) // 2
-        kernels[number, margin : margin + size, margin : margin + size] = sample.kernel
-        listed.append(
-            {
-                "size": size,
-                "r": sample.position.r,
-                "phi": sample.position.phi,
-                "weight": sample.weight,
-                "photo": sample.photo,
-                "pixel_pitch_um": sample.pixel_pitch_um,
-                "estimator": sample.estimator,
-                "error": sample.error,
-                "spectrum": None if sample.spectrum is None else sample.spectrum.to_bytes().hex(),
-                "half_diagonal_px": sample.half_diagonal_px,
-                "settings": {
-                    "aperture": sample.settings.aperture,
-                    "focal_mm": sample.settings.focal_mm,
-                    "focus_m": distances.written(sample.settings.focus_m),
-                    "channel": sample.settings.channel,
-                },
-            }
-        )
-    with (folder / KERNELS).open("wb") as file:
-        save_array(file, kernels)
-    (folder / SAMPLES).write_text(json.dumps(listed), encoding="utf-8")
+    """Hand samples to a task: kernels and spectra as npy files, the rest as JSON."""
+    packed = pack_samples([entry.sample for entry in stored])
+    for name, array in ((KERNELS, packed.kernels), (SPECTRA, packed.spectra)):
+        if array is not None:
+            with (folder / name).open("wb") as file:
+                save_array(file, array)
+    (folder / SAMPLES).write_text(json.dumps(packed.entries), encoding="utf-8")

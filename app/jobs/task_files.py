@@ -11,6 +11,9 @@ KERNELS: Final = "kernels.npy"
 SAMPLES: Final = "samples.json"
 """Position, settings, weight and origin of each kernel."""
 
+SPECTRA: Final = "spectra.npy"
+"""What the patch of each kernel says without one; absent where none says anything."""
+
 FAMILY: Final = "family"
 """Folder of the samples of other copies that the model leans on; absent without any."""
 

@@ -30,6 +30,7 @@ from app.jobs.task_files import (
     REPORT,
     SAMPLES,
     SHOWN,
+    SPECTRA,
     SUFFIX,
 )
 from app.sandbox.child import Progress, Task
@@ -39,13 +40,13 @@ from lensmodel.core import codec
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.files import save_array
 from lensmodel.core.psf import PsfSample
-from lensmodel.core.spectrum import PatchSpectrum
-from lensmodel.core.types import FieldPosition, LensSettings, Planes
+from lensmodel.core.types import LensSettings, Planes
 from lensmodel.correction.engine import first_use
 from lensmodel.estimation import estimators
 from lensmodel.estimation import measure as lens_measure
 from lensmodel.estimation.patches import Patch, selectors
 from lensmodel.model import LensModel, ModelSettings
+from lensmodel.model.sample_codec import PackedSamples, unpack_samples
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.report.lens_test import lens_test
 from lensmodel.workflow import pipeline
@@ -319,30 +320,10 @@ def _with_family(folder: Path, settings: ModelSettings) -> LensModel:
 
 def _samples(folder: Path) -> list[PsfSample]:
     kernels = np.load(folder / KERNELS, allow_pickle=False, mmap_mode="r")
-    listed = json.loads((folder / SAMPLES).read_text(encoding="utf-8"))
-    samples = []
-    for kernel, entry in zip(kernels, listed, strict=True):
-        margin = (kernel.shape[0] - entry["size"]) // 2
-        inner = slice(margin, margin + entry["size"])
-        samples.append(
-            PsfSample(
-                kernel=np.asarray(kernel[inner, inner], dtype=np.float64),
-                position=FieldPosition(entry["r"], entry["phi"]),
-                settings=_settings(entry["settings"]),
-                weight=entry["weight"],
-                photo=entry["photo"],
-                pixel_pitch_um=entry["pixel_pitch_um"],
-                estimator=entry["estimator"],
-                error=entry["error"],
-                spectrum=_spectrum(entry["spectrum"]),
-                half_diagonal_px=entry["half_diagonal_px"],
-            )
-        )
-    return samples
-
-
-def _spectrum(stored: str | None) -> PatchSpectrum | None:
-    return None if stored is None else PatchSpectrum.from_bytes(bytes.fromhex(stored))
+    entries = json.loads((folder / SAMPLES).read_text(encoding="utf-8"))
+    spectra = folder / SPECTRA
+    rows = np.load(spectra, allow_pickle=False) if spectra.is_file() else None
+    return unpack_samples(PackedSamples(entries, kernels, rows))
 
 
 def _settings(stored: Mapping[str, Any]) -> LensSettings:

@@ -1,10 +1,9 @@
 """What a PSF costs over HTTP, and when a new version is seen; prints the table of docs/lab/lens-model.md.
 
     python -m app.lab.psf_service [--requests 400] [--photos 6] [--processes 3] [--size 55] [--busy 0]
-        [--mode kernels]
 
 Several API processes, as `lensmodel serve` starts them, serve one database with one simulated lens that a
-worker has learned, in the mode that is the default or another. One client asks each of them over a
+worker has learned. One client asks each of them over a
 connection that stays open, for a new place every time. Gross is the wall time of a request seen by the
 client; net is what remains of it after that of `/healthz` on the same connection: the share of HTTP,
 framework and client. The CPU time is the server's, by request. `--busy` lets so many tasks of a worker
@@ -41,8 +40,7 @@ from app.store.upkeep import migrate
 from app.store.versions import learned_key
 from lensmodel.core.types import CHANNELS, LensSettings
 from lensmodel.lab.model.model_benchmark import patch_places
-from lensmodel.model import LensModel, ModelSettings
-from lensmodel.model.answer import MODES
+from lensmodel.model import LensModel
 from lensmodel.simulate import SimulatedLens, draw_lens
 
 SIDE, SEED, READY_S = 31, 0, 60.0
@@ -122,10 +120,10 @@ def count_photo(store: Store, lens: SimulatedLens, rng: np.random.Generator) -> 
     return row.public_id
 
 
-def learn(store: Store, storage: Storage, lens_id: str, mode: str) -> int:
+def learn(store: Store, storage: Storage, lens_id: str) -> int:
     """Fit the newest version wholly, as a worker does; return how many samples it has."""
     state, stored = store.samples.of_lens(lens_id)
-    model = LensModel.fit([one.sample for one in stored], ModelSettings(mode=mode)).warmed()
+    model = LensModel.fit([one.sample for one in stored]).warmed()
     storage.put(learned_key(lens_id, state.version, state.rebuild_epoch), model.learned())
     return len(stored)
 
@@ -216,19 +214,18 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=3)
     parser.add_argument("--busy", type=int, default=0, metavar="TASKS")
     parser.add_argument("--size", type=int, default=55, help="side of the kernels that are asked for")
-    parser.add_argument("--mode", choices=MODES, default=ModelSettings().mode, help="of the models")
     wanted = parser.parse_args()
     lens, rng = draw_lens(SEED), np.random.default_rng(0)
     with tempfile.TemporaryDirectory(prefix="lensmodel-") as folder:
-        settings = Settings(data_dir=Path(folder), log_level="warning", model_mode=wanted.mode)
+        settings = Settings(data_dir=Path(folder), log_level="warning")
         store, storage = Store(settings), Storage(settings.storage)
         migrate.upgrade(store.database)
         for _ in range(wanted.photos):
             lens_id = count_photo(store, lens, rng)
-        samples = learn(store, storage, lens_id, wanted.mode)
+        samples = learn(store, storage, lens_id)
         with serving(settings, wanted.processes) as members, busy(wanted.busy):
             print(
-                f"{samples} samples of {SIDE} px, mode {wanted.mode}, answers of {wanted.size} px, "
+                f"{samples} samples of {SIDE} px, answers of {wanted.size} px, "
                 f"{wanted.requests} requests, "
                 f"{wanted.busy} tasks beside them, load average {os.getloadavg()[0]:.1f}"
             )

@@ -11,7 +11,7 @@ import os
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from app.sandbox import account
@@ -163,9 +163,6 @@ class Settings(BaseSettings):
         default=True,
         description="A lens that has seen little leans on its owner's other copies of the same model.",
     )
-    model_mode: Literal["both", "kernels", "mixed", "wavefront", "paper"] = Field(
-        default="both", description="What lens models make of their samples."
-    )
     model_unit: Literal["micrometre", "half-diagonal"] = Field(
         default="micrometre", description="In what the kernels of bodies with different pixels agree."
     )
@@ -190,20 +187,16 @@ class Settings(BaseSettings):
     def _no_unknown_names(cls, values: object) -> object:
         known = {PREFIX + name.upper() for name in cls.model_fields} | {CLIENT_KEY}
         for name in os.environ:
+            if name.upper() == "LENS_MODEL_MODE":
+                raise ValueError(
+                    "the setting LENS_MODEL_MODE is gone: leave it out; each lens has its model, default or "
+                    "paper: send photos with model=paper, or `lensmodel calibrate --model paper`"
+                )
             if name.upper().startswith(PREFIX) and name.upper() not in known:
                 near = difflib.get_close_matches(name.upper(), known, n=1)
                 hint = f"did you mean {near[0]}?" if near else "run `lensmodel config` to see all settings"
                 raise ValueError(f"unknown setting {name}: {hint}")
         return values
-
-    @field_validator("model_mode", mode="before")
-    @classmethod
-    def _no_former_mode(cls, value: object) -> object:
-        if value in {"evidence", "likeliest"}:
-            raise ValueError(
-                f"the mode {value!r} is gone: leave LENS_MODEL_MODE out, or set it to kernels or mixed"
-            )
-        return value
 
     @model_validator(mode="after")
     def _odd_kernel(self) -> Settings:

@@ -90,7 +90,11 @@ class Support(Model):
     )
     predicted_error: float | None
     model: PsfModel = Field(default="default", description="the model of the lens that answered")
-    mode: str = Field(description="what that made of the samples")
+    answered_by: str = Field(
+        description="what made the answer: regression, wavefront and regression, wavefront, or paper; the "
+        "numbers here are of that"
+    )
+    reason: str = Field(description="why that one, in plain words")
     family: FamilyOut | None = None
 
 

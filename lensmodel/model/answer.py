@@ -15,14 +15,13 @@ from lensmodel.core.types import Kernel
 
 BOTH: Final = "both"
 KERNELS: Final = "kernels"
-MIXED: Final = "mixed"
 WAVEFRONT: Final = "wavefront"
 PAPER: Final = "paper"
-MODES: Final = (BOTH, KERNELS, MIXED, WAVEFRONT, PAPER)
+MODES: Final = (BOTH, KERNELS, WAVEFRONT, PAPER)
 """What can be made of the neighbours of a question; `modes` tells what they are."""
 
-FORMER_MODES: Final = frozenset({"evidence", "likeliest"})
-"""Modes that profiles of earlier versions may name; they are read as `KERNELS`."""
+FORMER_MODES: Final = frozenset({"evidence", "likeliest", "mixed"})
+"""Modes that profiles of earlier versions may name; the usual one answers then."""
 
 MICROMETRE: Final = "micrometre"
 HALF_DIAGONAL: Final = "half-diagonal"
@@ -103,9 +102,9 @@ class PsfAnswer:
     kernel : Kernel, shape (size, size)
         In the image frame, centred, sum 1.
     effective_samples : float
-        (sum w)^2 / sum w^2 of the weights; samples of one photo count together in `photos`.
+        1 / sum W^2 of the samples' parts in the answer, see `provenance`.
     photos : int
-        Photos among the samples that were used.
+        Photos of these samples.
     extrapolated : bool
         True where no sample is near.
     predicted_error : float
@@ -123,12 +122,12 @@ class PsfAnswer:
         Name of the prior that the model leans on where it has seen little; empty without one.
     prior_share : float
         Weight of the prior in the kernel, 0..1; 0 without a prior.
-    image_frame_share : float
-        Weight of the regression in the image frame, 0..1, by held-out errors near the place.
     wavefront_share : float
         Weight of the fitted wavefront, 0..1.
-    mode : str
-        Which of `MODES` answered.
+    answered_by : str
+        Which model answered: "regression", "wavefront and regression", "wavefront" or "paper".
+    reason : str
+        Why that one.
     scatter : callable
         Computes `std`.
     """
@@ -144,9 +143,9 @@ class PsfAnswer:
     nearest: float = 0.0
     prior: str = ""
     prior_share: float = 0.0
-    image_frame_share: float = 0.0
     wavefront_share: float = 0.0
-    mode: str = BOTH
+    answered_by: str = ""
+    reason: str = ""
     scatter: Callable[[], NDArray[np.float64]] | None = field(default=None, repr=False)
 
     @property

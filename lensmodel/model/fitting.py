@@ -67,6 +67,8 @@ class Fit:
     validation : CrossValidation
     expected : ndarray, shape (n,)
         Squared errors that the estimators expect of their samples; 0 where they expect nothing.
+    heard : ndarray of bool, shape (n,)
+        Which samples carry the spectrum of their patch.
     rule, bandwidth : dict
         Bandwidths of eq. (8), and those in use.
     physical : Physics or None
@@ -87,6 +89,7 @@ class Fit:
     roster: Roster
     validation: CrossValidation
     expected: NDArray[np.float64]
+    heard: NDArray[np.bool_]
     rule: dict[str, float]
     bandwidth: dict[str, float]
     physical: Physics | None = None
@@ -118,17 +121,17 @@ class Fit:
         where = index.points
         widths = WidthField.fit(common, base) if smoother.transport else WidthField()
         local = LocalKernels.of(common, where, widths)
-        validation = cross_validate(common, settings, local, where, base, blend=smoother.blend)
+        validation = cross_validate(common, settings, local, where, base)
         if smoother.transport and any(flag.sample is None for flag in validation.flags):
             # a spoilt photo has bent the widths too: fit them again without its voice
             widths = WidthField.fit(common, validation.votes)
             local = local.rescaled(where, widths)
-            validation = cross_validate(common, settings, local, where, base, blend=smoother.blend)
+            validation = cross_validate(common, settings, local, where, base)
         rule = va.bandwidths(where)
         used = bandwidth(rule, settings, validation.choice)
         return cls(
             *(pixel, len(samples), widths, local, index, roster, validation),
-            *(expected_errors(samples), rule, used),
+            *(expected_errors(samples), with_spectra(samples), rule, used),
             mode=settings.mode,
             unit=settings.unit,
         )
@@ -142,16 +145,20 @@ class Fit:
         ends = () if physical is None else ends_of(common, votes, groups, scale, physical, on_step)
         return replace(self, physical=physical, ends=ends)
 
+    def end_at(self, settings: LensSettings) -> End | None:
+        """The end of a zoom that has the larger say at settings, if one has."""
+        end, share = nearest(self.ends, settings)
+        return None if share < _MOSTLY else end
+
     def physical_at(self, settings: LensSettings) -> Physics | None:
         """The wavefront that has the larger say at settings."""
-        end, share = nearest(self.ends, settings)
-        return self.physical if end is None or share < _MOSTLY else end.physical
+        end = self.end_at(settings)
+        return self.physical if end is None else end.physical
 
     @property
     def nbytes(self) -> int:
         """Bytes of stored kernels."""
-        image = self.validation.image
-        return self.local.nbytes + (0 if image is None else image.rest.nbytes)
+        return self.local.nbytes
 
     def takes(self, samples: Sequence[PsfSample], increment: float) -> bool:
         """Whether samples can join without fitting everything anew: they have room, and are few."""
@@ -170,12 +177,18 @@ class Fit:
             roster=self.roster.extended(common),
             validation=self.validation.extended(_claimed(samples, settings)),
             expected=np.concatenate([self.expected, expected_errors(samples)]),
+            heard=np.concatenate([self.heard, with_spectra(samples)]),
         )
 
 
 def expected_errors(samples: Sequence[PsfSample]) -> NDArray[np.float64]:
     """Squared errors that the estimators expect, shape (n,)."""
     return np.array([0.0 if s.error is None else min(s.error, 1.0) ** 2 for s in samples])
+
+
+def with_spectra(samples: Sequence[PsfSample]) -> NDArray[np.bool_]:
+    """Which samples carry the spectrum of their patch, shape (n,)."""
+    return np.array([s.spectrum is not None for s in samples], dtype=np.bool_)
 
 
 def _claimed(samples: Sequence[PsfSample], settings: ModelSettings) -> NDArray[np.float64]:

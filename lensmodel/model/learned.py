@@ -24,17 +24,16 @@ from lensmodel.model import variables as va
 from lensmodel.model.answer import MODES, ModelSettings
 from lensmodel.model.field.cross_validation import CrossValidation
 from lensmodel.model.field.index import SampleIndex
-from lensmodel.model.field.kriging import ImageFrame
 from lensmodel.model.field.leave_one_out import Choice
 from lensmodel.model.field.local_frame import LocalKernels
 from lensmodel.model.field.robust import Flag
 from lensmodel.model.field.transport import WidthField
-from lensmodel.model.fitting import Fit, Roster, expected_errors
-from lensmodel.model.wavefront.physical_mean import Physics
+from lensmodel.model.fitting import Fit, Roster, expected_errors, with_spectra
+from lensmodel.model.wavefront.physical_mean import APART, Physics
 from lensmodel.model.wavefront.zoom import End
 from lensmodel.optics.wavefront import NAMES, Wavefront
 
-VERSION: Final = 15
+VERSION: Final = 16
 """Raised whenever the same samples would be fitted otherwise."""
 
 _MOST_BYTES = 1 << 27  # unpacked: against files made to fill the memory
@@ -59,7 +58,7 @@ Arrays = dict[str, NDArray[np.float64]]
 
 def dump(fit: Fit, samples: Sequence[PsfSample], settings: ModelSettings) -> bytes:
     """Write what was learned from samples with settings."""
-    validation, image, physical = fit.validation, fit.validation.image, fit.physical
+    validation, physical = fit.validation, fit.physical
     arrays: Arrays = {
         "votes": validation.votes,
         "errors": validation.errors,
@@ -78,9 +77,6 @@ def dump(fit: Fit, samples: Sequence[PsfSample], settings: ModelSettings) -> byt
     }
     if fit.widths.slopes is not None:
         arrays["widths.slopes"] = fit.widths.slopes
-    if image is not None and validation.image_errors is not None:
-        arrays |= {"image_errors": validation.image_errors, **_arrays("image", image)}
-        document["image"] = _scalars(image)
     if physical is not None:
         document["physical"] = []
         for number, one in enumerate((physical, *(end.physical for end in fit.ends))):
@@ -157,7 +153,7 @@ def _checked(arrays: Mapping[str, NDArray[Any]], count: int) -> Arrays:
         if name.endswith(("votes", "errors", "noise")) and numbers.min(initial=0.0) < 0:
             raise ValueError(f"{name} is negative")
         per_sample = name.startswith("physical") and name.endswith(".errors")
-        if (per_sample or name in {"votes", "errors", "noise", "image_errors"}) and len(numbers) != count:
+        if (per_sample or name in {"votes", "errors", "noise"}) and len(numbers) != count:
             raise ValueError(f"{name} has {len(numbers)} entries for {count} samples")
         if numbers.ndim and len(numbers) > max(count, _MOST_NODES):
             raise ValueError(f"{name} has {len(numbers)} entries")
@@ -178,6 +174,8 @@ def _physical(document: Mapping[str, Any], lines: dict[str, Any], arrays: dict[s
     physics = Physics(front=wavefront, **scalars, **arrays)
     if not 0.0 <= physics.turned <= 1.0:
         raise ValueError("a probability lies outside 0..1")
+    if physics.apart not in APART or physics.agreed != (physics.apart == ""):
+        raise ValueError(f"no reason {physics.apart!r} to solve patches apart")
     if (
         physics.side < 1
         or physics.side % 2 == 0
@@ -195,12 +193,8 @@ def _fit(
     where = va.points(common)
     widths = WidthField(slopes=arrays.get("widths.slopes"), **document["widths"])
     local = LocalKernels.of(common, where, widths)
-    image, physical = None, None
+    physical = None
     ends: tuple[End, ...] = ()
-    if "image" in document:
-        image = ImageFrame(**document["image"], **_of(arrays, "image"))
-        if image.rest.shape != (len(image.vectors), image.mean.size):
-            raise ValueError("the image frame does not fit together")
     if "physical" in document:
         physical, *others = [
             _physical(values, _of(arrays, f"front{number}"), _of(arrays, f"physical{number}"))
@@ -215,8 +209,6 @@ def _fit(
         noise=arrays["noise"],
         choice=Choice(**document["choice"]),
         flags=tuple(Flag(**flag) for flag in document["flags"]),
-        image=image,
-        image_errors=arrays.get("image_errors"),
     )
     rule = {str(k): float(v) for k, v in document["rule"].items()}
     used = {str(k): float(v) for k, v in document["bandwidth"].items()}
@@ -237,6 +229,7 @@ def _fit(
         roster=Roster.of(common),
         validation=validation,
         expected=expected_errors(samples),
+        heard=with_spectra(samples),
         rule=rule,
         bandwidth=used,
         physical=physical,

@@ -25,18 +25,19 @@ from lensmodel.core.types import ZONES, FieldPosition, Kernel, LensSettings, Ste
 from lensmodel.model import learned as memory
 from lensmodel.model import pitch as pitches
 from lensmodel.model import variables as va
-from lensmodel.model.answer import BOTH, MICROMETRE, MIXED, WAVEFRONT, ModelSettings, PsfAnswer
+from lensmodel.model.answer import BOTH, MICROMETRE, WAVEFRONT, ModelSettings, PsfAnswer
 from lensmodel.model.answering import AnsweringModel, ModelField
 from lensmodel.model.field.robust import Flag
 from lensmodel.model.fitting import GROWTH, INCREMENT, Fit
 from lensmodel.model.predictor import Predictor
 from lensmodel.model.prior import Prior
+from lensmodel.model.provenance import provenance
 from lensmodel.model.trust.expected_error import Evidence, expected_error, joint_error, with_prior
 from lensmodel.model.trust.misleading_photos import without_misleading
 from lensmodel.model.trust.support import standard_error, support
 from lensmodel.model.wavefront.physical_mean import Physics
 
-_LISTED = 1e-3  # share of the weight from which on a photo or a prior is named (chosen)
+_LISTED = 1e-3  # share of the weight from which on a prior is named (chosen)
 
 
 class LensModel:
@@ -143,8 +144,7 @@ class LensModel:
         """Whether answers need a wavefront, or patches can judge it as a second opinion."""
         if self.settings.mode == WAVEFRONT:
             return True
-        informed = self.settings.mode == MIXED or any(s.spectrum is not None for s in self.samples)
-        return informed and self._predictor.smoother.physical
+        return self._predictor.smoother.physical and any(s.spectrum is not None for s in self.samples)
 
     def warmed(self, on_step: StepHook = ignore_step) -> LensModel:
         """Return the model with the wavefront fitted to its samples, if its method or mode has one.
@@ -235,11 +235,14 @@ class LensModel:
             usual=float(np.mean(fit.validation.errors**2)),
         )
         physical = fit.physical_at(settings)
-        alone = fit.mode in {MIXED, WAVEFRONT} and physical is not None and physical.agreed
+        alone = fit.mode == WAVEFRONT and physical is not None and physical.agreed
         if fit.mode == BOTH:
             error = joint_error(evidence, mixture, position.r)
         else:
             error = expected_error(evidence, mixture, wavefront_alone=alone)
+        wavefront_share = float(mixture.shares[0])
+        takes = self._predictor.smoother.physical
+        made = provenance(fit, answers, wavefront_share, settings, takes_wavefront=takes)
         share = float(prior_shares[0])
         if self.prior is not None and share > _LISTED:
             error = with_prior(error, share, self.prior.error(position, settings))
@@ -250,8 +253,8 @@ class LensModel:
 
         return PsfAnswer(
             kernel=self._predictor.pixels.resampled(mixture.kernels, size, pixel)[0],
-            effective_samples=1.0 / float((weight**2).sum()),
-            photos=int(np.count_nonzero(per_photo > _LISTED)),
+            effective_samples=made.effective_samples,
+            photos=made.photos,
             extrapolated=bool(beyond),
             predicted_error=min(error, 1.0),
             bandwidth=dict(fit.bandwidth),
@@ -260,10 +263,10 @@ class LensModel:
             nearest=nearest,
             prior="" if self.prior is None else self.prior.name,
             prior_share=share,
-            image_frame_share=float(mixture.shares[0, 1]),
-            wavefront_share=float(mixture.shares[0, 2]),
+            wavefront_share=wavefront_share,
+            answered_by=made.answered_by,
+            reason=made.reason,
             scatter=scatter,
-            mode=fit.mode,
         )
 
     def kernels(

@@ -4,7 +4,6 @@
 both          a quarter of the kernels of the neighbours averaged, three quarters of the wavefront of the
               lens where the spectra of all patches agree on one (the default)
 kernels       the kernels of the neighbours averaged, as in the paper
-mixed         the mixture of `combination`: kernels of both frames, and the wavefront
 wavefront     the wavefront of the lens alone, fitted to all samples (`physical_mean`)
 paper         the kernels of the neighbours averaged, and nothing else: bandwidths by eq. (8) alone,
               all samples as sure as they claim, no symmetry, nothing moved along the radius
@@ -21,24 +20,55 @@ behind either family of development lenses (`python -m lensmodel.lab.model.joint
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.core.files import fitted
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model.answer import BOTH, MIXED, WAVEFRONT
-from lensmodel.model.combination import WAVEFRONT_SHARE, Estimates, Mixture, relative_l2
+from lensmodel.model.answer import BOTH, WAVEFRONT
 from lensmodel.model.field.kriging import as_kernels
-from lensmodel.model.field.local_frame import Answers, LocalKernels
+from lensmodel.model.field.local_frame import Answers
+from lensmodel.model.fitting import Fit
 from lensmodel.model.trust.support import measured_share
 from lensmodel.model.wavefront.physical_mean import Physics
 
+WAVEFRONT_SHARE: Final = float(fitted("model")["wavefront_share"])
+"""Of the wavefront in the mode `both`; see `data/README.md`."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mixture:
+    """Answers to several questions, of averaged kernels and a wavefront.
+
+    Parameters
+    ----------
+    kernels : ndarray, shape (q, size, size)
+    squared : ndarray, shape (q,)
+        Squared held-out errors near the places.
+    usual : float
+        The same all over the field.
+    shares : ndarray, shape (q,)
+        Weights of the wavefront, 0..1.
+    averaged : ndarray, shape (q,)
+        Squared held-out errors of averaged kernels alone near the places.
+    apart : ndarray, shape (q,)
+        How far the wavefront lies from the averaged kernels, relative L2; 0 without it.
+    """
+
+    kernels: NDArray[np.float64]
+    squared: NDArray[np.float64]
+    usual: float
+    shares: NDArray[np.float64]
+    averaged: NDArray[np.float64]
+    apart: NDArray[np.float64]
+
 
 def answered(
-    mode: str,
-    estimates: Estimates,
-    local: LocalKernels,
+    fit: Fit,
+    physical: Physics | None,
     near: Answers,
     positions: Sequence[FieldPosition],
     settings: LensSettings,
@@ -46,12 +76,13 @@ def answered(
     size: int,
     expected: NDArray[np.float64],
 ) -> Mixture:
-    """Answer questions of one setting in one mode.
+    """Answer questions of one setting in the mode of a fit.
 
     Parameters
     ----------
-    mode : str
-        Of `answer.MODES`.
+    fit : Fit
+    physical : Physics or None
+        Wavefront of these settings.
     near : Answers
         Neighbours of the places and their weights.
     widths : ndarray, shape (q, 2)
@@ -59,22 +90,26 @@ def answered(
     expected : ndarray, shape (q,)
         Relative L2 that estimators expect of the neighbours: where they were measured, a wavefront says less.
     """
-    angles, mirror = np.array([p.phi for p in positions]), estimates.validation.choice.mirror
-    physical = estimates.physical
-    kernels = local.kernels(near, angles, widths, size, mirror)
-    if mode == WAVEFRONT and physical is not None:
+    validation, angles = fit.validation, np.array([p.phi for p in positions])
+    kernels = fit.local.kernels(near, angles, widths, size, validation.choice.mirror)
+    averaged = _alone(kernels, near, validation.errors)
+    if physical is None:
+        return averaged
+    if fit.mode == WAVEFRONT:
         rows = as_kernels(physical.rows(positions, settings), size)
-        errors = physical.extended_errors(len(estimates.validation.votes))
-        alone = _alone(rows, near, errors, 2)
-        averaged, apart = near.mean(estimates.validation.errors**2), relative_l2(rows, kernels)
-        return replace(alone, averaged=averaged, apart=apart)
-    if mode == BOTH and physical is not None and physical.agreed and physical.diffraction_known:
-        regression = _alone(kernels, near, estimates.validation.errors, 0)
+        alone = _alone(rows, near, physical.extended_errors(len(validation.votes)))
+        apart, shares = relative_l2(rows, kernels), np.ones(len(rows))
+        return replace(alone, shares=shares, averaged=averaged.squared, apart=apart)
+    if fit.mode == BOTH and physical.agreed and physical.diffraction_known:
         share = WAVEFRONT_SHARE * (1.0 - measured_share(expected))
-        return _with_wavefront(regression, physical, share, positions, settings)
-    if mode == MIXED:
-        return estimates.mixed(kernels, near, positions, settings)
-    return _alone(kernels, near, estimates.validation.errors, 0)
+        return _with_wavefront(averaged, physical, share, positions, settings)
+    return averaged
+
+
+def relative_l2(kernels: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Relative L2 of kernels about others of any brightness, shape (q,)."""
+    others = others / others.sum(axis=(1, 2), keepdims=True)
+    return np.asarray(np.linalg.norm(kernels - others, axis=(1, 2)) / np.linalg.norm(others, axis=(1, 2)))
 
 
 def _with_wavefront(
@@ -91,18 +126,14 @@ def _with_wavefront(
     return replace(
         averaged,
         kernels=averaged.kernels + share[:, None, None] * (rows - averaged.kernels),
-        shares=np.stack([1.0 - share, np.zeros_like(share), share], axis=1),
+        shares=share,
         apart=relative_l2(rows, averaged.kernels),
     )
 
 
-def _alone(kernels: NDArray[np.float64], near: Answers, errors: NDArray[np.float64], expert: int) -> Mixture:
-    shares = np.zeros((len(kernels), 3))
-    shares[:, expert] = 1.0
-    squared = near.mean(errors**2)
-    return Mixture(
-        kernels, squared, float(errors @ errors) / len(errors), shares, squared, np.zeros(len(kernels))
-    )
+def _alone(kernels: NDArray[np.float64], near: Answers, errors: NDArray[np.float64]) -> Mixture:
+    nothing, squared = np.zeros(len(kernels)), near.mean(errors**2)
+    return Mixture(kernels, squared, float(errors @ errors) / len(errors), nothing, squared, nothing)
 
 
 def between(one: Mixture, other: Mixture, share: float) -> Mixture:

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import variables as va
-from lensmodel.model.combination import Estimates, Mixture
 from lensmodel.model.field.local_frame import Answers
 from lensmodel.model.field.neighbourhood import Neighbourhood
 from lensmodel.model.field.smoothers import Smoother, smoothers
 from lensmodel.model.fitting import Fit
-from lensmodel.model.modes import answered, between
+from lensmodel.model.modes import Mixture, answered, between
 from lensmodel.model.pixels import Pixels
 from lensmodel.model.prior import Prior
 from lensmodel.model.trust.support import USUAL_ERROR
+from lensmodel.model.wavefront.physical_mean import Physics
 from lensmodel.model.wavefront.zoom import nearest
 
 _AROUND: Final = {**va.FALLBACK, "r": 0.15, "phi": 0.5}
@@ -43,7 +43,6 @@ class Predictor:
         self.prior = prior
         self.pixels = Pixels(fit.unit, fit.pixel)
         self._neighbourhood = Neighbourhood(fit.index, fit.validation.votes, scale, smoothers.create(method))
-        self._estimates = Estimates(fit.validation, scale, fit.physical)
 
     @property
     def smoother(self) -> Smoother:
@@ -75,12 +74,12 @@ class Predictor:
 
         expected = np.sqrt(near.mean(np.where(fit.expected > 0.0, fit.expected, USUAL_ERROR**2)))
 
-        def mixed(estimates: Estimates) -> Mixture:
-            return answered(fit.mode, estimates, fit.local, near, positions, settings, widths, size, expected)
+        def mixed(physical: Physics | None) -> Mixture:
+            return answered(fit, physical, near, positions, settings, widths, size, expected)
 
-        mixture = mixed(self._estimates) if end is None or share < 1.0 else None
+        mixture = mixed(fit.physical) if end is None or share < 1.0 else None
         if end is not None:
-            own = mixed(replace(self._estimates, physical=end.physical))
+            own = mixed(end.physical)
             mixture = own if mixture is None else between(own, mixture, share)
         assert mixture is not None
         shares = np.zeros(len(positions))

@@ -17,10 +17,8 @@ from __future__ import annotations
 import io
 import json
 import logging
-import math
 import zipfile
 import zlib
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -30,18 +28,16 @@ from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.files import atomic
-from lensmodel.core.psf import PsfSample, resized
-from lensmodel.core.spectrum import RINGS, SECTORS, PatchSpectrum
-from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model.answer import FORMER_MODES, KERNELS, ModelSettings
+from lensmodel.core.psf import PsfSample
+from lensmodel.model.answer import FORMER_MODES, ModelSettings
 from lensmodel.model.field.smoothers import FORMER_METHODS
 from lensmodel.model.lens_model import LensModel
+from lensmodel.model.sample_codec import PackedSamples, pack_samples, unpack_samples
 
 FORMAT = 1  # raised when older programs could not read a profile any more
 _MAX_BYTES = 1 << 30  # unpacked: against files made to fill the memory
 _MAX_SAMPLES = 200_000  # some 2,700 photos of 24 patches in three colours
 _MAX_SIDE = 255  # pixels (chosen)
-_INFINITY = "infinity"
 _LEARNED = "learned.npz"
 _SPECTRA = "spectra.npy"
 _FAMILY = "family.lensprofile"
@@ -110,7 +106,7 @@ def write_profile(file: IO[bytes], profile: LensProfile) -> None:
         raise InvalidInputError(
             f"a profile holds {_MAX_SAMPLES} samples of side {_MAX_SIDE}, not {len(samples)} of side {side}"
         )
-    stack = np.stack([resized(sample.kernel, side) for sample in samples]).astype(np.float32)
+    packed = pack_samples(samples)
     document = {
         "format": FORMAT,
         "units": {"r": "half-diagonal", "phi": "radian, counter-clockwise from the right", "kernel": "pixel"},
@@ -118,17 +114,15 @@ def write_profile(file: IO[bytes], profile: LensProfile) -> None:
         "photos": profile.photos,
         "cameras": [_named(asdict(camera)) for camera in profile.cameras],
         "model": asdict(profile.model.settings),
-        "samples": [_entry(sample) for sample in samples],
+        "samples": packed.entries,
     }
     if prior is not None and isinstance(prior.source, LensModel):
         document["family"] = {"name": prior.name, "strength": prior.strength}
-    arrays = io.BytesIO()
-    np.save(arrays, stack, allow_pickle=False)
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("profile.json", json.dumps(document, allow_nan=False))
-        archive.writestr("kernels.npy", arrays.getvalue())
-        if any(sample.spectrum is not None for sample in samples):
-            archive.writestr(_SPECTRA, _spectra(samples))
+        archive.writestr("kernels.npy", _saved(packed.kernels))
+        if packed.spectra is not None:
+            archive.writestr(_SPECTRA, _saved(packed.spectra))
         archive.writestr(_LEARNED, profile.model.learned(), zipfile.ZIP_STORED)
         if prior is not None and isinstance(prior.source, LensModel):
             family = io.BytesIO()
@@ -136,6 +130,12 @@ def write_profile(file: IO[bytes], profile: LensProfile) -> None:
             archive.writestr(_FAMILY, family.getvalue(), zipfile.ZIP_STORED)
         if _unpacked(archive) > _MAX_BYTES:
             raise InvalidInputError(f"a profile holds {_MAX_BYTES >> 20} MiB at most; save fewer samples")
+
+
+def _saved(array: NDArray[np.float32]) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array, allow_pickle=False)
+    return buffer.getvalue()
 
 
 def _within_limits(count: int, side: int) -> bool:
@@ -205,7 +205,8 @@ def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> 
                 f"{name} holds {len(entries)} samples but kernels of shape {stack.shape}; "
                 f"one is needed for each, of side {_MAX_SIDE} at most"
             )
-        samples = _samples(entries, stack, spectra)
+        rows = None if spectra is None else np.load(io.BytesIO(spectra), allow_pickle=False)
+        samples = unpack_samples(PackedSamples(entries, stack, rows))
         model = _model(samples, _settings(document["model"]), learned)
         if family is not None:
             other = _read(io.BytesIO(family), f"the family in {name}", alone=True)
@@ -217,70 +218,6 @@ def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> 
         raise
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise InvalidInputError(f"{name} is damaged: {error}") from error
-
-
-def _entry(sample: PsfSample) -> dict[str, Any]:
-    settings = asdict(sample.settings)
-    if settings["focus_m"] is not None and math.isinf(settings["focus_m"]):
-        settings["focus_m"] = _INFINITY
-    return {
-        "r": sample.position.r,
-        "phi": sample.position.phi,
-        "settings": settings,
-        "weight": sample.weight,
-        "photo": sample.photo,
-        "pixel_pitch_um": sample.pixel_pitch_um,
-        "half_diagonal_px": sample.half_diagonal_px,
-        "estimator": sample.estimator,
-        "error": sample.error,
-    }
-
-
-def _spectra(samples: Sequence[PsfSample]) -> bytes:
-    """One row for each sample, NaN where it has no spectrum."""
-    missing = np.full(RINGS * SECTORS + 3, np.nan, dtype="<f4").tobytes()
-    rows = b"".join(missing if s.spectrum is None else s.spectrum.to_bytes() for s in samples)
-    buffer = io.BytesIO()
-    np.save(buffer, np.frombuffer(rows, dtype="<f4").reshape(len(samples), -1), allow_pickle=False)
-    return buffer.getvalue()
-
-
-def _opened(data: bytes | None, count: int) -> list[PatchSpectrum | None]:
-    if data is None:
-        return [None] * count
-    rows = np.load(io.BytesIO(data), allow_pickle=False)
-    if rows.shape != (count, RINGS * SECTORS + 3) or rows.dtype != np.float32:
-        raise ValueError(f"spectra of shape {rows.shape} for {count} samples")
-    return [None if np.isnan(row).all() else PatchSpectrum.from_bytes(row.tobytes()) for row in rows]
-
-
-def _samples(
-    entries: Sequence[dict[str, Any]], stack: NDArray[np.float32], spectra: bytes | None
-) -> list[PsfSample]:
-    seen = _opened(spectra, len(entries))
-    return [_sample(*one) for one in zip(entries, stack, seen, strict=True)]
-
-
-def _sample(
-    entry: dict[str, Any],
-    kernel: Any,  # noqa: ANN401 - one row of an array of any shape
-    spectrum: PatchSpectrum | None,
-) -> PsfSample:
-    settings = dict(entry["settings"])
-    if settings.get("focus_m") == _INFINITY:
-        settings["focus_m"] = math.inf
-    return PsfSample(
-        kernel=kernel,
-        position=FieldPosition(float(entry["r"]), float(entry["phi"])),
-        settings=LensSettings(**settings),
-        weight=float(entry["weight"]),
-        photo=str(entry["photo"]),
-        spectrum=spectrum,
-        pixel_pitch_um=entry["pixel_pitch_um"],
-        estimator=str(entry["estimator"]),
-        error=entry.get("error"),
-        half_diagonal_px=entry.get("half_diagonal_px"),
-    )
 
 
 def _model(samples: list[PsfSample], settings: ModelSettings, learned: bytes | None) -> LensModel:
@@ -296,8 +233,8 @@ def _settings(values: dict[str, Any]) -> ModelSettings:
     # written until 0.2; it changed how finely kernels were kept, and no answer
     known = {key: value for key, value in values.items() if key != "oversampling"}
     if known.get("mode") in FORMER_MODES:
-        log.info("the mode %s of the profile is gone: its kernels are averaged", known["mode"])
-        known["mode"] = KERNELS
+        log.info("the mode %s of the profile is gone: the usual one answers", known["mode"])
+        del known["mode"]
     if known.get("method") in FORMER_METHODS:
         log.info("the regression %s of the profile is gone: the usual one answers", known["method"])
         del known["method"]

@@ -214,8 +214,8 @@ class Lens:
         Returns
         -------
         PsfAnswer
-            `.kernel` is the array, shape (size, size), float64; `.predicted_error` its expected relative L2
-            error; `.photos` and `.effective_samples` what it was made of.
+            `.kernel` is the array, shape (size, size), float64; `.predicted_error` its expected relative L2 error;
+            `.answered_by` what made it, `.reason` why; `.photos` and `.effective_samples` what of.
 
         Raises
         ------

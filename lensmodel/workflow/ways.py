@@ -18,16 +18,19 @@ class Way:
 
     Parameters
     ----------
+    name : str
+        What users call it.
     estimator : str
         Of `estimators`.
     kernel_size : int
         Odd side of the estimated kernels in pixels.
     mode : str
-        Of `MODES`.
+        Of `answer.MODES`.
     method : str
         Of `deconvolvers`.
     """
 
+    name: str
     estimator: str
     kernel_size: int
     mode: str
@@ -36,8 +39,8 @@ class Way:
 
 WAYS: Final[Mapping[str, Way]] = MappingProxyType(
     {
-        "default": Way("default", 31, BOTH, "standard"),
-        "paper": Way("michaeli-irani", 55, PAPER, "paper"),
+        "default": Way("default", "default", 31, BOTH, "standard"),
+        "paper": Way("paper", "michaeli-irani", 55, PAPER, "paper"),
     }
 )
 """`paper` is that of M. Hirsch and B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, sections 4

@@ -32,7 +32,7 @@ def test_a_lens_goes_the_papers_way_and_back(tmp_path: Path) -> None:
         result = service.http.get(f"/v1/corrections/{asked['id']}/result").content
         report = service.get(f"/v1/corrections/{asked['id']}")["report"]
 
-        assert (answer["support"]["model"], answer["support"]["mode"]) == ("paper", "paper")
+        assert (answer["support"]["model"], answer["support"]["answered_by"]) == ("paper", "paper")
         assert exported.model.settings.mode == "paper"
         assert {s.estimator.partition("/")[0] for s in exported.model.samples} == {"michaeli-irani"}
         assert {s.kernel.shape for s in exported.model.samples} == {(55, 55)}

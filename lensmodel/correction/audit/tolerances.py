@@ -6,20 +6,9 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
 
-LIMITS: Final[Mapping[str, float]] = MappingProxyType(
-    {
-        "too dark": 0.36,
-        "too bright": 0.75,
-        "isolated pixels": 1.25,
-        "hue, spots": 1.8,
-        "hue, area": 1.8,
-        "re-blur": 2.6,
-        "spectrum": 9.0,
-        "comb": 15.0,
-        "ringing": 1.0,
-        "grain": 3.9,
-    }
-)
+from lensmodel.core.files import fitted
+
+LIMITS: Final[Mapping[str, float]] = MappingProxyType(fitted("correction")["limits"])
 """Limit of each check, in the unit of its own equation.
 
 `python -m lensmodel.lab.correction.audit_table --limits` prints the limits at which less than a tenth of
@@ -31,9 +20,7 @@ none of them. Spectrum: points of light have a flat one, which in the higher ban
 slope; lights at night reach 8.3, where chance leaves the lower band less.
 """
 
-MOSAIC: Final[Mapping[str, float]] = MappingProxyType(
-    {"too dark": 2.0, "isolated pixels": 1.3, "hue, spots": 2.5, "hue, area": 2.5}
-)
+MOSAIC: Final[Mapping[str, float]] = MappingProxyType(fitted("correction")["mosaic"])
 """Factor on the limit for a mosaic.
 
 There two colours of three at each pixel are means of neighbours, so that the photo shows less light and dark

@@ -33,7 +33,7 @@ from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import PsfSample, distance
 from lensmodel.lab.chain.blind_gain import CAMERA, PLACES, Lens, lenses, shot, written
 from lensmodel.model import LensModel, ModelSettings
-from lensmodel.model.combination import relative_l2
+from lensmodel.model.modes import relative_l2
 from lensmodel.workflow import pipeline
 
 SHARES: Final = (0.0, 0.25, 0.5, 0.75, 0.875, 1.0)

@@ -41,7 +41,7 @@ from lensmodel.lab.model.exact import PaperModel
 from lensmodel.lab.model.smoothers import make_known
 from lensmodel.lab.model.stars import stars_of
 from lensmodel.model import LensModel, ModelSettings, fit_wavefront, smoothers
-from lensmodel.model.answer import MIXED, MODES
+from lensmodel.model.answer import KERNELS, MODES
 from lensmodel.simulate import draw_lens
 
 FRAME = Frame(2832, 4256)
@@ -131,9 +131,9 @@ def run_model_benchmark(
     photos : sequence of int
         How many photos of 24 patches a model sees.
     methods : sequence of str, optional
-        Names in `smoothers`, those of `lab.model.smoothers` included (each in mode "mixed"), "eff-linear",
-        "polynomial", "wavefront", "paper", or the modes "mode-kernels", "mode-wavefront", "mode-paper"; by
-        default all, but modes only of `photographs`.
+        Names in `smoothers`, those of `lab.model.smoothers` included (each in mode "kernels"), "eff-linear",
+        "polynomial", "wavefront", "paper", or the modes "mode-both", "mode-kernels", "mode-wavefront",
+        "mode-paper"; by default all, but modes only of `photographs`.
     psf_field : Path, optional
         Measured PSFs; then `seeds` and `photos` play no part.
     spoiled : float
@@ -255,8 +255,8 @@ def _fits(methods: Sequence[str] | None, *, modes: bool = False) -> dict[str, Fi
         "polynomial": _polynomial,
         "paper": _paper,
         "wavefront": _wavefront,
-        **{name: _regression(ModelSettings(method=name, mode=MIXED)) for name in smoothers},
-        **{f"mode-{mode}": _regression(ModelSettings(mode=mode)) for mode in MODES if mode != MIXED},
+        **{name: _regression(ModelSettings(method=name, mode=KERNELS)) for name in smoothers},
+        **{f"mode-{mode}": _regression(ModelSettings(mode=mode)) for mode in MODES},
     }
     unknown = [name for name in methods or () if name not in known]
     if unknown:

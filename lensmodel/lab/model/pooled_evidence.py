@@ -1,4 +1,4 @@
-"""What solving all patches together adds to kernels estimated one by one.
+"""What solving all patches together adds to kernels estimated one by one, in the mode `wavefront`.
 
     LENSMODEL_TEST_DATA=... python -m lensmodel.lab.model.pooled_evidence --seeds 1008,1010,1013 --photos 2
 
@@ -32,7 +32,7 @@ from lensmodel.workflow import pipeline
 _PLACES = 48
 _GOLDEN = math.pi * (3.0 - math.sqrt(5.0))
 _SIZE = 31
-MIXED = ModelSettings(mode="mixed")
+WAVEFRONT = ModelSettings(mode="wavefront")
 
 
 def places() -> list[FieldPosition]:
@@ -106,8 +106,8 @@ def main() -> None:
                 samples = [sample for photo in photos[:count] for sample in photo]
                 name = f"{seed} {truth.lens.model.removeprefix('Simulated ')}, {count}"
                 alone = [replace(sample, spectrum=None) for sample in samples]
-                row(f"{name}, kernels", LensModel.fit(alone, MIXED).warmed(), truth)
-                row(f"{name}, pooled", LensModel.fit(samples, MIXED).warmed(), truth)
+                row(f"{name}, kernels", LensModel.fit(alone, WAVEFRONT).warmed(), truth)
+                row(f"{name}, pooled", LensModel.fit(samples, WAVEFRONT).warmed(), truth)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """Ways to weigh neighbours that the product does not use: those that the comparison of regressions tells of.
 
-`make_known` registers them by name in this process, as a user registers a method of his own. "blended" is the
-usual regression with the image frame and without the wavefront.
+`make_known` registers them by name in this process, as a user registers a method of his own.
 """
 
 from __future__ import annotations
@@ -28,7 +27,6 @@ class NearestNeighbours:
     at: float = 1.0
     transport: bool = False
     reach: float = 8.0
-    blend: bool = False
     physical: bool = False
 
     def weights(self, near: Neighbours) -> NDArray[np.float64]:
@@ -49,7 +47,6 @@ class Abramson:
 
     transport: bool = False
     reach: float = 5.0
-    blend: bool = False
     physical: bool = False
 
     def weights(self, near: Neighbours) -> NDArray[np.float64]:
@@ -76,7 +73,6 @@ class LocalLinear:
     least: float = 5.0
     transport: bool = False
     reach: float = 4.0
-    blend: bool = False
     physical: bool = False
 
     def weights(self, near: Neighbours) -> NDArray[np.float64]:
@@ -114,7 +110,6 @@ class GaussianProcess:
     most: int = 128
     transport: bool = False
     reach: float = 12.0
-    blend: bool = False
     physical: bool = False
 
     def weights(self, near: Neighbours) -> NDArray[np.float64]:
@@ -136,8 +131,6 @@ class GaussianProcess:
 
 
 COMPARED: Final[dict[str, Callable[..., Smoother]]] = {
-    "blended": lambda **params: NadarayaWatson(transport=True, blend=True, **params),
-    "blended-gaussian-process": lambda **params: GaussianProcess(transport=True, blend=True, **params),
     "nearest": NearestNeighbours,
     "abramson": Abramson,
     "local-linear": LocalLinear,

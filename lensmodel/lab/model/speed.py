@@ -1,6 +1,6 @@
 """Speed and size of the lens model as ratios of one run; prints the table of docs/lab/lens-model.md.
 
-    python -m lensmodel.lab.model.speed [--samples 1000] [--many 100000] [--methods blended nadaraya-watson]
+    python -m lensmodel.lab.model.speed [--samples 1000] [--many 100000] [--methods combined nadaraya-watson]
 
 Peer: scipy's cKDTree over the flat cloud of (u, v, r, cos phi, sin phi) points of the same samples, 200
 nearest for every pixel of the answer, as the paper describes. CPU seconds of the process, medians.
@@ -112,7 +112,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--samples", type=int, default=1000)
     parser.add_argument("--many", type=int, default=4000)
-    parser.add_argument("--methods", nargs="+", default=["combined", "blended", "nadaraya-watson"])
+    parser.add_argument("--methods", nargs="+", default=["combined", "nadaraya-watson"])
     wanted = parser.parse_args()
     make_known()
     samples = lens(max(wanted.samples, wanted.many))
@@ -129,7 +129,7 @@ def main() -> None:
     for method in wanted.methods:
         for chosen in (few, samples[: wanted.many]):
             start = time.process_time()
-            model = LensModel.fit(chosen, ModelSettings(method=method, mode="mixed"))
+            model = LensModel.fit(chosen, ModelSettings(method=method))
             fit = time.process_time() - start
             start = time.process_time()
             model = model.warmed()

@@ -14,7 +14,6 @@ from lensmodel.core.types import WAVELENGTH_NM
 from lensmodel.model import variables as va
 from lensmodel.model.answer import PAPER, ModelSettings
 from lensmodel.model.field import robust
-from lensmodel.model.field.kriging import ImageFrame
 from lensmodel.model.field.leave_one_out import Choice, Held, choose
 from lensmodel.model.field.local_frame import LocalKernels
 from lensmodel.model.field.robust import Flag
@@ -39,9 +38,6 @@ class CrossValidation:
         own scatter.
     choice : Choice
     flags : tuple of Flag
-    image : ImageFrame or None
-        The regression of the image frame, if it takes part, and its held-out errors, shape (n,).
-    image_errors : ndarray or None
     """
 
     votes: NDArray[np.float64]
@@ -49,8 +45,6 @@ class CrossValidation:
     noise: NDArray[np.float64]
     choice: Choice
     flags: tuple[Flag, ...] = ()
-    image: ImageFrame | None = None
-    image_errors: NDArray[np.float64] | None = None
 
     def extended(self, votes: NDArray[np.float64]) -> CrossValidation:
         """Return it with samples that were not scored: the usual errors, the votes that they claim."""
@@ -63,7 +57,6 @@ class CrossValidation:
             votes=np.concatenate([self.votes, votes]),
             errors=longer(self.errors),
             noise=longer(self.noise),
-            image_errors=None if self.image_errors is None else longer(self.image_errors),
         )
 
 
@@ -104,8 +97,6 @@ def cross_validate(
     local: LocalKernels,
     where: NDArray[np.float64],
     base: NDArray[np.float64],
-    *,
-    blend: bool,
 ) -> CrossValidation:
     """Choose bandwidths by cross-validation, weigh robustly, note held-out errors.
 
@@ -119,8 +110,6 @@ def cross_validate(
         Their points.
     base : ndarray, shape (n,)
         Votes that they claim; those of 0 take no part.
-    blend : bool
-        Whether the image frame takes part.
     """
     rule = va.bandwidths(where)
     names, photo = np.unique([s.photo for s in samples], return_inverse=True)
@@ -177,16 +166,7 @@ def cross_validate(
     scatter = np.minimum(prepared.noise(prepared.weights(choice.r, choice.phi)), held_out**2)
     errors[:], noise[:] = float(np.median(held_out)), float(np.median(scatter))
     errors[scored], noise[scored] = held_out, scatter
-    if not blend:
-        return CrossValidation(votes, errors, noise, choice, flags)
-    trusted = scored[votes[scored] > 0]
-    scale = va.scales(bandwidth(rule, settings, choice))
-    image, seen = ImageFrame.fit(
-        [samples[i] for i in trusted], where[trusted], votes[trusted], scale, groups[trusted]
-    )
-    image_errors = np.full(len(samples), float(np.median(seen)))
-    image_errors[trusted] = seen
-    return CrossValidation(votes, errors, noise, choice, flags, image, image_errors)
+    return CrossValidation(votes, errors, noise, choice, flags)
 
 
 def _judging_channel(wavelengths: NDArray[np.float64]) -> float:

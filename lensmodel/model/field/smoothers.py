@@ -49,12 +49,8 @@ class Smoother(Protocol):
         """Distance in bandwidths beyond which samples are left out."""
 
     @property
-    def blend(self) -> bool:
-        """Whether the answer is mixed with that of the image frame, by their held-out errors."""
-
-    @property
     def physical(self) -> bool:
-        """Whether a fitted wavefront with the kriged rest takes part in that mixture."""
+        """Whether a wavefront may be fitted to the samples and take part in the answer."""
 
     def weights(self, near: Neighbours) -> NDArray[np.float64]:
         """Weights of sum 1, shape (m,)."""
@@ -77,7 +73,6 @@ class NadarayaWatson:
 
     transport: bool = False
     reach: float = 5.0
-    blend: bool = False
     physical: bool = False
 
     def weights(self, near: Neighbours) -> NDArray[np.float64]:
@@ -88,7 +83,7 @@ class NadarayaWatson:
 smoothers: Registry[Smoother] = Registry(
     "regression",
     {
-        "combined": lambda **params: NadarayaWatson(transport=True, blend=True, physical=True, **params),
+        "combined": lambda **params: NadarayaWatson(transport=True, physical=True, **params),
         "nadaraya-watson": NadarayaWatson,
     },
 )

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
-from lensmodel.model.combination import WAVEFRONT_SHARE, Mixture
+from lensmodel.core.files import fitted
+from lensmodel.model.modes import WAVEFRONT_SHARE, Mixture
 from lensmodel.model.trust.support import field_error, shared_error
 
 
@@ -71,14 +74,14 @@ def expected_error(evidence: Evidence, mixture: Mixture, *, wavefront_alone: boo
         error = math.sqrt(own) * evidence.distance_factor
     else:
         error = evidence.regression_error(float(mixture.usual) if evidence.extrapolated else own)
-    if mixture.shares[0, 2] > 0.0:
+    if mixture.shares[0] > 0.0:
         averaged = evidence.usual if evidence.extrapolated else float(mixture.averaged[0])
         error = max(error, evidence.regression_error(averaged), float(mixture.apart[0]))
     return error
 
 
-_AT_CENTER, _BY_RADIUS, _BY_DISTANCE, _LEAST_APART = -1.37, 0.60, 0.29, 0.02
-"""Of `joint_error`: `python -m lensmodel.lab.model.joint_answer`, development lenses of both families."""
+_JOINT: Final[Mapping[str, float]] = fitted("model")["joint_error"]
+"""a, b, c and the least distance of `joint_error`; see `data/README.md`."""
 
 
 def joint_error(evidence: Evidence, mixture: Mixture, r: float) -> float:
@@ -94,9 +97,10 @@ def joint_error(evidence: Evidence, mixture: Mixture, r: float) -> float:
         Half-diagonals.
     """
     own = evidence.regression_error(float(mixture.usual if evidence.extrapolated else mixture.squared[0]))
-    share = float(mixture.shares[0, 2]) / WAVEFRONT_SHARE
+    share = float(mixture.shares[0]) / WAVEFRONT_SHARE
     apart = float(mixture.apart[0])
-    joint = math.exp(_AT_CENTER + _BY_RADIUS * r + _BY_DISTANCE * math.log(apart + _LEAST_APART))
+    distance = math.log(apart + _JOINT["least_apart"])
+    joint = math.exp(_JOINT["at_center"] + _JOINT["by_radius"] * r + _JOINT["by_distance"] * distance)
     return math.hypot(math.sqrt(1.0 - share) * own, math.sqrt(share) * joint * evidence.distance_factor)
 
 

@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.belief import Belief, Narrowing
+from lensmodel.core.files import fitted
 from lensmodel.core.psf import PsfField, PsfSample, as_kernel
 from lensmodel.core.types import Channel, FieldPosition, Kernel, LensSettings
 from lensmodel.model import variables as va
@@ -42,24 +43,34 @@ from lensmodel.model.wavefront.likelihood import surprise
 NARROWINGS: Final = (Narrowing(), Narrowing(width=0.7), Narrowing(width=0.55), Narrowing(share=0.45))
 """What may have become of a kernel that is not the true one. Wider ones do no harm where they are missed."""
 
-# Chosen on lenses of development (third order 0 to 3 and 6, and three ray-traced designs; one, two and five
-# photos each) for the error that a linear filter by such a belief would leave. What gains most on those, says
-# `lensmodel.lab.model.belief_prior`, leans more on the wavefront: 0.1 to 0.2 dB more on them, and halos of 17
-# percent instead of 11 in a real photograph of a tree, which is harder to look at. So these stay.
-OF_BOTH: Final = ((0.02, 0.05, 0.05, 0.05), (0.20, 0.23, 0.30, 0.10))  # p of kernels and of the wavefront
+_FITTED: Final = fitted("model")["witness"]
+OF_BOTH: Final = (tuple(_FITTED["kernels"]), tuple(_FITTED["wavefront"]))
+"""p of kernels and of the wavefront, see `data/README.md`.
+
+Chosen on lenses of development (third order 0 to 3 and 6, and three ray-traced designs; one, two and five
+photos each) for the error that a linear filter by such a belief would leave. What gains most on those leans
+more on the wavefront: 0.1 to 0.2 dB more on them, and halos of 17 percent instead of 11 in a real photograph
+of a tree, which is harder to look at. So these stay.
+"""
+SPREAD_OF_BOTH: Final = float(_FITTED["spread"])
+"""Factor on the variance: the true kernel is none of the alternatives."""
+TEMPER, HALF = float(_FITTED["temper"]), float(_FITTED["half"])
+"""t of many photos, and how many photos halve it."""
+
 _OF_UNKNOWN: Final = ((0.20, 0.10, 0.10, 0.05), (0.15, 0.15, 0.15, 0.10))
-"""p where aperture or pixels are not known: a wavefront cannot tell narrow blur from diffraction then."""
-_OF_ONE: Final = ((0.1, 0.3, 0.3, 0.3),)  # p where the samples have no wavefront
-SPREAD_OF_BOTH, _SPREAD_OF_ONE = 1.5, 3.0
-"""Factors on the variance: the true kernel is none of the alternatives."""
-_AGAINST, _FOR = 12.0, 6.0  # bounds of what one patch says, from the first alternative on
-_RADIUS: Final = 0.3  # half-diagonals
-_FEWEST: Final = 5.0  # patches whose mean counts in full; one alone overrules nothing
-TEMPER, HALF = 2.0, 2.0  # t of many photos, and how many photos halve it
+"""p where aperture or pixels are not known (chosen: a wavefront cannot tell narrow blur from diffraction)."""
+_OF_ONE: Final = ((0.1, 0.3, 0.3, 0.3),)
+"""p where the samples have no wavefront (chosen: kernels that are too wide are what ruins a photo)."""
+_SPREAD_OF_ONE: Final = 3.0
+"""The factor on the variance there (chosen: one opinion covers less than two)."""
+_AGAINST, _FOR = 12.0, 6.0
+"""Bounds of what one patch says, from the first alternative on (chosen: no patch speaks for all)."""
+_RADIUS: Final = 0.3  # half-diagonals (chosen: a mean over several patches, so that one overrules nothing)
+_FEWEST: Final = 5.0  # patches whose mean counts in full (chosen: one alone overrules nothing)
 _FEWEST_VOTES: Final = 0.5  # patches; with fewer near a place the witness says nothing (chosen)
-_MOST: Final = 96  # patches of a model that are asked
+_MOST: Final = 96  # patches of a model that are asked (chosen: each costs some milliseconds)
 _TINY: Final = 1e-12
-_ALIKE: Final = 0.05  # least weight by settings
+_ALIKE: Final = 0.05  # least weight by settings (chosen: patches of others say little of these)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

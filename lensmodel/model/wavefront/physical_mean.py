@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +47,12 @@ _ALIKE = 1e-7  # covariance below which a sample is left out of an answer
 _CLEARLY = 2.0  # standard errors
 _STEPS = 2  # of the progress: the fit, the remainder
 
+NO_AGREEMENT: Final = "no agreement"
+FEW_SPECTRA: Final = "few spectra"
+SEVERAL_FOCAL_LENGTHS: Final = "several focal lengths"
+APART: Final = ("", NO_AGREEMENT, FEW_SPECTRA, SEVERAL_FOCAL_LENGTHS)
+"""Why patches were not solved together, if they were not."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Physics:
@@ -71,6 +78,8 @@ class Physics:
         Whether aperture and pixel pitch of an agreed wavefront are known.
     turned : float
         Probability that an agreed wavefront gives all kernels turned by 180 degrees.
+    apart : str
+        Of `APART`: why it is not `agreed`.
     """
 
     front: Wavefront
@@ -83,6 +92,7 @@ class Physics:
     agreed: bool = False
     diffraction_known: bool = False
     turned: float = 0.0
+    apart: str = ""
 
     @classmethod
     def fit(
@@ -111,7 +121,8 @@ class Physics:
         on_step(0, _STEPS)
         trusted = [samples[i].with_weight(float(votes[i])) for i in voting]
         # spectra of one focal length alone are solved together
-        pooled = None if focal_range(trusted) > ONE_FOCAL_LENGTH else pool(trusted, on_step)
+        several = focal_range(trusted) > ONE_FOCAL_LENGTH
+        pooled = None if several else pool(trusted, on_step)
         if pooled is not None and _suits(pooled, trusted):
             side = max(s.kernel.shape[0] for s in samples)
             empty = np.empty((0, 2)), np.empty((0, len(scale))), scale, np.empty((0, side**2))
@@ -141,7 +152,8 @@ class Physics:
         errors = np.full(len(samples), float(np.median(seen)))
         errors[chosen] = seen
         on_step(_STEPS, _STEPS)
-        return cls(front, side, vectors, where, scale, rest, errors)
+        apart = SEVERAL_FOCAL_LENGTHS if several else FEW_SPECTRA if pooled is None else NO_AGREEMENT
+        return cls(front, side, vectors, where, scale, rest, errors, apart=apart)
 
     def rows(self, positions: Sequence[FieldPosition], settings: LensSettings) -> NDArray[np.float64]:
         """Kernels of the image frame as flat rows, shape (q, side^2)."""

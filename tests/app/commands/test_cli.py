@@ -267,6 +267,15 @@ def test_psf_writes_files_that_open(folder: Path, suffix: str) -> None:
     assert shape == (15, 15)
 
 
+def test_psf_says_what_made_the_answer_and_why(folder: Path) -> None:
+    words = ["psf", str(folder / PROFILE), "--size", "15"]
+    said, told = (CliRunner().invoke(app, [*words, *more]).output for more in ([], ["--json"]))
+
+    support = json.loads(told)["support"]
+    assert (support["answered_by"], support["reason"]) == ("regression", "no patch has a spectrum")
+    assert "answered by regression: no patch has a spectrum" in " ".join(said.split())
+
+
 def test_two_runs_on_one_profile_drop_nothing_of_each_other(
     folder: Path, made: Path, here: Here, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -561,19 +570,20 @@ def test_a_new_copy_starts_from_another_and_can_leave_it(folder: Path, here: Her
     assert load_profile(folder / "new").model.prior is None
 
 
-def test_a_profile_keeps_the_mode_and_the_unit_that_it_was_told(
+def test_a_profile_keeps_the_unit_that_it_was_told_and_modes_are_gone(
     folder: Path, here: Here, few_patches: None
 ) -> None:
     words = ("calibrate", "one.dng", "-p", PROFILE, "--estimator", "whittle", "--workers", "1", "--json")
-    told = json.loads(here(*words, "--any-lens", "--mode", "kernels", "--unit", "half-diagonal").stdout)
+    told = json.loads(here(*words, "--any-lens", "--unit", "half-diagonal").stdout)
 
     kept = load_profile(folder / PROFILE).model
-    assert (kept.settings.mode, kept.settings.unit) == ("kernels", "half-diagonal")
-    assert told["mode"] == kept.mode == "kernels"
+    assert (kept.settings.mode, kept.settings.unit) == ("both", "half-diagonal")
     again = json.loads(here(*words, "--any-lens").stdout)
     assert again["results"][0]["state"] == "known"
-    assert again["mode"] == told["mode"]
-    assert here(*words, "--mode", "guess").returncode == 2
+    assert again["model"] == told["model"] == "default"
+    refused = here(*words, "--mode", "kernels")
+    assert refused.returncode == 2
+    assert "--model" in refused.stderr
 
 
 def test_a_lens_learned_the_papers_way_stays_so_and_is_corrected_so(
@@ -584,14 +594,13 @@ def test_a_lens_learned_the_papers_way_stays_so_and_is_corrected_so(
     told = json.loads(here(*words, *quick, "--model", "paper").stdout)
 
     kept = load_profile(folder / PROFILE).model
-    assert (told["mode"], kept.settings.mode, kept.samples[0].kernel.shape) == ("paper", "paper", (21, 21))
-    assert json.loads(here(*words, *quick).stdout)["mode"] == "paper"
+    assert (told["model"], kept.settings.mode, kept.samples[0].kernel.shape) == ("paper", "paper", (21, 21))
+    assert json.loads(here(*words, *quick).stdout)["model"] == "paper"
     assert here("correct", "one.dng", "-p", PROFILE, "-o", "out").returncode == 0
     with Image.open(folder / "out" / "one-corrected.tif") as written:
         assert "method paper" in str(written.tag_v2.get(270))
-    assert here(*words, *quick, "--model", "default", "--mode", "kernels").returncode == 2
     assert here(*words, "--kernel-size", "57").returncode == 2
-    assert json.loads(here(*words, *quick, "--model", "default").stdout)["mode"] == "both"
+    assert json.loads(here(*words, *quick, "--model", "default").stdout)["model"] == "default"
 
 
 def test_a_photo_that_says_little_is_corrected_with_a_word_of_warning(folder: Path, here: Here) -> None:

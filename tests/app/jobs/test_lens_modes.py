@@ -1,4 +1,4 @@
-"""What the service makes of samples: its mode, and pixels of several bodies."""
+"""What the service makes of samples: its models, and pixels of several bodies."""
 
 from __future__ import annotations
 
@@ -22,8 +22,10 @@ from app.runtime.settings import Settings
 from app.store import LensName, NewPatch, NewSample, Store
 from app.store.tables import SampleRow
 from app.store.versions import learned_key
+from app.ways import of_models
 from lensmodel.core.psf import gaussian, rms_width
 from lensmodel.core.types import FieldPosition, LensSettings, ignore_step
+from lensmodel.model import ModelSettings
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 SIDE, SUPPORT = 64, 11
@@ -42,11 +44,6 @@ def lens(steps: Steps) -> str:
     return str(steps.lens_id(steps.counted(patches=6)))
 
 
-def serve(settings: Settings, mode: str) -> TestClient:
-    chosen = settings.model_copy(update={"model_mode": mode})
-    return TestClient(create_app(chosen), raise_server_exceptions=False)
-
-
 def psf(client: TestClient, lens_id: str, **more: float) -> dict[str, Any]:
     answer = client.get(f"/v1/lenses/{lens_id}/psf", params={**ASKED, **more})
     assert answer.status_code == 200, answer.text
@@ -57,27 +54,35 @@ def width(answer: dict[str, Any]) -> float:
     return rms_width(np.array(answer["psf"]["data"]))
 
 
-def test_what_a_worker_learned_in_a_mode_is_served_in_that_mode_alone(
-    settings: Settings, store: Store, storage: Storage, lens: str, tmp_path: Path
+def test_what_a_worker_learned_is_served_for_that_model_alone(
+    settings: Settings, client: TestClient, store: Store, storage: Storage, lens: str, tmp_path: Path
 ) -> None:
     state, stored = store.samples.of_lens(lens)
     folder = tmp_path / "task"
     folder.mkdir()
     write_samples(folder, stored)
 
-    tasks.measure({"model": {"mode": "mixed", "unit": "micrometre"}}, folder, ignore_step)
+    tasks.measure({"model": of_models(settings, "default")}, folder, ignore_step)
     storage.put(learned_key(lens, state.version, state.rebuild_epoch), (folder / LEARNED).read_bytes())
 
-    with serve(settings, "mixed") as client:
-        assert psf(client, lens)["support"]["mode"] == "mixed"
-        assert "-l-" in client.get(f"/v1/lenses/{lens}/psf", params=ASKED).headers["etag"]
-    assert not ModelCache(store, 1 << 30, storage).get(lens).learned
+    assert "-l-" in client.get(f"/v1/lenses/{lens}/psf", params=ASKED).headers["etag"]
+    assert ModelCache(store, 1 << 30, storage).get(lens).learned
+    of_paper = ModelSettings(**of_models(settings, "paper"))
+    assert not ModelCache(store, 1 << 30, storage, settings=of_paper).get(lens).learned
 
 
-@pytest.mark.parametrize("mode", ["evidence", "likeliest"])
-def test_a_former_mode_is_refused_with_the_remedy(mode: str) -> None:
-    with pytest.raises(ValueError, match="is gone: leave LENS_MODEL_MODE out"):
-        Settings(model_mode=mode)  # type: ignore[arg-type] # what an environment may say
+def test_an_answer_says_what_made_it_and_why(client: TestClient, lens: str) -> None:
+    support = psf(client, lens)["support"]
+
+    assert (support["model"], support["answered_by"]) == ("default", "regression")
+    assert support["reason"] == "no patch has a spectrum"
+
+
+def test_the_setting_of_modes_is_refused_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LENS_MODEL_MODE", "kernels")
+
+    with pytest.raises(ValueError, match=r"is gone: leave it out; .* --model paper"):
+        Settings()
 
 
 def test_what_an_earlier_version_kept_of_patches_goes_with_its_photo(

@@ -12,9 +12,10 @@ from starlette.testclient import TestClient
 from app.client import Client
 from app.client_async import AsyncClient
 from app.http.model_cache import ModelCache
-from app.main import create_app
 from app.runtime.settings import Settings
 from app.store import Store
+from app.ways import way_of
+from lensmodel.workflow.ways import WAYS
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 TIFF = b"II*\x00" + bytes(3_000)
@@ -65,8 +66,8 @@ def test_every_answer_names_the_model_that_gave_it(client: TestClient, steps: St
     assert client.get(f"/v1/photos/{photo.public_id}").json()["state"] == "received"
     learn(steps, photo)
     after = support(client, lens)
-    assert ((before["model"], before["mode"]), (after["model"], after["mode"])) == (
-        ("default", "both"),
+    assert ((before["model"], before["answered_by"]), (after["model"], after["answered_by"])) == (
+        ("default", "regression"),
         ("paper", "paper"),
     )
     assert lens_of(client, lens) == ("paper", "paper")
@@ -107,18 +108,11 @@ def test_a_model_in_memory_does_not_survive_a_change(store: Store, steps: Steps)
     assert len(fitted.model.samples) == 18  # and none of before
 
 
-def test_the_settings_of_the_service_decide_for_the_default_model_only(
-    settings: Settings, steps: Steps
-) -> None:
-    plain, papers = steps.counted(serial="1", patches=6), steps.receive(model="paper")
-    learn(steps, papers, serial="2")
-    lenses = [steps.lens_id(photo) for photo in (plain, papers)]
+def test_the_settings_of_the_service_decide_for_the_default_model_only(settings: Settings) -> None:
+    chosen = settings.model_copy(update={"estimator": "whittle", "kernel_size": 21})
 
-    for mode, told in (("mixed", ("default", "mixed")), ("paper", ("paper", "paper"))):
-        chosen = settings.model_copy(update={"model_mode": mode, "family": False})
-        with TestClient(create_app(chosen)) as client:
-            said = [support(client, lens) for lens in lenses]
-        assert [(one["model"], one["mode"]) for one in said] == [told, ("paper", "paper")]
+    assert (way_of(chosen, "default").estimator, way_of(chosen, "default").kernel_size) == ("whittle", 21)
+    assert way_of(chosen, "paper") == WAYS["paper"]
 
 
 def test_photos_of_the_paper_are_corrected_its_way_unless_asked_otherwise(

@@ -39,11 +39,11 @@ def fitted(method: str, photos: int) -> LensModel:
     return LensModel.fit(samples, ModelSettings(method=method))
 
 
-def test_the_names_are_those_that_profiles_of_earlier_versions_may_hold() -> None:
+def test_the_names_are_among_those_that_profiles_of_earlier_versions_may_hold() -> None:
     make_known()
 
-    assert set(COMPARED) == FORMER_METHODS
-    assert set(smoothers) > FORMER_METHODS
+    assert set(COMPARED) < FORMER_METHODS
+    assert set(smoothers) > set(COMPARED)
 
 
 @pytest.mark.parametrize("method", sorted(COMPARED))
@@ -63,7 +63,7 @@ def test_follows_the_ring_family(method: str) -> None:
     assert float(np.median(errors)) < 0.08
 
 
-@pytest.mark.parametrize("method", ["blended", "transport-gaussian-process"])
+@pytest.mark.parametrize("method", ["transport", "transport-gaussian-process"])
 def test_many_places_at_once_are_the_same_as_one_by_one(method: str) -> None:
     model, asked = fitted(method, 2), places(9, 5)
 

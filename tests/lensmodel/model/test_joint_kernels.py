@@ -11,12 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lensmodel.core.psf import PsfSample, delta, distance, gaussian, rms_width
+from lensmodel.core.psf import PsfSample, distance, gaussian, rms_width
 from lensmodel.core.spectrum import RINGS, SECTORS, PatchSpectrum
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensSettings
 from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
-from lensmodel.model.combination import WAVEFRONT_SHARE, Estimates, Mixture, agreed_share, kernel_error
-from lensmodel.model.field.local_frame import Answers
+from lensmodel.model.modes import WAVEFRONT_SHARE, Mixture
 from lensmodel.model.trust.expected_error import Evidence, joint_error
 from lensmodel.model.wavefront.aberration_prior import BALANCE, corner_ratio, unlikeliness
 from lensmodel.model.wavefront.from_spectra import PatchView, PooledFit, fit_spectra
@@ -36,7 +35,7 @@ from lensmodel.simulate.aberrations import Aberrations
 
 PITCH = 4.5
 SETTINGS = LensSettings(aperture=2.0)
-MIXED = ModelSettings(mode="mixed")
+WAVEFRONT = ModelSettings(mode="wavefront")
 LENS = SimulatedLens(
     (
         Aberrations(
@@ -285,7 +284,7 @@ def known() -> list[PsfSample]:
 @pytest.fixture(scope="module")
 def warm(known: list[PsfSample], searching_shortly: Callable[[], AbstractContextManager[None]]) -> LensModel:
     with searching_shortly():
-        return LensModel.fit(known, MIXED).warmed()
+        return LensModel.fit(known).warmed()
 
 
 @pytest.mark.slow
@@ -299,21 +298,10 @@ def test_blur_that_no_wavefront_makes_is_left_to_the_kernels() -> None:
         for settings in [SETTINGS.with_channel(c)]
     ]
 
-    answer = LensModel.fit(known, MIXED).warmed().query(FieldPosition(0.5, 0.4), SETTINGS, 31)
+    answer = LensModel.fit(known).warmed().query(FieldPosition(0.5, 0.4), SETTINGS, 31)
 
+    assert (answer.answered_by, answer.reason) == ("regression", "no wavefront agrees with all patches")
     assert distance(answer.kernel, gaussian(31, 1.3**2 * np.eye(2))).rel_l2 < 0.05
-
-
-def test_kernels_that_end_in_a_point_neither_silence_the_wavefront_nor_pass_for_sure(warm: LensModel) -> None:
-    fit = warm._fit
-    estimates = Estimates(fit.validation, np.ones(7), fit.physical)
-    near = Answers(np.array([0]), np.array([1.0]), np.array([0, 1]))
-
-    wide = estimates.mixed(delta(31)[None], near, [FieldPosition(0.9, 0.3)], SETTINGS)
-
-    assert wide.shares[0, 2] > 0.9
-    assert rms_width(wide.kernels[0]) > 1.0
-    assert kernel_error(np.array([0.0])) >= 0.1
 
 
 def test_corner_ratio_is_that_of_the_spots_of_a_curved_field() -> None:
@@ -343,8 +331,8 @@ def test_few_patches_are_not_pooled(known: list[PsfSample]) -> None:
 @pytest.mark.slow
 def test_pooled_lens_is_nearer_to_the_truth_than_its_samples_and_kept_by_profiles(tmp_path: Path) -> None:
     known = samples(24, photos=2)
-    model = LensModel.fit(known, MIXED).warmed()
-    plain = LensModel.fit([replace(s, spectrum=None) for s in known], MIXED).warmed()
+    model = LensModel.fit(known).warmed()
+    plain = LensModel.fit([replace(s, spectrum=None) for s in known]).warmed()
 
     place = FieldPosition(0.85, 0.4)
     truth = LENS.kernel(place, SETTINGS, 31)
@@ -363,33 +351,28 @@ def test_pooled_lens_is_nearer_to_the_truth_than_its_samples_and_kept_by_profile
     assert all(s.spectrum is not None for s in back.samples)
 
 
-def test_wide_blur_leaves_the_say_to_the_wavefront() -> None:
-    share = agreed_share(np.array([0.4, 0.6, 0.9, 1.5, 3.0]), diffraction_known=False)
-    assert share[0] < 0.05
-    assert 0.7 < share[1] < 0.9
-    assert 0.95 < share[2] < share[3] < share[4] < 1.0
-
-
-def test_wavefront_has_the_say_at_any_width_where_its_diffraction_is_known(
+def test_a_wavefront_takes_part_only_where_its_diffraction_is_known(
     known: list[PsfSample], warm: LensModel, short_search: None
 ) -> None:
     place = FieldPosition(0.0, 0.0)
 
-    assert warm.query(place, SETTINGS, 31).wavefront_share == 1.0
-    unknown = [replace(s, pixel_pitch_um=None) for s in known]
-    assert LensModel.fit(unknown, MIXED).warmed().query(place, SETTINGS, 31).wavefront_share < 1.0
+    assert warm.query(place, SETTINGS, 31).wavefront_share == WAVEFRONT_SHARE
+    unknown = LensModel.fit([replace(s, pixel_pitch_um=None) for s in known]).warmed()
+    assert unknown.physical is not None
+    answer = unknown.query(place, SETTINGS, 31)
+    assert (answer.wavefront_share, answer.answered_by) == (0.0, "regression")
+    assert answer.reason == "aperture or pixel pitch unknown"
 
 
 def test_kernels_and_wavefront_answer_together_where_diffraction_is_known(warm: LensModel) -> None:
-    both, place = warm.opinion("both"), FieldPosition(0.7, 0.4)
-    assert both is not None
+    place = FieldPosition(0.7, 0.4)
     kernels, wavefront = (
         warm.opinion(mode).kernels([place], SETTINGS, 31) for mode in ("kernels", "wavefront")
     )
 
-    answer = both.query(place, SETTINGS, 31)
+    answer = warm.query(place, SETTINGS, 31)
 
-    assert (answer.mode, answer.wavefront_share) == ("both", WAVEFRONT_SHARE)
+    assert (answer.answered_by, answer.wavefront_share) == ("wavefront and regression", WAVEFRONT_SHARE)
     turned = warm.physical.turned  # no tail tells on which side of these kernels it lies
     either = (1.0 - turned) * wavefront[0] + turned * wavefront[0][::-1, ::-1]
     expected = (1.0 - WAVEFRONT_SHARE) * kernels[0] + WAVEFRONT_SHARE * either
@@ -405,6 +388,7 @@ def test_measured_kernels_leave_a_wavefront_no_say(known: list[PsfSample], warm:
     answer, other = (m.query(FieldPosition(0.7, 0.4), SETTINGS, 31) for m in (model, plain))
 
     assert answer.wavefront_share == 0.0
+    assert (answer.answered_by, answer.reason) == ("regression", "kernels were measured")
     assert np.array_equal(answer.kernel, other.kernel)
     assert answer.predicted_error == pytest.approx(other.predicted_error)
 
@@ -414,7 +398,7 @@ def test_the_error_to_expect_grows_with_what_kernels_and_wavefront_differ_by() -
 
     def told(apart: float, r: float = 0.5) -> float:
         one = np.ones(1)
-        shares = np.array([[1.0 - WAVEFRONT_SHARE, 0.0, WAVEFRONT_SHARE]])
+        shares = WAVEFRONT_SHARE * one
         mixture = Mixture(one[:, None, None], 0.1 * one, 0.1, shares, 0.1 * one, apart * one)
         return joint_error(evidence, mixture, r)
 
@@ -467,9 +451,9 @@ def test_wavefront_is_never_surer_than_the_kernels_nor_than_it_agrees_with_them(
 ) -> None:
     wide = [replace(s, kernel=gaussian(31, 2.0**2 * np.eye(2)), error=0.3) for s in known]
     place = FieldPosition(0.2, 0.4)
-    mixed, plain = LensModel.fit(wide, MIXED).warmed(), LensModel.fit(wide)
+    alone, plain = LensModel.fit(wide, WAVEFRONT).warmed(), LensModel.fit(wide)
 
-    answer, other = mixed.query(place, SETTINGS, 31), plain.query(place, SETTINGS, 31)
+    answer, other = alone.query(place, SETTINGS, 31), plain.query(place, SETTINGS, 31)
 
     assert answer.wavefront_share == 1.0
     apart = distance(answer.kernel, other.kernel).rel_l2

@@ -54,16 +54,20 @@ def noisy() -> list[PsfSample]:
 
 
 @pytest.mark.parametrize(
-    ("mode", "why"), [("guess", "not known"), ("likeliest", "gone"), ("evidence", "gone")]
+    ("mode", "why"),
+    [("guess", "not known"), ("likeliest", "gone"), ("evidence", "gone"), ("mixed", "gone")],
 )
 def test_unknown_modes_are_refused_with_the_known_ones(mode: str, why: str) -> None:
-    known = "both, kernels, mixed, wavefront, paper"
+    known = "both, kernels, wavefront, paper"
     with pytest.raises(UnknownMethodError, match=f"{why}; choose one of {known}"):
         ModelSettings(mode=mode)
 
 
-def test_a_profile_of_a_former_mode_opens_with_averaged_kernels(
-    noisy: list[PsfSample], tmp_path: Path
+@pytest.mark.parametrize(
+    ("mode", "method"), [("likeliest", "abramson"), ("mixed", "blended"), ("evidence", "combined")]
+)
+def test_a_profile_of_a_former_mode_opens_in_the_usual_one(
+    mode: str, method: str, noisy: list[PsfSample], tmp_path: Path
 ) -> None:
     model = LensModel.fit(noisy)
     save_profile(tmp_path / "new.lensprofile", LensProfile(model))
@@ -75,14 +79,14 @@ def test_a_profile_of_a_former_mode_opens_with_averaged_kernels(
             data = new.read(name)
             if name == "profile.json":
                 document = json.loads(data)
-                document["model"] |= {"mode": "likeliest", "method": "abramson"}
+                document["model"] |= {"mode": mode, "method": method}
                 data = json.dumps(document).encode()
             old.writestr(name, data)
         old.writestr("evidence/0.npz", b"of an earlier version")
 
     back = load_profile(tmp_path / "old.lensprofile").model
 
-    assert (back.settings.mode, back.settings.method) == ("kernels", "combined")
+    assert (back.settings.mode, back.settings.method) == ("both", "combined")
     place = FieldPosition(0.5, 1.0)
     one, other = (m.query(place, SETTINGS, SIZE).kernel for m in (model, back))
     assert np.abs(one - other).max() < 1e-6
@@ -130,5 +134,5 @@ def test_the_papers_way_is_its_equations_and_nothing_else(noisy: list[PsfSample]
 
     answer = model.warmed().query(asked, SETTINGS, SIZE)
 
-    assert (answer.mode, answer.wavefront_share, model.flags()) == ("paper", 0.0, ())
+    assert (answer.answered_by, answer.wavefront_share, model.flags()) == ("paper", 0.0, ())
     assert distance(answer.kernel, wanted).rel_l2 < 0.02

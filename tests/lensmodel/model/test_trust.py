@@ -397,9 +397,9 @@ class TestLearned:
         assert again.added(good[4]).samples == model.added(good[4]).samples
 
     def test_keeps_the_wavefront(self, good: list[list[PsfSample]]) -> None:
-        mixed, where = ModelSettings(mode="mixed"), FieldPosition(0.9, 0.5)
-        model = LensModel.fit(good[0], mixed).warmed()
-        again = LensModel.restored(model.samples, model.learned(), mixed)
+        alone, where = ModelSettings(mode="wavefront"), FieldPosition(0.9, 0.5)
+        model = LensModel.fit(good[0], alone).warmed()
+        again = LensModel.restored(model.samples, model.learned(), alone)
 
         assert again.warm
         assert np.array_equal(again.query(where, GREEN, SIZE).kernel, model.query(where, GREEN, SIZE).kernel)

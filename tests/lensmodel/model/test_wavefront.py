@@ -113,7 +113,7 @@ def of_lens(seed: int, photos: int) -> list[PsfSample]:
 
 @pytest.fixture(scope="module")
 def cold() -> LensModel:
-    return LensModel.fit(of_lens(4, 1), ModelSettings(mode="mixed"))
+    return LensModel.fit(of_lens(4, 1), ModelSettings(mode="wavefront"))
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +127,7 @@ def warm(cold: LensModel, steps: list[tuple[int, int]]) -> LensModel:
     return cold.warmed(lambda done, total: steps.append((done, total)))
 
 
-class TestCombined:
+class TestWavefrontAlone:
     def test_leans_on_the_wavefront_in_a_corner_without_samples(
         self, cold: LensModel, warm: LensModel
     ) -> None:
@@ -137,7 +137,7 @@ class TestCombined:
         combined = warm.query(corner, LensSettings(), 21)
 
         assert plain.wavefront_share == 0.0
-        assert combined.wavefront_share > 0.5
+        assert combined.wavefront_share == 1.0
         assert distance(combined.kernel, truth).rel_l2 < 0.6 * distance(plain.kernel, truth).rel_l2
 
     def test_is_no_worse_than_without_where_no_wavefront_fits(self) -> None:
@@ -154,7 +154,7 @@ class TestCombined:
             kernels = [(model.query(p, LensSettings(), 21).kernel, spots(p)) for p in asked]
             return float(np.mean([distance(k, t).rel_l2 for k, t in kernels]))
 
-        cold = LensModel.fit(samples, ModelSettings(mode="mixed"))
+        cold = LensModel.fit(samples, ModelSettings(mode="wavefront"))
         assert error(cold.warmed()) < 1.1 * error(cold)
 
     def test_waits_for_the_wavefront_until_it_is_asked_to_be_warm(
@@ -175,7 +175,8 @@ class TestCombined:
         assert model.warm
         assert model.warmed() is model
         answer = model.query(FieldPosition(0.5, 0.2), LensSettings(), 21)
-        assert (answer.mode, answer.wavefront_share) == ("both", 0.0)
+        assert (answer.answered_by, answer.wavefront_share) == ("regression", 0.0)
+        assert answer.reason == "no patch has a spectrum"
 
     def test_same_samples_give_the_same_wavefront(self, warm: LensModel) -> None:
         again = LensModel.fit(warm.samples, warm.settings).warmed()

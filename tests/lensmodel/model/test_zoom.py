@@ -21,7 +21,7 @@ from lensmodel.optics.wavefront import NAMES, Wavefront
 from lensmodel.simulate import SimulatedLens, draw_lens
 
 SIZE = 31
-MIXED = ModelSettings(mode="mixed")
+WAVEFRONT = ModelSettings(mode="wavefront")
 LENS = draw_lens(1001, "zoom")
 SHORT, LONG = LENS.focal_mm
 CORNER, MID = FieldPosition(0.85, 0.9), FieldPosition(0.5, -2.0)
@@ -76,7 +76,7 @@ def test_terms_follow_a_straight_line_over_octaves() -> None:
 def test_few_samples_at_one_end_of_a_zoom_lean_on_those_of_the_other(
     many: list[PsfSample], few: list[PsfSample]
 ) -> None:
-    alone = LensModel.fit(few, MIXED).warmed()
+    alone = LensModel.fit(few, WAVEFRONT).warmed()
 
     front = fit_wavefront([*many, *few])
 
@@ -94,7 +94,7 @@ def test_other_end_of_a_zoom_never_gets_worse(seed: int) -> None:
     for mine, other in (lens.focal_mm, lens.focal_mm[::-1]):
         rings = (0.15, 0.4, 0.6, 0.75, 0.9)
         own, few = taken(mine, rings, "mine", lens), taken(other, (0.3, 0.7), "other", lens)[1:7]
-        alone, both = LensModel.fit(own, MIXED).warmed(), LensModel.fit([*own, *few], MIXED).warmed()
+        alone, both = LensModel.fit(own, WAVEFRONT).warmed(), LensModel.fit([*own, *few], WAVEFRONT).warmed()
 
         def missed(model: LensModel, focal: float = mine) -> float:
             kernels = model.kernels(FIELD, at(focal, lens), SIZE)
@@ -104,17 +104,17 @@ def test_other_end_of_a_zoom_never_gets_worse(seed: int) -> None:
 
 
 @pytest.mark.slow
-def test_zoom_in_the_mixture_is_kept_by_what_was_learned_and_not_worse_at_the_other_end(
+def test_wavefronts_of_a_zoom_are_kept_by_what_was_learned_and_not_worse_at_the_other_end(
     many: list[PsfSample], few: list[PsfSample]
 ) -> None:
     samples = [*many, *few]
-    model, alone = LensModel.fit(samples, MIXED).warmed(), LensModel.fit(many, MIXED).warmed()
+    model, alone = LensModel.fit(samples, WAVEFRONT).warmed(), LensModel.fit(many, WAVEFRONT).warmed()
 
-    again = LensModel.restored(samples, model.learned(), MIXED)
+    again = LensModel.restored(samples, model.learned(), WAVEFRONT)
 
     for focal in (SHORT, 1.05 * SHORT, LONG):
         both = model.query(CORNER, at(focal), SIZE), again.query(CORNER, at(focal), SIZE)
-        assert both[0].wavefront_share > 0.2
+        assert both[0].wavefront_share == 1.0
         assert np.abs(both[0].kernel - both[1].kernel).max() < 1e-5
     for place in (CORNER, MID):
         own = error(alone.query(place, at(SHORT), SIZE).kernel, place, SHORT)

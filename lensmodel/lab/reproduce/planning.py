@@ -92,7 +92,7 @@ def planned(
         cases += tuple(_case(seed, few, files, stopped=_STOPPED_DOWN) for seed in seeds)
         many = _allowed((10, 20), 2 * len(files))
         cases += tuple(_case(seed, many, files) for seed in seeds if many != few)
-    names = PATHS if hard or size in {"default", "full"} else ()
+    names: tuple[str, ...] = PATHS if hard or size in {"default", "full"} else ()
     names += SCENES_THAT_HURT if hard or size == "full" else ()
     frame = _QUICK_FRAME if size == "quick" else _HARD_FRAME
     for number, name in enumerate(names):

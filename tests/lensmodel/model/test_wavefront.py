@@ -147,7 +147,7 @@ class TestWavefrontAlone:
             along = np.exp(-0.8 * t**2) + np.exp(-0.8 * (t - apart) ** 2) + np.exp(-0.8 * (t + apart) ** 2)
             return as_kernel(np.outer(np.exp(-0.8 * t**2), along))
 
-        samples = [PsfSample(spots(s.position), s.position, photo=s.photo) for s in of_lens(4, 2)]
+        samples = [PsfSample(spots(s.position), s.position, photo=s.photo) for s in of_lens(4, 1)]
         asked = [FieldPosition(r, a) for r in (0.2, 0.5, 0.8) for a in (-2.0, 0.3, 2.2)]
 
         def error(model: LensModel) -> float:

@@ -7,6 +7,7 @@ import io
 import json
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -58,6 +59,7 @@ def samples(
     return found
 
 
+@cache
 def report_of(channels: tuple[Channel, ...] = ("g",), *, draws: int = 4, **options: float | None) -> LensTest:
     given = [s for s in samples(**options) if s.settings.channel in channels]  # type: ignore[arg-type]
     model = LensModel.fit(given, QUICK)

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from lensmodel.photo import LinearPhoto, develop
     from lensmodel.photo.arrays import photo_from_array
     from lensmodel.workflow.api import calibrate, correct
-    from lensmodel.workflow.lens import Lens, field_grid
+    from lensmodel.workflow.field_grid import field_grid
+    from lensmodel.workflow.lens import Lens
     from lensmodel.workflow.pipeline import CalibrationEvent
 
 __all__ = [
@@ -67,7 +68,8 @@ _HOMES: Final = {
     "lensmodel.estimation.patches": ("Selector", "selectors"),
     "lensmodel.correction": ("Bounds", "Corrected", "Deconvolver", "Restored", "Sensor", "deconvolvers"),
     "lensmodel.core.errors": ("CancelledError", "LensModelError"),
-    "lensmodel.workflow.lens": ("Lens", "field_grid"),
+    "lensmodel.workflow.lens": ("Lens",),
+    "lensmodel.workflow.field_grid": ("field_grid",),
     "lensmodel.photo": ("LinearPhoto", "develop"),
     "lensmodel.workflow.calibrating": ("CalibrationEvent",),
     "lensmodel.core.psf": ("PsfSample",),

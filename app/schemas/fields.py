@@ -81,7 +81,7 @@ class Model(BaseModel):
 
 
 class Question(BaseModel):
-    """Common to what we are sent: a name that we do not know is an error, not a wish ignored."""
+    """Common to what we are sent: a name that we do not know is an error, and not ignored."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", protected_namespaces=())
 

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
-from contextlib import contextmanager
-from multiprocessing import get_context
+from concurrent.futures import Executor, Future
 from typing import Any, ParamSpec, TypeVar
 
 A = TypeVar("A")
@@ -26,16 +23,6 @@ class Here(Executor):
         except Exception as error:  # noqa: BLE001 - a future hands on whatever it was
             future.set_exception(error)
         return future
-
-
-@contextmanager
-def pool(executor: Executor | None, workers: int | None) -> Iterator[Executor]:
-    """Give the executor, or else `workers` processes of our own (None = one a core) for as long as needed."""
-    if executor is not None:
-        yield executor
-        return
-    with ProcessPoolExecutor(max(1, workers or os.cpu_count() or 1), mp_context=get_context("spawn")) as own:
-        yield own
 
 
 def in_order(

@@ -263,7 +263,22 @@ class PsfSample:
             raise InvalidInputError(f"the expected error must be finite and not negative, got {self.error}")
 
     def with_weight(self, weight: float) -> PsfSample:
-        """Return the same sample with another vote."""
+        """Return the same sample with another vote.
+
+        Parameters
+        ----------
+        weight : float
+            Confidence in 0..1.
+
+        Returns
+        -------
+        PsfSample
+
+        Raises
+        ------
+        InvalidInputError
+            If the weight lies outside 0..1.
+        """
         return replace(self, weight=weight)
 
 

@@ -106,7 +106,21 @@ class LensSettings:
         return None if self.aperture is None else 2.0 * math.log2(self.aperture)
 
     def with_channel(self, channel: Channel) -> LensSettings:
-        """Return the same settings for another colour channel."""
+        """Return the same settings for another colour channel.
+
+        Parameters
+        ----------
+        channel : {"r", "g", "b"}
+
+        Returns
+        -------
+        LensSettings
+
+        Raises
+        ------
+        InvalidInputError
+            If there is no such channel.
+        """
         return replace(self, channel=channel)
 
 
@@ -114,9 +128,19 @@ class LensSettings:
 class NoiseModel:
     """Variance of one plane's noise as a function of its level, var(y) = shot * y + read.
 
-    Both in linear units where saturation is 1: `shot` is one over the full-well count in
-    electrons, `read` the squared read noise. Source: A. Foi et al., "Practical
-    Poissonian-Gaussian noise modeling and fitting", IEEE TIP 17, 2008, eq. 1 and 2.
+    Both are in linear units where saturation is 1.
+
+    Parameters
+    ----------
+    shot : float
+        One over the full-well count in electrons; not negative.
+    read : float
+        Squared standard deviation of the read noise; not negative.
+
+    References
+    ----------
+    .. [1] A. Foi et al., "Practical Poissonian-Gaussian noise modeling and fitting", IEEE TIP 17, 2008,
+       eq. 1 and 2.
     """
 
     shot: float
@@ -129,16 +153,46 @@ class NoiseModel:
             )
 
     def variance(self, level: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Variance at each level of `level`, same shape."""
+        """Return the variance at each level.
+
+        Parameters
+        ----------
+        level : ndarray
+            Linear light; below 0 counts as 0.
+
+        Returns
+        -------
+        ndarray of float64, same shape
+        """
         return self.shot * np.maximum(np.asarray(level, dtype=np.float64), 0.0) + self.read
 
     def sigma_at(self, level: float) -> float:
-        """Standard deviation at one level."""
+        """Return the standard deviation at one level.
+
+        Parameters
+        ----------
+        level : float
+            Linear light; below 0 counts as 0.
+
+        Returns
+        -------
+        float
+        """
         return math.sqrt(self.shot * max(level, 0.0) + self.read)
 
     @classmethod
     def white(cls, sigma: float) -> NoiseModel:
-        """Signal-independent noise of standard deviation `sigma`."""
+        """Make noise that does not depend on the level.
+
+        Parameters
+        ----------
+        sigma : float
+            Its standard deviation, where saturation is 1.
+
+        Returns
+        -------
+        NoiseModel
+        """
         return cls(shot=0.0, read=sigma * sigma)
 
 

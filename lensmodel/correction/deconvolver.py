@@ -53,7 +53,17 @@ class Sensor:
             raise InvalidInputError(f"clip must be a positive level, got {self.clip}")
 
     def variance(self, plane: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Variance of the noise at each pixel."""
+        """Return the variance of the noise at each pixel.
+
+        Parameters
+        ----------
+        plane : ndarray
+            Linear light.
+
+        Returns
+        -------
+        ndarray of float32, same shape
+        """
         return self.noise.variance(plane).astype(np.float32)
 
 
@@ -79,9 +89,29 @@ class Deconvolver(Protocol):
     def deconvolve(
         self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step
     ) -> Restored:
-        """Estimate the latent plane; call `on_step(done, total)` after each step.
+        """Estimate the latent plane.
 
-        Compiled loops run through and call it once, at the end.
+        Parameters
+        ----------
+        blurred : Plane, shape (H, W), float32
+            Linear light, as the photo shows it.
+        blur : BlurOperator
+            From the latent plane, which is wider than the frame by the reach of the blur, onto the frame.
+        sensor : Sensor
+            Noise, clipping, and which pixels were measured.
+        on_step : callable
+            Called as `on_step(done, total)` after each step; raising `CancelledError` there stops the work.
+            Compiled loops run through and call it once, at the end.
+
+        Returns
+        -------
+        Restored
+            The latent plane inside the frame, shape (H, W), float32.
+
+        Raises
+        ------
+        InvalidInputError
+            If the method cannot invert such an operator.
         """
 
 
@@ -92,7 +122,21 @@ class ColourDeconvolver(Protocol):
     def deconvolve_planes(
         self, blurred: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor]
     ) -> Planes:
-        """Estimate the latent planes inside the frame."""
+        """Estimate the latent planes inside the frame.
+
+        Parameters
+        ----------
+        blurred : Planes, shape (3, H, W), float32
+            Linear light.
+        blurs : sequence of UniformBlur
+            One for each channel.
+        sensors : sequence of Sensor
+            One for each channel.
+
+        Returns
+        -------
+        Planes, shape (3, H, W), float32
+        """
 
 
 @runtime_checkable
@@ -124,7 +168,22 @@ class WarpableMethod(Protocol):
 def restore_planes(
     method: Deconvolver, blurred: Planes, blurs: Sequence[UniformBlur], sensors: Sequence[Sensor]
 ) -> Planes:
-    """Restore `(channel, row, col)` planes: together if the method can, else one by one."""
+    """Restore planes: together if the method can, else one by one.
+
+    Parameters
+    ----------
+    method : Deconvolver
+    blurred : Planes, shape (3, H, W), float32
+        Linear light.
+    blurs : sequence of UniformBlur
+        One for each channel.
+    sensors : sequence of Sensor
+        One for each channel.
+
+    Returns
+    -------
+    Planes, shape (3, H, W), float32
+    """
     if isinstance(method, ColourDeconvolver):
         return method.deconvolve_planes(blurred, blurs, sensors)
     restored = [

@@ -53,7 +53,15 @@ class PsfEstimate:
 
 
 class PsfEstimator(Protocol):
-    """A blind estimator: patches of one field position in, one kernel out."""
+    """A blind estimator: patches of one field position in, one kernel out.
+
+    Attributes
+    ----------
+    name : str
+        As in the registry; stored with each sample.
+    version : int
+        Grows when results change.
+    """
 
     name: str
     version: int
@@ -82,6 +90,11 @@ class PsfEstimator(Protocol):
         on_step : StepHook
             Progress; raising `CancelledError` there stops the work.
 
+        Returns
+        -------
+        PsfEstimate
+            Its kernel is float64 of shape (size, size), with sum 1 and its centre of mass in the middle.
+
         Raises
         ------
         NotEnoughEvidenceError
@@ -101,7 +114,30 @@ class PsfEstimator(Protocol):
         rng: np.random.Generator | None = None,
         on_step: StepHook = ignore_step,
     ) -> PsfEstimate:
-        """Estimate another channel of the same patches, starting from the result of the first."""
+        """Estimate another channel of the same patches, starting from the result of the first.
+
+        Parameters
+        ----------
+        patches : sequence of Plane
+            The windows in this channel, linear light.
+        noise : sequence of NoiseModel
+            One for each patch.
+        reference : PsfEstimate
+            What `estimate` gave for the first channel.
+        reference_patches : sequence of Plane
+            The same windows in the first channel.
+        size, rng, on_step
+            As of `estimate`.
+
+        Returns
+        -------
+        PsfEstimate
+
+        Raises
+        ------
+        NotEnoughEvidenceError
+            If no patch determines a kernel in this channel.
+        """
 
 
 LARGEST: Final = 55

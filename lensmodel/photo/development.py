@@ -36,6 +36,12 @@ def develop(path: Path | str, *, limits: Limits | None = None, demosaic: Demosai
     demosaic : {"default", "ahd", "dht", "linear", "half"}
         Demosaicing of RAW; "half" makes one pixel of each 2 x 2 cell, without interpolation.
 
+    Returns
+    -------
+    LinearPhoto
+        `.planes` is float32 of shape (3, height, width): linear light, black 0 and saturation 1, in sensor
+        orientation; with the noise of each plane, metadata and encoding.
+
     Raises
     ------
     UnreadablePhotoError

@@ -57,6 +57,14 @@ class LensIdentity:
 
     A serial is never blank and never a placeholder such as "0000000000": then it is `None`
     and `serial_source` is "none".
+
+    Parameters
+    ----------
+    maker, model : str or None
+        As the file names them.
+    serial : str or None
+    serial_source : str
+        Which tag the serial is from, or "none".
     """
 
     maker: str | None = None
@@ -107,7 +115,12 @@ class PhotoMetadata:
     pixel_pitch_um: float | None = None
 
     def without_serials(self) -> PhotoMetadata:
-        """Return the same without the serials of body and lens, which are personal data."""
+        """Return the same without the serials of body and lens, which are personal data.
+
+        Returns
+        -------
+        PhotoMetadata
+        """
         return replace(self, body_serial=None, lens=replace(self.lens, serial=None, serial_source="none"))
 
 
@@ -252,7 +265,7 @@ class LinearPhoto:
         That of the sensor where it is known. Demosaicing, denoising and compression leave less of it in
         a pixel than there is in a patch, and make errors of their own where there is detail. Where a
         camera's denoising took the fine grain and left the coarse one, that counts, or a correction that
-        was told of the fine one alone would take it for a scene and sharpen it.
+        knew the fine one alone would take it for a scene and sharpen it.
         """
         if self.sensor_noise is not None:
             return self.sensor_noise

@@ -87,7 +87,17 @@ class EdgeResponse:
         return min(folded, 90.0 - folded)
 
     def contrast(self, frequencies: ArrayLike) -> NDArray[np.float64]:
-        """Contrast at any frequencies in cycles/pixel, linearly interpolated."""
+        """Contrast at any frequencies in cycles/pixel, linearly interpolated.
+
+        Parameters
+        ----------
+        frequencies : array_like, shape (n,)
+            Cycles/pixel.
+
+        Returns
+        -------
+        ndarray of float64, shape (n,)
+        """
         return np.interp(np.asarray(frequencies, dtype=np.float64), self.frequencies, self.mtf)
 
     def compensated(self) -> EdgeResponse:
@@ -96,6 +106,10 @@ class EdgeResponse:
         A chart that is rendered pixel by pixel has been integrated over the pixel once already::
 
             mtf / (|sinc(f cos)| |sinc(f sin)|)
+
+        Returns
+        -------
+        EdgeResponse
         """
         return _response(
             self.frequencies,
@@ -105,13 +119,37 @@ class EdgeResponse:
 
 
 def pixel_mtf(frequencies: ArrayLike, angle: float) -> NDArray[np.float64]:
-    """Contrast that a square pixel leaves of a wave whose normal has this angle."""
+    """Contrast that a square pixel leaves of a wave whose normal has this angle.
+
+    Parameters
+    ----------
+    frequencies : array_like, shape (n,)
+        Cycles/pixel.
+    angle : float
+        Radians, counter-clockwise from the right.
+
+    Returns
+    -------
+    ndarray of float64, shape (n,)
+    """
     f = np.asarray(frequencies, dtype=np.float64)
     return np.abs(np.sinc(f * math.cos(angle)) * np.sinc(f * math.sin(angle)))
 
 
 def crossing(frequencies: ArrayLike, contrast: ArrayLike, level: float) -> float:
-    """First frequency where `contrast` falls to `level`, linearly interpolated; the last if never."""
+    """First frequency where `contrast` falls to `level`, linearly interpolated; the last if never.
+
+    Parameters
+    ----------
+    frequencies, contrast : array_like, shape (n,)
+        Frequencies ascend.
+    level : float
+
+    Returns
+    -------
+    float
+        In the unit of the frequencies.
+    """
     f, c = np.asarray(frequencies, dtype=np.float64), np.asarray(contrast, dtype=np.float64)
     below = np.flatnonzero(c < level)
     below = below[below > 0]

@@ -20,7 +20,17 @@ _SHIFT_WINDOW: Final = 1024  # pixels: the middle says as much as the whole
 
 
 def to_srgb(linear: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Linear light, clipped to 0..1, with the sRGB curve (IEC 61966-2-1): what an eye compares."""
+    """Linear light, clipped to 0..1, with the sRGB curve (IEC 61966-2-1): what an eye compares.
+
+    Parameters
+    ----------
+    linear : ndarray
+        Linear light, saturation 1.
+
+    Returns
+    -------
+    ndarray of float64, same shape, 0..1
+    """
     v = np.clip(np.asarray(linear, dtype=np.float64), 0.0, 1.0)
     return np.where(v <= 0.0031308, 12.92 * v, 1.055 * np.maximum(v, 0.0031308) ** (1.0 / 2.4) - 0.055)
 
@@ -52,6 +62,16 @@ def registered_zone_psnr(
         Pixels along the frame, and along each block, that do not count.
     block : int
         Side of a block; blocks overlap by two borders, so that all pixels inside count.
+
+    Returns
+    -------
+    dict of str to float
+        dB for a peak of 1, by zone; zones outside the picture are missing.
+
+    Raises
+    ------
+    InvalidInputError
+        If shapes differ, or the picture is too small for a block.
     """
     _same_shape(image, reference)
     if image.shape[-2:] != (frame.height, frame.width):
@@ -94,6 +114,21 @@ def best_shift(image: NDArray[np.floating], reference: NDArray[np.floating]) -> 
 
     Gauss-Newton on the sum of squared differences, s <- s - (G'G)^-1 G'(image(s) - reference), with
     G the picture's gradient; sub-pixel shifts are Fourier shifts of mirrored pictures.
+
+    Parameters
+    ----------
+    image, reference : ndarray, shape (..., H, W)
+        Linear light.
+
+    Returns
+    -------
+    tuple of float
+        Rows and columns; (0, 0) where nothing in the picture says.
+
+    Raises
+    ------
+    InvalidInputError
+        If shapes differ.
     """
     _same_shape(image, reference)
     rows, cols = (
@@ -121,7 +156,18 @@ def best_shift(image: NDArray[np.floating], reference: NDArray[np.floating]) -> 
 
 
 def shifted(image: NDArray[np.floating], row: float, col: float) -> NDArray[np.float64]:
-    """Move a picture by a real-valued shift, mirrored at its borders; exact for what it resolves."""
+    """Move a picture by a real-valued shift, mirrored at its borders; exact for what it resolves.
+
+    Parameters
+    ----------
+    image : ndarray, shape (..., H, W)
+    row, col : float
+        Pixels, downwards and to the right.
+
+    Returns
+    -------
+    ndarray of float64, same shape
+    """
     picture = np.asarray(image, dtype=np.float64)
     if row == 0.0 and col == 0.0:
         return picture

@@ -94,6 +94,10 @@ def psf_grid(
     at : FieldPosition, optional
         A single place instead of the grid.
 
+    Returns
+    -------
+    PsfGrid
+
     Raises
     ------
     InvalidInputError
@@ -120,7 +124,16 @@ class Exporter(Protocol):
         """How names of such files end, with the dot."""
 
     def encode(self, psfs: PsfGrid) -> bytes:
-        """Return the content of the file."""
+        """Return the content of the file.
+
+        Parameters
+        ----------
+        psfs : PsfGrid
+
+        Returns
+        -------
+        bytes
+        """
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,13 +296,30 @@ exporters: Registry[Exporter] = Registry(
 
 
 def format_of(path: Path) -> str | None:
-    """Return the format that the name of a file ends in, None where that is no format of ours."""
+    """Return the format that the name of a file ends in, None where that is no format of ours.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    str or None
+    """
     ending = path.suffix.lower()
     return next((name for name in exporters if ending in {f".{name}", exporters.create(name).suffix}), None)
 
 
 def export(path: Path | str, psfs: PsfGrid, file_format: str) -> None:
     """Write a grid in a format; the file appears complete or not at all.
+
+    Parameters
+    ----------
+    path : Path or str
+        An existing file is replaced.
+    psfs : PsfGrid
+    file_format : str
+        A name in `exporters`.
 
     Raises
     ------

@@ -21,7 +21,17 @@ _TICKS: Final = tuple((i / 5, f"{i / 5:.1f}") for i in range(6))
 
 
 def mtf_map_svg(report: LensReport) -> str:
-    """Draw the mean MTF50 of each cell of the picture, upright, as SVG; a question mark is a guess."""
+    """Draw the mean MTF50 of each cell of the picture, upright, as SVG; a question mark is a guess.
+
+    Parameters
+    ----------
+    report : LensReport
+
+    Returns
+    -------
+    str
+        The text of an SVG file.
+    """
     title = f"MTF50 in cycles/pixel{_at(report)}"
     across = WIDTH - 2 * _MARGIN
     high = across / report.aspect
@@ -49,7 +59,17 @@ def mtf_map_svg(report: LensReport) -> str:
 
 
 def curves_svg(report: LensReport) -> str:
-    """Draw contrast over the radius, sagittal solid and tangential dashed, as SVG."""
+    """Draw contrast over the radius, sagittal solid and tangential dashed, as SVG.
+
+    Parameters
+    ----------
+    report : LensReport
+
+    Returns
+    -------
+    str
+        The text of an SVG file.
+    """
     title = f"Contrast over the picture{_at(report)}"
     axes = Axes(_LEFT, _TOP, WIDTH - _RIGHT, HEIGHT - _BOTTOM, (0.0, 1.0), (0.0, 1.0))
     parts: list[Part] = [Label(_LEFT, 24, title)]
@@ -65,7 +85,17 @@ def curves_svg(report: LensReport) -> str:
 
 
 def apertures_svg(report: LensReport) -> str:
-    """Draw MTF50 of centre, mid and corner over the apertures that photos had, as SVG."""
+    """Draw MTF50 of centre, mid and corner over the apertures that photos had, as SVG.
+
+    Parameters
+    ----------
+    report : LensReport
+
+    Returns
+    -------
+    str
+        The text of an SVG file.
+    """
     title = "MTF50 in cycles/pixel by aperture"
     rows = report.apertures
     values = [getattr(row, zone) for row in rows for zone in ZONES]

@@ -42,7 +42,7 @@ class Sensor:
 
     @property
     def units(self) -> tuple[Unit, ...]:
-        """The units that can be told."""
+        """The units that are known."""
         return tuple(unit for unit in UNIT_NAMES if self.factor(unit) is not None)
 
     def words(self, frequency: float, unit: Unit = "c/px") -> str:

@@ -76,7 +76,18 @@ class Aberrations:
                 raise InvalidInputError(f"{each.name} must be finite, got {getattr(self, each.name)}")
 
     def mixed(self, other: Aberrations, share: float) -> Aberrations:
-        """Optics between two focal lengths: every term linear in `share` of `other`."""
+        """Optics between two focal lengths: every term linear in `share` of `other`.
+
+        Parameters
+        ----------
+        other : Aberrations
+        share : float
+            0 gives these, 1 gives `other`.
+
+        Returns
+        -------
+        Aberrations
+        """
         values: dict[str, Any] = {}
         for each in fields(self):
             a, b = np.asarray(getattr(self, each.name)), np.asarray(getattr(other, each.name))

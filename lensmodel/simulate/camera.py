@@ -112,23 +112,62 @@ class SimulatedCamera:
         return np.asarray(XYZ_TO_SRGB) / np.asarray(self.white_balance)[:, None]
 
     def channel_map(self) -> NDArray[np.intp]:
-        """Index into r, g, b of the colour filter over every pixel, `(height, width)`."""
+        """Index into r, g, b of the colour filter over every pixel, `(height, width)`.
+
+        Returns
+        -------
+        ndarray of int, shape (height, width)
+        """
         cell = np.array(["RGB".index(letter) for letter in self.pattern]).reshape(2, 2)
         return np.tile(cell, (self.height // 2, self.width // 2))
 
     def balanced(self, planes: Planes) -> Planes:
-        """What the sensor sees of a scene: each channel over its white balance multiplier."""
+        """What the sensor sees of a scene: each channel over its white balance multiplier.
+
+        Parameters
+        ----------
+        planes : Planes, shape (3, H, W), float32
+            White-balanced linear light.
+
+        Returns
+        -------
+        Planes, shape (3, H, W), float32
+        """
         gains = np.asarray(self.white_balance, dtype=np.float32)[:, None, None]
         return np.ascontiguousarray(planes / gains)
 
     def mosaic(self, planes: Planes, rng: np.random.Generator | None) -> NDArray[np.uint16]:
-        """Raw numbers of the light `planes` (sensor values, saturation 1); no noise without `rng`."""
+        """Raw numbers of the light `planes` (sensor values, saturation 1); no noise without `rng`.
+
+        Parameters
+        ----------
+        planes : Planes, shape (3, H, W), float32
+            Sensor values.
+        rng : numpy.random.Generator or None
+            Source of the noise.
+
+        Returns
+        -------
+        ndarray of uint16, shape (H, W)
+        """
         self._check(planes)
         light = np.take_along_axis(planes, self.channel_map()[None], axis=0)[0]
         return self._numbers(self._noisy(light, rng))
 
     def develop(self, planes: Planes, rng: np.random.Generator | None) -> Planes:
-        """Three full planes with noise, quantised and clipped at 1: a sensor without a mosaic."""
+        """Three full planes with noise, quantised and clipped at 1: a sensor without a mosaic.
+
+        Parameters
+        ----------
+        planes : Planes, shape (3, H, W), float32
+            Sensor values.
+        rng : numpy.random.Generator or None
+            Source of the noise; None makes none.
+
+        Returns
+        -------
+        Planes, shape (3, H, W), float32
+        """
         self._check(planes)
         numbers = self._numbers(self._noisy(planes, rng)).astype(np.float32)
         return (numbers - np.float32(self.black)) / np.float32(self.white - self.black)

@@ -86,6 +86,11 @@ def edge_area(rows: NDArray[np.floating], cols: NDArray[np.floating], normal: fl
         Pixel centres relative to the edge's point, broadcasting together.
     normal : float
         Angle of the normal, counter-clockwise from the right, pointing to the bright side.
+
+    Returns
+    -------
+    ndarray of float64
+        0 dark to 1 bright.
     """
     distance = np.asarray(cols) * math.cos(normal) - np.asarray(rows) * math.sin(normal)
     a, b = abs(math.cos(normal)), abs(math.sin(normal))
@@ -103,7 +108,21 @@ def edge_area(rows: NDArray[np.floating], cols: NDArray[np.floating], normal: fl
 def slanted_edge_scene(
     height: int, width: int, normal: float, *, dark: float = 0.2, bright: float = 0.8
 ) -> NDArray[np.float32]:
-    """One plane with one edge through its middle; see `edge_area`."""
+    """One plane with one edge through its middle; see `edge_area`.
+
+    Parameters
+    ----------
+    height, width : int
+        Pixels.
+    normal : float
+        Angle of the normal in radians, pointing to the bright side.
+    dark, bright : float
+        Linear light.
+
+    Returns
+    -------
+    ndarray of float32, shape (height, width)
+    """
     rows = (np.arange(height) - (height - 1) / 2.0)[:, None]
     cols = (np.arange(width) - (width - 1) / 2.0)[None, :]
     return (dark + (bright - dark) * edge_area(rows, cols, normal)).astype(np.float32)

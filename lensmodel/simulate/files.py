@@ -14,7 +14,19 @@ _BASE_ISO_ELECTRONS = 40000.0  # full well at ISO 100
 
 
 def shot_info(photo: SimulatedPhoto, *, taken_at: datetime | None = None, orientation: int = 1) -> ShotInfo:
-    """Metadata of a simulated photo as its camera would write it."""
+    """Metadata of a simulated photo as its camera would write it.
+
+    Parameters
+    ----------
+    photo : SimulatedPhoto
+    taken_at : datetime, optional
+    orientation : int
+        EXIF orientation, 1 to 8.
+
+    Returns
+    -------
+    ShotInfo
+    """
     truth = photo.truth
     lens, camera, settings = truth.lens, truth.camera, truth.settings
     widest = lens.widest(lens.focal_mm[0]), lens.widest(lens.focal_mm[-1])

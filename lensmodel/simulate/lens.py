@@ -112,6 +112,14 @@ class SimulatedLens:
     def at_focal(self, focal_mm: float | None = None) -> Aberrations:
         """Optics at a focal length; None means the shortest.
 
+        Parameters
+        ----------
+        focal_mm : float, optional
+
+        Returns
+        -------
+        Aberrations
+
         Raises
         ------
         InvalidInputError
@@ -225,7 +233,21 @@ class SimulatedLens:
         pitch_um: float = DEFAULT_PITCH_UM,
         defocus: float = 0.0,
     ) -> SimulatedField:
-        """The exact PSF of every place and channel at these settings, remembering what was asked."""
+        """The exact PSF of every place and channel at these settings, remembering what was asked.
+
+        Parameters
+        ----------
+        settings : LensSettings, optional
+            Default: wide open.
+        pitch_um : float
+            Pixel pitch of the camera in micrometres.
+        defocus : float
+            As of `kernel`.
+
+        Returns
+        -------
+        SimulatedField
+        """
         return SimulatedField(self, settings or LensSettings(), pitch_um, defocus)
 
     def transmission(self, h: tuple[float, float], settings: LensSettings) -> float:
@@ -245,7 +267,17 @@ class SimulatedLens:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedField:
-    """The PSF field of a simulated lens at one setting: the truth, in the shape of a `PsfField`."""
+    """The PSF field of a simulated lens at one setting: the truth, in the shape of a `PsfField`.
+
+    Parameters
+    ----------
+    lens : SimulatedLens
+    settings : LensSettings
+    pitch_um : float
+        Pixel pitch of the camera in micrometres.
+    defocus : float
+        As of `SimulatedLens.kernel`.
+    """
 
     lens: SimulatedLens
     settings: LensSettings
@@ -254,7 +286,19 @@ class SimulatedField:
     _known: dict[tuple[float, float, Channel, int], Kernel] = field(default_factory=dict, repr=False)
 
     def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
-        """Return the exact kernel of odd side `size`; see `SimulatedLens.kernel`."""
+        """Return the exact kernel of odd side `size`; see `SimulatedLens.kernel`.
+
+        Parameters
+        ----------
+        position : FieldPosition
+        channel : {"r", "g", "b"}
+        size : int
+            Odd side in pixels.
+
+        Returns
+        -------
+        Kernel, shape (size, size)
+        """
         key = (position.r, position.phi, channel, size)
         if key not in self._known:
             self._known[key] = self.lens.kernel(

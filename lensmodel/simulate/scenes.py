@@ -21,7 +21,17 @@ DEMO_SCENES: Final = ("city", "colosseum", "lake", "spices", "tea-gardens")
 
 
 def srgb_to_linear(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Undo the sRGB curve (IEC 61966-2-1) on values in 0..1."""
+    """Undo the sRGB curve (IEC 61966-2-1) on values in 0..1.
+
+    Parameters
+    ----------
+    values : ndarray
+        Coded values, 0..1.
+
+    Returns
+    -------
+    ndarray of float32, same shape
+    """
     v = np.asarray(values, dtype=np.float32)
     high = ((np.maximum(v, 0.04045) + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4)
     return np.where(v <= 0.04045, v / np.float32(12.92), high).astype(np.float32)
@@ -29,6 +39,10 @@ def srgb_to_linear(values: NDArray[np.floating]) -> NDArray[np.float32]:
 
 def load_scene(path: str | Path) -> Planes:
     """Load an sRGB photograph (PNG, JPEG, TIFF of 8 bits) as linear light.
+
+    Parameters
+    ----------
+    path : str or Path
 
     Returns
     -------
@@ -51,6 +65,15 @@ def load_scene(path: str | Path) -> Planes:
 def demo_data_path(name: str) -> Path:
     """Path of a file of `lensmodel/demo_data`; see its README for origin and licences.
 
+    Parameters
+    ----------
+    name : str
+        Of the file.
+
+    Returns
+    -------
+    Path
+
     Raises
     ------
     InvalidInputError
@@ -71,6 +94,15 @@ def demo_data_path(name: str) -> Path:
 
 def demo_scene(name: str) -> Planes:
     """Photograph of `DEMO_SCENES` as linear light, `(3, H, W)`.
+
+    Parameters
+    ----------
+    name : str
+        One of `DEMO_SCENES`.
+
+    Returns
+    -------
+    Planes, shape (3, H, W), float32
 
     Raises
     ------

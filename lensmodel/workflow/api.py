@@ -53,7 +53,7 @@ def calibrate(
 ) -> Lens:
     """Learn the blur of one lens from photos taken with it (Hirsch and Schölkopf, ICCV 2015).
 
-    Photos that cannot help are passed over, and `on_event` is told why: unreadable, too little detail, no
+    Photos that cannot help are passed over, and `on_event` learns why: unreadable, too little detail, no
     aperture, of another lens. One that the lens knows already is passed over too.
 
     Parameters

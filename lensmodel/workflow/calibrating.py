@@ -48,8 +48,15 @@ AHEAD: Final = 32
 class CalibrationEvent:
     """What just happened in a calibration, for progress displays.
 
-    `stage` is one of developing, selecting, estimating, counted, skipped; `done` of `total`
-    counts patches while estimating.
+    Parameters
+    ----------
+    photo : Path
+    stage : {"developing", "selecting", "estimating", "counted", "skipped"}
+        The last two end the work on a photo.
+    done, total : int
+        Patches, while estimating; else 0.
+    detail : str
+        Why a photo was skipped.
     """
 
     photo: Path

@@ -48,7 +48,7 @@ def difference(known: Mapping[str, str], cameras: Iterable[Camera], identity: Id
     - Where the photo names no lens, its camera must be one that the profile's photos were taken with: the
       lens of a compact is part of it, and two models of camera have two lenses. On the same body an
       unnamed lens may be any that was screwed on; that is for the owner to know.
-    - Where only the photo names its lens, its camera told more than it told the profile's photos, so
+    - Where only the photo names its lens, its camera recorded more than for the profile's photos, so
       nothing says that they are of one lens, unless the owner gave the profile a label.
 
     Parameters

@@ -22,6 +22,7 @@ from lensmodel.model import (
     save_profile,
 )
 from lensmodel.quality import mtf50_from_kernel, mtf_from_kernel
+from lensmodel.workflow.field_grid import field_grid
 from lensmodel.workflow.identity import Identity
 
 DEFAULT_SIZE = 55
@@ -146,6 +147,11 @@ class Lens:
             What the new photos say of lens and camera.
         any_lens : bool
             The photos may be of other lenses, so they do not name this one.
+
+        Returns
+        -------
+        Lens
+            With the names, cameras and photos of both.
         """
         known = None if lens is None else lens.profile
         names = {} if known is None else dict(known.lens)
@@ -162,6 +168,15 @@ class Lens:
     def load(cls, path: Path | str) -> Lens:
         """Open a lens profile.
 
+        Parameters
+        ----------
+        path : path
+            A file that `save` or the command wrote.
+
+        Returns
+        -------
+        Lens
+
         Raises
         ------
         InvalidInputError
@@ -175,16 +190,30 @@ class Lens:
         """Write the lens to a file, by custom `*.lensprofile`; it appears complete or not at all.
 
         A file of that name is replaced. The format is plain JSON and npy in a zip: no pickle, no code.
+
+        Parameters
+        ----------
+        path : path
+            Its folder must exist.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written.
         """
         save_profile(path, self.profile)
 
     def warmed(self) -> Lens:
-        """Return the lens with all fitted that takes long and is fitted once; `calibrate` did so."""
-        return (
-            self
-            if self.model.warm
-            else replace(self, profile=replace(self.profile, model=self.model.warmed()))
-        )
+        """Return the lens with all fitted that takes long and is fitted once; `calibrate` did so.
+
+        Returns
+        -------
+        Lens
+            This one if nothing is left to fit.
+        """
+        if self.model.warm:
+            return self
+        return replace(self, profile=replace(self.profile, model=self.model.warmed()))
 
     def psf(
         self,
@@ -354,36 +383,6 @@ class Lens:
         words = [self.profile.lens[key] for key in ("maker", "model") if self.profile.lens.get(key)]
         count = len(self.profile.photos)
         return f"{' '.join(words) or 'unknown lens'}, profile of {count} photo{'' if count == 1 else 's'}"
-
-
-def field_grid(
-    rows: int, cols: int, *, aspect: float = 1.5
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the field positions of the centres of equal cells of a picture.
-
-    Parameters
-    ----------
-    rows, cols : int
-        Number of cells.
-    aspect : float
-        Width over height of the picture.
-
-    Returns
-    -------
-    r, phi : ndarray of float64, shape (rows, cols)
-        Half diagonals, and radians; row 0 is the top in sensor orientation.
-
-    Raises
-    ------
-    InvalidInputError
-        If there are no cells, or the aspect is not positive.
-    """
-    if rows < 1 or cols < 1 or not aspect > 0.0:
-        raise InvalidInputError(f"a grid needs cells and an aspect, got {rows} x {cols}, aspect {aspect}")
-    half = np.hypot(aspect, 1.0)
-    up = (1.0 - (2.0 * np.arange(rows) + 1.0) / rows)[:, None] / half
-    right = ((2.0 * np.arange(cols) + 1.0) / cols - 1.0)[None, :] * aspect / half
-    return np.hypot(up, right), np.arctan2(up + 0.0 * right, right + 0.0 * up)
 
 
 def _each(values: ArrayLike, n: int, name: str) -> list[float]:

@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,8 @@ from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.psf import centroid, gaussian
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.workflow.lens import Lens, field_grid
+from lensmodel.workflow.field_grid import field_grid
+from lensmodel.workflow.lens import Lens
 
 NAMES = [
     "Bounds",
@@ -106,16 +108,44 @@ def test_a_public_signature_is_as_announced(name: str) -> None:
     assert parameters(public(name)) == SIGNATURES[name]
 
 
-@pytest.mark.parametrize(
-    "name", ["calibrate", "correct", "photo_from_array", "Lens.from_kernels", "Lens.psf"]
-)
-def test_a_public_function_documents_each_parameter_and_its_errors(name: str) -> None:
-    text = inspect.getdoc(public(name)) or ""
+FUNCTIONS = [name for name in NAMES if inspect.isfunction(public(name))] + [
+    f"{name}.{method}"
+    for name in NAMES
+    if inspect.isclass(public(name))
+    for method, value in vars(public(name)).items()
+    if not method.startswith("_") and isinstance(value, FunctionType | classmethod | staticmethod)
+]
+"""The public functions and methods."""
 
-    for parameter in set(inspect.signature(public(name)).parameters) - {"self"}:
-        assert parameter in text
-    for section in ("Parameters", "Returns", "Raises"):
-        assert f"{section}\n---" in text
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_public_function_documents_each_parameter_and_what_it_returns(name: str) -> None:
+    text, signature = inspect.getdoc(public(name)) or "", inspect.signature(public(name))
+    given = set(signature.parameters) - {"self"}
+
+    assert [parameter for parameter in sorted(given) if parameter not in text] == []
+    assert "Parameters\n---" in text or not given
+    assert "Returns\n---" in text or signature.return_annotation in {"None", "Self"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("calibrate", "correct", "develop", "field_grid", "photo_from_array"),
+        *("Deconvolver.deconvolve", "PsfEstimator.estimate", "PsfEstimator.estimate_channel"),
+        *(
+            "Lens.from_kernels",
+            "Lens.kernels",
+            "Lens.load",
+            "Lens.mtf",
+            "Lens.mtf50_map",
+            "Lens.psf",
+            "Lens.save",
+        ),
+    ],
+)
+def test_a_public_function_documents_its_errors(name: str) -> None:
+    assert "Raises\n---" in (inspect.getdoc(public(name)) or "")
 
 
 def test_an_unknown_name_is_no_attribute() -> None:

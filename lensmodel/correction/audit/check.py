@@ -224,11 +224,27 @@ class TileAudit:
 
     @classmethod
     def of(cls, keep: Plane, findings: tuple[Finding, ...]) -> TileAudit:
-        """Take the mean of a map."""
+        """Take the mean of a map.
+
+        Parameters
+        ----------
+        keep : Plane
+            Share of the correction to keep, 0..1.
+        findings : tuple of Finding
+
+        Returns
+        -------
+        TileAudit
+        """
         return cls(keep, findings, float(1.0 - keep.mean(dtype=np.float64)))
 
     def without_map(self) -> TileAudit:
-        """Return the figures alone, for a report: the maps of all tiles are as large as a photo's plane."""
+        """Return the figures alone, for a report: the maps of all tiles are as large as a photo's plane.
+
+        Returns
+        -------
+        TileAudit
+        """
         return replace(self, keep=np.zeros((0, 0), dtype=np.float32))
 
     @property

@@ -113,6 +113,10 @@ def pooled(audits: Iterable[tuple[Zone, tuple[int, int], TileAudit]], tile_side:
         Zone of each tile and its first pixel in the photo.
     tile_side : int
         Side of the square in pixels that a tile stands for.
+
+    Returns
+    -------
+    AuditReport
     """
     listed = list(audits)
     zones: dict[Zone, ZoneAudit] = {}

@@ -41,7 +41,17 @@ class PhotoAudit:
     report: AuditReport
 
     def mixed(self, original: Planes, corrected: Planes) -> Planes:
-        """Mix a correction back towards its original as far as it fails."""
+        """Mix a correction back towards its original as far as it fails.
+
+        Parameters
+        ----------
+        original, corrected : Planes, shape (3, rows, cols), float32
+            The photo and its correction.
+
+        Returns
+        -------
+        Planes, shape (3, rows, cols), float32
+        """
         return np.asarray(original + self.keep * (corrected - original), dtype=np.float32)
 
 
@@ -58,6 +68,10 @@ def audit_photo(
         What is known at a place: noise, clip levels, PSFs if any, where the sensor measured.
     on_step : StepHook
         Called after each tile; may raise to stop.
+
+    Returns
+    -------
+    PhotoAudit
 
     Raises
     ------

@@ -34,7 +34,17 @@ class Drift:
     origin: tuple[float, float]
 
     def spectra(self, shape: tuple[int, int]) -> NDArray[np.complex64]:
-        """Transfer functions of k_down and k_across on the `rfft2` grid of `shape`, `(2, rows, cols)`."""
+        """Transfer functions of k_down and k_across on the `rfft2` grid of `shape`, `(2, rows, cols)`.
+
+        Parameters
+        ----------
+        shape : tuple of int
+            Rows and columns of the plane.
+
+        Returns
+        -------
+        ndarray of complex64, shape (2, rows, cols // 2 + 1)
+        """
         rates = [
             _change(before, after, shape) / np.float32(max(pixels, 1.0))
             for before, after, pixels in (self.down, self.across)
@@ -88,18 +98,47 @@ class UniformBlur:
         return int(self.kernel.shape[0] // 2) + math.ceil(beyond) + (beyond != math.floor(beyond))
 
     def spectrum(self, shape: tuple[int, int]) -> NDArray[np.complex64]:
-        """Transfer function on the `rfft2` grid of `shape`, cached."""
+        """Transfer function on the `rfft2` grid of `shape`, cached.
+
+        Parameters
+        ----------
+        shape : tuple of int
+            Rows and columns, no smaller than the kernel.
+
+        Returns
+        -------
+        ndarray of complex64, shape (rows, cols // 2 + 1)
+        """
         if shape not in self._spectra:
             self._spectra[shape] = self.transfer(shape).astype(np.complex64)
         return self._spectra[shape]
 
     def transfer(self, shape: tuple[int, int]) -> NDArray[np.complex128]:
-        """Transfer function on the `rfft2` grid of `shape`, not cached."""
+        """Transfer function on the `rfft2` grid of `shape`, not cached.
+
+        Parameters
+        ----------
+        shape : tuple of int
+            Rows and columns, no smaller than the kernel.
+
+        Returns
+        -------
+        ndarray of complex128, shape (rows, cols // 2 + 1)
+        """
         spectrum = otf(self.kernel, shape)
         return spectrum * _phase(self.offset, shape) if self.offset != (0.0, 0.0) else spectrum
 
     def forward(self, latent: Plane) -> Plane:
-        """Return k * x where every pixel of the kernel meets data: `(h + k - 1, ...)` to `(h, ...)`."""
+        """Return k * x where every pixel of the kernel meets data: `(h + k - 1, ...)` to `(h, ...)`.
+
+        Parameters
+        ----------
+        latent : Plane, float32
+
+        Returns
+        -------
+        Plane, float32
+        """
         if min(latent.shape) <= 2 * self.reach:
             raise InvalidInputError(
                 f"a latent plane of {latent.shape} leaves no frame inside a kernel that reaches {self.reach}"
@@ -110,7 +149,16 @@ class UniformBlur:
         return np.ascontiguousarray(self.frame(blurred), dtype=np.float32)
 
     def adjoint(self, blurred: Plane) -> Plane:
-        """Return the correlation of y with k on the latent plane: `(h, ...)` to `(h + k - 1, ...)`."""
+        """Return the correlation of y with k on the latent plane: `(h, ...)` to `(h + k - 1, ...)`.
+
+        Parameters
+        ----------
+        blurred : Plane, float32
+
+        Returns
+        -------
+        Plane, float32
+        """
         latent = np.pad(blurred, self.reach)
         shape = fast_shape(latent.shape)
         spectrum = fft.rfft2(latent, shape) * np.conj(self.spectrum(shape))
@@ -122,6 +170,16 @@ class UniformBlur:
 
         A point sees a rectangle of the kernel, so cumulative sums suffice and no transform is needed,
         except for a shift by parts of a pixel.
+
+        Parameters
+        ----------
+        shape : tuple of int
+            Of the frame.
+
+        Returns
+        -------
+        Plane, float32
+            Wider than the frame by the side of the kernel less 1.
         """
         if self.offset != (0.0, 0.0):
             return self.adjoint(np.ones(shape, dtype=np.float32))
@@ -141,7 +199,16 @@ class UniformBlur:
         return inside.astype(np.float32)[np.ix_(*kinds)]
 
     def frame(self, latent: Plane) -> Plane:
-        """Return the part of the latent plane that the photo shows."""
+        """Return the part of the latent plane that the photo shows.
+
+        Parameters
+        ----------
+        latent : Plane
+
+        Returns
+        -------
+        Plane
+        """
         cut = self.reach
         return latent[cut : latent.shape[0] - cut, cut : latent.shape[1] - cut]
 

@@ -69,9 +69,25 @@ class Bounds:
         errors: Sequence[float],
         spread: int,
     ) -> Planes:
-        """Hold the correction of the part of a photo that begins at `at` within these bounds.
+        """Hold the correction of a part of a photo within these bounds.
 
-        `spread` says how far the blur there spreads light, in pixels.
+        Parameters
+        ----------
+        planes : Planes, shape (3, H, W), float32
+            The whole photo.
+        at : tuple of int
+            Row and column at which the part begins.
+        restored : Planes, shape (3, h, w), float32
+            The part as it was corrected.
+        errors : sequence of float
+            Expected relative L2 error of the kernel of each channel.
+        spread : int
+            How far the blur there spreads light, in pixels.
+
+        Returns
+        -------
+        Planes, shape (3, h, w), float32
+            `restored` itself where nothing bounds it.
         """
         if self.halo is None and max(errors) > 0.0:
             photo = photo_around(planes, at, restored, plateau_reach(spread))

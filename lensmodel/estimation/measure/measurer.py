@@ -77,6 +77,10 @@ class Measurer(Protocol):
         on_step : StepHook
             Called after each place.
 
+        Returns
+        -------
+        list of MeasuredPsf
+
         Raises
         ------
         InvalidInputError
@@ -97,6 +101,22 @@ def samples_of(
     """Make samples of measurements, as a `LensModel` takes them.
 
     The estimator is called `measured-NAME/VERSION`; the vote is full, the error is the measurement's own.
+
+    Parameters
+    ----------
+    measured : sequence of MeasuredPsf
+    method : Measurer
+        What made them.
+    photo : LinearPhoto
+        The one whose PSF was measured.
+    photo_id : str
+        Its name in the samples.
+    settings : LensSettings
+        Of the lens when it was taken.
+
+    Returns
+    -------
+    list of PsfSample
     """
     return [
         PsfSample(
@@ -115,12 +135,30 @@ def samples_of(
 
 
 def estimator_of(method: Measurer) -> str:
-    """Name and version as samples carry them."""
+    """Name and version as samples carry them.
+
+    Parameters
+    ----------
+    method : Measurer
+
+    Returns
+    -------
+    str
+    """
     return f"{PREFIX}{method.name}/{method.version}"
 
 
 def is_measured(sample: PsfSample) -> bool:
-    """Whether a sample was measured, and not estimated from an ordinary photo."""
+    """Whether a sample was measured, and not estimated from an ordinary photo.
+
+    Parameters
+    ----------
+    sample : PsfSample
+
+    Returns
+    -------
+    bool
+    """
     return sample.estimator.startswith(PREFIX)
 
 

@@ -97,14 +97,25 @@ class TargetPage:
 
     @cached_property
     def samples(self) -> NDArray[np.float32]:
-        """Reflectance at the samples, noise only, `shape`, ink 0 to paper 1."""
+        """Reflectance at the samples, noise only, `shape`, ink 0 to paper 1.
+
+        Returns
+        -------
+        ndarray of float32, shape `shape`
+        """
         rng = np.random.default_rng([_SEED, self.detail])
         noise = MEAN + CONTRAST * rng.standard_normal(self.shape)
         return np.clip(noise, 0.02, 0.98).astype(np.float32)
 
     @cached_property
     def raster(self) -> NDArray[np.float32]:
-        """The printed page, `DOTS` dots a sample; dot `d` lies at sample `d / DOTS`."""
+        """The printed page, `DOTS` dots a sample; dot `d` lies at sample `d / DOTS`.
+
+        Returns
+        -------
+        ndarray of float32
+            Ink 0 to paper 1.
+        """
         fine = np.clip(_finer(self.samples), INK, PAPER)
         height, width = fine.shape
         rows = np.arange(height, dtype=np.float32)[:, None] / DOTS
@@ -127,7 +138,18 @@ class TargetPage:
         return np.asarray(ndimage.spline_filter(self.raster, order=3, output=np.float32, mode="mirror"))
 
     def at(self, rows: NDArray[np.floating], cols: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Reflectance at places of the page, in samples; white beyond it."""
+        """Reflectance at places of the page, in samples; white beyond it.
+
+        Parameters
+        ----------
+        rows, cols : ndarray
+            Places, broadcasting together.
+
+        Returns
+        -------
+        ndarray of float32
+            Ink 0 to paper 1.
+        """
         places = np.stack([np.asarray(rows), np.asarray(cols)]) * DOTS
         reflectance = ndimage.map_coordinates(
             self._spline, places, order=3, prefilter=False, mode="constant", cval=PAPER, output=np.float32
@@ -135,7 +157,17 @@ class TargetPage:
         return np.asarray(reflectance, dtype=np.float32)
 
     def holds_noise(self, rows: NDArray[np.floating], cols: NDArray[np.floating]) -> bool:
-        """Whether noise, and nothing else, lies at all of these places."""
+        """Whether noise, and nothing else, lies at all of these places.
+
+        Parameters
+        ----------
+        rows, cols : ndarray
+            Places, in samples.
+
+        Returns
+        -------
+        bool
+        """
         last = self.shape[0] - 1, self.shape[1] - 1
         edge = self.border + 1.0
         inside = (rows > edge) & (rows < last[0] - edge) & (cols > edge) & (cols < last[1] - edge)

@@ -61,7 +61,20 @@ class Selector(Protocol):
     """Says how much each window tells about the PSF."""
 
     def score(self, windows: Windows, looked: Details) -> NDArray[np.float64]:
-        """Return one score in 0..1 a window, shape `(n,)`; higher tells more."""
+        """Score the windows of a photo.
+
+        Parameters
+        ----------
+        windows : Windows
+            n windows: where they lie, their edges, noise and clipping.
+        looked : Details
+            A second look at the same windows: spectrum, periods, blocks of JPEG.
+
+        Returns
+        -------
+        ndarray of float64, shape (n,)
+            0..1; higher tells more.
+        """
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,6 +40,11 @@ def sniff(head: bytes) -> FileKind:
     head : bytes
         The first `HEAD_BYTES` bytes of the file, or fewer where it is shorter.
 
+    Returns
+    -------
+    str
+        One of `FileKind`.
+
     Raises
     ------
     NotAnImageError

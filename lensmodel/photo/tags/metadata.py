@@ -54,6 +54,15 @@ def read_metadata(path: Path | str) -> PhotoMetadata:
 
     Unreadable metadata are unknown metadata; only a file that is no photo raises.
 
+    Parameters
+    ----------
+    path : Path or str
+        The file; its content decides what it is.
+
+    Returns
+    -------
+    PhotoMetadata
+
     Raises
     ------
     NotAnImageError, UnsupportedFormatError, TruncatedImageError
@@ -64,7 +73,16 @@ def read_metadata(path: Path | str) -> PhotoMetadata:
 
 
 def is_placeholder(serial: str) -> bool:
-    """Tell whether a serial is only what a camera writes when it knows none."""
+    """Tell whether a serial is only what a camera writes when it knows none.
+
+    Parameters
+    ----------
+    serial : str
+
+    Returns
+    -------
+    bool
+    """
     return _PLACEHOLDER.fullmatch(serial.strip()) is not None
 
 

@@ -22,6 +22,10 @@ from lensmodel.estimation.steps.recurrence import QUICK
 
 # Side of the kernel, alternations, side of the patches, where many are pooled (chosen, not measured)
 _POOLED_SUPPORT, _POOLED_ITERATIONS, _POOLED_SIDE = 21, 3, 160
+_USUAL_SIZE = 31  # pixels: who asks for larger kernels knows of blur that reaches far (chosen)
+# Half the side in widths of the Gaussian, which sees the core of wide blur alone, and the least side: first
+# for usual kernels, then for larger ones (chosen: a disc of 19 pixels looks like a Gaussian of 2.1)
+_REACH, _LEAST_SUPPORT = (3.0, 9.0), (15, 31)
 _STARTS, _STARTS_OF_CHANNEL = 10, 6  # random wavefronts for few patches (chosen, not measured)
 _PIXEL_SIGMA = 0.29  # pixels: standard deviation of a uniform pixel, 1/sqrt(12)
 _PER_WIDTH = 40.0
@@ -75,11 +79,15 @@ class Cautious:
         kept = usable(patches, noise, size)
         if len(kept) >= self.pooled:
             inner, models = [_middle(patch) for patch, _ in kept], [model for _, model in kept]
-            recurrence = PatchRecurrence(support=min(_POOLED_SUPPORT, size), iterations=_POOLED_ITERATIONS)
+            support = min(_POOLED_SUPPORT, size)
+            if size > _USUAL_SIZE:
+                width = Whittle().estimate(inner, models, size=size).diagnostics["width"]
+                support = max(support, _support(width, size))
+            recurrence = PatchRecurrence(support=support, iterations=_POOLED_ITERATIONS)
             from_recurrence = recurrence.estimate(inner, models, size=size, on_step=_half(on_step, 0))
             return self._agreed(kept, from_recurrence, began, size, on_step)
         gaussian = Whittle().estimate(patches, noise, size=size)
-        support = min(max(2 * round(3.0 * gaussian.diagnostics["width"] + 3.0) + 1, 15), 31, size)
+        support = _support(gaussian.diagnostics["width"], size)
         recurrence = PatchRecurrence(support=support, search=QUICK)
         from_recurrence = recurrence.estimate(patches, noise, size=size, on_step=_half(on_step, 0))
         return self._chosen(kept, gaussian, from_recurrence, began, size, on_step, _STARTS)
@@ -118,7 +126,9 @@ class Cautious:
         on_step: StepHook,
     ) -> PsfEstimate:
         """Kernel of the wavefront that many patches agree on."""
-        fitted = AberrationFit().fit(SceneSpectra.of(kept), from_recurrence.kernel, _half(on_step, 1))
+        fitted = AberrationFit(size=size).fit(
+            SceneSpectra.of(kept), from_recurrence.kernel, _half(on_step, 1)
+        )
         kernel = fitted.kernel(size)
         error = min(max(_POOLED_ERROR / math.sqrt(len(kept)), 0.05), 1.0)
         more = {
@@ -142,7 +152,11 @@ class Cautious:
         disagreement = distance(from_recurrence.kernel, gaussian.kernel).mtf_rmse
         likelihood = SpectralLikelihood.of(kept)
         fit = AberrationFit(
-            weight=self.trust, temper=likelihood.temper, starts=starts, kept=max(starts // 5, 2)
+            weight=self.trust,
+            temper=likelihood.temper,
+            starts=starts,
+            kept=max(starts // 5, 2),
+            size=size,
         )
         fitted = fit.fit(likelihood.whole, from_recurrence.kernel, _half(on_step, 1), likelihood.local)
         options = {
@@ -192,6 +206,12 @@ def _reported(
         seconds=time.process_time() - began,
         no_blur=is_no_blur(kernel),
     )
+
+
+def _support(width: float, size: int) -> int:
+    """Odd side of the kernel of patch recurrence, by the width of the Gaussian and the size asked for."""
+    reach, least = _REACH[size > _USUAL_SIZE], _LEAST_SUPPORT[size > _USUAL_SIZE]
+    return min(max(2 * round(reach * width + 3.0) + 1, least), size)
 
 
 def _middle(patch: Plane) -> Plane:

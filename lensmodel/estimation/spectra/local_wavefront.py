@@ -62,6 +62,8 @@ class AberrationFit:
         So many of the best go on for at most `rounds` steps; only these see local spectra.
     parts : float
         Share of the likelihood of local spectra that counts.
+    size : int
+        Odd side of the kernels that are asked for; where it is the largest of all, it is fitted on.
     """
 
     weight: float = 20.0
@@ -72,6 +74,7 @@ class AberrationFit:
     kept: int = 8
     rounds: int = 12
     parts: float = 0.02
+    size: int = 31
 
     def fit(
         self,
@@ -93,7 +96,8 @@ class AberrationFit:
             Spectra of small tiles of the same patches.
         """
         width = max(rms_width(reference), 0.3)
-        pupil = Pupil.of(_SIDES[width > _WIDE_PX])
+        usual, wide = _SIDES
+        pupil = Pupil.of(self.size if self.size > wide else wide if width > _WIDE_PX else usual)
         target = resized(reference, pupil.size)
         rng = np.random.default_rng(_SEED)
         total = self.starts + self.kept + 1

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -40,6 +40,7 @@ from lensmodel.model.wavefront.likelihood import surprise
 from lensmodel.optics.wavefront import Wavefront
 
 _MOST = 240  # samples of the remainder's process: its cost grows with their cube (chosen)
+_USUAL_SIDE = 31  # pixels: larger kernels are estimated where blur is known to reach far (chosen)
 _AROUND = 6  # pixels beyond the side that was fitted, for corners wider than every sample
 _NOTHING_LEFT = 1e3  # a nugget so large that the wavefront answers alone
 _WORST = 1.5  # relative errors beyond count no more than this: one outlier chooses nothing (chosen)
@@ -126,8 +127,10 @@ class Physics:
         if pooled is not None and _suits(pooled, trusted):
             side = max(s.kernel.shape[0] for s in samples)
             empty = np.empty((0, 2)), np.empty((0, len(scale))), scale, np.empty((0, side**2))
+            # spectra tell of wings that kernels estimated one by one have not
+            whole = pooled.front if side <= _USUAL_SIDE else replace(pooled.front, size=side)
             return cls(
-                *(pooled.front, side, *empty, pooled.errors(samples)),
+                *(whole, side, *empty, pooled.errors(samples)),
                 agreed=True,
                 diffraction_known=pooled.diffraction_known,
                 turned=pooled.turned,

@@ -7,7 +7,16 @@ from scipy import signal
 from lensmodel import estimation
 from lensmodel.core.errors import CancelledError, InvalidInputError, LensModelError, NotEnoughEvidenceError
 from lensmodel.core.least_squares import nonnegative_least_squares
-from lensmodel.core.psf import centroid, delta, distance, gaussian, rms_width
+from lensmodel.core.psf import (
+    as_kernel,
+    centred,
+    centroid,
+    delta,
+    distance,
+    gaussian,
+    resized,
+    rms_width,
+)
 from lensmodel.core.types import NoiseModel, Plane
 from lensmodel.estimation.methods.patch_recurrence import normal_equations
 from lensmodel.estimation.steps.recurrence import blend, recur
@@ -87,6 +96,63 @@ def test_impossible_input_is_refused_by_name(name: str) -> None:
     for wrong, size in ((y[:20, :20], 15), (broken, 15), (y, 16), (y, 99)):
         with pytest.raises(InvalidInputError):
             method.estimate([wrong], [noise], size=size)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] if name == "michaeli-irani" else [])
+        for name in estimation.estimators
+    ],
+)
+def test_every_registered_estimator_gives_kernels_of_55_pixels(name: str) -> None:
+    y = patch(gaussian(15, 1.5 * np.eye(2)), side=128)
+    found = estimation.estimators.create(name).estimate([y], [NoiseModel.white(SIGMA)], size=55)
+
+    assert found.kernel.shape == (55, 55)
+    assert found.kernel.sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("name", list(estimation.estimators))
+def test_kernels_of_57_pixels_are_refused_with_the_range(name: str) -> None:
+    y = patch(gaussian(15, np.eye(2)))
+    with pytest.raises(InvalidInputError, match=r"odd and in 3\.\.55, got 57"):
+        estimation.estimators.create(name).estimate([y], [NoiseModel.white(SIGMA)], size=57)
+
+
+def tilted_disc(radius: float, size: int = 55) -> np.ndarray:
+    """A disc brighter on one side: half as bright at the left as in the middle, half again at the right."""
+    over = 8
+    at = (np.arange(size * over) - (size * over - 1) / 2.0) / over
+    col, row = np.meshgrid(at, at)
+    fine = np.where(np.hypot(row, col) <= radius, 1.0 + 0.5 * col / radius, 0.0)
+    return np.asarray(centred(as_kernel(fine.reshape(size, over, size, over).sum(axis=(1, 3)))))
+
+
+def beyond(kernel: np.ndarray, side: int) -> float:
+    """Share of the light outside the middle square."""
+    out = (kernel.shape[0] - side) // 2
+    return 1.0 - float(kernel[out : out + side, out : out + side].sum()) if out > 0 else 0.0
+
+
+def test_default_sees_blur_beyond_31_pixels_where_larger_kernels_are_asked_for() -> None:
+    truth = tilted_disc(17.0)
+    scene = demo_scene("city")[1][300:482, 500:682]
+    y = signal.fftconvolve(scene, truth, mode="valid")
+    y = (y + np.random.default_rng(0).normal(0, 0.002, y.shape)).astype(np.float32)
+
+    usual, large = (
+        estimation.estimators.create("default").estimate([y], [NoiseModel.white(0.002)], size=size).kernel
+        for size in (31, 55)
+    )
+
+    assert beyond(truth, 31) == pytest.approx(0.065, abs=0.005)
+    assert 0.03 < beyond(large, 31) < 0.13
+    errors = [distance(resized(kernel, 55), truth).rel_l2 for kernel in (usual, large)]
+    assert errors[1] < 0.8 * errors[0]  # still a blind guess: of one patch behind a disc of 17 pixels
+    assert abs(rms_width(large) / rms_width(truth) - 1.0) < 0.5 * abs(
+        rms_width(usual) / rms_width(truth) - 1.0
+    )
 
 
 @pytest.mark.parametrize("name", NAMES)

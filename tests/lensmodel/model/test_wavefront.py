@@ -13,7 +13,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample, as_kernel, centroid, distance
 from lensmodel.core.types import FieldPosition, Kernel, LensSettings
 from lensmodel.model import LensModel, ModelSettings
-from lensmodel.model.wavefront.from_kernels import fit_wavefront, spread
+from lensmodel.model.wavefront.from_kernels import fit_wavefront, side_of_light, spread
 from lensmodel.optics.pupil import TERMS, PupilGrid
 from lensmodel.optics.wavefront import Wavefront
 from lensmodel.simulate import draw_lens
@@ -54,6 +54,14 @@ def test_one_photo_of_true_kernels_tells_the_corner_that_it_did_not_see() -> Non
 
     assert front is not None
     assert distance(front.kernel(corner, settings, 31), lens.kernel(corner, settings, 31)).rel_l2 < 0.08
+
+
+def test_light_beyond_35_pixels_is_part_of_what_is_fitted() -> None:
+    row, col = np.mgrid[-27:28, -27:28]
+    wide = as_kernel((np.hypot(row, col) < 22.0).astype(np.float64))
+
+    assert 40 <= side_of_light(wide) <= 45
+    assert side_of_light(as_kernel(np.asarray(wide[12:-12, 12:-12]))) == 31  # a kernel of the usual size
 
 
 @pytest.mark.parametrize(

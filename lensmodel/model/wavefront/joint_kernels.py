@@ -179,7 +179,8 @@ def pool(samples: Sequence[PsfSample], on_step: StepHook = ignore_step) -> Poole
     wide, narrow = _by_aperture(heads, widest)
     chosen = [at[id(s)] for s in (*spread(wide, _FINE_PLACES), *spread(narrow, _NARROW_PLACES))]
     parts = [[at[id(s)] for s in spread(own, _FINE_PLACES)] for own in _pairs(wide)]
-    votes = [(_tail_vote(fit.front, heads), fit) for fit in _searched(chosen, parts, begins, on_step)]
+    fits = _searched(chosen, parts, begins, on_step)
+    votes = [(tail_vote(_kernels(fit.front, heads), heads), fit) for fit in fits]
     # a vote of z standard deviations is a likelihood too: z^2 beside a cost of chi^2
     tails, best = min(votes, key=lambda vote: vote[1].cost - vote[0] ** 2)
     if tails < 0:
@@ -327,16 +328,20 @@ def _view(group: dict[Channel, PsfSample]) -> PatchView:
     return PatchView(head.position, head.settings, head.photo, scene)
 
 
-def _tail_vote(front: Wavefront, samples: Sequence[PsfSample]) -> float:
-    """How much the patches' tails agree with those of a wavefront, in standard deviations.
+def _kernels(front: Wavefront, samples: Sequence[PsfSample]) -> list[Kernel]:
+    """Kernels that are compared with the tails of samples."""
+    return [front.kernel(s.position, s.settings, _TAIL_SIDE) for s in samples]
+
+
+def tail_vote(kernels: Sequence[Kernel], samples: Sequence[PsfSample]) -> float:
+    """How much the patches' tails agree with those of kernels at their places, in standard deviations.
 
     Each patch votes by the cosine of the angle between the two: its strength is that of its scene's edges.
     """
     votes = []
-    for sample in samples:
+    for kernel, sample in zip(kernels, samples, strict=True):
         if sample.spectrum is not None:
-            own = _third_moment(front.kernel(sample.position, sample.settings, _TAIL_SIDE))
-            seen = sample.spectrum.tail
+            own, seen = _third_moment(kernel), sample.spectrum.tail
             lengths = math.hypot(*own) * math.hypot(*seen)
             votes.append((own[0] * seen[0] + own[1] * seen[1]) / lengths if lengths > 0.0 else 0.0)
     total, scatter = float(np.sum(votes)), float(np.sqrt(np.sum(np.square(votes))))

@@ -44,7 +44,9 @@ _TILE = 64  # pixels, as in `PatchSpectrum`
 _HALF = _TILE // 2  # sites of one lattice along a tile
 _INDEPENDENT = 3.8  # neighbouring frequencies under a Hann window that count as one
 _OVERLAP = 0.9  # tiles at half overlap that count as one
-_SCATTER = 0.05
+_SCATTER = (
+    0.05  # radians: what a scene's colours leave in a bin, whatever the noise (`lab.model.cross_spectra`)
+)
 _REACH_PX, _STEP_PX = 4.0, 0.5  # shifts that are tried first
 _SHIFT_ROUNDS = 6
 
@@ -86,9 +88,11 @@ def cross_phase(planes: Planes, cfa: BayerPattern, channel: Channel) -> CrossPha
     summed = _coherent_in_bins(planes, cfa, channel)
     tiles = math.prod((n - _TILE) // _HALF + 1 for n in planes.shape[1:])
     samples = _OVERLAP * tiles * np.maximum(_COUNT / _INDEPENDENT, 1.0)
-    squared = np.clip(np.abs(summed) ** 2, 1e-6, 1.0 - 1e-6)
+    # |mean|^2 of few samples is too large by one over their number
+    squared = (samples * np.abs(summed) ** 2 - 1.0) / np.maximum(samples - 1.0, 1e-3)
+    squared = np.clip(squared, 1e-6, 1.0 - 1e-6)
     variance = (1.0 - squared) / (2.0 * samples * squared)
-    precision = np.where(_COUNT > 0, 1.0 / (variance + _SCATTER**2), 0.0)
+    precision = np.where((_COUNT > 0) & (samples > 1.0), 1.0 / (variance + _SCATTER**2), 0.0)
     return CrossPhase(np.angle(summed).astype(np.float32), precision.astype(np.float32))
 
 
@@ -101,8 +105,8 @@ def _coherent_in_bins(planes: Planes, cfa: BayerPattern, channel: Channel) -> Wa
     cross, own, green = cross_spectra(planes, cfa, channel)
     coherent = cross / np.sqrt(np.maximum(own * green, 1e-30))
     cross = cross * np.exp(-2j * math.pi * (_FREQUENCY @ _shift(coherent)))
-    power = _binned(own).real * _binned(green).real
-    return _binned(cross) / np.sqrt(np.maximum(power, 1e-30))
+    power = binned(own).real * binned(green).real
+    return binned(cross) / np.sqrt(np.maximum(power, 1e-30))
 
 
 def cross_spectra(planes: Planes, cfa: BayerPattern, channel: Channel) -> tuple[Waves, Floats, Floats]:
@@ -111,7 +115,8 @@ def cross_spectra(planes: Planes, cfa: BayerPattern, channel: Channel) -> tuple[
     height, width = planes.shape[1:]
     if min(height, width) < _TILE:
         raise InvalidInputError(f"a patch must measure at least 64 x 64 pixels, got {height} x {width}")
-    cross, own, green = np.zeros(len(_KEPT), complex), np.zeros(len(_KEPT)), np.zeros(len(_KEPT))
+    cross: Waves = np.zeros(len(_KEPT), dtype=np.complex128)
+    own, green = np.zeros(len(_KEPT)), np.zeros(len(_KEPT))
     tops, lefts = range(0, height - _TILE + 1, _HALF), range(0, width - _TILE + 1, _HALF)
     for top in tops:
         for left in lefts:
@@ -152,7 +157,7 @@ def without_linear(columns: Floats, precision: NDArray[np.floating]) -> Floats:
 def mean_in_bins(values: Waves) -> Waves:
     """Mean of values on the 64 x 64 grid of `numpy.fft.fft2` in each bin, shape (PHASE_BINS,)."""
     rows, cols = (np.rint(axis * _TILE).astype(int) for axis in _FREQUENCY.T)
-    return _binned(values[rows, cols]) / np.maximum(_COUNT, 1)
+    return binned(values[rows, cols]) / np.maximum(_COUNT, 1)
 
 
 def _transform(tile: Floats, cfa: BayerPattern, channel: int) -> Waves:
@@ -172,7 +177,8 @@ def _transform(tile: Floats, cfa: BayerPattern, channel: int) -> Waves:
     return total
 
 
-def _binned(values: NDArray[np.number]) -> Waves:
+def binned(values: NDArray[np.number]) -> Waves:
+    """Sum of what `cross_spectra` gives in each bin, shape (PHASE_BINS,)."""
     real, imaginary = (np.bincount(_BIN, part, PHASE_BINS) for part in (np.real(values), np.imag(values)))
     return np.asarray(real + 1j * imaginary)
 
@@ -189,4 +195,4 @@ def _shift(coherent: Waves) -> Floats:
     for _ in range(_SHIFT_ROUNDS):
         left = np.sin(np.angle(coherent) - along @ shift)
         shift = shift + np.linalg.solve(normal, along.T @ (strength * left))
-    return shift
+    return np.asarray(shift)

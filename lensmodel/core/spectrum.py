@@ -116,7 +116,7 @@ class PatchSpectrum:
 
     def to_bytes(self) -> bytes:
         """Serialise to 684 or 1356 bytes: little-endian float32 of power, noise, tail, phase, precision."""
-        parts = [self.power.ravel(), [self.noise], self.tail]
+        parts = [self.power.ravel(), np.array([self.noise, *self.tail])]
         if self.cross is not None:
             parts += [self.cross.phase, self.cross.precision]
         return np.concatenate(parts).astype("<f4").tobytes()

@@ -5,6 +5,7 @@ Layout of a `.lensprofile`, format 1::
     profile.json    format, lens, cameras, provenance, settings of the model, one entry for each sample
     kernels.npy     (n, k, k) float32, sum 1, centred, in the order of the entries
     spectra.npy     optional: what each patch says without a kernel, see `PatchSpectrum`
+    phases.npy      optional: phase of red and blue against green, a part of that, see `CrossPhase`
     learned.npz     optional: what the model has learned from them, see `learned`
     family.lensprofile  optional: the profile of other copies that the model leans on, without one of its own
 
@@ -31,7 +32,7 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.files import atomic
 from lensmodel.core.psf import PsfSample, resized
-from lensmodel.core.spectrum import RINGS, SECTORS, PatchSpectrum
+from lensmodel.core.spectrum import PHASE_BINS, RINGS, SECTORS, PatchSpectrum
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model.answer import FORMER_MODES, KERNELS, ModelSettings
 from lensmodel.model.field.smoothers import FORMER_METHODS
@@ -44,6 +45,8 @@ _MAX_SIDE = 255  # pixels (chosen)
 _INFINITY = "infinity"
 _LEARNED = "learned.npz"
 _SPECTRA = "spectra.npy"
+_PHASES = "phases.npy"  # beside the spectra: older programs read those and pass over this
+_NUMBERS, _NUMBERS_OF_PHASES = RINGS * SECTORS + 3, 2 * PHASE_BINS  # of a row
 _FAMILY = "family.lensprofile"
 
 log = logging.getLogger(__name__)
@@ -129,6 +132,8 @@ def write_profile(file: IO[bytes], profile: LensProfile) -> None:
         archive.writestr("kernels.npy", arrays.getvalue())
         if any(sample.spectrum is not None for sample in samples):
             archive.writestr(_SPECTRA, _spectra(samples))
+        if any(sample.spectrum is not None and sample.spectrum.cross is not None for sample in samples):
+            archive.writestr(_PHASES, _phases(samples))
         archive.writestr(_LEARNED, profile.model.learned(), zipfile.ZIP_STORED)
         if prior is not None and isinstance(prior.source, LensModel):
             family = io.BytesIO()
@@ -179,7 +184,7 @@ def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> 
                 )
             document = json.loads(archive.read("profile.json"))
             stack = np.load(io.BytesIO(archive.read("kernels.npy")), allow_pickle=False)
-            spectra = archive.read(_SPECTRA) if _SPECTRA in names else None
+            spectra = tuple(archive.read(part) if part in names else None for part in (_SPECTRA, _PHASES))
             learned = archive.read(_LEARNED) if _LEARNED in names else None
             family = archive.read(_FAMILY) if _FAMILY in names and not alone else None
     except FileNotFoundError:
@@ -237,27 +242,47 @@ def _entry(sample: PsfSample) -> dict[str, Any]:
 
 
 def _spectra(samples: Sequence[PsfSample]) -> bytes:
-    """One row for each sample, NaN where it has no spectrum."""
-    missing = np.full(RINGS * SECTORS + 3, np.nan, dtype="<f4").tobytes()
-    rows = b"".join(missing if s.spectrum is None else s.spectrum.to_bytes() for s in samples)
+    """One row for each sample without its phases, NaN where it has no spectrum."""
+    end = 4 * _NUMBERS
+    return _rows([b"" if s.spectrum is None else s.spectrum.to_bytes()[:end] for s in samples], _NUMBERS)
+
+
+def _phases(samples: Sequence[PsfSample]) -> bytes:
+    """One row for each sample, NaN where it has no phases."""
+    start = 4 * _NUMBERS
+    rows = [b"" if s.spectrum is None else s.spectrum.to_bytes()[start:] for s in samples]
+    return _rows(rows, _NUMBERS_OF_PHASES)
+
+
+def _rows(rows: Sequence[bytes], numbers: int) -> bytes:
+    """An array of single precision as a file; empty rows are NaN."""
+    missing = np.full(numbers, np.nan, dtype="<f4").tobytes()
     buffer = io.BytesIO()
-    np.save(buffer, np.frombuffer(rows, dtype="<f4").reshape(len(samples), -1), allow_pickle=False)
+    values = np.frombuffer(b"".join(row or missing for row in rows), dtype="<f4")
+    np.save(buffer, values.reshape(len(rows), -1), allow_pickle=False)
     return buffer.getvalue()
 
 
-def _opened(data: bytes | None, count: int) -> list[PatchSpectrum | None]:
+def _opened(data: bytes | None, count: int, numbers: int) -> list[bytes]:
+    """Rows that `_rows` wrote; all are empty where there is no file."""
     if data is None:
-        return [None] * count
+        return [b""] * count
     rows = np.load(io.BytesIO(data), allow_pickle=False)
-    if rows.shape != (count, RINGS * SECTORS + 3) or rows.dtype != np.float32:
+    if rows.shape != (count, numbers) or rows.dtype != np.float32:
         raise ValueError(f"spectra of shape {rows.shape} for {count} samples")
-    return [None if np.isnan(row).all() else PatchSpectrum.from_bytes(row.tobytes()) for row in rows]
+    return [b"" if np.isnan(row).all() else row.tobytes() for row in rows]
 
 
 def _samples(
-    entries: Sequence[dict[str, Any]], stack: NDArray[np.float32], spectra: bytes | None
+    entries: Sequence[dict[str, Any]], stack: NDArray[np.float32], parts: tuple[bytes | None, ...]
 ) -> list[PsfSample]:
-    seen = _opened(spectra, len(entries))
+    columns = [
+        _opened(part, len(entries), numbers)
+        for part, numbers in zip(parts, (_NUMBERS, _NUMBERS_OF_PHASES), strict=True)
+    ]
+    seen = [
+        PatchSpectrum.from_bytes(row + phases) if row else None for row, phases in zip(*columns, strict=True)
+    ]
     return [_sample(*one) for one in zip(entries, stack, seen, strict=True)]
 
 

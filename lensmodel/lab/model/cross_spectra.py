@@ -39,6 +39,7 @@ from lensmodel.core.cross_phase import (
     mean_in_bins,
     unshifted,
 )
+from lensmodel.core.errors import NoUsablePatchesError
 from lensmodel.core.psf import PsfSample, delta, rms_width
 from lensmodel.core.spectrum import PHASE_RINGS, SECTORS, CrossPhase, PatchSpectrum, binned_spectrum, tail_of
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel
@@ -107,7 +108,7 @@ class Patch:
 def phases_of(lens: Lens, truth: SimulatedLens | GridLens, place: FieldPosition) -> dict[Channel, Floats]:
     """Phases of H_C conj(H_G) in the bins at a place, of blue and red."""
     field = truth.field(lens.settings)
-    waves = {c: _transform(field.kernel_at(place, c, _SIDE)) for c in CHANNELS}
+    waves = {c: transfer_of(field.kernel_at(place, c, _SIDE)) for c in CHANNELS}
     return {c: np.angle(mean_in_bins(waves[c] * waves["g"].conj())) for c in OTHERS}
 
 
@@ -119,7 +120,10 @@ def patches_of(lens: Lens, number: int, folder: Path) -> Iterator[Patch]:
     turned = _mirrored(lens.lens)
     for patch in pipeline.find_patches(developed).patches:
         cut = np.s_[:, patch.row : patch.row + patch.size, patch.col : patch.col + patch.size]
-        planes, cfa = developed.planes[cut], np.roll(developed.cfa, (-patch.row, -patch.col), axis=(0, 1))
+        planes, cfa = (
+            developed.planes[cut],
+            np.roll(developed.cfa, (-patch.row, -patch.col), axis=(0, 1)).tolist(),
+        )
         measured = {c: cross_phase(planes, cfa, c) for c in OTHERS}
         green = np.ascontiguousarray(planes[1])
         kernel = lens.lens.field(lens.settings).kernel_at(patch.position, "g", _SIDE)
@@ -148,7 +152,8 @@ def _mirrored(lens: SimulatedLens | GridLens) -> SimulatedLens | None:
     return replace(lens, optics=tuple(optics))
 
 
-def _transform(kernel: Kernel) -> NDArray[np.complex128]:
+def transfer_of(kernel: Kernel) -> NDArray[np.complex128]:
+    """Transfer function of a kernel on the grid of a tile."""
     grid = np.zeros((64, 64))
     grid[: len(kernel), : len(kernel)] = kernel
     half = len(kernel) // 2
@@ -243,7 +248,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         for lens in lenses(wanted.seeds, wanted.grids, CAMERA.full_well_electrons):
             for number in range(wanted.photos):
-                patches += patches_of(lens, number, Path(name))
+                try:
+                    patches += list(patches_of(lens, number, Path(name)))
+                except NoUsablePatchesError as error:
+                    print(f"{lens.name}, photo {number}: {error}")
+                    continue
                 print(f"{lens.name}, photo {number}: {len(patches)} patches so far", flush=True)
     report_rings(patches)
     report_lenses(patches)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from app.blobs.storage import Storage
-from app.jobs.task_files import KERNELS, PREVIEW, R_MAP, SAMPLES, SHOWN, SPECTRA
+from app.jobs.task_files import KERNELS, PHASES, PREVIEW, R_MAP, SAMPLES, SHOWN, SPECTRA
 from app.runtime import metrics
 from app.runtime.outage import OutageError, is_outage
 from app.runtime.settings import Settings
@@ -207,7 +207,7 @@ def _patient(wanted: Callable[[], bool]) -> Callable[[], bool]:
 def write_samples(folder: Path, stored: Sequence[StoredSample]) -> None:
     """Hand samples to a task: kernels and spectra as npy files, the rest as JSON."""
     packed = pack_samples([entry.sample for entry in stored])
-    for name, array in ((KERNELS, packed.kernels), (SPECTRA, packed.spectra)):
+    for name, array in ((KERNELS, packed.kernels), (SPECTRA, packed.spectra), (PHASES, packed.phases)):
         if array is not None:
             with (folder / name).open("wb") as file:
                 save_array(file, array)

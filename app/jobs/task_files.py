@@ -14,6 +14,9 @@ SAMPLES: Final = "samples.json"
 SPECTRA: Final = "spectra.npy"
 """What the patch of each kernel says without one; absent where none says anything."""
 
+PHASES: Final = "phases.npy"
+"""Phases of that patch's colours against green; absent where none has any."""
+
 FAMILY: Final = "family"
 """Folder of the samples of other copies that the model leans on; absent without any."""
 

@@ -25,6 +25,7 @@ from app.jobs.task_files import (
     KERNELS,
     LAYERS,
     LEARNED,
+    PHASES,
     PREVIEW,
     R_MAP,
     REPORT,
@@ -321,9 +322,11 @@ def _with_family(folder: Path, settings: ModelSettings) -> LensModel:
 def _samples(folder: Path) -> list[PsfSample]:
     kernels = np.load(folder / KERNELS, allow_pickle=False, mmap_mode="r")
     entries = json.loads((folder / SAMPLES).read_text(encoding="utf-8"))
-    spectra = folder / SPECTRA
-    rows = np.load(spectra, allow_pickle=False) if spectra.is_file() else None
-    return unpack_samples(PackedSamples(entries, kernels, rows))
+    spectra, phases = (
+        np.load(folder / name, allow_pickle=False) if (folder / name).is_file() else None
+        for name in (SPECTRA, PHASES)
+    )
+    return unpack_samples(PackedSamples(entries, kernels, spectra, phases))
 
 
 def _settings(stored: Mapping[str, Any]) -> LensSettings:

@@ -3,7 +3,8 @@
 The power spectrum tells how wide the blur is in every direction, once for all apertures and photos that
 are compared, but nothing of its phase. Of two kernels with equal power, one the other turned by 180
 degrees, the right one leaves the sparser gradients when it is taken off: `tail` says so in two numbers.
-Both are small, hold no picture, and can be summed over patches and photos before anything is solved.
+The phase of red or blue against green (`cross_phase`) says so where focus differs between the colours.
+All are small, hold no picture, and can be summed over patches and photos before anything is solved.
 """
 
 from __future__ import annotations
@@ -23,6 +24,14 @@ SECTORS: Final = 12
 RING_LIMITS: Final = (0.03, 0.5)
 """Frequencies of the innermost and outermost ring, cycles/pixel; rings are equally wide in log."""
 
+FIRST_PHASE_RING: Final = 3
+"""Rings below hold too few frequencies of a tile to be told apart by angle."""
+
+PHASE_RINGS: Final = 7
+"""Rings from `FIRST_PHASE_RING` on in which phases are known: below a quarter of the sampling rate."""
+
+PHASE_BINS: Final = PHASE_RINGS * SECTORS
+
 _TILE = 64  # pixels of a tile (chosen)
 # Pixels: no derivative is taken finer than the pixel or wider than kernels are (chosen)
 _TAIL_SIGMA = (0.5, 3.0)
@@ -33,6 +42,33 @@ _TAIL_RIM = 16  # pixels of the patch's rim that its window fades (chosen)
 _CORE_PX = (2, 4)  # nearer than this neighbours are alike: for the valley, for the peak
 _REPEATS = (-0.4, 0.9)  # correlation at the valley and the peak of what repeats
 _BYTES = 4 * (RINGS * SECTORS + 3)  # single precision: the bins, the noise and two asymmetries
+_BYTES_OF_PHASE = 4 * 2 * PHASE_BINS
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CrossPhase:
+    """Phase of one channel against green in the bins of a patch, as its mosaic shows it.
+
+    Parameters
+    ----------
+    phase : ndarray of float32, shape (PHASE_BINS,)
+        Of F_C conj(F_G), radians, at frequencies with rows downwards positive (the angle goes from the
+        columns' axis towards the rows', 0 to pi).
+    precision : ndarray of float32, shape (PHASE_BINS,)
+        Inverse variance; 0 where a bin says nothing.
+    """
+
+    phase: NDArray[np.float32]
+    precision: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        both = np.ravel(self.phase), np.ravel(self.precision)
+        sizes = {np.shape(self.phase), np.shape(self.precision)}
+        if sizes != {(PHASE_BINS,)} or not np.isfinite(both).all() or both[1].min() < 0:
+            raise InvalidInputError(
+                f"phases and precisions must be finite, {PHASE_BINS} each, the latter not negative; "
+                f"got shapes {sorted(sizes)}"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,11 +85,14 @@ class PatchSpectrum:
         (right, up): positive where taking off a blur with a tail to that side leaves sparser
         gradients than one with a tail to the other. Relative change of mean |gradient|^0.8; its sign
         counts, summed over patches.
+    cross : CrossPhase or None
+        Of red and blue: phase against green. None where the sensor's own samples are not at hand.
     """
 
     power: NDArray[np.float32]
     noise: float
     tail: tuple[float, float] = (0.0, 0.0)
+    cross: CrossPhase | None = None
 
     def __post_init__(self) -> None:
         numbers = (*np.ravel(self.power), self.noise, *self.tail)
@@ -68,30 +107,39 @@ class PatchSpectrum:
             )
 
     @classmethod
-    def of(cls, patch: Plane, noise: NoiseModel, width_px: float) -> PatchSpectrum:
+    def of(
+        cls, patch: Plane, noise: NoiseModel, width_px: float, cross: CrossPhase | None = None
+    ) -> PatchSpectrum:
         """Measure a patch whose blur has about this root mean square width per axis."""
         power, floor = binned_spectrum(patch, noise)
-        return cls(power, floor, tail_of(patch, width_px))
+        return cls(power, floor, tail_of(patch, width_px), cross)
 
     def to_bytes(self) -> bytes:
-        """Serialise to 684 bytes: little-endian float32 of power, noise and tail."""
-        return np.concatenate([self.power.ravel(), [self.noise], self.tail]).astype("<f4").tobytes()
+        """Serialise to 684 or 1356 bytes: little-endian float32 of power, noise, tail, phase, precision."""
+        parts = [self.power.ravel(), np.array([self.noise, *self.tail])]
+        if self.cross is not None:
+            parts += [self.cross.phase, self.cross.precision]
+        return np.concatenate(parts).astype("<f4").tobytes()
 
     @classmethod
     def from_bytes(cls, data: bytes) -> PatchSpectrum:
-        """Read what `to_bytes` wrote.
+        """Read what `to_bytes` wrote, with phases or without.
 
         Raises
         ------
         InvalidInputError
             For anything else.
         """
-        if len(data) != _BYTES:
-            raise InvalidInputError(f"a patch spectrum takes {_BYTES} bytes, got {len(data)}")
+        if len(data) not in {_BYTES, _BYTES + _BYTES_OF_PHASE}:
+            raise InvalidInputError(
+                f"a patch spectrum takes {_BYTES} bytes, or {_BYTES + _BYTES_OF_PHASE} with phases, "
+                f"got {len(data)}"
+            )
         values = np.frombuffer(data, dtype="<f4").astype(np.float32)
-        power = values[: RINGS * SECTORS].reshape(RINGS, SECTORS)
-        noise, right, up = (float(v) for v in values[RINGS * SECTORS :])
-        return cls(power, noise, (right, up))
+        power, rest = values[: RINGS * SECTORS].reshape(RINGS, SECTORS), values[RINGS * SECTORS :]
+        noise, right, up = (float(v) for v in rest[:3])
+        cross = None if len(data) == _BYTES else CrossPhase(rest[3 : 3 + PHASE_BINS], rest[3 + PHASE_BINS :])
+        return cls(power, noise, (right, up), cross)
 
 
 def binned_spectrum(patch: Plane, noise: NoiseModel) -> tuple[NDArray[np.float32], float]:

@@ -5,6 +5,7 @@ Layout of a `.lensprofile`, format 1::
     profile.json    format, lens, cameras, provenance, settings of the model, one entry for each sample
     kernels.npy     (n, k, k) float32, sum 1, centred, in the order of the entries
     spectra.npy     optional: what each patch says without a kernel, see `PatchSpectrum`
+    phases.npy      optional: phase of red and blue against green, a part of that, see `CrossPhase`
     learned.npz     optional: what the model has learned from them, see `learned`
     family.lensprofile  optional: the profile of other copies that the model leans on, without one of its own
 
@@ -40,6 +41,7 @@ _MAX_SAMPLES = 200_000  # some 2,700 photos of 24 patches in three colours
 _MAX_SIDE = 255  # pixels (chosen)
 _LEARNED = "learned.npz"
 _SPECTRA = "spectra.npy"
+_PHASES = "phases.npy"  # beside the spectra: older programs read those and pass over this
 _FAMILY = "family.lensprofile"
 
 log = logging.getLogger(__name__)
@@ -121,8 +123,9 @@ def write_profile(file: IO[bytes], profile: LensProfile) -> None:
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("profile.json", json.dumps(document, allow_nan=False))
         archive.writestr("kernels.npy", _saved(packed.kernels))
-        if packed.spectra is not None:
-            archive.writestr(_SPECTRA, _saved(packed.spectra))
+        for part, rows in ((_SPECTRA, packed.spectra), (_PHASES, packed.phases)):
+            if rows is not None:
+                archive.writestr(part, _saved(rows))
         archive.writestr(_LEARNED, profile.model.learned(), zipfile.ZIP_STORED)
         if prior is not None and isinstance(prior.source, LensModel):
             family = io.BytesIO()
@@ -136,6 +139,13 @@ def _saved(array: NDArray[np.float32]) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, array, allow_pickle=False)
     return buffer.getvalue()
+
+
+def _opened(archive: zipfile.ZipFile, part: str) -> NDArray[np.float32] | None:
+    """Read an array that a profile may lack."""
+    if part not in archive.namelist():
+        return None
+    return np.asarray(np.load(io.BytesIO(archive.read(part)), allow_pickle=False))
 
 
 def _within_limits(count: int, side: int) -> bool:
@@ -179,7 +189,7 @@ def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> 
                 )
             document = json.loads(archive.read("profile.json"))
             stack = np.load(io.BytesIO(archive.read("kernels.npy")), allow_pickle=False)
-            spectra = archive.read(_SPECTRA) if _SPECTRA in names else None
+            spectra, phases = (_opened(archive, part) for part in (_SPECTRA, _PHASES))
             learned = archive.read(_LEARNED) if _LEARNED in names else None
             family = archive.read(_FAMILY) if _FAMILY in names and not alone else None
     except FileNotFoundError:
@@ -205,8 +215,7 @@ def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> 
                 f"{name} holds {len(entries)} samples but kernels of shape {stack.shape}; "
                 f"one is needed for each, of side {_MAX_SIDE} at most"
             )
-        rows = None if spectra is None else np.load(io.BytesIO(spectra), allow_pickle=False)
-        samples = unpack_samples(PackedSamples(entries, stack, rows))
+        samples = unpack_samples(PackedSamples(entries, stack, spectra, phases))
         model = _model(samples, _settings(document["model"]), learned)
         if family is not None:
             other = _read(io.BytesIO(family), f"the family in {name}", alone=True)

@@ -11,13 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.psf import PsfSample
-from lensmodel.core.spectrum import RINGS, SECTORS, PatchSpectrum
+from lensmodel.core.spectrum import PHASE_BINS, RINGS, SECTORS, PatchSpectrum
 from lensmodel.core.types import FieldPosition, LensSettings
 
 _INFINITY: Final = "infinity"
 """A focus distance for which JSON has no number."""
 _SPECTRUM: Final = RINGS * SECTORS + 3
 """Numbers of a spectrum: power, noise and two of the tail."""
+_PHASES: Final = 2 * PHASE_BINS
+"""Numbers of what a spectrum says of phases: each with its precision."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,25 +33,32 @@ class PackedSamples:
     kernels : ndarray of float32, shape (n, k, k)
         Zeros around kernels that are smaller than the largest.
     spectra : ndarray of float32, shape (n, 171), or None
-        `PatchSpectrum.to_bytes`, NaN where a sample has none; None where none has.
+        `PatchSpectrum.to_bytes` without phases, NaN where a sample has none; None where none has.
+    phases : ndarray of float32, shape (n, 168), or None
+        The phases alike; kept apart, since earlier programs read spectra without.
     """
 
     entries: list[dict[str, Any]]
     kernels: NDArray[np.float32]
     spectra: NDArray[np.float32] | None
+    phases: NDArray[np.float32] | None = None
 
 
 def pack_samples(samples: Sequence[PsfSample]) -> PackedSamples:
     """Turn samples into what `unpack_samples` reads; kernels are rounded to single precision."""
     side = max(sample.kernel.shape[0] for sample in samples)
     kernels = np.zeros((len(samples), side, side), dtype=np.float32)
-    spectra = np.full((len(samples), _SPECTRUM), np.nan, dtype="<f4")
+    numbers = np.full((len(samples), _SPECTRUM + _PHASES), np.nan, dtype="<f4")
     for number, sample in enumerate(samples):
         kernels[number][_middle(side, sample.kernel.shape[0])] = sample.kernel
         if sample.spectrum is not None:
-            spectra[number] = np.frombuffer(sample.spectrum.to_bytes(), dtype="<f4")
-    some = any(sample.spectrum is not None for sample in samples)
-    return PackedSamples([_entry(sample) for sample in samples], kernels, spectra if some else None)
+            own = np.frombuffer(sample.spectrum.to_bytes(), dtype="<f4")
+            numbers[number, : own.size] = own
+    parts = (
+        None if np.isnan(rows).all() else np.ascontiguousarray(rows)
+        for rows in np.split(numbers, [_SPECTRUM], axis=1)
+    )
+    return PackedSamples([_entry(sample) for sample in samples], kernels, *parts)
 
 
 def unpack_samples(packed: PackedSamples) -> list[PsfSample]:
@@ -65,16 +74,23 @@ def unpack_samples(packed: PackedSamples) -> list[PsfSample]:
         If entries and arrays are not those of `pack_samples`.
     """
     count, side = len(packed.entries), packed.kernels.shape[1]
-    spectra = packed.spectra
-    if spectra is not None and (spectra.shape != (count, _SPECTRUM) or spectra.dtype != np.float32):
-        raise ValueError(f"spectra of shape {spectra.shape} for {count} samples")
+    spectra, phases = _rows(packed.spectra, count, _SPECTRUM), _rows(packed.phases, count, _PHASES)
     samples = []
     for number, (entry, kernel) in enumerate(zip(packed.entries, packed.kernels, strict=True)):
-        row = None if spectra is None or np.isnan(spectra[number]).all() else spectra[number].tobytes()
+        row = spectra[number] + phases[number] if spectra[number] else None
         size = int(entry["size"]) if "size" in entry else side
         own = kernel[_middle(side, size)]
         samples.append(_sample(entry, own, None if row is None else PatchSpectrum.from_bytes(row)))
     return samples
+
+
+def _rows(array: NDArray[np.float32] | None, count: int, numbers: int) -> list[bytes]:
+    """Bytes of each sample; none where there are no numbers."""
+    if array is None:
+        return [b""] * count
+    if array.shape != (count, numbers) or array.dtype != np.float32:
+        raise ValueError(f"spectra of shape {array.shape} for {count} samples")
+    return [b"" if np.isnan(row).all() else row.tobytes() for row in array]
 
 
 def _middle(side: int, size: int) -> tuple[slice, slice]:

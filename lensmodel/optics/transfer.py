@@ -28,9 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.loops import compiled
-from lensmodel.core.spectrum import RING_LIMITS, RINGS, SECTORS
+from lensmodel.core.spectrum import FIRST_PHASE_RING, PHASE_BINS, RING_LIMITS, RINGS, SECTORS
 
-FIRST_RING: Final = 3
+FIRST_RING: Final = FIRST_PHASE_RING
 """Rings below hold too few frequencies of a 64 px tile to be told apart by angle."""
 
 BINS: Final = (RINGS - FIRST_RING) * SECTORS
@@ -131,13 +131,10 @@ class Transfer:
         by_eye : ndarray, shape (BINS, 3)
             By `radius` and `shift`.
         """
-        otf, otf_by_blur, otf_by_eye = self._optical(blur, radius, shift)
-        centre, centre_by_blur, centre_by_eye = self._centre(blur, radius, shift)
-        turn = self.pixel * np.exp(-2j * math.pi * (self.aliases @ centre))
-        moved = -2j * math.pi * self.aliases * otf[:, None]
-        by = [otf[:, None], otf_by_blur + moved @ centre_by_blur, otf_by_eye + moved @ centre_by_eye]
-        columns = np.concatenate(by, axis=1) * turn[:, None]
-        kernel = np.add.reduceat(columns, self.first, axis=0)
+        return self.log_power_of(self.waves(blur, radius, shift))
+
+    def log_power_of(self, kernel: Waves) -> tuple[Floats, Floats, Floats]:
+        """`log_power` of what `waves` gave."""
         # |K|^2 and its derivatives 2 Re K* dK
         products = (kernel[:, :1].conj() * kernel).real * self.share[:, None]
         products[:, 1:] *= 2.0
@@ -145,6 +142,19 @@ class Transfer:
         safe = np.clip(power[:, 0], _LEAST, 1.0)
         relative = power[:, 1:] / safe[:, None]
         return np.log(safe), relative[:, :6], relative[:, 6:]
+
+    def waves(self, blur: Floats, radius: float, shift: tuple[float, float]) -> Waves:
+        """K at the S frequencies, and its derivatives by `blur`, `radius` and `shift`, shape (S, 10).
+
+        Parameters are those of `log_power`.
+        """
+        otf, otf_by_blur, otf_by_eye = self._optical(blur, radius, shift)
+        centre, centre_by_blur, centre_by_eye = self._centre(blur, radius, shift)
+        turn = self.pixel * np.exp(-2j * math.pi * (self.aliases @ centre))
+        moved = -2j * math.pi * self.aliases * otf[:, None]
+        by = [otf[:, None], otf_by_blur + moved @ centre_by_blur, otf_by_eye + moved @ centre_by_eye]
+        columns = np.concatenate(by, axis=1) * turn[:, None]
+        return cast("Waves", np.add.reduceat(columns, self.first, axis=0))
 
     def _optical(self, blur: Floats, radius: float, shift: tuple[float, float]) -> tuple[Waves, Waves, Waves]:
         """OTF of the lens alone at f + k, shape (F,), and its derivatives (F, 6), (F, 3)."""
@@ -184,6 +194,42 @@ class Transfer:
         """Transmission of the stop, and of the second circle with its derivatives."""
         open_ = _circle(*self.points, 1.0, (0.0, 0.0), self.steep)[0]
         return open_, *_circle(*self.points, radius, shift, self.steep)
+
+
+def phase_between(
+    channel: Transfer, of_channel: Waves, green: Transfer, of_green: Waves
+) -> tuple[Floats, Floats, Floats]:
+    """Phase of a channel's image against that of green in the innermost bins, and its derivatives.
+
+    Parameters
+    ----------
+    channel, green : Transfer
+        Of `PHASE_RINGS` rings at least.
+    of_channel, of_green : ndarray, shape (S, 10)
+        What their `waves` gave.
+
+    Returns
+    -------
+    phase : ndarray, shape (PHASE_BINS,)
+        Radians; that of the sum of conj(K_C) K_G over the frequencies of a bin, since K is the conjugate of
+        what `numpy.fft` makes of a kernel.
+    by_channel, by_green : ndarray, shape (PHASE_BINS, 9)
+        By what the columns of `of_channel` and of `of_green` are derived by.
+    """
+    bins = green.bins[green.bins < PHASE_BINS]
+    first, second = (waves[of.bins < PHASE_BINS] for of, waves in ((channel, of_channel), (green, of_green)))
+
+    def summed(values: Waves) -> Waves:
+        real, imaginary = (
+            np.stack([np.bincount(bins, column, PHASE_BINS) for column in part.T], axis=1)
+            for part in (values.real, values.imag)
+        )
+        return cast("Waves", real + 1j * imaginary)
+
+    by_channel, by_green = summed(first.conj() * second[:, :1]), summed(first[:, :1].conj() * second)
+    both = by_channel[:, :1]
+    safe = np.where(np.abs(both) > _LEAST, both, _LEAST)
+    return np.angle(both[:, 0]), (by_channel[:, 1:] / safe).imag, (by_green[:, 1:] / safe).imag
 
 
 @lru_cache(maxsize=32)

@@ -11,9 +11,10 @@ from typing import Final
 import numpy as np
 
 from lensmodel import estimation
+from lensmodel.core.cross_phase import cross_phase
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError, NoUsablePatchesError
 from lensmodel.core.psf import PsfSample, delta, rms_width
-from lensmodel.core.spectrum import PatchSpectrum, binned_spectrum
+from lensmodel.core.spectrum import CrossPhase, PatchSpectrum, binned_spectrum
 from lensmodel.core.types import (
     CHANNELS,
     Channel,
@@ -184,7 +185,9 @@ def estimate_cell(
                 estimator=f"{method.name}/{method.version}",
                 error=estimate.predicted_error if math.isfinite(estimate.predicted_error) else None,
                 # sharpened by cameras and compressed: no power law of a scene times a lens is left in them
-                spectrum=None if developed.lossy else PatchSpectrum.of(plane, noise, width),
+                spectrum=None
+                if developed.lossy
+                else PatchSpectrum.of(plane, noise, width, _cross(developed, patch, channel)),
                 half_diagonal_px=developed.frame.half_diagonal,
             )
             diagnostics = {**estimate.diagnostics, "predicted_error": estimate.predicted_error}
@@ -226,6 +229,16 @@ def witnesses_of(
         )
         for patch in (seen_patches(developed) if patches is None else patches)
     ]
+
+
+def _cross(developed: LinearPhoto, patch: Patch, channel: Channel) -> CrossPhase | None:
+    """Phase of red or blue against green, where the planes hold the samples of a Bayer mosaic."""
+    if developed.cfa is None or channel == "g":
+        return None
+    window = (slice(None), slice(patch.row, patch.row + patch.size), slice(patch.col, patch.col + patch.size))
+    first, second = (developed.cfa[(patch.row + row) % 2] for row in (0, 1))
+    cfa = tuple((cells[patch.col % 2], cells[(patch.col + 1) % 2]) for cells in (first, second))
+    return cross_phase(developed.planes[window], (cfa[0], cfa[1]), channel)
 
 
 def _view(developed: LinearPhoto, patch: Patch, channel: Channel) -> tuple[Plane, NoiseModel]:

@@ -243,7 +243,7 @@ class Lens:
         Returns
         -------
         PsfAnswer
-            `.kernel` is the array, shape (size, size), float64; `.predicted_error` its expected relative L2 error;
+            `.kernel` is the array, shape (size, size), float64; `.predicted_error` its expected relative L2;
             `.answered_by` what made it, `.reason` why; `.photos` and `.effective_samples` what of.
 
         Raises

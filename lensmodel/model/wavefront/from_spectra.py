@@ -11,24 +11,26 @@ against outliers), so that photos add up::
 
 by Levenberg-Marquardt, the unknowns z and w of a patch eliminated from the normal equations (Schur). Power
 knows nothing of the phase: a wavefront and its negative, which turns the kernels by 180 degrees, have
-equal spectra. Which of the two it is has to come from elsewhere (`refine`).
+equal spectra. Which of the two it is has to come from elsewhere: from phases between colours (`phase_costs`)
+and the patches' tails (`joint_kernels`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.core.spectrum import SECTORS
-from lensmodel.core.types import WAVELENGTH_NM, FieldPosition, LensSettings, StepHook, ignore_step
+from lensmodel.core.cross_phase import unshifted, without_linear
+from lensmodel.core.spectrum import PHASE_BINS, SECTORS, CrossPhase
+from lensmodel.core.types import WAVELENGTH_NM, Channel, FieldPosition, LensSettings, StepHook, ignore_step
 from lensmodel.model.wavefront.aberration_prior import unlikeliness
 from lensmodel.model.wavefront.scene_spectrum import BIAS, PHOTO_SPREAD, SHAPES, WITH_POWER, SceneView
-from lensmodel.optics.transfer import BINS, BORROWED_RINGS, Transfer
+from lensmodel.optics.transfer import BINS, BORROWED_RINGS, Transfer, phase_between
 from lensmodel.optics.wavefront import NAMES, Wavefront, design, stopped
 
 Floats = NDArray[np.float64]
@@ -44,6 +46,9 @@ _HELD = 1e12
 _TEMPER = 0.1
 """Share of the likelihood that counts: neighbouring bins and patches of one motif err alike."""
 
+_PHASE_TEMPER = 0.1
+_PHASE_SCATTER = 0.1  # radians: what the scenes of a photo have of their own (`lab.model.cross_spectra`)
+
 _FLOOR_RANGE = (-12.0, -1.0)  # of its logarithm
 _LARGEST_RESIDUAL = 3.0  # of a natural logarithm: beyond it no fit is linear (chosen)
 _TAILS = 6.0  # degrees of freedom of Student's t of a bin
@@ -58,12 +63,16 @@ _SMALLEST_EYE, _FARTHEST_EYE = 0.5, 1.0  # the two circles of the pupil have to 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchView:
-    """One patch: where, how the lens was set, of which photo, and its spectra."""
+    """One patch: where, how the lens was set, of which photo, its spectra, its phases against green.
+
+    Fits are to the spectra; phases judge them (`phase_costs`).
+    """
 
     position: FieldPosition
     settings: LensSettings
     photo: str
     scene: SceneView
+    phases: Mapping[Channel, CrossPhase] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,6 +188,25 @@ def fit_scene(view: SceneView, power: Floats) -> tuple[Floats, Floats, Floats]:
     return fitted.z, fitted.residual, fitted.signal
 
 
+def phase_costs(patches: Sequence[PatchView], front: Wavefront) -> tuple[float, float]:
+    """What the phases of patches cost behind a lens, and behind the same turned by 180 degrees.
+
+    Turned, a lens has the opposite phases. Costs are in the units of a fit's, and add to it. Neither is more
+    than without any phase: power tells little of the focus of colours, and phases of a lens that suit worse
+    than none say nothing of it.
+    """
+    lens = np.concatenate([front.terms, open_eye(np.asarray(front.eye))])
+    own = turned = none = 0.0
+    for patch in patches:
+        if patch.phases:
+            for channel, (phase, by_phase) in expected(front, lens, patch)[2].items():
+                seen = patch.phases[channel]
+                own += phase_terms(seen, phase, by_phase)[0]
+                turned += phase_terms(seen, -phase, by_phase)[0]
+                none += phase_terms(seen, np.zeros_like(phase), by_phase)[0]
+    return min(own, none), min(turned, none)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
     patches: tuple[PatchView, ...]
@@ -198,7 +226,7 @@ class _Problem:
         cost, scenes_after, trust = 0.0, [], []
         for i, patch in enumerate(self.patches):
             at = _LENS + len(PHOTO_SPREAD) * self.photos[patch.photo]
-            seen, by_lens = self._lens(lens, patch)
+            seen, by_lens, _ = expected(self.begin, lens, patch, coarse=self.coarse)
             # its change with the lens is no part of the derivatives: lenses far too sharp would gain by it
             rest = (BIAS + SHAPES[:, 1:3] @ shared[self.photos[patch.photo]])[:, None]
             rest = rest + WITH_POWER[:, None] * seen**2
@@ -222,27 +250,73 @@ class _Problem:
         gradient -= np.concatenate([pull, vote * shared.ravel()])
         return _State(cost, normal, gradient, scenes_after, np.array(trust))
 
-    def _lens(self, lens: Floats, patch: PatchView) -> tuple[Floats, Floats]:
-        """Return |OTF|^2 in the bins, shape (BINS, c), and the derivatives of its logarithm (BINS, c, 21)."""
-        x = patch.position.r * math.cos(patch.position.phi)
-        y = patch.position.r * math.sin(patch.position.phi)
-        values, derivatives = [], []
-        for channel in patch.scene.channels:
-            settings = patch.settings.with_channel(channel)
-            stop = self.begin.stop(settings)
-            q = math.exp(self.begin.log_q) * WAVELENGTH_NM[channel] / WAVELENGTH_NM["g"] / stop
-            linear = stopped(design(patch.position, settings), stop)
-            radius, move = lens[-2] / stop, lens[-1] / stop
-            transfer = Transfer.of(
-                q, _RINGS if channel == "g" else _RINGS - BORROWED_RINGS, coarse=self.coarse
-            )
-            value, by_blur, by_eye = transfer.log_power(
-                linear @ lens[: len(NAMES)], radius, (move * x, move * y)
-            )
-            values.append(np.exp(value))
-            by_move = by_eye[:, 1] * x + by_eye[:, 2] * y
-            derivatives.append(np.column_stack([by_blur @ linear, by_eye[:, 0] / stop, by_move / stop]))
-        return np.stack(values, axis=1), np.stack(derivatives, axis=1)
+
+def expected(
+    begin: Wavefront, lens: Floats, patch: PatchView, *, coarse: bool = False
+) -> tuple[Floats, Floats, dict[Channel, tuple[Floats, Floats]]]:
+    """What a patch should show behind a lens.
+
+    Parameters
+    ----------
+    begin : Wavefront
+        Its width of diffraction and widest aperture count.
+    lens : ndarray, shape (21,)
+        Terms and cat's eye.
+    patch : PatchView
+    coarse : bool
+        See `fit_spectra`.
+
+    Returns
+    -------
+    power : ndarray, shape (BINS, c)
+        |OTF|^2.
+    by_lens : ndarray, shape (BINS, c, 21)
+        Derivatives of its logarithm.
+    phases : dict
+        Of each channel compared with green: phases, (PHASE_BINS,), and derivatives, (PHASE_BINS, 21).
+    """
+    x = patch.position.r * math.cos(patch.position.phi)
+    y = patch.position.r * math.sin(patch.position.phi)
+    values, derivatives = [], []
+    waves: dict[Channel, tuple[Transfer, NDArray[np.complex128], Floats]] = {}
+    for channel in patch.scene.channels:
+        settings = patch.settings.with_channel(channel)
+        stop = begin.stop(settings)
+        q = math.exp(begin.log_q) * WAVELENGTH_NM[channel] / WAVELENGTH_NM["g"] / stop
+        linear = stopped(design(patch.position, settings), stop)
+        radius, move = lens[-2] / stop, lens[-1] / stop
+        transfer = Transfer.of(q, _RINGS if channel == "g" else _RINGS - BORROWED_RINGS, coarse=coarse)
+        wave = transfer.waves(linear @ lens[: len(NAMES)], radius, (move * x, move * y))
+        value, by_blur, by_eye = transfer.log_power_of(wave)
+        by_own = np.zeros((9, _LENS))  # what blur and cat's eye of this place and channel are of the lens
+        by_own[:6, : len(NAMES)] = linear
+        by_own[6, -2], by_own[7, -1], by_own[8, -1] = 1.0 / stop, x / stop, y / stop
+        values.append(np.exp(value))
+        derivatives.append(np.concatenate([by_blur, by_eye], axis=1) @ by_own)
+        waves[channel] = transfer, wave, by_own
+    phases = {}
+    for channel in patch.phases:
+        (own, wave, by_own), (green, light, by_green) = waves[channel], waves["g"]
+        phase, by_channel, by_light = phase_between(own, wave, green, light)
+        phases[channel] = phase, by_channel @ by_own + by_light @ by_green
+    return np.stack(values, axis=1), np.stack(derivatives, axis=1), phases
+
+
+def phase_terms(
+    seen: CrossPhase, phase: Floats, by_lens: Floats, temper: float = _PHASE_TEMPER
+) -> tuple[float, Floats, Floats]:
+    """Cost of phases with its normal equations and gradient, after the shift that suits best.
+
+    It is nu ln(1 + chi^2 / nu) with chi^2 = sum 2 p (1 - cos(seen - phase - 2 pi f.s)), times `temper`.
+    """
+    precision = seen.precision / (1.0 + seen.precision * _PHASE_SCATTER**2)
+    left = unshifted(CrossPhase(seen.phase, precision), phase)
+    chi2 = float(2.0 * precision @ (1.0 - np.cos(left)))
+    nu = _PATCH_TAILS * PHASE_BINS
+    weight = temper / (1.0 + chi2 / nu)
+    free = without_linear(by_lens, precision)
+    voted = precision[:, None] * free
+    return temper * nu * math.log1p(chi2 / nu), weight * free.T @ voted, weight * voted.T @ np.sin(left)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

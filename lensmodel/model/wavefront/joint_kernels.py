@@ -1,7 +1,8 @@
 """The kernels of all samples of a lens, solved together from their spectra.
 
 A wavefront is fitted to the spectra of all patches (`fit`), beginning with fits to the samples' own kernels
-and to their moments; the side of the tails is decided by the patches' vote (`PatchSpectrum.tail`).
+and to their moments; the side of the tails is decided by the patches' vote (`PatchSpectrum.tail`) and, where
+a photo's mosaic is known, by the phases of red and blue against green.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from lensmodel.model.wavefront.from_spectra import (
     PooledFit,
     fit_spectra,
     open_eye,
+    phase_costs,
 )
 from lensmodel.model.wavefront.least_squares import PRIOR_PX, USUAL_EYE
 from lensmodel.model.wavefront.scene_spectrum import SceneView
@@ -80,7 +82,8 @@ class Pooled:
     ----------
     fit : PooledFit
     tails : float
-        Vote of the patches for the side of the tails, in standard deviations; its sign was obeyed.
+        Vote of the patches for the side of the tails, by tails and phases, in standard deviations; its sign
+        was obeyed.
     trust : dict
         Median weight of each photo's patches; near 0 where something other than the lens blurred.
     diffraction_known : bool
@@ -179,11 +182,9 @@ def pool(samples: Sequence[PsfSample], on_step: StepHook = ignore_step) -> Poole
     wide, narrow = _by_aperture(heads, widest)
     chosen = [at[id(s)] for s in (*spread(wide, _FINE_PLACES), *spread(narrow, _NARROW_PLACES))]
     parts = [[at[id(s)] for s in spread(own, _FINE_PLACES)] for own in _pairs(wide)]
-    votes = [(_tail_vote(fit.front, heads), fit) for fit in _searched(chosen, parts, begins, on_step)]
-    # a vote of z standard deviations is a likelihood too: z^2 beside a cost of chi^2
-    tails, best = min(votes, key=lambda vote: vote[1].cost - vote[0] ** 2)
-    if tails < 0:
-        best = replace(best, front=_negative(best.front))
+    views = [_view(group) for group in chosen]
+    ends = [_sided(fit, heads, views) for fit in _searched(chosen, parts, begins, on_step)]
+    best, tails = min(ends, key=lambda end: end[0].cost)
     trust: dict[str, list[float]] = {}
     for group, value in zip(chosen, best.trust, strict=True):
         trust.setdefault(next(iter(group.values())).photo, []).append(float(value))
@@ -219,12 +220,27 @@ def _searched(
                 on_step(done := done + _MEDIUM_ROUNDS, total)
         most = _REFINED if part is chosen else _REFINED_OF_PAIR
         fronts += [fit.front for fit in _different(medium)[:most]]
-    fine, refined = [_view(group) for group in chosen], []
+    fine, refined = [replace(_view(group), phases={}) for group in chosen], []
     for front in fronts:
         refined.append(fit_spectra(fine, front, rounds=_FINE_ROUNDS))
         on_step(done := done + _FINE_ROUNDS, total)
     on_step(total, total)
     return refined
+
+
+def _sided(fit: PooledFit, heads: Sequence[PsfSample], views: Sequence[PatchView]) -> tuple[PooledFit, float]:
+    """Return a fit on the side that tails and phases speak for, and their vote in standard deviations.
+
+    Its cost is then with theirs, so that a lens whose coma is negated is found out as well. A vote of z
+    standard deviations is a likelihood too: z^2 beside a cost of chi^2, for one side and against the other.
+    """
+    vote = tail_vote(_kernels(fit.front, heads), heads)
+    own, turned = phase_costs(views, fit.front)
+    costs = fit.cost + own - vote * abs(vote), fit.cost + turned + vote * abs(vote)
+    apart = costs[1] - costs[0]
+    both = math.copysign(math.sqrt(abs(apart) / 2.0), apart) if apart else 0.0
+    front = fit.front if apart >= 0 else _negative(fit.front)
+    return replace(fit, front=front, cost=min(costs)), both
 
 
 def _pairs(samples: Sequence[PsfSample]) -> list[list[PsfSample]]:
@@ -324,19 +340,26 @@ def _view(group: dict[Channel, PsfSample]) -> PatchView:
     head = next(iter(group.values()))
     spectra = {c: group[c].spectrum for c in ("g", "r", "b") if c in group}
     scene = SceneView.of({c: s for c, s in spectra.items() if s is not None})
-    return PatchView(head.position, head.settings, head.photo, scene)
+    phases = {
+        c: s.cross for c, s in spectra.items() if s is not None and s.cross is not None and "g" in group
+    }
+    return PatchView(head.position, head.settings, head.photo, scene, phases)
 
 
-def _tail_vote(front: Wavefront, samples: Sequence[PsfSample]) -> float:
-    """How much the patches' tails agree with those of a wavefront, in standard deviations.
+def _kernels(front: Wavefront, samples: Sequence[PsfSample]) -> list[Kernel]:
+    """Kernels that are compared with the tails of samples."""
+    return [front.kernel(s.position, s.settings, _TAIL_SIDE) for s in samples]
+
+
+def tail_vote(kernels: Sequence[Kernel], samples: Sequence[PsfSample]) -> float:
+    """How much the patches' tails agree with those of kernels at their places, in standard deviations.
 
     Each patch votes by the cosine of the angle between the two: its strength is that of its scene's edges.
     """
     votes = []
-    for sample in samples:
+    for kernel, sample in zip(kernels, samples, strict=True):
         if sample.spectrum is not None:
-            own = _third_moment(front.kernel(sample.position, sample.settings, _TAIL_SIDE))
-            seen = sample.spectrum.tail
+            own, seen = _third_moment(kernel), sample.spectrum.tail
             lengths = math.hypot(*own) * math.hypot(*seen)
             votes.append((own[0] * seen[0] + own[1] * seen[1]) / lengths if lengths > 0.0 else 0.0)
     total, scatter = float(np.sum(votes)), float(np.sqrt(np.sum(np.square(votes))))

@@ -7,7 +7,15 @@ import pytest
 from scipy import signal
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.spectrum import RINGS, SECTORS, PatchSpectrum, binned_spectrum, tail_of
+from lensmodel.core.spectrum import (
+    PHASE_BINS,
+    RINGS,
+    SECTORS,
+    CrossPhase,
+    PatchSpectrum,
+    binned_spectrum,
+    tail_of,
+)
 from lensmodel.core.types import NoiseModel
 
 
@@ -61,6 +69,21 @@ def test_bytes_bring_the_same_spectrum_back() -> None:
     assert np.array_equal(back.power, spectrum.power)
     assert back.noise == pytest.approx(spectrum.noise, rel=1e-6)
     assert back.tail == pytest.approx(spectrum.tail, rel=1e-6)
+    assert back.cross is None
+
+
+def test_bytes_bring_the_phases_back_and_do_without() -> None:
+    rng = np.random.default_rng(4)
+    cross = CrossPhase(*rng.random((2, PHASE_BINS), dtype=np.float32))
+    spectrum = PatchSpectrum(rng.random((RINGS, SECTORS), dtype=np.float32), 0.1, (0.2, 0.3), cross)
+
+    data = spectrum.to_bytes()
+    back = PatchSpectrum.from_bytes(data)
+
+    assert back.cross is not None
+    assert np.array_equal(back.cross.phase, cross.phase)
+    assert np.array_equal(back.cross.precision, cross.precision)
+    assert PatchSpectrum.from_bytes(data[: 4 * (RINGS * SECTORS + 3)]).cross is None
 
 
 @pytest.mark.parametrize("data", [b"", b"x" * 100, np.full(RINGS * SECTORS + 3, np.nan, "<f4").tobytes()])

@@ -11,9 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lensmodel.core.cross_phase import CrossPhase
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample, delta, gaussian
-from lensmodel.core.spectrum import RINGS, SECTORS, PatchSpectrum
+from lensmodel.core.spectrum import PHASE_BINS, RINGS, SECTORS, PatchSpectrum
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
 from lensmodel.model.sample_codec import PackedSamples, pack_samples, unpack_samples
 
@@ -24,8 +25,10 @@ finite = {"allow_nan": False, "allow_infinity": False}
 def spectra(draw: st.DrawFn) -> PatchSpectrum:
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     tail = (draw(st.floats(-9, 9, width=32)), draw(st.floats(-9, 9, width=32)))
+    numbers = [rng.random(PHASE_BINS, dtype=np.float32) for _ in range(2)]
+    cross = CrossPhase(*numbers) if draw(st.booleans()) else None
     return PatchSpectrum(
-        rng.random((RINGS, SECTORS), dtype=np.float32), draw(st.floats(0, 1, width=32)), tail
+        rng.random((RINGS, SECTORS), dtype=np.float32), draw(st.floats(0, 1, width=32)), tail, cross
     )
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from lensmodel import correction, photo, quality
 from lensmodel.core import codec
+from lensmodel.core.cross_phase import log_likelihood, mean_in_bins
 from lensmodel.core.errors import InvalidInputError, MetadataMissingError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample
@@ -169,6 +170,43 @@ def test_spectra_of_photos_that_a_camera_sharpened_are_not_kept(
     )
 
     assert (found[0].sample.spectrum is not None) == kept
+
+
+def test_the_mosaic_s_phases_tell_the_lens_from_the_one_turned_by_180_degrees(
+    photos: dict[str, tuple[Path, SimulatedPhoto]],
+) -> None:
+    lake = photo.develop(photos["lake"][0])
+    places = ((1, 415), (112, 2), (223, 415))  # the pattern begins with each of its rows and columns
+    group = [Patch(row, col, 160, lake.frame.position(row + 79.5, col + 79.5), 1.0, 0) for row, col in places]
+    found = pipeline.estimate_cell(
+        lake, group, settings=SETTINGS, photo_id="a", estimator="whittle", channels=("g", "b")
+    )
+    field, more = LENS.field(SETTINGS, pitch_um=CAMERA.pitch_um), []
+    for cell in found:
+        assert cell.sample.spectrum is not None
+        cross = cell.sample.spectrum.cross
+        assert (cross is None) == (cell.channel == "g")
+        if cross is not None:
+            waves = []
+            for channel in ("b", "g"):
+                grid = np.zeros((64, 64))
+                grid[:41, :41] = field.kernel_at(cell.patch.position, channel, 41)
+                waves.append(np.fft.fft2(np.roll(grid, (-20, -20), axis=(0, 1))))
+            true = np.angle(mean_in_bins(waves[0] * waves[1].conj()))
+            more.append(log_likelihood(cross, true) - log_likelihood(cross, -true))
+
+    assert len(more) == 3
+    assert min(more) > 5.0
+
+
+def test_planes_without_a_mosaic_have_no_phases(city: LinearPhoto) -> None:
+    patch = Patch(128, 192, 128, city.frame.position(192, 256), 1.0, 0)
+    found = pipeline.estimate_cell(
+        replace(city, cfa=None), [patch], settings=SETTINGS, photo_id="a", estimator="whittle"
+    )
+
+    assert all(cell.sample.spectrum is not None for cell in found)
+    assert all(cell.sample.spectrum.cross is None for cell in found if cell.sample.spectrum is not None)
 
 
 def test_a_patch_that_took_no_part_becomes_a_sample_all_the_same(city: LinearPhoto) -> None:

@@ -25,15 +25,14 @@ from app.http.bodies import CLOSE
 from app.http.dependencies import Call, CallDep
 from app.http.idempotency import Once, OnceDep
 from app.routes.common import Cursor, Limit, OnlyId, cut, next_link, problems
+from app.routes.upload_checks import check_model, check_selector
 from app.runtime.settings import MIB, Settings
 from app.schemas import PatchPage, PhotoChange, PhotoOut, PhotoPage, PhotoState, UploadFields
 from app.store import LensName
 from app.store.access.accounts import Quota
 from app.store.ids import new_id
 from app.store.photo_steps import GIVEN_SETTINGS, folder_of
-from app.store.tables import LensRow, PhotoRow
-from lensmodel.core.errors import UnknownMethodError
-from lensmodel.estimation.patches import selectors
+from app.store.tables import PhotoRow
 
 router = APIRouter(tags=["photos"])
 GIB = 1024 * MIB
@@ -148,7 +147,7 @@ def _take(
 
     def record() -> PhotoOut:
         _check_kind(call, uploaded.fields, measured=measured)
-        _check_selector(uploaded.fields)
+        check_selector(uploaded.fields)
         where = location.remove(call.storage, f"{prefix}original")
         photo, fresh = _record(call, public_id, uploaded, prefix, where)
         call.response.status_code = status.HTTP_202_ACCEPTED if fresh else status.HTTP_200_OK
@@ -179,20 +178,6 @@ def _check_kind(call: Call, fields: UploadFields, *, measured: bool) -> None:
         )
     if fields.reference_id is not None:
         find_photo(call, fields.reference_id)
-
-
-def _check_selector(fields: UploadFields) -> None:
-    """Refuse a selector that is not there, or one for a photo whose patches nobody chooses."""
-    if fields.selector is None:
-        return
-    if fields.kind is not None:
-        raise InvalidParameterError(
-            f"selector={fields.selector} and kind exclude each other: leave one of them out"
-        )
-    try:
-        selectors.create(fields.selector)
-    except UnknownMethodError as error:
-        raise InvalidParameterError(str(error)) from error
 
 
 def _admit(call: Call) -> None:
@@ -244,7 +229,7 @@ def _record(
             raise UnknownLensError(
                 f"lens_id {fields.lens_id}: there is no such lens; GET /v1/lenses lists them"
             )
-        _check_model(fields, lens)
+        check_model(fields, lens)
     received = call.store.photos.receive(
         call.owner,
         public_id=public_id,
@@ -260,22 +245,13 @@ def _record(
     )
     if received.photo.public_id != public_id:
         if not received.fresh:
-            _check_model(fields, call.store.photos.lens_of(received.photo))
+            check_model(fields, call.store.photos.lens_of(received.photo))
         if received.wants_file:  # its file was given up: this is the same one
             key = f"{folder_of(received.photo)}original-{public_id}"
             call.storage.rename(f"{prefix}original", key)
             call.store.photos.restore_file(received.photo.public_id, key, where, again=received.fresh)
         call.storage.delete(prefix)  # the same bytes are stored already
     return describe(call, find_photo(call, received.photo.public_id)), received.fresh
-
-
-def _check_model(fields: UploadFields, lens: LensRow | None) -> None:
-    """Refuse a photo that was sent for another model than its lens has."""
-    if lens is not None and fields.model not in {None, lens.way}:
-        raise ConflictError(
-            f"model={fields.model}: lens {lens.public_id} has the model {lens.way}; PATCH /v1/lenses/"
-            f'{lens.public_id} with {{"model": "{fields.model}"}}, or leave model out'
-        )
 
 
 def describe(call: Call, photo: PhotoRow) -> PhotoOut:

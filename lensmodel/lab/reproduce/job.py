@@ -18,7 +18,7 @@ from lensmodel.core.types import Planes
 from lensmodel.lab.figure_parts import strip
 from lensmodel.lab.reproduce import measure, programs
 from lensmodel.lab.reproduce.cases import Case, Reproduction
-from lensmodel.lab.reproduce.general import general_field
+from lensmodel.lab.reproduce.general import general_field, general_key, general_words
 from lensmodel.lab.reproduce.measured import measured_field, photograph_target
 from lensmodel.lab.reproduce.progress import (
     CORRECT,
@@ -111,6 +111,7 @@ class Job:
             "family": case.family,
             "unseen": case.unseen,
             "source": case.source,
+            "general_profile": general_words(case) if with_general(case, self.plan) else "",
             "kind": case.lens.model.split()[1].lower(),
             "condition": case.condition,
             "condition_title": case.conditions.title,
@@ -129,7 +130,7 @@ class Job:
         return {
             "truth": {"": folder / "truth.json"},
             "measured": {"": folder / "measured.json"} if with_target(case, plan) else {},
-            "general": {"": folder / "general.json"} if with_general(case, plan) else {},
+            "general": {"": folder / f"general{general_key(case)}.json"} if with_general(case, plan) else {},
             "learned": {n: folder / f"learned-{n}.json" for n in counts},
             "paper": {n: folder / f"paper-{n}.json" for n in counts} if with_paper(case, plan) else {},
             "rivals": {

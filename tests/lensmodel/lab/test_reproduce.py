@@ -40,7 +40,13 @@ from lensmodel.lab.reproduce import (
 from lensmodel.lab.reproduce.cases import FIRST_SEED, Size, fingerprint, key_of
 from lensmodel.lab.reproduce.conditions import BASE, CONDITIONS, PATHS, SCENES_THAT_HURT
 from lensmodel.lab.reproduce.fidelity import EVERY, blocks, fidelity
-from lensmodel.lab.reproduce.general import MeanField, SymmetricField, general_field
+from lensmodel.lab.reproduce.general import (
+    MeanField,
+    SymmetricField,
+    general_field,
+    general_key,
+    general_words,
+)
 from lensmodel.lab.reproduce.interpolation import Flow
 from lensmodel.lab.reproduce.pages.bars import bars, held
 from lensmodel.lab.reproduce.pages.tables import groups, hard_rows, kept, shares, summary
@@ -235,6 +241,31 @@ def test_general_profile_of_a_drawn_lens_is_the_mean_of_development_lenses_of_it
     assert max(int(lens.serial.removeprefix("SIM")) for lens in lenses) < 100
     mean = np.mean([each.kernel_at(place, "g", 21) for each in field.fields], axis=0)
     np.testing.assert_allclose(field.kernel_at(place, "g", 21), mean / mean.sum())
+
+
+def test_general_profile_of_a_traced_lens_is_the_mean_of_other_copies_where_there_are_any(
+    tmp_path: Path,
+) -> None:
+    own = tmp_path / "traced-heliar.npz"
+    own.write_bytes(HELIAR.read_bytes())
+    (tmp_path / "traced-other.npz").write_bytes(TELEPHOTO.read_bytes())  # of another design
+    one = traced(own)
+    assert general_words(one) == "the lens itself made symmetric"
+    assert general_key(one) == ""
+
+    grid = read_grid(HELIAR)
+    copy = replace(
+        grid,
+        kernels=np.ascontiguousarray(grid.kernels[..., ::-1]),
+        facts={**grid.facts, "sensor_tilt_um": [-6.0, 4.0]},
+        _known={},
+    )
+    copy.write(tmp_path / "traced-heliar-copy.npz")
+    assert general_words(one) == "another copy of the design"
+    assert general_key(one) not in {"", general_key(traced(tmp_path / "traced-heliar-copy.npz"))}
+    place = FieldPosition(0.7, 0.4)
+    found = general_field(one).kernel_at(place, "g", 21)
+    np.testing.assert_allclose(found, copy.kernel_at(place, "g", 21), atol=1e-3)
 
 
 def test_flow_gives_the_psfs_of_its_windows_in_their_middles_and_their_mean_between() -> None:

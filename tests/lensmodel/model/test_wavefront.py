@@ -32,6 +32,18 @@ def test_derivatives_of_the_light_are_its_differences() -> None:
         assert np.abs(found[term] - wanted).max() < 5e-3 * np.abs(wanted).max()
 
 
+@pytest.mark.parametrize(("q", "size"), [(0.17, 33), (0.19, 25), (0.35, 21), (1.2, 9)])
+def test_folded_transform_gives_the_light_of_the_plain_one(q: float, size: int) -> None:
+    grid = PupilGrid.of(q, size)  # even and odd numbers of samples, in the pupil and across the light
+    g = np.array([1.0, 0.8, -0.4, -1.5, 0.4, 0.3, 0.2, -0.1])
+    amplitude = grid.amplitude(1.1, (0.2, 0.1))
+    angle = np.tensordot(g * np.pi / q, grid.terms.astype(np.float64), axes=1)
+
+    plain = np.abs(grid.rows @ (amplitude * np.exp(1j * angle)) @ grid.cols) ** 2
+
+    np.testing.assert_allclose(grid.fine_light(g, amplitude), plain, atol=1e-5 * plain.max())
+
+
 def test_tilt_to_the_right_moves_the_light_to_the_right() -> None:
     grid = PupilGrid.of(0.5, 21)
     amplitude = grid.amplitude(2.0, (0.0, 0.0))

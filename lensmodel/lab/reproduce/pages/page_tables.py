@@ -297,10 +297,11 @@ def which_lenses(page: Page, result: Mapping[str, Any]) -> None:
             case["title"],
             case["source"],
             "unseen" if case["unseen"] else "looked at during development",
+            case.get("general_profile", ""),
         ]
         for case in result["cases"]
     ]
-    page.table(["family", "lens", "source", ""], rows)
+    page.table(["family", "lens", "source", "", "general profile"], rows)
 
 
 def lenses(page: Page, result: Mapping[str, Any]) -> None:

@@ -3,8 +3,9 @@
     python -m app.lab.psf_service [--requests 400] [--photos 6] [--processes 3] [--size 55] [--busy 0]
 
 Several API processes, as `lensmodel serve` starts them, serve one database with one simulated lens that a
-worker has learned. One client asks each of them over a
-connection that stays open, for a new place every time. Gross is the wall time of a request seen by the
+worker has learned. Its samples are true kernels of a lens of third order with the spectra of patches behind
+them, so that the wavefront answers too; its share is printed, and none ends the benchmark. One client asks each
+of them over a connection that stays open, for a new place every time. Gross is the wall time of a request seen by the
 client; net is what remains of it after that of `/healthz` on the same connection: the share of HTTP,
 framework and client. The CPU time is the server's, by request. `--busy` lets so many tasks of a worker
 compute meanwhile. Then a photo joins the lens, and the very next answer of every process must be of the new
@@ -29,6 +30,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy import signal
 
 from app.blobs.storage import Storage
 from app.runtime import server
@@ -38,12 +40,17 @@ from app.store import LensName, NewPatch, NewSample, Store
 from app.store.ids import new_id
 from app.store.upkeep import migrate
 from app.store.versions import learned_key
-from lensmodel.core.types import CHANNELS, LensSettings
+from lensmodel.core.psf import resized, rms_width
+from lensmodel.core.spectrum import PatchSpectrum
+from lensmodel.core.types import CHANNELS, FieldPosition, Kernel, LensSettings, NoiseModel, Plane
 from lensmodel.lab.model.model_benchmark import patch_places
+from lensmodel.lab.scenes import dead_leaves
 from lensmodel.model import LensModel
 from lensmodel.simulate import SimulatedLens, draw_lens
 
 SIDE, SEED, READY_S = 31, 0, 60.0
+PATCH, NOISE, TRUTH = 128, 0.003, 41
+"""Side of the patches in pixels, standard deviation of their noise, side of the kernels that blur them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,22 +117,40 @@ def count_photo(store: Store, lens: SimulatedLens, rng: np.random.Generator) -> 
     )
     store.photos.set_state(public_id, ("selecting",), "estimating")
     settings = LensSettings(aperture=lens.at_focal().f_number, focal_mm=lens.focal_mm[0])
-    samples = [
-        NewSample(k, channel, lens.kernel(p, settings.with_channel(channel), SIDE), 1.0, "default/7")
-        for k, p in enumerate(places)
-        for channel in CHANNELS
-    ]
+    samples = []
+    for k, p in enumerate(places):
+        scene = dead_leaves(PATCH + TRUTH - 1, PATCH + TRUTH - 1, rng, oversampling=1)
+        for number, channel in enumerate(CHANNELS):
+            blur = lens.kernel(p, settings.with_channel(channel), TRUTH)
+            seen = spectrum_behind(blur, scene[number], rng).to_bytes()
+            kernel = resized(blur, SIDE)
+            samples.append(NewSample(k, channel, kernel, 1.0, "default/7", spectrum=seen))
     store.patches.finish(public_id, photo.epoch, samples)
     assert store.photos.finish(public_id, photo.epoch) is not None
     return row.public_id
 
 
-def learn(store: Store, storage: Storage, lens_id: str) -> int:
-    """Fit the newest version wholly, as a worker does; return how many samples it has."""
+def spectrum_behind(blur: Kernel, scene: Plane, rng: np.random.Generator) -> PatchSpectrum:
+    """Spectrum of a patch of a scene behind a kernel, with noise."""
+    patch = signal.fftconvolve(scene, blur, mode="valid")
+    noisy = (patch + rng.normal(0.0, NOISE, patch.shape)).astype(np.float32)
+    return PatchSpectrum.of(noisy, NoiseModel.white(NOISE), rms_width(blur))
+
+
+def learn(store: Store, storage: Storage, lens_id: str) -> tuple[int, float]:
+    """Fit the newest version wholly, as a worker does.
+
+    Returns
+    -------
+    samples : int
+    share : float
+        Of the wavefront in an answer of the middle of the field, which HTTP does not tell.
+    """
     state, stored = store.samples.of_lens(lens_id)
     model = LensModel.fit([one.sample for one in stored]).warmed()
     storage.put(learned_key(lens_id, state.version, state.rebuild_epoch), model.learned())
-    return len(stored)
+    answer = model.query(FieldPosition(0.5, 0.5), stored[0].sample.settings, SIDE)
+    return len(stored), answer.wavefront_share
 
 
 BUSY = """
@@ -222,10 +247,13 @@ def main() -> None:
         migrate.upgrade(store.database)
         for _ in range(wanted.photos):
             lens_id = count_photo(store, lens, rng)
-        samples = learn(store, storage, lens_id)
+        samples, share = learn(store, storage, lens_id)
+        if not share:
+            raise SystemExit("no wavefront answers: these times would be of the regression alone")
         with serving(settings, wanted.processes) as members, busy(wanted.busy):
             print(
-                f"{samples} samples of {SIDE} px, answers of {wanted.size} px, "
+                f"{samples} samples of {SIDE} px, share of the wavefront {share:.2f}, "
+                f"answers of {wanted.size} px, "
                 f"{wanted.requests} requests, "
                 f"{wanted.busy} tasks beside them, load average {os.getloadavg()[0]:.1f}"
             )

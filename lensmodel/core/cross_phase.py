@@ -44,9 +44,7 @@ _TILE = 64  # pixels, as in `PatchSpectrum`
 _HALF = _TILE // 2  # sites of one lattice along a tile
 _INDEPENDENT = 3.8  # neighbouring frequencies under a Hann window that count as one
 _OVERLAP = 0.9  # tiles at half overlap that count as one
-_SCATTER = (
-    0.05  # radians: what a scene's colours leave in a bin, whatever the noise (`lab.model.cross_spectra`)
-)
+_SCATTER = 0.05  # radians: what a scene's colours leave in a bin (`lab.model.cross_spectra`)
 _REACH_PX, _STEP_PX = 4.0, 0.5  # shifts that are tried first
 _SHIFT_ROUNDS = 6
 

@@ -236,9 +236,9 @@ def _cross(developed: LinearPhoto, patch: Patch, channel: Channel) -> CrossPhase
     if developed.cfa is None or channel == "g":
         return None
     window = (slice(None), slice(patch.row, patch.row + patch.size), slice(patch.col, patch.col + patch.size))
-    first, second = (developed.cfa[(patch.row + row) % 2] for row in (0, 1))
-    cfa = tuple((cells[patch.col % 2], cells[(patch.col + 1) % 2]) for cells in (first, second))
-    return cross_phase(developed.planes[window], (cfa[0], cfa[1]), channel)
+    rows = (developed.cfa[(patch.row + row) % 2] for row in (0, 1))
+    first, second = ((colours[patch.col % 2], colours[(patch.col + 1) % 2]) for colours in rows)
+    return cross_phase(developed.planes[window], (first, second), channel)
 
 
 def _view(developed: LinearPhoto, patch: Patch, channel: Channel) -> tuple[Plane, NoiseModel]:

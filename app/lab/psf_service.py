@@ -4,12 +4,12 @@
 
 Several API processes, as `lensmodel serve` starts them, serve one database with one simulated lens that a
 worker has learned. Its samples are true kernels of a lens of third order with the spectra of patches behind
-them, so that the wavefront answers too; its share is printed, and none ends the benchmark. One client asks each
-of them over a connection that stays open, for a new place every time. Gross is the wall time of a request seen by the
-client; net is what remains of it after that of `/healthz` on the same connection: the share of HTTP,
-framework and client. The CPU time is the server's, by request. `--busy` lets so many tasks of a worker
-compute meanwhile. Then a photo joins the lens, and the very next answer of every process must be of the new
-version.
+them, so that the wavefront answers too; its share is printed, and none ends the benchmark. One client asks
+each of them over a connection that stays open, for a new place every time. Gross is the wall time of a
+request seen by the client; net is what remains of it after that of `/healthz` on the same connection: the
+share of HTTP, framework and client. The CPU time is the server's, by request. `--busy` lets so many tasks
+of a worker compute meanwhile. Then a photo joins the lens, and the very next answer of every process must
+be of the new version.
 """
 
 from __future__ import annotations

@@ -45,9 +45,9 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    # what a worker fits of a wavefront is asked for in test_lens_modes: here each of many versions would wait
-    kernels = {"LENS_PATCHES": "4", "LENS_MODEL_MODE": "kernels"}
-    with running(tmp_path_factory.mktemp("journey") / "data", BRIEF, **OWN_ACCOUNT, **kernels) as made:
+    # of so few patches no wavefront is fitted, for which each of many versions would wait; see test_lens_modes
+    folder = tmp_path_factory.mktemp("journey") / "data"
+    with running(folder, BRIEF, **OWN_ACCOUNT, LENS_PATCHES="4") as made:
         yield made
 
 

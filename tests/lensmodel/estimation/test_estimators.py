@@ -135,6 +135,7 @@ def beyond(kernel: np.ndarray, side: int) -> float:
     return 1.0 - float(kernel[out : out + side, out : out + side].sum()) if out > 0 else 0.0
 
 
+@pytest.mark.slow
 def test_default_sees_blur_beyond_31_pixels_where_larger_kernels_are_asked_for() -> None:
     truth = tilted_disc(17.0)
     scene = demo_scene("city")[1][300:482, 500:682]

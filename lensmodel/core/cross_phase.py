@@ -42,11 +42,17 @@ Waves = NDArray[np.complex128]
 
 _TILE = 64  # pixels, as in `PatchSpectrum`
 _HALF = _TILE // 2  # sites of one lattice along a tile
-_INDEPENDENT = 3.8  # neighbouring frequencies under a Hann window that count as one
-_OVERLAP = 0.9  # tiles at half overlap that count as one
+# Neighbours under a Hann window that count as one: (1 + 2 (2/3)^2 + 2 (1/6)^2)^2, by the squared
+# correlations of its transform (F. J. Harris, Proc. IEEE 66, 1978)
+_INDEPENDENT = 3.8
+# Independent share of half-overlapping tiles: (1 + 2 (1/6)^2)^-2 (P. D. Welch, IEEE Trans. AU-15, 1967)
+_OVERLAP = 0.9
 _SCATTER = 0.05  # radians: what a scene's colours leave in a bin (`lab.model.cross_spectra`)
-_REACH_PX, _STEP_PX = 4.0, 0.5  # shifts that are tried first
-_SHIFT_ROUNDS = 6
+_REACH_PX, _STEP_PX = (
+    4.0,
+    0.5,
+)  # shifts that are tried first (chosen: beyond usual lateral colour)
+_SHIFT_ROUNDS = 6  # of Gauss and Newton (chosen: far below a hundredth of a pixel from such a start)
 
 _EDGES = np.geomspace(*RING_LIMITS, RINGS + 1)
 _AXIS = np.fft.fftfreq(_HALF) / 2.0  # cycles/pixel of the full lattice
@@ -108,7 +114,14 @@ def _coherent_in_bins(planes: Planes, cfa: BayerPattern, channel: Channel) -> Wa
 
 
 def cross_spectra(planes: Planes, cfa: BayerPattern, channel: Channel) -> tuple[Waves, Floats, Floats]:
-    """Mean cross spectrum of a channel with green over Hann-windowed tiles, and both powers."""
+    """Mean cross spectrum of a channel with green over Hann-windowed tiles, and both powers.
+
+    Returns
+    -------
+    cross : ndarray of complex128, shape (n,)
+    own, green : ndarray of float64, shape (n,)
+        At the n frequencies of `_FREQUENCY`.
+    """
     index = CHANNELS.index(channel)
     height, width = planes.shape[1:]
     if min(height, width) < _TILE:

@@ -67,7 +67,7 @@ class Fit:
     validation : CrossValidation
     expected : ndarray, shape (n,)
         Squared errors that the estimators expect of their samples; 0 where they expect nothing.
-    heard : ndarray of bool, shape (n,)
+    has_spectrum : ndarray of bool, shape (n,)
         Which samples carry the spectrum of their patch.
     rule, bandwidth : dict
         Bandwidths of eq. (8), and those in use.
@@ -89,7 +89,7 @@ class Fit:
     roster: Roster
     validation: CrossValidation
     expected: NDArray[np.float64]
-    heard: NDArray[np.bool_]
+    has_spectrum: NDArray[np.bool_]
     rule: dict[str, float]
     bandwidth: dict[str, float]
     physical: Physics | None = None
@@ -177,7 +177,7 @@ class Fit:
             roster=self.roster.extended(common),
             validation=self.validation.extended(_claimed(samples, settings)),
             expected=np.concatenate([self.expected, expected_errors(samples)]),
-            heard=np.concatenate([self.heard, with_spectra(samples)]),
+            has_spectrum=np.concatenate([self.has_spectrum, with_spectra(samples)]),
         )
 
 

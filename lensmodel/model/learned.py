@@ -29,7 +29,7 @@ from lensmodel.model.field.local_frame import LocalKernels
 from lensmodel.model.field.robust import Flag
 from lensmodel.model.field.transport import WidthField
 from lensmodel.model.fitting import Fit, Roster, expected_errors, with_spectra
-from lensmodel.model.wavefront.physical_mean import APART, Physics
+from lensmodel.model.wavefront.physical_mean import REASONS_APART, Physics
 from lensmodel.model.wavefront.zoom import End
 from lensmodel.optics.wavefront import NAMES, Wavefront
 
@@ -174,8 +174,8 @@ def _physical(document: Mapping[str, Any], lines: dict[str, Any], arrays: dict[s
     physics = Physics(front=wavefront, **scalars, **arrays)
     if not 0.0 <= physics.turned <= 1.0:
         raise ValueError("a probability lies outside 0..1")
-    if physics.apart not in APART or physics.agreed != (physics.apart == ""):
-        raise ValueError(f"no reason {physics.apart!r} to solve patches apart")
+    if physics.why_apart not in REASONS_APART or physics.agreed != (physics.why_apart == ""):
+        raise ValueError(f"no reason {physics.why_apart!r} to solve patches apart")
     if (
         physics.side < 1
         or physics.side % 2 == 0
@@ -229,7 +229,7 @@ def _fit(
         roster=Roster.of(common),
         validation=validation,
         expected=expected_errors(samples),
-        heard=with_spectra(samples),
+        has_spectrum=with_spectra(samples),
         rule=rule,
         bandwidth=used,
         physical=physical,

@@ -79,7 +79,7 @@ def provenance(
     np.add.at(parts, near.rows, np.maximum(near.weights, 0.0))
     parts *= (1.0 - share) / parts.sum()
     if share > 0.0:
-        parts += share * _heard(fit, settings)
+        parts += share * _wavefront_votes(fit, settings)
     per_photo = np.bincount(fit.roster.photo, parts)
     return Provenance(
         *_named(fit, share, settings, takes_wavefront=takes_wavefront),
@@ -107,16 +107,16 @@ def _without_wavefront(fit: Fit, settings: LensSettings, *, takes_wavefront: boo
         return "the regression that was chosen takes no wavefront"
     if physical is None:
         voting = fit.validation.votes > 0.0
-        if fit.mode == BOTH and not (fit.heard & voting).any():
+        if fit.mode == BOTH and not (fit.has_spectrum & voting).any():
             return "no patch has a spectrum"
         few = int(voting.sum()) < MIN_SAMPLES
         return f"fewer than {MIN_SAMPLES} samples" if few else "the wavefront is not fitted yet"
     if not physical.agreed:
-        return _APART[physical.apart]
+        return _APART[physical.why_apart]
     return "kernels were measured" if physical.diffraction_known else "aperture or pixel pitch unknown"
 
 
-def _heard(fit: Fit, settings: LensSettings) -> NDArray[np.float64]:
+def _wavefront_votes(fit: Fit, settings: LensSettings) -> NDArray[np.float64]:
     """Votes of sum 1 of the samples that the wavefront of some settings was fitted to, shape (n,).
 
     Channels of one patch are not counted apart: those of the question stand for all.
@@ -129,7 +129,7 @@ def _heard(fit: Fit, settings: LensSettings) -> NDArray[np.float64]:
     votes, points = fit.validation.votes.copy(), fit.index.points
     votes[len(physical.errors) :] = 0.0  # joined since
     if physical.agreed:
-        votes[~fit.heard] = 0.0
+        votes[~fit.has_spectrum] = 0.0
     if end is not None:
         votes[~(np.abs(points[:, 5] - end.octaves) <= ONE_FOCAL_LENGTH / 2.0)] = 0.0
     own = np.where(points[:, 4] == WAVELENGTH_NM[settings.channel], votes, 0.0)

@@ -18,7 +18,7 @@ _USUAL_F = 2.8
 USUAL_PITCH_UM = 4.5
 """Of sensors whose pixel pitch nobody knows."""
 
-_LARGEST = 55
+_LARGEST = 55  # pixels: the largest side that estimators give
 _COARSE, _FINE = 12, 36
 _COARSE_ROUNDS, _FINE_ROUNDS = 8, 12
 _STARTS, _REFINED = 4, 2

@@ -51,7 +51,7 @@ _STEPS = 2  # of the progress: the fit, the remainder
 NO_AGREEMENT: Final = "no agreement"
 FEW_SPECTRA: Final = "few spectra"
 SEVERAL_FOCAL_LENGTHS: Final = "several focal lengths"
-APART: Final = ("", NO_AGREEMENT, FEW_SPECTRA, SEVERAL_FOCAL_LENGTHS)
+REASONS_APART: Final = ("", NO_AGREEMENT, FEW_SPECTRA, SEVERAL_FOCAL_LENGTHS)
 """Why patches were not solved together, if they were not."""
 
 
@@ -79,8 +79,8 @@ class Physics:
         Whether aperture and pixel pitch of an agreed wavefront are known.
     turned : float
         Probability that an agreed wavefront gives all kernels turned by 180 degrees.
-    apart : str
-        Of `APART`: why it is not `agreed`.
+    why_apart : str
+        Of `REASONS_APART`: why it is not `agreed`; empty if it is.
     """
 
     front: Wavefront
@@ -93,7 +93,7 @@ class Physics:
     agreed: bool = False
     diffraction_known: bool = False
     turned: float = 0.0
-    apart: str = ""
+    why_apart: str = ""
 
     @classmethod
     def fit(
@@ -156,7 +156,7 @@ class Physics:
         errors[chosen] = seen
         on_step(_STEPS, _STEPS)
         apart = SEVERAL_FOCAL_LENGTHS if several else FEW_SPECTRA if pooled is None else NO_AGREEMENT
-        return cls(front, side, vectors, where, scale, rest, errors, apart=apart)
+        return cls(front, side, vectors, where, scale, rest, errors, why_apart=apart)
 
     def rows(self, positions: Sequence[FieldPosition], settings: LensSettings) -> NDArray[np.float64]:
         """Kernels of the image frame as flat rows, shape (q, side^2)."""

@@ -44,7 +44,7 @@ def physics(count: int, apart: str = "", *, known: bool = True) -> Physics:
     front = Wavefront(np.zeros(len(NAMES)), math.log(0.3), (1.15, 0.3), 2.0, SIDE)
     empty = np.empty((0, 2)), np.empty((0, 7)), np.ones(7), np.empty((0, SIDE**2))
     return Physics(
-        front, SIDE, *empty, np.full(count, 0.2), agreed=not apart, diffraction_known=known, apart=apart
+        front, SIDE, *empty, np.full(count, 0.2), agreed=not apart, diffraction_known=known, why_apart=apart
     )
 
 

@@ -2,7 +2,7 @@
 
 ============  ===============================================================================
 both          a quarter of the kernels of the neighbours averaged, three quarters of the wavefront of the
-              lens where the spectra of all patches agree on one (the default)
+              lens where the spectra of all patches agree on one and kernels are no exact ones (the default)
 kernels       the kernels of the neighbours averaged, as in the paper
 wavefront     the wavefront of the lens alone, fitted to all samples (`physical_mean`)
 paper         the kernels of the neighbours averaged, and nothing else: bandwidths by eq. (8) alone,
@@ -19,6 +19,7 @@ behind either family of development lenses (`python -m lensmodel.lab.model.joint
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -32,7 +33,7 @@ from lensmodel.model.answer import BOTH, WAVEFRONT
 from lensmodel.model.field.kriging import as_kernels
 from lensmodel.model.field.local_frame import Answers
 from lensmodel.model.fitting import Fit
-from lensmodel.model.trust.support import measured_share
+from lensmodel.model.trust.support import exact_share, measured_share
 from lensmodel.model.wavefront.physical_mean import Physics
 
 WAVEFRONT_SHARE: Final = float(fitted("model")["wavefront_share"])
@@ -101,7 +102,8 @@ def answered(
         apart, shares = relative_l2(rows, kernels), np.ones(len(rows))
         return replace(alone, shares=shares, averaged=averaged.squared, apart=apart)
     if fit.mode == BOTH and physical.agreed and physical.diffraction_known:
-        share = WAVEFRONT_SHARE * (1.0 - measured_share(expected))
+        known = np.maximum(measured_share(expected), exact_share(math.sqrt(averaged.usual)))
+        share = WAVEFRONT_SHARE * (1.0 - known)
         return _with_wavefront(averaged, physical, share, positions, settings)
     return averaged
 

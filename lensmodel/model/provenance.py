@@ -21,6 +21,7 @@ from lensmodel.core.types import WAVELENGTH_NM, LensSettings
 from lensmodel.model.answer import BOTH, KERNELS, PAPER, WAVEFRONT
 from lensmodel.model.field.local_frame import Answers
 from lensmodel.model.fitting import Fit
+from lensmodel.model.trust.support import exact_share
 from lensmodel.model.wavefront.from_kernels import MIN_SAMPLES, ONE_FOCAL_LENGTH
 from lensmodel.model.wavefront.joint_kernels import MIN_PLACES
 from lensmodel.model.wavefront.physical_mean import FEW_SPECTRA, NO_AGREEMENT, SEVERAL_FOCAL_LENGTHS
@@ -111,9 +112,10 @@ def _without_wavefront(fit: Fit, settings: LensSettings, *, takes_wavefront: boo
             return "no patch has a spectrum"
         few = int(voting.sum()) < MIN_SAMPLES
         return f"fewer than {MIN_SAMPLES} samples" if few else "the wavefront is not fitted yet"
-    if not physical.agreed:
-        return _APART[physical.why_apart]
-    return "kernels were measured" if physical.diffraction_known else "aperture or pixel pitch unknown"
+    if not physical.agreed or not physical.diffraction_known:
+        return "aperture or pixel pitch unknown" if physical.agreed else _APART[physical.why_apart]
+    exact = exact_share(float(np.sqrt(np.mean(fit.validation.errors**2)))) == 1.0
+    return "kernels agree with each other all over the field" if exact else "kernels were measured"
 
 
 def _wavefront_votes(fit: Fit, settings: LensSettings) -> NDArray[np.float64]:

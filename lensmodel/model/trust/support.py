@@ -27,6 +27,16 @@ def measured_share(error: float | NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.interp(error, (_MEASURED, _BLIND), (1.0, 0.0)))
 
 
+_EXACT, _SCATTERED = 0.03, 0.08
+"""Held-out errors of a whole field up to which its kernels are exact, and from which on they are estimates
+(chosen: blind estimates of one photo scatter by 0.11 at least)."""
+
+
+def exact_share(held_out: float) -> float:
+    """How far kernels that predict each other to a relative L2, all over the field, are exact: 1 or less."""
+    return float(np.interp(held_out, (_EXACT, _SCATTERED), (1.0, 0.0)))
+
+
 def field_error(held_out: float, noise: float, independent: float) -> float:
     """Expected relative L2 of an answer, from held-out errors that contain the samples' own noise.
 

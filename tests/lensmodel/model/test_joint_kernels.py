@@ -256,12 +256,13 @@ def test_a_patch_blurred_by_something_else_loses_its_trust() -> None:
 
 
 def samples(count: int, photos: int = 1) -> list[PsfSample]:
-    rng, found = np.random.default_rng(4), []
+    """Patches whose kernels are estimates: none is exact."""
+    rng, astray, found = np.random.default_rng(4), np.random.default_rng(5), []
     for i, place in enumerate(places(count, 6)):
         spectra = seen_at(place, rng, 0.15)
         for channel in CHANNELS:
             settings = SETTINGS.with_channel(channel)
-            width = rms_width(LENS.kernel(place, settings, 41))
+            width = rms_width(LENS.kernel(place, settings, 41)) * astray.normal(1.0, 0.15)
             found.append(
                 PsfSample(
                     gaussian(31, width**2 * np.eye(2)),
@@ -297,14 +298,7 @@ def gaussian_patch(width: float, rng: np.random.Generator, side: int = 192) -> P
     return PatchSpectrum.of(patch.astype(np.float32), NoiseModel.white(0.003), width)
 
 
-@pytest.mark.parametrize(
-    ("width", "seed"),
-    [
-        (1.3, 2),
-        pytest.param(1.0, 0, marks=pytest.mark.xfail(reason="a wavefront is taken for it: relative L2 0.29")),
-        pytest.param(1.8, 3, marks=pytest.mark.xfail(reason="a wavefront is taken for it: relative L2 0.34")),
-    ],
-)
+@pytest.mark.parametrize(("width", "seed"), [(1.3, 2), (1.0, 0), (1.8, 3)])
 def test_plain_gaussian_comes_back_as_one_by_default(width: float, seed: int, short_search: None) -> None:
     rng, truth = np.random.default_rng(seed), gaussian(31, width**2 * np.eye(2))
     known = []
@@ -315,6 +309,7 @@ def test_plain_gaussian_comes_back_as_one_by_default(width: float, seed: int, sh
     answer = LensModel.fit(known).warmed().query(FieldPosition(0.5, 0.4), SETTINGS, 31)
 
     assert distance(answer.kernel, truth).rel_l2 < 0.05
+    assert answer.answered_by == "regression"
 
 
 @pytest.mark.slow
@@ -364,12 +359,15 @@ def test_pooled_lens_is_nearer_to_the_truth_than_its_samples_and_kept_by_profile
     model = LensModel.fit(known).warmed()
     plain = LensModel.fit([replace(s, spectrum=None) for s in known]).warmed()
 
-    place = FieldPosition(0.85, 0.4)
-    truth = LENS.kernel(place, SETTINGS, 31)
-    assert (
-        distance(model.query(place, SETTINGS, 31).kernel, truth).rel_l2
-        < distance(plain.query(place, SETTINGS, 31).kernel, truth).rel_l2
+    asked, place = places(12, 9), FieldPosition(0.85, 0.4)
+    errors, of_kernels = (
+        [
+            distance(kernel, LENS.kernel(p, SETTINGS, 31)).rel_l2
+            for p, kernel in zip(asked, m.kernels(asked, SETTINGS, 31), strict=True)
+        ]
+        for m in (model, plain)
     )
+    assert np.mean(errors) < 0.9 * np.mean(of_kernels), (np.mean(errors), np.mean(of_kernels))
     assert model.query(place, SETTINGS, 31).wavefront_share > 0.3
 
     save_profile(tmp_path / "a.lensprofile", LensProfile(model))

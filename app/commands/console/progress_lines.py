@@ -20,23 +20,29 @@ class ProgressLines(Progress):
         super().__init__(disable=True)
         self._say = say or _to_standard_error
         self._every_s = every_s
-        self._began = self._last = time.monotonic()
+        self._began = self._last = self._stage_began = time.monotonic()
 
     def update(self, task_id: TaskID, **changes: Any) -> None:  # noqa: ANN401 - as there
         """Change a task as `Progress.update` does; tell it if it is time."""
+        before = self._tasks[task_id].completed, self._tasks[task_id].total
         super().update(task_id, **changes)
-        now = time.monotonic()
+        now, task = time.monotonic(), self._tasks[task_id]
+        if task.completed < before[0] or task.total != before[1]:
+            self._stage_began = now  # what came before does not tell how fast this goes
         if now - self._last >= self._every_s:
             self._last = now
-            self._say(line(self._tasks[task_id], now - self._began))
+            self._say(line(task, now - self._began, now - self._stage_began))
 
 
-def line(task: Task, seconds: float) -> str:
-    """Say how far a task is: time since the start, share, what is in work, time left if it can be told."""
+def line(task: Task, seconds: float, of_stage: float | None = None) -> str:
+    """Say how far a task is: time since the start, share, what is in work, time left if it can be told.
+
+    `of_stage` are the seconds since its count began, those since the start unless told.
+    """
     done = f" {task.percentage:3.0f} %" if task.total else ""
-    left = ""
+    left, of_stage = "", seconds if of_stage is None else of_stage
     if task.total and 0 < task.completed < task.total:
-        left = f", about {clock(seconds * (task.total - task.completed) / task.completed)} left"
+        left = f", about {clock(of_stage * (task.total - task.completed) / task.completed)} left"
     return f"[{clock(seconds)}]{done} {task.description or 'working'}{left}"
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from app.commands.console import progress_lines
 from app.commands.console.progress_lines import ProgressLines, clock
 from app.commands.console.table import aligned
 from app.words import mtf50_words
@@ -40,6 +41,18 @@ def test_without_a_terminal_progress_is_told_in_lines() -> None:
         lines.update(task, completed=1)
 
     assert said == ["[0:00]  25 % learning from a.dng, about 0:00 left"]
+
+
+def test_time_left_is_told_by_the_pace_of_the_stage_that_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    clock_s = iter((0.0, 60.0, 61.0, 62.0))
+    monkeypatch.setattr(progress_lines.time, "monotonic", lambda: next(clock_s))
+    lines = ProgressLines(said.append, every_s=0.0)
+    task = lines.add_task("estimating", total=4)
+    for done in (4, 0, 1):  # a minute of one stage, then a second of the next
+        lines.update(task, completed=done)
+
+    assert said[-1] == "[1:02]  25 % estimating, about 0:03 left"
 
 
 def test_quick_work_says_nothing() -> None:

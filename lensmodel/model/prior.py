@@ -14,7 +14,7 @@ from lensmodel.core.psf import PsfField
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model.answering import AnsweringModel
 
-_SMALL = 15  # pixels along a side of a kernel that is asked for its error alone
+_SMALL = 15  # pixels along a side of a kernel that is asked for its error alone (chosen: small)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

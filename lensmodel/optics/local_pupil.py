@@ -22,9 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-TERMS: Final = 8
-"""Number of wavefront terms; the last two are the tilts, which move the kernel."""
-
 COMA: Final = (1, 2)
 """Terms that a turn by 180 degrees negates, but for the tilts."""
 

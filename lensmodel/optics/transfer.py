@@ -28,7 +28,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.loops import compiled
-from lensmodel.core.spectrum import FIRST_PHASE_RING, PHASE_BINS, RING_LIMITS, RINGS, SECTORS
+from lensmodel.core.spectrum import (
+    FIRST_PHASE_RING,
+    PHASE_BINS,
+    RING_EDGES,
+    RINGS,
+    SECTORS,
+    bin_frequencies,
+)
 
 FIRST_RING: Final = FIRST_PHASE_RING
 """Rings below hold too few frequencies of a 64 px tile to be told apart by angle."""
@@ -36,34 +43,20 @@ FIRST_RING: Final = FIRST_PHASE_RING
 BINS: Final = (RINGS - FIRST_RING) * SECTORS
 """Number of bins that count."""
 
-_ACROSS, _ACROSS_COARSE = 26, 16  # samples across the pupil
+_ACROSS, _ACROSS_COARSE = 26, 16  # samples across the pupil: the cost goes with their square (chosen)
 
 COLUMNS: Final = 20
 """Real and imaginary sum, the latter two by six terms, and by three numbers of the cat's eye."""
 
-_EDGE = np.geomspace(*RING_LIMITS, RINGS + 1)
-_RATIO = float(_EDGE[1] / _EDGE[0])
-_INSIDE = (-0.3, 0.3)  # where a bin is sampled, in parts of its width
-_SMOOTH = 5  # rings in which one sample does: nothing has zeros at such low frequencies
-BORROWED_RINGS: Final = 3
-"""Outermost rings that say nothing of red and blue: demosaicing takes them from green."""
-_HIGHEST = 0.75  # cycles/pixel; beyond, lens and pixel pass too little to count
+_RATIO = float(RING_EDGES[1] / RING_EDGES[0])
+_INSIDE = (-0.3, 0.3)  # where a bin is sampled, in parts of its width: near Gauss's two points, 0.29
+_SMOOTH = 5  # rings in which one sample does: nothing has zeros at such low frequencies (chosen)
+_HIGHEST = 0.75  # cycles/pixel; beyond, lens and pixel pass too little to count (chosen)
 _LEAST = 1e-7  # |OTF|^2 at least: keeps its logarithm finite where the lens passes nothing
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Waves = NDArray[np.complex128]
-
-
-def bin_frequencies() -> tuple[Floats, Floats]:
-    """Modulus (cycles/pixel) and angle of the middle of each bin, shape (BINS,) each.
-
-    The angle is that of `spectrum.binned_spectrum`: from the columns' axis towards the rows'.
-    """
-    middle = np.sqrt(_EDGE[1:] * _EDGE[:-1])[FIRST_RING:]
-    angle = (np.arange(SECTORS) + 0.5) * math.pi / SECTORS
-    modulus, turned = np.meshgrid(middle, angle, indexing="ij")
-    return modulus.ravel(), turned.ravel()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -43,10 +43,12 @@ NAMES: Final = (
 
 _LARGEST_LOG_Q = 20.0  # far beyond all pixels and apertures
 _STEPS = 4  # of Newton at most (chosen)
-_MOVES = 8  # a centre of mass may go to and fro between two places
-_BAND_NM = 35.0  # half the distance between the outer wavelengths of one channel
+_MOVES = 8  # at most: a centre of mass may go to and fro between two places (chosen)
+_BAND_NM = (
+    35.0  # half the distance between the outer wavelengths of one channel (chosen: half a filter's width)
+)
 _CENTRED_PX = 1e-3  # pixels: a thousandth moves no figure that is reported
-_SPARE = 1  # pixels around a kernel by which it may be moved without being rendered anew
+_SPARE = 1  # pixels around a kernel by which it may be moved without being rendered anew (chosen)
 
 
 def design(position: FieldPosition, settings: LensSettings) -> NDArray[np.float64]:

@@ -41,7 +41,8 @@ from lensmodel.model.trust.support import USUAL_ERROR, measured_share
 from lensmodel.model.wavefront.likelihood import surprise
 
 NARROWINGS: Final = (Narrowing(), Narrowing(width=0.7), Narrowing(width=0.55), Narrowing(share=0.45))
-"""What may have become of a kernel that is not the true one. Wider ones do no harm where they are missed."""
+"""What may have become of a kernel that is not the true one (chosen: as blind kernels are off, and a sharp
+core in wide wings). Wider ones do no harm where they are missed."""
 
 _FITTED: Final = fitted("model")["witness"]
 OF_BOTH: Final = (tuple(_FITTED["kernels"]), tuple(_FITTED["wavefront"]))
@@ -69,7 +70,7 @@ _RADIUS: Final = 0.3  # half-diagonals (chosen: a mean over several patches, so 
 _FEWEST: Final = 5.0  # patches whose mean counts in full (chosen: one alone overrules nothing)
 _FEWEST_VOTES: Final = 0.5  # patches; with fewer near a place the witness says nothing (chosen)
 _MOST: Final = 96  # patches of a model that are asked (chosen: each costs some milliseconds)
-_TINY: Final = 1e-12
+_TINY: Final = 1e-12  # keeps a division finite where no patch speaks
 _ALIKE: Final = 0.05  # least weight by settings (chosen: patches of others say little of these)
 
 

@@ -148,6 +148,11 @@ LARGEST: Final = 55
 def require_size(size: int) -> None:
     """Refuse kernel sizes that cannot be estimated.
 
+    Parameters
+    ----------
+    size : int
+        Side of a kernel, pixels.
+
     Raises
     ------
     InvalidInputError

@@ -51,7 +51,7 @@ class Pupil:
 
     @classmethod
     def of(cls, size: int) -> Pupil:
-        """Lay out the pupil; layouts are remembered."""
+        """Lay out the pupil for kernels of odd side `size`, pixels; layouts are remembered."""
         return _laid_out(size)
 
     def kernel(self, g: Floats) -> tuple[Floats, Floats]:

@@ -36,6 +36,7 @@ from lensmodel.core.spectrum import (
     SECTORS,
     bin_frequencies,
 )
+from lensmodel.optics.pupil import ray_gradients
 
 FIRST_RING: Final = FIRST_PHASE_RING
 """Rings below hold too few frequencies of a 64 px tile to be told apart by angle."""
@@ -97,9 +98,16 @@ class Transfer:
 
     @classmethod
     def of(cls, q: float, rings: int = RINGS - FIRST_RING, *, coarse: bool = False) -> Transfer:
-        """Lay out the pupil for the innermost `rings` that count; layouts are remembered.
+        """Lay out the pupil; layouts are remembered.
 
-        `coarse` takes fewer samples and one frequency to a bin: a seventh of the sums, for searching.
+        Parameters
+        ----------
+        q : float
+            Wavelength x f-number / pixel pitch.
+        rings : int
+            How many of the innermost rings that count; bins beyond pass nothing.
+        coarse : bool
+            Fewer samples and one frequency to a bin: a seventh of the sums, for searching.
         """
         return _laid_out(round(q, 4), rings, coarse)
 
@@ -127,7 +135,7 @@ class Transfer:
         return self.log_power_of(self.waves(blur, radius, shift))
 
     def log_power_of(self, kernel: Waves) -> tuple[Floats, Floats, Floats]:
-        """`log_power` of what `waves` gave."""
+        """Return `log_power` of what `waves` gave, complex128 of shape (S, 10)."""
         # |K|^2 and its derivatives 2 Re K* dK
         products = (kernel[:, :1].conj() * kernel).real * self.share[:, None]
         products[:, 1:] *= 2.0
@@ -171,10 +179,7 @@ class Transfer:
         px, py = (point.astype(np.float64) for point in self.points)
         open_, alone, alone_by = self._stops(radius, shift)
         weight = (open_ * alone).astype(np.float64) ** 2
-        rho2 = px * px + py * py
-        right = [4 * rho2 * px, rho2 + 2 * px * px, 2 * px * py, 2 * px, 2 * px, 2 * py]
-        up = [4 * rho2 * py, 2 * px * py, rho2 + 2 * py * py, 2 * py, -2 * py, 2 * px]
-        rays = np.array([right, up])
+        rays = np.array(ray_gradients(px, py))
         by_blur = rays @ weight / weight.sum()
         centre = by_blur @ blur
         landed = np.einsum("akp,k->ap", rays, blur) - centre[:, None]

@@ -126,7 +126,14 @@ class WindowPrior:
 
     @classmethod
     def of(cls, measured: Mapping[str, Floats]) -> WindowPrior:
-        """Make one of the coefficients' medians, their covariance, and the rings' bias and roughness."""
+        """Make one of what was measured.
+
+        Parameters
+        ----------
+        measured : mapping of str to ndarray of float64
+            `usual`, (9,), medians of the coefficients; `spread`, (9, 9), their covariance; `bias` and
+            `roughness`, (12,), of the rings.
+        """
         usual = WINDOW_SHAPES[:, 1:] @ measured["usual"][1:] + by_ring(measured["bias"])
         return cls(usual, measured["spread"], by_ring(measured["roughness"]))
 

@@ -27,9 +27,9 @@ class SpectralLikelihood:
     whole : SceneSpectra
     local : LocalSpectra
     temper : float
-        Share of the likelihood of whole spectra that counts: neighbouring bins err alike.
+        Share of the likelihood of whole spectra that counts (chosen): neighbouring bins err alike.
     parts : float
-        The same of local spectra: tiles overlap, and no mixture is perfect.
+        The same of local spectra (chosen): tiles overlap, and no mixture is perfect.
     """
 
     whole: SceneSpectra

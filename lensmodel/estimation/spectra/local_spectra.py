@@ -31,17 +31,17 @@ from lensmodel.core.types import NoiseModel, Plane
 from lensmodel.estimation.spectra.leakage import Leakage
 
 SIDE: Final = 32
-"""Side of a tile, pixels."""
+"""Side of a tile, pixels (chosen: small enough to show one thing)."""
 
 COUPLED: Final = 0.5
-"""t above."""
+"""t above (chosen: of two neighbours under the window, one is new)."""
 
 _DATA = Path(__file__).parents[1] / "data" / "local_spectra.npz"
 _LOWEST, _HIGHEST = 0.04, 0.5  # cycles/pixel: below, a tile holds no whole period to speak of
 _STRIDE = 16  # half a tile: Welch's overlap
 # Natural logarithms of a scene's contrast over the usual (chosen)
 _LOG_GAINS: Final = np.linspace(-2.5, 2.5, 11)
-_FAINTEST = 1e-4  # of |K|^2: leakage and rounding hide what lies below
+_FAINTEST = 1e-4  # of |K|^2: leakage and rounding hide what lies below (chosen)
 
 Floats = NDArray[np.float64]
 

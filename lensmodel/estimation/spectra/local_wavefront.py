@@ -50,16 +50,16 @@ class AberrationFit:
     Parameters
     ----------
     weight : float
-        Of the reference kernel.
+        Of the reference kernel (chosen: it has to decide the phase, not the width).
     temper : float
-        Share of the spectra's likelihood that counts: neighbouring bins err alike.
+        Share of the spectra's likelihood that counts (chosen): neighbouring bins err alike.
     starts : int
         Random wavefronts, each moved `approach` steps towards the reference alone and `first` steps with
         the spectra.
     kept, rounds : int
         So many of the best go on for at most `rounds` steps; only these see local spectra.
     parts : float
-        Share of the likelihood of local spectra that counts.
+        Share of the likelihood of local spectra that counts (chosen): tiles overlap.
     size : int
         Odd side of the kernels that are asked for; where it is the largest of all, it is fitted on.
     """

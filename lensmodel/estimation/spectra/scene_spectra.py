@@ -24,7 +24,7 @@ from lensmodel.scene.prior import (
 )
 
 _SIDE = 64  # pixels: one tile of a patch's spectrum
-_FAINTEST = 1e-5  # of |K|²: beyond, leakage and rounding hide the zeros
+_FAINTEST = 1e-5  # of |K|²: beyond, leakage and rounding hide the zeros (chosen)
 
 Floats = NDArray[np.float64]
 

@@ -190,18 +190,43 @@ class WitnessedField:
         pitch_um: float | None = None,
         half_diagonal_px: float | None = None,
     ) -> WitnessedField:
-        """Hear the patches of a model and of a photo; takes some milliseconds a patch."""
+        """Hear the patches of a model and of a photo; takes some milliseconds a patch.
+
+        Parameters
+        ----------
+        model : LensModel
+            `warmed`: without its wavefront there is one opinion.
+        settings : LensSettings
+            Those of the photo that is to be corrected.
+        patches : sequence of PsfSample
+            Of that photo, see `Witness.of`.
+        pitch_um, half_diagonal_px : float, optional
+            Its pixels, as `LensModel.query` takes them.
+        """
         opinions = opinions_of(model)
         pixels = {"pitch_um": pitch_um, "half_diagonal_px": half_diagonal_px}
         fields = [one.field(settings, **pixels) for one in opinions]
         return cls(opinions, fields, Witness.of(opinions, settings, patches), settings, pixels)
 
     def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
-        """Return the mean kernel of odd side `size` at a field position, in the image frame."""
+        """Return the mean kernel at a field position, in the image frame; see `PsfField`."""
         return self.belief_at(position, channel, size).kernel
 
     def belief_at(self, position: FieldPosition, channel: Channel, size: int) -> Belief:
-        """Return what is thought of the PSF at a field position."""
+        """Return what is thought of the PSF at a field position.
+
+        Parameters
+        ----------
+        position : FieldPosition
+        channel : {"r", "g", "b"}
+        size : int
+            Odd side of the kernel, pixels.
+
+        Returns
+        -------
+        Belief
+            Mean kernel, and variance at each frequency.
+        """
         asked = self.settings.with_channel(channel)
         answer = self.opinions[0].query(position, asked, size, **self.pixels)
         expected = answer.predicted_error if math.isfinite(answer.predicted_error) else 1.0

@@ -30,8 +30,7 @@ from lensmodel.core.spectrum import (
     FIRST_PHASE_RING,
     PHASE_BINS,
     PHASE_RINGS,
-    RING_LIMITS,
-    RINGS,
+    RING_EDGES,
     SECTORS,
     CrossPhase,
 )
@@ -54,12 +53,11 @@ _REACH_PX, _STEP_PX = (
 )  # shifts that are tried first (chosen: beyond usual lateral colour)
 _SHIFT_ROUNDS = 6  # of Gauss and Newton (chosen: far below a hundredth of a pixel from such a start)
 
-_EDGES = np.geomspace(*RING_LIMITS, RINGS + 1)
 _AXIS = np.fft.fftfreq(_HALF) / 2.0  # cycles/pixel of the full lattice
 _ROW, _COL = (grid.ravel() for grid in np.meshgrid(_AXIS, _AXIS, indexing="ij"))
 _MODULUS = np.hypot(_ROW, _COL)
 _UPPER = (_ROW > 0) | ((_ROW == 0) & (_COL > 0))
-_RING = np.searchsorted(_EDGES, _MODULUS, side="right") - 1 - FIRST_PHASE_RING
+_RING = np.searchsorted(RING_EDGES, _MODULUS, side="right") - 1 - FIRST_PHASE_RING
 _KEPT = np.flatnonzero(_UPPER & (_RING >= 0) & (_RING < PHASE_RINGS))
 _BIN = _RING[_KEPT] * SECTORS + np.minimum(
     (np.arctan2(_ROW[_KEPT], _COL[_KEPT]) / math.pi * SECTORS).astype(int), SECTORS - 1

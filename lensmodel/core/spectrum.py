@@ -9,6 +9,7 @@ All are small, hold no picture, and can be summed over patches and photos before
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -23,6 +24,9 @@ RINGS: Final = 14
 SECTORS: Final = 12
 RING_LIMITS: Final = (0.03, 0.5)
 """Frequencies of the innermost and outermost ring, cycles/pixel; rings are equally wide in log."""
+
+RING_EDGES: Final = np.geomspace(*RING_LIMITS, RINGS + 1)
+"""Frequencies between the rings and at both ends, cycles/pixel."""
 
 FIRST_PHASE_RING: Final = 3
 """Rings below hold too few frequencies of a tile to be told apart by angle."""
@@ -166,8 +170,7 @@ def binned_spectrum(patch: Plane, noise: NoiseModel) -> tuple[NDArray[np.float32
     power = total / (count * energy)
     f_row, f_col = np.meshgrid(scipy.fft.fftfreq(side), scipy.fft.rfftfreq(side), indexing="ij")
     frequency, angle = np.hypot(f_row, f_col), np.mod(np.arctan2(f_row, f_col), np.pi)
-    edges = np.geomspace(*RING_LIMITS, RINGS + 1)
-    ring = np.searchsorted(edges, frequency, side="right") - 1
+    ring = np.searchsorted(RING_EDGES, frequency, side="right") - 1
     sector = np.minimum((angle / np.pi * SECTORS).astype(int), SECTORS - 1)
     spectrum = np.zeros((RINGS, SECTORS), dtype=np.float32)
     for i in range(RINGS):
@@ -177,6 +180,20 @@ def binned_spectrum(patch: Plane, noise: NoiseModel) -> tuple[NDArray[np.float32
             bin_ = in_ring & (sector == j)
             spectrum[i, j] = float(power[bin_].mean()) if bin_.any() else mean
     return spectrum, float(noise.sigma_at(float(patch.mean())) ** 2)
+
+
+def bin_frequencies(first_ring: int = FIRST_PHASE_RING) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Middles of the bins, rings from `first_ring` on.
+
+    Returns
+    -------
+    modulus, angle : ndarray of float64, shape (n,)
+        Cycles/pixel; radians from the columns' axis towards the rows', 0 to pi.
+    """
+    middle = np.sqrt(RING_EDGES[1:] * RING_EDGES[:-1])[first_ring:]
+    angle = (np.arange(SECTORS) + 0.5) * math.pi / SECTORS
+    modulus, turned = np.meshgrid(middle, angle, indexing="ij")
+    return modulus.ravel(), turned.ravel()
 
 
 def tail_of(patch: Plane, width_px: float) -> tuple[float, float]:

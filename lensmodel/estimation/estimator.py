@@ -15,7 +15,8 @@ from lensmodel.core.spectrum import repeats
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
 
 NO_BLUR_PX2 = 0.3
-"""Below this mean second moment the pixel and the scene's own softness hide a kernel."""
+"""Below this mean second moment the pixel and the scene's own softness hide a kernel (chosen: a pixel alone
+has 1/12 along each axis)."""
 
 _MIN_SIDE = 64  # pixels: one tile of a patch's spectrum
 _CONTRAST_IN_NOISE = 3.0  # standard deviations: less contrast is noise (chosen)
@@ -146,6 +147,11 @@ LARGEST: Final = 55
 
 def require_size(size: int) -> None:
     """Refuse kernel sizes that cannot be estimated.
+
+    Parameters
+    ----------
+    size : int
+        Side of a kernel, pixels.
 
     Raises
     ------

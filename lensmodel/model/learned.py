@@ -37,7 +37,7 @@ VERSION: Final = 16
 """Raised whenever the same samples would be fitted otherwise."""
 
 _MOST_BYTES = 1 << 27  # unpacked: against files made to fill the memory
-_MOST_NODES = 4096  # of arrays that do not grow with the samples
+_MOST_NODES = 4096  # of arrays that do not grow with the samples (chosen: far beyond any)
 _DAMAGED = (
     OSError,
     ValueError,

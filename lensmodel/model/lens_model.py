@@ -41,7 +41,10 @@ _LISTED = 1e-3  # share of the weight from which on a prior is named (chosen)
 
 
 class LensModel:
-    """PSF samples of one lens as a continuous function: a value, which `added` and the like keep."""
+    """PSF samples of one lens as a continuous function: a value, which `added` and the like keep.
+
+    Made by `fit` or `restored`, which say what samples, settings and prior are; `fit` is what was learned.
+    """
 
     def __init__(
         self,
@@ -68,6 +71,13 @@ class LensModel:
         prior: Prior | None = None,
     ) -> LensModel:
         """Build a model from samples.
+
+        Parameters
+        ----------
+        samples : sequence of PsfSample
+        settings : ModelSettings, optional
+        prior : Prior, optional
+            What answers lean on where there are few samples.
 
         Raises
         ------
@@ -278,9 +288,9 @@ class LensModel:
         pitch_um: float | None = None,
         half_diagonal_px: float | None = None,
     ) -> NDArray[np.float64]:
-        """Return the PSFs of many places at one setting, shape (n, size, size).
+        """Return the PSFs of many places at one setting, float64 of shape (n, size, size).
 
-        The same numbers as of `query`, several times faster: for grids and maps.
+        The same numbers as of `query`, whose parameters it takes, several times faster: for grids and maps.
         """
         if not positions:
             return np.empty((0, size, size))

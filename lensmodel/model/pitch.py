@@ -27,7 +27,7 @@ from lensmodel.model.answer import HALF_DIAGONAL
 
 _SAME = 0.005  # of the pitch: what rounding in metadata changes
 _PADDED = 2  # times the kernel, so that its images do not overlap
-_WIDEST = 8192  # pixels of the samples
+_WIDEST = 8192  # pixels of the samples along a side: memory (chosen)
 
 
 def pixel_of(sample: PsfSample, unit: str) -> float | None:

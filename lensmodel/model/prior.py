@@ -14,7 +14,7 @@ from lensmodel.core.psf import PsfField
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model.answering import AnsweringModel
 
-_SMALL = 15  # pixels along a side of a kernel that is asked for its error alone
+_SMALL = 15  # pixels along a side of a kernel that is asked for its error alone (chosen: small)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,13 +48,24 @@ class Prior:
         return not isinstance(self.source, AnsweringModel) or self.source.warm
 
     def warmed(self) -> Prior:
-        """Return the prior with the wavefront of its model."""
+        """Return the prior with the wavefront of its model, fitted if need be."""
         if not isinstance(self.source, AnsweringModel):
             return self
         return Prior(self.source.warmed(), self.strength, self.name)
 
     def share(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Its weight where so many samples speak, strength / (samples + strength)."""
+        """Its weight, strength / (samples + strength).
+
+        Parameters
+        ----------
+        samples : ndarray of float64, shape (n,)
+            Samples that speak at each place.
+
+        Returns
+        -------
+        ndarray of float64, shape (n,)
+            In 0..1.
+        """
         return self.strength / (samples + self.strength)
 
     def kernels(
@@ -66,7 +77,21 @@ class Prior:
         pitch_um: float | None = None,
         half_diagonal_px: float | None = None,
     ) -> NDArray[np.float64]:
-        """What it says of some places, shape (n, size, size)."""
+        """What it says of some places.
+
+        Parameters
+        ----------
+        positions : sequence of FieldPosition
+        settings : LensSettings
+        size : int
+            Odd side, pixels.
+        pitch_um, half_diagonal_px : float, optional
+            As of `LensModel.query`.
+
+        Returns
+        -------
+        ndarray of float64, shape (n, size, size)
+        """
         if isinstance(self.source, AnsweringModel):
             return self.source.kernels(
                 positions, settings, size, pitch_um=pitch_um, half_diagonal_px=half_diagonal_px
@@ -74,7 +99,7 @@ class Prior:
         return np.stack([self.source.kernel_at(p, settings.channel, size) for p in positions])
 
     def error(self, position: FieldPosition, settings: LensSettings) -> float:
-        """Relative L2 that it expects of itself; 1 where it cannot tell."""
+        """Relative L2 that it expects of itself at a place and settings; 1 where it cannot tell."""
         if isinstance(self.source, AnsweringModel):
             return self.source.query(position, settings, _SMALL).predicted_error
         return 1.0

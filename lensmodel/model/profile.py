@@ -37,7 +37,7 @@ from lensmodel.model.sample_codec import PackedSamples, pack_samples, unpack_sam
 
 FORMAT = 1  # raised when older programs could not read a profile any more
 _MAX_BYTES = 1 << 30  # unpacked: against files made to fill the memory
-_MAX_SAMPLES = 200_000  # some 2,700 photos of 24 patches in three colours
+_MAX_SAMPLES = 200_000  # some 2,700 photos of 24 patches in three colours (chosen: memory)
 _MAX_SIDE = 255  # pixels (chosen)
 _LEARNED = "learned.npz"
 _SPECTRA = "spectra.npy"
@@ -60,7 +60,13 @@ _UNREADABLE = (
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A body that photos of a lens were taken with, as far as they say; the lens may be part of it."""
+    """A body that photos of a lens were taken with; the lens may be part of it.
+
+    Parameters
+    ----------
+    maker, model, serial : str, optional
+        As the photos say; None where they do not.
+    """
 
     maker: str | None = None
     model: str | None = None
@@ -89,13 +95,32 @@ class LensProfile:
 
 
 def save_profile(path: Path | str, profile: LensProfile) -> None:
-    """Write a profile; the file appears complete or not at all."""
+    """Write a profile; the file appears complete or not at all.
+
+    Parameters
+    ----------
+    path : Path or str
+        Replaced if it is there.
+    profile : LensProfile
+
+    Raises
+    ------
+    InvalidInputError
+        As `write_profile`.
+    OSError
+        If the file cannot be written.
+    """
     with atomic(Path(path)) as file:
         write_profile(file, profile)
 
 
 def write_profile(file: IO[bytes], profile: LensProfile) -> None:
     """Write a profile to an open file.
+
+    Parameters
+    ----------
+    file : binary file, open for writing
+    profile : LensProfile
 
     Raises
     ------
@@ -159,6 +184,15 @@ def _unpacked(archive: zipfile.ZipFile) -> int:
 def load_profile(path: Path | str) -> LensProfile:
     """Open a profile.
 
+    Parameters
+    ----------
+    path : Path or str
+
+    Returns
+    -------
+    LensProfile
+        Its model answers at once: nothing is fitted again where the file holds what was learned.
+
     Raises
     ------
     InvalidInputError
@@ -168,7 +202,17 @@ def load_profile(path: Path | str) -> LensProfile:
 
 
 def read_profile(file: IO[bytes], name: str) -> LensProfile:
-    """Open a profile that lies in an open file; `name` is what errors call it.
+    """Open a profile that lies in an open file.
+
+    Parameters
+    ----------
+    file : binary file, open for reading
+    name : str
+        What errors call it.
+
+    Returns
+    -------
+    LensProfile
 
     Raises
     ------

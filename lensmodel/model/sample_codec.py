@@ -45,7 +45,18 @@ class PackedSamples:
 
 
 def pack_samples(samples: Sequence[PsfSample]) -> PackedSamples:
-    """Turn samples into what `unpack_samples` reads; kernels are rounded to single precision."""
+    """Turn samples into what `unpack_samples` reads.
+
+    Parameters
+    ----------
+    samples : sequence of PsfSample
+        One at least.
+
+    Returns
+    -------
+    PackedSamples
+        Kernels are rounded to single precision.
+    """
     side = max(sample.kernel.shape[0] for sample in samples)
     kernels = np.zeros((len(samples), side, side), dtype=np.float32)
     numbers = np.full((len(samples), _SPECTRUM + _PHASES), np.nan, dtype="<f4")
@@ -64,7 +75,14 @@ def pack_samples(samples: Sequence[PsfSample]) -> PackedSamples:
 def unpack_samples(packed: PackedSamples) -> list[PsfSample]:
     """Build the samples that `pack_samples` was given.
 
-    Entries without `size`, of profiles of earlier versions, have kernels as large as the array.
+    Parameters
+    ----------
+    packed : PackedSamples
+        Entries without `size`, of profiles of earlier versions, have kernels as large as the array.
+
+    Returns
+    -------
+    list of PsfSample
 
     Raises
     ------

@@ -29,6 +29,11 @@ def diffraction_otf(
         Pixel pitch in micrometres.
     channel : {"r", "g", "b"}
         Colour, for the wavelength.
+
+    Returns
+    -------
+    ndarray of float64
+        Of the shape to which `rows` and `cols` broadcast; real, 1 at frequency 0.
     """
     v = np.hypot(rows, cols) * WAVELENGTH_NM[channel] / 1000.0 * f_number / pitch_um
     v = np.minimum(v, 1.0)

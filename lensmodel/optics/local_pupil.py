@@ -22,9 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-TERMS: Final = 8
-"""Number of wavefront terms; the last two are the tilts, which move the kernel."""
-
 COMA: Final = (1, 2)
 """Terms that a turn by 180 degrees negates, but for the tilts."""
 
@@ -54,7 +51,7 @@ class Pupil:
 
     @classmethod
     def of(cls, size: int) -> Pupil:
-        """Lay out the pupil; layouts are remembered."""
+        """Lay out the pupil for kernels of odd side `size`, pixels; layouts are remembered."""
         return _laid_out(size)
 
     def kernel(self, g: Floats) -> tuple[Floats, Floats]:

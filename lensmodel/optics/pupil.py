@@ -21,17 +21,21 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-TERMS = 8
+Floats = NDArray[np.float64]
+
+TERMS: Final = 8
 """Number of wavefront terms; the last two are the tilts, which move the kernel."""
 
 _MIN_ACROSS, _MAX_ACROSS = 40, 176  # samples across the transform: aliasing below, memory above (chosen)
-_ALONE = 1.05  # period over the side of a kernel, at least
-_PERIOD = 1.25  # of the discrete pupil over the side of the kernel
-_SAMPLING = 0.9  # light is band limited to 1 / q cycles/pixel; its last tenth may alias, the pixel kills it
+_ALONE = 1.05  # period over the side of a kernel, at least: a twentieth between copies (chosen)
+_PERIOD = 1.25  # of the discrete pupil over the side of the kernel: wings fade in between (chosen)
+# Light is band limited to 1 / q cycles/pixel; its last tenth may alias, the pixel kills it (chosen)
+_SAMPLING = 0.9
 _MIN_FINE, _MAX_FINE = 3, 8  # samples per pixel (chosen)
 _RIM = 4  # samples: the pixel's box with its rounded edges
 
@@ -39,6 +43,24 @@ _RIM = 4  # samples: the pixel's box with its rounded edges
 def largest_side(q: float) -> int:
     """Odd side of the largest kernel that shows no copy of the light beside it: one period of the pupil."""
     return max(2 * int(_MAX_ACROSS * q / 2.0 / _ALONE) - 1, 1)
+
+
+def ray_gradients(px: Floats, py: Floats) -> tuple[Floats, Floats]:
+    """Where rays land by each of the first six terms: grad B_k of X(p) = sum_k g_k grad B_k(p), pixels.
+
+    Parameters
+    ----------
+    px, py : ndarray of float64, shape (n,)
+        Points of the pupil, (right, up).
+
+    Returns
+    -------
+    across, up : ndarray of float64, shape (6, n)
+    """
+    r2 = px * px + py * py
+    across = np.stack([4 * r2 * px, r2 + 2 * px * px, 2 * px * py, 2 * px, 2 * px, 2 * py])
+    up = np.stack([4 * r2 * py, 2 * px * py, r2 + 2 * py * py, 2 * py, -2 * py, 2 * px])
+    return across, up
 
 
 @dataclass(frozen=True, slots=True, eq=False)

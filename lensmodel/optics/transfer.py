@@ -28,7 +28,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.loops import compiled
-from lensmodel.core.spectrum import FIRST_PHASE_RING, PHASE_BINS, RING_LIMITS, RINGS, SECTORS
+from lensmodel.core.spectrum import (
+    FIRST_PHASE_RING,
+    PHASE_BINS,
+    RING_EDGES,
+    RINGS,
+    SECTORS,
+    bin_frequencies,
+)
+from lensmodel.optics.pupil import ray_gradients
 
 FIRST_RING: Final = FIRST_PHASE_RING
 """Rings below hold too few frequencies of a 64 px tile to be told apart by angle."""
@@ -36,34 +44,20 @@ FIRST_RING: Final = FIRST_PHASE_RING
 BINS: Final = (RINGS - FIRST_RING) * SECTORS
 """Number of bins that count."""
 
-_ACROSS, _ACROSS_COARSE = 26, 16  # samples across the pupil
+_ACROSS, _ACROSS_COARSE = 26, 16  # samples across the pupil: the cost goes with their square (chosen)
 
 COLUMNS: Final = 20
 """Real and imaginary sum, the latter two by six terms, and by three numbers of the cat's eye."""
 
-_EDGE = np.geomspace(*RING_LIMITS, RINGS + 1)
-_RATIO = float(_EDGE[1] / _EDGE[0])
-_INSIDE = (-0.3, 0.3)  # where a bin is sampled, in parts of its width
-_SMOOTH = 5  # rings in which one sample does: nothing has zeros at such low frequencies
-BORROWED_RINGS: Final = 3
-"""Outermost rings that say nothing of red and blue: demosaicing takes them from green."""
-_HIGHEST = 0.75  # cycles/pixel; beyond, lens and pixel pass too little to count
+_RATIO = float(RING_EDGES[1] / RING_EDGES[0])
+_INSIDE = (-0.3, 0.3)  # where a bin is sampled, in parts of its width: near Gauss's two points, 0.29
+_SMOOTH = 5  # rings in which one sample does: nothing has zeros at such low frequencies (chosen)
+_HIGHEST = 0.75  # cycles/pixel; beyond, lens and pixel pass too little to count (chosen)
 _LEAST = 1e-7  # |OTF|^2 at least: keeps its logarithm finite where the lens passes nothing
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Waves = NDArray[np.complex128]
-
-
-def bin_frequencies() -> tuple[Floats, Floats]:
-    """Modulus (cycles/pixel) and angle of the middle of each bin, shape (BINS,) each.
-
-    The angle is that of `spectrum.binned_spectrum`: from the columns' axis towards the rows'.
-    """
-    middle = np.sqrt(_EDGE[1:] * _EDGE[:-1])[FIRST_RING:]
-    angle = (np.arange(SECTORS) + 0.5) * math.pi / SECTORS
-    modulus, turned = np.meshgrid(middle, angle, indexing="ij")
-    return modulus.ravel(), turned.ravel()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,9 +98,16 @@ class Transfer:
 
     @classmethod
     def of(cls, q: float, rings: int = RINGS - FIRST_RING, *, coarse: bool = False) -> Transfer:
-        """Lay out the pupil for the innermost `rings` that count; layouts are remembered.
+        """Lay out the pupil; layouts are remembered.
 
-        `coarse` takes fewer samples and one frequency to a bin: a seventh of the sums, for searching.
+        Parameters
+        ----------
+        q : float
+            Wavelength x f-number / pixel pitch.
+        rings : int
+            How many of the innermost rings that count; bins beyond pass nothing.
+        coarse : bool
+            Fewer samples and one frequency to a bin: a seventh of the sums, for searching.
         """
         return _laid_out(round(q, 4), rings, coarse)
 
@@ -134,7 +135,7 @@ class Transfer:
         return self.log_power_of(self.waves(blur, radius, shift))
 
     def log_power_of(self, kernel: Waves) -> tuple[Floats, Floats, Floats]:
-        """`log_power` of what `waves` gave."""
+        """Return `log_power` of what `waves` gave, complex128 of shape (S, 10)."""
         # |K|^2 and its derivatives 2 Re K* dK
         products = (kernel[:, :1].conj() * kernel).real * self.share[:, None]
         products[:, 1:] *= 2.0
@@ -178,10 +179,7 @@ class Transfer:
         px, py = (point.astype(np.float64) for point in self.points)
         open_, alone, alone_by = self._stops(radius, shift)
         weight = (open_ * alone).astype(np.float64) ** 2
-        rho2 = px * px + py * py
-        right = [4 * rho2 * px, rho2 + 2 * px * px, 2 * px * py, 2 * px, 2 * px, 2 * py]
-        up = [4 * rho2 * py, 2 * px * py, rho2 + 2 * py * py, 2 * py, -2 * py, 2 * px]
-        rays = np.array([right, up])
+        rays = np.array(ray_gradients(px, py))
         by_blur = rays @ weight / weight.sum()
         centre = by_blur @ blur
         landed = np.einsum("akp,k->ap", rays, blur) - centre[:, None]

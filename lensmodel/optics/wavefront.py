@@ -43,14 +43,28 @@ NAMES: Final = (
 
 _LARGEST_LOG_Q = 20.0  # far beyond all pixels and apertures
 _STEPS = 4  # of Newton at most (chosen)
-_MOVES = 8  # a centre of mass may go to and fro between two places
-_BAND_NM = 35.0  # half the distance between the outer wavelengths of one channel
+_MOVES = 8  # at most: a centre of mass may go to and fro between two places (chosen)
+_BAND_NM = (
+    35.0  # half the distance between the outer wavelengths of one channel (chosen: half a filter's width)
+)
 _CENTRED_PX = 1e-3  # pixels: a thousandth moves no figure that is reported
-_SPARE = 1  # pixels around a kernel by which it may be moved without being rendered anew
+_SPARE = 1  # pixels around a kernel by which it may be moved without being rendered anew (chosen)
 
 
 def design(position: FieldPosition, settings: LensSettings) -> NDArray[np.float64]:
-    """Blur of the first six terms of `pupil` at the widest aperture per unknown, shape (6, 19)."""
+    """Blur of the first six terms of `pupil` per unknown, at the widest aperture.
+
+    Parameters
+    ----------
+    position : FieldPosition
+    settings : LensSettings
+        Only the channel counts; see `stopped` for the aperture.
+
+    Returns
+    -------
+    ndarray of float64, shape (6, 19)
+        The equations above, row by row; times `Wavefront.terms` it is blur in pixels.
+    """
     x, y = position.r * math.cos(position.phi), position.r * math.sin(position.phi)
     r2, t = position.r**2, (WAVELENGTH_NM[settings.channel] - WAVELENGTH_NM["g"]) / 100.0
     xx, xy = x * x - y * y, 2.0 * x * y
@@ -109,7 +123,21 @@ class Wavefront:
             )
 
     def kernel(self, position: FieldPosition, settings: LensSettings, size: int) -> Kernel:
-        """Kernel of the image frame, centred, of odd side `size`; three wavelengths to a channel."""
+        """Kernel at a place, the mean of three wavelengths of the channel.
+
+        Parameters
+        ----------
+        position : FieldPosition
+        settings : LensSettings
+            An unknown aperture counts as the widest, an unknown focal length as `focal_octaves`.
+        size : int
+            Odd side, pixels; zeros lie beyond one period of the pupil (`pupil.largest_side`).
+
+        Returns
+        -------
+        Kernel, shape (size, size)
+            In the image frame, of sum 1, centred.
+        """
         shortest = (WAVELENGTH_NM[settings.channel] - _BAND_NM) / WAVELENGTH_NM["g"]
         q = math.exp(self.log_q) * shortest / self.stop(settings)
         side = min(size, largest_side(q))
@@ -138,14 +166,26 @@ class Wavefront:
         return 0.0 if settings.focal_mm is None else math.log2(settings.focal_mm) - self.focal_octaves
 
     def grid(self, settings: LensSettings, shift_nm: float = 0.0, size: int | None = None) -> PupilGrid:
-        """Pupil and transform of a channel at an aperture."""
+        """Pupil and transform of a channel at an aperture; layouts are remembered.
+
+        Parameters
+        ----------
+        settings : LensSettings
+        shift_nm : float
+            Added to the channel's wavelength.
+        size : int, optional
+            Odd side of the kernels in pixels; `size` of the wavefront without it.
+        """
         colour = (WAVELENGTH_NM[settings.channel] + shift_nm) / WAVELENGTH_NM["g"]
         return _grid(round(math.exp(self.log_q) * colour / self.stop(settings), 4), size or self.size)
 
     def amplitude(
         self, grid: PupilGrid, position: FieldPosition, settings: LensSettings, eye: tuple[float, float]
     ) -> NDArray[np.float32]:
-        """Transmission of the pupil at a place."""
+        """Transmission of the pupil at a place, float32 of the grid's shape (m, m).
+
+        `eye` is a cat's eye as of the wavefront, whose own need not be asked for.
+        """
         s = self.stop(settings)
         move = eye[1] * position.r / s
         return grid.amplitude(eye[0] / s, (move * math.cos(position.phi), move * math.sin(position.phi)))
@@ -188,5 +228,17 @@ def _grid(q: float, size: int) -> PupilGrid:
 
 
 def stopped(blur: NDArray[np.float64], s: float) -> NDArray[np.float64]:
-    """Blur of the first six terms of `pupil` when the stop is narrowed to the part `s`."""
+    """Blur of the first six terms of `pupil` when the stop is narrowed: of degree n in p, times s^(n - 1).
+
+    Parameters
+    ----------
+    blur : ndarray of float64, shape (6, n)
+        At the widest aperture.
+    s : float
+        N0 / N, in 0..1.
+
+    Returns
+    -------
+    ndarray of float64, shape (6, n)
+    """
     return blur * np.array([s**3, s**2, s**2, s, s, s])[:, None]

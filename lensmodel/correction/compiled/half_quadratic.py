@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lensmodel.core.jit import jit
 from lensmodel.correction.compiled.common import ONE, ZERO, Complex, Real, to_plane, to_spectrum
 
-_REACH: Final = np.float32(1.0 / 24.0)  # as in `methods.shrinkage`
+_REACH: Final = np.float32(1.0 / 24.0)  # one over the largest argument of `methods.shrinkage`
 
 
 @jit

@@ -40,11 +40,13 @@ FLOOR: Final = 0.15
 """Error that no pair of edges shows of itself: what lies between two directions. Chosen: an even mixture of
 a core and its aberrations differs by that much from its own two slices' Gaussian."""
 
-_FREQUENCIES: Final = np.linspace(0.02, 0.5, 25)  # cycles/pixel
+_FREQUENCIES: Final = np.linspace(
+    0.02, 0.5, 25
+)  # cycles/pixel: steps far below what a kernel resolves (chosen)
 _SLICE_ERROR: Final = 0.01  # s: of an edge of 64 lines at 1 percent noise
 _PIXEL_SPREAD: Final = 0.02  # t: a pixel's light differs so much from a Gaussian's
 _CROSSING: Final = math.radians(45.0)  # edges closer in direction say the same of a kernel (chosen)
-_NEAR: Final = 0.3  # half diagonals between two edges of one constraint
+_NEAR: Final = 0.3  # half diagonals between two edges of one constraint: kernels hardly change (chosen)
 _REACH_PX: Final = 16.0  # pixels from an edge that its line spread is read at (chosen)
 _TAPER_PX: Final = 4.0  # pixels over which it fades (chosen)
 

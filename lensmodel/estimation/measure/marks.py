@@ -13,10 +13,12 @@ from scipy import ndimage
 from lensmodel.core.errors import NotEnoughEvidenceError
 
 _LOOKED_AT: Final = 1000  # pixels along the long side: noise has turned to grey, discs are 15 across
-_DARK: Final = 0.45  # of the surroundings' mean level, which is grey as the noise is
-_ROUND: Final = 0.85  # area of a filled ellipse over that of the ellipse of its second moments
-_LEAST_PX: Final = 20  # area of a disc
-_MOST_SHARE: Final = 0.004  # same, of the picture
+_DARK: Final = (
+    0.45  # of the surroundings' mean level, which is grey as the noise is (chosen: discs are black)
+)
+_ROUND: Final = 0.85  # area over that of the ellipse of the same second moments, 1 of an ellipse (chosen)
+_LEAST_PX: Final = 20  # area of a disc: below it no shape is seen (chosen)
+_MOST_SHARE: Final = 0.004  # same, of the picture: a page that fills it has less than a tenth (chosen)
 _CANDIDATES: Final = 14  # largest discs that are looked at for the four marks (chosen)
 _ALIKE: Final = 4.0  # the largest disc over the smallest in area: a page seen very much aslant
 _PAPER_OVER_DISC: Final = 2.0  # least ratio of the light of paper and print (chosen)

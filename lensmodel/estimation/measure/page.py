@@ -32,10 +32,11 @@ ASPECT: Final = 2**0.5
 """Long side over short side, as A4 and A3 have it."""
 
 DETAILS: Final = (1000, 1400, 2000, 2800, 4000, 5600)
-"""Samples along the long side that pages are made with; a photo is compared with each of them."""
+"""Samples along the long side that pages are made with; a photo is compared with each of them
+(chosen: factors of the root of two)."""
 
 PAPER: Final = 1.0  # reflectance, that of white by definition
-INK: Final = 0.0  # reflectance
+INK: Final = 0.0  # reflectance, that of black by definition
 MEAN: Final = 0.5  # of the noise: halfway between ink and paper
 CONTRAST: Final = 0.17
 """Standard deviation of the noise as a share of the paper's white: 3 of them reach ink and paper."""

@@ -42,7 +42,7 @@ USUAL_F_NUMBER: Final = 8.0
 """Aperture of the closed photo where it does not say: the sharpest of most lenses."""
 
 _USUAL_PITCH_UM: Final = 4.5  # where the photo does not say; as for `FLOOR`
-_CLEAR: Final = 8.0  # see `target`
+_CLEAR: Final = 8.0  # standard deviations, as in `target`, for the same reason
 _SIDE: Final = 160  # pixels of a window (chosen, not measured)
 _SPARE: Final = 24  # pixels around a window: deconvolution and interpolation spoil the rim
 _DAMPING: Final = 0.004  # of the squared transfer function: noise is not raised more than eightfold

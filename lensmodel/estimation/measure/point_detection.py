@@ -23,8 +23,8 @@ logger = logging.getLogger(__name__)
 DETECTORS: Final = ("auto", "sep", "photutils", "own")
 REMEDY: Final = "pip install 'lensmodel[stars]' finds faint and crowded lights better"
 
-_SIGMAS: Final = 8.0  # of the sky's scatter, that a light stands out by
-_NEIGHBOUR: Final = 0.1  # of its flux, that another light beside it may have
+_SIGMAS: Final = 8.0  # of the sky's scatter, that a light stands out by: fainter ones add noise (chosen)
+_NEIGHBOUR: Final = 0.1  # of its flux, that another light beside it may have (chosen)
 _SKY_CELL: Final = 64  # pixels of a cell in which the sky is one value, as SExtractor's default
 
 

@@ -17,7 +17,7 @@ from lensmodel.core.files import atomic
 from lensmodel.estimation.measure.page import DOTS, TargetPage
 
 PAPERS: Final = {"a2": (594.0, 420.0), "a3": (420.0, 297.0), "a4": (297.0, 210.0)}
-"""Width and height in millimetres, lying."""
+"""Width and height in millimetres, lying (ISO 216)."""
 
 SUFFIXES: Final = (".pdf", ".png", ".svg")
 

@@ -39,8 +39,8 @@ _CLEAR: Final = 8.0  # of the standard deviation: peaks of 10 000 lags of noise 
 # Pixels of a window: wide enough for the largest kernel, small enough for one blur (chosen)
 _SIDE: Final = 144
 _SURE: Final = 0.3  # error beyond which a measurement is not worth having
-_SMALLER: Final = (2 / 3, 1 / 2)  # shares of the side, tried where whole windows do not fit
-_LEAST_PIXELS: Final = 2.0  # for each of the kernel
+_SMALLER: Final = (2 / 3, 1 / 2)  # shares of the side, tried where whole windows do not fit (chosen)
+_LEAST_PIXELS: Final = 2.0  # for each of the kernel: fewer leave it to the prior (chosen)
 _TONE_WINDOWS: Final = 6  # in the middle of the frame, where the lens is sharpest (chosen)
 _TRIED: Final = 6  # windows looked at along each axis for one that is measured: the page may end anywhere
 

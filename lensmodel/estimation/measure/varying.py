@@ -51,7 +51,7 @@ _STEPS_PX: Final = (0.25, 0.1, 0.04)  # of the search for the phase, coarse to f
 _MOST_PX: Final = 1.0  # largest phase along an axis (chosen, not measured)
 _MOST_MOVES: Final = 24  # with one step, at most (chosen, not measured)
 _SEARCHED: Final = 100
-"""Steps from one phase to the next, whose kernels are alike."""
+"""Steps from one phase to the next, whose kernels are alike (chosen)."""
 
 
 @dataclass(frozen=True, slots=True)

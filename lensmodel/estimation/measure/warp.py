@@ -24,8 +24,8 @@ Places = tuple[NDArray[np.float64], NDArray[np.float64]]
 DEGREE: Final = 5
 """Radial distortion up to the fifth power of the radius: two coefficients and a decentred middle."""
 
-_FEWEST: Final = 6  # points that a polynomial of first order takes twice over
-_TRUSTED_PX: Final = 1.0  # a match that lies so far from the smooth field of all others is a wrong one
+_FEWEST: Final = 6  # points, twice as many as a polynomial of first order needs (chosen)
+_TRUSTED_PX: Final = 1.0  # a match that lies so far from the smooth field of all others is wrong (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,9 +6,11 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
+from lensmodel.core.files import fitted
 from lensmodel.core.psf import as_kernel, distance, rms_width
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
 from lensmodel.estimation.estimator import PsfEstimate, is_no_blur, usable
@@ -17,7 +19,7 @@ from lensmodel.estimation.methods.whittle import Whittle
 from lensmodel.estimation.spectra.kernel_choice import SpectralLikelihood
 from lensmodel.estimation.spectra.local_wavefront import AberrationFit
 from lensmodel.estimation.spectra.scene_spectra import SceneSpectra
-from lensmodel.estimation.steps.finish import signal_share
+from lensmodel.estimation.steps.finish import confidence_of, signal_share
 from lensmodel.estimation.steps.recurrence import QUICK
 
 # Side of the kernel, alternations, side of the patches, where many are pooled (chosen, not measured)
@@ -28,14 +30,17 @@ _USUAL_SIZE = 31  # pixels: who asks for larger kernels knows of blur that reach
 _REACH, _LEAST_SUPPORT = (3.0, 9.0), (15, 31)
 _STARTS, _STARTS_OF_CHANNEL = 10, 6  # random wavefronts for few patches (chosen, not measured)
 _PIXEL_SIGMA = 0.29  # pixels: standard deviation of a uniform pixel, 1/sqrt(12)
+_LEAST_ERROR = 0.05  # relative: no blind kernel was nearer to the truth (chosen)
 _PER_WIDTH = 40.0
-"""Cost of a kernel e times as wide: with equal evidence the narrower one wins, which does less harm."""
+"""Cost of a kernel e times as wide: with equal evidence the narrower one wins, which does less harm
+(chosen)."""
 
-_POOLED_ERROR = 0.7
-"""Relative error of a wavefront agreed on by n patches, times the root of n."""
+_FITTED = fitted("estimation")
+_POOLED_ERROR: Final = float(_FITTED["pooled_error"])
+"""Relative error of a wavefront agreed on by n patches, times the root of n; see `data/README.md`."""
 
-_AT_TYPICAL = -0.65
-"""Logarithm of the error where all agree on a usual scene, but wavefront and patch recurrence differ by 1."""
+_ERROR: Final[Mapping[str, float]] = _FITTED["default_error"]
+"""Constants of `predicted_error`; see `data/README.md`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +135,7 @@ class Cautious:
             SceneSpectra.of(kept), from_recurrence.kernel, _half(on_step, 1)
         )
         kernel = fitted.kernel(size)
-        error = min(max(_POOLED_ERROR / math.sqrt(len(kept)), 0.05), 1.0)
+        error = min(max(_POOLED_ERROR / math.sqrt(len(kept)), _LEAST_ERROR), 1.0)
         more = {
             "width": rms_width(kernel),
             "disagreement": distance(from_recurrence.kernel, kernel).mtf_rmse,
@@ -200,7 +205,7 @@ def _reported(
     return replace(
         from_recurrence,
         kernel=kernel,
-        confidence=1.0 / (1.0 + (error / 0.4) ** 2),
+        confidence=confidence_of(error),
         predicted_error=error,
         diagnostics={**from_recurrence.diagnostics, **more},
         seconds=time.process_time() - began,
@@ -242,6 +247,7 @@ def predicted_error(apart: float, disagreement: float, width: float, slope: floa
     slope : float
         Slope of the scene's power spectrum that went with it; a steep one hides blur or is it.
     """
-    by_kernels = 0.43 * math.log(max(apart, 1e-3)) + 1.1 * disagreement
-    by_scene = 0.33 * math.log(max(width, 0.2)) + 1.1 * (slope - 2.5)
-    return min(max(math.exp(_AT_TYPICAL + by_kernels + by_scene), 0.05), 1.0)
+    by_kernels = _ERROR["by_distance"] * math.log(max(apart, 1e-3)) + _ERROR["by_disagreement"] * disagreement
+    steeper = slope - _ERROR["usual_slope"]
+    by_scene = _ERROR["by_width"] * math.log(max(width, 0.2)) + _ERROR["by_slope"] * steeper
+    return min(max(math.exp(_ERROR["at_typical"] + by_kernels + by_scene), _LEAST_ERROR), 1.0)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from lensmodel.core.errors import NotEnoughEvidenceError
+from lensmodel.core.files import fitted
 from lensmodel.core.least_squares import nonnegative_least_squares
 from lensmodel.core.psf import as_kernel, centred, distance, resized, rms_width
 from lensmodel.core.spectrum import binned_spectrum
@@ -40,10 +41,10 @@ from lensmodel.estimation.steps.recurrence import (
 log = logging.getLogger(__name__)
 
 _BORDER = 3  # pixels left out along the rim (chosen, not measured)
-_ERROR: Final = (0.47, 1.0)
-"""Offset and slope of the expected relative L2 error by the disagreement of the halves of the patches: a line
-through 24 patches of `lensmodel bench blind --methods michaeli-irani --half dev --noise 0.01`, whose halves
-lie 0.14 apart and whose mean error is 0.61. It ranks patches weakly (rank correlation 0.28)."""
+_ERROR: Final[Mapping[str, float]] = fitted("estimation")["recurrence_error"]
+"""Expected relative L2 error by the disagreement of the halves of the patches: a line through 24 patches,
+whose halves lie 0.14 apart and whose mean error is 0.61, see `data/README.md`. It ranks patches weakly (rank
+correlation 0.28)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,7 +163,7 @@ class PatchRecurrence:
             raise NotEnoughEvidenceError("the patches determine no kernel; choose parts with more detail")
         final = resized(centred(state.kernel), size)
         apart = self._disagreement(state, views, latent)
-        error = min(_ERROR[0] + _ERROR[1] * apart, 1.0)
+        error = min(_ERROR["at_agreement"] + _ERROR["by_disagreement"] * apart, 1.0)
         of_scale = {"width": rms_width(final), "support": float(widest), "levels": float(levels)}
         return PsfEstimate(
             kernel=final,

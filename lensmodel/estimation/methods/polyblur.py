@@ -22,13 +22,15 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lensmodel.core.files import fitted
 from lensmodel.core.psf import centred, gaussian
 from lensmodel.core.types import NoiseModel, Plane, StepHook, ignore_step
 from lensmodel.estimation.estimator import PsfEstimate, usable
@@ -42,6 +44,8 @@ _STEEPEST = 5  # gradients whose mean stands for the largest: one alone is noise
 _PROBE_PX = 0.7  # pixels of the derivative of a Gaussian (chosen)
 _VARIANCES = (0.09, 16.0)  # squared pixels, as in the paper (sigma 0.3 to 4)
 
+_LAW: Final[Mapping[str, float]] = fitted("estimation")["polyblur"]
+
 Floats = NDArray[np.float64]
 
 
@@ -52,12 +56,11 @@ class Polyblur:
     Parameters
     ----------
     c, b : float
-        Of the law above, b in px; fitted to steep windows of the library's photographs, blurred by
-        Gaussians of 0.4 to 3 px, with 1 percent noise.
+        Of the law above, b in px; see `data/README.md`.
     """
 
-    c: float = 0.332
-    b: float = 0.837
+    c: float = _LAW["c"]
+    b: float = _LAW["b"]
 
     name = "polyblur"
     version = 1

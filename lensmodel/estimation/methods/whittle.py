@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import scipy
@@ -17,18 +18,23 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from lensmodel.core.errors import NotEnoughEvidenceError
+from lensmodel.core.files import fitted
 from lensmodel.core.psf import centred, gaussian, resized
 from lensmodel.core.types import NoiseModel, Plane, StepHook, ignore_step
 from lensmodel.estimation.estimator import PsfEstimate, is_no_blur, usable
 
 _TILE = 64  # pixels: neighbouring bins are nearly independent, blur nearly the same (chosen)
 _BAND = (0.05, 0.5)  # cycles/pixel: below, few bins and uneven light (chosen)
-# Scenes fall off with 2.0 to 4.0; a prior that expects too little makes kernels too wide.
+# Scenes fall off with 2.0 to 4.0; a prior that expects too little makes kernels too wide (chosen).
 _SLOPE, _SLOPE_SD = 2.5, 0.25
 _ORIENTATION_SD = 0.5  # of how much a scene prefers a direction (chosen)
 # Of the priors against a patch's likelihood, whose bins are not independent (chosen)
 _PRIOR_WEIGHT = 1.0 / 100.0
 _STARTS_PX = (0.7, 1.5, 3.0)  # widths to begin with, pixels: sharp, usual, soft (chosen)
+_ERROR: Final = float(fitted("estimation")["whittle_error"])
+"""Expected relative L2 error, see `data/README.md`; the likelihood does not rank its errors."""
+
+_CONFIDENCE = 0.35  # about `confidence_of` that error (chosen)
 _PER_PATCH = 4  # unknowns: amplitude, slope, two of direction
 
 Floats = NDArray[np.float64]
@@ -108,9 +114,9 @@ class Whittle:
         share = np.array([1.0 - signal[ring == i].mean() for i in range(14)])
         return PsfEstimate(
             kernel=kernel,
-            confidence=0.35,
+            confidence=_CONFIDENCE,
             reliability=np.clip(share, 0.0, 1.0),
-            predicted_error=0.57,  # median on simulated lenses: the likelihood does not rank its errors
+            predicted_error=_ERROR,
             diagnostics={
                 "width": float(np.sqrt(np.trace(covariance) / 2.0)),
                 "slope": float(np.mean(best.x[4::_PER_PATCH])),

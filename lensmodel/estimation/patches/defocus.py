@@ -22,7 +22,7 @@ JUMP_SHARE: Final = 0.5  # of the range of log widths, see `smooth_widths` (chos
 SURFACE_STEPS: Final = 12  # of reweighting (chosen, not measured)
 MIN_FOR_SURFACE: Final = 40  # windows, for six coefficients (chosen, not measured)
 QUARTER_ALLOWANCE: Final = 1.2
-"""A quarter of a window has fewer edges, its width a larger error."""
+"""A quarter of a window has fewer edges, its width a larger error (chosen, not measured)."""
 SHARP_PX: Final = 0.6
 """Edges of a sharp photo measure about this wide; a smaller width carries no information."""
 MIN_IN_RING: Final = 4  # windows (chosen): fewer have no median worth the name

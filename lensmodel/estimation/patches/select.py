@@ -29,7 +29,7 @@ BLOB_LIMIT: Final = 20  # connected clipped pixels (chosen, not measured)
 DARK_LIMIT: Final = 0.5  # share of a window's pixels (chosen, not measured)
 FLAT_CONTRAST: Final = 4.0  # variance of signal over that of noise (chosen, not measured)
 FLAT_EIGENVALUE: Final = 10.0
-"""Smaller eigenvalue of the structure tensor over that of noise."""
+"""Smaller eigenvalue of the structure tensor over that of noise (chosen, not measured)."""
 ONE_DIRECTION_RATIO: Final = (
     0.05  # smaller eigenvalue of the structure tensor over the larger (chosen, not measured)
 )

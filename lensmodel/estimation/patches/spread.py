@@ -13,16 +13,16 @@ from lensmodel.estimation.patches.windows import Windows
 RINGS: Final = 8  # of equal width in r (chosen, not measured)
 OCTANTS: Final = 8  # eighths of a turn, by definition
 PATCHES_A_CELL: Final = 3
-"""Of all that were asked for, on average."""
+"""Of all that were asked for, on average (chosen)."""
 MOST_A_CELL: Final = 4
 """Pooling the normal equations of four patches is worth most of what twelve give."""
 CELL_R: Final = 0.12  # half-diagonals (chosen): nearer windows tell of the same PSF
 CELL_ANGLE: Final = math.radians(24.0)  # the same around the centre (chosen)
 MOST_APART: Final = 3.0  # window sides: farther ones are never of one cell (chosen)
 
-SPREAD_STEP: Final = 1.0  # window sides
+SPREAD_STEP: Final = 1.0  # window sides (chosen)
 MOST_STEPS: Final = 4
-"""Distances to the nearest seed count in steps of one window, up to four."""
+"""Distances to the nearest seed count in steps of one window, up to four (chosen)."""
 
 
 def sector_of(windows: Windows) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

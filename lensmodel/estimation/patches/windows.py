@@ -22,7 +22,7 @@ from lensmodel.estimation.patches.details import SLOPE_ORDER
 from lensmodel.estimation.patches.rmap import FLAT_WINDOW, R_BINS, automatic_threshold, gradient_noise
 
 MIN_RIDGE_PIXELS: Final = 30
-"""Fewer edge pixels than this do not give a width."""
+"""Fewer edge pixels than this do not give a width (chosen)."""
 
 WIDTH_QUANTILE: Final = 0.3
 """Soft edges of the scene widen the upper half of the widths, not the lower: on sharp photographs, half of

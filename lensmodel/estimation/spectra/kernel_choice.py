@@ -12,9 +12,9 @@ from lensmodel.core.psf import resized
 from lensmodel.core.types import Kernel, NoiseModel, Plane
 from lensmodel.estimation.spectra.local_spectra import LocalSpectra, local_power
 from lensmodel.estimation.spectra.scene_spectra import SceneSpectra, log_power
+from lensmodel.scene.prior import TAILS
 
 _SIDE = 47  # pixels: holds the widest kernel that a patch's spectra tell of (chosen)
-_TAILS = 6.0  # degrees of freedom of Student's t of a bin, as in `model.wavefront.from_spectra`
 _ROUNDS = 8  # of Gauss and Newton (chosen)
 
 
@@ -27,9 +27,9 @@ class SpectralLikelihood:
     whole : SceneSpectra
     local : LocalSpectra
     temper : float
-        Share of the likelihood of whole spectra that counts: neighbouring bins err alike.
+        Share of the likelihood of whole spectra that counts (chosen): neighbouring bins err alike.
     parts : float
-        The same of local spectra: tiles overlap, and no mixture is perfect.
+        The same of local spectra (chosen): tiles overlap, and no mixture is perfect.
     """
 
     whole: SceneSpectra
@@ -56,4 +56,4 @@ class SpectralLikelihood:
         for _ in range(_ROUNDS):
             amplitudes = amplitudes - (change * left[:, None]).sum(axis=0) / (change**2).sum(axis=0)
             left, change = self.whole.residuals(blur, none, amplitudes)
-        return (_TAILS + 1.0) * float(np.log1p(left**2 / _TAILS).sum())
+        return (TAILS + 1.0) * float(np.log1p(left**2 / TAILS).sum())

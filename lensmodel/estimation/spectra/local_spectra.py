@@ -28,20 +28,20 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from lensmodel.core.types import NoiseModel, Plane
+from lensmodel.estimation.spectra.leakage import Leakage
 
 SIDE: Final = 32
-"""Side of a tile, pixels."""
+"""Side of a tile, pixels (chosen: small enough to show one thing)."""
 
 COUPLED: Final = 0.5
-"""t above."""
+"""t above (chosen: of two neighbours under the window, one is new)."""
 
 _DATA = Path(__file__).parents[1] / "data" / "local_spectra.npz"
 _LOWEST, _HIGHEST = 0.04, 0.5  # cycles/pixel: below, a tile holds no whole period to speak of
 _STRIDE = 16  # half a tile: Welch's overlap
 # Natural logarithms of a scene's contrast over the usual (chosen)
 _LOG_GAINS: Final = np.linspace(-2.5, 2.5, 11)
-_SCENE_FALL = 2.3  # exponent of a scene's power, about 2: Field 1987
-_FAINTEST = 1e-4  # of |K|^2: leakage and rounding hide what lies below
+_FAINTEST = 1e-4  # of |K|^2: leakage and rounding hide what lies below (chosen)
 
 Floats = NDArray[np.float64]
 
@@ -56,7 +56,7 @@ FREQUENCIES: Final = int(_TAKEN.sum())
 
 _HANN = 0.5 - 0.5 * np.cos(2.0 * np.pi * (np.arange(SIDE) + 0.5) / SIDE)  # von Hann's window
 _WINDOW = _HANN[:, None] * _HANN
-_FALL = 1.0 / np.maximum(_MODULUS, 1.0 / SIDE) ** _SCENE_FALL  # power of the usual scene
+_LEAKAGE = Leakage.of(SIDE)
 
 
 def periodograms(patch: Plane, stride: int = _STRIDE) -> Floats:
@@ -76,13 +76,8 @@ def periodograms(patch: Plane, stride: int = _STRIDE) -> Floats:
 
 
 def _leaked(power: Floats) -> Floats:
-    """Power as seen through the Hann window of a tile, (..., SIDE, SIDE // 2 + 1) to (..., FREQUENCIES)."""
-    scene = power * _FALL
-    mirrored = scene[..., -np.arange(SIDE), :]
-    wide = np.concatenate([mirrored[..., 1:2], scene, mirrored[..., -2:-1]], axis=-1)
-    mixed = (np.roll(wide, 1, -2) + np.roll(wide, -1, -2)) / 6.0 + wide * (2.0 / 3.0)
-    mixed = (mixed[..., :-2] + mixed[..., 2:]) / 6.0 + mixed[..., 1:-1] * (2.0 / 3.0)
-    return np.asarray(mixed[..., _TAKEN], dtype=np.float64)
+    """Power as seen through the window of a tile, (..., SIDE, SIDE // 2 + 1) to (..., FREQUENCIES)."""
+    return np.asarray(_LEAKAGE.seen(power)[..., _TAKEN], dtype=np.float64)
 
 
 _OPEN = _leaked(np.ones((SIDE, SIDE // 2 + 1)))  # what leaks where the transfer function is 1 everywhere

@@ -22,23 +22,21 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.core.descent import Descent
 from lensmodel.core.psf import as_kernel, centred, resized, rms_width
 from lensmodel.core.types import Kernel, StepHook, ignore_step
 from lensmodel.estimation.spectra.local_spectra import LocalSpectra, log_local_power
 from lensmodel.estimation.spectra.scene_spectra import SceneSpectra, log_power
-from lensmodel.optics.local_pupil import COMA, TERMS, Pupil
+from lensmodel.optics.aberration_prior import ABERRATIONS
+from lensmodel.optics.local_pupil import COMA, Pupil
+from lensmodel.optics.pupil import TERMS
+from lensmodel.scene.prior import TAILS
 
-# Expected spread of each term, pixels of blur (chosen, not measured).
-_USUAL_PX = np.array([3.0, 2.0, 2.0, 3.0, 1.5, 1.5, 3.0, 3.0])
-_TAILS = 6.0  # degrees of freedom of Student's t, as in `kernel_choice`
 _STRIDE_PX = 1.0  # pixels of blur: no term changes by more in one step (chosen)
 _ENOUGH = 0.05  # of the cost: less gained in a step ends the fit (chosen)
 _TRIES = 4  # steps with more damping before the fit ends (chosen)
 _SIDES: Final = (31, 47)  # pixels of the kernel: for usual and for wide blur (chosen)
 _WIDE_PX = 2.8  # RMS width from which on the larger one is taken (chosen)
-
-_USUAL_SHAPE = (0.4, 0.6, 0.6, 0.8, 0.6, 0.6)
-"""Spread of the terms of a random wavefront, in widths of the reference; no tilts."""
 
 _SEED = 0  # any number: fits repeat to the bit
 
@@ -52,16 +50,16 @@ class AberrationFit:
     Parameters
     ----------
     weight : float
-        Of the reference kernel.
+        Of the reference kernel (chosen: it has to decide the phase, not the width).
     temper : float
-        Share of the spectra's likelihood that counts: neighbouring bins err alike.
+        Share of the spectra's likelihood that counts (chosen): neighbouring bins err alike.
     starts : int
         Random wavefronts, each moved `approach` steps towards the reference alone and `first` steps with
         the spectra.
     kept, rounds : int
         So many of the best go on for at most `rounds` steps; only these see local spectra.
     parts : float
-        Share of the likelihood of local spectra that counts.
+        Share of the likelihood of local spectra that counts (chosen): tiles overlap.
     size : int
         Odd side of the kernels that are asked for; where it is the largest of all, it is fitted on.
     """
@@ -100,11 +98,11 @@ class AberrationFit:
         pupil = Pupil.of(self.size if self.size > wide else wide if width > _WIDE_PX else usual)
         target = resized(reference, pupil.size)
         rng = np.random.default_rng(_SEED)
-        total = self.starts + self.kept + 1
+        shape, total = ABERRATIONS.drawn_at_place, self.starts + self.kept + 1
         fits = []
         for done in range(self.starts):
             start = np.zeros(TERMS)
-            start[: len(_USUAL_SHAPE)] = rng.standard_normal(len(_USUAL_SHAPE)) * _USUAL_SHAPE * width
+            start[: len(shape)] = rng.standard_normal(len(shape)) * shape * width
             approached = self._descend(pupil, target, start, _Evidence(None), self.approach)
             fits.append(self._descend(pupil, target, approached.terms, _Evidence(spectra), self.first))
             on_step(done + 1, total)
@@ -124,27 +122,13 @@ class AberrationFit:
     def _descend(
         self, pupil: Pupil, target: Kernel, terms: Floats, evidence: _Evidence, rounds: int
     ) -> LocalWavefront:
-        state = self._state(pupil, target, terms, evidence, None)
-        damping = 1e-2
-        for _ in range(rounds):
-            better = None
-            for _ in range(_TRIES):
-                lifted = state.normal + np.diag(damping * np.diag(state.normal))
-                step = np.linalg.solve(lifted, state.gradient)
-                step *= min(1.0, _STRIDE_PX / max(float(np.abs(step[:TERMS]).max()), 1e-9))
-                candidate = self._state(
-                    pupil, target, state.terms + step[:TERMS], evidence, state.levels + step[TERMS:]
-                )
-                if candidate.cost < state.cost:
-                    better = candidate
-                    break
-                damping *= 6.0
-            if better is None:
-                break
-            gain, state = state.cost - better.cost, better
-            damping /= 4.0
-            if gain < _ENOUGH:
-                break
+        def moved(state: _State, step: Floats) -> _State:
+            step = step * min(1.0, _STRIDE_PX / max(float(np.abs(step[:TERMS]).max()), 1e-9))
+            after, levels = state.terms + step[:TERMS], state.levels + step[TERMS:]
+            return self._state(pupil, target, after, evidence, levels)
+
+        begin = self._state(pupil, target, terms, evidence, None)
+        state = Descent(rounds, _TRIES, enough=_ENOUGH).down(begin, moved)
         return LocalWavefront(state.terms, state.kernel, state.cost)
 
     def _state(
@@ -153,14 +137,15 @@ class AberrationFit:
         kernel, changes = pupil.kernel(terms)
         off, flat = (kernel - target).ravel(), changes.reshape(TERMS, -1)
         weight = self.weight / float((target**2).sum())
-        usual = terms / _USUAL_PX
+        spread = ABERRATIONS.at_place
+        usual = terms / spread
         state = _State(
             terms,
             np.zeros(0),
             kernel,
             float(usual @ usual) + weight * float(off @ off),
-            np.diag(1.0 / _USUAL_PX**2) + weight * (flat @ flat.T),
-            -usual / _USUAL_PX - weight * (flat @ off),
+            np.diag(1.0 / spread**2) + weight * (flat @ flat.T),
+            -usual / spread - weight * (flat @ off),
         )
         if evidence.whole is not None:
             count = len(evidence.whole.log_power)
@@ -181,11 +166,11 @@ class AberrationFit:
         if amplitudes is None:
             amplitudes = spectra.begin(blur)
         left, change = spectra.residuals(blur, by_terms, amplitudes)
-        weighted = change * (self.temper * (_TAILS + 1.0) / (_TAILS + left**2))[:, None]
+        weighted = change * (self.temper * (TAILS + 1.0) / (TAILS + left**2))[:, None]
         normal, gradient = change.T @ weighted, -(weighted.T @ left)
         normal[:TERMS, :TERMS] += state.normal
         gradient[:TERMS] += state.gradient
-        cost = state.cost + self.temper * (_TAILS + 1.0) * float(np.log1p(left**2 / _TAILS).sum())
+        cost = state.cost + self.temper * (TAILS + 1.0) * float(np.log1p(left**2 / TAILS).sum())
         return _State(state.terms, amplitudes, state.kernel, cost, normal, gradient)
 
     def _with_local(
@@ -221,7 +206,7 @@ class LocalWavefront:
     @property
     def unusual(self) -> float:
         """How unusual the wavefront is before any data, |g / usual|²."""
-        return float(np.square(self.terms / _USUAL_PX).sum())
+        return float(np.square(self.terms / ABERRATIONS.at_place).sum())
 
     def kernel(self, size: int) -> Kernel:
         """Kernel of odd side `size`, centred."""

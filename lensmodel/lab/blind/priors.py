@@ -19,12 +19,12 @@ from unittest import mock
 import numpy as np
 
 from lensmodel.estimation.spectra.local_spectra import SpectrumMixture
-from lensmodel.estimation.spectra.scene_spectra import ScenePrior
 from lensmodel.lab.blind.blind_benchmark import run_blind_benchmark
 from lensmodel.lab.blind.confidence import told
 from lensmodel.lab.blind.results import UNTOUCHED, BlindBenchmark, CaseResult, summarised
 from lensmodel.lab.cases import list_photos, photo_half
 from lensmodel.lab.training import make_local_spectra, make_scene_spectra
+from lensmodel.scene.prior import WindowPrior
 
 
 def main() -> None:
@@ -49,10 +49,10 @@ def main() -> None:
     for fold in range(asked.folds):
         held = {photo.stem for photo in photos[fold :: asked.folds]}
         known = [photo for photo in photos if photo.stem not in held]
-        scene = ScenePrior.of(make_scene_spectra.measured(known))
+        scene = WindowPrior.of(make_scene_spectra.measured(known))
         mixture = make_local_spectra.learned(known)
         with (
-            mock.patch.object(ScenePrior, "load", return_value=scene),
+            mock.patch.object(WindowPrior, "load", return_value=scene),
             mock.patch.object(SpectrumMixture, "load", return_value=mixture),
         ):
             report = run_blind_benchmark(settings, only=held)

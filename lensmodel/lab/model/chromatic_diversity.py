@@ -41,7 +41,7 @@ from lensmodel.lab.chain.blind_gain import CAMERA, PLACES, Lens, lenses, shot, w
 from lensmodel.lab.model.cross_spectra import OTHERS, transfer_of
 from lensmodel.model.wavefront.from_kernels import fit_wavefront
 from lensmodel.model.wavefront.from_spectra import PatchView, expected, open_eye, phase_terms
-from lensmodel.model.wavefront.scene_spectrum import SceneView
+from lensmodel.model.wavefront.scene_view import SceneView
 from lensmodel.optics.wavefront import NAMES, Wavefront
 from lensmodel.workflow import pipeline
 

@@ -1,4 +1,4 @@
-"""Photographs behind lenses that are known: the numbers of `lensmodel.model.wavefront.scene_spectrum`.
+"""Photographs behind lenses that are known: the numbers of `patch` in `lensmodel.scene.prior`.
 
     LENSMODEL_TEST_DATA=... python -m lensmodel.lab.model.scene_spectra --seeds 0:8 --photos 5
 
@@ -21,13 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel import photo
-from lensmodel.core.spectrum import SECTORS, PatchSpectrum
+from lensmodel.core.spectrum import SECTORS, PatchSpectrum, bin_frequencies
 from lensmodel.core.types import CHANNELS, Channel, LensSettings
 from lensmodel.lab.cases import list_photos, photo_half
 from lensmodel.lab.reproduce.scenes import centred_cut
 from lensmodel.model.wavefront.from_spectra import fit_scene
-from lensmodel.model.wavefront.scene_spectrum import ORBITS, SHAPES, SceneView
-from lensmodel.optics.transfer import bin_frequencies
+from lensmodel.model.wavefront.scene_view import SceneView
+from lensmodel.scene.prior import ORBITS, PATCH_SHAPES
 from lensmodel.simulate import SimulatedCamera, SimulatedField, draw_lens, load_scene, photograph, write_photo
 from lensmodel.workflow import pipeline
 
@@ -87,9 +87,9 @@ def spread(values: Floats) -> Floats:
 
 def report(seen: list[Seen]) -> None:
     """Fit the scenes and print."""
-    shapes = SHAPES.shape[1]
+    shapes = PATCH_SHAPES.shape[1]
     fits = [fit_scene(replace(s.scene, vote=s.scene.vote / _WIDE), s.truth) for s in seen]
-    unknowns = np.stack([z for z, _, _ in fits])
+    unknowns = np.stack([fit.unknowns for fit in fits])
     photos = np.array([s.photo for s in seen])
     centres = np.stack([np.median(unknowns[photos == p], axis=0) for p in sorted(set(photos))])
     within = np.concatenate(
@@ -103,7 +103,7 @@ def report(seen: list[Seen]) -> None:
     print("spread of photos   ", spread(centres)[:shapes])
     print("channels about it  ", spread(unknowns)[shapes:-1].reshape(3, 3))
     print("floor: usual, spread", np.array([np.median(unknowns[:, -1]), spread(unknowns)[-1]]))
-    rest, signal = np.stack([r for _, r, _ in fits]), np.stack([s for _, _, s in fits])
+    rest, signal = np.stack([fit.residual for fit in fits]), np.stack([fit.signal for fit in fits])
     for k, channel in enumerate(_ORDER):
         ring_rest = rest[:, :, k].reshape(len(seen), -1, SECTORS)
         strong = signal[:, :, k].reshape(ring_rest.shape) > 0.5

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lensmodel.core.jit import jit
 
-# Of the cubic B-spline, in single precision.
+# Of the cubic B-spline (M. Unser, IEEE Signal Processing Magazine 16, 1999, eq. 4), in single precision.
 _ONE, _HALF = np.float32(1.0), np.float32(0.5)
 _SIXTH, _TWO_THIRDS = np.float32(1.0 / 6.0), np.float32(2.0 / 3.0)
 

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from lensmodel.core.types import FieldPosition
 
 NUGGETS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
-"""Variances of a sample of vote 1, over that of the field, that cross-validation chooses from."""
+"""Variances of a sample of vote 1, over that of the field, that cross-validation chooses from (chosen:
+finely enough for a factor, which hardly matters)."""
 
 _SETTINGS = (3, 4, 5, 6)  # columns of `variables.COLUMNS` that are no place
 

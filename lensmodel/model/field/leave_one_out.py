@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import InvalidInputError
 
 MULTIPLES = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)  # of the bandwidth by the normal reference rule (chosen)
-# The same around the centre; 20 means rotational symmetry
+# The same around the centre; 20 means rotational symmetry (chosen)
 PHI_MULTIPLES = (0.5, 0.7, 1.0, 1.4, 2.0, 4.0, 20.0)
-MIRRORS = (0.0, 0.3, 1.0)  # weights of mirror images: none, some, full
+MIRRORS = (0.0, 0.3, 1.0)  # weights of mirror images: none, some, full (chosen)
 _CAP = 1.5  # relative errors beyond count no more than this: one outlier chooses nothing (chosen)
 _AS_GOOD, _NEGLIGIBLE = 1.01, 1e-3  # errors nearer than this are equal: their difference is noise (chosen)
 

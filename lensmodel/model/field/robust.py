@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from lensmodel.core.psf import PsfSample, second_moments
 from lensmodel.model.field.leave_one_out import Held
 
-_TUKEY = 4.685  # 95 % efficiency for normal errors (Tukey's biweight)
+_TUKEY = 4.685  # 95 % efficiency for normal errors (P. J. Huber, "Robust Statistics", 1981: Tukey's biweight)
 _ROUNDS = 4  # of reweighting (chosen)
 _MIN_PHOTOS = 3  # with two nobody knows which one is wrong
 _LISTED = 0.5  # weight below which a photo is named (chosen)

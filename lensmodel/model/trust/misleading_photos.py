@@ -32,11 +32,11 @@ from lensmodel.model.wavefront.likelihood import surprise
 
 _FIRST: Final = 2
 """Photos that nothing can be held against: of two that differ, nobody says which is wrong."""
-_PATCHES: Final = 8  # of a photo that are asked
-_PHOTOS: Final = 6  # of those before that are asked, the latest
-_BOUND: Final = 12.0  # of what one patch says
-_SIGNIFICANT: Final = 2.0  # standard errors
-_LEAST: Final = 0.5  # mean rise that matters: less is not seen in a picture
+_PATCHES: Final = 8  # of a photo that are asked (chosen: each costs some milliseconds)
+_PHOTOS: Final = 6  # of those before that are asked, the latest (chosen, as `_PATCHES`)
+_BOUND: Final = 12.0  # of what one patch says (chosen, as in `witness`: no patch speaks for all)
+_SIGNIFICANT: Final = 2.0  # standard errors: one photo in forty is held wrong by chance (chosen)
+_LEAST: Final = 0.5  # mean rise that matters: less is not seen in a picture (chosen)
 REASON: Final = "with its kernels the patches of the other photos are less likely than without"
 
 

@@ -9,17 +9,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.core.files import fitted
 from lensmodel.model import variables as va
 
-_FAR = 2.5  # bandwidths: a Gaussian has fallen to 0.04 there
-
-
+_FAR = 2.5  # bandwidths: a Gaussian has fallen to 0.04 there (chosen)
 _MEASURED, _BLIND = 0.08, 0.15
 """Expected errors of kernels up to which, as of those measured on a target, they are believed more than
 patches are, and from which on they count as blind estimates do, none of which expects less (chosen)."""
 
-USUAL_ERROR: Final = 0.4
-"""Relative L2 error that blind estimates share where they do not say (of simulated lenses, one photo)."""
+USUAL_ERROR: Final = float(fitted("model")["usual_error"])
+"""Relative L2 error that blind estimates share where they do not say; see `data/README.md`."""
 
 
 def measured_share(error: float | NDArray[np.float64]) -> NDArray[np.float64]:

@@ -41,7 +41,8 @@ from lensmodel.model.trust.support import USUAL_ERROR, measured_share
 from lensmodel.model.wavefront.likelihood import surprise
 
 NARROWINGS: Final = (Narrowing(), Narrowing(width=0.7), Narrowing(width=0.55), Narrowing(share=0.45))
-"""What may have become of a kernel that is not the true one. Wider ones do no harm where they are missed."""
+"""What may have become of a kernel that is not the true one (chosen: as blind kernels are off, and a sharp
+core in wide wings). Wider ones do no harm where they are missed."""
 
 _FITTED: Final = fitted("model")["witness"]
 OF_BOTH: Final = (tuple(_FITTED["kernels"]), tuple(_FITTED["wavefront"]))
@@ -71,7 +72,7 @@ _RADIUS: Final = 0.3  # half-diagonals (chosen: a mean over several patches, so 
 _FEWEST: Final = 5.0  # patches whose mean counts in full (chosen: one alone overrules nothing)
 _FEWEST_VOTES: Final = 0.5  # patches; with fewer near a place the witness says nothing (chosen)
 _MOST: Final = 96  # patches of a model that are asked (chosen: each costs some milliseconds)
-_TINY: Final = 1e-12
+_TINY: Final = 1e-12  # keeps a division finite where no patch speaks
 _ALIKE: Final = 0.05  # least weight by settings (chosen: patches of others say little of these)
 
 
@@ -191,18 +192,43 @@ class WitnessedField:
         pitch_um: float | None = None,
         half_diagonal_px: float | None = None,
     ) -> WitnessedField:
-        """Hear the patches of a model and of a photo; takes some milliseconds a patch."""
+        """Hear the patches of a model and of a photo; takes some milliseconds a patch.
+
+        Parameters
+        ----------
+        model : LensModel
+            `warmed`: without its wavefront there is one opinion.
+        settings : LensSettings
+            Those of the photo that is to be corrected.
+        patches : sequence of PsfSample
+            Of that photo, see `Witness.of`.
+        pitch_um, half_diagonal_px : float, optional
+            Its pixels, as `LensModel.query` takes them.
+        """
         opinions = opinions_of(model)
         pixels = {"pitch_um": pitch_um, "half_diagonal_px": half_diagonal_px}
         fields = [one.field(settings, **pixels) for one in opinions]
         return cls(opinions, fields, Witness.of(opinions, settings, patches), settings, pixels)
 
     def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
-        """Return the mean kernel of odd side `size` at a field position, in the image frame."""
+        """Return the mean kernel at a field position, in the image frame; see `PsfField`."""
         return self.belief_at(position, channel, size).kernel
 
     def belief_at(self, position: FieldPosition, channel: Channel, size: int) -> Belief:
-        """Return what is thought of the PSF at a field position."""
+        """Return what is thought of the PSF at a field position.
+
+        Parameters
+        ----------
+        position : FieldPosition
+        channel : {"r", "g", "b"}
+        size : int
+            Odd side of the kernel, pixels.
+
+        Returns
+        -------
+        Belief
+            Mean kernel, and variance at each frequency.
+        """
         asked = self.settings.with_channel(channel)
         answer = self.opinions[0].query(position, asked, size, **self.pixels)
         expected = answer.predicted_error if math.isfinite(answer.predicted_error) else 1.0

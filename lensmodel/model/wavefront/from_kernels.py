@@ -10,27 +10,34 @@ import numpy as np
 
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import WAVELENGTH_NM, Kernel
-from lensmodel.model.wavefront.least_squares import PRIOR_PX, SLOPE_PX, USUAL_EYE, Problem
+from lensmodel.model.wavefront.least_squares import Problem
 from lensmodel.model.wavefront.starts import starts
+from lensmodel.optics.aberration_prior import ABERRATIONS
 from lensmodel.optics.wavefront import NAMES, Wavefront, design, stopped
 
-_USUAL_F = 2.8
+_USUAL_F = 2.8  # widest f-number where no sample says (chosen: between primes and zooms)
 USUAL_PITCH_UM = 4.5
-"""Of sensors whose pixel pitch nobody knows."""
+"""Of sensors whose pixel pitch nobody knows (chosen: 42 megapixels on 36 x 24 mm)."""
 
 _LARGEST = 55  # pixels: the largest side that estimators give
-_COARSE, _FINE = 12, 36
-_COARSE_ROUNDS, _FINE_ROUNDS = 8, 12
-_STARTS, _REFINED = 4, 2
-_REFINING_ROUNDS, _KNOWN = 6, 0.03
-_BLUR_PX = 1.0
-_GUESSED = 0.1
-_LEAST_HALF, _HELD_LIGHT = 5, 0.98
+_COARSE, _FINE = (
+    12,
+    36,
+)  # samples of the search and of the fit: 36 kernels over-determine 22 unknowns (chosen)
+_COARSE_ROUNDS, _FINE_ROUNDS = 8, 12  # steps at most: only the last fit has to end (chosen)
+_STARTS, _REFINED = 4, 2  # beginnings by moments, and those of them that are fitted in full (chosen)
+_REFINING_ROUNDS = 6  # steps at most of a fit that begins near its end (chosen)
+_KNOWN, _PITCH_GUESSED, _APERTURE_GUESSED = 0.03, 0.3, 0.5
+"""Standard deviation of the logarithm of diffraction's width q: with aperture and pitch known, without the
+pitch, and without both (chosen: f-numbers are rounded to 3 percent, most pitches lie within a third)."""
+_BLUR_PX = 1.0  # of kernels in the search: minima that differ by less in their kernels become one (chosen)
+_LEAST_HALF = 5  # pixels: half the side of the smallest kernel that is fitted (chosen: 11 x 11 hold a core)
+_HELD_LIGHT = 0.98  # share that the fitted square holds; the rest is noise of estimates (chosen)
 MIN_SAMPLES = 12
-"""Fewer samples make no wavefront."""
+"""Fewer samples make no wavefront (chosen: half the patches of one photo)."""
 
 ONE_FOCAL_LENGTH = 0.25
-"""Octaves within which focal lengths are one."""
+"""Octaves within which focal lengths are one (chosen: over a fifth of it lenses hardly change)."""
 
 
 def fit_wavefront(samples: Sequence[PsfSample], start: Wavefront | None = None) -> Wavefront | None:
@@ -62,13 +69,13 @@ def fit_wavefront(samples: Sequence[PsfSample], start: Wavefront | None = None) 
     pitch = float(np.median(pitches)) if pitches else USUAL_PITCH_UM
     kept.sort(key=_order)
     log_q = math.log(WAVELENGTH_NM["g"] / 1000.0 * widest / pitch)
-    vague = 0.03 if apertures and pitches else (0.3 if apertures else 0.5)
+    vague = _KNOWN if apertures and pitches else (_PITCH_GUESSED if apertures else _APERTURE_GUESSED)
     zoom = focal_range(kept) > ONE_FOCAL_LENGTH
     few, many = spread(kept, _COARSE * (1 + zoom)), spread(kept, _FINE * (1 + zoom))
     size = max(side_of_light(s.kernel) for s in many)
     begins = [start] if start is not None else []
     if start is None:
-        usual = Wavefront(np.zeros(len(NAMES)), log_q, USUAL_EYE, widest, size)
+        usual = Wavefront(np.zeros(len(NAMES)), log_q, ABERRATIONS.eye, widest, size)
         if zoom:
             known = [math.log2(s.settings.focal_mm) for s in kept if s.settings.focal_mm is not None]
             usual = replace(usual, slopes=np.zeros(len(NAMES)), focal_octaves=float(np.median(known)))
@@ -79,7 +86,7 @@ def fit_wavefront(samples: Sequence[PsfSample], start: Wavefront | None = None) 
     fine = Problem(tuple(many), size, log_q, vague, 0.0)
     fitted = [fine.solve(replace(begin, size=size, f_number=widest), _FINE_ROUNDS) for begin in begins]
     likeliest, cost, errors = min(fitted, key=lambda fit: fit[1])
-    if vague > _GUESSED:
+    if vague > _KNOWN:
         # the width of diffraction was a guess: blur alone leads to minima at either side of it
         for guess in (log_q - 0.5, log_q + 0.5):
             other, other_cost, other_errors = fine.solve(replace(likeliest, log_q=guess), _FINE_ROUNDS)
@@ -118,12 +125,13 @@ def side_of_light(kernel: Kernel) -> int:
 def _starts(samples: Sequence[PsfSample], usual: Wavefront) -> list[Wavefront]:
     """Wavefronts whose ray spots have the moments of samples."""
     designs = np.stack([stopped(design(s.position, s.settings), usual.stop(s.settings)) for s in samples])
+    expected = ABERRATIONS.with_kernels
     q, count = math.exp(usual.log_q), len(NAMES)
     if usual.slopes is None:
-        return [replace(usual, terms=terms) for terms in starts(samples, designs, PRIOR_PX, q, _STARTS)]
+        return [replace(usual, terms=terms) for terms in starts(samples, designs, expected, q, _STARTS)]
     octaves = np.array([usual.octaves(s.settings) for s in samples])
     both = np.concatenate([designs, designs * octaves[:, None, None]], axis=2)
-    vectors = starts(samples, both, np.concatenate([PRIOR_PX, SLOPE_PX]), q, 2 * _STARTS)
+    vectors = starts(samples, both, np.concatenate([expected, ABERRATIONS.slopes]), q, 2 * _STARTS)
     return [replace(usual, terms=terms[:count], slopes=terms[count:]) for terms in vectors]
 
 

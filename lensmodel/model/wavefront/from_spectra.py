@@ -26,12 +26,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.cross_phase import unshifted, without_linear
+from lensmodel.core.descent import Descent
+from lensmodel.core.files import fitted
 from lensmodel.core.spectrum import PHASE_BINS, SECTORS, CrossPhase
 from lensmodel.core.types import WAVELENGTH_NM, Channel, FieldPosition, LensSettings, StepHook, ignore_step
-from lensmodel.model.wavefront.aberration_prior import unlikeliness
-from lensmodel.model.wavefront.scene_spectrum import BIAS, PHOTO_SPREAD, SHAPES, WITH_POWER, SceneView
-from lensmodel.optics.transfer import BINS, BORROWED_RINGS, Transfer, phase_between
+from lensmodel.model.wavefront.scene_view import SceneView
+from lensmodel.optics.aberration_prior import unlikeliness
+from lensmodel.optics.transfer import BINS, Transfer, phase_between
 from lensmodel.optics.wavefront import NAMES, Wavefront, design, stopped
+from lensmodel.scene.prior import BORROWED_RINGS, LARGEST_RESIDUAL, PATCH_SHAPES, PATCHES, TAILS
 
 Floats = NDArray[np.float64]
 
@@ -42,23 +45,24 @@ SYMMETRIC: Final = np.array(
 )
 """Which unknowns a centred lens of third order has in one colour."""
 
-_HELD = 1e12
+_HELD = 1e12  # inverse variance of an unknown that is to stay: beyond any that data give
 _TEMPER = 0.1
-"""Share of the likelihood that counts: neighbouring bins and patches of one motif err alike."""
+"""Share of the likelihood that counts (chosen): neighbouring bins and patches of one motif err alike."""
 
-_PHASE_TEMPER = 0.1
-_PHASE_SCATTER = 0.1  # radians: what the scenes of a photo have of their own (`lab.model.cross_spectra`)
+_PHASES: Final[Mapping[str, float]] = fitted("model")["phases"]
+"""Scatter in radians and temper of phases, see `data/README.md`."""
 
-_FLOOR_RANGE = (-12.0, -1.0)  # of its logarithm
-_LARGEST_RESIDUAL = 3.0  # of a natural logarithm: beyond it no fit is linear (chosen)
-_TAILS = 6.0  # degrees of freedom of Student's t of a bin
-_PATCH_TAILS = 3.0  # of a patch, in units of its bins
+_FLOOR_RANGE = (-12.0, -1.0)  # of its logarithm: below it nothing is seen, above it no lens (chosen)
+PATCH_TAILS: Final = 3.0
+"""Degrees of freedom of Student's t of a patch, in units of its bins (chosen): a patch that something else
+blurred loses its say, an unusual one keeps it."""
+
 # Of Gauss and Newton: at first, and from where the last step left a scene (chosen)
 _SCENE_ROUNDS, _SCENE_ROUNDS_AGAIN = 3, 2
 _TRIES = 5  # steps with more damping before the fit ends (chosen)
 _STRIDE_PX = 1.5  # pixels of blur: no term changes by more in one step (chosen)
 _ENOUGH = 0.2  # of the cost: less gained in a step ends the fit; minima differ by more (chosen)
-_SMALLEST_EYE, _FARTHEST_EYE = 0.5, 1.0  # the two circles of the pupil have to overlap all over the field
+_SMALLEST_EYE, _FARTHEST_EYE = 0.5, 1.0  # radius, shift: the circles overlap all over the field (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,6 +102,8 @@ class PooledFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _State:
+    lens: Floats
+    shared: Floats  # what the patches of each photo share
     cost: float
     normal: Floats
     gradient: Floats
@@ -131,37 +137,19 @@ def fit_spectra(
     photos = sorted({patch.photo for patch in patches})
     problem = _Problem(tuple(patches), {name: i for i, name in enumerate(photos)}, begin, coarse)
     lens = np.concatenate([begin.terms, open_eye(np.asarray(begin.eye))])
-    shared = np.zeros((len(photos), len(PHOTO_SPREAD)))
-    state = problem.state(lens, shared, None)
+    shared = np.zeros((len(photos), len(PATCHES.photo_spread)))
     held = np.zeros(_LENS + shared.size)
     held[:_LENS] = np.where(SYMMETRIC, 0.0, _HELD) if symmetric else 0.0
-    damping = 1e-2
-    for done in range(rounds):
-        better: tuple[Floats, Floats, _State] | None = None
-        for _ in range(_TRIES):
-            step = np.linalg.solve(
-                state.normal + np.diag(damping * np.diag(state.normal) + held), state.gradient
-            )
-            step = step * min(1.0, _STRIDE_PX / max(float(np.abs(step[: len(NAMES)]).max()), 1e-9))
-            moved = lens + step[:_LENS]
-            moved[-2:] = open_eye(moved[-2:])
-            moved_shared = shared + step[_LENS:].reshape(shared.shape)
-            after = problem.state(moved, moved_shared, state.scenes)
-            if after.cost < state.cost:
-                better = moved, moved_shared, after
-                break
-            damping *= 6.0
-        if better is None:
-            break
-        gain = state.cost - better[2].cost
-        lens, shared, state = better
-        damping /= 4.0
-        on_step(done + 1, rounds)
-        if gain < _ENOUGH:
-            break
+    descent = Descent(rounds, _TRIES, enough=_ENOUGH)
+    state = descent.down(
+        problem.state(lens, shared, None),
+        problem.moved,
+        held=held,
+        on_round=lambda done: on_step(done, rounds),
+    )
     on_step(rounds, rounds)
     covariance = np.asarray(np.linalg.inv(state.normal), dtype=np.float64)[:_LENS, :_LENS]
-    return PooledFit(problem.front(lens), state.cost, covariance, state.trust)
+    return PooledFit(problem.front(state.lens), state.cost, covariance, state.trust)
 
 
 def open_eye(eye: Floats) -> tuple[float, float]:
@@ -169,7 +157,27 @@ def open_eye(eye: Floats) -> tuple[float, float]:
     return max(float(eye[0]), _SMALLEST_EYE), float(np.clip(eye[1], -_FARTHEST_EYE, _FARTHEST_EYE))
 
 
-def fit_scene(view: SceneView, power: Floats) -> tuple[Floats, Floats, Floats]:
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneFit:
+    """The scene of a patch behind a lens that is known.
+
+    Parameters
+    ----------
+    unknowns : ndarray, shape (z,)
+        See `SceneView`.
+    residual, signal : ndarray, shape (BINS, c)
+        What is left of the log power, and the share of the scene in the power.
+    cost : float
+        Of the residuals by Student's t, and of the unknowns by their prior.
+    """
+
+    unknowns: Floats
+    residual: Floats
+    signal: Floats
+    cost: float
+
+
+def fit_scene(view: SceneView, power: Floats) -> SceneFit:
     """Fit the scene of one patch behind a lens that is known.
 
     Parameters
@@ -178,14 +186,9 @@ def fit_scene(view: SceneView, power: Floats) -> tuple[Floats, Floats, Floats]:
     power : ndarray, shape (BINS, c)
         |OTF|^2.
 
-    Returns
-    -------
-    unknowns : ndarray, shape (z,)
-    residual, signal : ndarray, shape (BINS, c)
-        What is left of the log power, and the share of the scene in the power.
     """
-    fitted = _Scene.fitted(view, power, BIAS[:, None], None)
-    return fitted.z, fitted.residual, fitted.signal
+    fitted = _Scene.fitted(view, power, PATCHES.bias[:, None], None)
+    return SceneFit(fitted.z, fitted.residual, fitted.signal, fitted.cost)
 
 
 def phase_costs(patches: Sequence[PatchView], front: Wavefront) -> tuple[float, float]:
@@ -219,20 +222,27 @@ class _Problem:
         eye = (float(lens[-2]), float(lens[-1]))
         return replace(self.begin, terms=lens[: len(NAMES)].copy(), eye=eye)
 
+    def moved(self, state: _State, step: Floats) -> _State:
+        """Where a step leads, made shorter if it is too bold."""
+        step = step * min(1.0, _STRIDE_PX / max(float(np.abs(step[: len(NAMES)]).max()), 1e-9))
+        lens = state.lens + step[:_LENS]
+        lens[-2:] = open_eye(lens[-2:])
+        return self.state(lens, state.shared + step[_LENS:].reshape(state.shared.shape), state.scenes)
+
     def state(self, lens: Floats, shared: Floats, scenes: list[Floats] | None) -> _State:
         """Cost with its normal equations; `scenes` are the patches' unknowns to begin with."""
         count = _LENS + shared.size
         normal, gradient = np.zeros((count, count)), np.zeros(count)
         cost, scenes_after, trust = 0.0, [], []
         for i, patch in enumerate(self.patches):
-            at = _LENS + len(PHOTO_SPREAD) * self.photos[patch.photo]
+            at = _LENS + len(PATCHES.photo_spread) * self.photos[patch.photo]
             seen, by_lens, _ = expected(self.begin, lens, patch, coarse=self.coarse)
             # its change with the lens is no part of the derivatives: lenses far too sharp would gain by it
-            rest = (BIAS + SHAPES[:, 1:3] @ shared[self.photos[patch.photo]])[:, None]
-            rest = rest + WITH_POWER[:, None] * seen**2
+            rest = (PATCHES.bias + PATCH_SHAPES[:, 1:3] @ shared[self.photos[patch.photo]])[:, None]
+            rest = rest + PATCHES.with_power[:, None] * seen**2
             z = None if scenes is None else scenes[i]
             fitted = _Scene.fitted(patch.scene, seen, rest, z)
-            nu = _PATCH_TAILS * BINS * len(patch.scene.channels)
+            nu = PATCH_TAILS * BINS * len(patch.scene.channels)
             cost += _TEMPER * nu * math.log1p(fitted.cost / nu)
             trusted = 1.0 / (1.0 + fitted.cost / nu)
             weight = _TEMPER * trusted
@@ -243,12 +253,12 @@ class _Problem:
             scenes_after.append(fitted.z)
             trust.append(trusted)
         unusual, curvature, pull = unlikeliness(lens)
-        vote = np.tile(1.0 / PHOTO_SPREAD**2, len(self.photos))
+        vote = np.tile(1.0 / PATCHES.photo_spread**2, len(self.photos))
         cost += unusual + float(vote @ shared.ravel() ** 2)
         normal[:_LENS, :_LENS] += curvature
         normal[range(_LENS, count), range(_LENS, count)] += vote
         gradient -= np.concatenate([pull, vote * shared.ravel()])
-        return _State(cost, normal, gradient, scenes_after, np.array(trust))
+        return _State(lens, shared, cost, normal, gradient, scenes_after, np.array(trust))
 
 
 def expected(
@@ -303,16 +313,16 @@ def expected(
 
 
 def phase_terms(
-    seen: CrossPhase, phase: Floats, by_lens: Floats, temper: float = _PHASE_TEMPER
+    seen: CrossPhase, phase: Floats, by_lens: Floats, temper: float = _PHASES["temper"]
 ) -> tuple[float, Floats, Floats]:
     """Cost of phases with its normal equations and gradient, after the shift that suits best.
 
     It is nu ln(1 + chi^2 / nu) with chi^2 = sum 2 p (1 - cos(seen - phase - 2 pi f.s)), times `temper`.
     """
-    precision = seen.precision / (1.0 + seen.precision * _PHASE_SCATTER**2)
+    precision = seen.precision / (1.0 + seen.precision * _PHASES["scatter"] ** 2)
     left = unshifted(CrossPhase(seen.phase, precision), phase)
     chi2 = float(2.0 * precision @ (1.0 - np.cos(left)))
-    nu = _PATCH_TAILS * PHASE_BINS
+    nu = PATCH_TAILS * PHASE_BINS
     weight = temper / (1.0 + chi2 / nu)
     free = without_linear(by_lens, precision)
     voted = precision[:, None] * free
@@ -342,7 +352,7 @@ class _Scene:
             rounds = _SCENE_ROUNDS
             z = view.usual.copy()
             left = view.log_power - np.log(power + math.exp(z[-1])) - rest - view.shapes @ z
-            z[SHAPES.shape[1] : -1 : 3] += np.median(left, axis=0)
+            z[PATCH_SHAPES.shape[1] : -1 : 3] += np.median(left, axis=0)
         else:
             z = begin
         state = cls._about(view, power, rest, z)
@@ -358,12 +368,12 @@ class _Scene:
         passed = power + floor
         scene = np.exp(np.clip(view.shapes @ z + np.log(passed) + rest, -60.0, 60.0))
         signal = scene / (scene + view.noise)
-        residual = np.clip(view.log_power - np.log(scene + view.noise), -_LARGEST_RESIDUAL, _LARGEST_RESIDUAL)
+        residual = np.clip(view.log_power - np.log(scene + view.noise), -LARGEST_RESIDUAL, LARGEST_RESIDUAL)
         count = residual.shape[1]
         distance = np.einsum("bi,bij,bj->b", residual, view.precision, residual)
-        precision = view.precision * ((_TAILS + count) / (_TAILS + distance))[:, None, None]
+        precision = view.precision * ((TAILS + count) / (TAILS + distance))[:, None, None]
         off = z - view.usual
-        cost = float((_TAILS + count) * np.log1p(distance / _TAILS).sum() + view.vote @ off**2)
+        cost = float((TAILS + count) * np.log1p(distance / TAILS).sum() + view.vote @ off**2)
         by_scene = view.shapes * signal[:, :, None]
         by_scene[:, :, -1] = floor / passed * signal
         unknowns = by_scene.shape[2]
@@ -377,7 +387,7 @@ class _Scene:
 
     def reduced(self, by_lens: Floats) -> tuple[Floats, Floats, int]:
         """Normal equations of the lens and of the photo's share, the scene eliminated."""
-        shared = np.broadcast_to(SHAPES[:, None, 1:3], (*self.signal.shape, len(PHOTO_SPREAD)))
+        shared = np.broadcast_to(PATCH_SHAPES[:, None, 1:3], (*self.signal.shape, len(PATCHES.photo_spread)))
         columns = np.concatenate([by_lens * self.kept[:, :, None], shared], axis=2) * self.signal[:, :, None]
         count = columns.shape[2]
         flat = columns.reshape(-1, count)

@@ -8,16 +8,16 @@ a photo's mosaic is known, by the phases of red and blue against green.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.core.files import fitted
 from lensmodel.core.psf import PsfSample, distance, rms_width
 from lensmodel.core.types import WAVELENGTH_NM, Channel, FieldPosition, Kernel, StepHook, ignore_step
-from lensmodel.model.wavefront.aberration_prior import BALANCE
 from lensmodel.model.wavefront.from_kernels import USUAL_PITCH_UM, fit_wavefront, side_of_light, spread
 from lensmodel.model.wavefront.from_spectra import (
     SYMMETRIC,
@@ -27,45 +27,46 @@ from lensmodel.model.wavefront.from_spectra import (
     open_eye,
     phase_costs,
 )
-from lensmodel.model.wavefront.least_squares import PRIOR_PX, USUAL_EYE
-from lensmodel.model.wavefront.scene_spectrum import SceneView
+from lensmodel.model.wavefront.scene_view import SceneView
 from lensmodel.model.wavefront.starts import starts
+from lensmodel.optics.aberration_prior import ABERRATIONS
 from lensmodel.optics.wavefront import NAMES, Wavefront, design, stopped
 
 MIN_PLACES: Final = 8
-"""Fewer patches with a spectrum are not solved together."""
+"""Fewer patches with a spectrum are not solved together (chosen: a third of those of a photo)."""
 
 Group: TypeAlias = dict[Channel, PsfSample]
 """Samples of one patch in its channels."""
 
-_COMA = slice(2, 6)  # the odd terms
+_COMA = slice(2, 6)  # the odd terms of `NAMES`
+# Patches that a search looks at coarsely, in green, and in full: the cost grows with them (chosen: those of
+# one photo, of one and a half, of two)
 _COARSE_PLACES, _MEDIUM_PLACES, _FINE_PLACES = 24, 36, 48
 _NARROW_PLACES, _STOPPED_DOWN = 24, 2.0
 """Patches at most of photos stopped down, and the multiple of the widest f-number from which on they are (two
 stops). With all of them, five such photos take back what one adds (`lensmodel.lab.chain.stopped_down`)."""
-_COARSE_ROUNDS, _MEDIUM_ROUNDS, _FINE_ROUNDS = 7, 6, 16
+_COARSE_ROUNDS, _MEDIUM_ROUNDS, _FINE_ROUNDS = (
+    7,
+    6,
+    16,
+)  # steps at most: only the last fit has to end (chosen)
+# Starts by moments, minima kept of the coarse search, and those fitted in full, of all photos and of a pair
+# (chosen: each of the last costs seconds)
 _STARTS, _KEPT, _REFINED, _REFINED_OF_PAIR = 6, 12, 4, 2
-_FEWEST_PAIRED, _MOST_PAIRS = 3, 2  # photos, and pairs of them
-_FIRST, _RANDOM = 16, 24
-_SAME_PX = 0.4
-_USUAL_SHAPE: Final = {
-    "spherical": 1.2,
-    "coma": 1.5,
-    "field curvature": 1.3,
-    "astigmatism": 1.3,
-}
-"""Spread of the terms of a random wavefront, in widths of the samples' kernels."""
-
-_FOCUS_SPREAD = 0.5  # about `BALANCE`
-
-_TAIL_SIDE = 31
-_ERROR_PLACES, _DRAWS, _SEED = 14, 6, 0
-_DRAWN, _LEAST_DRAWN = 0.7, 0.3
-"""Share of the scatter of draws that is told of one photo, and the least of what n photos leave of it. The
-corners of a single photo may be soft by themselves; what several agree on is nearer to the truth."""
-
-_LEAST_ERROR, _RISE = 0.07, 1.5
-"""What more patches do not mend, at r = 0, and how it grows: as exp(1.5 r).
+_FEWEST_PAIRED, _MOST_PAIRS = 3, 2  # photos, and pairs of them (chosen: two photos are a pair themselves)
+_FIRST, _RANDOM = 16, 24  # samples of the first fit to kernels, and random wavefronts to begin with (chosen)
+_SAME_PX = 0.4  # pixels of blur: terms nearer than that lie in one minimum (chosen)
+_TAIL_SIDE = 31  # pixels of kernels whose third moments count: wider wings are noise to them (chosen)
+_ERROR_PLACES, _DRAWS = (
+    14,
+    6,
+)  # places and draws that tell the scatter: each draw costs a kernel a place (chosen)
+_ALIKE_R = 0.15  # half-diagonals: the scatter changes no faster over the field (chosen)
+_SEED = 0  # any number: fits repeat to the bit
+_ERROR: Final[Mapping[str, float]] = fitted("model")["pooled_error"]
+"""Constants of `Pooled.errors`: share of the scatter of draws that is told of one photo, the least of what n
+photos leave of it, and what more patches do not mend, at r = 0 and by r; see `data/README.md`. The corners of
+a single photo may be soft by themselves; what several agree on is nearer to the truth.
 
 The figures were chosen on 21 fits of simulated lenses of development seeds (0 to 30, one photo to five):
 with them 44 % of the places are told within a factor of 1.5, 43 % with each lens left out in turn, and no
@@ -136,10 +137,11 @@ class Pooled:
         here = np.array([_vector(s) for s in samples])
         there = np.array([_vector(s) for s in few])
         apart = ((here[:, None] - there[None]) ** 2).sum(axis=-1)
-        weight = np.exp(-0.5 * apart / 0.15**2) + 1e-9
+        weight = np.exp(-0.5 * apart / _ALIKE_R**2) + 1e-9
         drawn_here = weight @ np.sqrt(squared / _DRAWS) / weight.sum(axis=1)
-        least = _LEAST_ERROR * np.exp([_RISE * s.position.r for s in samples])
-        share = _DRAWN * max(1.0 / max(len({s.photo for s in samples}), 1), _LEAST_DRAWN)
+        least = _ERROR["at_center"] * np.exp([_ERROR["by_radius"] * s.position.r for s in samples])
+        photos = max(len({s.photo for s in samples}), 1)
+        share = _ERROR["drawn"] * max(1.0 / photos, _ERROR["least_drawn"])
         return np.hypot(share * drawn_here, least)
 
 
@@ -171,10 +173,10 @@ def pool(samples: Sequence[PsfSample], on_step: StepHook = ignore_step) -> Poole
         pitch = float(np.median(pitches)) if pitches else USUAL_PITCH_UM
         first = replace(first, f_number=widest, log_q=_log_q(widest, pitch))
     begins = [first]
-    centred = np.where(SYMMETRIC[: len(PRIOR_PX)], PRIOR_PX, 0.0)
+    centred = np.where(SYMMETRIC[: len(NAMES)], ABERRATIONS.with_kernels, 0.0)
     designs = np.stack([stopped(design(s.position, s.settings), first.stop(s.settings)) for s in heads])
     begins += [
-        replace(first, terms=terms * (centred > 0), eye=USUAL_EYE)
+        replace(first, terms=terms * (centred > 0), eye=ABERRATIONS.eye)
         for terms in starts(heads, designs, np.maximum(centred, 1e-3), math.exp(first.log_q), _STARTS)
     ]
     begins += _random_fronts(first, float(np.median([rms_width(s.kernel) for s in heads])))
@@ -278,11 +280,11 @@ def _random_fronts(first: Wavefront, width: float) -> list[Wavefront]:
     rng, fronts = np.random.default_rng(_SEED), []
     for _ in range(_RANDOM):
         terms = np.zeros(len(NAMES))
-        for name, usual in _USUAL_SHAPE.items():
+        for name, usual in ABERRATIONS.drawn.items():
             terms[NAMES.index(name)] = rng.normal(0.0, usual)
-        balance = BALANCE * terms[NAMES.index("spherical")]
-        terms[NAMES.index("focus")] = balance + rng.normal(0.0, _FOCUS_SPREAD)
-        fronts.append(replace(first, terms=width * terms, eye=USUAL_EYE))
+        balance = ABERRATIONS.balance * terms[NAMES.index("spherical")]
+        terms[NAMES.index("focus")] = balance + rng.normal(0.0, ABERRATIONS.drawn_balance)
+        fronts.append(replace(first, terms=width * terms, eye=ABERRATIONS.eye))
     return fronts
 
 

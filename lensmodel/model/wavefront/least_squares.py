@@ -9,28 +9,35 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lensmodel.core.descent import Descent
 from lensmodel.core.psf import PsfSample, resized
+from lensmodel.optics.aberration_prior import ABERRATIONS
 from lensmodel.optics.wavefront import NAMES, Wavefront, design, stopped
 
-PRIOR_PX: Final = np.array(
-    [4.0, 0.5, 4.0, 1.0, 1.0, 0.5, 4.0, 1.0, 1.0, 4.0, 0.5, 1.0, 1.0, 4.0, 1.0, 1.0, 1.0, 1.0, 0.5]
-)
-"""Usual size of each linear unknown, in pixels."""
+Floats = NDArray[np.float64]
 
-USUAL_EYE: Final = (1.15, 0.25)
-SLOPE_PX: Final = 0.6 * PRIOR_PX
-"""Usual change of each linear unknown by octave of focal length."""
-
-_SHAPE_PRIOR: Final = np.array([0.15, 0.3])  # of the cat's eye: radius and shift per unit of field
-_NOISE = 0.1  # relative L2 that a good sample has against the best wavefront
+_NOISE = 0.1  # relative L2 that a good sample has against the best wavefront (chosen)
 _HUBER = 0.35  # relative error: that of a usual estimate (chosen)
 _ENOUGH = 2e-3  # of the cost: less gained in a step ends the fit (chosen)
+_TRIES = 4  # steps with more damping before the fit ends (chosen)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _State:
+    """A wavefront with the tilts of its samples, and which way down."""
+
+    front: Wavefront
+    tilts: Floats
+    cost: float
+    normal: Floats
+    gradient: Floats
+    errors: Floats  # relative L2 of each sample
+    follows: list[tuple[Floats, Floats]]  # how the tilts of each sample follow a step
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,45 +50,30 @@ class Problem:
     vague: float  # standard deviation of log q about `log_q`
     blur_px: float
 
-    def solve(self, begin: Wavefront, rounds: int) -> tuple[Wavefront, float, NDArray[np.float64]]:
+    def solve(self, begin: Wavefront, rounds: int) -> tuple[Wavefront, float, Floats]:
         """Levenberg-Marquardt; returns the wavefront, its cost and each sample's relative L2."""
         wanted = [self._soft(resized(s.kernel, self.size)) for s in self.samples]
         norms = np.array([np.linalg.norm(w) for w in wanted])
         votes = np.array([s.weight for s in self.samples])
         designs = [design(s.position, s.settings) for s in self.samples]
-        now, tilts = begin, self._tilts(begin)
-        damping = 1e-2
-        state = self._linearised(now, tilts, designs, wanted, norms, votes)
-        for _ in range(rounds):
-            cost, normal, gradient, _, locals_ = state
-            improved = False
-            for _ in range(4):
-                step = np.asarray(
-                    -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient), dtype=np.float64
-                )
-                moved = _moved(now, step)
-                tilts_ = tilts + np.stack([-(a + b @ step) for a, b in locals_])
-                after = self._linearised(moved, tilts_, designs, wanted, norms, votes)
-                if after[0] < cost:
-                    improved = True
-                    break
-                damping *= 8.0
-            if not improved:
-                break
-            gain = cost - after[0]
-            now, tilts, state, damping = moved, tilts_, after, damping / 5.0
-            if gain < _ENOUGH * cost:
-                break
-        return now, state[0], state[3]
 
-    def _soft(self, kernel: NDArray[np.float64]) -> NDArray[np.float64]:
+        def moved(state: _State, step: Floats) -> _State:
+            tilts = state.tilts + np.stack([-(a + b @ step) for a, b in state.follows])
+            return self._linearised(_moved(state.front, step), tilts, designs, wanted, norms, votes)
+
+        descent = Descent(rounds, _TRIES, enough_of_cost=_ENOUGH, raised=8.0, lowered=5.0)
+        state = self._linearised(begin, self._tilts(begin), designs, wanted, norms, votes)
+        state = descent.down(state, moved)
+        return state.front, state.cost, state.errors
+
+    def _soft(self, kernel: Floats) -> Floats:
         if self.blur_px == 0.0:
             return np.asarray(kernel)
         return np.asarray(
             ndimage.gaussian_filter(kernel, self.blur_px, axes=(-2, -1), mode="constant", truncate=3.0)
         )
 
-    def _tilts(self, front: Wavefront) -> NDArray[np.float64]:
+    def _tilts(self, front: Wavefront) -> Floats:
         tilts = []
         for s in self.samples:
             grid = front.grid(s.settings)
@@ -92,28 +84,27 @@ class Problem:
     def _linearised(
         self,
         front: Wavefront,
-        tilts: NDArray[np.float64],
-        designs: Sequence[NDArray[np.float64]],
-        wanted: Sequence[NDArray[np.float64]],
-        norms: NDArray[np.float64],
-        votes: NDArray[np.float64],
-    ) -> tuple[
-        float,
-        NDArray[np.float64],
-        NDArray[np.float64],
-        NDArray[np.float64],
-        list[tuple[NDArray[np.float64], NDArray[np.float64]]],
-    ]:
-        """Cost, normal matrix, gradient, relative L2 of each sample, and how tilts follow a step."""
+        tilts: Floats,
+        designs: Sequence[Floats],
+        wanted: Sequence[Floats],
+        norms: Floats,
+        votes: Floats,
+    ) -> _State:
+        """Cost about a wavefront, and its normal equations."""
         slopes = np.empty(0) if front.slopes is None else front.slopes
         count = len(NAMES) + 3 + slopes.size  # log q and the cat's eye
         precision = np.concatenate(
-            [PRIOR_PX**-2.0, [self.vague**-2.0], _SHAPE_PRIOR**-2.0, SLOPE_PX[: slopes.size] ** -2.0]
+            [
+                ABERRATIONS.with_kernels**-2.0,
+                [self.vague**-2.0],
+                np.array(ABERRATIONS.eye_spread) ** -2.0,
+                ABERRATIONS.slopes[: slopes.size] ** -2.0,
+            ]
         )
         apart = np.concatenate(
-            [front.terms, [front.log_q - self.log_q], np.subtract(front.eye, USUAL_EYE), slopes]
+            [front.terms, [front.log_q - self.log_q], np.subtract(front.eye, ABERRATIONS.eye), slopes]
         )
-        normal, gradient = np.diag(precision), precision * apart
+        normal, uphill = np.diag(precision), precision * apart
         cost = float(precision @ apart**2)
         errors, locals_ = np.zeros(len(self.samples)), []
         for i, s in enumerate(self.samples):
@@ -128,20 +119,20 @@ class Problem:
             trust = votes[i] * min(1.0, _HUBER / max(errors[i], 1e-12)) / _NOISE**2
             clean = columns - follows.T @ moves
             normal += trust * (clean @ clean.T)
-            gradient += trust * (clean @ free)
+            uphill += trust * (clean @ free)
             flat = errors[i] ** 2 if errors[i] <= _HUBER else _HUBER * (2 * errors[i] - _HUBER)
             cost += votes[i] * flat / _NOISE**2
             locals_.append((own, follows))
         assert normal.shape == (count, count)
-        return cost, normal, gradient, errors, locals_
+        return _State(front, tilts, cost, normal, -uphill, errors, locals_)
 
     def _columns(
         self,
         front: Wavefront,
         sample: PsfSample,
-        tilt: NDArray[np.float64],
-        linear: NDArray[np.float64],
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        tilt: Floats,
+        linear: Floats,
+    ) -> tuple[Floats, Floats, Floats]:
         """Kernel of sum 1, its derivatives by the unknowns (count, k^2) and by the tilts (2, k^2)."""
         settings, position = sample.settings, sample.position
         grid = front.grid(settings)
@@ -168,7 +159,7 @@ class Problem:
         return kernel, np.concatenate(columns), normalised[6:8]
 
 
-def _moved(front: Wavefront, step: NDArray[np.float64]) -> Wavefront:
+def _moved(front: Wavefront, step: Floats) -> Wavefront:
     n = len(NAMES)
     q = float(np.clip(front.log_q + step[n], math.log(0.1), math.log(12.0)))
     eye = (max(front.eye[0] + float(step[n + 1]), 0.4), front.eye[1] + float(step[n + 2]))

@@ -1,6 +1,6 @@
 """How likely patches are behind a lens that was learned without them.
 
-The power spectrum of a patch is that of its scene times |OTF|^2 (`scene_spectrum`). With the scene's few
+The power spectrum of a patch is that of its scene times |OTF|^2 (`scene_view`). With the scene's few
 unknowns fitted to each patch, the better kernel leaves the smaller rest. No kernel that was estimated from
 the patch takes part, so that a model is not judged by the mistakes that it shares with the estimator.
 """
@@ -14,15 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.psf import PsfSample
-from lensmodel.core.spectrum import SECTORS
+from lensmodel.core.spectrum import SECTORS, bin_frequencies
 from lensmodel.core.types import Kernel
-from lensmodel.model.wavefront.from_spectra import fit_scene
-from lensmodel.model.wavefront.scene_spectrum import SceneView
-from lensmodel.optics.transfer import BINS, bin_frequencies
+from lensmodel.model.wavefront.from_spectra import PATCH_TAILS, fit_scene
+from lensmodel.model.wavefront.scene_view import SceneView
+from lensmodel.optics.transfer import BINS
 
-_TAILS, _PATCH_TAILS = 6.0, 3.0  # degrees of freedom of a bin, and of a patch in units of its bins
-_FLOOR = (-6.5, 3.0)  # logarithm of what is added to |OTF|^2: whoever sees none may have none
-_INSIDE = (-1.0 / 3.0, 0.0, 1.0 / 3.0)  # where a bin is sampled, in parts of its width
+_FLOOR = (-6.5, 3.0)  # logarithm of what is added to |OTF|^2: whoever sees none may have none (chosen)
+_INSIDE = (-1.0 / 3.0, 0.0, 1.0 / 3.0)  # where a bin is sampled, in parts of its width: middles of its thirds
 
 
 def surprise(sample: PsfSample, kernel: Kernel, share: float = 1.0) -> float:
@@ -32,11 +31,8 @@ def surprise(sample: PsfSample, kernel: Kernel, share: float = 1.0) -> float:
     """
     assert sample.spectrum is not None
     view = SceneView.of({sample.settings.channel: sample.spectrum}).with_floor(*_FLOOR)
-    unknowns, residual, _ = fit_scene(view, _power(kernel, share)[:, None])
-    squared = np.einsum("bi,bij,bj->b", residual, view.precision, residual)
-    cost = float((_TAILS + 1.0) * np.log1p(squared / _TAILS).sum() + view.vote @ (unknowns - view.usual) ** 2)
-    nu = _PATCH_TAILS * BINS
-    return nu * math.log1p(cost / nu)
+    nu = PATCH_TAILS * BINS
+    return nu * math.log1p(fit_scene(view, _power(kernel, share)[:, None]).cost / nu)
 
 
 def _power(kernel: Kernel, share: float) -> NDArray[np.float64]:

@@ -9,16 +9,29 @@ same turned by 180 degrees; third moments do.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.core.descent import Descent
 from lensmodel.core.psf import PsfSample, second_moments
+from lensmodel.optics.pupil import ray_gradients
 
 _RAYS = 11  # across the pupil (chosen)
-_TRIES, _ROUNDS = 24, 25  # random beginnings, and steps of each (chosen)
+_BEGINNINGS, _TRIES = 24, 25  # at random, and steps that are tried from each (chosen)
+_ENOUGH = 1e-4  # of the cost: less gained in a step ends a descent (chosen)
 _SEED = 0  # any number: fits repeat to the bit
+_FLOOR = 1e-9  # of the diagonal that is damped: far below any that counts (chosen)
 _LEVEL = 0.01  # of the peak: fainter pixels are noise to a second moment (chosen)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _State:
+    terms: NDArray[np.float64]
+    cost: float
+    normal: NDArray[np.float64]
+    gradient: NDArray[np.float64]
 
 
 def starts(
@@ -47,7 +60,7 @@ def starts(
     scale = float(max(np.median(second[:, 0] + second[:, 1]) / 2.0, 0.05))
     rng = np.random.default_rng(_SEED)
     ranked = []
-    for _ in range(_TRIES):
+    for _ in range(_BEGINNINGS):
         terms = rng.normal(0.0, 0.4 * np.sqrt(scale), len(prior_px)) * prior_px / prior_px.max()
         ranked.append(
             _descended(terms, designs, across, up, second / scale, third / scale**1.5, scale, prior_px)
@@ -65,10 +78,7 @@ def _rays() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     p = (np.arange(_RAYS) + 0.5) * 2.0 / _RAYS - 1.0
     x, y = (a.ravel() for a in np.meshgrid(p, p))
     inside = x * x + y * y <= 1.0
-    x, y = x[inside], y[inside]
-    r2 = x * x + y * y
-    across = np.stack([4 * r2 * x, r2 + 2 * x * x, 2 * x * y, 2 * x, 2 * x, 2 * y])
-    up = np.stack([4 * r2 * y, 2 * x * y, r2 + 2 * y * y, 2 * y, -2 * y, 2 * x])
+    across, up = ray_gradients(x[inside], y[inside])
     return across - across.mean(axis=1, keepdims=True), up - up.mean(axis=1, keepdims=True)
 
 
@@ -98,14 +108,14 @@ def _descended(
     scale: float,
     prior_px: NDArray[np.float64],
 ) -> tuple[float, NDArray[np.float64]]:
-    """Levenberg-Marquardt on the moments; returns the cost and the unknowns."""
+    """Least squares of the moments; returns the cost and the unknowns."""
     rays = across.shape[1]
     by_x = np.einsum("nkm,kr->nmr", designs, across)
     by_y = np.einsum("nkm,kr->nmr", designs, up)
     ridge = 0.02 * np.sqrt(scale) / prior_px
     two, three = 1.0 / scale, 0.3 / scale**1.5
 
-    def evaluate(t: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def about(t: NDArray[np.float64]) -> _State:
         x, y = np.einsum("nmr,m->nr", by_x, t), np.einsum("nmr,m->nr", by_y, t)
         pairs = [(x * x, [(2 * x, None)]), (y * y, [(None, 2 * y)]), (x * y, [(y, x)])]
         cubes = [
@@ -126,21 +136,9 @@ def _descended(
                 slopes.append(factor * slope)
         values.append(ridge * t)
         slopes.append(np.diag(ridge))
-        return np.concatenate(values), np.concatenate(slopes)
+        miss, change = np.concatenate(values), np.concatenate(slopes)
+        return _State(t, float(miss @ miss), change.T @ change, -(change.T @ miss))
 
-    damping = 1e-2
-    miss, slope = evaluate(terms)
-    cost = float(miss @ miss)
-    for _ in range(_ROUNDS):
-        normal, gradient = slope.T @ slope, slope.T @ miss
-        step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-9), gradient)
-        after, after_slope = evaluate(terms + step)
-        if float(after @ after) < cost:
-            terms, miss, slope = terms + step, after, after_slope
-            gain, cost = cost - float(after @ after), float(after @ after)
-            damping /= 4.0
-            if gain < 1e-4 * cost:
-                break
-        else:
-            damping *= 6.0
-    return cost, terms
+    descent = Descent(_TRIES, _TRIES, enough_of_cost=_ENOUGH, floor=_FLOOR, most_tries=_TRIES)
+    state = descent.down(about(terms), lambda state, step: about(state.terms + step))
+    return state.cost, state.terms

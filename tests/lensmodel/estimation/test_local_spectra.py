@@ -14,7 +14,8 @@ from lensmodel.estimation.spectra.local_spectra import (
     periodograms,
 )
 from lensmodel.lab.scenes import dead_leaves
-from lensmodel.optics.local_pupil import TERMS, Pupil
+from lensmodel.optics.local_pupil import Pupil
+from lensmodel.optics.pupil import TERMS
 
 LENS = np.array([0.3, 0.9, -0.5, 0.6, 0.5, -0.3, 0.0, 0.0])
 NOISE = 1e-3

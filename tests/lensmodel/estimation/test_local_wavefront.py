@@ -11,9 +11,11 @@ from lensmodel.core.errors import CancelledError, LensModelError
 from lensmodel.core.psf import as_kernel, centred, centroid, distance, gaussian, rms_width
 from lensmodel.core.types import NoiseModel
 from lensmodel.estimation.spectra.local_wavefront import AberrationFit
-from lensmodel.estimation.spectra.scene_spectra import BINS, SHAPES, ScenePrior, SceneSpectra, log_power
+from lensmodel.estimation.spectra.scene_spectra import SceneSpectra, log_power
 from lensmodel.lab.scenes import dead_leaves
-from lensmodel.optics.local_pupil import TERMS, Pupil
+from lensmodel.optics.local_pupil import Pupil
+from lensmodel.optics.pupil import TERMS
+from lensmodel.scene.prior import WINDOW_BINS, WINDOW_SCATTER, WINDOW_SHAPES, WindowPrior
 
 LENS = np.array([0.3, 0.9, -0.5, 0.6, 0.5, -0.3, 0.0, 0.0])
 NOISE = 1e-7
@@ -25,11 +27,11 @@ def kernel_of(terms: np.ndarray) -> np.ndarray:
 
 def spectra_of(kernel: np.ndarray, count: int, *, scatter: float = 1.0, seed: int = 0) -> SceneSpectra:
     """Spectra of scenes drawn from the prior, behind a kernel; with scatter 0 all are the usual scene."""
-    prior, rng = ScenePrior.load(), np.random.default_rng(seed)
+    prior, rng = WindowPrior.load(), np.random.default_rng(seed)
     blur, _ = log_power(kernel, np.zeros((1, *kernel.shape)))
-    covariance = SHAPES @ prior.spread @ SHAPES.T + np.diag(prior.roughness**2)
-    scenes = prior.usual - 4.0 + scatter * rng.multivariate_normal(np.zeros(BINS), covariance, count)
-    whitening = np.linalg.inv(np.linalg.cholesky(covariance + 0.13**2 * np.eye(BINS)))
+    covariance = WINDOW_SHAPES @ prior.spread @ WINDOW_SHAPES.T + np.diag(prior.roughness**2)
+    scenes = prior.usual - 4.0 + scatter * rng.multivariate_normal(np.zeros(WINDOW_BINS), covariance, count)
+    whitening = np.linalg.inv(np.linalg.cholesky(covariance + WINDOW_SCATTER**2 * np.eye(WINDOW_BINS)))
     return SceneSpectra(
         np.log(np.exp(scenes + blur) + NOISE),
         np.full(count, NOISE),

@@ -12,24 +12,24 @@ import numpy as np
 import pytest
 
 from lensmodel.core.psf import PsfSample, distance, gaussian, rms_width
-from lensmodel.core.spectrum import RINGS, SECTORS, PatchSpectrum
+from lensmodel.core.spectrum import RINGS, SECTORS, PatchSpectrum, bin_frequencies
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensSettings, NoiseModel
 from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
 from lensmodel.model.modes import WAVEFRONT_SHARE, Mixture
 from lensmodel.model.trust.expected_error import Evidence, joint_error
-from lensmodel.model.wavefront.aberration_prior import BALANCE, corner_ratio, unlikeliness
 from lensmodel.model.wavefront.from_spectra import PatchView, PooledFit, fit_spectra
 from lensmodel.model.wavefront.joint_kernels import MIN_PLACES, Pooled, _by_aperture, _pairs, pool
-from lensmodel.model.wavefront.scene_spectrum import BIAS, WITH_POWER, Floats, SceneView
+from lensmodel.model.wavefront.scene_view import Floats, SceneView
+from lensmodel.optics.aberration_prior import ABERRATIONS, corner_ratio, unlikeliness
 from lensmodel.optics.transfer import (
     BINS,
     COLUMNS,
     FIRST_RING,
     Transfer,
-    bin_frequencies,
     sums,
 )
 from lensmodel.optics.wavefront import Wavefront
+from lensmodel.scene.prior import PATCHES
 from lensmodel.simulate import SimulatedLens
 from lensmodel.simulate.aberrations import Aberrations
 
@@ -72,7 +72,7 @@ def seen_at(
     rough: float,
     blur: Kernel | None = None,
     filled: float = 0.0,
-    beyond: Floats = WITH_POWER,
+    beyond: Floats = PATCHES.with_power,
 ) -> dict[Channel, PatchSpectrum]:
     """Spectra of a scene that falls off by a power law, behind the lens or behind one kernel.
 
@@ -89,7 +89,7 @@ def seen_at(
         noise = 1e-7
         power = np.zeros((RINGS, SECTORS), np.float32)
         passed = power_of(kernel)
-        seen = scene * np.exp(BIAS + beyond * passed**2) * (passed + filled)
+        seen = scene * np.exp(PATCHES.bias + beyond * passed**2) * (passed + filled)
         power[FIRST_RING:] = (seen + noise).reshape(-1, SECTORS)
         found[channel] = PatchSpectrum(power, noise)
     return found
@@ -142,7 +142,7 @@ def test_power_is_that_of_the_simulated_lens() -> None:
 
 def test_the_bias_has_the_symmetries_of_a_square_lattice() -> None:
     _, angle = bin_frequencies()
-    by_ring = (BIAS + 0.4 * WITH_POWER).reshape(-1, SECTORS)
+    by_ring = (PATCHES.bias + 0.4 * PATCHES.with_power).reshape(-1, SECTORS)
     folded = np.abs((angle[:SECTORS] + math.pi / 4) % (math.pi / 2) - math.pi / 4)
 
     for same in np.unique(folded.round(9)):
@@ -161,7 +161,7 @@ def test_zeros_that_are_filled_do_not_move_the_lens() -> None:
 
 
 @pytest.mark.xfail(
-    strict=True, reason="WITH_POWER moves lenses of half a pixel; it was kept for sharper ones"
+    strict=True, reason="PATCHES.with_power moves lenses of half a pixel; it was kept for sharper ones"
 )
 def test_zeros_that_are_filled_do_not_move_the_lens_behind_exact_power() -> None:
     rng = np.random.default_rng(3)
@@ -467,7 +467,7 @@ def test_focus_that_balances_spherical_aberration_is_expected() -> None:
     nothing = view(FieldPosition(0.5, 0.0), dict.fromkeys(CHANNELS, noise))
     alone, both = (replace(true_front(), terms=np.zeros(19)) for _ in range(2))
     alone.terms[0] = both.terms[0] = 0.5
-    both.terms[6] = BALANCE * 0.5
+    both.terms[6] = ABERRATIONS.balance * 0.5
 
     costs = [fit_spectra([nothing], front, rounds=0).cost for front in (alone, both)]
 

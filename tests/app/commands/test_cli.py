@@ -12,6 +12,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -223,10 +224,13 @@ def test_photographer_bounds_halos_and_takes_the_grain_away(folder: Path, here: 
     assert np.mean((bound < low - 50) | (bound > high + 50)) < 0.001
 
 
-def test_corrected_dng_opens_as_raw(folder: Path, here: Here) -> None:
+def test_corrected_dng_opens_as_raw_and_without_a_terminal_standard_error_stays_empty(
+    folder: Path, here: Here
+) -> None:
     done = here("correct", "one.dng", "-p", PROFILE, "-o", "out", "--format", "dng", "--method", "fast")
 
     assert done.stdout.splitlines() == [str(Path("out/one-corrected.dng"))]
+    assert done.stderr == ""
     with rawpy.imread(str(folder / "out/one-corrected.dng")) as raw:
         assert raw.sizes.width > 400
 
@@ -666,28 +670,32 @@ def test_stopped_correction_leaves_whole_files_only_and_goes_on(folder: Path, ma
 # --- progress ----------------------------------------------------------------------------------
 
 
-def on_a_terminal(folder: Path, *words: str) -> tuple[str, str]:
-    """Run a command whose standard error is a terminal; return what each of the two outputs got."""
-    ours, theirs = pty.openpty()
-    process = subprocess.Popen(
-        command(*words),
-        cwd=folder,
-        env={**ENVIRONMENT, "PYTHONPATH": str(HERE.parents[1]), "TERM": "xterm", "COLUMNS": "120"},
-        stdout=subprocess.PIPE,
-        stderr=theirs,
-        text=True,
-    )
-    os.close(theirs)
-    seen = b""
-    while chunk := _read(ours):
-        seen += chunk
-    os.close(ours)
-    said, _ = process.communicate(timeout=stretched(PATIENCE_S))
-    return said, seen.decode()
+Seen = Callable[..., tuple[str, str]]
 
 
-def test_progress_with_time_left_is_on_a_terminal_and_results_are_in_the_pipe(folder: Path) -> None:
-    said, seen = on_a_terminal(folder, "correct", "one.dng", "-p", PROFILE, "-o", "out", "--method", "fast")
+@pytest.fixture
+def on_a_terminal(here: Here, monkeypatch: pytest.MonkeyPatch) -> Seen:
+    """Run `main` with a terminal for standard error; return what each of the two outputs got."""
+
+    def run(*words: str) -> tuple[str, str]:
+        ours, theirs = pty.openpty()
+        seen: list[bytes] = []
+        reader = threading.Thread(target=lambda: seen.extend(iter(partial(_read, ours), b"")))
+        reader.start()
+        with os.fdopen(theirs, "w") as terminal, monkeypatch.context() as patch:
+            patch.setenv("TERM", "xterm")
+            patch.setenv("COLUMNS", "120")
+            patch.setattr(sys, "stderr", terminal)
+            said = here(*words).stdout
+        reader.join()
+        os.close(ours)
+        return said, b"".join(seen).decode()
+
+    return run
+
+
+def test_progress_with_time_left_is_on_a_terminal_and_results_are_in_the_pipe(on_a_terminal: Seen) -> None:
+    said, seen = on_a_terminal("correct", "one.dng", "-p", PROFILE, "-o", "out", "--method", "fast")
 
     assert said.splitlines() == [str(Path("out/one-corrected.tif"))]
     assert "ETA" in seen
@@ -695,9 +703,9 @@ def test_progress_with_time_left_is_on_a_terminal_and_results_are_in_the_pipe(fo
 
 
 @pytest.mark.slow
-def test_a_benchmark_of_the_lens_model_says_how_far_it_is(folder: Path) -> None:
+def test_a_benchmark_of_the_lens_model_says_how_far_it_is(on_a_terminal: Seen) -> None:
     said, seen = on_a_terminal(
-        folder, "bench", "model", "--seeds", "1000:1003", "--photos", "1", "--methods", "eff-linear"
+        "bench", "model", "--seeds", "1000:1003", "--photos", "1", "--methods", "eff-linear"
     )
 
     assert said.startswith("| method |")
@@ -705,8 +713,8 @@ def test_a_benchmark_of_the_lens_model_says_how_far_it_is(folder: Path) -> None:
     assert "3/3" in seen
 
 
-def test_a_question_to_the_lens_says_that_it_is_being_answered(folder: Path) -> None:
-    said, seen = on_a_terminal(folder, "psf", PROFILE)
+def test_a_question_to_the_lens_says_that_it_is_being_answered(on_a_terminal: Seen) -> None:
+    said, seen = on_a_terminal("psf", PROFILE)
 
     assert said.startswith("centre, r 0")
     assert "asking the lens" in seen
@@ -717,9 +725,3 @@ def _read(terminal: int) -> bytes:
         return os.read(terminal, 4096)
     except OSError:  # Linux says so when the other side is closed
         return b""
-
-
-def test_without_a_terminal_standard_error_stays_empty(folder: Path, here: Here) -> None:
-    done = here("correct", "one.dng", "-p", PROFILE, "-o", "out", "--method", "fast")
-
-    assert done.stderr == ""

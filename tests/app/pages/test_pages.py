@@ -16,6 +16,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe  # type: ignore[import-untyped]  # has no types
 from playwright.sync_api import (
     Browser,
+    BrowserContext,
     ConsoleMessage,
     Page,
     Request,
@@ -115,17 +116,25 @@ class Visitor:
             self.strangers.append(request.url)
 
 
-@pytest.fixture
-def visitor(browser: Browser, service: Service) -> Iterator[Visitor]:
-    context = browser.new_context(
+@pytest.fixture(scope="module")
+def context(browser: Browser, service: Service) -> Iterator[BrowserContext]:
+    """Give the session of one visitor: what the browser has compiled of the scripts serves all its pages."""
+    opened = browser.new_context(
         base_url=service.info()["url"], viewport={"width": 1280, "height": 900}, has_touch=True
     )
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def visitor(context: BrowserContext, service: Service) -> Iterator[Visitor]:
     patience = stretched(PATIENCE_MS)  # anew for each test: the machine may have become busy
     expect.set_options(timeout=patience)
     context.set_default_timeout(patience)
     made = Visitor(context.new_page(), service.info()["url"])
     yield made
-    context.close()
+    context.set_offline(False)
+    made.page.close()
     assert made.strangers == []
     assert made.complaints == []
 

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy import signal
@@ -29,7 +31,12 @@ NAMES = sorted(compared)  # those of the laboratory keep the same contract
 
 
 def patch(kernel: np.ndarray, *, sigma: float = SIGMA, seed: int = 0, side: int = 96) -> Plane:
-    margin = kernel.shape[0] - 1
+    return _patch(kernel.tobytes(), kernel.shape[0], sigma, seed, side).copy()  # a test may change it
+
+
+@cache
+def _patch(kernel_bytes: bytes, size: int, sigma: float, seed: int, side: int) -> Plane:
+    kernel, margin = np.frombuffer(kernel_bytes).reshape(size, size), size - 1
     rng = np.random.default_rng(seed)
     scene = dead_leaves(side + margin, side + margin, rng, largest=40.0)[1]
     y = signal.fftconvolve(scene, kernel, mode="valid")

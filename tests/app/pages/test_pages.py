@@ -219,12 +219,6 @@ def test_photos_chosen_and_dropped_are_learned_from_while_the_page_watches(
     assert not visitor.complaints
 
 
-def test_every_raw_ending_can_be_picked(page: Page) -> None:
-    page.goto("/")
-    endings = set(str(page.locator("#files").get_attribute("accept")).split(","))
-    assert {".cr3", ".iiq", ".3fr", ".x3f", ".rw2", ".nef", ".dng", ".tif", ".png", ".jpg"} <= endings
-
-
 def test_a_file_that_is_no_photo_is_refused_in_a_plain_sentence(visitor: Visitor, page: Page) -> None:
     page.goto("/")
 
@@ -599,6 +593,7 @@ def test_a_lens_is_renamed_merged_and_its_profile_taken_along(
     page.wait_for_url("**/")
 
 
+@pytest.mark.slow  # page and request without a browser: test_parts.py, test_lens_model.py
 def test_a_lens_page_changes_the_model_and_back(page: Page, service: Service, tmp_path: Path) -> None:
     lens = service.calibrated(write_photo(tmp_path / "w.dng", 71, serial="W-1"))["lens_id"]
     page.goto(f"/lenses/{lens}")

@@ -30,6 +30,7 @@ from typer.testing import CliRunner
 
 from app.cli import app, main
 from app.commands.console.progress_lines import EVERY_S, ProgressLines
+from lensmodel.core import parallel
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
@@ -158,8 +159,15 @@ def _picture() -> np.ndarray[Any, np.dtype[np.uint8]]:
 
 @pytest.fixture
 def few_patches(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Learn from three patches of a photo: too few for a wavefront, whose fit takes longer than the rest."""
-    few = partial(pipeline.samples_of_photo, count=3)
+    """Learn from three patches of a photo: too few for a wavefront, whose fit takes longer than the rest.
+
+    Here, as a process of its own takes longer to import than to estimate them.
+    """
+    learn = pipeline.samples_of_photo
+
+    def few(path: Path, **options: Any) -> list[PsfSample]:
+        return learn(path, **{**options, "count": 3, "executor": parallel.Here()})
+
     monkeypatch.setattr("lensmodel.workflow.pipeline.samples_of_photo", few)
 
 

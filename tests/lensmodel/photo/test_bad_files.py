@@ -59,7 +59,8 @@ def attempt(path: Path, report: Connection) -> None:
 
 def outcome(path: Path) -> tuple[str | None, tuple[int, ...], bool]:
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["lensmodel.photo"])
+    # what a child needs of this file too: it would import it anew for each
+    context.set_forkserver_preload(["lensmodel.photo", "pytest"])
     receive, send = context.Pipe(duplex=False)
     process = context.Process(target=attempt, args=(path, send))
     process.start()

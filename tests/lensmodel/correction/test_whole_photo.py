@@ -364,7 +364,7 @@ def test_zone_report_expects_less_gain_from_a_noisier_photo() -> None:
     seen, _ = photo(Soft(), BASE)
 
     clean, noisy = (
-        correct_planes(seen, Soft(), FRAME, noise=noise, method="fast", psf_error=0.1, pitch=60).zones
+        correct_planes(seen, Soft(), FRAME, noise=noise, method="fast", psf_error=0.1, pitch=40).zones
         for noise in (BASE, HIGH)
     )
 

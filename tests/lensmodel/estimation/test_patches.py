@@ -434,16 +434,16 @@ def test_structure_below_the_uniformity_of_sensors_is_no_evidence(scene: Plane) 
 
 
 def test_patches_avoid_a_sky_whose_noise_the_camera_smoothed(scene: Plane) -> None:
-    plane = photo_of(scene[:700, :800])
-    plane[:400] = vignetted_sky(400, 800, 0.004, grain_px=2.0)
+    plane = photo_of(scene)
+    plane[:500] = vignetted_sky(500, 1500, 0.004, grain_px=2.0)
     single = NoiseModel.white(0.0006)  # from pixel to pixel it is as low as that
     coarse = NoiseModel.white(0.02)
 
-    careless = select(plane, single, Frame(*plane.shape), count=24)
-    careful = select(plane, single, Frame(*plane.shape), count=24, coarse_noise=coarse)
+    careless = select(plane, single, Frame(*plane.shape), count=36)
+    careful = select(plane, single, Frame(*plane.shape), count=36, coarse_noise=coarse)
 
-    assert any(patch.row + patch.size < 380 for patch in careless.patches)
-    assert all(patch.row + patch.size > 380 for patch in careful.patches)
+    assert any(patch.row + patch.size < 480 for patch in careless.patches)
+    assert all(patch.row + patch.size > 480 for patch in careful.patches)
 
 
 def placed(*places: tuple[int, int], size: int = 100) -> list[Patch]:

@@ -243,22 +243,18 @@ def test_corrected_dng_opens_as_raw_and_without_a_terminal_standard_error_stays_
         assert raw.sizes.width > 400
 
 
-def test_folders_pass_over_corrected_photos_and_what_was_made_of_a_raw_file(folder: Path, here: Here) -> None:
-    for name in ("one.jpg", "one.tif"):
+def test_folders_pass_over_what_was_made_of_a_raw_file_and_one_bad_photo_does_not_stop_the_others(
+    folder: Path, here: Here
+) -> None:
+    for name in ("one.jpg", "one.tif", "one-corrected.tif"):
         Image.fromarray(_picture()).save(folder / name)
-    Image.fromarray(_picture()).save(folder / "one-corrected.tif")
-    done = here("correct", ".", "-p", PROFILE, "-o", "out", "--method", "fast", "--json")
-
-    assert [result["photo"] for result in json.loads(done.stdout)["results"]] == ["one.dng"]
-
-
-def test_one_bad_photo_does_not_stop_the_others(folder: Path, here: Here) -> None:
     (folder / "a-note.dng").write_text("this is text")
     done = here("correct", ".", "-p", PROFILE, "-o", "out", "--method", "fast", "--json")
 
     assert done.returncode == 1
-    states = [result["state"] for result in json.loads(done.stdout)["results"]]
-    assert states == ["failed", "corrected"]
+    results = json.loads(done.stdout)["results"]
+    assert [result["photo"] for result in results] == ["a-note.dng", "one.dng"]
+    assert [result["state"] for result in results] == ["failed", "corrected"]
     assert "give RAW, DNG, TIFF, PNG or JPEG" in one_sentence(done.stderr)
 
 

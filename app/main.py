@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import version
 
-from fastapi import Depends, FastAPI
+from fastapi import APIRouter, Depends, FastAPI
 from starlette.concurrency import run_in_threadpool
+from starlette.routing import BaseRoute
 
 from app import pages
 from app.access.authentication import Gate
@@ -114,8 +115,21 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_middleware(OwnNames, allowed=chosen.hosts)
     app.add_middleware(RequestLog)  # the last is the outermost
     errors.install(app)
-    app.include_router(health.probes)
-    app.include_router(session.router, prefix="/v1")
+    pages.install(app)
+    app.router.routes.extend(_routes())
+    return app
+
+
+@cache
+def _routes() -> tuple[BaseRoute, ...]:
+    """All routes, the same for each application of a process.
+
+    What FastAPI works out of a route, at the first request, it keeps with the route: it takes longer than
+    most requests, and need not be done again for an application with other settings.
+    """
+    router = APIRouter()
+    router.include_router(health.probes)
+    router.include_router(session.router, prefix="/v1")
     resources = (
         psf,  # first: routes are tried in their order, and this one is asked for most often
         photos,
@@ -131,11 +145,11 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     for resource in resources:
         # also here, not only in each route: a route without it would be open to all
-        app.include_router(
+        router.include_router(
             resource.router,
             prefix="/v1",
             dependencies=[Depends(call_of)],
             responses=problems(401, 403, 429),
         )
-    pages.install(app)
-    return app
+    pages.include(router)
+    return tuple(router.routes)

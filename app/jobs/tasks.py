@@ -6,6 +6,8 @@ in the folder. No task accesses the database or other photos.
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import json
 import logging
 import math
@@ -53,6 +55,13 @@ from lensmodel.report.lens_test import lens_test
 from lensmodel.workflow import pipeline
 
 log = logging.getLogger(__name__)
+
+LATE: Final = ("scipy.interpolate", "scipy.optimize", "lensmodel.core.jit")
+"""What the library imports where it is used: here the fork server does it once, not each of its children."""
+
+for _module in LATE:
+    with contextlib.suppress(ImportError):  # loops are compiled where an extra is installed
+        importlib.import_module(_module)
 
 
 def inspect(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:

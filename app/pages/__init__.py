@@ -1,5 +1,5 @@
 """The web page: what a person sees of the service, rendered by the service itself."""
 
-from app.pages.routes import install
+from app.pages.routes import include, install
 
-__all__ = ["install"]
+__all__ = ["include", "install"]

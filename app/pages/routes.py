@@ -24,12 +24,16 @@ HERE: Final = Path(__file__).parent
 router = APIRouter(include_in_schema=False)
 
 
-def install(app: FastAPI) -> None:
-    """Add the pages and their files to the application."""
-    app.include_router(signing.router)
+def include(site: APIRouter) -> None:
+    """Add the pages and their files to the routes of the service."""
+    site.include_router(signing.router)
     for part in (router, stream.router, photo_pages.router, lens_pages.router, picture_routes.router):
-        app.include_router(part, dependencies=[Depends(call_of)])
-    app.mount("/static", StaticFiles(directory=HERE / "static"), name="static")
+        site.include_router(part, dependencies=[Depends(call_of)])
+    site.mount("/static", StaticFiles(directory=HERE / "static"), name="static")
+
+
+def install(app: FastAPI) -> None:
+    """Let browsers have errors as pages."""
     for kind in (LensModelError, HTTPException, RequestValidationError, Exception):
         app.add_exception_handler(kind, _for_people(app.exception_handlers[kind]))
 

@@ -243,12 +243,13 @@ def _shift(moved: NDArray[np.float64], reference: NDArray[np.float64]) -> tuple[
 def _refined(cross: NDArray[np.complex128]) -> tuple[float, float]:
     """Peak of the correlation between pixels, by Newton steps on its Fourier series."""
     freq = 2.0 * np.pi * fft.fftfreq(_WINDOW)
-    w = np.stack(np.broadcast_arrays(freq[:, None], freq[None, :]))
     d = np.zeros(2)
     for _ in range(6):
-        phased = cross * np.exp(1j * (w[0] * d[0] + w[1] * d[1]))
-        gradient = np.array([-(w[i] * phased.imag).sum() for i in range(2)])
-        hessian = -np.array([[(w[i] * w[j] * phased.real).sum() for j in range(2)] for i in range(2)])
+        phased = cross * np.outer(np.exp(1j * freq * d[0]), np.exp(1j * freq * d[1]))
+        by_row, by_col = phased.sum(axis=1), phased.sum(axis=0)
+        gradient = -np.array([freq @ by_row.imag, freq @ by_col.imag])
+        mixed = freq @ phased.real @ freq
+        hessian = -np.array([[freq**2 @ by_row.real, mixed], [mixed, freq**2 @ by_col.real]])
         if np.linalg.eigvalsh(hessian)[-1] >= 0.0:
             break
         step = np.clip(-np.linalg.solve(hessian, gradient), -0.5, 0.5)

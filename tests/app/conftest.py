@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sqlalchemy import Engine, create_engine
 from starlette.testclient import TestClient
 
 from app.blobs.folder_creation import settle
 from app.blobs.storage import Storage
 from app.runtime.settings import Settings
-from app.store import LensName, NewPatch, NewSample, Store
+from app.store import LensName, NewPatch, NewSample, Store, database
 from app.store.database import Database
 from app.store.ids import new_id
 from app.store.tables import PhotoRow
@@ -128,6 +129,27 @@ def settings(tmp_path: Path) -> Settings:
         max_upload_mb=1,
         patches=3,  # of so few one is enough: the made-up photos of these tests have two
     )
+
+
+@pytest.fixture(scope="session", autouse=True)
+def statements_compiled_once() -> Iterator[None]:
+    """Let all engines of SQLite share what they make of statements.
+
+    Each test opens six of them, three of its own and three of its application; each would compile every
+    statement anew, which takes longer than the test.
+    """
+    first = create_engine("sqlite://", query_cache_size=5000)
+    first.connect().close()  # now its dialect knows the version
+
+    def sharing(url: Any, **options: Any) -> Engine:
+        engine = create_engine(url, **options)
+        if engine.dialect.name == first.dialect.name:
+            engine.dialect, engine._compiled_cache = first.dialect, first._compiled_cache
+        return engine
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(database, "create_engine", sharing)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -241,14 +241,14 @@ def test_work_that_a_stop_interrupted_goes_on_at_the_next_start_and_a_killed_sup
     photos: Path, tmp_path: Path
 ) -> None:
     data = tmp_path / "data"
-    with running(data, **OWN_ACCOUNT) as before:
+    with running(data, BRIEF, **OWN_ACCOUNT) as before:
         photo = before.upload(photos / "sixth.dng")
         before.job(photo["id"], until=lambda job: job["stage"] == "estimating")
         pids = pids_of(before)
     left = alive(pids)
     file_left = (data / "service.json").exists()
 
-    after = Service(data, **OWN_ACCOUNT)
+    after = Service(data, BRIEF, **OWN_ACCOUNT)
     try:
         after.start()
         job = after.job(photo["id"])

@@ -186,6 +186,21 @@ def _information(power: NDArray[np.float64], sigma: float) -> NDArray[np.float64
     return np.log(np.maximum(mean / max(sigma * sigma, 1e-12), 1e-3)).reshape(BANDS, SECTORS)
 
 
+@lru_cache(maxsize=4)
+def _lags(size: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Weights of the power of gradients, autocorrelation of the window, and which lags lie beyond its core.
+
+    The last two reach a third of the window to each side; the second is 1 in the middle.
+    """
+    window, square_frequency, _ = _grids(size)
+    taper = fft.fftshift(fft.irfft2(np.square(np.abs(fft.rfft2(window))), s=(size, size)))
+    middle, reach = size // 2, size // 3
+    part = slice(middle - reach, middle + reach + 1)
+    lag = np.hypot(*np.ogrid[-reach : reach + 1, -reach : reach + 1])
+    weight = square_frequency * np.exp(-2.0 * square_frequency)
+    return weight, taper[part, part] / taper[middle, middle], lag >= _MAIN_LOBE_PX
+
+
 def _period(power: NDArray[np.float64], sigma: float) -> float:
     """Highest separate peak of the autocorrelation of the gradients.
 
@@ -194,10 +209,9 @@ def _period(power: NDArray[np.float64], sigma: float) -> float:
     the way from the origin the correlation must fall to half the peak's height.
     """
     size = power.shape[0]
-    window, square_frequency, _ = _grids(size)
-    signal = np.maximum(power - sigma * sigma, 0.0) * square_frequency * np.exp(-2.0 * square_frequency)
+    weight, taper, far = _lags(size)
+    signal = np.maximum(power - sigma * sigma, 0.0) * weight
     correlation = fft.fftshift(fft.irfft2(signal, s=(size, size)))
-    taper = fft.fftshift(fft.irfft2(np.square(np.abs(fft.rfft2(window))), s=(size, size)))
     middle = size // 2
     if correlation[middle, middle] <= 0.0:
         return 0.0
@@ -205,14 +219,12 @@ def _period(power: NDArray[np.float64], sigma: float) -> float:
     correlation = correlation / correlation[middle, middle]
     reach = size // 3
     part = slice(middle - reach, middle + reach + 1)
-    correlation = correlation[part, part] / (taper[part, part] / taper[middle, middle])
-    lag = np.hypot(*np.ogrid[-reach : reach + 1, -reach : reach + 1])
-    peaks = (correlation == ndimage.maximum_filter(correlation, 3)) & (lag >= _MAIN_LOBE_PX)
-    heights = np.where(peaks, correlation, 0.0)
+    correlation = correlation[part, part] / taper
+    peaks = np.argwhere((correlation == ndimage.maximum_filter(correlation, 3)) & far & (correlation > 0.0))
+    heights = correlation[peaks[:, 0], peaks[:, 1]]
     highest = 0.0
-    for at in np.argsort(heights.ravel())[::-1][:6]:
-        row, col = np.unravel_index(at, heights.shape)
-        height = float(heights[row, col])
+    for at in np.argsort(heights)[::-1][:6]:
+        (row, col), height = peaks[at], float(heights[at])
         t = np.linspace(0.0, 1.0, _ON_THE_WAY)
         way = correlation[
             np.rint(reach + (row - reach) * t).astype(int), np.rint(reach + (col - reach) * t).astype(int)
@@ -247,6 +259,6 @@ def _largest_blob(mask: NDArray[np.bool_]) -> int:
 
 
 def _kurtosis(values: NDArray[np.float64]) -> float:
-    d = np.concatenate([np.diff(values, axis=0).ravel(), np.diff(values, axis=1).ravel()])
-    square = float(np.mean(d**2))
-    return float(np.mean(d**4)) / max(square * square, 1e-30)
+    squares = np.concatenate([np.diff(values, axis=0).ravel(), np.diff(values, axis=1).ravel()]) ** 2
+    square = float(np.mean(squares))
+    return float(np.mean(squares**2)) / max(square * square, 1e-30)

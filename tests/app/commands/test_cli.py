@@ -12,6 +12,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -29,6 +30,7 @@ from typer.testing import CliRunner
 
 from app.cli import app, main
 from app.commands.console.progress_lines import EVERY_S, ProgressLines
+from lensmodel.core import parallel
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
@@ -157,8 +159,15 @@ def _picture() -> np.ndarray[Any, np.dtype[np.uint8]]:
 
 @pytest.fixture
 def few_patches(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Learn from three patches of a photo: too few for a wavefront, whose fit takes longer than the rest."""
-    few = partial(pipeline.samples_of_photo, count=3)
+    """Learn from three patches of a photo: too few for a wavefront, whose fit takes longer than the rest.
+
+    Here, as a process of its own takes longer to import than to estimate them.
+    """
+    learn = pipeline.samples_of_photo
+
+    def few(path: Path, **options: Any) -> list[PsfSample]:
+        return learn(path, **{**options, "count": 3, "executor": parallel.Here()})
+
     monkeypatch.setattr("lensmodel.workflow.pipeline.samples_of_photo", few)
 
 
@@ -223,30 +232,29 @@ def test_photographer_bounds_halos_and_takes_the_grain_away(folder: Path, here: 
     assert np.mean((bound < low - 50) | (bound > high + 50)) < 0.001
 
 
-def test_corrected_dng_opens_as_raw(folder: Path, here: Here) -> None:
+def test_corrected_dng_opens_as_raw_and_without_a_terminal_standard_error_stays_empty(
+    folder: Path, here: Here
+) -> None:
     done = here("correct", "one.dng", "-p", PROFILE, "-o", "out", "--format", "dng", "--method", "fast")
 
     assert done.stdout.splitlines() == [str(Path("out/one-corrected.dng"))]
+    assert done.stderr == ""
     with rawpy.imread(str(folder / "out/one-corrected.dng")) as raw:
         assert raw.sizes.width > 400
 
 
-def test_folders_pass_over_corrected_photos_and_what_was_made_of_a_raw_file(folder: Path, here: Here) -> None:
-    for name in ("one.jpg", "one.tif"):
+def test_folders_pass_over_what_was_made_of_a_raw_file_and_one_bad_photo_does_not_stop_the_others(
+    folder: Path, here: Here
+) -> None:
+    for name in ("one.jpg", "one.tif", "one-corrected.tif"):
         Image.fromarray(_picture()).save(folder / name)
-    Image.fromarray(_picture()).save(folder / "one-corrected.tif")
-    done = here("correct", ".", "-p", PROFILE, "-o", "out", "--method", "fast", "--json")
-
-    assert [result["photo"] for result in json.loads(done.stdout)["results"]] == ["one.dng"]
-
-
-def test_one_bad_photo_does_not_stop_the_others(folder: Path, here: Here) -> None:
     (folder / "a-note.dng").write_text("this is text")
     done = here("correct", ".", "-p", PROFILE, "-o", "out", "--method", "fast", "--json")
 
     assert done.returncode == 1
-    states = [result["state"] for result in json.loads(done.stdout)["results"]]
-    assert states == ["failed", "corrected"]
+    results = json.loads(done.stdout)["results"]
+    assert [result["photo"] for result in results] == ["a-note.dng", "one.dng"]
+    assert [result["state"] for result in results] == ["failed", "corrected"]
     assert "give RAW, DNG, TIFF, PNG or JPEG" in one_sentence(done.stderr)
 
 
@@ -666,28 +674,32 @@ def test_stopped_correction_leaves_whole_files_only_and_goes_on(folder: Path, ma
 # --- progress ----------------------------------------------------------------------------------
 
 
-def on_a_terminal(folder: Path, *words: str) -> tuple[str, str]:
-    """Run a command whose standard error is a terminal; return what each of the two outputs got."""
-    ours, theirs = pty.openpty()
-    process = subprocess.Popen(
-        command(*words),
-        cwd=folder,
-        env={**ENVIRONMENT, "PYTHONPATH": str(HERE.parents[1]), "TERM": "xterm", "COLUMNS": "120"},
-        stdout=subprocess.PIPE,
-        stderr=theirs,
-        text=True,
-    )
-    os.close(theirs)
-    seen = b""
-    while chunk := _read(ours):
-        seen += chunk
-    os.close(ours)
-    said, _ = process.communicate(timeout=stretched(PATIENCE_S))
-    return said, seen.decode()
+Seen = Callable[..., tuple[str, str]]
 
 
-def test_progress_with_time_left_is_on_a_terminal_and_results_are_in_the_pipe(folder: Path) -> None:
-    said, seen = on_a_terminal(folder, "correct", "one.dng", "-p", PROFILE, "-o", "out", "--method", "fast")
+@pytest.fixture
+def on_a_terminal(here: Here, monkeypatch: pytest.MonkeyPatch) -> Seen:
+    """Run `main` with a terminal for standard error; return what each of the two outputs got."""
+
+    def run(*words: str) -> tuple[str, str]:
+        ours, theirs = pty.openpty()
+        seen: list[bytes] = []
+        reader = threading.Thread(target=lambda: seen.extend(iter(partial(_read, ours), b"")))
+        reader.start()
+        with os.fdopen(theirs, "w") as terminal, monkeypatch.context() as patch:
+            patch.setenv("TERM", "xterm")
+            patch.setenv("COLUMNS", "120")
+            patch.setattr(sys, "stderr", terminal)
+            said = here(*words).stdout
+        reader.join()
+        os.close(ours)
+        return said, b"".join(seen).decode()
+
+    return run
+
+
+def test_progress_with_time_left_is_on_a_terminal_and_results_are_in_the_pipe(on_a_terminal: Seen) -> None:
+    said, seen = on_a_terminal("correct", "one.dng", "-p", PROFILE, "-o", "out", "--method", "fast")
 
     assert said.splitlines() == [str(Path("out/one-corrected.tif"))]
     assert "ETA" in seen
@@ -695,9 +707,9 @@ def test_progress_with_time_left_is_on_a_terminal_and_results_are_in_the_pipe(fo
 
 
 @pytest.mark.slow
-def test_a_benchmark_of_the_lens_model_says_how_far_it_is(folder: Path) -> None:
+def test_a_benchmark_of_the_lens_model_says_how_far_it_is(on_a_terminal: Seen) -> None:
     said, seen = on_a_terminal(
-        folder, "bench", "model", "--seeds", "1000:1003", "--photos", "1", "--methods", "eff-linear"
+        "bench", "model", "--seeds", "1000:1003", "--photos", "1", "--methods", "eff-linear"
     )
 
     assert said.startswith("| method |")
@@ -705,8 +717,8 @@ def test_a_benchmark_of_the_lens_model_says_how_far_it_is(folder: Path) -> None:
     assert "3/3" in seen
 
 
-def test_a_question_to_the_lens_says_that_it_is_being_answered(folder: Path) -> None:
-    said, seen = on_a_terminal(folder, "psf", PROFILE)
+def test_a_question_to_the_lens_says_that_it_is_being_answered(on_a_terminal: Seen) -> None:
+    said, seen = on_a_terminal("psf", PROFILE)
 
     assert said.startswith("centre, r 0")
     assert "asking the lens" in seen
@@ -717,9 +729,3 @@ def _read(terminal: int) -> bytes:
         return os.read(terminal, 4096)
     except OSError:  # Linux says so when the other side is closed
         return b""
-
-
-def test_without_a_terminal_standard_error_stays_empty(folder: Path, here: Here) -> None:
-    done = here("correct", "one.dng", "-p", PROFILE, "-o", "out", "--method", "fast")
-
-    assert done.stderr == ""

@@ -129,10 +129,7 @@ QUICK = {
 }
 """One of each command that takes a second at most; the others are run among the slow tests."""
 
-ALONE = {
-    "correct one.dng --profile my-24mm.lensprofile -o linear --format dng --method fast --json",
-    "config --json",
-}
+ALONE = {"config --json"}
 """Of the quick ones, those that have a process of their own, as all slow ones do: it takes a second."""
 
 

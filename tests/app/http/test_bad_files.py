@@ -20,7 +20,7 @@ from lensmodel.simulate import demo_data_path
 HERE = Path(__file__).parents[1]
 sys.path.insert(0, str(HERE))
 from deadline import Deadline  # noqa: E402 - beside these files
-from running import PATIENCE_S, Service, running, write_photo  # noqa: E402 - beside this file
+from running import LIGHT, PATIENCE_S, Service, running, write_photo  # noqa: E402 - beside this file
 
 sys.path.remove(str(HERE))
 
@@ -103,7 +103,7 @@ OWN = {
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     limits = {"LENS_INSPECT_SECONDS": "30", "LENS_WORKER_MEMORY_MB": "3000", "LENS_MAX_MEGAPIXELS": "50"}
-    with running(tmp_path_factory.mktemp("bad") / "data", **limits) as made:
+    with running(tmp_path_factory.mktemp("bad") / "data", LIGHT, **limits) as made:
         yield made
 
 

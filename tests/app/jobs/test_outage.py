@@ -320,14 +320,14 @@ def test_photos_outlast_a_storage_that_is_away(settings: Settings, store: Store,
         send(store, storage, 1)
         until(lambda: states(store) == {"counted"}, log)  # a worker without any photo founds a missing folder
         storage.folder.rename(aside)
-        send(store, Storage(f"file://{aside}"), 3, first=1)
-        until(lambda: log.read_text().count("is away") >= 6, log)
+        send(store, Storage(f"file://{aside}"), 2, first=1)
+        until(lambda: log.read_text().count("is away") >= 4, log)
         seen = states(store)
         aside.rename(storage.folder)
         until(lambda: states(store) == {"counted"}, log)
 
     assert "failed" not in seen
-    check_counted_once(store, 4)
+    check_counted_once(store, 3)
 
 
 @pytest.mark.slow

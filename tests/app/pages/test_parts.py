@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -181,6 +182,14 @@ def test_every_kind_of_photo_has_a_glance(kind: str, tmp_path: Path) -> None:
 
     with Image.open(tmp_path / GLANCE) as picture:
         assert picture.width > picture.height > 16
+
+
+def test_every_raw_ending_can_be_picked(client: TestClient) -> None:
+    picker = re.search(r'<input id="files"[^>]* accept="([^"]*)"', client.get("/").text)
+
+    assert picker is not None
+    endings = {".cr3", ".iiq", ".3fr", ".x3f", ".rw2", ".nef", ".dng", ".tif", ".png", ".jpg"}
+    assert endings <= set(picker[1].split(","))
 
 
 def test_waiting_photos_are_grouped_by_body_and_focal_length(steps: Steps, store: Store) -> None:

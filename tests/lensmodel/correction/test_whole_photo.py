@@ -1,6 +1,7 @@
 """A whole photo: cells, borders, windows, workers, uncertainty."""
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -52,9 +53,15 @@ def scene(seed: int = 0) -> Planes:
     return planes
 
 
-def photo(lens: Soft, noise: tuple[NoiseModel, ...], seed: int = 1) -> tuple[Planes, Planes]:
+def photo(lens: Soft, noise: tuple[NoiseModel, ...]) -> tuple[Planes, Planes]:
     """Return what a camera sees and the sharp frame; light from outside the frame is in it."""
-    rng, sharp = np.random.default_rng(seed), scene()
+    seen, sharp = _photo(lens, noise)
+    return seen.copy(), sharp.copy()  # a test may change them
+
+
+@cache
+def _photo(lens: Soft, noise: tuple[NoiseModel, ...]) -> tuple[Planes, Planes]:
+    rng, sharp = np.random.default_rng(1), scene()
     seen = []
     for plane, channel, model in zip(sharp, CHANNELS, noise, strict=True):
         flow = EfficientFilterFlow.of_field(lens, FRAME, channel, pitch=64, size=17)
@@ -62,6 +69,12 @@ def photo(lens: Soft, noise: tuple[NoiseModel, ...], seed: int = 1) -> tuple[Pla
         light = flow.forward(np.ascontiguousarray(plane[cut:-cut, cut:-cut]))
         seen.append(light + rng.standard_normal(light.shape) * np.sqrt(model.variance(light)))
     return np.stack(seen).astype(np.float32), sharp[:, 30:-30, 30:-30]
+
+
+@cache
+def whole(lens: Soft, noise: tuple[NoiseModel, ...], method: str = "standard") -> Planes:
+    """The whole photo corrected with the lens that took it, by one worker."""
+    return correct_planes(photo(lens, noise)[0], lens, FRAME, noise=noise, method=method, workers=1).planes
 
 
 def rmse(a: np.ndarray, b: np.ndarray) -> float:
@@ -98,7 +111,7 @@ def test_cells_of_a_large_frame_stay_within_their_bounds() -> None:
 def test_correction_brings_the_photo_nearer_to_the_scene(method: str, noise: tuple[NoiseModel, ...]) -> None:
     seen, sharp = photo(Soft(), noise)
 
-    restored = correct_planes(seen, Soft(), FRAME, noise=noise, method=method).planes
+    restored = whole(Soft(), noise, method)
 
     share = {"standard": 0.75, "fast": 0.9}[method]  # one linear pass removes less
     assert rmse(restored, sharp) < share * rmse(seen, sharp)
@@ -108,7 +121,7 @@ def test_correction_brings_the_photo_nearer_to_the_scene(method: str, noise: tup
 def test_correction_is_never_worse_than_the_photo_at_extreme_noise(method: str) -> None:
     seen, sharp = photo(Soft(), DARK)
 
-    restored = correct_planes(seen, Soft(), FRAME, noise=DARK, method=method).planes
+    restored = whole(Soft(), DARK, method)
 
     assert rmse(restored, sharp) < rmse(seen, sharp)
 
@@ -116,20 +129,18 @@ def test_correction_is_never_worse_than_the_photo_at_extreme_noise(method: str) 
 def test_correction_is_the_same_for_any_number_of_workers() -> None:
     seen, _ = photo(Soft(), BASE)
 
-    one = correct_planes(seen, Soft(), FRAME, noise=BASE, workers=1).planes
     three = correct_planes(seen, Soft(), FRAME, noise=BASE, workers=3).planes
 
-    np.testing.assert_array_equal(one, three)
+    np.testing.assert_array_equal(whole(Soft(), BASE), three)
 
 
 def test_correction_of_a_window_shows_the_pixels_of_the_whole() -> None:
     seen, _ = photo(Soft(), BASE)
     roi = (37, 101, 64, 90)
 
-    whole = correct_planes(seen, Soft(), FRAME, noise=BASE).planes
     part = correct_planes(seen, Soft(), FRAME, noise=BASE, roi=roi).planes
 
-    np.testing.assert_array_equal(part, whole[:, 37:101, 101:191])
+    np.testing.assert_array_equal(part, whole(Soft(), BASE)[:, 37:101, 101:191])
 
 
 def test_correction_reads_and_writes_memory_mapped_planes(tmp_path: Path) -> None:
@@ -141,15 +152,14 @@ def test_correction_reads_and_writes_memory_mapped_planes(tmp_path: Path) -> Non
     correct_planes(mapped, Soft(), FRAME, noise=BASE, method="fast", out=out)
     out.flush()
 
-    expected = correct_planes(seen, Soft(), FRAME, noise=BASE, method="fast").planes
-    np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), expected)
+    np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), whole(Soft(), BASE, "fast"))
 
 
 def test_border_is_restored_like_the_inside_from_the_fourth_pixel_on() -> None:
     lens = Soft(1.2, 1.2)
     seen, sharp = photo(lens, BASE)
 
-    restored = correct_planes(seen, lens, FRAME, noise=BASE).planes
+    restored = whole(lens, BASE)
 
     depth = np.minimum.outer(
         np.minimum(np.arange(FRAME.height), np.arange(FRAME.height)[::-1]),
@@ -175,7 +185,7 @@ def test_light_from_beyond_the_frame_leaves_no_ripples_at_the_border_of_a_soft_l
     lens = Soft(2.5, 2.5)
     seen, sharp = photo(lens, BASE)
 
-    restored = correct_planes(seen, lens, FRAME, noise=BASE, method=method).planes
+    restored = whole(lens, BASE, method)
 
     inside = np.zeros((FRAME.height, FRAME.width), dtype=np.bool_)
     inside[16:-16, 16:-16] = True
@@ -221,9 +231,8 @@ def test_strength_half_lies_half_way() -> None:
     seen, _ = photo(Soft(), BASE)
 
     half = correct_planes(seen, Soft(), FRAME, noise=BASE, method="fast", strength=0.5).planes
-    full = correct_planes(seen, Soft(), FRAME, noise=BASE, method="fast").planes
 
-    np.testing.assert_allclose(half, (seen + full) / 2, atol=1e-5)
+    np.testing.assert_allclose(half, (seen + whole(Soft(), BASE, "fast")) / 2, atol=1e-5)
 
 
 def test_wrong_kernel_with_its_error_stated_does_less_harm() -> None:
@@ -253,7 +262,7 @@ def test_result_stays_within_the_range_of_the_photo_where_no_halo_is_allowed() -
     low, high = (f(seen, (1, 5, 5), mode="nearest") for f in (ndimage.minimum_filter, ndimage.maximum_filter))
 
     held = correct_planes(seen, Soft(), FRAME, noise=BASE, bounds=Bounds(halo=0.0)).planes
-    free = correct_planes(seen, Soft(), FRAME, noise=BASE).planes
+    free = whole(Soft(), BASE)
 
     assert np.all(held >= low - 1e-6)
     assert np.all(held <= high + 1e-6)

@@ -269,6 +269,7 @@ def test_a_pair_gives_the_kernel_of_the_open_photo() -> None:
     assert np.median([distance(one.kernel, lopsided()).rel_l2 for one in found]) < 0.08
 
 
+@pytest.mark.slow  # twice the kernel of a pair, which the test before finds as it is
 def test_what_demosaicing_makes_up_does_not_come_into_the_kernel_of_a_pair(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

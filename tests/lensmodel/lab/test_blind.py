@@ -252,6 +252,7 @@ def test_a_limit_spreads_over_photos_and_psfs() -> None:
     assert len({c.psf_number for c in cases}) == 10
 
 
+@pytest.mark.slow
 def test_more_scenes_than_photos_are_further_windows_of_the_same_photos() -> None:
     options = {"half": "all", "noise": 1e-3, "patch": 128, "variant": "gaussian", "pool": 1, "seed": 3}
     cases = make_cases(list_photos(), 2, limit=None, choice="r-map", scenes=12, **options)

@@ -8,6 +8,7 @@ from lensmodel.lab.correction.correction_benchmark import SoftCorners, correct_t
 from lensmodel.lab.peers import Peer
 
 
+@pytest.mark.slow  # the next one corrects the same photo, a part of it
 def test_benchmark_times_each_method_and_prints_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     photo = np.full((3, 210, 220), 0.3, dtype=np.float32)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -48,15 +49,25 @@ def even(height: int = 64, width: int = 64, noise: float = 0.01, seed: int = 1) 
     return np.clip(GREY + noise * rng.normal(size=(height, width, 3)), 0.0, 1.0)
 
 
-def leaves(height: int, width: int, seed: int = 2) -> Shown:
+def leaves(height: int, width: int) -> Shown:
     """Shapes of all sizes with sharp edges, coloured as moderately as most things are."""
-    rng = np.random.default_rng(seed)
+    return _leaves(height, width).copy()  # a test may change them
+
+
+@cache
+def _leaves(height: int, width: int) -> Shown:
+    rng = np.random.default_rng(2)
     picture = np.full((height, width, 3), 0.5)
     rows, cols = np.mgrid[:height, :width]
     for _ in range(400):
         radius = float(rng.choice([2.0, 4.0, 8.0, 16.0]))
-        inside = np.hypot(rows - rng.uniform(0, height), cols - rng.uniform(0, width)) < radius
-        picture[inside] = rng.uniform(0.2, 0.7) * rng.uniform(0.75, 1.25, 3)
+        row, col = rng.uniform(0, height), rng.uniform(0, width)
+        near = (
+            slice(max(int(row - radius), 0), int(row + radius) + 2),
+            slice(max(int(col - radius), 0), int(col + radius) + 2),
+        )
+        inside = np.hypot(rows[near] - row, cols[near] - col) < radius
+        picture[near][inside] = rng.uniform(0.2, 0.7) * rng.uniform(0.75, 1.25, 3)
     return ndimage.gaussian_filter(picture, (0.5, 0.5, 0.0))
 
 

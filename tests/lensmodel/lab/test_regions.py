@@ -11,6 +11,8 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.estimation.patches.good_regions import FEATURES, TreeEnsemble
 from lensmodel.lab.training.train_regions import Labelled, _arrays, fit, judged, read_table
 
+pytestmark = pytest.mark.slow  # of training, whose library takes a second to import
+
 
 def labelled(count: int, half: str, seed: int) -> list[Labelled]:
     """Windows whose similarity follows the first feature, in groups of eight."""

@@ -126,6 +126,7 @@ def test_variance_of_a_gaussian_line_is_its_own() -> None:
     assert core_variance(np.exp(-0.5 * (s / 1.5) ** 2)) == pytest.approx(1.5**2, rel=0.15)
 
 
+@pytest.mark.slow  # its parts are tested above, each by itself
 def test_kee_recovers_widths_and_axes_of_a_field_of_gaussians(monkeypatch: pytest.MonkeyPatch) -> None:
     def truth(place: FieldPosition) -> np.ndarray:
         return gaussian(SIDE, local(place, 0.8, math.hypot(0.8, 1.5 * place.r)))
@@ -190,6 +191,7 @@ def test_field_between_two_radii_is_their_mean() -> None:
     assert distance(middle, 0.5 * (basis.mean[0] + basis.mean[1])).rel_l2 < 0.02
 
 
+@pytest.mark.slow  # its parts are tested above, each by itself
 def test_schuler_recovers_a_lens_within_its_basis(monkeypatch: pytest.MonkeyPatch) -> None:
     def truth(place: FieldPosition) -> np.ndarray:
         return gaussian(SIDE, local(place, 0.5 + 0.35 * place.r, 0.5 + 1.45 * place.r))

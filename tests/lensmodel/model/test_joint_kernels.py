@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -53,17 +54,27 @@ LENS = SimulatedLens(
 LOG_Q = math.log(0.54 * 2.0 / PITCH)
 
 
-def power_of(kernel: np.ndarray) -> np.ndarray:
-    """|OTF|^2 at the middles of the bins by a direct sum, shape (BINS,)."""
+@cache
+def phases(side: int) -> np.ndarray:
+    """exp(-2 pi i f x) of each middle of a bin and each pixel, shape (BINS, side^2)."""
     modulus, angle = bin_frequencies()
-    half = kernel.shape[0] // 2
+    half = side // 2
     row, col = np.mgrid[-half : half + 1, -half : half + 1]
-    phase = np.exp(
+    return np.exp(
         -2j
         * np.pi
         * (modulus[:, None] * (np.sin(angle)[:, None] * row.ravel() + np.cos(angle)[:, None] * col.ravel()))
     )
-    return np.abs(phase @ kernel.ravel()) ** 2
+
+
+def power_of(kernel: np.ndarray) -> np.ndarray:
+    """|OTF|^2 at the middles of the bins by a direct sum, shape (BINS,)."""
+    return np.abs(phases(kernel.shape[0]) @ kernel.ravel()) ** 2
+
+
+@cache
+def true_kernel(place: FieldPosition, channel: Channel) -> Kernel:
+    return LENS.kernel(place, SETTINGS.with_channel(channel), 41)
 
 
 def seen_at(
@@ -85,7 +96,7 @@ def seen_at(
     scene = scene * np.exp(rough * rng.standard_normal(BINS))
     found = {}
     for channel in CHANNELS:
-        kernel = LENS.kernel(place, SETTINGS.with_channel(channel), 41) if blur is None else blur
+        kernel = true_kernel(place, channel) if blur is None else blur
         noise = 1e-7
         power = np.zeros((RINGS, SECTORS), np.float32)
         passed = power_of(kernel)
@@ -160,6 +171,7 @@ def test_zeros_that_are_filled_do_not_move_the_lens() -> None:
     assert max(errors_of(fitted.front)) < 0.1
 
 
+@pytest.mark.slow  # what is known not to hold
 @pytest.mark.xfail(
     strict=True, reason="PATCHES.with_power moves lenses of half a pixel; it was kept for sharper ones"
 )
@@ -262,7 +274,7 @@ def samples(count: int, photos: int = 1) -> list[PsfSample]:
         spectra = seen_at(place, rng, 0.15)
         for channel in CHANNELS:
             settings = SETTINGS.with_channel(channel)
-            width = rms_width(LENS.kernel(place, settings, 41)) * astray.normal(1.0, 0.15)
+            width = rms_width(true_kernel(place, channel)) * astray.normal(1.0, 0.15)
             found.append(
                 PsfSample(
                     gaussian(31, width**2 * np.eye(2)),
@@ -288,6 +300,16 @@ def warm(known: list[PsfSample], searching_shortly: Callable[[], AbstractContext
         return LensModel.fit(known).warmed()
 
 
+@pytest.fixture(scope="module")
+def without_pitch(
+    known: list[PsfSample], searching_shortly: Callable[[], AbstractContextManager[None]]
+) -> LensModel:
+    """A model of wide kernels whose pixels are of unknown size."""
+    wide = [replace(s, kernel=gaussian(31, 4.0 * np.eye(2)), pixel_pitch_um=None) for s in known]
+    with searching_shortly():
+        return LensModel.fit(wide).warmed()
+
+
 def gaussian_patch(width: float, rng: np.random.Generator, side: int = 192) -> PatchSpectrum:
     """Spectrum of noise of power 1/f^2 behind a Gaussian: made from pixels, not by the model's own rules."""
     frequency = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None, :])
@@ -298,7 +320,10 @@ def gaussian_patch(width: float, rng: np.random.Generator, side: int = 192) -> P
     return PatchSpectrum.of(patch.astype(np.float32), NoiseModel.white(0.003), width)
 
 
-@pytest.mark.parametrize(("width", "seed"), [(1.3, 2), (1.0, 0), (1.8, 3)])
+@pytest.mark.parametrize(
+    ("width", "seed"),
+    [(1.0, 0), *(pytest.param(width, seed, marks=pytest.mark.slow) for width, seed in ((1.3, 2), (1.8, 3)))],
+)
 def test_plain_gaussian_comes_back_as_one_by_default(width: float, seed: int, short_search: None) -> None:
     rng, truth = np.random.default_rng(seed), gaussian(31, width**2 * np.eye(2))
     known = []
@@ -380,14 +405,13 @@ def test_pooled_lens_is_nearer_to_the_truth_than_its_samples_and_kept_by_profile
 
 
 def test_a_wavefront_takes_part_only_where_its_diffraction_is_known(
-    known: list[PsfSample], warm: LensModel, short_search: None
+    warm: LensModel, without_pitch: LensModel
 ) -> None:
     place = FieldPosition(0.0, 0.0)
 
     assert warm.query(place, SETTINGS, 31).wavefront_share == WAVEFRONT_SHARE
-    unknown = LensModel.fit([replace(s, pixel_pitch_um=None) for s in known]).warmed()
-    assert unknown.physical is not None
-    answer = unknown.query(place, SETTINGS, 31)
+    assert without_pitch.physical is not None
+    answer = without_pitch.query(place, SETTINGS, 31)
     assert (answer.wavefront_share, answer.answered_by) == (0.0, "regression")
     assert answer.reason == "aperture or pixel pitch unknown"
 
@@ -435,15 +459,12 @@ def test_the_error_to_expect_grows_with_what_kernels_and_wavefront_differ_by() -
     assert 0.05 < told(0.2) < 0.5
 
 
-def test_unknown_pitch_is_taken_as_a_usual_one_not_as_wide_kernels_suggest(
-    known: list[PsfSample], short_search: None
-) -> None:
-    unknown = [replace(s, kernel=gaussian(31, 4.0 * np.eye(2)), pixel_pitch_um=None) for s in known]
-    found = pool(unknown)
+def test_unknown_pitch_is_taken_as_a_usual_one_not_as_wide_kernels_suggest(without_pitch: LensModel) -> None:
+    pooled = without_pitch.physical
 
-    assert found is not None
-    assert not found.diffraction_known
-    assert found.front.log_q == pytest.approx(LOG_Q)
+    assert isinstance(pooled, Pooled)
+    assert not pooled.diffraction_known
+    assert pooled.front.log_q == pytest.approx(LOG_Q)
 
 
 def test_error_is_told_even_where_the_cat_s_eye_is_hardly_known() -> None:
@@ -475,11 +496,12 @@ def test_focus_that_balances_spherical_aberration_is_expected() -> None:
 
 
 def test_wavefront_is_never_surer_than_the_kernels_nor_than_it_agrees_with_them(
-    known: list[PsfSample], short_search: None
+    known: list[PsfSample], warm: LensModel
 ) -> None:
     wide = [replace(s, kernel=gaussian(31, 2.0**2 * np.eye(2)), error=0.3) for s in known]
     place = FieldPosition(0.2, 0.4)
-    alone, plain = LensModel.fit(wide, WAVEFRONT).warmed(), LensModel.fit(wide)
+    plain = LensModel.fit(wide)
+    alone = LensModel(tuple(wide), WAVEFRONT, replace(plain._fit, physical=warm._fit.physical))
 
     answer, other = alone.query(place, SETTINGS, 31), plain.query(place, SETTINGS, 31)
 

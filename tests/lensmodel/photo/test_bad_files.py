@@ -59,7 +59,8 @@ def attempt(path: Path, report: Connection) -> None:
 
 def outcome(path: Path) -> tuple[str | None, tuple[int, ...], bool]:
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["lensmodel.photo"])
+    # what a child needs of this file too: it would import it anew for each
+    context.set_forkserver_preload(["lensmodel.photo", "pytest"])
     receive, send = context.Pipe(duplex=False)
     process = context.Process(target=attempt, args=(path, send))
     process.start()
@@ -90,6 +91,7 @@ def test_bad_files_are_refused_in_our_words_or_are_photos(shared_data: Path) -> 
             assert shape == (3, *PHOTOS[path.name]), path.name
 
 
+@pytest.mark.slow  # damaged headers are read in this process in test_inspect.py
 @pytest.mark.tools
 def test_damaged_copies_of_real_files_never_escape(shared_data: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)

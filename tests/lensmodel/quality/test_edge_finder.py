@@ -65,6 +65,7 @@ class Gaussian:
         return gaussian(size, np.eye(2) * 1.4**2)
 
 
+@pytest.mark.slow  # in decibels the same is asked in tests/lensmodel/workflow/test_pipeline.py
 def test_correction_with_the_true_psf_gains_in_every_zone() -> None:
     noise = NoiseModel(1 / 50000, 1e-6)
     planes = np.stack([noisy(soft(1.4), noise)] * 3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from scipy import stats
 from lensmodel.core.codec import from_json, to_json
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample, gaussian
-from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.core.types import FieldPosition, Kernel, LensSettings
 from lensmodel.model import LensModel, ModelSettings
 from lensmodel.quality import mtf50_from_kernel
 from lensmodel.report import LensReport, ReportSettings, decentring, lens_report
@@ -38,12 +39,17 @@ def places(seed: int) -> list[FieldPosition]:
     return found
 
 
+@cache
+def true_kernel(lens: SimulatedLens, place: FieldPosition, settings: LensSettings) -> Kernel:
+    return lens.kernel(place, settings, SIZE)
+
+
 def true_samples(
     lens: SimulatedLens, photos: int, aperture: float | None = None, pitch: float | None = None
 ) -> list[PsfSample]:
     settings = LensSettings(aperture=aperture or lens.optics[0].f_number)
     return [
-        PsfSample(lens.kernel(p, settings, SIZE), p, settings, photo=f"p{i}", pixel_pitch_um=pitch)
+        PsfSample(true_kernel(lens, p, settings), p, settings, photo=f"p{i}", pixel_pitch_um=pitch)
         for i in range(photos)
         for p in places(i)
     ]

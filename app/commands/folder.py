@@ -24,7 +24,6 @@ from lensmodel import estimation
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.types import LensSettings
 from lensmodel.correction.expected_gain import WORTH_DB
-from lensmodel.model import ModelSettings
 from lensmodel.workflow import pipeline
 from lensmodel.workflow.lens import Lens
 
@@ -80,15 +79,7 @@ def run(
     *,
     as_json: bool,
 ) -> None:
-    """Learn the lens of every group of photos and correct them all.
-
-    Raises
-    ------
-    UsageError
-        If something is wrong that can be seen before any work.
-    typer.Exit
-        With 1 if a photo could not be read or corrected.
-    """
+    """Learn the lens of every group of photos and correct them all."""
     paths = files.photos(names)
     targets = correction.targets_of(paths, output, correction.EXTENSION[options.file_format])
     with files.as_usage():
@@ -144,7 +135,7 @@ class _Folder:
         self._display = display
         self._journal = Journal(output)
         self._learned: Counter[tuple[str, str]] = Counter()
-        self._calibrations: dict[Path, calibration.Calibration] = {}
+        self._calibrations: dict[Path, pipeline.Calibration] = {}
 
     def profile_of(self, group: Group) -> Path:
         """Name the file of a group's lens profile."""
@@ -176,7 +167,7 @@ class _Folder:
             calibrated.finish(partial(_correcting, bars, task, number))
         bars.remove_task(task)
 
-    def _calibration(self, target: Path) -> calibration.Calibration:
+    def _calibration(self, target: Path) -> pipeline.Calibration:
         options = calibration.Options(
             aperture=self._options.aperture,
             estimator=self._learning.estimator,
@@ -188,10 +179,9 @@ class _Folder:
             unit=None,
             selector=self._learning.selector,
         )
-        settings = LensSettings(aperture=self._options.aperture)
-        return calibration.Calibration(target, options, settings, ModelSettings(), None)
+        return calibration.calibration_of(target, options)
 
-    def _learns(self, calibrated: calibration.Calibration, shot: Shot, on_event: pipeline.EventHook) -> bool:
+    def _learns(self, calibrated: pipeline.Calibration, shot: Shot, on_event: pipeline.EventHook) -> bool:
         """Learn from one photo; return whether it counts, now or from an earlier run."""
         photo = pipeline.photo_id(shot.path)
         learning, options = self._learning, self._options
@@ -203,7 +193,7 @@ class _Folder:
             self._display.detail(f"{shot.path}: {refused}")
             return False
         try:
-            calibrated.add(shot.path, on_event)
+            calibrated.add(shot.path, on_event=on_event)
         except LensModelError as error:
             self._journal.note("not learned from", photo, under, str(error))
             self._display.detail(f"{shot.path}: {error}")

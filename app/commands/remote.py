@@ -48,13 +48,6 @@ def run(
         "auto": learn from these photos too; else the id of a lens of the service.
     output, options, display, as_json
         As of `correction.run`.
-
-    Raises
-    ------
-    UsageError
-        If something is wrong that can be seen before any work, or no service answers.
-    typer.Exit
-        With 1 if a photo could not be corrected.
     """
     import httpx2  # noqa: PLC0415 - an extra: the commands on files do without it
 

@@ -88,14 +88,14 @@ class LensProfile:
     cameras: tuple[Camera, ...] = ()
 
 
-def save_profile(path: Path | str, profile: LensProfile) -> None:
-    """Write a profile; the file appears complete or not at all."""
+def save_profile(path: Path | str, profile: LensProfile, *, learned: bool = True) -> None:
+    """Write a profile; the file appears complete or not at all; see `write_profile`."""
     with atomic(Path(path)) as file:
-        write_profile(file, profile)
+        write_profile(file, profile, learned=learned)
 
 
-def write_profile(file: IO[bytes], profile: LensProfile) -> None:
-    """Write a profile to an open file.
+def write_profile(file: IO[bytes], profile: LensProfile, *, learned: bool = True) -> None:
+    """Write a profile to an open file; without what was `learned`, whoever opens it fits it anew.
 
     Raises
     ------
@@ -126,7 +126,8 @@ def write_profile(file: IO[bytes], profile: LensProfile) -> None:
         for part, rows in ((_SPECTRA, packed.spectra), (_PHASES, packed.phases)):
             if rows is not None:
                 archive.writestr(part, _saved(rows))
-        archive.writestr(_LEARNED, profile.model.learned(), zipfile.ZIP_STORED)
+        if learned:
+            archive.writestr(_LEARNED, profile.model.learned(), zipfile.ZIP_STORED)
         if prior is not None and isinstance(prior.source, LensModel):
             family = io.BytesIO()
             write_profile(family, LensProfile(prior.source))

@@ -158,8 +158,7 @@ def _picture() -> np.ndarray[Any, np.dtype[np.uint8]]:
 @pytest.fixture
 def few_patches(monkeypatch: pytest.MonkeyPatch) -> None:
     """Learn from three patches of a photo: too few for a wavefront, whose fit takes longer than the rest."""
-    few = partial(pipeline.samples_of_photo, count=3)
-    monkeypatch.setattr("lensmodel.workflow.pipeline.samples_of_photo", few)
+    monkeypatch.setattr("lensmodel.workflow.pipeline.Recipe", partial(pipeline.Recipe, count=3))
 
 
 # --- results -----------------------------------------------------------------------------------
@@ -279,12 +278,12 @@ def test_psf_says_what_made_the_answer_and_why(folder: Path) -> None:
 def test_two_runs_on_one_profile_drop_nothing_of_each_other(
     folder: Path, made: Path, here: Here, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def estimated(path: Path, **options: Any) -> list[PsfSample]:
+    def estimated(path: Path, recipe: pipeline.Recipe, **options: Any) -> list[PsfSample]:
         known = load_profile(folder / PROFILE)  # the other run saves while this one estimates
         save_profile(folder / PROFILE, replace(known, photos={**known.photos, "fedcba9876543210": "y.dng"}))
         return [PsfSample(gaussian(15, np.eye(2)), FieldPosition(0.5, 0.0), LensSettings(2.8), photo="z")]
 
-    monkeypatch.setattr("lensmodel.workflow.pipeline.samples_of_photo", estimated)
+    monkeypatch.setattr("lensmodel.workflow.calibrating.samples_of_photo", estimated)
     done = here("calibrate", "one.dng", "-p", PROFILE)
 
     assert done.returncode == 0, done.stderr

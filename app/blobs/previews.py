@@ -14,7 +14,7 @@ from lensmodel.estimation.patches import r_map
 from lensmodel.photo import LinearPhoto, shown
 
 SIDE: Final = 1600
-"""Longer side of a preview in pixels at most (chosen)."""
+"""Longer side of a preview in pixels at most (chosen): fills a usual screen."""
 
 _TURN: dict[int, Callable[[NDArray[np.generic]], NDArray[np.generic]]] = {
     1: lambda a: a,

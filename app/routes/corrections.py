@@ -243,11 +243,6 @@ def byte_range(header: str | None, size: int) -> tuple[int, int]:
     """Return the part of a file that a Range header asks for, its end excluded.
 
     Anything but one plain range asks for all of it, as RFC 9110 (14.2) allows.
-
-    Raises
-    ------
-    RangeError
-        If the range begins beyond the end.
     """
     match = _RANGE.fullmatch(header.strip()) if header else None
     if match is None or match.group(0) == "bytes=-":

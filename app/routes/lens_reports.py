@@ -42,15 +42,7 @@ _CONTENT: Final = {kind.partition(";")[0]: {"schema": {"type": "string"}} for ki
 
 
 def stored_report(call: Call, lens: LensRow) -> LensTest:
-    """Return the report of the newest version of a lens.
-
-    Raises
-    ------
-    NoSamplesError
-        If the lens has no samples yet.
-    NotReadyError
-        If no worker has made it yet.
-    """
+    """Return the report of the newest version of a lens."""
     if lens.sample_count == 0:
         raise NoSamplesError(f"lens {lens.public_id} has no samples yet: upload photos taken with it")
     try:

@@ -32,7 +32,7 @@ MEDIA_TYPES: Final[dict[Format, str]] = {
     "tiff": "image/tiff",
 }
 MAX_GRID: Final = 25
-"""Columns and rows of a map at most (chosen, not measured)."""
+"""Columns and rows of a map at most (chosen): more kernels are too small to be looked at."""
 
 MAX_FIELD_PIXELS: Final = 2_000_000
 """Pixels of all kernels of a map (chosen): 25 x 25 kernels of 55 pixels; with 255 pixels a map took 8.5 s."""
@@ -83,13 +83,7 @@ def read_psf_as(
 
 
 def accepted(header: str) -> Format:
-    """Return the format that an Accept header prefers.
-
-    Raises
-    ------
-    NotAcceptableError
-        If it names none that is available.
-    """
+    """Return the format that an Accept header prefers."""
     preferences: list[tuple[float, str]] = []
     for preference in header.split(","):
         media, *parameters = (part.strip().lower() for part in preference.split(";"))

@@ -163,7 +163,8 @@ class ProfileFile:
             mode = None if self._options.model is None else way_named(self._options.model).mode
             model = self._with_family(profile.model.answering(mode=mode, unit=self._options.unit))
             self._lens, self._stamp_read = Lens(replace(profile, model=model)), stamp
-            self.settled = self.settled and model is profile.model
+            # a run that was stopped left no fit: the next one makes it, whether it has photos or not
+            self.settled = self.settled and model is profile.model and model.warm
         return self._lens
 
     def keep(self, lens: Lens, *, whole: bool) -> None:

@@ -78,7 +78,7 @@ def run(
             bars.update(task, description=path.name)
             try:
                 result = correct_one(
-                    path, target, lens, settings, options, display, partial(_show, bars, task, number)
+                    path, target, lens, settings, options, display, partial(show_share, bars, task, number)
                 )
             except (LensModelError, OSError) as error:
                 result = files.failed(error)
@@ -205,5 +205,6 @@ def audited(audit: AuditReport) -> list[str]:
     ]
 
 
-def _show(bars: Progress, task: TaskID, number: int, done: int, total: int) -> None:
+def show_share(bars: Progress, task: TaskID, number: int, done: int, total: int) -> None:
+    """Show that photo `number` is done as far as `done` of `total`."""
     bars.update(task, completed=number + done / max(total, 1))

@@ -164,7 +164,7 @@ class _Folder:
         """Fit what takes long, once for each lens."""
         task = bars.add_task("joining what all photos say", total=len(self._calibrations))
         for number, calibrated in enumerate(self._calibrations.values()):
-            calibrated.finish(partial(_correcting, bars, task, number))
+            calibrated.finish(partial(correction.show_share, bars, task, number))
         bars.remove_task(task)
 
     def _calibration(self, target: Path) -> pipeline.Calibration:
@@ -221,7 +221,9 @@ class _Folder:
         for number, shot in enumerate(group.shots):
             bars.update(task, description=f"correcting {shot.path.name}")
             target = targets[shot.path]
-            result = self._correct_shot(shot, target, lens, partial(_correcting, bars, task, number))
+            result = self._correct_shot(
+                shot, target, lens, partial(correction.show_share, bars, task, number)
+            )
             states[result["state"]] += 1
             self._say(shot.path, target, result, as_json=as_json)
             if result["state"] == "corrected":
@@ -277,10 +279,6 @@ def _learning(bars: Progress, task: TaskID, number: int, event: pipeline.Calibra
     bars.update(
         task, description=f"learning from {event.photo.name}: {event.stage}", completed=number + share
     )
-
-
-def _correcting(bars: Progress, task: TaskID, number: int, done: int, total: int) -> None:
-    bars.update(task, completed=number + done / max(total, 1))
 
 
 def _document(row: Row) -> dict[str, Any]:

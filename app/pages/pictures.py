@@ -12,10 +12,10 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
-from app.blobs.previews import upright
 from app.blobs.storage import Storage
 from app.errors import NotReadyError, UnknownPictureError
 from app.schemas import PatchOut, Region
+from lensmodel.photo import upright
 
 Picture = NDArray[np.uint8]
 N = TypeVar("N", int, float)

@@ -14,7 +14,7 @@ FIRST_PAUSE_S: Final = 0.5
 the restart of an API process."""
 
 LONGEST_PAUSE_S: Final = 30.0
-"""Where the service asks for a longer pause, its refusal is handed on (chosen)."""
+"""Where the service asks for a longer pause, its refusal is handed on (chosen): it may take long."""
 
 _SAFE: Final = frozenset({"GET", "HEAD", "PUT", "DELETE", "OPTIONS"})
 """Sent twice they do what they do once (RFC 9110, section 9.2.2)."""

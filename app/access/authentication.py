@@ -32,7 +32,7 @@ FRESH_S: Final = 1.0
 """Seconds for which a process trusts what it has read of a key (chosen): a revoked key works no longer."""
 
 MAX_CACHED: Final = 10_000
-"""Keys and sessions that a process remembers at most (chosen, not measured)."""
+"""Keys and sessions that a process remembers at most (chosen): some MiB, more than a service has users."""
 
 HASHES_AT_ONCE: Final = 2
 HASHES_WAIT_S: Final = 5.0
@@ -97,13 +97,7 @@ class Gate:
         return None if shown is None else self._remembered(_digest(shown))
 
     def who(self, request: Request) -> Who:
-        """Return who asks.
-
-        Raises
-        ------
-        NotSignedInError
-            If there is no key and no session, or no valid one.
-        """
+        """Return who asks."""
         if not self.is_closed():
             return EVERYBODY
         shown = shown_by(request)
@@ -118,13 +112,7 @@ class Gate:
         return who
 
     def admit(self, who: Who, method: str) -> None:
-        """Refuse what the scopes do not allow, and requests beyond the rate limit.
-
-        Raises
-        ------
-        ForbiddenError, QuotaError
-            See above.
-        """
+        """Refuse what the scopes do not allow, and requests beyond the rate limit."""
         if who.key_id is None:
             return
         self.require(who, "read" if method in {"GET", "HEAD", "OPTIONS"} else "write")
@@ -136,13 +124,7 @@ class Gate:
             )
 
     def require(self, who: Who, scope: Scope) -> None:
-        """Refuse a key without a scope.
-
-        Raises
-        ------
-        ForbiddenError
-            If it has neither this scope nor a wider one.
-        """
+        """Refuse a key without a scope."""
         if not keys.covers(who.scopes, scope):
             raise ForbiddenError(
                 f"this key may {' and '.join(who.scopes)}, and this takes {scope}: use another key"
@@ -162,13 +144,7 @@ class Gate:
         return again is not None
 
     def sign_in(self, text: str) -> tuple[Who, str]:
-        """Begin a session with a key; return its owner, and the token for the browser.
-
-        Raises
-        ------
-        NotSignedInError
-            If the key is not valid.
-        """
+        """Begin a session with a key; return its owner, and the token for the browser."""
         who = self._look_up(text) if keys.prefix_of(text) else None
         if who is None or who.key_id is None:
             raise NotSignedInError("this key is not valid, or no longer: look for a blank or a missing end")

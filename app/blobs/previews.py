@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
@@ -11,27 +10,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lensmodel.estimation.patches import r_map
-from lensmodel.photo import LinearPhoto, shown
+from lensmodel.photo import LinearPhoto, shown, upright
 
 SIDE: Final = 1600
-"""Longer side of a preview in pixels at most (chosen)."""
-
-_TURN: dict[int, Callable[[NDArray[np.generic]], NDArray[np.generic]]] = {
-    1: lambda a: a,
-    2: lambda a: a[:, ::-1],
-    3: lambda a: a[::-1, ::-1],
-    4: lambda a: a[::-1],
-    5: lambda a: a.swapaxes(0, 1),
-    6: lambda a: a.swapaxes(0, 1)[:, ::-1],
-    7: lambda a: a[::-1, ::-1].swapaxes(0, 1),
-    8: lambda a: a.swapaxes(0, 1)[::-1],
-}
-"""From sensor orientation to upright, by EXIF orientation (EXIF 2.3, tag Orientation)."""
-
-
-def upright(pixels: NDArray[np.generic], orientation: int) -> NDArray[np.generic]:
-    """Turn an array `(row, col, ...)` from sensor orientation to upright."""
-    return _TURN.get(orientation, _TURN[1])(pixels)
+"""Longer side of a preview in pixels at most (chosen): fills a usual screen."""
 
 
 def preview(developed: LinearPhoto) -> bytes:

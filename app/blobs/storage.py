@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from obstore.store import ClientConfig
 
 CHUNK = 1 << 20
-"""Bytes that are read at once (chosen)."""
+"""Bytes that are read at once (chosen): large enough that calls cost nothing beside the copying."""
 
 PATIENCE_S: Final = 20.0
 """Seconds for one request to an object store (chosen): it moves at most 8 MiB, at 0.4 MiB/s."""
 
 CONNECT_S: Final = 5.0
-"""Seconds to connect (chosen, not measured)."""
+"""Seconds to connect (chosen): a store that lives answers in far less, and a request waits for it."""
 
 MARK: Final = "lensmodel-blobs"
 """A file in each folder of blobs: the empty mount point of a missing disk has none."""
@@ -114,13 +114,7 @@ class Storage:
 
     @property
     def _store(self) -> ObjectStore:
-        """The blobs.
-
-        Raises
-        ------
-        OSError
-            If the folder is missing: a fault of the machine, not of a blob.
-        """
+        """The blobs."""
         if not self.is_there:
             raise OSError(errno.ENODEV, "the folder of the blobs is away", str(self.folder))
         if self._opened is None:
@@ -155,13 +149,7 @@ class Storage:
             obstore.delete(self._store, key)
 
     def get(self, key: str) -> bytes:
-        """Return a whole blob.
-
-        Raises
-        ------
-        FileNotFoundError
-            If there is none of that key.
-        """
+        """Return a whole blob; FileNotFoundError where there is none of that key."""
         return bytes(obstore.get(self._store, key).bytes())
 
     def info(self, key: str) -> BlobInfo:

@@ -11,7 +11,7 @@ import rawpy
 import tifffile
 from PIL import Image, ImageOps
 
-from app.blobs.previews import upright
+from lensmodel.photo import upright
 
 SIDE: Final = 480
 """Longer side of a glance in pixels at most (chosen): sharp at 240 CSS pixels on a high-density screen."""

@@ -40,13 +40,7 @@ class Question:
 def run(
     source: Path, question: Question, output: Path | None, display: Display, *, force: bool, as_json: bool
 ) -> None:
-    """Answer in words, as JSON, or into a file.
-
-    Raises
-    ------
-    UsageError
-        If the question or the file is refused.
-    """
+    """Answer in words, as JSON, or into a file."""
     with files.as_usage():
         place = FieldPosition(question.r, question.phi)
         settings = LensSettings(aperture=question.aperture, channel=question.channel)

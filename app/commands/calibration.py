@@ -3,32 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Future
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import typer
-from rich.progress import Progress, TaskID
 
 from app.commands import cluster
 from app.commands.console import files
 from app.commands.console.display import Display
 from app.commands.console.failure import UsageError
-from lensmodel import estimation
-from lensmodel.core.errors import InvalidInputError, LensModelError, MetadataMissingError
-from lensmodel.core.psf import PsfSample
-from lensmodel.core.types import ZONE_WORDS, LensSettings, StepHook
-from lensmodel.estimation.estimator import require_size
-from lensmodel.estimation.patches import selectors
-from lensmodel.model import LensModel, LensProfile, ModelSettings, save_profile
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.types import ZONE_WORDS, LensSettings
+from lensmodel.model import LensModel, LensProfile, ModelSettings, Prior, save_profile
 from lensmodel.model.answer import MICROMETRE
 from lensmodel.photo.endings import ENDINGS
 from lensmodel.workflow import pipeline
-from lensmodel.workflow.identity import Identity, difference
 from lensmodel.workflow.lens import Lens
-from lensmodel.workflow.ways import Way, way_named, way_of
+from lensmodel.workflow.ways import way_named, way_of
 
 _ZIP: Final = b"PK"
 """First bytes of a profile, damaged or not: the signature of a ZIP file."""
@@ -53,54 +45,46 @@ class Options:
 
 
 def run(names: Sequence[str], target: Path, options: Options, display: Display, *, as_json: bool) -> None:
-    """Add photos to a profile, one after the other, and save it after each.
-
-    Raises
-    ------
-    UsageError
-        If something is wrong that can be seen before any work.
-    typer.Exit
-        With 1 if a photo could not be used.
-    """
+    """Add photos to a profile, one after the other, and save it after each."""
     paths = files.photos(names)
     _refuse(target, paths, options)
     with files.as_usage():
-        chosen = _chosen(options)
-        settings = LensSettings(aperture=options.aperture)
+        _recipe(options).check()
         family = None if options.family is None else files.profile_at(options.family)
-    calibration = Calibration(target, options, settings, chosen, family)
+    calibration = calibration_of(target, options, family)
     results: list[dict[str, Any]] = []
     with display.progress() as bars:
         task = bars.add_task("", total=len(paths))
-        for number, (path, samples) in enumerate(cluster.estimated(options.scheduler, paths, calibration)):
-            try:
-                result = calibration.add(path, partial(_show, bars, task, number), samples)
-            except (LensModelError, OSError) as error:
-                code = error.code if isinstance(error, LensModelError) else "unreadable"
-                result = {"state": "failed", "code": code, "reason": files.reason(error)}
-                display.error(f"{path}: {result['reason']}")
-            if result["state"] == "known":
-                display.note(f"{path}: the profile has it already")
-            results.append({"photo": str(path), **result})
-            bars.update(task, completed=number + 1)
+
+        def on_event(event: pipeline.CalibrationEvent) -> None:
+            share = event.done / event.total if event.total else 0.0
+            bars.update(
+                task, description=f"{event.photo.name}: {event.stage}", completed=len(results) + share
+            )
+
+        with cluster.executor_of(options.scheduler) as (executor, ahead):
+            for verdict in calibration.learn(paths, executor, ahead=ahead, on_event=on_event):
+                result = _result(verdict, display)
+                results.append({"photo": str(verdict.photo), **result})
+                bars.update(task, completed=len(results))
         bars.remove_task(task)
         whole = bars.add_task("joining what all photos say", total=None)
-        calibration.finish(lambda done, total: bars.update(whole, completed=done, total=total))
-    profile = calibration.profile
+        lens = calibration.finish(lambda done, total: bars.update(whole, completed=done, total=total))
+    coverage = {} if lens is None else lens.model.coverage()
     summary = {
-        "profile": str(target) if profile else None,
-        "photos": len(profile.photos) if profile else 0,
-        "samples": len(profile.model.samples) if profile else 0,
-        "coverage": profile.model.coverage() if profile else {},
-        "model": way_of(profile.model).name if profile else None,
+        "profile": str(target) if lens else None,
+        "photos": len(lens.profile.photos) if lens else 0,
+        "samples": len(lens.samples) if lens else 0,
+        "coverage": coverage,
+        "model": way_of(lens.model).name if lens else None,
         "results": results,
     }
     if as_json:
         display.document(summary)
-    elif profile is not None and any(result["state"] != "failed" for result in results):
-        cover = ", ".join(f"{ZONE_WORDS[zone]} {count}" for zone, count in profile.model.coverage().items())
+    elif lens is not None and any(result["state"] != "failed" for result in results):
+        cover = ", ".join(f"{ZONE_WORDS[zone]} {count}" for zone, count in coverage.items())
         display.result(f"{target}: photos {summary['photos']}, samples {summary['samples']} ({cover})")
-    if profile is None:
+    if lens is None:
         display.error(
             "no photo could be used, so there is no profile; the lines above say what each photo needs"
         )
@@ -108,13 +92,39 @@ def run(names: Sequence[str], target: Path, options: Options, display: Display, 
         raise typer.Exit(1)
 
 
-def _chosen(options: Options) -> ModelSettings:
-    """Return the settings of a new profile's model, after checking that everything named exists."""
-    way = way_named(options.model or "default")
-    estimation.estimators.create(options.estimator or way.estimator)
-    require_size(options.kernel_size or way.kernel_size)
-    selectors.create(options.selector)
-    return ModelSettings(mode=way.mode, unit=options.unit or MICROMETRE)
+def calibration_of(target: Path, options: Options, family: LensProfile | None = None) -> pipeline.Calibration:
+    """Return the work on a profile, which may be there already."""
+    recipe = _recipe(options)
+    return pipeline.Calibration(
+        ProfileFile(target, options, family),
+        recipe,
+        begin=ModelSettings(mode=recipe.way.mode, unit=options.unit or MICROMETRE),
+        prior=None if family is None else Prior(family.model, name=_name_of(family)),
+        any_lens=options.any_lens,
+        workers=options.workers,
+    )
+
+
+def _recipe(options: Options) -> pipeline.Recipe:
+    return pipeline.Recipe(
+        LensSettings(aperture=options.aperture),
+        model=options.model,
+        estimator=options.estimator,
+        kernel_size=options.kernel_size,
+        selector=options.selector,
+    )
+
+
+def _result(verdict: pipeline.Verdict, display: Display) -> dict[str, Any]:
+    """Say what became of a photo, at once and in the document."""
+    if verdict.error is not None:
+        result = files.failed(verdict.error)
+        display.error(f"{verdict.photo}: {result['reason']}")
+        return result
+    if verdict.samples is None:
+        display.note(f"{verdict.photo}: the profile has it already")
+        return {"state": "known"}
+    return {"state": "counted", "samples": verdict.samples}
 
 
 def _refuse(target: Path, photos: Sequence[Path], options: Options) -> None:
@@ -132,128 +142,37 @@ def _refuse(target: Path, photos: Sequence[Path], options: Options) -> None:
         raise UsageError(f"{options.family} is the profile itself; give that of another copy after --family")
 
 
-def _show(bars: Progress, task: TaskID, number: int, event: pipeline.CalibrationEvent) -> None:
-    share = event.done / event.total if event.total else 0.0
-    bars.update(task, description=f"{event.photo.name}: {event.stage}", completed=number + share)
-
-
-class Calibration:
-    """A profile that grows, and its file.
+class ProfileFile:
+    """The shelf of a lens that is kept in a file, with the options applied to it.
 
     Another run may add to the same file meanwhile: the profile is read again whenever the file has
     changed, so that no run drops what another one learned.
     """
 
-    def __init__(
-        self,
-        target: Path,
-        options: Options,
-        settings: LensSettings,
-        chosen: ModelSettings,
-        family: LensProfile | None,
-    ) -> None:
-        self.profile: LensProfile | None = None
-        self._target, self._options, self._settings, self._chosen = target, options, settings, chosen
-        self._family, self._changed = family, False
+    def __init__(self, target: Path, options: Options, family: LensProfile | None) -> None:
+        self.settled = True
+        self._target, self._options, self._family = target, options, family
+        self._lens: Lens | None = None
         self._stamp_read = _stamp(target) if options.force else None
-        self._follow()
 
-    def finish(self, on_step: StepHook) -> None:
-        """Do the slow fits, once, after all photos."""
-        self._follow()
-        if self.profile is not None and self._changed:
-            whole = replace(self.profile, model=self.profile.model.warmed(on_step))
-            if (
-                _stamp(self._target) == self._stamp_read
-            ):  # else another run is adding photos, and does this at its end
-                self._save(whole)
-
-    def order(self, path: Path) -> tuple[Any, ...] | None:
-        """Return what a cluster needs to estimate a photo; None if there is nothing to estimate."""
-        if path.stem.endswith(files.CORRECTED) or self._has(pipeline.photo_id(path)):
-            return None
-        if self._settings.aperture is None and not files.says_aperture(path):
-            return None
-        options, count = self._options, pipeline.DEFAULT_PATCHES
-        settings = (self._settings, self._estimator, count, options.selector, self._kernel_size)
-        return path.name, path.read_bytes(), *settings
-
-    def add(
-        self, path: Path, on_event: pipeline.EventHook, estimated: Future[list[PsfSample]] | None = None
-    ) -> dict[str, Any]:
-        """Learn from one photo, whose samples may come from a cluster; return what became of it."""
-        if path.stem.endswith(files.CORRECTED):
-            raise InvalidInputError(
-                "it was corrected already and says nothing about the lens; give the original"
-            )
-        key = pipeline.photo_id(path)
-        if self._has(key):
-            return {"state": "known"}
-        identity = files.identity(path)
-        self._refuse_other_lens(identity)
-        if self._settings.aperture is None and not files.says_aperture(path):
-            raise MetadataMissingError("it does not say its aperture; add it, for example --aperture 2.8")
-        samples = (
-            pipeline.samples_of_photo(
-                path,
-                settings=self._settings,
-                estimator=self._estimator,
-                selector=self._options.selector,
-                kernel_size=self._kernel_size,
-                workers=self._options.workers,
-                on_event=on_event,
-            )
-            if estimated is None
-            else estimated.result()
-        )
-        if self._has(key):
-            return {"state": "known"}
-        self._refuse_other_lens(identity)
-        if self.profile is None:
-            lens, model = None, self._with_family(LensModel.fit(samples, self._chosen))
-        else:
-            lens, model = Lens(self.profile), self.profile.model.added(samples)
-        grown = Lens.grown(lens, model, {key: path.name}, [identity], any_lens=self._options.any_lens)
-        self._save(grown.profile)
-        self._changed = True
-        return {"state": "counted", "samples": len(samples)}
-
-    @property
-    def _way(self) -> Way:
-        """The way the lens is learned: as the options say, else as before."""
-        if self._options.model is not None or self.profile is None:
-            return way_named(self._options.model or "default")
-        return way_of(self.profile.model)
-
-    @property
-    def _estimator(self) -> str:
-        return self._options.estimator or self._way.estimator
-
-    @property
-    def _kernel_size(self) -> int:
-        return self._options.kernel_size or self._way.kernel_size
-
-    def _has(self, photo: str) -> bool:
-        self._follow()
-        return self.profile is not None and photo in self.profile.photos
-
-    def _refuse_other_lens(self, identity: Identity) -> None:
-        if self.profile is None or self._options.any_lens:
-            return
-        why = difference(self.profile.lens, self.profile.cameras, identity)
-        if why is not None:
-            raise InvalidInputError(f"{why}; give it a profile of its own, or add --any-lens")
-
-    def _follow(self) -> None:
-        """Read the profile if another run changed it, and apply the options to it."""
+    def lens(self) -> Lens | None:
+        """Return the lens, read anew if another run changed the file."""
         stamp = _stamp(self._target)
-        if stamp in {None, self._stamp_read}:
-            return
-        profile = _opened(self._target)
-        mode = None if self._options.model is None else way_named(self._options.model).mode
-        model = self._with_family(profile.model.answering(mode=mode, unit=self._options.unit))
-        self.profile, self._stamp_read = replace(profile, model=model), stamp
-        self._changed = self._changed or model is not profile.model
+        if stamp not in {None, self._stamp_read}:
+            profile = _opened(self._target)
+            mode = None if self._options.model is None else way_named(self._options.model).mode
+            model = self._with_family(profile.model.answering(mode=mode, unit=self._options.unit))
+            self._lens, self._stamp_read = Lens(replace(profile, model=model)), stamp
+            # a run that was stopped left no fit: the next one makes it, whether it has photos or not
+            self.settled = self.settled and model is profile.model and model.warm
+        return self._lens
+
+    def keep(self, lens: Lens, *, whole: bool) -> None:
+        """Save the lens; what was learned of the samples only once all of them are there."""
+        self._target.parent.mkdir(parents=True, exist_ok=True)
+        save_profile(self._target, lens.profile, learned=whole)
+        self._lens, self._stamp_read = lens, _stamp(self._target)
+        self.settled = whole
 
     def _with_family(self, model: LensModel) -> LensModel:
         """Add the profile of another copy as a prior, as the options say."""
@@ -261,14 +180,12 @@ class Calibration:
             return model.with_prior(None)
         if self._family is None:
             return model
-        lens = self._family.lens
-        name = " ".join(lens[key] for key in ("maker", "model", "serial") if lens.get(key))
-        return model.with_prior(self._family.model, name=name or "another copy")
+        return model.with_prior(self._family.model, name=_name_of(self._family))
 
-    def _save(self, profile: LensProfile) -> None:
-        self._target.parent.mkdir(parents=True, exist_ok=True)
-        save_profile(self._target, profile)
-        self.profile, self._stamp_read = profile, _stamp(self._target)
+
+def _name_of(family: LensProfile) -> str:
+    words = [family.lens[key] for key in ("maker", "model", "serial") if family.lens.get(key)]
+    return " ".join(words) or "another copy"
 
 
 def _opened(target: Path) -> LensProfile:

@@ -2,42 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from concurrent.futures import Future
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from contextlib import contextmanager
 from importlib import import_module
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from app.commands.console.failure import UsageError
-from lensmodel.core import parallel
-from lensmodel.core.psf import PsfSample
-from lensmodel.workflow import pipeline
+from lensmodel.workflow.pipeline import AHEAD
 
 CONNECT_S = 10.0
-"""Seconds to reach the scheduler of a cluster (chosen, not measured)."""
+"""Seconds to reach the scheduler of a cluster (chosen): one in the same network answers at once."""
 
 
-class Orders(Protocol):
-    """Knows what is to be estimated of a photo."""
-
-    def order(self, path: Path) -> tuple[Any, ...] | None:
-        """Return the arguments of `pipeline.samples_of_bytes`, or None."""
-
-
-def estimated(
-    scheduler: str | None, paths: Iterable[Path], orders: Orders
-) -> Iterator[tuple[Path, Future[list[PsfSample]] | None]]:
-    """Give photos in their order, each with its samples to come; None where they are to be made here.
+@contextmanager
+def executor_of(scheduler: str | None) -> Iterator[tuple[Executor | None, int]]:
+    """Give the executor of a cluster, and how many photos to send ahead; None without a cluster.
 
     Only the bytes of photos and the samples travel: the machines need lensmodel, and none of the files.
-
-    Raises
-    ------
-    UsageError
-        If there is no cluster at that address, or nothing to reach it with.
     """
     if scheduler is None:
-        yield from ((path, None) for path in paths)
+        yield None, AHEAD
         return
     try:
         dask: Any = import_module("distributed")  # an extra, loaded only where it is asked for
@@ -51,6 +36,4 @@ def estimated(
         threads = sum(client.nthreads().values())
         if not threads:
             raise UsageError(f"--scheduler {scheduler}: it has no workers; start some by `dask worker`")
-        yield from parallel.in_order(
-            executor, pipeline.samples_of_bytes, paths, orders.order, ahead=2 * threads
-        )
+        yield executor, 2 * threads

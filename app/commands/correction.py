@@ -21,6 +21,7 @@ from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.types import ZONE_WORDS, LensSettings, StepHook, Zone
 from lensmodel.correction.audit import HELD, AuditReport
 from lensmodel.photo import OutputFormat
+from lensmodel.photo.endings import CORRECTED
 from lensmodel.workflow.identity import difference
 from lensmodel.workflow.lens import Lens
 
@@ -62,15 +63,7 @@ def run(
     *,
     as_json: bool,
 ) -> None:
-    """Correct photos into a folder, one after the other.
-
-    Raises
-    ------
-    UsageError
-        If something is wrong that can be seen before any work.
-    typer.Exit
-        With 1 if a photo could not be corrected.
-    """
+    """Correct photos into a folder, one after the other."""
     targets = targets_of(files.photos(names), output, EXTENSION[options.file_format])
     with files.as_usage():
         if options.method is not None:
@@ -85,7 +78,7 @@ def run(
             bars.update(task, description=path.name)
             try:
                 result = correct_one(
-                    path, target, lens, settings, options, display, partial(_show, bars, task, number)
+                    path, target, lens, settings, options, display, partial(show_share, bars, task, number)
                 )
             except (LensModelError, OSError) as error:
                 result = files.failed(error)
@@ -106,19 +99,13 @@ def run(
 
 
 def targets_of(paths: Sequence[Path], output: Path | None, extension: str) -> dict[Path, Path]:
-    """Return the photos by the file that each becomes; no two may become the same.
-
-    Raises
-    ------
-    UsageError
-        If two would, or if a folder for them cannot be one.
-    """
+    """Return the photos by the file that each becomes; no two may become the same."""
     targets: dict[Path, Path] = {}
     for path in paths:
         folder = path.parent / FOLDER if output is None else output
         if folder.exists() and not folder.is_dir():
             raise UsageError(f"{folder} is a file; give a folder to -o")
-        target = folder / f"{path.stem}{files.CORRECTED}{extension}"
+        target = folder / f"{path.stem}{CORRECTED}{extension}"
         if target in targets:
             raise UsageError(
                 f"{targets[target]} and {path} would both become {target}; "
@@ -137,14 +124,8 @@ def correct_one(
     display: Display,
     on_step: StepHook,
 ) -> dict[str, Any]:
-    """Correct one photo; return what became of it: `corrected`, `kept` or `left`.
-
-    Raises
-    ------
-    LensModelError, OSError
-        If it could not be done.
-    """
-    if path.stem.endswith(files.CORRECTED):
+    """Correct one photo; return what became of it: `corrected`, `kept` or `left`."""
+    if path.stem.endswith(CORRECTED):
         raise InvalidInputError("it was corrected already; give the original")
     if target.exists() and not options.force:
         return {"state": "kept"}
@@ -224,5 +205,6 @@ def audited(audit: AuditReport) -> list[str]:
     ]
 
 
-def _show(bars: Progress, task: TaskID, number: int, done: int, total: int) -> None:
+def show_share(bars: Progress, task: TaskID, number: int, done: int, total: int) -> None:
+    """Show that photo `number` is done as far as `done` of `total`."""
     bars.update(task, completed=number + done / max(total, 1))

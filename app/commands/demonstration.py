@@ -70,13 +70,7 @@ def demo(
 
 
 def _refuse_what_others_wrote(folder: Path, *, force: bool) -> None:
-    """Make sure that nothing is replaced but what an earlier demo wrote and nobody changed since.
-
-    Raises
-    ------
-    UsageError
-        If the folder holds anything else.
-    """
+    """Make sure that nothing is replaced but what an earlier demo wrote and nobody changed since."""
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"{folder} is a file; give a folder to -o")
     if force or not folder.is_dir():

@@ -24,7 +24,6 @@ from lensmodel import estimation
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.types import LensSettings
 from lensmodel.correction.expected_gain import WORTH_DB
-from lensmodel.model import ModelSettings
 from lensmodel.workflow import pipeline
 from lensmodel.workflow.lens import Lens
 
@@ -80,15 +79,7 @@ def run(
     *,
     as_json: bool,
 ) -> None:
-    """Learn the lens of every group of photos and correct them all.
-
-    Raises
-    ------
-    UsageError
-        If something is wrong that can be seen before any work.
-    typer.Exit
-        With 1 if a photo could not be read or corrected.
-    """
+    """Learn the lens of every group of photos and correct them all."""
     paths = files.photos(names)
     targets = correction.targets_of(paths, output, correction.EXTENSION[options.file_format])
     with files.as_usage():
@@ -144,7 +135,7 @@ class _Folder:
         self._display = display
         self._journal = Journal(output)
         self._learned: Counter[tuple[str, str]] = Counter()
-        self._calibrations: dict[Path, calibration.Calibration] = {}
+        self._calibrations: dict[Path, pipeline.Calibration] = {}
 
     def profile_of(self, group: Group) -> Path:
         """Name the file of a group's lens profile."""
@@ -173,10 +164,10 @@ class _Folder:
         """Fit what takes long, once for each lens."""
         task = bars.add_task("joining what all photos say", total=len(self._calibrations))
         for number, calibrated in enumerate(self._calibrations.values()):
-            calibrated.finish(partial(_correcting, bars, task, number))
+            calibrated.finish(partial(correction.show_share, bars, task, number))
         bars.remove_task(task)
 
-    def _calibration(self, target: Path) -> calibration.Calibration:
+    def _calibration(self, target: Path) -> pipeline.Calibration:
         options = calibration.Options(
             aperture=self._options.aperture,
             estimator=self._learning.estimator,
@@ -188,10 +179,9 @@ class _Folder:
             unit=None,
             selector=self._learning.selector,
         )
-        settings = LensSettings(aperture=self._options.aperture)
-        return calibration.Calibration(target, options, settings, ModelSettings(), None)
+        return calibration.calibration_of(target, options)
 
-    def _learns(self, calibrated: calibration.Calibration, shot: Shot, on_event: pipeline.EventHook) -> bool:
+    def _learns(self, calibrated: pipeline.Calibration, shot: Shot, on_event: pipeline.EventHook) -> bool:
         """Learn from one photo; return whether it counts, now or from an earlier run."""
         photo = pipeline.photo_id(shot.path)
         learning, options = self._learning, self._options
@@ -203,7 +193,7 @@ class _Folder:
             self._display.detail(f"{shot.path}: {refused}")
             return False
         try:
-            calibrated.add(shot.path, on_event)
+            calibrated.add(shot.path, on_event=on_event)
         except LensModelError as error:
             self._journal.note("not learned from", photo, under, str(error))
             self._display.detail(f"{shot.path}: {error}")
@@ -231,7 +221,9 @@ class _Folder:
         for number, shot in enumerate(group.shots):
             bars.update(task, description=f"correcting {shot.path.name}")
             target = targets[shot.path]
-            result = self._correct_shot(shot, target, lens, partial(_correcting, bars, task, number))
+            result = self._correct_shot(
+                shot, target, lens, partial(correction.show_share, bars, task, number)
+            )
             states[result["state"]] += 1
             self._say(shot.path, target, result, as_json=as_json)
             if result["state"] == "corrected":
@@ -287,10 +279,6 @@ def _learning(bars: Progress, task: TaskID, number: int, event: pipeline.Calibra
     bars.update(
         task, description=f"learning from {event.photo.name}: {event.stage}", completed=number + share
     )
-
-
-def _correcting(bars: Progress, task: TaskID, number: int, done: int, total: int) -> None:
-    bars.update(task, completed=number + done / max(total, 1))
 
 
 def _document(row: Row) -> dict[str, Any]:

@@ -99,17 +99,7 @@ class Group:
 
 
 def groups(shots: Iterable[Shot]) -> list[Group]:
-    """Sort photos by body, lens and focal length.
-
-    Parameters
-    ----------
-    shots : iterable of Shot
-
-    Returns
-    -------
-    list of Group
-        By the name of their profile, then by focal length.
-    """
+    """Sort photos by body, lens and focal length."""
     owners: dict[tuple[str, ...], list[Shot]] = {}
     for shot in shots:
         owners.setdefault(shot.owner, []).append(shot)

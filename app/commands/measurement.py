@@ -25,14 +25,15 @@ from app.commands.console.options import (
 from app.schemas import MeasurementKind
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.types import LensSettings
-from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
+from lensmodel.model import save_profile
 from lensmodel.photo.endings import ENDINGS
 from lensmodel.workflow import pipeline
 from lensmodel.workflow.identity import difference
+from lensmodel.workflow.lens import Lens
 
 PAPERS: Final = ("a2", "a3", "a4")
 USUAL_DETAIL: Final = 4000
-"""Default of `target --detail` (chosen, not measured)."""
+"""Default of `target --detail` (chosen): for a page that spans most of a 24-megapixel photo."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,31 +142,27 @@ def _add(group: tuple[Path, ...], target: Path, options: Options, on_step: Any) 
     from lensmodel.workflow.joining import joined  # noqa: PLC0415 - see `_run`
 
     path, key = group[0], pipeline.photo_id(group[0])
-    known = load_profile(target) if target.exists() else None
-    if known is not None and key in known.photos:
+    known = Lens.load(target) if target.exists() else None
+    if known is not None and key in known.profile.photos:
         return {"state": "known"}
     identity = files.identity(path)
     if known is not None and not options.any_lens:
-        why = difference(known.lens, known.cameras, identity)
+        why = difference(known.profile.lens, known.profile.cameras, identity)
         if why is not None:
             raise InvalidInputError(f"{why}; give it a profile of its own, or add --any-lens")
-    given = None if files.says_aperture(path) else LensSettings(aperture=options.aperture)
     samples = measuring.samples_of_measurement(
-        options.kind, group, settings=given, size=options.size, on_step=on_step
+        options.kind,
+        group,
+        settings=LensSettings(aperture=options.aperture),
+        size=options.size,
+        on_step=on_step,
     )
     if target.exists():  # another run may have added to it meanwhile
-        known = load_profile(target)
-    model: LensModel = joined(None if known is None else known.model, samples, replace=options.replace)
-    cameras = () if identity.camera is None else (identity.camera,)
-    if known is None:
-        grown = LensProfile(model, dict(identity.lens), {key: path.name}, cameras)
-    else:
-        lens = known.lens if options.any_lens else {**identity.lens, **known.lens}
-        more = tuple(camera for camera in cameras if camera not in known.cameras)
-        photos = {name: label for name, label in known.photos.items() if _counts(name, model)}
-        grown = replace(
-            known, model=model, lens=lens, photos={**photos, key: path.name}, cameras=(*known.cameras, *more)
-        )
+        known = Lens.load(target)
+    model = joined(None if known is None else known.model, samples, replace=options.replace)
+    grown = Lens.grown(known, model, {key: path.name}, [identity], any_lens=options.any_lens).profile
+    left = {sample.photo for sample in model.samples}  # `--replace` may have taken all of a photo
+    grown = replace(grown, photos={name: label for name, label in grown.photos.items() if name in left})
     target.parent.mkdir(parents=True, exist_ok=True)
     save_profile(target, grown)
     green = sorted(s.error or 0.0 for s in samples if s.settings.channel == "g") or [1.0]
@@ -176,11 +173,6 @@ def _add(group: tuple[Path, ...], target: Path, options: Options, on_step: Any) 
         "estimator": samples[0].estimator,
         "error": green[len(green) // 2],
     }
-
-
-def _counts(photo: str, model: LensModel) -> bool:
-    """Whether a photo still has samples in the model; `--replace` may have taken them all."""
-    return any(sample.photo == photo for sample in model.samples)
 
 
 def target(

@@ -48,13 +48,6 @@ def run(
         "auto": learn from these photos too; else the id of a lens of the service.
     output, options, display, as_json
         As of `correction.run`.
-
-    Raises
-    ------
-    UsageError
-        If something is wrong that can be seen before any work, or no service answers.
-    typer.Exit
-        With 1 if a photo could not be corrected.
     """
     import httpx2  # noqa: PLC0415 - an extra: the commands on files do without it
 
@@ -66,7 +59,7 @@ def run(
     results: list[dict[str, Any]] = []
     try:
         with Client(url) as client, display.progress() as bars:
-            work = _Remote(client, lens, options, display, bars)
+            work = _Remote(client, lens, options, display)
             task = bars.add_task("sending", total=len(targets))
             sent = {}
             for number, (target, path) in enumerate(targets.items()):
@@ -92,10 +85,8 @@ def run(
 class _Remote:
     """The requests to the service, photo by photo."""
 
-    def __init__(
-        self, client: Client, lens: str, options: correction.Options, display: Display, bars: Progress
-    ) -> None:
-        self._client, self._options, self._display, self._bars = client, options, display, bars
+    def __init__(self, client: Client, lens: str, options: correction.Options, display: Display) -> None:
+        self._client, self._options, self._display = client, options, display
         self._lens = None if lens == AUTO else lens
 
     def sent(self, path: Path, target: Path) -> dict[str, Any] | str:
@@ -107,7 +98,7 @@ class _Remote:
                 path, calibrate=self._lens is None, lens_id=self._lens, aperture=self._options.aperture
             ).id
         except (LensModelError, OSError) as error:
-            return _failed(error)
+            return files.failed(error)
 
     def result(
         self,
@@ -137,7 +128,7 @@ class _Remote:
             target.parent.mkdir(parents=True, exist_ok=True)
             self._client.download(wanted.id, target)
         except (LensModelError, OSError) as error:
-            return _failed(error)
+            return files.failed(error)
         return {"state": "corrected", "lens_id": wanted.lens_id, "report": report}
 
     def _request(self) -> dict[str, Any]:
@@ -171,11 +162,6 @@ class _Remote:
                 if zone in zones
             )
             self._display.detail(f"{path.name}, expected gain: {', '.join(gains)}")
-
-
-def _failed(error: Exception) -> dict[str, Any]:
-    code = error.code if isinstance(error, LensModelError) else "unreadable"
-    return {"state": "failed", "code": code, "reason": files.reason(error)}
 
 
 def _show(bars: Progress, task: TaskID, number: int, words: str, job: JobOut) -> None:

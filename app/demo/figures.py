@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from xml.sax.saxutils import escape
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from lensmodel.core.files import write_atomically
+from lensmodel.report.drawing import COLOURS, Axes, Label, svg
 from lensmodel.report.photo_crops import Picture, crop_boxes
 
 _GAP, _LABEL = 6, 18
@@ -37,41 +38,16 @@ def mosaic(rows: Mapping[str, Picture], path: Path, *, side: int = 220) -> None:
 
 def curve(path: Path, *, title: str, x_label: str, series: Mapping[str, Sequence[float]], unit: str) -> None:
     """Write a small SVG line chart; x counts 1, 2, 3 ... along each series."""
-    width, height, left, bottom, top, right = 460, 260, 52, 40, 34, 120
-    colours = ("#1a73e8", "#d93025", "#188038", "#f29900")
     values = [v for line in series.values() for v in line]
     low, high = min(0.0, *values), max(values) * 1.08 or 1.0
     count = max(len(line) for line in series.values())
-
-    def place(index: int, value: float) -> tuple[float, float]:
-        x = left + (width - left - right) * (index / max(count - 1, 1))
-        return x, height - bottom - (height - bottom - top) * (value - low) / (high - low)
-
+    axes = Axes(52, 34, 340, 220, (1.0, max(float(count), 2.0)), (low, high))
+    ticks = [(float(tick), f"{tick:.2f}") for tick in np.linspace(low, high, 5)]
     parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
-        'font-family="system-ui, sans-serif" font-size="12" role="img">',
-        f"<title>{escape(title)}</title>",
-        f'<rect width="{width}" height="{height}" fill="white"/>',
-        f'<text x="{left}" y="18" font-weight="600">{escape(title)}</text>',
-        f'<text x="{(left + width - right) / 2}" y="{height - 8}" '
-        f'text-anchor="middle">{escape(x_label)}</text>',
+        Label(52, 18, title),
+        *axes.grid([(float(k), str(k)) for k in range(1, count + 1)], ticks, x_label),
     ]
-    for tick in np.linspace(low, high, 5):
-        _, y = place(0, float(tick))
-        parts.append(f'<line x1="{left}" x2="{width - right}" y1="{y:.1f}" y2="{y:.1f}" stroke="#dadce0"/>')
-        parts.append(f'<text x="{left - 6}" y="{y + 4:.1f}" text-anchor="end">{tick:.2f}</text>')
-    for index in range(count):
-        x, _ = place(index, low)
-        parts.append(f'<text x="{x:.1f}" y="{height - bottom + 16}" text-anchor="middle">{index + 1}</text>')
     for number, (name, line) in enumerate(series.items()):
-        colour = colours[number % len(colours)]
-        points = [place(i, v) for i, v in enumerate(line)]
-        joined = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
-        parts.append(f'<polyline points="{joined}" fill="none" stroke="{colour}" stroke-width="2"/>')
-        parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="{colour}"/>' for x, y in points]
-        parts.append(
-            f'<text x="{width - right + 10}" y="{top + 16 * number + 10}" '
-            f'fill="{colour}">{escape(name)} {escape(unit)}</text>'
-        )
-    parts.append("</svg>")
-    path.write_text("\n".join(parts), encoding="utf-8")
+        parts.append(axes.curve(range(1, len(line) + 1), line, COLOURS[number]))
+        parts += axes.key(number, f"{name} {unit}", COLOURS[number])
+    write_atomically(path, svg(title, 520, 264, parts).encode())

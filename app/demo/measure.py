@@ -17,7 +17,7 @@ from lensmodel.core.types import ZONES, FieldPosition, Planes, Zone
 from lensmodel.photo import develop
 
 _BORDER = 8
-"""Pixels at the edge of the picture that are left out (chosen, not measured)."""
+"""Pixels at the edge of the picture that are left out (chosen): there the blur reaches beyond the picture."""
 
 
 @dataclass(frozen=True, slots=True)

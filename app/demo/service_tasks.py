@@ -19,7 +19,7 @@ OnJob = Callable[[str, JobOut], None]
 """Takes the same line, and the job that it tells of."""
 
 PATIENCE_SECONDS = 900.0
-"""Longest wait for one job (chosen, not measured)."""
+"""Longest wait for one job (chosen): far longer than one takes, on a slow machine too."""
 
 
 def follow(

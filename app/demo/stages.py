@@ -29,7 +29,8 @@ WEIGHTS: Final[Mapping[str, float]] = {
 """Seconds of each stage on a machine of two cores; only their ratios count once some are over."""
 
 _TRUST_S: Final = 10.0
-"""Seconds of `WEIGHTS` that are trusted before this machine has shown its own speed (chosen)."""
+"""Seconds of `WEIGHTS` that are trusted before this machine has shown its own speed (chosen):
+the first stages are too short to tell it."""
 
 
 class Stages:

@@ -50,13 +50,7 @@ class Pace:
         self._bytes = 0
 
     async def next(self, receive: Receive) -> Message:
-        """Return the next message of a body.
-
-        Raises
-        ------
-        SlowBodyError
-            If it does not come in time, or the body so far came too slowly.
-        """
+        """Return the next message of a body."""
         began = time.monotonic()
         try:
             message = await asyncio.wait_for(receive(), self._patience_s)

@@ -18,7 +18,8 @@ LOOK_S: Final = 0.1
 """Seconds between two polls of the tables while anybody waits (chosen): one or two reads of 0.1 ms."""
 
 CALM_S: Final = 5.0
-"""Seconds between two polls where the database announces changes (chosen, not measured)."""
+"""Seconds between two polls where the database announces changes (chosen): only a lost announcement waits so
+long."""
 
 Marks = Mapping[str, Hashable]
 """A value for each key that changes with its state; deleted keys are missing."""

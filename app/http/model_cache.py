@@ -34,7 +34,7 @@ LOOK_S = 1.0
 """Seconds between two looks for the fit of a worker (chosen): each is a request to the storage."""
 
 BYTES_FACTOR = 4
-"""Size of a fitted model over that of its kernels (chosen, not measured): it also holds splines of them."""
+"""Size of a fitted model over that of its kernels (chosen): it also holds splines of them."""
 
 
 _Key: TypeAlias = tuple[str, int | str | None]
@@ -113,15 +113,6 @@ class ModelCache:
         `state` and `relatives` are those of the lens if the caller has just read them. Without a version the
         model leans on the owner's other copies of the lens as they are now, unless `family` is false; the
         model of a given version rests on the photos of that lens alone, and never changes.
-
-        Raises
-        ------
-        UnknownLensError
-            If there is no such lens.
-        NoSamplesError
-            If the lens has none (in that version).
-        ConflictError
-            If samples of that version were removed since.
         """
         own = self._of_lens(lens_id, version, state)
         if not (self._family and family and version is None):
@@ -269,13 +260,7 @@ def family_name(family: Family) -> str:
 
 
 def check_version(store: Store, lens_id: str, version: int, state: LensState) -> None:
-    """Check that the samples of an earlier version are still complete.
-
-    Raises
-    ------
-    ConflictError
-        If there is no such version, or samples were removed since.
-    """
+    """Check that the samples of an earlier version are still complete."""
     lens = store.lenses.get(lens_id)
     later = [] if lens is None else store.lenses.history(lens, after=version)
     if version > state.version:

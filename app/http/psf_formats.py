@@ -25,7 +25,7 @@ View: TypeAlias = tuple[float, float, float, float]
 """Part of a picture: left, top, width and height as fractions of it."""
 
 DIGITS: Final = 10
-"""Decimals of kernels, whose sum is 1, in JSON (chosen, not measured)."""
+"""Decimals of kernels, whose sum is 1, in JSON (chosen): float32 resolves no more of 0.001."""
 
 GAP_PX: Final = 2
 """Pixels between the kernels of a map (chosen for looks)."""

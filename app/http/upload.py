@@ -204,21 +204,7 @@ async def receive(
     patience_s: float = 30.0,
     within_s: float = math.inf,
 ) -> Uploaded:
-    """Stream the body of a request into the blob `key`.
-
-    Raises
-    ------
-    MalformedUploadError
-        If the body has not the form of an upload.
-    TooLargeError
-        If the photo has more than `limit` bytes.
-    UnreadablePhotoError
-        If the first bytes are of no supported image type.
-    SlowBodyError
-        If nothing arrives for `patience_s`, the rate stays too low, or the body takes longer than `within_s`.
-    pydantic.ValidationError
-        If a form or query field is out of range.
-    """
+    """Stream the body of a request into the blob `key`."""
     query = {name: value for name, value in request.query_params.items() if name != "filename"}
     UploadFields.model_validate(query)  # before the body: a wrong query need not send it
     if declared_length(request) > limit + 2 * MAX_FORM_BYTES:

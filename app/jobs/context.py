@@ -34,13 +34,15 @@ from lensmodel.model.sample_codec import pack_samples
 log = logging.getLogger(__name__)
 
 CRASHES: Final = 3
-"""Deaths of a child by a signal before its job fails (chosen, not measured)."""
+"""Deaths of a child by a signal before its job fails (chosen): one may be the machine's fault, three are the
+file's."""
 
 BACKOFF_S: Final = 0.5
-"""Seconds before the second attempt, four times as long before each further one (chosen)."""
+"""Seconds before the second attempt, four times as long before each further one (chosen): a machine short of
+memory recovers, and its owner hardly waits."""
 
 SPARE_MB: Final = 768
-"""Address space in MiB of a task besides its picture (chosen, not measured)."""
+"""Address space in MiB of a task besides its picture (chosen): what libraries reserve, and room to spare."""
 
 
 class JobFailedError(Exception):
@@ -85,16 +87,8 @@ class JobContext:
         """Run a task, with retries where they can help; return its result.
 
         After a death by signal the task is retried after a pause, after too little memory once with twice
-        as much. What the library refuses with a reason would be refused again.
-
-        Raises
-        ------
-        NotWantedError
-            If the job was cancelled meanwhile.
-        JobFailedError
-            If the task cannot be done.
-        OutageError
-            If the machine lacks disk space or memory.
+        as much. What the library refuses with a reason would be refused again. Ends by `NotWantedError`,
+        `JobFailedError`, or `OutageError` where the machine lacks disk space or memory.
         """
         wanted = _patient(wanted)
         crashes = 0

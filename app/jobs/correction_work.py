@@ -131,14 +131,7 @@ class CorrectionWork:
     def _family(
         self, relatives: list[dict[str, Any]], model: dict[str, str], folder: Path
     ) -> tuple[int, str]:
-        """Pass the samples of other copies of the lens to the task, and their fit if it is in memory.
-
-        Returns
-        -------
-        copies : int
-        key : str
-            Of the fit: the copies with their versions, and the settings of the model.
-        """
+        """Pass the samples of other copies of the lens to the task, and their fit if it is in memory."""
         family = [Relative(entry["lens_id"], LensState(**entry["state"])) for entry in relatives]
         stored = self._context.store.samples.of_family(family)
         if not stored:

@@ -16,14 +16,15 @@ from app.store.photo_steps import settings_of
 from app.store.tables import PhotoRow
 from app.ways import way_of
 from lensmodel.core.errors import InvalidInputError, InvalidKernelError
-from lensmodel.core.psf import as_kernel
-from lensmodel.core.types import CHANNELS, FieldPosition
+from lensmodel.core.psf import PsfSample
+from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
 
 MAX_PLACES: Final = 1000
 """Most places of a measurement (chosen): no method has so many cells, a child that returns more is broken."""
 
 WAIT_S: Final = 60.0
-"""How long the open photo of a pair waits until the closed one is inspected (chosen)."""
+"""How long the open photo of a pair waits until the closed one is inspected (chosen): that takes
+seconds, unless many photos are before it."""
 
 _UNREAD: Final = ("received", "inspecting")
 _BYTES_A_PIXEL: Final = 96  # chosen, not measured: two mapped photos, a float64 plane of each, intermediates
@@ -39,11 +40,6 @@ class MeasurementWork:
         """Measure the PSF all over a photo and store it as patches with samples.
 
         A repeated call adds nothing twice.
-
-        Raises
-        ------
-        JobFailedError
-            If the photo cannot be measured, or the result of the child is invalid.
         """
         folders = [developed, *self._reference(photo, wanted)]
         settings = self._context.settings
@@ -114,12 +110,14 @@ def _checked(listed: Any, folder: Path) -> tuple[list[NewPatch], list[NewSample]
             )
             samples.append(
                 NewSample(
-                    idx=number,
-                    channel=channel,
-                    kernel=as_kernel(kernel),
-                    weight=1.0,
-                    estimator=str(entry["estimator"])[:60],
-                    predicted_error=error,
+                    number,
+                    PsfSample(
+                        kernel,
+                        position,
+                        LensSettings(channel=channel),
+                        estimator=str(entry["estimator"]),
+                        error=error,
+                    ),
                 )
             )
     except (

@@ -1,14 +1,15 @@
 """The job of a photo: inspect, identify the lens, develop, choose patches, estimate PSFs, count.
 
-Each step reads the tables first and does only what is not done yet. So the job may be started
-again at any time, by any worker, and still every effect happens once.
+The order of the steps is the library's (`lensmodel.workflow.calibrating.take`). Each reads the tables first
+and does only what is not done yet. So the job may be started again at any time, by any worker, and still
+every effect happens once.
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
@@ -23,19 +24,20 @@ from app.jobs.queue import Job, JobEngine
 from app.jobs.task_files import KERNELS
 from app.jobs.thumbnail_work import keep_glance
 from app.sandbox.outcome import Limits
-from app.store import LensName, NewSample
+from app.store import LensName, NewSample, Store
 from app.store.photo_steps import settings_of
 from app.store.tables import PHOTO_RUNNING, LensRow, PatchRow, PhotoRow
 from app.ways import way_of
 from lensmodel.core.errors import InvalidInputError, InvalidKernelError, NoUsablePatchesError
-from lensmodel.core.psf import as_kernel
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.spectrum import PatchSpectrum
+from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.workflow import pipeline
 
 log = logging.getLogger(__name__)
 
 WAIT_S: Final = 0.2
-"""Seconds between two looks at the open cells of a photo (chosen)."""
+"""Seconds between two looks at the open cells of a photo (chosen): a cell takes seconds, a look one query."""
 
 LOOK_AFTER_S: Final = 5.0
 """Seconds between two checks that each open cell still has a job (chosen): only dead workers lose one."""
@@ -47,209 +49,19 @@ class PhotoWork:
     def __init__(self, context: JobContext, engine: JobEngine) -> None:
         self._context, self._engine = context, engine
         self._store = context.store
-        self._measurements = MeasurementWork(context)
 
     def photo(self, photo_id: str, epoch: int) -> None:
         """Take a photo through all steps, as far as it can get."""
-
-        def wanted() -> bool:
-            return self._store.photos.is_live(photo_id, epoch)
-
-        if not wanted():
+        if not self._store.photos.is_live(photo_id, epoch):
             return
         try:
-            photo = self._begin(photo_id, epoch)
-            photo = self._inspect(photo, wanted)
-            if not self._identify(photo):
-                return
-            self._move(photo, ("inspecting", "developing"), "developing")
-            developed = self._context.developed(photo, wanted)
-            self._move(photo, ("developing", "selecting"), "selecting")
-            if photo.given.get("kind"):
-                self._measurements.measure(photo, developed, wanted)
-                self._finish_measured(photo)
-                return
-            self._select(photo, developed, wanted)
-            self._move(photo, ("selecting", "estimating"), "estimating")
-            self._estimate(photo, wanted)
-            self._finish(photo)
+            photo = _begun(self._store, photo_id, epoch)
+            steps = _Measured if photo.given.get("kind") else _Steps
+            pipeline.take(steps(self._context, self._engine, photo))
         except NotWantedError:
             log.info("photo %s is not wanted any more", photo_id)
         except JobFailedError as error:
             self._store.photos.fail(photo_id, epoch, error.code, error.detail)
-
-    def _get(self, photo_id: str) -> PhotoRow:
-        photo = self._store.photos.get(photo_id)
-        if photo is None:
-            raise NotWantedError
-        return photo
-
-    def _begin(self, photo_id: str, epoch: int) -> PhotoRow:
-        photos = self._store.photos
-        started = {"started_at": datetime.now(UTC), "attempt": 1}
-        if not photos.set_state(photo_id, ("received",), "inspecting", epoch=epoch, **started):
-            state = self._get(photo_id).state
-            attempt = PhotoRow.attempt + 1
-            if state not in PHOTO_RUNNING or not photos.set_state(
-                photo_id, (state,), state, epoch=epoch, attempt=attempt
-            ):
-                raise NotWantedError
-        return self._get(photo_id)
-
-    def _move(self, photo: PhotoRow, before: tuple[str, ...], to: str) -> None:
-        """Move to the next state; a photo that is already further stays there."""
-        if not self._store.photos.set_state(photo.public_id, before, to, epoch=photo.epoch):
-            state = self._get(photo.public_id).state
-            if state not in {"developing", "selecting", "estimating"}:
-                raise NotWantedError
-
-    def _inspect(self, photo: PhotoRow, wanted: Callable[[], bool]) -> PhotoRow:
-        if photo.state != "inspecting":
-            return photo
-        limits = Limits(memory_mb=SPARE_MB, wall_s=self._context.settings.inspect_seconds)
-        with self._context.original(photo) as path, self._context.sandbox.folder() as folder:
-            arguments = {"path": str(path), "max_megapixels": self._context.settings.max_megapixels}
-            info = self._context.attempt(
-                "inspect", arguments, folder=folder, limits=limits, wanted=wanted, reads=[path]
-            )
-            keep_glance(self._context, photo, info, path, wanted)
-        self._record(photo, info)
-        return self._get(photo.public_id)
-
-    def _record(self, photo: PhotoRow, info: dict[str, Any]) -> None:
-        metadata, lens = info["metadata"], info["metadata"]["lens"]
-        taken = metadata["taken_at"]
-        self._store.photos.record_inspection(
-            photo.public_id,
-            width=info["width"],
-            height=info["height"],
-            identity=LensName(lens["maker"], lens["model"], lens["serial"], lens["serial_source"]),
-            aperture=metadata["aperture"],
-            focal_mm=metadata["focal_mm"],
-            focus_m=metadata["focus_m"],
-            pixel_pitch_um=metadata["pixel_pitch_um"],
-            orientation=metadata["orientation"],
-            camera_maker=metadata["camera_maker"],
-            camera_model=metadata["camera_model"],
-            body_key=body_key(
-                metadata["camera_maker"], metadata["camera_model"], metadata.get("body_serial")
-            ),
-            iso=metadata["iso"],
-            exposure_s=metadata["exposure_s"],
-            # Cameras write local time without a zone; as UTC it at least sorts.
-            taken_at=None if taken is None else datetime.fromisoformat(taken).replace(tzinfo=UTC),
-        )
-
-    def _identify(self, photo: PhotoRow) -> bool:
-        """Assign the lens; return whether to go on and calibrate it."""
-        if photo.state != "inspecting":
-            return True
-        photos, single = self._store.photos, self._context.settings.assume_single_copy
-        lens = photos.assign_lens(photo.public_id, single_copy=single)
-        if not photo.calibrate:
-            photos.set_state(
-                photo.public_id, ("inspecting",), "stored", epoch=photo.epoch, finished_at=datetime.now(UTC)
-            )
-            return False
-        _require_model(photo, lens)
-        missing = _missing(photo, lens_known=lens is not None)
-        if missing:
-            photos.set_state(
-                photo.public_id,
-                ("inspecting",),
-                "needs_lens",
-                epoch=photo.epoch,
-                error_code="metadata_missing",
-                error_detail=missing,
-            )
-        return not missing
-
-    def _select(self, photo: PhotoRow, developed: Path, wanted: Callable[[], bool]) -> None:
-        if self._store.patches.all_of(photo.public_id, photo.epoch):
-            return
-        limits = self._context.limits(photo, self._context.settings.develop_seconds, 120)
-        arguments = {
-            "developed": str(developed),
-            "count": self._context.settings.patches,
-            "selector": photo.given.get("selector") or self._context.settings.selector,
-        }
-        with self._context.sandbox.folder() as folder:
-            try:
-                selection = self._context.attempt(
-                    "select", arguments, folder=folder, limits=limits, wanted=wanted, reads=[developed]
-                )
-            except JobFailedError as error:
-                if error.code != "invalid_parameter":
-                    raise
-                size = f"{photo.width}x{photo.height}"
-                text = f"the photo of {size} pixels is too small to tell about its lens; send it in full size"
-                raise JobFailedError("no_usable_patches", text) from error
-        if selection["lateral"] is not None:
-            self._store.photos.record_lateral(photo.public_id, selection["lateral"])
-        self._store.patches.add(photo.public_id, photo.epoch, plan_of(selection))
-
-    def _estimate(self, photo: PhotoRow, wanted: Callable[[], bool]) -> None:
-        """Hand out the cells and wait until each is done, rejected or given up."""
-        owner = self._store_owner(photo)
-        jobs = {
-            cell: Job("cell", (photo.public_id, photo.epoch, cell), owner)
-            for cell in self._store.patches.cells(photo.public_id, photo.epoch)
-        }
-        for job in jobs.values():
-            self._engine.enqueue(job)
-        looked = time.monotonic()
-        while wanted():
-            still_open = self._store.patches.cells(photo.public_id, photo.epoch)
-            if not still_open:
-                return
-            if time.monotonic() - looked > LOOK_AFTER_S:
-                looked = time.monotonic()
-                for cell in still_open:
-                    self._look_after(photo, cell, jobs.get(cell))
-            time.sleep(WAIT_S)
-        raise NotWantedError
-
-    def _store_owner(self, photo: PhotoRow) -> str:
-        return f"owner-{photo.owner_id}"
-
-    def _look_after(self, photo: PhotoRow, cell: int, job: Job | None) -> None:
-        """Repair a cell whose job the engine lost, or gave up after it killed its workers."""
-        if job is None:
-            return
-        status = self._engine.status(job)
-        if status == "unknown":
-            self._engine.enqueue(job)
-        elif status in {"done", "lost"}:
-            rows = self._store.patches.of_cell(photo.public_id, photo.epoch, cell)
-            numbers = [row.idx for row in rows]
-            self._store.patches.fail(photo.public_id, photo.epoch, numbers, "crashed_repeatedly")
-
-    def _finish(self, photo: PhotoRow) -> None:
-        rows = self._store.patches.all_of(photo.public_id, photo.epoch)
-        tried = [row for row in rows if row.cell is not None]
-        good = sum(row.state == "done" for row in tried)
-        self._require_spread([row for row in tried if row.state == "done"])
-        if good >= self._context.settings.min_good_patches:
-            version = self._store.photos.finish(photo.public_id, photo.epoch)
-            if version is not None:
-                log.info("photo %s counted, lens version %d", photo.public_id, version)
-            return
-        raise JobFailedError(*why_not(tried, good))
-
-    def _finish_measured(self, photo: PhotoRow) -> None:
-        """Count a measurement: it states its own error, and one place is enough."""
-        version = self._store.photos.finish(photo.public_id, photo.epoch)
-        if version is not None:
-            log.info("measurement %s counted, lens version %d", photo.public_id, version)
-
-    def _require_spread(self, done: list[PatchRow]) -> None:
-        """Refuse a photo if all patches that gave a PSF lie in one place."""
-        if not done:
-            return
-        try:
-            pipeline.require_spread([patch_of(row) for row in done], count=self._context.settings.patches)
-        except NoUsablePatchesError as error:
-            raise JobFailedError(error.code, str(error)) from error
 
     def cell(self, photo_id: str, epoch: int, cell: int) -> None:
         """Estimate the PSF of one field cell of a photo."""
@@ -258,7 +70,7 @@ class PhotoWork:
             return
         numbers = [row.idx for row in rows]
         try:
-            samples = self._samples(self._get(photo_id), rows)
+            samples = self._samples(_row(self._store, photo_id), rows)
         except NotWantedError:
             return
         except JobFailedError as error:
@@ -300,33 +112,242 @@ class PhotoWork:
                 reads=[developed],
                 compiles=True,
             )
-            return [_sample(folder, number, entry) for number, entry in enumerate(listed)]
+            places = {row.idx: FieldPosition(row.r, row.phi) for row in rows}
+            return [_sample(folder, number, entry, places) for number, entry in enumerate(listed)]
 
 
-def _sample(folder: Path, number: int, entry: dict[str, Any]) -> NewSample:
+class _Steps:
+    """`PhotoSteps` by rows and tasks: each reads the tables first, and does only what is not done yet."""
+
+    def __init__(self, context: JobContext, engine: JobEngine, photo: PhotoRow) -> None:
+        self._context, self._engine, self._photo = context, engine, photo
+        self._store = context.store
+        self._developed = Path()
+
+    def _wanted(self) -> bool:
+        return self._store.photos.is_live(self._photo.public_id, self._photo.epoch)
+
+    def inspect(self) -> bool:
+        """Read the header and assign the lens; return whether to go on and calibrate it."""
+        if self._photo.state != "inspecting":
+            return True
+        limits = Limits(memory_mb=SPARE_MB, wall_s=self._context.settings.inspect_seconds)
+        with self._context.original(self._photo) as path, self._context.sandbox.folder() as folder:
+            arguments = {"path": str(path), "max_megapixels": self._context.settings.max_megapixels}
+            info = self._context.attempt(
+                "inspect", arguments, folder=folder, limits=limits, wanted=self._wanted, reads=[path]
+            )
+            keep_glance(self._context, self._photo, info, path, self._wanted)
+        self._record(info)
+        self._photo = _row(self._store, self._photo.public_id)
+        return self._identify()
+
+    def _record(self, info: dict[str, Any]) -> None:
+        metadata, lens = info["metadata"], info["metadata"]["lens"]
+        taken = metadata["taken_at"]
+        self._store.photos.record_inspection(
+            self._photo.public_id,
+            width=info["width"],
+            height=info["height"],
+            identity=LensName(lens["maker"], lens["model"], lens["serial"], lens["serial_source"]),
+            aperture=metadata["aperture"],
+            focal_mm=metadata["focal_mm"],
+            focus_m=metadata["focus_m"],
+            pixel_pitch_um=metadata["pixel_pitch_um"],
+            orientation=metadata["orientation"],
+            camera_maker=metadata["camera_maker"],
+            camera_model=metadata["camera_model"],
+            body_key=body_key(
+                metadata["camera_maker"], metadata["camera_model"], metadata.get("body_serial")
+            ),
+            iso=metadata["iso"],
+            exposure_s=metadata["exposure_s"],
+            # Cameras write local time without a zone; as UTC it at least sorts.
+            taken_at=None if taken is None else datetime.fromisoformat(taken).replace(tzinfo=UTC),
+        )
+
+    def _identify(self) -> bool:
+        photo = self._photo
+        photos, single = self._store.photos, self._context.settings.assume_single_copy
+        lens = photos.assign_lens(photo.public_id, single_copy=single)
+        if not photo.calibrate:
+            photos.set_state(
+                photo.public_id, ("inspecting",), "stored", epoch=photo.epoch, finished_at=datetime.now(UTC)
+            )
+            return False
+        _require_model(photo, lens)
+        missing = _missing(photo, lens_known=lens is not None)
+        if missing:
+            photos.set_state(
+                photo.public_id,
+                ("inspecting",),
+                "needs_lens",
+                epoch=photo.epoch,
+                error_code="metadata_missing",
+                error_detail=missing,
+            )
+        return not missing
+
+    def enter(self, stage: pipeline.Stage) -> None:
+        """Move to the next state; a photo that is already further stays there."""
+        photo, before = self._photo, _BEFORE[stage]
+        if not self._store.photos.set_state(photo.public_id, (before, stage), stage, epoch=photo.epoch):
+            state = _row(self._store, photo.public_id).state
+            if state not in _BEFORE:
+                raise NotWantedError
+
+    def develop(self) -> None:
+        """Develop the photo, unless this machine has it developed."""
+        self._developed = self._context.developed(self._photo, self._wanted)
+
+    def select(self) -> None:
+        """Choose the patches, and measure the lateral colour."""
+        photo, developed = self._photo, self._developed
+        if self._store.patches.all_of(photo.public_id, photo.epoch):
+            return
+        limits = self._context.limits(photo, self._context.settings.develop_seconds, 120)
+        arguments = {
+            "developed": str(developed),
+            "count": self._context.settings.patches,
+            "selector": photo.given.get("selector") or self._context.settings.selector,
+        }
+        with self._context.sandbox.folder() as folder:
+            try:
+                selection = self._context.attempt(
+                    "select", arguments, folder=folder, limits=limits, wanted=self._wanted, reads=[developed]
+                )
+            except JobFailedError as error:
+                if error.code != "invalid_parameter":
+                    raise
+                size = f"{photo.width}x{photo.height}"
+                text = f"the photo of {size} pixels is too small to tell about its lens; send it in full size"
+                raise JobFailedError("no_usable_patches", text) from error
+        if selection["lateral"] is not None:
+            self._store.photos.record_lateral(photo.public_id, selection["lateral"])
+        self._store.patches.add(photo.public_id, photo.epoch, plan_of(selection))
+
+    def estimate(self) -> None:
+        """Hand out the cells and wait until each is done, rejected or given up."""
+        photo = self._photo
+        owner = f"owner-{photo.owner_id}"
+        jobs = {
+            cell: Job("cell", (photo.public_id, photo.epoch, cell), owner)
+            for cell in self._store.patches.cells(photo.public_id, photo.epoch)
+        }
+        for job in jobs.values():
+            self._engine.enqueue(job)
+        looked = time.monotonic()
+        while self._wanted():
+            still_open = self._store.patches.cells(photo.public_id, photo.epoch)
+            if not still_open:
+                return
+            if time.monotonic() - looked > LOOK_AFTER_S:
+                looked = time.monotonic()
+                for cell in still_open:
+                    self._look_after(cell, jobs.get(cell))
+            time.sleep(WAIT_S)
+        raise NotWantedError
+
+    def _look_after(self, cell: int, job: Job | None) -> None:
+        """Repair a cell whose job the engine lost, or gave up after it killed its workers."""
+        if job is None:
+            return
+        photo = self._photo
+        status = self._engine.status(job)
+        if status == "unknown":
+            self._engine.enqueue(job)
+        elif status in {"done", "lost"}:
+            rows = self._store.patches.of_cell(photo.public_id, photo.epoch, cell)
+            numbers = [row.idx for row in rows]
+            self._store.patches.fail(photo.public_id, photo.epoch, numbers, "crashed_repeatedly")
+
+    def count(self) -> None:
+        """Count the photo, if enough of its patches gave a PSF, and not all in one place."""
+        photo, settings = self._photo, self._context.settings
+        rows = self._store.patches.all_of(photo.public_id, photo.epoch)
+        tried = [row for row in rows if row.cell is not None]
+        done = [row for row in tried if row.state == "done"]
+        if done:
+            try:
+                pipeline.require_spread([patch_of(row) for row in done], count=settings.patches)
+            except NoUsablePatchesError as error:
+                raise JobFailedError(error.code, str(error)) from error
+        if len(done) < settings.min_good_patches:
+            raise JobFailedError(*why_not(tried, len(done)))
+        self._finish()
+
+    def _finish(self) -> None:
+        version = self._store.photos.finish(self._photo.public_id, self._photo.epoch)
+        if version is not None:
+            log.info("photo %s counted, lens version %d", self._photo.public_id, version)
+
+
+class _Measured(_Steps):
+    """A photo that was made to measure the lens: one task measures all over it."""
+
+    def select(self) -> None:
+        """Measure; the places are the patches, and their samples are there at once."""
+        MeasurementWork(self._context).measure(self._photo, self._developed, self._wanted)
+
+    def estimate(self) -> None:
+        """Nothing is left to estimate."""
+
+    def count(self) -> None:
+        """Count it: it states its own error, and one place is enough."""
+        self._finish()
+
+
+_BEFORE: Final[Mapping[str, str]] = {
+    "developing": "inspecting",
+    "selecting": "developing",
+    "estimating": "selecting",
+}
+"""States of a photo that is being worked on, with the one that comes before each."""
+
+
+def _row(store: Store, photo_id: str) -> PhotoRow:
+    photo = store.photos.get(photo_id)
+    if photo is None:
+        raise NotWantedError
+    return photo
+
+
+def _begun(store: Store, photo_id: str, epoch: int) -> PhotoRow:
+    """Take up a photo: a new one, or one that another worker left."""
+    photos = store.photos
+    started = {"started_at": datetime.now(UTC), "attempt": 1}
+    if not photos.set_state(photo_id, ("received",), "inspecting", epoch=epoch, **started):
+        state = _row(store, photo_id).state
+        attempt = PhotoRow.attempt + 1
+        if state not in PHOTO_RUNNING or not photos.set_state(
+            photo_id, (state,), state, epoch=epoch, attempt=attempt
+        ):
+            raise NotWantedError
+    return _row(store, photo_id)
+
+
+def _sample(
+    folder: Path, number: int, entry: dict[str, Any], places: Mapping[int, FieldPosition]
+) -> NewSample:
     """Validate one result of a child as untrusted input."""
     try:
         kernels = np.load(folder / KERNELS, allow_pickle=False, mmap_mode="r")
-        kernel = as_kernel(kernels[number])
-        weight = float(np.clip(entry["weight"], 0.0, 1.0))
         spectrum = None if entry["spectrum"] is None else bytes.fromhex(entry["spectrum"])
-        if spectrum is not None:
-            PatchSpectrum.from_bytes(spectrum)
+        sample = PsfSample(
+            kernels[number],
+            places[entry["idx"]],
+            LensSettings(channel=entry["channel"]),
+            weight=float(np.clip(entry["weight"], 0.0, 1.0)),
+            estimator=str(entry["estimator"]),
+            error=entry["predicted_error"],
+            spectrum=None if spectrum is None else PatchSpectrum.from_bytes(spectrum),
+        )
+        return NewSample(entry["idx"], sample, entry["diagnostics"])
     except (
         *(InvalidKernelError, InvalidInputError, OSError),
         *(ValueError, TypeError, LookupError),  # not the expected JSON
     ) as error:
         raise JobFailedError("internal_error", f"the estimator gave no kernel: {error}") from error
-    return NewSample(
-        idx=entry["idx"],
-        channel=entry["channel"],
-        kernel=kernel,
-        weight=weight,
-        estimator=entry["estimator"],
-        predicted_error=entry["predicted_error"],
-        spectrum=spectrum,
-        diagnostics=entry["diagnostics"],
-    )
 
 
 def _require_model(photo: PhotoRow, lens: LensRow | None) -> None:

@@ -41,7 +41,8 @@ QUEUE_OF: Final[Mapping[Kind, str]] = {
     "measure": "patches",
 }
 MAX_STARTS: Final[Mapping[Kind, int]] = {"photo": 50, "cell": 5, "correction": 5, "measure": 3}
-"""Restarts of a job after deaths of its worker, before it is given up (chosen, not measured)."""
+"""Restarts of a job after deaths of its worker, before it is given up (chosen): the job of a photo only
+waits for others and hardly kills one, the others may be what killed it."""
 
 POLL_S: Final[Mapping[str, float]] = {"photos": 0.25, "patches": 0.1, "corrections": 0.25}
 """Seconds between two polls of each queue (chosen): three polls every 0.1 s take a tenth of a core."""

@@ -40,7 +40,7 @@ from app.store import LensName, NewPatch, NewSample, Store
 from app.store.ids import new_id
 from app.store.upkeep import migrate
 from app.store.versions import learned_key
-from lensmodel.core.psf import resized, rms_width
+from lensmodel.core.psf import PsfSample, resized, rms_width
 from lensmodel.core.spectrum import PatchSpectrum
 from lensmodel.core.types import CHANNELS, FieldPosition, Kernel, LensSettings, NoiseModel, Plane
 from lensmodel.lab.model.model_benchmark import patch_places
@@ -121,10 +121,11 @@ def count_photo(store: Store, lens: SimulatedLens, rng: np.random.Generator) -> 
     for k, p in enumerate(places):
         scene = dead_leaves(PATCH + TRUTH - 1, PATCH + TRUTH - 1, rng, oversampling=1)
         for number, channel in enumerate(CHANNELS):
-            blur = lens.kernel(p, settings.with_channel(channel), TRUTH)
-            seen = spectrum_behind(blur, scene[number], rng).to_bytes()
-            kernel = resized(blur, SIDE)
-            samples.append(NewSample(k, channel, kernel, 1.0, "default/7", spectrum=seen))
+            asked = settings.with_channel(channel)
+            blur = lens.kernel(p, asked, TRUTH)
+            seen = spectrum_behind(blur, scene[number], rng)
+            sample = PsfSample(resized(blur, SIDE), p, asked, estimator="default/7", spectrum=seen)
+            samples.append(NewSample(k, sample))
     store.patches.finish(public_id, photo.epoch, samples)
     assert store.photos.finish(public_id, photo.epoch) is not None
     return row.public_id

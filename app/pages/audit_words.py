@@ -27,7 +27,8 @@ MAX_PLACES: Final = 6
 """Places that are listed (chosen): the worst ones."""
 
 SQUARE: Final = 96
-"""Side of a square in photo pixels for audits without `tile_side` (chosen, not measured)."""
+"""Side of a square in photo pixels for audits without `tile_side` (chosen): large enough to
+find in the picture."""
 
 
 @dataclass(frozen=True, slots=True)

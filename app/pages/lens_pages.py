@@ -111,13 +111,7 @@ def lens_charts(
 
 
 def _aperture(text: str) -> float | None:
-    """Return the f-number that a form sends; None where it sends nothing.
-
-    Raises
-    ------
-    InvalidParameterError
-        If it is no f-number.
-    """
+    """Return the f-number that a form sends; None where it sends nothing."""
     try:
         return _APERTURE.validate_python(text) if text else None
     except ValidationError as error:

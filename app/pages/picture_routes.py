@@ -23,7 +23,8 @@ Number = Annotated[int, Path(ge=0, le=10_000)]
 Which = Literal["before", "after"]
 
 WHOLE: Final = 1600
-"""Longer side in pixels of the picture that is shown until the tiles are loaded (chosen)."""
+"""Longer side in pixels of the picture that is shown until the tiles are loaded (chosen):
+that of a preview."""
 
 NOTHING: Final = (
     '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 3 2">'

@@ -12,10 +12,10 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
-from app.blobs.previews import upright
 from app.blobs.storage import Storage
 from app.errors import NotReadyError, UnknownPictureError
 from app.schemas import PatchOut, Region
+from lensmodel.photo import upright
 
 Picture = NDArray[np.uint8]
 N = TypeVar("N", int, float)
@@ -88,13 +88,7 @@ def exists(storage: Storage, key: str) -> bool:
 
 
 def stored(storage: Storage, key: str) -> bytes:
-    """Return a picture that a worker has made.
-
-    Raises
-    ------
-    NotReadyError
-        If there is none: not made yet.
-    """
+    """Return a picture that a worker has made."""
     try:
         return storage.get(key)
     except FileNotFoundError as error:
@@ -171,13 +165,7 @@ def _decoded(storage: Storage, key: str, media_type: str, orientation: int) -> P
 
 
 def tile(picture: Picture, col: int, row: int) -> bytes:
-    """Render one of the tiles that a picture is cut into, from the top left.
-
-    Raises
-    ------
-    UnknownPictureError
-        If the picture does not reach so far.
-    """
+    """Render one of the tiles that a picture is cut into, from the top left."""
     part = picture[row * TILE : (row + 1) * TILE, col * TILE : (col + 1) * TILE]
     if not part.size:
         raise UnknownPictureError(f"the picture has no tile in column {col}, row {row}")

@@ -14,6 +14,7 @@ PHOTOS: Final = 60
 """Photos and lenses of a list (chosen): the newest of them."""
 
 HOPELESS: Final = frozenset({"failed", "cancelled"})
+"""States of photos without a result."""
 
 MAX_WAITING: Final = 1000
 """Waiting photos on the page at most: as many as one request can change."""

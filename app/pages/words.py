@@ -43,10 +43,10 @@ FILES: Final[Mapping[str, str]] = {
     "dng": "Linear DNG",
 }
 ENOUGH_PLACES: Final = 20
-"""Places in a zone from which it counts as well covered (chosen, not measured)."""
+"""Places in a zone from which it counts as well covered (chosen): those of some three photos."""
 
 SHOWN_PLACES: Final = 3
-"""Places that an advice names at most (chosen)."""
+"""Places that an advice names at most (chosen): nobody photographs by a longer list."""
 
 ACTIVE: Final = frozenset({"received", "inspecting", "developing", "selecting", "estimating"})
 UNDEVELOPED: Final = frozenset({"received", "inspecting", "developing", "needs_lens", "failed", "cancelled"})

@@ -8,9 +8,11 @@ from urllib.parse import urlencode
 
 from fastapi import Query
 
+from app.errors import UnknownLensError
 from app.http.dependencies import Call
 from app.http.errors import MEDIA_TYPE
 from app.schemas import OptionalName, Problem
+from app.store.tables import LensRow
 
 Limit = Annotated[int, Query(ge=1, le=200, description="items on a page")]
 Cursor = Annotated[
@@ -40,6 +42,20 @@ def problems(*statuses: int, also: Answers | None = None) -> Answers:
         for status in (*statuses, 500, 503)
     }
     return answers | (also or {})
+
+
+def matches(call: Call, tag: str) -> bool:
+    """Say whether a request already has the answer of this tag (RFC 9110, 13.1.2)."""
+    sent = call.request.headers.get("if-none-match", "")
+    return sent.strip() == "*" or tag in {entry.strip().removeprefix("W/") for entry in sent.split(",")}
+
+
+def named_lens(call: Call, lens_id: str) -> LensRow:
+    """Return the lens that a field of a request names."""
+    lens = call.store.lenses.get(lens_id, call.owner)
+    if lens is None:
+        raise UnknownLensError(f"lens_id {lens_id}: there is no such lens; GET /v1/lenses lists them")
+    return lens
 
 
 def cut(rows: Sequence[Row], limit: int) -> tuple[list[Row], str | None]:

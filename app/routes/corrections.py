@@ -15,14 +15,13 @@ from app.errors import (
     NotReadyError,
     RangeError,
     UnknownCorrectionError,
-    UnknownLensError,
 )
 from app.http import views
 from app.http.dependencies import Call, CallDep
 from app.http.idempotency import OnceDep
 from app.http.middleware import ONLY_HEAD
 from app.http.model_cache import check_version
-from app.routes.common import Cursor, Limit, OnlyId, next_link, problems
+from app.routes.common import Cursor, Limit, OnlyId, matches, named_lens, next_link, problems
 from app.routes.photos import SEND_AGAIN, find_photo
 from app.schemas import CorrectionIn, CorrectionOut, CorrectionPage
 from app.store.corrections import CorrectionPlan
@@ -110,10 +109,7 @@ def _check_region(photo: PhotoRow, options: CorrectionIn) -> None:
 
 def _lens_for(call: Call, photo: PhotoRow, lens_id: str | None) -> LensRow:
     if lens_id is not None:
-        lens = call.store.lenses.get(lens_id, call.owner)
-        if lens is None:
-            raise UnknownLensError(f"lens_id {lens_id}: there is no such lens; GET /v1/lenses lists them")
-        return lens
+        return named_lens(call, lens_id)
     lens = call.store.photos.lens_of(photo) or call.store.lenses.by_identity(photo)
     if lens is not None:
         return lens
@@ -221,8 +217,7 @@ def read_result(correction_id: str, call: CallDep) -> Response:
         "Content-Disposition": _disposition(row.result_name or "corrected"),
         "X-Content-Type-Options": "nosniff",
     }
-    cached_tags = {entry.strip() for entry in call.request.headers.get("if-none-match", "").split(",")}
-    if cached_tags & {tag, f"W/{tag}", "*"}:
+    if matches(call, tag):
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
     part = call.request.headers.get("range")
     if call.request.headers.get("if-range", tag) != tag:
@@ -243,11 +238,6 @@ def byte_range(header: str | None, size: int) -> tuple[int, int]:
     """Return the part of a file that a Range header asks for, its end excluded.
 
     Anything but one plain range asks for all of it, as RFC 9110 (14.2) allows.
-
-    Raises
-    ------
-    RangeError
-        If the range begins beyond the end.
     """
     match = _RANGE.fullmatch(header.strip()) if header else None
     if match is None or match.group(0) == "bytes=-":

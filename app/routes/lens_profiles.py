@@ -27,7 +27,7 @@ MAX_BYTES: Final = 64 << 20
 """Largest profile that is accepted (chosen): twenty times that of a hundred photos."""
 
 _PAGE: Final = 200
-"""Photos that are read at once (chosen)."""
+"""Photos that are read at once (chosen): bounds the memory that a large lens takes."""
 
 _FILE: Final = {"application/zip": {"schema": {"type": "string", "format": "binary"}}}
 

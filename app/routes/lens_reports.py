@@ -12,7 +12,7 @@ from fastapi import APIRouter, Query, Response, status
 
 from app.errors import NotReadyError
 from app.http.dependencies import Call, CallDep
-from app.routes.common import problems
+from app.routes.common import matches, problems
 from app.routes.lenses import find_lens
 from app.schemas.fields import Aperture, OptionalId
 from app.store.tables import LensRow
@@ -42,15 +42,7 @@ _CONTENT: Final = {kind.partition(";")[0]: {"schema": {"type": "string"}} for ki
 
 
 def stored_report(call: Call, lens: LensRow) -> LensTest:
-    """Return the report of the newest version of a lens.
-
-    Raises
-    ------
-    NoSamplesError
-        If the lens has no samples yet.
-    NotReadyError
-        If no worker has made it yet.
-    """
+    """Return the report of the newest version of a lens."""
     if lens.sample_count == 0:
         raise NoSamplesError(f"lens {lens.public_id} has no samples yet: upload photos taken with it")
     try:
@@ -102,7 +94,7 @@ def read_report(
         "X-Content-Type-Options": "nosniff",
         "Content-Disposition": _disposition(test.name, form),
     }
-    if tag in call.request.headers.get("if-none-match", ""):
+    if matches(call, tag):
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
     if compared:
         second_test = test if second_lens is lens else stored_report(call, second_lens)

@@ -6,9 +6,9 @@ from typing import Any
 
 from fastapi import APIRouter
 
-from app.errors import InvalidParameterError, UnknownLensError
+from app.errors import InvalidParameterError
 from app.http.dependencies import CallDep
-from app.routes.common import problems
+from app.routes.common import named_lens, problems
 from app.routes.photos import describe, find_photo
 from app.schemas import PhotoPage, PhotosChange
 from app.store import LensName
@@ -29,8 +29,8 @@ def change_photos(change: PhotosChange, call: CallDep) -> PhotoPage:
         raise InvalidParameterError("send lens_id or new_lens, or the settings of these photos")
     if change.lens_id is not None and change.new_lens is not None:
         raise InvalidParameterError("lens_id and new_lens each name the lens: send one of them")
-    if change.lens_id is not None and call.store.lenses.get(change.lens_id, call.owner) is None:
-        raise UnknownLensError(f"lens_id {change.lens_id}: there is no such lens; GET /v1/lenses lists them")
+    if change.lens_id is not None:
+        named_lens(call, change.lens_id)
     photos = [find_photo(call, key) for key in dict.fromkeys(change.photo_ids)]
     given: dict[str, Any] = change.model_dump(include=set(GIVEN_SETTINGS), exclude_none=True)
     lens: LensName | str | None = change.lens_id

@@ -24,7 +24,7 @@ from app.http import upload, views
 from app.http.bodies import CLOSE
 from app.http.dependencies import Call, CallDep
 from app.http.idempotency import Once, OnceDep
-from app.routes.common import Cursor, Limit, OnlyId, cut, next_link, problems
+from app.routes.common import Cursor, Limit, OnlyId, cut, named_lens, next_link, problems
 from app.routes.upload_checks import check_model, check_selector
 from app.runtime.settings import MIB, Settings
 from app.schemas import PatchPage, PhotoChange, PhotoOut, PhotoPage, PhotoState, UploadFields
@@ -224,12 +224,7 @@ def _record(
     fields = uploaded.fields
     given = fields.model_dump(exclude={"calibrate"}, exclude_none=True)
     if fields.lens_id is not None:
-        lens = call.store.lenses.get(fields.lens_id, call.owner)
-        if lens is None:
-            raise UnknownLensError(
-                f"lens_id {fields.lens_id}: there is no such lens; GET /v1/lenses lists them"
-            )
-        check_model(fields, lens)
+        check_model(fields, named_lens(call, fields.lens_id))
     received = call.store.photos.receive(
         call.owner,
         public_id=public_id,
@@ -364,11 +359,7 @@ def _target_lens(call: Call, photo: PhotoRow, change: PhotoChange) -> LensName |
     if sum(way is not None for way in ways) > 1:
         raise InvalidParameterError("lens_id, lens_serial and new_lens each name the lens: send one of them")
     if change.lens_id is not None:
-        if call.store.lenses.get(change.lens_id, call.owner) is None:
-            raise UnknownLensError(
-                f"lens_id {change.lens_id}: there is no such lens; GET /v1/lenses lists them"
-            )
-        return change.lens_id
+        return named_lens(call, change.lens_id).public_id
     maker, model = change.lens_maker or photo.lens_maker, change.lens_model or photo.lens_model
     if change.new_lens is not None:
         return LensName(maker, model, None, label=change.new_lens.label)

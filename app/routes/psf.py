@@ -14,7 +14,7 @@ from app.http import psf_formats
 from app.http.dependencies import Call, CallDep
 from app.http.model_cache import Fitted
 from app.http.questions import QueryModel
-from app.routes.common import Answers, problems
+from app.routes.common import Answers, matches, problems
 from app.runtime import metrics
 from app.schemas import FieldQuery, PsfOut, PsfQuery, QueryOut
 from app.store.samples import Family, LensState
@@ -32,7 +32,7 @@ MEDIA_TYPES: Final[dict[Format, str]] = {
     "tiff": "image/tiff",
 }
 MAX_GRID: Final = 25
-"""Columns and rows of a map at most (chosen, not measured)."""
+"""Columns and rows of a map at most (chosen): more kernels are too small to be looked at."""
 
 MAX_FIELD_PIXELS: Final = 2_000_000
 """Pixels of all kernels of a map (chosen): 25 x 25 kernels of 55 pixels; with 255 pixels a map took 8.5 s."""
@@ -83,13 +83,7 @@ def read_psf_as(
 
 
 def accepted(header: str) -> Format:
-    """Return the format that an Accept header prefers.
-
-    Raises
-    ------
-    NotAcceptableError
-        If it names none that is available.
-    """
+    """Return the format that an Accept header prefers."""
     preferences: list[tuple[float, str]] = []
     for preference in header.split(","):
         media, *parameters = (part.strip().lower() for part in preference.split(";"))
@@ -112,7 +106,7 @@ def _answer(lens_id: str, at: PsfQuery, form: Format, call: Call) -> Response:
         "Cache-Control": "private, max-age=3600" if pinned else "private, no-cache",
         "Vary": "Accept",
     }
-    if _matches(call, tag):
+    if matches(call, tag):
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
     position = FieldPosition(at.r, at.phi)
     setting = LensSettings(at.aperture, at.focal_length_mm, at.focus_distance_m, at.channel)
@@ -162,11 +156,6 @@ def etag(fitted: Fitted, question: str) -> str:
     return f'"{fitted.lens_id}-v{state.version}-e{state.rebuild_epoch}-{sort}-{digest}"'
 
 
-def _matches(call: Call, tag: str) -> bool:
-    sent = call.request.headers.get("if-none-match", "")
-    return sent.strip() == "*" or tag in {entry.strip().removeprefix("W/") for entry in sent.split(",")}
-
-
 @router.get(
     "/lenses/{lens_id}/field.png",
     operation_id="getFieldMap",
@@ -205,7 +194,7 @@ def read_field(lens_id: str, at: Annotated[FieldQuery, Depends(_FIELD)], call: C
     fitted = call.models.get(lens_id, at.version, state=state, family=at.family, relatives=relatives)
     tag = etag(fitted, at.model_dump_json())
     headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
-    if _matches(call, tag):
+    if matches(call, tag):
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
     setting = LensSettings(at.aperture, at.focal_length_mm, at.focus_distance_m, at.channel)
 

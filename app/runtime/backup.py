@@ -63,13 +63,7 @@ class Backup:
 
 
 def backup(database: Database, storage: Storage, folder: Path, on_step: StepHook = ignore_step) -> Backup:
-    """Bring a backup folder up to date with an installation, which may be running.
-
-    Raises
-    ------
-    BackupError
-        If the installation lacks blobs that its rows name: `lensmodel doctor` says which.
-    """
+    """Bring a backup folder up to date with an installation, which may be running."""
     transfer.check_schema(database)
     folder.mkdir(parents=True, exist_ok=True)
     target = Storage(f"file://{(folder / BLOBS).resolve()}")
@@ -160,13 +154,6 @@ def restore(
     """Fill an empty installation from a backup; return how many rows, by table.
 
     Blobs come first and the rows in one transaction, so an interrupted restore can be repeated.
-
-    Raises
-    ------
-    BackupError
-        If the backup is damaged.
-    InvalidInputError
-        If the installation is not empty, or of another schema.
     """
     manifest = _manifest(folder)
     source = Storage(f"file://{(folder / BLOBS).resolve()}")
@@ -213,15 +200,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
 def move(
     source: tuple[Database, Storage], target: tuple[Database, Storage], on_step: StepHook = ignore_step
 ) -> dict[str, int]:
-    """Copy a stopped installation to another database and storage; return how many rows, by table.
-
-    Raises
-    ------
-    InvalidInputError
-        If the other one is not empty.
-    BackupError
-        If the counts of both differ afterwards.
-    """
+    """Copy a stopped installation to another database and storage; return how many rows, by table."""
     migrate.upgrade(source[0])
     migrate.upgrade(target[0])
     stored = dict(target[1].listed())

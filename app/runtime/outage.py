@@ -26,10 +26,12 @@ CODE: Final = "outage"
 
 FIRST_PAUSE_S: Final = 1.0
 LONGEST_PAUSE_S: Final = 60.0
-"""Shortest and longest pause before a retry (chosen, not measured)."""
+"""Shortest and longest pause before a retry (chosen): a restart of the database takes seconds, and after
+a long outage work goes on within a minute."""
 
 BUGS: Final = 3
-"""Attempts at a job that fails with an unforeseen error (chosen, not measured)."""
+"""Attempts at a job that fails with an unforeseen error (chosen): what the moment caused passes, and a real
+fault is reported soon."""
 
 _SQLITE_FULL: Final = 13
 """SQLITE_FULL of sqlite3.h."""

@@ -42,13 +42,14 @@ POLL_S: Final = 0.1
 """Seconds between two looks at the members (chosen): two calls of waitpid."""
 
 READY_POLL_S: Final = 0.25
-"""Seconds between two requests of `/readyz` during the start (chosen)."""
+"""Seconds between two requests of `/readyz` during the start (chosen): few beside a start of some seconds."""
 
 STOP_S: Final = 15.0
 """How long members may take to stop before they are killed (chosen): longer than `server.GRACE_S`."""
 
 STEADY_S: Final = 20.0
-"""A process that ran so long is restarted at once, and its earlier deaths are forgotten (chosen)."""
+"""A process that ran so long is restarted at once, and its earlier deaths are forgotten (chosen): one that
+cannot work ends within the few seconds of its start."""
 
 MAX_EARLY_DEATHS: Final = 6
 """Deaths in a row before `STEADY_S` that end the service (chosen): the pauses between them grow to 8 s."""
@@ -60,17 +61,7 @@ ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_N
 
 
 def serve(settings: Settings) -> int:
-    """Run the whole service until SIGTERM or Ctrl-C; return the exit status.
-
-    Raises
-    ------
-    UsageError
-        If another service works on the same data.
-    UsageError
-        If others can reach it and there is no valid key.
-    InvalidInputError
-        If the address cannot be listened on, or a newer program made the database.
-    """
+    """Run the whole service until SIGTERM or Ctrl-C; return the exit status."""
     confine.keep_private()
     settings.data_dir.mkdir(parents=True, exist_ok=True)
     with alone(settings.data_dir), contextlib.closing(_listener(settings)) as listener:
@@ -99,13 +90,7 @@ def run_worker(settings: Settings) -> None:
 
 
 def _prepare(settings: Settings) -> None:
-    """Bring the schema up to date, and check that there is a key if one is needed.
-
-    Raises
-    ------
-    UsageError
-        If there is no valid key where one is needed.
-    """
+    """Bring the schema up to date, and check that there is a key if one is needed."""
     _migrate(settings)
     database = Database(settings.database)
     try:

@@ -45,13 +45,7 @@ class Account:
     gid: int
 
     def become(self) -> None:
-        """Change this process to the account, and give up all capabilities.
-
-        Raises
-        ------
-        OSError
-            If this process may not change to it.
-        """
+        """Change this process to the account, and give up all capabilities."""
         os.setgroups([])
         os.setresgid(self.gid, self.gid, self.gid)
         os.setresuid(self.uid, self.uid, self.uid)
@@ -108,13 +102,7 @@ def may_change() -> bool:
 
 
 def find(name: str) -> Account | None:
-    """Return an account by its name, or the usual one; None if there is none, or with `NONE`.
-
-    Raises
-    ------
-    ValueError
-        If there is no account of that name, or it is the superuser's.
-    """
+    """Return an account by its name, or the usual one; None if there is none, or with `NONE`."""
     if name == NONE:
         return None
     for candidate in USUAL if name == AUTO else (name,):

@@ -41,7 +41,7 @@ NICENESS: Final = 10
 (sched(7))."""
 
 _PROGRESS_S: Final = 0.1
-"""Seconds between two messages of progress (chosen)."""
+"""Seconds between two messages of progress (chosen): a bar that moves, and hardly any work for the parent."""
 
 _PR_SET_PDEATHSIG: Final = 1
 """Of linux/prctl.h."""

@@ -108,13 +108,7 @@ class _Program(ctypes.Structure):
 
 
 def refuse() -> None:
-    """Put the filter in force for this thread and all that it starts; `no_new_privs` must be set.
-
-    Raises
-    ------
-    OSError
-        If the kernel has no filters, or the processor is not one of ours.
-    """
+    """Put the filter in force for this thread and all that it starts; `no_new_privs` must be set."""
     processor = _PROCESSORS.get(platform.machine())
     if processor is None:
         raise OSError(errno.ENOSYS, f"no filter was written for {platform.machine()}")

@@ -15,7 +15,7 @@ from pydantic import (
 )
 
 MAX_PSF_SIZE = 255
-"""Side of a kernel in pixels at most (chosen, not measured)."""
+"""Side of a kernel in pixels at most (chosen): that of a profile."""
 
 
 MAX_VERSION: Final = 2**31 - 1

@@ -21,7 +21,8 @@ from sqlalchemy.orm import Session
 from app.store.tables import Base
 
 BUSY_TIMEOUT_MS = 30_000
-"""How long a transaction of SQLite waits for the one writer (chosen, not measured)."""
+"""How long a transaction of SQLite waits for the one writer (chosen): transactions take milliseconds, on a
+slow disk seconds."""
 
 SERVER_DEADLINES: Final = {
     "connect_timeout": 5,

@@ -6,7 +6,7 @@ from sqlalchemy import select
 
 from app.store.access.owners import find_to_change
 from app.store.database import Database
-from app.store.lens_ways import choose
+from app.store.lens_ways import choose, photos_of
 from app.store.removal import forget
 from app.store.sample_moves import move, switch
 from app.store.tables import EventRow, LensRow, PhotoRow
@@ -52,14 +52,7 @@ class LensChanges:
                 return False
             if len({lens.way, lens.answering_way, target.way, target.answering_way}) > 1:
                 return False
-            photos = list(
-                session.scalars(
-                    select(PhotoRow)
-                    .where(PhotoRow.lens_id == lens.id, PhotoRow.deleted_at.is_(None))
-                    .order_by(PhotoRow.id)
-                    .with_for_update()
-                )
-            )
+            photos = photos_of(session, lens)
             if any(photo.state in LEARNING for photo in photos):
                 return False
             for photo in photos:

@@ -26,6 +26,12 @@ def locked(session: Session, lens_id: int) -> LensRow:
     return session.scalars(query.execution_options(populate_existing=True)).one()
 
 
+def photos_of(session: Session, lens: LensRow) -> list[PhotoRow]:
+    """Return the photos of a lens, locked until the transaction ends."""
+    query = select(PhotoRow).where(PhotoRow.lens_id == lens.id, PhotoRow.deleted_at.is_(None))
+    return list(session.scalars(query.order_by(PhotoRow.id).with_for_update()))
+
+
 def teaches(session: Session, photo: PhotoRow) -> bool:
     """Whether samples of a photo count: those of this epoch, or those of an earlier one."""
     if photo.relearning:
@@ -62,14 +68,7 @@ def choose(session: Session, lens: LensRow, way: str) -> int:
     """
     if lens.way == way:
         return 0
-    photos = list(
-        session.scalars(
-            select(PhotoRow)
-            .where(PhotoRow.lens_id == lens.id, PhotoRow.deleted_at.is_(None))
-            .order_by(PhotoRow.id)
-            .with_for_update()
-        )
-    )
+    photos = photos_of(session, lens)
     returns = way == lens.answering_way
     counted = [photo for photo in photos if photo.state == "counted" and photo.way != way]
     missing = sum(photo.file_gone_at is not None for photo in counted)

@@ -21,7 +21,8 @@ TEACHES: Final = and_(
 """Photos that count, including those that are being estimated anew."""
 
 TRIES: Final = 10
-"""How often to look again for a lens that was deleted between insert and select (chosen, not measured)."""
+"""How often to look again for a lens that was deleted between insert and select (chosen): each
+time its last photo must have been deleted in between."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,8 @@ log = logging.getLogger(__name__)
 
 CHANNEL: Final = "lensmodel_changes"
 RETRY_S: Final = 1.0
-"""Seconds before a new attempt to connect, and between two looks at whether to stop (chosen)."""
+"""Seconds before a new attempt to connect, and between two looks at whether to stop (chosen): until
+then changes are found by polling."""
 
 
 class Notices:

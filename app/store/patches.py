@@ -2,40 +2,30 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-import numpy as np
 from sqlalchemy import Select, func, select, update
 from sqlalchemy.orm import Session
 
 from app.store import windows
 from app.store.access.owners import now
 from app.store.database import Database, insert_new
+from app.store.sample_rows import columns_of
 from app.store.tables import PatchRow, PhotoRow, SampleRow
 from app.store.windows import NewPatch
-from lensmodel.core.types import Channel, Kernel
-
-DTYPE: Final = "<f4"
-FORMAT_VERSION: Final = 1
-"""Raised when the layout of a stored kernel changes."""
+from lensmodel.core.psf import PsfSample
 
 OPEN: Final = ("pending", "running")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NewSample:
-    """One kernel that was estimated for one channel of the patch `idx`."""
+    """One sample that was estimated from the patch `idx`, and what the estimator says of itself."""
 
     idx: int
-    channel: Channel
-    kernel: Kernel
-    weight: float
-    estimator: str
-    predicted_error: float | None = None
-    spectrum: bytes | None = None
+    sample: PsfSample
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -120,7 +110,11 @@ class PatchStore:
                 )
             )
             patches = {patch.idx: patch for patch in of_numbers}
-            rows = [_sample_row(photo, patches[s.idx], s) for s in samples if s.idx in patches]
+            rows = [
+                columns_of(new.sample, photo, patches[new.idx], new.diagnostics)
+                for new in samples
+                if new.idx in patches
+            ]
             stored = insert_new(session, SampleRow, rows)
             for patch in patches.values():
                 patch.state, patch.finished_at = "done", patch.finished_at or now()
@@ -183,25 +177,3 @@ def recount(session: Session, photo: PhotoRow) -> int:
     photo.patches_done = counts.get("done", 0) + counts.get("failed", 0)
     photo.patches_total = sum(counts.values()) - rejected
     return photo.patches_total
-
-
-def _sample_row(photo: PhotoRow, patch: PatchRow, sample: NewSample) -> dict[str, Any]:
-    blob = np.ascontiguousarray(sample.kernel, dtype=DTYPE).tobytes()
-    return {
-        "photo_id": photo.id,
-        "patch_id": patch.id,
-        "channel": sample.channel,
-        "r": patch.r,
-        "phi": patch.phi,
-        "weight": sample.weight,
-        "predicted_error": sample.predicted_error,
-        "size": sample.kernel.shape[0],
-        "dtype": DTYPE,
-        "format_version": FORMAT_VERSION,
-        "crc32": zlib.crc32(blob),
-        "psf": blob,
-        "spectrum": sample.spectrum,
-        "estimator": sample.estimator,
-        "diagnostics": dict(sample.diagnostics),
-        "created_at": now(),
-    }

@@ -14,11 +14,12 @@ from app.store.photo_steps import WORKED_ON
 from app.store.tables import PHOTO_FINAL, PHOTO_RUNNING, CorrectionRow, LensRow, OwnerRow, PhotoRow
 
 FILE_KEPT: Final = timedelta(days=1)
-"""How long the file of a photo is kept for a first correction, or for a retry after an outage (chosen)."""
+"""How long the file of a photo is kept for a first correction, or for a retry after an outage (chosen):
+its owner looks again within a day."""
 
 GRACE: Final = timedelta(hours=1)
 """With `keep_photos=corrections`: how long a photo that has just calibrated its lens can still be corrected
-(chosen)."""
+(chosen): who sent photos to correct them asks for it in the same sitting."""
 
 
 class PhotoReads:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import zlib
 from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
@@ -16,7 +14,7 @@ from app.schemas import distances
 from app.store.access.owners import find_to_change, now
 from app.store.database import Database, insert_new
 from app.store.ids import new_id
-from app.store.patches import DTYPE, FORMAT_VERSION
+from app.store.sample_rows import columns_of
 from app.store.tables import LensRow, PatchRow, PhotoRow, SampleRow
 from app.store.versions import new_version, record_event, take_samples
 from lensmodel.core.psf import PsfSample
@@ -86,7 +84,7 @@ def _photo(
 def _samples(session: Session, photo: PhotoRow, samples: Sequence[PsfSample]) -> None:
     places: dict[tuple[float, float], int] = {}
     for sample in samples:
-        places.setdefault((sample.position.r, sample.position.phi), len(places))
+        places.setdefault(_place(sample), len(places))
     done: dict[str, Any] = {"photo_id": photo.id, "epoch": photo.epoch, "state": "done", "attempts": 0}
     box = {"row": 0, "col": 0, "size": 0, "finished_at": now()}  # a profile does not say where in pixels
     insert_new(
@@ -94,33 +92,12 @@ def _samples(session: Session, photo: PhotoRow, samples: Sequence[PsfSample]) ->
         PatchRow,
         [{**done, **box, "idx": idx, "cell": idx, "r": r, "phi": phi} for (r, phi), idx in places.items()],
     )
-    keys = {row.idx: row.id for row in session.scalars(select(PatchRow).where(PatchRow.photo_id == photo.id))}
-    insert_new(session, SampleRow, [_row(photo, keys[places[_place(s)]], s) for s in samples])
+    patches = {row.idx: row for row in session.scalars(select(PatchRow).where(PatchRow.photo_id == photo.id))}
+    rows = [columns_of(sample, photo, patches[places[_place(sample)]], {}) for sample in samples]
+    insert_new(session, SampleRow, rows)
     photo.patches_total = photo.patches_done = len(places)
     session.flush()
 
 
 def _place(sample: PsfSample) -> tuple[float, float]:
     return sample.position.r, sample.position.phi
-
-
-def _row(photo: PhotoRow, patch_id: int, sample: PsfSample) -> dict[str, Any]:
-    blob = np.ascontiguousarray(sample.kernel, dtype=DTYPE).tobytes()
-    return {
-        "photo_id": photo.id,
-        "patch_id": patch_id,
-        "channel": sample.settings.channel,
-        "r": sample.position.r,
-        "phi": sample.position.phi,
-        "weight": sample.weight,
-        "predicted_error": sample.error,
-        "size": sample.kernel.shape[0],
-        "dtype": DTYPE,
-        "format_version": FORMAT_VERSION,
-        "crc32": zlib.crc32(blob),
-        "psf": blob,
-        "spectrum": None if sample.spectrum is None else sample.spectrum.to_bytes(),
-        "estimator": sample.estimator[:60] or "profile",
-        "diagnostics": {},
-        "created_at": now(),
-    }

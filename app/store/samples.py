@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import math
-import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Final, TypeAlias, cast
+from typing import Any, Final, TypeAlias
 
-import numpy as np
 from sqlalchemy import Row, and_, bindparam, select
 from sqlalchemy.orm import aliased
 
-from app.schemas import distances
 from app.store.access.owners import is_id
 from app.store.database import Database
-from app.store.patches import DTYPE
+from app.store.sample_rows import COLUMNS, sample_in
 from app.store.tables import LensRow, OwnerRow, PhotoRow, SampleRow
-from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfSample
-from lensmodel.core.spectrum import PatchSpectrum
-from lensmodel.core.types import Channel, FieldPosition, LensSettings
 
 _STATE = select(LensRow.version, LensRow.rebuild_epoch, LensRow.answering_way).where(
     LensRow.public_id == bindparam("lens"), LensRow.deleted_at.is_(None)
@@ -60,13 +53,7 @@ _KNOWN = (
     .order_by(_OTHER.public_id.desc())
 )
 MAX_FAMILY_SAMPLES: Final = 2000
-"""Most samples of other copies that a model leans on (chosen, not measured): more take longer to fit."""
-
-
-class CorruptSampleError(LensModelError):
-    """A stored kernel is not what was written."""
-
-    code = "corrupt_sample"
+"""Most samples of other copies that a model leans on (chosen): more take longer to fit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,27 +140,7 @@ class SampleStore:
         version that was seen can turn up later.
         """
         query = (
-            select(
-                SampleRow.id,
-                SampleRow.version_added,
-                SampleRow.channel,
-                SampleRow.r,
-                SampleRow.phi,
-                SampleRow.weight,
-                SampleRow.size,
-                SampleRow.crc32,
-                SampleRow.psf,
-                SampleRow.spectrum,
-                SampleRow.estimator,
-                SampleRow.predicted_error,
-                PhotoRow.public_id.label("photo"),
-                PhotoRow.aperture,
-                PhotoRow.focal_mm,
-                PhotoRow.focus_m,
-                PhotoRow.pixel_pitch_um,
-                PhotoRow.width,
-                PhotoRow.height,
-            )
+            select(SampleRow.id, SampleRow.version_added, *COLUMNS)
             .join(PhotoRow, PhotoRow.id == SampleRow.photo_id)
             .join(LensRow, LensRow.id == SampleRow.lens_id)
             .where(LensRow.public_id == lens_id, SampleRow.version_added > after_version)
@@ -189,7 +156,10 @@ class SampleStore:
             ).one_or_none()
             if state is None:
                 return LensState(0, 0), []
-            return LensState(state[0], state[1], state[2]), [_stored(row) for row in session.execute(query)]
+            stored = [
+                StoredSample(row.id, row.version_added, sample_in(row)) for row in session.execute(query)
+            ]
+            return LensState(state[0], state[1], state[2]), stored
 
 
 def _family(rows: Iterable[Row[*tuple[Any, ...]]]) -> Family:
@@ -201,29 +171,3 @@ def _family(rows: Iterable[Row[*tuple[Any, ...]]]) -> Family:
             relatives.append(Relative(row.public_id, LensState(row.version, row.rebuild_epoch)))
             samples += row.sample_count
     return tuple(relatives)
-
-
-def _stored(row: Row[*tuple[Any, ...]]) -> StoredSample:
-    if zlib.crc32(row.psf) != row.crc32:
-        raise CorruptSampleError(f"sample {row.id} differs from what was written: restore the database")
-    kernel = np.frombuffer(row.psf, dtype=DTYPE).reshape(row.size, row.size)
-    return StoredSample(
-        row.id,
-        row.version_added,
-        PsfSample(
-            kernel=kernel.astype(np.float64),
-            position=FieldPosition(row.r, row.phi),
-            settings=LensSettings(
-                row.aperture, row.focal_mm, distances.read(row.focus_m), cast("Channel", row.channel)
-            ),
-            weight=row.weight,
-            photo=row.photo,
-            pixel_pitch_um=row.pixel_pitch_um,
-            estimator=row.estimator,
-            error=row.predicted_error,
-            spectrum=None if row.spectrum is None else PatchSpectrum.from_bytes(row.spectrum),
-            half_diagonal_px=None
-            if not (row.width and row.height)
-            else math.hypot(row.width, row.height) / 2,
-        ),
-    )

@@ -94,7 +94,7 @@ class LensProfile:
     cameras: tuple[Camera, ...] = ()
 
 
-def save_profile(path: Path | str, profile: LensProfile) -> None:
+def save_profile(path: Path | str, profile: LensProfile, *, learned: bool = True) -> None:
     """Write a profile; the file appears complete or not at all.
 
     Parameters
@@ -102,6 +102,8 @@ def save_profile(path: Path | str, profile: LensProfile) -> None:
     path : Path or str
         Replaced if it is there.
     profile : LensProfile
+    learned : bool
+        Whether what was learned is kept; without it, whoever opens the file fits it anew.
 
     Raises
     ------
@@ -111,16 +113,18 @@ def save_profile(path: Path | str, profile: LensProfile) -> None:
         If the file cannot be written.
     """
     with atomic(Path(path)) as file:
-        write_profile(file, profile)
+        write_profile(file, profile, learned=learned)
 
 
-def write_profile(file: IO[bytes], profile: LensProfile) -> None:
+def write_profile(file: IO[bytes], profile: LensProfile, *, learned: bool = True) -> None:
     """Write a profile to an open file.
 
     Parameters
     ----------
     file : binary file, open for writing
     profile : LensProfile
+    learned : bool
+        As of `save_profile`.
 
     Raises
     ------
@@ -151,7 +155,8 @@ def write_profile(file: IO[bytes], profile: LensProfile) -> None:
         for part, rows in ((_SPECTRA, packed.spectra), (_PHASES, packed.phases)):
             if rows is not None:
                 archive.writestr(part, _saved(rows))
-        archive.writestr(_LEARNED, profile.model.learned(), zipfile.ZIP_STORED)
+        if learned:
+            archive.writestr(_LEARNED, profile.model.learned(), zipfile.ZIP_STORED)
         if prior is not None and isinstance(prior.source, LensModel):
             family = io.BytesIO()
             write_profile(family, LensProfile(prior.source))

@@ -1,4 +1,4 @@
-"""PSF samples as named fields and arrays, and back: in profiles, and between the service and its tasks."""
+"""PSF samples as named fields and arrays, and back: in profiles, in tasks of the service, in its tables."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def pack_samples(samples: Sequence[PsfSample]) -> PackedSamples:
         None if np.isnan(rows).all() else np.ascontiguousarray(rows)
         for rows in np.split(numbers, [_SPECTRUM], axis=1)
     )
-    return PackedSamples([_entry(sample) for sample in samples], kernels, *parts)
+    return PackedSamples([entry_of(sample) for sample in samples], kernels, *parts)
 
 
 def unpack_samples(packed: PackedSamples) -> list[PsfSample]:
@@ -98,7 +98,7 @@ def unpack_samples(packed: PackedSamples) -> list[PsfSample]:
         row = spectra[number] + phases[number] if spectra[number] else None
         size = int(entry["size"]) if "size" in entry else side
         own = kernel[_middle(side, size)]
-        samples.append(_sample(entry, own, None if row is None else PatchSpectrum.from_bytes(row)))
+        samples.append(sample_of(entry, own, None if row is None else PatchSpectrum.from_bytes(row)))
     return samples
 
 
@@ -119,7 +119,8 @@ def _middle(side: int, size: int) -> tuple[slice, slice]:
     return slice(margin, margin + size), slice(margin, margin + size)
 
 
-def _entry(sample: PsfSample) -> dict[str, Any]:
+def entry_of(sample: PsfSample) -> dict[str, Any]:
+    """Return the named fields of a sample: all of it but the kernel and the spectrum."""
     settings = asdict(sample.settings)
     if settings["focus_m"] is not None and math.isinf(settings["focus_m"]):
         settings["focus_m"] = _INFINITY
@@ -137,9 +138,10 @@ def _entry(sample: PsfSample) -> dict[str, Any]:
     }
 
 
-def _sample(
+def sample_of(
     entry: Mapping[str, Any], kernel: NDArray[np.float32], spectrum: PatchSpectrum | None
 ) -> PsfSample:
+    """Build the sample of which `entry_of` returned the fields."""
     settings = dict(entry["settings"])
     if settings.get("focus_m") == _INFINITY:
         settings["focus_m"] = math.inf

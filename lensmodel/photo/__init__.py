@@ -17,7 +17,7 @@ from lensmodel.photo.values import (
     PhotoInfo,
     PhotoMetadata,
 )
-from lensmodel.photo.writing import shown, write_image
+from lensmodel.photo.writing import shown, upright, write_image
 
 __all__ = [
     "HEAD_BYTES",
@@ -38,5 +38,6 @@ __all__ = [
     "read_metadata",
     "shown",
     "sniff",
+    "upright",
     "write_image",
 ]

@@ -13,3 +13,6 @@ RAW_ENDINGS: Final = frozenset(f".{ending}" for ending in _RAW.split())
 what a file is, its content tells."""
 
 ENDINGS: Final = RAW_ENDINGS | {".jpg", ".jpeg", ".tif", ".tiff", ".png"}
+
+CORRECTED: Final = "-corrected"
+"""Ends the names of what `lensmodel correct` wrote: it says nothing about its lens any more."""

@@ -30,10 +30,6 @@ def inspect(path: Path | str, limits: Limits | None = None) -> PhotoInfo:
     limits : Limits, optional
         How large it may be.
 
-    Returns
-    -------
-    PhotoInfo
-
     Raises
     ------
     NotAnImageError, UnsupportedFormatError

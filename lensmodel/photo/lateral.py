@@ -110,10 +110,6 @@ def estimate_lateral(planes: Planes, frame: Frame, *, clip: float | Sequence[flo
     clip : float or sequence of float
         Windows that reach this level, of all channels or of each, are left out.
 
-    Returns
-    -------
-    LateralColour
-
     Raises
     ------
     InvalidInputError

@@ -244,8 +244,8 @@ def _write_jpeg(
 def _write_png(
     file: BinaryIO, pixels: Pixels, icc: bytes, encoding: Encoding, description: str, xmp: bytes
 ) -> None:
-    upright = np.ascontiguousarray(_UPRIGHT[encoding.orientation](pixels))
-    data = imagecodecs.png_encode(upright, **_PNG_OPTIONS)
+    turned = np.ascontiguousarray(upright(pixels, encoding.orientation))
+    data = imagecodecs.png_encode(turned, **_PNG_OPTIONS)
     header_end = 33  # signature and IHDR; the profile must come before the pixels
     file.write(data[:header_end])
     file.write(_chunk(b"iCCP", b"ICC\0\0" + zlib.compress(icc)))
@@ -304,7 +304,12 @@ _UPRIGHT: Final[Mapping[int, Callable[[Pixels], Pixels]]] = {
     7: lambda a: a[::-1, ::-1].swapaxes(0, 1),
     8: np.rot90,
 }
-"""EXIF orientation -> how to turn the stored pixels upright."""
+"""EXIF orientation -> how to turn the stored pixels upright (EXIF 2.3, tag Orientation)."""
+
+
+def upright(pixels: Pixels, orientation: int) -> Pixels:
+    """Turn an array `(row, col, ...)` from sensor orientation to upright, by its EXIF orientation."""
+    return _UPRIGHT.get(orientation, _UPRIGHT[1])(pixels)
 
 
 def shown(planes: Planes, encoding: Encoding) -> NDArray[np.uint8]:

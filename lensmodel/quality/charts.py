@@ -130,16 +130,7 @@ def measure_edges(
 
 
 def by_zone(measurements: Sequence[EdgeMeasurement]) -> dict[Zone, ZoneSharpness]:
-    """Gather measured edges by zone; zones without an edge are missing.
-
-    Parameters
-    ----------
-    measurements : sequence of EdgeMeasurement
-
-    Returns
-    -------
-    dict of str to ZoneSharpness
-    """
+    """Gather measured edges by zone; zones without an edge are missing."""
     table = {}
     for zone in ZONES:
         here = [m for m in measurements if m.zone == zone]

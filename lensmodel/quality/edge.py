@@ -106,10 +106,6 @@ class EdgeResponse:
         A chart that is rendered pixel by pixel has been integrated over the pixel once already::
 
             mtf / (|sinc(f cos)| |sinc(f sin)|)
-
-        Returns
-        -------
-        EdgeResponse
         """
         return _response(
             self.frequencies,
@@ -168,10 +164,6 @@ def slanted_edge(plane: NDArray[np.floating]) -> EdgeResponse:
     plane : ndarray, shape (H, W)
         Linear light; one straight edge and flat ground on both sides. 80 x 60 pixels or more are
         recommended; the edge should lean 2 to 10 degrees, or more as long as it stays clear of 45.
-
-    Returns
-    -------
-    EdgeResponse
 
     Raises
     ------

@@ -116,10 +116,6 @@ def decentring(model: LensModel, settings: LensSettings) -> Decentring:
     model : LensModel
     settings : LensSettings
         Channel, and aperture within 0.7 stop; wide open shows most.
-
-    Returns
-    -------
-    Decentring
     """
     samples = _voters(model, settings)
     photos = len({s.photo for s in samples})

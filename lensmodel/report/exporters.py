@@ -94,10 +94,6 @@ def psf_grid(
     at : FieldPosition, optional
         A single place instead of the grid.
 
-    Returns
-    -------
-    PsfGrid
-
     Raises
     ------
     InvalidInputError
@@ -124,16 +120,7 @@ class Exporter(Protocol):
         """How names of such files end, with the dot."""
 
     def encode(self, psfs: PsfGrid) -> bytes:
-        """Return the content of the file.
-
-        Parameters
-        ----------
-        psfs : PsfGrid
-
-        Returns
-        -------
-        bytes
-        """
+        """Return the content of the file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,16 +283,7 @@ exporters: Registry[Exporter] = Registry(
 
 
 def format_of(path: Path) -> str | None:
-    """Return the format that the name of a file ends in, None where that is no format of ours.
-
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    str or None
-    """
+    """Return the format that the name of a file ends in, None where that is no format of ours."""
     ending = path.suffix.lower()
     return next((name for name in exporters if ending in {f".{name}", exporters.create(name).suffix}), None)
 

@@ -23,10 +23,6 @@ _TICKS: Final = tuple((i / 5, f"{i / 5:.1f}") for i in range(6))
 def mtf_map_svg(report: LensReport) -> str:
     """Draw the mean MTF50 of each cell of the picture, upright, as SVG; a question mark is a guess.
 
-    Parameters
-    ----------
-    report : LensReport
-
     Returns
     -------
     str
@@ -61,10 +57,6 @@ def mtf_map_svg(report: LensReport) -> str:
 def curves_svg(report: LensReport) -> str:
     """Draw contrast over the radius, sagittal solid and tangential dashed, as SVG.
 
-    Parameters
-    ----------
-    report : LensReport
-
     Returns
     -------
     str
@@ -86,10 +78,6 @@ def curves_svg(report: LensReport) -> str:
 
 def apertures_svg(report: LensReport) -> str:
     """Draw MTF50 of centre, mid and corner over the apertures that photos had, as SVG.
-
-    Parameters
-    ----------
-    report : LensReport
 
     Returns
     -------

@@ -35,25 +35,12 @@ def direction_in_words(phi: float) -> str:
     ----------
     phi : float
         Radians, counter-clockwise from the right, +pi/2 towards the top of the sensor's picture.
-
-    Returns
-    -------
-    str
     """
     return _DIRECTIONS[round(phi / (math.pi / 4.0)) % 8]
 
 
 def place_in_words(position: FieldPosition) -> str:
-    """Name a place so that somebody can put it into the viewfinder: "the upper left corner".
-
-    Parameters
-    ----------
-    position : FieldPosition
-
-    Returns
-    -------
-    str
-    """
+    """Name a place so that somebody can put it into the viewfinder: "the upper left corner"."""
     if position.r < CENTER_ZONE_R:
         return "the centre"
     side = direction_in_words(position.phi)
@@ -141,10 +128,6 @@ def little_seen(positions: Iterable[FieldPosition], least: int = ENOUGH_NEAR) ->
         Where patches gave a PSF.
     least : int
         Patches within `NEAR_R` that are enough.
-
-    Returns
-    -------
-    list of FieldPosition
     """
     points = np.array([(p.r * math.cos(p.phi), p.r * math.sin(p.phi)) for p in positions]).reshape(-1, 2)
     counts = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from concurrent.futures import Executor
 from pathlib import Path
 
@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel import correction, photo
-from lensmodel.core.errors import InvalidInputError, LensModelError
+from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.types import LensSettings, StepHook, ignore_step
 from lensmodel.estimation import PsfEstimator
 from lensmodel.estimation.patches import Selector
 from lensmodel.model import ModelSettings
 from lensmodel.photo.arrays import photo_from_array
+from lensmodel.photo.tags.xmp_block import sidecar_path, write_sidecar
 from lensmodel.workflow import pipeline
-from lensmodel.workflow.identity import Identity, difference
 from lensmodel.workflow.lens import Lens
 from lensmodel.workflow.pipeline import CalibrationEvent, EventHook, ignore_event
-from lensmodel.workflow.ways import WAYS, way_named, way_of
+from lensmodel.workflow.ways import way_of
 
 FORMATS: dict[str, photo.OutputFormat] = {
     ".tif": "tiff16",
@@ -109,73 +109,39 @@ def calibrate(
     paths = [Path(photos)] if isinstance(photos, str | Path) else [Path(path) for path in photos]
     for path in paths:
         path.stat()
-    way = (
-        way_named(model)
-        if isinstance(model, str)
-        else WAYS["default"]
-        if lens is None
-        else way_of(lens.model)
-    )
-    chosen = ModelSettings(mode=way.mode) if isinstance(model, str) else model
-    grown = _Growing(lens, any_lens=any_lens, on_event=on_event)
-    fitted = pipeline.calibrate(
-        grown.admitted(paths),
-        model=None if lens is None else lens.model,
-        settings=LensSettings(aperture, focal_mm, focus_m),
-        model_settings=chosen,
-        estimator=way.estimator if estimator is None else estimator,
-        selector=selector,
-        count=patches,
-        kernel_size=kernel_size or way.kernel_size,
+    if lens is not None and model is not None:
+        raise InvalidInputError("the lens has a model of its own; give lens or model, not both")
+    calibration = pipeline.Calibration(
+        pipeline.InMemory(lens),
+        pipeline.Recipe(
+            LensSettings(aperture, focal_mm, focus_m),
+            model=model if isinstance(model, str) else None,
+            estimator=estimator,
+            kernel_size=kernel_size,
+            selector=selector,
+            count=patches,
+        ),
+        begin=None if isinstance(model, str) else model,
+        any_lens=any_lens,
         workers=workers,
-        executor=executor,
-        on_event=grown.record,
     )
-    return Lens.grown(lens, fitted, grown.photos, grown.identities, any_lens=any_lens)
-
-
-class _Growing:
-    """What the photos of one calibration say of their lens, as they are counted."""
-
-    def __init__(self, lens: Lens | None, *, any_lens: bool, on_event: EventHook) -> None:
-        self.photos: dict[str, str] = {}
-        self.identities: list[Identity] = []
-        self._names = {} if lens is None else dict(lens.profile.lens)
-        self._cameras = [] if lens is None else list(lens.profile.cameras)
-        self._any_lens, self._on_event = any_lens, on_event
-        self._known = lens is not None
-
-    def admitted(self, paths: Iterable[Path]) -> Iterator[Path]:
-        """Give the photos that nothing speaks against; those that cannot be read are refused later on."""
-        for path in paths:
-            if (why := self._objection(path)) is not None:
-                self._on_event(CalibrationEvent(path, "skipped", detail=why))
-            else:
-                yield path
-
-    def _objection(self, path: Path) -> str | None:
-        if self._any_lens or not self._known:
-            return None
-        try:
-            return difference(self._names, self._cameras, _identity(path))
-        except LensModelError:
-            return None
-
-    def record(self, event: CalibrationEvent) -> None:
-        """Remember a photo that counted, and pass the event on."""
-        if event.stage == "counted":
-            identity = _identity(event.photo)
-            self.photos[pipeline.photo_id(event.photo)] = event.photo.name
-            self.identities.append(identity)
-            self._known = True
-            self._names = {**identity.lens, **self._names}
-            if identity.camera is not None:
-                self._cameras.append(identity.camera)
-        self._on_event(event)
-
-
-def _identity(path: Path) -> Identity:
-    return Identity.of(photo.inspect(path).metadata)
+    reasons = []
+    for verdict in calibration.learn(paths, executor, on_event=on_event):
+        path, count = verdict.photo, verdict.samples
+        if verdict.error is not None:
+            reasons.append(f"{path.name}: {verdict.error}")
+            event = CalibrationEvent(path, "skipped", detail=str(verdict.error))
+        elif count is None:
+            event = CalibrationEvent(path, "skipped", detail="its samples are in the model already")
+        else:
+            event = CalibrationEvent(path, "counted", count, count)
+        on_event(event)
+    learned = calibration.finish()
+    if learned is None:
+        raise NotEnoughEvidenceError(
+            "no photo could be used:\n  " + "\n  ".join(reasons or ["none was given"])
+        )
+    return learned.warmed()
 
 
 def correct(
@@ -256,23 +222,58 @@ def correct(
     known = (lens if isinstance(lens, Lens) else Lens.load(lens)).warmed()
     method = way_of(known.model).method if method is None else method
     correction.deconvolvers.resolve(method)  # before the work of developing
-    return pipeline.correct(
-        source or (image if isinstance(image, photo.LinearPhoto) else photo_from_array(np.asarray(image))),
+    developed = (
+        image
+        if isinstance(image, photo.LinearPhoto)
+        else photo_from_array(np.asarray(image))
+        if source is None
+        else photo.develop(source)
+    )
+    corrected = pipeline.correct_photo(
+        developed,
         known.model,
-        target,
-        settings=LensSettings(aperture, focal_mm, focus_m),
+        pipeline.settings_of(developed, LensSettings(aperture, focal_mm, focus_m)),
         method=method,
         strength=strength,
         bounds=bounds,
-        file_format=written or "tiff16",
-        color_space=color_space,
-        quality=quality,
-        least_gain_db=least_gain_db,
-        sidecar=sidecar,
-        lens=known.description,
+        lateral=pipeline.lateral_of(developed),
         workers=workers or os.cpu_count() or 1,
         on_step=on_step,
     )
+    too_little = least_gain_db is not None and corrected.expected_gain_db < least_gain_db
+    if target is None or too_little:
+        return corrected
+    encoding, metadata = developed.encoding, developed.info.metadata
+    del developed  # its planes are as large as the result: at 100 megapixels, 1.1 GiB
+    name = method if isinstance(method, str) else type(method).__name__
+    description = (
+        f"lens blur corrected by lensmodel: {known.description}, "
+        f"method {name}, strength {strength:g}{'' if bounds is None else bounds.described}"
+    )
+    photo.write_image(
+        target,
+        corrected.planes,
+        encoding,
+        format=written or "tiff16",
+        color_space=color_space,
+        quality=quality,
+        description=description,
+    )
+    if sidecar:
+        write_sidecar(
+            sidecar_path(target),
+            metadata,
+            source="" if source is None else source.name,
+            description=description,
+            done={
+                "Method": name,
+                "Strength": f"{strength:g}",
+                "Profile": known.description,
+                "ExpectedGainDb": f"{corrected.expected_gain_db:.2f}",
+                "NothingToCorrect": str(corrected.nothing_to_correct).lower(),
+            },
+        )
+    return corrected
 
 
 def _format_of(output: Path) -> photo.OutputFormat:

@@ -1,35 +1,42 @@
-"""Steps 1 and 2: PSF samples of many photos, and the lens model that they make."""
+"""Steps 1 and 2: from photos to a lens. One loop over photos for library and commands.
+
+a photo : inspect -> develop -> select -> estimate -> count      (`take`; in the service as well)
+a lens  : photo, photo, ... -> fitted once                       (`Calibration`)
+"""
 
 from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Callable, Iterable
-from concurrent.futures import Executor, as_completed
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, Future, as_completed
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, Protocol
 
 from lensmodel import estimation, photo
 from lensmodel.core import parallel, processes
 from lensmodel.core.errors import (
     InvalidInputError,
     LensModelError,
-    MetadataMissingError,
     NotEnoughEvidenceError,
     NoUsablePatchesError,
 )
 from lensmodel.core.psf import PsfSample
-from lensmodel.core.types import (
-    LensSettings,
-)
+from lensmodel.core.types import LensSettings, StepHook, ignore_step
 from lensmodel.estimation import patches
 from lensmodel.estimation.estimator import require_size
 from lensmodel.estimation.patches import Patch
-from lensmodel.model import LensModel, ModelSettings
-from lensmodel.workflow.developed import load_developed, photo_id, save_developed, settings_of
+from lensmodel.model import LensModel, ModelSettings, Prior
+from lensmodel.photo.endings import CORRECTED
+from lensmodel.workflow.developed import (
+    load_developed,
+    photo_id,
+    require_aperture,
+    save_developed,
+    settings_of,
+)
 from lensmodel.workflow.estimating import (
-    DEFAULT_KERNEL_SIZE,
     DEFAULT_PATCHES,
     CellSample,
     cells,
@@ -37,11 +44,16 @@ from lensmodel.workflow.estimating import (
     find_patches,
     require_spread,
 )
+from lensmodel.workflow.identity import Identity, difference
+from lensmodel.workflow.lens import Lens
+from lensmodel.workflow.ways import Way, chosen_way, way_named
 
 log = logging.getLogger(__name__)
 
 AHEAD: Final = 32
 """Photos that are sent to an executor at once (chosen): a gigabyte of them, work for some dozen processes."""
+
+Stage = Literal["developing", "selecting", "estimating"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +72,7 @@ class CalibrationEvent:
     """
 
     photo: Path
-    stage: Literal["developing", "selecting", "estimating", "counted", "skipped"]
+    stage: Stage | Literal["counted", "skipped"]
     done: int = 0
     total: int = 0
     detail: str = ""
@@ -73,14 +85,183 @@ def ignore_event(event: CalibrationEvent) -> None:
     """Do nothing: the default `EventHook`."""
 
 
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """How the samples of a photo are made; what is None is as the lens is learned (`ways`).
+
+    Parameters
+    ----------
+    settings : LensSettings
+        Values for photos that do not say their own (`settings_of`).
+    model : str, optional
+        Name of a way; None is that of the lens, of a new one the usual.
+    estimator : str or PsfEstimator, optional
+        Name in `estimators`, or an object of one's own.
+    kernel_size : int, optional
+        Odd side of the kernels in pixels.
+    selector : str or Selector
+        Name in `selectors`, or an object of one's own.
+    count : int
+        Patches asked for.
+    """
+
+    settings: LensSettings = field(default_factory=LensSettings)
+    model: str | None = None
+    estimator: str | estimation.PsfEstimator | None = None
+    kernel_size: int | None = None
+    selector: str | patches.Selector = "r-map"
+    count: int = DEFAULT_PATCHES
+
+    def of_lens(self, lens: Lens | None) -> Recipe:
+        """Return it as it holds for a lens."""
+        return replace(self, model=chosen_way(self.model, None if lens is None else lens.model).name)
+
+    @property
+    def way(self) -> Way:
+        """The way it follows where it says nothing else."""
+        return way_named(self.model or "default")
+
+    @property
+    def method(self) -> str | estimation.PsfEstimator:
+        """The estimator that it takes."""
+        return self.way.estimator if self.estimator is None else self.estimator
+
+    @property
+    def size(self) -> int:
+        """The side of its kernels in pixels."""
+        return self.kernel_size or self.way.kernel_size
+
+    def check(self) -> None:
+        """Refuse names and sizes that there are not, before any work."""
+        estimation.estimators.resolve(self.method)
+        require_size(self.size)
+        patches.selectors.resolve(self.selector)
+
+
+class PhotoSteps(Protocol):
+    """The work on one photo, wherever it is done: here in `samples_of_photo`, in the service by jobs."""
+
+    def inspect(self) -> bool:
+        """Read what the file says; False where the photo is not to teach its lens, or cannot yet."""
+
+    def enter(self, stage: Stage) -> None:
+        """Take note of the step that comes."""
+
+    def develop(self) -> None:
+        """Make linear planes of the file."""
+
+    def select(self) -> None:
+        """Choose patches."""
+
+    def estimate(self) -> None:
+        """Estimate a PSF for each cell of them."""
+
+    def count(self) -> None:
+        """Hand over the samples; refuse the photo where they tell too little (`require_spread`)."""
+
+
+def take(photo: PhotoSteps) -> None:
+    """Take one photo through all steps."""
+    if not photo.inspect():
+        return
+    photo.enter("developing")
+    photo.develop()
+    photo.enter("selecting")
+    photo.select()
+    photo.enter("estimating")
+    photo.estimate()
+    photo.count()
+
+
+class _StepsHere:
+    """`PhotoSteps` in this process, and cells in those of a pool; the developed photo lies in a folder."""
+
+    def __init__(
+        self,
+        path: Path,
+        recipe: Recipe,
+        folder: Path,
+        workers: int | None,
+        executor: Executor | None,
+        on_event: EventHook,
+    ) -> None:
+        self.samples: list[PsfSample] = []
+        self._path, self._recipe, self._folder = path, recipe, folder
+        self._workers, self._executor, self._on_event = workers, executor, on_event
+        self._groups: list[tuple[Patch, ...]] = []
+        self._by_cell: dict[int, list[CellSample]] = {}
+
+    @property
+    def _total(self) -> int:
+        return sum(map(len, self._groups))
+
+    def inspect(self) -> bool:
+        require_aperture(photo.inspect(self._path).metadata, self._recipe.settings)
+        return True
+
+    def enter(self, stage: Stage) -> None:
+        self._on_event(CalibrationEvent(self._path, stage, 0, self._total))
+
+    def develop(self) -> None:
+        save_developed(photo.develop(self._path), self._folder)
+
+    def select(self) -> None:
+        developed = load_developed(self._folder)
+        recipe = self._recipe
+        self._groups = cells(find_patches(developed, count=recipe.count, selector=recipe.selector))
+
+    def estimate(self) -> None:
+        recipe, done = self._recipe, 0
+        settings = settings_of(load_developed(self._folder), recipe.settings)
+        method = estimation.estimators.resolve(recipe.method)
+        order = (settings, photo_id(self._path), method, recipe.size)
+        with processes.pool(self._executor, self._workers, method) as pool:
+            jobs = {
+                pool.submit(_cell_from_folder, self._folder, group, *order): index
+                for index, group in enumerate(self._groups)
+            }
+            try:
+                for job in as_completed(jobs):
+                    index = jobs[job]
+                    try:
+                        self._by_cell[index] = job.result()
+                    except NotEnoughEvidenceError as error:
+                        log.info("a cell of %s was dropped: %s", self._path.name, error)
+                    done += len(self._groups[index])
+                    self._on_event(CalibrationEvent(self._path, "estimating", done, self._total))
+            except BaseException:
+                for job in jobs:
+                    job.cancel()  # leaving `with` waits only for what runs
+                raise
+
+    def count(self) -> None:
+        made = [cell for index in sorted(self._by_cell) for cell in self._by_cell[index]]
+        if not made:
+            raise NoUsablePatchesError(
+                f"none of the {self._total} patches of {self._path.name} determines a PSF; "
+                "use a photo with more fine detail in focus"
+            )
+        require_spread([cell.patch for cell in made if cell.channel == "g"], count=self._recipe.count)
+        self.samples = [cell.sample for cell in made]
+
+
+def _cell_from_folder(
+    folder: Path,
+    group: tuple[Patch, ...],
+    settings: LensSettings,
+    key: str,
+    estimator: estimation.PsfEstimator,
+    size: int,
+) -> list[CellSample]:
+    return estimate_cell(
+        load_developed(folder), group, settings=settings, photo_id=key, estimator=estimator, size=size
+    )
+
+
 def samples_of_photo(
     path: Path,
+    recipe: Recipe | None = None,
     *,
-    settings: LensSettings | None = None,
-    estimator: str | estimation.PsfEstimator = "default",
-    selector: str | patches.Selector = "r-map",
-    count: int = DEFAULT_PATCHES,
-    kernel_size: int = DEFAULT_KERNEL_SIZE,
     workers: int | None = None,
     executor: Executor | None = None,
     on_event: EventHook = ignore_event,
@@ -90,182 +271,225 @@ def samples_of_photo(
     Cells are estimated in `workers` processes (all cores by default), or by an executor that sees the
     files of this machine; the result does not depend on it. An estimator of one's own that other processes
     cannot load (`processes.portable`) runs in threads of this one.
-
-    Raises
-    ------
-    MetadataMissingError
-        If the aperture is neither in the file nor given.
-    NoUsablePatchesError
-        If the photo tells nothing about the blur, or too little, or of one place only.
     """
-    require_size(kernel_size)
-    method = estimation.estimators.resolve(estimator)
-    on_event(CalibrationEvent(path, "developing"))
-    developed = photo.develop(path)
-    chosen = settings_of(developed, settings)
-    if chosen.aperture is None:
-        raise MetadataMissingError(
-            f"{path.name} does not say its aperture; give it (for example --aperture 2.8)"
-        )
-    on_event(CalibrationEvent(path, "selecting"))
-    key = photo_id(path)
-    groups = cells(find_patches(developed, count=count, selector=selector))
-    total = sum(len(group) for group in groups)
-    on_event(CalibrationEvent(path, "estimating", 0, total))
-    by_cell: dict[int, list[CellSample]] = {}
-    done = 0
+    recipe = recipe or Recipe()
+    recipe.check()
     with tempfile.TemporaryDirectory(prefix="lensmodel-") as folder:
-        save_developed(developed, Path(folder))
-        del developed
-        with processes.pool(executor, workers, method) as pool:
-            jobs = {
-                pool.submit(_cell_from_folder, folder, group, chosen, key, method, kernel_size): index
-                for index, group in enumerate(groups)
-            }
-            try:
-                for job in as_completed(jobs):
-                    index = jobs[job]
-                    try:
-                        by_cell[index] = job.result()
-                    except NotEnoughEvidenceError as error:
-                        log.info("a cell of %s was dropped: %s", path.name, error)
-                    done += len(groups[index])
-                    on_event(CalibrationEvent(path, "estimating", done, total))
-            except BaseException:
-                for job in jobs:
-                    job.cancel()  # leaving `with` waits only for what runs
-                raise
-    samples = [cell.sample for index in sorted(by_cell) for cell in by_cell[index]]
-    if not samples:
-        raise NoUsablePatchesError(
-            f"none of the {total} patches of {path.name} determines a PSF; "
-            "use a photo with more fine detail in focus"
-        )
-    determined = [cell.patch for index in sorted(by_cell) for cell in by_cell[index] if cell.channel == "g"]
-    require_spread(determined, count=count)
-    return samples
+        steps = _StepsHere(path, recipe, Path(folder), workers, executor, on_event)
+        take(steps)
+        return steps.samples
 
 
-def _cell_from_folder(
-    folder: str,
-    group: tuple[Patch, ...],
-    settings: LensSettings,
-    key: str,
-    estimator: str | estimation.PsfEstimator,
-    size: int,
-) -> list[CellSample]:
-    return estimate_cell(
-        load_developed(Path(folder)), group, settings=settings, photo_id=key, estimator=estimator, size=size
-    )
-
-
-def samples_of_bytes(
-    name: str,
-    data: bytes,
-    settings: LensSettings | None,
-    estimator: str | estimation.PsfEstimator,
-    count: int = DEFAULT_PATCHES,
-    selector: str | patches.Selector = "r-map",
-    kernel_size: int = DEFAULT_KERNEL_SIZE,
-) -> list[PsfSample]:
+def samples_of_bytes(name: str, data: bytes, recipe: Recipe) -> list[PsfSample]:
     """Do as `samples_of_photo` in this process alone, with a photo that lies on another machine."""
     with tempfile.TemporaryDirectory(prefix="lensmodel-") as folder:
         path = Path(folder) / Path(name).name
         path.write_bytes(data)
-        return samples_of_photo(
-            path,
-            settings=settings,
-            estimator=estimator,
-            selector=selector,
-            count=count,
-            kernel_size=kernel_size,
-            executor=parallel.Here(),
-        )
+        return samples_of_photo(path, recipe, executor=parallel.Here())
 
 
-def calibrate(
-    paths: Iterable[Path],
-    *,
-    model: LensModel | None = None,
-    settings: LensSettings | None = None,
-    model_settings: ModelSettings | None = None,
-    estimator: str | estimation.PsfEstimator = "default",
-    selector: str | patches.Selector = "r-map",
-    count: int = DEFAULT_PATCHES,
-    kernel_size: int = DEFAULT_KERNEL_SIZE,
-    workers: int | None = None,
-    executor: Executor | None = None,
-    on_event: EventHook = ignore_event,
-) -> LensModel:
-    """Learn the blur of one lens from photos taken with it; the model is `warmed`.
+class Shelf(Protocol):
+    """Where a lens is kept while it learns: in memory, or in a file that other runs may add to."""
 
-    Photos that cannot help (no detail, unreadable) are skipped and reported through `on_event`.
+    @property
+    def settled(self) -> bool:
+        """Whether what `lens` returns is kept already."""
+
+    def lens(self) -> Lens | None:
+        """Return the newest lens: the same object until another run has changed it."""
+
+    def keep(self, lens: Lens, *, whole: bool) -> None:
+        """Keep a lens that has learned from one photo more, or is `whole`: completely fitted."""
+
+
+class InMemory:
+    """The shelf of a single run."""
+
+    settled = True
+
+    def __init__(self, lens: Lens | None) -> None:
+        self._lens = lens
+
+    def lens(self) -> Lens | None:
+        """Return the lens that was kept last."""
+        return self._lens
+
+    def keep(self, lens: Lens, *, whole: bool) -> None:
+        """Keep a lens."""
+        del whole
+        self._lens = lens
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What became of a photo: how many samples it gave, None where the lens has it already; or why not."""
+
+    photo: Path
+    samples: int | None = None
+    error: LensModelError | OSError | None = None
+
+
+class Calibration:
+    """A lens that learns from one photo after the other, and is fitted once when all are there.
 
     Parameters
     ----------
-    paths : iterable of Path
-        Photos of one lens. RAW is best, JPEG worst.
-    model : LensModel, optional
-        What is known already; photos that it has not seen are added to it.
-    settings : LensSettings, optional
-        Values for the files that do not say their own.
-    model_settings : ModelSettings, optional
-        Choices of a new model; one that is given keeps its own.
-    executor : Executor, optional
-        Runs whole photos, whose bytes are sent to it: of other machines too. Without one, `workers`
-        processes share the patches of one photo after the other.
+    shelf : Shelf
+        Keeps the lens after each photo.
+    recipe : Recipe
+        How each is estimated.
+    begin : ModelSettings, optional
+        Choices of the regression of a new lens; a known one keeps its own.
+    prior : Prior, optional
+        What a new lens leans on.
+    any_lens : bool
+        Take photos that seem to be of another lens as well.
+    workers : int, optional
+        Processes, where photos are estimated here.
 
     Raises
     ------
-    InvalidInputError
-        If both a model and settings for a new one are given.
-    NotEnoughEvidenceError
-        If no photo gave a sample and there was no model to start from.
+    UnknownMethodError, InvalidInputError
+        If the recipe cannot be followed.
     """
-    if model is not None and model_settings is not None:
-        raise InvalidInputError("the model has settings of its own; give a model or model_settings")
-    samples: list[PsfSample] = []
-    reasons: list[str] = []
-    known = set() if model is None else {sample.photo for sample in model.samples}
 
-    def sent(path: Path) -> tuple[Any, ...] | None:
-        wanted = executor is not None and photo_id(path) not in known
-        order = (settings, estimator, count, selector, kernel_size)
-        return (path.name, path.read_bytes(), *order) if wanted else None
+    def __init__(
+        self,
+        shelf: Shelf,
+        recipe: Recipe,
+        *,
+        begin: ModelSettings | None = None,
+        prior: Prior | None = None,
+        any_lens: bool = False,
+        workers: int | None = None,
+    ) -> None:
+        self._shelf, self._recipe = shelf, recipe
+        self._begin, self._prior = begin or ModelSettings(mode=recipe.way.mode), prior
+        self._any_lens, self._workers = any_lens, workers
+        self._base = self._current = shelf.lens()
+        self._new: list[PsfSample] = []  # in `_current`, and not in `_base`
+        self._joined = False
+        recipe.of_lens(self._current).check()
 
-    ahead = 1 if executor is None else AHEAD
-    for path, job in parallel.in_order(
-        executor or parallel.Here(), samples_of_bytes, paths, sent, ahead=ahead
-    ):
-        if (key := photo_id(path)) in known:
-            on_event(CalibrationEvent(path, "skipped", detail="its samples are in the model already"))
-            continue
-        try:
-            learned = (
-                samples_of_photo(
-                    path,
-                    settings=settings,
-                    estimator=estimator,
-                    selector=selector,
-                    count=count,
-                    kernel_size=kernel_size,
-                    workers=workers,
-                    on_event=on_event,
-                )
-                if job is None
-                else job.result()
-            )
-        except LensModelError as error:
-            reasons.append(f"{path.name}: {error}")
-            on_event(CalibrationEvent(path, "skipped", detail=str(error)))
-            continue
-        samples.extend(learned)
-        known.add(key)
-        on_event(CalibrationEvent(path, "counted", len(learned), len(learned)))
-    if model is not None:
-        return (model.added(samples) if samples else model).warmed()
-    if not samples:
-        raise NotEnoughEvidenceError(
-            "no photo could be used:\n  " + "\n  ".join(reasons or ["none was given"])
+    def learn(
+        self,
+        paths: Iterable[Path],
+        executor: Executor | None = None,
+        *,
+        ahead: int = AHEAD,
+        on_event: EventHook = ignore_event,
+    ) -> Iterator[Verdict]:
+        """Learn from photos in their order, and give what becomes of each.
+
+        Parameters
+        ----------
+        paths : iterable of Path
+        executor : Executor, optional
+            Runs whole photos, whose bytes are sent to it: of other machines too. Without one, processes of
+            this machine share the patches of one photo after the other.
+        ahead : int
+            Photos that are sent at once.
+        on_event : callable
+            Learns of each step that is done here.
+        """
+
+        def sent(path: Path) -> tuple[Any, ...] | None:
+            return None if executor is None else self._order(path)
+
+        jobs = parallel.in_order(
+            executor or parallel.Here(), samples_of_bytes, paths, sent, ahead=1 if executor is None else ahead
         )
-    return LensModel.fit(samples, model_settings or ModelSettings()).warmed()
+        for path, job in jobs:
+            try:
+                verdict = Verdict(path, self.add(path, job, on_event=on_event))
+            except (LensModelError, OSError) as error:
+                verdict = Verdict(path, error=error)
+            yield verdict
+
+    def add(
+        self,
+        path: Path,
+        estimated: Future[list[PsfSample]] | None = None,
+        *,
+        on_event: EventHook = ignore_event,
+    ) -> int | None:
+        """Learn from one photo; return how many samples it gave, None where the lens has it already."""
+        key = photo_id(path)
+        if self._knows(key):
+            return None
+        identity = self._admitted(path)
+        samples = (
+            samples_of_photo(
+                path, self._recipe.of_lens(self._lens()), workers=self._workers, on_event=on_event
+            )
+            if estimated is None
+            else estimated.result()
+        )
+        if self._knows(key):  # another run has added it meanwhile
+            return None
+        lens = self._lens()
+        self._require_same_lens(lens, identity)
+        model = self._fitted(samples) if lens is None else lens.model.grown(samples)
+        grown = Lens.grown(lens, model, {key: path.name}, [identity], any_lens=self._any_lens)
+        self._shelf.keep(grown, whole=False)
+        self._current, self._joined = grown, True
+        self._new += samples
+        return len(samples)
+
+    def finish(self, on_step: StepHook = ignore_step) -> Lens | None:
+        """Fit what was learned, once; return the lens, None where no photo could be used."""
+        lens = self._lens()
+        if lens is None or (self._shelf.settled and not self._joined):
+            return lens
+        model = self._fitted(self._new) if self._base is None else self._base.model.added(self._new)
+        whole = replace(lens, profile=replace(lens.profile, model=model.warmed(on_step)))
+        if self._lens() is lens:  # else another run is adding photos, and fits them all at its end
+            self._shelf.keep(whole, whole=True)
+            self._base, self._current, self._new = whole, whole, []
+        return self._current
+
+    def _order(self, path: Path) -> tuple[str, bytes, Recipe] | None:
+        """Return what an executor needs to estimate a photo; None if there is nothing to estimate."""
+        try:
+            if self._knows(photo_id(path)):
+                return None
+            self._admitted(path)
+            return path.name, path.read_bytes(), self._recipe.of_lens(self._lens())
+        except (LensModelError, OSError):  # `add` says so when its turn comes
+            return None
+
+    def _lens(self) -> Lens | None:
+        """Return what is known; where another run has changed it, that contains what this one kept."""
+        lens = self._shelf.lens()
+        if lens is not self._current:
+            self._base = self._current = lens
+            self._new = []
+        return lens
+
+    def _knows(self, key: str) -> bool:
+        lens = self._lens()
+        return lens is not None and (
+            key in lens.profile.photos or any(sample.photo == key for sample in lens.samples)
+        )
+
+    def _fitted(self, samples: list[PsfSample]) -> LensModel:
+        return LensModel.fit(samples, self._begin, prior=self._prior)
+
+    def _admitted(self, path: Path) -> Identity:
+        """Return what a photo says of lens and camera, after refusing one that cannot teach this lens."""
+        if path.stem.endswith(CORRECTED):
+            raise InvalidInputError(
+                "it was corrected already and says nothing about the lens; give the original"
+            )
+        said = photo.inspect(path).metadata
+        identity = Identity.of(said)
+        self._require_same_lens(self._lens(), identity)
+        require_aperture(said, self._recipe.settings)
+        return identity
+
+    def _require_same_lens(self, lens: Lens | None, identity: Identity) -> None:
+        if lens is None or self._any_lens:
+            return
+        why = difference(lens.profile.lens, lens.profile.cameras, identity)
+        if why is not None:
+            raise InvalidInputError(f"{why}; give it a profile of its own, or add --any-lens")

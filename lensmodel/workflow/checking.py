@@ -75,13 +75,6 @@ def check(
         What the photo does not say itself.
     on_step : StepHook
         Called after each tile; may raise to stop.
-
-    Raises
-    ------
-    InvalidInputError
-        If the files show pictures of different sizes.
-    UnreadablePhotoError
-        If one cannot be read.
     """
     before, after = photo.develop(original), photo.develop(corrected)
     if before.planes.shape != after.planes.shape:

@@ -5,23 +5,16 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Final
 
-from lensmodel import correction, photo, quality
+from lensmodel import correction, quality
 from lensmodel.core.belief import UncertainField
 from lensmodel.core.psf import PsfField
-from lensmodel.core.types import (
-    LensSettings,
-    StepHook,
-    ignore_step,
-)
+from lensmodel.core.types import LensSettings, StepHook, ignore_step
 from lensmodel.model import LensModel, WitnessedField
 from lensmodel.model.answer import PAPER
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.lateral import LateralColour, estimate_lateral, resample
-from lensmodel.photo.tags.xmp_block import sidecar_path, write_sidecar
-from lensmodel.workflow.developed import settings_of
 from lensmodel.workflow.estimating import SeenPatch, witnesses_of
 from lensmodel.workflow.ways import way_of
 
@@ -160,77 +153,3 @@ def _with_measured_gain(
         for zone, report in corrected.zones.items()
     }
     return dataclasses.replace(corrected, zones=zones)
-
-
-def correct(
-    source: Path | LinearPhoto,
-    model: LensModel,
-    output: Path | None,
-    *,
-    settings: LensSettings | None = None,
-    method: str | correction.Deconvolver | None = None,
-    strength: float = 1.0,
-    bounds: correction.Bounds | None = None,
-    file_format: photo.OutputFormat = "tiff16",
-    color_space: photo.ColorSpace = "same",
-    quality: int = 95,
-    least_gain_db: float | None = None,
-    sidecar: bool = False,
-    lens: str = "",
-    workers: int = 1,
-    on_step: StepHook = ignore_step,
-) -> correction.Corrected:
-    """Correct one photo and write the result, if it is to be written, in the encoding of the input.
-
-    The file appears complete or not at all. It says in a tag what was done; `lens` goes into that. With
-    `least_gain_db` there is none where less is expected to be gained. With `sidecar` an XMP file beside it
-    tells what was done.
-    """
-    developed = source if isinstance(source, LinearPhoto) else photo.develop(source)
-    method = way_of(model).method if method is None else method
-    chosen = settings_of(developed, settings)
-    corrected = correct_photo(
-        developed,
-        model,
-        chosen,
-        method=method,
-        strength=strength,
-        bounds=bounds,
-        lateral=lateral_of(developed),
-        workers=workers,
-        on_step=on_step,
-    )
-    too_little = least_gain_db is not None and corrected.expected_gain_db < least_gain_db
-    if output is None or too_little:
-        return corrected
-    encoding, name = developed.encoding, method if isinstance(method, str) else type(method).__name__
-    metadata, name_of_source = developed.info.metadata, source.name if isinstance(source, Path) else ""
-    del developed  # its planes are as large as the result: at 100 megapixels, 1.1 GiB
-    description = (
-        f"lens blur corrected by lensmodel: {lens + ', ' if lens else ''}"
-        f"method {name}, strength {strength:g}{'' if bounds is None else bounds.described}"
-    )
-    photo.write_image(
-        output,
-        corrected.planes,
-        encoding,
-        format=file_format,
-        color_space=color_space,
-        quality=quality,
-        description=description,
-    )
-    if sidecar:
-        write_sidecar(
-            sidecar_path(output),
-            metadata,
-            source=name_of_source,
-            description=description,
-            done={
-                "Method": name,
-                "Strength": f"{strength:g}",
-                "Profile": lens,
-                "ExpectedGainDb": f"{corrected.expected_gain_db:.2f}",
-                "NothingToCorrect": str(corrected.nothing_to_correct).lower(),
-            },
-        )
-    return corrected

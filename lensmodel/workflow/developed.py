@@ -11,16 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from lensmodel.core import codec
-from lensmodel.core.errors import (
-    InvalidInputError,
-)
+from lensmodel.core.errors import InvalidInputError, MetadataMissingError
 from lensmodel.core.files import atomic, save_array
 from lensmodel.core.spectrum import PatchSpectrum
-from lensmodel.core.types import (
-    FieldPosition,
-    LensSettings,
-)
-from lensmodel.photo import LinearPhoto
+from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.photo import LinearPhoto, PhotoMetadata
 from lensmodel.workflow.estimating import SeenPatch
 
 
@@ -39,13 +34,7 @@ def save_developed(developed: LinearPhoto, folder: Path) -> None:
 
 
 def load_developed(folder: Path) -> LinearPhoto:
-    """Open what `save_developed` kept; the planes are memory-mapped, read-only.
-
-    Raises
-    ------
-    InvalidInputError
-        If the folder holds no complete developed photo.
-    """
+    """Open what `save_developed` kept; the planes are memory-mapped, read-only."""
     try:
         planes = np.load(folder / "planes.npy", mmap_mode="r", allow_pickle=False)
         stored = json.loads((folder / "photo.json").read_text(encoding="utf-8"))
@@ -89,6 +78,12 @@ def settings_of(developed: LinearPhoto, given: LensSettings | None = None) -> Le
         focal_mm=given.focal_mm if known.focal_mm is None else known.focal_mm,
         focus_m=given.focus_m if known.focus_m is None else known.focus_m,
     )
+
+
+def require_aperture(said: PhotoMetadata, given: LensSettings | None = None) -> None:
+    """Refuse a photo of unknown aperture."""
+    if said.aperture is None and (given is None or given.aperture is None):
+        raise MetadataMissingError("it does not say its aperture; add it, for example --aperture 2.8")
 
 
 def photo_id(path: Path) -> str:

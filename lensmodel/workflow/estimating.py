@@ -76,13 +76,7 @@ def find_patches(
     selector: str | patches.Selector = "r-map",
     on_step: StepHook = ignore_step,
 ) -> Selection:
-    """Choose the patches that tell about the blur, on the green plane.
-
-    Raises
-    ------
-    NoUsablePatchesError
-        If no part of the photo does, or too few parts to count for a lens (`patches.require_enough`).
-    """
+    """Choose the patches that tell about the blur, on the green plane."""
     third = (min(developed.frame.height, developed.frame.width) // 3) // 2 * 2
     size = min(_PATCH_SIZE, max(third, _SMALLEST_PATCH))
     selection = patches.select(
@@ -111,11 +105,6 @@ def require_spread(determined: Sequence[Patch], *, count: int = DEFAULT_PATCHES)
         Patches with a PSF.
     count : int
         How many patches were asked for.
-
-    Raises
-    ------
-    NoUsablePatchesError
-        If what is left does not tell how the blur changes over the field.
     """
     patches.require_enough(determined, least=min(patches.LEAST_PARTS, math.ceil(count / 3)))
 
@@ -145,11 +134,6 @@ def estimate_cell(
     The patches of a cell share one kernel: their normal equations are summed, which is worth
     more than averaging finished kernels. Each patch becomes one sample at its own place, and
     the votes of a cell's samples add up to the confidence of its estimate.
-
-    Raises
-    ------
-    NotEnoughEvidenceError
-        If the cell does not determine a kernel.
     """
     method = estimation.estimators.resolve(estimator)
     rng = np.random.default_rng(seed)

@@ -34,11 +34,6 @@ def joined(
         Take out the blind samples at the settings that were measured now: what is measured knows better.
     model_settings : ModelSettings, optional
         Choices of a new model.
-
-    Raises
-    ------
-    NoSamplesError
-        If there is nothing to fit.
     """
     if model is None:
         return LensModel.fit(samples, model_settings or ModelSettings())

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from lensmodel.core.errors import InvalidInputError, MetadataMissingError
+from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings, StepHook, ignore_step
 from lensmodel.estimation import measure
@@ -38,13 +38,6 @@ def samples_of_measurement(
         Odd side of the kernels in pixels.
     on_step : StepHook
         Called after each place.
-
-    Raises
-    ------
-    MetadataMissingError
-        If the aperture is neither in the file nor given.
-    InvalidInputError, NotEnoughEvidenceError, UnreadablePhotoError
-        If the photos cannot be used; the text says why.
     """
     photos = [develop(path) for path in paths]
     return samples_of_developed(
@@ -65,23 +58,14 @@ def samples_of_developed(
     method = measure.methods.create(kind)
     if not photos:
         raise InvalidInputError(f"measuring by {kind} needs photos, none was given")
+    pipeline.require_aperture(photos[0].info.metadata, settings)
     chosen = pipeline.settings_of(photos[0], settings)
-    if chosen.aperture is None:
-        raise MetadataMissingError(
-            "the photo does not say its aperture; give it (for example --aperture 2.8)"
-        )
     measured = method.measure(photos, size=size, on_step=on_step)
     return measure.samples_of(measured, method, photos[0], photo_id=photo_id, settings=chosen)
 
 
 def measurements_of(kind: str, paths: Sequence[Path]) -> list[tuple[Path, ...]]:
-    """Group photos into measurements: each for itself, or in twos, the wider aperture first.
-
-    Raises
-    ------
-    InvalidInputError
-        If photos are left over, or two do not say which of them is the open one.
-    """
+    """Group photos into measurements: each for itself, or in twos, the wider aperture first."""
     method = measure.methods.create(kind)
     count = method.photos
     if not paths or len(paths) % count:

@@ -1,6 +1,6 @@
 """From photos to a lens model, and from a model to corrected photos: the only glue.
 
-    develop -> find_patches -> estimate_cell (many, independent) -> LensModel.fit
+    develop -> find_patches -> estimate_cell (many, independent) -> Calibration -> LensModel
     develop -> correct_photo -> write
 
 Each step is a plain function on values, so that a script, the command line and the workers of
@@ -9,18 +9,26 @@ run in as many processes as there are. Here they are under one name.
 """
 
 from lensmodel.workflow.calibrating import (
+    AHEAD,
+    Calibration,
     CalibrationEvent,
     EventHook,
-    calibrate,
+    InMemory,
+    PhotoSteps,
+    Recipe,
+    Stage,
+    Verdict,
     ignore_event,
     samples_of_bytes,
     samples_of_photo,
+    take,
 )
-from lensmodel.workflow.correcting import correct, correct_photo, lateral_of, psfs_for
+from lensmodel.workflow.correcting import correct_photo, lateral_of, psfs_for
 from lensmodel.workflow.developed import (
     load_developed,
     load_seen,
     photo_id,
+    require_aperture,
     save_developed,
     save_seen,
     settings_of,
@@ -38,14 +46,19 @@ from lensmodel.workflow.estimating import (
 )
 
 __all__ = [
+    "AHEAD",
     "DEFAULT_KERNEL_SIZE",
     "DEFAULT_PATCHES",
+    "Calibration",
     "CalibrationEvent",
     "CellSample",
     "EventHook",
-    "calibrate",
+    "InMemory",
+    "PhotoSteps",
+    "Recipe",
+    "Stage",
+    "Verdict",
     "cells",
-    "correct",
     "correct_photo",
     "estimate_cell",
     "find_patches",
@@ -55,6 +68,7 @@ __all__ = [
     "load_seen",
     "photo_id",
     "psfs_for",
+    "require_aperture",
     "require_spread",
     "samples_of_bytes",
     "samples_of_photo",
@@ -62,5 +76,6 @@ __all__ = [
     "save_seen",
     "seen_patches",
     "settings_of",
+    "take",
     "witnesses_of",
 ]

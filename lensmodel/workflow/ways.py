@@ -49,13 +49,7 @@ Richardson-Lucy deconvolution, without what guards photos from errors of any of 
 
 
 def way_named(name: str) -> Way:
-    """Return a way.
-
-    Raises
-    ------
-    UnknownMethodError
-        If there is none of that name.
-    """
+    """Return a way."""
     if name not in WAYS:
         raise UnknownMethodError(f"no model {name!r}; known: {', '.join(WAYS)}")
     return WAYS[name]
@@ -64,3 +58,8 @@ def way_named(name: str) -> Way:
 def way_of(model: LensModel) -> Way:
     """Return the way that a lens was learned."""
     return WAYS["paper" if model.settings.mode == PAPER else "default"]
+
+
+def chosen_way(name: str | None, model: LensModel | None) -> Way:
+    """Return the way to learn a lens: as asked for, else that of its model, else the usual one."""
+    return way_of(model) if name is None and model is not None else way_named(name or "default")

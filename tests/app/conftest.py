@@ -22,7 +22,8 @@ from app.store.database import Database
 from app.store.ids import new_id
 from app.store.tables import PhotoRow
 from app.store.upkeep.migrate import downgrade, upgrade
-from lensmodel.core.psf import gaussian
+from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
 
 PLACES = [(0.05, 0.0), (0.3, 0.6), (0.5, 2.2), (0.6, -2.2), (0.8, -0.6), (0.9, 0.59)]
 
@@ -88,7 +89,18 @@ class Steps:
     def estimate(self, photo: PhotoRow, indices: tuple[int, ...] = (0, 1), *, width: float = 1.0) -> int:
         kernel = gaussian(15, width * np.eye(2))
         samples = [
-            NewSample(k, channel, kernel, 0.5, "default/1") for k in indices for channel in ("r", "g", "b")
+            NewSample(
+                k,
+                PsfSample(
+                    kernel,
+                    FieldPosition(*PLACES[k % len(PLACES)]),
+                    LensSettings(channel=channel),
+                    weight=0.5,
+                    estimator="default/1",
+                ),
+            )
+            for k in indices
+            for channel in CHANNELS
         ]
         return self.store.patches.finish(photo.public_id, photo.epoch, samples)
 

@@ -6,17 +6,14 @@ import glob
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from app.commands.console.failure import UsageError
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.model import LensProfile, load_profile
 from lensmodel.photo import inspect
-from lensmodel.photo.endings import ENDINGS, RAW_ENDINGS
+from lensmodel.photo.endings import CORRECTED, ENDINGS, RAW_ENDINGS
 from lensmodel.workflow.identity import Identity
-
-CORRECTED: Final = "-corrected"
-"""Ends the names of what `lensmodel correct` wrote."""
 
 
 def photos(names: Iterable[str]) -> list[Path]:
@@ -24,11 +21,6 @@ def photos(names: Iterable[str]) -> list[Path]:
 
     Of folders and patterns, corrected photos are left out, and what is no RAW file beside a RAW file
     of the same name, which shows the same exposure again.
-
-    Raises
-    ------
-    UsageError
-        If a name matches nothing.
     """
     unique: dict[Path, None] = {}
     for name in names:
@@ -63,15 +55,7 @@ def same(first: Path, second: Path) -> bool:
 
 
 def profile_at(path: Path) -> LensProfile:
-    """Open a profile.
-
-    Raises
-    ------
-    UsageError
-        If there is none.
-    InvalidInputError
-        If the file is no profile, or a damaged one.
-    """
+    """Open a profile."""
     if path.is_dir():
         raise UsageError(f"{path} is a folder; give the file of a lens profile")
     if not path.exists():
@@ -92,13 +76,7 @@ def says_aperture(path: Path) -> bool:
 
 
 def refuse_existing(*paths: Path | None, force: bool) -> None:
-    """Make sure, before any work, that nothing is replaced that the user did not give up.
-
-    Raises
-    ------
-    UsageError
-        If one of the files is there.
-    """
+    """Make sure, before any work, that nothing is replaced that the user did not give up."""
     for path in paths:
         if path is not None and not force and path.exists():
             raise UsageError(f"{path} is there already; --force replaces it")

@@ -16,7 +16,7 @@ from app.store.database import Database, insert_new
 from app.store.tables import PhotoRow
 
 KEEP: Final = timedelta(hours=24)
-"""How long an answer is kept (chosen, not measured)."""
+"""How long an answer is kept (chosen): a client that lost it asks again within a day."""
 
 LOST: Final = timedelta(seconds=60)
 """A request without an answer after this time will get none: its process was killed (chosen). Answers take
@@ -39,15 +39,7 @@ class IdempotencyStore:
         self._db = database
 
     def begin(self, owner: str, key: str, request_hash: str) -> Given | None:
-        """Begin a request; return its stored answer, None if it is to be carried out now.
-
-        Raises
-        ------
-        InvalidParameterError
-            If the key came with another request.
-        ConflictError
-            If the same request is being answered.
-        """
+        """Begin a request; return its stored answer, None if it is to be carried out now."""
         with self._db.writing() as session:
             owner_key = ensure_owner(session, owner, may_be_new=owner == LOCAL)
             fresh = {

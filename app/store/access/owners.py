@@ -29,13 +29,7 @@ def owner_id(session: Session, name: str) -> int | None:
 
 
 def ensure_owner(session: Session, name: str, *, may_be_new: bool = True) -> int:
-    """Return the key of an owner, created if new.
-
-    Raises
-    ------
-    NotSignedInError
-        If there is no such owner and `may_be_new` is false: the account was erased during the request.
-    """
+    """Return the key of an owner, created if new."""
     key = owner_id(session, name)
     if key is None:
         if not may_be_new:

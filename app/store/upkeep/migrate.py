@@ -49,11 +49,6 @@ def upgrade(database: Database) -> bool:
 
     Only one process at a time gets in; the others wait and then find nothing left to do. A
     SQLite file that holds data is copied first, beside itself.
-
-    Raises
-    ------
-    InvalidInputError
-        If a newer program made the database.
     """
     before = current(database)
     if before == head():

@@ -34,11 +34,6 @@ def copy(source: Connection, target: Database) -> dict[str, int]:
     """Copy every row of a snapshot into an empty database of the same schema; return how many by table.
 
     One transaction: all or nothing.
-
-    Raises
-    ------
-    InvalidInputError
-        If there are rows in the target.
     """
     copied = {}
     with target.writer.begin() as connection:
@@ -63,13 +58,7 @@ def counts(source: Connection) -> dict[str, int]:
 
 
 def check_schema(database: Database) -> None:
-    """Make sure that a database has the schema of this program.
-
-    Raises
-    ------
-    InvalidInputError
-        If not.
-    """
+    """Make sure that a database has the schema of this program."""
     present, wanted = migrate.current(database), migrate.head()
     if present != wanted:
         raise InvalidInputError(

@@ -186,7 +186,7 @@ def outcomes(
     for number in range(most):
         path = written(folder / f"{lens.number}-{number}.dng", shot(lens, number), tiff=tiff)
         try:
-            samples.append(pipeline.samples_of_photo(path, settings=lens.settings, workers=1))
+            samples.append(pipeline.samples_of_photo(path, pipeline.Recipe(lens.settings), workers=1))
         except NotEnoughEvidenceError:
             samples.append([])
     last = shot(lens, most)

@@ -90,7 +90,8 @@ def rows(lens: Lens, counts: list[int], folder: Path) -> Iterator[str]:
         written(folder / f"{lens.name}-{k}.dng", shot(lens, k), tiff=False) for k in range(max(counts) + 1)
     ]
     learned = [
-        pipeline.samples_of_photo(path, settings=lens.settings, workers=1) for path in files[: max(counts)]
+        pipeline.samples_of_photo(path, pipeline.Recipe(lens.settings), workers=1)
+        for path in files[: max(counts)]
     ]
     sharp, developed = shot(lens, max(counts)).sharp, photo.develop(files[-1])
     lateral = pipeline.lateral_of(developed)

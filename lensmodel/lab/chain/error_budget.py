@@ -167,10 +167,9 @@ def shares(
 def rows_of(shot: Shot, how: str, estimator: str, count: int, workers: int) -> Iterator[tuple[str, Row]]:
     """All rows that these files tell."""
     truth, case = shot.truth(), shot.case
+    recipe = pipeline.Recipe(estimator=estimator, count=count)
     samples = [
-        sample
-        for path in shot.learn
-        for sample in pipeline.samples_of_photo(path, estimator=estimator, count=count, workers=workers)
+        sample for path in shot.learn for sample in pipeline.samples_of_photo(path, recipe, workers=workers)
     ]
     model = LensModel.fit(samples).warmed()
     before = reached(shot.chart.planes, shot.held_out.planes, shot)

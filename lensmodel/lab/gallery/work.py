@@ -30,6 +30,7 @@ from lensmodel.lab.reproduce.store import Unit, stored
 from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
 from lensmodel.photo import develop
 from lensmodel.workflow import pipeline
+from lensmodel.workflow.lens import Lens
 
 log = logging.getLogger(__name__)
 
@@ -173,8 +174,13 @@ def _worked(picture: Picture, room: Room, wishes: Wishes, say: Words) -> Unit:
     with tempfile.TemporaryDirectory(prefix="lensmodel-gallery-") as name:
         output = Path(name) / "corrected.tif"
         try:
-            corrected = pipeline.correct(
-                picture.path, model, output, settings=override, color_space="srgb", workers=wishes.workers
+            corrected = lensmodel.correct(
+                picture.path,
+                Lens(LensProfile(model)),
+                output,
+                aperture=override.aperture,
+                color_space="srgb",
+                workers=wishes.workers,
             )
         except LensModelError as error:
             reason = f"correction was refused: {error}"
@@ -205,13 +211,13 @@ def _model(picture: Picture, room: Room, wishes: Wishes, override: LensSettings,
             say(words)
 
     try:
-        model = pipeline.calibrate(
-            [picture.path],
-            settings=override,
-            model_settings=wishes.model,
+        model = lensmodel.calibrate(
+            picture.path,
+            aperture=override.aperture,
+            model=wishes.model,
             workers=wishes.workers,
             on_event=heard,
-        )
+        ).model
     except LensModelError as error:
         raise InvalidInputError(reasons[0] if reasons else str(error)) from error
     save_profile(path, LensProfile(model))

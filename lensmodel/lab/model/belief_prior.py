@@ -129,7 +129,7 @@ def learned(lens: Lens, folder: Path, counts: Sequence[int] = ()) -> Iterator[li
     for number in range(max(counts, default=2)):
         path = written(folder / f"{lens.number}-{number}.dng", shot(lens, number), tiff=False)
         try:
-            photos.append(pipeline.samples_of_photo(path, settings=lens.settings, workers=1))
+            photos.append(pipeline.samples_of_photo(path, pipeline.Recipe(lens.settings), workers=1))
         except NotEnoughEvidenceError:
             photos.append([])
     parts = [photos[:count] for count in counts] or [[own] for own in photos] + [photos] * all(photos)

@@ -76,7 +76,7 @@ def samples_of(lens: Lens, number: int, folder: Path) -> list[PsfSample]:
         return samples
     path = written(folder / f"{lens.number}-{number}.dng", shot(lens, number), tiff=False)
     try:
-        samples = pipeline.samples_of_photo(path, settings=lens.settings, workers=1)
+        samples = pipeline.samples_of_photo(path, pipeline.Recipe(lens.settings), workers=1)
     except NotEnoughEvidenceError:
         samples = []
     path.unlink()

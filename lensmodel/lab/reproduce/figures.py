@@ -99,7 +99,9 @@ def _fig4(plan: Reproduction, case: Case, folder: Path, workers: int | None) -> 
         developed = develop(shots.learn[0])
         chosen = pipeline.find_patches(developed)
         try:
-            samples = pipeline.samples_of_photo(shots.learn[0], estimator=plan.estimator, workers=workers)
+            samples = pipeline.samples_of_photo(
+                shots.learn[0], pipeline.Recipe(estimator=plan.estimator), workers=workers
+            )
         except LensModelError as error:
             return {"failed": str(error)}
     green = [s for s in samples if s.settings.channel == "g"]

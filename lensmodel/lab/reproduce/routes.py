@@ -134,8 +134,7 @@ class DirectRoute:
                 samples = tuple(
                     pipeline.samples_of_photo(
                         photo,
-                        estimator=self._way.estimator,
-                        kernel_size=self._way.kernel_size,
+                        pipeline.Recipe(estimator=self._way.estimator, kernel_size=self._way.kernel_size),
                         workers=self._workers,
                     )
                 )

@@ -59,10 +59,6 @@ def read_metadata(path: Path | str) -> PhotoMetadata:
     path : Path or str
         The file; its content decides what it is.
 
-    Returns
-    -------
-    PhotoMetadata
-
     Raises
     ------
     NotAnImageError, UnsupportedFormatError, TruncatedImageError
@@ -73,16 +69,7 @@ def read_metadata(path: Path | str) -> PhotoMetadata:
 
 
 def is_placeholder(serial: str) -> bool:
-    """Tell whether a serial is only what a camera writes when it knows none.
-
-    Parameters
-    ----------
-    serial : str
-
-    Returns
-    -------
-    bool
-    """
+    """Tell whether a serial is only what a camera writes when it knows none."""
     return _PLACEHOLDER.fullmatch(serial.strip()) is not None
 
 

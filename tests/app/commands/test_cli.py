@@ -30,7 +30,6 @@ from typer.testing import CliRunner
 
 from app.cli import app, main
 from app.commands.console.progress_lines import EVERY_S, ProgressLines
-from lensmodel.core import parallel
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
@@ -159,16 +158,8 @@ def _picture() -> np.ndarray[Any, np.dtype[np.uint8]]:
 
 @pytest.fixture
 def few_patches(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Learn from three patches of a photo: too few for a wavefront, whose fit takes longer than the rest.
-
-    Here, as a process of its own takes longer to import than to estimate them.
-    """
-    learn = pipeline.samples_of_photo
-
-    def few(path: Path, **options: Any) -> list[PsfSample]:
-        return learn(path, **{**options, "count": 3, "executor": parallel.Here()})
-
-    monkeypatch.setattr("lensmodel.workflow.pipeline.samples_of_photo", few)
+    """Learn from three patches of a photo: too few for a wavefront, whose fit takes longer than the rest."""
+    monkeypatch.setattr("lensmodel.workflow.pipeline.Recipe", partial(pipeline.Recipe, count=3))
 
 
 # --- results -----------------------------------------------------------------------------------
@@ -287,12 +278,12 @@ def test_psf_says_what_made_the_answer_and_why(folder: Path) -> None:
 def test_two_runs_on_one_profile_drop_nothing_of_each_other(
     folder: Path, made: Path, here: Here, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def estimated(path: Path, **options: Any) -> list[PsfSample]:
+    def estimated(path: Path, recipe: pipeline.Recipe, **options: Any) -> list[PsfSample]:
         known = load_profile(folder / PROFILE)  # the other run saves while this one estimates
         save_profile(folder / PROFILE, replace(known, photos={**known.photos, "fedcba9876543210": "y.dng"}))
         return [PsfSample(gaussian(15, np.eye(2)), FieldPosition(0.5, 0.0), LensSettings(2.8), photo="z")]
 
-    monkeypatch.setattr("lensmodel.workflow.pipeline.samples_of_photo", estimated)
+    monkeypatch.setattr("lensmodel.workflow.calibrating.samples_of_photo", estimated)
     done = here("calibrate", "one.dng", "-p", PROFILE)
 
     assert done.returncode == 0, done.stderr

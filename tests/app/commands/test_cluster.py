@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import lensmodel
 from app.cli import app
 from lensmodel.core import parallel
 from lensmodel.core.psf import PsfSample
@@ -82,10 +83,11 @@ def stacked(samples: list[PsfSample]) -> np.ndarray:
 
 
 def test_a_photo_gives_the_same_samples_wherever_it_is_estimated(photo: Path) -> None:
-    here = pipeline.samples_of_photo(photo, estimator="whittle", count=4, executor=parallel.Here())
+    recipe = pipeline.Recipe(estimator="whittle", count=4)
+    here = pipeline.samples_of_photo(photo, recipe, executor=parallel.Here())
     with ThreadPoolExecutor(2) as threads:
-        beside = pipeline.samples_of_photo(photo, estimator="whittle", count=4, executor=threads)
-    sent = pipeline.samples_of_bytes(photo.name, photo.read_bytes(), None, "whittle", 4)
+        beside = pipeline.samples_of_photo(photo, recipe, executor=threads)
+    sent = pipeline.samples_of_bytes(photo.name, photo.read_bytes(), recipe)
 
     np.testing.assert_array_equal(stacked(beside), stacked(here))
     np.testing.assert_array_equal(stacked(sent), stacked(here))
@@ -98,12 +100,12 @@ def test_whole_photos_are_calibrated_by_an_executor(photo: Path, tmp_path: Path)
     events: list[pipeline.CalibrationEvent] = []
 
     with ThreadPoolExecutor(2) as threads:
-        model = pipeline.calibrate(
-            [photo, broken, photo], estimator="whittle", count=4, executor=threads, on_event=events.append
+        lens = lensmodel.calibrate(
+            [photo, broken, photo], estimator="whittle", patches=4, executor=threads, on_event=events.append
         )
 
     assert [event.stage for event in events] == ["counted", "skipped", "skipped"]
-    assert {sample.photo for sample in model.samples} == {pipeline.photo_id(photo)}
+    assert {sample.photo for sample in lens.samples} == {pipeline.photo_id(photo)}
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from app.store import LensName, NewPatch, NewSample, Store
 from app.store.tables import SampleRow
 from app.store.versions import learned_key
 from app.ways import of_models
-from lensmodel.core.psf import gaussian, rms_width
+from lensmodel.core.psf import PsfSample, gaussian, rms_width
 from lensmodel.core.types import FieldPosition, LensSettings, ignore_step
 from lensmodel.model import ModelSettings
 
@@ -125,7 +125,10 @@ def taken(steps: Steps, store: Store) -> Callable[..., str]:
         store.patches.add(photo.public_id, photo.epoch, patches)
         store.photos.set_state(photo.public_id, ("selecting",), "estimating")
         kernel = gaussian(25, sigma_px**2 * np.eye(2))
-        samples = [NewSample(k, "g", kernel, 0.5, "default/1") for k in range(6)]
+        samples = [
+            NewSample(k, PsfSample(kernel, FieldPosition(*place), weight=0.5, estimator="default/1"))
+            for k, place in enumerate(places)
+        ]
         store.patches.finish(photo.public_id, photo.epoch, samples)
         assert store.photos.finish(photo.public_id, photo.epoch) is not None
         return str(steps.lens_id(photo))

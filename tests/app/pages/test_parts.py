@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from PIL import Image
 from starlette.testclient import TestClient
 
-from app.blobs.previews import upright
 from app.blobs.storage import Storage
 from app.jobs import tasks
 from app.jobs.body_keys import body_key
@@ -28,6 +27,7 @@ from app.store import LensName, Store
 from app.store.corrections import Result
 from app.store.photo_steps import folder_of
 from lensmodel.core.types import ignore_step
+from lensmodel.photo import upright
 from lensmodel.photo.dng import write_bayer_dng
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other

@@ -32,12 +32,12 @@ def answered(folder: Path, listed: list[dict[str, Any]]) -> list[dict[str, Any]]
 def test_what_a_child_measured_becomes_patches_with_samples(tmp_path: Path) -> None:
     patches, samples = _checked(answered(tmp_path, [place(0), place(0, "r"), place(1)]), tmp_path)
     assert [patch.idx for patch in patches] == [0, 1]
-    assert [(s.idx, s.channel, s.predicted_error) for s in samples] == [
+    assert [(new.idx, new.sample.settings.channel, new.sample.error) for new in samples] == [
         (0, "g", 0.04),
         (0, "r", 0.04),
         (1, "g", 0.04),
     ]
-    assert {s.estimator for s in samples} == {"measured-target/1"}
+    assert {new.sample.estimator for new in samples} == {"measured-target/1"}
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import zlib
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -232,6 +233,33 @@ def test_samples_come_back_as_they_were_written(store: Store, steps: Steps) -> N
     assert sample.settings.aperture == 1.4
     assert sample.photo == photo.public_id
     np.testing.assert_allclose(sample.kernel, gaussian(15, np.eye(2)), atol=1e-7)
+
+
+def test_a_sample_is_stored_as_earlier_programs_read_it(store: Store, steps: Steps) -> None:
+    steps.counted(width=2.0)
+    kernel = gaussian(15, 2.0 * np.eye(2)).astype("<f4").tobytes()
+    with store.database.reading() as session:
+        row = session.scalars(select(SampleRow).order_by(SampleRow.id).limit(1)).one()
+        stored = {column.key: getattr(row, column.key) for column in SampleRow.__table__.columns}
+
+    del stored["id"], stored["photo_id"], stored["patch_id"], stored["lens_id"], stored["created_at"]
+    assert stored == {
+        "version_added": 1,
+        "channel": "r",
+        "r": 0.05,
+        "phi": 0.0,
+        "weight": 0.5,
+        "predicted_error": None,
+        "size": 15,
+        "dtype": "<f4",
+        "format_version": 1,
+        "crc32": zlib.crc32(kernel),
+        "psf": kernel,
+        "spectrum": None,
+        "statistics_key": None,
+        "estimator": "default/1",
+        "diagnostics": {},
+    }
 
 
 def test_only_samples_of_later_versions_are_read_on(store: Store, steps: Steps) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage, special
 
+import lensmodel
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
@@ -35,9 +36,9 @@ from lensmodel.lab.gallery.frames import FRAMES, take
 from lensmodel.lab.gallery.measure import TILE, bars, measured
 from lensmodel.lab.gallery.rendering import aligned
 from lensmodel.lab.gallery.truth import best_shift, gains
-from lensmodel.model import LensModel
+from lensmodel.model import LensModel, LensProfile
 from lensmodel.photo import develop
-from lensmodel.workflow import pipeline
+from lensmodel.workflow.lens import Lens
 
 Shown = NDArray[np.float64]
 GREY = 0.45
@@ -405,7 +406,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def known_lens(*args: Any, **options: Any) -> LensModel:
+def known_lens(*args: Any, **options: Any) -> Lens:
     samples = [
         PsfSample(
             gaussian(15, np.eye(2)),
@@ -417,10 +418,10 @@ def known_lens(*args: Any, **options: Any) -> LensModel:
         for r in (0.1, 0.5, 0.9)
         for phi in (-2.0, 0.5, 2.5)
     ]
-    return LensModel.fit(samples, options["model_settings"])
+    return Lens(LensProfile(LensModel.fit(samples, options["model"])))
 
 
-def refused(*args: Any, **options: Any) -> LensModel:
+def refused(*args: Any, **options: Any) -> Lens:
     raise NotEnoughEvidenceError("no photo could be used")
 
 
@@ -440,7 +441,7 @@ def test_asking_for_no_such_picture_names_those_there_are(folder: Path) -> None:
 def test_the_page_shows_a_corrected_picture_and_its_figures(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pipeline, "calibrate", known_lens)
+    monkeypatch.setattr(lensmodel, "calibrate", known_lens)
     monkeypatch.setattr(working.peers.Peer, "installed", property(lambda _: False))
     output = tmp_path / "gallery"
 
@@ -469,7 +470,7 @@ def test_the_audits_map_and_its_worst_places_are_shown_where_there_is_an_audit(
     fake = SimpleNamespace(audit_photo=audit_photo, Evidence=SimpleNamespace)
     monkeypatch.setattr(auditing, "find_spec", lambda _: object())
     monkeypatch.setattr(auditing, "import_module", lambda _: fake)
-    monkeypatch.setattr(pipeline, "calibrate", known_lens)
+    monkeypatch.setattr(lensmodel, "calibrate", known_lens)
     monkeypatch.setattr(working.peers.Peer, "installed", property(lambda _: False))
     output = tmp_path / "gallery"
 
@@ -490,7 +491,7 @@ def test_without_an_audit_there_is_no_map(monkeypatch: pytest.MonkeyPatch) -> No
 def test_a_photo_whose_calibration_is_refused_is_shown_as_it_was(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pipeline, "calibrate", refused)
+    monkeypatch.setattr(lensmodel, "calibrate", refused)
     monkeypatch.setattr(working.peers.Peer, "installed", property(lambda _: False))
 
     entries = list(hang(real_pictures(folder), tmp_path / "gallery", Wishes(), on_picture=ignore))
@@ -508,11 +509,11 @@ def test_what_is_stored_is_not_made_again_unless_asked(
 ) -> None:
     calls = []
 
-    def counted(*args: Any, **options: Any) -> LensModel:
+    def counted(*args: Any, **options: Any) -> Lens:
         calls.append(args)
         return refused()
 
-    monkeypatch.setattr(pipeline, "calibrate", counted)
+    monkeypatch.setattr(lensmodel, "calibrate", counted)
     monkeypatch.setattr(working.peers.Peer, "installed", property(lambda _: False))
     pictures = real_pictures(folder)
 

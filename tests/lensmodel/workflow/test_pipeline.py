@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import lensmodel
 from lensmodel import correction, photo, quality
 from lensmodel.core import codec
 from lensmodel.core.cross_phase import log_likelihood, mean_in_bins
@@ -138,13 +139,12 @@ def test_calibrated_lens_makes_another_photo_sharper(
     short_search: None,
 ) -> None:
     events: list[pipeline.CalibrationEvent] = []
-    model = pipeline.calibrate(
-        [photos["city"][0]], estimator=estimator, count=count, workers=1, on_event=events.append
-    )
+    city = photos["city"][0]
+    lens = lensmodel.calibrate(city, estimator=estimator, patches=count, workers=1, on_event=events.append)
     path, shot = photos["lake"]
     output = tmp_path / "corrected.tif"
 
-    corrected = pipeline.correct(path, model, output, method=method)
+    corrected = lensmodel.correct(path, lens, output, method=method)
 
     before = quality.registered_zone_psnr(photo.develop(path).planes, shot.sharp, CAMERA.frame)
     after = quality.registered_zone_psnr(corrected.planes, shot.sharp, CAMERA.frame)
@@ -154,7 +154,7 @@ def test_calibrated_lens_makes_another_photo_sharper(
     stages = [event.stage for event in events]
     assert stages[0] == "developing"
     assert stages[-1] == "counted"
-    assert pipeline.calibrate([photos["city"][0]] * 2, model=model, on_event=events.append) is model
+    assert lensmodel.calibrate([city] * 2, lens=lens, on_event=events.append) is lens
     assert [event.stage for event in events][len(stages) :] == ["skipped"] * 2
 
 
@@ -233,9 +233,9 @@ def test_photos_that_cannot_help_are_skipped_with_the_reason(tmp_path: Path) -> 
     events: list[pipeline.CalibrationEvent] = []
 
     with pytest.raises(NotEnoughEvidenceError, match=r"notes\.jpg"):
-        pipeline.calibrate([text], on_event=events.append)
+        lensmodel.calibrate(text, on_event=events.append)
 
-    assert [event.stage for event in events] == ["developing", "skipped"]
+    assert [event.stage for event in events] == ["skipped"]
 
 
 def test_photo_without_aperture_asks_for_it(tmp_path: Path) -> None:

@@ -1,0 +1,175 @@
+"""The loop over photos that command, library and service share, without estimating anything."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lensmodel import photo
+from lensmodel.core.errors import InvalidInputError, MetadataMissingError
+from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.types import FieldPosition, LensSettings, StepHook, ignore_step
+from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
+from lensmodel.workflow import calibrating, pipeline
+from lensmodel.workflow.lens import Lens
+
+
+def samples_of(name: str) -> list[PsfSample]:
+    return [
+        PsfSample(gaussian(15, np.eye(2)), FieldPosition(r, phi), LensSettings(2.8), photo=name)
+        for r in (0.1, 0.5, 0.9)
+        for phi in (-2.0, 0.5, 2.5)
+    ]
+
+
+@pytest.fixture
+def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """Two files that pass for photos; their samples are made up."""
+
+    def estimated(path: Path, recipe: pipeline.Recipe, **options: object) -> list[PsfSample]:
+        return samples_of(pipeline.photo_id(path))
+
+    def inspected(path: Path) -> photo.PhotoInfo:
+        aperture = None if path.stem == "unknown" else 2.8
+        return photo.PhotoInfo("dng", 6, 4, photo.PhotoMetadata(aperture=aperture))
+
+    monkeypatch.setattr(calibrating, "samples_of_photo", estimated)
+    monkeypatch.setattr(calibrating.photo, "inspect", inspected)
+    paths = [tmp_path / "a.dng", tmp_path / "b.dng"]
+    for path in paths:
+        path.write_bytes(path.name.encode())
+    return paths
+
+
+class Noting(pipeline.InMemory):
+    """Notes how often a lens is kept, and which of them is whole."""
+
+    def __init__(self, lens: Lens | None = None) -> None:
+        super().__init__(lens)
+        self.kept: list[bool] = []
+
+    def keep(self, lens: Lens, *, whole: bool) -> None:
+        super().keep(lens, whole=whole)
+        self.kept.append(whole)
+
+
+def test_a_lens_is_kept_after_each_photo_and_fitted_once_at_the_end(
+    photos: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fitted: list[int] = []
+
+    def warmed(model: LensModel, on_step: StepHook = ignore_step) -> LensModel:
+        fitted.append(len(model.samples))
+        return model
+
+    monkeypatch.setattr(LensModel, "warmed", warmed)
+    shelf = Noting()
+    calibration = pipeline.Calibration(shelf, pipeline.Recipe())
+
+    verdicts = list(calibration.learn([*photos, photos[0]]))
+    lens = calibration.finish()
+
+    assert [verdict.samples for verdict in verdicts] == [9, 9, None]
+    assert lens is not None
+    assert sorted(lens.profile.photos.values()) == ["a.dng", "b.dng"]
+    assert shelf.kept == [False, False, True]
+    assert fitted == [18]
+
+
+def test_nothing_is_kept_where_nothing_was_learned(photos: list[Path]) -> None:
+    key = pipeline.photo_id(photos[0])
+    shelf = Noting(Lens(LensProfile(LensModel.fit(samples_of(key)), {}, {key: "a.dng"})))
+    calibration = pipeline.Calibration(shelf, pipeline.Recipe())
+
+    assert calibration.add(photos[0]) is None
+    assert calibration.finish() is shelf.lens()
+    assert shelf.kept == []
+
+
+def test_what_another_run_added_meanwhile_stays(photos: list[Path]) -> None:
+    shelf = Noting()
+    calibration = pipeline.Calibration(shelf, pipeline.Recipe())
+    calibration.add(photos[0])
+    kept = shelf.lens()
+    assert kept is not None
+    others = Lens(
+        replace(kept.profile, model=LensModel.fit([*kept.samples, *samples_of("x")]), photos={"x": "x.dng"})
+    )
+
+    shelf.keep(others, whole=False)
+    calibration.add(photos[1])
+    lens = calibration.finish()
+
+    assert lens is not None
+    assert len(lens.samples) == 27
+    assert sorted(lens.profile.photos.values()) == ["b.dng", "x.dng"]
+
+
+def test_photos_that_cannot_teach_a_lens_are_refused_before_any_work(
+    photos: list[Path], tmp_path: Path
+) -> None:
+    calibration = pipeline.Calibration(Noting(), pipeline.Recipe())
+    for name in ("a-corrected.dng", "unknown.dng"):
+        (tmp_path / name).write_bytes(name.encode())
+
+    with pytest.raises(InvalidInputError, match="give the original"):
+        calibration.add(tmp_path / "a-corrected.dng")
+    with pytest.raises(MetadataMissingError, match="--aperture"):
+        calibration.add(tmp_path / "unknown.dng")
+
+    assert calibration.finish() is None
+
+
+def test_a_profile_without_a_fit_opens_with_the_same_answers(tmp_path: Path) -> None:
+    profile = LensProfile(LensModel.fit(samples_of("x")), {}, {"x": "x.dng"})
+    save_profile(tmp_path / "whole", profile)
+    save_profile(tmp_path / "between", profile, learned=False)
+
+    whole, between = (
+        load_profile(tmp_path / name).model.query(FieldPosition(0.4, 0.3), LensSettings(2.8))
+        for name in ("whole", "between")
+    )
+
+    np.testing.assert_allclose(between.kernel, whole.kernel, atol=1e-6)
+
+
+class Written:
+    """Steps that only say that they were taken."""
+
+    def __init__(self, *, goes_on: bool) -> None:
+        self.taken: list[str] = []
+        self._goes_on = goes_on
+
+    def inspect(self) -> bool:
+        self.taken.append("inspect")
+        return self._goes_on
+
+    def enter(self, stage: pipeline.Stage) -> None:
+        self.taken.append(stage)
+
+    def develop(self) -> None:
+        self.taken.append("develop")
+
+    def select(self) -> None:
+        self.taken.append("select")
+
+    def estimate(self) -> None:
+        self.taken.append("estimate")
+
+    def count(self) -> None:
+        self.taken.append("count")
+
+
+def test_a_photo_takes_its_steps_in_order_and_none_after_a_refusal() -> None:
+    counted, refused = Written(goes_on=True), Written(goes_on=False)
+
+    pipeline.take(counted)
+    pipeline.take(refused)
+
+    assert counted.taken == [
+        *("inspect", "developing", "develop", "selecting", "select", "estimating", "estimate", "count")
+    ]
+    assert refused.taken == ["inspect"]

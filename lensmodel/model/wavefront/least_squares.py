@@ -1,4 +1,4 @@
-"""Least squares of a wavefront against samples: Levenberg-Marquardt with exact derivatives.
+"""Least squares of a wavefront against samples: exact derivatives by its terms, differences by the pupil.
 
 Each sample may move by a fraction of a pixel: its tilts are eliminated before the step. Starts come
 from the moments of the samples (`starts`).
@@ -24,6 +24,9 @@ Floats = NDArray[np.float64]
 _NOISE = 0.1  # relative L2 that a good sample has against the best wavefront (chosen)
 _HUBER = 0.35  # relative error: that of a usual estimate (chosen)
 _ENOUGH = 2e-3  # of the cost: less gained in a step ends the fit (chosen)
+# Of the differences that stand for derivatives: by the cat's eye, whose edge is one sample of the pupil wide,
+# and by the width of diffraction (chosen)
+_EYE_STEP, _LOG_Q_STEP = 0.02, 0.05
 _TRIES = 4  # steps with more damping before the fit ends (chosen)
 
 
@@ -138,14 +141,14 @@ class Problem:
         grid = front.grid(settings)
         radius, shift = front.eye
         amplitude = front.amplitude(grid, position, settings, front.eye)
-        wider = front.amplitude(grid, position, settings, (radius + 0.02, shift)) - amplitude
-        further = front.amplitude(grid, position, settings, (radius, shift + 0.02)) - amplitude
+        wider = front.amplitude(grid, position, settings, (radius + _EYE_STEP, shift)) - amplitude
+        further = front.amplitude(grid, position, settings, (radius, shift + _EYE_STEP)) - amplitude
         g = front.blur(position, settings)
         g[6:] = tilt
-        light, derivatives = grid.with_derivatives(g, amplitude, (wider / 0.02, further / 0.02))
-        softer = replace(front, log_q=front.log_q + 0.05).grid(settings)
+        light, derivatives = grid.with_derivatives(g, amplitude, (wider / _EYE_STEP, further / _EYE_STEP))
+        softer = replace(front, log_q=front.log_q + _LOG_Q_STEP).grid(settings)
         broad = softer.light(g, front.amplitude(softer, position, settings, front.eye))
-        by_q = (broad / broad.sum() * light.sum() - light) / 0.05
+        by_q = (broad / broad.sum() * light.sum() - light) / _LOG_Q_STEP
         stack = self._soft(np.concatenate([derivatives, by_q[None], light[None]]))
         flat = stack.reshape(len(stack), -1)
         total = light.sum()

@@ -20,9 +20,9 @@ from lensmodel import correction
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.types import ZONE_WORDS, LensSettings, StepHook, Zone
 from lensmodel.correction.audit import HELD, AuditReport
-from lensmodel.photo import OutputFormat
+from lensmodel.photo import OutputFormat, inspect
 from lensmodel.photo.endings import CORRECTED
-from lensmodel.workflow.identity import difference
+from lensmodel.workflow.identity import Identity, difference
 from lensmodel.workflow.lens import Lens
 
 EXTENSION: Final[dict[OutputFormat, str]] = {
@@ -129,7 +129,8 @@ def correct_one(
         raise InvalidInputError("it was corrected already; give the original")
     if target.exists() and not options.force:
         return {"state": "kept"}
-    identity = files.identity(path)
+    said = inspect(path).metadata
+    identity = Identity.of(said)
     why = difference(lens.profile.lens, lens.profile.cameras, identity)
     if why is not None and not (options.any_lens or options.force):
         raise InvalidInputError(f"{why}; use the profile of its own lens, or add --any-lens")
@@ -137,7 +138,7 @@ def correct_one(
         display.note(f"{path}: {why}; it is corrected all the same, as you asked")
     elif not identity.names_lens:
         display.note(f"{path} does not name its lens; it is taken for a photo of the profile's lens")
-    if settings.aperture is None and not files.says_aperture(path):
+    if settings.aperture is None and said.aperture is None:
         display.note(f"{path} does not say its aperture; all apertures of the profile are taken together")
     target.parent.mkdir(parents=True, exist_ok=True)
     corrected = lensmodel.correct(

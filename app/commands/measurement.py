@@ -26,9 +26,10 @@ from app.schemas import MeasurementKind
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.types import LensSettings
 from lensmodel.model import save_profile
+from lensmodel.photo import inspect
 from lensmodel.photo.endings import ENDINGS
 from lensmodel.workflow import pipeline
-from lensmodel.workflow.identity import difference
+from lensmodel.workflow.identity import Identity, difference
 from lensmodel.workflow.lens import Lens
 
 PAPERS: Final = ("a2", "a3", "a4")
@@ -145,7 +146,7 @@ def _add(group: tuple[Path, ...], target: Path, options: Options, on_step: Any) 
     known = Lens.load(target) if target.exists() else None
     if known is not None and key in known.profile.photos:
         return {"state": "known"}
-    identity = files.identity(path)
+    identity = Identity.of(inspect(path).metadata)
     if known is not None and not options.any_lens:
         why = difference(known.profile.lens, known.profile.cameras, identity)
         if why is not None:

@@ -11,9 +11,7 @@ from typing import Any
 from app.commands.console.failure import UsageError
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.model import LensProfile, load_profile
-from lensmodel.photo import inspect
 from lensmodel.photo.endings import CORRECTED, ENDINGS, RAW_ENDINGS
-from lensmodel.workflow.identity import Identity
 
 
 def photos(names: Iterable[str]) -> list[Path]:
@@ -63,16 +61,6 @@ def profile_at(path: Path) -> LensProfile:
             f"no lens profile at {path}; make it with `lensmodel calibrate PHOTO... --profile {path}`"
         )
     return load_profile(path)
-
-
-def identity(path: Path) -> Identity:
-    """Return what a photo says of its lens and its camera."""
-    return Identity.of(inspect(path).metadata)
-
-
-def says_aperture(path: Path) -> bool:
-    """Tell whether a photo says its own aperture; what the command line says is then not needed."""
-    return inspect(path).metadata.aperture is not None
 
 
 def refuse_existing(*paths: Path | None, force: bool) -> None:

@@ -71,7 +71,7 @@ _HOMES: Final = {
     "lensmodel.workflow.lens": ("Lens",),
     "lensmodel.workflow.field_grid": ("field_grid",),
     "lensmodel.photo": ("LinearPhoto", "develop"),
-    "lensmodel.workflow.calibrating": ("CalibrationEvent",),
+    "lensmodel.workflow.sampling": ("CalibrationEvent",),
     "lensmodel.core.psf": ("PsfSample",),
     "lensmodel.model": ("ModelSettings", "PsfAnswer"),
     "lensmodel.core.types": ("FieldPosition", "LensSettings", "NoiseModel"),

@@ -1,6 +1,6 @@
 """The job of a photo: inspect, identify the lens, develop, choose patches, estimate PSFs, count.
 
-The order of the steps is the library's (`lensmodel.workflow.calibrating.take`). Each reads the tables first
+The order of the steps is the library's (`lensmodel.workflow.sampling.take`). Each reads the tables first
 and does only what is not done yet. So the job may be started again at any time, by any worker, and still
 every effect happens once.
 """

@@ -8,21 +8,7 @@ the service run the same code. The steps in the middle are independent of each o
 run in as many processes as there are. Here they are under one name.
 """
 
-from lensmodel.workflow.calibrating import (
-    AHEAD,
-    Calibration,
-    CalibrationEvent,
-    EventHook,
-    InMemory,
-    PhotoSteps,
-    Recipe,
-    Stage,
-    Verdict,
-    ignore_event,
-    samples_of_bytes,
-    samples_of_photo,
-    take,
-)
+from lensmodel.workflow.calibrating import AHEAD, Calibration, InMemory, Verdict
 from lensmodel.workflow.correcting import correct_photo, lateral_of, psfs_for
 from lensmodel.workflow.developed import (
     load_developed,
@@ -43,6 +29,17 @@ from lensmodel.workflow.estimating import (
     require_spread,
     seen_patches,
     witnesses_of,
+)
+from lensmodel.workflow.sampling import (
+    CalibrationEvent,
+    EventHook,
+    PhotoSteps,
+    Recipe,
+    Stage,
+    ignore_event,
+    samples_of_bytes,
+    samples_of_photo,
+    take,
 )
 
 __all__ = [

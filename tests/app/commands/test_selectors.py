@@ -14,7 +14,7 @@ import pytest
 import lensmodel
 from app.cli import main
 from lensmodel.core.errors import NotEnoughEvidenceError, NoUsablePatchesError
-from lensmodel.workflow import calibrating
+from lensmodel.workflow import sampling
 
 HERE = Path(__file__).parents[1]
 sys.path.insert(0, str(HERE))
@@ -33,7 +33,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[object]:
         selectors.append(selector)
         raise NoUsablePatchesError("no patch was chosen")
 
-    monkeypatch.setattr(calibrating, "find_patches", find_patches)
+    monkeypatch.setattr(sampling, "find_patches", find_patches)
     return selectors
 
 

@@ -471,6 +471,7 @@ def test_unknown_pitch_is_taken_as_a_usual_one_not_as_wide_kernels_suggest(witho
     physics = without_pitch.physical
 
     assert physics is not None
+    assert physics.agreed
     assert not physics.diffraction_known
     assert physics.front.log_q == pytest.approx(LOG_Q)
 

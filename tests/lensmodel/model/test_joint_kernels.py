@@ -460,11 +460,12 @@ def test_the_error_to_expect_grows_with_what_kernels_and_wavefront_differ_by() -
 
 
 def test_unknown_pitch_is_taken_as_a_usual_one_not_as_wide_kernels_suggest(without_pitch: LensModel) -> None:
-    pooled = without_pitch.physical
+    physics = without_pitch.physical
 
-    assert isinstance(pooled, Pooled)
-    assert not pooled.diffraction_known
-    assert pooled.front.log_q == pytest.approx(LOG_Q)
+    assert physics is not None
+    assert physics.agreed
+    assert not physics.diffraction_known
+    assert physics.front.log_q == pytest.approx(LOG_Q)
 
 
 def test_error_is_told_even_where_the_cat_s_eye_is_hardly_known() -> None:
@@ -500,8 +501,8 @@ def test_wavefront_is_never_surer_than_the_kernels_nor_than_it_agrees_with_them(
 ) -> None:
     wide = [replace(s, kernel=gaussian(31, 2.0**2 * np.eye(2)), error=0.3) for s in known]
     place = FieldPosition(0.2, 0.4)
-    plain = LensModel.fit(wide)
-    alone = LensModel(tuple(wide), WAVEFRONT, replace(plain._fit, physical=warm._fit.physical))
+    plain, cold = LensModel.fit(wide), LensModel.fit(wide, WAVEFRONT)
+    alone = LensModel(tuple(wide), WAVEFRONT, replace(cold._fit, physical=warm._fit.physical))
 
     answer, other = alone.query(place, SETTINGS, 31), plain.query(place, SETTINGS, 31)
 

@@ -53,8 +53,7 @@ RECONCILE_S: Final = 10.0  # of the tables with the engine: the longest wait of 
 TIDY_S: Final = 60.0  # of deletion: nobody waits for it
 REPORTS_S: Final = 6 * 3600.0  # of the search for missing reports: it lists all fitted models
 KEEP_JOBS: Final = timedelta(days=2)
-"""How long the engine remembers ended jobs (chosen): our own tables hold the truth, and a fault of
-yesterday can still be looked into."""
+"""How long the engine remembers ended jobs (chosen): a fault of yesterday can still be looked into."""
 
 _OURS: Final = "an error of ours; the log of the worker has it; retry later, or report the file"
 _LATER: Final = "retry once its operator has mended that"

@@ -24,11 +24,13 @@ PLACE = FieldPosition(0.9, 1.0)
 SPECTRUM = PatchSpectrum(np.full((RINGS, SECTORS), 1e-3, dtype=np.float32), 1e-5)
 
 
-def taken(photos: int = 2, patches: int = 6, focal_mm: float | None = None) -> list[PsfSample]:
-    """Patches of every channel with spectra, the photos at different radii."""
+def taken(
+    photos: int = 2, patches: int = 6, focal_mm: float | None = None, *, exact: bool = False
+) -> list[PsfSample]:
+    """Patches of every channel with spectra, the photos at different radii; estimates differ by a third in width."""
     return [
         PsfSample(
-            gaussian(SIDE, np.eye(2)),
+            gaussian(SIDE, (1.0 if exact or k % 2 else 2.0) * np.eye(2)),
             FieldPosition(0.15 + 0.7 * photo, 0.9 * k - 2.7),
             LensSettings(2.0, focal_mm, None, channel),
             photo=f"p{photo}",
@@ -98,6 +100,15 @@ def test_an_answer_without_any_wavefront_says_why(
     answer = with_wavefront(samples, None, settings).query(PLACE, SETTINGS, SIDE)
 
     assert (answer.answered_by, answer.reason) == named
+
+
+def test_kernels_that_agree_all_over_the_field_answer_alone() -> None:
+    samples = taken(exact=True)
+
+    answer = with_wavefront(samples, physics(len(samples))).query(PLACE, SETTINGS, SIDE)
+
+    assert (answer.answered_by, answer.wavefront_share) == ("regression", 0.0)
+    assert answer.reason == "kernels agree with each other all over the field"
 
 
 def test_all_patches_that_the_wavefront_was_fitted_to_stand_behind_its_answer() -> None:

@@ -27,7 +27,7 @@ SPECTRUM = PatchSpectrum(np.full((RINGS, SECTORS), 1e-3, dtype=np.float32), 1e-5
 def taken(
     photos: int = 2, patches: int = 6, focal_mm: float | None = None, *, exact: bool = False
 ) -> list[PsfSample]:
-    """Patches of every channel with spectra, the photos at different radii; estimates differ by a third in width."""
+    """Patches of every channel with spectra, the photos at different radii; estimates differ in width."""
     return [
         PsfSample(
             gaussian(SIDE, (1.0 if exact or k % 2 else 2.0) * np.eye(2)),

@@ -15,7 +15,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from lensmodel.core import parallel
+from lensmodel.core.errors import LensModelError
+from lensmodel.core.types import LensSettings
 from lensmodel.simulate import demo_data_path
+from lensmodel.workflow import pipeline
 
 HERE = Path(__file__).parents[1]
 sys.path.insert(0, str(HERE))
@@ -132,6 +136,19 @@ def answers(service: Service) -> dict[str, dict[str, Any]]:
 
 
 @pytest.mark.parametrize("name", OWN)
+def test_a_bad_file_is_refused_by_whoever_reads_it(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.write_bytes(OWN[name])
+
+    with pytest.raises(LensModelError) as refusal:
+        pipeline.samples_of_photo(path, settings=LensSettings(4.0), count=2, executor=parallel.Here())
+
+    assert refusal.value.code in KNOWN_CODES
+    assert len(str(refusal.value)) > 15
+
+
+@pytest.mark.slow  # as the test before, which needs no service
+@pytest.mark.parametrize("name", OWN)
 def test_a_bad_file_is_refused_with_a_code_and_a_sentence(
     name: str, answers: dict[str, dict[str, Any]]
 ) -> None:
@@ -142,11 +159,13 @@ def test_a_bad_file_is_refused_with_a_code_and_a_sentence(
     assert "Traceback" not in problem["detail"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["bomb.png", "tall.png", "huge.tif"])
 def test_a_bomb_is_refused_by_its_header(name: str, answers: dict[str, dict[str, Any]]) -> None:
     assert answers[name]["code"] in {"decompression_bomb", "image_too_large"}
 
 
+@pytest.mark.slow
 def test_a_good_photo_still_goes_through_afterwards_in_the_same_worker(
     service: Service, answers: dict[str, dict[str, Any]], tmp_path: Path
 ) -> None:

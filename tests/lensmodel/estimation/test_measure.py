@@ -194,8 +194,9 @@ def target_photo() -> LinearPhoto:
     return photo_of(scene, lopsided())
 
 
+@pytest.mark.parametrize("details", [(500,), pytest.param((400, 500), marks=pytest.mark.slow)])
 def test_a_target_is_found_and_gives_the_kernel_as_it_is(
-    target_photo: LinearPhoto, monkeypatch: pytest.MonkeyPatch
+    target_photo: LinearPhoto, monkeypatch: pytest.MonkeyPatch, details: tuple[int, ...]
 ) -> None:
     placed: list[PlacedPage] = []
     find = Target.find
@@ -205,7 +206,7 @@ def test_a_target_is_found_and_gives_the_kernel_as_it_is(
         return placed[-1]
 
     monkeypatch.setattr(Target, "find", noted)  # to find a page takes longer than all the rest
-    method = Target(across=2, down=1, details=(400, 500))
+    method = Target(across=2, down=1, details=details)
     found = method.measure([target_photo], size=21, channels=("g",))
     assert [page.page.detail for page in placed] == [500]
     assert found

@@ -300,16 +300,6 @@ def warm(known: list[PsfSample], searching_shortly: Callable[[], AbstractContext
         return LensModel.fit(known).warmed()
 
 
-@pytest.fixture(scope="module")
-def without_pitch(
-    known: list[PsfSample], searching_shortly: Callable[[], AbstractContextManager[None]]
-) -> LensModel:
-    """A model of wide kernels whose pixels are of unknown size."""
-    wide = [replace(s, kernel=gaussian(31, 4.0 * np.eye(2)), pixel_pitch_um=None) for s in known]
-    with searching_shortly():
-        return LensModel.fit(wide).warmed()
-
-
 def gaussian_patch(width: float, rng: np.random.Generator, side: int = 192) -> PatchSpectrum:
     """Spectrum of noise of power 1/f^2 behind a Gaussian: made from pixels, not by the model's own rules."""
     frequency = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None, :])
@@ -404,14 +394,13 @@ def test_pooled_lens_is_nearer_to_the_truth_than_its_samples_and_kept_by_profile
     assert all(s.spectrum is not None for s in back.samples)
 
 
-def test_a_wavefront_takes_part_only_where_its_diffraction_is_known(
-    warm: LensModel, without_pitch: LensModel
-) -> None:
-    place = FieldPosition(0.0, 0.0)
+def test_a_wavefront_takes_part_only_where_its_diffraction_is_known(warm: LensModel) -> None:
+    place, physics = FieldPosition(0.0, 0.0), warm.physical
+    assert physics is not None
+    unknown = replace(warm._fit, physical=replace(physics, diffraction_known=False))
 
     assert warm.query(place, SETTINGS, 31).wavefront_share == WAVEFRONT_SHARE
-    assert without_pitch.physical is not None
-    answer = without_pitch.query(place, SETTINGS, 31)
+    answer = LensModel(warm.samples, warm.settings, unknown).query(place, SETTINGS, 31)
     assert (answer.wavefront_share, answer.answered_by) == (0.0, "regression")
     assert answer.reason == "aperture or pixel pitch unknown"
 
@@ -459,13 +448,25 @@ def test_the_error_to_expect_grows_with_what_kernels_and_wavefront_differ_by() -
     assert 0.05 < told(0.2) < 0.5
 
 
-def test_unknown_pitch_is_taken_as_a_usual_one_not_as_wide_kernels_suggest(without_pitch: LensModel) -> None:
-    physics = without_pitch.physical
+def test_unknown_pitch_is_taken_as_a_usual_one_not_as_wide_kernels_suggest(
+    known: list[PsfSample], short_search: None
+) -> None:
+    unknown = [replace(s, kernel=gaussian(31, 4.0 * np.eye(2)), pixel_pitch_um=None) for s in known]
+    found = pool(unknown)
 
-    assert physics is not None
-    assert physics.agreed
-    assert not physics.diffraction_known
-    assert physics.front.log_q == pytest.approx(LOG_Q)
+    assert found is not None
+    assert not found.diffraction_known
+    assert found.front.log_q == pytest.approx(LOG_Q)
+
+
+@pytest.mark.slow
+def test_a_wavefront_that_was_fitted_without_a_pitch_takes_no_part(
+    known: list[PsfSample], short_search: None
+) -> None:
+    unknown = LensModel.fit([replace(s, pixel_pitch_um=None) for s in known]).warmed()
+
+    assert unknown.physical is not None
+    assert unknown.query(FieldPosition(0.0, 0.0), SETTINGS, 31).reason == "aperture or pixel pitch unknown"
 
 
 def test_error_is_told_even_where_the_cat_s_eye_is_hardly_known() -> None:

@@ -237,4 +237,6 @@ class Calibration:
             return
         why = difference(lens.profile.lens, lens.profile.cameras, identity)
         if why is not None:
-            raise InvalidInputError(f"{why}; give it a profile of its own, or allow it (--any-lens, any_lens=True)")
+            raise InvalidInputError(
+                f"{why}; give it a profile of its own, or allow it (--any-lens, any_lens=True)"
+            )

@@ -141,7 +141,7 @@ def test_a_bad_file_is_refused_by_whoever_reads_it(name: str, tmp_path: Path) ->
     path.write_bytes(OWN[name])
 
     with pytest.raises(LensModelError) as refusal:
-        pipeline.samples_of_photo(path, settings=LensSettings(4.0), count=2, executor=parallel.Here())
+        pipeline.samples_of_photo(path, pipeline.Recipe(LensSettings(4.0), count=2), executor=parallel.Here())
 
     assert refusal.value.code in KNOWN_CODES
     assert len(str(refusal.value)) > 15

@@ -47,10 +47,8 @@ _INDEPENDENT = 3.8
 # Independent share of half-overlapping tiles: (1 + 2 (1/6)^2)^-2 (P. D. Welch, IEEE Trans. AU-15, 1967)
 _OVERLAP = 0.9
 _SCATTER = 0.05  # radians: what a scene's colours leave in a bin (`lab.model.cross_spectra`)
-_REACH_PX, _STEP_PX = (
-    4.0,
-    0.5,
-)  # shifts that are tried first (chosen: beyond usual lateral colour)
+# Shifts that are tried first (chosen: beyond usual lateral colour)
+_REACH_PX, _STEP_PX = 4.0, 0.5
 _SHIFT_ROUNDS = 6  # of Gauss and Newton (chosen: far below a hundredth of a pixel from such a start)
 
 _AXIS = np.fft.fftfreq(_HALF) / 2.0  # cycles/pixel of the full lattice

@@ -242,7 +242,7 @@ class LensModel:
             independent=1.0 / float((per_photo**2).sum()),
             nearest=nearest,
             extrapolated=bool(beyond),
-            usual=float(np.mean(fit.validation.errors**2)),
+            usual=fit.validation.usual,
         )
         physical = fit.physical_at(settings)
         alone = fit.mode == WAVEFRONT and physical is not None and physical.agreed

@@ -102,7 +102,7 @@ def answered(
         apart, shares = relative_l2(rows, kernels), np.ones(len(rows))
         return replace(alone, shares=shares, averaged=averaged.squared, apart=apart)
     if fit.mode == BOTH and physical.agreed and physical.diffraction_known:
-        known = np.maximum(measured_share(expected), exact_share(math.sqrt(averaged.usual)))
+        known = np.maximum(measured_share(expected), exact_share(math.sqrt(validation.usual)))
         share = WAVEFRONT_SHARE * (1.0 - known)
         return _with_wavefront(averaged, physical, share, positions, settings)
     return averaged

@@ -12,9 +12,8 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.model import pitch as pitches
 from lensmodel.model.answer import MICROMETRE
 
-_WIDEST = (
-    255  # pixels along a side of the widest kernel that is made for coarser pixels to be asked for: memory
-)
+# Pixels along a side of the widest kernel that is made for coarser pixels to be asked for: memory
+_WIDEST = 255
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ had the same::
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -114,7 +115,7 @@ def _without_wavefront(fit: Fit, settings: LensSettings, *, takes_wavefront: boo
         return f"fewer than {MIN_SAMPLES} samples" if few else "the wavefront is not fitted yet"
     if not physical.agreed or not physical.diffraction_known:
         return "aperture or pixel pitch unknown" if physical.agreed else _APART[physical.why_apart]
-    exact = exact_share(float(np.sqrt(np.mean(fit.validation.errors**2)))) == 1.0
+    exact = exact_share(math.sqrt(fit.validation.usual)) == 1.0
     return "kernels agree with each other all over the field" if exact else "kernels were measured"
 
 

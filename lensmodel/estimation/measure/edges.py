@@ -40,9 +40,8 @@ FLOOR: Final = 0.15
 """Error that no pair of edges shows of itself: what lies between two directions. Chosen: an even mixture of
 a core and its aberrations differs by that much from its own two slices' Gaussian."""
 
-_FREQUENCIES: Final = np.linspace(
-    0.02, 0.5, 25
-)  # cycles/pixel: steps far below what a kernel resolves (chosen)
+# Cycles/pixel: steps far below what a kernel resolves (chosen)
+_FREQUENCIES: Final = np.linspace(0.02, 0.5, 25)
 _SLICE_ERROR: Final = 0.01  # s: of an edge of 64 lines at 1 percent noise
 _PIXEL_SPREAD: Final = 0.02  # t: a pixel's light differs so much from a Gaussian's
 _CROSSING: Final = math.radians(45.0)  # edges closer in direction say the same of a kernel (chosen)

@@ -13,9 +13,8 @@ from scipy import ndimage
 from lensmodel.core.errors import NotEnoughEvidenceError
 
 _LOOKED_AT: Final = 1000  # pixels along the long side: noise has turned to grey, discs are 15 across
-_DARK: Final = (
-    0.45  # of the surroundings' mean level, which is grey as the noise is (chosen: discs are black)
-)
+# Of the surroundings' mean level, which is grey as the noise is (chosen: discs are black)
+_DARK: Final = 0.45
 _ROUND: Final = 0.85  # area over that of the ellipse of the same second moments, 1 of an ellipse (chosen)
 _LEAST_PX: Final = 20  # area of a disc: below it no shape is seen (chosen)
 _MOST_SHARE: Final = 0.004  # same, of the picture: a page that fills it has less than a tenth (chosen)

@@ -49,9 +49,8 @@ _DAMPING: Final = 0.004  # of the squared transfer function: noise is not raised
 _STOPS_APART: Final = 2.0  # least difference of the apertures (chosen, not measured)
 _SURE: Final = 0.3  # expected relative L2 from which on a window is dropped (chosen, not measured)
 _COARSE: Final = 4  # factor by which photos are shrunk for the first match (chosen, not measured)
-_NOISE_GRID: Final = (
-    128  # frequencies along an axis (chosen, not measured); its lags have to hold two kernels
-)
+# Frequencies along an axis (chosen, not measured); its lags have to hold two kernels
+_NOISE_GRID: Final = 128
 _RINGS: Final = 16  # of frequency, 0 to 0.5 cycles/pixel (chosen, not measured)
 _ALIASED: Final = 0.03
 """Share of its alias that a demosaiced colour of a mosaic holds: of 0.03, 0.06 and 0.1 the one with the least

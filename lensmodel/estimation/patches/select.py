@@ -30,9 +30,8 @@ DARK_LIMIT: Final = 0.5  # share of a window's pixels (chosen, not measured)
 FLAT_CONTRAST: Final = 4.0  # variance of signal over that of noise (chosen, not measured)
 FLAT_EIGENVALUE: Final = 10.0
 """Smaller eigenvalue of the structure tensor over that of noise (chosen, not measured)."""
-ONE_DIRECTION_RATIO: Final = (
-    0.05  # smaller eigenvalue of the structure tensor over the larger (chosen, not measured)
-)
+# Smaller eigenvalue of the structure tensor over the larger (chosen, not measured)
+ONE_DIRECTION_RATIO: Final = 0.05
 SECTOR_INFORMATION: Final = float(np.log(2.0))  # power twice that of noise, signal as strong as noise
 PERIOD_LIMIT: Final = 0.8  # see `Details.period` (chosen, not measured)
 BLOCKINESS_LIMIT: Final = 1.8  # see `Details.blockiness` (chosen, not measured)

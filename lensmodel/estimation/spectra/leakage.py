@@ -10,9 +10,8 @@ from scipy import fft
 
 Floats = NDArray[np.float64]
 
-_SCENE_FALL = (
-    2.3  # exponent of a scene's power, about 2 (D. J. Field, JOSA A 4, 1987); chosen within 2.0 to 2.6
-)
+# Exponent of a scene's power, about 2 (D. J. Field, JOSA A 4, 1987); chosen within 2.0 to 2.6
+_SCENE_FALL = 2.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,7 +22,8 @@ from typing import Final
 
 from lensmodel import correction, photo
 from lensmodel.core.belief import Belief, UncertainField
-from lensmodel.core.psf import PsfField
+from lensmodel.core.errors import NotEnoughEvidenceError
+from lensmodel.core.psf import PsfField, PsfSample
 from lensmodel.core.types import ZONES, Channel, FieldPosition, Kernel
 from lensmodel.lab.chain.blind_gain import (
     CAMERA,
@@ -89,15 +90,15 @@ def rows(lens: Lens, counts: list[int], folder: Path) -> Iterator[str]:
     files = [
         written(folder / f"{lens.name}-{k}.dng", shot(lens, k), tiff=False) for k in range(max(counts) + 1)
     ]
-    learned = [
-        pipeline.samples_of_photo(path, pipeline.Recipe(lens.settings), workers=1)
-        for path in files[: max(counts)]
-    ]
+    learned = [_samples(path, lens) for path in files[: max(counts)]]
     sharp, developed = shot(lens, max(counts)).sharp, photo.develop(files[-1])
     lateral = pipeline.lateral_of(developed)
     pictures = to_srgb(shown(developed.planes)), to_srgb(shown(sharp))
     for count in counts:
         known = [sample for own in learned[:count] for sample in own]
+        if not known:
+            yield f"| {lens.name} | {count} | its photos show too little | | | | |"
+            continue
         model = LensModel.fit(known, ModelSettings()).warmed()
         for name, field in fields(lens, model, developed):
             made: correction.Corrected = pipeline.correct_photo(
@@ -110,6 +111,14 @@ def rows(lens: Lens, counts: list[int], folder: Path) -> Iterator[str]:
             expected = " / ".join("?" if gain is None else f"{gain:+.1f}" for gain in told)
             lost = f"{seen.loss_share:.1%}"
             yield f"| {lens.name} | {count} | {name} | {gained} | {light} | {expected} | {lost} |"
+
+
+def _samples(path: Path, lens: Lens) -> list[PsfSample]:
+    """Samples of a photo; none where it shows too little."""
+    try:
+        return pipeline.samples_of_photo(path, pipeline.Recipe(lens.settings), workers=1)
+    except NotEnoughEvidenceError:
+        return []
 
 
 def main() -> None:

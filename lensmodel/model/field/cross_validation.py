@@ -46,6 +46,11 @@ class CrossValidation:
     choice: Choice
     flags: tuple[Flag, ...] = ()
 
+    @property
+    def usual(self) -> float:
+        """Mean squared held-out error of the whole field."""
+        return float(np.mean(self.errors**2))
+
     def extended(self, votes: NDArray[np.float64]) -> CrossValidation:
         """Return it with samples that were not scored: the usual errors, the votes that they claim."""
 

@@ -38,10 +38,8 @@ _SHEET = 1 << 21  # pixels at once: 16 MB of doubles (chosen)
 FINER = 2
 """Coefficients for each pixel along an axis; 1 where memory is short."""
 
-_SMOOTH, _NARROW = (
-    7,
-    3,
-)  # degrees: near the band limit where light is smooth, short where it is narrow (chosen)
+# Degrees: near the band limit where light is smooth, short where it is narrow (chosen)
+_SMOOTH, _NARROW = 7, 3
 _ALIASED = (0.05, 0.2)  # contrast at the Nyquist frequency: below, above
 _MARGIN = 8  # pixels: the spline's response has fallen to 3e-5 there
 

@@ -20,10 +20,8 @@ USUAL_PITCH_UM = 4.5
 """Of sensors whose pixel pitch nobody knows (chosen: 42 megapixels on 36 x 24 mm)."""
 
 _LARGEST = 55  # pixels: the largest side that estimators give
-_COARSE, _FINE = (
-    12,
-    36,
-)  # samples of the search and of the fit: 36 kernels over-determine 22 unknowns (chosen)
+# Samples of the search and of the fit: 36 kernels over-determine 22 unknowns (chosen)
+_COARSE, _FINE = 12, 36
 _COARSE_ROUNDS, _FINE_ROUNDS = 8, 12  # steps at most: only the last fit has to end (chosen)
 _STARTS, _REFINED = 4, 2  # beginnings by moments, and those of them that are fitted in full (chosen)
 _REFINING_ROUNDS = 6  # steps at most of a fit that begins near its end (chosen)

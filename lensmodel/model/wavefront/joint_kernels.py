@@ -45,11 +45,8 @@ _COARSE_PLACES, _MEDIUM_PLACES, _FINE_PLACES = 24, 36, 48
 _NARROW_PLACES, _STOPPED_DOWN = 24, 2.0
 """Patches at most of photos stopped down, and the multiple of the widest f-number from which on they are (two
 stops). With all of them, five such photos take back what one adds (`lensmodel.lab.chain.stopped_down`)."""
-_COARSE_ROUNDS, _MEDIUM_ROUNDS, _FINE_ROUNDS = (
-    7,
-    6,
-    16,
-)  # steps at most: only the last fit has to end (chosen)
+# Steps at most: only the last fit has to end (chosen)
+_COARSE_ROUNDS, _MEDIUM_ROUNDS, _FINE_ROUNDS = 7, 6, 16
 # Starts by moments, minima kept of the coarse search, and those fitted in full, of all photos and of a pair
 # (chosen: each of the last costs seconds)
 _STARTS, _KEPT, _REFINED, _REFINED_OF_PAIR = 6, 12, 4, 2
@@ -57,10 +54,8 @@ _FEWEST_PAIRED, _MOST_PAIRS = 3, 2  # photos, and pairs of them (chosen: two pho
 _FIRST, _RANDOM = 16, 24  # samples of the first fit to kernels, and random wavefronts to begin with (chosen)
 _SAME_PX = 0.4  # pixels of blur: terms nearer than that lie in one minimum (chosen)
 _TAIL_SIDE = 31  # pixels of kernels whose third moments count: wider wings are noise to them (chosen)
-_ERROR_PLACES, _DRAWS = (
-    14,
-    6,
-)  # places and draws that tell the scatter: each draw costs a kernel a place (chosen)
+# Places and draws that tell the scatter: each draw costs a kernel a place (chosen)
+_ERROR_PLACES, _DRAWS = 14, 6
 _ALIKE_R = 0.15  # half-diagonals: the scatter changes no faster over the field (chosen)
 _SEED = 0  # any number: fits repeat to the bit
 _ERROR: Final[Mapping[str, float]] = fitted("model")["pooled_error"]

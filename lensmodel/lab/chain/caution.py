@@ -44,15 +44,15 @@ from lensmodel.workflow.correcting import psfs_for
 
 Prior = tuple[tuple[float, ...], ...]
 
-NARROWER: Final[Prior] = ((0.02, 0.05, 0.05, 0.05), (0.2, 0.23, 0.3, 0.1))
-"""A prior that takes three kernels of four for too wide (the default until 2026-11-25)."""
+SURER: Final[Prior] = ((0.06, 0.04, 0.04, 0.03), (0.37, 0.18, 0.2, 0.08))
+"""A prior that takes one kernel of two for too wide, where the default takes three of four (chosen)."""
 
 RULES: Final[dict[str, tuple[Prior, float]]] = {
     "default": (OF_BOTH, SPREAD_OF_BOTH),
-    "variance x 0.4": (OF_BOTH, 0.4 * SPREAD_OF_BOTH),
-    "variance x 4": (OF_BOTH, 4.0 * SPREAD_OF_BOTH),
-    "narrower": (NARROWER, SPREAD_OF_BOTH),
-    "narrower, variance x 4": (NARROWER, 4.0 * SPREAD_OF_BOTH),
+    "half the variance": (OF_BOTH, 0.5 * SPREAD_OF_BOTH),
+    "a quarter": (OF_BOTH, 0.25 * SPREAD_OF_BOTH),
+    "surer": (SURER, SPREAD_OF_BOTH),
+    "surer, a quarter": (SURER, 0.25 * SPREAD_OF_BOTH),
 }
 """Prior of the alternatives and factor on their variance."""
 

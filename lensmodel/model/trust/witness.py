@@ -48,15 +48,13 @@ _FITTED: Final = fitted("model")["witness"]
 OF_BOTH: Final = (tuple(_FITTED["kernels"]), tuple(_FITTED["wavefront"]))
 """p of kernels and of the wavefront, see `data/README.md`.
 
-A search on lenses of development for the error that a linear filter by such a belief would leave
-(`lensmodel.lab.model.belief_prior`) took three kernels of four for too wide, and the correction of whole
-photos gained a half of what the same kernels allow. So prior and spread were chosen by corrected photos, of
-third order 0, 1, 3, 5, 6 and 7 and of three ray-traced designs (`lensmodel.lab.chain.caution`): surer gains
-more behind most of them, and costs linear light behind the sharpest lens and the center of one of field
-curvature.
+Chosen on lenses of development (third order 0 to 3 and 6, and three ray-traced designs; one, two and five
+photos each) for the error that a linear filter by such a belief would leave. Surer ones gain 0.1 to 0.8 dB
+more on most of them (`lensmodel.lab.chain.caution`), and in a real photograph of a tree corners out of focus
+get ragged lights and dots. So these stay.
 """
 SPREAD_OF_BOTH: Final = float(_FITTED["spread"])
-"""Factor on the variance, chosen with them: less than one, for a correction limits itself besides."""
+"""Factor on the variance: the true kernel is none of the alternatives."""
 TEMPER, HALF = float(_FITTED["temper"]), float(_FITTED["half"])
 """t of many photos, and how many photos halve it."""
 

@@ -195,8 +195,15 @@ def write_photo(
     path: Path, seed: int, *, sigma: float = 1.3, serial: str = "L-42", aperture: float | None = 2.8
 ) -> Path:
     """Write a raw photo of such a scene, taken through a round Gaussian blur."""
-    rng = np.random.default_rng(seed)
     light = ndimage.gaussian_filter(scene(seed), sigma)
+    return write_light(path, light, seed, serial=serial, aperture=aperture)
+
+
+def write_light(
+    path: Path, light: NDArray[np.float64], seed: int, *, serial: str = "L-42", aperture: float | None = 2.8
+) -> Path:
+    """Write a raw photo of such light, of 20,000 electrons where it is 1."""
+    rng = np.random.default_rng(seed)
     electrons = rng.poisson(light * 20000.0)
     mosaic = np.clip(512 + electrons / 20000.0 * 15000.0, 0, 16383).round().astype(np.uint16)
     shot = ShotInfo(

@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ import numpy as np
 import pytest
 import typer
 from PIL import Image
+from scipy import ndimage
 from sqlalchemy import update
 from typer.core import TyperCommand, TyperGroup
 
@@ -36,12 +38,14 @@ from app.store.database import Database
 from app.store.upkeep.migrate import upgrade
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.estimation.measure.page import TargetPage
+from lensmodel.lab.measured import scenes
 from lensmodel.model import LensModel, LensProfile, save_profile
 
 HERE = Path(__file__).parents[1]
 sys.path.insert(0, str(HERE))
 from deadline import stretched  # noqa: E402 - beside these files
-from running import scene, write_photo  # noqa: E402 - same
+from running import scene, write_light, write_photo  # noqa: E402 - same
 
 sys.path.remove(str(HERE))
 
@@ -141,6 +145,19 @@ def test_the_quick_examples_are_examples() -> None:
     assert set(EXAMPLES) >= QUICK >= ALONE
 
 
+def write_what_measures(folder: Path) -> None:
+    """Write a photo of a printed page, and one scene at two apertures."""
+    page = 0.8 * scenes.target_scene(TargetPage(1000), (360, 510), scenes.Setup(fill=0.97))[1]
+    noise = 0.4 + 0.12 * np.random.default_rng(7).standard_normal((720, 960))
+    noise = np.clip(ndimage.gaussian_filter(noise, 0.5), 0.05, 0.9)
+    for name, light, sigma, aperture in (
+        ("page", page, 1.0, 2.8),
+        ("open", noise, 1.3, 2.8),
+        ("closed", noise, 0.4, 8.0),
+    ):
+        write_light(folder / f"{name}.dng", ndimage.gaussian_filter(light, sigma), 6, aperture=aperture)
+
+
 @pytest.fixture(scope="session")
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with all that the examples speak of."""
@@ -148,7 +165,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "holiday").mkdir()
     (folder / "sharp").mkdir()
     write_photo(folder / "holiday" / "first.dng", 2)
-    for name, seed in (("one", 1), ("one-more", 3), ("mine", 4)):
+    for name, seed in (("one", 1), ("one-more", 3), ("mine", 4), ("first", 5)):
         write_photo(folder / f"{name}.dng", seed)
     for k in range(4):
         picture = np.rint(255.0 * scene(10 + k)).astype(np.uint8)
@@ -174,6 +191,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     lens = {"maker": "Test Optics", "model": "Test 35mm f/1.8", "serial": "L-42"}
     known = LensProfile(LensModel.fit(samples), lens, {"0123456789abcdef": "x.dng"})
     save_profile(folder / "my-24mm.lensprofile", known)
+    save_profile(folder / "a-friends-24mm.lensprofile", replace(known, lens={**lens, "serial": "L-43"}))
     database = Database(f"sqlite:///{folder / 'lensmodel-data' / 'app.db'}")
     upgrade(database)
     KeyStore(database).create("anna", ["write"])
@@ -257,6 +275,8 @@ def test_example_runs(
     words = [*shlex.split(line), *SHORTER.get(EXAMPLES[line], [])]
     if "auto" in words:
         words += ["--estimator", "whittle", "--learn-from", "1"]
+    if EXAMPLES[line] == "measure":
+        write_what_measures(folder)
     kept = KEPT.get(EXAMPLES[line])
     if kept is not None and (finished / kept).is_dir():
         shutil.copytree(finished / kept, folder / kept)

@@ -13,7 +13,12 @@ _FEW: Final = 256  # unknowns up to which all eigenvalues are as quick (chosen)
 
 
 def nonnegative_least_squares(
-    a: NDArray[np.float64], b: NDArray[np.float64], start: NDArray[np.float64], steps: int = 200
+    a: NDArray[np.float64],
+    b: NDArray[np.float64],
+    start: NDArray[np.float64],
+    steps: int = 200,
+    *,
+    smallest: float = -np.inf,
 ) -> NDArray[np.float64]:
     """Minimise k'Ak/2 - b'k over k >= 0 by accelerated projected gradients (FISTA).
 
@@ -23,10 +28,13 @@ def nonnegative_least_squares(
         Symmetric; directions of negative curvature, which noise correction can leave, are lifted.
     b, start : ndarray, shape (n,)
         Where A is zero, nothing is known and the start is returned.
+    steps : int
+    smallest : float
+        What no eigenvalue is below, if that is known: to find it out costs as much as all steps.
     """
     if not a.any():
         return start.copy()
-    largest, lift = _largest_and_lift(a)
+    largest, lift = _largest_and_lift(a, smallest)
     step = 1.0 / (largest + lift)
     k, momentum, t = start.copy(), start.copy(), 1.0
     for _ in range(steps):
@@ -37,7 +45,7 @@ def nonnegative_least_squares(
     return k
 
 
-def _largest_and_lift(a: NDArray[np.float64]) -> tuple[float, float]:
+def _largest_and_lift(a: NDArray[np.float64], smallest: float) -> tuple[float, float]:
     """Largest eigenvalue, and what all are lifted by so that none is below `_LEAST` of that.
 
     All eigenvalues of a kernel of 55 x 55 pixels take ten times as long as to find out by a Cholesky
@@ -46,7 +54,8 @@ def _largest_and_lift(a: NDArray[np.float64]) -> tuple[float, float]:
     if len(a) > _FEW:
         start = np.ones(len(a))
         largest = float(scipy.sparse.linalg.eigsh(a, 1, v0=start, return_eigenvectors=False)[0])
-        if largest > 0.0 and _positive(a - _LEAST * largest * np.eye(len(a))):
+        least = _LEAST * largest
+        if largest > 0.0 and (smallest > least or _positive(a - least * np.eye(len(a)))):
             return largest, 0.0
     eigenvalues = np.linalg.eigvalsh(a)
     largest = float(eigenvalues[-1])

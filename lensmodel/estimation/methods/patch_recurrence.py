@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy import fft
 
@@ -189,8 +190,10 @@ class PatchRecurrence:
         votes = [1.0 / max(view.noise**2, 1e-6) for view in views]
         a = np.asarray(sum(vote * part[0] for vote, part in zip(votes, parts, strict=True)))
         b = np.asarray(sum(vote * part[1] for vote, part in zip(votes, parts, strict=True)))
-        a[np.diag_indices_from(a)] += self.ridge * np.trace(a) / a.shape[0]
-        solved = nonnegative_least_squares(a, b, begin.ravel())
+        ridge = self.ridge * np.trace(a) / a.shape[0]
+        a[np.diag_indices_from(a)] += ridge
+        taken = sum(vote * part[2] for vote, part in zip(votes, parts, strict=True))
+        solved = nonnegative_least_squares(a, b, begin.ravel(), smallest=ridge - taken)
         solved[solved < 0.01 * solved.max()] = 0.0
         if not solved.max() > 0:
             raise NotEnoughEvidenceError("the kernel vanished; the patches hold no detail beyond the noise")
@@ -217,8 +220,8 @@ class PatchRecurrence:
         return min(distance(*halves).rel_l2, 1.0)
 
 
-Part: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Normal equations of one patch, A and b."""
+Part: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64], float]
+"""Normal equations of one patch: A, b, and the most by which an eigenvalue of A can be below zero."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -250,6 +253,8 @@ def normal_equations(x: Image, y: Image, side: int, noise: float, response: NDAr
     -------
     A : ndarray, shape (side², side²)
     b : ndarray, shape (side²,)
+    taken : float
+        The largest eigenvalue of what was taken off A is no larger: N s² max |H|², as of a circulant matrix.
     """
     half = side // 2
     margin = _BORDER
@@ -259,12 +264,15 @@ def normal_equations(x: Image, y: Image, side: int, noise: float, response: NDAr
     n = target.size
     gram, cross = window_products(inner, target, side)
     a, b = gram[::-1, ::-1].copy(), cross[::-1].copy()
-    rows, cols = np.divmod(np.arange(side * side), side)
-    spectrum = fft.rfft2(response)
-    acf = fft.irfft2(np.abs(spectrum) ** 2, s=response.shape)
-    a -= n * noise**2 * acf[rows[:, None] - rows, cols[:, None] - cols]
-    b -= n * noise**2 * response[half - rows, half - cols]
-    return a, b
+    power = np.abs(fft.rfft2(response)) ** 2
+    acf = n * noise**2 * fft.irfft2(power, s=response.shape)
+    lags = np.arange(1 - side, side)
+    # [i, j, k, l] is acf(i - k, j - l): windows of all lags, the second offset counted backwards
+    apart = sliding_window_view(acf[np.ix_(lags, lags)], (side, side))[:, :, ::-1, ::-1]
+    a.reshape((side,) * 4)[...] -= apart
+    offsets = half - np.arange(side)
+    b -= n * noise**2 * response[np.ix_(offsets, offsets)].ravel()
+    return a, b, n * noise**2 * float(power.max())
 
 
 def reliability(kept: Sequence[tuple[Plane, NoiseModel]]) -> NDArray[np.float64]:

@@ -202,7 +202,7 @@ def test_kernel_step_recovers_the_kernel_where_the_scene_is_known() -> None:
     y = signal.fftconvolve(scene, truth, mode="same") + rng.normal(0, SIGMA, scene.shape)
     response = np.zeros((40, 40))  # this scene took nothing from y
 
-    a, b = normal_equations(scene, y, 9, SIGMA, response)
+    a, b, _ = normal_equations(scene, y, 9, SIGMA, response)
     k = nonnegative_least_squares(a, b, np.asarray(delta(9)).ravel()).reshape(9, 9)
 
     assert distance(k, truth).rel_l2 < 0.08  # the noise alone costs 0.057
@@ -213,11 +213,12 @@ def test_noise_correction_leaves_nothing_of_pure_noise() -> None:
     y = rng.normal(0, 0.1, (220, 220))
     x, response = blend(y, gaussian(9, 0.8 * np.eye(2)), np.zeros_like(y), 0.2)
 
-    raw_a, raw_b = normal_equations(x, y, 9, 0.0, response)
-    a, b = normal_equations(x, y, 9, 0.1, response)
+    raw_a, raw_b, _ = normal_equations(x, y, 9, 0.0, response)
+    a, b, taken = normal_equations(x, y, 9, 0.1, response)
 
     assert np.abs(a).max() < 0.06 * np.abs(raw_a).max()
     assert np.abs(b).max() < 0.06 * np.abs(raw_b).max()
+    assert 0.5 * taken < np.linalg.eigvalsh(raw_a - a)[-1] <= taken
 
 
 def test_image_step_with_the_true_kernel_and_scene_returns_the_scene() -> None:

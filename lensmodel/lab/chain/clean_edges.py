@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lensmodel import photo
-from lensmodel.core.geometry import zone_of
+from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.types import ZONES, FieldPosition, Kernel, Plane
 from lensmodel.lab.chain.blind_gain import CAMERA, Lens, lenses, seed_range, shot, written
 
@@ -50,15 +50,15 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """A clean edge: where, the unit vector across it (right, down), and A(1) to A(`REACH`)."""
+    """A clean edge: where, the unit vector across it towards the light (right, down), A(1) to A(`REACH`)."""
 
     position: FieldPosition
     across: tuple[float, float]
     profile: Floats
 
 
-def clean_edges(plane: Plane) -> list[tuple[float, float, tuple[float, float], Floats]]:
-    """Edges of a plane as (row, column, across, profile)."""
+def clean_edges(plane: Plane, frame: Frame) -> list[Edge]:
+    """Find the clean edges of a plane, shape (h, w), in linear light of full scale 1."""
     values = plane.astype(np.float64)
     down, right = (ndimage.gaussian_filter(values, _SMOOTH, order=order) for order in ((1, 0), (0, 1)))
     strength = np.hypot(down, right) + 1e-12
@@ -94,7 +94,10 @@ def clean_edges(plane: Plane) -> list[tuple[float, float, tuple[float, float], F
     for distance, least, most in _LINE:
         good &= (profiles[:, distance - 1] > least) & (profiles[:, distance - 1] < most)
     kept = np.flatnonzero(good)
-    return [(float(rows[i]), float(cols[i]), (float(x[i]), float(y[i])), profiles[i]) for i in kept]
+    return [
+        Edge(frame.position(float(rows[i]), float(cols[i])), (float(x[i]), float(y[i])), profiles[i])
+        for i in kept
+    ]
 
 
 def _unevenness(side: Floats) -> Floats:
@@ -126,8 +129,7 @@ def edges_of(lens: Lens, number: int) -> list[Edge]:
     """Clean edges of the green plane of a photo of a lens."""
     with tempfile.TemporaryDirectory() as folder:
         developed = photo.develop(written(Path(folder) / "photo.dng", shot(lens, number), tiff=False))
-    found = clean_edges(developed.planes[1])
-    return [Edge(developed.frame.position(row, col), across, a) for row, col, across, a in found]
+    return clean_edges(developed.planes[1], developed.frame)
 
 
 def main() -> None:

@@ -640,10 +640,7 @@ def test_an_address_without_anything_is_a_page_for_people_and_json_for_programs(
     visitor.complaints.clear()  # the browser notes each 404
 
 
-@pytest.mark.parametrize(
-    "kind",
-    ["lens", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("home", "photo", "correction"))],
-)
+@pytest.mark.parametrize("kind", ["home", "lens", "photo", "correction"])
 def test_a_page_is_accessible_fits_each_screen_and_shows_the_focus(
     page: Page, learned: dict[str, Any], correction: dict[str, Any], kind: str
 ) -> None:

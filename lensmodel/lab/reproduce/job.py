@@ -47,6 +47,7 @@ from lensmodel.lab.reproduce.routes import (
     Remembered,
     Route,
     corrected_with,
+    paper_way,
 )
 from lensmodel.lab.reproduce.shots import Shots, take
 from lensmodel.lab.reproduce.store import Unit, read, stored
@@ -289,7 +290,7 @@ class Job:
         if all(path.exists() for path in targets.values()):
             self.progress.tell(f"{self.case.title}: the paper's way, stored", weight, fresh=False)
             return
-        route = DirectRoute(self.work / "paper", workers=self.workers, way=WAYS["paper"])
+        route = DirectRoute(self.work / "paper", workers=self.workers, way=paper_way(self.case))
         self._learned(route, shots, targets, own_way=True)
 
     def _learned(

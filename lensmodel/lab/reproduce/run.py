@@ -29,8 +29,8 @@ from lensmodel.lab.reproduce import figures
 from lensmodel.lab.reproduce.cases import Reproduction, fingerprint, key_of
 from lensmodel.lab.reproduce.conditions import BASE
 from lensmodel.lab.reproduce.job import Job
-from lensmodel.lab.reproduce.progress import FIGURES, OnWork, Progress, weight_of
-from lensmodel.lab.reproduce.routes import OpenRoute
+from lensmodel.lab.reproduce.progress import FIGURES, OnWork, Progress, weight_of, with_paper
+from lensmodel.lab.reproduce.routes import OpenRoute, paper_way
 from lensmodel.lab.reproduce.store import Unit, stored
 from lensmodel.lab.rivals import kee, rivals
 from lensmodel.lab.rivals.basis import STORED
@@ -119,6 +119,9 @@ def run_reproduction(
             "programs": list(plan.programs),
             "own_scenes": plan.scenes is None,
             "paper": plan.paper,
+            "paper_kernel": max(
+                (paper_way(case).kernel_size for case in plan.cases if with_paper(case, plan)), default=None
+            ),
         },
         "scenes": [path.stem for path in files],
         "developed_on": [path.stem for path in files if photo_half(path.stem) == "dev"],

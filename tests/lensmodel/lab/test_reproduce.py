@@ -51,6 +51,7 @@ from lensmodel.lab.reproduce.interpolation import Flow
 from lensmodel.lab.reproduce.pages.bars import bars, held
 from lensmodel.lab.reproduce.pages.tables import groups, hard_rows, kept, shares, summary
 from lensmodel.lab.reproduce.planning import in_turn
+from lensmodel.lab.reproduce.routes import paper_way
 from lensmodel.lab.reproduce.scenes import centred_cut, frame_scene, layout_for, scene_files
 from lensmodel.lab.reproduce.shots import Shots, guard_of, take
 from lensmodel.lab.traced import read_grid
@@ -984,7 +985,9 @@ def test_papers_own_way_is_learned_beside_the_default_and_taken_up_again(
     assert list(made["cases"][0]["paper"]["1"]["methods"]) == ["paper"]
     next(tmp_path.rglob("paper-2.json")).unlink()
     reproduced(tmp_path, Nothing(), chosen)
-    assert opened == [("michaeli-irani", 55)] * 2
+    assert opened == [("michaeli-irani", 31)] * 2
+    assert paper_way(replace(chosen.cases[0], height=2000, width=3000)).kernel_size == 55
+    assert made["plan"]["paper_kernel"] == 31
 
 
 def test_stopped_run_goes_on_where_it_was(tmp_path: Path, quick_photos: list[str]) -> None:

@@ -73,9 +73,10 @@ def _conditions(result: Mapping[str, Any]) -> str:
         for name in dict.fromkeys(c["family"] for c in cases)
     )
     paper = (
-        "The paper's own way from end to end (Michaeli and Irani's kernels up to 55 pixels, its regression, "
-        "Richardson-Lucy deconvolution alone) stands beside the default; it runs in the library. "
-        if plan.get("paper")
+        "The paper's own way from end to end (Michaeli and Irani's kernels up to "
+        f"{plan['paper_kernel']} pixels, its regression, Richardson-Lucy deconvolution alone) stands beside "
+        "the default; it runs in the library. "
+        if plan.get("paper_kernel")
         else ""
     )
     return (

@@ -47,7 +47,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     # of so few patches no wavefront is fitted, for which each version would wait; see test_lens_modes
     folder = tmp_path_factory.mktemp("journey") / "data"
-    with running(folder, BRIEF, **OWN_ACCOUNT, LENS_PATCHES="4") as made:
+    with running(folder, BRIEF, **OWN_ACCOUNT) as made:
         yield made
 
 

@@ -158,8 +158,8 @@ def _picture() -> np.ndarray[Any, np.dtype[np.uint8]]:
 
 @pytest.fixture
 def few_patches(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Learn from three patches of a photo: too few for a wavefront, whose fit takes longer than the rest."""
-    monkeypatch.setattr("lensmodel.workflow.pipeline.Recipe", partial(pipeline.Recipe, count=3))
+    """Learn from two patches of a photo: with those of a profile too few for a wavefront, which takes longest."""
+    monkeypatch.setattr("lensmodel.workflow.pipeline.Recipe", partial(pipeline.Recipe, count=2))
 
 
 # --- results -----------------------------------------------------------------------------------

@@ -158,7 +158,7 @@ def _picture() -> np.ndarray[Any, np.dtype[np.uint8]]:
 
 @pytest.fixture
 def few_patches(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Learn from two patches of a photo: with those of a profile too few for a wavefront, which takes longest."""
+    """Learn from two patches of a photo, too few for a wavefront: its fit takes longer than the rest."""
     monkeypatch.setattr("lensmodel.workflow.pipeline.Recipe", partial(pipeline.Recipe, count=2))
 
 

@@ -117,21 +117,23 @@ def test_the_side_of_a_tail_is_that_of_the_kernel_found() -> None:
         assert distance(found, right).rel_l2 < distance(found, right[::-1, ::-1]).rel_l2
 
 
-def patches(kernel: np.ndarray, count: int) -> list[np.ndarray]:
-    side, found = 64 + kernel.shape[0] - 1, []
-    for seed in range(count):
+@pytest.fixture(scope="module")
+def six_patches() -> list[np.ndarray]:
+    kernel, found = kernel_of(LENS), []
+    side = 64 + kernel.shape[0] - 1
+    for seed in range(6):
         rng = np.random.default_rng(seed)
         blurred = signal.fftconvolve(dead_leaves(side, side, rng, largest=40.0)[1], kernel, mode="valid")
         found.append((blurred + rng.normal(0, 0.01, blurred.shape)).astype(np.float32))
     return found
 
 
-def test_default_agrees_on_a_wavefront_from_six_patches_on() -> None:
+def test_default_agrees_on_a_wavefront_from_six_patches_on(six_patches: list[np.ndarray]) -> None:
     truth = kernel_of(LENS)
     seen: list[tuple[int, int]] = []
 
     found = estimation.estimators.create("default").estimate(
-        patches(truth, 6),
+        six_patches,
         [NoiseModel.white(0.01)] * 6,
         size=21,
         on_step=lambda done, total: seen.append((done, total)),
@@ -154,9 +156,9 @@ def test_fitting_a_wavefront_can_be_cancelled() -> None:
         AberrationFit().fit(spectra_of(truth, 1), as_kernel(truth), stop)
 
 
-def test_another_channel_of_six_patches_follows_the_first() -> None:
+def test_another_channel_of_six_patches_follows_the_first(six_patches: list[np.ndarray]) -> None:
     truth, method = kernel_of(LENS), estimation.estimators.create("default")
-    seen, noise = patches(truth, 6), [NoiseModel.white(0.01)] * 6
+    seen, noise = six_patches, [NoiseModel.white(0.01)] * 6
     green = replace(
         estimation.estimators.create("whittle").estimate(seen, noise, size=21), kernel=as_kernel(truth)
     )

@@ -1,4 +1,5 @@
 import json
+from functools import cache
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from lensmodel.photo.lateral import IDENTITY, LateralColour, estimate_lateral, r
 FRAME = Frame(640, 900)
 
 
+@cache
 def scene(seed: int = 0) -> np.ndarray:
     """Return a smooth random texture with features of a few pixels."""
     rng = np.random.default_rng(seed)
@@ -38,10 +40,14 @@ RED = (0.0, 0.0, -0.0012, 1.0028)
 BLUE = (0.0, 0.001, 0.0, 0.9985)
 
 
-def photo(noise: float = 0.0) -> Planes:
+@cache
+def fringed() -> Planes:
     sharp = scene()
-    planes = np.stack([displaced(sharp, RED) * 0.6, sharp, displaced(sharp, BLUE) * 0.8])
-    rng = np.random.default_rng(7)
+    return np.stack([displaced(sharp, RED) * 0.6, sharp, displaced(sharp, BLUE) * 0.8])
+
+
+def photo(noise: float = 0.0) -> Planes:
+    planes, rng = fringed(), np.random.default_rng(7)
     return (planes + noise * rng.standard_normal(planes.shape)).astype(np.float32)
 
 

@@ -54,17 +54,31 @@ def _take_turns_at_compiling(folder: Path) -> None:
 
 @contextmanager
 def _searching_shortly() -> Iterator[None]:
-    from lensmodel.model.wavefront import joint_kernels  # noqa: PLC0415 - not for tests of the service
+    # not for tests of the service
+    from lensmodel.model.wavefront import from_kernels, joint_kernels, starts  # noqa: PLC0415
 
+    counts = {
+        joint_kernels: {
+            "_STARTS": 2,
+            "_RANDOM": 0,
+            "_KEPT": 2,
+            "_REFINED": 1,
+            "_COARSE_ROUNDS": 3,
+            "_MEDIUM_ROUNDS": 3,
+        },
+        from_kernels: {"_STARTS": 2, "_REFINED": 1, "_COARSE_ROUNDS": 3, "_FINE_ROUNDS": 4},
+        starts: {"_BEGINNINGS": 8},
+    }
     with pytest.MonkeyPatch.context() as patch:
-        for name, count in {"_STARTS": 2, "_RANDOM": 0, "_KEPT": 2, "_REFINED": 1}.items():
-            patch.setattr(joint_kernels, name, count)
+        for module, names in counts.items():
+            for name, count in names.items():
+                patch.setattr(module, name, count)
         yield
 
 
 @pytest.fixture(scope="session")
 def searching_shortly() -> Callable[[], AbstractContextManager[None]]:
-    """Fits wavefronts to spectra from a few beginnings, where a test asks what is made of the best of them.
+    """Fits wavefronts from a few beginnings, where a test asks what is made of the best of them.
 
     That takes seconds instead of twenty. Whether the lens itself is found is asked with the whole search.
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import pytest
@@ -180,6 +181,28 @@ def surface(clipped: int) -> np.ndarray:
     return np.where(label, 1.15 * colour[:, None, None], light).astype(np.float32)
 
 
+SURFACE = Frame(120, 160)
+
+
+@cache
+def taken(clipped: int, width: float, shift: float) -> tuple[np.ndarray, np.ndarray]:
+    """Photo of the surface through a `Lens`, and the light that it shows."""
+    scene, frame = surface(clipped), SURFACE
+    lens = Lens(gaussian(19, np.eye(2) * width**2), shift)
+    rows, cols = np.indices((frame.height, frame.width), dtype=np.float64)
+    row, col = frame.center
+    truth, light = scene[:, 20:-20, 20:-20], []
+    for plane, channel in zip(scene.astype(np.float64), CHANNELS, strict=True):
+        # a round Gaussian is one along the rows after one along the columns
+        soft = ndimage.convolve1d(plane, lens.kernel.sum(axis=1), axis=0)
+        soft = ndimage.convolve1d(soft, lens.kernel.sum(axis=0), axis=1)
+        size = 1.0 + lens.displacement(1.0, channel) / frame.half_diagonal
+        where = [(rows - row) / size + row + 20, (cols - col) / size + col + 20]
+        light.append(ndimage.map_coordinates(soft, where, order=3))
+    seen = np.stack(light) + np.random.default_rng(8).standard_normal(truth.shape) * 4e-3
+    return np.minimum(seen, 1.0).astype(np.float32), truth
+
+
 @pytest.mark.parametrize(
     ("method", "clipped"),
     [
@@ -194,25 +217,13 @@ def surface(clipped: int) -> np.ndarray:
 def test_clipped_surfaces_beside_lateral_colour_show_no_dots(
     method: str, clipped: int, width: float, shift: float
 ) -> None:
-    scene, frame = surface(clipped), Frame(120, 160)
-    lens = Lens(gaussian(19, np.eye(2) * width**2), shift)
-    rows, cols = np.indices((frame.height, frame.width), dtype=np.float64)
-    row, col = frame.center
-    truth, light = scene[:, 20:-20, 20:-20], []
-    for plane, channel in zip(scene.astype(np.float64), CHANNELS, strict=True):
-        soft = ndimage.convolve(plane, lens.kernel)
-        size = 1.0 + lens.displacement(1.0, channel) / frame.half_diagonal
-        where = [(rows - row) / size + row + 20, (cols - col) / size + col + 20]
-        light.append(ndimage.map_coordinates(soft, where, order=3))
-    noise = NoiseModel(2e-5, 1e-6)
-    seen = np.stack(light) + np.random.default_rng(8).standard_normal(truth.shape) * 4e-3
-    photo = np.minimum(seen, 1.0).astype(np.float32)
+    lens, (photo, truth) = Lens(gaussian(19, np.eye(2) * width**2), shift), taken(clipped, width, shift)
 
     made = correct_planes(
         photo,
         lens,
-        frame,
-        noise=[noise] * 3,
+        SURFACE,
+        noise=[NoiseModel(2e-5, 1e-6)] * 3,
         method=method,
         lateral=lens if shift > 0.0 else None,
         clip=(0.995, 0.995, 0.995),

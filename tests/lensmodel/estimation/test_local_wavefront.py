@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from lensmodel import estimation
 from lensmodel.core.errors import CancelledError, LensModelError
 from lensmodel.core.psf import as_kernel, centred, centroid, distance, gaussian, rms_width
 from lensmodel.core.types import NoiseModel
+from lensmodel.estimation.methods import default
 from lensmodel.estimation.spectra.local_wavefront import AberrationFit
 from lensmodel.estimation.spectra.scene_spectra import SceneSpectra, log_power
 from lensmodel.lab.scenes import dead_leaves
@@ -89,7 +91,9 @@ def test_the_true_wavefront_scores_best_where_the_scene_is_known() -> None:
 def mtf_error(truth: np.ndarray, count: int, seed: int) -> float:
     wrong = gaussian(31, 2.2 * rms_width(truth) ** 2 * np.eye(2))  # as a softer scene would make it
     spectra = spectra_of(truth, count, seed=seed)
-    return distance(AberrationFit(weight=2.0).fit(spectra, as_kernel(wrong)).kernel(31), truth).mtf_rmse
+    return distance(
+        AberrationFit(weight=2.0, starts=8, kept=2).fit(spectra, as_kernel(wrong)).kernel(31), truth
+    ).mtf_rmse
 
 
 def test_width_is_found_behind_scenes_of_the_prior_though_the_start_is_too_wide() -> None:
@@ -117,6 +121,12 @@ def test_the_side_of_a_tail_is_that_of_the_kernel_found() -> None:
         assert distance(found, right).rel_l2 < distance(found, right[::-1, ::-1]).rel_l2
 
 
+@pytest.fixture
+def short_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the estimator fit from a third of its beginnings: these lead as near to the truth."""
+    monkeypatch.setattr(default, "AberrationFit", partial(AberrationFit, starts=8, kept=2))
+
+
 @pytest.fixture(scope="module")
 def six_patches() -> list[np.ndarray]:
     kernel, found = kernel_of(LENS), []
@@ -128,7 +138,9 @@ def six_patches() -> list[np.ndarray]:
     return found
 
 
-def test_default_agrees_on_a_wavefront_from_six_patches_on(six_patches: list[np.ndarray]) -> None:
+def test_default_agrees_on_a_wavefront_from_six_patches_on(
+    six_patches: list[np.ndarray], short_fit: None
+) -> None:
     truth = kernel_of(LENS)
     seen: list[tuple[int, int]] = []
 
@@ -156,7 +168,9 @@ def test_fitting_a_wavefront_can_be_cancelled() -> None:
         AberrationFit().fit(spectra_of(truth, 1), as_kernel(truth), stop)
 
 
-def test_another_channel_of_six_patches_follows_the_first(six_patches: list[np.ndarray]) -> None:
+def test_another_channel_of_six_patches_follows_the_first(
+    six_patches: list[np.ndarray], short_fit: None
+) -> None:
     truth, method = kernel_of(LENS), estimation.estimators.create("default")
     seen, noise = six_patches, [NoiseModel.white(0.01)] * 6
     green = replace(

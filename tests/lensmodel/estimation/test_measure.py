@@ -36,6 +36,7 @@ from lensmodel.workflow.joining import joined
 from lensmodel.workflow.measuring import samples_of_developed
 
 SHAPE = (360, 540)
+PAIR_SHAPE = (288, 432)  # of less a pair is as good: it needs no lights and no page
 NOISE = NoiseModel(1 / 40000, (4 / 40000) ** 2)
 
 
@@ -206,7 +207,7 @@ def test_a_target_is_found_and_gives_the_kernel_as_it_is(
         return placed[-1]
 
     monkeypatch.setattr(Target, "find", noted)  # to find a page takes longer than all the rest
-    method = Target(across=2, down=1, details=details)
+    method = Target(across=2, down=1, side=88, details=details)
     found = method.measure([target_photo], size=21, channels=("g",))
     assert [page.page.detail for page in placed] == [500]
     assert found
@@ -259,13 +260,13 @@ def test_an_unknown_detector_is_refused() -> None:
 
 def test_a_pair_gives_the_kernel_of_the_open_photo() -> None:
     rng = np.random.default_rng(5)
-    height, width = (n + 2 * scenes.MARGIN for n in SHAPE)
+    height, width = (n + 2 * scenes.MARGIN for n in PAIR_SHAPE)
     scene = np.clip(0.4 + 0.12 * rng.standard_normal((height, width)), 0.05, 0.9)
     scene = signal.fftconvolve(scene, gaussian(9, np.eye(2) * 0.2), mode="same")
     sharp = at_f8()
     moved = scenes.moved_scene(np.stack([scene] * 3).astype(np.float32), (0.4, -0.7), 0.05)[1]
     opened, closed = photo_of(scene, lopsided()), photo_of(moved, sharp, 1, 8.0)
-    found = Pair(across=2, down=1, side=128).measure([opened, closed], size=21, channels=("g",))
+    found = Pair(across=2, down=1, side=104).measure([opened, closed], size=21, channels=("g",))
     assert found
     assert np.median([distance(one.kernel, lopsided()).rel_l2 for one in found]) < 0.08
 
@@ -309,7 +310,7 @@ def demosaiced(photo: LinearPhoto) -> LinearPhoto:
 
 def test_a_pair_is_not_misled_by_detail_that_passed_for_noise() -> None:
     rng = np.random.default_rng(5)
-    height, width = (n + 2 * scenes.MARGIN for n in SHAPE)
+    height, width = (n + 2 * scenes.MARGIN for n in PAIR_SHAPE)
     contrast = np.clip(np.linspace(-0.06, 0.3, width), 0.0, 0.12)  # the left of the frame is quiet
     scene = np.clip(0.4 + contrast * rng.standard_normal((height, width)), 0.05, 0.9)
     scene = signal.fftconvolve(scene, gaussian(9, np.eye(2) * 0.2), mode="same")
@@ -319,7 +320,7 @@ def test_a_pair_is_not_misled_by_detail_that_passed_for_noise() -> None:
         replace(photo, noise=said, sensor_noise=said)
         for photo in (photo_of(scene, lopsided()), photo_of(scene, sharp, 1, 8.0))
     ]
-    found = Pair(across=2, down=1, side=128).measure(pair, size=21, channels=("g",))
+    found = Pair(across=2, down=1, side=104).measure(pair, size=21, channels=("g",))
     assert np.median([distance(one.kernel, lopsided()).rel_l2 for one in found]) < 0.1
 
 
@@ -355,7 +356,7 @@ def test_edges_of_one_direction_are_no_constraint() -> None:
 
 def test_measured_samples_join_or_replace_blind_ones(target_photo: LinearPhoto) -> None:
     place = measure.MeasuredPsf(
-        lopsided(), target_photo.frame.position(100, 100), "g", 0.04, (100.0, 100.0), 144
+        resized(lopsided(), 11), target_photo.frame.position(100, 100), "g", 0.04, (100.0, 100.0), 144
     )
     method = measure.methods.create("target")
     blind = [

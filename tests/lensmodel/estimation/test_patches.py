@@ -72,7 +72,7 @@ def selection(photo: Plane) -> Selection:
 @pytest.fixture(scope="module")
 def part(photo: Plane) -> Plane:
     """A third of the photo, for what does not hang on its size."""
-    return photo[:600, :800].copy()
+    return photo[:480, :640].copy()
 
 
 @pytest.fixture(scope="module")
@@ -200,11 +200,11 @@ def test_scores_lie_in_zero_to_one_and_jpeg_counts_for_less(part: Plane, selecti
 
 
 def test_a_window_with_edges_scores_above_one_with_faint_texture(scene: Plane) -> None:
-    faint = scene[:600, :800].copy()
-    faint[:, :400] = 0.4 + 0.15 * (faint[:, :400] - 0.4)
+    faint = scene[:480, :640].copy()
+    faint[:, :320] = 0.4 + 0.15 * (faint[:, :320] - 0.4)
     patches = chosen(photo_of(faint), count=24).patches
-    left = [p.score for p in patches if p.col + p.size <= 400]
-    right = [p.score for p in patches if p.col >= 400]
+    left = [p.score for p in patches if p.col + p.size <= 320]
+    right = [p.score for p in patches if p.col >= 320]
 
     assert np.mean(right) > np.mean(left) + 0.1
 
@@ -258,7 +258,7 @@ def _in_a_corner(row: int, col: int) -> bool:
 
 
 def test_edges_of_one_direction_only_are_rejected() -> None:
-    stripes = np.repeat(np.cumsum(np.random.default_rng(3).normal(0, 1, 100)), 12)[None, :].repeat(600, 0)
+    stripes = np.repeat(np.cumsum(np.random.default_rng(3).normal(0, 1, 60)), 12)[None, :].repeat(480, 0)
     plane = photo_of((0.5 + 0.3 * np.tanh(stripes / 3)).astype(np.float32))
 
     with pytest.raises(NoUsablePatchesError, match="one-directional"):
@@ -266,18 +266,18 @@ def test_edges_of_one_direction_only_are_rejected() -> None:
 
 
 def test_a_grid_that_repeats_is_rejected_as_periodic() -> None:
-    rows, cols = np.mgrid[:600, :800]
+    rows, cols = np.mgrid[:480, :640]
     tile = ((rows % 24 < 12) ^ (cols % 30 < 11)).astype(np.float32) * 0.5 + 0.2
 
     with pytest.raises(NoUsablePatchesError, match="periodic"):
         chosen(photo_of(tile))
 
 
-def test_steps_on_the_grid_of_jpeg_blocks_are_rejected(scene: Plane) -> None:
-    coarse = scene[:600, :800].reshape(75, 8, 100, 8).mean(axis=(1, 3)).repeat(8, 0).repeat(8, 1)
+def test_steps_on_the_grid_of_jpeg_blocks_are_rejected(scene: Plane, part: Plane) -> None:
+    coarse = scene[:480, :640].reshape(60, 8, 80, 8).mean(axis=(1, 3)).repeat(8, 0).repeat(8, 1)
 
     with pytest.raises(NoUsablePatchesError, match="jpeg-blocks"):
-        chosen((coarse + photo_of(scene)[:600, :800] * 0.05).astype(np.float32))
+        chosen((coarse + part * 0.05).astype(np.float32))
 
 
 def test_windows_with_missing_pixels_are_rejected_as_border(part: Plane) -> None:
@@ -304,7 +304,8 @@ def test_a_defocused_part_is_left_out_and_the_rest_kept(scene: Plane, selection:
 
 
 def test_the_soft_side_of_a_decentred_lens_is_not_taken_for_defocus(scene: Plane) -> None:
-    rows, cols = np.mgrid[-500:500, -750:750] / 901.0
+    scene = scene[:720, :1080]
+    rows, cols = np.mgrid[-360:360, -540:540] / 649.0
     sigma = 0.6 + 1.5 * (rows**2 + (cols + 0.25) ** 2)
     steps = np.array([0.5, 0.8, 1.2, 1.7, 2.4])
     blurred = np.stack([ndimage.gaussian_filter(scene, step) for step in steps])
@@ -314,22 +315,23 @@ def test_the_soft_side_of_a_decentred_lens_is_not_taken_for_defocus(scene: Plane
     soft = blurred[low, r, c] * (1 - (at - low)) + blurred[low + 1, r, c] * (at - low)
     result = chosen(photo_of(soft.astype(np.float32), blur_px=0.01))
 
-    assert result.counts.get("defocus", 0) < 0.05 * 17 * 28
+    windows = len(result.patches) + len(result.rejected)
+    assert result.counts.get("defocus", 0) < 0.05 * windows
     assert sum(p.position.r > 0.6 and abs(p.position.phi) < 0.8 for p in result.patches) >= 3
 
 
 def test_camera_shake_is_warned_of_and_blur_that_turns_with_the_field_is_not(
     scene: Plane, part_selection: Selection
 ) -> None:
-    sharp = scene[:600, :800]
+    sharp = scene[:480, :640]
     shaken = ndimage.uniform_filter1d(sharp, 9, axis=0)
-    rows, cols = np.mgrid[-300:300, -400:400]
-    frame_r = np.hypot(rows, cols) / 500
+    rows, cols = np.mgrid[-240:240, -320:320]
+    frame_r = np.hypot(rows, cols) / 400
     along = np.stack([cols, rows]) / np.maximum(np.hypot(rows, cols), 1)
     radial = np.mean(
         [
             ndimage.map_coordinates(
-                sharp, [rows + 300 + t * along[1] * frame_r, cols + 400 + t * along[0] * frame_r], order=1
+                sharp, [rows + 240 + t * along[1] * frame_r, cols + 320 + t * along[0] * frame_r], order=1
             )
             for t in np.linspace(-4, 4, 9)
         ],
@@ -396,11 +398,11 @@ def test_a_slope_is_no_contrast() -> None:
     assert found.contrast.max() < 4.0
 
 
-def test_detail_counts_the_same_on_a_slope(photo: Plane) -> None:
-    slope = np.linspace(0.0, 0.2, photo.shape[1], dtype=np.float32)
+def test_detail_counts_the_same_on_a_slope(part: Plane) -> None:
+    slope = np.linspace(0.0, 0.2, part.shape[1], dtype=np.float32)
     plain, sloping = (
         windows_of(blocks.measure_blocks(plane, NOISE, 48, 2.0, ignore_step), Frame(*plane.shape), NOISE)
-        for plane in (photo, photo + slope)
+        for plane in (part, part + slope)
     )
 
     np.testing.assert_allclose(sloping.contrast, plain.contrast, rtol=0.15)
@@ -422,7 +424,7 @@ def test_evidence_is_the_capacity_of_white_signal() -> None:
 
 
 def test_a_soft_corner_is_evidence_by_its_lowest_frequencies(scene: Plane) -> None:
-    soft = photo_of(scene, blur_px=2.5)[200:392, 200:392]
+    soft = photo_of(scene[184:408, 184:408], blur_px=2.5)[16:208, 16:208]
 
     assert look_at(soft, 0.003, 1.0, (0, 0)).evidence[0] > 0.5
 
@@ -433,8 +435,8 @@ def test_structure_below_the_uniformity_of_sensors_is_no_evidence(scene: Plane) 
     assert look_at(faint, 1e-6, 1.0, (0, 0)).evidence[0] < EVIDENCE_FLOOR
 
 
-def test_patches_avoid_a_sky_whose_noise_the_camera_smoothed(scene: Plane) -> None:
-    plane = photo_of(scene)
+def test_patches_avoid_a_sky_whose_noise_the_camera_smoothed(photo: Plane) -> None:
+    plane = photo.copy()
     plane[:500] = vignetted_sky(500, 1500, 0.004, grain_px=2.0)
     single = NoiseModel.white(0.0006)  # from pixel to pixel it is as low as that
     coarse = NoiseModel.white(0.02)

@@ -72,7 +72,7 @@ def test_covariance_of_an_oblique_gaussian_is_recovered_from_three_patches() -> 
     turn = math.radians(34)
     axes = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
     truth = axes @ np.diag([2.5**2, 1.0]) @ axes.T
-    patches = [leaves(gaussian(25, truth), seed=seed, side=200) for seed in (0, 1, 2)]
+    patches = [leaves(gaussian(25, truth), seed=seed, side=128) for seed in (0, 1, 2)]
 
     found = second_moments(Polyblur().estimate(patches, [NOISE] * 3).kernel, 0.0)
 
@@ -86,7 +86,7 @@ def test_covariance_of_an_oblique_gaussian_is_recovered_from_three_patches() -> 
 
 
 def test_sharp_patches_give_a_kernel_like_a_point() -> None:
-    found = Polyblur().estimate([leaves(delta(25), side=200)], [NOISE], size=15)
+    found = Polyblur().estimate([leaves(delta(25), side=128)], [NOISE], size=15)
 
     assert found.no_blur
     assert found.kernel.max() > 0.5

@@ -17,7 +17,7 @@ import lensmodel
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.lab.gallery import Picture, Wishes, chosen, hang, real_pictures, text, write_page
+from lensmodel.lab.gallery import Picture, Wishes, chosen, crops, hang, real_pictures, text, write_page
 from lensmodel.lab.gallery import audit as auditing
 from lensmodel.lab.gallery import work as working
 from lensmodel.lab.gallery.crops import ZOOM, places, sheet
@@ -395,8 +395,9 @@ def test_another_programs_picture_is_turned_and_moved_onto_ours() -> None:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Test data of one photo, one stand-in, and files that hold no picture."""
+    monkeypatch.setattr(crops, "ZOOM", 1)  # to pack enlarged crops would take longer than all the rest
     (tmp_path / "real").mkdir()
     (tmp_path / "meta").mkdir()
     eight = np.rint(255.0 * np.clip(blurred(leaves(224, 256), 1.0), 0.0, 1.0)).astype(np.uint8)
@@ -407,6 +408,11 @@ def folder(tmp_path: Path) -> Path:
 
 
 def known_lens(*args: Any, **options: Any) -> Lens:
+    return _known_lens(options["model"])
+
+
+@cache
+def _known_lens(model: Any) -> Lens:
     samples = [
         PsfSample(
             gaussian(15, np.eye(2)),
@@ -418,7 +424,7 @@ def known_lens(*args: Any, **options: Any) -> Lens:
         for r in (0.1, 0.5, 0.9)
         for phi in (-2.0, 0.5, 2.5)
     ]
-    return Lens(LensProfile(LensModel.fit(samples, options["model"])))
+    return Lens(LensProfile(LensModel.fit(samples, model)))
 
 
 def refused(*args: Any, **options: Any) -> Lens:

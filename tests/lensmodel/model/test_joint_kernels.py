@@ -18,6 +18,7 @@ from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensS
 from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
 from lensmodel.model.modes import WAVEFRONT_SHARE, Mixture
 from lensmodel.model.trust.expected_error import Evidence, joint_error
+from lensmodel.model.wavefront import from_kernels, joint_kernels
 from lensmodel.model.wavefront.from_spectra import PatchView, PooledFit, fit_spectra
 from lensmodel.model.wavefront.joint_kernels import MIN_PLACES, Pooled, _by_aperture, _pairs, pool
 from lensmodel.model.wavefront.scene_view import Floats, SceneView
@@ -77,6 +78,11 @@ def true_kernel(place: FieldPosition, channel: Channel) -> Kernel:
     return LENS.kernel(place, SETTINGS.with_channel(channel), 41)
 
 
+@cache
+def true_power(place: FieldPosition, channel: Channel) -> np.ndarray:
+    return power_of(true_kernel(place, channel))
+
+
 def seen_at(
     place: FieldPosition,
     rng: np.random.Generator,
@@ -96,22 +102,19 @@ def seen_at(
     scene = scene * np.exp(rough * rng.standard_normal(BINS))
     found = {}
     for channel in CHANNELS:
-        kernel = true_kernel(place, channel) if blur is None else blur
         noise = 1e-7
         power = np.zeros((RINGS, SECTORS), np.float32)
-        passed = power_of(kernel)
+        passed = true_power(place, channel) if blur is None else power_of(blur)
         seen = scene * np.exp(PATCHES.bias + beyond * passed**2) * (passed + filled)
         power[FIRST_RING:] = (seen + noise).reshape(-1, SECTORS)
         found[channel] = PatchSpectrum(power, noise)
     return found
 
 
-def places(count: int, seed: int = 5) -> list[FieldPosition]:
-    rng = np.random.default_rng(seed)
-    return [
-        FieldPosition(float(r), float(p))
-        for r, p in zip(np.sqrt(rng.random(count)) * 0.95, rng.uniform(-3, 3, count), strict=True)
-    ]
+def places(count: int, seed: int = 6) -> list[FieldPosition]:
+    """Places over the field; fewer are the first of more, so that tests share their true kernels."""
+    drawn = np.random.default_rng(seed).uniform((0, -3), (1, 3), (count, 2))
+    return [FieldPosition(0.95 * math.sqrt(r), float(phi)) for r, phi in drawn]
 
 
 def view(place: FieldPosition, spectra: dict[Channel, PatchSpectrum], photo: str = "a") -> PatchView:
@@ -227,7 +230,7 @@ def test_negative_of_a_wavefront_turns_its_kernels_and_keeps_their_power() -> No
 
 def test_generating_lens_scores_best() -> None:
     rng = np.random.default_rng(1)
-    patches = [view(place, seen_at(place, rng, 0.0)) for place in places(16)]
+    patches = [view(place, seen_at(place, rng, 0.0)) for place in places(8)]
     cost = fit_spectra(patches, true_front(), rounds=0).cost
 
     for index in (0, 2, 6, 9, 13):
@@ -239,7 +242,7 @@ def test_generating_lens_scores_best() -> None:
 
 def test_fit_returns_to_the_lens_from_beside_it() -> None:
     rng = np.random.default_rng(2)
-    patches = [view(place, seen_at(place, rng, 0.2)) for place in places(20)]
+    patches = [view(place, seen_at(place, rng, 0.2)) for place in places(12)]
     terms = true_front().terms * 0.8
     terms[6] += 0.2
 
@@ -252,7 +255,7 @@ def test_fit_returns_to_the_lens_from_beside_it() -> None:
 
 def test_a_patch_blurred_by_something_else_loses_its_trust() -> None:
     rng = np.random.default_rng(3)
-    spots = places(16)
+    spots = places(12)
     spectra = [seen_at(place, rng, 0.1) for place in spots]
     row = np.arange(RINGS)[:, None]
     spoilt = {
@@ -270,7 +273,7 @@ def test_a_patch_blurred_by_something_else_loses_its_trust() -> None:
 def samples(count: int, photos: int = 1) -> list[PsfSample]:
     """Patches whose kernels are estimates: none is exact."""
     rng, astray, found = np.random.default_rng(4), np.random.default_rng(5), []
-    for i, place in enumerate(places(count, 6)):
+    for i, place in enumerate(places(count)):
         spectra = seen_at(place, rng, 0.15)
         for channel in CHANNELS:
             settings = SETTINGS.with_channel(channel)
@@ -332,7 +335,7 @@ def test_blur_that_no_wavefront_makes_is_left_to_the_kernels() -> None:
     blur, rng = gaussian(41, 1.3**2 * np.eye(2)), np.random.default_rng(4)
     known = [
         PsfSample(gaussian(31, 1.3**2 * np.eye(2)), place, settings, 0.5, "photo", PITCH, spectrum=seen[c])
-        for place in places(MIN_PLACES + 2, 6)
+        for place in places(MIN_PLACES + 2)
         for seen in [seen_at(place, rng, 0.15, blur)]
         for c in CHANNELS
         for settings in [SETTINGS.with_channel(c)]
@@ -449,8 +452,11 @@ def test_the_error_to_expect_grows_with_what_kernels_and_wavefront_differ_by() -
 
 
 def test_unknown_pitch_is_taken_as_a_usual_one_not_as_wide_kernels_suggest(
-    known: list[PsfSample], short_search: None
+    known: list[PsfSample], short_search: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    for rounds in ("_COARSE_ROUNDS", "_MEDIUM_ROUNDS", "_FINE_ROUNDS"):
+        monkeypatch.setattr(joint_kernels, rounds, 1)  # the pitch is chosen before the first of them,
+    monkeypatch.setattr(from_kernels, "_FINE_ROUNDS", 2)  # and kernels have had their say after two
     unknown = [replace(s, kernel=gaussian(31, 4.0 * np.eye(2)), pixel_pitch_um=None) for s in known]
     found = pool(unknown)
 

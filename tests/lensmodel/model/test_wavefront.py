@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import Any
 
@@ -143,8 +145,13 @@ def steps() -> list[tuple[int, int]]:
 
 
 @pytest.fixture(scope="module")
-def warm(cold: LensModel, steps: list[tuple[int, int]]) -> LensModel:
-    return cold.warmed(lambda done, total: steps.append((done, total)))
+def warm(
+    cold: LensModel,
+    steps: list[tuple[int, int]],
+    searching_shortly: Callable[[], AbstractContextManager[None]],
+) -> LensModel:
+    with searching_shortly():
+        return cold.warmed(lambda done, total: steps.append((done, total)))
 
 
 class TestWavefrontAlone:
@@ -160,7 +167,7 @@ class TestWavefrontAlone:
         assert combined.wavefront_share == 1.0
         assert distance(combined.kernel, truth).rel_l2 < 0.6 * distance(plain.kernel, truth).rel_l2
 
-    def test_is_no_worse_than_without_where_no_wavefront_fits(self) -> None:
+    def test_is_no_worse_than_without_where_no_wavefront_fits(self, short_search: None) -> None:
         # three separate spots in a row, apart by the field: no pupil makes them
         def spots(place: FieldPosition) -> Kernel:
             t, apart = np.arange(-10, 11), 3.0 + 2.0 * place.r
@@ -198,7 +205,7 @@ class TestWavefrontAlone:
         assert (answer.answered_by, answer.wavefront_share) == ("regression", 0.0)
         assert answer.reason == "no patch has a spectrum"
 
-    def test_same_samples_give_the_same_wavefront(self, warm: LensModel) -> None:
+    def test_same_samples_give_the_same_wavefront(self, warm: LensModel, short_search: None) -> None:
         again = LensModel.fit(warm.samples, warm.settings).warmed()
         corner = FieldPosition(0.97, 0.58)
         one, two = (model.query(corner, LensSettings(), 21) for model in (warm, again))

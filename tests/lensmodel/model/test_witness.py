@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -50,23 +51,27 @@ def patches(true: float, estimated: Width, *, count: int = 30, photo: str = "pho
     ]
 
 
+@cache
 def model(true: float, estimated: float) -> LensModel:
     return LensModel.fit(patches(true, lambda _: estimated))
 
 
-def believed(known: LensModel, own: Sequence[PsfSample] = ()) -> WitnessedField:
+@cache
+def believed(known: LensModel, own: tuple[PsfSample, ...] = ()) -> WitnessedField:
     return WitnessedField.of(known, SETTINGS, own)
 
 
+@cache
 def mute(true: float, estimated: float, *, error: float | None = 0.3) -> LensModel:
     """A model whose patches have no spectra."""
     known = patches(true, lambda _: estimated)
     return LensModel.fit([replace(s, spectrum=None, error=error) for s in known])
 
 
-def here(true: float) -> list[PsfSample]:
+@cache
+def here(true: float) -> tuple[PsfSample, ...]:
     """Patches of the photo that is to be corrected."""
-    return [replace(s, kernel=delta(31), photo="here") for s in patches(true, lambda _: 1.0)]
+    return tuple(replace(s, kernel=delta(31), photo="here") for s in patches(true, lambda _: 1.0))
 
 
 def width_at(field: WitnessedField, place: FieldPosition, channel: Channel = "g") -> float:
@@ -131,7 +136,7 @@ def test_patches_of_the_photo_speak_where_those_of_the_lens_cannot() -> None:
     known = mute(1.0, 1.6)
 
     assert width_at(believed(known, here(1.0)), RIGHT) < 0.8 * 1.6
-    alone, heard = (believed(known, own).witness.shares(RIGHT)[0, 0] for own in ([], here(1.0)))
+    alone, heard = (believed(known, own).witness.shares(RIGHT)[0, 0] for own in ((), here(1.0)))
     assert heard < 0.5 * alone
 
 
@@ -160,7 +165,7 @@ def test_where_nobody_speaks_the_error_is_that_of_the_samples_or_the_usual_one()
 
 def test_one_patch_alone_does_not_overrule_a_model() -> None:
     one = replace(here(1.0)[0], position=RIGHT)
-    first, all_ = (believed(mute(1.0, 1.6), [one] * count).witness.shares(RIGHT)[0, 0] for count in (1, 8))
+    first, all_ = (believed(mute(1.0, 1.6), (one,) * count).witness.shares(RIGHT)[0, 0] for count in (1, 8))
 
     assert first > 4.0 * all_
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+from functools import cache
 from pathlib import Path
 
 import imagecodecs
@@ -423,6 +424,9 @@ def test_all_but_the_planes_travels_as_json(tmp_path: Path) -> None:
 # --- real files --------------------------------------------------------------------------------
 
 
+real_raw = cache(photo.develop)  # two tests look at one of them
+
+
 @pytest.mark.tools
 @pytest.mark.parametrize(
     ("name", "size", "pipeline"),
@@ -435,7 +439,7 @@ def test_all_but_the_planes_travels_as_json(tmp_path: Path) -> None:
 def test_real_raw_files_become_photos(
     shared_data: Path, name: str, size: tuple[int, int], pipeline: str
 ) -> None:
-    developed = photo.develop(shared_data / "raw" / name)
+    developed = real_raw(shared_data / "raw" / name)
     info = photo.inspect(shared_data / "raw" / name)
 
     assert developed.planes.shape[1:] == size == (info.height, info.width)
@@ -443,13 +447,13 @@ def test_real_raw_files_become_photos(
     assert 0.01 < developed.planes.mean() < 0.5
     # A picture: neighbours are alike, in each plane and between the planes.
     for plane in developed.planes:
-        assert np.corrcoef(plane[:, 1:].ravel(), plane[:, :-1].ravel())[0, 1] > 0.9
-    assert np.corrcoef(developed.planes[0].ravel(), developed.planes[1].ravel())[0, 1] > 0.5
+        assert np.corrcoef(plane[::4, 1:].ravel(), plane[::4, :-1].ravel())[0, 1] > 0.9
+    assert np.corrcoef(developed.planes[0, ::4].ravel(), developed.planes[1, ::4].ravel())[0, 1] > 0.5
 
 
 @pytest.mark.tools
 def test_the_greens_of_the_nikon_d1_clip_below_its_red(shared_data: Path) -> None:
-    red, green, _ = photo.develop(shared_data / "raw" / "nikon_d1.nef").clip
+    red, green, _ = real_raw(shared_data / "raw" / "nikon_d1.nef").clip
 
     assert red == 1.0
     assert green == pytest.approx(0.973, abs=0.003)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -26,6 +28,7 @@ def noisy(plane: NDArray[np.floating], noise: NoiseModel) -> NDArray[np.float32]
     return seen.astype(np.float32)
 
 
+@cache
 def soft(sigma: float) -> NDArray[np.float32]:
     rows = (CHART.scene.shape[1] - FRAME.height) // 2
     return ndimage.gaussian_filter(CHART.scene[1], sigma)[rows:-rows, rows:-rows]
@@ -176,7 +179,8 @@ def test_strange_planes_have_no_edges_and_no_errors(plane: NDArray[np.float64]) 
 
 
 def test_edges_that_a_correction_destroyed_are_not_counted() -> None:
-    photo = soft(1.0)
+    photo = soft(1.0)[:420, 700:]
 
+    assert edge_gains(photo, photo)
     assert edge_gains(photo, np.full_like(photo, 0.5)) == {}
     assert edge_gains(photo, np.full_like(photo, np.nan)) == {}

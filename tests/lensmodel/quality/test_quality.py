@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -265,6 +266,7 @@ def test_srgb_curve_has_its_known_values_and_clips() -> None:
     )
 
 
+@cache
 def smooth_scene() -> NDArray[np.float64]:
     scene = dead_leaves(120, 160, np.random.default_rng(1))
     return np.stack([ndimage.gaussian_filter(p.astype(np.float64), 1.5) for p in scene])

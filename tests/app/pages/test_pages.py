@@ -41,8 +41,8 @@ FLAGS = [
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
-    "--process-per-site",
-    "--disable-features=SpareRendererForSitePerProcess",
+    "--process-per-site",  # all pages are of one service: see `first_page`
+    "--disable-features=SpareRendererForSitePerProcess",  # none is begun for the next
 ]
 WIDTHS = (360, 390, 768, 1280, 2560)
 RULES = {"runOnly": {"type": "tag", "values": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"]}}
@@ -121,7 +121,7 @@ class Visitor:
 def first_page(browser: Browser, service: Service) -> Iterator[Page]:
     """Give a page that stays open, in the session of one visitor: it opens the others.
 
-    So they share its process, with what it has compiled of the scripts: each would take as long again.
+    So they share its process and what that has compiled of the scripts; a process each takes longer.
     """
     opened = browser.new_context(
         base_url=service.info()["url"], viewport={"width": 1280, "height": 900}, has_touch=True

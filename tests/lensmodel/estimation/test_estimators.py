@@ -177,7 +177,7 @@ def test_cancelling_stops_the_work(name: str) -> None:
         )
 
 
-def test_a_wider_blur_gives_a_wider_kernel(few_starts: None) -> None:
+def test_a_wider_blur_gives_a_wider_kernel() -> None:
     widths = [
         rms_width(
             estimation.estimators.create("default")

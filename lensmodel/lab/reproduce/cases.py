@@ -116,7 +116,7 @@ class Case:
     def unseen(self) -> bool:
         """Whether nothing was developed or chosen on it."""
         if self.grid is None:
-            return self.seed >= FIRST_SEED
+            return self.seed >= FIRST_SEED and self.seed not in families.SEEDS_LOOKED_AT
         return families.design(self.grid) not in families.LOOKED_AT
 
     @property

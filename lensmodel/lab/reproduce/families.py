@@ -15,10 +15,15 @@ Family: TypeAlias = Literal["third order", "ray-traced"]
 FAMILIES: Final[tuple[Family, ...]] = ("third order", "ray-traced")
 
 FIRST_SEED: Final = 1000
-"""Seeds of third-order lenses below are for development; nothing is ever chosen on those from here on."""
+"""Seeds of third-order lenses below are for development, and parameters are chosen on them."""
+
+SEEDS_LOOKED_AT: Final = frozenset({1000, 1001, 1002, 1003, 1006})
+"""Of those beyond: results of these were looked into during development, and two choices followed from it, the
+share of corrections of compressed photos (1001) and the pairs of photos that the search tries (1002)."""
 
 LOOKED_AT: Final = frozenset({"heliar", "reverse-telephoto", "tronnier", "retrofocus"})
-"""Designs of ray-traced lenses that were looked at during development; no other was."""
+"""Designs of ray-traced lenses that were looked at during development. The others were measured besides, but
+nothing was chosen on them."""
 
 _TRACED_FROM: Final = 2000
 _TRACED: Final = 100_000

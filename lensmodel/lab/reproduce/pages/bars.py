@@ -142,11 +142,10 @@ def _psf(made: Mapping[str, Any]) -> Iterator[Bar]:
 
 
 def _mtf(made: Mapping[str, Any], method: str) -> Iterator[Bar]:
-    rows = {row["state"].removeprefix("n = "): row for row in made["mtf"][method]}
     for zone in ZONES:
         for n, limit in zip(COUNTS, _HIGHEST_MTF, strict=True):
-            value = rows[n][zone]["mtf_max"] if n in rows else None
-            yield Bar("highest corrected MTF", zone, value, high=limit, n=n)
+            value = made["highest_mtf"][method].get(n, {}).get(zone)
+            yield Bar("highest corrected MTF of any lens", zone, value, high=limit, n=n)
     for zone in PLACES:
         for n, (low, high) in _SHARE.items():
             value = made["share"][method].get(n, {}).get(zone)

@@ -83,6 +83,7 @@ def summary(result: Result) -> dict[str, Any]:
     dict
         `mtf`, `psnr`, `ssim`: rows of states by method, with the mean over the lenses that have it;
         `share`: share of the true-PSF gain in MTF50; `halo`: overshoot beyond that of the true PSF;
+        `highest_mtf`: the highest corrected MTF of any lens;
         `psnr_kept`, `ssim_kept`: share of its gain; `psnr_control`: gain by denoising alone;
         `worse`: zones that fell; `psf` (green), `psf_by_channel`, `psf_others` (rivals, a general profile,
         the paper's own way, measured); `predicted_right`; `forecast_off`: mean absolute error of the gain
@@ -103,6 +104,7 @@ def summary(result: Result) -> dict[str, Any]:
             for method in methods
         },
         "halo": {method: _by_count(result, partial(halo, method=method)) for method in methods},
+        "highest_mtf": {method: _highest_mtf(result, method) for method in methods},
         "psnr": {method: _fidelity(result, method, "psnr") for method in methods},
         "ssim": {method: _fidelity(result, method, "ssim") for method in methods},
         "psnr_control": _zones(lambda z: mean(gain(c, c["truth"]["control"], z) for c in result["cases"])),
@@ -206,6 +208,17 @@ def kept(case: Result, n: int, method: str, of: str = "psnr") -> dict[str, float
         after = gain(case, case["learned"][str(n)]["methods"][method], zone, of)
         found[zone] = None if true is None or after is None or true < MEASURABLE[of] else after / true
     return found
+
+
+def _highest_mtf(result: Result, method: str) -> dict[str, dict[str, float | None]]:
+    """The highest corrected MTF of any lens, by number of photos and zone: a mean would hide it."""
+
+    def highest(n: int, zone: str) -> float | None:
+        states = [case["learned"][str(n)]["methods"][method] for case in _having(result, n)]
+        found = [get((state.get("edges") or {}).get(zone), "mtf_max") for state in states]
+        return max((value for value in found if value is not None), default=None)
+
+    return {str(n): _zones(partial(highest, n)) for n in counts(result)}
 
 
 def worse(result: Result, method: str) -> dict[str, dict[str, int]]:

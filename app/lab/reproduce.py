@@ -67,6 +67,15 @@ def reproduce(
         list[str] | None,
         typer.Option(metavar="NAME", help="Only lenses whose name begins so: 1003, heliar; again for more."),
     ] = None,
+    photos: Annotated[
+        int | None,
+        typer.Option(
+            "--photos",
+            metavar="N",
+            min=1,
+            help="Learn from at most N photos: the fewer, the larger the frames that the photographs allow.",
+        ),
+    ] = None,
     results: Annotated[
         Path | None,
         typer.Option(
@@ -80,6 +89,9 @@ def reproduce(
     ] = False,
     no_target: Annotated[
         bool, typer.Option("--no-target", help="Leave out the lens measured with a target, which is slow.")
+    ] = False,
+    no_rivals: Annotated[
+        bool, typer.Option("--no-rivals", help="Leave out the paper's blind rivals, which are slow.")
     ] = False,
     no_figures: Annotated[
         bool, typer.Option("--no-figures", help="Leave Figs. 2 and 4 to a later run.")
@@ -122,6 +134,8 @@ def reproduce(
     shown = display.of(context, quiet=quiet, verbose=verbose)
     if quick + small + full > 1:
         raise UsageError("--quick, --small and --full exclude each other; give one of them")
+    if photos is not None and quick + small + full:
+        raise UsageError("--photos is for the default size; leave out --quick, --small and --full")
     refuse_existing(json_output, *(output / name for name in PAGE), force=force)
     from app.lab.service_route import CODE, ServiceRoutes  # noqa: PLC0415 - only this command needs them
     from lensmodel.lab.reproduce import (  # noqa: PLC0415 - as above: the simulation is slow to import
@@ -141,8 +155,10 @@ def reproduce(
         lenses=lenses,
         grids=grids or None,
         only=only or (),
+        photos=photos,
         paper=not no_paper,
         target=not no_target,
+        rivals=not no_rivals,
     )
     result = run_reproduction(
         plan,

@@ -18,8 +18,8 @@ FIRST_SEED: Final = 1000
 """Seeds of third-order lenses below are for development, and parameters are chosen on them."""
 
 SEEDS_LOOKED_AT: Final = frozenset({1000, 1001, 1002, 1003, 1006})
-"""Of those beyond: results of these were looked into during development, and two choices followed from it, the
-share of corrections of compressed photos (1001) and the pairs of photos that the search tries (1002)."""
+"""Of those beyond: results of these were looked into during development, and two choices followed: the
+share of the correction that compressed photos get (1001), and pairs of photos in the search (1002)."""
 
 LOOKED_AT: Final = frozenset({"heliar", "reverse-telephoto", "tronnier", "retrofocus"})
 """Designs of ray-traced lenses that were looked at during development. The others were measured besides, but

@@ -35,8 +35,10 @@ def planned(
     lenses: int | None = None,
     grids: Sequence[Path] | None = None,
     only: Sequence[str] = (),
+    photos: int | None = None,
     paper: bool = True,
     target: bool = True,
+    rivals: bool = True,
 ) -> Reproduction:
     """Plan a run of one of four sizes.
 
@@ -61,13 +63,19 @@ def planned(
         Grids of ray-traced lenses, one lens each; None takes those of the repository.
     only : sequence of str
         Only lenses whose name begins so, such as "1003" or "heliar"; for sittings on several machines.
+    photos : int or None
+        Each lens learns from at most so many: the fewer, the larger the frames that photographs are
+        composed to. Only of the default size, and of its photos at base ISO.
     paper, target : bool
         See `Reproduction`.
+    rivals : bool
+        Whether the paper's blind rivals are run where the size has them.
 
     Raises
     ------
     InvalidInputError
-        If `lenses` is below one, two grids are of one design and aperture, or no lens has such a name.
+        If `lenses` or `photos` is below one, `photos` is given for another size, two grids are of one design
+        and aperture, or no lens has such a name.
 
     Notes
     -----
@@ -76,6 +84,10 @@ def planned(
     files = scene_files(scenes)
     if lenses is not None and lenses < 1:
         raise InvalidInputError(f"a reproduction takes at least one lens, not {lenses}")
+    if photos is not None and (photos < 1 or size != "default"):
+        raise InvalidInputError(
+            f"at most {photos} photos of size {size}: give one or more, without another size beside it"
+        )
     seeds = range(FIRST_SEED, FIRST_SEED + 8)[:lenses]
     paths = tuple(families.repository_grids() if grids is None else grids)[:lenses]
     if size == "quick":
@@ -83,7 +95,8 @@ def planned(
         cases = tuple(_case(seed, (1, 2), files, _QUICK_FRAME) for seed in two)
         cases += tuple(_traced(path, (1, 2), files, _QUICK_FRAME) for path in paths)
     else:
-        few, frame = _allowed((1, 2, 5), len(files)), _HARD_FRAME if size == "small" else None
+        wanted = tuple(n for n in (1, 2, 5) if photos is None or n <= photos)
+        few, frame = _allowed(wanted, len(files)), _HARD_FRAME if size == "small" else None
         cases = tuple(_case(seed, few, files, frame) for seed in seeds)
         cases += tuple(_traced(path, few, files, frame) for path in paths)
     if size == "full":
@@ -109,7 +122,7 @@ def planned(
         _chosen(cases, only),
         scenes,
         estimator,
-        rivals=() if size == "small" else RIVALS,
+        rivals=RIVALS if rivals and size != "small" else (),
         programs=programs.installed(),
         size=size,
         paper=paper,

@@ -160,6 +160,15 @@ def traced(path: Path = HELIAR, **changes: Any) -> Case:
     return replace(one, height=480, width=640, **changes)
 
 
+def test_fewer_photos_leave_larger_frames() -> None:
+    two, five = (planned("default", lenses=1, photos=n, rivals=False) for n in (1, None))
+    assert {one.photos[-1] for one in two.cases} == {1}
+    assert two.cases[0].height * two.cases[0].width > 1.5 * five.cases[0].height * five.cases[0].width
+    assert (two.rivals, bool(planned("default", lenses=1).rivals)) == ((), True)
+    with pytest.raises(InvalidInputError, match="at most 2 photos of size quick"):
+        planned("quick", photos=2)
+
+
 def test_plan_has_lenses_of_both_families_and_says_which_were_looked_at() -> None:
     cases = planned("quick").cases
     assert [one.family for one in cases] == ["third order"] * 2 + ["ray-traced"] * 2

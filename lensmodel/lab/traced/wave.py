@@ -21,7 +21,7 @@ from lensmodel.lab.traced.rays import Bundle
 Array = NDArray[np.float64]
 
 PATH_DEGREE: Final = 12
-"""Of the path: its residual stays below a hundredth of a wave in the designs of `designs`."""
+"""Of the path: its residual stays below 0.013 waves in the copies of `copies`, mostly below 0.003."""
 
 MAP_DEGREE: Final = 6
 """Of where rays cross the stop and the rims: higher degrees swing outside the light."""

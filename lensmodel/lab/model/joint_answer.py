@@ -1,10 +1,10 @@
 r"""How near averaged kernels, the wavefront and means of both are to the truth, and what error to expect.
 
     LENSMODEL_TEST_DATA=... python -m lensmodel.lab.model.joint_answer --seeds 0 1 3 4 5 \
-        --grids GRID.npz ... [--photos 1 2 5] [--samples FOLDER]
+        --grids GRID.npz ... [--photos 1 2 5] [--channel g] [--samples FOLDER]
 
 Each lens takes photos as in `lensmodel.lab.chain.blind_gain` and is learned from the first n. At sixteen
-places the green PSF is asked of the regression, of the wavefront, and of their means with shares of the
+places the PSF of a channel is asked of the regression, of the wavefront, and of means with shares of the
 wavefront from a quarter to seven eighths. Printed is the relative L2 error by lens and zone (median of the
 places), its mean by family, and how often each answer is nearer than the worse and the better of the two.
 
@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import PsfSample, distance
+from lensmodel.core.types import CHANNELS, Channel
 from lensmodel.lab.chain.blind_gain import CAMERA, PLACES, Lens, lenses, shot, written
 from lensmodel.model import LensModel, ModelSettings
 from lensmodel.model.modes import relative_l2
@@ -84,17 +85,17 @@ def samples_of(lens: Lens, number: int, folder: Path) -> list[PsfSample]:
     return samples
 
 
-def row_of(lens: Lens, photos: int, samples: Sequence[PsfSample]) -> Row | None:
+def row_of(lens: Lens, photos: int, samples: Sequence[PsfSample], channel: Channel = "g") -> Row | None:
     """Learn and compare; None where no wavefront fits."""
     model = LensModel.fit(samples, ModelSettings()).warmed()
     kernels, wavefront = model.opinion("kernels"), model.opinion("wavefront")
     if kernels is None or wavefront is None:
         return None
-    truth, asked = lens.lens.field(lens.settings), lens.settings.with_channel("g")
+    truth, asked = lens.lens.field(lens.settings), lens.settings.with_channel(channel)
     averaged, rendered = (one.kernels(PLACES, asked, _SIZE) for one in (kernels, wavefront))
     errors = [
         [
-            distance((1.0 - share) * k + share * w, truth.kernel_at(place, "g", _SIZE)).rel_l2
+            distance((1.0 - share) * k + share * w, truth.kernel_at(place, channel, _SIZE)).rel_l2
             for share in SHARES
         ]
         for place, k, w in zip(PLACES, averaged, rendered, strict=True)
@@ -161,6 +162,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="*", default=[])
     parser.add_argument("--grids", type=Path, nargs="*", default=[])
     parser.add_argument("--photos", type=int, nargs="*", default=[1, 2, 5])
+    parser.add_argument("--channel", choices=CHANNELS, default="g", help="whose PSFs are asked for")
     parser.add_argument("--samples", type=Path, help="folder that keeps what patches gave")
     wanted = parser.parse_args()
     rows = []
@@ -170,7 +172,7 @@ def main() -> None:
         for lens in lenses(wanted.seeds, wanted.grids, CAMERA.full_well_electrons):
             for count in wanted.photos:
                 samples = [s for number in range(count) for s in samples_of(lens, number, folder)]
-                row = row_of(lens, count, samples) if samples else None
+                row = row_of(lens, count, samples, wanted.channel) if samples else None
                 print(f"{lens.name}, {count} photos: {'no wavefront' if row is None else 'done'}", flush=True)
                 rows += [] if row is None else [row]
     print_errors(rows)

@@ -18,6 +18,7 @@ from scipy import fft
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import Kernel, Plane
+from lensmodel.lab.correction.methods.half_quadratic import half_quadratic
 from lensmodel.lab.correction.methods.mixture import shipped_mixture
 
 BORDER: Final = 28
@@ -172,12 +173,8 @@ class Epll:
         otf = shifted_otf(kernel, (y.shape[0], y.shape[1]), shift)
         weight = 1.0 / (sigma * sigma)
         data, power = weight * np.conj(otf) * fft.rfft2(y), weight * np.square(np.abs(otf))
-        prior = shipped_mixture()
-        x = y
-        for turn, beta in enumerate(self.betas):
-            z = prior.cleaned(x.astype(np.float32), 1.0 / beta, turn, self.step)
-            x = fft.irfft2((data + beta * fft.rfft2(z)) / (power + beta), s=y.shape)
-        return _inner(x)
+        target = shipped_mixture().spectrum_of_cleaned(self.betas, self.step)
+        return _inner(half_quadratic(y, data, power, self.betas, target))
 
 
 judges: Registry[Judge] = Registry("non-blind judge", {"hyper-laplacian": HyperLaplacian, "epll": Epll})

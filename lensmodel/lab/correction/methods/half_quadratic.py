@@ -16,15 +16,18 @@ def half_quadratic(
     y: NDArray[Any],
     data: NDArray[np.complexfloating[Any, Any]],
     power: NDArray[np.floating[Any]],
-    couplings: Sequence[float],
+    couplings: Sequence[float | np.float32],
     target: Callable[[NDArray[Any], int], NDArray[np.complexfloating[Any, Any]]],
     on_step: StepHook = ignore_step,
+    *,
+    curvature: NDArray[np.floating[Any]] | float = 1.0,
+    floor: float = 0.0,
 ) -> NDArray[Any]:
     """Alternate between the prior's answer to the latest x and the data, for growing coupling beta.
 
     ::
 
-        X = (data + beta T(x)) / (power + beta)
+        X = (data + beta T(x)) / (power + beta C + floor)
 
     Parameters
     ----------
@@ -35,9 +38,14 @@ def half_quadratic(
     couplings : sequence of float
         beta of each turn.
     target : callable
-        From x and the number of the turn the spectrum T of what the prior makes of x.
+        From x and the number of the turn the spectrum T of what the prior makes of x, or of its gradients
+        led back by the transposed differences.
     on_step : callable
         Called after each turn.
+    curvature : ndarray or float
+        C: 1 where the prior answers with a picture, |D|² summed over the differences D where with gradients.
+    floor : float
+        Keeps the quotient finite where neither the data nor the prior says anything.
 
     Returns
     -------
@@ -46,7 +54,15 @@ def half_quadratic(
     """
     x = y
     for turn, beta in enumerate(couplings):
-        spectrum = (data + beta * target(x, turn)) / (power + beta)
+        spectrum = (data + beta * target(x, turn)) / (power + beta * curvature + floor)
         x = fft.irfft2(spectrum, s=y.shape).astype(y.dtype, copy=False)
         on_step(turn + 1, len(couplings))
     return x
+
+
+def growing(first: float, last: float, factor: float) -> tuple[float, ...]:
+    """Return couplings from `first`, each `factor` times the one before, up to `last` and a thousandth."""
+    betas = [first] if first <= last * 1.001 else []
+    while betas and betas[-1] * factor <= last * 1.001:
+        betas.append(betas[-1] * factor)
+    return tuple(betas)

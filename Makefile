@@ -73,7 +73,7 @@ docs: install ## the reference as a static site, site/index.html
 notebooks: install ## run the notebooks of docs/notebooks anew, minutes
 	@$(BIN)/python tools/run_notebooks.py docs/notebooks/*.ipynb
 
-wheel-check: ## build the wheel and use it in a clean environment (asks the network)
+wheel-check: ## build the wheel and use it in clean environments (asks the network)
 	@tools/wheel_check.sh $(PYTHON)
 
 gallery: install ## pictures to look at, gallery-output/index.html (real ones with LENSMODEL_TEST_DATA)

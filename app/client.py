@@ -82,7 +82,8 @@ class Client(LensCalls):
 
         `on_progress(sent, total)` is called in bytes after each mebibyte. With `model` the photo founds a
         lens that is learned so; of a lens that is there and has another it is refused, see `choose_model`.
-        `selector` chooses its patches instead of the service's own.
+        `selector` chooses its patches instead of the service's own. Settings are those of a file that does
+        not say its own; `change_photo` corrects one that says them wrongly.
 
         With `kind` it was made to measure the lens; of a pair it is the open photo, and `reference_id` is the
         closed one, sent before with `calibrate=False`.

@@ -1,6 +1,7 @@
 #!/bin/sh
-# Builds the wheel, installs it in a clean environment with the extras of the service, and uses what a user
-# uses: the command, the library, the service. Nothing of the source tree is on the path.
+# Builds the wheel and installs it in two clean environments. Without any extra: the command's help, and the
+# five lines of docs/library.md on simulated photos. With the extras of the service: the command, the library,
+# the service. Nothing of the source tree is on the path; of its files, the page and photographs are read.
 #
 #     tools/wheel_check.sh [PYTHON]
 set -eu
@@ -17,10 +18,52 @@ size=$(stat -c %s "$wheel")
 echo "wheel: $(basename "$wheel"), $size bytes"
 test "$size" -lt 3000000 || { echo "the wheel is larger than 3 MB: what came in?"; exit 1; }
 
-"$python" -m venv "$work/venv"
-"$work/venv/bin/pip" install --quiet "$wheel[service,fast]"
 cd "$work"
 unset PYTHONPATH
+"$python" -m venv "$work/bare"
+"$work/bare/bin/pip" install --quiet "$wheel"
+"$work/bare/bin/python" -m lensmodel --help >/dev/null
+"$work/bare/bin/lensmodel" calibrate --help >/dev/null
+mkdir five-lines
+(cd five-lines && "$work/bare/bin/python" - "$here" <<'PYTHON'
+import re
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+import lensmodel
+from lensmodel.core.types import LensSettings
+from lensmodel.simulate import BlurOptions, SimulatedCamera, draw_lens, load_scene, photograph, write_photo
+
+assert "site-packages" in lensmodel.__file__, lensmodel.__file__
+extras = [name for name in ("fastapi", "sqlalchemy", "numba", "sklearn", "reportlab") if find_spec(name)]
+assert not extras, extras
+source = Path(sys.argv[1])
+camera = SimulatedCamera(height=384, width=576, pitch_um=9.0)
+true_lens = draw_lens(5, "soft-fast")
+settings = LensSettings(aperture=true_lens.at_focal().f_number)
+options = BlurOptions(pitch_um=camera.pitch_um, step=0.3, size=41)
+for seed, (name, scene, left) in enumerate([("a", "tea-gardens", 400), ("b", "lake", 400), ("c", "city", 500)]):
+    whole = load_scene(source / "lensmodel" / "demo_data" / f"{scene}.jpg")
+    cut = np.ascontiguousarray(whole[:, 200 : 200 + camera.height + 32, left : left + camera.width + 32])
+    shot = photograph(cut, true_lens, settings, camera, np.random.default_rng(seed), options=options)
+    write_photo(Path(f"{name}.dng"), shot)
+
+lines = re.search(r"```python\n(.*?)```", (source / "docs" / "library.md").read_text(encoding="utf-8"), re.DOTALL)
+names = {}
+exec(compile(lines.group(1), "docs/library.md", "exec"), names)  # its calibrate starts processes by itself
+assert names["kernel"].shape == (55, 55) and abs(names["kernel"].sum() - 1.0) < 1e-9
+assert names["photo"].planes.shape == (3, camera.height, camera.width)
+assert sorted(names["lens"].profile.photos.values()) == ["a.dng", "b.dng"]
+assert lensmodel.Lens.load("my-24mm.lensprofile").samples and Path("c.tif").exists()
+PYTHON
+)
+echo "without extras: the help, and the five lines of the library"
+
+"$python" -m venv "$work/venv"
+"$work/venv/bin/pip" install --quiet "$wheel[service,fast]"
 export PATH="$work/venv/bin:$PATH"
 
 lensmodel --version

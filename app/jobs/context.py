@@ -20,8 +20,8 @@ from app.jobs.task_files import KERNELS, PHASES, PREVIEW, R_MAP, SAMPLES, SHOWN,
 from app.runtime import metrics
 from app.runtime.outage import OutageError, is_outage
 from app.runtime.settings import Settings
-from app.sandbox.child import Progress
-from app.sandbox.outcome import Limits, Outcome
+from app.sandbox.child import ProgressHook
+from app.sandbox.outcome import Outcome, TaskLimits
 from app.sandbox.runner import Sandbox
 from app.store import Store, StoredSample
 from app.store.jobs import JobStore
@@ -78,11 +78,11 @@ class JobContext:
         arguments: Mapping[str, Any],
         *,
         folder: Path,
-        limits: Limits,
+        limits: TaskLimits,
         wanted: Callable[[], bool],
         reads: Sequence[Path] = (),
         compiles: bool = False,
-        on_progress: Progress = ignore_step,
+        on_progress: ProgressHook = ignore_step,
     ) -> Any:  # noqa: ANN401 - JSON of any shape
         """Run a task, with retries where they can help; return its result.
 
@@ -141,11 +141,11 @@ class JobContext:
             time.sleep(1.0)
         raise NotWantedError
 
-    def limits(self, photo: PhotoRow, seconds: float, bytes_per_pixel: int) -> Limits:
+    def limits(self, photo: PhotoRow, seconds: float, bytes_per_pixel: int) -> TaskLimits:
         """Return limits that grow with the photo; 12 bytes a pixel are the mapped planes alone."""
         pixels = (photo.width or 0) * (photo.height or 0)
         memory = SPARE_MB + bytes_per_pixel * pixels // (1 << 20)
-        return Limits(memory_mb=min(memory, max(self.sandbox.budget.memory_mb, SPARE_MB)), wall_s=seconds)
+        return TaskLimits(memory_mb=min(memory, max(self.sandbox.budget.memory_mb, SPARE_MB)), wall_s=seconds)
 
     @contextmanager
     def original(self, photo: PhotoRow) -> Iterator[Path]:

@@ -23,8 +23,8 @@ from app.jobs.context import (
 )
 from app.jobs.task_files import AFTER, BEFORE, FAMILY, LAYERS, LEARNED, REPORT, SUFFIX
 from app.runtime.outage import missable
-from app.sandbox.child import Progress
-from app.sandbox.outcome import Limits
+from app.sandbox.child import ProgressHook
+from app.sandbox.outcome import TaskLimits
 from app.store.corrections import CorrectionPlan, Result, folder_of
 from app.store.photo_steps import settings_of
 from app.store.samples import LensState, Relative
@@ -164,7 +164,7 @@ class CorrectionWork:
             (folder / LEARNED).write_bytes(self._context.storage.get(key))
         return state
 
-    def _progress_of(self, correction_id: str) -> Progress:
+    def _progress_of(self, correction_id: str) -> ProgressHook:
         last = 0.0
 
         def tell(done: int, total: int) -> None:
@@ -214,7 +214,7 @@ class CorrectionWork:
         def wanted() -> bool:
             return self._is_newest(lens_id, version)
 
-        limits = Limits(memory_mb=2 * SPARE_MB, wall_s=self._context.settings.patch_seconds)
+        limits = TaskLimits(memory_mb=2 * SPARE_MB, wall_s=self._context.settings.patch_seconds)
         try:
             with self._context.sandbox.folder() as folder:
                 state = self._samples(lens_id, version, folder)
@@ -237,7 +237,7 @@ class CorrectionWork:
     ) -> None:
         """Write the report of the lens whose samples lie in a folder; a failure is only logged."""
         settings = self._context.settings
-        limits = Limits(memory_mb=2 * SPARE_MB, wall_s=settings.correct_seconds)
+        limits = TaskLimits(memory_mb=2 * SPARE_MB, wall_s=settings.correct_seconds)
         arguments = {"model": model, "about": self._about(lens_id)}
         try:
             self._context.attempt(

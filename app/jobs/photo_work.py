@@ -23,7 +23,7 @@ from app.jobs.patch_plans import described, patch_of, plan_of, why_not
 from app.jobs.queue import Job, JobEngine
 from app.jobs.task_files import KERNELS
 from app.jobs.thumbnail_work import keep_glance
-from app.sandbox.outcome import Limits
+from app.sandbox.outcome import TaskLimits
 from app.store import LensName, NewSample, Store
 from app.store.photo_steps import settings_of
 from app.store.tables import PHOTO_RUNNING, LensRow, PatchRow, PhotoRow
@@ -131,7 +131,7 @@ class _Steps:
         """Read the header and assign the lens; return whether to go on and calibrate it."""
         if self._photo.state != "inspecting":
             return True
-        limits = Limits(memory_mb=SPARE_MB, wall_s=self._context.settings.inspect_seconds)
+        limits = TaskLimits(memory_mb=SPARE_MB, wall_s=self._context.settings.inspect_seconds)
         with self._context.original(self._photo) as path, self._context.sandbox.folder() as folder:
             arguments = {"path": str(path), "max_megapixels": self._context.settings.max_megapixels}
             info = self._context.attempt(

@@ -36,7 +36,7 @@ from app.jobs.task_files import (
     SPECTRA,
     SUFFIX,
 )
-from app.sandbox.child import Progress, Task
+from app.sandbox.child import ProgressHook, Task
 from app.schemas import distances
 from lensmodel import correction, photo
 from lensmodel.core import codec
@@ -64,7 +64,7 @@ for _module in LATE:
         importlib.import_module(_module)
 
 
-def inspect(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+def inspect(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     """Read the header of `path`: size, kind, camera, lens, settings."""
     del folder, progress
     info = photo.inspect(Path(arguments["path"]), photo.Limits(max_megapixels=arguments["max_megapixels"]))
@@ -73,7 +73,7 @@ def inspect(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
     return header
 
 
-def glance(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+def glance(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     """Render a small picture of the photo at `path`."""
     del progress
     picture = thumbnails.glance(Path(arguments["path"]), arguments["kind"], arguments["orientation"] or 1)
@@ -81,7 +81,7 @@ def glance(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[
     return {}
 
 
-def develop(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+def develop(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     """Develop `path` to linear planes in the folder."""
     del progress
     limits = photo.Limits(max_megapixels=arguments["max_megapixels"])
@@ -94,7 +94,7 @@ def develop(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
     return {"height": developed.frame.height, "width": developed.frame.width, "pipeline": developed.pipeline}
 
 
-def select(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+def select(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     """Choose the patches of the photo developed in `developed`, and measure its lateral colour."""
     del folder
     developed = pipeline.load_developed(Path(arguments["developed"]))
@@ -115,7 +115,7 @@ def select(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[
     return {"patches": codec.to_json(selection.patches), "rejected": rejected, "lateral": lateral}
 
 
-def estimate(arguments: dict[str, Any], folder: Path, progress: Progress) -> list[dict[str, Any]]:
+def estimate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[dict[str, Any]]:
     """Estimate the PSF of one field cell in each channel, from its patches."""
     developed = pipeline.load_developed(Path(arguments["developed"]))
     group = [codec.from_json(Patch, stored) for stored in arguments["patches"]]
@@ -150,7 +150,7 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: Progress) -> lis
     return listed
 
 
-def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     """Correct the photo in `developed` with the samples in the folder; write the result there.
 
     The fitted model is written there as well, unless it was given.
@@ -208,7 +208,7 @@ def correct(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
     return {"file": name, "report": _numbers(codec.to_json(report))}
 
 
-def measure(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+def measure(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     """Return how well the model of the samples in the folder predicts held-out photos.
 
     The fitted model, including the wavefront of the lens, is written to the folder.
@@ -219,7 +219,7 @@ def measure(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict
     return {"error": _numbers(error), "coverage": _numbers(codec.to_json(model.coverage()))}
 
 
-def report(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+def report(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     """Write the report of the lens of the samples in the folder; `about` has its name and photo shape."""
     model = _model(folder, ModelSettings(**arguments["model"])).warmed()
     about = arguments["about"]
@@ -236,7 +236,7 @@ def report(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[
     return {}
 
 
-def measure_lens(arguments: dict[str, Any], folder: Path, progress: Progress) -> list[dict[str, Any]]:
+def measure_lens(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[dict[str, Any]]:
     """Measure the PSF on photos made for it, in `developed`; kernels go to the folder."""
     photos = [pipeline.load_developed(Path(name)) for name in arguments["developed"]]
     method = lens_measure.methods.create(arguments["kind"])

@@ -8,7 +8,7 @@ from typing import Any
 
 from app.jobs.context import SPARE_MB, JobContext
 from app.jobs.task_files import GLANCE
-from app.sandbox.outcome import Limits
+from app.sandbox.outcome import TaskLimits
 from app.store.photo_steps import folder_of
 from app.store.tables import PhotoRow
 
@@ -17,7 +17,7 @@ def keep_glance(
     context: JobContext, photo: PhotoRow, info: dict[str, Any], path: Path, wanted: Callable[[], bool]
 ) -> None:
     """Store a small picture of the photo at `path`; none where it cannot be rendered."""
-    limits = Limits(memory_mb=2 * SPARE_MB, wall_s=context.settings.inspect_seconds)
+    limits = TaskLimits(memory_mb=2 * SPARE_MB, wall_s=context.settings.inspect_seconds)
     arguments = {"path": str(path), "kind": info["kind"], "orientation": info["metadata"]["orientation"]}
     with context.sandbox.folder() as folder:
         outcome = context.sandbox.run(

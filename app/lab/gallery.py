@@ -68,11 +68,11 @@ def gallery(
         known = [] if folder is None else hall.real_pictures(folder)
         pictures = hall.chosen([*known, *hall.simulated_pictures(output / hall.CACHE)], only or [])
 
-    def told(words: str, done: int, total: int) -> None:
+    def progress(words: str, done: int, total: int) -> None:
         shown.progress_line(f"{done} of {total} finished, {words}", time.monotonic() - began)
 
     entries = []
-    for entry in hall.hang(pictures, output, wishes, on_picture=told):
+    for entry in hall.hang(pictures, output, wishes, on_picture=progress):
         entries.append(entry)
         page = hall.write_page(entries, output)  # after each: a run that is stopped leaves a page
     shown.result(hall.text(entries))

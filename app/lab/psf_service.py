@@ -214,12 +214,12 @@ def serving(settings: Settings, processes: int) -> Iterator[list[Member]]:
 
 def timed(member: Member, paths: Sequence[str]) -> tuple[list[float], float]:
     """Wall milliseconds of each request, and CPU milliseconds of the server by request."""
-    cpu, found = member.cpu_s(), []
+    cpu, walls_ms = member.cpu_s(), []
     for path in paths:
         start = time.perf_counter()
         member.get(path)
-        found.append(1e3 * (time.perf_counter() - start))
-    return found, 1e3 * (member.cpu_s() - cpu) / len(paths)
+        walls_ms.append(1e3 * (time.perf_counter() - start))
+    return walls_ms, 1e3 * (member.cpu_s() - cpu) / len(paths)
 
 
 def questions(lens_id: str, lens: SimulatedLens, count: int, size: int, suffix: str = "") -> list[str]:

@@ -168,7 +168,7 @@ def reproduce(
         code=() if direct else CODE,
         with_figures=not no_figures,
         results=results,
-        on_work=Progress(quiet=shown.quiet),
+        on_work=WorkLines(quiet=shown.quiet),
     )
     result["figures"]["fig1"] = collected(benchmark, output / "pictures")
     written = [*write_page(result, output)]
@@ -177,7 +177,7 @@ def reproduce(
     shown.result(f"Code {result['code']}. Written: " + ", ".join(str(path) for path in written))
 
 
-class Progress:
+class WorkLines:
     """One line on standard error after each piece of work, with the time left."""
 
     def __init__(self, *, quiet: bool = False) -> None:

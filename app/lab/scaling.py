@@ -229,17 +229,17 @@ def rows(wishes: argparse.Namespace) -> dict[str, Any]:
                     1,
                 ),
             }
-            found: dict[str, Any] = {"lenses": lenses, "fill_s": round(filled, 1)}
-            found |= {f"{name}, ms": round(timed(*call), 2) for name, call in asked.items()}
+            figures: dict[str, Any] = {"lenses": lenses, "fill_s": round(filled, 1)}
+            figures |= {f"{name}, ms": round(timed(*call), 2) for name, call in asked.items()}
             for invariant in INVARIANTS:
                 with store.database.reading() as session:
                     began = time.perf_counter()
                     broken = invariant.find(session)
-                    found[f"check {invariant.name}, s"] = round(time.perf_counter() - began, 2)
+                    figures[f"check {invariant.name}, s"] = round(time.perf_counter() - began, 2)
                     assert not broken, (invariant.name, broken[:3])
             if store.database.is_sqlite:
-                found["file_mb"] = store.database.path.stat().st_size >> 20
-            return found | migrations(store)
+                figures["file_mb"] = store.database.path.stat().st_size >> 20
+            return figures | migrations(store)
 
 
 def migrations(store: Store) -> dict[str, float]:
@@ -253,17 +253,17 @@ def migrations(store: Store) -> dict[str, float]:
     count = select(func.count()).select_from(SampleRow)
     with store.database.reading() as session:
         before = session.scalar(count)
-    found = {
+    figures = {
         f"schema {step.revision} undone, s": spent(
             functools.partial(migrate.downgrade, store.database, str(step.down_revision))
         )
         for step in migrate.steps()
         if step.down_revision
     }
-    found["all of them done, s"] = spent(lambda: migrate.upgrade(store.database))
+    figures["all of them done, s"] = spent(lambda: migrate.upgrade(store.database))
     with store.database.reading() as session:
         assert session.scalar(count) == before
-    return found
+    return figures
 
 
 def simulate(photos_a_day: float, slots: int, seconds: float, *, days: float, seed: int) -> dict[str, float]:
@@ -340,8 +340,8 @@ def main() -> int:
     waiting.add_argument("--seconds", type=float, required=True, help="CPU seconds of one photo")
     waiting.set_defaults(run=queue)
     wishes = parser.parse_args()
-    found = wishes.run(wishes)
-    for line in found if isinstance(found, list) else [found]:
+    figures = wishes.run(wishes)
+    for line in figures if isinstance(figures, list) else [figures]:
         print(json.dumps(line))
     return 0
 

@@ -55,7 +55,7 @@ class ServiceRoute:
 
     def answers(self, places: Sequence[Place], settings: LensSettings, size: int) -> list[Answer]:
         """Ask for the PSFs at some places; see `Route`."""
-        lens_id, found = self._known(), []
+        lens_id, answers = self._known(), []
         for place, channel in places:
             psf = self._client.psf(
                 lens_id,
@@ -67,8 +67,8 @@ class ServiceRoute:
                 size=size,
             )
             error = psf.support.predicted_error
-            found.append(Answer(as_kernel(psf.psf.data), np.nan if error is None else error))
-        return found
+            answers.append(Answer(as_kernel(psf.psf.data), np.nan if error is None else error))
+        return answers
 
     def corrected(self, photo: Path, method: str) -> CorrectedPhoto:
         """Have a photo corrected that the lens does not learn from; see `Route`."""

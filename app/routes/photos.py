@@ -84,8 +84,11 @@ _RECEIVED: Final = problems(
 async def create_photo(once: OnceDep) -> PhotoOut | Response:
     """Store a photo, and calibrate its lens with it unless `calibrate=false`.
 
-    The fields may stand in the form or in the query. What they say goes before the file's own
-    metadata. With `kind` the photo was made to measure the lens: a `target`, `points`, `edges`, or the open
+    The fields may stand in the form or in the query. The lens that they name goes before that of the file.
+    Aperture, focal length, focus distance and pixel pitch are taken where the file does not say its own;
+    `PATCH /v1/photos/{id}` corrects a file that says them wrongly.
+
+    With `kind` the photo was made to measure the lens: a `target`, `points`, `edges`, or the open
     photo of a `pair`, whose closed one was sent before with `calibrate=false` and is its `reference_id`.
     With `model` it founds a lens that is learned so; of a lens with another model it is refused, or fails
     with `conflict` where only the file says which lens it was: `PATCH /v1/lenses/{id}` changes the model.

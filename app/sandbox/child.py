@@ -27,8 +27,8 @@ from app.sandbox import confine
 from app.sandbox.account import Account
 from lensmodel.core.errors import LensModelError
 
-Progress: TypeAlias = Callable[[int, int], None]
-Task: TypeAlias = Callable[[dict[str, Any], Path, Progress], Any]
+ProgressHook: TypeAlias = Callable[[int, int], None]
+Task: TypeAlias = Callable[[dict[str, Any], Path, ProgressHook], Any]
 """Called as `task(arguments, folder, progress)`; returns what JSON can write."""
 
 RESULT: Final = "result.json"

@@ -21,7 +21,7 @@ MAX_RESULT: Final = 16 * 1024 * 1024
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class TaskLimits:
     """Resources that one task may use.
 
     Parameters
@@ -44,7 +44,7 @@ class Limits:
     file_mb: int = 8192
     open_files: int = 256
 
-    def with_memory(self, memory_mb: int) -> Limits:
+    def with_memory(self, memory_mb: int) -> TaskLimits:
         """Return the same limits with another memory."""
         return replace(self, memory_mb=memory_mb)
 
@@ -71,7 +71,7 @@ class Outcome:
     detail: str = ""
 
 
-def outcome_of(message: dict[str, Any] | None, status: int, folder: Path, limits: Limits) -> Outcome:
+def outcome_of(message: dict[str, Any] | None, status: int, folder: Path, limits: TaskLimits) -> Outcome:
     """Return the outcome from the last message of a child, if any, and its exit status (or -signal)."""
     ending = None if message is None else message.get("end")
     if ending == "ok" and status == 0:
@@ -89,30 +89,30 @@ def outcome_of(message: dict[str, Any] | None, status: int, folder: Path, limits
     return Outcome("crashed", code="crashed", detail=detail)
 
 
-def _refused(code: str, text: str, limits: Limits) -> Outcome:
+def _refused(code: str, text: str, limits: TaskLimits) -> Outcome:
     del limits
     return Outcome("error", code=code, detail=text)
 
 
-def _swollen(code: str, text: str, limits: Limits) -> Outcome:
+def _swollen(code: str, text: str, limits: TaskLimits) -> Outcome:
     del code, text
     detail = f"needs more than the {limits.memory_mb} MiB it may take; give a smaller photo"
     return Outcome("memory_limit", code="memory_limit", detail=detail)
 
 
-def _no_room(code: str, text: str, limits: Limits) -> Outcome:
+def _no_room(code: str, text: str, limits: TaskLimits) -> Outcome:
     del code, text, limits
     return Outcome("outage", code="outage", detail="there is no room on the disk for the work")
 
 
-def _bug(code: str, text: str, limits: Limits) -> Outcome:
+def _bug(code: str, text: str, limits: TaskLimits) -> Outcome:
     del limits
     log.error("unforeseen %s in a task:\n%s", code, text)
     why = f"an unforeseen {code} stopped the work; the log of the worker says where"
     return Outcome("crashed", code="internal_error", detail=why)
 
 
-_OUTCOMES: Final[Mapping[object, Callable[[str, str, Limits], Outcome]]] = {
+_OUTCOMES: Final[Mapping[object, Callable[[str, str, TaskLimits], Outcome]]] = {
     "error": _refused,
     "memory_limit": _swollen,
     "no_room": _no_room,

@@ -32,7 +32,7 @@ from typing import Any, Final
 from app.sandbox import child
 from app.sandbox.account import Account
 from app.sandbox.budget import POLL_S, Budget
-from app.sandbox.outcome import Limits, Outcome, cancelled, outcome_of
+from app.sandbox.outcome import Outcome, TaskLimits, cancelled, outcome_of
 from lensmodel.core.types import ignore_step
 
 MAX_MESSAGE: Final = 64 * 1024
@@ -155,11 +155,11 @@ class Sandbox:
         arguments: Mapping[str, Any],
         *,
         folder: Path,
-        limits: Limits,
+        limits: TaskLimits,
         reads: Sequence[Path] = (),
         compiles: bool = False,
         wanted: Callable[[], bool] = lambda: True,
-        on_progress: child.Progress = ignore_step,
+        on_progress: child.ProgressHook = ignore_step,
     ) -> Outcome:
         """Run one task to its end.
 
@@ -209,7 +209,9 @@ class Sandbox:
             for path in reads:
                 self.account.may_read(path)
 
-    def _order(self, task: str, arguments: Mapping[str, Any], folder: Path, limits: Limits) -> dict[str, Any]:
+    def _order(
+        self, task: str, arguments: Mapping[str, Any], folder: Path, limits: TaskLimits
+    ) -> dict[str, Any]:
         numbers = asdict(limits)
         numbers["cpu_s"] = limits.cpu_s or math.ceil(limits.wall_s * 1.25) + 5
         return {
@@ -232,7 +234,11 @@ class Sandbox:
         return process
 
     def _watch(
-        self, watched: _Watched, limits: Limits, wanted: Callable[[], bool], on_progress: child.Progress
+        self,
+        watched: _Watched,
+        limits: TaskLimits,
+        wanted: Callable[[], bool],
+        on_progress: child.ProgressHook,
     ) -> Outcome | None:
         """Read messages until the child has ended; or return the outcome if it must be killed."""
         last_check = 0.0

@@ -31,7 +31,7 @@ from app.schemas.fields import (
     PsfModel,
     Question,
 )
-from app.schemas.jobs import JobLinks, JobOut, JobPage, JobState, Progress, RetriedOut
+from app.schemas.jobs import JobLinks, JobOut, JobPage, JobProgress, JobState, RetriedOut
 from app.schemas.lenses import (
     CalibrationOut,
     CalibrationPage,
@@ -81,6 +81,7 @@ __all__ = [
     "JobLinks",
     "JobOut",
     "JobPage",
+    "JobProgress",
     "JobState",
     "KernelOut",
     "KernelSize",
@@ -108,7 +109,6 @@ __all__ = [
     "PhotosChange",
     "PixelPitch",
     "Problem",
-    "Progress",
     "PsfModel",
     "PsfOut",
     "PsfQuery",

@@ -10,7 +10,7 @@ from app.schemas.fields import Model, Problem
 JobState = Literal["queued", "running", "waiting", "succeeded", "failed", "cancelled"]
 
 
-class Progress(Model):
+class JobProgress(Model):
     """How far a job is."""
 
     done: int
@@ -35,7 +35,7 @@ class JobOut(Model):
     kind: Literal["photo", "correction", "rebuild"]
     state: JobState
     stage: str | None
-    progress: Progress
+    progress: JobProgress
     eta_seconds: float | None
     attempt: int
     error: Problem | None

@@ -40,7 +40,10 @@ PhotoState = Literal[
 
 
 class UploadFields(Question):
-    """What an owner may say about a photo; it goes before what the file says."""
+    """What an owner may say about a photo.
+
+    The lens that it names goes before that of the file; a setting counts where the file says none.
+    """
 
     calibrate: bool = Field(default=True, description="false only stores the photo to correct it")
     kind: Annotated[MeasurementKind | None, BeforeValidator(blank_is_none)] = Field(
@@ -73,7 +76,7 @@ class NewLens(Question):
 
 
 class PhotoChange(Question):
-    """What to change about a photo; at least one field."""
+    """What to change about a photo; at least one field. It goes before what the file says."""
 
     lens_id: Id | None = None
     lens_serial: Name | None = None

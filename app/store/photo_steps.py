@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import timedelta
 from typing import Any, Final, Protocol
 
@@ -25,6 +25,11 @@ GIVEN_SETTINGS = {
     "pixel_pitch_um": "pixel_pitch_um",
 }
 """Fields that the owner may give, with the column that each fills."""
+
+FALLBACKS: Final = "fallbacks"
+"""Key in `PhotoRow.given` of the settings that came with the file: the header's own go before them. Settings
+under their own names are corrections made since and go before the header. In rows of earlier versions those
+that came with the file stand there too, and keep their precedence."""
 
 DESCRIPTION: Final = (
     *("lens_maker", "lens_model", "lens_serial", "lens_serial_source", "camera_maker", "camera_model"),
@@ -66,6 +71,20 @@ def folder_of(photo: PhotoRow) -> str:
 def settings_of(photo: PhotoRow) -> dict[str, Any]:
     """Return the lens settings of a photo, as tasks read them."""
     return {"aperture": photo.aperture, "focal_mm": photo.focal_mm, "focus_m": photo.focus_m}
+
+
+def of_upload(fields: Mapping[str, Any], before: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return the fields of an upload, after those of `before`, as `PhotoRow.given` holds them."""
+    known = before or {}
+    fallbacks = {name: value for name, value in fields.items() if name in GIVEN_SETTINGS}
+    merged = {**known, **{name: value for name, value in fields.items() if name not in GIVEN_SETTINGS}}
+    return {**merged, FALLBACKS: {**known.get(FALLBACKS, {}), **fallbacks}} if fallbacks else merged
+
+
+def setting(photo: PhotoRow, field: str, header: float | None) -> float | None:
+    """Return a setting by precedence: corrected by the owner, in the header, given with the file."""
+    ranked = (photo.given.get(field), header, photo.given.get(FALLBACKS, {}).get(field))
+    return next((value for value in ranked if value is not None), None)
 
 
 def empty(photo: PhotoRow) -> None:

@@ -27,7 +27,9 @@ from app.store.photo_steps import (
     folder_of,
     let_go,
     move,
+    of_upload,
     restart,
+    setting,
     widen,
 )
 from app.store.removal import forget_if_empty
@@ -96,7 +98,7 @@ class PhotoStore(PhotoReads):
                 "byte_size": byte_size,
                 "blob_key": blob_key,
                 "calibrate": calibrate,
-                "given": dict(given),
+                "given": of_upload(given),
                 "state": "received",
                 "received_at": now(),
                 "stage_at": now(),
@@ -108,7 +110,7 @@ class PhotoStore(PhotoReads):
                 prefix = f"{blob_key.rpartition('/')[0]}/"
                 session.execute(delete(GarbageRow).where(GarbageRow.prefix == prefix))
                 return Received(known, fresh=True)
-            merged = {**known.given, **given}
+            merged = of_upload(given, known.given)
             again = (
                 known.state in {"failed", "cancelled"}
                 or (calibrate and not known.calibrate)
@@ -187,7 +189,7 @@ class PhotoStore(PhotoReads):
         exposure_s: float | None = None,
         taken_at: datetime | None = None,
     ) -> None:
-        """Store what the header says; values that the owner gave take precedence."""
+        """Store what the header says; the owner's corrections go before it, settings of the upload after."""
         header = {
             "aperture": aperture,
             "focal_mm": focal_mm,
@@ -199,8 +201,7 @@ class PhotoStore(PhotoReads):
             if photo is None:
                 return
             for field, column in GIVEN_SETTINGS.items():
-                value = photo.given.get(field)
-                setattr(photo, column, header[column] if value is None else value)
+                setattr(photo, column, setting(photo, field, header[column]))
             serial = photo.given.get("lens_serial")
             photo.width, photo.height, photo.orientation = width, height, orientation
             photo.camera_maker, photo.camera_model, photo.body_key = camera_maker, camera_model, body_key

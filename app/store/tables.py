@@ -153,7 +153,7 @@ class PhotoRow(Base):
     blob_key: Mapped[str]
     calibrate: Mapped[bool]
     given: Mapped[dict[str, Any]]
-    """What the owner said about the photo; takes precedence over what the file says."""
+    """What the owner said about the photo; goes before what the file says, except `photo_steps.FALLBACKS`."""
 
     width: Mapped[int | None]
     height: Mapped[int | None]

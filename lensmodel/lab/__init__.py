@@ -1,4 +1,4 @@
 """The laboratory: all that measures the library, compares it with others, and trains its data.
 
-It may import everything; nothing outside imports it.
+It may import everything; only the commands of `app/lab` import it.
 """

@@ -20,11 +20,12 @@ from lensmodel.core.types import CHANNELS, Channel, FieldPosition, LensSettings
 from lensmodel.model import LensModel, PsfAnswer
 from lensmodel.report.places import landmarks, little_seen, place_in_words
 
-_SIZE: Final = 15  # the kernel itself plays no part
-_SETTINGS: Final = 24
-_SATISFIED: Final = 0.01
+_SIZE: Final = 15  # pixels (chosen: quick to ask for; the kernel itself plays no part)
+_SETTINGS: Final = 24  # settings that are asked about, those of the most samples (chosen: for time)
+_SATISFIED: Final = 0.01  # of the kernel's norm: less gain is not worth another photo (chosen)
 _WEIGHT: Final[dict[Channel, float]] = {"g": 1.0, "r": 0.5, "b": 0.5}
-"""Sharpness is seen in luminance, to which red and blue together give about as much as green."""
+"""Sharpness is seen in luminance, to which red and blue together give about as much as green
+(chosen: round numbers)."""
 
 _COLOURS: Final[dict[Channel, str]] = {
     "g": "fine detail",

@@ -31,9 +31,10 @@ DRAWS: Final = 16
 """A standard deviation over so few is known to a fifth (chosen for time)."""
 
 FEWEST_PHOTOS: Final = 3
-"""With fewer, patches are drawn instead of photos, which share their photo's focus: too small an error."""
+"""With fewer, patches are drawn instead of photos, which share their photo's focus: too small an error
+(chosen: two photos have but three different draws)."""
 
-_RING: Final = 2  # places of a ring, as many as tell its mean
+_RING: Final = 2  # places of a ring, whose mean is its value (chosen: fewer than in the report, for time)
 
 Drawn = Literal["photos", "patches"]
 

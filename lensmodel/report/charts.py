@@ -12,15 +12,16 @@ from lensmodel.report.lens_test import LensTest, Tested
 from lensmodel.report.palette import colour, ink, rgb
 from lensmodel.report.units import NYQUIST, Sensor, Unit
 
-# Layout in points of the picture; axes have five steps.
+# Layout in points of the picture (chosen: keys and numbers beside the axes are not cut off); axes have five
+# steps.
 WIDTH: Final = 640
 HEIGHT: Final = 380
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 160, 40, 52
 _GAP: Final = 20
 _SCALE_HIGH: Final = 14
-_LEAST_WIDTH_PX: Final = 0.5  # what the axis of widths shows at least: a point may have none
+_LEAST_WIDTH_PX: Final = 0.5  # what the axis of widths shows at least: a point may have none (chosen)
 _RADII_TICKS: Final = tuple((k / 5, f"{k / 5:.1f}") for k in range(6))
-_TURNS: Final = tuple(k * math.pi / 24 for k in range(48))
+_TURNS: Final = tuple(k * math.pi / 24 for k in range(48))  # radians: so many corners look round (chosen)
 _INKS: Final[dict[Channel, str]] = {"r": "#c2410c", "g": "#15803d", "b": "#0b6e99"}
 _NAMES: Final[dict[Channel, str]] = {"r": "red", "g": "green", "b": "blue"}
 

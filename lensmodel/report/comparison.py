@@ -18,13 +18,14 @@ from lensmodel.report.palette import colour, ink, rgb
 from lensmodel.report.units import NYQUIST
 
 _SURE: Final = 2.0
-"""Standard errors by which two places must differ to be called different."""
+"""Standard errors by which two places must differ to be called different (chosen: chance
+does it in one of twenty)."""
 
 _ALIKE: Final = 0.05
 """Share by which zones may differ and still be called alike: less is not seen (chosen)."""
 
 _LETTERS: Final = 18
-"""Of a name in the key of a chart."""
+"""Of a name in the key of a chart (chosen: they fit beside it)."""
 
 _TICKS: Final = tuple((k / 5, f"{k / 5:.1f}") for k in range(6))
 _NAMES: Final[dict[Zone, str]] = {"center": "in the centre", "mid": "halfway out", "corner": "in the corners"}

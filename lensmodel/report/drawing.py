@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Final, TypeAlias
 from xml.sax.saxutils import escape
 
+# sRGB (chosen: hues that are easily told apart on white)
 COLOURS: Final = ("#0b6e99", "#c2410c", "#15803d", "#7e22ce", "#a16207", "#be185d", "#334155")
 GREY: Final = "#6b7280"
 PALE: Final = "#e5e7eb"

@@ -30,10 +30,10 @@ from lensmodel.quality import mtf_from_kernel, tangential_sagittal_mtf50
 from lensmodel.report.places import DEFAULT_ASPECT, grid
 
 FREQUENCIES: Final = tuple(round(0.05 * i, 2) for i in range(1, 11))
-"""Cycles/pixel of the MTF table, up to the Nyquist frequency."""
+"""Cycles/pixel of the MTF table, up to the Nyquist frequency (chosen: ten rows)."""
 
-_MOST_BYTES: Final = 1 << 29  # of one file: against questions that fill the memory
-_GAP: Final = 2  # pixels between two kernels of a sheet
+_MOST_BYTES: Final = 1 << 29  # of one file: against questions that fill the memory (chosen)
+_GAP: Final = 2  # pixels between two kernels of a sheet (chosen)
 _ABOUT: Final = "point spread functions by lensmodel; row 0 at the top, each sums to 1"
 
 

@@ -28,15 +28,15 @@ _STEPS_MM: Final = (50.0, 20.0, 10.0)
 with small pixels at the largest of which four lie below half of the Nyquist frequency (chosen)."""
 
 FALLBACK_FREQUENCIES: Final = (0.05, 0.1, 0.15, 0.2)
-"""Cycles/pixel of the curves where no pixel pitch is known: 10 to 40 lp/mm at 5 micrometres."""
+"""Cycles/pixel of the curves where no pixel pitch is known: 10 to 40 lp/mm at 5 micrometres (chosen)."""
 
-# Half-diagonals; nothing is asked in the very corner, which no sample reaches
+# Half-diagonals (chosen: nothing is asked in the very corner, which no sample reaches)
 _RADII: Final = tuple(float(r) for r in np.linspace(0.0, 0.95, 11).round(4))
 _RING: Final = 3  # places of a ring whose mean is its value (chosen)
-_MOST_APERTURES: Final = 12  # a page holds as many rows
-# Half-diagonals: the middle of each zone by area or so
+_MOST_APERTURES: Final = 12  # a page holds as many rows (chosen)
+# Half-diagonals (chosen: about the middle of each zone)
 _ZONE_RADIUS: Final[dict[Zone, float]] = {"center": 0.15, "mid": 0.5, "corner": 0.88}
-_EVEN_PX: Final = 0.1  # widths along u and v that differ by less count as alike
+_EVEN_PX: Final = 0.1  # widths along u and v that differ by less count as alike (chosen)
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,9 +32,10 @@ _CRISP, _SHARP, _SOFT = 0.35, 0.2, 0.1
 a little soft (chosen: an ideal pixel behind an ideal lens reaches .6, a demosaiced photo about .3)."""
 
 _GUESSED: Final = 0.5
-"""Mean expected error of the kernels from which on a verdict is called a guess: half of them may be wrong."""
+"""Mean expected error of the kernels from which on a verdict is called a guess (chosen: half of a kernel may
+be wrong)."""
 
-_LATERAL_R: Final = tuple(round(0.1 * k, 1) for k in range(11))  # half-diagonals
+_LATERAL_R: Final = tuple(round(0.1 * k, 1) for k in range(11))  # half-diagonals (chosen: curves are smooth)
 
 
 @dataclass(frozen=True, slots=True)

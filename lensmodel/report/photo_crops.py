@@ -10,7 +10,7 @@ from lensmodel.core.types import Planes
 Picture = NDArray[np.uint8]
 """`(row, col, 3)` sRGB, as shown."""
 
-_EDGE = 4  # pixels of the border that demosaicing leaves unsure
+_EDGE = 4  # pixels of the border that demosaicing leaves unsure (chosen)
 
 
 def as_shown(planes: Planes, gain: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Picture:

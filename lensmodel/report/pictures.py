@@ -11,12 +11,13 @@ from lensmodel.report.drawing import COLOURS, GREY, Axes, Box, Label, Part, svg
 from lensmodel.report.lens_report import LensReport
 from lensmodel.report.palette import colour, ink, rgb
 
-# Layout in points of the picture; axes have five steps.
+# Layout in points of the picture (chosen: keys and numbers beside the axes are not cut off); axes have five
+# steps.
 WIDTH: Final = 640
 HEIGHT: Final = 400
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 170, 40, 52
 _MARGIN: Final = 20
-_LINE_CHARACTERS: Final = 100
+_LINE_CHARACTERS: Final = 100  # so many fit into the width at the size of the font (chosen)
 _TICKS: Final = tuple((i / 5, f"{i / 5:.1f}") for i in range(6))
 
 

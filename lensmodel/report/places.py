@@ -17,10 +17,11 @@ DEFAULT_ASPECT: Final = 1.5
 
 NEAR_R: Final = 0.3
 """Distance in half diagonals within which a patch speaks for a place: no spot of the picture is further from
-all `landmarks`, and blur changes little over it."""
+all `landmarks`, and blur changes little over it (chosen)."""
 
 ENOUGH_NEAR: Final = 5
-"""Patches near a place that has been seen well: a mean of five is known twice as well as one of them."""
+"""Patches near a place that has been seen well: a mean of five is known twice as well as one of them
+(chosen)."""
 
 _DIRECTIONS: Final = (
     *("right", "upper right", "top", "upper left"),

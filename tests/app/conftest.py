@@ -38,8 +38,8 @@ class Steps:
     def receive(self, *, calibrate: bool = True, **given: Any) -> PhotoRow:
         return self._receive(f"{next(self._numbers):064x}", calibrate=calibrate, given=given)
 
-    def receive_again(self, photo: PhotoRow) -> PhotoRow:
-        return self._receive(photo.sha256, calibrate=photo.calibrate, given={})
+    def receive_again(self, photo: PhotoRow, **given: Any) -> PhotoRow:
+        return self._receive(photo.sha256, calibrate=photo.calibrate, given=given)
 
     def _receive(self, sha256: str, *, calibrate: bool, given: dict[str, Any]) -> PhotoRow:
         public_id = new_id()

@@ -18,18 +18,18 @@ from typing import Any
 
 import numpy as np
 
-from app.sandbox.child import Progress
+from app.sandbox.child import ProgressHook
 from lensmodel.core.errors import NoUsablePatchesError
 
 
-def add(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+def add(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     np.save(folder / "sum.npy", np.array(arguments["a"]) + np.array(arguments["b"]))
     progress(1, 2)
     progress(2, 2)
     return {"environment": dict(os.environ), "folder": str(Path.cwd()), "pid": os.getpid()}
 
 
-def weight(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+def weight(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     session = Path("/proc/self/autogroup")
     return {
         "nice": os.getpriority(os.PRIO_PROCESS, 0),
@@ -37,51 +37,51 @@ def weight(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[
     }
 
 
-def refuse(arguments: dict[str, Any], folder: Path, progress: Progress) -> None:
+def refuse(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
     raise NoUsablePatchesError("nothing sharp in this photo; use another one")
 
 
-def swell(arguments: dict[str, Any], folder: Path, progress: Progress) -> int:
+def swell(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> int:
     return int(np.ones(arguments["mb"] << 17).sum())
 
 
-def spin(arguments: dict[str, Any], folder: Path, progress: Progress) -> None:
+def spin(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
     while True:
         pass
 
 
-def sleep(arguments: dict[str, Any], folder: Path, progress: Progress) -> None:
+def sleep(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
     Path(arguments["pid_file"]).write_text(str(os.getpid()))
     progress(0, 1)
     time.sleep(60)
 
 
-def spawn(arguments: dict[str, Any], folder: Path, progress: Progress) -> None:
+def spawn(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
     process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
     Path(arguments["pid_file"]).write_text(str(process.pid))
     progress(0, 1)
     time.sleep(60)
 
 
-def crash(arguments: dict[str, Any], folder: Path, progress: Progress) -> None:
+def crash(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
     ctypes.string_at(0)
 
 
-def die(arguments: dict[str, Any], folder: Path, progress: Progress) -> None:
+def die(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def blunder(arguments: dict[str, Any], folder: Path, progress: Progress) -> None:
+def blunder(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
     raise KeyError("nobody thought of this")
 
 
-def write(arguments: dict[str, Any], folder: Path, progress: Progress) -> None:
+def write(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
     with (folder / "large").open("wb") as file:
         for _ in range(arguments["mb"]):
             file.write(bytes(1 << 20))
 
 
-def open_files(arguments: dict[str, Any], folder: Path, progress: Progress) -> int:
+def open_files(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> int:
     held = []
     try:
         while True:
@@ -90,12 +90,12 @@ def open_files(arguments: dict[str, Any], folder: Path, progress: Progress) -> i
         return len(held)
 
 
-def fill_the_disk(arguments: dict[str, Any], folder: Path, progress: Progress) -> None:
+def fill_the_disk(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def probe(  # noqa: C901 - one try each
-    arguments: dict[str, Any], folder: Path, progress: Progress
+    arguments: dict[str, Any], folder: Path, progress: ProgressHook
 ) -> dict[str, str]:
     """Try what a task that a hostile file took over would try; say how far each came."""
 
@@ -167,7 +167,7 @@ def probe(  # noqa: C901 - one try each
     return found
 
 
-def link(arguments: dict[str, Any], folder: Path, progress: Progress) -> None:
+def link(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
     """Leave links where the worker expects what the task made."""
     (folder / "preview.jpg").symlink_to(arguments["database"])
     (folder / "inner").mkdir()
@@ -175,7 +175,7 @@ def link(arguments: dict[str, Any], folder: Path, progress: Progress) -> None:
     (folder / "inner" / "made").write_text("made")
 
 
-def shout(arguments: dict[str, Any], folder: Path, progress: Progress) -> None:
+def shout(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
     raise NoUsablePatchesError("x" * 1_000_000)
 
 

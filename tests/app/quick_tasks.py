@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from app.jobs.task_files import KERNELS
-from app.sandbox.child import Progress
+from app.sandbox.child import ProgressHook
 from lensmodel.core.files import save_array
 from lensmodel.core.psf import gaussian
 
@@ -28,17 +28,17 @@ METADATA = {
 }
 
 
-def inspect(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+def inspect(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     return {"kind": "dng", "width": 64, "height": 48, "metadata": METADATA}
 
 
-def develop(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+def develop(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     with (folder / "planes.npy").open("wb") as file:
         save_array(file, np.zeros((3, 48, 64), np.float32))
     return {}
 
 
-def select(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+def select(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     patches = [
         {
             "row": 0,
@@ -53,7 +53,7 @@ def select(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[
     return {"patches": patches, "rejected": [], "lateral": None}
 
 
-def estimate(arguments: dict[str, Any], folder: Path, progress: Progress) -> list[dict[str, Any]]:
+def estimate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[dict[str, Any]]:
     time.sleep(SECONDS)
     with (folder / KERNELS).open("wb") as file:
         save_array(file, np.stack([gaussian(5, np.eye(2))] * 3))
@@ -67,7 +67,7 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: Progress) -> lis
     return [{"idx": arguments["numbers"][0], "channel": channel, **common} for channel in ("r", "g", "b")]
 
 
-def measure(arguments: dict[str, Any], folder: Path, progress: Progress) -> dict[str, Any]:
+def measure(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     return {"error": {}, "coverage": {}}
 
 

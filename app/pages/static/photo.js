@@ -13,12 +13,12 @@ function setUpRmap() {
 
 export function setUpPhoto() {
   setUpRmap();
-  const told = byId("told");
+  const placeWords = byId("place-words");
   const frames = [...document.querySelectorAll(".overlay rect")];
-  if (!told) return;
+  if (!placeWords) return;
   const choose = (frame) => {
     for (const other of frames) other.classList.toggle("chosen", other === frame);
-    told.textContent = frame.dataset.words;
+    placeWords.textContent = frame.dataset.words;
   };
   for (const frame of frames) {
     frame.addEventListener("click", () => choose(frame));

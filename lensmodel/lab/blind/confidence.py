@@ -24,7 +24,7 @@ _POINT_PX = 0.1
 _DROPPED = 0.3
 
 
-def told(rows: list[dict[str, Any]]) -> str:
+def summary(rows: list[dict[str, Any]]) -> str:
     """Return the figures of one method at one noise level."""
     confidence, ratio, predicted, error, width, true = (
         np.array([row[key] for row in rows], dtype=np.float64)
@@ -58,7 +58,7 @@ def main() -> None:
             if row["confidence"] is not None:
                 groups.setdefault((row["method"], row["noise"]), []).append(row)
         for (method, noise), rows in groups.items():
-            print(f"{method}, {100 * noise:g} %, {len(rows)} cases: {told(rows)}")
+            print(f"{method}, {100 * noise:g} %, {len(rows)} cases: {summary(rows)}")
 
 
 if __name__ == "__main__":

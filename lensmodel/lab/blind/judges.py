@@ -18,6 +18,7 @@ from scipy import fft
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import Kernel, Plane
+from lensmodel.lab.correction.methods.half_quadratic import growing, half_quadratic
 from lensmodel.lab.correction.methods.mixture import shipped_mixture
 
 BORDER: Final = 28
@@ -101,16 +102,17 @@ class HyperLaplacian:
         lam = self.weight / (sigma * sigma)
         data, power = lam * np.conj(otf) * fft.rfft2(y), lam * np.square(np.abs(otf))
         laplacian = np.square(np.abs(dr)) + np.square(np.abs(dc))
-        x, beta = y, self.first
-        while beta <= self.last * 1.001:
+        betas = growing(self.first, self.last, self.factor)
+
+        def led_back(x: NDArray[np.float64], turn: int) -> Spectrum:
             spectrum = fft.rfft2(x)
-            target = np.zeros_like(spectrum)
+            total = np.zeros_like(spectrum)
             for d in (dr, dc):
-                gradient = fft.irfft2(d * spectrum, s=y.shape)
-                target += np.conj(d) * fft.rfft2(_shrink(gradient, beta, self.exponent))
-            x = fft.irfft2((data + beta * target) / (power + beta * laplacian + 1e-12), s=y.shape)
-            beta *= self.factor
-        return _inner(x)
+                gradient = fft.irfft2(d * spectrum, s=x.shape)
+                total += np.conj(d) * fft.rfft2(_shrink(gradient, betas[turn], self.exponent))
+            return total
+
+        return _inner(half_quadratic(y, data, power, betas, led_back, curvature=laplacian, floor=1e-12))
 
 
 _TABLE_REACH: Final = 1.5
@@ -172,12 +174,8 @@ class Epll:
         otf = shifted_otf(kernel, (y.shape[0], y.shape[1]), shift)
         weight = 1.0 / (sigma * sigma)
         data, power = weight * np.conj(otf) * fft.rfft2(y), weight * np.square(np.abs(otf))
-        prior = shipped_mixture()
-        x = y
-        for turn, beta in enumerate(self.betas):
-            z = prior.cleaned(x.astype(np.float32), 1.0 / beta, turn, self.step)
-            x = fft.irfft2((data + beta * fft.rfft2(z)) / (power + beta), s=y.shape)
-        return _inner(x)
+        target = shipped_mixture().spectrum_of_cleaned(self.betas, self.step)
+        return _inner(half_quadratic(y, data, power, self.betas, target))
 
 
 judges: Registry[Judge] = Registry("non-blind judge", {"hyper-laplacian": HyperLaplacian, "epll": Epll})

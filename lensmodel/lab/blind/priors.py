@@ -20,7 +20,7 @@ import numpy as np
 
 from lensmodel.estimation.spectra.local_spectra import SpectrumMixture
 from lensmodel.lab.blind.blind_benchmark import run_blind_benchmark
-from lensmodel.lab.blind.confidence import told
+from lensmodel.lab.blind.confidence import summary
 from lensmodel.lab.blind.results import UNTOUCHED, BlindBenchmark, CaseResult, summarised
 from lensmodel.lab.cases import list_photos, photo_half
 from lensmodel.lab.training import make_local_spectra, make_scene_spectra
@@ -68,7 +68,7 @@ def main() -> None:
     for noise in settings.noise:
         rows = [asdict(r) for r in results if r.noise == noise and r.method != UNTOUCHED and not r.declined]
         gained = np.exp(np.mean([np.log(row["error_ratio"] / row["untouched_ratio"]) for row in rows]))
-        print(f"{100 * noise:g} %: ER over untouched {gained:.3f}; {told(rows)}")
+        print(f"{100 * noise:g} %: ER over untouched {gained:.3f}; {summary(rows)}")
 
 
 if __name__ == "__main__":

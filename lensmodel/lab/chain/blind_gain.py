@@ -289,8 +289,8 @@ def main() -> None:
                 if isinstance(outcome, str):
                     print(f"| {lens.name} | {count} | {outcome} | | | | | | |", flush=True)
                     continue
-                told = [outcome.expected.get(zone) for zone in ZONES]
-                words = " / ".join("?" if gain is None else f"{gain:+.1f}" for gain in told)
+                announced = [outcome.expected.get(zone) for zone in ZONES]
+                words = " / ".join("?" if gain is None else f"{gain:+.1f}" for gain in announced)
                 seen, unshifted, linear = (
                     " / ".join(f"{gain[zone]:+.2f}" for zone in ZONES)
                     for gain in (outcome.shown.zones, outcome.unshifted, outcome.linear.zones)

@@ -106,9 +106,9 @@ def rows(lens: Lens, counts: list[int], folder: Path) -> Iterator[str]:
             )
             seen = registered_gains(pictures[0], to_srgb(shown(made.planes)), pictures[1])
             linear = registered_gains(developed.planes, made.planes, sharp)
-            told = [made.zones[zone].expected_gain_db if zone in made.zones else None for zone in ZONES]
+            announced = [made.zones[zone].expected_gain_db if zone in made.zones else None for zone in ZONES]
             gained, light = (" / ".join(f"{g.zones[z]:+.2f}" for z in ZONES) for g in (seen, linear))
-            expected = " / ".join("?" if gain is None else f"{gain:+.1f}" for gain in told)
+            expected = " / ".join("?" if gain is None else f"{gain:+.1f}" for gain in announced)
             lost = f"{seen.loss_share:.1%}"
             yield f"| {lens.name} | {count} | {name} | {gained} | {light} | {expected} | {lost} |"
 

@@ -42,7 +42,7 @@ _SMOOTH, _AROUND, _APART = 1.5, 8.0, 7  # pixels: of the gradient, of the mean a
 _EVEN, _CONTRAST, _BRIGHTEST = 0.06, 0.25, 0.9  # of the step, of the mean, of full scale (chosen)
 _MOST: Final = 6000  # candidates of a photo, the strongest (chosen)
 _LINE = ((2, 0.0, 1.02), (3, 0.0, 1.02), (6, 0.98, np.inf))  # beyond these A is that of a line (chosen)
-_FEWEST: Final = 8  # edges of a zone that are told (chosen)
+_FEWEST: Final = 8  # edges of a zone whose profiles are printed (chosen)
 _SIDE: Final = 63  # pixels of a true kernel
 
 Floats = NDArray[np.float64]
@@ -153,8 +153,10 @@ def main() -> None:
                 print(f"| {lens.name} | {zone} | {len(kept)} | {scenes} | - | - |", flush=True)
                 continue
             true = [true_profile(truth.kernel_at(edge.position, "g", _SIDE), edge.across) for edge in kept]
-            told = " | ".join(_words(np.median(rows, axis=0)) for rows in (true, [e.profile for e in kept]))
-            print(f"| {lens.name} | {zone} | {len(kept)} | {scenes} | {told} |", flush=True)
+            profiles = " | ".join(
+                _words(np.median(rows, axis=0)) for rows in (true, [e.profile for e in kept])
+            )
+            print(f"| {lens.name} | {zone} | {len(kept)} | {scenes} | {profiles} |", flush=True)
 
 
 def _words(profile: Floats) -> str:

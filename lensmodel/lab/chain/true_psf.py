@@ -69,9 +69,9 @@ def main() -> None:
             for kind, field in (("true", lens.lens.field(lens.settings)), ("point", PointField())):
                 after = shown(corrected_with(developed, field, wanted.method))
                 gains[kind] = np.array(channel_gains(after, before, truth))
-                told = " | ".join(" / ".join(f"{gain:+.2f}" for gain in row) for row in gains[kind])
+                gain_words = " | ".join(" / ".join(f"{gain:+.2f}" for gain in row) for row in gains[kind])
                 worst = block_gains(after, before, truth).min()
-                print(f"| {lens.name} | {kind} | {told} | {worst:+.2f} |", flush=True)
+                print(f"| {lens.name} | {kind} | {gain_words} | {worst:+.2f} |", flush=True)
             falls["the developed photo"] += int((gains["true"] < -FALL_DB).sum())
             falls["the point"] += int((gains["true"] - gains["point"] < -FALL_DB).sum())
             count += gains["true"].size

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from skimage import restoration
 
+from lensmodel.core.files import atomic
 from lensmodel.core.psf import PsfField, as_kernel
 from lensmodel.core.types import (
     CHANNELS,
@@ -223,15 +224,14 @@ def trial(case: Case, folder: Path, cache: Path) -> Trial:
     if not path.exists():
         made = _made(case, folder)
         cache.mkdir(parents=True, exist_ok=True)
-        part = path.with_name(f".{path.name}.part.npz")
         kept: dict[str, Any] = {
             "kernels": made.kernels,
             "scene": made.scene,
             "photo": made.photo,
             **made.made,
         }
-        np.savez(part, **kept)
-        part.replace(path)
+        with atomic(path) as file:
+            np.savez(file, **kept)
     with np.load(path) as file:
         arrays: dict[str, Any] = dict(file)
     return Trial(case, arrays.pop("scene"), arrays.pop("photo"), kernels=arrays.pop("kernels"), made=arrays)

@@ -132,11 +132,11 @@ def _section(entry: Entry) -> list[str]:
     parts = [f'<h2 id="{entry.picture.slug}">{escape(entry.picture.name)}</h2>']
     parts.append(f"<p>{escape('; '.join(_words(entry)))}.</p>")
     if unit.get("announced"):
-        told = ", ".join(
+        gains = ", ".join(
             f"{zone} {'not known' if value is None else f'{value:+.1f} dB'}"
             for zone, value in unit["announced"].items()
         )
-        parts.append(f"<p>Announced gain: {escape(told)}.</p>")
+        parts.append(f"<p>Announced gain: {escape(gains)}.</p>")
     if entry.audit:
         words = "What the audit would hold back: white is everything"
         parts.append(

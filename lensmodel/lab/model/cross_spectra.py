@@ -226,11 +226,11 @@ def report_lenses(patches: Sequence[Patch]) -> None:
     expected, seen, mirrored, seen_mirrored, tails = np.array(votes).T
     for least in (0.0, 0.5, 1.0, 2.0):
         strong = expected >= least
-        told = mirrored >= max(least, 1e-3)
+        strong_mirrored = mirrored >= max(least, 1e-3)
         print(
             f"phase expected to tell by {least:g} or more: {strong.sum()} photos, right in "
             f"{(seen[strong] > 0).sum()}, tails right in {(tails[strong] > 0).sum()}; coma negated: "
-            f"{told.sum()}, right in {(seen_mirrored[told] > 0).sum()}"
+            f"{strong_mirrored.sum()}, right in {(seen_mirrored[strong_mirrored] > 0).sum()}"
         )
     both = np.sign(seen) * seen**2 + np.sign(tails) * tails**2
     print(f"tails right in {(tails > 0).sum()} of {len(tails)}, tails and phase in {(both > 0).sum()}")

@@ -50,10 +50,10 @@ def estimated_samples(
             developed = photo.develop(path)
             for group in pipeline.cells(pipeline.find_patches(developed, count=count)):
                 try:
-                    told = pipeline.estimate_cell(
+                    estimates = pipeline.estimate_cell(
                         developed, group, settings=settings, photo_id=f"photo{number}", channels=("g",)
                     )
                 except NotEnoughEvidenceError:
                     continue
-                found += [one.sample for one in told]
+                found += [estimate.sample for estimate in estimates]
     return found

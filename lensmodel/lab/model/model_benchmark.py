@@ -191,8 +191,8 @@ def run_model_benchmark(
                 done += 1
                 on_step(done, total)
     rows = [_over_lenses(*key, lenses, seconds[key]) for key, lenses in collected.items()]
-    told = {"seeds": list(seeds), "spoiled": spoiled, "photographs": photographs is not None}
-    return {**told, "rows": [_plain(row) for row in rows]}
+    conditions = {"seeds": list(seeds), "spoiled": spoiled, "photographs": photographs is not None}
+    return {**conditions, "rows": [_plain(row) for row in rows]}
 
 
 def predictor(method: str, samples: Sequence[PsfSample]) -> Predictor:

@@ -76,9 +76,9 @@ def row(name: str, model: LensModel, truth: SimulatedField) -> None:
         errors[zone_of(place.r)].append(error)
         widths[zone_of(place.r)].append(rms_width(answer.kernel) / rms_width(kernel))
         right += 1 / 1.5 < answer.predicted_error / error < 1.5
-    told = " / ".join(f"{np.median(errors[zone]):.2f}" for zone in ZONES)
+    medians = " / ".join(f"{np.median(errors[zone]):.2f}" for zone in ZONES)
     wide = " / ".join(f"{np.median(widths[zone]):.2f}" for zone in ZONES)
-    print(f"| {name} | {told} | {wide} | {right / _PLACES:.0%} |", flush=True)
+    print(f"| {name} | {medians} | {wide} | {right / _PLACES:.0%} |", flush=True)
 
 
 def main() -> None:

@@ -167,7 +167,7 @@ def widened(kernel: Kernel, factor: float) -> Kernel:
 
 
 def spoiled(kernels: Sequence[Kernels], kind: str) -> list[Kernels]:
-    """What a model is told instead of the truth."""
+    """What a model learns from instead of the truth."""
     how, _, where = kind.partition(" ")
     xy = np.array([(p.r * math.cos(p.phi), p.r * math.sin(p.phi)) for p in PLACES])
     found: list[Kernels] = []

@@ -22,8 +22,8 @@ from app.jobs.queue import Handler, Job, Kind, Status
 from app.jobs.task_files import FAMILY, KERNELS, LEARNED, PREVIEW, SAMPLES
 from app.runtime.settings import Settings
 from app.sandbox.budget import Budget
-from app.sandbox.child import Progress
-from app.sandbox.outcome import Limits, Outcome
+from app.sandbox.child import ProgressHook
+from app.sandbox.outcome import Outcome, TaskLimits
 from app.store import Store
 from app.store.tables import PhotoRow
 from app.store.versions import LEARNED_VERSION, learned_key, report_key
@@ -105,7 +105,7 @@ class Scripted:
         self.budget = Budget(2, 2048)
         self.account = None
         self.stopping = False
-        self.limits: list[Limits] = []
+        self.limits: list[TaskLimits] = []
         self.ran: list[str] = []
         self.seen: dict[str, dict[str, Any]] = {}
         self.files: set[str] = set()
@@ -131,11 +131,11 @@ class Scripted:
         arguments: Mapping[str, Any],
         *,
         folder: Path,
-        limits: Limits,
+        limits: TaskLimits,
         reads: Sequence[Path],
         wanted: Callable[[], bool],
         compiles: bool = False,
-        on_progress: Progress = ignore_step,
+        on_progress: ProgressHook = ignore_step,
     ) -> Outcome:
         self.ran.append(task)
         self.limits.append(limits)
@@ -503,7 +503,7 @@ def test_a_lost_file_is_told_of(work: PhotoWork, context: JobContext, photo: Pho
 
 def attempt(context: JobContext, wanted: Callable[[], bool] = lambda: True) -> Any:
     with context.sandbox.folder() as folder:
-        return context.attempt("task", {}, folder=folder, limits=Limits(500, 10), wanted=wanted)
+        return context.attempt("task", {}, folder=folder, limits=TaskLimits(500, 10), wanted=wanted)
 
 
 def test_a_crash_is_tried_again(context: JobContext, sandbox: Scripted) -> None:

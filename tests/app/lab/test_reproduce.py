@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from app.cli import app
 from app.client import JobEndedError
-from app.lab.reproduce import Progress
+from app.lab.reproduce import WorkLines
 from app.lab.service_route import CODE, ServiceRoute, ServiceRoutes
 from app.schemas import JobOut
 from lensmodel.core.errors import NoSamplesError
@@ -85,7 +85,7 @@ def test_progress_tells_the_share_done_and_leaves_stored_work_out_of_the_estimat
 ) -> None:
     now = iter([0.0, 0.0, 10.0, 20.0])  # begun, then once a line
     monkeypatch.setattr("app.lab.reproduce.time", SimpleNamespace(monotonic=lambda: next(now)))
-    tell = Progress()
+    tell = WorkLines()
     tell("stored", 50.0, 100.0, fresh=False)
     tell("photo", 60.0, 100.0, fresh=True)
     tell("end", 100.0, 100.0, fresh=True)

@@ -397,7 +397,7 @@ def test_a_photo_shows_where_it_learned_and_why_not_elsewhere(page: Page, learne
     expect(page.locator(".overlay > img").first).to_have_js_property("complete", value=True)
 
     used.last.dispatch_event("click")
-    expect(page.locator("#told")).to_contain_text("Used (")
+    expect(page.locator("#place-words")).to_contain_text("Used (")
     reason = page.locator(".reasons button").first
     reason.click()
     lit = page.locator(".overlay rect.lit")

@@ -22,7 +22,7 @@ import pytest
 from app.sandbox import confine
 from app.sandbox.budget import Budget
 from app.sandbox.child import NICENESS
-from app.sandbox.outcome import Limits, Outcome
+from app.sandbox.outcome import Outcome, TaskLimits
 from app.sandbox.runner import Sandbox
 
 HERE = Path(__file__).parents[1]
@@ -31,7 +31,7 @@ from deadline import Deadline, stretched  # noqa: E402 - beside these files
 
 sys.path.remove(str(HERE))
 
-LIMITS = Limits(memory_mb=512, wall_s=stretched(30))
+LIMITS = TaskLimits(memory_mb=512, wall_s=stretched(30))
 Run = Callable[..., Outcome]
 
 
@@ -52,7 +52,7 @@ def sandbox(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Sandbox
 
 @pytest.fixture
 def run(sandbox: Sandbox) -> Run:
-    def run(task: str, *, limits: Limits = LIMITS, **options: Any) -> Outcome:
+    def run(task: str, *, limits: TaskLimits = LIMITS, **options: Any) -> Outcome:
         arguments = options.pop("arguments", {})
         with sandbox.folder() as folder:
             return sandbox.run(task, arguments, folder=folder, limits=limits, **options)
@@ -140,19 +140,19 @@ def test_a_memory_bomb_ends_in_memory_limit_and_the_parent_lives(run: Run) -> No
 
 
 def test_a_file_beyond_the_limit_is_refused(run: Run) -> None:
-    limits = Limits(memory_mb=512, wall_s=30, file_mb=4)
+    limits = TaskLimits(memory_mb=512, wall_s=30, file_mb=4)
 
     assert run("write", limits=limits, arguments={"mb": 8}).ending == "memory_limit"
 
 
 def test_open_files_are_limited(run: Run) -> None:
-    assert 16 < run("open_files", limits=Limits(512, 30, open_files=64)).value < 64
+    assert 16 < run("open_files", limits=TaskLimits(512, 30, open_files=64)).value < 64
 
 
 def test_a_busy_loop_is_killed_at_the_wall_limit(run: Run) -> None:
     start = time.monotonic()
 
-    outcome = run("spin", limits=Limits(memory_mb=512, wall_s=0.6))
+    outcome = run("spin", limits=TaskLimits(memory_mb=512, wall_s=0.6))
 
     assert outcome.code == "time_limit"
     assert "0.6 s" in outcome.detail
@@ -160,7 +160,7 @@ def test_a_busy_loop_is_killed_at_the_wall_limit(run: Run) -> None:
 
 
 def test_a_busy_loop_is_killed_at_the_processor_limit(run: Run) -> None:
-    outcome = run("spin", limits=Limits(memory_mb=512, wall_s=stretched(30), cpu_s=1))
+    outcome = run("spin", limits=TaskLimits(memory_mb=512, wall_s=stretched(30), cpu_s=1))
 
     assert outcome.ending == "time_limit"
     assert "1 s of processor time" in outcome.detail
@@ -244,7 +244,7 @@ def test_a_child_dies_with_its_killed_parent(tmp_path: Path) -> None:
         from pathlib import Path
         sys.path.insert(0, {str(HERE)!r})
         from app.sandbox.budget import Budget
-        from app.sandbox.outcome import Limits
+        from app.sandbox.outcome import TaskLimits
         from app.sandbox.runner import Sandbox
         if __name__ == "__main__":
             scratch, shared = Path({str(tmp_path / "scratch")!r}), Path({str(pid_file.parent)!r})
@@ -254,7 +254,7 @@ def test_a_child_dies_with_its_killed_parent(tmp_path: Path) -> None:
                     "sleep",
                     {{"pid_file": {str(pid_file)!r}}},
                     folder=folder,
-                    limits=Limits(512, 60),
+                    limits=TaskLimits(512, 60),
                     compiles=True,
                 )
         """
@@ -296,7 +296,7 @@ sys.path.insert(0, {here!r})
 from app.sandbox import confine
 from app.sandbox.account import find
 from app.sandbox.budget import Budget
-from app.sandbox.outcome import Limits
+from app.sandbox.outcome import TaskLimits
 from app.sandbox.runner import Sandbox
 if __name__ == "__main__":
     data = Path({data!r})
@@ -315,7 +315,7 @@ if __name__ == "__main__":
     with box.folder() as folder, box.folder() as copies:
         (copies / "own").write_text("the photo of this task")
         arguments["own"] = str(copies / "own")
-        outcome = box.run("probe", arguments, folder=folder, limits=Limits(1024, 300),
+        outcome = box.run("probe", arguments, folder=folder, limits=TaskLimits(1024, 300),
                           reads=[copies / "own"])
     print(json.dumps([outcome.ending, outcome.detail, outcome.value]))
 """

@@ -126,6 +126,39 @@ def test_work_of_an_old_epoch_changes_nothing(store: Store, steps: Steps) -> Non
     assert steps.fresh(photo).state == "received"
 
 
+def test_what_the_header_says_goes_before_what_came_with_the_file(steps: Steps) -> None:
+    said, silent = steps.receive(aperture=2.8), steps.receive(aperture=2.8)
+
+    steps.inspect(said, aperture=1.4)
+    steps.inspect(silent, aperture=None)
+
+    assert (said.aperture, silent.aperture) == (2.8, 2.8)  # all that is known when the file has arrived
+    assert (steps.fresh(said).aperture, steps.fresh(silent).aperture) == (1.4, 2.8)
+
+
+def test_a_correction_by_the_owner_goes_before_the_header(store: Store, steps: Steps) -> None:
+    photo = steps.receive(aperture=2.8)
+    steps.inspect(photo, aperture=1.4)
+
+    store.photos.change(photo.public_id, OWNER, {"aperture": 2.0})
+    store.photos.fail(photo.public_id, 2, "time_limit", "late")
+    steps.receive_again(photo, aperture=4.0)  # the same file with another value: no correction
+    steps.inspect(photo, aperture=1.4)
+
+    assert (steps.fresh(photo).epoch, steps.fresh(photo).aperture) == (3, 2.0)
+
+
+def test_an_aperture_sent_with_the_same_bytes_ends_the_wait_for_it(store: Store, steps: Steps) -> None:
+    photo = steps.receive()
+    steps.inspect(photo, aperture=None)
+    store.photos.set_state(photo.public_id, ("inspecting",), "needs_lens")
+
+    assert steps.receive_again(photo, aperture=4.0).state == "received"
+    steps.inspect(photo, aperture=None)
+
+    assert steps.fresh(photo).aperture == 4.0
+
+
 def test_a_counted_photo_never_starts_anew(store: Store, steps: Steps) -> None:
     photo = steps.counted()
     lens = steps.lens_id(photo)
@@ -204,12 +237,12 @@ def test_without_a_serial_no_lens_is_guessed(store: Store, steps: Steps) -> None
     assert store.photos.assign_lens(photo.public_id, single_copy=True) is not None
 
 
-def test_what_the_owner_gave_goes_before_the_file(store: Store, steps: Steps) -> None:
-    photo = steps.receive(aperture=2.8, lens_serial="mine")
-    steps.inspect(photo, serial="123", aperture=1.4)
+def test_the_lens_that_the_owner_names_goes_before_that_of_the_file(store: Store, steps: Steps) -> None:
+    photo = steps.receive(lens_serial="mine")
+    steps.inspect(photo, serial="123")
 
     again = steps.fresh(photo)
-    assert (again.aperture, again.lens_serial, again.lens_serial_source) == (2.8, "mine", "user")
+    assert (again.lens_serial, again.lens_serial_source) == ("mine", "user")
 
 
 def test_a_stored_photo_makes_no_lens_but_joins_one(store: Store, steps: Steps) -> None:

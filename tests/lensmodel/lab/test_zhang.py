@@ -8,7 +8,7 @@ from scipy import signal
 from lensmodel.core.psf import as_kernel, delta, distance, gaussian, rms_width
 from lensmodel.core.types import Kernel, NoiseModel, Plane
 from lensmodel.lab.blind.methods.zhang import Zhang
-from lensmodel.lab.blind.methods.zhang_model import Scene, pooled_kernel
+from lensmodel.lab.blind.methods.zhang_model import GradientBeliefs, pooled_kernel
 from lensmodel.lab.blind.steps.kernel_step import Grid, Term, least_squares_kernel
 from lensmodel.lab.scenes import dead_leaves
 
@@ -37,7 +37,7 @@ def bent(size: int = 13) -> Kernel:
 
 def explained(y: NDArray[np.floating], kernel: Kernel, sweeps: int = 10) -> float:
     """Free energy when everything but the kernel is fitted."""
-    found = Scene.of(y.astype(np.float64), kernel.shape[0], kernel, FLOOR)
+    found = GradientBeliefs.of(y.astype(np.float64), kernel.shape[0], kernel, FLOOR)
     for _ in range(sweeps):
         found = found.improved(kernel, 8).with_noise(kernel)
     return found.free_energy(kernel)
@@ -64,7 +64,7 @@ def test_the_mirrored_kernel_has_more_free_energy() -> None:
 
 def test_every_update_lowers_the_free_energy() -> None:
     y, kernel = shot(bent(), side=72).astype(np.float64), gaussian(13, np.eye(2))
-    found = Scene.of(y, 13, kernel, FLOOR)
+    found = GradientBeliefs.of(y, 13, kernel, FLOOR)
     energy = found.free_energy(kernel)
     for _ in range(6):
         found = found.improved(kernel, 8)
@@ -82,7 +82,7 @@ def test_every_update_lowers_the_free_energy() -> None:
 
 def test_scaling_scene_against_kernel_changes_no_free_energy() -> None:
     y, kernel = shot(bent(), side=72).astype(np.float64), bent()
-    found = Scene.of(y, 13, kernel, FLOOR).improved(kernel, 4)
+    found = GradientBeliefs.of(y, 13, kernel, FLOOR).improved(kernel, 4)
 
     assert found.scaled(2.0).free_energy(kernel / 2.0) == pytest.approx(found.free_energy(kernel), rel=1e-5)
 

@@ -107,14 +107,14 @@ class _Rounds:
     side: int = 0
 
     def __call__(self, level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:
-        scenes = [Scene.of(view, level.side, self.settings.edges) for view in level.views]
+        patches = [PatchLevel.of(view, level.side, self.settings.edges) for view in level.views]
         kernel = centred(kernel)
         for i in range(level.iterations):
             sparsity = max(self.settings.sparsity * _FADE**-i, _LEAST_SPARSITY)
-            latents = tuple(scene.restored(kernel, sparsity) for scene in scenes)
+            latents = tuple(patch.restored(kernel, sparsity) for patch in patches)
             pairs: list[Pair] = []
-            for scene, latent in zip(scenes, latents, strict=True):
-                pairs += scene.pairs(latent, _FADE**-i)
+            for patch, latent in zip(patches, latents, strict=True):
+                pairs += patch.pairs(latent, _FADE**-i)
             self.pairs, self.side = tuple(pairs), level.side
             kernel = pruned(
                 self._solved(KernelEquations.of(pairs, level.side)), self.settings.threshold, _ISLAND
@@ -134,7 +134,7 @@ class _Rounds:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene:
+class PatchLevel:
     """What stays of one patch on one level: its derivatives, spectra and first threshold."""
 
     canvas: Canvas
@@ -145,7 +145,7 @@ class Scene:
     first: float
 
     @classmethod
-    def of(cls, view: View, side: int, edges: float) -> Scene:
+    def of(cls, view: View, side: int, edges: float) -> PatchLevel:
         """Prepare a patch for a kernel of `side`."""
         canvas = Canvas.around(view.y, side)
         row, col = down(view.y), across(view.y)

@@ -106,19 +106,19 @@ class _Phases:
     side: int = 0
 
     def __call__(self, level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:
-        scenes = [_Scene.of(view, level.side) for view in level.views]
+        patches = [_PatchLevel.of(view, level.side) for view in level.views]
         if level.number == level.count - 1:
             edges = [(down(x), across(x)) for x in latents]
-            latents = tuple(s.deconvolved(kernel, e) for s, e in zip(scenes, edges, strict=True))
+            latents = tuple(s.deconvolved(kernel, e) for s, e in zip(patches, edges, strict=True))
         for i in range(level.iterations):
-            edges = [s.selected(x, _FADE**-i) for s, x in zip(scenes, latents, strict=True)]
-            self.pairs = tuple(p for s, e in zip(scenes, edges, strict=True) for p in s.pairs(e))
+            edges = [s.selected(x, _FADE**-i) for s, x in zip(patches, latents, strict=True)]
+            self.pairs = tuple(p for s, e in zip(patches, edges, strict=True) for p in s.pairs(e))
             self.side = level.side
             equations = KernelEquations.of(self.pairs, level.side)
             kernel = pruned(equations.divided(_GAMMA), self.settings.threshold)
             if level.number == 0 and i == level.iterations - 1:
                 kernel = self._refined(equations, kernel)
-            latents = tuple(s.deconvolved(kernel, e) for s, e in zip(scenes, edges, strict=True))
+            latents = tuple(s.deconvolved(kernel, e) for s, e in zip(patches, edges, strict=True))
             tick()
         return LevelResult(kernel, latents)
 
@@ -158,7 +158,7 @@ def usefulness(y: Image) -> Image:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Scene:
+class _PatchLevel:
     """What stays of one patch on one level: its spectra, useful pixels and first threshold."""
 
     canvas: Canvas
@@ -170,7 +170,7 @@ class _Scene:
     side: int
 
     @classmethod
-    def of(cls, view: View, side: int) -> _Scene:
+    def of(cls, view: View, side: int) -> _PatchLevel:
         y = view.y
         canvas = Canvas.around(y, side)
         useful = usefulness(y)

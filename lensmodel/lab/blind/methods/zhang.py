@@ -26,7 +26,7 @@ from lensmodel.core.psf import centred, distance, gaussian
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
 from lensmodel.estimation.estimator import PsfEstimate, usable
 from lensmodel.estimation.steps.finish import finished
-from lensmodel.lab.blind.methods.zhang_model import Scene, pooled_kernel
+from lensmodel.lab.blind.methods.zhang_model import GradientBeliefs, pooled_kernel
 from lensmodel.lab.blind.steps.cleaning import cleaned
 from lensmodel.lab.blind.steps.pyramid import Image, Level, LevelResult, Schedule, Tick, View, coarse_to_fine
 from lensmodel.lab.blind.steps.starting_from import StartingFrom
@@ -108,13 +108,14 @@ class _Sweeps:
 
     steps: int
     floor: float
-    scenes: tuple[Scene, ...] = ()
+    scenes: tuple[GradientBeliefs, ...] = ()
 
     def __call__(self, level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:
         kernel = centred(kernel)  # or it drifts, level by level, until the support cuts it
         # λ and γ start anew on each level: what was learned on the coarser one is too sure of itself.
         scenes = [
-            Scene.of(view.y, level.side, kernel, self.floor + 2.0 * view.noise**2) for view in level.views
+            GradientBeliefs.of(view.y, level.side, kernel, self.floor + 2.0 * view.noise**2)
+            for view in level.views
         ]
         for _ in range(level.iterations):
             scenes = [scene.improved(kernel, self.steps) for scene in scenes]
@@ -126,7 +127,7 @@ class _Sweeps:
         return LevelResult(kernel, latents)
 
 
-def _disagreement(scenes: Sequence[Scene], kernel: Kernel) -> float:
+def _disagreement(scenes: Sequence[GradientBeliefs], kernel: Kernel) -> float:
     """Relative L2 distance of the kernels that the two gradient directions give alone."""
     ways = [[scene.weighted()[i] for scene in scenes] for i in (0, 1)]
     down, across = (pooled_kernel(way, kernel) for way in ways)

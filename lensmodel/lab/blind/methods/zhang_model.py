@@ -117,7 +117,7 @@ class Belief:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene:
+class GradientBeliefs:
     """Beliefs on the two gradient images of one patch, with the noise variance λ of both.
 
     Parameters
@@ -136,7 +136,7 @@ class Scene:
     floor: float
 
     @classmethod
-    def of(cls, y: NDArray[np.float64], side: int, kernel: Kernelish, floor: float) -> Scene:
+    def of(cls, y: NDArray[np.float64], side: int, kernel: Kernelish, floor: float) -> GradientBeliefs:
         """Start with half of the gradients' power as noise: nearly everything is still open."""
         down, across = np.diff(y, axis=0), np.diff(y, axis=1)
         noise = _FIRST_NOISE * 0.5 * float(np.mean(down**2) + np.mean(across**2)) + floor
@@ -144,7 +144,7 @@ class Scene:
             Belief.first(down, side, kernel, noise), Belief.first(across, side, kernel, noise), noise, floor
         )
 
-    def improved(self, kernel: Kernelish, steps: int) -> Scene:
+    def improved(self, kernel: Kernelish, steps: int) -> GradientBeliefs:
         """Update x, c and γ of both gradients."""
         down, across = (
             belief.sharpened(kernel, self.noise, steps).spread(kernel, self.noise).sparser()
@@ -152,11 +152,11 @@ class Scene:
         )
         return replace(self, down=down, across=across)
 
-    def scaled(self, factor: float) -> Scene:
+    def scaled(self, factor: float) -> GradientBeliefs:
         """Multiply both x by a factor, as k is divided by it."""
         return replace(self, down=self.down.scaled(factor), across=self.across.scaled(factor))
 
-    def with_noise(self, kernel: Kernelish) -> Scene:
+    def with_noise(self, kernel: Kernelish) -> GradientBeliefs:
         """Update λ = (|y - k * x|² + sum_i c_i w_i + d) / n."""
         n = self.down.y.size + self.across.y.size
         misfit = self.down.misfit(kernel) + self.across.misfit(kernel)

@@ -11,6 +11,7 @@ from lensmodel.core.types import Plane, StepHook, ignore_step
 from lensmodel.correction.blur import BlurOperator
 from lensmodel.correction.deconvolver import Restored, Sensor, uniform
 from lensmodel.correction.tiles.canvas import Canvas
+from lensmodel.lab.correction.methods.half_quadratic import half_quadratic
 from lensmodel.lab.correction.methods.mixture import shipped_mixture
 
 _WHITE = 0.9
@@ -51,10 +52,7 @@ class Epll:
         K = kernel.spectrum(canvas.shape)
         weight = light * light / max(float(sensor.variance(blurred).mean()), 1e-9)
         data, power = weight * np.conj(K) * fft.rfft2(y), weight * np.abs(K) ** 2
-        prior, x = shipped_mixture(), y
-        for turn, beta in enumerate(self.betas):
-            z = prior.cleaned(x, 1.0 / beta, turn, self.stride)
-            x = fft.irfft2((data + beta * fft.rfft2(z)) / (power + beta), canvas.shape).astype(np.float32)
-            on_step(turn + 1, len(self.betas))
+        target = shipped_mixture().spectrum_of_cleaned(self.betas, self.stride)
+        x = half_quadratic(y, data, power, self.betas, target, on_step)
         restored = np.ascontiguousarray(canvas.cut(x) * np.float32(light))
         return Restored(restored, steps=len(self.betas))

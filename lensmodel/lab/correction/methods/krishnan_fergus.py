@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import fft
 
 from lensmodel.core.types import Plane, StepHook, ignore_step
@@ -12,6 +14,7 @@ from lensmodel.correction.blur import BlurOperator
 from lensmodel.correction.deconvolver import Restored, Sensor, uniform
 from lensmodel.correction.methods.shrinkage import Shrinkage
 from lensmodel.correction.tiles.canvas import Canvas
+from lensmodel.lab.correction.methods.half_quadratic import growing, half_quadratic
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,20 +51,16 @@ class KrishnanFergus:
         slopes = (rows[:, None] + cols[None, :]).astype(np.float32)
         pulled, power = np.conj(K) * fft.rfft2(data), np.abs(K) ** 2
         prox = Shrinkage.of(self.alpha)
-        latent, beta, step = data, 1.0, 0
-        while beta < 256.0:
-            step += 1
-            back = np.zeros(shape, dtype=np.float32)
+        betas = growing(1.0, 256.0, 2.0 * math.sqrt(2.0))
+
+        def led_back(x: NDArray[np.float32], turn: int) -> NDArray[np.complex64]:
+            total = np.zeros(shape, dtype=np.float32)
             for axis in (0, 1):
-                slope = np.roll(latent, -1, axis=axis) - latent
-                kept = prox(slope, float(prox.scale(1.0 / beta)))
-                back += np.roll(kept, 1, axis=axis) - kept
-            weight = np.float32(beta / fidelity)
-            spectrum = (pulled + weight * fft.rfft2(back)) / (power + weight * slopes)
-            latent = fft.irfft2(spectrum, shape).astype(np.float32)
-            beta *= 2.0 * np.sqrt(2.0)
-            on_step(step, _STEPS)
-        return Restored(np.ascontiguousarray(canvas.cut(latent)), steps=step)
+                slope = np.roll(x, -1, axis=axis) - x
+                kept = prox(slope, float(prox.scale(1.0 / betas[turn])))
+                total += np.roll(kept, 1, axis=axis) - kept
+            return np.asarray(fft.rfft2(total))
 
-
-_STEPS = 6
+        couplings = [np.float32(beta / fidelity) for beta in betas]
+        latent = half_quadratic(data, pulled, power, couplings, led_back, on_step, curvature=slopes)
+        return Restored(np.ascontiguousarray(canvas.cut(latent)), steps=len(betas))

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 _SHIPPED = Path(__file__).parents[2] / "data" / "epll.npz"
 
@@ -93,6 +96,12 @@ class PatchMixture:
                 total[at] += clean[:, :, i, j]
                 count[at] += 1.0
         return total / count
+
+    def spectrum_of_cleaned(
+        self, betas: Sequence[float], step: int
+    ) -> Callable[[NDArray[Any], int], NDArray[np.complexfloating[Any, Any]]]:
+        """Return the target of `half_quadratic`: x cleaned for noise of variance 1/beta of the turn."""
+        return lambda x, turn: fft.rfft2(self.cleaned(x.astype(np.float32), 1.0 / betas[turn], turn, step))
 
 
 @lru_cache(maxsize=1)

@@ -1,0 +1,68 @@
+"""Half-quadratic splitting by Fourier transform: the loop that the methods compared share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from lensmodel.core.types import StepHook, ignore_step
+
+
+def half_quadratic(
+    y: NDArray[Any],
+    data: NDArray[np.complexfloating[Any, Any]],
+    power: NDArray[np.floating[Any]],
+    couplings: Sequence[float | np.float32],
+    target: Callable[[NDArray[Any], int], NDArray[np.complexfloating[Any, Any]]],
+    on_step: StepHook = ignore_step,
+    *,
+    curvature: NDArray[np.floating[Any]] | float = 1.0,
+    floor: float = 0.0,
+) -> NDArray[Any]:
+    """Alternate between the prior's answer to the latest x and the data, for growing coupling beta.
+
+    ::
+
+        X = (data + beta T(x)) / (power + beta C + floor)
+
+    Parameters
+    ----------
+    y : ndarray, shape (rows, cols)
+        The blurred grid, where x begins; x keeps its type.
+    data, power : ndarray, shape (rows, cols // 2 + 1)
+        conj(K) Y and |K|², both over the variance of the noise.
+    couplings : sequence of float
+        beta of each turn.
+    target : callable
+        From x and the number of the turn the spectrum T of what the prior makes of x, or of its gradients
+        led back by the transposed differences.
+    on_step : callable
+        Called after each turn.
+    curvature : ndarray or float
+        C: 1 where the prior answers with a picture, |D|² summed over the differences D where with gradients.
+    floor : float
+        Keeps the quotient finite where neither the data nor the prior says anything.
+
+    Returns
+    -------
+    ndarray, shape (rows, cols)
+        x after the last turn.
+    """
+    x = y
+    for turn, beta in enumerate(couplings):
+        spectrum = (data + beta * target(x, turn)) / (power + beta * curvature + floor)
+        x = fft.irfft2(spectrum, s=y.shape).astype(y.dtype, copy=False)
+        on_step(turn + 1, len(couplings))
+    return x
+
+
+def growing(first: float, last: float, factor: float) -> tuple[float, ...]:
+    """Return couplings from `first`, each `factor` times the one before, up to `last` and a thousandth."""
+    betas = [first] if first <= last * 1.001 else []
+    while betas and betas[-1] * factor <= last * 1.001:
+        betas.append(betas[-1] * factor)
+    return tuple(betas)

@@ -9,6 +9,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
@@ -90,6 +91,18 @@ def short_search() -> Iterator[None]:
     """Search so during a whole test."""
     with _searching_shortly():
         yield
+
+
+@pytest.fixture
+def estimated_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Estimate in this process: a worker process first takes a second to import the library."""
+    from lensmodel.core import parallel, processes  # noqa: PLC0415 - most tests need neither
+
+    @contextmanager
+    def here(executor: Executor | None, *_: object) -> Iterator[Executor]:
+        yield executor or parallel.Here()
+
+    monkeypatch.setattr(processes, "pool", here)
 
 
 @pytest.fixture(scope="session")

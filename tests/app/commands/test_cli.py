@@ -570,7 +570,7 @@ def test_a_new_copy_starts_from_another_and_can_leave_it(folder: Path, here: Her
 
 
 def test_a_profile_keeps_the_unit_that_it_was_told_and_modes_are_gone(
-    folder: Path, here: Here, few_patches: None, estimated_here: None
+    folder: Path, here: Here, few_patches: None, estimated_here: None, short_search: None
 ) -> None:
     words = ("calibrate", "one.dng", "-p", PROFILE, "--estimator", "whittle", "--workers", "1", "--json")
     told = json.loads(here(*words, "--any-lens", "--unit", "half-diagonal").stdout)
@@ -586,7 +586,7 @@ def test_a_profile_keeps_the_unit_that_it_was_told_and_modes_are_gone(
 
 
 def test_a_lens_learned_the_papers_way_stays_so_and_is_corrected_so(
-    folder: Path, here: Here, few_patches: None, estimated_here: None
+    folder: Path, here: Here, few_patches: None, estimated_here: None, short_search: None
 ) -> None:
     words = ("calibrate", "one.dng", "-p", PROFILE, "--workers", "1", "--any-lens", "--json")
     quick = ("--estimator", "whittle", "--kernel-size", "21")

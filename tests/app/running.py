@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -179,8 +180,9 @@ def served(settings: Settings) -> Iterator[int]:
         listener.close()
 
 
+@cache
 def scene(seed: int, height: int = SHAPE[0], width: int = SHAPE[1]) -> NDArray[np.float64]:
-    """Rectangles of all sizes over each other: sharp edges of all directions and no period."""
+    """Rectangles of all sizes over each other, not to be changed: sharp edges everywhere, and no period."""
     rng = np.random.default_rng(seed)
     rows, cols = np.mgrid[0:height, 0:width]
     picture = np.full((height, width), 0.4)

@@ -26,11 +26,11 @@ from lensmodel.core.psf import rms_width
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 from deadline import Deadline, stretched  # noqa: E402 - beside this file
+from in_process import lensmodel  # noqa: E402 - same
 from running import (  # noqa: E402 - same
     BRIEF,
     OWN_ACCOUNT,
     PATIENCE_S,
-    PROGRAM,
     SHAPE,
     SMALL,
     Service,
@@ -251,12 +251,7 @@ def test_a_killed_api_is_replaced_and_callers_wait_meanwhile(service: Service, f
 
 
 def test_a_second_service_on_the_same_data_is_refused(service: Service) -> None:
-    second = subprocess.run(
-        [*PROGRAM, "serve", "--port", "0", "--data", str(service.data)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    second = lensmodel("serve", "--port", "0", "--data", str(service.data), cwd=service.data)
 
     assert second.returncode == 2
     assert "another service already works on" in second.stderr

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import threading
 
@@ -9,9 +10,14 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
+
+# Most of what tests make is never garbage: modules, and what libraries keep of statements and types. To look
+# through all of it as often as usual takes a tenth of the time of tests that compute nothing.
+gc.set_threshold(20_000, 20, 10)
 
 # Services of tests keep their data for a moment only: what is compiled is kept longer, once for all tests.
 os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "numba"))
@@ -90,6 +96,18 @@ def short_search() -> Iterator[None]:
     """Search so during a whole test."""
     with _searching_shortly():
         yield
+
+
+@pytest.fixture
+def estimated_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Estimate in this process: a worker process first takes a second to import the library."""
+    from lensmodel.core import parallel, processes  # noqa: PLC0415 - most tests need neither
+
+    @contextmanager
+    def here(executor: Executor | None, *_: object) -> Iterator[Executor]:
+        yield executor or parallel.Here()
+
+    monkeypatch.setattr(processes, "pool", here)
 
 
 @pytest.fixture(scope="session")

@@ -64,6 +64,17 @@ for _module in LATE:
         importlib.import_module(_module)
 
 
+def _ready_for_loops() -> None:
+    """Let Numba set up what every compiled loop needs: each child would take a third of a second for it."""
+    with contextlib.suppress(ImportError, AttributeError):  # an extra, and names that it may change
+        target = importlib.import_module("numba.core.registry").cpu_target
+        target.typing_context.refresh()
+        target.target_context.refresh()
+
+
+_ready_for_loops()
+
+
 def inspect(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     """Read the header of `path`: size, kind, camera, lens, settings."""
     del folder, progress

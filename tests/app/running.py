@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,8 @@ LIGHT = [sys.executable, str(Path(__file__).with_name("light_service.py"))]
 BRIEF = [sys.executable, str(Path(__file__).with_name("brief_service.py"))]
 """The same whose workers report on lenses in brief."""
 FINAL = {"succeeded", "failed", "cancelled"}
+SHAPE, SMALL = (320, 448), (224, 320)
+"""Of photos, in pixels; of a small one all is done in half the time, but nothing is said of its corners."""
 
 
 class Service:
@@ -66,7 +69,7 @@ class Service:
         self.http = httpx2.Client(timeout=stretched(60.0))
 
     def start(self) -> None:
-        """Start and wait until it says that it is ready."""
+        """Start, or start again, and wait until it says that it is ready."""
         with self.log.open("a") as log:
             self.process = subprocess.Popen(
                 [*self._program, "serve", "--port", "0", "--data", str(self.data)],
@@ -84,7 +87,10 @@ class Service:
         """Stop as Ctrl-C does; return the exit status."""
         assert self.process is not None
         self.process.send_signal(signal.SIGTERM)
-        return self.process.wait(stretched(30))
+        status = self.process.wait(stretched(30))
+        if self.process.stdout is not None:
+            self.process.stdout.close()
+        return status
 
     def close(self) -> None:
         """Leave nothing behind."""
@@ -174,8 +180,9 @@ def served(settings: Settings) -> Iterator[int]:
         listener.close()
 
 
-def scene(seed: int, height: int = 320, width: int = 448) -> NDArray[np.float64]:
-    """Rectangles of all sizes over each other: sharp edges of all directions and no period."""
+@cache
+def scene(seed: int, height: int = SHAPE[0], width: int = SHAPE[1]) -> NDArray[np.float64]:
+    """Rectangles of all sizes over each other, not to be changed: sharp edges everywhere, and no period."""
     rng = np.random.default_rng(seed)
     rows, cols = np.mgrid[0:height, 0:width]
     picture = np.full((height, width), 0.4)
@@ -192,10 +199,16 @@ def scene(seed: int, height: int = 320, width: int = 448) -> NDArray[np.float64]
 
 
 def write_photo(
-    path: Path, seed: int, *, sigma: float = 1.3, serial: str = "L-42", aperture: float | None = 2.8
+    path: Path,
+    seed: int,
+    *,
+    sigma: float = 1.3,
+    serial: str = "L-42",
+    aperture: float | None = 2.8,
+    shape: tuple[int, int] = SHAPE,
 ) -> Path:
     """Write a raw photo of such a scene, taken through a round Gaussian blur."""
-    light = ndimage.gaussian_filter(scene(seed), sigma)
+    light = ndimage.gaussian_filter(scene(seed, *shape), sigma)
     return write_light(path, light, seed, serial=serial, aperture=aperture)
 
 

@@ -26,7 +26,16 @@ from lensmodel.core.psf import rms_width
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 from deadline import Deadline, stretched  # noqa: E402 - beside this file
-from running import BRIEF, OWN_ACCOUNT, PATIENCE_S, PROGRAM, Service, running, write_photo  # noqa: E402 - beside this file
+from in_process import lensmodel  # noqa: E402 - same
+from running import (  # noqa: E402 - same
+    BRIEF,
+    OWN_ACCOUNT,
+    PATIENCE_S,
+    SHAPE,
+    SMALL,
+    Service,
+    write_photo,
+)
 
 sys.path.remove(str(HERE))
 
@@ -38,17 +47,21 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Photos of one lens, one of them without its serial."""
     folder = tmp_path_factory.mktemp("photos")
     for seed, name in enumerate(("first", "second", "third", "fourth", "fifth", "sixth")):
-        write_photo(folder / f"{name}.dng", seed, sigma=SIGMA)
-    write_photo(folder / "nameless.dng", 10, sigma=SIGMA, serial="")
+        shape = SHAPE if name in {"first", "third"} else SMALL  # what is shown of it, and what is corrected
+        write_photo(folder / f"{name}.dng", seed, sigma=SIGMA, shape=shape)
+    write_photo(folder / "nameless.dng", 10, sigma=SIGMA, serial="", shape=SMALL)
     return folder
 
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     # of so few patches no wavefront is fitted, for which each version would wait; see test_lens_modes
-    folder = tmp_path_factory.mktemp("journey") / "data"
-    with running(folder, BRIEF, **OWN_ACCOUNT) as made:
+    made = Service(tmp_path_factory.mktemp("journey") / "data", BRIEF, **OWN_ACCOUNT)
+    try:
+        made.start()
         yield made
+    finally:
+        made.close()
 
 
 @pytest.fixture(scope="module")
@@ -181,7 +194,7 @@ def test_a_stored_photo_is_corrected_and_the_result_is_sharper(
     assert set(correction["report"]["zones"]) == {"center", "mid", "corner"}
     assert result.headers["content-type"] == "image/tiff"
     assert "third-corrected.tif" in result.headers["content-disposition"]
-    assert sharp.shape == (320, 448)
+    assert sharp.shape == SHAPE
     assert np.abs(np.diff(sharp.astype(float))).mean() > 1.2 * np.abs(np.diff(soft.astype(float))).mean()
 
 
@@ -237,45 +250,8 @@ def test_a_killed_api_is_replaced_and_callers_wait_meanwhile(service: Service, f
     assert service.info()["api_pid"] != api
 
 
-def test_work_that_a_stop_interrupted_goes_on_at_the_next_start_and_a_killed_supervisor_leaves_no_process(
-    photos: Path, tmp_path: Path
-) -> None:
-    data = tmp_path / "data"
-    with running(data, BRIEF, **OWN_ACCOUNT) as before:
-        photo = before.upload(photos / "sixth.dng")
-        before.job(photo["id"], until=lambda job: job["stage"] == "estimating")
-        pids = pids_of(before)
-    left = alive(pids)
-    file_left = (data / "service.json").exists()
-
-    after = Service(data, BRIEF, **OWN_ACCOUNT)
-    try:
-        after.start()
-        job = after.job(photo["id"])
-        lens_id = after.get(f"/v1/photos/{photo['id']}")["lens_id"]
-        events = additions(after, lens_id, photo["id"])
-        pids = pids_of(after)
-        os.kill(after.info()["pid"], signal.SIGKILL)
-        deadline = Deadline(20)
-        while alive(pids) and not deadline.passed():
-            time.sleep(0.1)
-    finally:
-        after.close()
-
-    assert left == []
-    assert not file_left
-    assert job["state"] == "succeeded", job
-    assert len(events) == 1
-    assert alive(pids) == []
-
-
 def test_a_second_service_on_the_same_data_is_refused(service: Service) -> None:
-    second = subprocess.run(
-        [*PROGRAM, "serve", "--port", "0", "--data", str(service.data)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    second = lensmodel("serve", "--port", "0", "--data", str(service.data), cwd=service.data)
 
     assert second.returncode == 2
     assert "another service already works on" in second.stderr
@@ -332,3 +308,32 @@ def test_a_second_copy_leans_on_the_first_and_says_so(
     assert "family" not in reports[1]
     assert results[0] != results[1]
     assert answer["support"]["family"]["lenses"] == 1
+
+
+def test_work_that_a_stop_interrupted_goes_on_at_the_next_start_and_a_killed_supervisor_leaves_no_process(
+    service: Service, photos: Path
+) -> None:
+    # the last test of the service: it ends for good
+    photo = service.upload(photos / "sixth.dng")
+    service.job(photo["id"], until=lambda job: job["stage"] == "estimating")
+    pids = pids_of(service)
+    status = service.stop()
+    left = alive(pids)
+    file_left = (service.data / "service.json").exists()
+
+    service.start()
+    job = service.job(photo["id"])
+    lens_id = service.get(f"/v1/photos/{photo['id']}")["lens_id"]
+    events = additions(service, lens_id, photo["id"])
+    pids = pids_of(service)
+    os.kill(service.info()["pid"], signal.SIGKILL)
+    deadline = Deadline(20)
+    while alive(pids) and not deadline.passed():
+        time.sleep(0.1)
+
+    assert status == 0, service.log.read_text()[-4000:]
+    assert left == []
+    assert not file_left
+    assert job["state"] == "succeeded", job
+    assert len(events) == 1
+    assert alive(pids) == []

@@ -22,7 +22,7 @@ from lensmodel.workflow import pipeline
 
 HERE = Path(__file__).parents[1]
 sys.path.insert(0, str(HERE))
-from running import write_photo  # noqa: E402 - beside this file
+from running import SMALL, write_photo  # noqa: E402 - beside this file
 
 sys.path.remove(str(HERE))
 
@@ -75,7 +75,7 @@ def test_what_is_not_taken_any_more_is_cancelled() -> None:
 
 @pytest.fixture(scope="module")
 def photo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_photo(tmp_path_factory.mktemp("photos") / "one.dng", 1)
+    return write_photo(tmp_path_factory.mktemp("photos") / "one.dng", 1, shape=SMALL)
 
 
 def stacked(samples: list[PsfSample]) -> np.ndarray:
@@ -94,7 +94,7 @@ def test_a_photo_gives_the_same_samples_wherever_it_is_estimated(photo: Path) ->
     assert [sample.photo for sample in sent] == [sample.photo for sample in here]
 
 
-def test_whole_photos_are_calibrated_by_an_executor(photo: Path, tmp_path: Path) -> None:
+def test_whole_photos_are_calibrated_by_an_executor(photo: Path, tmp_path: Path, short_search: None) -> None:
     broken = tmp_path / "broken.dng"
     broken.write_bytes(photo.read_bytes()[:2000])
     events: list[pipeline.CalibrationEvent] = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 
@@ -9,35 +10,49 @@ import pytest
 
 from app.commands.console import extras
 
+COMMANDS = ["serve", "doctor", "keys list", "calibrate gone.dng --profile new.lensprofile"]
 WITHOUT = """
-import sys
+import contextlib, io, json, sys
 sys.modules.update(dict.fromkeys({missing!r}))
-sys.argv = ["lensmodel", *{words!r}]
 from app.cli import main
-main()
+for command in {commands!r}:
+    sys.argv, status, errors = ["lensmodel", *command.split()], 0, io.StringIO()
+    with contextlib.redirect_stderr(errors):
+        try:
+            main()
+        except SystemExit as end:
+            status = end.code
+    print(json.dumps([status, errors.getvalue()]))
 """
 
 
-def without_service(*words: str) -> subprocess.CompletedProcess[str]:
+@pytest.fixture(scope="module")
+def ended() -> dict[str, tuple[int, str]]:
+    """Exit status and standard error of each command, of one process without what the extra brings."""
     # typer may bring pydantic
     missing = [name for name in extras.EXTRAS["service"] if name != "pydantic"]
-    code = WITHOUT.format(missing=missing, words=list(words))
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    code = WITHOUT.format(missing=missing, commands=COMMANDS)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    said = map(json.loads, done.stdout.splitlines())
+    return {command: (status, errors) for command, (status, errors) in zip(COMMANDS, said, strict=True)}
 
 
-@pytest.mark.parametrize("words", [["serve"], ["doctor"], ["keys", "list"]], ids=" ".join)
-def test_a_command_of_the_service_says_which_extra_it_needs(words: list[str]) -> None:
-    done = without_service(*words)
+@pytest.mark.parametrize("command", COMMANDS[:3])
+def test_a_command_of_the_service_says_which_extra_it_needs(
+    command: str, ended: dict[str, tuple[int, str]]
+) -> None:
+    status, errors = ended[command]
 
-    assert done.returncode == 1
-    assert "pip install 'lensmodel[service]'" in done.stderr
-    assert [line for line in done.stderr.splitlines() if "Traceback" in line] == []
+    assert status == 1
+    assert "pip install 'lensmodel[service]'" in errors
+    assert [line for line in errors.splitlines() if "Traceback" in line] == []
 
 
-def test_commands_on_files_do_without_the_service() -> None:
-    done = without_service("calibrate", "gone.dng", "--profile", "new.lensprofile")
+def test_commands_on_files_do_without_the_service(ended: dict[str, tuple[int, str]]) -> None:
+    status, errors = ended[COMMANDS[3]]
 
-    assert (done.returncode, "no photo called gone.dng" in done.stderr) == (2, True)
+    assert (status, "no photo called gone.dng" in errors) == (2, True)
 
 
 def test_a_module_that_no_extra_brings_is_no_extra() -> None:

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import io
 import json
-import logging
-import signal
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.cli import main
 from app.commands.grouping import Shot, groups
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
@@ -28,7 +22,8 @@ from lensmodel.workflow.pipeline import photo_id
 
 HERE = Path(__file__).parents[1]
 sys.path.insert(0, str(HERE))
-from running import write_photo  # noqa: E402 - beside this file
+from in_process import lensmodel  # noqa: E402 - same
+from running import SMALL, write_photo  # noqa: E402 - beside this file
 
 sys.path.remove(str(HERE))
 
@@ -46,38 +41,15 @@ AUTO = (
 )
 
 
-def lensmodel(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """Run the command in this process, which saves seconds of imports a run."""
-    root, out, err, status = logging.getLogger(), io.StringIO(), io.StringIO(), 0
-    handlers, level = list(root.handlers), root.level
-    signals = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        with (
-            pytest.MonkeyPatch.context() as patched,
-            contextlib.redirect_stdout(out),
-            contextlib.redirect_stderr(err),
-        ):
-            patched.chdir(cwd)
-            patched.setattr(sys, "argv", ["lensmodel", *words])
-            main()
-    except SystemExit as end:
-        status = int(end.code or 0)
-    finally:
-        root.handlers[:], root.level = handlers, level
-        for number, handler in signals.items():
-            signal.signal(number, handler)
-    return subprocess.CompletedProcess(words, status, out.getvalue(), err.getvalue())
-
-
 @pytest.fixture(scope="module")
 def card(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder as it comes from a card: two lenses, one of them known, and a file that is no photo."""
     here = tmp_path_factory.mktemp("card")
     photos = here / "holiday"
     photos.mkdir()
-    write_photo(photos / "a.dng", 1)
-    write_photo(photos / "b.dng", 2)
-    write_photo(photos / "c.dng", 3, serial="L-43", sigma=20.0)  # nothing to be learned from
+    write_photo(photos / "a.dng", 1, shape=SMALL)
+    write_photo(photos / "b.dng", 2, shape=SMALL)
+    write_photo(photos / "c.dng", 3, serial="L-43", sigma=20.0, shape=SMALL)  # nothing to be learned from
     (photos / "broken.dng").write_bytes(b"no photo")
     samples = [
         PsfSample(gaussian(15, np.eye(2) * 1.7), FieldPosition(r, phi), LensSettings(2.8, 35.0), photo="x")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-import subprocess
 import sys
 from pathlib import Path
 
@@ -11,15 +10,10 @@ import pytest
 
 HERE = Path(__file__).parents[1]
 sys.path.insert(0, str(HERE))
-from running import Service, write_photo  # noqa: E402 - beside this folder
+from in_process import lensmodel  # noqa: E402 - beside this folder
+from running import Service, write_photo  # noqa: E402 - same
 
 sys.path.remove(str(HERE))
-
-
-def lensmodel(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "lensmodel", *words], cwd=cwd, capture_output=True, text=True, check=False
-    )
 
 
 def test_a_service_that_does_not_answer_is_wrong_usage(tmp_path: Path) -> None:

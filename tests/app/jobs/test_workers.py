@@ -238,7 +238,7 @@ def test_a_lens_changes_its_model_whenever_workers_die(
     assert not any(broken.values()), broken
 
 
-def test_the_loss_of_the_engines_database_loses_no_photo(
+def test_the_loss_of_the_engines_database_loses_no_photo_and_that_of_the_tables_ends_a_worker(
     crew: Crew, store: Store, settings: Settings, send: Callable[[int], list[PhotoRow]]
 ) -> None:
     send(1)
@@ -248,21 +248,16 @@ def test_the_loss_of_the_engines_database_loses_no_photo(
     for path in settings.data_dir.glob("jobs.db*"):
         path.unlink()
 
-    crew.hire()
+    second = crew.hire()
     until(lambda: states(store) == ["counted"])
 
     check_counts(store, 1)
-
-
-def test_a_worker_stops_when_its_database_is_replaced(crew: Crew, store: Store, settings: Settings) -> None:
-    worker = crew.hire()
-    until(lambda: store.workers.live(60))
     path = settings.data_dir / "app.db"
     path.rename(path.with_suffix(".old"))
     path.write_bytes(path.with_suffix(".old").read_bytes())
 
-    assert worker.wait(stretched(60)) == 70
-    crew.processes.remove(worker)
+    assert second.wait(stretched(60)) == 70
+    crew.processes.remove(second)
     assert "was replaced" in (settings.data_dir / "workers.log").read_text()
 
 

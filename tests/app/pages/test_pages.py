@@ -445,8 +445,8 @@ def test_sliders_show_their_effect_on_the_part_that_is_seen(page: Page, learned:
         page.get_by_label("Grain removed").fill("1")
     assert more.value.post_data_json["layers"] is True  # only now: they take as long again
     half = shown(page)
-    page.wait_for_function(
-        "before => document.querySelector('#viewer canvas').toDataURL() !== before", arg=half
+    page.wait_for_function(  # looking with each picture of the screen would take longer than the preview
+        "before => document.querySelector('#viewer canvas').toDataURL() !== before", arg=half, polling=250
     )
     asked.clear()
     page.get_by_label("Faint texture kept").fill("0.5")

@@ -137,6 +137,7 @@ def test_calibrated_lens_makes_another_photo_sharper(
     photos: dict[str, tuple[Path, SimulatedPhoto]],
     tmp_path: Path,
     short_search: None,
+    estimated_here: None,
 ) -> None:
     events: list[pipeline.CalibrationEvent] = []
     city = photos["city"][0]

@@ -61,16 +61,18 @@ def _take_turns_at_compiling(folder: Path) -> None:
 @contextmanager
 def _searching_shortly() -> Iterator[None]:
     # not for tests of the service
-    from lensmodel.model.wavefront import from_kernels, joint_kernels, starts  # noqa: PLC0415
+    from lensmodel.model.wavefront import from_kernels, joint_kernels, search, starts  # noqa: PLC0415
 
     counts = {
-        joint_kernels: {
-            "_STARTS": 2,
+        joint_kernels: {"_STARTS": 2, "_MOST_SINGLE": 0, "_JUDGED": 1, "_LAST_ROUNDS": 2},
+        search: {
             "_RANDOM": 0,
             "_KEPT": 2,
             "_REFINED": 1,
+            "_DIRECTIONS": 1,
             "_COARSE_ROUNDS": 3,
             "_MEDIUM_ROUNDS": 3,
+            "_HELD_ROUNDS": 1,
         },
         from_kernels: {"_STARTS": 2, "_REFINED": 1, "_COARSE_ROUNDS": 3, "_FINE_ROUNDS": 4},
         starts: {"_BEGINNINGS": 8},

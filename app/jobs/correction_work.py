@@ -21,7 +21,7 @@ from app.jobs.context import (
     NotWantedError,
     write_samples,
 )
-from app.jobs.task_files import AFTER, BEFORE, FAMILY, LAYERS, LEARNED, REPORT, SUFFIX
+from app.jobs.task_files import AFTER, BEFORE, EARLIER, FAMILY, LAYERS, LEARNED, REPORT, SUFFIX
 from app.runtime.outage import missable
 from app.sandbox.child import ProgressHook
 from app.sandbox.outcome import TaskLimits
@@ -48,6 +48,9 @@ THREAD_MB: Final = 136
 """Address space in MiB that a thread reserves: 8 of stack and 128 that glibc maps for the heap of an arena,
 most of it never touched."""
 
+EARLIER_VERSIONS: Final = 8
+"""Versions back in which a fit is looked for that a new one may begin with (chosen): photos that come
+together are fitted together, and few lenses get more at a time."""
 
 FAMILIES: Final = 8
 """Fitted families in memory (chosen): those of the lenses whose previews are being looked at."""
@@ -159,9 +162,12 @@ class CorrectionWork:
             text = f"version {version} of lens {lens_id} has no samples any more; ask for the newest version"
             raise JobFailedError("no_samples", text)
         write_samples(folder, stored)
-        key = learned_key(lens_id, version, state.rebuild_epoch)
-        with suppress(FileNotFoundError):  # not fitted yet: the task does it
-            (folder / LEARNED).write_bytes(self._context.storage.get(key))
+        for number in range(version, max(version - EARLIER_VERSIONS, 1) - 1, -1):
+            # not fitted yet: the task does it, beginning with what an earlier version came to
+            with suppress(FileNotFoundError):
+                learned = self._context.storage.get(learned_key(lens_id, number, state.rebuild_epoch))
+                (folder / (LEARNED if number == version else EARLIER)).write_bytes(learned)
+                break
         return state
 
     def _progress_of(self, correction_id: str) -> ProgressHook:

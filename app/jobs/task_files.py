@@ -23,6 +23,9 @@ FAMILY: Final = "family"
 LEARNED: Final = "learned.npz"
 """The model fitted to the samples."""
 
+EARLIER: Final = "earlier.npz"
+"""What an earlier version of the lens was fitted to be, where a new fit may begin; absent without one."""
+
 REPORT: Final = "report.json"
 """The report of a lens test."""
 

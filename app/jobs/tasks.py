@@ -22,6 +22,7 @@ from app.blobs import previews, thumbnails
 from app.jobs.task_files import (
     AFTER,
     BEFORE,
+    EARLIER,
     FAMILY,
     GLANCE,
     KERNELS,
@@ -319,7 +320,8 @@ def _model(folder: Path, settings: ModelSettings) -> LensModel:
         except InvalidInputError as error:
             log.info("the model is fitted anew: %s", error)
             learned.unlink()
-    return LensModel.fit(samples, settings)
+    model, earlier = LensModel.fit(samples, settings), folder / EARLIER
+    return model.begun_with(earlier.read_bytes()) if earlier.is_file() else model
 
 
 def _with_family(folder: Path, settings: ModelSettings) -> LensModel:

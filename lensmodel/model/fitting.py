@@ -22,6 +22,7 @@ from lensmodel.model.field.smoothers import smoothers
 from lensmodel.model.field.transport import WidthField
 from lensmodel.model.wavefront.physical_mean import Physics
 from lensmodel.model.wavefront.zoom import End, ends_of, nearest
+from lensmodel.optics.wavefront import Wavefront
 
 INCREMENT: Final = 0.05
 """Growth after which all is fitted anew: eq. (8) moves bandwidths by a hundredth until then (chosen)."""
@@ -75,6 +76,8 @@ class Fit:
         None until `warmed`, or if it takes no part.
     ends : tuple of End
         Of a zoom: focal lengths that answer by a wavefront of their own.
+    former : tuple of Wavefront
+        Of fits to fewer samples: where `warmed` begins, besides all other beginnings.
     mode : str
         Which mode answers.
     unit : str
@@ -96,6 +99,7 @@ class Fit:
     mode: str = BOTH
     unit: str = MICROMETRE
     ends: tuple[End, ...] = ()
+    former: tuple[Wavefront, ...] = ()
 
     @classmethod
     def of(cls, samples: Sequence[PsfSample], settings: ModelSettings) -> Fit:
@@ -141,7 +145,7 @@ class Fit:
         groups = held_together(samples, self.roster.photo)
         common, scale = pitches.at_pixel(samples, self.pixel, self.unit), va.scales(self.bandwidth)
         votes = self.validation.votes
-        physical = Physics.fit(common, votes, groups, scale, on_step)
+        physical = Physics.fit(common, votes, groups, scale, on_step, self.former)
         ends = () if physical is None else ends_of(common, votes, groups, scale, physical, on_step)
         return replace(self, physical=physical, ends=ends)
 
@@ -149,6 +153,15 @@ class Fit:
         """The end of a zoom that has the larger say at settings, if one has."""
         end, share = nearest(self.ends, settings)
         return None if share < _MOSTLY else end
+
+    def begun_with(self, earlier: Fit) -> Fit:
+        """Return it with the wavefront of a fit to fewer samples as one more beginning of its own."""
+        if earlier.pixel != self.pixel:
+            return self
+        physical = earlier.physical
+        if physical is None or not physical.agreed:
+            return replace(self, former=earlier.former)
+        return replace(self, former=(physical.front,))
 
     def physical_at(self, settings: LensSettings) -> Physics | None:
         """The wavefront that has the larger say at settings."""

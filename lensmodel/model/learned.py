@@ -33,7 +33,7 @@ from lensmodel.model.wavefront.physical_mean import REASONS_APART, Physics
 from lensmodel.model.wavefront.zoom import End
 from lensmodel.optics.wavefront import NAMES, Wavefront
 
-VERSION: Final = 16
+VERSION: Final = 17
 """Raised whenever the same samples would be fitted otherwise."""
 
 _MOST_BYTES = 1 << 27  # unpacked: against files made to fill the memory
@@ -99,17 +99,34 @@ def load(data: bytes, samples: Sequence[PsfSample], settings: ModelSettings) -> 
         If it is damaged, of another version, or belongs to other samples or settings.
     """
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
-                raise InvalidInputError("what was learned unpacks to too much; fit the model again")
-        with np.load(io.BytesIO(data), allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-        document = json.loads(arrays.pop("document").tobytes())
+        document, arrays = _opened(data)
         if document["version"] != VERSION or document["belongs"] != _belongs(samples, settings):
             raise InvalidInputError("what was learned belongs to other samples or another version; fit again")
         return _fit(document, _checked(arrays, len(samples)), samples, settings)
     except _DAMAGED as error:
         raise InvalidInputError(f"what was learned is damaged ({error}); fit the model again") from error
+
+
+def fronts(data: bytes) -> tuple[Wavefront, ...]:
+    """Wavefront that all patches agreed on when `data` was learned, whatever its samples; else nothing."""
+    try:
+        document, arrays = _opened(data)
+        if document["version"] != VERSION or "physical" not in document:
+            return ()
+        values = document["physical"][0]
+        lines = {name: np.asarray(line, dtype=np.float64) for name, line in _of(arrays, "front0").items()}
+        return (_front(values["front"], lines),) if values["agreed"] else ()
+    except (*_DAMAGED, InvalidInputError):
+        return ()
+
+
+def _opened(data: bytes) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
+            raise InvalidInputError("what was learned unpacks to too much; fit the model again")
+    with np.load(io.BytesIO(data), allow_pickle=False) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    return json.loads(arrays.pop("document").tobytes()), arrays
 
 
 def _belongs(samples: Sequence[PsfSample], settings: ModelSettings) -> str:
@@ -165,13 +182,15 @@ def _of(arrays: Arrays, prefix: str) -> dict[str, Any]:
     return {name.partition(".")[2]: v for name, v in arrays.items() if name.startswith(f"{prefix}.")}
 
 
-def _physical(document: Mapping[str, Any], lines: dict[str, Any], arrays: dict[str, Any]) -> Physics:
+def _front(scalars: Mapping[str, Any], lines: Mapping[str, Any]) -> Wavefront:
     if any(line.shape != (len(NAMES),) for line in lines.values()):
         raise ValueError("the terms of a wavefront do not fit together")
-    scalars, front = dict(document), dict(document["front"])
-    del scalars["front"]
-    wavefront = Wavefront(**lines, **{**front, "eye": tuple(front["eye"])})
-    physics = Physics(front=wavefront, **scalars, **arrays)
+    return Wavefront(**lines, **{**scalars, "eye": tuple(scalars["eye"])})
+
+
+def _physical(document: Mapping[str, Any], lines: dict[str, Any], arrays: dict[str, Any]) -> Physics:
+    scalars = {name: value for name, value in document.items() if name != "front"}
+    physics = Physics(front=_front(document["front"], lines), **scalars, **arrays)
     if not 0.0 <= physics.turned <= 1.0:
         raise ValueError("a probability lies outside 0..1")
     if physics.why_apart not in REASONS_APART or physics.agreed != (physics.why_apart == ""):

@@ -92,9 +92,8 @@ class LensModel:
     def added(self, samples: Sequence[PsfSample]) -> LensModel:
         """Return the model with more samples.
 
-        A handful is put in place without touching the others: bandwidths, widths and cross-validated
-        factors stay until the model has grown by a twentieth; then all is fitted anew, and wants to be
-        `warmed` again.
+        A handful is put in place without touching the others, until the model has grown by a twentieth; then
+        all is fitted anew, and wants to be `warmed` again: that begins where this fit ended, too.
         """
         return self._with(samples, INCREMENT)
 
@@ -111,7 +110,9 @@ class LensModel:
         if not new:
             return self
         if not self._fit.takes(new, increment):
-            return self.refitted((*self.samples, *new))
+            every = (*self.samples, *new)
+            fit = Fit.of(every, self.settings).begun_with(self._fit)
+            return LensModel(every, self.settings, fit, prior=self.prior)
         fit = self._fit.extended(new, self.settings)
         return LensModel((*self.samples, *new), self.settings, fit, prior=self.prior)
 
@@ -138,6 +139,14 @@ class LensModel:
         settings, kept = settings or ModelSettings(), tuple(samples)
         return cls(kept, settings, memory.load(learned, kept, settings), prior=prior)
 
+    def begun_with(self, learned: bytes) -> LensModel:
+        """Return the model whose fit begins where `learned` of fewer samples ended, besides all other places.
+
+        Bytes that are damaged or of another version leave the model as it is.
+        """
+        fit = replace(self._fit, former=memory.fronts(learned))
+        return LensModel(self.samples, self.settings, fit, prior=self.prior)
+
     def learned(self) -> bytes:
         """What was learned from the samples, the wavefront included if `warm`; see `restored`."""
         return memory.dump(self._fit, self.samples, self.settings)
@@ -159,10 +168,10 @@ class LensModel:
     def warmed(self, on_step: StepHook = ignore_step) -> LensModel:
         """Return the model with the wavefront fitted to its samples, if its method or mode has one.
 
-        That takes some seconds of CPU, and the answers are good without it, so it is not done behind
-        anybody's back: call it once when the samples are complete. The same samples give the same model.
-        A correction hears the wavefront as a second opinion (`witness`), whatever mode answers. Photos that
-        make the patches of the others less likely lose their votes here (`misleading`).
+        That takes seconds of CPU, and the answers are good without it: call it once when the samples are
+        complete. The same samples give the same model, if none of them was fitted before. A correction hears
+        the wavefront as a second opinion (`witness`). Photos that make the patches of the others less likely
+        lose their votes here (`misleading`).
         """
         if self.warm:
             return self

@@ -104,7 +104,8 @@ def answered(
     if fit.mode == BOTH and physical.agreed and physical.diffraction_known:
         known = np.maximum(measured_share(expected), exact_share(math.sqrt(validation.usual)))
         share = WAVEFRONT_SHARE * (1.0 - known)
-        return _with_wavefront(averaged, physical, share, positions, settings)
+        if share.any():
+            return _with_wavefront(averaged, physical, share, positions, settings)
     return averaged
 
 

@@ -25,7 +25,7 @@ from lensmodel.core.spectrum import SECTORS, PatchSpectrum, bin_frequencies
 from lensmodel.core.types import CHANNELS, Channel, LensSettings
 from lensmodel.lab.cases import list_photos, photo_half
 from lensmodel.lab.reproduce.scenes import centred_cut
-from lensmodel.model.wavefront.from_spectra import fit_scene
+from lensmodel.model.wavefront.scene_fit import fit_scene
 from lensmodel.model.wavefront.scene_view import SceneView
 from lensmodel.scene.prior import ORBITS, PATCH_SHAPES
 from lensmodel.simulate import SimulatedCamera, SimulatedField, draw_lens, load_scene, photograph, write_photo

@@ -38,6 +38,7 @@ _PARTS: Final = (
     "core",
     "photo",
     "optics",
+    "scene",
     "estimation",
     "model",
     "correction",

@@ -22,8 +22,8 @@ SEEDS_LOOKED_AT: Final = frozenset({1000, 1001, 1002, 1003, 1006})
 share of the correction that compressed photos get (1001), and pairs of photos in the search (1002)."""
 
 LOOKED_AT: Final = frozenset({"heliar", "reverse-telephoto", "tronnier", "retrofocus"})
-"""Designs of ray-traced lenses that were looked at during development. The others were measured besides, but
-nothing was chosen on them."""
+"""Designs of ray-traced lenses that were looked at during development. Of the others it is known what they
+have of each aberration, which went into what is expected of lenses; nothing was chosen on photos of them."""
 
 _TRACED_FROM: Final = 2000
 _TRACED: Final = 100_000

@@ -85,7 +85,7 @@ class Route(Protocol):
 
 _SMALL_FRAME: Final = 2e6
 """Pixels below which the paper's way estimates kernels of the default's size (chosen): its 55 pixels are of
-frames of 21 megapixels, a hundredth of their width, and cost three times as much."""
+frames of 21 megapixels, a hundredth of their width, and take several times as long."""
 
 
 def paper_way(case: Case) -> Way:
@@ -154,8 +154,7 @@ class DirectRoute:
                 refused.write_text(json.dumps(str(error)), encoding="utf-8")
                 return str(error)
             save_profile(stored, LensProfile(LensModel.fit(samples, chosen)))
-        model = LensModel.fit(samples, chosen) if self._model is None else self._model.added(samples)
-        self._model = model.warmed()
+        self._model = LensModel.fit(samples, chosen) if self._model is None else self._model.added(samples)
         return ""
 
     def answers(self, places: Sequence[Place], settings: LensSettings, size: int) -> list[Answer]:
@@ -183,6 +182,7 @@ class DirectRoute:
     def _known(self) -> LensModel:
         if self._model is None:
             raise NoSamplesError("no photo has counted yet: learn from one with fine detail in focus")
+        self._model = self._model.warmed()  # only where something is asked: every fit costs half a minute
         return self._model
 
 

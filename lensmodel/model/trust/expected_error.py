@@ -43,7 +43,10 @@ class Evidence:
 
     @property
     def distance_factor(self) -> float:
-        """How well the nearest samples agree says nothing of a place without samples."""
+        """How well the nearest samples agree says nothing of a place without samples.
+
+        Half as much again for each bandwidth beyond the first (chosen: kernels change by as much).
+        """
         return 1.0 + 0.5 * max(self.nearest - 1.0, 0.0)
 
     @property

@@ -30,11 +30,12 @@ from lensmodel.core.descent import Descent
 from lensmodel.core.files import fitted
 from lensmodel.core.spectrum import PHASE_BINS, SECTORS, CrossPhase
 from lensmodel.core.types import WAVELENGTH_NM, Channel, FieldPosition, LensSettings, StepHook, ignore_step
+from lensmodel.model.wavefront.scene_fit import SceneState
 from lensmodel.model.wavefront.scene_view import SceneView
 from lensmodel.optics.aberration_prior import unlikeliness
 from lensmodel.optics.transfer import BINS, Transfer, phase_between
 from lensmodel.optics.wavefront import NAMES, Wavefront, design, stopped
-from lensmodel.scene.prior import BORROWED_RINGS, LARGEST_RESIDUAL, PATCH_SHAPES, PATCHES, TAILS
+from lensmodel.scene.prior import BORROWED_RINGS, PATCH_SHAPES, PATCHES
 
 Floats = NDArray[np.float64]
 
@@ -52,13 +53,11 @@ _TEMPER = 0.1
 _PHASES: Final[Mapping[str, float]] = fitted("model")["phases"]
 """Scatter in radians and temper of phases, see `data/README.md`."""
 
-_FLOOR_RANGE = (-12.0, -1.0)  # of its logarithm: below it nothing is seen, above it no lens (chosen)
 PATCH_TAILS: Final = 3.0
 """Degrees of freedom of Student's t of a patch, in units of its bins (chosen): a patch that something else
 blurred loses its say, an unusual one keeps it."""
 
-# Of Gauss and Newton: at first, and from where the last step left a scene (chosen)
-_SCENE_ROUNDS, _SCENE_ROUNDS_AGAIN = 3, 2
+_HELD_ROUNDS = 3  # steps of what photos share behind a lens that is known (chosen)
 _TRIES = 5  # steps with more damping before the fit ends (chosen)
 _STRIDE_PX = 1.5  # pixels of blur: no term changes by more in one step (chosen)
 _ENOUGH = 0.2  # of the cost: less gained in a step ends the fit; minima differ by more (chosen)
@@ -69,7 +68,7 @@ _SMALLEST_EYE, _FARTHEST_EYE = 0.5, 1.0  # radius, shift: the circles overlap al
 class PatchView:
     """One patch: where, how the lens was set, of which photo, its spectra, its phases against green.
 
-    Fits are to the spectra; phases judge them (`phase_costs`).
+    Phases are observations of a fit as spectra are, and judge fits made without them (`phase_costs`).
     """
 
     position: FieldPosition
@@ -152,43 +151,23 @@ def fit_spectra(
     return PooledFit(problem.front(state.lens), state.cost, covariance, state.trust)
 
 
+def held_cost(patches: Sequence[PatchView], front: Wavefront) -> float:
+    """What patches cost behind a lens that was made without them; what those of a photo share is fitted."""
+    photos = sorted({patch.photo for patch in patches})
+    problem = _Problem(tuple(patches), {name: i for i, name in enumerate(photos)}, front, coarse=False)
+    lens = np.concatenate([front.terms, open_eye(np.asarray(front.eye))])
+    shared = np.zeros((len(photos), len(PATCHES.photo_spread)))
+    held = np.zeros(_LENS + shared.size)
+    held[:_LENS] = _HELD
+    state = Descent(_HELD_ROUNDS, _TRIES, enough=_ENOUGH).down(
+        problem.state(lens, shared, None), problem.moved, held=held
+    )
+    return state.cost - unlikeliness(lens)[0]
+
+
 def open_eye(eye: Floats) -> tuple[float, float]:
     """Nearest cat's eye, radius and shift, that leaves light everywhere in the field."""
     return max(float(eye[0]), _SMALLEST_EYE), float(np.clip(eye[1], -_FARTHEST_EYE, _FARTHEST_EYE))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SceneFit:
-    """The scene of a patch behind a lens that is known.
-
-    Parameters
-    ----------
-    unknowns : ndarray, shape (z,)
-        See `SceneView`.
-    residual, signal : ndarray, shape (BINS, c)
-        What is left of the log power, and the share of the scene in the power.
-    cost : float
-        Of the residuals by Student's t, and of the unknowns by their prior.
-    """
-
-    unknowns: Floats
-    residual: Floats
-    signal: Floats
-    cost: float
-
-
-def fit_scene(view: SceneView, power: Floats) -> SceneFit:
-    """Fit the scene of one patch behind a lens that is known.
-
-    Parameters
-    ----------
-    view : SceneView
-    power : ndarray, shape (BINS, c)
-        |OTF|^2.
-
-    """
-    fitted = _Scene.fitted(view, power, PATCHES.bias[:, None], None)
-    return SceneFit(fitted.z, fitted.residual, fitted.signal, fitted.cost)
 
 
 def phase_costs(patches: Sequence[PatchView], front: Wavefront) -> tuple[float, float]:
@@ -236,12 +215,12 @@ class _Problem:
         cost, scenes_after, trust = 0.0, [], []
         for i, patch in enumerate(self.patches):
             at = _LENS + len(PATCHES.photo_spread) * self.photos[patch.photo]
-            seen, by_lens, _ = expected(self.begin, lens, patch, coarse=self.coarse)
+            seen, by_lens, phases = expected(self.begin, lens, patch, coarse=self.coarse)
             # its change with the lens is no part of the derivatives: lenses far too sharp would gain by it
             rest = (PATCHES.bias + PATCH_SHAPES[:, 1:3] @ shared[self.photos[patch.photo]])[:, None]
             rest = rest + PATCHES.with_power[:, None] * seen**2
             z = None if scenes is None else scenes[i]
-            fitted = _Scene.fitted(patch.scene, seen, rest, z)
+            fitted = SceneState.fitted(patch.scene, seen, rest, z)
             nu = PATCH_TAILS * BINS * len(patch.scene.channels)
             cost += _TEMPER * nu * math.log1p(fitted.cost / nu)
             trusted = 1.0 / (1.0 + fitted.cost / nu)
@@ -250,6 +229,11 @@ class _Problem:
             places = [*range(_LENS), *range(at, at + own_count - _LENS)]
             normal[np.ix_(places, places)] += weight * own_normal
             gradient[places] += weight * own_gradient
+            for channel, (phase, by_phase) in phases.items():
+                told, by_both, downhill = phase_terms(patch.phases[channel], phase, by_phase)
+                cost += told
+                normal[:_LENS, :_LENS] += by_both
+                gradient[:_LENS] += downhill
             scenes_after.append(fitted.z)
             trust.append(trusted)
         unusual, curvature, pull = unlikeliness(lens)
@@ -327,73 +311,3 @@ def phase_terms(
     free = without_linear(by_lens, precision)
     voted = precision[:, None] * free
     return temper * nu * math.log1p(chi2 / nu), weight * free.T @ voted, weight * voted.T @ np.sin(left)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Scene:
-    """The scene of a patch fitted for one lens, and the linearised residuals about it."""
-
-    z: Floats
-    cost: float
-    residual: Floats  # (BINS, c)
-    signal: Floats  # (BINS, c): derivative of the log power by that of the scene
-    kept: Floats  # (BINS, c): derivative of ln(|OTF|^2 + floor) by that of |OTF|^2
-    precision: Floats  # (BINS, c, c), outliers weighted down
-    weighted: Floats  # (BINS, c): precision times residual
-    by_scene: Floats  # (BINS, c, z)
-    normal: Floats
-    gradient: Floats
-
-    @classmethod
-    def fitted(cls, view: SceneView, power: Floats, rest: Floats, begin: Floats | None) -> _Scene:
-        """Solve for the patch's own unknowns by Gauss-Newton."""
-        rounds = _SCENE_ROUNDS_AGAIN
-        if begin is None:
-            rounds = _SCENE_ROUNDS
-            z = view.usual.copy()
-            left = view.log_power - np.log(power + math.exp(z[-1])) - rest - view.shapes @ z
-            z[PATCH_SHAPES.shape[1] : -1 : 3] += np.median(left, axis=0)
-        else:
-            z = begin
-        state = cls._about(view, power, rest, z)
-        for _ in range(rounds):
-            z = z + np.clip(np.linalg.solve(state.normal, state.gradient), -3.0, 3.0)
-            z[-1] = np.clip(z[-1], *_FLOOR_RANGE)
-            state = cls._about(view, power, rest, z)
-        return state
-
-    @classmethod
-    def _about(cls, view: SceneView, power: Floats, rest: Floats, z: Floats) -> _Scene:
-        floor = math.exp(z[-1])
-        passed = power + floor
-        scene = np.exp(np.clip(view.shapes @ z + np.log(passed) + rest, -60.0, 60.0))
-        signal = scene / (scene + view.noise)
-        residual = np.clip(view.log_power - np.log(scene + view.noise), -LARGEST_RESIDUAL, LARGEST_RESIDUAL)
-        count = residual.shape[1]
-        distance = np.einsum("bi,bij,bj->b", residual, view.precision, residual)
-        precision = view.precision * ((TAILS + count) / (TAILS + distance))[:, None, None]
-        off = z - view.usual
-        cost = float((TAILS + count) * np.log1p(distance / TAILS).sum() + view.vote @ off**2)
-        by_scene = view.shapes * signal[:, :, None]
-        by_scene[:, :, -1] = floor / passed * signal
-        unknowns = by_scene.shape[2]
-        flat = by_scene.reshape(-1, unknowns)
-        weighted = np.einsum("bij,bj->bi", precision, residual)
-        normal = np.einsum("bij,bjz->biz", precision, by_scene).reshape(-1, unknowns).T @ flat
-        normal += np.diag(view.vote)
-        gradient = flat.T @ weighted.ravel() - view.vote * off
-        kept = power / passed
-        return cls(z, cost, residual, signal, kept, precision, weighted, by_scene, normal, gradient)
-
-    def reduced(self, by_lens: Floats) -> tuple[Floats, Floats, int]:
-        """Normal equations of the lens and of the photo's share, the scene eliminated."""
-        shared = np.broadcast_to(PATCH_SHAPES[:, None, 1:3], (*self.signal.shape, len(PATCHES.photo_spread)))
-        columns = np.concatenate([by_lens * self.kept[:, :, None], shared], axis=2) * self.signal[:, :, None]
-        count = columns.shape[2]
-        flat = columns.reshape(-1, count)
-        voted = np.einsum("bij,bjn->bin", self.precision, columns).reshape(-1, count)
-        mixed = self.by_scene.reshape(flat.shape[0], -1).T @ voted
-        solved = np.linalg.solve(self.normal, np.column_stack([mixed, self.gradient]))
-        normal = flat.T @ voted - mixed.T @ solved[:, :-1]
-        gradient = flat.T @ self.weighted.ravel() - mixed.T @ solved[:, -1]
-        return normal, gradient, count

@@ -10,14 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.files import fitted
 from lensmodel.core.psf import PsfSample, distance, rms_width
-from lensmodel.core.types import WAVELENGTH_NM, Channel, FieldPosition, Kernel, StepHook, ignore_step
+from lensmodel.core.types import WAVELENGTH_NM, FieldPosition, Kernel, StepHook, ignore_step
 from lensmodel.model.wavefront.from_kernels import USUAL_PITCH_UM, fit_wavefront, side_of_light, spread
 from lensmodel.model.wavefront.from_spectra import (
     SYMMETRIC,
@@ -27,7 +27,15 @@ from lensmodel.model.wavefront.from_spectra import (
     open_eye,
     phase_costs,
 )
-from lensmodel.model.wavefront.scene_view import SceneView
+from lensmodel.model.wavefront.search import (
+    MOST_PATCHES,
+    Group,
+    held_out,
+    pairs,
+    random_fronts,
+    search,
+    view,
+)
 from lensmodel.model.wavefront.starts import starts
 from lensmodel.optics.aberration_prior import ABERRATIONS
 from lensmodel.optics.wavefront import NAMES, Wavefront, design, stopped
@@ -35,24 +43,15 @@ from lensmodel.optics.wavefront import NAMES, Wavefront, design, stopped
 MIN_PLACES: Final = 8
 """Fewer patches with a spectrum are not solved together (chosen: a third of those of a photo)."""
 
-Group: TypeAlias = dict[Channel, PsfSample]
-"""Samples of one patch in its channels."""
-
-_COMA = slice(2, 6)  # the odd terms of `NAMES`
-# Patches that a search looks at coarsely, in green, and in full: the cost grows with them (chosen: those of
-# one photo, of one and a half, of two)
-_COARSE_PLACES, _MEDIUM_PLACES, _FINE_PLACES = 24, 36, 48
 _NARROW_PLACES, _STOPPED_DOWN = 24, 2.0
 """Patches at most of photos stopped down, and the multiple of the widest f-number from which on they are (two
 stops). With all of them, five such photos take back what one adds (`lensmodel.lab.chain.stopped_down`)."""
-# Steps at most: only the last fit has to end (chosen)
-_COARSE_ROUNDS, _MEDIUM_ROUNDS, _FINE_ROUNDS = 7, 6, 16
-# Starts by moments, minima kept of the coarse search, and those fitted in full, of all photos and of a pair
-# (chosen: each of the last costs seconds)
-_STARTS, _KEPT, _REFINED, _REFINED_OF_PAIR = 6, 12, 4, 2
-_FEWEST_PAIRED, _MOST_PAIRS = 3, 2  # photos, and pairs of them (chosen: two photos are a pair themselves)
-_FIRST, _RANDOM = 16, 24  # samples of the first fit to kernels, and random wavefronts to begin with (chosen)
-_SAME_PX = 0.4  # pixels of blur: terms nearer than that lie in one minimum (chosen)
+_STARTS = 6  # by moments, for the search (chosen)
+_FIRST = 16  # samples of the first fit to kernels (chosen)
+_MOST_SINGLE = 2  # photos that are fitted alone (chosen: each costs as much as a whole fit of one)
+_JUDGED = 4  # minima that are judged by patches left out (chosen: each costs some seconds)
+_JUDGEMENT = 15  # steps of a fit that judging one is worth, for the progress
+_LAST_ROUNDS = 10  # steps of the fit with phases at most, from where it ended without them (chosen)
 _TAIL_SIDE = 31  # pixels of kernels whose third moments count: wider wings are noise to them (chosen)
 # Places and draws that tell the scatter: each draw costs a kernel a place (chosen)
 _ERROR_PLACES, _DRAWS = 14, 6
@@ -140,13 +139,18 @@ class Pooled:
         return np.hypot(share * drawn_here, least)
 
 
-def pool(samples: Sequence[PsfSample], on_step: StepHook = ignore_step) -> Pooled | None:
+def pool(
+    samples: Sequence[PsfSample], on_step: StepHook = ignore_step, known: Sequence[Wavefront] = ()
+) -> Pooled | None:
     """Solve all samples of one focal length together.
 
     Parameters
     ----------
     samples : sequence of PsfSample
         Those without a spectrum only help to begin.
+    known : sequence of Wavefront
+        What earlier fits of the lens, to fewer samples, came to; without any, single photos are fitted first,
+        and the steps of each begin anew.
 
     Returns
     -------
@@ -174,55 +178,47 @@ def pool(samples: Sequence[PsfSample], on_step: StepHook = ignore_step) -> Poole
         replace(first, terms=terms * (centred > 0), eye=ABERRATIONS.eye)
         for terms in starts(heads, designs, np.maximum(centred, 1e-3), math.exp(first.log_q), _STARTS)
     ]
-    begins += _random_fronts(first, float(np.median([rms_width(s.kernel) for s in heads])))
+    begins += random_fronts(first, float(np.median([rms_width(s.kernel) for s in heads])))
     at = {id(head): group for head, group in zip(heads, places, strict=True)}
     wide, narrow = _by_aperture(heads, widest)
-    chosen = [at[id(s)] for s in (*spread(wide, _FINE_PLACES), *spread(narrow, _NARROW_PLACES))]
-    parts = [[at[id(s)] for s in spread(own, _FINE_PLACES)] for own in _pairs(wide)]
-    views = [_view(group) for group in chosen]
-    ends = [_sided(fit, heads, views) for fit in _searched(chosen, parts, begins, on_step)]
-    best, tails = min(ends, key=lambda end: end[0].cost)
+    chosen = [at[id(s)] for s in (*spread(wide, MOST_PATCHES), *spread(narrow, _NARROW_PLACES))]
+    parts = [[at[id(s)] for s in spread(own, MOST_PATCHES)] for own in pairs(wide)]
+    views = [view(group) for group in chosen]
+    known = known or _of_single_photos(samples, on_step)
+    former = [replace(first, terms=front.terms, eye=front.eye) for front in known]
+    searched = 0
+
+    def on_search(done: int, total: int) -> None:
+        nonlocal searched
+        searched = total
+        on_step(done, total + _JUDGED * _JUDGEMENT)
+
+    sides = [_sided(fit, heads, views) for fit in search(chosen, parts, begins, former, on_search)]
+    sides.sort(key=lambda side: side[0].cost)
+    best, tails, least = *sides[0], math.inf
+    for number, side in enumerate(sides[:_JUDGED]):
+        fit, votes = _with_phases(*side, heads, views)
+        cost = fit.cost + held_out(chosen, fit.front)
+        if cost < least:
+            best, tails, least = fit, votes, cost
+        on_step(searched + (number + 1) * _JUDGEMENT, searched + _JUDGED * _JUDGEMENT)
+    on_step(searched + _JUDGED * _JUDGEMENT, searched + _JUDGED * _JUDGEMENT)
     trust: dict[str, list[float]] = {}
     for group, value in zip(chosen, best.trust, strict=True):
         trust.setdefault(next(iter(group.values())).photo, []).append(float(value))
-    known = widest is not None and bool(pitches)
-    return Pooled(best, tails, {photo: float(np.median(values)) for photo, values in trust.items()}, known)
+    sure = widest is not None and bool(pitches)
+    return Pooled(best, tails, {photo: float(np.median(values)) for photo, values in trust.items()}, sure)
 
 
-def _searched(
-    chosen: Sequence[Group], parts: Sequence[Sequence[Group]], begins: Sequence[Wavefront], on_step: StepHook
-) -> list[PooledFit]:
-    """Fit from many starts: all of them coarsely and centred, the best in green, the best of those in full.
+def _of_single_photos(samples: Sequence[PsfSample], on_step: StepHook) -> list[Wavefront]:
+    """What the first photos say of the lens alone; nothing of a single photo, which is all there is.
 
-    Where the pupil is round, a wavefront whose coma is negated has the same spectra as before. Only the
-    cat's eye tells the two apart, so that both are tried. What many photos make likely in green can all lie
-    in one minimum that is not the deepest of all colours together; what pairs of them do lies in others.
+    An earlier version of the fit, where there is one, stands in for them: it had them among its beginnings.
     """
-    total = (1 + len(parts)) * (len(begins) * _COARSE_ROUNDS + 2 * _KEPT * _MEDIUM_ROUNDS)
-    total += (_REFINED + len(parts) * _REFINED_OF_PAIR) * _FINE_ROUNDS
-    done = 0
-    fronts: list[Wavefront] = []
-    for part in (chosen, *parts):
-        green = [_view({"g": group["g"]}) for group in part if "g" in group]
-        fits = []
-        for begin in begins:
-            fits.append(
-                fit_spectra(green[:_COARSE_PLACES], begin, rounds=_COARSE_ROUNDS, symmetric=True, coarse=True)
-            )
-            on_step(done := done + _COARSE_ROUNDS, total)
-        medium = []
-        for fit in _different(fits)[:_KEPT]:
-            for front in (fit.front, _mirrored(fit.front)):
-                medium.append(fit_spectra(green[:_MEDIUM_PLACES], front, rounds=_MEDIUM_ROUNDS))
-                on_step(done := done + _MEDIUM_ROUNDS, total)
-        most = _REFINED if part is chosen else _REFINED_OF_PAIR
-        fronts += [fit.front for fit in _different(medium)[:most]]
-    fine, refined = [replace(_view(group), phases={}) for group in chosen], []
-    for front in fronts:
-        refined.append(fit_spectra(fine, front, rounds=_FINE_ROUNDS))
-        on_step(done := done + _FINE_ROUNDS, total)
-    on_step(total, total)
-    return refined
+    photos = sorted({s.photo for s in samples})
+    first = photos[:_MOST_SINGLE] if len(photos) > 1 else []
+    alone = [pool([s for s in samples if s.photo == photo], on_step) for photo in first]
+    return [one.front for one in alone if one is not None]
 
 
 def _sided(fit: PooledFit, heads: Sequence[PsfSample], views: Sequence[PatchView]) -> tuple[PooledFit, float]:
@@ -240,13 +236,15 @@ def _sided(fit: PooledFit, heads: Sequence[PsfSample], views: Sequence[PatchView
     return replace(fit, front=front, cost=min(costs)), both
 
 
-def _pairs(samples: Sequence[PsfSample]) -> list[list[PsfSample]]:
-    """Samples of the first photos two by two, of three photos or more, whatever their order."""
-    photos = sorted({s.photo for s in samples})
-    if len(photos) < _FEWEST_PAIRED:
-        return []
-    pairs = [set(photos[i : i + 2]) for i in range(0, len(photos) - 1, 2)][:_MOST_PAIRS]
-    return [[s for s in samples if s.photo in pair] for pair in pairs]
+def _with_phases(
+    fit: PooledFit, votes: float, heads: Sequence[PsfSample], views: Sequence[PatchView]
+) -> tuple[PooledFit, float]:
+    """Return a fit that is on its side with phases as observations, where patches have them, and its vote."""
+    if not any(patch.phases for patch in views):
+        return fit, votes
+    fit = fit_spectra(views, fit.front, rounds=_LAST_ROUNDS)
+    vote = tail_vote(_kernels(fit.front, heads), heads)
+    return replace(fit, cost=fit.cost - vote * abs(vote)), votes
 
 
 def _by_aperture(
@@ -266,33 +264,9 @@ def _by_aperture(
     return [s for s in samples if id(s) not in closed], narrow
 
 
-def _random_fronts(first: Wavefront, width: float) -> list[Wavefront]:
-    """Draw centred lenses that blur about as much as the samples.
-
-    Kernels that were estimated one by one have the widths of the lens, not always its character: where
-    spherical aberration is balanced by focus, their moments lead elsewhere.
-    """
-    rng, fronts = np.random.default_rng(_SEED), []
-    for _ in range(_RANDOM):
-        terms = np.zeros(len(NAMES))
-        for name, usual in ABERRATIONS.drawn.items():
-            terms[NAMES.index(name)] = rng.normal(0.0, usual)
-        balance = ABERRATIONS.balance * terms[NAMES.index("spherical")]
-        terms[NAMES.index("focus")] = balance + rng.normal(0.0, ABERRATIONS.drawn_balance)
-        fronts.append(replace(first, terms=width * terms, eye=ABERRATIONS.eye))
-    return fronts
-
-
 def _negative(front: Wavefront) -> Wavefront:
     """Return the wavefront of the kernels turned by 180 degrees."""
     return replace(front, terms=-front.terms)
-
-
-def _mirrored(front: Wavefront) -> Wavefront:
-    """Negate the coma."""
-    terms = front.terms.copy()
-    terms[_COMA] *= -1.0
-    return replace(front, terms=terms)
 
 
 def _log_q(aperture: float, pitch_um: float) -> float:
@@ -304,43 +278,13 @@ def _log_q(aperture: float, pitch_um: float) -> float:
     return math.log(WAVELENGTH_NM["g"] / 1000.0 * aperture / pitch_um)
 
 
-def _cost(fit: PooledFit) -> float:
-    return fit.cost
-
-
-def _different(fits: Sequence[PooledFit]) -> list[PooledFit]:
-    """Fits that ended in different minima, the best first; a wavefront and its negative count as one.
-
-    Their costs say nothing of that: unlike lenses can be about as likely.
-    """
-    kept: list[PooledFit] = []
-    for fit in sorted(fits, key=_cost):
-        if all(_apart(fit.front.terms, other.front.terms) > _SAME_PX for other in kept):
-            kept.append(fit)
-    return kept
-
-
-def _apart(terms: NDArray[np.float64], others: NDArray[np.float64]) -> float:
-    return float(min(np.abs(terms - others).max(), np.abs(terms + others).max()))
-
-
-def _places(samples: Sequence[PsfSample]) -> list[dict[Channel, PsfSample]]:
+def _places(samples: Sequence[PsfSample]) -> list[Group]:
     """Samples of one patch in its channels."""
-    places: dict[tuple[str, float, float], dict[Channel, PsfSample]] = {}
+    places: dict[tuple[str, float, float], Group] = {}
     for sample in samples:
         key = (sample.photo, sample.position.r, sample.position.phi)
         places.setdefault(key, {})[sample.settings.channel] = sample
     return list(places.values())
-
-
-def _view(group: dict[Channel, PsfSample]) -> PatchView:
-    head = next(iter(group.values()))
-    spectra = {c: group[c].spectrum for c in ("g", "r", "b") if c in group}
-    scene = SceneView.of({c: s for c, s in spectra.items() if s is not None})
-    phases = {
-        c: s.cross for c, s in spectra.items() if s is not None and s.cross is not None and "g" in group
-    }
-    return PatchView(head.position, head.settings, head.photo, scene, phases)
 
 
 def _kernels(front: Wavefront, samples: Sequence[PsfSample]) -> list[Kernel]:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.spectrum import SECTORS, bin_frequencies
 from lensmodel.core.types import Kernel
-from lensmodel.model.wavefront.from_spectra import PATCH_TAILS, fit_scene
+from lensmodel.model.wavefront.from_spectra import PATCH_TAILS
+from lensmodel.model.wavefront.scene_fit import fit_scene
 from lensmodel.model.wavefront.scene_view import SceneView
 from lensmodel.optics.transfer import BINS
 

@@ -103,6 +103,7 @@ class Physics:
         groups: NDArray[np.intp],
         scale: NDArray[np.float64],
         on_step: StepHook = ignore_step,
+        former: Sequence[Wavefront] = (),
     ) -> Physics | None:
         """Fit to samples; None where there are too few of them.
 
@@ -115,6 +116,8 @@ class Physics:
             Samples that are held out together.
         scale : ndarray, shape (7,)
             Bandwidths.
+        former : sequence of Wavefront
+            What earlier fits of the lens, to fewer samples, came to.
         """
         voting = [int(i) for i in np.flatnonzero(votes > 0)]
         if len(voting) < MIN_SAMPLES:
@@ -123,7 +126,7 @@ class Physics:
         trusted = [samples[i].with_weight(float(votes[i])) for i in voting]
         # spectra of one focal length alone are solved together
         several = focal_range(trusted) > ONE_FOCAL_LENGTH
-        pooled = None if several else pool(trusted, on_step)
+        pooled = None if several else pool(trusted, on_step, former)
         if pooled is not None and _suits(pooled, trusted):
             side = max(s.kernel.shape[0] for s in samples)
             empty = np.empty((0, 2)), np.empty((0, len(scale))), scale, np.empty((0, side**2))

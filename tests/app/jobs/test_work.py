@@ -19,7 +19,7 @@ from app.jobs.correction_work import CorrectionWork
 from app.jobs.missing_reports import ask_for_reports
 from app.jobs.photo_work import PhotoWork
 from app.jobs.queue import Handler, Job, Kind, Status
-from app.jobs.task_files import FAMILY, KERNELS, LEARNED, PREVIEW, SAMPLES
+from app.jobs.task_files import EARLIER, FAMILY, KERNELS, LEARNED, PREVIEW, SAMPLES
 from app.runtime.settings import Settings
 from app.sandbox.budget import Budget
 from app.sandbox.child import ProgressHook
@@ -623,6 +623,26 @@ def test_what_a_correction_learned_of_an_earlier_version_is_not_kept(
     assert context.store.samples.of_lens(lens_id)[0].version == 2
     with pytest.raises(FileNotFoundError):
         context.storage.get(learned_key(lens_id, 1, state.rebuild_epoch))
+
+
+def test_a_new_version_is_fitted_from_where_the_one_before_ended(
+    context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any
+) -> None:
+    begun = []
+
+    def begin(arguments: dict[str, Any], folder: Path) -> Outcome:
+        begun.append(((folder / EARLIER).read_bytes(), (folder / LEARNED).exists()))
+        return ok({"error": None, "coverage": None})(arguments, folder)
+
+    lens_id = steps.lens_id(counted)
+    state, _ = context.store.samples.of_lens(lens_id)
+    context.storage.put(learned_key(lens_id, 1, state.rebuild_epoch), b"fitted before")
+    steps.counted()
+    sandbox.answers["measure"] = [begin]
+
+    CorrectionWork(context).measure(lens_id, 2)
+
+    assert begun == [(b"fitted before", False)]
 
 
 def test_a_family_is_fitted_once_until_one_of_its_copies_changes(

@@ -18,10 +18,11 @@ from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensS
 from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
 from lensmodel.model.modes import WAVEFRONT_SHARE, Mixture
 from lensmodel.model.trust.expected_error import Evidence, joint_error
-from lensmodel.model.wavefront import from_kernels, joint_kernels
+from lensmodel.model.wavefront import from_kernels, joint_kernels, search
 from lensmodel.model.wavefront.from_spectra import PatchView, PooledFit, fit_spectra
-from lensmodel.model.wavefront.joint_kernels import MIN_PLACES, Pooled, _by_aperture, _pairs, pool
+from lensmodel.model.wavefront.joint_kernels import MIN_PLACES, Pooled, _by_aperture, pool
 from lensmodel.model.wavefront.scene_view import Floats, SceneView
+from lensmodel.model.wavefront.search import Group, pairs
 from lensmodel.optics.aberration_prior import ABERRATIONS, corner_ratio, unlikeliness
 from lensmodel.optics.transfer import (
     BINS,
@@ -410,6 +411,66 @@ def test_a_wavefront_takes_part_only_where_its_diffraction_is_known(warm: LensMo
     assert answer.reason == "aperture or pixel pitch unknown"
 
 
+def test_a_lens_that_grows_is_fitted_from_where_its_last_fit_ended(
+    warm: LensModel, known: list[PsfSample]
+) -> None:
+    assert warm.physical is not None
+    more = [replace(s, photo="another") for s in known]
+    learned = warm.learned()
+
+    grown, anew = warm.added(more), LensModel.fit([*known, *more]).begun_with(learned)
+
+    for model in (grown, anew):
+        assert not model.warm
+        (former,) = model._fit.former
+        np.testing.assert_array_equal(former.terms, warm.physical.front.terms)
+        assert former.eye == warm.physical.front.eye
+    assert grown.added(more)._fit.former == grown._fit.former  # fitted only at the end of many photos
+
+
+def test_damaged_memories_of_an_earlier_fit_are_no_beginnings(
+    warm: LensModel, known: list[PsfSample]
+) -> None:
+    learned, rng = warm.learned(), np.random.default_rng(0)
+    damaged = [b"", learned[: len(learned) // 2], LensModel.fit(known).learned()]
+    for at in rng.integers(0, len(learned), 20):
+        changed = bytearray(learned)
+        changed[at] ^= 0xFF
+        damaged.append(bytes(changed))
+
+    for data in damaged:
+        former = LensModel.fit(known).begun_with(data)._fit.former
+        assert all(np.isfinite(front.terms).all() for front in former)
+    assert LensModel.fit(known).begun_with(damaged[1])._fit.former == ()
+    assert LensModel.fit(known).begun_with(damaged[2])._fit.former == ()
+
+
+def test_without_an_earlier_fit_single_photos_are_fitted_first(
+    known: list[PsfSample], monkeypatch: pytest.MonkeyPatch, short_search: None
+) -> None:
+    begun: list[int] = []
+
+    def searched(
+        groups: list[Group], _parts: object, begins: list[Wavefront], former: list[Wavefront], _hook: object
+    ) -> list[PooledFit]:
+        begun.append(len(former))
+        return [PooledFit(begins[0], 0.0, np.eye(21), np.ones(len(groups)))]
+
+    monkeypatch.setattr(joint_kernels, "_MOST_SINGLE", 2)
+    monkeypatch.setattr(joint_kernels, "fit_wavefront", lambda _: true_front())
+    monkeypatch.setattr(joint_kernels, "starts", lambda *_: [])
+    monkeypatch.setattr(joint_kernels, "search", searched)
+    monkeypatch.setattr(joint_kernels, "held_out", lambda *_: 0.0)
+    two = [*known, *(replace(s, photo="another") for s in known)]
+
+    found = pool(two)
+    assert found is not None
+    assert begun == [0, 0, 2]  # each photo alone, then both beginning with them
+
+    pool(two, known=[found.front])
+    assert begun[3:] == [1]
+
+
 def test_kernels_and_wavefront_answer_together_where_diffraction_is_known(warm: LensModel) -> None:
     place = FieldPosition(0.7, 0.4)
     kernels, wavefront = (
@@ -457,7 +518,7 @@ def test_unknown_pitch_is_taken_as_a_usual_one_not_as_wide_kernels_suggest(
     known: list[PsfSample], short_search: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for rounds in ("_COARSE_ROUNDS", "_MEDIUM_ROUNDS", "_FINE_ROUNDS"):
-        monkeypatch.setattr(joint_kernels, rounds, 1)  # the pitch is chosen before the first of them,
+        monkeypatch.setattr(search, rounds, 1)  # the pitch is chosen before the first of them,
     monkeypatch.setattr(from_kernels, "_FINE_ROUNDS", 2)  # and kernels have had their say after two
     unknown = [replace(s, kernel=gaussian(31, 4.0 * np.eye(2)), pixel_pitch_um=None) for s in known]
     found = pool(unknown)
@@ -497,8 +558,8 @@ def test_focus_that_balances_spherical_aberration_is_expected() -> None:
     noise = PatchSpectrum(np.full((RINGS, SECTORS), 1e-7, np.float32), 1e-7)
     nothing = view(FieldPosition(0.5, 0.0), dict.fromkeys(CHANNELS, noise))
     alone, both = (replace(true_front(), terms=np.zeros(19)) for _ in range(2))
-    alone.terms[0] = both.terms[0] = 0.5
-    both.terms[6] = ABERRATIONS.balance * 0.5
+    alone.terms[0] = both.terms[0] = 1.0
+    both.terms[6] = ABERRATIONS.balance
 
     costs = [fit_spectra([nothing], front, rounds=0).cost for front in (alone, both)]
 
@@ -541,8 +602,8 @@ def test_photos_are_paired_whatever_their_order_and_few_are_not() -> None:
         for i, photo in enumerate("edcbaabcde")
     ]
 
-    pairs = [{s.photo for s in part} for part in _pairs(samples)]
+    found = [{s.photo for s in part} for part in pairs(samples)]
 
-    assert pairs == [{s.photo for s in part} for part in _pairs(samples[::-1])] == [{"a", "b"}, {"c", "d"}]
-    assert [len(part) for part in _pairs(samples)] == [4, 4]
-    assert _pairs([s for s in samples if s.photo in "ab"]) == []
+    assert found == [{s.photo for s in part} for part in pairs(samples[::-1])] == [{"a", "b"}, {"c", "d"}]
+    assert [len(part) for part in pairs(samples)] == [4, 4]
+    assert pairs([s for s in samples if s.photo in "ab"]) == []

@@ -15,7 +15,8 @@ from lensmodel.core.spectrum import PHASE_BINS, RINGS, SECTORS, CrossPhase, Patc
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensSettings
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
 from lensmodel.model.wavefront.from_spectra import PatchView, PooledFit, expected, phase_costs
-from lensmodel.model.wavefront.joint_kernels import _places, _sided, _view
+from lensmodel.model.wavefront.joint_kernels import _places, _sided
+from lensmodel.model.wavefront.search import view
 from lensmodel.optics.wavefront import NAMES, Wavefront
 
 SETTINGS = LensSettings(aperture=2.0)
@@ -48,7 +49,7 @@ def samples(front: Wavefront, place: FieldPosition) -> dict[Channel, PsfSample]:
 
 
 def views(front: Wavefront) -> list[PatchView]:
-    return [_view(samples(front, place)) for place in PLACES]
+    return [view(samples(front, place)) for place in PLACES]
 
 
 def lens_of(front: Wavefront) -> np.ndarray:

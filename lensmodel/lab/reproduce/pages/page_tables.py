@@ -288,8 +288,9 @@ def which_lenses(page: Page, result: Mapping[str, Any]) -> None:
     """Name every lens, where it comes from, and whether anything was developed on it."""
     page.title("The lenses")
     page.text(
-        "Nothing was developed or chosen on an unseen lens. Parameters are chosen on other lenses; two "
-        "choices followed from a look at lenses of this page. Third-order lenses are of the theory that the "
+        "Nothing was developed or chosen on photos of an unseen lens; what all designs have of each "
+        "aberration is known, and expected of lenses. Parameters are chosen on other lenses; three choices "
+        "followed from a look at lenses of this page. Third-order lenses are of the theory that the "
         "wavefront fit assumes, ray-traced ones of published designs, traced to all orders."
     )
     rows = [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import random
 import shutil
@@ -16,20 +15,18 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from app.blobs.storage import Storage
-from app.jobs.task_files import KERNELS, PHASES, PREVIEW, R_MAP, SAMPLES, SHOWN, SPECTRA
+from app.jobs.task_files import PREVIEW, R_MAP, SHOWN
 from app.runtime import metrics
 from app.runtime.outage import OutageError, is_outage
 from app.runtime.settings import Settings
 from app.sandbox.child import ProgressHook
 from app.sandbox.outcome import Outcome, TaskLimits
 from app.sandbox.runner import Sandbox
-from app.store import Store, StoredSample
+from app.store import Store
 from app.store.jobs import JobStore
 from app.store.photo_steps import folder_of
 from app.store.tables import PhotoRow
-from lensmodel.core.files import save_array
 from lensmodel.core.types import ignore_step
-from lensmodel.model.sample_codec import pack_samples
 
 log = logging.getLogger(__name__)
 
@@ -196,13 +193,3 @@ def _patient(wanted: Callable[[], bool]) -> Callable[[], bool]:
             return True
 
     return ask
-
-
-def write_samples(folder: Path, stored: Sequence[StoredSample]) -> None:
-    """Hand samples to a task: kernels and spectra as npy files, the rest as JSON."""
-    packed = pack_samples([entry.sample for entry in stored])
-    for name, array in ((KERNELS, packed.kernels), (SPECTRA, packed.spectra), (PHASES, packed.phases)):
-        if array is not None:
-            with (folder / name).open("wb") as file:
-                save_array(file, array)
-    (folder / SAMPLES).write_text(json.dumps(packed.entries), encoding="utf-8")

@@ -19,8 +19,8 @@ from app.jobs.context import (
     JobContext,
     JobFailedError,
     NotWantedError,
-    write_samples,
 )
+from app.jobs.sample_files import write_samples
 from app.jobs.task_files import AFTER, BEFORE, EARLIER, FAMILY, LAYERS, LEARNED, REPORT, SUFFIX
 from app.runtime.outage import missable
 from app.sandbox.child import ProgressHook
@@ -140,7 +140,7 @@ class CorrectionWork:
         if not stored:
             return 0, ""
         (folder / FAMILY).mkdir()
-        write_samples(folder / FAMILY, stored)
+        write_samples(folder / FAMILY, [entry.sample for entry in stored])
         key = json.dumps([relatives, model], sort_keys=True)
         fitted = self._families.get(key)
         if fitted is not None:
@@ -161,7 +161,7 @@ class CorrectionWork:
         if not stored:
             text = f"version {version} of lens {lens_id} has no samples any more; ask for the newest version"
             raise JobFailedError("no_samples", text)
-        write_samples(folder, stored)
+        write_samples(folder, [entry.sample for entry in stored])
         for number in range(version, max(version - EARLIER_VERSIONS, 1) - 1, -1):
             # not fitted yet: the task does it, beginning with what an earlier version came to
             with suppress(FileNotFoundError):

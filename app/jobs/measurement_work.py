@@ -7,17 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
 from app.jobs.context import JobContext, JobFailedError
-from app.jobs.task_files import KERNELS
+from app.jobs.sample_files import DAMAGED, returned_samples
 from app.store import NewPatch, NewSample
 from app.store.photo_steps import settings_of
 from app.store.tables import PhotoRow
 from app.ways import way_of
-from lensmodel.core.errors import InvalidInputError, InvalidKernelError
-from lensmodel.core.psf import PsfSample
-from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.types import CHANNELS
 
 MAX_PLACES: Final = 1000
 """Most places of a measurement (chosen): no method has so many cells, a child that returns more is broken."""
@@ -85,16 +82,14 @@ class MeasurementWork:
 def _checked(listed: Any, folder: Path) -> tuple[list[NewPatch], list[NewSample]]:  # noqa: ANN401 - a child's JSON
     """Validate the measurements of a child as untrusted input."""
     try:
-        kernels = np.load(folder / KERNELS, allow_pickle=False, mmap_mode="r")
-        if not 0 < len(listed) == len(kernels) <= MAX_PLACES * len(CHANNELS):
-            raise InvalidInputError(f"{len(listed)} samples and {len(kernels)} kernels")
+        if not 0 < len(listed) <= MAX_PLACES * len(CHANNELS):
+            raise InvalidInputError(f"{len(listed)} samples")
         patches: dict[int, NewPatch] = {}
         samples = []
-        for kernel, entry in zip(kernels, listed, strict=True):
-            position = FieldPosition(float(entry["r"]), float(entry["phi"]))
-            number, channel, error = int(entry["idx"]), entry["channel"], float(entry["error"])
-            if channel not in CHANNELS or not 0.0 <= error <= 1.0 or not 0 <= number < MAX_PLACES:
-                raise InvalidInputError(f"a sample of channel {channel!r} with error {error}")
+        for sample, entry in zip(returned_samples(folder, count=len(listed)), listed, strict=True):
+            number, error = int(entry["idx"]), sample.error
+            if error is None or not error <= 1.0 or not 0 <= number < MAX_PLACES:
+                raise InvalidInputError(f"a sample of place {number} with error {error}")
             patches.setdefault(
                 number,
                 NewPatch(
@@ -102,27 +97,13 @@ def _checked(listed: Any, folder: Path) -> tuple[list[NewPatch], list[NewSample]
                     row=int(entry["row"]),
                     col=int(entry["col"]),
                     size=int(entry["side"]),
-                    r=position.r,
-                    phi=position.phi,
+                    r=sample.position.r,
+                    phi=sample.position.phi,
                     cell=number,
                     score=1.0 - error,
                 ),
             )
-            samples.append(
-                NewSample(
-                    number,
-                    PsfSample(
-                        kernel,
-                        position,
-                        LensSettings(channel=channel),
-                        estimator=str(entry["estimator"]),
-                        error=error,
-                    ),
-                )
-            )
-    except (
-        *(InvalidKernelError, InvalidInputError, OSError),
-        *(ValueError, TypeError, LookupError),  # not the expected JSON
-    ) as error:
+            samples.append(NewSample(number, sample))
+    except DAMAGED as error:
         raise JobFailedError("internal_error", f"the measurement gave no kernels: {error}") from error
     return list(patches.values()), samples

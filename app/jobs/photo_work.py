@@ -10,28 +10,25 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
-
-import numpy as np
 
 from app.jobs.body_keys import body_key
 from app.jobs.context import SPARE_MB, JobContext, JobFailedError, NotWantedError
 from app.jobs.measurement_work import MeasurementWork
 from app.jobs.patch_plans import described, patch_of, plan_of, why_not
 from app.jobs.queue import Job, JobEngine
-from app.jobs.task_files import KERNELS
+from app.jobs.sample_files import DAMAGED, returned_samples
 from app.jobs.thumbnail_work import keep_glance
 from app.sandbox.outcome import TaskLimits
 from app.store import LensName, NewSample, Store
 from app.store.photo_steps import settings_of
 from app.store.tables import PHOTO_RUNNING, LensRow, PatchRow, PhotoRow
 from app.ways import way_of
-from lensmodel.core.errors import InvalidInputError, InvalidKernelError, NoUsablePatchesError
-from lensmodel.core.psf import PsfSample
-from lensmodel.core.spectrum import PatchSpectrum
-from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.core.errors import NoUsablePatchesError
+from lensmodel.core.types import FieldPosition
 from lensmodel.workflow import pipeline
 
 log = logging.getLogger(__name__)
@@ -113,7 +110,7 @@ class PhotoWork:
                 compiles=True,
             )
             places = {row.idx: FieldPosition(row.r, row.phi) for row in rows}
-            return [_sample(folder, number, entry, places) for number, entry in enumerate(listed)]
+            return _checked(listed, folder, places)
 
 
 class _Steps:
@@ -326,27 +323,15 @@ def _begun(store: Store, photo_id: str, epoch: int) -> PhotoRow:
     return _row(store, photo_id)
 
 
-def _sample(
-    folder: Path, number: int, entry: dict[str, Any], places: Mapping[int, FieldPosition]
-) -> NewSample:
-    """Validate one result of a child as untrusted input."""
+def _checked(listed: Any, folder: Path, places: Mapping[int, FieldPosition]) -> list[NewSample]:  # noqa: ANN401 - a child's JSON
+    """Validate the samples of a child as untrusted input; they lie where their patches do."""
     try:
-        kernels = np.load(folder / KERNELS, allow_pickle=False, mmap_mode="r")
-        spectrum = None if entry["spectrum"] is None else bytes.fromhex(entry["spectrum"])
-        sample = PsfSample(
-            kernels[number],
-            places[entry["idx"]],
-            LensSettings(channel=entry["channel"]),
-            weight=float(np.clip(entry["weight"], 0.0, 1.0)),
-            estimator=str(entry["estimator"]),
-            error=entry["predicted_error"],
-            spectrum=None if spectrum is None else PatchSpectrum.from_bytes(spectrum),
-        )
-        return NewSample(entry["idx"], sample, entry["diagnostics"])
-    except (
-        *(InvalidKernelError, InvalidInputError, OSError),
-        *(ValueError, TypeError, LookupError),  # not the expected JSON
-    ) as error:
+        samples = returned_samples(folder, count=len(listed))
+        return [
+            NewSample(entry["idx"], replace(sample, position=places[entry["idx"]]), entry["diagnostics"])
+            for entry, sample in zip(listed, samples, strict=True)
+        ]
+    except DAMAGED as error:
         raise JobFailedError("internal_error", f"the estimator gave no kernel: {error}") from error
 
 

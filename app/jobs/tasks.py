@@ -1,7 +1,7 @@
 """Tasks that run in child processes: functions of the library, called with JSON and files.
 
-A task takes JSON and its own empty folder, and returns JSON. Arrays go in and out as npy files
-in the folder. No task accesses the database or other photos.
+A task takes JSON and its own empty folder, and returns JSON. Arrays go in and out as files in the
+folder, PSF samples by `app.jobs.sample_files`. No task accesses the database or other photos.
 """
 
 from __future__ import annotations
@@ -19,22 +19,19 @@ from typing import Any, Final
 import numpy as np
 
 from app.blobs import previews, thumbnails
+from app.jobs.sample_files import read_samples, write_samples
 from app.jobs.task_files import (
     AFTER,
     BEFORE,
     EARLIER,
     FAMILY,
     GLANCE,
-    KERNELS,
     LAYERS,
     LEARNED,
-    PHASES,
     PREVIEW,
     R_MAP,
     REPORT,
-    SAMPLES,
     SHOWN,
-    SPECTRA,
     SUFFIX,
 )
 from app.sandbox.child import ProgressHook, Task
@@ -42,15 +39,12 @@ from app.schemas import distances
 from lensmodel import correction, photo
 from lensmodel.core import codec
 from lensmodel.core.errors import InvalidInputError, LensModelError
-from lensmodel.core.files import save_array
-from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings, Planes
 from lensmodel.correction.engine import first_use
 from lensmodel.estimation import estimators
 from lensmodel.estimation import measure as lens_measure
 from lensmodel.estimation.patches import Patch, selectors
 from lensmodel.model import LensModel, ModelSettings
-from lensmodel.model.sample_codec import PackedSamples, unpack_samples
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.report.lens_test import lens_test
 from lensmodel.workflow import pipeline
@@ -128,7 +122,10 @@ def select(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> d
 
 
 def estimate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[dict[str, Any]]:
-    """Estimate the PSF of one field cell in each channel, from its patches."""
+    """Estimate the PSF of one field cell in each channel, from its patches.
+
+    The samples go to the folder.
+    """
     developed = pipeline.load_developed(Path(arguments["developed"]))
     group = [codec.from_json(Patch, stored) for stored in arguments["patches"]]
     numbers = {(patch.row, patch.col): idx for patch, idx in zip(group, arguments["numbers"], strict=True)}
@@ -142,23 +139,12 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) ->
         seed=arguments["seed"],
         on_step=progress,
     )
-    with (folder / KERNELS).open("wb") as file:
-        save_array(file, np.stack([np.asarray(result.sample.kernel) for result in results]))
+    write_samples(folder, [result.sample for result in results])
     listed = []
     for result in results:
-        spectrum = result.sample.spectrum
         diagnostics = {name: _finite(value) for name, value in result.diagnostics.items()}
-        listed.append(
-            {
-                "idx": numbers[result.patch.row, result.patch.col],
-                "channel": result.channel,
-                "weight": result.sample.weight,
-                "estimator": result.sample.estimator,
-                "predicted_error": diagnostics.pop("predicted_error", None),
-                "diagnostics": diagnostics,
-                "spectrum": None if spectrum is None else spectrum.to_bytes().hex(),
-            }
-        )
+        diagnostics.pop("predicted_error", None)  # the sample has it
+        listed.append({"idx": numbers[result.patch.row, result.patch.col], "diagnostics": diagnostics})
     return listed
 
 
@@ -249,12 +235,18 @@ def report(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> d
 
 
 def measure_lens(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[dict[str, Any]]:
-    """Measure the PSF on photos made for it, in `developed`; kernels go to the folder."""
+    """Measure the PSF on photos made for it, in `developed`; samples go to the folder."""
     photos = [pipeline.load_developed(Path(name)) for name in arguments["developed"]]
     method = lens_measure.methods.create(arguments["kind"])
     measurements = method.measure(photos, size=arguments["size"], on_step=progress)
-    with (folder / KERNELS).open("wb") as file:
-        save_array(file, np.stack([np.asarray(measured.kernel) for measured in measurements]))
+    samples = lens_measure.samples_of(
+        [replace(measured, error=min(measured.error, 1.0)) for measured in measurements],
+        method,
+        photos[0],
+        photo_id=arguments["photo"],
+        settings=_settings(arguments["settings"]),
+    )
+    write_samples(folder, samples)
     numbers: dict[tuple[float, float], int] = {}
     return [
         {
@@ -262,11 +254,6 @@ def measure_lens(arguments: dict[str, Any], folder: Path, progress: ProgressHook
             "row": round(measured.pixel[0] - (measured.side - 1) / 2),
             "col": round(measured.pixel[1] - (measured.side - 1) / 2),
             "side": measured.side,
-            "r": measured.position.r,
-            "phi": measured.position.phi,
-            "channel": measured.channel,
-            "error": min(measured.error, 1.0),
-            "estimator": lens_measure.estimator_of(method),
         }
         for measured in measurements
     ]
@@ -312,7 +299,7 @@ def _lateral(developed: photo.LinearPhoto) -> LateralColour | None:
 
 def _model(folder: Path, settings: ModelSettings) -> LensModel:
     """Build the model of the samples in a folder."""
-    samples = _samples(folder)
+    samples = read_samples(folder)
     learned = folder / LEARNED
     if learned.is_file():
         try:
@@ -339,16 +326,6 @@ def _with_family(folder: Path, settings: ModelSettings) -> LensModel:
     if not (family / LEARNED).is_file():
         (family / LEARNED).write_bytes(prior.learned())
     return model.with_prior(prior)
-
-
-def _samples(folder: Path) -> list[PsfSample]:
-    kernels = np.load(folder / KERNELS, allow_pickle=False, mmap_mode="r")
-    entries = json.loads((folder / SAMPLES).read_text(encoding="utf-8"))
-    spectra, phases = (
-        np.load(folder / name, allow_pickle=False) if (folder / name).is_file() else None
-        for name in (SPECTRA, PHASES)
-    )
-    return unpack_samples(PackedSamples(entries, kernels, spectra, phases))
 
 
 def _settings(stored: Mapping[str, Any]) -> LensSettings:

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from app.jobs.task_files import KERNELS
+from app.jobs.sample_files import write_samples
 from app.sandbox.child import ProgressHook
 from lensmodel.core.files import save_array
-from lensmodel.core.psf import gaussian
+from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
 
 CELLS = 8
 SECONDS = 0.3
@@ -55,16 +56,15 @@ def select(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> d
 
 def estimate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[dict[str, Any]]:
     time.sleep(SECONDS)
-    with (folder / KERNELS).open("wb") as file:
-        save_array(file, np.stack([gaussian(5, np.eye(2))] * 3))
-    common = {
-        "weight": 1.0,
-        "estimator": f"quick-{arguments['estimator']}-{arguments['size']}",
-        "predicted_error": 0.1,
-        "diagnostics": {"worker": float(os.getppid())},  # its fork server: one of each worker
-        "spectrum": None,
-    }
-    return [{"idx": arguments["numbers"][0], "channel": channel, **common} for channel in ("r", "g", "b")]
+    kernel, name = gaussian(5, np.eye(2)), f"quick-{arguments['estimator']}-{arguments['size']}"
+    place = FieldPosition(0.0, 0.0)
+    samples = [
+        PsfSample(kernel, place, LensSettings(channel=channel), estimator=name, error=0.1)
+        for channel in CHANNELS
+    ]
+    write_samples(folder, samples)
+    told = {"worker": float(os.getppid())}  # its fork server: one of each worker
+    return [{"idx": arguments["numbers"][0], "diagnostics": told} for _ in samples]
 
 
 def measure(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:

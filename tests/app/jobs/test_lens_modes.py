@@ -15,7 +15,7 @@ from starlette.testclient import TestClient
 from app.blobs.storage import Storage
 from app.http.model_cache import ModelCache
 from app.jobs import tasks
-from app.jobs.context import write_samples
+from app.jobs.sample_files import write_samples
 from app.jobs.task_files import LEARNED
 from app.main import create_app
 from app.runtime.settings import Settings
@@ -60,7 +60,7 @@ def test_what_a_worker_learned_is_served_for_that_model_alone(
     state, stored = store.samples.of_lens(lens)
     folder = tmp_path / "task"
     folder.mkdir()
-    write_samples(folder, stored)
+    write_samples(folder, [entry.sample for entry in stored])
 
     tasks.measure({"model": of_models(settings, "default")}, folder, ignore_step)
     storage.put(learned_key(lens, state.version, state.rebuild_epoch), (folder / LEARNED).read_bytes())

@@ -19,6 +19,7 @@ from app.jobs.correction_work import CorrectionWork
 from app.jobs.missing_reports import ask_for_reports
 from app.jobs.photo_work import PhotoWork
 from app.jobs.queue import Handler, Job, Kind, Status
+from app.jobs.sample_files import write_samples
 from app.jobs.task_files import EARLIER, FAMILY, KERNELS, LEARNED, PREVIEW, SAMPLES
 from app.runtime.settings import Settings
 from app.sandbox.budget import Budget
@@ -27,11 +28,13 @@ from app.sandbox.outcome import Outcome, TaskLimits
 from app.store import Store
 from app.store.tables import PhotoRow
 from app.store.versions import LEARNED_VERSION, learned_key, report_key
-from lensmodel.core.psf import gaussian
-from lensmodel.core.types import ignore_step
+from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings, ignore_step
 from lensmodel.model import learned
 
 Answer = Callable[[dict[str, Any], Path], Outcome]
+KERNEL = gaussian(15, np.eye(2))
+ELSEWHERE = FieldPosition(1.0, 3.0)  # a sample of a patch lies where its patch does, whatever a child says
 LENS = {"maker": "Canon", "model": "EF24mm f/1.4L", "serial": "123", "serial_source": "exif"}
 INFO = {
     "kind": "dng",
@@ -80,21 +83,14 @@ def develop(arguments: dict[str, Any], folder: Path) -> Outcome:
 
 
 def estimate(arguments: dict[str, Any], folder: Path) -> Outcome:
-    listed = [
-        {
-            "idx": number,
-            "channel": channel,
-            "weight": 0.5,
-            "estimator": "whittle/1",
-            "predicted_error": 0.1,
-            "diagnostics": {},
-            "spectrum": None,
-        }
-        for number in arguments["numbers"]
-        for channel in ("r", "g", "b")
+    numbers = [number for number in arguments["numbers"] for _ in CHANNELS]
+    samples = [
+        PsfSample(KERNEL, ELSEWHERE, LensSettings(channel=channel), 0.5, estimator="whittle/1", error=0.1)
+        for _ in arguments["numbers"]
+        for channel in CHANNELS
     ]
-    np.save(folder / KERNELS, np.stack([gaussian(15, np.eye(2))] * len(listed)))
-    return Outcome("ok", value=listed)
+    write_samples(folder, samples)
+    return Outcome("ok", value=[{"idx": number, "diagnostics": {}} for number in numbers])
 
 
 class Scripted:
@@ -242,10 +238,46 @@ def test_patches_are_chosen_by_whom_the_photo_names_else_by_the_services_own(
 
 
 def measured(arguments: dict[str, Any], folder: Path) -> Outcome:
-    np.save(folder / KERNELS, np.stack([gaussian(15, np.eye(2))] * 2))
-    entry = {"idx": 0, "row": 9, "col": 9, "side": 144, "r": 0.2, "phi": 0.1, "error": 0.04}
     estimator = f"measured-{arguments['kind']}/1"
-    return Outcome("ok", value=[entry | {"channel": c, "estimator": estimator} for c in "gr"])
+    samples = [
+        PsfSample(KERNEL, FieldPosition(0.2, 0.1), LensSettings(channel=c), estimator=estimator, error=0.04)
+        for c in ("g", "r")
+    ]
+    write_samples(folder, samples)
+    return Outcome("ok", value=[{"idx": 0, "row": 9, "col": 9, "side": 144}] * 2)
+
+
+def test_samples_lie_where_their_patches_do(
+    work: PhotoWork, context: JobContext, photo: PhotoRow, steps: Any
+) -> None:
+    work.photo(photo.public_id, 1)
+
+    _, samples = context.store.samples.of_lens(steps.lens_id(photo))
+    assert {(round(entry.sample.position.r, 9), entry.sample.position.phi) for entry in samples} == {
+        (0.1, 0.5),
+        (0.3, 0.5),
+    }
+
+
+def nobody_elses_patch(arguments: dict[str, Any], folder: Path) -> Outcome:
+    listed = estimate(arguments, folder).value
+    return Outcome("ok", value=[entry | {"idx": 77} for entry in listed])
+
+
+def fewer_than_announced(arguments: dict[str, Any], folder: Path) -> Outcome:
+    listed = estimate(arguments, folder).value
+    return Outcome("ok", value=listed[:-1])
+
+
+@pytest.mark.parametrize("child", [nobody_elses_patch, fewer_than_announced, ok(None), ok([{"idx": 0}])])
+def test_a_cell_whose_child_answers_nonsense_fails(
+    work: PhotoWork, context: JobContext, sandbox: Scripted, photo: PhotoRow, steps: Any, child: Answer
+) -> None:
+    sandbox.answers["estimate"] = [child]
+    work.photo(photo.public_id, 1)
+
+    patches = context.store.patches.all_of(photo.public_id, 1)
+    assert {(row.state, row.reason) for row in patches} == {("failed", "internal_error")}
 
 
 def test_a_photo_of_the_target_counts_with_what_was_measured_and_no_blind_estimate(

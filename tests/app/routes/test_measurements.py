@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
+import json
+import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
+from app.jobs import tasks
 from app.jobs.context import JobFailedError
 from app.jobs.measurement_work import _checked
-from app.jobs.task_files import KERNELS
+from app.jobs.sample_files import write_samples
+from app.jobs.task_files import SAMPLES
 from app.store import Store
-from lensmodel.core.psf import gaussian
+from lensmodel.core.geometry import Frame
+from lensmodel.core.psf import PsfSample, gaussian
+from lensmodel.core.registry import Registry
+from lensmodel.core.types import FieldPosition, NoiseModel, ignore_step
+from lensmodel.estimation.measure import MeasuredPsf
+from lensmodel.photo import LinearPhoto
+from lensmodel.photo.values import Encoding, PhotoInfo
+from lensmodel.workflow import pipeline
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 PNG = b"\x89PNG\r\n\x1a\n" + b"\0" * 4096
@@ -21,11 +33,16 @@ PNG = b"\x89PNG\r\n\x1a\n" + b"\0" * 4096
 
 def place(number: int, channel: str = "g", **changed: Any) -> dict[str, Any]:
     entry = {"idx": number, "row": 10, "col": 20, "side": 144, "r": 0.3, "phi": 0.1 * number}
-    return entry | {"channel": channel, "error": 0.04, "estimator": "measured-target/1"} | changed
+    return entry | {"settings": {"channel": channel}, "error": 0.04} | changed
 
 
 def answered(folder: Path, listed: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    np.save(folder / KERNELS, np.stack([gaussian(15, np.eye(2))] * len(listed)))
+    """Write samples with the fields of `listed`, which may be nonsense."""
+    kernel, estimator = gaussian(15, np.eye(2)), "measured-target/1"
+    write_samples(folder, [PsfSample(kernel, FieldPosition(0.0, 0.0), estimator=estimator) for _ in listed])
+    entries = json.loads((folder / SAMPLES).read_text())
+    written = [entry | own for entry, own in zip(entries, listed, strict=True)]
+    (folder / SAMPLES).write_text(json.dumps(written))
     return listed
 
 
@@ -40,9 +57,65 @@ def test_what_a_child_measured_becomes_patches_with_samples(tmp_path: Path) -> N
     assert {new.sample.estimator for new in samples} == {"measured-target/1"}
 
 
+class AtTwoPlaces:
+    """Measures the middle well in two colours, and a corner so badly that it cannot say how badly."""
+
+    name: ClassVar[str] = "quick"
+    version: ClassVar[int] = 3
+    photos: ClassVar[int] = 1
+
+    def measure(self, photos: Sequence[LinearPhoto], *, size: int, **_: Any) -> list[MeasuredPsf]:
+        kernel, middle, corner = gaussian(size, np.eye(2)), FieldPosition(0.1, 0.2), FieldPosition(0.9, -2.0)
+        return [
+            MeasuredPsf(kernel, middle, "g", 0.04, (30.0, 40.0), 21),
+            MeasuredPsf(kernel, corner, "g", math.inf, (50.5, 4.5), 8),
+            MeasuredPsf(kernel, middle, "r", 0.05, (30.0, 40.0), 21),
+        ]
+
+
+def test_what_the_task_measures_arrives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shot = LinearPhoto(
+        planes=np.zeros((3, 60, 80), np.float32),
+        frame=Frame(60, 80),
+        noise=(NoiseModel.white(0.01),) * 3,
+        clip=(1.0, 1.0, 1.0),
+        info=PhotoInfo("dng", 80, 60),
+        encoding=Encoding(),
+        pipeline="test",
+    )
+    pipeline.save_developed(shot, tmp_path / "developed")
+    monkeypatch.setattr(tasks.lens_measure, "methods", Registry("way of measuring", {"quick": AtTwoPlaces}))
+    settings = {"aperture": 2.8, "focal_mm": None, "focus_m": -1.0}
+    arguments = {"developed": [str(tmp_path / "developed")], "photo": "p1", "settings": settings}
+
+    listed = tasks.measure_lens(arguments | {"kind": "quick", "size": 15}, tmp_path, ignore_step)
+    patches, samples = _checked(json.loads(json.dumps(listed)), tmp_path)
+
+    assert [(p.idx, p.row, p.col, p.size, p.score) for p in patches] == [
+        (0, 20, 30, 21, 0.96),
+        (1, 47, 1, 8, 0),
+    ]
+    assert [(new.idx, new.sample.settings.channel, new.sample.error) for new in samples] == [
+        (0, "g", 0.04),
+        (1, "g", 1.0),
+        (0, "r", 0.05),
+    ]
+    assert {(new.sample.estimator, new.sample.weight) for new in samples} == {("measured-quick/3", 1.0)}
+
+
 @pytest.mark.parametrize(
     "changed",
-    [{"channel": "x"}, {"error": 7.0}, {"error": float("nan")}, {"r": 2.0}, {"idx": -1}, {"row": "a"}],
+    [
+        {"settings": {"channel": "x"}},
+        {"error": None},
+        {"error": 7.0},
+        {"error": float("nan")},
+        {"r": 2.0},
+        {"weight": 2.0},
+        {"idx": -1},
+        {"idx": float("inf")},
+        {"row": "a"},
+    ],
 )
 def test_nonsense_of_a_child_is_refused(tmp_path: Path, changed: dict[str, Any]) -> None:
     with pytest.raises(JobFailedError, match="gave no kernels"):

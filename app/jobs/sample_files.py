@@ -1,0 +1,114 @@
+"""PSF samples between workers and their tasks: what the codec of samples makes of them, as files of a folder.
+
+In the folder `KERNELS`, `SPECTRA` and `PHASES` are npy files, `SAMPLES` is JSON; see `PackedSamples`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from tokenize import TokenError
+from typing import Final
+
+import numpy as np
+from numpy.lib.format import open_memmap
+from numpy.typing import NDArray
+
+from app.jobs.task_files import KERNELS, PHASES, SAMPLES, SPECTRA
+from app.sandbox.outcome import MAX_RESULT
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.files import save_array
+from lensmodel.core.psf import PsfSample
+from lensmodel.model.sample_codec import PackedSamples, pack_samples, unpack_samples
+
+MAX_SIDE: Final = 255
+"""Pixels across a returned kernel at most (chosen): what a profile holds, see docs/profile-format.md."""
+
+DAMAGED: Final = (
+    InvalidInputError,
+    OSError,
+    *(ValueError, TypeError, LookupError, AttributeError),  # other shapes, or not the expected JSON
+    *(ArithmeticError, MemoryError, RecursionError),  # numbers, arrays and lists as large as one may claim
+    TokenError,  # a header that NumPy takes for one of Python 2
+)
+"""What reading the answer of a task raises if the task did not write what it should."""
+
+
+def write_samples(folder: Path, samples: Sequence[PsfSample]) -> None:
+    """Write samples for a task, or for the worker that waits for them.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the task.
+    samples : sequence of PsfSample
+        One at least.
+    """
+    packed = pack_samples(samples)
+    for name, array in ((KERNELS, packed.kernels), (SPECTRA, packed.spectra), (PHASES, packed.phases)):
+        if array is not None:
+            with (folder / name).open("wb") as file:
+                save_array(file, array)
+    (folder / SAMPLES).write_text(json.dumps(packed.entries), encoding="utf-8")
+
+
+def read_samples(folder: Path) -> list[PsfSample]:
+    """Read what `write_samples` wrote.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the task.
+
+    Returns
+    -------
+    list of PsfSample
+    """
+    return unpack_samples(_packed(folder))
+
+
+def returned_samples(folder: Path, *, count: int) -> list[PsfSample]:
+    """Read the samples that a task returned, as untrusted input.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the task, which the photo that it decoded may have taken over.
+    count : int
+        How many there must be.
+
+    Returns
+    -------
+    list of PsfSample
+
+    Raises
+    ------
+    InvalidInputError
+        If there are not `count`, or their kernels are wider than `MAX_SIDE`, or a value is out of its range.
+        Files of another kind raise any other of `DAMAGED`.
+    """
+    if (folder / SAMPLES).stat().st_size > MAX_RESULT:
+        raise InvalidInputError(f"{SAMPLES} is larger than {MAX_RESULT} bytes")
+    packed = _packed(folder)
+    entries, kernels = packed.entries, packed.kernels
+    if not isinstance(entries, list) or kernels.ndim != 3 or kernels.dtype != "<f4":
+        raise InvalidInputError(f"samples that the codec did not write: kernels {kernels.shape}")
+    if not len(entries) == len(kernels) == count or kernels.shape[1] > MAX_SIDE:
+        raise InvalidInputError(
+            f"{count} samples announced, {len(entries)} and kernels {kernels.shape} written"
+        )
+    return unpack_samples(packed)
+
+
+def _packed(folder: Path) -> PackedSamples:
+    entries = json.loads((folder / SAMPLES).read_text(encoding="utf-8"))
+    spectra, phases = (
+        _mapped(folder / name) if (folder / name).is_file() else None for name in (SPECTRA, PHASES)
+    )
+    return PackedSamples(entries, _mapped(folder / KERNELS), spectra, phases)
+
+
+def _mapped(path: Path) -> NDArray[np.float32]:
+    """Map an npy file, since its header may claim any size; never an archive or a pickle in its place."""
+    return open_memmap(path, mode="r")

@@ -1,0 +1,125 @@
+"""Samples in the folder of a task: written by one process, read by another that trusts it or does not."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.jobs import sample_files
+from app.jobs.sample_files import DAMAGED, MAX_SIDE, read_samples, returned_samples, write_samples
+from app.jobs.task_files import KERNELS, PHASES, SAMPLES, SPECTRA
+from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.psf import PsfSample, delta, gaussian
+from lensmodel.core.spectrum import RINGS, SECTORS, PatchSpectrum
+from lensmodel.core.types import FieldPosition, LensSettings
+
+SPECTRUM = PatchSpectrum(np.ones((RINGS, SECTORS), dtype=np.float32), 0.5, (1.0, 2.0))
+SAMPLE = PsfSample(
+    gaussian(5, np.eye(2)),
+    FieldPosition(0.4, 0.3),
+    LensSettings(2.8, channel="b"),
+    weight=0.25,
+    estimator="quick/1",
+    spectrum=SPECTRUM,
+    error=0.2,
+)
+Damage = Callable[[Path], object]
+
+
+def test_a_returned_sample_is_that_of_the_task(tmp_path: Path) -> None:
+    write_samples(tmp_path, [SAMPLE, PsfSample(delta(3), FieldPosition(0.0, 0.0))])
+
+    first, second = returned_samples(tmp_path, count=2)
+
+    np.testing.assert_allclose(first.kernel, SAMPLE.kernel, atol=1e-7)
+    assert first.spectrum is not None
+    assert first.spectrum.to_bytes() == SPECTRUM.to_bytes()
+    assert (first.position, first.settings, first.weight) == (SAMPLE.position, SAMPLE.settings, 0.25)
+    assert (first.estimator, first.error) == ("quick/1", 0.2)
+    assert (second.kernel.shape, second.spectrum) == ((3, 3), None)
+    assert [sample.error for sample in read_samples(tmp_path)] == [0.2, None]
+
+
+def array(name: str, values: np.ndarray) -> Damage:
+    return lambda folder: np.save(folder / name, values)
+
+
+def changed(**values: object) -> Damage:
+    def damage(folder: Path) -> None:
+        (entry,) = json.loads((folder / SAMPLES).read_text())
+        (folder / SAMPLES).write_text(json.dumps([entry | values]))
+
+    return damage
+
+
+def text(written: str) -> Damage:
+    return lambda folder: (folder / SAMPLES).write_text(written)
+
+
+def raw(content: bytes) -> Damage:
+    return lambda folder: (folder / KERNELS).write_bytes(content)
+
+
+def archive(folder: Path) -> None:
+    with (folder / KERNELS).open("wb") as file:
+        np.savez(file, np.ones((1, 5, 5), dtype=np.float32))
+
+
+def boundless(folder: Path) -> None:
+    with (folder / KERNELS).open("wb") as file:
+        head = {"descr": "<f4", "fortran_order": False, "shape": (1, 10**9, 10**9)}
+        np.lib.format.write_array_header_1_0(file, head)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        raw(b""),
+        raw(b"PK\x03\x04" + bytes(40)),
+        raw(pickle.dumps(np.ones((1, 5, 5)))),
+        archive,
+        boundless,
+        array(KERNELS, np.ones((1, 5, 5))),
+        array(KERNELS, np.ones((2, 5, 5), dtype=np.float32)),
+        array(KERNELS, np.ones((5, 5), dtype=np.float32)),
+        array(KERNELS, np.full((1, 5, 5), np.nan, dtype=np.float32)),
+        array(KERNELS, np.ones((1, MAX_SIDE + 2, MAX_SIDE + 2), dtype=np.float32)),
+        array(SPECTRA, np.ones((1, 3), dtype=np.float32)),
+        array(PHASES, np.ones((4, 168), dtype=np.float32)),
+        changed(size=float("inf")),
+        changed(size=7),
+        changed(weight=2.0),
+        changed(error="small"),
+        changed(r=10**400),
+        changed(settings={"channel": "x"}),
+        changed(settings={"zoom": 2}),
+        text("{}"),
+        text("5"),
+        text("[5]"),
+        text('["size"]'),
+        text("[" * 10**5),
+        lambda folder: (folder / SAMPLES).unlink(),
+        lambda folder: (folder / KERNELS).unlink(),
+    ],
+)
+def test_whatever_a_child_wrote_instead_is_refused(tmp_path: Path, damage: Damage) -> None:
+    write_samples(tmp_path, [SAMPLE])
+    damage(tmp_path)
+
+    with pytest.raises(DAMAGED):
+        returned_samples(tmp_path, count=1)
+
+
+def test_entries_that_are_too_long_to_read_are_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_samples(tmp_path, [SAMPLE])
+    monkeypatch.setattr(sample_files, "MAX_RESULT", 100)
+
+    with pytest.raises(InvalidInputError, match="larger than 100 bytes"):
+        returned_samples(tmp_path, count=1)

@@ -1,0 +1,78 @@
+"""What the commands fit that made the constants of blind estimators."""
+
+from __future__ import annotations
+
+import json
+import lzma
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lensmodel.lab.blind.polyblur_law import SIGMAS_PX, law_of, slopes_behind
+from lensmodel.lab.blind.recurrence_line import is_of, line_through, readings, rows_of
+
+
+def test_the_law_of_slopes_is_recovered_from_slopes_that_follow_it() -> None:
+    sigmas = np.array(SIGMAS_PX)
+
+    c, b = law_of(sigmas, 0.3 / np.hypot(sigmas, 0.9))
+
+    assert (c, b) == pytest.approx((0.3, 0.9), rel=1e-6)
+
+
+def test_the_law_of_slopes_is_that_of_a_step_where_windows_hold_one() -> None:
+    """A step of height 1, square pixels and a probe of 0.7 px: c = 1 / sqrt(2 pi), b² = 0.49 + 1/12 + 1/4.
+
+    The edge lies between two pixels; half a pixel beside it the slope is that of a variance larger by 1/4, to
+    first order.
+    """
+    step = np.tile(np.where(np.arange(122) < 61, 0.05, 0.85), (122, 1))
+    sigmas = np.array(SIGMAS_PX[4:])
+    rng = np.random.default_rng(0)
+
+    across = [np.median(slopes_behind([step], sigma, rng)[:, 3]) for sigma in sigmas]
+
+    c, b = law_of(sigmas, np.array(across))
+    assert c == pytest.approx(1 / math.sqrt(2 * math.pi), rel=0.05)
+    assert b == pytest.approx(math.sqrt(0.49 + 1 / 12 + 1 / 4), rel=0.15)
+
+
+def test_the_line_of_recurrence_is_recovered_from_points_that_lie_beside_it() -> None:
+    apart = np.linspace(0.05, 0.3, 40)
+    beside = 0.01 * (-1.0) ** np.arange(40)
+
+    line = line_through(apart, 0.4 + 1.2 * apart + beside)
+
+    assert (line.at_agreement, line.by_disagreement) == pytest.approx((0.4, 1.2), abs=0.02)
+    # of a line's slope: spread of the errors over that of the points and the root of their number
+    assert line.spread[1] == pytest.approx(0.01 / (apart.std() * math.sqrt(38)), rel=0.02)
+
+
+def row(case: str, predicted: float, **changed: Any) -> dict[str, Any]:
+    usual = {"method": "michaeli-irani", "declined": False, "rel_l2": 0.5}
+    return {"case": case, "predicted_error": predicted, **usual, **changed}
+
+
+def test_disagreements_are_read_back_from_predicted_errors_that_are_no_bound() -> None:
+    apart, error = readings([row("a/psf00", 0.57), row("a/psf01", 1.0), row("a/psf02", 0.67, rel_l2=0.7)])
+
+    np.testing.assert_allclose(apart, [0.1, 0.2])
+    np.testing.assert_allclose(error, [0.5, 0.7])
+
+
+def test_cases_are_read_from_reports_and_from_packed_lines(tmp_path: Path) -> None:
+    rows = [row("a/psf00", 0.5), row("b/psf01", 0.6, method="default"), row("c/psf02", 0.7, declined=True)]
+    (tmp_path / "blind.json").write_text(json.dumps({"cases": rows}))
+    with lzma.open(tmp_path / "cases.jsonl.xz", "wt") as file:
+        file.writelines(json.dumps(stored) + "\n" for stored in rows)
+
+    assert rows_of(tmp_path / "blind.json") == rows_of(tmp_path / "cases.jsonl.xz") == rows[:1]
+
+
+def test_a_case_is_of_a_half_by_its_photo_and_its_psf() -> None:
+    assert is_of("dev", "s07_tea_gardens+3/psf00")
+    assert not is_of("test", "s07_tea_gardens+3/psf00")
+    assert is_of("all", "s07_tea_gardens/psf01")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.files import write_atomically
 
 Unit: TypeAlias = dict[str, Any]
 """What one file holds: plain values."""
@@ -27,9 +27,7 @@ def stored(path: Path, make: Callable[[], Unit]) -> tuple[Unit, bool]:
         return read(path), False
     unit = make()
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile("w", dir=path.parent, suffix=".part", delete=False) as part:
-        json.dump(unit, part, indent=1, allow_nan=False)
-    Path(part.name).replace(path)
+    write_atomically(path, json.dumps(unit, indent=1, allow_nan=False).encode())
     return unit, True
 
 

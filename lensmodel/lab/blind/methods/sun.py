@@ -25,7 +25,7 @@ from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
 from lensmodel.estimation.estimator import PsfEstimate, usable
 from lensmodel.estimation.steps.finish import finished
 from lensmodel.lab.blind.steps.cleaning import cleaned
-from lensmodel.lab.blind.steps.edge_patches import SIDE, PatchPrior, default_prior, edge_mask, target
+from lensmodel.lab.blind.steps.edge_patches import SIDE, EdgePatchPrior, default_prior, edge_mask, target
 from lensmodel.lab.blind.steps.kernel_step import Grid, Term, least_squares_kernel
 from lensmodel.lab.blind.steps.pyramid import Image, Level, LevelResult, Schedule, Tick, View, coarse_to_fine
 from lensmodel.lab.blind.steps.starting_from import StartingFrom
@@ -117,7 +117,7 @@ class _Alternation:
     """The alternation on one level; its last kernel step stays for the verdict."""
 
     method: Sun
-    prior: PatchPrior
+    prior: EdgePatchPrior
     terms: tuple[Term, ...] = ()
 
     def __call__(self, level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:

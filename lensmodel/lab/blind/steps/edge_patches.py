@@ -35,7 +35,7 @@ Image = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PatchPrior:
+class EdgePatchPrior:
     """Patterns of sharp edges and the distribution of their contrast.
 
     Parameters
@@ -50,7 +50,7 @@ class PatchPrior:
     steepness: Image
 
     @classmethod
-    def load(cls, path: Path = _DATA) -> PatchPrior:
+    def load(cls, path: Path = _DATA) -> EdgePatchPrior:
         """Read what `lensmodel.lab.training.make_edge_patches` wrote."""
         with np.load(path, allow_pickle=False) as stored:
             return cls(stored["patches"].astype(np.float64), stored["steepness"].astype(np.float64))
@@ -73,9 +73,9 @@ class PatchPrior:
 
 
 @lru_cache(maxsize=1)
-def default_prior() -> PatchPrior:
+def default_prior() -> EdgePatchPrior:
     """Return the prior that ships with the library."""
-    return PatchPrior.load()
+    return EdgePatchPrior.load()
 
 
 def edge_mask(x: Image, share: float = EDGE_SHARE) -> NDArray[np.bool_]:
@@ -130,7 +130,7 @@ def local_range(x: Image) -> Image:
     )
 
 
-def target(x: Image, mask: NDArray[np.bool_], prior: PatchPrior) -> tuple[Image, Image]:
+def target(x: Image, mask: NDArray[np.bool_], prior: EdgePatchPrior) -> tuple[Image, Image]:
     """Mean of the sharp windows over each pixel, and how many lie over it.
 
     Returns

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
+from lensmodel.core.files import write_atomically
 from lensmodel.lab.reproduce.pages.tables import table
 
 _STYLE = """
@@ -64,11 +64,6 @@ class Page:
 
 
 def written_whole(path: Path, text: str) -> Path:
-    """Write a file that appears whole or not at all."""
-    with tempfile.NamedTemporaryFile(
-        "w", dir=path.parent, suffix=".part", delete=False, encoding="utf-8"
-    ) as part:
-        part.write(text)
-    Path(part.name).chmod(0o644)
-    Path(part.name).replace(path)
+    """Write a text that appears whole or not at all, and return its path."""
+    write_atomically(path, text.encode())
     return path

@@ -36,7 +36,7 @@ SPAN: Final = re.compile(r"(\d{1,6})(h|d|w|y)", re.ASCII)
 HOURS: Final = {"h": 1, "d": 24, "w": 24 * 7, "y": 24 * 365}
 """Hours of each unit of a span."""
 
-GIB: Final = 1 << 30
+GIB: Final = 1 << 30  # bytes of a GiB
 
 
 def _span(text: str) -> timedelta:

@@ -21,7 +21,7 @@ from lensmodel.simulate import CameraLens
 
 log = logging.getLogger(__name__)
 
-_PATIENCE = 4 * 3600.0
+_PATIENCE = 4 * 3600.0  # seconds for all photos of a case (chosen): a service that hangs ends the run
 
 CODE = tuple(Path(__file__).parents[1] / name for name in ("jobs", "sandbox"))
 """Code of the service on which the figures depend."""

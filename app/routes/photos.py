@@ -67,7 +67,7 @@ _UPLOAD_BODY = {
     },
 }
 
-_REFUSED: Final = (400, 403, 404, 408, 409, 413, 415, 422, 429, 507)
+_REFUSED: Final = (400, 403, 404, 408, 409, 413, 415, 422, 429, 507)  # of uploads and the checks before them
 _RECEIVED: Final = problems(
     *_REFUSED, also={200: {"model": PhotoOut, "description": "The same bytes are known"}}
 )

@@ -21,7 +21,7 @@ PREFIX = "LENS_"
 CLIENT_KEY = "LENS_API_KEY"
 """Not a setting of the service: the key that its clients send."""
 
-MIB = 1024 * 1024
+MIB = 1024 * 1024  # bytes
 LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
 
 

@@ -37,9 +37,9 @@ DATA: Final = Path(__file__).parent / "data"
 WHITE: Final = 0.9
 """Level of a scene's 99.5 percentile."""
 
-JPEG_QUALITY: Final = 90
+JPEG_QUALITY: Final = 90  # of the camera (chosen)
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
-_CHOICE_SIGMA = 0.01
+_CHOICE_SIGMA = 0.01  # noise by which windows are ranked: that of most cases (chosen)
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-_POINT_PX = 0.1
-_DROPPED = 0.3
+_POINT_PX = 0.1  # RMS width below which a true PSF is a point: one of a single pixel has 0 (chosen)
+_DROPPED = 0.3  # share of the least confident (chosen)
 
 
 def summary(rows: list[dict[str, Any]]) -> str:

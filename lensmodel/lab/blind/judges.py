@@ -115,7 +115,7 @@ class HyperLaplacian:
         return _inner(half_quadratic(y, data, power, betas, led_back, curvature=laplacian, floor=1e-12))
 
 
-_TABLE_REACH: Final = 1.5
+_TABLE_REACH: Final = 1.5  # where tables end at least: gradients of scenes in 0..1 hardly go beyond (chosen)
 
 
 @lru_cache(maxsize=32)

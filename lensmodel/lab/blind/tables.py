@@ -17,16 +17,16 @@ from PIL import Image, ImageDraw, ImageFont
 from lensmodel.lab.blind.results import UNTOUCHED, BlindReport, CaseResult
 from lensmodel.report.drawing import COLOURS, GREY, PALE, Label, Line, svg
 
-WIDTH: Final = 640
+WIDTH: Final = 640  # layout in points (chosen), as in `lensmodel.report.pictures`
 HEIGHT: Final = 400
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 170, 34, 48
-LOWEST: Final = 1.0
+LOWEST: Final = 1.0  # error ratios on the axis: 1 is the true kernel; few lie beyond 10 (chosen)
 HIGHEST: Final = 10.0
 _HEADS = (
     *("noise", "method", "cases", "better than blurry", "ER < 3", "ER < 2", "ER median (p90)"),
     *("NCC", "rel. L2", "MTF error", "width", "seconds"),
 )
-_PNG_SCALE = 2
+_PNG_SCALE = 2  # pixels a point (chosen): sharp on dense screens
 
 
 def markdown_table(report: BlindReport) -> str:

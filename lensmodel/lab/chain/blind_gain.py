@@ -52,9 +52,9 @@ from lensmodel.simulate import (
 from lensmodel.workflow import pipeline
 
 CAMERA: Final = SimulatedCamera(height=900, width=1350, full_well_electrons=20_000.0)
-MARGIN, BLOCK, RIM = 64, 128, 8
-LOSS_DB: Final = 0.5
-FALL_DB: Final = 0.05
+MARGIN, BLOCK, RIM = 64, 128, 8  # pixels beyond a crop, of a block, along the rim (chosen)
+LOSS_DB: Final = 0.5  # of a block, that counts (chosen)
+FALL_DB: Final = 0.05  # of a zone, that counts (chosen)
 PLACES: Final = [FieldPosition(r, phi) for r in (0.05, 0.35, 0.6, 0.85) for phi in (0.4, 2.0, -2.4, -0.9)]
 
 

@@ -28,10 +28,10 @@ from lensmodel.lab.cases import list_photos
 from lensmodel.photo.dng import write_bayer_dng
 from lensmodel.simulate import load_scene
 
-_WHITE, _ELECTRONS, _READ = 16383, 50_000.0, 0.001
-_BLUR_PX = 0.8
+_WHITE, _ELECTRONS, _READ = 16383, 50_000.0, 0.001  # 14 bits, a full well, read noise over it (chosen)
+_BLUR_PX = 0.8  # of the lens (chosen)
 _PAGE = os.sysconf("SC_PAGE_SIZE")
-_BALANCE = (0.5, 1.0, 0.65)
+_BALANCE = (0.5, 1.0, 0.65)  # of r, g, b in the light of day (chosen)
 
 
 def compose(files: Sequence[Path], megapixels: float, first: int, target: Path) -> None:

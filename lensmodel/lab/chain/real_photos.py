@@ -58,7 +58,7 @@ SLOPES = np.linspace(1.6, 3.2, 17)
 USUAL_SLOPE, SLOPE_SCATTER = 2.4, 0.35
 FILL = 0.01
 """What fills the zeros of |OTF|^2 where blur changes within a patch; the same for all that are compared."""
-WIDTHS_PX = (0.3, 0.45, 0.6, 0.75, 0.9, 1.1, 1.3, 1.6, 2.0, 2.5)
+WIDTHS_PX = (0.3, 0.45, 0.6, 0.75, 0.9, 1.1, 1.3, 1.6, 2.0, 2.5)  # of Gaussians to compare with (chosen)
 
 
 @dataclass(frozen=True)

@@ -56,12 +56,12 @@ KINDS: Final = ("soft-fast", "coma", "astigmatism", "decentred", "nearly-perfect
 HALVES: Final[dict[str, int]] = {"development": 1, "held out": 2}
 """Number of the first photograph of each half; the others follow two by two."""
 
-RGGB: Final[BayerPattern] = ((0, 1), (1, 2))
-_SCENES: Final = 24
+RGGB: Final[BayerPattern] = ((0, 1), (1, 2))  # colour by row and column of the mosaic: red first
+_SCENES: Final = 24  # photographs of docs/lab/data.md
 _EXPOSURE: Final = 0.9  # of the photograph's own: what is white there stays below saturation
-_KERNEL: Final = 55
+_KERNEL: Final = 55  # pixels: the largest side that estimators give
 _NODES: Final = 3  # kernels along a side of the window; between them they fade into each other
-_RIM: Final = 8
+_RIM: Final = 8  # pixels that corrections know less of: no block lies there (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

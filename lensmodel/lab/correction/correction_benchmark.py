@@ -28,8 +28,8 @@ from lensmodel.lab.correction.methods import compared
 from lensmodel.lab.peers import Peer
 from lensmodel.quality.images import to_srgb
 
-_TILE = 256
-_KERNEL = 25
+_TILE = 256  # pixels: a tile of the engine
+_KERNEL = 25  # pixels: of a blur of 2 px (chosen)
 
 
 @dataclass(frozen=True, slots=True)

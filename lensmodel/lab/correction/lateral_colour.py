@@ -29,7 +29,7 @@ from lensmodel.simulate import load_scene
 TRUE: dict[Channel, tuple[float, float, float]] = {"r": (0.0004, 0.0, 1.0006), "b": (-0.0003, 0.0, 0.9992)}
 """b, c and v of r (v + c r + b r²), r in halves of the shorter side, as Hugin has them."""
 PHOTOS = ("s10", "s05", "s17")
-RADII = (0.5, 0.9)
+RADII = (0.5, 0.9)  # of the field (chosen): half way, and near the corner
 
 
 def shift(terms: tuple[float, ...], r: float, frame: Frame) -> float:

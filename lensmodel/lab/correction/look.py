@@ -32,10 +32,10 @@ from lensmodel.simulate import draw_lens
 
 SIZE = tuple(extent + 238 for extent in WINDOW)
 """As large as a window and all around it that the lens draws light from."""
-OVER = 3
-CROP = 360
-ERROR = 0.4
-FLAT = 12
+OVER = 3  # samples a pixel along each axis (chosen)
+CROP = 360  # pixels that are shown (chosen)
+ERROR = 0.4  # expected of the PSF (chosen): usual after one photo
+FLAT = 12  # pixels of the squares that grain is measured in (chosen)
 
 
 def chart() -> Planes:

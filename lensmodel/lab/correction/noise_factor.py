@@ -31,7 +31,7 @@ from lensmodel.photo import LinearPhoto, develop
 from lensmodel.photo.values import PlaneNoise
 from lensmodel.simulate import draw_lens
 
-FRAME = (480, 640)
+FRAME = (480, 640)  # rows and columns (chosen): a run of minutes
 FILES = ("base", "high-iso", "tiff", "jpeg")
 
 

@@ -40,6 +40,8 @@ CORNERS: Final[dict[str, tuple[int, int]]] = {"center": (840, 1260), "mid": (340
 SWEEP: Final = (0.5, 2.0)
 """Factors on the strength of the prior that are tried against the truth."""
 _AROUND, _KERNEL, _NODES, _RIM, _NEAR = 64, 55, 120, 8, 16
+"""Pixels around a window that are corrected with it, across a kernel, between kernels, along the rim that
+does not count, and beside clipped light that count as near it (chosen)."""
 
 Gains = dict[str, dict[str, tuple[float, float]]]
 """Gain in PSNR (dB) and SSIM by method and zone."""

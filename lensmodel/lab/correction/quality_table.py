@@ -39,7 +39,7 @@ from lensmodel.simulate import draw_lens
 KINDS = ("soft-fast", "coma", "astigmatism", "decentred", "nearly-perfect")
 PAIRS = (("s05", "s17"), ("s19", "s21"))
 LAMPS = ("s06", "s01")
-LAMP_GAIN = 2.5
+LAMP_GAIN = 2.5  # by which lamps outshine the scene (chosen)
 
 
 @dataclass(frozen=True)

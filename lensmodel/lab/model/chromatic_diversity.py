@@ -49,9 +49,9 @@ FACTORS: Final = (0.5, 0.75, 1.0, 1.25, 1.5)
 _SIDE: Final = 41
 _SCATTER: Final = 0.2
 """Of ln of the ratio in a bin, between patches: `docs/lab/accuracy.md`, about the middle of its bands."""
-_ROUNDS, _TRIES, _STRIDE_PX = 25, 5, 1.0
+_ROUNDS, _TRIES, _STRIDE_PX = 25, 5, 1.0  # of the descent, its tries each, its longest step (chosen)
 _LIMIT: Final = 1.0  # of a residual of ln ratio: near zeros of a transfer function it counts no more (chosen)
-_ZONES: Final = (slice(0, 4), slice(4, 12), slice(12, 16))
+_ZONES: Final = (slice(0, 4), slice(4, 12), slice(12, 16))  # of the places: center, mid field, corner
 
 Floats = NDArray[np.float64]
 

@@ -44,11 +44,11 @@ from lensmodel.model import LensModel, ModelSettings, fit_wavefront, smoothers
 from lensmodel.model.answer import KERNELS, MODES
 from lensmodel.simulate import draw_lens
 
-FRAME = Frame(2832, 4256)
-PATCHES = (4, 6)
-SIZE = 31
-MARGIN_PX = 96
-_SOFT_PX, _GRAIN = 1.1, 0.4
+FRAME = Frame(2832, 4256)  # 12 megapixels, 3:2 (chosen)
+PATCHES = (4, 6)  # rows and columns: 24 patches, as a calibration has in one photo
+SIZE = 31  # pixels: that of an estimate
+MARGIN_PX = 96  # half a window of a calibration: patches lie within the frame
+_SOFT_PX, _GRAIN = 1.1, 0.4  # at level 1: by them `level` is about the relative L2, see below
 
 Predictor = Callable[[FieldPosition], Kernel]
 Fit = Callable[[Sequence[PsfSample]], Predictor]

@@ -29,9 +29,9 @@ from lensmodel.model import LensModel, ModelSettings
 from lensmodel.simulate import SimulatedCamera, SimulatedField, draw_lens, load_scene, photograph, write_photo
 from lensmodel.workflow import pipeline
 
-_PLACES = 48
+_PLACES = 48  # on a spiral over the field (chosen)
 _GOLDEN = math.pi * (3.0 - math.sqrt(5.0))
-_SIZE = 31
+_SIZE = 31  # pixels: that of an estimate
 WAVEFRONT = ModelSettings(mode="wavefront")
 
 

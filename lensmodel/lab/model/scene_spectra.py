@@ -33,7 +33,7 @@ from lensmodel.workflow import pipeline
 
 Floats = NDArray[np.float64]
 _ORDER: tuple[Channel, ...] = ("g", "r", "b")
-_SIDE = 55
+_SIDE = 55  # pixels of true kernels: the largest side of estimates
 _WIDE = 9.0  # how much wider than usual the priors are
 
 

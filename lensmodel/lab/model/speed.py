@@ -24,10 +24,10 @@ from lensmodel.lab.local_frame import pixel_to_local
 from lensmodel.lab.model.smoothers import make_known
 from lensmodel.model import LensModel, ModelSettings
 
-SIDE, NEAREST = 31, 200
-_DRAWN = 5000
-PER_PHOTO = 24
-GRID = (20, 30)
+SIDE, NEAREST = 31, 200  # pixels of a kernel; samples that the peer averages
+_DRAWN = 5000  # samples that differ; then they come again (chosen)
+PER_PHOTO = 24  # patches of a calibration
+GRID = (20, 30)  # rows and columns of a map (chosen)
 SETTINGS = LensSettings(aperture=2.8, channel="g")
 
 

@@ -15,14 +15,14 @@ from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample, centred, distance
 from lensmodel.core.types import Kernel
 
-SIZE = 11
-MOST = 160
-_GROUPS = 5
+SIZE = 11  # pixels of the window of a star (chosen)
+MOST = 160  # stars at most, the brightest (chosen)
+_GROUPS = 5  # to hold out in turn (chosen)
 _SIGMAS = 15.0  # of the sky's noise, that the peak of a usable star has
-_SATURATED = 0.9
+_SATURATED = 0.9  # of the brightest value: peaks above may be cut (chosen)
 _NEIGHBOUR = 0.25  # of its peak, that another source beside a star may have
-_FEWEST = 20
-_REDRAWN = 8
+_FEWEST = 20  # stars: four a group (chosen)
+_REDRAWN = 8  # draws of the noise of a star (chosen)
 _HOT = 0.06  # of its peak: a pixel whose neighbours hold less in the mean is hot, no lens is so sharp
 
 

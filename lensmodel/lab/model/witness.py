@@ -48,7 +48,7 @@ INNER = slice(32, 224)
 ASKED, NEAR_QUARTER = (5, 4, 9, 13, 20, 6), 4
 ERROR = 0.3
 """What estimators usually expect of their kernels."""
-LOSS, LEAST = 0.3, 0.05
+LOSS, LEAST = 0.3, 0.05  # dB of a clear loss, and of any that counts (chosen)
 FRAME = Frame(ROWS * TILE, COLS * TILE)
 CORNERS = [(row * TILE, col * TILE) for row in range(ROWS) for col in range(COLS)]
 PLACES = [FRAME.position(row + TILE / 2 - 0.5, col + TILE / 2 - 0.5) for row, col in CORNERS]

@@ -17,8 +17,8 @@ from lensmodel.simulate import draw_lens
 
 Lens = TypeVar("Lens")
 
-_QUICK_FRAME = (640, 960)
-_HARD_FRAME = (840, 1260)
+_QUICK_FRAME = (640, 960)  # rows and columns (chosen): 0.6 megapixels
+_HARD_FRAME = (840, 1260)  # rows and columns (chosen): a megapixel
 _STOPPED_DOWN = 2.0  # two stops
 
 _DRAWN_EACH: Final = {"quick": 1, "small": 2, "default": 2, "full": 4}

@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 
 _WRAP_MARGIN: Final = 1.25  # period of the sum over cosines over the extent of the light
 _SAMPLES: Final = (96, 512)  # across the pupil: enough for its edge; more than the widest blur needs
-_CENTRED_PX: Final = 5e-4
+_CENTRED_PX: Final = 5e-4  # a thousandth moves no figure, as `lensmodel.core.psf` has it
 _RECENTRINGS: Final = 10  # wide tails that the array cuts off pull its centre of mass step by step
 _SPARE_PX: Final = 2  # the kernel may move by so much before the light is computed anew
 

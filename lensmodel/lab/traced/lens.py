@@ -27,7 +27,7 @@ FOCUS_POINTS: Final = ((0.0, 1.0), (0.35, 0.5), (0.65, 0.25))
 FIELD_MARGIN: Final = 1.05
 """Fields are traced so far beyond the corner: light of outside blurs into the frame."""
 
-_CHIEF_STEPS: Final = 24
+_CHIEF_STEPS: Final = 24  # fields between axis and corner that chief rays are traced for (chosen)
 
 
 def spectrum(channel: Channel, count: int = 3) -> tuple[tuple[float, float], ...]:

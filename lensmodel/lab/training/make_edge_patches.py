@@ -19,14 +19,14 @@ from lensmodel.lab.blind.steps.edge_patches import SIDE, edge_mask, steepness_of
 from lensmodel.lab.blind.steps.pyramid import View
 from lensmodel.lab.scenes import dead_leaves
 
-COUNT: Final = 220
-ANGLES: Final = 32
-SCENES: Final = 6
-QUANTILES: Final = 64
+COUNT: Final = 220  # windows of the prior (chosen)
+ANGLES: Final = 32  # of edges in a turn (chosen)
+SCENES: Final = 6  # of dead leaves (chosen)
+QUANTILES: Final = 64  # of the steepness (chosen)
 
 OUT: Final = Path(__file__).parents[1] / "data" / "edge_patches.npz"
 
-_FINE = 8
+_FINE = 8  # samples a pixel along each axis (chosen)
 
 
 def primitives() -> NDArray[np.float64]:

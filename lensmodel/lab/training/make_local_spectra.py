@@ -19,13 +19,13 @@ from lensmodel.core.types import Plane
 from lensmodel.estimation.spectra.local_spectra import COUPLED, SpectrumMixture, periodograms
 from lensmodel.lab.cases import list_photos, photo_half, scene_of
 
-COMPONENTS, ROUNDS = 128, 25
-_PATCH, _STRIDE = 256, 24
-_TILES = 40_000
+COMPONENTS, ROUNDS = 128, 25  # and rounds of expectation maximisation (chosen)
+_PATCH, _STRIDE = 256, 24  # pixels of a window, and between its tiles (chosen)
+_TILES = 40_000  # of all photographs: some 300 a component (chosen)
 _FLAT = 0.02  # standard deviation of a window that no selection takes
 _SPREAD = 0.3  # of ln gain
 _KEPT = 2.0  # tiles by which a component stays what it was
-_LEAST = 1e-9
+_LEAST = 1e-9  # added to powers: its logarithm stays finite
 
 
 def tiles_of(photo: Path, rng: np.random.Generator) -> list[Plane]:

@@ -21,8 +21,8 @@ from lensmodel.core.types import NoiseModel
 from lensmodel.lab.cases import good_corners, list_photos, photo_half, scene_of
 from lensmodel.scene.prior import FIRST_WINDOW_RING, LEAST_POWER, WINDOW_SHAPES
 
-_PATCH, _MARGIN, _WINDOWS = 256, 27, 16
-_SILENT = NoiseModel.white(1e-6)
+_PATCH, _MARGIN, _WINDOWS = 256, 27, 16  # pixels, half a kernel, of each photo: as in the benchmark
+_SILENT = NoiseModel.white(1e-6)  # noise of the photographs themselves: taken for none
 
 
 def log_spectra(photos: Sequence[Path]) -> NDArray[np.float64]:

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.simulate import load_scene
 
-SIDE: Final = 8
-WHITE: Final = 0.9
-_LEAST_PAST_THE_MIDDLE = 3
+SIDE: Final = 8  # pixels of a window, as in the paper
+WHITE: Final = 0.9  # level of the 99.5 percentile, as in `lensmodel.lab.cases`
+_LEAST_PAST_THE_MIDDLE = 3  # arguments: a folder, a file, a photograph
 
 
 def windows_of(photo: Path, count: int, rng: np.random.Generator) -> NDArray[np.float32]:

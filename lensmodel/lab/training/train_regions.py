@@ -39,12 +39,12 @@ from lensmodel.lab.blind.methods import compared
 from lensmodel.lab.cases import list_photos, photo_half, scene_of
 from lensmodel.simulate import draw_lens
 
-SIZE: Final = 192
-KERNEL_SIZE: Final = 55
-WINDOWS_A_GROUP: Final = 8
-FIRST_SEED: Final = {"dev": 7000, "test": 8000}
-TOP: Final = 3
-_ARGUMENTS = 4
+SIZE: Final = 192  # pixels of a window: that of a calibration
+KERNEL_SIZE: Final = 55  # pixels: that of patch recurrence
+WINDOWS_A_GROUP: Final = 8  # of one photo behind one lens (chosen)
+FIRST_SEED: Final = {"dev": 7000, "test": 8000}  # of the lenses of each half: they differ (chosen)
+TOP: Final = 3  # windows of a group that a choice is judged by (chosen)
+_ARGUMENTS = 4  # of `collect` with GROUPS; one less at least
 
 
 @dataclass(frozen=True, slots=True)

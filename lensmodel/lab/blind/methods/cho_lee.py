@@ -39,9 +39,9 @@ from lensmodel.lab.blind.steps.gradients import (
 from lensmodel.lab.blind.steps.pyramid import Image, Level, LevelResult, Tick
 from lensmodel.lab.blind.steps.starting_from import StartingFrom
 
-_ORDER_WEIGHTS = (50.0, 25.0, 12.5)
-_ALPHA = 0.1
-_BETA = 5.0
+_ORDER_WEIGHTS = (50.0, 25.0, 12.5)  # of values, first and second derivatives: as in the paper
+_ALPHA = 0.1  # as in the paper
+_BETA = 5.0  # as in the paper
 _ERROR = (0.55, 0.5)  # offset and slope by disagreement: at its mean the mean error on lens blur
 
 

@@ -31,22 +31,22 @@ from lensmodel.lab.blind.steps.cleaning import cleaned
 from lensmodel.lab.blind.steps.edge_patches import edge_mask
 from lensmodel.lab.blind.steps.pyramid import Image, View
 
-_DIRECTIONS = 24
-_STEP_PX = 0.25
-_TENSOR_PX = 2.0
-_COHERENT = 0.85
-_CONTRAST_IN_NOISE = 12.0
-_FLAT_SHARE = 0.06
+_DIRECTIONS = 24  # of normals in half a turn: 7.5 degrees apart (chosen)
+_STEP_PX = 0.25  # bins of a profile: four a pixel, as ISO 12233
+_TENSOR_PX = 2.0  # over which the structure tensor is averaged (chosen)
+_COHERENT = 0.85  # of the tensor: corners and texture have less (chosen)
+_CONTRAST_IN_NOISE = 12.0  # of a step: its slopes stand out of the noise then (chosen)
+_FLAT_SHARE = 0.06  # of the step, by which its sides may vary (chosen)
 _WIDE_SHARE = 0.45  # of the reach; a ramp that fills the window has 0.58
-_SCATTER_SHARE = 0.06
-_EDGE_SHARE = 0.08
-_STRIDE_PX = 4
-_STRAIGHTENINGS = 3
-_LEAST_EDGES = 3
-_CORE_LEVEL = 0.05
-_ROUND_WEIGHT = 0.5
+_SCATTER_SHARE = 0.06  # of the step, by which values may leave the profile (chosen)
+_EDGE_SHARE = 0.08  # of the pixels, the strongest, are looked at (chosen)
+_STRIDE_PX = 4  # a crest is the steepest place so far around (chosen)
+_STRAIGHTENINGS = 3  # Gauss-Newton steps, each of 0.1 rad at most (chosen)
+_LEAST_EDGES = 3  # fewer are chance (chosen)
+_CORE_LEVEL = 0.05  # of the peak: noise in the tails has no part in a width (chosen)
+_ROUND_WEIGHT = 0.5  # of a round Gaussian; a direction of many edges has 1 (chosen)
 _SAMPLING_PX2 = 1.0 / 12.0 + 5.0 / 12.0 * _STEP_PX**2  # of the pixel, the bins and their differences
-_LEAST_DIRECTIONS = 2
+_LEAST_DIRECTIONS = 2  # one alone says nothing of the other axis
 
 Floats = NDArray[np.float64]
 

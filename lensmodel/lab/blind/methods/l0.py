@@ -41,12 +41,12 @@ from lensmodel.lab.blind.steps.gradients import (
 from lensmodel.lab.blind.steps.pyramid import Image, Level, LevelResult, Tick, View
 from lensmodel.lab.blind.steps.starting_from import StartingFrom
 
-_LAST_BETA = 1e5
+_LAST_BETA = 1e5  # as in Pan et al., like all up to `_ISLAND`
 _GROWTH = 2.0
 _LEAST_SPARSITY = 1e-4
 _FADE = 1.1
 _GAMMA = 2.0
-_ISLAND = 0.1
+_ISLAND = 0.1  # of the mass of the kernel: smaller islands are dropped
 _ERROR = (0.1, 1.2)  # offset and slope by disagreement, on simulated lenses
 
 

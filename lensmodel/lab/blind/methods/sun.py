@@ -30,9 +30,9 @@ from lensmodel.lab.blind.steps.kernel_step import Grid, Term, least_squares_kern
 from lensmodel.lab.blind.steps.pyramid import Image, Level, LevelResult, Schedule, Tick, View, coarse_to_fine
 from lensmodel.lab.blind.steps.starting_from import StartingFrom
 
-_INTENSITY_WEIGHT = 0.1
-_LEAST_EDGE_PX = 30
-_ERROR_FLOOR, _ERROR_SLOPE = 0.3, 0.5
+_INTENSITY_WEIGHT = 0.1  # w of values, of differences it is 1 (chosen): noise in values reaches far
+_LEAST_EDGE_PX = 30  # gradients on edges: of fewer a kernel is chance (chosen)
+_ERROR_FLOOR, _ERROR_SLOPE = 0.3, 0.5  # by disagreement (chosen): nothing is kept that fitted them
 
 
 @dataclass(frozen=True, slots=True)

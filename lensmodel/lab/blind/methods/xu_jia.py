@@ -41,15 +41,15 @@ from lensmodel.lab.blind.steps.gradients import (
 from lensmodel.lab.blind.steps.pyramid import Image, Level, LevelResult, Tick, View
 from lensmodel.lab.blind.steps.starting_from import StartingFrom
 
-_WINDOW = 5
-_OFFSET = 0.5
-_GAMMA = 10.0
-_LAMBDA = 2e-3
-_FADE = 1.1
-_SHOCKS, _SHOCK_STEP = 5, 0.5
-_SMOOTHING_PX = 1.0
-_REWEIGHTINGS = 3
-_LEAST_VALUE = 1e-4
+_WINDOW = 5  # pixels: h of the paper
+_OFFSET = 0.5  # as in the paper: keeps flat regions from standing out
+_GAMMA = 10.0  # of |k|² in phase one (chosen)
+_LAMBDA = 2e-3  # of the selected gradients in the coarse image (chosen)
+_FADE = 1.1  # by which thresholds fall each round, as in the paper
+_SHOCKS, _SHOCK_STEP = 5, 0.5  # steps of the shock filter, and their size (chosen)
+_SMOOTHING_PX = 1.0  # before the shock filter: noise would be steepened (chosen)
+_REWEIGHTINGS = 3  # solutions weighted by the last sizes of |k| (chosen)
+_LEAST_VALUE = 1e-4  # keeps the weight of an empty pixel finite (chosen)
 _ERROR = (0.55, 0.5)  # offset and slope by disagreement: at its mean the mean error on lens blur
 
 

@@ -31,8 +31,8 @@ from lensmodel.lab.blind.steps.cleaning import cleaned
 from lensmodel.lab.blind.steps.pyramid import Image, Level, LevelResult, Schedule, Tick, View, coarse_to_fine
 from lensmodel.lab.blind.steps.starting_from import StartingFrom
 
-_FIRST_SIGMA_PX = 0.7
-_ERROR_FLOOR, _ERROR_SLOPE = 0.15, 0.5
+_FIRST_SIGMA_PX = 0.7  # of the first kernel, in pixels of the coarsest level (chosen)
+_ERROR_FLOOR, _ERROR_SLOPE = 0.15, 0.5  # by disagreement (chosen): nothing is kept that fitted them
 
 
 @dataclass(frozen=True, slots=True)

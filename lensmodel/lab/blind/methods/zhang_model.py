@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from lensmodel.lab.blind.steps.kernel_step import Floats, Grid, Kernelish, Term, least_squares_kernel
 
-_TINY = 1e-12
-_FIRST_NOISE = 0.5
+_TINY = 1e-12  # keeps divisions finite: far below any power of gradients
+_FIRST_NOISE = 0.5  # share of the power of gradients that is thought noise at first (chosen): nearly convex
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,7 +10,7 @@ from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import as_kernel
 from lensmodel.core.types import Kernel
 
-_EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=np.int_)
+_EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=np.int_)  # pixels that touch at a corner belong together
 
 
 def cleaned(kernel: NDArray[np.float64], threshold: float, least_mass: float = 0.0) -> Kernel:

@@ -24,11 +24,11 @@ SIDE = 5
 EDGE_SHARE = 0.03
 """So many of the pixels lie on the mask, the strongest first."""
 
-_ORIENTATIONS = 8
-_REACH = 4
-_ALONG_PX, _ACROSS_PX = 2.0, 1.0
-_LEAST_LENGTH = 4
-_AROUND = 11
+_ORIENTATIONS = 8  # of the filters: 22.5 degrees apart (chosen)
+_REACH = 4  # pixels of a filter: two standard deviations along the edge
+_ALONG_PX, _ACROSS_PX = 2.0, 1.0  # standard deviations of a filter (chosen): longer than wide
+_LEAST_LENGTH = 4  # pixels of an edge: shorter ones are noise (chosen)
+_AROUND = 11  # pixels: window of the local range, two patterns wide (chosen)
 _DATA = Path(__file__).parents[2] / "data" / "edge_patches.npz"
 
 Image = NDArray[np.float64]

@@ -27,8 +27,8 @@ from lensmodel.estimation.steps.finish import finished
 from lensmodel.lab.blind.steps.cleaning import cleaned
 from lensmodel.lab.blind.steps.pyramid import Image, LevelSolver, Schedule, View, coarse_to_fine
 
-_ORIENTATIONS = 4
-_TINY = 1e-12
+_ORIENTATIONS = 4  # as in Cho and Lee
+_TINY = 1e-12  # keeps divisions finite: far below any gradient
 
 Mask = NDArray[np.bool_]
 KernelSolver = Callable[["KernelEquations"], NDArray[np.float64]]

@@ -16,7 +16,7 @@ Floats = NDArray[np.float32]
 Spectrum = NDArray[np.complex64]
 Kernelish = NDArray[np.float64]
 
-_TINY = 1e-12
+_TINY = 1e-12  # keeps divisions finite: far below any power
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,7 +36,7 @@ Tick: TypeAlias = Callable[[], None]
 RATIO = math.sqrt(0.5)
 """Size of a level over that of the next finer one, as in the public codes of these methods."""
 
-_SMALLEST_IMAGE = 24
+_SMALLEST_IMAGE = 24  # shorter side of the coarsest level in pixels (chosen)
 _REACH = 2  # of the cubic, in pixels of the coarser grid
 
 

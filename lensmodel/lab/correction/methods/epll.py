@@ -14,7 +14,7 @@ from lensmodel.correction.tiles.canvas import Canvas
 from lensmodel.lab.correction.methods.half_quadratic import half_quadratic
 from lensmodel.lab.correction.methods.mixture import shipped_mixture
 
-_WHITE = 0.9
+_WHITE = 0.9  # of the photographs that the mixture was fitted to, see `lensmodel.lab.cases`
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,6 +28,7 @@ COUNTS: Final = ("1", "2", "5")
 DECONVOLUTION: Final = "standard"
 """What a user gets who chooses nothing; bars are of its corrections."""
 
+# What is asked (chosen); three values are of 1, 2 and 5 photos, pairs of `PLACES` or ends of a band.
 _PSF: Final = {
     "g": ((0.25, 0.40), (0.20, 0.32), (0.15, 0.25)),
     "rb": ((0.30, 0.45), (0.25, 0.38), (0.20, 0.30)),

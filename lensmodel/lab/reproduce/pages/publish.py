@@ -28,8 +28,8 @@ ROOT = Path(__file__).resolve().parents[4]
 PAGE, PICTURE = ROOT / "docs/lab/results", ROOT / "docs/images/before-after.jpg"
 SHOWN: tuple[Zone, ...] = ("center", "corner")
 METHOD = "standard"
-_QUALITY = 90
-_LABEL_PX = 96
+_QUALITY = 90  # of JPEG (chosen)
+_LABEL_PX = 96  # column of the labels (chosen)
 
 
 def page(folder: Path, names: set[str], kept: set[str], summary: str) -> int:

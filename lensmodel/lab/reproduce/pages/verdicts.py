@@ -9,7 +9,7 @@ from lensmodel.core.types import CHANNELS, ZONES
 
 Result = Mapping[str, Any]
 
-TOLERATED_DB: Final = 0.05
+TOLERATED_DB: Final = 0.05  # dB of a zone (chosen): less counts as equal
 
 MEASURABLE: Final = {"psnr": 0.2, "ssim": 0.002}
 """Gains of the true PSF below these say nothing of a lens."""

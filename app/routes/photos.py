@@ -249,7 +249,9 @@ def _record(
             call.storage.rename(f"{prefix}original", key)
             call.store.photos.restore_file(received.photo.public_id, key, where, again=received.fresh)
         call.storage.delete(prefix)  # the same bytes are stored already
-    return describe(call, find_photo(call, received.photo.public_id)), received.fresh
+    # another request may have deleted it meanwhile: then it is told as it was received
+    photo = call.store.photos.get(received.photo.public_id, call.owner) or received.photo
+    return describe(call, photo), received.fresh
 
 
 def describe(call: Call, photo: PhotoRow) -> PhotoOut:

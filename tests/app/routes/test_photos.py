@@ -16,6 +16,7 @@ from app.routes import jobs
 from app.runtime.settings import Settings
 from app.schemas import JobOut
 from app.store import Store
+from app.store.photo_reads import PhotoReads
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 TIFF = b"II*\x00" + bytes(9000)
@@ -311,6 +312,17 @@ def test_deleting_a_photo_deletes_file_samples_and_job(client: TestClient, setti
     assert client.delete(f"/v1/photos/{photo['id']}").status_code == 404
     assert list((settings.data_dir / "blobs" / "photos").iterdir()) == []
     assert client.post("/v1/photos", content=TIFF).status_code == 202
+
+
+def test_a_photo_that_is_deleted_while_it_is_sent_is_told_as_it_was_received(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(PhotoReads, "get", lambda *_: None)
+
+    answer = client.post("/v1/photos", content=TIFF)
+
+    assert answer.status_code == 202, answer.text
+    assert answer.json()["state"] == "received"
 
 
 def test_a_job_tells_how_far_it_is(client: TestClient, steps: Steps) -> None:

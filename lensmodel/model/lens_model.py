@@ -142,7 +142,7 @@ class LensModel:
     def begun_with(self, learned: bytes) -> LensModel:
         """Return the model whose fit begins where `learned` of fewer samples ended, besides all other places.
 
-        Bytes that are damaged or of another version leave the model as it is.
+        Bytes that are damaged or of another version are no beginning.
         """
         fit = replace(self._fit, former=memory.fronts(learned))
         return LensModel(self.samples, self.settings, fit, prior=self.prior)

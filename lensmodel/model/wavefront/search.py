@@ -34,10 +34,8 @@ MOST_PATCHES: Final = 48
 """Patches that a fit looks at in all colours: the cost grows with them (chosen: those of two photos)."""
 
 _COMA = slice(2, 6)  # the odd terms of `NAMES`
-_COARSE_PLACES, _MEDIUM_PLACES = (
-    24,
-    36,
-)  # patches of the first stages (chosen: those of a photo, of one and a half)
+# Patches of the first two stages (chosen: those of a photo, of one and a half)
+_COARSE_PLACES, _MEDIUM_PLACES = 24, 36
 # Steps at most: only the last fit has to end (chosen)
 _COARSE_ROUNDS, _MEDIUM_ROUNDS, _FINE_ROUNDS, _HELD_ROUNDS = 7, 6, 16, 5
 # Minima kept of the coarse search, and those fitted in full (chosen: each of the last costs seconds)
@@ -95,7 +93,10 @@ def search(
 
 
 def held_out(groups: Sequence[Group], front: Wavefront) -> float:
-    """What each half of the patches costs behind the lens that the other half makes of a wavefront."""
+    """What each half of the patches costs behind the lens that the other half makes of a wavefront.
+
+    In the units of a fit's cost; it compares among wavefronts of the same patches.
+    """
     total = 0.0
     for half in (0, 1):
         seen = [powers(group) for k, group in enumerate(groups) if k % 2 == half]
@@ -189,6 +190,7 @@ def _decentred(groups: Sequence[Group], front: Wavefront) -> Wavefront:
 
 
 def _moved(front: Wavefront, x: float, y: float) -> Wavefront:
+    """The terms of third order with the center of the field at (x, y), half-diagonals right and up."""
     terms = dict(zip(NAMES, front.terms.tolist(), strict=True))
     curved, coma, astigmatic = (terms[name] for name in ("field curvature", "coma", "astigmatism"))
     terms["focus"] += curved * (x * x + y * y)

@@ -1,7 +1,9 @@
-"""How large the rooms of the house are."""
+"""How large the rooms of the house are, and that its constants say where they come from."""
 
 from __future__ import annotations
 
+import ast
+from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -30,3 +32,55 @@ def test_a_room_of_many_modules_says_why() -> None:
         if count > MOST_MODULES and "more than fifteen modules because" not in says:
             silent.append(f"{room.relative_to(ROOT)}: {count}")
     assert silent == []
+
+
+def is_text(one: ast.stmt) -> bool:
+    """Whether it is the words below a constant."""
+    return (
+        isinstance(one, ast.Expr) and isinstance(one.value, ast.Constant) and isinstance(one.value.value, str)
+    )
+
+
+def is_numbers(value: ast.expr | None) -> bool:
+    """Whether a value is numbers alone, and what is computed of them and of other names."""
+    if value is None or not any(
+        isinstance(one, ast.Constant)
+        and isinstance(one.value, int | float)
+        and not isinstance(one.value, bool)
+        for one in ast.walk(value)
+    ):
+        return False
+    kinds = (ast.Constant, ast.Tuple, ast.Set, ast.List, ast.Dict, ast.UnaryOp, ast.BinOp, ast.Name)
+    whole = (one for one in ast.walk(value) if isinstance(one, ast.expr))
+    return all(isinstance(one, kinds) and not isinstance(getattr(one, "value", 0), str) for one in whole)
+
+
+def silent(source: str) -> Iterator[int]:
+    """Yield the lines of constants without a word.
+
+    A word stands on their own lines, or above or below the lines without a gap that they belong to.
+    """
+    lines, group = source.splitlines(), list[ast.Assign | ast.AnnAssign]()
+    for one in [*ast.parse(source).body, ast.Pass(lineno=len(lines) + 9)]:
+        below = bool(group) and one.lineno == (group[-1].end_lineno or 0) + 1
+        if group and not (below and isinstance(one, ast.Assign | ast.AnnAssign)):
+            said = (below and is_text(one)) or lines[group[0].lineno - 2].startswith("#")
+            for mute in group if not said else ():
+                if is_numbers(mute.value) and "#" not in "".join(lines[mute.lineno - 1 : mute.end_lineno]):
+                    yield mute.lineno
+            group = []
+        if isinstance(one, ast.Assign | ast.AnnAssign):
+            group.append(one)
+
+
+def test_constants_have_a_word() -> None:
+    mute = [
+        f"{path.relative_to(ROOT)}:{line}" for path in modules() for line in silent(path.read_text("utf-8"))
+    ]
+    assert mute == []
+
+
+def test_a_constant_without_a_word_is_found() -> None:
+    assert list(
+        silent('A = 1  # one\nB = (2.0, -3)\n\n# of both\nC = 4\nD = 5\n\nE = 6\nF = 7\n"""Two."""\n')
+    ) == [2]

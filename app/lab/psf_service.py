@@ -48,7 +48,7 @@ from lensmodel.lab.scenes import dead_leaves
 from lensmodel.model import LensModel
 from lensmodel.simulate import SimulatedLens, draw_lens
 
-SIDE, SEED, READY_S = 31, 0, 60.0
+SIDE, SEED, READY_S = 31, 0, 60.0  # pixels of an estimate; of the lens; longest wait for an answer (chosen)
 PATCH, NOISE, TRUTH = 128, 0.003, 41
 """Side of the patches in pixels, standard deviation of their noise, side of the kernels that blur them."""
 

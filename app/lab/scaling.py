@@ -41,8 +41,8 @@ from app.store.upkeep import migrate
 from app.store.upkeep.invariants import INVARIANTS
 from lensmodel.core.psf import gaussian
 
-PATCHES, CHANNELS = 8, "rgb"
-SIDE = 31
+PATCHES, CHANNELS = 8, "rgb"  # of a made-up photo (chosen): fewer patches make more photos of the same rows
+SIDE = 31  # pixels of a kernel: that of an estimate
 PEAK = 2.5
 """The busiest hour of a day over its mean hour (chosen: people send photos in the evening)."""
 

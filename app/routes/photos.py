@@ -35,7 +35,7 @@ from app.store.photo_steps import GIVEN_SETTINGS, folder_of
 from app.store.tables import PhotoRow
 
 router = APIRouter(tags=["photos"])
-GIB = 1024 * MIB
+GIB = 1024 * MIB  # bytes
 SEND_AGAIN = "send the same file again, and ask then (LENS_KEEP_PHOTOS says how long files stay)"
 
 _UPLOAD_BODY = {

@@ -35,7 +35,7 @@ RESULT: Final = "result.json"
 MAX_TEXT: Final = 4000
 """Characters of an error text at most (chosen): a traceback in less than `runner.MAX_MESSAGE` bytes."""
 
-_MIB: Final = 1024 * 1024
+_MIB: Final = 1024 * 1024  # bytes
 NICENESS: Final = 10
 """Default niceness of tasks above that of the worker (chosen): a tenth of the weight of a process at 0
 (sched(7))."""

@@ -17,10 +17,7 @@ from pydantic import (
 MAX_PSF_SIZE = 255
 """Side of a kernel in pixels at most (chosen): that of a profile."""
 
-
 MAX_VERSION: Final = 2**31 - 1
-
-
 """The largest number of an INTEGER column of PostgreSQL."""
 
 

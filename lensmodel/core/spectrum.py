@@ -20,8 +20,10 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import NoiseModel, Plane
 
+# Bins (chosen): a ring is a fifth wider than the one within it, a sector is 15 degrees of half a turn.
 RINGS: Final = 14
 SECTORS: Final = 12
+
 RING_LIMITS: Final = (0.03, 0.5)
 """Frequencies of the innermost and outermost ring, cycles/pixel; rings are equally wide in log."""
 

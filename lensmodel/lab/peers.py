@@ -25,8 +25,8 @@ from lensmodel.core.psf import gaussian
 from lensmodel.core.types import Planes
 from lensmodel.photo.dng import write_bayer_dng
 
-_LIMIT_S: Final = 1800
-_FULL: Final = 65535
+_LIMIT_S: Final = 1800  # seconds that a program may take (chosen): one that hangs must end
+_FULL: Final = 65535  # largest number of 16 bits
 
 Command = Callable[[Path, Path, Path, float], list[str]]
 """Words of a command, from the input, the output, a folder for settings and a setting."""

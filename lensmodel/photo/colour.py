@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lensmodel.photo.values import Matrix3, Transfer
 
-CODES: Final = 65536
+CODES: Final = 65536  # of 16 bits
 Curve: TypeAlias = NDArray[np.float32]
 """Linear light at the codes k / 65535, shape (65536,), not decreasing."""
 

@@ -31,13 +31,15 @@ XYZ_TO_SRGB: Final = (
 )
 """CIE XYZ (D65) to linear sRGB, IEC 61966-2-1."""
 
+# Types of TIFF 6.0, section 2, and their bytes.
 _BYTE, _ASCII, _SHORT, _LONG, _RATIONAL, _UNDEFINED, _SRATIONAL = 1, 2, 3, 4, 5, 7, 10
 _SIZES: Final = {_BYTE: 1, _ASCII: 1, _SHORT: 2, _LONG: 4, _RATIONAL: 8, _UNDEFINED: 1, _SRATIONAL: 8}
-_EXIF_IFD: Final = 34665  # tags and values of TIFF 6.0, TIFF/EP and DNG 1.6 from here on
-_STRIP_OFFSETS: Final = 273
-_MAX_UINT32: Final = 2**32 - 1
-_CFA, _LINEAR_RAW = 32803, 34892
-_D65: Final = 21
+
+_EXIF_IFD: Final = 34665  # tag, Exif 2.32, section 4.6.3
+_STRIP_OFFSETS: Final = 273  # tag, TIFF 6.0, section 8
+_MAX_UINT32: Final = 2**32 - 1  # largest number of a LONG
+_CFA, _LINEAR_RAW = 32803, 34892  # PhotometricInterpretation of TIFF/EP and of DNG 1.6, chapter 3
+_D65: Final = 21  # CalibrationIlluminant1 of DNG 1.6, chapter 4, in the numbers of Exif's LightSource
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,13 +19,13 @@ GRAIN: Final = 4
 _GRAIN_LEVELS: Final = (0.25, 0.5, 0.75)
 """Shares of the pixels that are darker than the levels at which grain is compared."""
 
-_BINS: Final = 24
+_BINS: Final = 24  # levels at most, from dark to bright (chosen): a line of two terms needs no more
 _FLAT_SHARE: Final = 0.15
 """Share of the blocks of one level, the least textured, that count."""
 
-_MIN_BLOCKS: Final = 24
-_ENOUGH_PIXELS: Final = 3_000_000
-_MAD_TO_SIGMA: Final = 1.4826
+_MIN_BLOCKS: Final = 24  # of a level (chosen): 1,536 pixels tell a standard deviation within some percent
+_ENOUGH_PIXELS: Final = 3_000_000  # of a plane (chosen): more would not change the fit
+_MAD_TO_SIGMA: Final = 1.4826  # of a normal distribution: 1 / its upper quartile
 _CUT: Final = 1.5
 """Standard deviations beyond which a difference counts as no more than that: see `_scale`."""
 

@@ -24,8 +24,8 @@ Grid = NDArray[np.float64]
 _BLOCKS: Final = 96
 """Blocks along the longer side: a few pixels of misplacement do not matter then, and 6,000 are enough."""
 
-_SMALLEST_JPEG: Final = 2 * _BLOCKS
-_MOST_JPEG_PIXELS: Final = 64_000_000
+_SMALLEST_JPEG: Final = 2 * _BLOCKS  # pixels; the shorter side may have half, one to a block (chosen)
+_MOST_JPEG_PIXELS: Final = 64_000_000  # against files made to fill the memory (chosen)
 _ASPECT: Final = 0.03
 """How much the shapes of the two may differ: JPEGs lack the rim that demosaicing needs."""
 
@@ -35,7 +35,7 @@ _LIKENESS: Final = 0.8
 _MIDTONES: Final = (0.15, 0.8)
 """Numbers of the JPEG, full is 1, in which a camera's tone curve is nearest to sRGB."""
 
-_UNCLIPPED: Final = 0.5
+_UNCLIPPED: Final = 0.5  # largest mean of a block, full is 1 (chosen): leaves brighter pixels room
 _NEUTRAL: Final = 1.6
 """Largest over smallest of the linear colours: curves and saturation settings change strong colours more."""
 

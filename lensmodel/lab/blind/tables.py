@@ -17,10 +17,13 @@ from PIL import Image, ImageDraw, ImageFont
 from lensmodel.lab.blind.results import UNTOUCHED, BlindReport, CaseResult
 from lensmodel.report.drawing import COLOURS, GREY, PALE, Label, Line, svg
 
-WIDTH: Final = 640  # layout in points (chosen), as in `lensmodel.report.pictures`
+# Layout in points (chosen), as in `lensmodel.report.pictures`: the picture, then the margins of the plot.
+WIDTH: Final = 640
 HEIGHT: Final = 400
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 170, 34, 48
-LOWEST: Final = 1.0  # error ratios on the axis: 1 is the true kernel; few lie beyond 10 (chosen)
+
+# Error ratios at the ends of the axis: 1 is the true kernel; few lie beyond 10 (chosen).
+LOWEST: Final = 1.0
 HIGHEST: Final = 10.0
 _HEADS = (
     *("noise", "method", "cases", "better than blurry", "ER < 3", "ER < 2", "ER median (p90)"),

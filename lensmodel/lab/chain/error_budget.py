@@ -47,8 +47,8 @@ from lensmodel.photo import LinearPhoto, develop
 from lensmodel.simulate import SimulatedField, SimulatedLens, draw_lens, edge_chart, photograph, write_photo
 from lensmodel.workflow import pipeline
 
-FRAME = (600, 900)
-SIZE = 31
+FRAME = (600, 900)  # rows and columns of a photo (chosen): half a megapixel, for many lenses in little time
+SIZE = 31  # pixels of a kernel: that of an estimate
 LEAST_LP_PER_PH, LEAST_DB = 10.0, 0.2
 """Gains of the true PSF below these say nothing."""
 

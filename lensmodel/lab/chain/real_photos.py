@@ -51,11 +51,11 @@ DEFAULT = (
     "large/dunes_21.2MP.jpg",
 )
 PAIRS = (("dji_fc300s_no_serial", "dji_fc300s_b"),)
-CROP = 320
-TILE = 64
-SIZE = 31
-SLOPES = np.linspace(1.6, 3.2, 17)
-USUAL_SLOPE, SLOPE_SCATTER = 2.4, 0.35
+CROP = 320  # pixels of a crop (chosen: enough for the eye)
+TILE = 64  # pixels of a tile whose power is averaged (chosen)
+SIZE = 31  # pixels of a kernel: that of an estimate
+SLOPES = np.linspace(1.6, 3.2, 17)  # exponents s that are tried, 0.1 apart
+USUAL_SLOPE, SLOPE_SCATTER = 2.4, 0.35  # prior of s: mean and standard deviation (chosen)
 FILL = 0.01
 """What fills the zeros of |OTF|^2 where blur changes within a patch; the same for all that are compared."""
 WIDTHS_PX = (0.3, 0.45, 0.6, 0.75, 0.9, 1.1, 1.3, 1.6, 2.0, 2.5)  # of Gaussians to compare with (chosen)

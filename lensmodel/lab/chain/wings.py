@@ -24,17 +24,17 @@ from lensmodel.core.psf import otf
 from lensmodel.core.types import ZONES, Kernel, Zone
 from lensmodel.lab.chain.blind_gain import CAMERA, PLACES, lenses, seed_range
 
-SIZE: Final = 55
+SIZE: Final = 55  # pixels of a true kernel: what the grids hold
 CORE: Final = 4
 """Pixels: the core is the square that reaches so far from the middle pixel, which is the centre of mass."""
 _CORE = (slice(SIZE // 2 - CORE, SIZE // 2 + CORE + 1),) * 2
-GRID: Final = (256, 256)
+GRID: Final = (256, 256)  # pixels of the scene (chosen): some kernels wide
 SLOPE, CONTRAST, NOISE = 2.4, 0.03, 1e-4
 """Exponent of the power of the scene, its variance, and that of the noise."""
 
 Spectrum = NDArray[np.complex128]
 _ROWS, _COLS = np.fft.fftfreq(GRID[0])[:, None], np.fft.rfftfreq(GRID[1])[None, :]
-_TIMES = np.where((_COLS == 0.0) | (_COLS == 0.5), 1.0, 2.0)
+_TIMES = np.where((_COLS == 0.0) | (_COLS == 0.5), 1.0, 2.0)  # how often the whole spectrum holds each
 
 
 def _scene() -> NDArray[np.float64]:

@@ -43,8 +43,8 @@ from lensmodel.simulate import (
     write_photo,
 )
 
-PITCH_UM: Final = 6.0
-SIDE, KERNEL, RIM = 144, 21, 12
+PITCH_UM: Final = 6.0  # of the camera (chosen)
+SIDE, KERNEL, RIM = 144, 21, 12  # pixels of a window, a fitted kernel, the rim that is not judged (chosen)
 CORNERS: Final = {"center": (184, 312), "mid": (60, 150), "corner": (14, 14)}
 """First pixels of the windows, even, so that every one begins on the same colour of the mosaic."""
 DEMOSAICS: Final[dict[str, Demosaic]] = {"ahd": "ahd", "dht": "dht", "linear": "linear", "half": "half"}

@@ -16,8 +16,8 @@ SIDE: Final = 96
 ZOOM: Final = 3
 """Pixels of a crop, and how many times each is shown."""
 
-WORST: Final = 3
-_BLOCK: Final = 48
+WORST: Final = 3  # crops of the worst places (chosen)
+_BLOCK: Final = 48  # pixels of a square that is scored: half a crop, so that one shows all of it
 _EVEN: Final = 0.02
 """Added to the local contrast: a change of an even place counts against it, not against nothing."""
 _GAP: Final = 6  # pixels between crops (chosen)

@@ -38,26 +38,26 @@ _FAR: Final = 2.0
 
 Chosen: with 1.5, correct sharpening of twigs and letters to half their width had up to 70 dots a megapixel.
 """
-_HINT: Final = 0.1
+_HINT: Final = 0.1  # share of a colour that the original must have there for its line to be traced (chosen)
 
-_LUMA: Final = np.array([0.299, 0.587, 0.114])
-_BLOCK: Final = 32
+_LUMA: Final = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
+_BLOCK: Final = 32  # pixels of a square whose grain is taken: holds two periods of `BANDS` (chosen)
 _SPECTRUM_OF_GRAIN: Final = 8.0
 """Power density of coarse over fine: white noise has 1, demosaiced noise 2 to 5, a scene (1/f^2) about 20."""
-_FLAT_SHARE: Final = 0.1
+_FLAT_SHARE: Final = 0.1  # of the squares, the flattest; so many at least (chosen: medians of fewer jump)
 _FLAT_BLOCKS: Final = 8
 _LEAST_GRAIN: Final = 1e-3
 """Standard deviation below which a place holds rounding to eight bits and no grain."""
 
-_TEXTURE_BLOCK: Final = 16
+_TEXTURE_BLOCK: Final = 16  # pixels of a square (chosen)
 _TEXTURE: Final = (0.006, 0.05)
 """Standard deviations of lightness that count as low contrast: one and a half to thirteen of 255, chosen."""
-_TEXTURE_PERCENTILE: Final = 5.0
+_TEXTURE_PERCENTILE: Final = 5.0  # of the squares (chosen): nearly the worst, not one odd place
 
-_EDGE_GRID: Final = 16
-_REACH: Final = 12
+_EDGE_GRID: Final = 16  # pixels of a square, of which one edge is taken at most (chosen)
+_REACH: Final = 12  # pixels of a profile to either side; from `_PLATEAU` on it must be even (chosen)
 _PLATEAU: Final = 7
-_STEP: Final = 0.2
+_STEP: Final = 0.2  # least step of an edge, full scale is 1 (chosen: 50 of 255)
 _EVEN: Final = 0.06
 """Standard deviation of a plateau beside an edge, as a share of the step: chosen, half of the bar."""
 _HALO: Final = 5.0

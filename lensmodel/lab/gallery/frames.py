@@ -25,7 +25,7 @@ HEIGHT: Final = 832
 WIDTH: Final = 1248
 """A megapixel: all demo photographs cover it, and it is calibrated in half a minute."""
 
-JPEG_QUALITY: Final = 92
+JPEG_QUALITY: Final = 92  # of 100 (chosen): that of a fine JPEG, as in `lensmodel.lab.camera_jpeg`
 
 
 @dataclass(frozen=True, slots=True)

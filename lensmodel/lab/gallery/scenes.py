@@ -119,6 +119,8 @@ def sky(rng: np.random.Generator, height: int, width: int) -> Planes:
 
 
 _LAMPS: Final[tuple[Colour, ...]] = ((1.0, 0.85, 0.6), (1.0, 0.6, 0.25), (0.7, 0.9, 1.0), (1.0, 0.15, 0.1))
+"""Linear light of street lamps: warm white, sodium, cold white and red, chosen."""
+
 _SKIN: Final[tuple[Colour, ...]] = (
     (0.62, 0.36, 0.25),
     (0.30, 0.16, 0.10),

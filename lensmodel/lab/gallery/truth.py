@@ -20,17 +20,17 @@ from lensmodel.lab.gallery.figures import Shown, luma
 Stored: TypeAlias = NDArray[np.floating] | NDArray[np.uint16]
 """A picture `(row, col, 3)`, sRGB-encoded: 0 to 1, or whole numbers up to 65535."""
 
-BLOCK: Final = 128
+BLOCK: Final = 128  # pixels of a side (chosen)
 LOSS_DB: Final = 0.5
 """A block that loses more than this counts."""
 
 ZONE_LIMITS: Final = {"center": (0.0, 0.3), "mid": (0.3, 0.75), "corner": (0.75, 1.01)}
 """Distances from the middle in half diagonals, as the documentation defines them."""
 
-_MARGIN: Final = 8
-_LARGEST_SHIFT: Final = 3.0
-_STEPS: Final = 4
-_LEAST_ERROR: Final = 1e-8
+_MARGIN: Final = 8  # pixels around a block: more than it is shifted
+_LARGEST_SHIFT: Final = 3.0  # pixels (chosen): beyond, nothing in the block says where it lies
+_STEPS: Final = 4  # of Gauss-Newton (chosen)
+_LEAST_ERROR: Final = 1e-8  # mean square, full scale is 1 (chosen): 80 dB, so that ratios stay finite
 
 
 @dataclass(frozen=True, slots=True)

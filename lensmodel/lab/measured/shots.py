@@ -29,7 +29,7 @@ from lensmodel.simulate import (
     write_photo,
 )
 
-BASE_ISO_ELECTRONS: Final = 40000.0
+BASE_ISO_ELECTRONS: Final = 40000.0  # full well of a pixel (chosen)
 KERNEL: Final = 41
 """Side of the kernels that photos are blurred with: the grids hold 55, of which this much has light."""
 

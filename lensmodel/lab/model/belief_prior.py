@@ -36,14 +36,15 @@ from lensmodel.model import LensModel, ModelSettings, WitnessedField
 from lensmodel.model.trust.witness import HALF, NARROWINGS, OF_BOTH, SPREAD_OF_BOTH, TEMPER
 from lensmodel.workflow import pipeline
 
-SIZE: Final = 55
+SIZE: Final = 55  # pixels of a kernel: what the grids hold
 NOISE: Final = 16.0 / 300.0
 """Power of the noise where that of the scene is 1/f^2: 1/300 of it at 0.25 cycles/pixel."""
-SHIFTS: Final = np.arange(-2.0, 2.01, 0.25)
+SHIFTS: Final = np.arange(-2.0, 2.01, 0.25)  # pixels, tried along rows and columns (chosen)
 HARM: Final = 6.0
 """How much more a dB that is lost counts than one that is gained, in a search."""
 
 Spectrum = NDArray[np.complex128]
+# By frequency: its square, the power of the scene, and how often the whole spectrum holds it.
 _ROWS, _COLS = np.fft.fftfreq(GRID[0])[:, None], np.fft.rfftfreq(GRID[1])[None, :]
 _F2 = _ROWS**2 + _COLS**2
 _SCENE = np.divide(1.0, _F2, out=np.zeros_like(_F2), where=_F2 > 0.0)

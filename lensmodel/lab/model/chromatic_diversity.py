@@ -45,8 +45,8 @@ from lensmodel.model.wavefront.scene_view import SceneView
 from lensmodel.optics.wavefront import NAMES, Wavefront
 from lensmodel.workflow import pipeline
 
-FACTORS: Final = (0.5, 0.75, 1.0, 1.25, 1.5)
-_SIDE: Final = 41
+FACTORS: Final = (0.5, 0.75, 1.0, 1.25, 1.5)  # on the terms of the true wavefront (chosen)
+_SIDE: Final = 41  # pixels of a true kernel (chosen)
 _SCATTER: Final = 0.2
 """Of ln of the ratio in a bin, between patches: `docs/lab/accuracy.md`, about the middle of its bands."""
 _ROUNDS, _TRIES, _STRIDE_PX = 25, 5, 1.0  # of the descent, its tries each, its longest step (chosen)

@@ -49,7 +49,7 @@ from lensmodel.model.wavefront.joint_kernels import tail_vote
 from lensmodel.simulate import SimulatedLens
 from lensmodel.workflow import pipeline
 
-_SIDE: Final = 55
+_SIDE: Final = 55  # pixels of a true kernel: what the grids hold
 OTHERS: Final[tuple[Channel, ...]] = ("b", "r")
 """Channels that are compared with green."""
 

@@ -40,7 +40,7 @@ from lensmodel.workflow import pipeline
 SHARES: Final = (0.0, 0.25, 0.5, 0.75, 0.875, 1.0)
 """Of the wavefront."""
 
-_SIZE: Final = 55
+_SIZE: Final = 55  # pixels of a kernel: what the grids hold
 _ZONES: Final = (slice(0, 4), slice(4, 12), slice(12, 16))
 """Of `PLACES`: center, mid field, corner."""
 

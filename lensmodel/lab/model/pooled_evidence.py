@@ -30,7 +30,7 @@ from lensmodel.simulate import SimulatedCamera, SimulatedField, draw_lens, load_
 from lensmodel.workflow import pipeline
 
 _PLACES = 48  # on a spiral over the field (chosen)
-_GOLDEN = math.pi * (3.0 - math.sqrt(5.0))
+_GOLDEN = math.pi * (3.0 - math.sqrt(5.0))  # radians: the golden angle spreads points evenly
 _SIZE = 31  # pixels: that of an estimate
 WAVEFRONT = ModelSettings(mode="wavefront")
 

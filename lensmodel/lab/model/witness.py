@@ -42,10 +42,10 @@ from lensmodel.simulate.blur import BlurOptions
 from lensmodel.simulate.camera import SimulatedPhoto, Truth
 
 KINDS = ("right", "x1.3", "x1.6", "turned", "displaced", "x1.3 quarter", "x1.6 quarter", "displaced quarter")
-TILE, ROWS, COLS, SIZE = 256, 4, 6, 55
+TILE, ROWS, COLS, SIZE = 256, 4, 6, 55  # pixels of a tile, tiles of a frame (chosen), pixels of a kernel
 INNER = slice(32, 224)
 """Of a tile, what serves as a patch: its rim holds its neighbour's light."""
-ASKED, NEAR_QUARTER = (5, 4, 9, 13, 20, 6), 4
+ASKED, NEAR_QUARTER = (5, 4, 9, 13, 20, 6), 4  # tiles that are corrected (chosen); so many for one quarter
 ERROR = 0.3
 """What estimators usually expect of their kernels."""
 LOSS, LEAST = 0.3, 0.05  # dB of a clear loss, and of any that counts (chosen)

@@ -20,10 +20,10 @@ Container = Literal["dng", "tiff", "jpeg"]
 Scenery = Callable[[Planes, np.random.Generator], Planes]
 
 BASE: Final = "base"
-_DISC_PX = 4.0
-_TRAIL_PX = 11
-_NIGHT = 0.05
-_LAMPS = 60
+_DISC_PX = 4.0  # radius of a point out of focus (chosen)
+_TRAIL_PX = 11  # way of what moves while the shutter is open (chosen)
+_NIGHT = 0.05  # share of the light by night (chosen)
+_LAMPS = 60  # of a picture (chosen)
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,8 @@ LOOKED_AT: Final = frozenset({"heliar", "reverse-telephoto", "tronnier", "retrof
 """Designs of ray-traced lenses that were looked at during development. Of the others it is known what they
 have of each aberration, which went into what is expected of lenses; nothing was chosen on photos of them."""
 
-_TRACED_FROM: Final = 2000  # seeds above those of drawn lenses (chosen)
+# Seeds of ray-traced lenses (chosen): above those of drawn ones, so many that designs hardly share one.
+_TRACED_FROM: Final = 2000
 _TRACED: Final = 100_000
 
 

@@ -15,12 +15,12 @@ from lensmodel import quality
 from lensmodel.core.geometry import CENTER_ZONE_R, CORNER_ZONE_R, Frame
 from lensmodel.core.types import ZONES, Planes, Zone
 
-BLOCK: Final = 128
-BORDER: Final = 8
+BLOCK: Final = 128  # pixels of a side (chosen)
+BORDER: Final = 8  # pixels of a block that do not count: more than it is shifted
 EVERY: Final = 120
 """Up to so many blocks all are looked at, of more every second one, as on a chessboard."""
 
-_LARGEST_SHIFT = 3.0
+_LARGEST_SHIFT = 3.0  # pixels (chosen)
 _CORE = (slice(BORDER, -BORDER), slice(BORDER, -BORDER))
 
 

@@ -27,6 +27,7 @@ from lensmodel.photo import develop
 from lensmodel.report.photo_crops import as_shown
 from lensmodel.workflow import pipeline
 
+# Layout (chosen): places that are shown, pixels of a kernel and of a photo's width, PSFs down and across.
 _SHOWN: Final = (FieldPosition(0.5, 2.5), FieldPosition(0.8, 0.55), FieldPosition(0.95, -2.6))
 _SIZE: Final = 31
 _WIDTH: Final = 720

@@ -56,7 +56,7 @@ from lensmodel.photo import LinearPhoto, develop
 from lensmodel.report import photo_crops
 from lensmodel.workflow.ways import WAYS
 
-CROP_PX = 128
+CROP_PX = 128  # side of a crop in a strip (chosen)
 _ALONE = ("truth", "measured", "general")
 CONTROL = "standard"
 """Method whose denoising alone is the control."""

@@ -20,14 +20,14 @@ from lensmodel.lab.reproduce.routes import Answer, Place
 from lensmodel.lab.reproduce.shots import Shots, guard_of
 from lensmodel.simulate import edge_chart
 
-PSF_SIZE: Final = 55
+PSF_SIZE: Final = 55  # pixels of a kernel: the largest of the paper, and what the grids hold
 NEAR: Final = 1.5
 """A predicted error within this factor of the true one counts as right."""
 
 FAIR_OVERSHOOT: Final = 5.0
 """Percent of the step: corrections are compared at no more than that."""
 
-_MIXES = 10
+_MIXES = 10  # steps of a strength slider (chosen): tenths
 
 
 def places() -> list[Place]:

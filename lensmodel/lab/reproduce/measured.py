@@ -25,9 +25,9 @@ from lensmodel.simulate import photograph, write_photo
 SIZE: Final = 31
 """Side of the kernels, that of the blind estimates."""
 
-_FILL: Final = 0.97
-_EXPOSURE: Final = 0.8
-_SEED: Final = 77
+_FILL: Final = 0.97  # share of the frame that the target fills (chosen: corners count too)
+_EXPOSURE: Final = 0.8  # factor on the light (chosen: white does not clip)
+_SEED: Final = 77  # of the noise, beside that of the case (chosen)
 
 
 def page_of(case: Case) -> measure.TargetPage:

@@ -21,8 +21,8 @@ from lensmodel.photo.colour import srgb_to_linear
 from lensmodel.quality.images import to_srgb
 
 _NAMES: Final = ("G'MIC Richardson-Lucy", "RawTherapee capture sharpening")
-_DARK: Final = 1e-3
-_MOST: Final = 5.0
+_DARK: Final = 1e-3  # light added to both sides of a ratio, full scale is 1 (chosen): dark places have none
+_MOST: Final = 5.0  # largest ratio, and its inverse the least (chosen)
 
 Gains = tuple[float, float, float]
 

@@ -19,7 +19,7 @@ from lensmodel.simulate import load_scene
 MARGIN: Final = 28
 """Pixels that a scene reaches beyond the frame on every side: half a kernel."""
 
-_GRIDS: Final = {1: (1, 1), 2: (1, 2), 4: (2, 2)}
+_GRIDS: Final = {1: (1, 1), 2: (1, 2), 4: (2, 2)}  # rows and columns of so many
 
 
 @dataclass(frozen=True, slots=True)

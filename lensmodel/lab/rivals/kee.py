@@ -34,13 +34,13 @@ from lensmodel.lab.blind.steps.pyramid import View
 from lensmodel.lab.rivals.rival import Window, polynomial, powers, windows_of
 from lensmodel.photo import LinearPhoto
 
-_DIRECTIONS = 24
-_STEP_PX = 0.25
-_CORE_LEVEL = 0.05
+_DIRECTIONS = 24  # in half a turn, like `_STEP_PX` as in `lensmodel.lab.blind.methods.edges`
+_STEP_PX = 0.25  # bins of a profile
+_CORE_LEVEL = 0.05  # of the peak (chosen): what lies below is left out, noise would widen the variance
 _SAMPLING_PX2 = 1.0 / 12.0 + 5.0 / 12.0 * _STEP_PX**2  # of the pixel, the bins and their differences
-_LEAST_EDGES = 12
-_ROUNDS = 12
-_LEAST_PX2, _MOST_PX2 = 0.01, 36.0
+_LEAST_EDGES = 12  # of a colour (chosen): two for each of six monomials
+_ROUNDS = 12  # of reweighted least squares (chosen)
+_LEAST_PX2, _MOST_PX2 = 0.01, 36.0  # bounds of a variance (chosen): standard deviations of 0.1 and 6 pixels
 
 Floats = NDArray[np.float64]
 

@@ -15,14 +15,14 @@ from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.lab.rivals.basis import STORED, principal, save_basis
 from lensmodel.simulate import draw_lens
 
-SEEDS: Final = range(100)
-RADII: Final = (0.0, 0.25, 0.5, 0.7, 0.85, 1.0)
+SEEDS: Final = range(100)  # those of development
+RADII: Final = (0.0, 0.25, 0.5, 0.7, 0.85, 1.0)  # half diagonals (chosen): denser outwards
 QUARTERS: Final = (0, 1, 2, 3)
 """Directions of the field in quarter turns: only these take a kernel to the local frame exactly."""
 
-SIDE: Final = 31
-COMPONENTS: Final = 32
-_STOPS: Final = (1.0, math.sqrt(2.0))
+SIDE: Final = 31  # pixels of a kernel: that of an estimate
+COMPONENTS: Final = 32  # kept in the basis (chosen)
+_STOPS: Final = (1.0, math.sqrt(2.0))  # factors on the f-number (chosen): wide open, and one stop closed
 
 
 def main() -> None:

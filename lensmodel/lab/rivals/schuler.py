@@ -45,8 +45,8 @@ from lensmodel.lab.rivals.basis import BasisField, RadialBasis, composed, harmon
 from lensmodel.lab.rivals.rival import Window, windows_of
 from lensmodel.photo import LinearPhoto
 
-_ALPHA = 5e-3
-_LEAST_WINDOWS = 3
+_ALPHA = 5e-3  # weight of the gradients in the deconvolution, noise has its own beside it (chosen)
+_LEAST_WINDOWS = 3  # that determine a field (chosen): as many as a coefficient has terms
 
 Floats = NDArray[np.float64]
 

@@ -23,7 +23,7 @@ from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensS
 FORMAT: Final = 1
 """Raised when files of an older form can no longer be read."""
 
-_CENTRED_PX: Final = 5e-3
+_CENTRED_PX: Final = 5e-3  # that a centre of mass may stay off the middle (chosen)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,8 +17,8 @@ from lensmodel.core import psf
 from lensmodel.core.types import FieldPosition, Kernel, LensSettings
 from lensmodel.simulate import draw_lens
 
-SIZE: Final = 55
-FIRST_SEED: Final = 5000
+SIZE: Final = 55  # pixels of a kernel: the largest that the paper estimates
+FIRST_SEED: Final = 5000  # apart from the seeds of other commands (chosen)
 SEEDS: Final = 24
 """So many copies of each kind are looked at for the one whose corner comes nearest to the width."""
 
@@ -50,6 +50,7 @@ WANTED: Final = (
     Wanted("soft-fast", 0.90, -33.0, 4.2, 3.8),
     Wanted("soft-fast", 0.97, -147.0, 5.0, 3.5),
 )
+"""From sharp to soft, of lenses of different character (chosen)."""
 
 
 def make(wanted: Wanted) -> tuple[Kernel, dict[str, object]]:

@@ -21,7 +21,7 @@ from typing import Final
 from lensmodel.photo.headers.ifd import Buffer
 
 MAGIC: Final = b"HEAPCCDR"
-MAGIC_AT: Final = 6  # offsets, masks and tags of CIFF 1.0 from here on
+MAGIC_AT: Final = 6  # bytes before it: byte order, and where the root heap begins
 
 MAX_RECORDS: Final = 1024
 """Records read of one file; cameras write below 100."""
@@ -32,12 +32,15 @@ MAX_HEAPS: Final = 32
 MAX_RECORD_BYTES: Final = 4096
 """Bytes read of one record; those that say something of the exposure have fewer than 300."""
 
+# Directories of CIFF 1.0: bytes of a record; of its type code the mark of a value inside the record, the bits
+# that say where the value lies, the kinds that are heaps, and the bits of the kind.
 _RECORD: Final = 10
 _INLINE: Final = 0x4000
 _STORAGE: Final = 0xC000
 _HEAPS: Final = (0x2800, 0x3000)
 _KIND: Final = 0x3800
 
+# Type codes: of CIFF 1.0, and 0x1029 to 0x102D, the maker's own, as ExifTool's tables have them.
 _MAKE_MODEL: Final = 0x080A
 _FOCAL: Final = 0x1029
 _SHOT: Final = 0x102A
@@ -50,7 +53,7 @@ _EXPOSURE: Final = 0x1818
 _TURNS: Final[Mapping[int, int]] = {0: 1, 90: 6, 180: 3, 270: 8}
 """Clockwise degrees to the EXIF orientation."""
 
-_INCH_UM: Final = 25400.0
+_INCH_UM: Final = 25400.0  # by definition
 _THIRDS: Final[Mapping[int, float]] = {0x0C: 32.0 / 3.0, 0x14: 64.0 / 3.0}
 """In steps of a 32nd Canon rounds a third of a stop to 12 and two thirds to 20."""
 

@@ -26,6 +26,7 @@ MAX_DIRECTORIES: Final = 64
 MAX_VALUE_BYTES: Final = 16 << 20
 """Bytes read of one value; the largest honest ones are ICC profiles and offset tables."""
 
+# Type -> format of `struct`: TIFF 6.0, section 2, and from 16 on BigTIFF; 13 is an offset of a directory.
 _FORMATS: Final[Mapping[int, str]] = {
     1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 6: "b", 7: "s", 8: "h",
     9: "i", 10: "ii", 11: "f", 12: "d", 13: "I", 16: "Q", 17: "q", 18: "Q",

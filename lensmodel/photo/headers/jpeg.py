@@ -13,9 +13,11 @@ from lensmodel.photo.headers.header import MAX_SEGMENTS, Header, check_size
 from lensmodel.photo.headers.ifd import Buffer, TiffReader
 from lensmodel.photo.values import Limits
 
+# Second bytes of markers SOS, EOI and DQT: ITU-T T.81, table B.1.
 _START_OF_SCAN: Final = 0xDA
 _END_OF_IMAGE: Final = 0xD9
 _TABLES: Final = 0xDB
+
 _NO_FRAMES: Final = {0xC4, 0xC8, 0xCC}
 """Markers in the range of the frame headers that are none: tables and an extension."""
 

@@ -19,10 +19,10 @@ from lensmodel.photo.headers.ifd import MAX_DIRECTORIES, Buffer, Directory, Tiff
 from lensmodel.photo.headers.jpeg import read_jpeg
 from lensmodel.photo.values import Limits
 
-_DNG_VERSION: Final = 0xC612  # DNG 1.6
+_DNG_VERSION: Final = 0xC612  # tag, DNG 1.6, chapter 4
 
 _RAW_PHOTOMETRIC: Final = {32803, 34892}
-"""Colour filter array and linear RAW."""
+"""PhotometricInterpretation: colour filter array (TIFF/EP) and linear RAW (DNG 1.6, chapter 3)."""
 
 _LOSSY: Final = 34892
 """Compression of a DNG by baseline JPEG, eight bits a sample: DNG 1.4, "Compression"."""

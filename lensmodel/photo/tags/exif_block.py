@@ -18,9 +18,10 @@ from typing import Final
 from lensmodel.photo.values import PhotoMetadata
 
 SOFTWARE: Final = "lensmodel"
-SOFTWARE_TAG: Final = 0x0131  # tags and types of Exif 2.32 from here on
-EXIF_POINTER: Final = 0x8769
+SOFTWARE_TAG: Final = 0x0131  # TIFF 6.0, section 8
+EXIF_POINTER: Final = 0x8769  # Exif 3.0, section 4.6.3
 
+# Types of Exif 3.0, section 4.6.2.
 _ASCII, _SHORT, _LONG, _RATIONAL, _UNDEFINED = 2, 3, 4, 5, 7
 
 

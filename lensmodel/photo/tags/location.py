@@ -19,7 +19,8 @@ from typing import Final
 
 from lensmodel.photo.headers.ifd import MAX_DIRECTORIES, Buffer, TiffReader
 
-GPS: Final = 0x8825  # tags of Exif 2.32 and TIFF/EP from here on
+# Tags that point to directories: of Exif 3.0, section 4.6.3, and of TIFF/EP.
+GPS: Final = 0x8825
 EXIF: Final = 0x8769
 SUB_DIRECTORIES: Final = 0x014A
 
@@ -29,9 +30,12 @@ MAX_BLOCKS: Final = 64
 MAX_TAGS: Final = 64
 """Tags of a GPS directory; there are 32. What has more is none."""
 
+# Bounds against files made to cost time (chosen): bytes of a value, of which honest ones have some dozen,
+# places named in XMP, and chunks of a PNG.
 MAX_VALUE: Final = 1 << 16
 MAX_WORDS: Final = 1000
 MAX_CHUNKS: Final = 10_000
+
 MAX_CHUNK_BYTES: Final = 16 << 20
 """Chosen like `lensmodel.photo.headers.header.MAX_BLOCK_BYTES`: of what is no image data."""
 

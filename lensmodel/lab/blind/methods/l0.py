@@ -41,7 +41,9 @@ from lensmodel.lab.blind.steps.gradients import (
 from lensmodel.lab.blind.steps.pyramid import Image, Level, LevelResult, Tick, View
 from lensmodel.lab.blind.steps.starting_from import StartingFrom
 
-_LAST_BETA = 1e5  # as in Pan et al., like all up to `_ISLAND`
+# As in Pan et al.: the last weight of the splitting and its growth, the least sparsity and how it and the
+# thresholds fall from one iteration to the next, the weight of |k|^2 in the kernel step; all up to `_ISLAND`.
+_LAST_BETA = 1e5
 _GROWTH = 2.0
 _LEAST_SPARSITY = 1e-4
 _FADE = 1.1

@@ -20,7 +20,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy import ndimage
 
-SIDE = 5
+SIDE = 5  # pixels of a window, as in the paper
 EDGE_SHARE = 0.03
 """So many of the pixels lie on the mask, the strongest first."""
 

@@ -18,7 +18,7 @@ from lensmodel.lab.traced.copies import another, copies
 from lensmodel.photo import develop
 from lensmodel.simulate import BlurOptions, SimulatedCamera, blurred, photograph, write_photo
 
-DATA = Path(__file__).parents[1] / "data"
+DATA = Path(__file__).parents[2] / "data"
 GRIDS = sorted(DATA.glob("traced-*.npz"))
 
 

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow  # a method to compare with, of the laboratory
 
 SIGMA = 0.005
 NOISE = NoiseModel.white(SIGMA)
-DATA = Path(__file__).parents[1] / "data" / "levin09.npz"
+DATA = Path(__file__).parents[2] / "data" / "levin09.npz"
 
 
 @dataclass(frozen=True)

@@ -52,13 +52,13 @@ security: install ## known holes in what we use (asks the network), and suspicio
 
 SEEDS ?= 20
 torture: install ## random deaths and outages, SEEDS times on SQLite and on PostgreSQL with S3
-	@$(BIN)/python tests/app/torture.py --seeds $(SEEDS)
-	@$(BIN)/python tests/app/torture.py --seeds $(SEEDS) --servers
+	@$(BIN)/python tests/app/endurance/torture.py --seeds $(SEEDS)
+	@$(BIN)/python tests/app/endurance/torture.py --seeds $(SEEDS) --servers
 
 MINUTES ?= 10
 fuzz: install ## made-up requests and damaged files, MINUTES each
-	@$(BIN)/python tests/app/fuzz_api.py --minutes $(MINUTES)
-	@$(BIN)/python tests/app/fuzz_parsers.py --minutes $(MINUTES)
+	@$(BIN)/python tests/app/endurance/fuzz_api.py --minutes $(MINUTES)
+	@$(BIN)/python tests/app/endurance/fuzz_parsers.py --minutes $(MINUTES)
 
 format: install ## let the formatter and the linter mend what they can
 	@$(BIN)/ruff format .

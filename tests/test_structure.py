@@ -34,6 +34,13 @@ def test_a_room_of_many_modules_says_why() -> None:
     assert silent == []
 
 
+def test_tests_stand_in_the_same_tree_as_the_code() -> None:
+    of = {path.parent.relative_to(ROOT / "tests") for path in (ROOT / "tests").rglob("*/test_*.py")}
+    assert [str(room) for room in of if not (ROOT / room).is_dir()] == []
+    full = [room for room in of if len(list((ROOT / "tests" / room).glob("*.py"))) > MOST_MODULES]
+    assert full == []
+
+
 def is_text(one: ast.stmt) -> bool:
     """Whether it is the words below a constant."""
     return (

@@ -45,9 +45,10 @@ PROGRAM = [sys.executable, "-m", "app.cli"]
 OWN_ACCOUNT = {"LENS_TASK_USER": "none"}
 """Tasks with the account of the tests find the loops that were compiled before: each other service that is
 started by root compiles them anew, half a minute of it, into a folder of its own."""
-LIGHT = [sys.executable, str(Path(__file__).with_name("light_service.py"))]
+STAND_INS = Path(__file__).with_name("stand_ins")
+LIGHT = [sys.executable, str(STAND_INS / "light_service.py")]
 """The same whose workers estimate nothing."""
-BRIEF = [sys.executable, str(Path(__file__).with_name("brief_service.py"))]
+BRIEF = [sys.executable, str(STAND_INS / "brief_service.py")]
 """The same whose workers report on lenses in brief."""
 FINAL = {"succeeded", "failed", "cancelled"}
 SHAPE, SMALL = (320, 448), (224, 320)

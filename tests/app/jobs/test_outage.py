@@ -31,6 +31,7 @@ from app.store.tables import EventRow, PhotoRow, SampleRow
 from app.store.upkeep.migrate import upgrade
 
 HERE = Path(__file__).parents[1]
+STAND_INS = HERE / "stand_ins"
 sys.path.insert(0, str(HERE))
 from deadline import Deadline  # noqa: E402 - beside these files
 from servers import postgres  # noqa: E402 - same
@@ -256,10 +257,10 @@ def test_all_that_an_outage_ended_is_retried_by_one_call(
 
 @contextmanager
 def hired(settings: Settings) -> Iterator[subprocess.Popen[bytes]]:
-    path = os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")])
+    path = os.pathsep.join([str(STAND_INS), os.environ.get("PYTHONPATH", "")])
     with (settings.data_dir / "workers.log").open("a") as log:
         process = subprocess.Popen(
-            [sys.executable, str(HERE / "quick_worker.py")],
+            [sys.executable, str(STAND_INS / "quick_worker.py")],
             env=os.environ | environment(settings) | {"PYTHONPATH": path},
             stderr=log,
         )

@@ -28,6 +28,7 @@ from app.store.tables import EventRow, PatchRow, PhotoRow, SampleRow
 from app.store.upkeep.invariants import INVARIANTS
 
 HERE = Path(__file__).parents[1]
+STAND_INS = HERE / "stand_ins"
 sys.path.insert(0, str(HERE))
 from deadline import Deadline, stretched  # noqa: E402 - beside these files
 
@@ -42,13 +43,13 @@ class Crew:
 
     def __init__(self, settings: Settings) -> None:
         self._log = (settings.data_dir / "workers.log").open("a")
-        path = os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")])
+        path = os.pathsep.join([str(STAND_INS), os.environ.get("PYTHONPATH", "")])
         self._environment = os.environ | environment(settings) | {"PYTHONPATH": path}
         self.processes: list[subprocess.Popen[bytes]] = []
 
     def hire(self) -> subprocess.Popen[bytes]:
         process = subprocess.Popen(
-            [sys.executable, str(HERE / "quick_worker.py")],
+            [sys.executable, str(STAND_INS / "quick_worker.py")],
             env=self._environment,
             stderr=self._log,
             start_new_session=True,

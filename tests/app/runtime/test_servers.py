@@ -13,12 +13,14 @@ from typing import Any
 import pytest
 
 HERE = Path(__file__).parents[1]
-sys.path.insert(0, str(HERE))
+BESIDE = [str(HERE), str(HERE / "endurance")]
+sys.path[:0] = BESIDE
 from deadline import stretched  # noqa: E402 - beside this file
 from servers import Moto, Postgres, moto, postgres  # noqa: E402
 from torture import Plan, in_environment, torture  # noqa: E402
 
-sys.path.remove(str(HERE))
+for folder in BESIDE:
+    sys.path.remove(folder)
 
 from app.blobs.storage import Storage  # noqa: E402
 from app.runtime import backup as copies  # noqa: E402

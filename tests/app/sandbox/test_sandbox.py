@@ -25,7 +25,8 @@ from app.sandbox.child import NICENESS
 from app.sandbox.outcome import Outcome, TaskLimits
 from app.sandbox.runner import Sandbox
 
-HERE = Path(__file__).parents[1]
+OWN = Path(__file__).parent
+HERE = OWN.parent
 sys.path.insert(0, str(HERE))
 from deadline import Deadline, stretched  # noqa: E402 - beside these files
 
@@ -37,7 +38,7 @@ Run = Callable[..., Outcome]
 
 @pytest.fixture
 def sandbox(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Sandbox]:
-    monkeypatch.syspath_prepend(str(HERE))
+    monkeypatch.syspath_prepend(str(OWN))
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     made = Sandbox(
         tmp_path / "scratch",
@@ -242,7 +243,7 @@ def test_a_child_dies_with_its_killed_parent(tmp_path: Path) -> None:
         f"""
         import sys
         from pathlib import Path
-        sys.path.insert(0, {str(HERE)!r})
+        sys.path.insert(0, {str(OWN)!r})
         from app.sandbox.budget import Budget
         from app.sandbox.outcome import TaskLimits
         from app.sandbox.runner import Sandbox
@@ -338,7 +339,7 @@ def probed(
         port = listener.getsockname()[1]
         script = data.with_name("service.py")
         script.write_text(
-            PROBE.format(here=str(HERE), data=str(data), port=port, user=user, module=module, but=but),
+            PROBE.format(here=str(OWN), data=str(data), port=port, user=user, module=module, but=but),
             encoding="utf-8",
         )
         said = subprocess.run(

@@ -1,6 +1,6 @@
 """Walk the whole HTTP interface by its own description with made-up values; no answer may be a 500.
 
-    python tests/app/fuzz_api.py [--minutes 10] [--seed 0]
+    python tests/app/endurance/fuzz_api.py [--minutes 10] [--seed 0]
 
 Starts a service on an empty folder, gives it one calibrated photo, and lets schemathesis ask for everything
 that `/openapi.json` describes, and for what it forbids; `fuzz_hooks.py` lets most requests be about what is
@@ -17,6 +17,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from running import LIGHT, Service, running, write_photo
 
 HERE = Path(__file__).resolve().parent

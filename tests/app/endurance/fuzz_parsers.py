@@ -1,6 +1,6 @@
 """Feed damaged files to all that reads what strangers send; keep each that is not refused in words.
 
-    python tests/app/fuzz_parsers.py [--minutes 10] [--seed 0] [--keep FOLDER]
+    python tests/app/endurance/fuzz_parsers.py [--minutes 10] [--seed 0] [--keep FOLDER]
 
 Each reader gets a valid file of its kind with random damage: bytes set, inserted, removed, doubled, numbers
 of the header made huge, the end cut off. It may read it, or refuse it with an error of the library; any other

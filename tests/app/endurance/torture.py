@@ -1,7 +1,7 @@
 """Random deaths and outages under work, and then: everything counted exactly once, nothing lost.
 
-    python tests/app/torture.py --seeds 20              # SQLite and a folder
-    python tests/app/torture.py --seeds 20 --servers    # PostgreSQL and S3 (moto)
+    python tests/app/endurance/torture.py --seeds 20              # SQLite and a folder
+    python tests/app/endurance/torture.py --seeds 20 --servers    # PostgreSQL and S3 (moto)
 
 Three workers estimate the photos of two owners while, as the seed says, workers are killed (alone, or with
 their children), the database server crashes, the storage goes away, and disks are full: that of the data
@@ -27,10 +27,11 @@ from typing import TypeAlias
 
 from sqlalchemy import func, select
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1]
+STAND_INS = HERE / "stand_ins"
 sys.path.insert(0, str(HERE))
 
-from deadline import stretched  # noqa: E402 - beside this file
+from deadline import stretched  # noqa: E402 - of the tests of the service
 from servers import Postgres, moto, postgres  # noqa: E402
 from small_disk import kept_full, small_disk  # noqa: E402
 
@@ -65,7 +66,7 @@ class Crew:
 
     def __init__(self, settings: Settings, extra: dict[str, str], log: Path) -> None:
         self.log = log
-        path = os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")])
+        path = os.pathsep.join([str(STAND_INS), os.environ.get("PYTHONPATH", "")])
         self._environment = os.environ | environment(settings) | {"PYTHONPATH": path} | extra
         self.processes: list[subprocess.Popen[bytes]] = []
 
@@ -73,7 +74,7 @@ class Crew:
         with self.log.open("a") as log:
             self.processes.append(
                 subprocess.Popen(
-                    [sys.executable, str(HERE / "quick_worker.py")],
+                    [sys.executable, str(STAND_INS / "quick_worker.py")],
                     env=self._environment,
                     stderr=log,
                     start_new_session=True,
@@ -306,11 +307,11 @@ def main() -> int:
     for seed in range(wishes.first, wishes.first + wishes.seeds):
         with tempfile.TemporaryDirectory(prefix="lensmodel-torture-") as folder:
             try:
-                print(torture(Path(folder), seed, servers=wishes.servers), flush=True)  # noqa: T201
+                print(torture(Path(folder), seed, servers=wishes.servers), flush=True)
             except AssertionError as error:
                 failed += 1
-                print(f"seed {seed}: FAILED: {error}", flush=True)  # noqa: T201
-    print(f"{wishes.seeds - failed} of {wishes.seeds} seeds passed")  # noqa: T201
+                print(f"seed {seed}: FAILED: {error}", flush=True)
+    print(f"{wishes.seeds - failed} of {wishes.seeds} seeds passed")
     return 1 if failed else 0
 
 

@@ -1,6 +1,6 @@
 """Use a service in every way at once for an hour, and look whether anything grows that must not.
 
-    python tests/app/load.py [--minutes 60] [--photos 40] [--kill-every 60] [--seed 0]
+    python tests/app/endurance/load.py [--minutes 60] [--photos 40] [--kill-every 60] [--seed 0]
 
 A service of its own (SQLite, a folder, workers whose estimates are made up) gets uploads, PSF queries,
 corrections, cancels, exclusions and deletions from several threads, while its API and worker processes are
@@ -27,12 +27,14 @@ from pathlib import Path
 from typing import Any
 
 import httpx2
-from running import LIGHT, Service, running, write_photo
 
 from app.blobs.storage import Storage
 from app.runtime.doctor import examine
 from app.runtime.settings import Settings
 from app.store import Store
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from running import LIGHT, Service, running, write_photo
 
 SCENES = 6
 PATIENCE_S = 600.0

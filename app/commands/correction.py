@@ -39,7 +39,7 @@ FOLDER: Final = "corrected"
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class CorrectionOptions:
     """The options of the command."""
 
     aperture: float | None
@@ -58,7 +58,7 @@ def run(
     names: Sequence[str],
     source: Path,
     output: Path | None,
-    options: Options,
+    options: CorrectionOptions,
     display: Display,
     *,
     as_json: bool,
@@ -120,7 +120,7 @@ def correct_one(
     target: Path,
     lens: Lens,
     settings: LensSettings,
-    options: Options,
+    options: CorrectionOptions,
     display: Display,
     on_step: StepHook,
 ) -> dict[str, Any]:

@@ -22,7 +22,7 @@ _SUBJECT: Final = {
 
 
 @dataclass
-class Account:
+class JobRecord:
     """Kind and ending of one job."""
 
     kind: str
@@ -34,9 +34,9 @@ class Account:
 
 
 @contextmanager
-def accounted(kind: str, arguments: Sequence[str | int]) -> Iterator[Account]:
+def accounted(kind: str, arguments: Sequence[str | int]) -> Iterator[JobRecord]:
     """Provide the account of a job; inside, each log line carries the ids of the job and its subject."""
-    account = Account(kind)
+    account = JobRecord(kind)
     ids = {"job_id": "/".join([kind, *map(str, arguments)])}
     if kind in _SUBJECT:
         ids[_SUBJECT[kind]] = str(arguments[0])

@@ -25,7 +25,7 @@ from app.blobs.storage import Storage
 from app.jobs.context import JobContext
 from app.jobs.correction_work import CorrectionWork
 from app.jobs.developed_cache import drop_developed
-from app.jobs.job_log import Account, accounted
+from app.jobs.job_log import JobRecord, accounted
 from app.jobs.missing_reports import ask_for_reports
 from app.jobs.photo_work import PhotoWork
 from app.jobs.queue import DbosEngine, Handler, Job, JobEngine
@@ -110,7 +110,7 @@ class Worker:
         self._last_beat = time.monotonic()
         self._files = {path: _identity(path) for path in self._database_files()}
 
-    def _task_account(self, data: Path) -> account.Account | None:
+    def _task_account(self, data: Path) -> account.SystemAccount | None:
         """Return the account that children change to, with access to their folders and to nothing else."""
         if "account" not in self._confined:
             return None
@@ -217,7 +217,7 @@ class Worker:
             with accounted(handler.__name__, arguments) as account:
                 work(account, *arguments)
 
-        def work(account: Account, *arguments: str | int) -> None:
+        def work(account: JobRecord, *arguments: str | int) -> None:
             patience = Patience(self._settings.outage_hours * 3600.0)
             while True:
                 try:

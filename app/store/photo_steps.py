@@ -39,7 +39,7 @@ DESCRIPTION: Final = (
 """Columns that describe a photo; all are emptied when it is deleted."""
 
 
-class Identity(Protocol):
+class CopyIdentity(Protocol):
     """Which copy of which lens, as `lensmodel.photo.LensIdentity` says it."""
 
     @property

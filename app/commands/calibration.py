@@ -119,7 +119,7 @@ def _recipe(options: CalibrationOptions) -> pipeline.Recipe:
     )
 
 
-def _result(verdict: pipeline.Verdict, display: Display) -> dict[str, Any]:
+def _result(verdict: pipeline.PhotoVerdict, display: Display) -> dict[str, Any]:
     """Say what became of a photo, at once and in the document."""
     if verdict.error is not None:
         result = files.failed(verdict.error)

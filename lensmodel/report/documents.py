@@ -9,7 +9,7 @@ from typing import Final
 from lensmodel.core.types import ZONES
 from lensmodel.report.charts import apertures_chart, charts_of, lateral_chart
 from lensmodel.report.comparison import Comparison
-from lensmodel.report.drawing import Chart
+from lensmodel.report.drawing import ReportChart
 from lensmodel.report.lens_test import LensTest, Tested
 from lensmodel.report.units import UNIT_NAMES
 
@@ -130,7 +130,7 @@ def _page(title: str, parts: Iterable[str]) -> str:
     )
 
 
-def _figures(charts: Sequence[Chart]) -> str:
+def _figures(charts: Sequence[ReportChart]) -> str:
     # lettering of a chart stays large enough to read; on a narrow screen the chart scrolls, by keys as well
     figures = "".join(f'<figure tabindex="0">{chart.svg()}</figure>' for chart in charts)
     return f'<div class="charts">{figures}</div>'

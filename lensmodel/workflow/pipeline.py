@@ -8,7 +8,7 @@ the service run the same code. The steps in the middle are independent of each o
 run in as many processes as there are. Here they are under one name.
 """
 
-from lensmodel.workflow.calibrating import AHEAD, Calibration, InMemory, Verdict
+from lensmodel.workflow.calibrating import AHEAD, Calibration, InMemory, PhotoVerdict
 from lensmodel.workflow.correcting import correct_photo, lateral_of, psfs_for
 from lensmodel.workflow.developed import (
     load_developed,
@@ -52,9 +52,9 @@ __all__ = [
     "EventHook",
     "InMemory",
     "PhotoSteps",
+    "PhotoVerdict",
     "Recipe",
     "Stage",
-    "Verdict",
     "cells",
     "correct_photo",
     "estimate_cell",

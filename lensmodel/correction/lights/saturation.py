@@ -16,7 +16,7 @@ from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.blur.compiled_uniform import CompiledBlur
 from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.engine import Engine, compiled
-from lensmodel.correction.lights.clipped import Region, around, regions
+from lensmodel.correction.lights.clipped import ClippedRegion, around, regions
 from lensmodel.correction.methods.richardson_lucy import climbed, first_guess
 
 _LEAST_SEEN: Final = 0.02  # least share of a point's light that counts as measured (chosen, not measured)
@@ -177,7 +177,7 @@ def _spread(blur: UniformBlur) -> float:
 
 
 def _estimate(
-    region: Region,
+    region: ClippedRegion,
     plane: NDArray[np.float32],
     clipped: NDArray[np.bool_],
     blur: UniformBlur,

@@ -60,7 +60,7 @@ _FEWEST: Final = 64  # points that a fit of brightness takes (chosen)
 
 
 @dataclass(frozen=True, slots=True)
-class Pair:
+class AperturePair:
     """Non-blind PSFs of the first photo; the second is the same scene, closed by two stops or more.
 
     Parameters

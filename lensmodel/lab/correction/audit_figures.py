@@ -13,7 +13,7 @@ import numpy as np
 from lensmodel.core.psf import as_kernel
 from lensmodel.core.types import Planes
 from lensmodel.correction.audit import CHECKS, Evidence, held_back, nearby
-from lensmodel.correction.audit.check import Pair
+from lensmodel.correction.audit.check import TilePair
 from lensmodel.correction.audit.findings import HELD
 from lensmodel.correction.audit.tile import GROWN
 from lensmodel.correction.blur import UniformBlur, crop_to_support
@@ -155,7 +155,7 @@ def shares(case: AuditCase, folder: Path, method: str, rounds: int) -> list[floa
 
 def factors(block: Block) -> dict[str, float]:
     """By how much each check's limit would have to be larger for a tenth of the block to be held back."""
-    pair = Pair.of(block.photo, block.corrected, block.evidence)
+    pair = TilePair.of(block.photo, block.corrected, block.evidence)
     found = {}
     for name, check in CHECKS.items():
         severity = check(pair)

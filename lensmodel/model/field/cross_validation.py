@@ -14,7 +14,7 @@ from lensmodel.core.types import WAVELENGTH_NM
 from lensmodel.model import variables as va
 from lensmodel.model.answer import PAPER, ModelSettings
 from lensmodel.model.field import robust
-from lensmodel.model.field.leave_one_out import Choice, Held, choose
+from lensmodel.model.field.leave_one_out import Choice, HeldOut, choose
 from lensmodel.model.field.local_frame import LocalKernels
 from lensmodel.model.field.robust import Flag
 from lensmodel.model.wavefront.from_kernels import ONE_FOCAL_LENGTH
@@ -122,11 +122,11 @@ def cross_validate(
     several = len(np.unique(photo[voting])) >= 2
     groups = held_together(samples, photo)
 
-    def held(rows: NDArray[np.intp], votes: NDArray[np.float64]) -> Held:
+    def held(rows: NDArray[np.intp], votes: NDArray[np.float64]) -> HeldOut:
         kernels = local.upright(rows)
         scale = va.scales(bandwidth(rule, settings, Choice()))
         flat = kernels.reshape(len(rows), -1)
-        return Held.of(flat, kernels.shape[1], where[rows], scale, votes[rows], groups[rows])
+        return HeldOut.of(flat, kernels.shape[1], where[rows], scale, votes[rows], groups[rows])
 
     green = voting[where[voting, 4] == _judging_channel(where[voting, 4])]
     choice = Choice(mirror=settings.mirror or 0.0)

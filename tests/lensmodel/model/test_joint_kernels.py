@@ -17,7 +17,7 @@ from lensmodel.core.spectrum import RINGS, SECTORS, PatchSpectrum, bin_frequenci
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensSettings, NoiseModel
 from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
 from lensmodel.model.modes import WAVEFRONT_SHARE, Mixture
-from lensmodel.model.trust.expected_error import Evidence, joint_error
+from lensmodel.model.trust.expected_error import SampleEvidence, joint_error
 from lensmodel.model.wavefront import from_kernels, joint_kernels, search
 from lensmodel.model.wavefront.from_spectra import PatchView, PooledFit, fit_spectra
 from lensmodel.model.wavefront.joint_kernels import MIN_PLACES, Pooled, _by_aperture, pool
@@ -501,7 +501,7 @@ def test_measured_kernels_leave_a_wavefront_no_say(known: list[PsfSample], warm:
 
 
 def test_the_error_to_expect_grows_with_what_kernels_and_wavefront_differ_by() -> None:
-    evidence = Evidence(0.01, 0.16, 2.0, 0.3, extrapolated=False, usual=0.1)
+    evidence = SampleEvidence(0.01, 0.16, 2.0, 0.3, extrapolated=False, usual=0.1)
 
     def told(apart: float, r: float = 0.5) -> float:
         one = np.ones(1)

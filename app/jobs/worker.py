@@ -20,7 +20,7 @@ from typing import Final, TypeAlias
 from sqlalchemy.exc import OperationalError
 
 from app.blobs.erasure import erase
-from app.blobs.folder_creation import settle
+from app.blobs.folder_creation import settle_folder
 from app.blobs.storage import Storage
 from app.jobs.context import JobContext
 from app.jobs.correction_work import CorrectionWork
@@ -136,7 +136,7 @@ class Worker:
         beat_s = min(self._settings.lease_seconds / 4, 5.0)
         # in a thread of its own: nothing below, and no duty, may delay the lease
         lease = self._start_thread(beat_s, self._keep_lease)
-        self._insist(lambda: settle(self._store, self._context.storage))
+        self._insist(lambda: settle_folder(self._store, self._context.storage))
         photos, corrections = PhotoWork(self._context, self._engine), CorrectionWork(self._context)
         self._engine.start(
             {
@@ -214,10 +214,10 @@ class Worker:
         """Wrap a job: failures are retried, and the last one ends the job with a reason."""
 
         def run(*arguments: str | int) -> None:
-            with accounted(handler.__name__, arguments) as account:
-                work(account, *arguments)
+            with accounted(handler.__name__, arguments) as record:
+                work(record, *arguments)
 
-        def work(account: JobRecord, *arguments: str | int) -> None:
+        def work(record: JobRecord, *arguments: str | int) -> None:
             patience = Patience(self._settings.outage_hours * 3600.0)
             while True:
                 try:
@@ -231,9 +231,9 @@ class Worker:
                         log.exception("job %s", name)
                     if pause is None:
                         ending = Ending.of(error)
-                        account.ending = ending.code
+                        record.ending = ending.code
                         break
-                    account.retries(error)
+                    record.retries(error)
                     self._rest(pause)
                 else:
                     return

@@ -43,7 +43,7 @@ def facts(test: LensTest) -> str:
     return ", ".join(parts)
 
 
-def error_words(tested: Tested) -> str:
+def error_map_words(tested: Tested) -> str:
     """Say what the bands and error maps of a report are."""
     if tested.spread is None:
         return "Too little is known to estimate the error of these figures."
@@ -87,7 +87,7 @@ def to_html(test: LensTest) -> str:
         parts.append(f"<h2>{'At ' + f'f/{aperture:g}' if aperture is not None else 'Aperture unknown'}</h2>")
         parts.append(_list(tested.report.summary))
         parts.append(_figures(charts_of(test, aperture)))
-        parts.append(f'<p class="note">{escape(error_words(tested))}</p>')
+        parts.append(f'<p class="note">{escape(error_map_words(tested))}</p>')
     parts += ["<h2>What would help most</h2>", f"<p>{escape(test.advice.text)}</p>"]
     return _page(test.name, parts)
 
@@ -113,7 +113,7 @@ def comparison_html(comparison: Comparison) -> str:
         *(f'<p class="facts">{escape(side.facts)}.</p>' for side in (first, second)),
         _table(head, rows),
         _figures(comparison.charts),
-        f'<p class="note">{escape(error_words(first.tested))}</p>',
+        f'<p class="note">{escape(error_map_words(first.tested))}</p>',
     ]
     return _page(title, parts)
 

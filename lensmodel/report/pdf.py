@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from lensmodel.report.charts import apertures_chart, charts_of, lateral_chart
 from lensmodel.report.comparison import Comparison
-from lensmodel.report.documents import error_words, facts, zone_table
+from lensmodel.report.documents import error_map_words, facts, zone_table
 from lensmodel.report.drawing import Area, Box, Label, Line, Part, ReportChart
 from lensmodel.report.lens_test import LensTest
 
@@ -38,7 +38,7 @@ def to_pdf(test: LensTest) -> bytes:
         for line in tested.report.summary:
             story.text(f"- {line}", 9.5)
         story.charts(charts_of(test, aperture))
-        story.text(error_words(tested), 8.5)
+        story.text(error_map_words(tested), 8.5)
     story.heading("What would help most", 13)
     story.text(test.advice.text, 10)
     return story.done()
@@ -62,7 +62,7 @@ def comparison_pdf(comparison: Comparison) -> bytes:
     rows = [[c.zone, f"{c.first:.3f}", f"{c.second:.3f}", f"{c.share:+.0%}"] for c in comparison.zones]
     story.table(head, rows)
     story.charts(comparison.charts)
-    story.text(error_words(comparison.first.tested), 8.5)
+    story.text(error_map_words(comparison.first.tested), 8.5)
     return story.done()
 
 

@@ -60,7 +60,7 @@ def _sums(pair: TilePair, channel: int, blur: UniformBlur) -> NDArray[np.float32
     evidence, sigma = pair.evidence, pair.sigma[channel]
     x, y = pair.corrected[channel], pair.original[channel]
     error = max(evidence.psf_errors[channel], MODEL_ERROR)
-    counted = usable(y, blur, evidence.clip[channel], evidence.measured[channel])
+    counted = usable_pixels(y, blur, evidence.clip[channel], evidence.measured[channel])
     if pair.loops is not None:
         sums, shape = blocks.empty(3, pair.shape), _grid(pair.shape, blur)
         spectrum = _transfer(blur, shape, pair.loops)
@@ -100,7 +100,7 @@ def reblurred(plane: Plane, blur: UniformBlur) -> Plane:
     return np.asarray(blurred[: plane.shape[0], : plane.shape[1]], dtype=np.float32)
 
 
-def usable(
+def usable_pixels(
     plane: Plane, blur: UniformBlur, clip: float, measured: NDArray[np.bool_] | None
 ) -> NDArray[np.bool_]:
     """Pixels that were measured, show no clipped light and lie inside the rim, which draws on the unknown."""

@@ -65,7 +65,7 @@ def regions(clipped: NDArray[np.bool_], reach: int) -> list[ClippedRegion]:
     return [_region(piece, tight, clipped.shape, active.shape, reach) for piece, tight in pieces]
 
 
-def around(marked: NDArray[np.bool_], axis: int, reach: int) -> slice:
+def span_around(marked: NDArray[np.bool_], axis: int, reach: int) -> slice:
     """From `reach` before the first mark along an axis to `reach` after the last."""
     at = np.flatnonzero(marked.any(axis=1 - axis))
     return slice(max(int(at[0]) - reach, 0), int(at[-1]) + reach + 1)

@@ -20,7 +20,13 @@ from lensmodel.correction.methods.sparse_gradient import SparseGradient
 from lensmodel.correction.methods.wiener import frequency_squared, prior
 from lensmodel.correction.tiles.beyond_frame import fill_outside
 from lensmodel.correction.tiles.canvas import Canvas, seam
-from lensmodel.correction.tiles.local_statistics import BLOCK, BlockMeans, signal_variance, smoothed, spread
+from lensmodel.correction.tiles.local_statistics import (
+    BLOCK,
+    BlockMeans,
+    signal_variance,
+    smoothed,
+    spread_blocks,
+)
 from lensmodel.correction.tiles.transfers import transfers
 
 _FINE: Final = 1.0 / 16.0  # cycles per pixel: a window of 13 pixels sees frequencies above this
@@ -96,7 +102,7 @@ class DirectFilter:
         mean = float(contrast.mean())
         low, high = np.log(self.calm), np.log(self.busy)
         share = np.clip((np.log(contrast / mean) - low) / (high - low), 0.0, 1.0)
-        busy = spread(share.astype(np.float32), canvas)
+        busy = spread_blocks(share.astype(np.float32), canvas)
         K, _ = transfers(blurs, canvas.shape, 1.0, loops, drifting=False)
         levels = np.array(
             [[3.0 * mean * f, max(colour, _LEAST_COLOUR * 3.0 * mean) * f] for f in (self.busy, self.calm)]

@@ -88,7 +88,7 @@ def signal_variance(blocks: BlockMeans, noise: NDArray[np.float32] | float) -> N
     return np.asarray(np.maximum(local - noise, 0.0) + _UNSURE * noise + np.float32(1e-12), dtype=np.float32)
 
 
-def spread(blocks: NDArray[np.float32], canvas: Canvas) -> NDArray[np.float32]:
+def spread_blocks(blocks: NDArray[np.float32], canvas: Canvas) -> NDArray[np.float32]:
     """Interpolate a coarse plane linearly onto a canvas, its margin cross-faded like the data's."""
     height, width = canvas.shape
     across = _interpolation(canvas.cols, canvas.margin, width) @ np.ascontiguousarray(blocks.T)

@@ -99,7 +99,7 @@ def find_lights(plane: NDArray[np.floating], detector: str = "auto") -> list[Poi
     return sorted(_by_maxima(clean, scatter), key=lambda light: -light.peak)
 
 
-def isolated(lights: list[PointLight], reach: float) -> list[PointLight]:
+def isolated_lights(lights: list[PointLight], reach: float) -> list[PointLight]:
     """Lights that have no other beside them that would disturb, within `reach` pixels."""
     places = np.array([(light.row, light.col) for light in lights]).reshape(-1, 2)
     peaks = np.array([light.peak for light in lights])

@@ -26,7 +26,7 @@ from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import centred
 from lensmodel.core.types import CHANNELS, Channel, StepHook, ignore_step
 from lensmodel.estimation.measure.measurer import MeasuredPsf, require_photos
-from lensmodel.estimation.measure.point_detection import PointLight, find_lights, isolated, sky_of
+from lensmodel.estimation.measure.point_detection import PointLight, find_lights, isolated_lights, sky_of
 from lensmodel.estimation.measure.solve import Solved, solve
 from lensmodel.estimation.measure.windows import NEAR_CLIP, measured_pixels, photo_noise
 from lensmodel.photo import LinearPhoto
@@ -74,7 +74,7 @@ class Points:
         require_photos(self, photos)
         photo = photos[0]
         plane = np.asarray(photo.planes[1], dtype=np.float64)
-        lights = isolated(find_lights(plane, self.detector), size)
+        lights = isolated_lights(find_lights(plane, self.detector), size)
         usable = [light for light in lights if _whole(light, photo, size) and not _saturated(light, photo)]
         cells: dict[tuple[int, int], list[PointLight]] = {}
         for light in usable:

@@ -85,7 +85,7 @@ def look_at(path: Path, aperture: float | None, estimator: str, count: int) -> S
         settings = pipeline.settings_of(photo, LensSettings(aperture=aperture))
     chosen = pipeline.find_patches(photo, count=count)
     halves: tuple[list[PsfSample], list[PsfSample]] = ([], [])
-    for group in pipeline.cells(chosen):
+    for group in pipeline.patches_by_cell(chosen):
         for half, samples in enumerate(halves):
             part = group[half::2]
             if not part:

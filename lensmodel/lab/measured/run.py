@@ -113,7 +113,7 @@ def _blind(path: Path, size: int) -> list[Found]:
     photo = develop(path)
     settings = pipeline.settings_of(photo)
     found: list[Found] = []
-    for group in pipeline.cells(pipeline.find_patches(photo, count=_BLIND_PATCHES)):
+    for group in pipeline.patches_by_cell(pipeline.find_patches(photo, count=_BLIND_PATCHES)):
         try:
             cells = pipeline.estimate_cell(
                 photo, group, settings=settings, photo_id="bench", size=size, channels=("g",)

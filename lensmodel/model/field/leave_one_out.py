@@ -140,7 +140,7 @@ class Choice:
             raise InvalidInputError(f"a held-out error must be finite and not negative, got {self.error}")
 
 
-def choose(held: HeldOut, *, r: bool = True, phi: bool = True, mirror: bool = True) -> Choice:
+def choose_factors(held: HeldOut, *, r: bool = True, phi: bool = True, mirror: bool = True) -> Choice:
     """Search the factors, each only where it is free, for the least held-out error."""
 
     def best(options: tuple[float, ...], make: Callable[[float], Choice]) -> Choice:

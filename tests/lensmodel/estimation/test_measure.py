@@ -21,7 +21,7 @@ from lensmodel.estimation.measure.edges import SlantedEdges, constrained
 from lensmodel.estimation.measure.page import TargetPage
 from lensmodel.estimation.measure.pair import AperturePair
 from lensmodel.estimation.measure.placed_page import PlacedPage
-from lensmodel.estimation.measure.point_detection import find_lights, isolated
+from lensmodel.estimation.measure.point_detection import find_lights, isolated_lights
 from lensmodel.estimation.measure.points import Points
 from lensmodel.estimation.measure.solve import solve
 from lensmodel.estimation.measure.target import Target
@@ -250,7 +250,7 @@ def test_lights_beside_others_are_left_out() -> None:
     plane += np.random.default_rng(0).normal(0, 1e-4, plane.shape)
     lights = find_lights(plane, "own")
     assert len(lights) == 3
-    assert [(round(one.row), round(one.col)) for one in isolated(lights, 21)] == [(80, 120)]
+    assert [(round(one.row), round(one.col)) for one in isolated_lights(lights, 21)] == [(80, 120)]
 
 
 def test_an_unknown_detector_is_refused() -> None:

@@ -17,7 +17,7 @@ import typer
 
 from app.commands.console import display, extras, interrupt
 from app.commands.console.failure import InterruptedByUser, UsageError
-from app.commands.console.on_demand import Entry, OnDemand
+from app.commands.console.on_demand import CommandEntry, OnDemand
 from lensmodel.core.errors import LensModelError
 
 interrupt.workers_ignore_it()
@@ -26,77 +26,77 @@ interrupt.workers_ignore_it()
 class Commands(OnDemand):
     """The commands as `--help` lists them; a test holds each against its own help."""
 
-    entries: ClassVar[Mapping[str, Entry]] = {
-        "calibrate": Entry(
+    entries: ClassVar[Mapping[str, CommandEntry]] = {
+        "calibrate": CommandEntry(
             "app.commands.photos:calibrate", "Learn the blur of one lens from photos, into a profile."
         ),
-        "correct": Entry("app.commands.photos:correct", "Remove the blur of the lens from photos."),
-        "check": Entry(
+        "correct": CommandEntry("app.commands.photos:correct", "Remove the blur of the lens from photos."),
+        "check": CommandEntry(
             "app.commands.checking:check",
             "Find where a photo corrected by any program shows what the original cannot have contained.",
         ),
-        "psf": Entry(
+        "psf": CommandEntry(
             "app.commands.photos:psf",
             "Show what the lens makes of a point of light at one place in the picture.",
         ),
-        "measure": Entry(
+        "measure": CommandEntry(
             "app.commands.measurement:measure",
             "Measure the blur of a lens from photos made for the purpose, into a profile.",
         ),
-        "target": Entry(
+        "target": CommandEntry(
             "app.commands.measurement:target", "Write the page to print for `lensmodel measure target`."
         ),
-        "report": Entry(
+        "report": CommandEntry(
             "app.commands.report:report",
             "Say how sharp a lens is, whether it is centred, and which photo would help most.",
         ),
-        "export": Entry(
+        "export": CommandEntry(
             "app.commands.report:export_psfs",
             "Write PSFs for other programs: a grid over the picture, or a single place with --r and --phi.",
         ),
-        "serve": Entry(
+        "serve": CommandEntry(
             "app.commands.service:serve",
             "Run the whole service: the API, a worker, and a guard that restarts them.",
         ),
-        "api": Entry(
+        "api": CommandEntry(
             "app.commands.service:api",
             "Run only the API process, for installations on many machines.",
             hidden=True,
         ),
-        "worker": Entry(
+        "worker": CommandEntry(
             "app.commands.service:worker",
             "Run only a worker process, for installations on many machines.",
             hidden=True,
         ),
-        "config": Entry(
+        "config": CommandEntry(
             "app.commands.service:config",
             "Print the effective settings as environment variables; secrets are masked.",
         ),
-        "doctor": Entry(
+        "doctor": CommandEntry(
             "app.commands.upkeep:doctor",
             "Check an installation, running or not: tables, blobs, and whether a worker is running.",
         ),
-        "backup": Entry(
+        "backup": CommandEntry(
             "app.commands.upkeep:backup",
             "Copy all rows and blobs of an installation into a folder, even while it runs.",
         ),
-        "restore": Entry("app.commands.upkeep:restore", "Fill an empty installation from a backup."),
-        "migrate": Entry(
+        "restore": CommandEntry("app.commands.upkeep:restore", "Fill an empty installation from a backup."),
+        "migrate": CommandEntry(
             "app.commands.upkeep:migrate",
             "Move a stopped installation to another database, and to another storage.",
         ),
-        "demo": Entry(
+        "demo": CommandEntry(
             "app.commands.demonstration:demo",
             "Run the whole process on a real RAW file and on a simulated lens whose true blur is known.",
         ),
-        "reproduce": Entry(
+        "reproduce": CommandEntry(
             "app.lab.reproduce:reproduce",
             "Make the paper's figures and its Table 1 on simulated lenses that nothing was tuned on.",
         ),
-        "keys": Entry(
+        "keys": CommandEntry(
             "app.commands.keys:keys", "Make, list, renew and end the keys of a service that others can reach."
         ),
-        "bench": Entry("app.lab.benchmarks:bench", "Measure quality and speed."),
+        "bench": CommandEntry("app.lab.benchmarks:bench", "Measure quality and speed."),
     }
 
 

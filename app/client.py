@@ -22,7 +22,7 @@ from typing import Final
 import httpx2
 
 from app import schemas as s
-from app.client_connection import DEFAULT_URL, Query, ServiceProblemError, check, read, said
+from app.client_connection import DEFAULT_URL, Query, ServiceProblemError, read, require_success, said
 from app.client_lenses import LensCalls
 from app.schemas.account import AccountOut
 from lensmodel.core.errors import LensModelError
@@ -145,7 +145,7 @@ class Client(LensCalls):
 
     def delete_photo(self, photo_id: str) -> None:
         """Delete a photo with all that was made of it."""
-        check(self._http.delete(f"/v1/photos/{photo_id}"))
+        require_success(self._http.delete(f"/v1/photos/{photo_id}"))
 
     def job(self, job_id: str) -> s.JobOut:
         """Return one job."""
@@ -235,7 +235,7 @@ class Client(LensCalls):
 
     def delete_correction(self, correction_id: str) -> None:
         """Delete a correction with its file; one that runs stops."""
-        check(self._http.delete(f"/v1/corrections/{correction_id}"))
+        require_success(self._http.delete(f"/v1/corrections/{correction_id}"))
 
     def account(self) -> AccountOut:
         """Return who asks, what he has and what he may have."""
@@ -247,7 +247,7 @@ class Client(LensCalls):
 
     def erase_account(self) -> None:
         """Erase all that the service keeps of this owner, its keys too. There is no way back."""
-        check(self._http.delete("/v1/account"))
+        require_success(self._http.delete("/v1/account"))
 
     def download(self, correction_id: str, path: str | Path) -> Path:
         """Save the corrected photo; the file appears under its name only when it is complete."""

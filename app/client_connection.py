@@ -85,7 +85,7 @@ class Connection:
         with self._http.stream("GET", address, params=said(query) if query else None) as answer:
             if answer.is_error:
                 answer.read()
-            check(answer)
+            require_success(answer)
             with atomic(target) as file:
                 for piece in answer.iter_bytes():
                     file.write(piece)
@@ -108,7 +108,7 @@ def said(query: Query) -> dict[str, str | int | float | bool]:
     return {name: value for name, value in query.items() if value is not None}
 
 
-def check(answer: httpx2.Response) -> httpx2.Response:
+def require_success(answer: httpx2.Response) -> httpx2.Response:
     """Return an answer that is no refusal.
 
     Raises
@@ -130,4 +130,4 @@ def check(answer: httpx2.Response) -> httpx2.Response:
 
 def read(model: type[M], answer: httpx2.Response) -> M:
     """Return the object that an answer holds."""
-    return model.model_validate_json(check(answer).content)
+    return model.model_validate_json(require_success(answer).content)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app import schemas as s
-from app.client_connection import Connection, Query, check, read, said
+from app.client_connection import Connection, Query, read, require_success, said
 from lensmodel.core.types import Channel
 
 
@@ -54,18 +54,18 @@ class LensCalls(Connection):
     ) -> NDArray[np.float32]:
         """Return only the kernel, shape (size, size), float32; the parameters are those of `psf`."""
         params = said({"r": r, "phi": phi, **query})
-        answer = check(self._http.get(f"/v1/lenses/{lens_id}/psf.npy", params=params))
+        answer = require_success(self._http.get(f"/v1/lenses/{lens_id}/psf.npy", params=params))
         kernel: NDArray[np.float32] = np.load(io.BytesIO(answer.content), allow_pickle=False)
         return kernel
 
     def field_png(self, /, lens_id: str, **query: str | float | None) -> bytes:
         """Return the map of PSFs over the field as a PNG; the parameters are those of the endpoint."""
         params = {name: value for name, value in query.items() if value is not None}
-        return check(self._http.get(f"/v1/lenses/{lens_id}/field.png", params=params)).content
+        return require_success(self._http.get(f"/v1/lenses/{lens_id}/field.png", params=params)).content
 
     def delete_lens(self, lens_id: str) -> None:
         """Delete a lens with all that was learned of it."""
-        check(self._http.delete(f"/v1/lenses/{lens_id}"))
+        require_success(self._http.delete(f"/v1/lenses/{lens_id}"))
 
     def rename_lens(self, lens_id: str, label: str | None) -> s.LensOut:
         """Call a lens by a name of its owner's; None takes the name away."""

@@ -14,7 +14,7 @@ from starlette.routing import BaseRoute
 
 from app import pages
 from app.access.authentication import Gate
-from app.blobs.folder_creation import settle
+from app.blobs.folder_creation import settle_folder
 from app.blobs.storage import Storage
 from app.http import errors
 from app.http.bodies import JsonBodies
@@ -62,7 +62,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         store = Store(chosen)
         storage = Storage(chosen.storage, patience_s=chosen.storage_seconds, create=False)
         with missable():  # /readyz tries again
-            settle(store, storage)
+            settle_folder(store, storage)
         cache = ModelCache(
             store,
             chosen.model_cache_mb * MIB,

@@ -8,7 +8,7 @@ from app.runtime.settings import Settings
 from lensmodel.workflow.ways import WAYS, Way
 
 
-def way_of(settings: Settings, name: str) -> Way:
+def configured_way(settings: Settings, name: str) -> Way:
     """Return the estimator, kernel size, model mode and correction method of a model.
 
     The settings of the service choose estimator and kernel size of the model `default`; all else is fixed.
@@ -20,4 +20,4 @@ def way_of(settings: Settings, name: str) -> Way:
 
 def of_models(settings: Settings, name: str) -> dict[str, str]:
     """Return the arguments of `ModelSettings` for lenses of a model."""
-    return {"mode": way_of(settings, name).mode, "unit": settings.model_unit}
+    return {"mode": configured_way(settings, name).mode, "unit": settings.model_unit}

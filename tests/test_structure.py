@@ -1,8 +1,9 @@
-"""How large the rooms of the house are, and that its constants say where they come from."""
+"""How large the rooms of the house are, what classes are called, and where constants come from."""
 
 from __future__ import annotations
 
 import ast
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +14,19 @@ PACKAGES = ("lensmodel", "app")
 
 def modules() -> list[Path]:
     return [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+
+
+def public_classes(*, lab: bool) -> dict[str, list[str]]:
+    """Where the public top-level classes are defined, by name: those of the laboratory or of the product."""
+    homes = defaultdict(list)
+    for path in modules():
+        home = path.relative_to(ROOT)
+        if home.is_relative_to("lensmodel/lab") is lab:
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            for node in tree.body:
+                if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                    homes[node.name].append(str(home))
+    return dict(homes)
 
 
 def test_modules_are_short() -> None:
@@ -91,3 +105,13 @@ def test_a_constant_without_a_word_is_found() -> None:
     assert list(
         silent('A = 1  # one\nB = (2.0, -3)\n\n# of both\nC = 4\nD = 5\n\nE = 6\nF = 7\n"""Two."""\n')
     ) == [2]
+
+
+def test_each_class_of_the_product_has_a_name_of_its_own() -> None:
+    shared = {name: homes for name, homes in public_classes(lab=False).items() if len(homes) > 1}
+    assert shared == {}
+
+
+def test_the_laboratory_calls_nothing_as_a_class_of_the_product_is_called() -> None:
+    product, lab = public_classes(lab=False), public_classes(lab=True)
+    assert {name: lab[name] + product[name] for name in lab.keys() & product.keys()} == {}

@@ -8,7 +8,7 @@ from app.blobs.storage import Storage
 from app.store import Store
 
 
-def settle(store: Store, storage: Storage) -> None:
+def settle_folder(store: Store, storage: Storage) -> None:
     """Create the folder of the blobs if it is new; leave one that is unmounted as it is.
 
     It is new as long as no row names a file. A folder that is older than the mark file is recognised by

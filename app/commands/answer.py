@@ -27,7 +27,7 @@ WRITTEN: Final = (".npy", ".json", ".tif", ".png")
 
 
 @dataclass(frozen=True, slots=True)
-class Question:
+class PsfQuestion:
     """Which PSF is asked for."""
 
     r: float
@@ -38,7 +38,7 @@ class Question:
 
 
 def run(
-    source: Path, question: Question, output: Path | None, display: Display, *, force: bool, as_json: bool
+    source: Path, question: PsfQuestion, output: Path | None, display: Display, *, force: bool, as_json: bool
 ) -> None:
     """Answer in words, as JSON, or into a file."""
     with files.as_usage():

@@ -27,7 +27,7 @@ _ZIP: Final = b"PK"
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class CalibrationOptions:
     """The options of the command."""
 
     aperture: float | None
@@ -44,7 +44,9 @@ class Options:
     kernel_size: int | None = None
 
 
-def run(names: Sequence[str], target: Path, options: Options, display: Display, *, as_json: bool) -> None:
+def run(
+    names: Sequence[str], target: Path, options: CalibrationOptions, display: Display, *, as_json: bool
+) -> None:
     """Add photos to a profile, one after the other, and save it after each."""
     paths = files.photos(names)
     _refuse(target, paths, options)
@@ -92,7 +94,9 @@ def run(names: Sequence[str], target: Path, options: Options, display: Display, 
         raise typer.Exit(1)
 
 
-def calibration_of(target: Path, options: Options, family: LensProfile | None = None) -> pipeline.Calibration:
+def calibration_of(
+    target: Path, options: CalibrationOptions, family: LensProfile | None = None
+) -> pipeline.Calibration:
     """Return the work on a profile, which may be there already."""
     recipe = _recipe(options)
     return pipeline.Calibration(
@@ -105,7 +109,7 @@ def calibration_of(target: Path, options: Options, family: LensProfile | None = 
     )
 
 
-def _recipe(options: Options) -> pipeline.Recipe:
+def _recipe(options: CalibrationOptions) -> pipeline.Recipe:
     return pipeline.Recipe(
         LensSettings(aperture=options.aperture),
         model=options.model,
@@ -115,7 +119,7 @@ def _recipe(options: Options) -> pipeline.Recipe:
     )
 
 
-def _result(verdict: pipeline.Verdict, display: Display) -> dict[str, Any]:
+def _result(verdict: pipeline.PhotoVerdict, display: Display) -> dict[str, Any]:
     """Say what became of a photo, at once and in the document."""
     if verdict.error is not None:
         result = files.failed(verdict.error)
@@ -127,7 +131,7 @@ def _result(verdict: pipeline.Verdict, display: Display) -> dict[str, Any]:
     return {"state": "counted", "samples": verdict.samples}
 
 
-def _refuse(target: Path, photos: Sequence[Path], options: Options) -> None:
+def _refuse(target: Path, photos: Sequence[Path], options: CalibrationOptions) -> None:
     """Refuse to replace a photo, and options that contradict each other."""
     if target.is_dir():
         raise UsageError(f"{target} is a folder; give the file of a lens profile")
@@ -149,7 +153,7 @@ class ProfileFile:
     changed, so that no run drops what another one learned.
     """
 
-    def __init__(self, target: Path, options: Options, family: LensProfile | None) -> None:
+    def __init__(self, target: Path, options: CalibrationOptions, family: LensProfile | None) -> None:
         self.settled = True
         self._target, self._options, self._family = target, options, family
         self._lens: Lens | None = None

@@ -39,7 +39,7 @@ FOLDER: Final = "corrected"
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class CorrectionOptions:
     """The options of the command."""
 
     aperture: float | None
@@ -58,7 +58,7 @@ def run(
     names: Sequence[str],
     source: Path,
     output: Path | None,
-    options: Options,
+    options: CorrectionOptions,
     display: Display,
     *,
     as_json: bool,
@@ -120,7 +120,7 @@ def correct_one(
     target: Path,
     lens: Lens,
     settings: LensSettings,
-    options: Options,
+    options: CorrectionOptions,
     display: Display,
     on_step: StepHook,
 ) -> dict[str, Any]:
@@ -171,10 +171,10 @@ def remarks(result: Mapping[str, Any]) -> list[str]:
     """Return remarks on a corrected photo."""
     if result["nothing_to_correct"]:
         return ["nothing to correct: its pixels stayed as they were"]
-    return [*measured(result["zones"]), *audited(result["audit"]), *colour(result["chroma_step"])]
+    return [*measured(result["zones"]), *audited(result["audit"]), *colour_remarks(result["chroma_step"])]
 
 
-def colour(step: tuple[int, int]) -> list[str]:
+def colour_remarks(step: tuple[int, int]) -> list[str]:
     """Tell in words where a file stores colour too coarsely to be corrected pixel by pixel."""
     if max(step) == 1:
         return []

@@ -16,7 +16,7 @@ from app.commands import calibration, correction
 from app.commands.console import files
 from app.commands.console.display import Display
 from app.commands.console.table import aligned
-from app.commands.grouping import Group, Shot, groups
+from app.commands.grouping import PhotoGroup, Shot, groups
 from app.commands.journal import Journal
 from app.words import gain_words
 from lensmodel import correction as corrections
@@ -55,10 +55,10 @@ class Learning:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class GroupResult:
     """What became of a group of photos; a line of the table."""
 
-    group: Group
+    group: PhotoGroup
     profile: Path
     learned: int
     states: Mapping[str, int]
@@ -73,7 +73,7 @@ class Row:
 def run(
     names: Sequence[str],
     output: Path | None,
-    options: correction.Options,
+    options: correction.CorrectionOptions,
     learning: Learning,
     display: Display,
     *,
@@ -127,7 +127,7 @@ class _Folder:
         self,
         output: Path,
         profiles: Path,
-        options: correction.Options,
+        options: correction.CorrectionOptions,
         learning: Learning,
         display: Display,
     ) -> None:
@@ -137,11 +137,11 @@ class _Folder:
         self._learned: Counter[tuple[str, str]] = Counter()
         self._calibrations: dict[Path, pipeline.Calibration] = {}
 
-    def profile_of(self, group: Group) -> Path:
+    def profile_of(self, group: PhotoGroup) -> Path:
         """Name the file of a group's lens profile."""
         return self._profiles / f"{group.name}{ENDING}"
 
-    def learn(self, group: Group, bars: Progress) -> None:
+    def learn(self, group: PhotoGroup, bars: Progress) -> None:
         """Learn a group's lens from its usable photos, at most as many as the options say."""
         target = self.profile_of(group)
         if target not in self._calibrations:
@@ -168,7 +168,7 @@ class _Folder:
         bars.remove_task(task)
 
     def _calibration(self, target: Path) -> pipeline.Calibration:
-        options = calibration.Options(
+        options = calibration.CalibrationOptions(
             aperture=self._options.aperture,
             estimator=self._learning.estimator,
             workers=self._options.workers,
@@ -205,13 +205,13 @@ class _Folder:
 
     def correct(
         self,
-        group: Group,
+        group: PhotoGroup,
         targets: Mapping[Path, Path],
         bars: Progress,
         results: list[dict[str, Any]],
         *,
         as_json: bool,
-    ) -> Row:
+    ) -> GroupResult:
         """Correct the photos of a group that gain from it; leave the others."""
         profile = self.profile_of(group)
         lens = Lens(files.profile_at(profile)).warmed() if profile.exists() else None
@@ -231,7 +231,7 @@ class _Folder:
             results.append({"photo": str(shot.path), "output": str(target), **result})
             bars.update(task, completed=number + 1)
         bars.remove_task(task)
-        return Row(group, profile, self._learned[group.name, group.focal], states, tuple(gains))
+        return GroupResult(group, profile, self._learned[group.name, group.focal], states, tuple(gains))
 
     def _correct_shot(
         self, shot: Shot, target: Path, lens: Lens | None, on_step: Callable[[int, int], None]
@@ -281,7 +281,7 @@ def _learning(bars: Progress, task: TaskID, number: int, event: pipeline.Calibra
     )
 
 
-def _document(row: Row) -> dict[str, Any]:
+def _document(row: GroupResult) -> dict[str, Any]:
     return {
         "camera": row.group.camera,
         "lens": row.group.lens,
@@ -297,7 +297,7 @@ def _document(row: Row) -> dict[str, Any]:
     }
 
 
-def _table(rows: Sequence[Row]) -> str:
+def _table(rows: Sequence[GroupResult]) -> str:
     head = [
         *("camera", "lens", "focal length", "photos", "learned from", "corrected", "left", "failed"),
         "expected gain",

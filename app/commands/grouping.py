@@ -48,7 +48,7 @@ class Shot:
 
 
 @dataclass(frozen=True, slots=True)
-class Group:
+class PhotoGroup:
     """Photos of one body, one lens and about one focal length.
 
     Parameters
@@ -98,12 +98,12 @@ class Group:
         return [shots[i] for i in range(longest) for shots in ordered if i < len(shots)]
 
 
-def groups(shots: Iterable[Shot]) -> list[Group]:
+def groups(shots: Iterable[Shot]) -> list[PhotoGroup]:
     """Sort photos by body, lens and focal length."""
     owners: dict[tuple[str, ...], list[Shot]] = {}
     for shot in shots:
         owners.setdefault(shot.owner, []).append(shot)
-    all_groups: list[Group] = []
+    all_groups: list[PhotoGroup] = []
     names: set[str] = set()
     for owner in sorted(owners):
         runs = _by_focal(owners[owner])
@@ -111,7 +111,7 @@ def groups(shots: Iterable[Shot]) -> list[Group]:
         for run in runs:
             name = shared or _free(_name(run[0], with_focal=True), names)
             names.add(name)
-            all_groups.append(Group(tuple(sorted(run, key=lambda shot: shot.path)), name))
+            all_groups.append(PhotoGroup(tuple(sorted(run, key=lambda shot: shot.path)), name))
     return all_groups
 
 

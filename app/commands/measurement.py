@@ -38,7 +38,7 @@ USUAL_DETAIL: Final = 4000
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class MeasurementOptions:
     """The options of the command."""
 
     kind: str
@@ -96,11 +96,13 @@ def measure(
         raise UsageError(f"measure one of {', '.join(get_args(MeasurementKind))}, not {kind!r}")
     if size % 2 == 0:
         raise UsageError(f"--size must be odd, got {size}; a PSF has one middle pixel")
-    options = Options(kind, aperture, size, replace_blind, any_lens)
+    options = MeasurementOptions(kind, aperture, size, replace_blind, any_lens)
     _run(photos, profile, options, shown, as_json=json_output)
 
 
-def _run(names: list[str], target: Path, options: Options, shown: Display, *, as_json: bool) -> None:
+def _run(
+    names: list[str], target: Path, options: MeasurementOptions, shown: Display, *, as_json: bool
+) -> None:
     from lensmodel.workflow import measuring  # noqa: PLC0415 - half of SciPy, which `--help` should not wait for
 
     paths = files.photos(names)
@@ -137,7 +139,7 @@ def _run(names: list[str], target: Path, options: Options, shown: Display, *, as
         raise typer.Exit(1)
 
 
-def _add(group: tuple[Path, ...], target: Path, options: Options, on_step: Any) -> dict[str, Any]:  # noqa: ANN401
+def _add(group: tuple[Path, ...], target: Path, options: MeasurementOptions, on_step: Any) -> dict[str, Any]:  # noqa: ANN401
     """Measure on the photos of one measurement and save the profile; say what became of it."""
     from lensmodel.workflow import measuring  # noqa: PLC0415 - see `_run`
     from lensmodel.workflow.joining import joined  # noqa: PLC0415 - see `_run`

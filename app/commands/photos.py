@@ -117,7 +117,7 @@ def calibrate(
     calibration.run(
         photos,
         profile,
-        calibration.Options(
+        calibration.CalibrationOptions(
             aperture,
             estimator,
             workers,
@@ -254,7 +254,7 @@ def correct(
     shown = display.of(context, quiet=quiet, verbose=verbose)
     if halo is not None and not halo >= 0.0:
         raise UsageError(f"--halo must not be negative, got {halo:g}")
-    options = correction.Options(
+    options = correction.CorrectionOptions(
         aperture,
         method,
         strength,
@@ -317,7 +317,7 @@ def psf(
     shown = display.of(context, quiet=quiet, verbose=verbose)
     answer.run(
         profile,
-        answer.Question(r, phi, aperture, channel, size),
+        answer.PsfQuestion(r, phi, aperture, channel, size),
         output,
         shown,
         force=force,

@@ -31,7 +31,7 @@ def run(
     url: str,
     lens: str,
     output: Path | None,
-    options: correction.Options,
+    options: correction.CorrectionOptions,
     display: Display,
     *,
     as_json: bool,
@@ -85,7 +85,9 @@ def run(
 class _Remote:
     """The requests to the service, photo by photo."""
 
-    def __init__(self, client: Client, lens: str, options: correction.Options, display: Display) -> None:
+    def __init__(
+        self, client: Client, lens: str, options: correction.CorrectionOptions, display: Display
+    ) -> None:
         self._client, self._options, self._display = client, options, display
         self._lens = None if lens == AUTO else lens
 

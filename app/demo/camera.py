@@ -30,7 +30,7 @@ CHART = "chart"
 
 
 @dataclass(frozen=True, slots=True)
-class Shot:
+class DemoShot:
     """One photo that the demo took.
 
     Parameters
@@ -75,7 +75,7 @@ def chart_edges() -> tuple[ChartEdge, ...]:
 
 def take_photos(
     folder: Path, *, workers: int, on_photo: Callable[[str, int, int], None], names: Sequence[str] = ()
-) -> dict[str, Shot]:
+) -> dict[str, DemoShot]:
     """Photograph every scene through the lens, in parallel processes.
 
     Parameters
@@ -85,7 +85,7 @@ def take_photos(
     """
     names = tuple(names) or (*LEARN_FROM, HELD_OUT, CHART)
     folder.mkdir(parents=True, exist_ok=True)
-    shots: dict[str, Shot] = {}
+    shots: dict[str, DemoShot] = {}
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         jobs = [pool.submit(_take, name, number, folder) for number, name in enumerate(names)]
         for job in as_completed(jobs):
@@ -95,11 +95,11 @@ def take_photos(
     return shots
 
 
-def _take(name: str, number: int, folder: Path) -> Shot:
+def _take(name: str, number: int, folder: Path) -> DemoShot:
     lens, camera, settings = demo_lens(), demo_camera(), demo_settings()
     scene = edge_chart(camera.frame).scene if name == CHART else _framed(demo_scene(name), camera)
     photo = photograph(scene, lens, settings, camera, np.random.default_rng(number))
-    shot = Shot(name, folder / f"{name}.dng", folder / f"{name}-sharp.npy")
+    shot = DemoShot(name, folder / f"{name}.dng", folder / f"{name}-sharp.npy")
     np.save(shot.truth, photo.sharp, allow_pickle=False)
     write_photo(shot.path, photo)
     return shot

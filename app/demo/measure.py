@@ -52,12 +52,12 @@ def psf_error(client: Client, lens_id: str, version: int) -> dict[Zone, float]:
     return {zone: float(np.median(values)) for zone, values in errors.items()}
 
 
-def developed(shot: camera.Shot) -> Planes:
+def developed(shot: camera.DemoShot) -> Planes:
     """Return the photo as it was, developed in the same way as the service does."""
     return develop(shot.path).planes
 
 
-def psnr(planes: Planes, shot: camera.Shot) -> dict[Zone, float]:
+def psnr(planes: Planes, shot: camera.DemoShot) -> dict[Zone, float]:
     """PSNR in dB of the sRGB-encoded, white-balanced picture in each zone, registered block by block."""
     gains = np.asarray(camera.demo_camera().white_balance, dtype=np.float32)[:, None, None]
     return quality.registered_zone_psnr(

@@ -14,7 +14,7 @@ _JUDGED: tuple[Zone, ...] = ("center", "corner")
 
 
 @dataclass(slots=True)
-class Report:
+class DemoReport:
     """Filled in as the demo goes; one entry of a list for each photo that the lens has learned from."""
 
     lens: str

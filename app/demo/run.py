@@ -12,7 +12,7 @@ from pathlib import Path
 from app.client import Client, JobEndedError
 from app.demo import camera, figures, measure
 from app.demo.own_service import own_service
-from app.demo.report import Report
+from app.demo.report import DemoReport
 from app.demo.service_tasks import corrected, follow, planes_of
 from app.demo.stages import Stages, Tell
 from lensmodel.report.photo_crops import as_shown
@@ -61,9 +61,9 @@ def run(output: Path, tell: Tell, *, estimator: str = "default") -> bool:
 
 
 def _simulated(
-    client: Client, shots: dict[str, camera.Shot], work: Path, output: Path, stages: Stages
-) -> Report:
-    report = Report(lens=camera.demo_lens().model, aperture=camera.demo_settings().aperture or 0.0)
+    client: Client, shots: dict[str, camera.DemoShot], work: Path, output: Path, stages: Stages
+) -> DemoReport:
+    report = DemoReport(lens=camera.demo_lens().model, aperture=camera.demo_settings().aperture or 0.0)
     stages.begin("develop", "Uploading the photos to be corrected, which the lens does not learn from")
     held_out = client.upload(shots[camera.HELD_OUT].path, calibrate=False)
     chart = client.upload(shots[camera.CHART].path, calibrate=False)
@@ -134,7 +134,7 @@ def _simulated(
     return report
 
 
-def _real(client: Client, report: Report, stages: Stages) -> None:
+def _real(client: Client, report: DemoReport, stages: Stages) -> None:
     """Upload a real photo that shows too little of its lens, and keep what the service says to it."""
     stages.begin(
         "refuse a real photo",

@@ -37,7 +37,7 @@ class _Page:
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class OpenPage:
     """One open page."""
 
     changed: Callable[[float], Awaitable[None]]
@@ -61,14 +61,14 @@ class OpenPages:
         self._pages: defaultdict[tuple[str, ...], _Page] = defaultdict(_Page)
 
     @contextlib.contextmanager
-    def view(self, owner: str, name: str, key: str, draw: Callable[[], Fragments]) -> Iterator[View]:
+    def view(self, owner: str, name: str, key: str, draw: Callable[[], Fragments]) -> Iterator[OpenPage]:
         """Open a page of an owner; `draw` is called in a thread, once for all its viewers after a change."""
         at = (owner, name, key)
         page = self._pages[at]
         page.viewers += 1
         try:
             with self._watch.of(owner) as waiting:
-                yield View(waiting.changed, lambda: _parts(page, waiting.count(), draw))
+                yield OpenPage(waiting.changed, lambda: _parts(page, waiting.count(), draw))
         finally:
             page.viewers -= 1
             if not page.viewers:

@@ -24,7 +24,7 @@ from app.sandbox.outcome import Outcome, TaskLimits
 from app.sandbox.runner import Sandbox
 from app.store import Store
 from app.store.jobs import JobStore
-from app.store.photo_steps import folder_of
+from app.store.photo_steps import photo_folder
 from app.store.tables import PhotoRow
 from lensmodel.core.types import ignore_step
 
@@ -175,7 +175,7 @@ class JobContext:
                 self.attempt("develop", arguments, folder=folder, limits=limits, wanted=wanted, reads=[path])
                 for name in (PREVIEW, R_MAP, SHOWN):
                     if (folder / name).is_file():
-                        self.storage.put_file(f"{folder_of(photo)}{name}", folder / name)
+                        self.storage.put_file(f"{photo_folder(photo)}{name}", folder / name)
                 shutil.rmtree(target, ignore_errors=True)
                 folder.rename(target)  # complete, or absent
             return target

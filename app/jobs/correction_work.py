@@ -25,8 +25,8 @@ from app.jobs.task_files import AFTER, BEFORE, EARLIER, FAMILY, LAYERS, LEARNED,
 from app.runtime.outage import missable
 from app.sandbox.child import ProgressHook
 from app.sandbox.outcome import TaskLimits
-from app.store.corrections import CorrectionPlan, Result, folder_of
-from app.store.photo_steps import settings_of
+from app.store.corrections import CorrectionPlan, Result, correction_folder
+from app.store.photo_steps import stored_settings
 from app.store.samples import LensState, Relative
 from app.store.tables import CorrectionRow
 from app.store.versions import learned_key, report_key
@@ -97,7 +97,7 @@ class CorrectionWork:
         arguments: dict[str, Any] = {
             "developed": str(developed),
             "settings": params.get("settings")
-            or settings_of(photo),  # as they were when the correction was requested
+            or stored_settings(photo),  # as they were when the correction was requested
             "lateral": photo.lateral,
             "method": params["method"],
             "strength": params["strength"],
@@ -187,7 +187,7 @@ class CorrectionWork:
             raise JobFailedError("internal_error", "the correction wrote no file; retry, or report the photo")
         with path.open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
-        base = folder_of(plan.correction)
+        base = correction_folder(plan.correction)
         key = f"{base}result{path.suffix}"
         self._context.storage.put_file(key, path)
         for shown in (BEFORE, AFTER, *LAYERS):
@@ -208,7 +208,7 @@ class CorrectionWork:
         """Delete the files of a correction that was cancelled or deleted while they were stored."""
         row = self._corrections.get(correction.public_id)
         if row is None or row.state != "succeeded":  # another worker may have finished it
-            self._context.storage.delete(folder_of(correction))
+            self._context.storage.delete(correction_folder(correction))
 
     def measure(self, lens_id: str, version: int, _again: int = 0) -> None:
         """Measure how well one version of a lens predicts held-out photos, and write its report.

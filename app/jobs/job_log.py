@@ -22,7 +22,7 @@ _SUBJECT: Final = {
 
 
 @dataclass
-class Account:
+class JobRecord:
     """Kind and ending of one job."""
 
     kind: str
@@ -34,18 +34,18 @@ class Account:
 
 
 @contextmanager
-def accounted(kind: str, arguments: Sequence[str | int]) -> Iterator[Account]:
-    """Provide the account of a job; inside, each log line carries the ids of the job and its subject."""
-    account = Account(kind)
+def accounted(kind: str, arguments: Sequence[str | int]) -> Iterator[JobRecord]:
+    """Provide the record of a job; inside, each log line carries the ids of the job and its subject."""
+    record = JobRecord(kind)
     ids = {"job_id": "/".join([kind, *map(str, arguments)])}
     if kind in _SUBJECT:
         ids[_SUBJECT[kind]] = str(arguments[0])
     began = time.monotonic()
     with bound_contextvars(**ids):
         try:
-            yield account
+            yield record
         except BaseException:
-            account.ending = "raised"
+            record.ending = "raised"
             raise
         finally:
-            metrics.JOB_SECONDS.labels(kind, account.ending).observe(time.monotonic() - began)
+            metrics.JOB_SECONDS.labels(kind, record.ending).observe(time.monotonic() - began)

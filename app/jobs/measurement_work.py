@@ -10,9 +10,9 @@ from typing import Any, Final
 from app.jobs.context import JobContext, JobFailedError
 from app.jobs.sample_files import DAMAGED, returned_samples
 from app.store import NewPatch, NewSample
-from app.store.photo_steps import settings_of
+from app.store.photo_steps import stored_settings
 from app.store.tables import PhotoRow
-from app.ways import way_of
+from app.ways import configured_way
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import CHANNELS
 
@@ -44,8 +44,8 @@ class MeasurementWork:
             "kind": photo.given["kind"],
             "developed": [str(folder) for folder in folders],
             "photo": photo.public_id,
-            "settings": settings_of(photo),
-            "size": way_of(settings, photo.way).kernel_size,
+            "settings": stored_settings(photo),
+            "size": configured_way(settings, photo.way).kernel_size,
         }
         limits = self._context.limits(photo, settings.correct_seconds, _BYTES_A_PIXEL)
         with self._context.sandbox.folder() as folder:

@@ -24,9 +24,9 @@ from app.jobs.sample_files import DAMAGED, returned_samples
 from app.jobs.thumbnail_work import keep_glance
 from app.sandbox.outcome import TaskLimits
 from app.store import LensName, NewSample, Store
-from app.store.photo_steps import settings_of
+from app.store.photo_steps import stored_settings
 from app.store.tables import PHOTO_RUNNING, LensRow, PatchRow, PhotoRow
-from app.ways import way_of
+from app.ways import configured_way
 from lensmodel.core.errors import NoUsablePatchesError
 from lensmodel.core.types import FieldPosition
 from lensmodel.workflow import pipeline
@@ -86,14 +86,14 @@ class PhotoWork:
             return self._store.photos.is_live(photo.public_id, photo.epoch)
 
         settings = self._context.settings
-        way = way_of(settings, photo.way)
+        way = configured_way(settings, photo.way)
         developed = self._context.developed(photo, wanted)
         arguments = {
             "developed": str(developed),
             "photo": photo.public_id,
             "patches": [described(row) for row in rows],
             "numbers": [row.idx for row in rows],
-            "settings": settings_of(photo),
+            "settings": stored_settings(photo),
             "estimator": way.estimator,
             "size": way.kernel_size,
             "seed": rows[0].idx,

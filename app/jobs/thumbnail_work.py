@@ -9,7 +9,7 @@ from typing import Any
 from app.jobs.context import SPARE_MB, JobContext
 from app.jobs.task_files import GLANCE
 from app.sandbox.outcome import TaskLimits
-from app.store.photo_steps import folder_of
+from app.store.photo_steps import photo_folder
 from app.store.tables import PhotoRow
 
 
@@ -24,4 +24,4 @@ def keep_glance(
             "glance", arguments, folder=folder, limits=limits, reads=[path], wanted=wanted
         )
         if outcome.ending == "ok" and (folder / GLANCE).is_file():
-            context.storage.put_file(f"{folder_of(photo)}{GLANCE}", folder / GLANCE)
+            context.storage.put_file(f"{photo_folder(photo)}{GLANCE}", folder / GLANCE)

@@ -20,12 +20,12 @@ from typing import Final, TypeAlias
 from sqlalchemy.exc import OperationalError
 
 from app.blobs.erasure import erase
-from app.blobs.folder_creation import settle
+from app.blobs.folder_creation import settle_folder
 from app.blobs.storage import Storage
 from app.jobs.context import JobContext
 from app.jobs.correction_work import CorrectionWork
 from app.jobs.developed_cache import drop_developed
-from app.jobs.job_log import Account, accounted
+from app.jobs.job_log import JobRecord, accounted
 from app.jobs.missing_reports import ask_for_reports
 from app.jobs.photo_work import PhotoWork
 from app.jobs.queue import DbosEngine, Handler, Job, JobEngine
@@ -110,7 +110,7 @@ class Worker:
         self._last_beat = time.monotonic()
         self._files = {path: _identity(path) for path in self._database_files()}
 
-    def _task_account(self, data: Path) -> account.Account | None:
+    def _task_account(self, data: Path) -> account.SystemAccount | None:
         """Return the account that children change to, with access to their folders and to nothing else."""
         if "account" not in self._confined:
             return None
@@ -136,7 +136,7 @@ class Worker:
         beat_s = min(self._settings.lease_seconds / 4, 5.0)
         # in a thread of its own: nothing below, and no duty, may delay the lease
         lease = self._start_thread(beat_s, self._keep_lease)
-        self._insist(lambda: settle(self._store, self._context.storage))
+        self._insist(lambda: settle_folder(self._store, self._context.storage))
         photos, corrections = PhotoWork(self._context, self._engine), CorrectionWork(self._context)
         self._engine.start(
             {
@@ -214,10 +214,10 @@ class Worker:
         """Wrap a job: failures are retried, and the last one ends the job with a reason."""
 
         def run(*arguments: str | int) -> None:
-            with accounted(handler.__name__, arguments) as account:
-                work(account, *arguments)
+            with accounted(handler.__name__, arguments) as record:
+                work(record, *arguments)
 
-        def work(account: Account, *arguments: str | int) -> None:
+        def work(record: JobRecord, *arguments: str | int) -> None:
             patience = Patience(self._settings.outage_hours * 3600.0)
             while True:
                 try:
@@ -231,9 +231,9 @@ class Worker:
                         log.exception("job %s", name)
                     if pause is None:
                         ending = Ending.of(error)
-                        account.ending = ending.code
+                        record.ending = ending.code
                         break
-                    account.retries(error)
+                    record.retries(error)
                     self._rest(pause)
                 else:
                     return

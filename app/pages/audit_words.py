@@ -32,7 +32,7 @@ find in the picture."""
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class MarkedPlace:
     """A place of the upright photo in its pixels, with a caption."""
 
     x: int
@@ -41,12 +41,12 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class HeldBack:
     """What was held back: a sentence, the reasons, and the worst places."""
 
     words: str
     reasons: list[str]
-    places: list[Place]
+    places: list[MarkedPlace]
 
 
 def check_words(name: str) -> str:
@@ -54,7 +54,7 @@ def check_words(name: str) -> str:
     return CHECKS.get(name, name)
 
 
-def held_places(audit: Mapping[str, Any], height: int, width: int, orientation: int) -> Held | None:
+def held_places(audit: Mapping[str, Any], height: int, width: int, orientation: int) -> HeldBack | None:
     """Return what was held back of a correction; None where nothing was checked."""
     zones = audit.get("zones") or {}
     tiles = sum(zone["tiles"] for zone in zones.values())
@@ -76,8 +76,8 @@ def held_places(audit: Mapping[str, Any], height: int, width: int, orientation: 
     worst = audit.get("worst", []) if share >= LEAST else []  # less cannot be seen
     for place in worst[:MAX_PLACES]:
         y, x = upright_point(place["row"], place["col"], height, width, orientation)
-        places.append(Place(x, y, f"{place['held_back']:.0%}: {check_words(place['check'])}"))
-    return Held(words, reasons, places)
+        places.append(MarkedPlace(x, y, f"{place['held_back']:.0%}: {check_words(place['check'])}"))
+    return HeldBack(words, reasons, places)
 
 
 def held_squares(

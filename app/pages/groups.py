@@ -11,7 +11,7 @@ from app.store.tables import PhotoRow
 
 
 @dataclass(frozen=True, slots=True)
-class Group:
+class WaitingGroup:
     """Photos that wait for their lens and were probably taken with the same one.
 
     Parameters
@@ -51,7 +51,7 @@ def camera_name(maker: str | None, model: str | None) -> str:
     return f"{known} {model or ''}".strip()
 
 
-def grouped(rows: Sequence[PhotoRow]) -> list[Group]:
+def grouped(rows: Sequence[PhotoRow]) -> list[WaitingGroup]:
     """Group photos by body, focal length and lens name."""
     groups: defaultdict[tuple[str, str, float, str], list[PhotoRow]] = defaultdict(list)
     for row in rows:
@@ -62,7 +62,7 @@ def grouped(rows: Sequence[PhotoRow]) -> list[Group]:
         if body not in bodies[camera]:
             bodies[camera].append(body)
     return [
-        Group(
+        WaitingGroup(
             camera=camera or None,
             body=bodies[camera].index(body) + 1 if len(bodies[camera]) > 1 else None,
             focal_mm=focal or None,

@@ -23,7 +23,7 @@ from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.types import FieldPosition
 from lensmodel.report.charts import apertures_chart, charts_of, lateral_chart
 from lensmodel.report.comparison import Side, compare
-from lensmodel.report.documents import error_words, zone_table
+from lensmodel.report.documents import error_map_words, zone_table
 from lensmodel.report.lens_test import LensTest
 from lensmodel.report.units import Unit
 
@@ -128,7 +128,7 @@ def _charts(test: LensTest, aperture: float | None, unit: Unit) -> dict[str, Any
     return {
         "charts": charts,
         "table": zone_table(test),
-        "error_note": error_words(test.at(aperture)),
+        "error_note": error_map_words(test.at(aperture)),
     }
 
 

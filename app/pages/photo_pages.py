@@ -19,8 +19,8 @@ from app.routes import corrections as correction_routes
 from app.routes import lenses as lens_routes
 from app.routes import photos as photo_routes
 from app.schemas import CorrectionIn, Id, PhotoOut, Region
-from app.store.corrections import folder_of as folder_of_correction
-from app.store.photo_steps import folder_of
+from app.store.corrections import correction_folder
+from app.store.photo_steps import photo_folder
 from app.store.tables import PhotoRow
 
 ROWS: Final = (("upper", 0.0), ("", 0.5), ("lower", 1.0))
@@ -49,7 +49,7 @@ def _upright(photo: PhotoOut, row: PhotoRow) -> PhotoOut:
 def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
     """Show a photo: how to correct it, and what it taught."""
     row = photo_routes.find_photo(call, photo_id)
-    photo = photo_routes.describe(call, row)
+    photo = photo_routes.described_photo(call, row)
     patches = [views.patch_out(patch) for patch in call.store.patches.listed(photo_id)]
     if row.height and row.width:
         turned = row.orientation or 1
@@ -62,7 +62,7 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
     return page(
         "photo.html",
         photo=_upright(photo, row),
-        can_look=pictures.exists(call.storage, f"{folder_of(row)}{SHOWN}"),
+        can_look=pictures.exists(call.storage, f"{photo_folder(row)}{SHOWN}"),
         gently=row.kind == "jpeg",
         patches=patches,
         used=sum(patch.state == "done" for patch in patches),
@@ -112,9 +112,9 @@ def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
     plan = correction_routes.find_plan(call, correction_id)
     correction = views.correction_out(plan)
     report = correction.report or {}
-    photo, row = photo_routes.describe(call, plan.photo), plan.photo
+    photo, row = photo_routes.described_photo(call, plan.photo), plan.photo
     can_look = correction.roi is None and pictures.exists(
-        call.storage, f"{folder_of_correction(plan.correction)}{AFTER}"
+        call.storage, f"{correction_folder(plan.correction)}{AFTER}"
     )
     size = (row.height or 1, row.width or 1, row.orientation or 1)
     return page(

@@ -12,9 +12,8 @@ from app.jobs.task_files import AFTER, BEFORE, GLANCE, LAYERS, PREVIEW, R_MAP, S
 from app.pages import pictures
 from app.routes import corrections as correction_routes
 from app.routes import photos as photo_routes
-from app.store.corrections import CorrectionPlan
-from app.store.corrections import folder_of as folder_of_correction
-from app.store.photo_steps import folder_of
+from app.store.corrections import CorrectionPlan, correction_folder
+from app.store.photo_steps import photo_folder
 
 Share = Annotated[float, Query(ge=0, le=1, allow_inf_nan=False)]
 Side = Annotated[int, Query(ge=16, le=2000)]
@@ -47,30 +46,30 @@ def _picture(data: bytes, media_type: str = "image/jpeg") -> Response:
 @router.get("/ui/photos/{photo_id}/glance.jpg")
 def photo_glance(photo_id: str, call: CallDep) -> Response:
     """Show a photo as small as a list needs it: also before it is developed, and nothing where nothing is."""
-    folder = folder_of(photo_routes.find_photo(call, photo_id))
+    folder = photo_folder(photo_routes.find_photo(call, photo_id))
     for name in (GLANCE, PREVIEW):
         if pictures.exists(call.storage, f"{folder}{name}"):
-            return _picture(pictures.resized(pictures.stored(call.storage, f"{folder}{name}"), 480))
+            return _picture(pictures.shrunk_preview(pictures.stored(call.storage, f"{folder}{name}"), 480))
     return Response(NOTHING, media_type="image/svg+xml", headers={"Cache-Control": "no-store"})
 
 
 @router.get("/ui/photos/{photo_id}/preview.jpg")
 def photo_preview(photo_id: str, call: CallDep, size: Side = 1200) -> Response:
     """Show a photo in small."""
-    key = f"{folder_of(photo_routes.find_photo(call, photo_id))}{PREVIEW}"
-    return _picture(pictures.resized(pictures.stored(call.storage, key), size))
+    key = f"{photo_folder(photo_routes.find_photo(call, photo_id))}{PREVIEW}"
+    return _picture(pictures.shrunk_preview(pictures.stored(call.storage, key), size))
 
 
 @router.get("/ui/photos/{photo_id}/r-map.png")
 def photo_r_map(photo_id: str, call: CallDep, size: Side = 1200) -> Response:
     """Show where the edges of a photo tell about the blur."""
-    key = f"{folder_of(photo_routes.find_photo(call, photo_id))}{R_MAP}"
-    return _picture(pictures.resized(pictures.stored(call.storage, key), size), "image/png")
+    key = f"{photo_folder(photo_routes.find_photo(call, photo_id))}{R_MAP}"
+    return _picture(pictures.shrunk_preview(pictures.stored(call.storage, key), size), "image/png")
 
 
 def _shown(call: Call, photo_id: str, half: int) -> pictures.Picture:
     photo = photo_routes.find_photo(call, photo_id)
-    key = f"{folder_of(photo)}{SHOWN}"
+    key = f"{photo_folder(photo)}{SHOWN}"
     return pictures.level(call.storage, key, "image/jpeg", photo.orientation or 1, half)
 
 
@@ -106,7 +105,7 @@ def _compared(call: Call, correction_id: str) -> CorrectionPlan:
 
 def _side(call: Call, correction_id: str, which: Which, half: int) -> pictures.Picture:
     plan = _compared(call, correction_id)
-    key = f"{folder_of_correction(plan.correction)}{_OF[which]}"
+    key = f"{correction_folder(plan.correction)}{_OF[which]}"
     return pictures.level(call.storage, key, "image/jpeg", plan.photo.orientation or 1, half)
 
 
@@ -145,7 +144,7 @@ def correction_layer(
     plan = _compared(call, correction_id)
     if name in {"smooth", "clean"} and not plan.correction.params.get("layers"):
         raise InvalidParameterError(f"correction {correction_id} has no layers")
-    key = f"{folder_of_correction(plan.correction)}{_OF[name]}"
+    key = f"{correction_folder(plan.correction)}{_OF[name]}"
     media_type = "image/jpeg" if name in {"before", "after"} else "image/png"
     picture = pictures.decoded(call.storage, key, media_type, plan.photo.orientation or 1)
     return _picture(pictures.png(picture), "image/png")

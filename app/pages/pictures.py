@@ -95,7 +95,7 @@ def stored(storage: Storage, key: str) -> bytes:
         raise NotReadyError("there is no such picture yet: wait for the job that makes it") from error
 
 
-def resized(data: bytes, side: int) -> bytes:
+def shrunk_preview(data: bytes, side: int) -> bytes:
     """Make a preview smaller, its longer side at most `side` pixels."""
     with Image.open(io.BytesIO(data)) as image:
         kind = str(image.format)

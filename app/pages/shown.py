@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from app.http.dependencies import Call
-from app.pages.groups import Group, grouped
+from app.pages.groups import WaitingGroup, grouped
 from app.routes import lenses as lens_routes
 from app.routes import photos as photo_routes
 from app.schemas import LensOut, PhotoOut
@@ -53,7 +53,7 @@ def anew(call: Call, lens_id: str) -> int:
     return call.store.lenses.learned_anew(lens_routes.find_lens(call, lens_id))
 
 
-def waiting(call: Call) -> list[Group]:
+def waiting(call: Call) -> list[WaitingGroup]:
     """Group the photos that wait for their owner to say which lens it was."""
     rows = call.store.photos.page(call.owner, before=None, limit=MAX_WAITING, state="needs_lens")
     return grouped([row for row in rows if row.lens_id is None])

@@ -71,7 +71,7 @@ def _home(call: Call, _: str) -> Fragments:
 
 
 def _photo(call: Call, photo_id: str) -> Fragments:
-    photo = photo_routes.describe(call, photo_routes.find_photo(call, photo_id))
+    photo = photo_routes.described_photo(call, photo_routes.find_photo(call, photo_id))
     return {"photo-state": fragment("_photo_state.html", photo=photo)}
 
 

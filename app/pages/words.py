@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from app.pages.groups import Group
+from app.pages.groups import WaitingGroup
 from app.schemas import CalibrationOut, CorrectionOut, LensOut, PatchOut, PhotoOut, Problem
 from app.words import gain_words
 from lensmodel.core.types import FieldPosition
@@ -152,7 +152,7 @@ def file_words(correction: CorrectionOut) -> str:
     return f"{name}; it says in its metadata what was done, and with which lens."
 
 
-def waiting_words(groups: Sequence[Group]) -> str:
+def waiting_words(groups: Sequence[WaitingGroup]) -> str:
     """Say how many photos wait for their lens."""
     count = sum(len(group.photos) for group in groups)
     if count == 1:
@@ -160,7 +160,7 @@ def waiting_words(groups: Sequence[Group]) -> str:
     return f"{count} photos do not say which copy of a lens they were taken with."
 
 
-def group_name(group: Group) -> str:
+def group_name(group: WaitingGroup) -> str:
     """Say what the photos of a group have in common."""
     camera = group.camera or "Unknown camera"
     body = "" if group.body is None else f", body {group.body}"
@@ -169,7 +169,7 @@ def group_name(group: Group) -> str:
     return f"{camera}{body}{lens}{focal}: {counted(len(group.photos), 'photo')}"
 
 
-def group_example(group: Group) -> str:
+def group_example(group: WaitingGroup) -> str:
     """Suggest a name for the lens of a group."""
     return f"My {group.focal_mm:g} mm" if group.focal_mm else "My 35 mm"
 

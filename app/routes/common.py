@@ -44,7 +44,7 @@ def problems(*statuses: int, also: Answers | None = None) -> Answers:
     return answers | (also or {})
 
 
-def matches(call: Call, tag: str) -> bool:
+def matches_tag(call: Call, tag: str) -> bool:
     """Say whether a request already has the answer of this tag (RFC 9110, 13.1.2)."""
     sent = call.request.headers.get("if-none-match", "")
     return sent.strip() == "*" or tag in {entry.strip().removeprefix("W/") for entry in sent.split(",")}

@@ -21,14 +21,14 @@ from app.http.dependencies import Call, CallDep
 from app.http.idempotency import OnceDep
 from app.http.middleware import ONLY_HEAD
 from app.http.model_cache import check_version
-from app.routes.common import Cursor, Limit, OnlyId, matches, named_lens, next_link, problems
+from app.routes.common import Cursor, Limit, OnlyId, matches_tag, named_lens, next_link, problems
 from app.routes.photos import SEND_AGAIN, find_photo
 from app.schemas import CorrectionIn, CorrectionOut, CorrectionPage
 from app.store.corrections import CorrectionPlan
-from app.store.photo_steps import settings_of
+from app.store.photo_steps import stored_settings
 from app.store.samples import LensState
 from app.store.tables import LensRow, PhotoRow
-from app.ways import way_of
+from app.ways import configured_way
 from lensmodel.core.errors import MetadataMissingError, NoSamplesError, UnknownMethodError
 from lensmodel.correction import deconvolvers
 
@@ -62,9 +62,9 @@ def create(options: CorrectionIn, call: Call) -> CorrectionOut:
     lens = _lens_for(call, photo, options.lens_id)
     version = _version_for(call, lens, options.lens_version)
     params = options.model_dump(mode="json", include={"strength", "output", "roi"})
-    params["method"] = options.method or way_of(call.settings, lens.answering_way).method
+    params["method"] = options.method or configured_way(call.settings, lens.answering_way).method
     # with other settings of the photo the same request is a new correction
-    params["settings"] = settings_of(photo)
+    params["settings"] = stored_settings(photo)
     # only values other than the defaults: requests stored before there were bounds stay the same
     params |= options.model_dump(
         mode="json", include={"halo", "texture", "denoise", "layers"}, exclude_defaults=True
@@ -217,7 +217,7 @@ def read_result(correction_id: str, call: CallDep) -> Response:
         "Content-Disposition": _disposition(row.result_name or "corrected"),
         "X-Content-Type-Options": "nosniff",
     }
-    if matches(call, tag):
+    if matches_tag(call, tag):
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
     part = call.request.headers.get("range")
     if call.request.headers.get("if-range", tag) != tag:

@@ -11,7 +11,7 @@ from typing import Final, get_args
 
 from fastapi import APIRouter, Response, status
 
-from app.blobs.folder_creation import settle
+from app.blobs.folder_creation import settle_folder
 from app.http.dependencies import Call, CallDep, ProbeDep
 from app.routes.common import problems
 from app.routes.photos import GIB
@@ -103,7 +103,7 @@ def _schema(call: Call) -> None:
 
 
 def _storage(call: Call) -> None:
-    settle(call.store, call.storage)
+    settle_folder(call.store, call.storage)
     call.storage.check_writable()
 
 

@@ -16,7 +16,7 @@ from app.routes.common import problems
 from app.routes.lenses import find_lens, read_lens
 from app.schemas import LensOut
 from app.store.profile_intake import take_in
-from app.ways import way_of
+from app.ways import configured_way
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.model.answer import PAPER
 from lensmodel.model.profile import LensProfile, read_profile, write_profile
@@ -99,7 +99,7 @@ def _add(lens_id: str, data: bytes, call: Call) -> LensOut:
         raise MalformedUploadError(str(error)) from error
     lens = find_lens(call, lens_id)
     paper_lens, paper_profile = (
-        mode == PAPER for mode in (way_of(call.settings, lens.way).mode, profile.model.settings.mode)
+        mode == PAPER for mode in (configured_way(call.settings, lens.way).mode, profile.model.settings.mode)
     )
     if paper_lens != paper_profile or lens.way != lens.answering_way:
         raise ConflictError(

@@ -12,7 +12,7 @@ from fastapi import APIRouter, Query, Response, status
 
 from app.errors import NotReadyError
 from app.http.dependencies import Call, CallDep
-from app.routes.common import matches, problems
+from app.routes.common import matches_tag, problems
 from app.routes.lenses import find_lens
 from app.schemas.fields import Aperture, OptionalId
 from app.store.tables import LensRow
@@ -94,7 +94,7 @@ def read_report(
         "X-Content-Type-Options": "nosniff",
         "Content-Disposition": _disposition(test.name, form),
     }
-    if matches(call, tag):
+    if matches_tag(call, tag):
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
     if compared:
         second_test = test if second_lens is lens else stored_report(call, second_lens)

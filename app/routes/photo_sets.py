@@ -9,7 +9,7 @@ from fastapi import APIRouter
 from app.errors import InvalidParameterError
 from app.http.dependencies import CallDep
 from app.routes.common import named_lens, problems
-from app.routes.photos import describe, find_photo
+from app.routes.photos import described_photo, find_photo
 from app.schemas import PhotoPage, PhotosChange
 from app.store import LensName
 from app.store.photo_steps import GIVEN_SETTINGS
@@ -41,5 +41,5 @@ def change_photos(change: PhotosChange, call: CallDep) -> PhotoPage:
             lens = find_photo(call, photo.public_id).given.get("lens_id")
         else:
             call.store.photos.change(photo.public_id, call.owner, given, lens=lens)
-    items = [describe(call, find_photo(call, photo.public_id)) for photo in photos]
+    items = [described_photo(call, find_photo(call, photo.public_id)) for photo in photos]
     return PhotoPage(items=items, next=None)

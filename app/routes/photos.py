@@ -31,7 +31,7 @@ from app.schemas import PatchPage, PhotoChange, PhotoOut, PhotoPage, PhotoState,
 from app.store import LensName
 from app.store.access.accounts import Quota
 from app.store.ids import new_id
-from app.store.photo_steps import GIVEN_SETTINGS, folder_of
+from app.store.photo_steps import GIVEN_SETTINGS, photo_folder
 from app.store.tables import PhotoRow
 
 router = APIRouter(tags=["photos"])
@@ -245,16 +245,16 @@ def _record(
         if not received.fresh:
             check_model(fields, call.store.photos.lens_of(received.photo))
         if received.wants_file:  # its file was given up: this is the same one
-            key = f"{folder_of(received.photo)}original-{public_id}"
+            key = f"{photo_folder(received.photo)}original-{public_id}"
             call.storage.rename(f"{prefix}original", key)
             call.store.photos.restore_file(received.photo.public_id, key, where, again=received.fresh)
         call.storage.delete(prefix)  # the same bytes are stored already
     # another request may have deleted it meanwhile: then it is told as it was received
     photo = call.store.photos.get(received.photo.public_id, call.owner) or received.photo
-    return describe(call, photo), received.fresh
+    return described_photo(call, photo), received.fresh
 
 
-def describe(call: Call, photo: PhotoRow) -> PhotoOut:
+def described_photo(call: Call, photo: PhotoRow) -> PhotoOut:
     """Return a photo with its lens, or with the candidates."""
     lens = call.store.photos.lens_of(photo)
     return views.photo_out(photo, None if lens is None else lens.public_id, candidates(call, photo))
@@ -294,7 +294,7 @@ def list_photos(
 @router.get("/photos/{photo_id}", operation_id="getPhoto", responses=problems(404, 422))
 def read_photo(photo_id: str, call: CallDep) -> PhotoOut:
     """Return one photo."""
-    return describe(call, find_photo(call, photo_id))
+    return described_photo(call, find_photo(call, photo_id))
 
 
 @router.get("/photos/{photo_id}/patches", operation_id="listPatches", responses=problems(404, 422))
@@ -356,7 +356,7 @@ def change_photo(photo_id: str, change: PhotoChange, call: CallDep) -> PhotoOut:
             f"excluded={change.excluded}: a photo in state {photo.state} does not count; "
             "only counted ones can be excluded"
         )
-    return describe(call, photo)
+    return described_photo(call, photo)
 
 
 def _target_lens(call: Call, photo: PhotoRow, change: PhotoChange) -> LensName | str | None:

@@ -14,7 +14,7 @@ from app.http import psf_formats
 from app.http.dependencies import Call, CallDep
 from app.http.model_cache import Fitted
 from app.http.questions import QueryModel
-from app.routes.common import Answers, matches, problems
+from app.routes.common import Answers, matches_tag, problems
 from app.runtime import metrics
 from app.schemas import FieldQuery, PsfOut, PsfQuery, QueryOut
 from app.store.samples import Family, LensState
@@ -106,7 +106,7 @@ def _answer(lens_id: str, at: PsfQuery, form: Format, call: Call) -> Response:
         "Cache-Control": "private, max-age=3600" if pinned else "private, no-cache",
         "Vary": "Accept",
     }
-    if matches(call, tag):
+    if matches_tag(call, tag):
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
     position = FieldPosition(at.r, at.phi)
     setting = LensSettings(at.aperture, at.focal_length_mm, at.focus_distance_m, at.channel)
@@ -194,7 +194,7 @@ def read_field(lens_id: str, at: Annotated[FieldQuery, Depends(_FIELD)], call: C
     fitted = call.models.get(lens_id, at.version, state=state, family=at.family, relatives=relatives)
     tag = etag(fitted, at.model_dump_json())
     headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
-    if matches(call, tag):
+    if matches_tag(call, tag):
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
     setting = LensSettings(at.aperture, at.focal_length_mm, at.focus_distance_m, at.channel)
 

@@ -29,7 +29,7 @@ STILL_COMING: Final = timedelta(minutes=30)
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class Violation:
     """One violation of a check."""
 
     check: str
@@ -40,21 +40,21 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class DoctorReport:
     """The checks that ran, and their findings."""
 
     checks: tuple[str, ...]
-    findings: tuple[Finding, ...]
+    findings: tuple[Violation, ...]
 
     @property
-    def open(self) -> tuple[Finding, ...]:
+    def open(self) -> tuple[Violation, ...]:
         """Findings that were not mended."""
         return tuple(finding for finding in self.findings if not finding.mended)
 
 
 def examine(
     settings: Settings, store: Store, storage: Storage, *, repair: bool = False, deep: bool = False
-) -> Report:
+) -> DoctorReport:
     """Run all checks.
 
     Parameters
@@ -68,7 +68,7 @@ def examine(
     """
     findings = list(_tables(store, repair=repair))
     checks = [invariant.name for invariant in INVARIANTS]
-    blobs: dict[str, Callable[[], Iterator[Finding]]] = {
+    blobs: dict[str, Callable[[], Iterator[Violation]]] = {
         "work": lambda: _work(settings, store),
         "blobs": lambda: _blobs(store, storage, repair=repair),
     }
@@ -77,36 +77,36 @@ def examine(
     for name, check in blobs.items():
         checks.append(name)
         findings.extend(check())
-    return Report(tuple(checks), tuple(findings))
+    return DoctorReport(tuple(checks), tuple(findings))
 
 
-def _tables(store: Store, *, repair: bool) -> Iterator[Finding]:
+def _tables(store: Store, *, repair: bool) -> Iterator[Violation]:
     for invariant in INVARIANTS:
         with store.database.reading() as session:
             broken = invariant.find(session)
         for subject in broken:
             if invariant.mend is None or not repair:
                 remedy = invariant.remedy if invariant.mend is None else "lensmodel doctor --repair mends it"
-                yield Finding(invariant.name, subject, f"not so: {invariant.sentence}", remedy)
+                yield Violation(invariant.name, subject, f"not so: {invariant.sentence}", remedy)
                 continue
             with store.database.writing() as session:
                 if subject in invariant.find(session):  # not mended by another process meanwhile
                     invariant.mend(session, subject)
-            yield Finding(invariant.name, subject, f"was not so: {invariant.sentence}", "", mended=True)
+            yield Violation(invariant.name, subject, f"was not so: {invariant.sentence}", "", mended=True)
 
 
-def _work(settings: Settings, store: Store) -> Iterator[Finding]:
+def _work(settings: Settings, store: Store) -> Iterator[Violation]:
     waiting = sum(store.operation.load().jobs.values())
     if waiting and not store.workers.live(settings.lease_seconds):
         says = f"{waiting} jobs are unfinished and no worker lives"
-        yield Finding("work", "workers", says, "start lensmodel serve, or lensmodel worker")
+        yield Violation("work", "workers", says, "start lensmodel serve, or lensmodel worker")
 
 
-def _blobs(store: Store, storage: Storage, *, repair: bool) -> Iterator[Finding]:
+def _blobs(store: Store, storage: Storage, *, repair: bool) -> Iterator[Violation]:
     """Compare the stored blobs with the tables, which are read last, since blobs are written first."""
     if not storage.is_there:
         where = str(storage.folder)
-        yield Finding("blobs", where, "the folder of the blobs is away", "mount its disk, or restore it")
+        yield Violation("blobs", where, "the folder of the blobs is away", "mount its disk, or restore it")
         return
     sizes = dict(storage.listed())
     with store.database.reading() as session:
@@ -129,7 +129,7 @@ def _blobs(store: Store, storage: Storage, *, repair: bool) -> Iterator[Finding]
     for public_id, key, size in photos:
         if newer.get(key) != size:
             problem = "missing" if key not in newer else f"{newer[key]} bytes instead of {size}"
-            yield Finding(
+            yield Violation(
                 "blobs", public_id, f"the file of the photo is {problem}", "restore it, or delete the photo"
             )
     for correction_id, result, length in results:
@@ -147,29 +147,29 @@ def _group(key: str) -> str:
     return "/".join([*key.split("/")[:2], ""])
 
 
-def _lost_result(store: Store, correction_id: str, *, repair: bool) -> Finding:
+def _lost_result(store: Store, correction_id: str, *, repair: bool) -> Violation:
     says = "the result of the correction is missing"
     if not repair:
-        return Finding("blobs", correction_id, says, "lensmodel doctor --repair lets it be made again")
+        return Violation("blobs", correction_id, says, "lensmodel doctor --repair lets it be made again")
     with store.database.writing() as session:
         session.execute(
             update(CorrectionRow)
             .where(CorrectionRow.public_id == correction_id, CorrectionRow.state == "succeeded")
             .values(state="failed", error_code=OUTAGE, error_detail="its result was lost: retry it")
         )
-    return Finding("blobs", correction_id, f"{says}; it can be retried now", "", mended=True)
+    return Violation("blobs", correction_id, f"{says}; it can be retried now", "", mended=True)
 
 
-def _orphan(store: Store, prefix: str, *, repair: bool) -> Finding:
+def _orphan(store: Store, prefix: str, *, repair: bool) -> Violation:
     says = "no row names these blobs"
     if not repair:
-        return Finding("blobs", prefix, says, "lensmodel doctor --repair gives them up for deletion")
+        return Violation("blobs", prefix, says, "lensmodel doctor --repair gives them up for deletion")
     with store.database.writing() as session:
         insert_new(session, GarbageRow, [{"prefix": prefix, "not_before": now() + STILL_COMING}])
-    return Finding("blobs", prefix, f"{says}; they will be deleted", "", mended=True)
+    return Violation("blobs", prefix, f"{says}; they will be deleted", "", mended=True)
 
 
-def _kernels(store: Store) -> Iterator[Finding]:
+def _kernels(store: Store) -> Iterator[Violation]:
     last = 0
     while True:
         with store.database.reading() as session:
@@ -183,13 +183,13 @@ def _kernels(store: Store) -> Iterator[Finding]:
             return
         for key, psf, crc32 in rows:
             if zlib.crc32(psf) != crc32:
-                yield Finding(
+                yield Violation(
                     "kernels", f"sample {key}", "differs from what was written", "restore the database"
                 )
         last = rows[-1][0]
 
 
-def _photos(store: Store, storage: Storage) -> Iterator[Finding]:
+def _photos(store: Store, storage: Storage) -> Iterator[Violation]:
     with store.database.reading() as session:
         rows = session.execute(
             select(PhotoRow.public_id, PhotoRow.blob_key, PhotoRow.sha256, PhotoRow.byte_size).where(
@@ -204,4 +204,4 @@ def _photos(store: Store, storage: Storage) -> Iterator[Finding]:
         except FileNotFoundError:
             continue  # a finding of `_blobs`
         if digest.hexdigest() != sha256:
-            yield Finding("photos", public_id, "the file differs from what was sent", "restore the blobs")
+            yield Violation("photos", public_id, "the file differs from what was sent", "restore the blobs")

@@ -38,7 +38,7 @@ _CAPABILITY_VERSION: Final = 0x20080522
 
 
 @dataclass(frozen=True, slots=True)
-class Account:
+class SystemAccount:
     """An account of the machine, by its numbers."""
 
     uid: int
@@ -101,7 +101,7 @@ def may_change() -> bool:
     return _effective() & _NEEDED == _NEEDED
 
 
-def find(name: str) -> Account | None:
+def find(name: str) -> SystemAccount | None:
     """Return an account by its name, or the usual one; None if there is none, or with `NONE`."""
     if name == NONE:
         return None
@@ -110,7 +110,7 @@ def find(name: str) -> Account | None:
             entry = pwd.getpwnam(candidate)
             if entry.pw_uid == 0:
                 raise ValueError(f"{candidate} is the superuser's account, which children must not have")
-            return Account(entry.pw_uid, entry.pw_gid)
+            return SystemAccount(entry.pw_uid, entry.pw_gid)
     if name == AUTO:
         return None
     raise ValueError(f"no account of this machine is called {name!r}")

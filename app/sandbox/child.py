@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 from app.sandbox import confine
-from app.sandbox.account import Account
+from app.sandbox.account import SystemAccount
 from lensmodel.core.errors import LensModelError
 
 ProgressHook: TypeAlias = Callable[[int, int], None]
@@ -100,7 +100,7 @@ def main(order: dict[str, Any], line: Connection) -> None:
 
 def _confine(folder: Path, order: dict[str, Any]) -> None:
     writes = [folder, *map(Path, order["writes"])]
-    account = Account(*order["account"]) if order["account"] else None
+    account = SystemAccount(*order["account"]) if order["account"] else None
     if account is not None:
         os.umask(0o007)  # the worker reads its files as a member of its group
     confine.confine(writes, map(Path, order["reads"]), account)

@@ -27,7 +27,7 @@ from typing import Final
 
 from app.sandbox import account as accounts
 from app.sandbox import seccomp
-from app.sandbox.account import Account
+from app.sandbox.account import SystemAccount
 
 MEASURES: Final = ("account", "no_new_privs", "namespaces", "files", "system_calls")
 """`account`: a separate one; `namespaces`: a network without interfaces and a separate count of processes;
@@ -70,7 +70,9 @@ class _Beneath(ctypes.Structure):
     _fields_ = (("allowed", ctypes.c_uint64), ("parent", ctypes.c_int32))
 
 
-def confine(writes: Sequence[Path], reads: Iterable[Path] = (), account: Account | None = None) -> list[str]:
+def confine(
+    writes: Sequence[Path], reads: Iterable[Path] = (), account: SystemAccount | None = None
+) -> list[str]:
     """Give up access to all but the program itself, `reads`, and `writes`; return the measures in force.
 
     Call it while the process has a single thread: others would keep their permissions.
@@ -81,7 +83,7 @@ def confine(writes: Sequence[Path], reads: Iterable[Path] = (), account: Account
         Folders where files may be created, changed and removed; the first is the task's own.
     reads : iterable of Path
         Files and folders that may be read besides the libraries.
-    account : Account, optional
+    account : SystemAccount, optional
         Account to change to; OSError if that is refused.
     """
     in_force = []

@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from app.sandbox import child
-from app.sandbox.account import Account
+from app.sandbox.account import SystemAccount
 from app.sandbox.budget import POLL_S, Budget
 from app.sandbox.outcome import Outcome, TaskLimits, cancelled, outcome_of
 from lensmodel.core.types import ignore_step
@@ -70,7 +70,7 @@ class Sandbox:
     cache : Path, optional
         Where tasks that decode no untrusted file keep compiled code, unless the environment names another
         folder, which is ignored with an `account` that might not reach it.
-    account : Account, optional
+    account : SystemAccount, optional
         Account of confined children; None keeps that of this process.
     niceness : int, optional
         How far the children give way to this process, see nice(2); 0 = not at all.
@@ -85,7 +85,7 @@ class Sandbox:
         preload: Sequence[str] | None = None,
         confined: bool = True,
         cache: Path | None = None,
-        account: Account | None = None,
+        account: SystemAccount | None = None,
         niceness: int = child.NICENESS,
     ) -> None:
         self._niceness = niceness

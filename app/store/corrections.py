@@ -11,7 +11,7 @@ from typing import Any
 from sqlalchemy import Select, select, update
 
 from app.errors import ConflictError, UnknownPhotoError
-from app.store.access.owners import find, find_to_change, is_id, now, owned
+from app.store.access.owners import find_owned, find_to_change, is_id, now, owned
 from app.store.database import Database, insert_new
 from app.store.ids import new_id
 from app.store.tables import CorrectionRow, GarbageRow, LensRow, OwnerRow, PhotoRow
@@ -44,7 +44,7 @@ def params_hash(params: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(params, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
-def folder_of(correction: CorrectionRow) -> str:
+def correction_folder(correction: CorrectionRow) -> str:
     """Return the prefix of a correction's blobs."""
     return f"corrections/{correction.public_id}/"
 
@@ -106,7 +106,7 @@ class CorrectionStore:
     def get(self, correction_id: str, owner: str | None = None) -> CorrectionRow | None:
         """Return one correction, or None."""
         with self._db.reading() as session:
-            return find(session, CorrectionRow, correction_id, owner)
+            return find_owned(session, CorrectionRow, correction_id, owner)
 
     def plan(self, correction_id: str, owner: str | None = None) -> CorrectionPlan | None:
         """Return a correction with its photo and lens, or None."""
@@ -248,10 +248,10 @@ class CorrectionStore:
     def delete(self, correction_id: str, owner: str) -> str | None:
         """Forget a correction; return the prefix of its blobs, None if there is no such correction."""
         with self._db.writing() as session:
-            row = find(session, CorrectionRow, correction_id, owner)
+            row = find_owned(session, CorrectionRow, correction_id, owner)
             if row is None:
                 return None
-            prefix = folder_of(row)
+            prefix = correction_folder(row)
             insert_new(session, GarbageRow, [{"prefix": prefix, "not_before": now()}])
             session.delete(row)
             return prefix

@@ -6,9 +6,9 @@ from sqlalchemy import select
 
 from app.store.access.owners import find_to_change
 from app.store.database import Database
-from app.store.lens_ways import choose, photos_of
+from app.store.lens_ways import choose_way, photos_of
 from app.store.removal import forget
-from app.store.sample_moves import move, switch
+from app.store.sample_moves import move_photo, switch
 from app.store.tables import EventRow, LensRow, PhotoRow
 
 LEARNING = ("received", "inspecting", "developing", "selecting", "estimating")
@@ -36,7 +36,7 @@ class LensChanges:
         """
         with self._db.writing(durable=True) as session:
             lens = find_to_change(session, LensRow, lens_id, owner)
-            return None if lens is None else choose(session, lens, way)
+            return None if lens is None else choose_way(session, lens, way)
 
     def merge(self, lens_id: str, into: str, owner: str) -> bool:
         """Give all photos of a lens to another one and forget it: they were one copy all along.
@@ -56,7 +56,7 @@ class LensChanges:
             if any(photo.state in LEARNING for photo in photos):
                 return False
             for photo in photos:
-                move(session, photo, target)
+                move_photo(session, photo, target)
             target.complete(lens.maker, lens.model)
             session.flush()
             forget(session, lens)

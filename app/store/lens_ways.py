@@ -13,11 +13,11 @@ from sqlalchemy.orm import Session
 
 from app.store.access.owners import now
 from app.store.database import insert_new
-from app.store.patches import recount as recount_patches
+from app.store.patches import recount_patches
 from app.store.photo_steps import LATE, WORKED_ON, drop_patches, restart
 from app.store.removal import statistics_of
 from app.store.tables import PHOTO_RUNNING, EventRow, GarbageRow, LensRow, PatchRow, PhotoRow
-from app.store.versions import new_version, record_event, recount, take_samples
+from app.store.versions import new_version, record_event, recount_samples, take_samples
 
 
 def locked(session: Session, lens_id: int) -> LensRow:
@@ -49,7 +49,7 @@ def join(session: Session, photo: PhotoRow, kind: str) -> int | None:
     assert photo.lens_id is not None
     lens = locked(session, photo.lens_id)
     if lens.way != lens.answering_way:
-        return settle(session, lens.id)
+        return settle_way(session, lens.id)
     return _add(session, photo, kind)
 
 
@@ -61,7 +61,7 @@ def _add(session: Session, photo: PhotoRow, kind: str) -> int:
     return version
 
 
-def choose(session: Session, lens: LensRow, way: str) -> int:
+def choose_way(session: Session, lens: LensRow, way: str) -> int:
     """Choose the way of a lens; its counted photos start again, and so do those that are being estimated.
 
     Returns how many photos cannot because their files are gone; then nothing changes.
@@ -90,7 +90,7 @@ def choose(session: Session, lens: LensRow, way: str) -> int:
     return 0
 
 
-def settle(session: Session, lens_id: int) -> int | None:
+def settle_way(session: Session, lens_id: int) -> int | None:
     """Let a lens answer in the way that was chosen, once no photo is being estimated in it any more.
 
     Returns the new version of the lens, None where nothing changes. Where no photo could be estimated in the
@@ -118,7 +118,7 @@ def settle(session: Session, lens_id: int) -> int | None:
             forget_before(session, photo)
     for photo in relearned:
         take_samples(session, photo, version)
-    recount(session, lens.id)
+    recount_samples(session, lens.id)
     session.refresh(lens)
     record_event(
         session, lens.id, version, "model_changed", None, samples_added=lens.sample_count - samples_before

@@ -9,7 +9,7 @@ from typing import Any, Final
 from sqlalchemy import and_, delete, func, or_, select, update
 from sqlalchemy.orm import Session
 
-from app.store.access.owners import find, now, owned
+from app.store.access.owners import find_owned, now, owned
 from app.store.database import Database, insert_new
 from app.store.ids import new_id
 from app.store.kinds import identity_key, kind_key
@@ -146,7 +146,7 @@ class LensStore:
     def get(self, lens_id: str, owner: str | None = None) -> LensRow | None:
         """Return one lens, or None."""
         with self._db.reading() as session:
-            return find(session, LensRow, lens_id, owner)
+            return find_owned(session, LensRow, lens_id, owner)
 
     def page(
         self,
@@ -253,7 +253,7 @@ class LensStore:
     def record_metrics(self, lens_id: str, version: int, metrics: dict[str, Any]) -> None:
         """Store the metrics of one version, once: held-out `error`, `coverage`, `bandwidth`."""
         with self._db.writing() as session:
-            lens = find(session, LensRow, lens_id, None)
+            lens = find_owned(session, LensRow, lens_id, None)
             if lens is not None:
                 session.execute(
                     update(EventRow)

@@ -66,7 +66,7 @@ class PatchStore:
             rejected = [patch for patch in patches if patch.rejected is not None]
             if photo.windows is None:
                 photo.windows, photo.windows_rejected = windows.packed(rejected), len(rejected)
-            return recount(session, photo)
+            return recount_patches(session, photo)
 
     def all_of(self, photo_id: str, epoch: int | None = None) -> list[PatchRow]:
         """Return the patches of a photo that were chosen for estimation, in the order of their numbers."""
@@ -119,7 +119,7 @@ class PatchStore:
             for patch in patches.values():
                 patch.state, patch.finished_at = "done", patch.finished_at or now()
             session.flush()
-            recount(session, photo)
+            recount_patches(session, photo)
             return stored
 
     def fail(
@@ -140,7 +140,7 @@ class PatchStore:
                 )
                 .values(state="rejected" if rejected else "failed", reason=reason[:60], finished_at=now())
             )
-            recount(session, photo)
+            recount_patches(session, photo)
 
 
 def _of_photo(photo_id: str, epoch: int | None = None) -> Select[PatchRow]:
@@ -164,7 +164,7 @@ def _live(session: Session, photo_id: str, epoch: int) -> PhotoRow | None:
     )
 
 
-def recount(session: Session, photo: PhotoRow) -> int:
+def recount_patches(session: Session, photo: PhotoRow) -> int:
     """Count the patches anew: recomputed, never incremented, so that a repeat cannot count twice."""
     rows = session.execute(
         select(PatchRow.state, func.count())

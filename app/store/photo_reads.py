@@ -8,7 +8,7 @@ from typing import Final
 
 from sqlalchemy import func, select
 
-from app.store.access.owners import find, now, owned
+from app.store.access.owners import find_owned, now, owned
 from app.store.database import Database
 from app.store.photo_steps import WORKED_ON
 from app.store.tables import PHOTO_FINAL, PHOTO_RUNNING, CorrectionRow, LensRow, OwnerRow, PhotoRow
@@ -31,7 +31,7 @@ class PhotoReads:
     def get(self, photo_id: str, owner: str | None = None) -> PhotoRow | None:
         """Return one photo, or None."""
         with self._db.reading() as session:
-            return find(session, PhotoRow, photo_id, owner)
+            return find_owned(session, PhotoRow, photo_id, owner)
 
     def newest_file(self) -> str | None:
         """Return the key of the file of the newest photo, or None where there is no file."""

@@ -39,7 +39,7 @@ DESCRIPTION: Final = (
 """Columns that describe a photo; all are emptied when it is deleted."""
 
 
-class Identity(Protocol):
+class CopyIdentity(Protocol):
     """Which copy of which lens, as `lensmodel.photo.LensIdentity` says it."""
 
     @property
@@ -63,12 +63,12 @@ LATE = timedelta(minutes=10)
 """Deleted blobs are deleted once more after this time (chosen): a worker may have written another one."""
 
 
-def folder_of(photo: PhotoRow) -> str:
+def photo_folder(photo: PhotoRow) -> str:
     """Return the prefix of a photo's blobs."""
     return f"{photo.blob_key.rpartition('/')[0]}/"
 
 
-def settings_of(photo: PhotoRow) -> dict[str, Any]:
+def stored_settings(photo: PhotoRow) -> dict[str, Any]:
     """Return the lens settings of a photo, as tasks read them."""
     return {"aperture": photo.aperture, "focal_mm": photo.focal_mm, "focus_m": photo.focus_m}
 
@@ -87,7 +87,7 @@ def setting(photo: PhotoRow, field: str, header: float | None) -> float | None:
     return next((value for value in ranked if value is not None), None)
 
 
-def empty(photo: PhotoRow) -> None:
+def erase_description(photo: PhotoRow) -> None:
     """Erase all that the file and its owner said of a deleted photo."""
     photo.given, photo.filename, photo.sha256 = {}, "", ""
     for column in DESCRIPTION:
@@ -126,7 +126,7 @@ def restart(session: Session, photo: PhotoRow) -> None:
         photo.windows, photo.windows_rejected = None, 0
 
 
-def move(
+def change_state(
     session: Session,
     photo_id: str,
     from_states: Sequence[str],

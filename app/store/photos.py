@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 from app.errors import BusyError
 from app.store import lens_ways, lenses, sample_moves
 from app.store.access.idempotency import forget_answers
-from app.store.access.owners import ensure_owner, find, find_to_change, now
+from app.store.access.owners import ensure_owner, find_owned, find_to_change, now
 from app.store.database import insert_new
 from app.store.lenses import LensName
 from app.store.photo_reads import PhotoReads
@@ -21,13 +21,13 @@ from app.store.photo_steps import (
     GIVEN_SETTINGS,
     LATE,
     UNFINISHED,
-    Identity,
+    CopyIdentity,
+    change_state,
     drop_patches,
-    empty,
-    folder_of,
+    erase_description,
     let_go,
-    move,
     of_upload,
+    photo_folder,
     restart,
     setting,
     widen,
@@ -137,7 +137,7 @@ class PhotoStore(PhotoReads):
             if session.scalar(unfinished.limit(1)) is not None:
                 return False
             photo.file_gone_at = now()
-            keys = [photo.blob_key, *(f"{folder_of(photo)}{name}" for name in names)]
+            keys = [photo.blob_key, *(f"{photo_folder(photo)}{name}" for name in names)]
             insert_new(session, GarbageRow, [{"prefix": key, "not_before": now()} for key in keys])
             return True
 
@@ -168,7 +168,7 @@ class PhotoStore(PhotoReads):
         nothing.
         """
         with self._db.writing() as session:
-            return move(session, photo_id, from_states, to, epoch=epoch, **fields)
+            return change_state(session, photo_id, from_states, to, epoch=epoch, **fields)
 
     def record_inspection(
         self,
@@ -176,7 +176,7 @@ class PhotoStore(PhotoReads):
         *,
         width: int,
         height: int,
-        identity: Identity,
+        identity: CopyIdentity,
         aperture: float | None,
         focal_mm: float | None,
         focus_m: float | None,
@@ -272,7 +272,7 @@ class PhotoStore(PhotoReads):
                 if given:
                     sample_moves.change_settings(session, photo, given, columns)
                 if chosen is not None:
-                    sample_moves.move(session, photo, chosen)
+                    sample_moves.move_photo(session, photo, chosen)
             elif begins or given or chosen is not None:
                 sample_moves.begin_again(session, photo, given, columns, chosen)
             return True
@@ -281,7 +281,9 @@ class PhotoStore(PhotoReads):
         """End a photo that is being worked on with a reason; its samples never count."""
         with self._db.writing() as session:
             fields = {"error_code": code, "error_detail": detail, "finished_at": now()}
-            failed = move(session, photo_id, ("received", *PHOTO_RUNNING), "failed", epoch=epoch, **fields)
+            failed = change_state(
+                session, photo_id, ("received", *PHOTO_RUNNING), "failed", epoch=epoch, **fields
+            )
             if failed:
                 _ended(session, photo_id)
             return failed
@@ -302,7 +304,9 @@ class PhotoStore(PhotoReads):
         """
         with self._db.writing() as session:
             photo = find_to_change(session, PhotoRow, photo_id, owner)
-            if photo is None or not move(session, photo_id, UNFINISHED, "cancelled", finished_at=now()):
+            if photo is None or not change_state(
+                session, photo_id, UNFINISHED, "cancelled", finished_at=now()
+            ):
                 return False
             drop_patches(session, photo)
             _ended(session, photo_id)
@@ -317,7 +321,7 @@ class PhotoStore(PhotoReads):
         """
         with self._db.writing() as session:
             done = {"finished_at": now(), "counted_at": now()}
-            if not move(session, photo_id, ("estimating",), "counted", epoch=epoch, **done):
+            if not change_state(session, photo_id, ("estimating",), "counted", epoch=epoch, **done):
                 return None
             photo = session.scalars(select(PhotoRow).where(PhotoRow.public_id == photo_id)).one()
             if photo.lens_id is None:
@@ -345,12 +349,12 @@ class PhotoStore(PhotoReads):
             photo.deleted_at = now()
             photo.state = "cancelled" if photo.state in UNFINISHED else photo.state
             forget_answers(session, photo)
-            empty(photo)
+            erase_description(photo)
             photo.windows, photo.windows_rejected = None, 0
             forget_if_empty(session, photo)
             if lens_id is not None:
-                lens_ways.settle(session, lens_id)
-            prefix = folder_of(photo)
+                lens_ways.settle_way(session, lens_id)
+            prefix = photo_folder(photo)
             insert_new(session, GarbageRow, [{"prefix": prefix, "not_before": now() + LATE}])
             return prefix
 
@@ -380,11 +384,11 @@ def _ended(session: Session, photo_id: str) -> None:
     """Clean up after a photo without a result: its lens is deleted if empty, or no longer waits for it."""
     photo = let_go(session, photo_id)
     if photo.relearning and photo.lens_id is not None:
-        lens_ways.settle(session, photo.lens_id)
+        lens_ways.settle_way(session, photo.lens_id)
 
 
 def _chosen(session: Session, photo: PhotoRow, lens: LensName | str | None, owner: str) -> LensRow | None:
     """Return the lens that an owner describes or whose id is given; None where neither is."""
     if isinstance(lens, LensName):
         return lenses.named(session, photo.owner_id, lens, way=photo.given.get("model", photo.way))
-    return None if lens is None else find(session, LensRow, lens, owner)
+    return None if lens is None else find_owned(session, LensRow, lens, owner)

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from sqlalchemy.orm import Session
 
 from app.store.access.owners import now
-from app.store.lens_ways import forget_before, join, locked, settle, teaches
+from app.store.lens_ways import forget_before, join, locked, settle_way, teaches
 from app.store.photo_steps import restart
 from app.store.tables import LensRow, PhotoRow
 from app.store.versions import drop_samples, new_version, record_event
@@ -41,7 +41,7 @@ def switch(session: Session, photo: PhotoRow, after: Literal["counted", "exclude
         session.flush()
         if taught:
             give_back(session, photo, "photo_excluded")
-        settle(session, photo.lens_id)
+        settle_way(session, photo.lens_id)
         return True
     if photo.way != locked(session, photo.lens_id).way:
         if photo.file_gone_at is not None:
@@ -59,7 +59,7 @@ def may_move(photo: PhotoRow, lens: LensRow) -> bool:
     return photo.state != "counted" or photo.way == lens.way or photo.file_gone_at is None
 
 
-def move(session: Session, photo: PhotoRow, lens: LensRow) -> None:
+def move_photo(session: Session, photo: PhotoRow, lens: LensRow) -> None:
     """Give a finished photo that `may_move` to another lens; both get a new version if it counts."""
     before = photo.lens_id
     if before == lens.id:
@@ -75,7 +75,7 @@ def move(session: Session, photo: PhotoRow, lens: LensRow) -> None:
         else:
             restart(session, photo)
     if before is not None:
-        settle(session, before)
+        settle_way(session, before)
 
 
 def change_settings(
@@ -112,4 +112,4 @@ def begin_again(
         photo.given = {**kept, "lens_id": chosen.public_id}
     restart(session, photo)
     if leaves and before is not None:
-        settle(session, before)
+        settle_way(session, before)

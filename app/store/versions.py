@@ -73,7 +73,7 @@ def take_samples(session: Session, photo: PhotoRow, version: int) -> int:
         .rowcount
     )
     assert photo.lens_id is not None
-    recount(session, photo.lens_id)
+    recount_samples(session, photo.lens_id)
     return joined
 
 
@@ -87,11 +87,11 @@ def drop_samples(session: Session, photo: PhotoRow) -> int:
         .rowcount
     )
     assert photo.lens_id is not None
-    recount(session, photo.lens_id)
+    recount_samples(session, photo.lens_id)
     return dropped
 
 
-def recount(session: Session, lens_id: int) -> None:
+def recount_samples(session: Session, lens_id: int) -> None:
     """Count the samples and photos of a lens anew: recomputed, never incremented."""
     samples, photos = session.execute(
         select(func.count(), func.count(SampleRow.photo_id.distinct())).where(SampleRow.lens_id == lens_id)

@@ -38,7 +38,7 @@ from lensmodel.correction.tiles.lattice import Cell
 from lensmodel.correction.tiles.texture import SHARE, texture_kept
 
 
-class LateralShift(Protocol):
+class LateralColourShift(Protocol):
     """Lateral colour of a lens: how far red and blue images lie from the green one."""
 
     def displacement(self, r: float, channel: Channel) -> float:
@@ -55,7 +55,7 @@ class CorrectionJob:
 
     planes: Planes
     beliefs: Callable[[FieldPosition, Channel], Belief]
-    lateral: LateralShift | None
+    lateral: LateralColourShift | None
     frame: Frame
     method: Deconvolver
     strength: float

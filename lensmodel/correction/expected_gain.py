@@ -20,7 +20,7 @@ from lensmodel.core.types import ZONES, EdgeGain, Plane, Planes, Zone
 from lensmodel.correction.audit import AuditReport
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.deconvolver import Sensor
-from lensmodel.correction.methods.wiener import counts, frequency_squared
+from lensmodel.correction.methods.wiener import frequency_counts, frequency_squared
 from lensmodel.correction.tiles.lattice import Cell
 
 WORTH_DB: Final = 0.1
@@ -138,7 +138,7 @@ def plan(
     """
     before = after = 0.0
     shares: list[float] = []
-    times = counts(_GRID)
+    times = frequency_counts(_GRID)
     for plane, belief, offset, sensor in zip(tile, beliefs, offsets, sensors, strict=True):
         point = UniformBlur(delta(1), offset).spectrum(_GRID)
         K = point if belief.kernel.shape[0] > WIDEST else UniformBlur(belief.kernel, offset).spectrum(_GRID)
@@ -219,7 +219,7 @@ def _ring_means(values: NDArray[np.floating]) -> NDArray[np.float64]:
 @lru_cache(maxsize=1)
 def _rings() -> tuple[NDArray[np.float64], ...]:
     """Weights of each ring's frequencies, by how often the whole spectrum holds them; their sum is 1."""
-    modulus, times = np.sqrt(frequency_squared(_GRID)), counts(_GRID)
+    modulus, times = np.sqrt(frequency_squared(_GRID)), frequency_counts(_GRID)
     rings = [times * ((modulus >= low) & (modulus < high)) for low, high in pairwise(_EDGES)]
     return tuple(ring / ring.sum() for ring in rings)
 

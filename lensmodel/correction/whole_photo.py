@@ -27,7 +27,7 @@ from lensmodel.core.types import (
 )
 from lensmodel.correction.audit import AuditReport, pooled
 from lensmodel.correction.blur import crop_to_support
-from lensmodel.correction.cell import CorrectionJob, LateralShift, RestoredCell, restore_cell
+from lensmodel.correction.cell import CorrectionJob, LateralColourShift, RestoredCell, restore_cell
 from lensmodel.correction.deconvolver import CoarseMethod, Deconvolver
 from lensmodel.correction.engine import compiled, keep_freed_memory
 from lensmodel.correction.expected_gain import ZoneReport, zone_reports
@@ -94,7 +94,7 @@ def correct_planes(
     method: str | Deconvolver = "standard",
     strength: float = 1.0,
     psf_error: PsfError | None = None,
-    lateral: LateralShift | None = None,
+    lateral: LateralColourShift | None = None,
     cfa: BayerPattern | None = None,
     bounds: Bounds | None = None,
     layers: Sequence[Bounds] = (),
@@ -132,7 +132,7 @@ def correct_planes(
     psf_error : float, callable or None
         Expected relative L2 error of the PSF: the larger, the more of a point is mixed into it, and the less
         is allowed beside edges. None takes the error of an `UncertainField`, and 0 for any other field.
-    lateral : LateralShift or None
+    lateral : LateralColourShift or None
         Lateral colour to remove in the same step: it becomes part of the red and blue PSFs, so
         nothing is interpolated. Leave it out where the planes were resampled before.
     cfa : BayerPattern or None

@@ -43,7 +43,7 @@ _CHOICE_SIGMA = 0.01  # noise by which windows are ranked: that of most cases (c
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class BlindCase:
     """One question: a photo, a PSF and a noise level.
 
     Parameters
@@ -179,7 +179,7 @@ def make_cases(
     limit: int | None,
     choice: Choice = "random",
     scenes: int | None = None,
-) -> tuple[Case, ...]:
+) -> tuple[BlindCase, ...]:
     """Every scene with every PSF of a half; at most `limit`, spread over both by a seeded shuffle.
 
     A scene is a window of a photo: one of each, or `scenes` of all in turn. With `pool` > 1 the further
@@ -202,7 +202,7 @@ def make_cases(
     order = np.random.default_rng(seed).permutation(len(pairs))
     chosen = order if limit is None else _spread(pairs, order, limit)
     return tuple(
-        Case(
+        BlindCase(
             tuple(own[(i + k) % len(own)] for k in range(pool)),
             *(n, noise, patch, variant, seed, choice),
             window=i // len(own),
@@ -256,7 +256,7 @@ def good_corners(photo: Path, patch: int, margin: int) -> tuple[tuple[int, int],
     )
 
 
-def observe(case: Case, kernel: Kernel) -> Observation:
+def observe(case: BlindCase, kernel: Kernel) -> Observation:
     """Make what the camera sees: blur by valid convolution, then noise, then the variant's camera."""
     patches = []
     sharp: Plane | None = None
@@ -271,7 +271,7 @@ def observe(case: Case, kernel: Kernel) -> Observation:
     return Observation(tuple(patches), NoiseModel.white(case.noise), sharp, kernel)
 
 
-def _drawn(photo: Path, kernel: Kernel, case: Case, rng: np.random.Generator) -> tuple[Plane, Plane]:
+def _drawn(photo: Path, kernel: Kernel, case: BlindCase, rng: np.random.Generator) -> tuple[Plane, Plane]:
     """Sharp and photographed window, drawn by chance."""
     size, margin = case.patch, kernel.shape[0] // 2
     corners = good_corners(photo, size, margin)
@@ -280,7 +280,7 @@ def _drawn(photo: Path, kernel: Kernel, case: Case, rng: np.random.Generator) ->
     return scene[1, margin : margin + size, margin : margin + size], _photographed(scene, kernel, case, rng)
 
 
-def _chosen(photo: Path, kernel: Kernel, case: Case, rng: np.random.Generator) -> tuple[Plane, Plane]:
+def _chosen(photo: Path, kernel: Kernel, case: BlindCase, rng: np.random.Generator) -> tuple[Plane, Plane]:
     """Sharp and photographed window, the best that a selector finds in the whole blurred photograph.
 
     The next ones are the best that overlap none before them; where all others do, the best of those.
@@ -320,7 +320,7 @@ def _apart(patches: Sequence[Patch], number: int) -> Patch:
     return [*apart, *rest][number % len(patches)]
 
 
-def _photographed(scene: Planes, kernel: Kernel, case: Case, rng: np.random.Generator) -> Plane:
+def _photographed(scene: Planes, kernel: Kernel, case: BlindCase, rng: np.random.Generator) -> Plane:
     def blurred(plane: Plane) -> NDArray[np.float64]:
         sharp = plane.astype(np.float64)
         return np.asarray(signal.fftconvolve(sharp, kernel, mode="valid"))

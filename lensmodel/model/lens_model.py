@@ -32,7 +32,7 @@ from lensmodel.model.fitting import GROWTH, INCREMENT, Fit
 from lensmodel.model.predictor import Predictor
 from lensmodel.model.prior import Prior
 from lensmodel.model.provenance import provenance
-from lensmodel.model.trust.expected_error import Evidence, expected_error, joint_error, with_prior
+from lensmodel.model.trust.expected_error import SampleEvidence, expected_error, joint_error, with_prior
 from lensmodel.model.trust.misleading_photos import without_misleading
 from lensmodel.model.trust.support import standard_error, support
 from lensmodel.model.wavefront.physical_mean import Physics
@@ -245,7 +245,7 @@ class LensModel:
         weight /= weight.sum()
         per_photo = np.bincount(fit.roster.photo[rows], weight)
         nearest, beyond = support(fit.index.points[rows], va.point(position, settings), fit.rule)
-        evidence = Evidence(
+        evidence = SampleEvidence(
             scatter=float(weight @ fit.validation.noise[rows]),
             expected=float(weight @ fit.expected[rows]),
             independent=1.0 / float((per_photo**2).sum()),

@@ -97,7 +97,7 @@ def bandwidths(where: NDArray[np.float64]) -> dict[str, float]:
     return bandwidths
 
 
-def support(widths: Mapping[str, float]) -> dict[str, float]:
+def support_widths(widths: Mapping[str, float]) -> dict[str, float]:
     """Bandwidths of eq. (8) itself: by them one tells near from far, whatever smoothing is best."""
     return {**widths, "r": widths["r"] / _PLACE_SHARE, "phi": widths["phi"] / _PLACE_SHARE}
 

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from typing import Final
 
 from lensmodel.core.types import ZONE_WORDS, ZONES, Channel
-from lensmodel.report.drawing import COLOURS, GREY, INK, Area, Axes, Box, Chart, Label, Line, Part
+from lensmodel.report.drawing import COLOURS, GREY, INK, Area, Axes, Box, Label, Line, Part, ReportChart
 from lensmodel.report.lens_test import LensTest, Tested
 from lensmodel.report.palette import colour, ink, rgb
-from lensmodel.report.units import NYQUIST, Sensor, Unit
+from lensmodel.report.units import NYQUIST, SensorGeometry, Unit
 
 # Layout in points of the picture (chosen: keys and numbers beside the axes are not cut off); axes have five
 # steps.
@@ -26,7 +26,9 @@ _INKS: Final[dict[Channel, str]] = {"r": "#c2410c", "g": "#15803d", "b": "#0b6e9
 _NAMES: Final[dict[Channel, str]] = {"r": "red", "g": "green", "b": "blue"}
 
 
-def map_chart(tested: Tested, sensor: Sensor, unit: Unit = "c/px", top: float = NYQUIST) -> Chart:
+def map_chart(
+    tested: Tested, sensor: SensorGeometry, unit: Unit = "c/px", top: float = NYQUIST
+) -> ReportChart:
     """Draw MTF50 maps, tangential and sagittal, on one scale from 0 to `top` cycles/pixel."""
     points = tested.report.field
     guessed = [point.extrapolated for point in points]
@@ -36,7 +38,7 @@ def map_chart(tested: Tested, sensor: Sensor, unit: Unit = "c/px", top: float = 
     return _maps(tested, f"MTF50 in {name[unit]}", parts, any(guessed))
 
 
-def error_chart(tested: Tested, sensor: Sensor) -> Chart | None:
+def error_chart(tested: Tested, sensor: SensorGeometry) -> ReportChart | None:
     """Draw the standard errors of both maps on one scale; None where they are not known."""
     spread = tested.spread
     if spread is None:
@@ -46,13 +48,13 @@ def error_chart(tested: Tested, sensor: Sensor) -> Chart | None:
     return _maps(tested, f"Standard error of MTF50, cycles/pixel, over {spread.drawn}", parts, guessed=False)
 
 
-def _maps(tested: Tested, title: str, parts: list[Part], guessed: bool) -> Chart:
+def _maps(tested: Tested, title: str, parts: list[Part], guessed: bool) -> ReportChart:
     report = tested.report
     high = _map_height(report.aspect)
     note = "? no photo shows this place: guessed" if guessed else ""
     parts = [Label(_GAP, 24, f"{title}{_at(tested)}"), *parts]
     parts.append(Label(WIDTH - _GAP, _TOP + high + 58, note, GREY, "end"))
-    return Chart(title, WIDTH, round(_TOP + high + 70), tuple(parts))
+    return ReportChart(title, WIDTH, round(_TOP + high + 70), tuple(parts))
 
 
 def _map_height(aspect: float) -> float:
@@ -63,7 +65,7 @@ def _two_maps(
     tested: Tested,
     values: tuple[Sequence[float], Sequence[float]],
     top: float,
-    sensor: Sensor,
+    sensor: SensorGeometry,
     unit: Unit,
     guessed: Sequence[bool] | None,
     *,
@@ -111,7 +113,7 @@ def _figure(value: float, factor: float, *, capped: bool = False) -> str:
     return f">{text}" if capped else text
 
 
-def curves_chart(tested: Tested) -> Chart:
+def curves_chart(tested: Tested) -> ReportChart:
     """Draw contrast over the radius: sagittal solid, tangential dashed, bands of one standard error."""
     report, axes = tested.report, _axes(1.0)
     parts: list[Part] = [Label(_LEFT, 24, f"Contrast over the picture{_at(tested)}")]
@@ -129,10 +131,10 @@ def curves_chart(tested: Tested) -> Chart:
         lines.append(axes.curve(report.radii, curve.tangential, own, dashed=True))
         lines += axes.key(2 * i, f"{name} S", own)
         lines += axes.key(2 * i + 1, f"{name} T", own, dashed=True)
-    return Chart("Contrast over the picture", WIDTH, HEIGHT, (*parts, *_inside(axes, bands), *lines))
+    return ReportChart("Contrast over the picture", WIDTH, HEIGHT, (*parts, *_inside(axes, bands), *lines))
 
 
-def colours_chart(test: LensTest, aperture: float | None) -> Chart:
+def colours_chart(test: LensTest, aperture: float | None) -> ReportChart:
     """Draw contrast of red, green and blue over the radius, mean of tangential and sagittal."""
     matching = [one for one in test.tested if one.report.settings.aperture == aperture]
     axes = _axes(1.0)
@@ -147,10 +149,10 @@ def colours_chart(test: LensTest, aperture: float | None) -> Chart:
         mean = [(t + s) / 2.0 for t, s in zip(own.tangential, own.sagittal, strict=True)]
         parts.append(axes.curve(one.report.radii, mean, _INKS[channel]))
         parts += axes.key(i, _NAMES[channel], _INKS[channel])
-    return Chart("Contrast by colour", WIDTH, HEIGHT, tuple(parts))
+    return ReportChart("Contrast by colour", WIDTH, HEIGHT, tuple(parts))
 
 
-def field_chart(tested: Tested) -> Chart:
+def field_chart(tested: Tested) -> ReportChart:
     """Draw how wide points are along the radius and around the centre, see `FieldShape`."""
     shape, radii = tested.report.shape, tested.report.radii
     top = 1.15 * max(*shape.along_u, *shape.along_v, _LEAST_WIDTH_PX)
@@ -167,10 +169,10 @@ def field_chart(tested: Tested) -> Chart:
         Label(axes.right + 14, _TOP + 95, "curvature, or blur that", GREY, size=10),
         Label(axes.right + 14, _TOP + 108, "grows with the field", GREY, size=10),
     ]
-    return Chart("Astigmatism and field curvature", WIDTH, HEIGHT, tuple(parts))
+    return ReportChart("Astigmatism and field curvature", WIDTH, HEIGHT, tuple(parts))
 
 
-def apertures_chart(test: LensTest, unit: Unit = "c/px") -> Chart | None:
+def apertures_chart(test: LensTest, unit: Unit = "c/px") -> ReportChart | None:
     """Draw MTF50 of each zone by aperture; None with fewer than two."""
     apertures = [aperture for aperture in test.apertures if aperture is not None]
     if len(apertures) < 2:
@@ -186,10 +188,10 @@ def apertures_chart(test: LensTest, unit: Unit = "c/px") -> Chart | None:
         own = [factor * min(row[zone], NYQUIST) for row in rows]
         parts.append(axes.curve(range(len(rows)), own, COLOURS[i]))
         parts += axes.key(i, ZONE_WORDS[zone], COLOURS[i])
-    return Chart("MTF50 by aperture", WIDTH, HEIGHT, tuple(parts))
+    return ReportChart("MTF50 by aperture", WIDTH, HEIGHT, tuple(parts))
 
 
-def centring_chart(tested: Tested) -> Chart:
+def centring_chart(tested: Tested) -> ReportChart:
     """Draw towards which side the lens is softer, with the circle of twice its error."""
     centring, aspect = tested.report.decentring, tested.report.aspect
     high = 260
@@ -223,10 +225,10 @@ def centring_chart(tested: Tested) -> Chart:
         "certain if the cross lies outside"
     )
     parts.append(Label(WIDTH / 2, top + high + 42, note, GREY, "middle", 10))
-    return Chart("Centring", WIDTH, top + high + 56, tuple(parts))
+    return ReportChart("Centring", WIDTH, top + high + 56, tuple(parts))
 
 
-def lateral_chart(test: LensTest) -> Chart | None:
+def lateral_chart(test: LensTest) -> ReportChart | None:
     """Draw lateral colour over the radius; None where no photo showed it."""
     shift = test.lateral
     if shift is None:
@@ -241,10 +243,10 @@ def lateral_chart(test: LensTest) -> Chart | None:
     for i, (channel, values) in enumerate(rows):
         parts.append(axes.curve(shift.radii, values, _INKS[channel]))
         parts += axes.key(i, _NAMES[channel], _INKS[channel])
-    return Chart("Lateral colour", WIDTH, HEIGHT, tuple(parts))
+    return ReportChart("Lateral colour", WIDTH, HEIGHT, tuple(parts))
 
 
-def charts_of(test: LensTest, aperture: float | None, unit: Unit = "c/px") -> list[Chart]:
+def charts_of(test: LensTest, aperture: float | None, unit: Unit = "c/px") -> list[ReportChart]:
     """All charts of one aperture, in the order of a report."""
     tested = test.at(aperture)
     charts = [

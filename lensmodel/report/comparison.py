@@ -11,7 +11,7 @@ import numpy as np
 from lensmodel.core.geometry import zone_of
 from lensmodel.core.types import ZONES, Zone
 from lensmodel.report.charts import HEIGHT, WIDTH
-from lensmodel.report.drawing import COLOURS, GREY, Area, Axes, Box, Chart, Label, Part
+from lensmodel.report.drawing import COLOURS, GREY, Area, Axes, Box, Label, Part, ReportChart
 from lensmodel.report.lens_report import Curve
 from lensmodel.report.lens_test import Tested, zone_means
 from lensmodel.report.palette import colour, ink, rgb
@@ -86,14 +86,14 @@ class Comparison:
     verdict : str
         One sentence.
     zones : tuple of ZoneChange
-    charts : tuple of Chart
+    charts : tuple of ReportChart
     """
 
     first: Side
     second: Side
     verdict: str
     zones: tuple[ZoneChange, ...]
-    charts: tuple[Chart, ...]
+    charts: tuple[ReportChart, ...]
 
 
 def compare(first: Side, second: Side) -> Comparison:
@@ -144,7 +144,7 @@ def _verdict(first: Side, second: Side, zones: tuple[ZoneChange, ...]) -> str:
     return f"Compared with {first.name}, {second.name} is {', '.join(words[:-1])} and {words[-1]}."
 
 
-def _curves(first: Side, second: Side, low: bool) -> Chart:
+def _curves(first: Side, second: Side, low: bool) -> ReportChart:
     """Draw contrast of both over the radius, at a low or a high frequency that both have."""
     pairs = [
         (a, b) for a in first.tested.report.curves for b in second.tested.report.curves if _same(a, b)
@@ -168,7 +168,7 @@ def _curves(first: Side, second: Side, low: bool) -> Chart:
         lines.append(axes.curve(radii, curve.tangential, ink_, dashed=True))
         lines += axes.key(2 * i, f"{_short(side.name)} S", ink_)
         lines += axes.key(2 * i + 1, f"{_short(side.name)} T", ink_, dashed=True)
-    return Chart(title, WIDTH, HEIGHT, (*parts, *lines))
+    return ReportChart(title, WIDTH, HEIGHT, (*parts, *lines))
 
 
 def _frequency(curve: Curve) -> str:
@@ -186,7 +186,7 @@ def _same(a: Curve, b: Curve) -> bool:
     return abs(a.frequency - b.frequency) < 0.01
 
 
-def _difference(first: Side, second: Side) -> Chart | None:
+def _difference(first: Side, second: Side) -> ReportChart | None:
     """Draw MTF50 of the second less that of the first; places within two standard errors are pale."""
     one, two = first.tested.report, second.tested.report
     if (one.rows, one.cols) != (two.rows, two.cols):
@@ -210,7 +210,7 @@ def _difference(first: Side, second: Side) -> Chart | None:
         )
     note = f"blue: {second.name} is sharper; ? within the error"
     parts.append(Label(20, 40 + high + 20, note, GREY))
-    return Chart(title, WIDTH, round(high + 72), tuple(parts))
+    return ReportChart(title, WIDTH, round(high + 72), tuple(parts))
 
 
 def _place_error(first: Tested, place: int, second: Tested) -> float | None:

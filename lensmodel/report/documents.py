@@ -9,7 +9,7 @@ from typing import Final
 from lensmodel.core.types import ZONES
 from lensmodel.report.charts import apertures_chart, charts_of, lateral_chart
 from lensmodel.report.comparison import Comparison
-from lensmodel.report.drawing import Chart
+from lensmodel.report.drawing import ReportChart
 from lensmodel.report.lens_test import LensTest, Tested
 from lensmodel.report.units import UNIT_NAMES
 
@@ -43,7 +43,7 @@ def facts(test: LensTest) -> str:
     return ", ".join(parts)
 
 
-def error_words(tested: Tested) -> str:
+def error_map_words(tested: Tested) -> str:
     """Say what the bands and error maps of a report are."""
     if tested.spread is None:
         return "Too little is known to estimate the error of these figures."
@@ -87,7 +87,7 @@ def to_html(test: LensTest) -> str:
         parts.append(f"<h2>{'At ' + f'f/{aperture:g}' if aperture is not None else 'Aperture unknown'}</h2>")
         parts.append(_list(tested.report.summary))
         parts.append(_figures(charts_of(test, aperture)))
-        parts.append(f'<p class="note">{escape(error_words(tested))}</p>')
+        parts.append(f'<p class="note">{escape(error_map_words(tested))}</p>')
     parts += ["<h2>What would help most</h2>", f"<p>{escape(test.advice.text)}</p>"]
     return _page(test.name, parts)
 
@@ -113,7 +113,7 @@ def comparison_html(comparison: Comparison) -> str:
         *(f'<p class="facts">{escape(side.facts)}.</p>' for side in (first, second)),
         _table(head, rows),
         _figures(comparison.charts),
-        f'<p class="note">{escape(error_words(first.tested))}</p>',
+        f'<p class="note">{escape(error_map_words(first.tested))}</p>',
     ]
     return _page(title, parts)
 
@@ -130,7 +130,7 @@ def _page(title: str, parts: Iterable[str]) -> str:
     )
 
 
-def _figures(charts: Sequence[Chart]) -> str:
+def _figures(charts: Sequence[ReportChart]) -> str:
     # lettering of a chart stays large enough to read; on a narrow screen the chart scrolls, by keys as well
     figures = "".join(f'<figure tabindex="0">{chart.svg()}</figure>' for chart in charts)
     return f'<div class="charts">{figures}</div>'

@@ -61,7 +61,7 @@ Part: TypeAlias = Line | Label | Box | Area
 
 
 @dataclass(frozen=True, slots=True)
-class Chart:
+class ReportChart:
     """A picture of parts in picture coordinates, y downwards; it is written as SVG or into a PDF."""
 
     title: str

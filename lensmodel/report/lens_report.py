@@ -21,7 +21,7 @@ from lensmodel.model import LensModel
 from lensmodel.quality import mtf_from_kernel, tangential_sagittal_mtf50
 from lensmodel.report.decentring import Decentring, decentring
 from lensmodel.report.places import DEFAULT_ASPECT, grid, ring
-from lensmodel.report.units import Sensor
+from lensmodel.report.units import SensorGeometry
 
 _STEPS_MM: Final = (50.0, 20.0, 10.0)
 """Curves are drawn at one to four times such a step in lp/mm: 10 to 40, as lens tests are, and for sensors
@@ -299,7 +299,7 @@ def _frequencies(options: ReportSettings, pitch_um: float | None) -> list[tuple[
     return [(f, lp) for f, lp in pairs if f <= 0.5]
 
 
-_CYCLES: Final = Sensor()
+_CYCLES: Final = SensorGeometry()
 _Ring = list[tuple[FieldPosition, Kernel]]
 
 

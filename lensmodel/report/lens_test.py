@@ -18,7 +18,7 @@ from lensmodel.report.advice import Advice, advice
 from lensmodel.report.bootstrap import DRAWS, Spread, spreads_of
 from lensmodel.report.lens_report import LensReport, ReportSettings, apertures, lens_report, widest
 from lensmodel.report.places import DEFAULT_ASPECT
-from lensmodel.report.units import Sensor
+from lensmodel.report.units import SensorGeometry
 
 MOST_APERTURES: Final = 4  # a reader compares no more at once (chosen)
 ROWS: Final = 7  # of the grid of places (chosen)
@@ -59,7 +59,7 @@ class Tested:
 
 
 @dataclass(frozen=True, slots=True)
-class LateralShift:
+class LateralColourCurve:
     """Pixels outwards by which red and blue images lie beyond the green one, by radius."""
 
     radii: tuple[float, ...]
@@ -80,11 +80,11 @@ class LensTest:
         For photographers.
     photos, samples : int
         That it rests on.
-    sensor : Sensor
+    sensor : SensorGeometry
         For other units than cycles/pixel.
     tested : tuple of Tested
         By aperture, ascending, and by colour, green first.
-    lateral : LateralShift or None
+    lateral : LateralColourCurve or None
         None where no photo showed it.
     advice : Advice
         Which photo would help most.
@@ -94,9 +94,9 @@ class LensTest:
     verdict: str
     photos: int
     samples: int
-    sensor: Sensor
+    sensor: SensorGeometry
     tested: tuple[Tested, ...]
-    lateral: LateralShift | None
+    lateral: LateralColourCurve | None
     advice: Advice
 
     def at(self, aperture: float | None, channel: Channel = "g") -> Tested:
@@ -165,7 +165,7 @@ def lens_test(
         verdict=verdict(first),
         photos=first.photos,
         samples=first.samples,
-        sensor=Sensor(first.pixel_pitch_um, height_px or _height(model, aspect)),
+        sensor=SensorGeometry(first.pixel_pitch_um, height_px or _height(model, aspect)),
         tested=tuple(tested),
         lateral=_lateral(lateral),
         advice=advice(model),
@@ -189,7 +189,7 @@ def _height(model: LensModel, aspect: float) -> int | None:
     return None if half is None else round(2.0 * half / math.hypot(long, 1.0))
 
 
-def _lateral(measured: Sequence[LateralColour]) -> LateralShift | None:
+def _lateral(measured: Sequence[LateralColour]) -> LateralColourCurve | None:
     """Median displacement over the photos that could tell: one without edges cannot spoil it."""
     columns: dict[Channel, list[LateralColour]] = {
         "r": [each for each in measured if each.red_points > 0],
@@ -201,7 +201,7 @@ def _lateral(measured: Sequence[LateralColour]) -> LateralShift | None:
         tuple(median(each.displacement(r, channel) for each in columns[channel]) for r in _LATERAL_R)
         for channel in ("r", "b")
     )
-    return LateralShift(_LATERAL_R, red, blue, min(len(columns["r"]), len(columns["b"])))
+    return LateralColourCurve(_LATERAL_R, red, blue, min(len(columns["r"]), len(columns["b"])))
 
 
 def zone_means(report: LensReport) -> dict[Zone, float]:

@@ -8,8 +8,8 @@ from typing import Any, Final
 
 from lensmodel.report.charts import apertures_chart, charts_of, lateral_chart
 from lensmodel.report.comparison import Comparison
-from lensmodel.report.documents import error_words, facts, zone_table
-from lensmodel.report.drawing import Area, Box, Chart, Label, Line, Part
+from lensmodel.report.documents import error_map_words, facts, zone_table
+from lensmodel.report.drawing import Area, Box, Label, Line, Part, ReportChart
 from lensmodel.report.lens_test import LensTest
 
 _MARGIN: Final = 42.0  # points, 15 mm (chosen: every printer reaches so far)
@@ -38,7 +38,7 @@ def to_pdf(test: LensTest) -> bytes:
         for line in tested.report.summary:
             story.text(f"- {line}", 9.5)
         story.charts(charts_of(test, aperture))
-        story.text(error_words(tested), 8.5)
+        story.text(error_map_words(tested), 8.5)
     story.heading("What would help most", 13)
     story.text(test.advice.text, 10)
     return story.done()
@@ -62,7 +62,7 @@ def comparison_pdf(comparison: Comparison) -> bytes:
     rows = [[c.zone, f"{c.first:.3f}", f"{c.second:.3f}", f"{c.share:+.0%}"] for c in comparison.zones]
     story.table(head, rows)
     story.charts(comparison.charts)
-    story.text(error_words(comparison.first.tested), 8.5)
+    story.text(error_map_words(comparison.first.tested), 8.5)
     return story.done()
 
 
@@ -130,7 +130,7 @@ class _Story:
                 self._canvas.drawString(_MARGIN + k * step, self._y, _plain(cell))
         self._y -= size
 
-    def charts(self, charts: Sequence[Chart]) -> None:
+    def charts(self, charts: Sequence[ReportChart]) -> None:
         """Draw charts one below the other, so large that their lettering reads like small print."""
         gap = 12.0
         for chart in charts:
@@ -139,7 +139,7 @@ class _Story:
             self._chart(chart, _MARGIN, self._y - gap, scale)
             self._y -= chart.height * scale + gap
 
-    def _chart(self, chart: Chart, left: float, top: float, scale: float) -> None:
+    def _chart(self, chart: ReportChart, left: float, top: float, scale: float) -> None:
         self._canvas.saveState()
         self._canvas.translate(left, top)
         self._canvas.scale(scale, scale)

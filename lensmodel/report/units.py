@@ -13,7 +13,7 @@ NYQUIST: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Sensor:
+class SensorGeometry:
     """What turns cycles/pixel into other units.
 
     Parameters

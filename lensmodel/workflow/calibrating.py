@@ -66,7 +66,7 @@ class InMemory:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class PhotoVerdict:
     """What became of a photo: how many samples it gave, None where the lens has it already; or why not."""
 
     photo: Path
@@ -123,7 +123,7 @@ class Calibration:
         *,
         ahead: int = AHEAD,
         on_event: EventHook = ignore_event,
-    ) -> Iterator[Verdict]:
+    ) -> Iterator[PhotoVerdict]:
         """Learn from photos in their order, and give what becomes of each.
 
         Parameters
@@ -146,9 +146,9 @@ class Calibration:
         )
         for path, job in jobs:
             try:
-                verdict = Verdict(path, self.add(path, job, on_event=on_event))
+                verdict = PhotoVerdict(path, self.add(path, job, on_event=on_event))
             except (LensModelError, OSError) as error:
-                verdict = Verdict(path, error=error)
+                verdict = PhotoVerdict(path, error=error)
             yield verdict
 
     def add(

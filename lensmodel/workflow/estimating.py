@@ -109,7 +109,7 @@ def require_spread(determined: Sequence[Patch], *, count: int = DEFAULT_PATCHES)
     patches.require_enough(determined, least=min(patches.LEAST_PARTS, math.ceil(count / 3)))
 
 
-def cells(selection: Selection) -> list[tuple[Patch, ...]]:
+def patches_by_cell(selection: Selection) -> list[tuple[Patch, ...]]:
     """Group accepted patches by field cell, the unit of work, largest groups first."""
     grouped: dict[int, list[Patch]] = {}
     for patch in selection.patches:

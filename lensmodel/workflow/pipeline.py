@@ -8,7 +8,7 @@ the service run the same code. The steps in the middle are independent of each o
 run in as many processes as there are. Here they are under one name.
 """
 
-from lensmodel.workflow.calibrating import AHEAD, Calibration, InMemory, Verdict
+from lensmodel.workflow.calibrating import AHEAD, Calibration, InMemory, PhotoVerdict
 from lensmodel.workflow.correcting import correct_photo, lateral_of, psfs_for
 from lensmodel.workflow.developed import (
     load_developed,
@@ -23,9 +23,9 @@ from lensmodel.workflow.estimating import (
     DEFAULT_KERNEL_SIZE,
     DEFAULT_PATCHES,
     CellSample,
-    cells,
     estimate_cell,
     find_patches,
+    patches_by_cell,
     require_spread,
     seen_patches,
     witnesses_of,
@@ -52,10 +52,9 @@ __all__ = [
     "EventHook",
     "InMemory",
     "PhotoSteps",
+    "PhotoVerdict",
     "Recipe",
     "Stage",
-    "Verdict",
-    "cells",
     "correct_photo",
     "estimate_cell",
     "find_patches",
@@ -63,6 +62,7 @@ __all__ = [
     "lateral_of",
     "load_developed",
     "load_seen",
+    "patches_by_cell",
     "photo_id",
     "psfs_for",
     "require_aperture",

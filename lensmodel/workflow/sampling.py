@@ -31,9 +31,9 @@ from lensmodel.workflow.developed import (
 from lensmodel.workflow.estimating import (
     DEFAULT_PATCHES,
     CellSample,
-    cells,
     estimate_cell,
     find_patches,
+    patches_by_cell,
     require_spread,
 )
 from lensmodel.workflow.lens import Lens
@@ -196,7 +196,7 @@ class _StepsHere:
     def select(self) -> None:
         developed = load_developed(self._folder)
         recipe = self._recipe
-        self._groups = cells(find_patches(developed, count=recipe.count, selector=recipe.selector))
+        self._groups = patches_by_cell(find_patches(developed, count=recipe.count, selector=recipe.selector))
 
     def estimate(self) -> None:
         recipe, done = self._recipe, 0

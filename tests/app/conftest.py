@@ -14,7 +14,7 @@ import pytest
 from sqlalchemy import Engine, create_engine
 from starlette.testclient import TestClient
 
-from app.blobs.folder_creation import settle
+from app.blobs.folder_creation import settle_folder
 from app.blobs.storage import Storage
 from app.runtime.settings import Settings
 from app.store import LensName, NewPatch, NewSample, Store, database
@@ -185,7 +185,8 @@ def store(settings: Settings, empty_database: Path) -> Iterator[Store]:
     else:
         shutil.copy(empty_database, settings.data_dir / "app.db")
     opened = Store(settings)
-    settle(opened, Storage(settings.storage, create=False))  # before rows that name files which are not there
+    # before rows that name files which are not there
+    settle_folder(opened, Storage(settings.storage, create=False))
     yield opened
     opened.close()
 

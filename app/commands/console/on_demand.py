@@ -12,7 +12,7 @@ from typer.core import TyperCommand, TyperGroup
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class CommandEntry:
     """What the list of commands says of one, and where it is.
 
     Parameters
@@ -33,7 +33,7 @@ class Entry:
 class OnDemand(TyperGroup):
     """Commands known by their entries, each imported when it is called or its own help is asked for."""
 
-    entries: ClassVar[Mapping[str, Entry]] = {}
+    entries: ClassVar[Mapping[str, CommandEntry]] = {}
     """The entries by what is typed, in the order of the list."""
 
     def __init__(self, **given: Any) -> None:  # noqa: ANN401 - what Typer passes

@@ -14,7 +14,7 @@ from app.store.access.access_tables import IdempotencyRow, KeyRow, SessionRow
 from app.store.access.owners import now, owner_id
 from app.store.database import Database, insert_new
 from app.store.ids import new_id
-from app.store.photo_steps import LATE, folder_of
+from app.store.photo_steps import LATE, photo_folder
 from app.store.tables import (
     Base,
     CorrectionRow,
@@ -187,7 +187,7 @@ def _erase_photos(session: Session, photos: list[PhotoRow]) -> list[str]:
     keys = [photo.id for photo in photos]
     corrections = session.scalars(select(CorrectionRow.public_id).where(CorrectionRow.photo_id.in_(keys)))
     prefixes = [f"corrections/{key}/" for key in corrections]
-    prefixes += [folder_of(photo) for photo in photos]
+    prefixes += [photo_folder(photo) for photo in photos]
     session.execute(delete(CorrectionRow).where(CorrectionRow.photo_id.in_(keys)))
     session.execute(delete(SampleRow).where(SampleRow.photo_id.in_(keys)))
     session.execute(delete(PatchRow).where(PatchRow.photo_id.in_(keys)))

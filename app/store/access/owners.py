@@ -50,13 +50,13 @@ def owned(table: type[Owned], owner: str | None) -> Select[Owned]:
     return query
 
 
-def find(session: Session, table: type[Owned], public_id: str, owner: str | None) -> Owned | None:
+def find_owned(session: Session, table: type[Owned], public_id: str, owner: str | None) -> Owned | None:
     """Return one row by its public id if it is this owner's."""
     return None if not is_id(public_id) else session.scalar(_by_id(table, public_id, owner))
 
 
 def find_to_change(session: Session, table: type[Owned], public_id: str, owner: str | None) -> Owned | None:
-    """Return as `find`, locked until the transaction ends: what is read now still holds when it is changed.
+    """Return as `find_owned`, locked until the transaction ends: what is read still holds when it is changed.
 
     SQLite has one writer at a time anyway.
     """

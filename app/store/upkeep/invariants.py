@@ -13,12 +13,12 @@ from typing import Final, TypeAlias
 from sqlalchemy import ColumnElement, Select, and_, exists, func, or_, select, text
 from sqlalchemy.orm import Session
 
-from app.store.lens_ways import forget_before, join, settle, teaches
-from app.store.patches import recount as recount_patches
+from app.store.lens_ways import forget_before, join, settle_way, teaches
+from app.store.patches import recount_patches
 from app.store.photo_steps import WORKED_ON
 from app.store.sample_moves import give_back
 from app.store.tables import CorrectionRow, EventRow, LensRow, PatchRow, PhotoRow, SampleRow
-from app.store.versions import recount
+from app.store.versions import recount_samples
 
 Find: TypeAlias = Callable[[Session], Sequence[str]]
 Mend: TypeAlias = Callable[[Session, str], None]
@@ -117,7 +117,7 @@ def _totals() -> Select[str]:
 
 def _recount_lens(session: Session, lens_id: str) -> None:
     lens = session.scalars(select(LensRow).where(LensRow.public_id == lens_id).with_for_update()).one()
-    recount(session, lens.id)
+    recount_samples(session, lens.id)
 
 
 def _joined() -> Select[str]:
@@ -175,7 +175,7 @@ def _vote_anew(session: Session, photo_id: str) -> None:
     if teaches(session, photo):
         join(session, photo, "photo_included")
     else:
-        settle(session, photo.lens_id)
+        settle_way(session, photo.lens_id)
 
 
 def _sampled() -> Select[str]:
@@ -251,7 +251,7 @@ def _unsettled() -> Select[str]:
 
 
 def _settle(session: Session, lens_id: str) -> None:
-    settle(session, session.scalars(select(LensRow.id).where(LensRow.public_id == lens_id)).one())
+    settle_way(session, session.scalars(select(LensRow.id).where(LensRow.public_id == lens_id)).one())
 
 
 def _forgotten() -> Select[str]:

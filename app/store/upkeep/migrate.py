@@ -20,7 +20,7 @@ from lensmodel.core.errors import InvalidInputError
 _LOCK = 0x1E45  # any number that only this program uses
 
 
-def config(connection: Connection | None = None) -> Config:
+def alembic_config(connection: Connection | None = None) -> Config:
     """Return Alembic's configuration for the steps in `migrations/`."""
     alembic = Config()
     alembic.set_main_option("script_location", str(Path(migrations.__file__).parent).replace("%", "%%"))
@@ -30,12 +30,12 @@ def config(connection: Connection | None = None) -> Config:
 
 def head() -> str | None:
     """Return the newest revision that this program knows."""
-    return ScriptDirectory.from_config(config()).get_current_head()
+    return ScriptDirectory.from_config(alembic_config()).get_current_head()
 
 
 def steps() -> list[Script]:
     """Return all steps, the newest first."""
-    return list(ScriptDirectory.from_config(config()).walk_revisions())
+    return list(ScriptDirectory.from_config(alembic_config()).walk_revisions())
 
 
 def current(database: Database) -> str | None:
@@ -60,14 +60,14 @@ def upgrade(database: Database) -> bool:
     if database.is_sqlite and before is not None:
         _copy(database.path, before)
     with _alone(database) as connection:
-        command.upgrade(config(connection), "head")
+        command.upgrade(alembic_config(connection), "head")
     return True
 
 
 def downgrade(database: Database, revision: str) -> None:
     """Undo steps down to `revision` ("base" = all)."""
     with _alone(database) as connection:
-        command.downgrade(config(connection), revision)
+        command.downgrade(alembic_config(connection), revision)
 
 
 @contextmanager

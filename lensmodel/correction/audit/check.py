@@ -58,7 +58,7 @@ class Evidence:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pair:
+class TilePair:
     """A tile of a photo and its correction, with what several checks need.
 
     Parameters
@@ -86,7 +86,9 @@ class Pair:
     memo: dict[str, Any] = field(default_factory=dict, init=False)
 
     @classmethod
-    def of(cls, original: Planes, corrected: Planes, evidence: Evidence, *, engine: Engine = "auto") -> Pair:
+    def of(
+        cls, original: Planes, corrected: Planes, evidence: Evidence, *, engine: Engine = "auto"
+    ) -> TilePair:
         """Check that the planes belong together.
 
         Light above the photo's clipping level is written as that level, so it is also judged as that.
@@ -115,7 +117,9 @@ class Pair:
         return cls(original, written, np.asarray(sigma, dtype=np.float32), evidence, luma)
 
     @classmethod
-    def _compiled(cls, original: Planes, corrected: Planes, evidence: Evidence, loops: ModuleType) -> Pair:
+    def _compiled(
+        cls, original: Planes, corrected: Planes, evidence: Evidence, loops: ModuleType
+    ) -> TilePair:
         y, x = (np.ascontiguousarray(p, dtype=np.float32) for p in (original, corrected))
         written, sigma = np.empty_like(y), np.empty_like(y)
         luma = np.empty((2, *y.shape[1:]), dtype=np.float32)

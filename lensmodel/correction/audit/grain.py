@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lensmodel.core.types import Plane
 from lensmodel.correction.audit import blocks, nearby
-from lensmodel.correction.audit.check import Pair, Severity
+from lensmodel.correction.audit.check import Severity, TilePair
 from lensmodel.correction.audit.tolerances import LIMITS
 
 _CALM: Final = 1.5
@@ -18,7 +18,7 @@ _SCALES: Final = (1, 2)
 """Distances of the second differences in pixels: grain of a period of 2 pixels and of 4."""
 
 
-def amplified(pair: Pair) -> Severity:
+def amplified(pair: TilePair) -> Severity:
     """Severity of more grain in flat places than the photo has there: root of the ratio of powers.
 
     Less grain is no fault of this kind: how much to keep is a setting of the photographer's.
@@ -35,7 +35,7 @@ def amplified(pair: Pair) -> Severity:
     return Severity.of_blocks((np.sqrt(worst) / LIMITS["grain"]).astype(np.float32))
 
 
-def _sums(pair: Pair) -> list[NDArray[np.float32]]:
+def _sums(pair: TilePair) -> list[NDArray[np.float32]]:
     """Sums over blocks: noise, light and its square, and the detail of photo and result at each scale."""
     sigma, (y, x) = pair.luma_sigma, pair.luma
     if pair.loops is not None:

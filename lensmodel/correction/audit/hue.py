@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.correction.audit import blocks, nearby
-from lensmodel.correction.audit.check import Pair, Severity
+from lensmodel.correction.audit.check import Severity, TilePair
 from lensmodel.correction.audit.tolerances import limit
 
 _SIDE: Final = 7  # of the neighbourhood in pixels (chosen, not measured)
@@ -26,7 +26,7 @@ _NOISE: Final = 4.0  # standard deviations (chosen): noise alone exceeds them on
 _FLOOR: Final = 12.0  # standard deviations of light below which hue is noise (chosen)
 
 
-def foreign_spots(pair: Pair) -> Severity:
+def foreign_spots(pair: TilePair) -> Severity:
     """Severity of single colours beyond those that the photo shows within 3 pixels.
 
     Colour is (r - g) / (r + g + b) and (b - g) / (r + g + b) of the photo smoothed over 3 x 3 pixels, where
@@ -48,7 +48,7 @@ def foreign_spots(pair: Pair) -> Severity:
     return Severity(worst / np.float32(limit("hue, spots", mosaic=pair.evidence.mosaic)))
 
 
-def foreign_area(pair: Pair) -> Severity:
+def foreign_area(pair: TilePair) -> Severity:
     """Severity of colours beyond those of the photo over an area, relative to their range there."""
     if pair.loops is not None:
         return Severity.of_blocks(
@@ -62,7 +62,7 @@ def foreign_area(pair: Pair) -> Severity:
     return Severity.of_blocks(worst / np.float32(limit("hue, area", mosaic=pair.evidence.mosaic)))
 
 
-def _beside_white(pair: Pair) -> NDArray[np.bool_]:
+def _beside_white(pair: TilePair) -> NDArray[np.bool_]:
     """Where all colours are saturated close by."""
     top = np.asarray(pair.evidence.clip, dtype=np.float32)[:, None, None]
     least = (pair.original / top).min(axis=0)
@@ -71,7 +71,7 @@ def _beside_white(pair: Pair) -> NDArray[np.bool_]:
     return np.asarray(nearby.highest(least, _BESIDE) >= np.float32(_WHITE))
 
 
-def _compiled(pair: Pair, loops: ModuleType) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _compiled(pair: TilePair, loops: ModuleType) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Figures of both checks before their limits, of pixels and of blocks; computed once."""
     if "hue" not in pair.memo:
         spots, sums = np.empty(pair.shape, dtype=np.float32), blocks.empty(4, pair.shape)
@@ -87,7 +87,7 @@ def _compiled(pair: Pair, loops: ModuleType) -> tuple[NDArray[np.float32], NDArr
     return spots, area
 
 
-def _colours(pair: Pair) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+def _colours(pair: TilePair) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
     """How far each of two colours lies beyond its range in the photo, and that range; computed once."""
     if "colours" not in pair.memo:
         sigma = (pair.sigma[0] + pair.sigma[1] + pair.sigma[2]) * np.float32(1.0 / 3.0)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lensmodel.core.types import CHANNELS, Kernel
 from lensmodel.correction.audit import blocks, nearby
-from lensmodel.correction.audit.check import Pair, Severity
+from lensmodel.correction.audit.check import Severity, TilePair
 from lensmodel.correction.audit.tolerances import limit
 
 _NEAR: Final = 9
@@ -33,7 +33,7 @@ lines finer than the PSF are darker than anything that the photo shows: with a w
 and girders would need a limit 1.7 times that of others, with a quarter 1.1 times."""
 
 
-def too_dark(pair: Pair) -> Severity:
+def too_dark(pair: TilePair) -> Severity:
     """Severity of light below the photo's darkest within 4 pixels, and below zero.
 
     A correction that assumes a worse lens subtracts more light beside every edge than there was. The share
@@ -55,7 +55,7 @@ def too_dark(pair: Pair) -> Severity:
     return _share(pair, below, limit("too dark", mosaic=pair.evidence.mosaic))
 
 
-def too_bright(pair: Pair) -> Severity:
+def too_bright(pair: TilePair) -> Severity:
     """Severity of light above the photo's brightest within 4 pixels, as a share of what was changed.
 
     Details narrower than the PSF rightly rise above it, so more is allowed than below.
@@ -71,7 +71,7 @@ def too_bright(pair: Pair) -> Severity:
     return _share(pair, np.square(beyond), limit("too bright", mosaic=pair.evidence.mosaic))
 
 
-def _share(pair: Pair, power: NDArray[np.float32], allowed: float) -> Severity:
+def _share(pair: TilePair, power: NDArray[np.float32], allowed: float) -> Severity:
     """Root of the share of a power in that of the change around each pixel, over a limit."""
     if "change" not in pair.memo:
         change = np.square(pair.corrected - pair.original) + np.square(pair.sigma)
@@ -83,7 +83,7 @@ def _ratio(part: NDArray[np.float32], whole: NDArray[np.float32], allowed: float
     return Severity.of_blocks(np.sqrt(part / whole) / np.float32(allowed))
 
 
-def _compiled(pair: Pair, loops: ModuleType) -> NDArray[np.float32]:
+def _compiled(pair: TilePair, loops: ModuleType) -> NDArray[np.float32]:
     """What is too dark, too bright and changed, around each block; computed once."""
     if "light" not in pair.memo:
         sums = blocks.empty(3, pair.shape)
@@ -93,7 +93,7 @@ def _compiled(pair: Pair, loops: ModuleType) -> NDArray[np.float32]:
     return np.asarray(pair.memo["light"])
 
 
-def isolated(pair: Pair) -> Severity:
+def isolated(pair: TilePair) -> Severity:
     """Severity of single pixels that stand out of their neighbours, but do not in the photo.
 
     A point of light I stands out of the mean of the 5 x 5 pixels around it by (k_0 - mean k) I in the photo,
@@ -113,7 +113,7 @@ def isolated(pair: Pair) -> Severity:
     return Severity(worst / np.float32(limit("isolated pixels", mosaic=pair.evidence.mosaic)))
 
 
-def _point_gain(pair: Pair, channel: int) -> float:
+def _point_gain(pair: TilePair, channel: int) -> float:
     """How much more a point stands out of its surroundings than its image does, by the PSF if it is known."""
     if pair.evidence.blurs is None:
         return _USUAL_GAIN

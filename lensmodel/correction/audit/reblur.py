@@ -11,7 +11,7 @@ from scipy import fft
 
 from lensmodel.core.types import Plane
 from lensmodel.correction.audit import blocks
-from lensmodel.correction.audit.check import Pair, Severity
+from lensmodel.correction.audit.check import Severity, TilePair
 from lensmodel.correction.audit.tolerances import LIMITS
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.blur.uniform import fast_shape
@@ -28,7 +28,7 @@ _GLOW: Final = 0.005
 holds no more than white, and a lamp is up to a hundred times brighter or so (chosen)."""
 
 
-def misfit(pair: Pair) -> Severity:
+def misfit(pair: TilePair) -> Severity:
     """Severity of the residual of the photo y less the blurred result.
 
     With k the PSF, whose relative error is e, and x the result::
@@ -55,12 +55,12 @@ def misfit(pair: Pair) -> Severity:
     return Severity.of_blocks(worst / np.float32(LIMITS["re-blur"]))
 
 
-def _sums(pair: Pair, channel: int, blur: UniformBlur) -> NDArray[np.float32]:
+def _sums(pair: TilePair, channel: int, blur: UniformBlur) -> NDArray[np.float32]:
     """Sums over blocks of r², r and the number of pixels that count."""
     evidence, sigma = pair.evidence, pair.sigma[channel]
     x, y = pair.corrected[channel], pair.original[channel]
     error = max(evidence.psf_errors[channel], MODEL_ERROR)
-    counted = usable(y, blur, evidence.clip[channel], evidence.measured[channel])
+    counted = usable_pixels(y, blur, evidence.clip[channel], evidence.measured[channel])
     if pair.loops is not None:
         sums, shape = blocks.empty(3, pair.shape), _grid(pair.shape, blur)
         spectrum = _transfer(blur, shape, pair.loops)
@@ -100,7 +100,7 @@ def reblurred(plane: Plane, blur: UniformBlur) -> Plane:
     return np.asarray(blurred[: plane.shape[0], : plane.shape[1]], dtype=np.float32)
 
 
-def usable(
+def usable_pixels(
     plane: Plane, blur: UniformBlur, clip: float, measured: NDArray[np.bool_] | None
 ) -> NDArray[np.bool_]:
     """Pixels that were measured, show no clipped light and lie inside the rim, which draws on the unknown."""

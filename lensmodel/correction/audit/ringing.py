@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.correction.audit import blocks, nearby
-from lensmodel.correction.audit.check import Pair, Severity
+from lensmodel.correction.audit.check import Severity, TilePair
 from lensmodel.correction.audit.tolerances import LIMITS
 
 # Sides in pixels of a place that should be flat, and of the window in which its edge may lie (chosen)
@@ -19,7 +19,7 @@ _NOISE: Final = 8.0
 _STRONG: Final = 40.0  # standard deviations of a step that can ring visibly (chosen)
 
 
-def swing(pair: Pair) -> Severity:
+def swing(pair: TilePair) -> Severity:
     """Severity of waves of the light within 2 pixels, over the step of the photo within 7, where it is flat.
 
     Flat is where the photo's own range within 2 pixels is no more than 8 standard deviations of its

@@ -12,7 +12,7 @@ from scipy import fft
 
 from lensmodel.core.types import Plane
 from lensmodel.correction.audit import blocks
-from lensmodel.correction.audit.check import Pair, Severity
+from lensmodel.correction.audit.check import Severity, TilePair
 from lensmodel.correction.audit.tolerances import LIMITS
 
 SLOPE: Final = 2.2
@@ -32,7 +32,7 @@ _SECTORS: Final = 4  # directions: along, across and both diagonals
 _NOISE: Final = 4.0  # times the noise's power, below which no slope is seen (chosen)
 
 
-def overcorrected(pair: Pair) -> Severity:
+def overcorrected(pair: TilePair) -> Severity:
     """Severity of power at higher frequencies beyond what the photo's lower ones predict, by direction.
 
     With the power Y of the photo, X of the result and n of the noise in windows of 32 pixels::
@@ -51,7 +51,7 @@ def overcorrected(pair: Pair) -> Severity:
     return _severity(worst, LIMITS["spectrum"])
 
 
-def comb(pair: Pair) -> Severity:
+def comb(pair: TilePair) -> Severity:
     """Severity of lines near the limit of the grid that the photo does not have.
 
     A line is a frequency that stands out of the geometric mean of its band, to which a few lines add
@@ -80,7 +80,7 @@ class _Powers:
     line: NDArray[np.float32]
 
 
-def _powers(pair: Pair) -> _Powers:
+def _powers(pair: TilePair) -> _Powers:
     """Powers of a pair, computed once."""
     if "powers" not in pair.memo:
         variance = blocks.sums(np.square(pair.luma_sigma))
@@ -92,7 +92,7 @@ def _powers(pair: Pair) -> _Powers:
     return powers
 
 
-def _measured(pair: Pair, noise: NDArray[np.float32]) -> _Powers:
+def _measured(pair: TilePair, noise: NDArray[np.float32]) -> _Powers:
     labels, edge = _labels(), _near_limit()
     planes = _whole_windows(pair.luma)
     if pair.loops is not None:

@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from lensmodel.core.types import Plane, Planes
 from lensmodel.correction.audit import blocks, nearby
-from lensmodel.correction.audit.check import Evidence, Finding, Pair, Severity, TileAudit
+from lensmodel.correction.audit.check import Evidence, Finding, Severity, TileAudit, TilePair
 from lensmodel.correction.audit.grain import amplified
 from lensmodel.correction.audit.hue import foreign_area, foreign_spots
 from lensmodel.correction.audit.light import isolated, too_bright, too_dark
@@ -21,7 +21,7 @@ from lensmodel.correction.audit.ringing import swing
 from lensmodel.correction.audit.spectrum import comb, overcorrected
 from lensmodel.correction.engine import Engine
 
-Check: TypeAlias = Callable[[Pair], Severity]
+Check: TypeAlias = Callable[[TilePair], Severity]
 """Severity on a grid of places of a tile; above 1 is a fault."""
 
 CHECKS: Final[Mapping[str, Check]] = MappingProxyType(
@@ -85,7 +85,7 @@ def audit_tile(
     InvalidInputError
         If the planes have different sizes.
     """
-    pair = Pair.of(original, corrected, evidence, engine=engine)
+    pair = TilePair.of(original, corrected, evidence, engine=engine)
     inner = inner or (slice(None), slice(None))
     findings = []
     grids: dict[tuple[int, float, tuple[int, ...]], NDArray[np.float32]] = {}

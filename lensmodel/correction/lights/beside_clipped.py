@@ -14,7 +14,7 @@ from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.blur.compiled_uniform import CompiledBlur
 from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.engine import compiled
-from lensmodel.correction.lights.clipped import around
+from lensmodel.correction.lights.clipped import span_around
 from lensmodel.correction.lights.saturation import closed, compact, far, positive
 from lensmodel.correction.limits.hue import of_known_hue
 
@@ -65,7 +65,7 @@ def held_beside_clipped(
         return restored
     reach = max(far(blur) for blur in blurs)
     anywhere = np.asarray(clipped.any(axis=0))
-    rows, cols = (around(anywhere, axis, 2 * reach + _FADE + 1) for axis in (0, 1))
+    rows, cols = (span_around(anywhere, axis, 2 * reach + _FADE + 1) for axis in (0, 1))
     box = (slice(None), rows, cols)
     observed, corrected, lost = photo[box], restored[box].copy(), clipped[box]
     broad = np.stack([mask & ~compact(mask, reach) for mask in lost])

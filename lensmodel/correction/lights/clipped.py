@@ -20,7 +20,7 @@ _Span = tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True)
-class Region:
+class ClippedRegion:
     """A part of a tile whose lights are estimated together.
 
     Parameters
@@ -39,7 +39,7 @@ class Region:
     answers: Window
 
 
-def regions(clipped: NDArray[np.bool_], reach: int) -> list[Region]:
+def regions(clipped: NDArray[np.bool_], reach: int) -> list[ClippedRegion]:
     """Cut clipped pixels into regions.
 
     Light shows on measured pixels only: clipped pixels further inside a blown area than twice the blur's
@@ -65,7 +65,7 @@ def regions(clipped: NDArray[np.bool_], reach: int) -> list[Region]:
     return [_region(piece, tight, clipped.shape, active.shape, reach) for piece, tight in pieces]
 
 
-def around(marked: NDArray[np.bool_], axis: int, reach: int) -> slice:
+def span_around(marked: NDArray[np.bool_], axis: int, reach: int) -> slice:
     """From `reach` before the first mark along an axis to `reach` after the last."""
     at = np.flatnonzero(marked.any(axis=1 - axis))
     return slice(max(int(at[0]) - reach, 0), int(at[-1]) + reach + 1)
@@ -130,7 +130,7 @@ def _region(
     shape: tuple[int, ...],
     blocks: tuple[int, ...],
     reach: int,
-) -> Region:
+) -> ClippedRegion:
     """The windows of a piece, in pixels."""
     data, own, answers = [], [], []
     for (first, last), (low, high), extent, count in zip(piece, tight, shape, blocks, strict=True):
@@ -143,4 +143,4 @@ def _region(
         data.append(slice(start, stop))
         own.append(slice(begin + reach - start, end + reach - start))
         answers.append(slice(max(begin - start, 0), end - start))
-    return Region((data[0], data[1]), (own[0], own[1]), (answers[0], answers[1]))
+    return ClippedRegion((data[0], data[1]), (own[0], own[1]), (answers[0], answers[1]))

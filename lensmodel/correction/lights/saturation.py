@@ -16,7 +16,7 @@ from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.blur.compiled_uniform import CompiledBlur
 from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.engine import Engine, compiled
-from lensmodel.correction.lights.clipped import Region, around, regions
+from lensmodel.correction.lights.clipped import ClippedRegion, regions, span_around
 from lensmodel.correction.methods.richardson_lucy import climbed, first_guess
 
 _LEAST_SEEN: Final = 0.02  # least share of a point's light that counts as measured (chosen, not measured)
@@ -106,7 +106,7 @@ class Lights:
         if not shining.any():
             return np.asarray(result, dtype=np.float32)
         # No more of the tile than the filters of 5 pixels need.
-        rows, cols = (around(shining, axis, 4) for axis in (0, 1))
+        rows, cols = (span_around(shining, axis, 4) for axis in (0, 1))
         box = (slice(None), rows, cols)
         glow = self.glow[box]
         near = ndimage.maximum_filter(glow, (1, 5, 5), mode="nearest")
@@ -177,7 +177,7 @@ def _spread(blur: UniformBlur) -> float:
 
 
 def _estimate(
-    region: Region,
+    region: ClippedRegion,
     plane: NDArray[np.float32],
     clipped: NDArray[np.bool_],
     blur: UniformBlur,

@@ -20,7 +20,13 @@ from lensmodel.correction.methods.sparse_gradient import SparseGradient
 from lensmodel.correction.methods.wiener import frequency_squared, prior
 from lensmodel.correction.tiles.beyond_frame import fill_outside
 from lensmodel.correction.tiles.canvas import Canvas, seam
-from lensmodel.correction.tiles.local_statistics import BLOCK, Blocks, signal_variance, smoothed, spread
+from lensmodel.correction.tiles.local_statistics import (
+    BLOCK,
+    BlockMeans,
+    signal_variance,
+    smoothed,
+    spread_blocks,
+)
 from lensmodel.correction.tiles.transfers import transfers
 
 _FINE: Final = 1.0 / 16.0  # cycles per pixel: a window of 13 pixels sees frequencies above this
@@ -92,11 +98,11 @@ class DirectFilter:
         light = np.maximum(blurred.mean(axis=(1, 2)), 1e-4).astype(np.float32)
         canvas = Canvas.around(blurred, blurs, sensors)
         loops = compiled(self.engine)
-        contrast, colour, noise = _contrasts(Blocks.of(blurred, light, loops), light, sensors)
+        contrast, colour, noise = _contrasts(BlockMeans.of(blurred, light, loops), light, sensors)
         mean = float(contrast.mean())
         low, high = np.log(self.calm), np.log(self.busy)
         share = np.clip((np.log(contrast / mean) - low) / (high - low), 0.0, 1.0)
-        busy = spread(share.astype(np.float32), canvas)
+        busy = spread_blocks(share.astype(np.float32), canvas)
         K, _ = transfers(blurs, canvas.shape, 1.0, loops, drifting=False)
         levels = np.array(
             [[3.0 * mean * f, max(colour, _LEAST_COLOUR * 3.0 * mean) * f] for f in (self.busy, self.calm)]
@@ -129,7 +135,7 @@ class DirectFilter:
 
 
 def _contrasts(
-    blocks: Blocks, light: NDArray[np.float32], sensors: Sequence[Sensor]
+    blocks: BlockMeans, light: NDArray[np.float32], sensors: Sequence[Sensor]
 ) -> tuple[NDArray[np.float32], float, NDArray[np.float32]]:
     """Variance of luma around each block, of chroma in all, and of the noise of each colour.
 

@@ -21,7 +21,7 @@ from lensmodel.correction.methods.shrinkage import Shrinkage
 from lensmodel.correction.methods.wiener import prior, wiener_spectrum
 from lensmodel.correction.tiles.beyond_frame import fill_outside
 from lensmodel.correction.tiles.canvas import Canvas, seam
-from lensmodel.correction.tiles.local_statistics import Blocks, signal_variance, smoothed, spread
+from lensmodel.correction.tiles.local_statistics import BlockMeans, signal_variance, smoothed, spread_blocks
 from lensmodel.correction.tiles.mosaic import refilled
 from lensmodel.correction.tiles.transfers import transfers
 
@@ -140,8 +140,8 @@ class SparseGradient:
         loops: ModuleType | None,
         glow: Planes | None,
     ) -> _Problem:
-        blocks = Blocks.of(blurred, light, loops)
-        recorded = blocks if glow is None else Blocks.of(blurred + glow, light, loops)
+        blocks = BlockMeans.of(blurred, light, loops)
+        recorded = blocks if glow is None else BlockMeans.of(blurred + glow, light, loops)
         var = np.stack(
             [
                 s.noise.variance(smoothed(b * bright)) / bright**2
@@ -197,7 +197,7 @@ class SparseGradient:
             K=K,
             smooth=_gradient_power(canvas.shape),
             noise=noise.astype(np.float32),
-            scale=spread(prox.scale(threshold), canvas),
+            scale=spread_blocks(prox.scale(threshold), canvas),
             factors=prox.scale((weights[None, :] / couplings[:, None]).astype(np.float32)),
             couplings=couplings.astype(np.float32),
             turns=np.isin(np.arange(self.steps), (0, self.steps // 2)),
@@ -344,7 +344,7 @@ def _compiled(p: _Problem, loops: ModuleType) -> Planes:
 
 
 def _calm(
-    blocks: Blocks, level: NDArray[np.float32], noise: NDArray[np.float32], alpha: float
+    blocks: BlockMeans, level: NDArray[np.float32], noise: NDArray[np.float32], alpha: float
 ) -> NDArray[np.float32]:
     """How much smoother than an average scene each block is: the factor on kappa.
 

@@ -42,14 +42,14 @@ def frequency_squared(shape: tuple[int, int]) -> NDArray[np.float32]:
 
 @lru_cache(maxsize=8)
 def prior(shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """1 / S(f) for c = 1, and S(f) times `counts`."""
+    """1 / S(f) for c = 1, and S(f) times `frequency_counts`."""
     decay = frequency_squared(shape) ** np.float32(SLOPE / 2)
-    prior_power = counts(shape) / decay
+    prior_power = frequency_counts(shape) / decay
     decay.setflags(write=False)
     return decay, np.ascontiguousarray(prior_power, dtype=np.float32)
 
 
-def counts(shape: tuple[int, int]) -> NDArray[np.float32]:
+def frequency_counts(shape: tuple[int, int]) -> NDArray[np.float32]:
     """How often the whole spectrum holds each frequency of the half; the mean counts as none."""
     counts = np.full((shape[0], shape[1] // 2 + 1), 2.0, dtype=np.float32)
     counts[:, 0] = 1.0

@@ -44,7 +44,7 @@ def smoothed(blocks: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Blocks:
+class BlockMeans:
     """Means over blocks of a tile whose colours are scaled to equal light.
 
     Parameters
@@ -60,7 +60,7 @@ class Blocks:
     square: NDArray[np.float32]
 
     @classmethod
-    def of(cls, tile: Planes, light: NDArray[np.float32], loops: ModuleType | None) -> Blocks:
+    def of(cls, tile: Planes, light: NDArray[np.float32], loops: ModuleType | None) -> BlockMeans:
         """Take the means of a tile whose colours have the mean `light`."""
         if loops is not None:
             shape = tuple(-(-extent // BLOCK) for extent in tile.shape[1:])
@@ -73,12 +73,12 @@ class Blocks:
         return cls(np.stack([coarse(plane) for plane in scaled]), coarse(luma), coarse(luma * luma))
 
 
-def signal_variance(blocks: Blocks, noise: NDArray[np.float32] | float) -> NDArray[np.float32]:
+def signal_variance(blocks: BlockMeans, noise: NDArray[np.float32] | float) -> NDArray[np.float32]:
     """Local variance of luma less that of its noise, coarse; never below a tenth of the noise.
 
     Parameters
     ----------
-    blocks : Blocks
+    blocks : BlockMeans
         Of the tile.
     noise : ndarray or float
         Variance of its noise, coarse.
@@ -88,7 +88,7 @@ def signal_variance(blocks: Blocks, noise: NDArray[np.float32] | float) -> NDArr
     return np.asarray(np.maximum(local - noise, 0.0) + _UNSURE * noise + np.float32(1e-12), dtype=np.float32)
 
 
-def spread(blocks: NDArray[np.float32], canvas: Canvas) -> NDArray[np.float32]:
+def spread_blocks(blocks: NDArray[np.float32], canvas: Canvas) -> NDArray[np.float32]:
     """Interpolate a coarse plane linearly onto a canvas, its margin cross-faded like the data's."""
     height, width = canvas.shape
     across = _interpolation(canvas.cols, canvas.margin, width) @ np.ascontiguousarray(blocks.T)

@@ -51,7 +51,7 @@ _TAPER_PX: Final = 4.0  # pixels over which it fades (chosen)
 
 
 @dataclass(frozen=True, slots=True)
-class Edges:
+class SlantedEdges:
     """PSF constraints from the slanted edges of a chart, wherever they are in the frame."""
 
     name: ClassVar[str] = "edges"

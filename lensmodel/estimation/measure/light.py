@@ -27,7 +27,7 @@ _FEWEST: Final = 64  # pixels: five times as many as there are terms
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Light:
+class Illumination:
     """A quadratic in row and column whose mean over its square window is 1.
 
     Parameters
@@ -42,7 +42,7 @@ class Light:
     side: int
 
     @classmethod
-    def even(cls, side: int) -> Light:
+    def even(cls, side: int) -> Illumination:
         """Return light that is the same everywhere."""
         return cls(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]), side)
 
@@ -53,7 +53,7 @@ class Light:
 
 def fitted_light(
     observed: NDArray[np.floating], measured: NDArray[np.bool_], page: NDArray[np.floating], kernel: Kernel
-) -> Light:
+) -> Illumination:
     """Fit the light of a window.
 
     Parameters
@@ -82,7 +82,7 @@ def fitted_light(
     light = inner @ terms[:6]
     if not float(light.min()) > 0.0:
         raise NotEnoughEvidenceError("a window of the page is black, or does not show the page; light it")
-    return Light(np.asarray(terms[:6] / float(light.mean())), side)
+    return Illumination(np.asarray(terms[:6] / float(light.mean())), side)
 
 
 def _terms(side: int, margin: int) -> NDArray[np.float64]:

@@ -30,7 +30,7 @@ from lensmodel.estimation.measure.measurer import MeasuredPsf, require_photos
 from lensmodel.estimation.measure.quiet import with_bounded_noise
 from lensmodel.estimation.measure.smooth import quadratic
 from lensmodel.estimation.measure.warp import Warp, match, matched
-from lensmodel.estimation.measure.windows import grid, measured_pixels, window_psf
+from lensmodel.estimation.measure.windows import measured_pixels, window_corners, window_psf
 from lensmodel.optics.diffraction import diffraction_otf
 from lensmodel.photo import LinearPhoto
 
@@ -60,7 +60,7 @@ _FEWEST: Final = 64  # points that a fit of brightness takes (chosen)
 
 
 @dataclass(frozen=True, slots=True)
-class Pair:
+class AperturePair:
     """Non-blind PSFs of the first photo; the second is the same scene, closed by two stops or more.
 
     Parameters
@@ -134,7 +134,7 @@ class Pair:
             return np.asarray(ndimage.map_coordinates(reference, places, order=3, mode="mirror"))
 
         half = self.side // 2
-        corners = grid(plane.shape, self.side, plane.shape[1] // half, plane.shape[0] // half, 8)
+        corners = window_corners(plane.shape, self.side, plane.shape[1] // half, plane.shape[0] // half, 8)
         for degree in (1, 1, 3):
             warp, _ = matched(warp, shown, plane, corners, self.side, least_clarity=_CLEAR, degree=degree)
         return warp

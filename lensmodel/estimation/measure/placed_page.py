@@ -14,7 +14,7 @@ from scipy import fft
 
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.types import CHANNELS, Channel
-from lensmodel.estimation.measure.light import Light, fitted_light
+from lensmodel.estimation.measure.light import Illumination, fitted_light
 from lensmodel.estimation.measure.page import MEAN, TargetPage
 from lensmodel.estimation.measure.smooth import quadratic
 from lensmodel.estimation.measure.solve import Solved
@@ -100,7 +100,7 @@ class SolvedWindow:
     kernel: NDArray[np.float64]
     solved: Solved
     shift: tuple[float, float]
-    light: Light
+    light: Illumination
     side: int
 
 
@@ -128,21 +128,21 @@ def solve_window(
 
 def _light_on(
     photo: LinearPhoto, placed: PlacedPage, channel: Channel, corner: tuple[int, int], side: int
-) -> Light:
+) -> Illumination:
     """Light and a small kernel of a window, each found with the other."""
     row, col = corner
     measured = measured_pixels(photo, channel, row, col, (side, side))
     plane = photo.planes[CHANNELS.index(channel), row : row + side, col : col + side]
     observed = np.asarray(plane, dtype=np.float64)
     variance = even_variance(photo, channel, observed, measured)
-    light, page = Light.even(side), _lit(placed, Light.even(side), corner, side)
+    light, page = Illumination.even(side), _lit(placed, Illumination.even(side), corner, side)
     for _ in range(_LIGHT_ROUNDS):
         rough, shift = roughly(observed, measured, variance, _lit(placed, light, corner, side))
         light = fitted_light(observed, measured, page(shift, SMALL // 2), rough.kernel)
     return light
 
 
-def _lit(placed: PlacedPage, light: Light, corner: tuple[int, int], side: int) -> Latent:
+def _lit(placed: PlacedPage, light: Illumination, corner: tuple[int, int], side: int) -> Latent:
     """Return what a window shows without blur in some light."""
 
     def latent(shift: tuple[float, float], margin: int) -> NDArray[np.floating]:

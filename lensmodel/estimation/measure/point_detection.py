@@ -29,7 +29,7 @@ _SKY_CELL: Final = 64  # pixels of a cell in which the sky is one value, as SExt
 
 
 @dataclass(frozen=True, slots=True)
-class Light:
+class PointLight:
     """A point of light: middle `(row, col)` in pixels, and its peak above the sky."""
 
     row: float
@@ -61,7 +61,7 @@ def sky_of(plane: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
     return sky, max(scatter, 1e-7)
 
 
-def find_lights(plane: NDArray[np.floating], detector: str = "auto") -> list[Light]:
+def find_lights(plane: NDArray[np.floating], detector: str = "auto") -> list[PointLight]:
     """Find points of light, brightest first.
 
     Parameters
@@ -80,7 +80,7 @@ def find_lights(plane: NDArray[np.floating], detector: str = "auto") -> list[Lig
         raise InvalidInputError(f"no detector {detector!r}; known: {', '.join(DETECTORS)}")
     sky, scatter = sky_of(plane)
     clean = np.ascontiguousarray(plane - sky, dtype=np.float64)
-    ways: dict[str, tuple[str, Callable[[Any, NDArray[np.float64], float], list[Light]]]] = {
+    ways: dict[str, tuple[str, Callable[[Any, NDArray[np.float64], float], list[PointLight]]]] = {
         "sep": ("sep", _by_sep),
         "photutils": ("photutils.detection", _by_photutils),
     }
@@ -99,7 +99,7 @@ def find_lights(plane: NDArray[np.floating], detector: str = "auto") -> list[Lig
     return sorted(_by_maxima(clean, scatter), key=lambda light: -light.peak)
 
 
-def isolated(lights: list[Light], reach: float) -> list[Light]:
+def isolated_lights(lights: list[PointLight], reach: float) -> list[PointLight]:
     """Lights that have no other beside them that would disturb, within `reach` pixels."""
     places = np.array([(light.row, light.col) for light in lights]).reshape(-1, 2)
     peaks = np.array([light.peak for light in lights])
@@ -112,24 +112,24 @@ def isolated(lights: list[Light], reach: float) -> list[Light]:
     return kept
 
 
-def _by_sep(sep: Any, clean: NDArray[np.float64], scatter: float) -> list[Light]:  # noqa: ANN401 - an extra
+def _by_sep(sep: Any, clean: NDArray[np.float64], scatter: float) -> list[PointLight]:  # noqa: ANN401 - an extra
     rows = sep.extract(clean, _SIGMAS / 2, err=scatter, minarea=4)
-    return [Light(float(r["y"]), float(r["x"]), float(r["peak"])) for r in rows]
+    return [PointLight(float(r["y"]), float(r["x"]), float(r["peak"])) for r in rows]
 
 
 def _by_photutils(
     detection: Any,  # noqa: ANN401 - an extra
     clean: NDArray[np.float64],
     scatter: float,
-) -> list[Light]:
+) -> list[PointLight]:
     rows = detection.DAOStarFinder(threshold=_SIGMAS * scatter, fwhm=3.0)(clean)
     if rows is None:
         return []
     names = ("y_centroid", "x_centroid") if "y_centroid" in rows.colnames else ("ycentroid", "xcentroid")
-    return [Light(float(r[names[0]]), float(r[names[1]]), float(r["peak"])) for r in rows]
+    return [PointLight(float(r[names[0]]), float(r[names[1]]), float(r["peak"])) for r in rows]
 
 
-def _by_maxima(clean: NDArray[np.float64], scatter: float) -> list[Light]:
+def _by_maxima(clean: NDArray[np.float64], scatter: float) -> list[PointLight]:
     """Highest of their 5 x 5 neighbours after a little smoothing, with the centroid of 5 x 5 pixels."""
     smooth = ndimage.gaussian_filter(clean, 1.0)
     # smoothing by sigma 1 leaves 1 / (2 sqrt(pi)) of the scatter of white noise
@@ -144,7 +144,7 @@ def _by_maxima(clean: NDArray[np.float64], scatter: float) -> list[Light]:
         part = np.maximum(smooth[row - 2 : row + 3, col - 2 : col + 3], 0.0)
         total = float(part.sum())
         lights.append(
-            Light(
+            PointLight(
                 row + float((part.sum(axis=1) * t).sum()) / total,
                 col + float((part.sum(axis=0) * t).sum()) / total,
                 float(clean[row - 1 : row + 2, col - 1 : col + 2].max()),

@@ -26,7 +26,7 @@ from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import centred
 from lensmodel.core.types import CHANNELS, Channel, StepHook, ignore_step
 from lensmodel.estimation.measure.measurer import MeasuredPsf, require_photos
-from lensmodel.estimation.measure.point_detection import Light, find_lights, isolated, sky_of
+from lensmodel.estimation.measure.point_detection import PointLight, find_lights, isolated_lights, sky_of
 from lensmodel.estimation.measure.solve import Solved, solve
 from lensmodel.estimation.measure.windows import NEAR_CLIP, measured_pixels, photo_noise
 from lensmodel.photo import LinearPhoto
@@ -74,9 +74,9 @@ class Points:
         require_photos(self, photos)
         photo = photos[0]
         plane = np.asarray(photo.planes[1], dtype=np.float64)
-        lights = isolated(find_lights(plane, self.detector), size)
+        lights = isolated_lights(find_lights(plane, self.detector), size)
         usable = [light for light in lights if _whole(light, photo, size) and not _saturated(light, photo)]
-        cells: dict[tuple[int, int], list[Light]] = {}
+        cells: dict[tuple[int, int], list[PointLight]] = {}
         for light in usable:
             row = int(light.row * self.down / photo.frame.height)
             col = int(light.col * self.across / photo.frame.width)
@@ -102,12 +102,12 @@ class Points:
         return psfs
 
 
-def _whole(light: Light, photo: LinearPhoto, size: int) -> bool:
+def _whole(light: PointLight, photo: LinearPhoto, size: int) -> bool:
     half = size // 2 + 1
     return half <= light.row < photo.frame.height - half and half <= light.col < photo.frame.width - half
 
 
-def _saturated(light: Light, photo: LinearPhoto) -> bool:
+def _saturated(light: PointLight, photo: LinearPhoto) -> bool:
     row, col = round(light.row), round(light.col)
     near = np.asarray(photo.planes[:, max(row - 3, 0) : row + 4, max(col - 3, 0) : col + 4])
     return any(bool((plane >= NEAR_CLIP * clip).any()) for plane, clip in zip(near, photo.clip, strict=True))
@@ -132,7 +132,7 @@ class _Stamp:
 
 
 def _cell_psf(
-    photo: LinearPhoto, channel: Channel, lights: Sequence[Light], size: int, sky: NDArray[np.float64]
+    photo: LinearPhoto, channel: Channel, lights: Sequence[PointLight], size: int, sky: NDArray[np.float64]
 ) -> MeasuredPsf | None:
     stamps = [_stamp(photo, channel, light, size, sky) for light in lights]
     stamps = [stamp for stamp in stamps if stamp.flux > 0.0 and stamp.measured.sum() > size]
@@ -155,7 +155,9 @@ def _cell_psf(
     return MeasuredPsf(centred(solved.kernel), photo.frame.position(*pixel), channel, error, pixel, size)
 
 
-def _stamp(photo: LinearPhoto, channel: Channel, light: Light, size: int, sky: NDArray[np.float64]) -> _Stamp:
+def _stamp(
+    photo: LinearPhoto, channel: Channel, light: PointLight, size: int, sky: NDArray[np.float64]
+) -> _Stamp:
     half = size // 2
     top, left = round(light.row) - half, round(light.col) - half
     index = CHANNELS.index(channel)

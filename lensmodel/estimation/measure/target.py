@@ -25,7 +25,7 @@ from lensmodel.estimation.measure.measurer import MeasuredPsf, require_photos
 from lensmodel.estimation.measure.page import DETAILS, TargetPage
 from lensmodel.estimation.measure.placed_page import PlacedPage, SolvedWindow, solve_window, tones_of
 from lensmodel.estimation.measure.warp import Warp, homography_of, match, matched
-from lensmodel.estimation.measure.windows import grid
+from lensmodel.estimation.measure.windows import window_corners
 from lensmodel.photo import LinearPhoto
 
 FLOOR: Final = 0.02
@@ -85,7 +85,7 @@ class Target:
         across = min(self.across, max(width // (3 * self.side // 4), 2))
         held = [
             corner
-            for corner in grid((height, width), self.side, _TRIED * across, _TRIED * down, 0)
+            for corner in window_corners((height, width), self.side, _TRIED * across, _TRIED * down, 0)
             if placed.holds(*corner, self.side, size // 2)
         ]
         corners = _spread(held, across, down)
@@ -115,7 +115,9 @@ class Target:
         marks = find_marks(plane)
         placed = _identified(photo, plane, marks, self.details)
         side = self.side
-        corners = [corner for corner in grid(plane.shape, side, 12, 8, 0) if placed.holds(*corner, side, 0)]
+        corners = [
+            corner for corner in window_corners(plane.shape, side, 12, 8, 0) if placed.holds(*corner, side, 0)
+        ]
         warp = placed.warp
         for degree in (1, 3, 5, 5):
             warp, _ = matched(

@@ -146,7 +146,9 @@ def even_variance(
     return np.full(observed.shape, float(variance[measured].mean()) if measured.any() else 1.0)
 
 
-def grid(shape: tuple[int, int], side: int, across: int, down: int, margin: int) -> list[tuple[int, int]]:
+def window_corners(
+    shape: tuple[int, int], side: int, across: int, down: int, margin: int
+) -> list[tuple[int, int]]:
     """Top left corners of windows spread evenly over a frame, `margin` pixels away from its rim."""
     last = shape[0] - side - margin, shape[1] - side - margin
     if min(last) < margin:

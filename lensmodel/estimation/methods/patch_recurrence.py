@@ -36,7 +36,7 @@ from lensmodel.estimation.steps.recurrence import (
     level_shape,
     noise_gain,
     recur,
-    resample,
+    resized_image,
 )
 
 log = logging.getLogger(__name__)
@@ -66,7 +66,7 @@ class _Scaled:
         shape = level_shape(self.y.shape, level)
         if shape == self.y.shape:
             return self
-        return _Scaled(resample(self.y, shape), self.noise * noise_gain(self.y.shape, shape))
+        return _Scaled(resized_image(self.y, shape), self.noise * noise_gain(self.y.shape, shape))
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +154,7 @@ class PatchRecurrence:
             side = max(5, _odd(widest / ALPHA**level))
             views = [s.at(level) for s in scaled]
             kernel = _start(kernel, side) if level == levels - 1 else _upscaled(kernel, side)
-            latent = [resample(x, v.y.shape) for x, v in zip(latent, views, strict=True)]
+            latent = [resized_image(x, v.y.shape) for x, v in zip(latent, views, strict=True)]
             for _ in range(self.iterations):
                 state = self._step(views, latent, kernel, side)
                 kernel = state.kernel
@@ -300,5 +300,5 @@ def _upscaled(kernel: Kernel | None, side: int) -> Kernel:
     if kernel is None:
         return _start(None, side)
     grown = round(kernel.shape[0] * ALPHA)
-    fine = np.maximum(resample(np.asarray(kernel), (grown + 1 - grown % 2,) * 2), 0.0)
+    fine = np.maximum(resized_image(np.asarray(kernel), (grown + 1 - grown % 2,) * 2), 0.0)
     return resized(as_kernel(fine), side)

@@ -43,7 +43,7 @@ _STRIP_PIXELS = 2_000_000  # pixels at once, 8 MB a plane of float32 (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Blocks:
+class BlockSums:
     """Sums over blocks; every array starts with axes (block row, block column).
 
     Parameters
@@ -90,7 +90,7 @@ def intensity_scale(plane: Plane) -> float:
     return max(float(np.percentile(sample, 99.5)), 1e-3) if sample.size else 1.0
 
 
-def measure_blocks(plane: Plane, noise: NoiseModel, side: int, clip: float, on_step: StepHook) -> Blocks:
+def measure_blocks(plane: Plane, noise: NoiseModel, side: int, clip: float, on_step: StepHook) -> BlockSums:
     """Sum over blocks of `side` pixels, in strips, so that memory does not grow with the plane.
 
     About 0.2 s a megapixel; the grid is centred, and incomplete blocks at the rim are left out.
@@ -99,7 +99,7 @@ def measure_blocks(plane: Plane, noise: NoiseModel, side: int, clip: float, on_s
     n, m = height // side, width // side
     row0, col0 = (height - n * side) // 2, (width - m * side) // 2
     scale = intensity_scale(plane)
-    blocks = Blocks(
+    blocks = BlockSums(
         side=side,
         row=row0,
         col=col0,
@@ -126,7 +126,7 @@ def _strips(count: int, step: int) -> Iterator[tuple[int, int]]:
 
 
 def _measure_strip(
-    plane: Plane, blocks: Blocks, rows: slice, *, noise: NoiseModel, clip: float, scale: float
+    plane: Plane, blocks: BlockSums, rows: slice, *, noise: NoiseModel, clip: float, scale: float
 ) -> None:
     side, m = blocks.side, blocks.level.shape[1]
     top, bottom = blocks.row + rows.start * side, blocks.row + rows.stop * side
@@ -182,7 +182,7 @@ def _ridge(along_rows: Plane, along_cols: Plane, modulus: Plane) -> NDArray[np.b
 
 
 def _measure_widths(
-    blocks: Blocks,
+    blocks: BlockSums,
     rows: slice,
     smooth: Plane,
     gradients: tuple[Plane, Plane, Plane],

@@ -103,7 +103,7 @@ def look_at(
     )
 
 
-def joined(parts: list[Details]) -> Details:
+def joined_details(parts: list[Details]) -> Details:
     """Put the entries of several together."""
     return Details(*(np.concatenate([getattr(p, name) for p in parts]) for name in Details.__slots__))
 

@@ -183,13 +183,13 @@ def select(
     chosen: list[tuple[int, int]] = []
     score = np.zeros(len(windows))
     if short.size:
-        looked = details.joined([_look(plane, windows, int(i), clip, coarse_noise) for i in short])
+        looked = details.joined_details([_look(plane, windows, int(i), clip, coarse_noise) for i in short])
         reasons[short] = second_reasons(looked)
         fine = reasons[short] == ""
         left = short[fine]
         score[left] = chooser.score(windows.take(left), looked.take(fine)) * _focus_weight(excess[left])
         if left.size:
-            picks = spread.spread(windows.take(left), score[left], count)
+            picks = spread.spread_windows(windows.take(left), score[left], count)
             chosen = [(int(left[i]), cell) for i, cell in picks]
     if not chosen:
         raise NoUsablePatchesError(_nothing_usable(Counter(reasons.tolist())))

@@ -46,7 +46,7 @@ def shortlist(windows: Windows, score: NDArray[np.float64], most_a_sector: int) 
     return np.array(chosen, dtype=np.intp)
 
 
-def spread(windows: Windows, score: NDArray[np.float64], count: int) -> list[tuple[int, int]]:
+def spread_windows(windows: Windows, score: NDArray[np.float64], count: int) -> list[tuple[int, int]]:
     """Choose up to `count` windows in field cells.
 
     First the seeds, one a cell: always from the ring and octant that has the fewest so far, so

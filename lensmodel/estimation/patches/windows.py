@@ -16,7 +16,7 @@ from lensmodel.estimation.patches.blocks import (
     ORIENTATIONS,
     WIDTH_BINS,
     WIDTH_STEP_PX,
-    Blocks,
+    BlockSums,
 )
 from lensmodel.estimation.patches.details import SLOPE_ORDER
 from lensmodel.estimation.patches.rmap import FLAT_WINDOW, R_BINS, automatic_threshold, gradient_noise
@@ -90,7 +90,7 @@ class Windows:
         return Windows(size=self.size, **{name: part[index] for name, part in parts.items()})
 
 
-def windows_of(blocks: Blocks, frame: Frame, noise: NoiseModel) -> Windows:
+def windows_of(blocks: BlockSums, frame: Frame, noise: NoiseModel) -> Windows:
     """Put the windows together from block sums; windows start at every block."""
     size = blocks.side * BLOCKS_A_SIDE
     area = size * size
@@ -138,7 +138,7 @@ def _window_sum(values: NDArray[np.generic]) -> NDArray[np.float64]:
     return out.reshape(-1, *out.shape[2:])
 
 
-def _slope_variance(blocks: Blocks) -> NDArray[np.float64]:
+def _slope_variance(blocks: BlockSums) -> NDArray[np.float64]:
     """Variance of the polynomial of order `SLOPE_ORDER` that fits the means of a window's blocks.
 
     With M the polynomials without the constant averaged over blocks, G their covariance over the pixels and
@@ -163,7 +163,7 @@ def _slopes(side: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return averaged.reshape(len(parts), -1).T, flat @ flat.T / size**2
 
 
-def _corners(blocks: Blocks) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _corners(blocks: BlockSums) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     n, m = (count - BLOCKS_A_SIDE + 1 for count in blocks.level.shape)
     rows, cols = np.meshgrid(np.arange(n), np.arange(m), indexing="ij")
     return blocks.row + rows.ravel() * blocks.side, blocks.col + cols.ravel() * blocks.side

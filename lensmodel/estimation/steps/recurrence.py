@@ -54,7 +54,7 @@ QUICK = Search(stride=3, examples=10_000, tolerance=2.0)
 """Four times as fast; kernels differ by about a seventh of their norm and are about as right."""
 
 
-def resample(image: Image, shape: tuple[int, int]) -> Image:
+def resized_image(image: Image, shape: tuple[int, int]) -> Image:
     """Resize by cubic splines, anti-aliased when it shrinks (Gaussian of sigma (ratio - 1) / 2)."""
     if image.shape == shape:
         return image
@@ -77,7 +77,7 @@ def level_shape(shape: tuple[int, int], level: int) -> tuple[int, int]:
 def noise_gain(shape: tuple[int, int], target: tuple[int, int]) -> float:
     """Standard deviation that white noise of unit variance keeps when resampled."""
     white = np.random.default_rng(0).standard_normal(shape)
-    return float(resample(white, target)[4:-4, 4:-4].std())
+    return float(resized_image(white, target)[4:-4, 4:-4].std())
 
 
 def recur(x: Image, noise: float, bandwidth: float, search: Search = THOROUGH) -> Image:
@@ -97,7 +97,7 @@ def recur(x: Image, noise: float, bandwidth: float, search: Search = THOROUGH) -
     search : Search
     """
     stride = search.stride
-    smaller = resample(x, (round(x.shape[0] / ALPHA), round(x.shape[1] / ALPHA)))
+    smaller = resized_image(x, (round(x.shape[0] / ALPHA), round(x.shape[1] / ALPHA)))
     examples = sliding_window_view(smaller, (SIDE, SIDE)).reshape(-1, SIDE * SIDE)
     examples = (examples - examples.mean(axis=1, keepdims=True)).astype(np.float32)
     flat = max(2.0 * noise * noise, 1e-5)

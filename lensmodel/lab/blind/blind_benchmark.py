@@ -31,8 +31,8 @@ from lensmodel.estimation import PsfEstimator
 from lensmodel.lab.blind.judges import Judge, judges, squared_error
 from lensmodel.lab.blind.methods import compared
 from lensmodel.lab.blind.results import UNTOUCHED, BlindBenchmark, BlindReport, CaseResult, summarised
-from lensmodel.lab.blind.store import Store
-from lensmodel.lab.cases import Case, list_photos, load_psfs, make_cases, observe
+from lensmodel.lab.blind.store import ResultStore
+from lensmodel.lab.cases import BlindCase, list_photos, load_psfs, make_cases, observe
 
 logger = logging.getLogger(__name__)
 
@@ -93,7 +93,7 @@ def run_blind_benchmark(
         )
         if only is None or case.photos[0].stem in only
     ]
-    store = Store(cache, photos, settings, judge)
+    store = ResultStore(cache, photos, settings, judge)
     jobs = []
     for case in cases:
         kernel = kernels[case.psf_number]
@@ -123,7 +123,7 @@ def run_blind_benchmark(
 class _Job:
     """One case and the methods that have no result yet; what a worker process receives."""
 
-    case: Case
+    case: BlindCase
     kernel: Kernel
     methods: Mapping[str, PsfEstimator | None]
     judge: Judge

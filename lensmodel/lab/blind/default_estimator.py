@@ -29,7 +29,7 @@ from lensmodel.correction import Sensor, SparseGradient
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.lab import cases
 from lensmodel.lab.blind.methods import compared
-from lensmodel.lab.cases import Case, Half
+from lensmodel.lab.cases import BlindCase, Half
 from lensmodel.simulate import draw_lens, load_scene
 
 TRUTH = "true kernel"
@@ -82,7 +82,7 @@ def rows(
         variant = str(rng.choice(["gaussian", "gaussian", "bayer"]))
         seen = [
             cases.observe(
-                Case((photo,), 0, level, size, "bayer" if variant == "bayer" else "gaussian", s), kernel
+                BlindCase((photo,), 0, level, size, "bayer" if variant == "bayer" else "gaussian", s), kernel
             )
             for s in rng.integers(1 << 30, size=pool).tolist()
         ]

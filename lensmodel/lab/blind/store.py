@@ -17,12 +17,12 @@ from lensmodel.core.types import Kernel
 from lensmodel.estimation import PsfEstimator
 from lensmodel.lab.blind.judges import Judge
 from lensmodel.lab.blind.results import PROTOCOL, BlindBenchmark, CaseResult, plain
-from lensmodel.lab.cases import Case
+from lensmodel.lab.cases import BlindCase
 
 logger = logging.getLogger(__name__)
 
 
-class Store:
+class ResultStore:
     """Finished results by the content they came from; one file of JSON lines, only ever appended."""
 
     def __init__(
@@ -37,11 +37,13 @@ class Store:
             self._file = folder / "blind.jsonl"
             self._known = dict(_stored(self._file)) if self._file.exists() else {}
 
-    def find(self, case: Case, kernel: Kernel, name: str, method: PsfEstimator | None) -> CaseResult | None:
+    def find(
+        self, case: BlindCase, kernel: Kernel, name: str, method: PsfEstimator | None
+    ) -> CaseResult | None:
         """Return the stored result, or None."""
         return self._known.get(self._key(case, kernel, name, method))
 
-    def add(self, case: Case, kernel: Kernel, method: PsfEstimator | None, result: CaseResult) -> None:
+    def add(self, case: BlindCase, kernel: Kernel, method: PsfEstimator | None, result: CaseResult) -> None:
         """Keep a result, and write it out at once."""
         key = self._key(case, kernel, result.method, method)
         self._known[key] = result
@@ -49,7 +51,7 @@ class Store:
             with self._file.open("a", encoding="utf-8") as out:
                 out.write(json.dumps({"key": key, **plain(asdict(result))}) + "\n")
 
-    def _key(self, case: Case, kernel: Kernel, name: str, method: PsfEstimator | None) -> str:
+    def _key(self, case: BlindCase, kernel: Kernel, name: str, method: PsfEstimator | None) -> str:
         described = repr(method) if is_dataclass(method) else type(method).__qualname__
         parts = (
             PROTOCOL,

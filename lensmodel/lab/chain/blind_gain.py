@@ -59,7 +59,7 @@ PLACES: Final = [FieldPosition(r, phi) for r in (0.05, 0.35, 0.6, 0.85) for phi 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lens:
+class KnownLens:
     """A lens with known PSFs, and where to read on about it."""
 
     name: str
@@ -83,7 +83,7 @@ def scenes(half: str) -> list[Path]:
     ]
 
 
-def shot(lens: Lens, number: int) -> SimulatedPhoto:
+def shot(lens: KnownLens, number: int) -> SimulatedPhoto:
     """Photo `number` of a lens."""
     files = scenes("test" if lens.number >= 1000 else "dev")
     scene = load_scene(files[(5 * lens.number + 3 * number) % len(files)])
@@ -154,7 +154,7 @@ def block_gains(made: Planes, before: Planes, truth: Planes) -> NDArray[np.float
     return np.array(blocks)
 
 
-def psf_errors(lens: Lens, model: LensModel) -> tuple[float, float]:
+def psf_errors(lens: KnownLens, model: LensModel) -> tuple[float, float]:
     """Median relative L2 error of green, true and expected."""
     truth = lens.lens.field(lens.settings)  # of the usual pitch, which is that of the camera
     asked = lens.settings.with_channel("g")
@@ -167,7 +167,7 @@ def psf_errors(lens: Lens, model: LensModel) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
+class CorrectionOutcome:
     """What one correction came to."""
 
     shown: Gains
@@ -178,8 +178,8 @@ class Outcome:
 
 
 def outcomes(
-    lens: Lens, counts: Sequence[int], folder: Path, *, tiff: bool = False
-) -> Iterator[tuple[int, Outcome | str]]:
+    lens: KnownLens, counts: Sequence[int], folder: Path, *, tiff: bool = False
+) -> Iterator[tuple[int, CorrectionOutcome | str]]:
     """Learn a lens from some photos and correct another one, for each number of photos."""
     most = max(counts)
     samples: list[list[PsfSample]] = []
@@ -204,7 +204,7 @@ def outcomes(
         after = shown(made.planes, balanced=tiff)
         yield (
             count,
-            Outcome(
+            CorrectionOutcome(
                 registered_gains(*map(to_srgb, (before, after, truth))),
                 zone_gains(after, before, truth),
                 # a forecast is of the light that the file's numbers stand for, before any white balance
@@ -215,15 +215,15 @@ def outcomes(
         )
 
 
-def lenses(seeds: Sequence[int], grids: Sequence[Path], electrons: float) -> Iterator[Lens]:
+def lenses(seeds: Sequence[int], grids: Sequence[Path], electrons: float) -> Iterator[KnownLens]:
     """The lenses that were asked for, on a sensor of so many electrons at saturation."""
     camera = replace(CAMERA, full_well_electrons=electrons)
     for seed in seeds:
         drawn = draw_lens(seed)
-        yield Lens(str(seed), drawn, drawn.at_focal().f_number, seed, camera)
+        yield KnownLens(str(seed), drawn, drawn.at_focal().f_number, seed, camera)
     for index, path in enumerate(grids):
         truth = read_grid(path)
-        yield Lens(path.stem, GridLens((truth,)), truth.f_number, 2000 + index, camera)
+        yield KnownLens(path.stem, GridLens((truth,)), truth.f_number, 2000 + index, camera)
 
 
 def seed_range(text: str) -> list[int]:
@@ -241,7 +241,7 @@ class Tally:
         self.lost, self.blocks = 0, 0
         self.pairs: list[tuple[float, float]] = []
 
-    def add(self, outcome: Outcome) -> None:
+    def add(self, outcome: CorrectionOutcome) -> None:
         """Count one correction."""
         self.zones += outcome.shown.zones.values()
         self.unshifted += outcome.unshifted.values()

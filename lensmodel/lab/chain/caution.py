@@ -27,7 +27,7 @@ from lensmodel.core.psf import PsfField, PsfSample
 from lensmodel.core.types import ZONES, Channel, FieldPosition, Kernel
 from lensmodel.lab.chain.blind_gain import (
     CAMERA,
-    Lens,
+    KnownLens,
     lenses,
     registered_gains,
     seed_range,
@@ -73,7 +73,7 @@ class Rescaled:
         return self.field.belief_at(position, channel, size).widened(self.factor)
 
 
-def fields(lens: Lens, model: LensModel, developed: LinearPhoto) -> Iterator[tuple[str, PsfField]]:
+def fields(lens: KnownLens, model: LensModel, developed: LinearPhoto) -> Iterator[tuple[str, PsfField]]:
     """The same lens believed in by each rule, taken as certain, and as it is."""
     witnessed = psfs_for(developed, model, lens.settings)
     assert isinstance(witnessed, WitnessedField), "models of this command are not the paper's"
@@ -85,7 +85,7 @@ def fields(lens: Lens, model: LensModel, developed: LinearPhoto) -> Iterator[tup
     yield "true PSF", lens.lens.field(lens.settings)
 
 
-def rows(lens: Lens, counts: list[int], folder: Path) -> Iterator[str]:
+def rows(lens: KnownLens, counts: list[int], folder: Path) -> Iterator[str]:
     """Rows of the table of one lens."""
     files = [
         written(folder / f"{lens.name}-{k}.dng", shot(lens, k), tiff=False) for k in range(max(counts) + 1)
@@ -113,7 +113,7 @@ def rows(lens: Lens, counts: list[int], folder: Path) -> Iterator[str]:
             yield f"| {lens.name} | {count} | {name} | {gained} | {light} | {expected} | {lost} |"
 
 
-def _samples(path: Path, lens: Lens) -> list[PsfSample]:
+def _samples(path: Path, lens: KnownLens) -> list[PsfSample]:
     """Samples of a photo; none where it shows too little."""
     try:
         return pipeline.samples_of_photo(path, pipeline.Recipe(lens.settings), workers=1)

@@ -31,7 +31,7 @@ from scipy import ndimage
 from lensmodel import photo
 from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.types import ZONES, FieldPosition, Kernel, Plane
-from lensmodel.lab.chain.blind_gain import CAMERA, Lens, lenses, seed_range, shot, written
+from lensmodel.lab.chain.blind_gain import CAMERA, KnownLens, lenses, seed_range, shot, written
 
 REACH, NEAR, ALONG = 20, 4, 6
 """Pixels: of a profile to either side, of the step that is compared with, of an edge to either side."""
@@ -125,7 +125,7 @@ def true_profile(kernel: Kernel, across: tuple[float, float]) -> Floats:
     return np.asarray(within / within[NEAR - 1])
 
 
-def edges_of(lens: Lens, number: int) -> list[Edge]:
+def edges_of(lens: KnownLens, number: int) -> list[Edge]:
     """Clean edges of the green plane of a photo of a lens."""
     with tempfile.TemporaryDirectory() as folder:
         developed = photo.develop(written(Path(folder) / "photo.dng", shot(lens, number), tiff=False))

@@ -59,7 +59,7 @@ Row = dict[str, dict[str, float]]
 
 
 @dataclass(frozen=True)
-class Shot:
+class DevelopedFiles:
     """The files of one lens made in one way, developed."""
 
     case: Case
@@ -88,7 +88,7 @@ def without_lateral(lens: SimulatedLens) -> SimulatedLens:
     return replace(lens, optics=optics)
 
 
-def shoot(case: Case, files: Sequence[Path], folder: Path, how: str) -> Shot:
+def shoot(case: Case, files: Sequence[Path], folder: Path, how: str) -> DevelopedFiles:
     """Take all photos of a lens in one of the ways of `FILES`."""
     drawn = draw_lens(case.seed)
     lens = without_lateral(drawn) if how == "no lateral colour" else drawn
@@ -108,7 +108,9 @@ def shoot(case: Case, files: Sequence[Path], folder: Path, how: str) -> Shot:
         paths.append(path)
         if number == frames - 1:
             sharp = photo.sharp
-    return Shot(case, lens, tuple(paths[: frames - 1]), develop(paths[-2]), develop(paths[-1]), sharp)
+    return DevelopedFiles(
+        case, lens, tuple(paths[: frames - 1]), develop(paths[-2]), develop(paths[-1]), sharp
+    )
 
 
 def true_samples(samples: Sequence[PsfSample], truth: PsfField) -> list[PsfSample]:
@@ -145,7 +147,7 @@ def cautious(developed: LinearPhoto, model: LensModel, case: Case, method: str, 
     ).planes
 
 
-def reached(chart: Planes, photo: Planes, shot: Shot) -> tuple[dict[str, float], dict[str, float]]:
+def reached(chart: Planes, photo: Planes, shot: DevelopedFiles) -> tuple[dict[str, float], dict[str, float]]:
     """MTF50 of the chart and PSNR of the photo by zone."""
     gains = np.asarray(shot.case.camera.white_balance, dtype=np.float32)[:, None, None]
     psnr = fidelity(photo * gains, shot.sharp * gains, shot.case.camera.frame)["psnr"]
@@ -164,7 +166,9 @@ def shares(
     }
 
 
-def rows_of(shot: Shot, how: str, estimator: str, count: int, workers: int) -> Iterator[tuple[str, Row]]:
+def rows_of(
+    shot: DevelopedFiles, how: str, estimator: str, count: int, workers: int
+) -> Iterator[tuple[str, Row]]:
     """All rows that these files tell."""
     truth, case = shot.truth(), shot.case
     recipe = pipeline.Recipe(estimator=estimator, count=count)

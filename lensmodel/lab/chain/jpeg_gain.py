@@ -37,7 +37,7 @@ from lensmodel.lab.chain.blind_gain import (
     FALL_DB,
     LOSS_DB,
     RIM,
-    Lens,
+    KnownLens,
     lenses,
     seed_range,
     shot,
@@ -49,7 +49,7 @@ LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601, as JFI
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
+class JpegGains:
     """Gains in decibels of one correction: by zone, as expected there, of luma, of chroma, by block."""
 
     zones: dict[Zone, float]
@@ -60,8 +60,8 @@ class Outcome:
 
 
 def outcomes(
-    lens: Lens, camera: str, counts: Sequence[int], folder: Path
-) -> Iterator[tuple[int, Outcome | str]]:
+    lens: KnownLens, camera: str, counts: Sequence[int], folder: Path
+) -> Iterator[tuple[int, JpegGains | str]]:
     """Learn a lens from some JPEGs and correct another one, for each number of photos."""
     most, chain = max(counts), CAMERA_JPEGS[camera]
     samples = [learned(lens, camera, number, folder) for number in range(most)]
@@ -80,7 +80,7 @@ def outcomes(
         yield count, outcome(values(made.planes), before, truth, expected)
 
 
-def learned(lens: Lens, camera: str, number: int, folder: Path) -> list[PsfSample]:
+def learned(lens: KnownLens, camera: str, number: int, folder: Path) -> list[PsfSample]:
     """Samples of one photo, kept in the folder."""
     path = folder / f"{lens.number}-{number}-{camera}.jpg"
     kept, refused = path.with_suffix(".lensprofile"), path.with_suffix(".refused")
@@ -104,7 +104,7 @@ def values(planes: Planes) -> Planes:
     return np.where(dark, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
-def outcome(made: Planes, before: Planes, truth: Planes, expected: dict[Zone, float]) -> Outcome:
+def outcome(made: Planes, before: Planes, truth: Planes, expected: dict[Zone, float]) -> JpegGains:
     """Compare with what the camera should have shown."""
     after, first = made - truth, before - truth
     squared = [np.square(error).mean(axis=0) for error in (after, first)]
@@ -122,7 +122,7 @@ def outcome(made: Planes, before: Planes, truth: Planes, expected: dict[Zone, fl
         for top in range(RIM, truth.shape[1] - BLOCK, BLOCK)
         for left in range(RIM, truth.shape[2] - BLOCK, BLOCK)
     ]
-    return Outcome(
+    return JpegGains(
         zones,
         expected,
         decibels(*(np.square(error) for error in reversed(luma))),

@@ -62,7 +62,7 @@ WIDTHS_PX = (0.3, 0.45, 0.6, 0.75, 0.9, 1.1, 1.3, 1.6, 2.0, 2.5)  # of Gaussians
 
 
 @dataclass(frozen=True)
-class Seen:
+class SeenPhoto:
     """A photo, its patches, and the models of both halves and of all of them."""
 
     name: str
@@ -77,7 +77,7 @@ class Seen:
         return LensModel.fit(chosen).warmed()
 
 
-def look_at(path: Path, aperture: float | None, estimator: str, count: int) -> Seen:
+def look_at(path: Path, aperture: float | None, estimator: str, count: int) -> SeenPhoto:
     """Calibrate the halves of a photo."""
     photo = develop(path)
     settings = pipeline.settings_of(photo)
@@ -85,7 +85,7 @@ def look_at(path: Path, aperture: float | None, estimator: str, count: int) -> S
         settings = pipeline.settings_of(photo, LensSettings(aperture=aperture))
     chosen = pipeline.find_patches(photo, count=count)
     halves: tuple[list[PsfSample], list[PsfSample]] = ([], [])
-    for group in pipeline.cells(chosen):
+    for group in pipeline.patches_by_cell(chosen):
         for half, samples in enumerate(halves):
             part = group[half::2]
             if not part:
@@ -98,10 +98,10 @@ def look_at(path: Path, aperture: float | None, estimator: str, count: int) -> S
                 print(f"  {path.stem}: a cell tells nothing: {error}")
                 continue
             samples.extend(cell.sample for cell in found)
-    return Seen(path.stem, photo, settings, chosen.patches, halves)
+    return SeenPhoto(path.stem, photo, settings, chosen.patches, halves)
 
 
-def agreement(seen: Seen) -> dict[str, float]:
+def agreement(seen: SeenPhoto) -> dict[str, float]:
     """Median relative L2 and width ratio between the PSFs of both halves at the patches."""
     if not all(seen.halves):
         return {}
@@ -155,7 +155,7 @@ def log_likelihood(power: NDArray[np.float64], noise: float, kernel: Kernel, til
     return best
 
 
-def spectrum_of(seen: Seen, patch: Patch) -> tuple[NDArray[np.float64], float, float]:
+def spectrum_of(seen: SeenPhoto, patch: Patch) -> tuple[NDArray[np.float64], float, float]:
     """Spectrum of a patch, its noise, and how many independent tiles it has."""
     plane = seen.photo.planes[1, patch.row : patch.row + patch.size, patch.col : patch.col + patch.size]
     noise: NoiseModel = seen.photo.noise[1]
@@ -163,7 +163,9 @@ def spectrum_of(seen: Seen, patch: Patch) -> tuple[NDArray[np.float64], float, f
     return periodogram(plane), float(noise.sigma_at(float(plane.mean())) ** 2), count / 4.0
 
 
-def prediction(seen: Seen, model: LensModel, patches: Sequence[Patch], learned: Seen) -> dict[str, float]:
+def prediction(
+    seen: SeenPhoto, model: LensModel, patches: Sequence[Patch], learned: SeenPhoto
+) -> dict[str, float]:
     """How much better a model predicts patches than no blur and than the best Gaussian of its photo."""
     known = [spectrum_of(learned, patch) for patch in learned.patches]
     gaussians = [psf.gaussian(SIZE, np.eye(2) * width**2) for width in WIDTHS_PX]
@@ -216,7 +218,7 @@ def grain(before: NDArray[np.floating], after: NDArray[np.floating], side: int =
     return float(np.median([noise_gain(after[box], before[box]) for box in cut]))
 
 
-def corrected(seen: Seen, model: LensModel, method: str, out: Path | None) -> dict[str, object]:
+def corrected(seen: SeenPhoto, model: LensModel, method: str, out: Path | None) -> dict[str, object]:
     """Correct crops of center and corners; halos and grain of each, and a picture for the eye."""
     frame = seen.photo.frame
     found: dict[str, object] = {}
@@ -253,7 +255,7 @@ def main() -> None:
     paths = wanted.photos or [folder / name for name in DEFAULT]
     if wanted.out:
         wanted.out.mkdir(parents=True, exist_ok=True)
-    known: dict[str, Seen] = {}
+    known: dict[str, SeenPhoto] = {}
     results: dict[str, dict[str, object]] = {}
     for path in paths:
         began = time.monotonic()

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.psf import distance
-from lensmodel.lab.chain.blind_gain import CAMERA, PLACES, Lens, lenses
+from lensmodel.lab.chain.blind_gain import CAMERA, PLACES, KnownLens, lenses
 from lensmodel.lab.model.belief_prior import SIZE, Rule, places
 from lensmodel.lab.model.joint_answer import samples_of
 from lensmodel.lab.traced import GridLens, read_grid
@@ -38,7 +38,7 @@ _ZONES: Final = (slice(0, 4), slice(4, 12), slice(12, 16))
 """Of `PLACES`: center, mid field, corner."""
 
 
-def errors(lens: Lens, model: LensModel) -> NDArray[np.float64]:
+def errors(lens: KnownLens, model: LensModel) -> NDArray[np.float64]:
     """Relative L2 of regression, wavefront (NaN without) and belief at each place, `(3, 16)`."""
     field, truth = WitnessedField.of(model, lens.settings), lens.lens.field(lens.settings)
     rows = []
@@ -51,19 +51,21 @@ def errors(lens: Lens, model: LensModel) -> NDArray[np.float64]:
     return np.array(rows).T
 
 
-def pairs(seeds: Sequence[int], traced: Sequence[str], aperture: float) -> Iterator[tuple[Lens, Lens]]:
+def pairs(
+    seeds: Sequence[int], traced: Sequence[str], aperture: float
+) -> Iterator[tuple[KnownLens, KnownLens]]:
     """Each lens wide open and stopped down."""
     for lens in lenses(seeds, [], CAMERA.full_well_electrons):
         yield lens, closed_to(lens, aperture)
     for number, names in enumerate(traced):
         open_, closed = (read_grid(Path(name)) for name in names.split(":"))
-        lens = Lens(
+        lens = KnownLens(
             Path(names.split(":")[0]).stem, GridLens((open_, closed)), open_.f_number, 2000 + number, CAMERA
         )
         yield lens, closed_to(lens, closed.f_number)
 
 
-def closed_to(lens: Lens, aperture: float) -> Lens:
+def closed_to(lens: KnownLens, aperture: float) -> KnownLens:
     """Return a lens stopped down."""
     return replace(lens, name=f"{lens.name}-f{aperture:g}", f_number=aperture)
 

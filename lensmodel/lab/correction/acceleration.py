@@ -46,7 +46,7 @@ _REPEATS: Final = 3  # of a timing, of which the fastest counts (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Window:
+class TrialWindow:
     """One window to deconvolve."""
 
     noise: str
@@ -78,7 +78,7 @@ class Window:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class ScheduleOutcome:
     """What one schedule comes to on one window."""
 
     steps: float
@@ -87,7 +87,7 @@ class Outcome:
     after_db: tuple[float, ...]
 
 
-def windows(seeds: Sequence[int], folder: Path | None = None) -> Iterator[Window]:
+def windows(seeds: Sequence[int], folder: Path | None = None) -> Iterator[TrialWindow]:
     """Windows of all lenses, places and noises; each lens has a photograph of its own."""
     files = [path for path in list_photos(folder) if photo_half(path.stem) == "dev"]
     for number, seed in enumerate(seeds):
@@ -102,7 +102,7 @@ def windows(seeds: Sequence[int], folder: Path | None = None) -> Iterator[Window
             for noise, electrons in NOISES.items():
                 rng = np.random.default_rng([seed, int(electrons)])
                 grain = np.sqrt(clean / electrons + READ_SHARE**2) * rng.standard_normal(clean.shape)
-                yield Window(
+                yield TrialWindow(
                     noise,
                     place,
                     (clean + grain).astype(np.float32),
@@ -112,18 +112,18 @@ def windows(seeds: Sequence[int], folder: Path | None = None) -> Iterator[Window
                 )
 
 
-def outcomes(window: Window, most: int) -> dict[Acceleration, Outcome]:
+def outcomes(window: TrialWindow, most: int) -> dict[Acceleration, ScheduleOutcome]:
     """Follow every schedule over its steps; plain steps are followed three times as long."""
     curves: dict[Acceleration, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
     for name in ACCELERATIONS:
         steps = counts(most if name != "none" else 3 * most)
         curves[name] = steps, np.array([window.psnr(name, int(n)) for n in steps])
     wanted = min(float(psnr.max()) for _, psnr in curves.values()) - _LESS_DB
-    found: dict[Acceleration, Outcome] = {}
+    found: dict[Acceleration, ScheduleOutcome] = {}
     for name, (steps, psnr) in curves.items():
         needed = reached(steps, psnr, wanted)
         after = tuple(float(np.interp(n, steps, psnr)) for n in SHOWN_STEPS)
-        found[name] = Outcome(needed, needed * window.seconds_a_step(name), float(psnr.max()), after)
+        found[name] = ScheduleOutcome(needed, needed * window.seconds_a_step(name), float(psnr.max()), after)
     return found
 
 
@@ -144,7 +144,7 @@ def reached(steps: NDArray[np.float64], psnr: NDArray[np.float64], wanted: float
     return float(steps[first - 1] + share * (steps[first] - steps[first - 1]))
 
 
-def table(found: Sequence[tuple[Window, dict[Acceleration, Outcome]]]) -> str:
+def table(found: Sequence[tuple[TrialWindow, dict[Acceleration, ScheduleOutcome]]]) -> str:
     """Rows of noise and schedule, means over windows of all lenses and places."""
     lines = [
         "| noise | schedule | steps to equal quality | over fixed | CPU time over fixed "

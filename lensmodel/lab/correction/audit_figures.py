@@ -13,11 +13,11 @@ import numpy as np
 from lensmodel.core.psf import as_kernel
 from lensmodel.core.types import Planes
 from lensmodel.correction.audit import CHECKS, Evidence, held_back, nearby
-from lensmodel.correction.audit.check import Pair
+from lensmodel.correction.audit.check import TilePair
 from lensmodel.correction.audit.findings import HELD
 from lensmodel.correction.audit.tile import GROWN
 from lensmodel.correction.blur import UniformBlur, crop_to_support
-from lensmodel.lab.correction.audit_trials import BLOCK, CHANGES, FAULTS, SOUND, Case, Exposure, Trial
+from lensmodel.lab.correction.audit_trials import BLOCK, CHANGES, FAULTS, SOUND, AuditCase, Exposure, Trial
 from lensmodel.lab.images import psnr
 
 HALO: Final = 24
@@ -69,7 +69,7 @@ INNER: Final = (slice(None), slice(HALO, HALO + BLOCK), slice(HALO, HALO + BLOCK
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class BlockVerdict:
     """What the audit made of one block.
 
     Parameters
@@ -124,7 +124,7 @@ def blocks(trial: Trial, *, reblur: bool = True) -> Iterator[Block]:
             )
 
 
-def judged(block: Block) -> tuple[Verdict, float]:
+def judged(block: Block) -> tuple[BlockVerdict, float]:
     """Audit a block; seconds of the processor besides."""
     start = time.process_time()
     planes, audit = held_back(block.photo, block.corrected, block.evidence, inner=(INNER[1], INNER[2]))
@@ -136,10 +136,10 @@ def judged(block: Block) -> tuple[Verdict, float]:
     mended = (before - now) / (before - untouched) if before > untouched else 0.0
     checks = {finding.check: finding.held_back for finding in audit.findings}
     gain, after = block.gain, block.gain_of(planes)
-    return Verdict(block.made, block.mosaic, gain, after, audit.held_back, checks, mended), seconds
+    return BlockVerdict(block.made, block.mosaic, gain, after, audit.held_back, checks, mended), seconds
 
 
-def shares(case: Case, folder: Path, method: str, rounds: int) -> list[float]:
+def shares(case: AuditCase, folder: Path, method: str, rounds: int) -> list[float]:
     """Time of the audit over that of the correction without it, round by round, both of the processor."""
     exposure, found = Exposure.of(case, folder), []
     for number in range(rounds + 1):  # in the first one loops are compiled
@@ -155,7 +155,7 @@ def shares(case: Case, folder: Path, method: str, rounds: int) -> list[float]:
 
 def factors(block: Block) -> dict[str, float]:
     """By how much each check's limit would have to be larger for a tenth of the block to be held back."""
-    pair = Pair.of(block.photo, block.corrected, block.evidence)
+    pair = TilePair.of(block.photo, block.corrected, block.evidence)
     found = {}
     for name, check in CHECKS.items():
         severity = check(pair)
@@ -172,7 +172,7 @@ def factors(block: Block) -> dict[str, float]:
     return found
 
 
-def table(verdicts: Sequence[Verdict]) -> list[str]:
+def table(verdicts: Sequence[BlockVerdict]) -> list[str]:
     """Print lines of a table in Markdown: sound blocks first, then each fault."""
     lines = [
         "| correction | blocks | held back > 0.1 | caught | gain before, dB | after | still lose > 1 dB |",
@@ -187,7 +187,7 @@ def table(verdicts: Sequence[Verdict]) -> list[str]:
     return lines
 
 
-def _line(name: str, verdicts: Sequence[Verdict], *, faulty: bool) -> str:
+def _line(name: str, verdicts: Sequence[BlockVerdict], *, faulty: bool) -> str:
     def mean(values: list[float] | list[bool]) -> float:
         return float(np.mean(values))
 

@@ -34,14 +34,14 @@ from lensmodel.correction.audit import CHECKS
 from lensmodel.correction.audit.tolerances import LIMITS
 from lensmodel.lab.correction.audit_figures import (
     HALO,
-    Verdict,
+    BlockVerdict,
     blocks,
     factors,
     judged,
     shares,
     table,
 )
-from lensmodel.lab.correction.audit_trials import BLOCK, HALVES, SOUND, Case, cases, trial
+from lensmodel.lab.correction.audit_trials import BLOCK, HALVES, SOUND, AuditCase, cases, trial
 
 
 def main() -> None:
@@ -63,7 +63,7 @@ def main() -> None:
     if wanted.limits:
         print_limits(chosen, folder, wanted.cache)
         return
-    verdicts: list[Verdict] = []
+    verdicts: list[BlockVerdict] = []
     seconds = 0.0
     for case in chosen:
         for block in blocks(trial(case, folder, wanted.cache), reblur=not wanted.blind):
@@ -95,7 +95,7 @@ def print_cost(folder: Path) -> None:
             print(f"{'mosaic' if case.mosaic else 'planes'}, {method}: {share:.2f} ({low:.2f} to {high:.2f})")
 
 
-def print_limits(chosen: tuple[Case, ...], folder: Path, cache: Path) -> None:
+def print_limits(chosen: tuple[AuditCase, ...], folder: Path, cache: Path) -> None:
     """Print for each check what its limit has to be for the sound blocks, and what the faults would need."""
     start = time.perf_counter()
     found: dict[str, list[dict[str, float]]] = {}

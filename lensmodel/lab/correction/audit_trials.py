@@ -37,7 +37,7 @@ from lensmodel.lab.correction.quality import (
     EXPOSURES,
     FRAME,
     WINDOW,
-    View,
+    FrameWindow,
     composed,
     exposed,
     view,
@@ -121,7 +121,7 @@ CHANGES: Final = dict(zip(WRONG, (widened(1.6), turned), strict=True))
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class AuditCase:
     """One window of one lens's photo of one pair of photographs.
 
     Parameters
@@ -155,7 +155,7 @@ class Case:
         )
 
 
-def cases(half: str) -> tuple[Case, ...]:
+def cases(half: str) -> tuple[AuditCase, ...]:
     """List the cases of one half: every pair of photographs behind every kind of lens."""
     first = HALVES[half]
     pairs = [(n, n + 2) for n in range(first, _SCENES + 1, 4)]
@@ -164,7 +164,7 @@ def cases(half: str) -> tuple[Case, ...]:
         for k, kind in enumerate(KINDS):
             seed = 1000 + len(KINDS) * (first - 1) + k
             exposure = list(EXPOSURES)[(p + k // 2) % 2]
-            found.append(Case(half, pair, kind, seed, ZONES[(p + k) % 3], exposure, (p + k) % 2 == 1))
+            found.append(AuditCase(half, pair, kind, seed, ZONES[(p + k) % 3], exposure, (p + k) % 2 == 1))
     return tuple(found)
 
 
@@ -174,7 +174,7 @@ class Trial:
 
     Parameters
     ----------
-    case : Case
+    case : AuditCase
         What it is of.
     scene, photo : Planes
         Sharp light, and the photo of it, on the window less a rim.
@@ -184,7 +184,7 @@ class Trial:
         True kernels in the middles of the blocks.
     """
 
-    case: Case
+    case: AuditCase
     scene: Planes
     photo: Planes
     made: dict[str, Planes]
@@ -218,7 +218,7 @@ def _blocks(shape: tuple[int, ...]) -> list[tuple[int, int]]:
     return [(row, col) for row in starts[0] for col in starts[1]]
 
 
-def trial(case: Case, folder: Path, cache: Path) -> Trial:
+def trial(case: AuditCase, folder: Path, cache: Path) -> Trial:
     """Photograph and correct a case, or read what was made of it before."""
     path = cache / f"{case.name}.npz"
     if not path.exists():
@@ -245,7 +245,7 @@ class Exposure:
     ----------
     lens : WindowField
         The true PSFs.
-    window : View
+    window : FrameWindow
         Part of the frame that the lens was asked for.
     light : Planes
         The photo there, demosaiced.
@@ -258,14 +258,14 @@ class Exposure:
     """
 
     lens: WindowField
-    window: View
+    window: FrameWindow
     light: Planes
     whole: Planes
     noise: NoiseModel
     cfa: BayerPattern | None
 
     @classmethod
-    def of(cls, case: Case, folder: Path) -> Exposure:
+    def of(cls, case: AuditCase, folder: Path) -> Exposure:
         """Photograph the scene of a case."""
         lens = WindowField.of(draw_lens(case.seed, case.kind).field(LensSettings()), case.zone)
         files = [next(folder.glob(f"s{number:02d}_*")) for number in case.pair]
@@ -293,7 +293,7 @@ class Exposure:
         return np.ascontiguousarray(result.planes[:, _RIM:-_RIM, _RIM:-_RIM])
 
 
-def _made(case: Case, folder: Path) -> Trial:
+def _made(case: AuditCase, folder: Path) -> Trial:
     exposure = Exposure.of(case, folder)
     lens, at = exposure.lens, exposure.window
     made = {SOUND[0]: exposure.corrected(lens), SOUND[1]: exposure.corrected(lens, "fast")}

@@ -52,7 +52,7 @@ ROUTES: Final = ("ahd", "dht", "linear", "half", "own green", "joint")
 
 
 @dataclass(frozen=True, slots=True)
-class Shot:
+class MosaicPhoto:
     """One photo, its file and its lens."""
 
     shot: SimulatedPhoto
@@ -65,7 +65,7 @@ class Shot:
         return self.lens.field(self.settings, pitch_um=scale * PITCH_UM)
 
 
-def shots(seeds: list[int], electrons: float, folder: Path) -> Iterator[Shot]:
+def shots(seeds: list[int], electrons: float, folder: Path) -> Iterator[MosaicPhoto]:
     """Take the photos."""
     files = sorted((Path(os.environ["LENSMODEL_TEST_DATA"]) / "sharp").glob("*.png"))
     camera = SimulatedCamera(height=512, width=768, pitch_um=PITCH_UM, full_well_electrons=electrons)
@@ -81,7 +81,7 @@ def shots(seeds: list[int], electrons: float, folder: Path) -> Iterator[Shot]:
         shot = photograph(part, lens, settings, camera, np.random.default_rng(seed), options=options)
         path = folder / f"{seed}.dng"
         write_photo(path, shot)
-        yield Shot(shot, path, lens, settings)
+        yield MosaicPhoto(shot, path, lens, settings)
 
 
 def kernel_of(sharp: Plane, seen: Plane, known: NDArray[np.bool_], size: int) -> NDArray[np.float64]:
@@ -103,7 +103,7 @@ def binned(planes: Planes) -> Planes:
     return np.stack([planes[0, ::2, ::2], green, planes[2, 1::2, 1::2]])
 
 
-def developed(one: Shot, route: str) -> LinearPhoto:
+def developed(one: MosaicPhoto, route: str) -> LinearPhoto:
     """The photo as a route takes it."""
     return photo.develop(one.path, demosaic=DEMOSAICS.get(route, "ahd"))
 
@@ -114,7 +114,7 @@ def measured(seen: LinearPhoto) -> NDArray[np.intp]:
     return np.asarray(seen.cfa)[rows[:, None], cols[None, :]]
 
 
-def psf_errors(one: Shot, route: str, seen: LinearPhoto) -> dict[tuple[str, Channel], float]:
+def psf_errors(one: MosaicPhoto, route: str, seen: LinearPhoto) -> dict[tuple[str, Channel], float]:
     """Relative L2 error of the kernels that a window of each zone shows."""
     scale = 2 if route == "half" else 1
     sharp = binned(one.shot.sharp) if scale == 2 else one.shot.sharp
@@ -135,7 +135,7 @@ def psf_errors(one: Shot, route: str, seen: LinearPhoto) -> dict[tuple[str, Chan
     return found
 
 
-def own_green(one: Shot, seen: LinearPhoto) -> Planes:
+def own_green(one: MosaicPhoto, seen: LinearPhoto) -> Planes:
     """Correct the green of each zone's window from nothing but the green pixels of the sensor."""
     made = seen.planes.copy()
     noise = (seen.sensor_noise or seen.noise)[1]
@@ -151,7 +151,7 @@ def own_green(one: Shot, seen: LinearPhoto) -> Planes:
     return made
 
 
-def corrected(one: Shot, route: str, seen: LinearPhoto) -> Planes:
+def corrected(one: MosaicPhoto, route: str, seen: LinearPhoto) -> Planes:
     """Correct with the true field; a half-size picture is enlarged again."""
     if route == "own green":
         return own_green(one, seen)
@@ -176,7 +176,7 @@ def corrected(one: Shot, route: str, seen: LinearPhoto) -> Planes:
     return wide
 
 
-def levels(one: Shot, planes: Planes, channels: slice) -> dict[str, float]:
+def levels(one: MosaicPhoto, planes: Planes, channels: slice) -> dict[str, float]:
     """PSNR of the white-balanced sRGB picture in the window of each zone."""
     balance = np.asarray(one.shot.truth.camera.white_balance, dtype=np.float32)[:, None, None]
     found = {}

@@ -70,7 +70,7 @@ class Constant:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class FrameWindow:
     """One window of the frame.
 
     Parameters
@@ -112,7 +112,7 @@ def composed(files: Sequence[Path], gain: float = 1.0) -> Planes:
     return np.ascontiguousarray(np.concatenate(halves, axis=2) * np.float32(gain), dtype=np.float32)
 
 
-def view(zone: str, scene: Planes, field: PsfField) -> View:
+def view(zone: str, scene: Planes, field: PsfField) -> FrameWindow:
     """Photograph a window of the frame through a lens."""
     row, col = CORNERS[zone]
     top, left = max(row - _AROUND, 0), max(col - _AROUND, 0)
@@ -133,7 +133,7 @@ def view(zone: str, scene: Planes, field: PsfField) -> View:
                 share = source[c] * np.outer(weight_row, weight_col)
                 light[c] += signal.oaconvolve(share, kernel, mode="valid").astype(np.float32)
     sharp = np.ascontiguousarray(source[:, half : half + height, half : half + width])
-    return View(zone, top, left, np.maximum(light, 0.0), sharp, (row, col, *WINDOW))
+    return FrameWindow(zone, top, left, np.maximum(light, 0.0), sharp, (row, col, *WINDOW))
 
 
 def _nodes(extent: int) -> list[tuple[float, NDArray[np.float32]]]:
@@ -154,7 +154,7 @@ def exposed(light: Planes, noise: NoiseModel, rng: np.random.Generator) -> Plane
 
 
 def corrected(
-    seen: Planes, at: View, field: PsfField, noise: NoiseModel, method: str | Deconvolver
+    seen: Planes, at: FrameWindow, field: PsfField, noise: NoiseModel, method: str | Deconvolver
 ) -> Planes:
     """Correct a window as part of its frame; what was not photographed stays black."""
     whole = np.zeros((len(CHANNELS), FRAME.height, FRAME.width), dtype=np.float32)
@@ -175,7 +175,7 @@ def our_methods() -> dict[str, str | Deconvolver]:
 
 
 def gains_of(
-    views: Sequence[View],
+    views: Sequence[FrameWindow],
     field: PsfField,
     noise: NoiseModel,
     *,
@@ -206,7 +206,9 @@ def gains_of(
     return found
 
 
-def _peer_gains(peer: Peer, views: Sequence[View], seen: Sequence[Planes]) -> dict[str, tuple[float, float]]:
+def _peer_gains(
+    peer: Peer, views: Sequence[FrameWindow], seen: Sequence[Planes]
+) -> dict[str, tuple[float, float]]:
     """Best gain of a program in each window; all windows stand in one picture.
 
     A program that develops a mosaic is measured against its own development of the sharp scene.
@@ -253,7 +255,7 @@ def _gain(truth: Planes, before: Planes, after: Planes) -> tuple[float, float]:
 
 
 def lamp_gains(
-    at: View, field: PsfField, noise: NoiseModel, methods: Mapping[str, str | Deconvolver]
+    at: FrameWindow, field: PsfField, noise: NoiseModel, methods: Mapping[str, str | Deconvolver]
 ) -> dict[str, float]:
     """Gain in PSNR of the pixels near clipped ones; shape of the scene beyond saturation plays no part."""
     seen = exposed(at.light, noise, np.random.default_rng(11))

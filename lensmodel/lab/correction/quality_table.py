@@ -25,7 +25,7 @@ from lensmodel.core.psf import PsfField
 from lensmodel.core.types import ZONES, LensSettings, Planes
 from lensmodel.lab.correction.quality import (
     EXPOSURES,
-    View,
+    FrameWindow,
     composed,
     edge_figures,
     gains_of,
@@ -43,15 +43,15 @@ LAMP_GAIN = 2.5  # by which lamps outshine the scene (chosen)
 
 
 @dataclass(frozen=True)
-class Lens:
+class PhotographedLens:
     """A lens and what was photographed through it, without noise; made once for all exposures."""
 
     field: PsfField
-    views: list[list[View]]
-    lamps: View
+    views: list[list[FrameWindow]]
+    lamps: FrameWindow
 
     @classmethod
-    def draw(cls, kind: str, seed: int, pairs: int) -> Lens:
+    def draw(cls, kind: str, seed: int, pairs: int) -> PhotographedLens:
         """Photograph everything through one lens."""
         folder = Path(os.environ["LENSMODEL_TEST_DATA"]) / "sharp"
         field = draw_lens(seed, kind).field(LensSettings())
@@ -63,7 +63,7 @@ class Lens:
         return cls(field, views, view("mid", scene(LAMPS, LAMP_GAIN), field))
 
 
-def measured(lens: Lens, seed: int, exposure: str, programs: Sequence[str]) -> dict[str, object]:
+def measured(lens: PhotographedLens, seed: int, exposure: str, programs: Sequence[str]) -> dict[str, object]:
     """Everything about one lens at one exposure."""
     noise, peers = EXPOSURES[exposure], [peer for peer in PEERS if peer.program in programs]
     runs = []
@@ -93,12 +93,12 @@ def main() -> None:
     wanted.cache.mkdir(parents=True, exist_ok=True)
     found: dict[str, dict[str, dict[str, Any]]] = {exposure: {} for exposure in EXPOSURES}
     for kind in wanted.kinds:
-        lens: Lens | None = None
+        lens: PhotographedLens | None = None
         for exposure in EXPOSURES:
             path = wanted.cache / f"{kind}-{wanted.seed}-{exposure.replace(' ', '-')}.json"
             start = time.perf_counter()
             if not path.exists():
-                lens = lens or Lens.draw(kind, wanted.seed, wanted.pairs)
+                lens = lens or PhotographedLens.draw(kind, wanted.seed, wanted.pairs)
                 numbers = measured(lens, wanted.seed, exposure, wanted.peers)
                 path.write_text(json.dumps(numbers), encoding="utf-8")
             found[exposure][kind] = json.loads(path.read_text(encoding="utf-8"))

@@ -2,13 +2,13 @@
 
 from lensmodel.lab.gallery.page import PAGE, text, write_page
 from lensmodel.lab.gallery.pictures import Picture, chosen, real_pictures, simulated_pictures
-from lensmodel.lab.gallery.run import CACHE, Entry, hang
+from lensmodel.lab.gallery.run import CACHE, GalleryEntry, hang
 from lensmodel.lab.gallery.work import Wishes
 
 __all__ = [
     "CACHE",
     "PAGE",
-    "Entry",
+    "GalleryEntry",
     "Picture",
     "Wishes",
     "chosen",

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from lensmodel.lab.gallery.crops import SIDE, ZOOM
-from lensmodel.lab.gallery.run import Entry
+from lensmodel.lab.gallery.run import GalleryEntry
 from lensmodel.lab.reproduce.pages.sheet import written_whole
 from lensmodel.lab.reproduce.pages.tables import table
 
@@ -47,7 +47,7 @@ _COLUMN_OF: Final = {
 """Bar -> column of its figure."""
 
 
-def cells(entry: Entry) -> list[str]:
+def cells(entry: GalleryEntry) -> list[str]:
     """One row of the table of figures, in the order of `HEAD`."""
     found, state = entry.figures, entry.work["state"]
     if not found:
@@ -70,7 +70,7 @@ def cells(entry: Entry) -> list[str]:
     return [*row, zones, f"{100 * gains['loss_share']:.1f} %", f"{gains['worst_db']:+.2f}"]
 
 
-def summary(entries: Sequence[Entry]) -> list[str]:
+def summary(entries: Sequence[GalleryEntry]) -> list[str]:
     """Which bars hold, in words: one line for each."""
     lines = []
     for bar in _COLUMN_OF:
@@ -81,13 +81,13 @@ def summary(entries: Sequence[Entry]) -> list[str]:
     return lines
 
 
-def text(entries: Sequence[Entry]) -> str:
+def text(entries: Sequence[GalleryEntry]) -> str:
     """Figures and bars as Markdown, for a terminal."""
     rows = [cells(entry) for entry in entries]
     return table(HEAD, rows) + "\n\nBars\n\n" + "\n".join(f"- {line}" for line in summary(entries))
 
 
-def write_page(entries: Sequence[Entry], output: Path) -> Path:
+def write_page(entries: Sequence[GalleryEntry], output: Path) -> Path:
     """Write the page; its crops are there already."""
     output.mkdir(parents=True, exist_ok=True)
     parts = ["<h1>Gallery</h1>", f"<p>{escape(_INTRODUCTION)}</p>", "<h2>Bars</h2>"]
@@ -113,7 +113,7 @@ _INTRODUCTION: Final = (
 )
 
 
-def _figures(entries: Sequence[Entry]) -> str:
+def _figures(entries: Sequence[GalleryEntry]) -> str:
     head = "".join(f"<th>{escape(word)}</th>" for word in HEAD)
     rows = []
     for entry in entries:
@@ -127,7 +127,7 @@ def _figures(entries: Sequence[Entry]) -> str:
     return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
 
 
-def _section(entry: Entry) -> list[str]:
+def _section(entry: GalleryEntry) -> list[str]:
     unit = entry.work
     parts = [f'<h2 id="{entry.picture.slug}">{escape(entry.picture.name)}</h2>']
     parts.append(f"<p>{escape('; '.join(_words(entry)))}.</p>")
@@ -152,7 +152,7 @@ def _section(entry: Entry) -> list[str]:
     return parts
 
 
-def _words(entry: Entry) -> list[str]:
+def _words(entry: GalleryEntry) -> list[str]:
     """How a picture was made."""
     unit = entry.work
     words = [unit["state"] + (f" ({unit['reason']})" if unit["reason"] else ""), *unit["notes"]]

@@ -24,7 +24,7 @@ CROPS = "crops"
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class PicturePlace:
     """One place of a picture that is looked at.
 
     Parameters
@@ -34,7 +34,7 @@ class Place:
     row, col : int
         First pixel.
     file : str
-        Crops side by side, in the order of `Entry.columns`, relative to the page.
+        Crops side by side, in the order of `GalleryEntry.columns`, relative to the page.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class GalleryEntry:
     """What the page shows of one picture.
 
     Parameters
@@ -58,7 +58,7 @@ class Entry:
         Which it keeps.
     columns : tuple of str
         What stands side by side in the crops.
-    places : tuple of Place
+    places : tuple of PicturePlace
     audit : str
         File of the audit's map, "" without one.
     """
@@ -68,13 +68,13 @@ class Entry:
     figures: dict[str, Any]
     bars: dict[str, bool]
     columns: tuple[str, ...]
-    places: tuple[Place, ...]
+    places: tuple[PicturePlace, ...]
     audit: str = ""
 
 
 def hang(
     pictures: Sequence[Picture], output: Path, wishes: Wishes, *, on_picture: OnPicture
-) -> Iterator[Entry]:
+) -> Iterator[GalleryEntry]:
     """Make what the page shows, one picture after the other.
 
     Parameters
@@ -87,7 +87,7 @@ def hang(
 
     Yields
     ------
-    Entry
+    GalleryEntry
         Of each picture as soon as it is finished.
     """
     (output / CROPS).mkdir(parents=True, exist_ok=True)
@@ -101,10 +101,10 @@ def hang(
         yield entry
 
 
-def _entry(picture: Picture, output: Path, wishes: Wishes, say: Callable[[str], None]) -> Entry:
+def _entry(picture: Picture, output: Path, wishes: Wishes, say: Callable[[str], None]) -> GalleryEntry:
     if picture.unreadable:
         unit: Unit = {"state": "not read", "reason": picture.unreadable, "notes": []}
-        return Entry(picture, unit, {}, {}, (), ())
+        return GalleryEntry(picture, unit, {}, {}, (), ())
     room, unit = work(picture, output / CACHE, wishes, say)
     before = room.picture(room.before)
     assert before is not None
@@ -132,12 +132,12 @@ def _entry(picture: Picture, output: Path, wishes: Wishes, say: Callable[[str], 
     for number, (words, row, col) in enumerate(where, start=1):
         file = f"{CROPS}/{picture.slug}-{number}.png"
         Image.fromarray(crops.sheet(sheets, row, col, side)).save(output / file, optimize=True)
-        made.append(Place(words, row, col, file))
+        made.append(PicturePlace(words, row, col, file))
     audit = ""
     if keep is not None:
         audit = f"{CROPS}/{picture.slug}-audit.png"
         Image.fromarray(crops.drawn(keep)).save(output / audit, optimize=True)
-    return Entry(picture, unit, found, measure.bars(found), tuple(columns), tuple(made), audit)
+    return GalleryEntry(picture, unit, found, measure.bars(found), tuple(columns), tuple(made), audit)
 
 
 def _version() -> str:

@@ -31,7 +31,7 @@ _NEAR: Final = 1.5  # an expected error within this factor of the true one is ri
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class WayResult:
     """How one way did with one lens.
 
     Parameters
@@ -77,11 +77,11 @@ def measured(
     size: int,
     channels: Sequence[Channel] = CHANNELS,
     places: tuple[int, int] = (4, 3),
-) -> Row:
+) -> WayResult:
     """Take the photos of one way, measure, and compare; a result that is there is read again."""
     stored = folder / f"{kind}.json"
     if stored.exists():
-        return Row(**json.loads(stored.read_text(encoding="utf-8")))
+        return WayResult(**json.loads(stored.read_text(encoding="utf-8")))
     paths = take(bench, "pair" if kind == "blind" else kind, folder, detail)
     began = time.process_time()
     ways: dict[str, Callable[[], list[Found]]] = {
@@ -94,7 +94,7 @@ def measured(
         found = ways.get(kind, lambda: _by(measure.methods.create(kind), paths, size, channels))()
         row = _compared(bench, kind, found, size, time.process_time() - began)
     except LensModelError as error:
-        row = Row(bench.name, bench.family, kind, 0, {}, 1.0, 1.0, 0.0, 0.0, str(error))
+        row = WayResult(bench.name, bench.family, kind, 0, {}, 1.0, 1.0, 0.0, 0.0, str(error))
     stored.write_text(json.dumps(asdict(row)), encoding="utf-8")
     return row
 
@@ -114,7 +114,7 @@ def _blind(path: Path, size: int) -> list[Found]:
     photo = develop(path)
     settings = pipeline.settings_of(photo)
     found: list[Found] = []
-    for group in pipeline.cells(pipeline.find_patches(photo, count=_BLIND_PATCHES)):
+    for group in pipeline.patches_by_cell(pipeline.find_patches(photo, count=_BLIND_PATCHES)):
         try:
             cells = pipeline.estimate_cell(
                 photo, group, settings=settings, photo_id="bench", size=size, channels=("g",)
@@ -128,7 +128,7 @@ def _blind(path: Path, size: int) -> list[Found]:
     return found
 
 
-def _compared(bench: Bench, kind: str, found: Sequence[Found], size: int, seconds: float) -> Row:
+def _compared(bench: Bench, kind: str, found: Sequence[Found], size: int, seconds: float) -> WayResult:
     truth = bench.truth()
     errors: dict[str, list[float]] = {}
     expected, right = [], []
@@ -139,7 +139,7 @@ def _compared(bench: Bench, kind: str, found: Sequence[Found], size: int, second
             expected.append(said)
         right.append(1.0 / _NEAR <= said / max(seen, 1e-9) <= _NEAR)
     green = errors.get("g", [1.0])
-    return Row(
+    return WayResult(
         lens=bench.name,
         family=bench.family,
         kind=kind,
@@ -152,7 +152,7 @@ def _compared(bench: Bench, kind: str, found: Sequence[Found], size: int, second
     )
 
 
-def table(rows: Sequence[Row]) -> str:
+def table(rows: Sequence[WayResult]) -> str:
     """Write the rows as a Markdown table, all ways against each other."""
     head = ("lens", "way", "places", "error g", "r", "b", "9 in 10", "expected", "right", "CPU s")
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]

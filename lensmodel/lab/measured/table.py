@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lensmodel.lab.measured.run import KINDS, PAIR_GOAL, TARGET_GOAL, Row, measured, table
+from lensmodel.lab.measured.run import KINDS, PAIR_GOAL, TARGET_GOAL, WayResult, measured, table
 from lensmodel.lab.measured.shots import camera_of, third_order, traced
 
 
@@ -40,7 +40,7 @@ def main() -> None:
     for entry in filter(None, asked.traced.split(",")):
         opened, _, closed = entry.partition(":")
         benches.append(traced(Path(opened), Path(closed) if closed else None, camera))
-    rows: list[Row] = []
+    rows: list[WayResult] = []
     for bench in benches:
         folder = asked.output / f"{bench.name.replace(' ', '-').replace('/', '')}-{asked.height}"
         for kind in asked.kinds.split(","):

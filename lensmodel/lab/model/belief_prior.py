@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from lensmodel.core.belief import GRID
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import PsfSample, otf
-from lensmodel.lab.chain.blind_gain import CAMERA, PLACES, Lens, lenses, seed_range, shot, written
+from lensmodel.lab.chain.blind_gain import CAMERA, PLACES, KnownLens, lenses, seed_range, shot, written
 from lensmodel.model import LensModel, ModelSettings, WitnessedField
 from lensmodel.model.trust.witness import HALF, NARROWINGS, OF_BOTH, SPREAD_OF_BOTH, TEMPER
 from lensmodel.workflow import pipeline
@@ -67,7 +67,7 @@ class Rule:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Place:
+class TruePlace:
     """The true transfer function of a place, the alternatives to it, and what patches say of them.
 
     Parameters
@@ -111,7 +111,7 @@ def _shifted(truth: Spectrum, towards: Spectrum) -> Spectrum:
     return min(moved, key=lambda one: float((_TIMES * _SCENE * np.abs(one - towards) ** 2).sum()))
 
 
-def places(lens: Lens, model: LensModel) -> Iterator[Place]:
+def places(lens: KnownLens, model: LensModel) -> Iterator[TruePlace]:
     """Places of a lens by a fitted model; none where it has no wavefront."""
     field, truth = WitnessedField.of(model, lens.settings), lens.lens.field(lens.settings)
     if len(field.opinions) == 1:
@@ -121,10 +121,10 @@ def places(lens: Lens, model: LensModel) -> Iterator[Place]:
         made = np.array([[otf(change.of(kernel), GRID) for change in NARROWINGS] for kernel in kernels])
         costs, photos = field.witness.evidence(place)
         true = _shifted(otf(truth.kernel_at(place, "g", SIZE), GRID), made[:, :2].mean(axis=(0, 1)))
-        yield Place(true, made, costs, photos)
+        yield TruePlace(true, made, costs, photos)
 
 
-def learned(lens: Lens, folder: Path, counts: Sequence[int] = ()) -> Iterator[list[PsfSample]]:
+def learned(lens: KnownLens, folder: Path, counts: Sequence[int] = ()) -> Iterator[list[PsfSample]]:
     """Samples of the first photos of a lens, `counts` of them, or of either of two and of both."""
     photos: list[list[PsfSample]] = []
     for number in range(max(counts, default=2)):
@@ -139,13 +139,13 @@ def learned(lens: Lens, folder: Path, counts: Sequence[int] = ()) -> Iterator[li
             yield samples
 
 
-def judged(seen: Sequence[Place], rule: Rule) -> tuple[float, float, float]:
+def judged(seen: Sequence[TruePlace], rule: Rule) -> tuple[float, float, float]:
     """Mean gain, share of places that lose more than 0.05 dB, and least gain."""
     gains = np.array([place.gain(rule) for place in seen])
     return float(gains.mean()), float((gains < -0.05).mean()), float(gains.min())
 
 
-def searched(seen: Sequence[Place], rule: Rule, tries: int) -> Rule:
+def searched(seen: Sequence[TruePlace], rule: Rule, tries: int) -> Rule:
     """Change the prior at random and keep what is worth more."""
 
     def worth(candidate: Rule) -> float:
@@ -186,7 +186,7 @@ def main() -> None:
     parser.add_argument("--photos", type=int, nargs="*", default=[], help="how many photos to learn from")
     parser.add_argument("--search", type=int, default=0, help="random changes to try")
     wanted = parser.parse_args()
-    seen: list[Place] = []
+    seen: list[TruePlace] = []
     with tempfile.TemporaryDirectory() as name:
         for lens in lenses(wanted.seeds, wanted.grids, CAMERA.full_well_electrons):
             for samples in learned(lens, Path(name), wanted.photos):

@@ -37,7 +37,7 @@ from lensmodel.core.cross_phase import binned, cross_phase, cross_spectra, mean_
 from lensmodel.core.psf import PsfSample, distance, rms_width
 from lensmodel.core.spectrum import PHASE_BINS, RINGS, SECTORS, PatchSpectrum
 from lensmodel.core.types import CHANNELS, Channel
-from lensmodel.lab.chain.blind_gain import CAMERA, PLACES, Lens, lenses, shot, written
+from lensmodel.lab.chain.blind_gain import CAMERA, PLACES, KnownLens, lenses, shot, written
 from lensmodel.lab.model.cross_spectra import OTHERS, transfer_of
 from lensmodel.model.wavefront.from_kernels import fit_wavefront
 from lensmodel.model.wavefront.from_spectra import PatchView, expected, open_eye, phase_terms
@@ -57,14 +57,14 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Relative:
+class ColourRelations:
     """What the colours of one patch say of each other: phases in the view, ln of ratios here."""
 
     view: PatchView
     ratios: dict[Channel, Floats]
 
 
-def true_wavefront(lens: Lens) -> Wavefront:
+def true_wavefront(lens: KnownLens) -> Wavefront:
     """Wavefront fitted to the true kernels of three colours."""
     truth = lens.lens.field(lens.settings)
     samples = [
@@ -82,7 +82,7 @@ def true_wavefront(lens: Lens) -> Wavefront:
     return front
 
 
-def seen(lens: Lens, number: int, folder: Path, *, exact: bool) -> Iterator[Relative]:
+def seen(lens: KnownLens, number: int, folder: Path, *, exact: bool) -> Iterator[ColourRelations]:
     """Relative information of the patches of one photo, measured or computed from the true kernels."""
     developed = photo.develop(written(folder / "photo.dng", shot(lens, number), tiff=False))
     assert developed.cfa is not None, "a Bayer file"
@@ -102,10 +102,12 @@ def seen(lens: Lens, number: int, folder: Path, *, exact: bool) -> Iterator[Rela
             ratios[channel] = np.log(np.maximum(own, 1e-12) / np.maximum(green, 1e-12))
         flat = PatchSpectrum(np.ones((RINGS, SECTORS), np.float32), 0.0)  # its scene takes no part
         scene = SceneView.of({"g": flat, "r": flat, "b": flat})
-        yield Relative(PatchView(patch.position, lens.settings, str(number), scene, phases), ratios)
+        yield ColourRelations(PatchView(patch.position, lens.settings, str(number), scene, phases), ratios)
 
 
-def terms_of(patches: Sequence[Relative], begin: Wavefront, lens: Floats) -> tuple[float, Floats, Floats]:
+def terms_of(
+    patches: Sequence[ColourRelations], begin: Wavefront, lens: Floats
+) -> tuple[float, Floats, Floats]:
     """Cost of a lens, its normal equations and gradient; chi^2 of ratios and phases."""
     cost, normal, gradient = 0.0, np.zeros((lens.size, lens.size)), np.zeros(lens.size)
     for patch in patches:
@@ -128,7 +130,7 @@ def terms_of(patches: Sequence[Relative], begin: Wavefront, lens: Floats) -> tup
     return cost, normal, gradient
 
 
-def fitted(patches: Sequence[Relative], begin: Wavefront) -> tuple[Wavefront, float, float]:
+def fitted(patches: Sequence[ColourRelations], begin: Wavefront) -> tuple[Wavefront, float, float]:
     """Fit by Levenberg-Marquardt; the lens with the cost before and after."""
     lens = np.concatenate([begin.terms, begin.eye])
     state, damping = terms_of(patches, begin, lens), 1e-2
@@ -153,7 +155,7 @@ def fitted(patches: Sequence[Relative], begin: Wavefront) -> tuple[Wavefront, fl
     return front, first, state[0]
 
 
-def report(lens: Lens, patches: Sequence[Relative]) -> None:
+def report(lens: KnownLens, patches: Sequence[ColourRelations]) -> None:
     """Fit from all beginnings and print."""
     truth, green = lens.lens.field(lens.settings), lens.settings.with_channel("g")
     true = true_wavefront(lens)
@@ -187,7 +189,7 @@ def main() -> None:
     wanted = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         for lens in lenses(wanted.seeds, wanted.grids, CAMERA.full_well_electrons):
-            patches: list[Relative] = []
+            patches: list[ColourRelations] = []
             for number in range(wanted.photos):
                 patches += seen(lens, number, Path(name), exact=wanted.exact)
             report(lens, patches)

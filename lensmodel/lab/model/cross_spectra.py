@@ -43,7 +43,7 @@ from lensmodel.core.errors import NoUsablePatchesError
 from lensmodel.core.psf import PsfSample, delta, rms_width
 from lensmodel.core.spectrum import PHASE_RINGS, SECTORS, CrossPhase, PatchSpectrum, binned_spectrum, tail_of
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel
-from lensmodel.lab.chain.blind_gain import CAMERA, Lens, lenses, shot, written
+from lensmodel.lab.chain.blind_gain import CAMERA, KnownLens, lenses, shot, written
 from lensmodel.lab.traced import GridLens
 from lensmodel.model.wavefront.joint_kernels import tail_vote
 from lensmodel.simulate import SimulatedLens
@@ -57,7 +57,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Patch:
+class MeasuredPatch:
     """One patch: what was measured of it, and what is true there.
 
     Parameters
@@ -106,14 +106,16 @@ class Patch:
         return expected, seen
 
 
-def phases_of(lens: Lens, truth: SimulatedLens | GridLens, place: FieldPosition) -> dict[Channel, Floats]:
+def phases_of(
+    lens: KnownLens, truth: SimulatedLens | GridLens, place: FieldPosition
+) -> dict[Channel, Floats]:
     """Phases of H_C conj(H_G) in the bins at a place, of blue and red."""
     field = truth.field(lens.settings)
     waves = {c: transfer_of(field.kernel_at(place, c, _SIDE)) for c in CHANNELS}
     return {c: np.angle(mean_in_bins(waves[c] * waves["g"].conj())) for c in OTHERS}
 
 
-def patches_of(lens: Lens, number: int, folder: Path) -> Iterator[Patch]:
+def patches_of(lens: KnownLens, number: int, folder: Path) -> Iterator[MeasuredPatch]:
     """Measure the patches of one photo."""
     path = written(folder / "photo.dng", shot(lens, number), tiff=False)
     developed = photo.develop(path)
@@ -131,7 +133,7 @@ def patches_of(lens: Lens, number: int, folder: Path) -> Iterator[Patch]:
         spectrum = PatchSpectrum(
             *binned_spectrum(green, developed.noise[1]), tail_of(green, rms_width(kernel))
         )
-        yield Patch(
+        yield MeasuredPatch(
             lens.name,
             number,
             measured,
@@ -161,12 +163,12 @@ def transfer_of(kernel: Kernel) -> NDArray[np.complex128]:
     return np.fft.fft2(np.roll(grid, (-half, -half), axis=(0, 1)))
 
 
-def residuals(patch: Patch, channel: Channel) -> Floats:
+def residuals(patch: MeasuredPatch, channel: Channel) -> Floats:
     """Measured less true phase in the bins, after the shift that suits best."""
     return unshifted(patch.measured[channel], patch.true[channel])
 
 
-def report_rings(patches: Sequence[Patch]) -> None:
+def report_rings(patches: Sequence[MeasuredPatch]) -> None:
     """Print coherence, scatter and signal by ring."""
     print(
         "\n| ring, cycles/pixel | channel | coherence | scatter, rad | over expected | sine of true phase |"
@@ -204,7 +206,7 @@ def deviations(gains: Sequence[tuple[float, float]]) -> tuple[float, float]:
     return expected / scale, seen / scale
 
 
-def report_lenses(patches: Sequence[Patch]) -> None:
+def report_lenses(patches: Sequence[MeasuredPatch]) -> None:
     """Print what tells each lens from its twins, and how often each vote is right."""
     print(
         "\n| lens, photo | turned: a patch, the photo, as it was | coma negated: photo, as it was | tails |"
@@ -245,7 +247,7 @@ def main() -> None:
     parser.add_argument("--grids", type=Path, nargs="*", default=[])
     parser.add_argument("--photos", type=int, default=2, help="photos of each lens")
     wanted = parser.parse_args()
-    patches: list[Patch] = []
+    patches: list[MeasuredPatch] = []
     with tempfile.TemporaryDirectory() as name:
         for lens in lenses(wanted.seeds, wanted.grids, CAMERA.full_well_electrons):
             for number in range(wanted.photos):

@@ -48,7 +48,7 @@ def estimated_samples(
             path, rng = Path(folder) / f"{number}.dng", np.random.default_rng([seed, number])
             write_photo(path, photograph(scene, lens, settings, camera, rng))
             developed = photo.develop(path)
-            for group in pipeline.cells(pipeline.find_patches(developed, count=count)):
+            for group in pipeline.patches_by_cell(pipeline.find_patches(developed, count=count)):
                 try:
                     estimates = pipeline.estimate_cell(
                         developed, group, settings=settings, photo_id=f"photo{number}", channels=("g",)

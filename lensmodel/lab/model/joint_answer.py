@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.psf import PsfSample, distance
 from lensmodel.core.types import CHANNELS, Channel
-from lensmodel.lab.chain.blind_gain import CAMERA, PLACES, Lens, lenses, shot, written
+from lensmodel.lab.chain.blind_gain import CAMERA, PLACES, KnownLens, lenses, shot, written
 from lensmodel.model import LensModel, ModelSettings
 from lensmodel.model.modes import relative_l2
 from lensmodel.workflow import pipeline
@@ -48,7 +48,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Row:
+class LensErrors:
     """One lens learned from some photos.
 
     Parameters
@@ -69,7 +69,7 @@ class Row:
     r: Array
 
 
-def samples_of(lens: Lens, number: int, folder: Path) -> list[PsfSample]:
+def samples_of(lens: KnownLens, number: int, folder: Path) -> list[PsfSample]:
     """Samples of one photo, from the folder where they are kept or anew."""
     kept = folder / f"{lens.name}-{number}.pickle"
     if kept.exists():
@@ -85,7 +85,9 @@ def samples_of(lens: Lens, number: int, folder: Path) -> list[PsfSample]:
     return samples
 
 
-def row_of(lens: Lens, photos: int, samples: Sequence[PsfSample], channel: Channel = "g") -> Row | None:
+def row_of(
+    lens: KnownLens, photos: int, samples: Sequence[PsfSample], channel: Channel = "g"
+) -> LensErrors | None:
     """Learn and compare; None where no wavefront fits."""
     model = LensModel.fit(samples, ModelSettings()).warmed()
     kernels, wavefront = model.opinion("kernels"), model.opinion("wavefront")
@@ -102,10 +104,10 @@ def row_of(lens: Lens, photos: int, samples: Sequence[PsfSample], channel: Chann
     ]
     r = np.array([place.r for place in PLACES])
     drawn = lens.number < 2000
-    return Row(lens.name, drawn, photos, np.array(errors), relative_l2(rendered, averaged), r)
+    return LensErrors(lens.name, drawn, photos, np.array(errors), relative_l2(rendered, averaged), r)
 
 
-def print_errors(rows: Sequence[Row]) -> None:
+def print_errors(rows: Sequence[LensErrors]) -> None:
     """Print the tables of errors."""
     print("\n| lens, photos | " + " | ".join(f"{share:g}" for share in SHARES) + " |")
     print("|---" * (len(SHARES) + 1) + "|")
@@ -129,20 +131,20 @@ def print_errors(rows: Sequence[Row]) -> None:
         print(f"| {words} | {' | '.join(f'{share:.0%}' for share in shares)} |")
 
 
-def features(rows: Sequence[Row]) -> Array:
+def features(rows: Sequence[LensErrors]) -> Array:
     """1, r and ln(d + 0.02), `(n, 3)`."""
     r, apart = (np.concatenate([getattr(row, name) for row in rows]) for name in ("r", "apart"))
     return np.stack([np.ones_like(r), r, np.log(apart + 0.02)], axis=1)
 
 
-def print_told(rows: Sequence[Row], share: float) -> None:
+def print_told(rows: Sequence[LensErrors], share: float) -> None:
     """Print the coefficients of the error to tell of the mean with a share, and how often it is right."""
     column = SHARES.index(share)
 
-    def logs(some: Sequence[Row]) -> Array:
+    def logs(some: Sequence[LensErrors]) -> Array:
         return np.log(np.concatenate([row.errors[:, column] for row in some]))
 
-    def fitted(some: Sequence[Row]) -> Array:
+    def fitted(some: Sequence[LensErrors]) -> Array:
         return np.asarray(np.linalg.lstsq(features(some), logs(some), rcond=None)[0])
 
     off = []

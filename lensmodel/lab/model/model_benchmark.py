@@ -96,7 +96,7 @@ def asked_places() -> list[FieldPosition]:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class MethodErrors:
     """Errors of one method: mean relative L2 by zone after sub-pixel alignment.
 
     `worst` are the means of the lens that is worst in each zone, where there were several. `net` is what of
@@ -153,7 +153,7 @@ def run_model_benchmark(
     fits = _fits(methods, modes=photographs is not None)
     if psf_field is not None:
         samples = load_field(psf_field)
-        rows: list[Row] = []
+        rows: list[MethodErrors] = []
         for name, fit in fits.items():
             on_step(len(rows), len(fits))
             rows.append(_held_out(name, fit, samples))
@@ -318,7 +318,7 @@ def _polynomial(samples: Sequence[PsfSample]) -> Predictor:
     return lambda place: as_kernel(np.maximum(features(_xy([place])) @ solved, 0.0).reshape(size, size))
 
 
-def _held_out(name: str, fit: Fit, samples: Sequence[PsfSample]) -> Row:
+def _held_out(name: str, fit: Fit, samples: Sequence[PsfSample]) -> MethodErrors:
     groups = sorted({s.photo for s in samples})
     start, errors, noise = time.process_time(), [], list[float]()
     for group in groups:
@@ -335,18 +335,18 @@ def _held_out(name: str, fit: Fit, samples: Sequence[PsfSample]) -> Row:
 
 def _over_lenses(
     name: str, photos: int, lenses: Sequence[Sequence[tuple[Zone, float]]], seconds: float
-) -> Row:
+) -> MethodErrors:
     mean = _row(name, photos, [error for errors in lenses for error in errors], seconds)
     alone = [_row(name, photos, errors, 0.0).errors for errors in lenses]
     return replace(mean, worst={zone: max(one.get(zone, 0.0) for one in alone) for zone in mean.errors})
 
 
-def _row(name: str, photos: int, errors: Sequence[tuple[Zone, float]], seconds: float) -> Row:
+def _row(name: str, photos: int, errors: Sequence[tuple[Zone, float]], seconds: float) -> MethodErrors:
     by_zone = {zone: [e for z, e in errors if z == zone] for zone in ZONES}
-    return Row(name, photos, {z: float(np.mean(e)) for z, e in by_zone.items() if e}, seconds)
+    return MethodErrors(name, photos, {z: float(np.mean(e)) for z, e in by_zone.items() if e}, seconds)
 
 
-def _plain(row: Row) -> dict[str, Any]:
+def _plain(row: MethodErrors) -> dict[str, Any]:
     return {
         "method": row.method,
         "photos": row.photos,

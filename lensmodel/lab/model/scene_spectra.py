@@ -38,7 +38,7 @@ _WIDE = 9.0  # how much wider than usual the priors are
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class PatchTruth:
     """Spectra of a patch and the true |OTF|^2 of its channels, shape (BINS, 3)."""
 
     photo: str
@@ -55,7 +55,7 @@ def power_of(kernel: Floats) -> Floats:
     return np.asarray(np.abs(np.exp(-2j * np.pi * along) @ kernel.ravel()) ** 2)
 
 
-def patches(seed: int, files: list[Path], folder: Path) -> Iterator[Seen]:
+def patches(seed: int, files: list[Path], folder: Path) -> Iterator[PatchTruth]:
     """Take, develop and select."""
     lens = draw_lens(seed)
     settings = LensSettings(aperture=lens.at_focal().f_number, focal_mm=lens.focal_mm[0])
@@ -77,7 +77,7 @@ def patches(seed: int, files: list[Path], folder: Path) -> Iterator[Seen]:
                 plane = np.ascontiguousarray(developed.planes[index][window])
                 spectra[channel] = PatchSpectrum.of(plane, developed.noise[index], 1.0)
                 truth.append(power_of(field.kernel_at(patch.position, channel, _SIDE)))
-            yield Seen(f"{seed}/{file.stem}", SceneView.of(spectra), np.stack(truth, axis=1))
+            yield PatchTruth(f"{seed}/{file.stem}", SceneView.of(spectra), np.stack(truth, axis=1))
 
 
 def spread(values: Floats) -> Floats:
@@ -85,7 +85,7 @@ def spread(values: Floats) -> Floats:
     return np.asarray(1.4826 * np.median(np.abs(values - np.median(values, axis=0)), axis=0))
 
 
-def report(seen: list[Seen]) -> None:
+def report(seen: list[PatchTruth]) -> None:
     """Fit the scenes and print."""
     shapes = PATCH_SHAPES.shape[1]
     fits = [fit_scene(replace(s.scene, vote=s.scene.vote / _WIDE), s.truth) for s in seen]
@@ -141,7 +141,7 @@ def main() -> None:
     data = os.environ.get("LENSMODEL_TEST_DATA")
     files = [p for p in list_photos(Path(data) / "sharp" if data else None) if photo_half(p.stem) == "dev"]
     first, last = (int(n) for n in arguments.seeds.split(":"))
-    seen: list[Seen] = []
+    seen: list[PatchTruth] = []
     with tempfile.TemporaryDirectory() as folder:
         for seed in range(first, last):
             order = np.random.default_rng(seed).permutation(len(files))[: arguments.photos]

@@ -88,7 +88,7 @@ class ByChannel:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shot:
+class TilePhoto:
     """A developed photo of tiles, and its sharp light."""
 
     photo: LinearPhoto
@@ -129,7 +129,7 @@ class Shot:
         return psnr(corrected * scale, truth, srgb=True) - psnr(before * scale, truth, srgb=True)
 
 
-def shoot(kernels: Sequence[Kernels], files: Sequence[Path], rng: np.random.Generator) -> Shot:
+def shoot(kernels: Sequence[Kernels], files: Sequence[Path], rng: np.random.Generator) -> TilePhoto:
     """Take a photo of tiles, each the busiest of three cuts of photographs."""
     camera = SimulatedCamera(height=FRAME.height, width=FRAME.width)
     clean = np.zeros((len(CHANNELS), FRAME.height, FRAME.width), dtype=np.float32)
@@ -155,7 +155,7 @@ def shoot(kernels: Sequence[Kernels], files: Sequence[Path], rng: np.random.Gene
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "tiles.dng"
         write_photo(path, SimulatedPhoto(camera.mosaic(clean, rng), clean, clean, sharp, truth))
-        return Shot(photo.develop(path), sharp)
+        return TilePhoto(photo.develop(path), sharp)
 
 
 def widened(kernel: Kernel, factor: float) -> Kernel:
@@ -185,7 +185,7 @@ def spoiled(kernels: Sequence[Kernels], kind: str) -> list[Kernels]:
 
 
 def outcome(
-    truth: Sequence[Kernels], shots: Sequence[Shot], kind: str, settings: LensSettings
+    truth: Sequence[Kernels], shots: Sequence[TilePhoto], kind: str, settings: LensSettings
 ) -> NDArray[np.float64]:
     """Gains of some tiles of the last photo without and with witnesses, shape (tiles, 2)."""
     green, pitch = settings.with_channel("g"), SimulatedCamera().pitch_um

@@ -63,7 +63,7 @@ CONTROL = "standard"
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
+class CaseJob:
     """One case; `truth` keeps the kernels that were asked for, which are slow to make."""
 
     case: Case

@@ -15,7 +15,7 @@ from lensmodel.lab.reproduce.families import FIRST_SEED
 from lensmodel.lab.reproduce.scenes import layout_for, scene_files
 from lensmodel.simulate import draw_lens
 
-Lens = TypeVar("Lens")
+LensT = TypeVar("LensT")
 
 _QUICK_FRAME = (640, 960)  # rows and columns (chosen): 0.6 megapixels
 _HARD_FRAME = (840, 1260)  # rows and columns (chosen): a megapixel
@@ -130,7 +130,7 @@ def planned(
     )
 
 
-def in_turn(lenses: Sequence[Lens], number: int, count: int) -> list[Lens]:
+def in_turn(lenses: Sequence[LensT], number: int, count: int) -> list[LensT]:
     """Lenses of a condition: other ones for each, in turn, as unlike each other as they come."""
     each = min(count, len(lenses))
     return [lenses[(number + len(lenses) * i // each) % len(lenses)] for i in range(each)]

@@ -28,7 +28,7 @@ from lensmodel.lab.cases import photo_half
 from lensmodel.lab.reproduce import figures
 from lensmodel.lab.reproduce.cases import Reproduction, fingerprint, key_of
 from lensmodel.lab.reproduce.conditions import BASE
-from lensmodel.lab.reproduce.job import Job
+from lensmodel.lab.reproduce.job import CaseJob
 from lensmodel.lab.reproduce.progress import FIGURES, OnWork, Progress, weight_of, with_paper
 from lensmodel.lab.reproduce.routes import OpenRoute, paper_way
 from lensmodel.lab.reproduce.store import Unit, stored
@@ -85,7 +85,7 @@ def run_reproduction(
     progress = Progress(on_work, weights + (FIGURES if with_figures else 0.0))
     done = []
     for case, key in zip(plan.cases, keys, strict=True):
-        job = Job(
+        job = CaseJob(
             case,
             case.truth(),
             plan,

@@ -31,7 +31,7 @@ from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel
 from lensmodel.lab.blind.methods.edges import EdgeProfile, profiles
 from lensmodel.lab.blind.steps.pyramid import View
-from lensmodel.lab.rivals.rival import Window, polynomial, powers, windows_of
+from lensmodel.lab.rivals.rival import PhotoWindow, polynomial, powers, windows_of
 from lensmodel.photo import LinearPhoto
 
 _DIRECTIONS = 24  # in half a turn, like `_STEP_PX` as in `lensmodel.lab.blind.methods.edges`
@@ -108,7 +108,7 @@ class Kee:
             {channel: self._fitted(windows, i) for i, channel in enumerate(CHANNELS)}, self.degree
         )
 
-    def _fitted(self, windows: Sequence[Window], channel: int) -> Floats:
+    def _fitted(self, windows: Sequence[PhotoWindow], channel: int) -> Floats:
         places: list[tuple[float, float]] = []
         edges: list[EdgeProfile] = []
         for window in windows:

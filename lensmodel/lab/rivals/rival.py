@@ -37,7 +37,7 @@ class Rival(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Window:
+class PhotoWindow:
     """A window of a photo in all channels.
 
     Parameters
@@ -58,14 +58,14 @@ class Window:
         return self.planes[channel]
 
 
-def windows_of(photos: Sequence[LinearPhoto]) -> list[Window]:
+def windows_of(photos: Sequence[LinearPhoto]) -> list[PhotoWindow]:
     """Cut the windows that tell about the blur, chosen in green as a calibration does."""
     found = []
     for photo in photos:
         for patch in pipeline.find_patches(photo, count=PATCHES).patches:
             rows, cols = slice(patch.row, patch.row + patch.size), slice(patch.col, patch.col + patch.size)
             planes = np.ascontiguousarray(photo.planes[:, rows, cols])
-            found.append(Window(planes, photo.noise, patch.position))
+            found.append(PhotoWindow(planes, photo.noise, patch.position))
     return found
 
 

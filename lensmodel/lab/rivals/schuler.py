@@ -30,9 +30,9 @@ from scipy import fft
 from lensmodel.core.errors import NotEnoughEvidenceError
 from lensmodel.core.types import CHANNELS, Kernel
 from lensmodel.lab.blind.steps.gradients import (
-    Canvas,
+    DerivativePair,
     KernelEquations,
-    Pair,
+    PeriodicPlane,
     across,
     bilateral,
     down,
@@ -42,7 +42,7 @@ from lensmodel.lab.blind.steps.gradients import (
 )
 from lensmodel.lab.blind.steps.pyramid import Image, View
 from lensmodel.lab.rivals.basis import BasisField, RadialBasis, composed, harmonics, load_basis
-from lensmodel.lab.rivals.rival import Window, windows_of
+from lensmodel.lab.rivals.rival import PhotoWindow, windows_of
 from lensmodel.photo import LinearPhoto
 
 _ALPHA = 5e-3  # weight of the gradients in the deconvolution, noise has its own beside it (chosen)
@@ -95,7 +95,7 @@ class Schuler:
         return BasisField(basis, found)
 
     def _coefficients(
-        self, windows: Sequence[Window], turned: Sequence[Floats], channel: int, start: Floats
+        self, windows: Sequence[PhotoWindow], turned: Sequence[Floats], channel: int, start: Floats
     ) -> Floats:
         side = turned[0].shape[-1]
         patches = [_Patch.of(window, channel, side) for window in windows]
@@ -145,18 +145,18 @@ class _Patch:
     """One window of one colour, and its deconvolution by one division of spectra."""
 
     view: View
-    canvas: Canvas
+    canvas: PeriodicPlane
     spectrum: NDArray[np.complex128]
     slopes: Image
 
     @classmethod
-    def of(cls, window: Window, channel: int, side: int) -> _Patch:
+    def of(cls, window: PhotoWindow, channel: int, side: int) -> _Patch:
         view = View.of(window.plane(channel), window.noise[channel])
-        canvas = Canvas.around(view.y, side)
+        canvas = PeriodicPlane.around(view.y, side)
         row, col = canvas.gradient_power()
         return cls(view, canvas, canvas.spectrum(view.y), row + col)
 
-    def predicted(self, kernel: Kernel, fade: float, least: int) -> list[Pair]:
+    def predicted(self, kernel: Kernel, fade: float, least: int) -> list[DerivativePair]:
         """Gradients of the sharp image, guessed where they are strong, beside the observed ones."""
         k = self.canvas.otf(kernel)
         weight = _ALPHA + 4.0 * self.view.noise**2
@@ -168,6 +168,6 @@ class _Patch:
         margin = inside(row.shape, kernel.shape[0] // 2 + 1)
         strong = np.hypot(row, col) >= oriented_threshold(row, col, least, margin)
         return [
-            Pair(np.where(strong, row, 0.0), down(self.view.y), 1.0, 0),
-            Pair(np.where(strong, col, 0.0), across(self.view.y), 1.0, 1),
+            DerivativePair(np.where(strong, row, 0.0), down(self.view.y), 1.0, 0),
+            DerivativePair(np.where(strong, col, 0.0), across(self.view.y), 1.0, 1),
         ]

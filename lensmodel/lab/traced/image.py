@@ -25,7 +25,7 @@ from scipy.interpolate import CubicSpline
 
 from lensmodel.core.psf import as_kernel, centroid
 from lensmodel.core.types import Kernel
-from lensmodel.lab.traced.wave import Pupil
+from lensmodel.lab.traced.wave import TracedPupil
 
 Array = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ _SPARE_PX: Final = 2  # the kernel may move by so much before the light is compu
 
 
 def kernel_of(
-    pupils: Sequence[tuple[Pupil, float, float]],
+    pupils: Sequence[tuple[TracedPupil, float, float]],
     radius: float,
     limits: tuple[float, ...],
     *,
@@ -50,7 +50,7 @@ def kernel_of(
 
     Parameters
     ----------
-    pupils : sequence of (Pupil, wavelength_um, weight)
+    pupils : sequence of (TracedPupil, wavelength_um, weight)
         All with the same reference point.
     radius, limits
         Of the stop and the rims, mm.
@@ -79,7 +79,7 @@ def kernel_of(
     return as_kernel(kernel), center
 
 
-def transmission(pupil: Pupil, radius: float, limits: tuple[float, ...]) -> float:
+def transmission(pupil: TracedPupil, radius: float, limits: tuple[float, ...]) -> float:
     """Area in mm^2 of the light that enters and arrives."""
     step = 2.0 * max(pupil.half) / _SAMPLES[0]
     amplitude, _ = pupil.evaluate(*pupil.grid(step), radius, limits, 0.0)
@@ -87,7 +87,10 @@ def transmission(pupil: Pupil, radius: float, limits: tuple[float, ...]) -> floa
 
 
 def _geometric(
-    pupils: Sequence[tuple[Pupil, float, float]], radius: float, limits: tuple[float, ...], focus_um: float
+    pupils: Sequence[tuple[TracedPupil, float, float]],
+    radius: float,
+    limits: tuple[float, ...],
+    focus_um: float,
 ) -> tuple[tuple[float, float], float]:
     """Median of the rays (right, up), near the core, and their largest distance from it, micrometres."""
     xs, ys, ws = [], [], []
@@ -111,7 +114,7 @@ def _median(values: Array, weights: Array) -> float:
 
 
 def _intensity(
-    pupils: Sequence[tuple[Pupil, float, float]],
+    pupils: Sequence[tuple[TracedPupil, float, float]],
     radius: float,
     limits: tuple[float, ...],
     size: int,

@@ -16,7 +16,7 @@ from lensmodel.lab.traced.designs import designs
 from lensmodel.lab.traced.image import kernel_of, transmission
 from lensmodel.lab.traced.prescription import Design
 from lensmodel.lab.traced.rays import Array, Fault, Tracer
-from lensmodel.lab.traced.wave import Pupil
+from lensmodel.lab.traced.wave import TracedPupil
 
 BAND_NM: Final[dict[Channel, float]] = {"r": 32.0, "g": 38.0, "b": 32.0}
 """Standard deviation of a channel's light: full widths of 75, 90 and 75 nm, typical of Bayer filters."""
@@ -188,23 +188,23 @@ class TracedLens:
 
     def pupils(
         self, h: tuple[float, float], channel: Channel, f_number: float
-    ) -> list[tuple[Pupil, float, float]]:
+    ) -> list[tuple[TracedPupil, float, float]]:
         """Pupils of a field vector (right, up) with wavelengths (um) and weights of the channel."""
         return self._coloured(h, (channel,), f_number)[channel]
 
     def pupils_of_all(
         self, h: tuple[float, float], f_number: float
-    ) -> dict[Channel, list[tuple[Pupil, float, float]]]:
+    ) -> dict[Channel, list[tuple[TracedPupil, float, float]]]:
         """`pupils` of all channels, with one reference point."""
         return self._coloured(h, CHANNELS, f_number)
 
     def _coloured(
         self, h: tuple[float, float], channels: tuple[Channel, ...], f_number: float
-    ) -> dict[Channel, list[tuple[Pupil, float, float]]]:
+    ) -> dict[Channel, list[tuple[TracedPupil, float, float]]]:
         colours = [(c, wave, weight) for c in channels for wave, weight in spectrum(c, self.copy.wavelengths)]
         waves = tuple(wave for _, wave, _ in colours)
         found = self._pupils(self._tracer, h, self.stop_radius(f_number), waves, self.limits)
-        by_channel: dict[Channel, list[tuple[Pupil, float, float]]] = {c: [] for c in channels}
+        by_channel: dict[Channel, list[tuple[TracedPupil, float, float]]] = {c: [] for c in channels}
         for pupil, (channel, wave, weight) in zip(found, colours, strict=True):
             by_channel[channel].append((pupil, wave, weight))
         return by_channel
@@ -242,14 +242,14 @@ class TracedLens:
         radius: float,
         waves: tuple[float, ...],
         limits: tuple[float, ...],
-    ) -> list[Pupil]:
+    ) -> list[TracedPupil]:
         angles, heights, maps = self._field
         r = min(math.hypot(*h), self.largest_r)
         theta = float(np.interp(r, heights, angles))
         phi = math.atan2(h[1], h[0])
         direction = (math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi))
         start = _turned(maps[int(np.argmin(np.abs(heights - r)))], phi)
-        return [Pupil.of(b) for b in tracer.bundles(direction, radius, waves, limits, start=start)]
+        return [TracedPupil.of(b) for b in tracer.bundles(direction, radius, waves, limits, start=start)]
 
 
 def _chief_heights(tracer: Tracer, half_field_deg: float, beyond: float) -> tuple[Array, Array, list[Array]]:

@@ -30,7 +30,7 @@ _GUARD: Final = 1.3  # times the affine image of the stop: beyond it, polynomial
 
 
 @dataclass(frozen=True, slots=True)
-class Pupil:
+class TracedPupil:
     """What one object point sees through the lens in one wavelength.
 
     Parameters
@@ -56,7 +56,7 @@ class Pupil:
     residual_um: float
 
     @classmethod
-    def of(cls, bundle: Bundle) -> Pupil:
+    def of(cls, bundle: Bundle) -> TracedPupil:
         """Fit a bundle."""
         low, high = bundle.cosines.min(axis=1), bundle.cosines.max(axis=1)
         center, half = (low + high) / 2.0, (high - low) / 2.0

@@ -30,7 +30,7 @@ from lensmodel.core.geometry import Frame
 from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel, ignore_step
 from lensmodel.estimation import PsfEstimator
 from lensmodel.estimation.patches.blocks import BLOCKS_A_SIDE, measure_blocks
-from lensmodel.estimation.patches.details import joined, look_at
+from lensmodel.estimation.patches.details import joined_details, look_at
 from lensmodel.estimation.patches.good_regions import FEATURES, TreeEnsemble, features_of
 from lensmodel.estimation.patches.select import RMapSelector, first_reasons
 from lensmodel.estimation.patches.windows import windows_of
@@ -85,7 +85,7 @@ def label_group(photo: Path, number: int, estimator: PsfEstimator) -> Iterator[L
         np.ascontiguousarray(plane[r : r + SIZE, c : c + SIZE])
         for r, c in zip(part.rows, part.cols, strict=True)
     ]
-    looked = joined(
+    looked = joined_details(
         [
             look_at(patch, sigma, 1.0, (int(r), int(c)))
             for patch, r, c in zip(patches, part.rows, part.cols, strict=True)

@@ -14,7 +14,7 @@ from lensmodel.core.types import WAVELENGTH_NM
 from lensmodel.model import variables as va
 from lensmodel.model.answer import PAPER, ModelSettings
 from lensmodel.model.field import robust
-from lensmodel.model.field.leave_one_out import Choice, Held, choose
+from lensmodel.model.field.leave_one_out import Choice, HeldOut, choose_factors
 from lensmodel.model.field.local_frame import LocalKernels
 from lensmodel.model.field.robust import Flag
 from lensmodel.model.wavefront.from_kernels import ONE_FOCAL_LENGTH
@@ -67,7 +67,7 @@ class CrossValidation:
 
 def bandwidth(rule: dict[str, float], settings: ModelSettings, choice: Choice) -> dict[str, float]:
     """Bandwidths of a rule, factors of cross-validation and the wishes of a user."""
-    bandwidths = rule = va.support(rule) if settings.mode == PAPER else dict(rule)
+    bandwidths = rule = va.support_widths(rule) if settings.mode == PAPER else dict(rule)
     bandwidths["r"] = settings.r or rule["r"] * choice.r
     phi = rule["phi"] * choice.phi
     if settings.rotational is not None:
@@ -122,11 +122,11 @@ def cross_validate(
     several = len(np.unique(photo[voting])) >= 2
     groups = held_together(samples, photo)
 
-    def held(rows: NDArray[np.intp], votes: NDArray[np.float64]) -> Held:
+    def held(rows: NDArray[np.intp], votes: NDArray[np.float64]) -> HeldOut:
         kernels = local.upright(rows)
         scale = va.scales(bandwidth(rule, settings, Choice()))
         flat = kernels.reshape(len(rows), -1)
-        return Held.of(flat, kernels.shape[1], where[rows], scale, votes[rows], groups[rows])
+        return HeldOut.of(flat, kernels.shape[1], where[rows], scale, votes[rows], groups[rows])
 
     green = voting[where[voting, 4] == _judging_channel(where[voting, 4])]
     choice = Choice(mirror=settings.mirror or 0.0)
@@ -135,7 +135,7 @@ def cross_validate(
     def chosen(votes: NDArray[np.float64]) -> Choice:
         if not automatic:
             return choice
-        factors = choose(
+        factors = choose_factors(
             held(_thinned(green, _CV_SAMPLES), votes),
             r=settings.r is None,
             phi=settings.phi is None and settings.rotational is None,

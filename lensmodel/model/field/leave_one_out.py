@@ -29,7 +29,7 @@ _AS_GOOD, _NEGLIGIBLE = 1.01, 1e-3  # errors nearer than this are equal: their d
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Held:
+class HeldOut:
     """Samples prepared for cross-validation.
 
     Parameters
@@ -60,7 +60,7 @@ class Held:
         scale: NDArray[np.float64],
         votes: NDArray[np.float64],
         groups: NDArray[np.intp],
-    ) -> Held:
+    ) -> HeldOut:
         """Prepare kernels given as flat rows of a square grid, at points `where` (n, 7)."""
         rows = np.asarray(rows, dtype=np.float64)  # errors are small differences of these products
         flipped = rows.reshape(-1, side, side)[:, ::-1].reshape(len(rows), -1)
@@ -140,7 +140,7 @@ class Choice:
             raise InvalidInputError(f"a held-out error must be finite and not negative, got {self.error}")
 
 
-def choose(held: Held, *, r: bool = True, phi: bool = True, mirror: bool = True) -> Choice:
+def choose_factors(held: HeldOut, *, r: bool = True, phi: bool = True, mirror: bool = True) -> Choice:
     """Search the factors, each only where it is free, for the least held-out error."""
 
     def best(options: tuple[float, ...], make: Callable[[float], Choice]) -> Choice:

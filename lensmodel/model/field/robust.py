@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.psf import PsfSample, second_moments
-from lensmodel.model.field.leave_one_out import Held
+from lensmodel.model.field.leave_one_out import HeldOut
 
 _TUKEY = 4.685  # 95 % efficiency for normal errors (P. J. Huber, "Robust Statistics", 1981: Tukey's biweight)
 _ROUNDS = 4  # of reweighting (chosen)
@@ -53,7 +53,7 @@ class Flag:
 
 
 def factors(
-    held: Held, photos: NDArray[np.intp], *, r: float, phi: float, mirror: float
+    held: HeldOut, photos: NDArray[np.intp], *, r: float, phi: float, mirror: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Factors on the votes of samples.
 

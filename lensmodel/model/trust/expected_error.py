@@ -15,7 +15,7 @@ from lensmodel.model.trust.support import field_error, shared_error
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
+class SampleEvidence:
     """What is known of the samples that answer a question.
 
     Parameters
@@ -60,12 +60,12 @@ class Evidence:
         return math.hypot(own * self.distance_factor, self.shared)
 
 
-def expected_error(evidence: Evidence, mixture: Mixture, *, wavefront_alone: bool) -> float:
+def expected_error(evidence: SampleEvidence, mixture: Mixture, *, wavefront_alone: bool) -> float:
     """Relative L2 that the first answer of a mixture expects of itself.
 
-    The regression's is held out (`Evidence.regression_error`), and so is that of a wavefront which answers
-    alone. But a wavefront that cannot bend as the lens does agrees with itself all over the field: it
-    is never surer than the kernels would be, nor than it agrees with them.
+    The regression's is held out (`SampleEvidence.regression_error`), and so is that of a wavefront which
+    answers alone. But a wavefront that cannot bend as the lens does agrees with itself all over the
+    field: it is never surer than the kernels would be, nor than it agrees with them.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ _JOINT: Final[Mapping[str, float]] = fitted("model")["joint_error"]
 """a, b, c and the least distance of `joint_error`; see `data/README.md`."""
 
 
-def joint_error(evidence: Evidence, mixture: Mixture, r: float) -> float:
+def joint_error(evidence: SampleEvidence, mixture: Mixture, r: float) -> float:
     """Relative L2 that the first mean of averaged kernels and a wavefront's expects of itself.
 
     With d the relative L2 by which the two differ, e = exp(a + b r + c ln(d + 0.02)). Held-out kernels share

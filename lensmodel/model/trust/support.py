@@ -81,7 +81,7 @@ def support(
 
     Distances count in bandwidths of eq. (8), `rule` from `variables.bandwidths`.
     """
-    gaps = va.gaps(where, asked, va.scales(va.support(rule)))
+    gaps = va.gaps(where, asked, va.scales(va.support_widths(rule)))
     squared = gaps**2
     nearest = int(squared.sum(axis=1).argmin())
     beyond = {name for name, value in zip(va.COLUMNS, np.abs(gaps).min(axis=0), strict=True) if value > _FAR}

@@ -10,7 +10,7 @@ import numpy as np
 
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import WAVELENGTH_NM, Kernel
-from lensmodel.model.wavefront.least_squares import Problem
+from lensmodel.model.wavefront.least_squares import WavefrontProblem
 from lensmodel.model.wavefront.starts import starts
 from lensmodel.optics.aberration_prior import ABERRATIONS
 from lensmodel.optics.wavefront import NAMES, Wavefront, design, stopped
@@ -69,7 +69,7 @@ def fit_wavefront(samples: Sequence[PsfSample], start: Wavefront | None = None) 
     log_q = math.log(WAVELENGTH_NM["g"] / 1000.0 * widest / pitch)
     vague = _KNOWN if apertures and pitches else (_PITCH_GUESSED if apertures else _APERTURE_GUESSED)
     zoom = focal_range(kept) > ONE_FOCAL_LENGTH
-    few, many = spread(kept, _COARSE * (1 + zoom)), spread(kept, _FINE * (1 + zoom))
+    few, many = spread_samples(kept, _COARSE * (1 + zoom)), spread_samples(kept, _FINE * (1 + zoom))
     size = max(side_of_light(s.kernel) for s in many)
     begins = [start] if start is not None else []
     if start is None:
@@ -77,11 +77,11 @@ def fit_wavefront(samples: Sequence[PsfSample], start: Wavefront | None = None) 
         if zoom:
             known = [math.log2(s.settings.focal_mm) for s in kept if s.settings.focal_mm is not None]
             usual = replace(usual, slopes=np.zeros(len(NAMES)), focal_octaves=float(np.median(known)))
-        coarse = Problem(tuple(few), size, log_q, vague, _BLUR_PX)
+        coarse = WavefrontProblem(tuple(few), size, log_q, vague, _BLUR_PX)
         tried = [coarse.solve(front, _COARSE_ROUNDS) for front in _starts(many, usual)]
         # the best fit of few blurred samples need not lead to the best of all sharp ones
         begins = [front for front, _, _ in sorted(tried, key=lambda fit: fit[1])[:_REFINED]]
-    fine = Problem(tuple(many), size, log_q, vague, 0.0)
+    fine = WavefrontProblem(tuple(many), size, log_q, vague, 0.0)
     fitted = [fine.solve(replace(begin, size=size, f_number=widest), _FINE_ROUNDS) for begin in begins]
     likeliest, cost, errors = min(fitted, key=lambda fit: fit[1])
     if vague > _KNOWN:
@@ -100,8 +100,8 @@ def fit_wavefront(samples: Sequence[PsfSample], start: Wavefront | None = None) 
 
 def refined(front: Wavefront, samples: Sequence[PsfSample]) -> Wavefront:
     """A wavefront after some steps towards samples, of which there may be fewer than it was fitted to."""
-    many = spread(samples, _FINE * (1 + (front.slopes is not None)))
-    problem = Problem(tuple(many), front.size, front.log_q, _KNOWN, 0.0)
+    many = spread_samples(samples, _FINE * (1 + (front.slopes is not None)))
+    problem = WavefrontProblem(tuple(many), front.size, front.log_q, _KNOWN, 0.0)
     return problem.solve(front, _REFINING_ROUNDS)[0]
 
 
@@ -148,7 +148,7 @@ def _order(sample: PsfSample) -> tuple[float, float, float, str, str]:
     return place.r, place.phi, sample.settings.aperture or 0.0, sample.settings.channel, sample.photo
 
 
-def spread(samples: Sequence[PsfSample], count: int) -> list[PsfSample]:
+def spread_samples(samples: Sequence[PsfSample], count: int) -> list[PsfSample]:
     """Choose samples far from each other in place and settings; the first is the best one.
 
     Where every place is taken, those of the larger votes follow, and of equal votes by photo.

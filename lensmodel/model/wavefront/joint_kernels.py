@@ -18,7 +18,12 @@ from numpy.typing import NDArray
 from lensmodel.core.files import fitted
 from lensmodel.core.psf import PsfSample, distance, rms_width
 from lensmodel.core.types import WAVELENGTH_NM, FieldPosition, Kernel, StepHook, ignore_step
-from lensmodel.model.wavefront.from_kernels import USUAL_PITCH_UM, fit_wavefront, side_of_light, spread
+from lensmodel.model.wavefront.from_kernels import (
+    USUAL_PITCH_UM,
+    fit_wavefront,
+    side_of_light,
+    spread_samples,
+)
 from lensmodel.model.wavefront.from_spectra import (
     SYMMETRIC,
     PatchView,
@@ -114,7 +119,7 @@ class Pooled:
         hypot(0.7 c d, 0.07 exp(1.5 r)), with d the scatter of draws from the fit's covariance and c one over
         the number of photos, 0.3 at least.
         """
-        few = spread(samples, _ERROR_PLACES)
+        few = spread_samples(samples, _ERROR_PLACES)
         rng = np.random.default_rng(_SEED)
         lens = np.concatenate([self.front.terms, self.front.eye])
         values, vectors = np.linalg.eigh(self.fit.covariance)
@@ -139,7 +144,7 @@ class Pooled:
         return np.hypot(share * drawn_here, least)
 
 
-def pool(
+def pool_samples(
     samples: Sequence[PsfSample], on_step: StepHook = ignore_step, known: Sequence[Wavefront] = ()
 ) -> Pooled | None:
     """Solve all samples of one focal length together.
@@ -162,7 +167,7 @@ def pool(
     if len(places) < MIN_PLACES:
         return None
     heads = [group.get("g", next(iter(group.values()))) for group in places]
-    first = fit_wavefront(spread(samples, _FIRST))
+    first = fit_wavefront(spread_samples(samples, _FIRST))
     if first is None:
         return None
     widest = min((s.settings.aperture for s in seen if s.settings.aperture is not None), default=None)
@@ -181,8 +186,10 @@ def pool(
     begins += random_fronts(first, float(np.median([rms_width(s.kernel) for s in heads])))
     at = {id(head): group for head, group in zip(heads, places, strict=True)}
     wide, narrow = _by_aperture(heads, widest)
-    chosen = [at[id(s)] for s in (*spread(wide, MOST_PATCHES), *spread(narrow, _NARROW_PLACES))]
-    parts = [[at[id(s)] for s in spread(own, MOST_PATCHES)] for own in pairs(wide)]
+    chosen = [
+        at[id(s)] for s in (*spread_samples(wide, MOST_PATCHES), *spread_samples(narrow, _NARROW_PLACES))
+    ]
+    parts = [[at[id(s)] for s in spread_samples(own, MOST_PATCHES)] for own in pairs(wide)]
     views = [view(group) for group in chosen]
     known = known or _of_single_photos(samples, on_step)
     former = [replace(first, terms=front.terms, eye=front.eye) for front in known]
@@ -217,7 +224,7 @@ def _of_single_photos(samples: Sequence[PsfSample], on_step: StepHook) -> list[W
     """
     photos = sorted({s.photo for s in samples})
     first = photos[:_MOST_SINGLE] if len(photos) > 1 else []
-    alone = [pool([s for s in samples if s.photo == photo], on_step) for photo in first]
+    alone = [pool_samples([s for s in samples if s.photo == photo], on_step) for photo in first]
     return [one.front for one in alone if one is not None]
 
 

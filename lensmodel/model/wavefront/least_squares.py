@@ -44,7 +44,7 @@ class _State:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Problem:
+class WavefrontProblem:
     """Least squares of a wavefront against samples, both blurred alike."""
 
     samples: tuple[PsfSample, ...]

@@ -33,9 +33,9 @@ from lensmodel.model.wavefront.from_kernels import (
     ONE_FOCAL_LENGTH,
     fit_wavefront,
     focal_range,
-    spread,
+    spread_samples,
 )
-from lensmodel.model.wavefront.joint_kernels import Pooled, pool
+from lensmodel.model.wavefront.joint_kernels import Pooled, pool_samples
 from lensmodel.model.wavefront.likelihood import surprise
 from lensmodel.optics.wavefront import Wavefront
 
@@ -126,7 +126,7 @@ class Physics:
         trusted = [samples[i].with_weight(float(votes[i])) for i in voting]
         # spectra of one focal length alone are solved together
         several = focal_range(trusted) > ONE_FOCAL_LENGTH
-        pooled = None if several else pool(trusted, on_step, former)
+        pooled = None if several else pool_samples(trusted, on_step, former)
         if pooled is not None and _suits(pooled, trusted):
             side = max(s.kernel.shape[0] for s in samples)
             empty = np.empty((0, 2)), np.empty((0, len(scale))), scale, np.empty((0, side**2))
@@ -143,7 +143,7 @@ class Physics:
         if front is None:
             return None
         on_step(1, _STEPS)
-        kept = sorted(known[id(s)] for s in spread([samples[i] for i in voting], _MOST))
+        kept = sorted(known[id(s)] for s in spread_samples([samples[i] for i in voting], _MOST))
         chosen = np.array(kept, dtype=np.intp)
         nodes = [samples[i] for i in kept]
         side = max(s.kernel.shape[0] for s in samples)

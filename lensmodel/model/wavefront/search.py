@@ -99,8 +99,8 @@ def held_out(groups: Sequence[Group], front: Wavefront) -> float:
     """
     total = 0.0
     for half in (0, 1):
-        seen = [powers(group) for k, group in enumerate(groups) if k % 2 == half]
-        others = [powers(group) for k, group in enumerate(groups) if k % 2 != half]
+        seen = [without_phases(group) for k, group in enumerate(groups) if k % 2 == half]
+        others = [without_phases(group) for k, group in enumerate(groups) if k % 2 != half]
         if seen and others:
             total += held_cost(others, fit_spectra(seen, front, rounds=_HELD_ROUNDS).front)
     return total
@@ -143,7 +143,7 @@ def view(group: Group) -> PatchView:
     return PatchView(head.position, head.settings, head.photo, scene, phases)
 
 
-def powers(group: Group) -> PatchView:
+def without_phases(group: Group) -> PatchView:
     """The same without phases: a lens and its negative are one minimum to a search."""
     return replace(view(group), phases={})
 
@@ -154,7 +154,7 @@ def _in_green(groups: Sequence[Group], begins: Sequence[Wavefront], steps: _Step
     Where the pupil is round, a wavefront whose coma is negated has the same spectra as before. Only the
     cat's eye tells the two apart, so that both are tried.
     """
-    green = [powers({"g": group["g"]}) for group in groups if "g" in group][:_MEDIUM_PLACES]
+    green = [without_phases({"g": group["g"]}) for group in groups if "g" in group][:_MEDIUM_PLACES]
     coarse = []
     for begin in begins:
         coarse.append(
@@ -171,7 +171,7 @@ def _in_green(groups: Sequence[Group], begins: Sequence[Wavefront], steps: _Step
 
 def _fine(groups: Sequence[Group], front: Wavefront, steps: _Steps) -> PooledFit:
     """Fit all colours of patches."""
-    fit = fit_spectra([powers(group) for group in groups], front, rounds=_FINE_ROUNDS)
+    fit = fit_spectra([without_phases(group) for group in groups], front, rounds=_FINE_ROUNDS)
     steps.add(_FINE_ROUNDS)
     return fit
 
@@ -183,7 +183,7 @@ def _decentred(groups: Sequence[Group], front: Wavefront) -> Wavefront:
     aberration theory: K. Thompson, "Description of the third-order optical aberrations of near-circular pupil
     optical systems without symmetry", JOSA A 22, 2005).
     """
-    views = [powers(group) for group in groups]
+    views = [without_phases(group) for group in groups]
     angles = 2.0 * math.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
     moved = [_moved(front, _ASIDE * math.cos(angle), _ASIDE * math.sin(angle)) for angle in angles]
     return min(moved, key=lambda one: fit_spectra(views, one, rounds=0).cost)

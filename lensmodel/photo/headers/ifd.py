@@ -36,7 +36,7 @@ _MAGIC: Final = {42: False, 43: True, 0x55: False, 0x4F52: False, 0x5352: False}
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class IfdEntry:
     """One tag of a directory; the value is read from the buffer when asked for."""
 
     kind: int
@@ -92,7 +92,7 @@ class Entry:
             return raw.decode("latin-1").strip()
 
 
-Directory: TypeAlias = Mapping[int, Entry]
+Directory: TypeAlias = Mapping[int, IfdEntry]
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +135,7 @@ class TiffReader:
             return None
         return cls(buffer, base, order, struct.unpack(order + "Q", head[8:16])[0], big=True)
 
-    def directory(self, offset: int) -> tuple[dict[int, Entry], int]:
+    def directory(self, offset: int) -> tuple[dict[int, IfdEntry], int]:
         """Read the directory at `offset` from `base`; its tags and the offset of the next, or 0."""
         count_size, entry_size, word = (8, 20, "Q") if self.big else (2, 12, "I")
         word_size = struct.calcsize("=" + word)
@@ -144,7 +144,7 @@ class TiffReader:
         if len(head) < count_size:
             return {}, 0
         count = struct.unpack(self.order + ("Q" if self.big else "H"), head)[0]
-        entries: dict[int, Entry] = {}
+        entries: dict[int, IfdEntry] = {}
         at = start + count_size
         for _ in range(min(count, MAX_ENTRIES)):
             raw = bytes(self.buffer[at : at + entry_size])
@@ -156,13 +156,13 @@ class TiffReader:
                 inline = at + 4 + word_size
                 far = self.base + struct.unpack(self.order + word, raw[-word_size:])[0]
                 place = inline if size <= word_size else far
-                entries.setdefault(tag, Entry(kind, number, place, self.order, self.buffer))
+                entries.setdefault(tag, IfdEntry(kind, number, place, self.order, self.buffer))
             at += entry_size
         tail = bytes(self.buffer[at : at + word_size])
         complete = count <= MAX_ENTRIES and len(tail) == word_size
         return entries, struct.unpack(self.order + word, tail)[0] if complete else 0
 
-    def chain(self, first: int | None = None) -> Iterator[dict[int, Entry]]:
+    def chain(self, first: int | None = None) -> Iterator[dict[int, IfdEntry]]:
         """Yield the directories linked from the first one; a loop ends the chain."""
         offset, seen = self.first if first is None else first, set[int]()
         while offset and offset not in seen and len(seen) < MAX_DIRECTORIES:
@@ -171,7 +171,7 @@ class TiffReader:
             if entries:
                 yield entries
 
-    def below(self, entry: Entry | None) -> dict[int, Entry]:
+    def below(self, entry: IfdEntry | None) -> dict[int, IfdEntry]:
         """Read the directory that a pointer tag (EXIF, maker note part) points to; empty without one."""
         offset = None if entry is None else entry.integer()
         return {} if offset is None else self.directory(offset)[0]

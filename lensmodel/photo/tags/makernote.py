@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from lensmodel.photo.headers.ifd import Entry, TiffReader
+from lensmodel.photo.headers.ifd import IfdEntry, TiffReader
 
 _CENTIMETRES_INFINITY: Final = 65535  # Canon's word for infinity
 
@@ -29,14 +29,14 @@ class MakerNote:
     iso: float | None = None
 
 
-def read_maker_note(maker: str, note: Entry | None, reader: TiffReader) -> MakerNote:
+def read_maker_note(maker: str, note: IfdEntry | None, reader: TiffReader) -> MakerNote:
     """Read the maker note of EXIF tag 0x927C.
 
     Parameters
     ----------
     maker : str
         EXIF Make; decides the layout where the note carries no name of its own.
-    note : Entry or None
+    note : IfdEntry or None
         The tag.
     reader : TiffReader
         The structure that the tag lies in; Canon's and Panasonic's offsets count from its base.
@@ -51,11 +51,11 @@ def read_maker_note(maker: str, note: Entry | None, reader: TiffReader) -> Maker
     return by_maker(note, reader) if by_maker else MakerNote()
 
 
-def _text(entry: Entry | None) -> str | None:
+def _text(entry: IfdEntry | None) -> str | None:
     return None if entry is None else entry.text() or None
 
 
-def _canon(note: Entry, reader: TiffReader) -> MakerNote:
+def _canon(note: IfdEntry, reader: TiffReader) -> MakerNote:
     reader = _unmoved(note, reader)
     tags, _ = reader.directory(note.offset - reader.base)
     serial = None
@@ -68,7 +68,7 @@ def _canon(note: Entry, reader: TiffReader) -> MakerNote:
     return MakerNote(lens_model=_text(tags.get(0x0095)), lens_serial=serial, focus_m=focus)
 
 
-def _unmoved(note: Entry, reader: TiffReader) -> TiffReader:
+def _unmoved(note: IfdEntry, reader: TiffReader) -> TiffReader:
     """Correct the base of the offsets where a program moved the note without rewriting them.
 
     Canon ends its notes with a TIFF header of its own byte order whose offset is the note's
@@ -80,7 +80,7 @@ def _unmoved(note: Entry, reader: TiffReader) -> TiffReader:
     return TiffReader(reader.buffer, note.offset - footer.first, footer.order, footer.first)
 
 
-def _canon_focus(entry: Entry | None, index: int) -> float | None:
+def _canon_focus(entry: IfdEntry | None, index: int) -> float | None:
     """Geometric mean of the far and near bounds that Canon gives, in metres; `None` without both."""
     raw = b"" if entry is None else entry.raw()[2 * index : 2 * index + 4]
     if entry is None or len(raw) < 4:
@@ -91,7 +91,7 @@ def _canon_focus(entry: Entry | None, index: int) -> float | None:
     return float("inf") if far == _CENTIMETRES_INFINITY else float(math.sqrt(far * near)) / 100.0
 
 
-def _olympus(note: Entry, reader: TiffReader) -> MakerNote:
+def _olympus(note: IfdEntry, reader: TiffReader) -> MakerNote:
     head = bytes(reader.buffer[note.offset : note.offset + 16])
     if head.startswith(b"OLYMP\0"):  # old: offsets count from the file's TIFF header
         inner, first = reader, note.offset - reader.base + 8
@@ -123,7 +123,7 @@ def _metres(millimetres: int) -> float | None:
     return float("inf") if millimetres == 0xFFFFFFFF else millimetres / 1000.0
 
 
-def _olympus_part(reader: TiffReader, entry: Entry | None) -> dict[int, Entry]:
+def _olympus_part(reader: TiffReader, entry: IfdEntry | None) -> dict[int, IfdEntry]:
     """Read a sub-directory, given by a pointer or, in older notes, in place."""
     if entry is None:
         return {}
@@ -132,7 +132,7 @@ def _olympus_part(reader: TiffReader, entry: Entry | None) -> dict[int, Entry]:
     return reader.directory(entry.offset - reader.base)[0]
 
 
-def _nikon(note: Entry, reader: TiffReader) -> MakerNote:
+def _nikon(note: IfdEntry, reader: TiffReader) -> MakerNote:
     inner = TiffReader.open(reader.buffer, note.offset + 10)
     if inner is None:
         return MakerNote()
@@ -140,22 +140,22 @@ def _nikon(note: Entry, reader: TiffReader) -> MakerNote:
     return MakerNote(body_serial=_text(tags.get(0x001D)), iso=_nikon_iso(tags.get(0x0002)))
 
 
-def _nikon_first(note: Entry, reader: TiffReader) -> MakerNote:
+def _nikon_first(note: IfdEntry, reader: TiffReader) -> MakerNote:
     tags, _ = reader.directory(note.offset - reader.base)
     return MakerNote(iso=_nikon_iso(tags.get(0x0002)))
 
 
-def _nikon_iso(entry: Entry | None) -> float | None:
+def _nikon_iso(entry: IfdEntry | None) -> float | None:
     values = () if entry is None else entry.numbers()
     return values[1] if len(values) == 2 and values[1] > 0 else None
 
 
-def _panasonic(note: Entry, reader: TiffReader) -> MakerNote:
+def _panasonic(note: IfdEntry, reader: TiffReader) -> MakerNote:
     tags, _ = reader.directory(note.offset - reader.base + 12)
     return MakerNote(lens_model=_text(tags.get(0x0051)), lens_serial=_text(tags.get(0x0052)))
 
 
-_Parser = Callable[[Entry, TiffReader], MakerNote]
+_Parser = Callable[[IfdEntry, TiffReader], MakerNote]
 _BY_MAGIC: Final[tuple[tuple[bytes, _Parser], ...]] = (
     (b"OLYMP", _olympus),
     (b"OM SYSTEM\0\0\0", _olympus),

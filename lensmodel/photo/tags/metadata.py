@@ -20,7 +20,7 @@ from typing import Final
 
 from lensmodel.photo.headers.ciff import CiffShot
 from lensmodel.photo.headers.header import Header
-from lensmodel.photo.headers.ifd import Directory, Entry
+from lensmodel.photo.headers.ifd import Directory, IfdEntry
 from lensmodel.photo.headers.opening import opened_header
 from lensmodel.photo.tags.makernote import MakerNote, read_maker_note
 from lensmodel.photo.tags.xmp import read_xmp
@@ -132,7 +132,7 @@ class _Exif:
 
     @classmethod
     def of(cls, header: Header) -> _Exif:
-        tags: dict[int, Entry] = {}
+        tags: dict[int, IfdEntry] = {}
         block = 0
         for index, reader in enumerate(header.tiff):
             main, _ = reader.directory(reader.first)

@@ -25,7 +25,7 @@ from app.runtime.settings import Settings
 from app.schemas import Region
 from app.store import LensName, Store
 from app.store.corrections import Result
-from app.store.photo_steps import folder_of
+from app.store.photo_steps import photo_folder
 from lensmodel.core.types import ignore_step
 from lensmodel.photo import upright
 from lensmodel.photo.dng import write_bayer_dng
@@ -49,7 +49,7 @@ def test_a_preview_and_an_r_map_come_from_the_blobs_upright_in_any_size(
     tasks.develop({"path": str(tmp_path / "p.jpg"), "max_megapixels": 1.0}, tmp_path, ignore_step)
     photo = steps.counted()
     for name in (PREVIEW, R_MAP):
-        Storage(settings.storage).put_file(f"{folder_of(photo)}{name}", tmp_path / name)
+        Storage(settings.storage).put_file(f"{photo_folder(photo)}{name}", tmp_path / name)
 
     for name in (PREVIEW, R_MAP):
         assert opened(client, f"/ui/photos/{photo.public_id}/{name}").size == (90, 120)
@@ -163,7 +163,7 @@ def test_a_photo_is_glanced_at_before_it_is_developed(
     Image.fromarray(a_picture()).save(tmp_path / "p.jpg", exif=exif)
     arguments = {"path": str(tmp_path / "p.jpg"), "kind": "jpeg", "orientation": 6}
     tasks.glance(arguments, tmp_path, ignore_step)
-    Storage(settings.storage).put_file(f"{folder_of(photo)}{GLANCE}", tmp_path / GLANCE)
+    Storage(settings.storage).put_file(f"{photo_folder(photo)}{GLANCE}", tmp_path / GLANCE)
 
     assert opened(client, address).size == (258, 480)
 

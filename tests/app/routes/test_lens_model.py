@@ -14,7 +14,7 @@ from app.client_async import AsyncClient
 from app.http.model_cache import ModelCache
 from app.runtime.settings import Settings
 from app.store import Store
-from app.ways import way_of
+from app.ways import configured_way
 from lensmodel.workflow.ways import WAYS
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
@@ -111,8 +111,9 @@ def test_a_model_in_memory_does_not_survive_a_change(store: Store, steps: Steps)
 def test_the_settings_of_the_service_decide_for_the_default_model_only(settings: Settings) -> None:
     chosen = settings.model_copy(update={"estimator": "whittle", "kernel_size": 21})
 
-    assert (way_of(chosen, "default").estimator, way_of(chosen, "default").kernel_size) == ("whittle", 21)
-    assert way_of(chosen, "paper") == WAYS["paper"]
+    default = configured_way(chosen, "default")
+    assert (default.estimator, default.kernel_size) == ("whittle", 21)
+    assert configured_way(chosen, "paper") == WAYS["paper"]
 
 
 def test_photos_of_the_paper_are_corrected_its_way_unless_asked_otherwise(

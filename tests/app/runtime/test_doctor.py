@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from app.blobs.storage import Storage
 from app.cli import app
-from app.runtime.doctor import Report, examine
+from app.runtime.doctor import DoctorReport, examine
 from app.runtime.settings import Settings
 from app.store import Store
 from app.store.access.owners import now
@@ -38,15 +38,15 @@ def sound(settings: Settings, store: Store, steps: Any) -> list[PhotoRow]:
 
 
 @pytest.fixture
-def examined(settings: Settings, store: Store) -> Callable[..., Report]:
-    def run(**options: bool) -> Report:
+def examined(settings: Settings, store: Store) -> Callable[..., DoctorReport]:
+    def run(**options: bool) -> DoctorReport:
         return examine(settings, store, Storage(settings.storage), **options)
 
     return run
 
 
 def test_a_sound_installation_passes_every_check(
-    sound: list[PhotoRow], examined: Callable[..., Report]
+    sound: list[PhotoRow], examined: Callable[..., DoctorReport]
 ) -> None:
     report = examined()
 
@@ -54,7 +54,7 @@ def test_a_sound_installation_passes_every_check(
     assert len(report.checks) == len(INVARIANTS) + 2
 
 
-def test_an_empty_installation_is_sound(store: Store, examined: Callable[..., Report]) -> None:
+def test_an_empty_installation_is_sound(store: Store, examined: Callable[..., DoctorReport]) -> None:
     assert examined(deep=True).findings == ()
 
 
@@ -105,7 +105,7 @@ MENDED = {"totals", "votes", "progress"}
 
 @pytest.mark.parametrize("name", DAMAGES)
 def test_damage_to_the_tables_is_found_and_what_can_be_is_mended(
-    name: str, sound: list[PhotoRow], store: Store, examined: Callable[..., Report]
+    name: str, sound: list[PhotoRow], store: Store, examined: Callable[..., DoctorReport]
 ) -> None:
     check, damage = DAMAGES[name]
     with store.database.writing() as session:
@@ -118,7 +118,7 @@ def test_damage_to_the_tables_is_found_and_what_can_be_is_mended(
 
 
 def test_a_sample_of_an_excluded_photo_is_taken_out_and_the_model_learns_anew(
-    sound: list[PhotoRow], store: Store, steps: Any, examined: Callable[..., Report]
+    sound: list[PhotoRow], store: Store, steps: Any, examined: Callable[..., DoctorReport]
 ) -> None:
     lens_id = steps.lens_id(sound[0])
     before = store.samples.of_lens(lens_id)
@@ -134,7 +134,7 @@ def test_a_sample_of_an_excluded_photo_is_taken_out_and_the_model_learns_anew(
 
 
 def test_a_missing_or_torn_photo_is_found(
-    sound: list[PhotoRow], settings: Settings, examined: Callable[..., Report]
+    sound: list[PhotoRow], settings: Settings, examined: Callable[..., DoctorReport]
 ) -> None:
     storage = Storage(settings.storage)
     storage.delete(f"photos/{sound[0].public_id}/")
@@ -149,7 +149,7 @@ def test_a_missing_or_torn_photo_is_found(
 
 
 def test_blobs_that_nobody_names_are_given_up_for_deletion(
-    sound: list[PhotoRow], settings: Settings, store: Store, examined: Callable[..., Report]
+    sound: list[PhotoRow], settings: Settings, store: Store, examined: Callable[..., DoctorReport]
 ) -> None:
     Storage(settings.storage).put("photos/NOBODY/original", b"x")
     assert [finding.subject for finding in examined().open] == ["photos/NOBODY/"]
@@ -161,7 +161,7 @@ def test_blobs_that_nobody_names_are_given_up_for_deletion(
 
 
 def test_changed_bytes_are_found_when_all_is_read(
-    sound: list[PhotoRow], store: Store, examined: Callable[..., Report]
+    sound: list[PhotoRow], store: Store, examined: Callable[..., DoctorReport]
 ) -> None:
     with store.database.writing() as session:
         session.execute(update(SampleRow).where(SampleRow.photo_id == sound[0].id).values(psf=b"\0" * 900))
@@ -172,7 +172,7 @@ def test_changed_bytes_are_found_when_all_is_read(
 
 
 def test_work_that_nobody_does_is_found(
-    steps: Any, examined: Callable[..., Report], settings: Settings
+    steps: Any, examined: Callable[..., DoctorReport], settings: Settings
 ) -> None:
     photo = steps.receive()
     Storage(settings.storage).put(photo.blob_key, b"x" * photo.byte_size)

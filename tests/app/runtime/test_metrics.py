@@ -73,8 +73,8 @@ def test_requests_and_psf_queries_are_counted_by_route_and_never_by_id(
 def test_what_workers_leave_in_files_is_told_by_the_api_and_added_up(
     client: TestClient, settings: Settings
 ) -> None:
-    with accounted("photo", ("p", 1)) as account:
-        account.retries(OutageError())
+    with accounted("photo", ("p", 1)) as record:
+        record.retries(OutageError())
     own = numbers(metrics.generate_latest(metrics.WORKER).decode())
     for worker in ("one", "two"):
         metrics.leave(settings.data_dir, worker)

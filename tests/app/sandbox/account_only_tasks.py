@@ -8,13 +8,13 @@ from pathlib import Path
 from hostile_tasks import TASKS
 
 from app.sandbox import confine
-from app.sandbox.account import Account
+from app.sandbox.account import SystemAccount
 
 __all__ = ["TASKS"]
 
 
 def _only_account(
-    writes: Sequence[Path], reads: Iterable[Path] = (), account: Account | None = None
+    writes: Sequence[Path], reads: Iterable[Path] = (), account: SystemAccount | None = None
 ) -> list[str]:
     assert account is not None
     account.become()

@@ -14,7 +14,7 @@ from lensmodel.core import loops
 from lensmodel.core.psf import as_kernel, gaussian
 from lensmodel.core.types import NoiseModel, Planes
 from lensmodel.correction.audit import CHECKS, Evidence, audit_tile
-from lensmodel.correction.audit.check import Pair
+from lensmodel.correction.audit.check import TilePair
 from lensmodel.correction.blur import UniformBlur
 
 NOISE = NoiseModel(1 / 20_000, 0.001**2)
@@ -50,7 +50,7 @@ def test_both_engines_find_the_same(shape: tuple[int, int]) -> None:
     photo, made = pair_of(shape)
     known = evidence(shape)
 
-    plain, quick = (Pair.of(photo, made, known, engine=name) for name in ("numpy", "auto"))
+    plain, quick = (TilePair.of(photo, made, known, engine=name) for name in ("numpy", "auto"))
 
     assert quick.loops is not None
     for name, check in CHECKS.items():
@@ -64,10 +64,10 @@ def test_both_engines_know_a_lateral_shift() -> None:
     photo, made = pair_of((64, 72))
     known = evidence((64, 72), offset=(0.7, -1.6))
 
-    plain, quick = (CHECKS["re-blur"](Pair.of(photo, made, known, engine=e)) for e in ("numpy", "auto"))
+    plain, quick = (CHECKS["re-blur"](TilePair.of(photo, made, known, engine=e)) for e in ("numpy", "auto"))
 
     np.testing.assert_allclose(quick.values, plain.values, rtol=1e-3)
-    without = CHECKS["re-blur"](Pair.of(photo, made, evidence((64, 72))))
+    without = CHECKS["re-blur"](TilePair.of(photo, made, evidence((64, 72))))
     assert not np.allclose(quick.values, without.values, rtol=1e-2)
 
 
@@ -89,7 +89,7 @@ def test_the_audit_runs_where_numba_is_missing(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
     loops._load.cache_clear()
     try:
-        pair = Pair.of(photo, made, evidence((48, 48)))
+        pair = TilePair.of(photo, made, evidence((48, 48)))
         found = audit_tile(photo, made, evidence((48, 48)))
     finally:
         monkeypatch.undo()

@@ -17,7 +17,7 @@ from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.blur.compiled_uniform import CompiledBlur
 from lensmodel.correction.deconvolver import Sensor
 from lensmodel.correction.engine import compiled
-from lensmodel.correction.lights.clipped import Region, regions
+from lensmodel.correction.lights.clipped import ClippedRegion, regions
 from lensmodel.correction.lights.saturation import Lights, compact
 
 REACH = 4
@@ -33,7 +33,7 @@ def lamps(*places: tuple[int, int], shape: tuple[int, int] = (160, 200), radius:
     return light.astype(np.float32)
 
 
-def answered(found: list[Region], shape: tuple[int, int]) -> np.ndarray:
+def answered(found: list[ClippedRegion], shape: tuple[int, int]) -> np.ndarray:
     """How many regions answer for each pixel."""
     count = np.zeros(shape, dtype=int)
     for region in found:
@@ -41,7 +41,7 @@ def answered(found: list[Region], shape: tuple[int, int]) -> np.ndarray:
     return count
 
 
-def owned(found: list[Region], shape: tuple[int, int]) -> np.ndarray:
+def owned(found: list[ClippedRegion], shape: tuple[int, int]) -> np.ndarray:
     """How many regions own the light of each pixel of the latent plane."""
     count = np.zeros((shape[0] + 2 * REACH, shape[1] + 2 * REACH), dtype=int)
     for region in found:

@@ -11,7 +11,7 @@ from lensmodel.core.geometry import Frame
 from lensmodel.core.types import NoiseModel, Plane, ignore_step
 from lensmodel.estimation.patches import select
 from lensmodel.estimation.patches.blocks import measure_blocks
-from lensmodel.estimation.patches.details import Details, joined, look_at
+from lensmodel.estimation.patches.details import Details, joined_details, look_at
 from lensmodel.estimation.patches.good_regions import FEATURES, GoodRegionsSelector, TreeEnsemble, features_of
 from lensmodel.estimation.patches.windows import Windows, windows_of
 
@@ -36,7 +36,7 @@ def looked_at(plane: Plane) -> tuple[Windows, Details]:
     windows = windows_of(blocks, Frame(*plane.shape), NOISE)
     size = windows.size
     corners = list(zip(windows.rows.tolist(), windows.cols.tolist(), strict=True))
-    return windows, joined(
+    return windows, joined_details(
         [look_at(plane[r : r + size, c : c + size], SIGMA, 1.0, (r, c)) for r, c in corners]
     )
 

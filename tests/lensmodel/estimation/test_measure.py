@@ -17,11 +17,11 @@ from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import as_kernel, centred, distance, gaussian, resized
 from lensmodel.core.types import Kernel, LensSettings, NoiseModel
 from lensmodel.estimation import measure
-from lensmodel.estimation.measure.edges import Edges, constrained
+from lensmodel.estimation.measure.edges import SlantedEdges, constrained
 from lensmodel.estimation.measure.page import TargetPage
-from lensmodel.estimation.measure.pair import Pair
+from lensmodel.estimation.measure.pair import AperturePair
 from lensmodel.estimation.measure.placed_page import PlacedPage
-from lensmodel.estimation.measure.point_detection import find_lights, isolated
+from lensmodel.estimation.measure.point_detection import find_lights, isolated_lights
 from lensmodel.estimation.measure.points import Points
 from lensmodel.estimation.measure.solve import solve
 from lensmodel.estimation.measure.target import Target
@@ -250,7 +250,7 @@ def test_lights_beside_others_are_left_out() -> None:
     plane += np.random.default_rng(0).normal(0, 1e-4, plane.shape)
     lights = find_lights(plane, "own")
     assert len(lights) == 3
-    assert [(round(one.row), round(one.col)) for one in isolated(lights, 21)] == [(80, 120)]
+    assert [(round(one.row), round(one.col)) for one in isolated_lights(lights, 21)] == [(80, 120)]
 
 
 def test_an_unknown_detector_is_refused() -> None:
@@ -266,7 +266,7 @@ def test_a_pair_gives_the_kernel_of_the_open_photo() -> None:
     sharp = at_f8()
     moved = scenes.moved_scene(np.stack([scene] * 3).astype(np.float32), (0.4, -0.7), 0.05)[1]
     opened, closed = photo_of(scene, lopsided()), photo_of(moved, sharp, 1, 8.0)
-    found = Pair(across=2, down=1, side=104).measure([opened, closed], size=21, channels=("g",))
+    found = AperturePair(across=2, down=1, side=104).measure([opened, closed], size=21, channels=("g",))
     assert found
     assert np.median([distance(one.kernel, lopsided()).rel_l2 for one in found]) < 0.08
 
@@ -287,7 +287,7 @@ def test_what_demosaicing_makes_up_does_not_come_into_the_kernel_of_a_pair(
     pair = [demosaiced(photo_of(scene, lopsided())), demosaiced(photo_of(moved, sharp, 1, 8.0))]
 
     def error() -> float:
-        found = Pair(across=2, down=1, side=128).measure(pair, size=21, channels=("g",))
+        found = AperturePair(across=2, down=1, side=128).measure(pair, size=21, channels=("g",))
         return float(np.median([distance(one.kernel, lopsided()).rel_l2 for one in found]))
 
     now = error()
@@ -320,7 +320,7 @@ def test_a_pair_is_not_misled_by_detail_that_passed_for_noise() -> None:
         replace(photo, noise=said, sensor_noise=said)
         for photo in (photo_of(scene, lopsided()), photo_of(scene, sharp, 1, 8.0))
     ]
-    found = Pair(across=2, down=1, side=104).measure(pair, size=21, channels=("g",))
+    found = AperturePair(across=2, down=1, side=104).measure(pair, size=21, channels=("g",))
     assert np.median([distance(one.kernel, lopsided()).rel_l2 for one in found]) < 0.1
 
 
@@ -328,15 +328,15 @@ def test_a_pair_of_one_aperture_is_refused() -> None:
     grey = np.full((SHAPE[0] + 2 * scenes.MARGIN, SHAPE[1] + 2 * scenes.MARGIN), 0.4)
     photo = photo_of(grey, lopsided())
     with pytest.raises(InvalidInputError, match="two stops"):
-        Pair().measure([photo, photo], size=21)
+        AperturePair().measure([photo, photo], size=21)
     with pytest.raises(InvalidInputError, match="takes 2 photos"):
-        Pair().measure([photo], size=21)
+        AperturePair().measure([photo], size=21)
 
 
 def test_edges_anywhere_give_a_constraint_with_both_widths() -> None:
     kernel = gaussian(21, np.array([[3.0, 0.0], [0.0, 0.8]]))
     photo = photo_of(scenes.board_scene(110.0, SHAPE, scenes.Setup(distortion=0.0))[1], kernel)
-    found = Edges().measure([photo], size=21, channels=("g",))
+    found = SlantedEdges().measure([photo], size=21, channels=("g",))
     assert found
     seen = np.median([distance(one.kernel, kernel).rel_l2 for one in found])
     assert seen < 0.2

@@ -221,7 +221,7 @@ def test_progress_is_reported_to_the_end(part: Plane) -> None:
 
 
 def test_strips_leave_no_trace_in_the_sums(photo: Plane, monkeypatch: pytest.MonkeyPatch) -> None:
-    def measured(pixels: int) -> blocks.Blocks:
+    def measured(pixels: int) -> blocks.BlockSums:
         monkeypatch.setattr(blocks, "_STRIP_PIXELS", pixels)
         return blocks.measure_blocks(photo[:300, :400], NOISE, 32, 1.0, ignore_step)
 

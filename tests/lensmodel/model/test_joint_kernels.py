@@ -17,10 +17,10 @@ from lensmodel.core.spectrum import RINGS, SECTORS, PatchSpectrum, bin_frequenci
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensSettings, NoiseModel
 from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
 from lensmodel.model.modes import WAVEFRONT_SHARE, Mixture
-from lensmodel.model.trust.expected_error import Evidence, joint_error
+from lensmodel.model.trust.expected_error import SampleEvidence, joint_error
 from lensmodel.model.wavefront import from_kernels, joint_kernels, search
 from lensmodel.model.wavefront.from_spectra import PatchView, PooledFit, fit_spectra
-from lensmodel.model.wavefront.joint_kernels import MIN_PLACES, Pooled, _by_aperture, pool
+from lensmodel.model.wavefront.joint_kernels import MIN_PLACES, Pooled, _by_aperture, pool_samples
 from lensmodel.model.wavefront.scene_view import Floats, SceneView
 from lensmodel.model.wavefront.search import Group, pairs
 from lensmodel.optics.aberration_prior import ABERRATIONS, corner_ratio, unlikeliness
@@ -370,8 +370,8 @@ def test_what_speaks_against_a_lens_changes_as_its_slope_says() -> None:
 
 
 def test_few_patches_are_not_pooled(known: list[PsfSample]) -> None:
-    assert pool(known[: len(CHANNELS) * (MIN_PLACES - 1)]) is None
-    assert pool([replace(s, spectrum=None) for s in known]) is None
+    assert pool_samples(known[: len(CHANNELS) * (MIN_PLACES - 1)]) is None
+    assert pool_samples([replace(s, spectrum=None) for s in known]) is None
 
 
 @pytest.mark.slow
@@ -463,11 +463,11 @@ def test_without_an_earlier_fit_single_photos_are_fitted_first(
     monkeypatch.setattr(joint_kernels, "held_out", lambda *_: 0.0)
     two = [*known, *(replace(s, photo="another") for s in known)]
 
-    found = pool(two)
+    found = pool_samples(two)
     assert found is not None
     assert begun == [0, 0, 2]  # each photo alone, then both beginning with them
 
-    pool(two, known=[found.front])
+    pool_samples(two, known=[found.front])
     assert begun[3:] == [1]
 
 
@@ -501,7 +501,7 @@ def test_measured_kernels_leave_a_wavefront_no_say(known: list[PsfSample], warm:
 
 
 def test_the_error_to_expect_grows_with_what_kernels_and_wavefront_differ_by() -> None:
-    evidence = Evidence(0.01, 0.16, 2.0, 0.3, extrapolated=False, usual=0.1)
+    evidence = SampleEvidence(0.01, 0.16, 2.0, 0.3, extrapolated=False, usual=0.1)
 
     def told(apart: float, r: float = 0.5) -> float:
         one = np.ones(1)
@@ -521,7 +521,7 @@ def test_unknown_pitch_is_taken_as_a_usual_one_not_as_wide_kernels_suggest(
         monkeypatch.setattr(search, rounds, 1)  # the pitch is chosen before the first of them,
     monkeypatch.setattr(from_kernels, "_FINE_ROUNDS", 2)  # and kernels have had their say after two
     unknown = [replace(s, kernel=gaussian(31, 4.0 * np.eye(2)), pixel_pitch_um=None) for s in known]
-    found = pool(unknown)
+    found = pool_samples(unknown)
 
     assert found is not None
     assert not found.diffraction_known

@@ -15,7 +15,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample, as_kernel, centroid, distance
 from lensmodel.core.types import FieldPosition, Kernel, LensSettings
 from lensmodel.model import LensModel, ModelSettings
-from lensmodel.model.wavefront.from_kernels import fit_wavefront, side_of_light, spread
+from lensmodel.model.wavefront.from_kernels import fit_wavefront, side_of_light, spread_samples
 from lensmodel.optics.pupil import TERMS, PupilGrid
 from lensmodel.optics.wavefront import Wavefront
 from lensmodel.simulate import draw_lens
@@ -117,7 +117,7 @@ def test_no_sample_is_chosen_twice_where_photos_share_their_places() -> None:
         for i in range(10)
     ]
 
-    chosen = spread(samples, 24)
+    chosen = spread_samples(samples, 24)
 
     assert len({id(s) for s in chosen}) == 24
     assert len({s.position for s in chosen[:10]}) == 10

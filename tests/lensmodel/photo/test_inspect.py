@@ -24,7 +24,7 @@ from lensmodel.core.errors import (
     UnsupportedFormatError,
 )
 from lensmodel.photo.dng import write_bayer_dng, write_linear_dng
-from lensmodel.photo.headers.ifd import Entry
+from lensmodel.photo.headers.ifd import IfdEntry
 
 
 def chunk(name: bytes, body: bytes) -> bytes:
@@ -207,7 +207,7 @@ def test_a_tiff_of_a_hundred_pictures_is_refused(tmp_path: Path) -> None:
 
 
 def test_one_number_of_a_huge_tag_unpacks_no_other() -> None:
-    entry = Entry(kind=5, count=1 << 20, offset=0, order="<", buffer=struct.pack("<II", 7, 2) * (1 << 20))
+    entry = IfdEntry(kind=5, count=1 << 20, offset=0, order="<", buffer=struct.pack("<II", 7, 2) * (1 << 20))
     tracemalloc.start()
     found = entry.number()
     _, peak = tracemalloc.get_traced_memory()

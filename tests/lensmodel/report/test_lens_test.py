@@ -24,7 +24,7 @@ from lensmodel.report.documents import comparison_html, to_html
 from lensmodel.report.lens_test import LensTest, lens_test, zone_means
 from lensmodel.report.pdf import comparison_pdf, to_pdf
 from lensmodel.report.tables import to_csv
-from lensmodel.report.units import Sensor
+from lensmodel.report.units import SensorGeometry
 
 QUICK = ModelSettings(r=0.3, phi=0.8, mirror=0.0, method="nadaraya-watson", robust=False)
 SIZE = 15
@@ -74,13 +74,13 @@ def soft() -> LensTest:
 
 
 def test_a_figure_is_told_in_each_unit_and_never_beyond_what_a_sensor_shows() -> None:
-    sensor = Sensor(5.0, 4000)
+    sensor = SensorGeometry(5.0, 4000)
 
     assert [sensor.words(0.2, unit) for unit in sensor.units] == [".200", "800", "40"]
     assert sensor.words(1.0) == "at least .500"
     assert sensor.words(1.0, "lp/mm") == "at least 100"
-    assert Sensor().units == ("c/px",)
-    assert Sensor().words(0.2, "lp/mm") == "unknown"
+    assert SensorGeometry().units == ("c/px",)
+    assert SensorGeometry().words(0.2, "lp/mm") == "unknown"
 
 
 @pytest.mark.parametrize(

@@ -120,7 +120,7 @@ def test_cells_hold_every_patch_once_largest_first() -> None:
     place = FieldPosition(0.1, 0.0)
     patches = tuple(Patch(i, i, 64, place, 1.0, cell) for i, cell in enumerate((2, 1, 2, 0, 2, 1)))
 
-    groups = pipeline.cells(Selection(patches, ()))
+    groups = pipeline.patches_by_cell(Selection(patches, ()))
 
     assert [len(group) for group in groups] == [3, 2, 1]
     assert sorted(p.row for group in groups for p in group) == list(range(6))

@@ -1,4 +1,4 @@
-"""What all checks need of a tile, compiled; see `lensmodel.correction.audit.check.Pair`."""
+"""What all checks need of a tile, compiled; see `lensmodel.correction.audit.check.TilePair`."""
 
 from __future__ import annotations
 

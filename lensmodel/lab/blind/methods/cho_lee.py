@@ -23,9 +23,9 @@ from scipy import fft
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
 from lensmodel.estimation import PsfEstimate
 from lensmodel.lab.blind.steps.gradients import (
-    Canvas,
+    DerivativePair,
     KernelEquations,
-    Pair,
+    PeriodicPlane,
     across,
     bilateral,
     disagreement,
@@ -94,7 +94,7 @@ class _Rounds:
     """Prediction, kernel, deconvolution; the last pairs stay for the verdict."""
 
     settings: ChoLee
-    pairs: tuple[Pair, ...] = ()
+    pairs: tuple[DerivativePair, ...] = ()
     side: int = 0
 
     def __call__(self, level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:
@@ -110,7 +110,7 @@ class _Rounds:
                 thresholds = [
                     oriented_threshold(*e, least, inside(e[0].shape, level.side // 2 + 1)) for e in edges
                 ]
-            pairs: list[Pair] = []
+            pairs: list[DerivativePair] = []
             for edge, view, least_slope in zip(edges, level.views, thresholds, strict=True):
                 pairs += _pairs(edge, view.y, fade * least_slope)
             self.pairs, self.side = tuple(pairs), level.side
@@ -137,18 +137,18 @@ def _predicted(latent: Image, fade: float) -> tuple[Image, Image]:
     return down(sharp), across(sharp)
 
 
-def _pairs(edge: tuple[Image, Image], y: Image, threshold: float) -> list[Pair]:
+def _pairs(edge: tuple[Image, Image], y: Image, threshold: float) -> list[DerivativePair]:
     """Derivatives of first and second order, predicted and observed; eq. (8) and (9)."""
     strong = np.hypot(*edge) >= threshold
     row, col = np.where(strong, edge[0], 0.0), np.where(strong, edge[1], 0.0)
     y_row, y_col = down(y), across(y)
     _, first, second = _ORDER_WEIGHTS
     return [
-        Pair(row, y_row, first, 0),
-        Pair(col, y_col, first, 1),
-        Pair(down(row), down(y_row), second, 0),
-        Pair(across(col), across(y_col), second, 1),
-        Pair(0.5 * (across(row) + down(col)), across(y_row), second, 2),
+        DerivativePair(row, y_row, first, 0),
+        DerivativePair(col, y_col, first, 1),
+        DerivativePair(down(row), down(y_row), second, 0),
+        DerivativePair(across(col), across(y_col), second, 1),
+        DerivativePair(0.5 * (across(row) + down(col)), across(y_row), second, 2),
     ]
 
 
@@ -156,14 +156,14 @@ def _pairs(edge: tuple[Image, Image], y: Image, threshold: float) -> list[Pair]:
 class _Quick:
     """Deconvolution with Gaussian priors on derivatives, one division of spectra; eq. (4) to (6)."""
 
-    canvas: Canvas
+    canvas: PeriodicPlane
     spectrum: NDArray[np.complex128]
     weights: Image
     slopes: Image
 
     @classmethod
     def of(cls, y: Image, side: int) -> _Quick:
-        canvas = Canvas.around(y, side)
+        canvas = PeriodicPlane.around(y, side)
         row, col = canvas.gradient_power()
         zeroth, first, second = _ORDER_WEIGHTS
         weights = zeroth + first * (row + col) + second * (row**2 + col**2 + row * col)

@@ -27,9 +27,9 @@ from lensmodel.core.psf import centred
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
 from lensmodel.estimation import PsfEstimate
 from lensmodel.lab.blind.steps.gradients import (
-    Canvas,
+    DerivativePair,
     KernelEquations,
-    Pair,
+    PeriodicPlane,
     across,
     disagreement,
     down,
@@ -105,7 +105,7 @@ class _Rounds:
     """Image and kernel in turn, the sparsity falling from round to round."""
 
     settings: L0
-    pairs: tuple[Pair, ...] = ()
+    pairs: tuple[DerivativePair, ...] = ()
     side: int = 0
 
     def __call__(self, level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:
@@ -114,7 +114,7 @@ class _Rounds:
         for i in range(level.iterations):
             sparsity = max(self.settings.sparsity * _FADE**-i, _LEAST_SPARSITY)
             latents = tuple(patch.restored(kernel, sparsity) for patch in patches)
-            pairs: list[Pair] = []
+            pairs: list[DerivativePair] = []
             for patch, latent in zip(patches, latents, strict=True):
                 pairs += patch.pairs(latent, _FADE**-i)
             self.pairs, self.side = tuple(pairs), level.side
@@ -139,7 +139,7 @@ class _Rounds:
 class PatchLevel:
     """What stays of one patch on one level: its derivatives, spectra and first threshold."""
 
-    canvas: Canvas
+    canvas: PeriodicPlane
     y_row: Image
     y_col: Image
     spectrum: NDArray[np.complex64]
@@ -149,7 +149,7 @@ class PatchLevel:
     @classmethod
     def of(cls, view: View, side: int, edges: float) -> PatchLevel:
         """Prepare a patch for a kernel of `side`."""
-        canvas = Canvas.around(view.y, side)
+        canvas = PeriodicPlane.around(view.y, side)
         row, col = down(view.y), across(view.y)
         first = oriented_threshold(row, col, round(edges * side), inside(view.y.shape, side // 2 + 1))
         power = canvas.gradient_power()
@@ -178,11 +178,11 @@ class PatchLevel:
             beta *= _GROWTH
         return self.canvas.cut(x).astype(np.float64)
 
-    def pairs(self, latent: Image, fade: float) -> tuple[Pair, Pair]:
+    def pairs(self, latent: Image, fade: float) -> tuple[DerivativePair, DerivativePair]:
         """Derivatives of the latent image where it is steep, and the observed ones."""
         row, col = down(latent), across(latent)
         steep = np.hypot(row, col) >= fade * self.first
         return (
-            Pair(np.where(steep, row, 0.0), self.y_row, 1.0, 0),
-            Pair(np.where(steep, col, 0.0), self.y_col, 1.0, 1),
+            DerivativePair(np.where(steep, row, 0.0), self.y_row, 1.0, 0),
+            DerivativePair(np.where(steep, col, 0.0), self.y_col, 1.0, 1),
         )

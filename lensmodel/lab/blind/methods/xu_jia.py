@@ -25,10 +25,10 @@ from scipy import fft, ndimage
 from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook
 from lensmodel.estimation import PsfEstimate
 from lensmodel.lab.blind.steps.gradients import (
-    Canvas,
+    DerivativePair,
     KernelEquations,
     Mask,
-    Pair,
+    PeriodicPlane,
     across,
     disagreement,
     down,
@@ -102,7 +102,7 @@ class _Phases:
     """Phase one on every level, phase two at the end of the finest; the last pairs stay for the verdict."""
 
     settings: XuJia
-    pairs: tuple[Pair, ...] = ()
+    pairs: tuple[DerivativePair, ...] = ()
     side: int = 0
 
     def __call__(self, level: Level, kernel: Kernel, latents: tuple[Image, ...], tick: Tick) -> LevelResult:
@@ -161,7 +161,7 @@ def usefulness(y: Image) -> Image:
 class _PatchLevel:
     """What stays of one patch on one level: its spectra, useful pixels and first threshold."""
 
-    canvas: Canvas
+    canvas: PeriodicPlane
     y_row: Image
     y_col: Image
     spectrum: NDArray[np.complex128]
@@ -172,7 +172,7 @@ class _PatchLevel:
     @classmethod
     def of(cls, view: View, side: int) -> _PatchLevel:
         y = view.y
-        canvas = Canvas.around(y, side)
+        canvas = PeriodicPlane.around(y, side)
         useful = usefulness(y)
         row, col = down(y), across(y)
         mask = inside(y.shape, side // 2 + 1)
@@ -192,9 +192,9 @@ class _PatchLevel:
         kept = useful & (np.hypot(row, col) >= fade * strong)
         return np.where(kept, row, 0.0), np.where(kept, col, 0.0)
 
-    def pairs(self, edge: tuple[Image, Image]) -> tuple[Pair, Pair]:
+    def pairs(self, edge: tuple[Image, Image]) -> tuple[DerivativePair, DerivativePair]:
         """Derivatives, selected and observed."""
-        return Pair(edge[0], self.y_row, 1.0, 0), Pair(edge[1], self.y_col, 1.0, 1)
+        return DerivativePair(edge[0], self.y_row, 1.0, 0), DerivativePair(edge[1], self.y_col, 1.0, 1)
 
     def deconvolved(self, kernel: Kernel, edge: tuple[Image, Image]) -> Image:
         """Coarse image with the selected gradients as its prior, one division of spectra; eq. (7)."""

@@ -32,7 +32,7 @@ _FIRST_NOISE = 0.5  # share of the power of gradients that is thought noise at f
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Belief:
+class GradientPosterior:
     """What is believed of one gradient image: x, γ, c.
 
     Parameters
@@ -50,7 +50,7 @@ class Belief:
     variance: Floats
 
     @classmethod
-    def first(cls, y: NDArray[np.floating], side: int, kernel: Kernelish, noise: float) -> Belief:
+    def first(cls, y: NDArray[np.floating], side: int, kernel: Kernelish, noise: float) -> GradientPosterior:
         """Start with one γ for all, the mean square of y."""
         grid = Grid((y.shape[0], y.shape[1]), side)
         power = np.float32(max(float(np.mean(np.square(y))), _TINY))
@@ -60,12 +60,12 @@ class Belief:
         belief = cls(grid, y.astype(np.float32), x, gamma, gamma)
         return belief.spread(kernel, noise)
 
-    def spread(self, kernel: Kernelish, noise: float) -> Belief:
+    def spread(self, kernel: Kernelish, noise: float) -> GradientPosterior:
         """Update c = 1 / (w / λ + 1 / γ)."""
         precision = self.grid.reach_of(kernel) / np.float32(noise) + 1.0 / self.gamma
         return replace(self, variance=(1.0 / precision).astype(np.float32))
 
-    def sharpened(self, kernel: Kernelish, noise: float, steps: int) -> Belief:
+    def sharpened(self, kernel: Kernelish, noise: float, steps: int) -> GradientPosterior:
         """Update x = argmin |y - k * x|² / λ + sum_i x_i² / γ_i by preconditioned conjugate gradients.
 
         The preconditioner is c, the inverse of the diagonal.
@@ -93,11 +93,11 @@ class Belief:
             power = after
         return replace(self, x=x)
 
-    def sparser(self) -> Belief:
+    def sparser(self) -> GradientPosterior:
         """Update γ_i = x_i² + c_i."""
         return replace(self, gamma=np.maximum(np.square(self.x) + self.variance, _TINY))
 
-    def scaled(self, factor: float) -> Belief:
+    def scaled(self, factor: float) -> GradientPosterior:
         """Multiply x by a factor, as k is divided by it; F stays."""
         s, s2 = np.float32(factor), np.float32(factor * factor)
         return replace(self, x=self.x * s, gamma=self.gamma * s2, variance=self.variance * s2)
@@ -122,7 +122,7 @@ class GradientBeliefs:
 
     Parameters
     ----------
-    down, across : Belief
+    down, across : GradientPosterior
         Differences between neighbouring rows and columns.
     noise : float
         λ; differences of white noise of variance σ² have 2 σ².
@@ -130,8 +130,8 @@ class GradientBeliefs:
         d over the number of pixels.
     """
 
-    down: Belief
-    across: Belief
+    down: GradientPosterior
+    across: GradientPosterior
     noise: float
     floor: float
 
@@ -141,7 +141,10 @@ class GradientBeliefs:
         down, across = np.diff(y, axis=0), np.diff(y, axis=1)
         noise = _FIRST_NOISE * 0.5 * float(np.mean(down**2) + np.mean(across**2)) + floor
         return cls(
-            Belief.first(down, side, kernel, noise), Belief.first(across, side, kernel, noise), noise, floor
+            GradientPosterior.first(down, side, kernel, noise),
+            GradientPosterior.first(across, side, kernel, noise),
+            noise,
+            floor,
         )
 
     def improved(self, kernel: Kernelish, steps: int) -> GradientBeliefs:
@@ -166,12 +169,12 @@ class GradientBeliefs:
         """F of both gradients."""
         return sum(b.free_energy(kernel, self.noise, self.floor) for b in (self.down, self.across))
 
-    def weighted(self) -> tuple[tuple[Belief, float], tuple[Belief, float]]:
+    def weighted(self) -> tuple[tuple[GradientPosterior, float], tuple[GradientPosterior, float]]:
         """Both beliefs with their weight 1 / λ in the kernel step."""
         return (self.down, 1.0 / self.noise), (self.across, 1.0 / self.noise)
 
 
-def pooled_kernel(beliefs: Sequence[tuple[Belief, float]], kernel: Kernelish) -> Kernelish:
+def pooled_kernel(beliefs: Sequence[tuple[GradientPosterior, float]], kernel: Kernelish) -> Kernelish:
     """Update k >= 0 to the minimum of the summed free energies of beliefs with their weights 1 / λ.
 
     min over k >= 0 of  sum_l (|y_l - k * x_l|² + sum_j k_j² sum_i c_l,i) / λ_l

@@ -120,7 +120,7 @@ def inside(shape: tuple[int, ...], margin: int) -> Mask:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Canvas:
+class PeriodicPlane:
     """A periodic plane that shows an image in its middle, for image steps by FFT.
 
     Parameters
@@ -135,7 +135,7 @@ class Canvas:
     pad: tuple[int, int]
 
     @classmethod
-    def around(cls, image: Image, side: int) -> Canvas:
+    def around(cls, image: Image, side: int) -> PeriodicPlane:
         """Room for a kernel of `side` between opposite borders, of a size that suits the FFT."""
         rows, cols = image.shape
         return cls((rows, cols), (_fast_pad(rows, side), _fast_pad(cols, side)))
@@ -188,7 +188,7 @@ def _fast_pad(length: int, least: int) -> int:
 
 @lru_cache(maxsize=64)
 def _closing(length: int, pad: int) -> Image:
-    """Matrix `(length + 2 pad, length)` of `Canvas.filled` along one axis."""
+    """Matrix `(length + 2 pad, length)` of `PeriodicPlane.filled` along one axis."""
     total = length + 2 * pad
     matrix = np.zeros((total, length))
     for i in range(total):
@@ -211,7 +211,7 @@ def _mirrored(place: int, length: int) -> int:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pair:
+class DerivativePair:
     """A predicted derivative of the sharp image, and the same derivative as observed.
 
     Parameters
@@ -250,7 +250,7 @@ class KernelEquations:
     grid: tuple[int, int]
 
     @classmethod
-    def of(cls, pairs: Sequence[Pair], side: int) -> KernelEquations:
+    def of(cls, pairs: Sequence[DerivativePair], side: int) -> KernelEquations:
         """Sum over pairs; predictions near the border, whose blur reaches outside, are left out.
 
         Raises

@@ -923,8 +923,8 @@ def quick_photos(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return {"refused": "no page was photographed", "psf": None, "methods": {}, "pictures": {}}
 
     monkeypatch.setattr(job, "take", made_up)
-    monkeypatch.setattr(job.Job, "_measured_truth", truth)
-    monkeypatch.setattr(job.Job, "_measured_by_target", by_target)
+    monkeypatch.setattr(job.CaseJob, "_measured_truth", truth)
+    monkeypatch.setattr(job.CaseJob, "_measured_by_target", by_target)
     return taken
 
 
@@ -1056,12 +1056,12 @@ def test_new_version_of_the_rivals_computes_them_alone(
     del quick_photos
     asked: list[str] = []
 
-    def measured(self: job.Job, name: str, shots: Shots) -> dict[str, Any]:
+    def measured(self: job.CaseJob, name: str, shots: Shots) -> dict[str, Any]:
         del shots
         asked.append(name)
         return {"refused": "", "psf": None, "pictures": {}, "methods": {}}
 
-    monkeypatch.setattr(job.Job, "_measured_rival", measured)
+    monkeypatch.setattr(job.CaseJob, "_measured_rival", measured)
     chosen = replace(plan(case(photos=(1,))), rivals=("kee",))
     reproduced(tmp_path, Nothing(), chosen)
     monkeypatch.setattr(run, "rivals_version", lambda: "other")

@@ -16,7 +16,7 @@ from lensmodel.core.types import FieldPosition, NoiseModel
 from lensmodel.lab.rivals import BasisField, Kee, RadialBasis, Schuler, load_basis, principal, rivals
 from lensmodel.lab.rivals.basis import save_basis
 from lensmodel.lab.rivals.kee import core_variance
-from lensmodel.lab.rivals.rival import Window, polynomial, powers
+from lensmodel.lab.rivals.rival import PhotoWindow, polynomial, powers
 from lensmodel.lab.scenes import dead_leaves
 from lensmodel.simulate import draw_lens
 
@@ -46,7 +46,7 @@ def straight_edges() -> np.ndarray:
     return scene
 
 
-def windows(kernel_of: object, scene: np.ndarray, side: int = 140) -> list[Window]:
+def windows(kernel_of: object, scene: np.ndarray, side: int = 140) -> list[PhotoWindow]:
     """A scene photographed at six places of the frame, each with the kernel of its middle."""
     found = []
     rng = np.random.default_rng(0)
@@ -57,7 +57,7 @@ def windows(kernel_of: object, scene: np.ndarray, side: int = 140) -> list[Windo
             wide = np.pad(sharp, 20, mode="symmetric")
             seen = fftconvolve(wide, kernel_of(place), mode="same")[20 : 20 + side, 20 : 20 + side]  # type: ignore[operator]
             seen = seen + rng.normal(0.0, 1e-3, seen.shape)
-            found.append(Window(np.stack([seen] * 3).astype(np.float32), (NOISE,) * 3, place))
+            found.append(PhotoWindow(np.stack([seen] * 3).astype(np.float32), (NOISE,) * 3, place))
     return found
 
 
@@ -145,7 +145,7 @@ def test_kee_recovers_widths_and_axes_of_a_field_of_gaussians(monkeypatch: pytes
 
 
 def test_kee_refuses_photos_without_edges(monkeypatch: pytest.MonkeyPatch) -> None:
-    flat = Window(np.full((3, 128, 128), 0.5, dtype=np.float32), (NOISE,) * 3, FieldPosition(0.5, 0.0))
+    flat = PhotoWindow(np.full((3, 128, 128), 0.5, dtype=np.float32), (NOISE,) * 3, FieldPosition(0.5, 0.0))
     monkeypatch.setattr("lensmodel.lab.rivals.kee.windows_of", lambda _: [flat])
     with pytest.raises(NotEnoughEvidenceError, match="straight edges"):
         Kee().field(())

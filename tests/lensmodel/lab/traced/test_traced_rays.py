@@ -21,7 +21,7 @@ from lensmodel.lab.traced.make import make_grid
 from lensmodel.lab.traced.patents import PATENTS
 from lensmodel.lab.traced.prescription import Design, Surface, optic_of
 from lensmodel.lab.traced.rays import Fault, Tracer
-from lensmodel.lab.traced.wave import Pupil
+from lensmodel.lab.traced.wave import TracedPupil
 from lensmodel.simulate import Aberrations, SimulatedLens
 from lensmodel.simulate.lens import spectrum
 
@@ -106,7 +106,7 @@ def traced_and_simulated(
     tracer, defocus, pitch = Tracer(design), -0.5, 0.25 * f_number
     radius, theta = float(tracer.marginal(f_number)[0]), math.radians(field_deg)
     direction = math.sin(theta) * math.cos(angle), math.sin(theta) * math.sin(angle)
-    pupil = Pupil.of(tracer.bundles(direction, radius, (WAVE_UM,))[0])
+    pupil = TracedPupil.of(tracer.bundles(direction, radius, (WAVE_UM,))[0])
     # W020 = -dz / (8 N^2): the sensor stands before the focus where the edge of the wave is late
     focus_um = 1000.0 * paraxial_shift(design) - 8.0 * f_number**2 * WAVE_UM * defocus
     band = [(pupil, wave, weight) for wave, weight in spectrum("g")]  # of the simulator

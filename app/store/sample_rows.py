@@ -34,6 +34,7 @@ _OWN: Final[_Columns] = {
     "size": SampleRow.size,
     "estimator": SampleRow.estimator,
     "error": SampleRow.predicted_error,
+    "darkest": SampleRow.darkest,
 }
 _OF_PHOTO: Final[_Columns] = {"photo": PhotoRow.public_id, "pixel_pitch_um": PhotoRow.pixel_pitch_um}
 _SETTINGS: Final[_Columns] = {

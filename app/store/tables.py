@@ -267,6 +267,7 @@ class SampleRow(Base):
     phi: Mapped[float]
     weight: Mapped[float]
     predicted_error: Mapped[float | None]
+    darkest: Mapped[float | None]  # see `PsfSample`
     size: Mapped[int]
     dtype: Mapped[str] = mapped_column(String(10))
     format_version: Mapped[int]

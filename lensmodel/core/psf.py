@@ -236,6 +236,9 @@ class PsfSample:
         Relative L2 distance to the truth that the method expects of it; None where it says nothing.
     half_diagonal_px : float or None
         Half the diagonal of the frame in pixels; None where unknown.
+    darkest : float or None
+        Light of the darkest places around the patch over that near them: what the share of light that the
+        lens throws far cannot exceed (`lensmodel.model.far_light`); None where unknown.
     """
 
     kernel: Kernel
@@ -248,6 +251,7 @@ class PsfSample:
     spectrum: PatchSpectrum | None = None
     error: float | None = None
     half_diagonal_px: float | None = None
+    darkest: float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kernel", as_kernel(self.kernel))
@@ -261,6 +265,8 @@ class PsfSample:
                 raise InvalidInputError(f"the {name} must be positive {unit}, got {size}")
         if self.error is not None and not (math.isfinite(self.error) and self.error >= 0.0):
             raise InvalidInputError(f"the expected error must be finite and not negative, got {self.error}")
+        if self.darkest is not None and not (math.isfinite(self.darkest) and self.darkest >= 0.0):
+            raise InvalidInputError(f"the darkest share must be finite and not negative, got {self.darkest}")
 
     def with_weight(self, weight: float) -> PsfSample:
         """Return the same sample with another vote.

@@ -15,6 +15,7 @@ from lensmodel.core.types import LensSettings, StepHook, ignore_step
 from lensmodel.model import pitch as pitches
 from lensmodel.model import variables as va
 from lensmodel.model.answer import BOTH, MICROMETRE, ModelSettings
+from lensmodel.model.far_light import FarLight, bounds_of
 from lensmodel.model.field.cross_validation import CrossValidation, bandwidth, cross_validate, held_together
 from lensmodel.model.field.index import SampleIndex
 from lensmodel.model.field.local_frame import LocalKernels
@@ -76,6 +77,10 @@ class Fit:
         None until `warmed`, or if it takes no part.
     ends : tuple of End
         Of a zoom: focal lengths that answer by a wavefront of their own.
+    darkest : ndarray, shape (n,)
+        Bounds of far light that samples carry; NaN where one carries none.
+    heard : tuple of PsfSample
+        Of a photo that is to be corrected: they bound far light too, and say nothing else here.
     former : tuple of Wavefront
         Of fits to fewer samples: where `warmed` begins, besides all other beginnings.
     mode : str
@@ -95,6 +100,8 @@ class Fit:
     has_spectrum: NDArray[np.bool_]
     rule: dict[str, float]
     bandwidth: dict[str, float]
+    darkest: NDArray[np.float64]
+    heard: tuple[PsfSample, ...] = ()
     physical: Physics | None = None
     mode: str = BOTH
     unit: str = MICROMETRE
@@ -135,7 +142,7 @@ class Fit:
         used = bandwidth(rule, settings, validation.choice)
         return cls(
             *(pixel, len(samples), widths, local, index, roster, validation),
-            *(expected_errors(samples), with_spectra(samples), rule, used),
+            *(expected_errors(samples), with_spectra(samples), rule, used, bounds_of(samples)),
             mode=settings.mode,
             unit=settings.unit,
         )
@@ -168,6 +175,16 @@ class Fit:
         end = self.end_at(settings)
         return self.physical if end is None else end.physical
 
+    def far_light(self) -> FarLight:
+        """What photos that vote allow of far light; the one that is heard says nothing without them."""
+        heard = () if _is_one_of(self.heard, self.index.points, self.darkest) else self.heard
+        bounds = np.concatenate([self.darkest, bounds_of(heard)])
+        speaks = np.isfinite(bounds)
+        speaks[: len(self.darkest)] &= self.validation.votes > 0.0
+        points = np.concatenate([self.index.points, va.points(heard)])
+        photos = np.concatenate([self.roster.photo, np.full(len(heard), len(self.roster.numbers))])
+        return FarLight(points[speaks], bounds[speaks], photos[speaks], va.scales(self.bandwidth))
+
     @property
     def nbytes(self) -> int:
         """Bytes of stored kernels."""
@@ -191,7 +208,22 @@ class Fit:
             validation=self.validation.extended(_claimed(samples, settings)),
             expected=np.concatenate([self.expected, expected_errors(samples)]),
             has_spectrum=np.concatenate([self.has_spectrum, with_spectra(samples)]),
+            darkest=np.concatenate([self.darkest, bounds_of(samples)]),
         )
+
+
+def _is_one_of(
+    patches: Sequence[PsfSample], points: NDArray[np.float64], darkest: NDArray[np.float64]
+) -> bool:
+    """Whether patches show what samples of a model show already, or samples tell nothing of far light."""
+    known = {
+        (round(r, 6), round(dark, 6)) for r, dark in zip(points[:, 0], darkest, strict=True) if dark >= 0.0
+    }
+    return not known or any(
+        (round(patch.position.r, 6), round(patch.darkest, 6)) in known
+        for patch in patches
+        if patch.darkest is not None
+    )
 
 
 def expected_errors(samples: Sequence[PsfSample]) -> NDArray[np.float64]:

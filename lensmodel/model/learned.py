@@ -22,6 +22,7 @@ from lensmodel.core.psf import PsfSample
 from lensmodel.model import pitch as pitches
 from lensmodel.model import variables as va
 from lensmodel.model.answer import MODES, ModelSettings
+from lensmodel.model.far_light import bounds_of
 from lensmodel.model.field.cross_validation import CrossValidation
 from lensmodel.model.field.index import SampleIndex
 from lensmodel.model.field.leave_one_out import Choice
@@ -33,7 +34,7 @@ from lensmodel.model.wavefront.physical_mean import REASONS_APART, Physics
 from lensmodel.model.wavefront.zoom import End
 from lensmodel.optics.wavefront import NAMES, Wavefront
 
-VERSION: Final = 17
+VERSION: Final = 18
 """Raised whenever the same samples would be fitted otherwise."""
 
 _MOST_BYTES = 1 << 27  # unpacked: against files made to fill the memory
@@ -249,6 +250,7 @@ def _fit(
         validation=validation,
         expected=expected_errors(samples),
         has_spectrum=with_spectra(samples),
+        darkest=bounds_of(samples),
         rule=rule,
         bandwidth=used,
         physical=physical,

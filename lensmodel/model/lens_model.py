@@ -191,6 +191,11 @@ class LensModel:
             return None
         return LensModel(self.samples, self.settings, replace(self._fit, mode=mode), prior=self.prior)
 
+    def hearing(self, patches: Sequence[PsfSample]) -> LensModel:
+        """Return the model that also heeds how dark a photo gets, which is to be corrected: `Fit.heard`."""
+        fit = replace(self._fit, heard=tuple(patches))
+        return LensModel(self.samples, self.settings, fit, prior=self.prior)
+
     def with_prior(
         self, source: PsfField | AnsweringModel | None, strength: float = 2.0, name: str = "other copies"
     ) -> LensModel:
@@ -311,14 +316,9 @@ class LensModel:
 
     def kernel_of(self, sample: PsfSample) -> Kernel:
         """Return the PSF at the place and settings of a sample, in its pixels and of its size."""
-        kernels = self.kernels(
-            [sample.position],
-            sample.settings,
-            sample.kernel.shape[0],
-            pitch_um=sample.pixel_pitch_um,
-            half_diagonal_px=sample.half_diagonal_px,
-        )
-        return np.asarray(kernels[0])
+        pixels = {"pitch_um": sample.pixel_pitch_um, "half_diagonal_px": sample.half_diagonal_px}
+        size = sample.kernel.shape[0]
+        return np.asarray(self.kernels([sample.position], sample.settings, size, **pixels)[0])
 
     def weights(
         self, position: FieldPosition, settings: LensSettings

@@ -9,8 +9,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.core.far_light import with_far_light
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import variables as va
+from lensmodel.model.answer import PAPER
 from lensmodel.model.field.local_frame import Answers
 from lensmodel.model.field.neighbourhood import Neighbourhood
 from lensmodel.model.field.smoothers import Smoother, smoothers
@@ -18,7 +20,7 @@ from lensmodel.model.fitting import Fit
 from lensmodel.model.modes import Mixture, answered, between
 from lensmodel.model.pixels import Pixels
 from lensmodel.model.prior import Prior
-from lensmodel.model.trust.support import USUAL_ERROR
+from lensmodel.model.trust.support import USUAL_ERROR, measured_share
 from lensmodel.model.wavefront.physical_mean import Physics
 from lensmodel.model.wavefront.zoom import nearest
 
@@ -42,6 +44,7 @@ class Predictor:
         self.fit = fit
         self.prior = prior
         self.pixels = Pixels(fit.unit, fit.pixel)
+        self._far_light = None if fit.mode == PAPER else fit.far_light()
         self._neighbourhood = Neighbourhood(fit.index, fit.validation.votes, scale, smoothers.create(method))
 
     @property
@@ -82,6 +85,10 @@ class Predictor:
             own = mixed(end.physical)
             mixture = own if mixture is None else between(own, mixture, share)
         assert mixture is not None
+        if self._far_light is not None:
+            # kernels that were measured show all of the light
+            far = self._far_light.shares(positions, settings) * (1.0 - measured_share(expected))
+            mixture = replace(mixture, kernels=with_far_light(mixture.kernels, far))
         shares = np.zeros(len(positions))
         if self.prior is not None:
             shares = self.prior.share(self._samples_around(positions, settings))

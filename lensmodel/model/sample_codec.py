@@ -135,6 +135,7 @@ def entry_of(sample: PsfSample) -> dict[str, Any]:
         "half_diagonal_px": sample.half_diagonal_px,
         "estimator": sample.estimator,
         "error": sample.error,
+        "darkest": sample.darkest,
     }
 
 
@@ -156,4 +157,5 @@ def sample_of(
         spectrum=spectrum,
         error=entry.get("error"),
         half_diagonal_px=entry.get("half_diagonal_px"),
+        darkest=entry.get("darkest"),
     )

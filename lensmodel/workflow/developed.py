@@ -59,6 +59,7 @@ def load_seen(folder: Path) -> list[SeenPatch] | None:
                 PatchSpectrum(
                     np.asarray(one["spectrum"]["power"], dtype=np.float32), one["spectrum"]["noise"]
                 ),
+                None if one["darkest"] is None else float(one["darkest"]),
             )
             for one in stored
         ]

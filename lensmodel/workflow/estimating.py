@@ -26,6 +26,7 @@ from lensmodel.core.types import (
     ignore_step,
 )
 from lensmodel.estimation import patches
+from lensmodel.estimation.darkest import darkest_share
 from lensmodel.estimation.patches import Patch, Selection
 from lensmodel.photo import LinearPhoto
 
@@ -63,10 +64,20 @@ class CellSample:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenPatch:
-    """A patch of a photo as a witness of a model's kernels: where it lies, and its spectrum in green."""
+    """A patch of a photo as a witness of a model's kernels.
+
+    Parameters
+    ----------
+    position : FieldPosition
+    spectrum : PatchSpectrum
+        Of green.
+    darkest : float or None
+        As `PsfSample.darkest`.
+    """
 
     position: FieldPosition
     spectrum: PatchSpectrum
+    darkest: float | None = None
 
 
 def find_patches(
@@ -173,6 +184,7 @@ def estimate_cell(
                 if developed.lossy
                 else PatchSpectrum.of(plane, noise, width, _cross(developed, patch, channel)),
                 half_diagonal_px=developed.frame.half_diagonal,
+                darkest=_darkest(developed, patch) if channel == "g" else None,
             )
             diagnostics = {**estimate.diagnostics, "predicted_error": estimate.predicted_error}
             results.append(CellSample(patch, channel, sample, diagnostics))
@@ -190,7 +202,11 @@ def seen_patches(developed: LinearPhoto) -> list[SeenPatch]:
         return []
     try:
         return [
-            SeenPatch(patch.position, PatchSpectrum(*binned_spectrum(*_view(developed, patch, "g"))))
+            SeenPatch(
+                patch.position,
+                PatchSpectrum(*binned_spectrum(*_view(developed, patch, "g"))),
+                _darkest(developed, patch),
+            )
             for patch in find_patches(developed).patches
         ]
     except (NoUsablePatchesError, InvalidInputError):  # nothing to see, or too small a picture
@@ -210,6 +226,7 @@ def witnesses_of(
             pixel_pitch_um=known.pixel_pitch_um,
             half_diagonal_px=developed.frame.half_diagonal,
             spectrum=patch.spectrum,
+            darkest=patch.darkest,
         )
         for patch in (seen_patches(developed) if patches is None else patches)
     ]
@@ -223,6 +240,14 @@ def _cross(developed: LinearPhoto, patch: Patch, channel: Channel) -> CrossPhase
     rows = (developed.cfa[(patch.row + row) % 2] for row in (0, 1))
     first, second = ((colours[patch.col % 2], colours[(patch.col + 1) % 2]) for colours in rows)
     return cross_phase(developed.planes[window], (first, second), channel)
+
+
+def _darkest(developed: LinearPhoto, patch: Patch) -> float | None:
+    """How dark green gets around a patch; shadows of compressed files are of their camera's making."""
+    if developed.lossy:
+        return None
+    half = patch.size // 2
+    return darkest_share(developed.planes[1], float(developed.clip[1]), patch.row + half, patch.col + half)
 
 
 def _view(developed: LinearPhoto, patch: Patch, channel: Channel) -> tuple[Plane, NoiseModel]:

@@ -203,7 +203,7 @@ class WitnessedField:
         pitch_um, half_diagonal_px : float, optional
             Its pixels, as `LensModel.query` takes them.
         """
-        opinions = opinions_of(model)
+        opinions = opinions_of(model.hearing(patches))
         pixels = {"pitch_um": pitch_um, "half_diagonal_px": half_diagonal_px}
         fields = [one.field(settings, **pixels) for one in opinions]
         return cls(opinions, fields, Witness.of(opinions, settings, patches), settings, pixels)

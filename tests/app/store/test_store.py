@@ -283,6 +283,7 @@ def test_a_sample_is_stored_as_earlier_programs_read_it(store: Store, steps: Ste
         "phi": 0.0,
         "weight": 0.5,
         "predicted_error": None,
+        "darkest": None,
         "size": 15,
         "dtype": "<f4",
         "format_version": 1,

@@ -37,6 +37,7 @@ LITTLE, SOME, OFTEN = float(_FITTED["little"]), float(_FITTED["some"]), float(_F
 
 _WEAKENS: Final = 0.2  # by which a bound weakens over half a diagonal (chosen: a half of how designs change)
 _ALIKE: Final = 1.0  # bandwidths of settings within which photos speak of each other (chosen)
+_AT_ONCE: Final = 2048  # bounds that are weighed at once (chosen: some megabytes)
 _LEAST: Final = 0.004  # bound of a photo (chosen: below, black level decides)
 _SHARES: Final = np.arange(0.0025, 0.7, 0.005)
 """Shares that are weighed, middles of intervals (chosen: no design throws more than seven tenths so far)."""
@@ -74,12 +75,16 @@ class FarLight:
         if not alike.any():
             return nothing
         r = np.array([position.r for position in positions])
-        reach = self.bounds[alike] + _WEAKENS * np.abs(r[:, None] - self.points[alike, 0])
-        numbers, photo = np.unique(self.photos[alike], return_inverse=True)
-        least = np.full((len(r), len(numbers)), np.inf)
-        for number in range(len(numbers)):
-            least[:, number] = reach[:, photo == number].min(axis=1)
-        return expected_share(least)
+        own = [alike & (self.photos == photo) for photo in np.unique(self.photos[alike])]
+        least = np.stack(
+            [
+                (self.bounds[mine] + _WEAKENS * np.abs(r[:, None] - self.points[mine, 0])).min(axis=1)
+                for mine in own
+            ],
+            axis=1,
+        )
+        parts = np.array_split(least, max(least.size // _AT_ONCE, 1))
+        return np.concatenate([expected_share(part) for part in parts])
 
 
 def expected_share(bounds: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -177,7 +177,9 @@ class Fit:
 
     def far_light(self) -> FarLight:
         """What photos that vote allow of far light; the one that is heard says nothing without them."""
-        heard = () if _is_one_of(self.heard, self.index.points, self.darkest) else self.heard
+        heard = self.heard
+        if heard and _is_one_of(heard, self.index.points, self.darkest):
+            heard = ()
         bounds = np.concatenate([self.darkest, bounds_of(heard)])
         speaks = np.isfinite(bounds)
         speaks[: len(self.darkest)] &= self.validation.votes > 0.0

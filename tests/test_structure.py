@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 from collections import defaultdict
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -12,8 +13,19 @@ MOST_LINES, MOST_MODULES = 400, 15
 PACKAGES = ("lensmodel", "app")
 
 
-def modules() -> list[Path]:
-    return [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+@cache
+def modules() -> tuple[Path, ...]:
+    return tuple(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+
+
+@cache
+def text(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
+@cache
+def parsed(source: str) -> ast.Module:
+    return ast.parse(source)
 
 
 def public_classes(*, lab: bool) -> dict[str, list[str]]:
@@ -22,8 +34,7 @@ def public_classes(*, lab: bool) -> dict[str, list[str]]:
     for path in modules():
         home = path.relative_to(ROOT)
         if home.is_relative_to("lensmodel/lab") is lab:
-            tree = ast.parse(path.read_text(encoding="utf-8"))
-            for node in tree.body:
+            for node in parsed(text(path)).body:
                 if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                     homes[node.name].append(str(home))
     return dict(homes)
@@ -33,7 +44,7 @@ def test_modules_are_short() -> None:
     long = {
         str(path.relative_to(ROOT)): lines
         for path in modules()
-        if (lines := len(path.read_text(encoding="utf-8").splitlines())) > MOST_LINES
+        if (lines := len(text(path).splitlines())) > MOST_LINES
     }
     assert long == {}
 
@@ -82,7 +93,7 @@ def silent(source: str) -> Iterator[int]:
     A word stands on their own lines, or above or below the lines without a gap that they belong to.
     """
     lines, group = source.splitlines(), list[ast.Assign | ast.AnnAssign]()
-    for one in [*ast.parse(source).body, ast.Pass(lineno=len(lines) + 9)]:
+    for one in [*parsed(source).body, ast.Pass(lineno=len(lines) + 9)]:
         below = bool(group) and one.lineno == (group[-1].end_lineno or 0) + 1
         if group and not (below and isinstance(one, ast.Assign | ast.AnnAssign)):
             said = (below and is_text(one)) or lines[group[0].lineno - 2].startswith("#")
@@ -95,9 +106,7 @@ def silent(source: str) -> Iterator[int]:
 
 
 def test_constants_have_a_word() -> None:
-    mute = [
-        f"{path.relative_to(ROOT)}:{line}" for path in modules() for line in silent(path.read_text("utf-8"))
-    ]
+    mute = [f"{path.relative_to(ROOT)}:{line}" for path in modules() for line in silent(text(path))]
     assert mute == []
 
 

@@ -127,12 +127,12 @@ SERVER = os.environ.get("LENSMODEL_TEST_DATABASE", "")
 """A PostgreSQL database to empty and to run the tests on, instead of SQLite files."""
 
 
-@pytest.fixture
-def settings(tmp_path: Path) -> Settings:
+@pytest.fixture(scope="session")
+def usual_settings() -> Settings:
+    """Read and check the environment once: for each test anew it takes as long as a small test."""
     return Settings(
-        data_dir=tmp_path / "data",
         database_url=SERVER,
-        jobs_url=f"sqlite:///{tmp_path / 'data' / 'jobs.db'}",
+        jobs_url="sqlite:///jobs.db",
         shared_filesystem=True,
         long_poll_seconds=2.0,
         min_free_mb=0,
@@ -141,6 +141,12 @@ def settings(tmp_path: Path) -> Settings:
         max_upload_mb=1,
         patches=3,  # of so few one is enough: the made-up photos of these tests have two
     )
+
+
+@pytest.fixture
+def settings(usual_settings: Settings, tmp_path: Path) -> Settings:
+    data = tmp_path / "data"
+    return usual_settings.model_copy(update={"data_dir": data, "jobs_url": f"sqlite:///{data / 'jobs.db'}"})
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -168,7 +168,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, seed in (("one", 1), ("one-more", 3), ("mine", 4), ("first", 5)):
         write_photo(folder / f"{name}.dng", seed)
     for k in range(4):
-        picture = np.rint(255.0 * scene(10 + k)).astype(np.uint8)
+        picture = np.rint(255.0 * scene(k)).astype(np.uint8)
         Image.fromarray(np.dstack([picture] * 3)).save(folder / "sharp" / f"{k}.png")
     shutil.copy(folder / "sharp" / "0.png", folder / "scan.png")
     with Image.open(folder / "scan.png") as scan:

@@ -27,7 +27,7 @@ from playwright.sync_api import (
 HERE = Path(__file__).parents[1]
 sys.path.insert(0, str(HERE))
 from deadline import stretched  # noqa: E402 - beside these files
-from running import BRIEF, OWN_ACCOUNT, Service, running, write_photo  # noqa: E402 - beside this file
+from running import BRIEF, OWN_ACCOUNT, SMALL, Service, running, write_photo  # noqa: E402 - beside this file
 
 sys.path.remove(str(HERE))
 
@@ -216,8 +216,8 @@ def test_an_empty_service_says_how_to_begin(page: Page) -> None:
 def test_photos_chosen_and_dropped_are_learned_from_while_the_page_watches(
     visitor: Visitor, page: Page, tmp_path: Path
 ) -> None:
-    chosen = write_photo(tmp_path / "chosen.dng", 1, serial="C-1")
-    dropped = write_photo(tmp_path / "dropped.dng", 2, serial="C-1")
+    chosen = write_photo(tmp_path / "chosen.dng", 1, serial="C-1", shape=SMALL)
+    dropped = write_photo(tmp_path / "dropped.dng", 2, serial="C-1", shape=SMALL)
     page.goto("/")
     page.evaluate(RECORD)
 
@@ -282,7 +282,7 @@ def test_a_preview_that_nobody_waits_for_is_stopped(page: Page, learned: dict[st
 def test_an_aperture_is_asked_for_where_photos_do_not_say_it(
     page: Page, service: Service, tmp_path: Path
 ) -> None:
-    sent = service.upload(write_photo(tmp_path / "old.dng", 33, serial="", aperture=None))
+    sent = service.upload(write_photo(tmp_path / "old.dng", 33, serial="", aperture=None, shape=SMALL))
     service.job(sent["id"], until=lambda job: job["state"] == "waiting")
     page.goto("/")
     group = page.locator("[data-group]")
@@ -298,13 +298,13 @@ def test_an_aperture_is_asked_for_where_photos_do_not_say_it(
 def test_photos_that_wait_are_named_together_by_their_pictures(
     page: Page, service: Service, learned: dict[str, Any], tmp_path: Path
 ) -> None:
-    sent = [service.upload(write_photo(tmp_path / "nameless-0.dng", 31, serial=""))]
+    sent = [service.upload(write_photo(tmp_path / "nameless-0.dng", 31, serial="", shape=SMALL))]
     service.job(sent[0]["id"], until=lambda job: job["state"] == "waiting")
     page.goto("/")
     group = page.locator("[data-group]")
     expect(group).to_have_count(1)
     # the group grows before the eyes, and is still one form
-    sent.append(service.upload(write_photo(tmp_path / "nameless-1.dng", 32, serial="")))
+    sent.append(service.upload(write_photo(tmp_path / "nameless-1.dng", 32, serial="", shape=SMALL)))
     expect(group.locator("legend")).to_contain_text("Test T-1, Test 35mm f/1.8, 35 mm: 2 photos")
     expect(group).to_have_count(1)
     expect(group.locator("img").first).not_to_have_js_property("naturalWidth", 0)
@@ -329,7 +329,7 @@ def test_photos_that_wait_are_named_together_by_their_pictures(
 
 
 def test_a_damaged_file_leaves_no_empty_lens(page: Page, service: Service, tmp_path: Path) -> None:
-    whole = write_photo(tmp_path / "whole.dng", 41, serial="")
+    whole = write_photo(tmp_path / "whole.dng", 41, serial="", shape=SMALL)
     (tmp_path / "cut.dng").write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
     photo = service.upload(tmp_path / "cut.dng", lens_serial="D-1", lens_model="Damaged 50 mm")
     assert service.job(photo["id"])["state"] == "failed"
@@ -580,7 +580,9 @@ def test_a_lens_is_renamed_merged_and_its_profile_taken_along(
     page: Page, service: Service, tmp_path: Path
 ) -> None:
     made = [
-        service.calibrated(write_photo(tmp_path / f"m{k}.dng", 61 + k, serial=f"M-{k}"))["lens_id"]
+        service.calibrated(write_photo(tmp_path / f"m{k}.dng", 61 + k, serial=f"M-{k}", shape=SMALL))[
+            "lens_id"
+        ]
         for k in range(2)
     ]
     page.goto(f"/lenses/{made[0]}")

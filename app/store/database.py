@@ -116,10 +116,9 @@ def insert_new(session: Session, table: type[Base], rows: Sequence[dict[str, Any
         return 0
     dialect = session.get_bind().dialect.name
     insert = sqlite.insert if dialect == "sqlite" else postgresql.insert
-    key = table.__mapper__.primary_key[0]
-    inserted = 0
-    for row in rows:
-        # RETURNING shows on both databases what went in; on PostgreSQL the row count does not
-        statement = insert(table).values(**row).on_conflict_do_nothing().returning(key)
-        inserted += len(session.connection().execute(statement).all())
+    # RETURNING shows on both databases what went in; on PostgreSQL the row count does not
+    statement = insert(table).on_conflict_do_nothing().returning(table.__mapper__.primary_key[0])
+    connection, inserted = session.connection(), 0
+    for row in rows:  # values given here, not in the statement, which else is made anew for each row
+        inserted += len(connection.execute(statement, row).all())
     return inserted

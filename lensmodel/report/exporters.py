@@ -50,6 +50,8 @@ class PsfGrid:
     settings : LensSettings
     predicted_error : tuple of float
         Expected relative L2 of each kernel.
+    answered_by, reason : tuple of str
+        Which model answered for each kernel, and why that one.
     """
 
     kernels: NDArray[np.float32]
@@ -58,6 +60,8 @@ class PsfGrid:
     cols: int
     settings: LensSettings
     predicted_error: tuple[float, ...]
+    answered_by: tuple[str, ...]
+    reason: tuple[str, ...]
 
     def __post_init__(self) -> None:
         n = len(self.positions)
@@ -65,8 +69,13 @@ class PsfGrid:
             raise InvalidInputError(
                 f"{self.rows} x {self.cols} places need as many kernels, got shape {self.kernels.shape}"
             )
-        if len(self.predicted_error) != n:
-            raise InvalidInputError(f"{n} kernels need as many errors, got {len(self.predicted_error)}")
+        for what, given in (
+            ("errors", self.predicted_error),
+            ("answerers", self.answered_by),
+            ("reasons", self.reason),
+        ):
+            if len(given) != n:
+                raise InvalidInputError(f"{n} kernels need as many {what}, got {len(given)}")
 
 
 def psf_grid(
@@ -109,7 +118,16 @@ def psf_grid(
         )
     answers = [model.query(place, settings, size) for place in places]
     kernels = np.stack([answer.kernel for answer in answers]).astype(np.float32)
-    return PsfGrid(kernels, places, rows, cols, settings, tuple(a.predicted_error for a in answers))
+    return PsfGrid(
+        kernels,
+        places,
+        rows,
+        cols,
+        settings,
+        predicted_error=tuple(answer.predicted_error for answer in answers),
+        answered_by=tuple(answer.answered_by for answer in answers),
+        reason=tuple(answer.reason for answer in answers),
+    )
 
 
 class Exporter(Protocol):
@@ -152,7 +170,8 @@ class Fits:
     Notes
     -----
     Rows are stored from the bottom, as is the custom of the format, and ROWORDER says so. The
-    extension POSITIONS lists r, phi (radians, counter-clockwise from the right) and the expected error.
+    extension POSITIONS lists r, phi (radians, counter-clockwise from the right), the expected error, which
+    model answered and why.
     Source: "Definition of the Flexible Image Transport System", version 4.0, 2018, sec. 3.3 and 7.3.
     """
 
@@ -183,6 +202,10 @@ class Fits:
                 fits.Column("R", "D", unit="half-diagonal", array=[p.r for p in psfs.positions]),
                 fits.Column("PHI", "D", unit="rad", array=[p.phi for p in psfs.positions]),
                 fits.Column("ERROR", "D", array=list(psfs.predicted_error)),
+                *(
+                    fits.Column(name, f"{max(map(len, words))}A", array=list(words))
+                    for name, words in (("ANSWERER", psfs.answered_by), ("REASON", psfs.reason))
+                ),
             ],
             name="POSITIONS",
         )
@@ -193,7 +216,7 @@ class Fits:
 
 @dataclass(frozen=True, slots=True)
 class Npz:
-    """NumPy archive with `psf` (n, k, k), `r`, `phi`, `error`, `shape` (rows, cols) and `aperture`."""
+    """NumPy archive with `psf` (n, k, k), `shape` (rows, cols), and of each place what `encode` names."""
 
     suffix: str = ".npz"
 
@@ -207,6 +230,8 @@ class Npz:
             r=np.array([p.r for p in psfs.positions]),
             phi=np.array([p.phi for p in psfs.positions]),
             error=np.array(psfs.predicted_error),
+            answered_by=np.array(psfs.answered_by),
+            reason=np.array(psfs.reason),
             shape=np.array([psfs.rows, psfs.cols]),
             aperture=np.full(len(psfs.positions), aperture),
             channel=np.array(psfs.settings.channel),
@@ -312,10 +337,16 @@ def export(path: Path | str, psfs: PsfGrid, file_format: str) -> None:
 def document(psfs: PsfGrid, *, kernels: bool) -> dict[str, Any]:
     """A grid as what `json` can write, with its units; kernels as lists of rows on request."""
     entries = []
-    for place, error, kernel in zip(psfs.positions, psfs.predicted_error, psfs.kernels, strict=True):
-        entry: dict[str, Any] = {"r": place.r, "phi": place.phi, "predicted_error": error}
+    for i, place in enumerate(psfs.positions):
+        entry: dict[str, Any] = {
+            "r": place.r,
+            "phi": place.phi,
+            "predicted_error": psfs.predicted_error[i],
+            "answered_by": psfs.answered_by[i],
+            "reason": psfs.reason[i],
+        }
         if kernels:
-            entry["kernel"] = _matrix(kernel)
+            entry["kernel"] = _matrix(psfs.kernels[i])
         entries.append(entry)
     settings = psfs.settings
     return {

@@ -5,9 +5,12 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
+
+import lensmodel
 
 LIBRARY = Path(__file__).parents[2] / "docs" / "library.md"
 ABSENT = [
@@ -56,6 +59,11 @@ def five_lines() -> str:
 
 def test_the_first_lines_of_the_library_page_are_five(five_lines: str) -> None:
     assert len([line for line in five_lines.splitlines() if line]) == 5
+
+
+def test_the_package_itself_begins_with_the_same_lines(five_lines: str) -> None:
+    assert lensmodel.__doc__ is not None
+    assert textwrap.indent(five_lines, "    ") in lensmodel.__doc__
 
 
 def test_the_five_lines_run_without_any_extra(five_lines: str, tmp_path: Path) -> None:

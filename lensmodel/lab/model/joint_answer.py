@@ -137,8 +137,8 @@ def features(rows: Sequence[LensErrors]) -> Array:
     return np.stack([np.ones_like(r), r, np.log(apart + 0.02)], axis=1)
 
 
-def print_told(rows: Sequence[LensErrors], share: float) -> None:
-    """Print the coefficients of the error to tell of the mean with a share, and how often it is right."""
+def print_expected_error(rows: Sequence[LensErrors], share: float) -> None:
+    """Print the coefficients of the expected error of the mean with a share, and how often it is right."""
     column = SHARES.index(share)
 
     def logs(some: Sequence[LensErrors]) -> Array:
@@ -180,7 +180,7 @@ def main() -> None:
     print_errors(rows)
     if len({row.lens for row in rows}) > 1:
         for share in (0.0, 0.5, 0.75):
-            print_told(rows, share)
+            print_expected_error(rows, share)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,6 @@ from functools import partial
 from app.jobs import tasks
 from lensmodel.report.lens_test import lens_test
 
-tasks.lens_test = partial(lens_test, draws=2, rows=5)  # instead of 16 and 7
+tasks.lens_test = partial(lens_test, draws=2, rows=5, size=15)  # instead of 16, 7 and 31
 
 TASKS = tasks.TASKS

@@ -503,15 +503,15 @@ def test_measured_kernels_leave_a_wavefront_no_say(known: list[PsfSample], warm:
 def test_the_error_to_expect_grows_with_what_kernels_and_wavefront_differ_by() -> None:
     evidence = SampleEvidence(0.01, 0.16, 2.0, 0.3, extrapolated=False, usual=0.1)
 
-    def told(apart: float, r: float = 0.5) -> float:
+    def error(apart: float, r: float = 0.5) -> float:
         one = np.ones(1)
         shares = WAVEFRONT_SHARE * one
         mixture = Mixture(one[:, None, None], 0.1 * one, 0.1, shares, 0.1 * one, apart * one)
         return joint_error(evidence, mixture, r)
 
-    assert told(0.05) < told(0.2) < told(0.8)
-    assert told(0.2, 0.1) < told(0.2, 0.9)
-    assert 0.05 < told(0.2) < 0.5
+    assert error(0.05) < error(0.2) < error(0.8)
+    assert error(0.2, 0.1) < error(0.2, 0.9)
+    assert 0.05 < error(0.2) < 0.5
 
 
 def test_unknown_pitch_is_taken_as_a_usual_one_not_as_wide_kernels_suggest(

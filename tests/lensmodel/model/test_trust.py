@@ -232,31 +232,31 @@ class TestHonesty:
 
 
 class TestSharedError:
-    def told(self, photos: int, noise: float, expected: float | None) -> LensModel:
+    def model(self, photos: int, noise: float, expected: float | None) -> LensModel:
         samples = merged([photo(f"p{i}", i, noise=noise) for i in range(photos)])
         return LensModel.fit([replace(s, error=expected) for s in samples])
 
     def test_what_estimators_expect_does_not_fall_with_the_number_of_photos(self) -> None:
         where = FieldPosition(0.5, 0.3)
-        few, many = (self.told(n, 0.1, 0.3).query(where, GREEN, SIZE) for n in (2, 8))
+        few, many = (self.model(n, 0.1, 0.3).query(where, GREEN, SIZE) for n in (2, 8))
 
         assert many.predicted_error >= many.shared_error > 0.2
         assert many.shared_error == pytest.approx(few.shared_error, rel=0.1)
 
     def test_what_scatters_is_not_shared(self) -> None:
         where = FieldPosition(0.5, 0.3)
-        quiet, noisy = (self.told(6, noise, 0.3).query(where, GREEN, SIZE) for noise in (0.02, 0.5))
+        quiet, noisy = (self.model(6, noise, 0.3).query(where, GREEN, SIZE) for noise in (0.02, 0.5))
 
         assert noisy.shared_error < quiet.shared_error
         assert quiet.shared_error == pytest.approx(0.3, abs=0.02)
 
     def test_estimators_that_expect_nothing_share_nothing(self) -> None:
-        assert self.told(3, 0.1, None).query(FieldPosition(0.5, 0.3), GREEN, SIZE).shared_error == 0.0
+        assert self.model(3, 0.1, None).query(FieldPosition(0.5, 0.3), GREEN, SIZE).shared_error == 0.0
 
     @pytest.mark.parametrize("bad", [-0.1, math.nan, math.inf])
     def test_impossible_expectations_are_refused(self, bad: float) -> None:
         with pytest.raises(InvalidInputError, match="expected error"):
-            self.told(1, 0.1, bad)
+            self.model(1, 0.1, bad)
 
 
 class TestPrior:

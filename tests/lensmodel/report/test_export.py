@@ -8,6 +8,7 @@ import io
 import json
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,7 @@ def arrow() -> PsfGrid:
     """One kernel with its light above and to the right: a flipped axis shows."""
     kernel = np.zeros((1, 5, 5), dtype=np.float32)
     kernel[0, 0, 2], kernel[0, 2, 4] = 0.75, 0.25
-    return PsfGrid(kernel, (FieldPosition(0.5, 1.0),), 1, 1, SETTINGS, (0.1,))
+    return PsfGrid(kernel, (FieldPosition(0.5, 1.0),), 1, 1, SETTINGS, (0.1,), ("regression",), ("so",))
 
 
 def test_a_grid_asks_the_model_at_each_place(model: LensModel, psfs: PsfGrid) -> None:
@@ -120,6 +121,23 @@ def test_json_of_a_grid_holds_every_kernel_to_the_last_bit(psfs: PsfGrid, tmp_pa
     assert (stored["rows"], stored["cols"], stored["aperture"]) == (2, 3, 2.0)
 
 
+def test_each_place_says_which_model_answered_and_why(psfs: PsfGrid, tmp_path: Path) -> None:
+    fits = importlib.import_module("astropy.io.fits")
+    made = list(zip(psfs.answered_by, psfs.reason, strict=True))
+    for name in ("json", "tiff", "npz", "fits"):
+        export(tmp_path / name, psfs, name)
+
+    with tifffile.TiffFile(tmp_path / "tiff") as written:
+        texts = [(tmp_path / "json").read_text("utf-8"), written.pages.first.description]
+    for text in texts:
+        assert [(p["answered_by"], p["reason"]) for p in json.loads(text)["psfs"]] == made
+    with np.load(tmp_path / "npz", allow_pickle=False) as stored, fits.open(tmp_path / "fits") as file:
+        assert list(zip(stored["answered_by"], stored["reason"], strict=True)) == made
+        table = file["POSITIONS"].data
+        assert list(zip(table["ANSWERER"], table["REASON"], strict=True)) == made
+    assert made[0] == ("regression", "no patch has a spectrum")
+
+
 def test_json_of_a_single_place_is_a_bare_matrix_with_the_top_row_first(tmp_path: Path) -> None:
     export(tmp_path / "one.json", arrow(), "json")
 
@@ -187,4 +205,6 @@ def test_grids_too_large_for_memory_are_refused(model: LensModel) -> None:
 
 def test_grids_of_another_number_of_kernels_are_refused(psfs: PsfGrid) -> None:
     with pytest.raises(InvalidInputError, match="2 x 2 places"):
-        PsfGrid(psfs.kernels, psfs.positions, 2, 2, SETTINGS, psfs.predicted_error)
+        replace(psfs, rows=2, cols=2)
+    with pytest.raises(InvalidInputError, match="6 kernels need as many reasons, got 1"):
+        replace(psfs, reason=("so",))

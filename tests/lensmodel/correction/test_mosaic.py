@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -35,10 +37,16 @@ class Colours:
         return as_kernel(np.pad(self.kernel(channel), (size - 17) // 2))
 
 
+@cache
+def leaves() -> tuple[np.ndarray, np.random.Generator]:
+    """Return the one scene, not to be changed, and the numbers that come after it, to be copied."""
+    rng = np.random.default_rng(4)
+    return dead_leaves(*(side + 32 for side in SIDES), rng) * 0.8, rng
+
+
 def taken(lens: Colours, path: Path) -> tuple[photo.LinearPhoto, np.ndarray]:
     """Photograph leaves through a lens; return the developed photo and the sharp light."""
-    rng = np.random.default_rng(4)
-    scene = dead_leaves(*(side + 32 for side in SIDES), rng) * 0.8
+    scene, rng = leaves()[0], deepcopy(leaves()[1])
     kernels = [lens.kernel(name) for name in CHANNELS]  # round: rows and columns one after the other
     light = np.stack(
         [

@@ -14,6 +14,7 @@ from typing import Final
 
 import numpy as np
 
+from lensmodel.core.files import atomic, save_array
 from lensmodel.core.types import Planes, StepHook, ignore_step
 from lensmodel.lab.reproduce.cases import Case
 from lensmodel.lab.reproduce.scenes import centred_cut, frame_scene
@@ -105,9 +106,8 @@ def _take(case: Case, files: tuple[Path, ...], folder: Path, number: int) -> Non
         scene = case.conditions.scenery(scene, np.random.default_rng([case.seed, number, 1]))
     photo = photograph(scene, case.lens, case.settings, camera, rng)
     if number == frames - 1:
-        part = shots.sharp.with_suffix(".part.npy")
-        np.save(part, photo.sharp, allow_pickle=False)
-        part.replace(shots.sharp)
+        with atomic(shots.sharp) as file:
+            save_array(file, photo.sharp)
     # last, and whole or not at all: a photo that is there is complete
     _write(shots.files[number], photo, case)
 

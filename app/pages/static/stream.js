@@ -5,6 +5,13 @@ import { byId } from "./common.js";
 const PATIENCE_MS = 4000;
 
 let afterwards = "/"; // where to go when what the page shows is gone
+let leaving = false; // the answer and the stream both tell of it: the second going would break off the first
+
+function leave() {
+  if (leaving) return;
+  leaving = true;
+  location.assign(afterwards);
+}
 
 // Do what removes what the page shows, and go on at `url`: the stream may tell of it before the answer comes.
 export async function removing(url, act) {
@@ -15,7 +22,7 @@ export async function removing(url, act) {
     afterwards = "/";
     throw reason;
   }
-  location.assign(url);
+  leave();
 }
 
 // Make `old` like `fresh` and keep what is alike: focus, open details, what was typed.
@@ -81,7 +88,7 @@ export function setUpStream(onPart) {
     });
     source.addEventListener("gone", () => {
       source.close();
-      location.assign(afterwards);
+      leave();
     });
   };
   window.addEventListener("offline", () => (away.hidden = false));
@@ -93,5 +100,6 @@ export function setUpStream(onPart) {
   // a page in the background holds no connection; shown again it is brought up to date
   document.addEventListener("visibilitychange", () => (document.hidden ? source?.close() : reopen()));
   window.addEventListener("pagehide", () => source?.close());
+  window.addEventListener("pageshow", (event) => (leaving &&= !event.persisted)); // come back to
   open();
 }

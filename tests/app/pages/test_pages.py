@@ -268,17 +268,6 @@ def test_a_photo_without_any_lens_can_still_be_looked_at_and_deleted(
     expect(page.get_by_role("button", name="Whole photo")).to_be_enabled()
 
 
-def test_a_preview_that_nobody_waits_for_is_stopped(page: Page, learned: dict[str, Any]) -> None:
-    page.goto(f"/photos/{learned['id']}")
-    with page.expect_response(lambda answer: answer.url.endswith("/preview")) as begun:
-        page.get_by_role("button", name="upper left").click()
-    first = begun.value.json()["id"]
-    with page.expect_request(lambda request: request.method == "DELETE" and request.url.endswith(first)):
-        page.get_by_role("button", name="lower right").click()
-
-    expect(page.locator("#preview-words")).to_contain_text("This is what you get")
-
-
 def test_an_aperture_is_asked_for_where_photos_do_not_say_it(
     page: Page, service: Service, tmp_path: Path
 ) -> None:
@@ -433,9 +422,16 @@ def shown(page: Page) -> str:
     return found
 
 
-def test_sliders_show_their_effect_on_the_part_that_is_seen(page: Page, learned: dict[str, Any]) -> None:
+def test_a_preview_that_nobody_waits_for_is_stopped_and_sliders_show_their_effect_on_the_part_that_is_seen(
+    page: Page, learned: dict[str, Any]
+) -> None:
     page.goto(f"/photos/{learned['id']}")
-    page.get_by_role("button", name="lower right").click()
+    with page.expect_response(lambda answer: answer.url.endswith("/preview")) as begun:
+        page.get_by_role("button", name="upper left").click()
+    first = begun.value.json()["id"]
+    with page.expect_request(lambda request: request.method == "DELETE" and request.url.endswith(first)):
+        page.get_by_role("button", name="lower right").click()
+
     expect(page.locator("#preview-words")).to_contain_text("This is what you get")
     expect(page.locator("#viewer")).to_have_attribute("data-shown", "split")
     page.get_by_role("button", name="After", exact=True).click()

@@ -75,8 +75,8 @@ export function setUpStream(onPart) {
       away.hidden = true;
     });
     source.addEventListener("error", () => {
-      timer ||= setTimeout(() => (away.hidden = false), PATIENCE_MS);
-      if (source.readyState === EventSource.CLOSED) setTimeout(() => document.hidden || reopen(), PATIENCE_MS);
+      timer ||= setTimeout(() => (away.hidden = false), navigator.onLine ? PATIENCE_MS : 0);
+      if (source.readyState === EventSource.CLOSED) setTimeout(reopen, PATIENCE_MS);
     });
     source.addEventListener("part", (event) => {
       const target = byId(event.lastEventId);
@@ -91,14 +91,14 @@ export function setUpStream(onPart) {
       leave();
     });
   };
-  window.addEventListener("offline", () => (away.hidden = false));
-  window.addEventListener("online", () => reopen());
+  // a page in the background holds no connection; shown again it is brought up to date
   const reopen = () => {
     source?.close();
-    open();
+    if (!document.hidden) open();
   };
-  // a page in the background holds no connection; shown again it is brought up to date
-  document.addEventListener("visibilitychange", () => (document.hidden ? source?.close() : reopen()));
+  // a service on this very computer needs no network, and a connection of before says nothing: ask anew
+  for (const event of ["offline", "online"]) window.addEventListener(event, reopen);
+  document.addEventListener("visibilitychange", reopen);
   window.addEventListener("pagehide", () => source?.close());
   window.addEventListener("pageshow", (event) => (leaving &&= !event.persisted)); // come back to
   open();

@@ -148,16 +148,16 @@ class CaseJob:
 
     def _shots(self, folder: Path) -> Shots:
         total = (self.case.photos[-1] + 2) * SHOT
-        told = 0.0
+        reported = 0.0
 
         def on_step(done: int, count: int) -> None:
-            nonlocal told
+            nonlocal reported
             share = total * done / count
-            self.progress.tell(f"{self.case.title}: photo {done} of {count} taken", share - told)
-            told = share
+            self.progress.tell(f"{self.case.title}: photo {done} of {count} taken", share - reported)
+            reported = share
 
         shots = take(self.case, self.plan.files(), folder, workers=self.workers, on_step=on_step)
-        self.progress.tell(f"{self.case.title}: photos are there", total - told, fresh=told > 0)
+        self.progress.tell(f"{self.case.title}: photos are there", total - reported, fresh=reported > 0)
         return shots
 
     def _truth(self, path: Path, shots: Shots) -> None:
@@ -336,8 +336,8 @@ class CaseJob:
             state = measure.state(edges, after.planes, shots, case, before=chart)
             state["nothing_to_correct"] = after.nothing_to_correct
             if self._raw:
-                told = measure.forecast(before["light"], after.planes, after.expected_db, shots, case)
-                state["forecast"] = told
+                light = before["light"]
+                state["forecast"] = measure.forecast(light, after.planes, after.expected_db, shots, case)
             unit["methods"][method] = state
             unit["pictures"][f"{label}-{method}"] = self._picture(f"{label}-{method}", after.planes)
         # not before: until a correction, or its own leisure, has fitted the model, a service answers in part

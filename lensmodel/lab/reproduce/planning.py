@@ -9,7 +9,7 @@ from typing import Final, TypeVar
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.lab.reproduce import families, programs
-from lensmodel.lab.reproduce.cases import RIVALS, Case, Reproduction, Size
+from lensmodel.lab.reproduce.cases import HARD_METHODS, METHODS, RIVALS, Case, Reproduction, Size
 from lensmodel.lab.reproduce.conditions import PATHS, SCENES_THAT_HURT
 from lensmodel.lab.reproduce.families import FIRST_SEED
 from lensmodel.lab.reproduce.scenes import layout_for, scene_files
@@ -39,6 +39,7 @@ def planned(
     paper: bool = True,
     target: bool = True,
     rivals: bool = True,
+    default_only: bool = False,
 ) -> Reproduction:
     """Plan a run of one of four sizes.
 
@@ -70,6 +71,8 @@ def planned(
         See `Reproduction`.
     rivals : bool
         Whether the paper's blind rivals are run where the size has them.
+    default_only : bool
+        Only what a user gets who chooses nothing is measured, beside the photo as it was and the true PSF.
 
     Raises
     ------
@@ -122,11 +125,13 @@ def planned(
         _chosen(cases, only),
         scenes,
         estimator,
-        rivals=RIVALS if rivals and size != "small" else (),
-        programs=programs.installed(),
+        methods=HARD_METHODS if default_only else METHODS,
+        rivals=RIVALS if rivals and size != "small" and not default_only else (),
+        programs=() if default_only else programs.installed(),
         size=size,
-        paper=paper,
-        target=target,
+        paper=paper and not default_only,
+        general=not default_only,
+        target=target and not default_only,
     )
 
 

@@ -51,6 +51,7 @@ def describe(
             model=fitted.way,
             answered_by=answer.answered_by,
             reason=answer.reason,
+            far_light=float(answer.far_light),
             family=FamilyOut(lenses=len(fitted.family), weight=float(answer.prior_share))
             if fitted.family
             else None,

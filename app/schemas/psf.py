@@ -95,6 +95,10 @@ class Support(Model):
         "numbers here are of that"
     )
     reason: str = Field(description="why that one, in plain words")
+    far_light: float = Field(
+        default=0.0,
+        description="share of the light that lies far from the core, as shadows of the photos allow, 0..1",
+    )
     family: FamilyOut | None = None
 
 

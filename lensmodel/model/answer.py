@@ -124,6 +124,9 @@ class PsfAnswer:
         Weight of the prior in the kernel, 0..1; 0 without a prior.
     wavefront_share : float
         Weight of the fitted wavefront, 0..1.
+    far_light : float
+        Share of the kernel's light that lies far from its core as shadows of the photos allow, 0..1, see
+        `far_light`; 0 where none speaks of it.
     answered_by : str
         Which model answered: "regression", "wavefront and regression", "wavefront" or "paper".
     reason : str
@@ -144,6 +147,7 @@ class PsfAnswer:
     prior: str = ""
     prior_share: float = 0.0
     wavefront_share: float = 0.0
+    far_light: float = 0.0
     answered_by: str = ""
     reason: str = ""
     scatter: Callable[[], NDArray[np.float64]] | None = field(default=None, repr=False)

@@ -288,6 +288,7 @@ class LensModel:
             prior="" if self.prior is None else self.prior.name,
             prior_share=share,
             wavefront_share=wavefront_share,
+            far_light=float(mixture.far_light[0]),
             answered_by=made.answered_by,
             reason=made.reason,
             scatter=scatter,
@@ -309,9 +310,8 @@ class LensModel:
         if not positions:
             return np.empty((0, size, size))
         pixel = self._predictor.pixels.asked(pitch_um, half_diagonal_px)
-        _, mixture, _ = self._predictor.ask(
-            positions, settings, self._predictor.pixels.inner_size(size, pixel)
-        )
+        inside = self._predictor.pixels.inner_size(size, pixel)
+        _, mixture, _ = self._predictor.ask(positions, settings, inside)
         return self._predictor.pixels.resampled(mixture.kernels, size, pixel)
 
     def kernel_of(self, sample: PsfSample) -> Kernel:

@@ -57,6 +57,8 @@ class Mixture:
         Squared held-out errors of averaged kernels alone near the places.
     apart : ndarray, shape (q,)
         How far the wavefront lies from the averaged kernels, relative L2; 0 without it.
+    far_light : ndarray, shape (q,)
+        Share of the light of `kernels` that was added far from their core, 0..1.
     """
 
     kernels: NDArray[np.float64]
@@ -65,6 +67,7 @@ class Mixture:
     shares: NDArray[np.float64]
     averaged: NDArray[np.float64]
     apart: NDArray[np.float64]
+    far_light: NDArray[np.float64]
 
 
 def answered(
@@ -136,7 +139,7 @@ def _with_wavefront(
 
 def _alone(kernels: NDArray[np.float64], near: Answers, errors: NDArray[np.float64]) -> Mixture:
     nothing, squared = np.zeros(len(kernels)), near.mean(errors**2)
-    return Mixture(kernels, squared, float(errors @ errors) / len(errors), nothing, squared, nothing)
+    return Mixture(kernels, squared, float(errors @ errors) / len(errors), nothing, squared, nothing, nothing)
 
 
 def between(one: Mixture, other: Mixture, share: float) -> Mixture:
@@ -149,4 +152,5 @@ def between(one: Mixture, other: Mixture, share: float) -> Mixture:
         share * one.shares + rest * other.shares,
         share * one.averaged + rest * other.averaged,
         share * one.apart + rest * other.apart,
+        share * one.far_light + rest * other.far_light,
     )

@@ -88,7 +88,7 @@ class Predictor:
         if self._far_light is not None:
             # kernels that were measured show all of the light
             far = self._far_light.shares(positions, settings) * (1.0 - measured_share(expected))
-            mixture = replace(mixture, kernels=with_far_light(mixture.kernels, far))
+            mixture = replace(mixture, kernels=with_far_light(mixture.kernels, far), far_light=far)
         shares = np.zeros(len(positions))
         if self.prior is not None:
             shares = self.prior.share(self._samples_around(positions, settings))
@@ -97,7 +97,11 @@ class Predictor:
                 positions, settings, size, pitch_um=pitch, half_diagonal_px=half_diagonal
             )
             part = shares[:, None, None]
-            mixture = replace(mixture, kernels=(1.0 - part) * mixture.kernels + part * other)
+            mixture = replace(
+                mixture,
+                kernels=(1.0 - part) * mixture.kernels + part * other,
+                far_light=(1.0 - shares) * mixture.far_light,
+            )
         return near, mixture, shares
 
     def _samples_around(

@@ -75,6 +75,9 @@ def test_kernels_get_what_the_shadows_of_the_photos_allow() -> None:
     np.testing.assert_allclose(kernels[0].sum(), 1.0)
     assert outside(model) == pytest.approx(0.5 * expected, rel=0.35)  # half of it lies beyond eight pixels
     assert outside(learned(None, None, None, None)) < 1e-5
+    answer = model.query(FieldPosition(0.5, 0.3), OPEN, 55)
+    assert answer.far_light == pytest.approx(expected, rel=0.1)  # nearest bounds are some way off
+    np.testing.assert_array_equal(answer.kernel, kernels[0])
 
 
 def test_each_colour_gets_what_green_says() -> None:

@@ -136,6 +136,14 @@ def test_third_order_simulator_is_the_limit_of_a_real_design_at_small_apertures(
     assert errors[-1] < 0.015
 
 
+def test_third_order_simulator_is_the_limit_of_a_real_design_at_small_fields() -> None:
+    design = designs.create("heliar").scaled(4.0)
+    errors = [distance(*traced_and_simulated(design, 16.0, deg, 0.9)).rel_l2 for deg in (20.0, 12.0, 8.0, 4.0)]
+    assert errors == sorted(errors, reverse=True)
+    assert errors[0] > 0.05
+    assert errors[-1] < 0.015
+
+
 def seidel_waves(design: Design, f_number: float, field_deg: float) -> dict[str, float]:
     """Hopkins coefficients in waves from the sums of third-order theory, paraxial image plane."""
     system = optic_of(design)

@@ -138,7 +138,9 @@ def test_third_order_simulator_is_the_limit_of_a_real_design_at_small_apertures(
 
 def test_third_order_simulator_is_the_limit_of_a_real_design_at_small_fields() -> None:
     design = designs.create("heliar").scaled(4.0)
-    errors = [distance(*traced_and_simulated(design, 16.0, deg, 0.9)).rel_l2 for deg in (20.0, 12.0, 8.0, 4.0)]
+    errors = [
+        distance(*traced_and_simulated(design, 16.0, deg, 0.9)).rel_l2 for deg in (20.0, 12.0, 8.0, 4.0)
+    ]
     assert errors == sorted(errors, reverse=True)
     assert errors[0] > 0.05
     assert errors[-1] < 0.015

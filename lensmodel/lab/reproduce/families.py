@@ -17,6 +17,10 @@ FAMILIES: Final[tuple[Family, ...]] = ("third order", "ray-traced")
 FIRST_SEED: Final = 1000
 """Seeds of third-order lenses below are for development, and parameters are chosen on them."""
 
+SEEDS: Final = (1008, *range(1001, 1008))
+"""Of third-order lenses that are run, one of each kind; 1008 is the soft, fast one instead of 1000, so that
+half of them are unseen."""
+
 SEEDS_LOOKED_AT: Final = frozenset({1000, 1001, 1002, 1003, 1006})
 """Of those beyond: results of these were looked into during development, and two choices followed: the
 share of the correction that compressed photos get (1001), and pairs of photos in the search (1002)."""

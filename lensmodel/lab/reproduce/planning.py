@@ -11,7 +11,6 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.lab.reproduce import families, programs
 from lensmodel.lab.reproduce.cases import HARD_METHODS, METHODS, RIVALS, Case, Reproduction, Size
 from lensmodel.lab.reproduce.conditions import PATHS, SCENES_THAT_HURT
-from lensmodel.lab.reproduce.families import FIRST_SEED
 from lensmodel.lab.reproduce.scenes import layout_for, scene_files
 from lensmodel.simulate import draw_lens
 
@@ -91,10 +90,10 @@ def planned(
         raise InvalidInputError(
             f"at most {photos} photos of size {size}: give one or more, without another size beside it"
         )
-    seeds = range(FIRST_SEED, FIRST_SEED + 8)[:lenses]
+    seeds = families.SEEDS[:lenses]
     paths = tuple(families.repository_grids() if grids is None else grids)[:lenses]
     if size == "quick":
-        two = (FIRST_SEED, FIRST_SEED + 4)[:lenses]
+        two = (families.SEEDS[0], families.SEEDS[4])[:lenses]
         cases = tuple(_case(seed, (1, 2), files, _QUICK_FRAME) for seed in two)
         cases += tuple(_traced(path, (1, 2), files, _QUICK_FRAME) for path in paths)
     else:

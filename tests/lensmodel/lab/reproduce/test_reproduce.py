@@ -127,7 +127,7 @@ def test_fewer_lenses_are_the_first_ones_and_their_results_serve_more() -> None:
     base = [one for one in some.cases if one.condition == BASE]
 
     assert base == [one for one in every.cases if one.condition == BASE][:3]
-    assert {one.seed for one in some.cases} == {1000, 1001, 1002}
+    assert {one.seed for one in some.cases} == {1008, 1001, 1002}
     assert key_of(base[0], some, "direct", "abc") == key_of(every.cases[0], every, "direct", "abc")
     assert len(planned("quick", lenses=1, grids=()).cases) == 1
     with pytest.raises(InvalidInputError, match="at least one lens"):
@@ -172,8 +172,8 @@ def test_fewer_photos_leave_larger_frames() -> None:
 def test_plan_has_lenses_of_both_families_and_says_which_were_looked_at() -> None:
     cases = planned("quick").cases
     assert [one.family for one in cases] == ["third order"] * 2 + ["ray-traced"] * 2
-    assert [one.unseen for one in cases] == [False, True, False, False]
-    assert {one.name.partition("-")[0] for one in cases} == {"1000", "1004", "heliar", "reverse"}
+    assert [one.unseen for one in cases] == [True, True, False, False]
+    assert {one.name.partition("-")[0] for one in cases} == {"1008", "1004", "heliar", "reverse"}
     assert len({one.seed for one in cases}) == 4
 
 

@@ -20,7 +20,7 @@ from lensmodel.model.answer import MICROMETRE
 from lensmodel.photo.endings import ENDINGS
 from lensmodel.workflow import pipeline
 from lensmodel.workflow.lens import Lens
-from lensmodel.workflow.ways import way_named, way_of
+from lensmodel.workflow.ways import way_of
 
 _ZIP: Final = b"PK"
 """First bytes of a profile, damaged or not: the signature of a ZIP file."""
@@ -164,8 +164,13 @@ class ProfileFile:
         stamp = _stamp(self._target)
         if stamp not in {None, self._stamp_read}:
             profile = _opened(self._target)
-            mode = None if self._options.model is None else way_named(self._options.model).mode
-            model = self._with_family(profile.model.answering(mode=mode, unit=self._options.unit))
+            learned, asked = way_of(profile.model).name, self._options.model or way_of(profile.model).name
+            if asked != learned:  # its kernels are the other model's: the two would be mixed
+                raise InvalidInputError(
+                    f"the lens in {self._target.name} has the model {learned}, not {asked}: name a new file "
+                    "after --profile and give its photos again, or replace the file with --force"
+                )
+            model = self._with_family(profile.model.answering(unit=self._options.unit))
             self._lens, self._stamp_read = Lens(replace(profile, model=model)), stamp
             # a run that was stopped left no fit: the next one makes it, whether it has photos or not
             self.settled = self.settled and model is profile.model and model.warm

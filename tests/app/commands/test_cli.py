@@ -34,6 +34,7 @@ from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
 from lensmodel.workflow import pipeline
+from lensmodel.workflow.ways import way_of
 
 HERE = Path(__file__).parents[1]
 sys.path.insert(0, str(HERE))
@@ -588,19 +589,25 @@ def test_a_profile_keeps_the_unit_that_it_was_told_and_modes_are_gone(
 def test_a_lens_learned_the_papers_way_stays_so_and_is_corrected_so(
     folder: Path, here: Here, few_patches: None, estimated_here: None, short_search: None
 ) -> None:
-    words = ("calibrate", "one.dng", "-p", PROFILE, "--workers", "1", "--any-lens", "--json")
+    new = "paper.lensprofile"
+    words = ("calibrate", "one.dng", "-p", new, "--workers", "1", "--any-lens", "--json")
     quick = ("--estimator", "whittle", "--kernel-size", "21")
     told = json.loads(here(*words, *quick, "--model", "paper").stdout)
 
-    kept = load_profile(folder / PROFILE).model
+    kept = load_profile(folder / new).model
     sides = {sample.kernel.shape for sample in kept.samples}
     assert (told["model"], kept.settings.mode, max(sides)) == ("paper", "paper", (21, 21))
     assert json.loads(here(*words, *quick).stdout)["model"] == "paper"
-    assert here("correct", "one.dng", "-p", PROFILE, "-o", "out").returncode == 0
+    assert here("correct", "one.dng", "-p", new, "-o", "out").returncode == 0
     with Image.open(folder / "out" / "one-corrected.tif") as written:
         assert "method paper" in str(written.tag_v2.get(270))
     assert here(*words, "--kernel-size", "57").returncode == 2
-    assert json.loads(here(*words, *quick, "--model", "default").stdout)["model"] == "default"
+    # kernels of the two models are not to be mixed
+    for profile, asked, has in ((new, "default", "paper"), (PROFILE, "paper", "default")):
+        refused = here("calibrate", "two.dng", "-p", profile, "--any-lens", *quick, "--model", asked)
+        assert refused.returncode != 0
+        assert f"has the model {has}, not {asked}" in refused.stderr
+        assert way_of(load_profile(folder / profile).model).name == has
 
 
 def test_a_photo_that_says_little_is_corrected_with_a_word_of_warning(folder: Path, here: Here) -> None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.types import Kernel
+from lensmodel.model.field.smoothers import smoothers
 
 BOTH: Final = "both"
 KERNELS: Final = "kernels"
@@ -76,6 +77,7 @@ class ModelSettings:
             value = getattr(self, name)
             if value is not None and not 0.0 <= value <= 1.0:
                 raise InvalidInputError(f"{name} symmetry must lie in 0..1, or None, got {value}")
+        smoothers.create(self.method)  # refuses a name that there is not
         if self.mode not in MODES:
             why = "is gone" if self.mode in FORMER_MODES else "is not known"
             raise UnknownMethodError(

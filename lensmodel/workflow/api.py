@@ -19,6 +19,7 @@ from lensmodel.model import ModelSettings
 from lensmodel.photo.arrays import photo_from_array
 from lensmodel.photo.tags.xmp_block import sidecar_path, write_sidecar
 from lensmodel.workflow import pipeline
+from lensmodel.workflow.arguments import require_workers
 from lensmodel.workflow.lens import Lens
 from lensmodel.workflow.pipeline import CalibrationEvent, EventHook, ignore_event
 from lensmodel.workflow.ways import way_of
@@ -106,6 +107,7 @@ def calibrate(
     NotEnoughEvidenceError
         If no photo could be used; the text says why for each.
     """
+    require_workers(workers)
     paths = [Path(photos)] if isinstance(photos, str | Path) else [Path(path) for path in photos]
     for path in paths:
         path.stat()
@@ -214,6 +216,8 @@ def correct(
     UnknownMethodError
         If there is no method of that name.
     """
+    require_workers(workers)
+    given = LensSettings(aperture, focal_mm, focus_m)
     target = None if output is None else Path(output)
     written = file_format or (None if target is None else _format_of(target))
     source = Path(image) if isinstance(image, str | Path) else None
@@ -232,7 +236,7 @@ def correct(
     corrected = pipeline.correct_photo(
         developed,
         known.model,
-        pipeline.settings_of(developed, LensSettings(aperture, focal_mm, focus_m)),
+        pipeline.settings_of(developed, given),
         method=method,
         strength=strength,
         bounds=bounds,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +21,7 @@ from lensmodel.model import (
     save_profile,
 )
 from lensmodel.quality import mtf50_from_kernel, mtf_from_kernel
+from lensmodel.workflow.arguments import frequencies_of, named_each, one_each, places_joined
 from lensmodel.workflow.field_grid import field_grid
 from lensmodel.workflow.identity import Identity
 
@@ -99,8 +99,8 @@ class Lens:
         if stack.ndim != 3:
             raise InvalidInputError(f"kernels must have the shape (n, k, k), got {stack.shape}")
         n = len(stack)
-        places = zip(_each(r, n, "r"), _each(phi, n, "phi"), strict=True)
-        apertures = [None] * n if aperture is None else _each(aperture, n, "aperture")
+        places = zip(one_each(r, n, "r"), one_each(phi, n, "phi"), strict=True)
+        apertures = [None] * n if aperture is None else one_each(aperture, n, "aperture")
         samples = [
             PsfSample(
                 centred(kernel),
@@ -115,9 +115,9 @@ class Lens:
                 stack,
                 places,
                 apertures,
-                _named(channel, n, "channel"),
-                _each(weight, n, "weight"),
-                _named(photo, n, "photo"),
+                named_each(channel, n, "channel"),
+                one_each(weight, n, "weight"),
+                named_each(photo, n, "photo"),
                 strict=True,
             )
         ]
@@ -279,11 +279,9 @@ class Lens:
         Raises
         ------
         InvalidInputError
-            If a value is out of its range.
+            If the shapes of `r` and `phi` do not broadcast, or a value is out of its range.
         """
-        radii, angles = np.broadcast_arrays(
-            np.asarray(r, dtype=np.float64), np.asarray(phi, dtype=np.float64)
-        )
+        radii, angles = places_joined(r, phi)
         places = [
             FieldPosition(float(a), float(b)) for a, b in zip(radii.ravel(), angles.ravel(), strict=True)
         ]
@@ -305,8 +303,8 @@ class Lens:
         ----------
         r, phi : array_like
             Field positions, of shapes that broadcast to one shape S.
-        frequencies : array_like, shape (n,)
-            Cycles/pixel.
+        frequencies : array_like, shape (n,) or ()
+            Cycles/pixel; not negative.
         aperture, channel
             As of `psf`.
 
@@ -318,9 +316,10 @@ class Lens:
         Raises
         ------
         InvalidInputError
-            If a value is out of its range.
+            If the frequencies are no list of finite numbers from 0 on, the shapes of `r` and `phi` do not
+            broadcast, or a value is out of its range.
         """
-        wanted = np.atleast_1d(np.asarray(frequencies, dtype=np.float64))
+        wanted = frequencies_of(frequencies)
         kernels = self.kernels(r, phi, aperture=aperture, channel=channel)
         angles = np.broadcast_to(np.asarray(phi, dtype=np.float64), kernels.shape[:-2])
         out = np.empty((2, *angles.shape, len(wanted)))
@@ -383,17 +382,3 @@ class Lens:
         words = [self.profile.lens[key] for key in ("maker", "model") if self.profile.lens.get(key)]
         count = len(self.profile.photos)
         return f"{' '.join(words) or 'unknown lens'}, profile of {count} photo{'' if count == 1 else 's'}"
-
-
-def _each(values: ArrayLike, n: int, name: str) -> list[float]:
-    array = np.asarray(values, dtype=np.float64)
-    if array.shape not in {(), (n,)}:
-        raise InvalidInputError(f"{name} must be one number or {n}, one for each kernel, got {array.shape}")
-    return [float(value) for value in np.broadcast_to(array, (n,))]
-
-
-def _named(values: str | Sequence[str], n: int, name: str) -> list[Any]:
-    names = [values] * n if isinstance(values, str) else list(values)
-    if len(names) != n:
-        raise InvalidInputError(f"{name} must be one or {n}, one for each kernel, got {len(names)}")
-    return names

@@ -240,6 +240,30 @@ def test_arrays_that_do_not_fit_each_other_are_refused(change: dict[str, Any]) -
         Lens.from_kernels(**given)
 
 
+@pytest.mark.parametrize(
+    ("frequencies", "text"),
+    [
+        ([[0.1, 0.2]], r"\(1, 2\)"),
+        ([0.1, np.nan], "got nan"),
+        ([0.1, -0.2], r"got -0\.2"),
+        (np.inf, "got inf"),
+    ],
+    ids=str,
+)
+def test_frequencies_that_no_contrast_has_are_refused(frequencies: Any, text: str) -> None:
+    lens, _ = field_of_gaussians()
+
+    with pytest.raises(InvalidInputError, match=text):
+        lens.mtf(0.5, 0.0, frequencies)
+
+
+def test_places_whose_shapes_do_not_fit_are_refused() -> None:
+    lens, _ = field_of_gaussians()
+
+    with pytest.raises(InvalidInputError, match=r"\(2,\) and \(3,\)"):
+        lens.kernels([0.1, 0.2], [0.0, 1.0, 2.0])
+
+
 # --- arrays in, arrays out; methods of one's own ----------------------------------------------
 
 
@@ -273,8 +297,35 @@ def test_what_would_be_lost_work_is_refused_before_it() -> None:
         lensmodel.correct(planes, lens, method="nonsense")
     with pytest.raises(InvalidInputError, match="height, width"):
         lensmodel.correct(planes[0], lens)
+    with pytest.raises(InvalidInputError, match="workers must be at least 1, got 0"):
+        lensmodel.correct(planes, lens, workers=0)
     with pytest.raises(FileNotFoundError):
         lensmodel.calibrate("gone.dng")
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.0, float("nan")])
+def test_an_aperture_that_no_lens_has_is_refused_before_a_photo_is_read(value: float) -> None:
+    lens, _ = field_of_gaussians()
+
+    for refused in (
+        lambda: lensmodel.photo_from_array(np.zeros((3, 8, 8)), aperture=value),
+        lambda: lensmodel.correct("gone.dng", lens, aperture=value),
+        lambda: lensmodel.calibrate([], aperture=value),
+    ):
+        with pytest.raises(InvalidInputError, match=f"f-number in 0.5..128, got {value}"):
+            refused()
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.0, float("nan"), float("inf")])
+def test_a_pixel_pitch_that_no_sensor_has_is_refused(value: float) -> None:
+    with pytest.raises(InvalidInputError, match=f"positive micrometres, got {value}"):
+        lensmodel.photo_from_array(np.zeros((3, 8, 8)), pixel_pitch_um=value)
+
+
+@pytest.mark.parametrize("asked", [{"workers": 0}, {"patches": 0}, {"kernel_size": 0}], ids=str)
+def test_a_calibration_that_asks_for_nothing_is_refused_at_once(asked: dict[str, int]) -> None:
+    with pytest.raises(InvalidInputError, match=", got 0"):
+        lensmodel.calibrate([], **asked)  # type: ignore[arg-type]
 
 
 def test_a_photo_is_not_replaced_by_its_correction(tmp_path: Path) -> None:

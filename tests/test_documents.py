@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from lensmodel.photo.endings import ENDINGS
+
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted(page for page in DOCS.glob("*.md") if page.name != "changelog.md")
@@ -65,6 +67,13 @@ def broken(page: Path) -> list[str]:
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_a_page_for_users_is_short(page: Path) -> None:
     assert len(page.read_text(encoding="utf-8").split()) < MOST_WORDS
+
+
+def test_the_page_of_formats_lists_the_endings_that_are_taken() -> None:
+    read = (DOCS / "formats.md").read_text(encoding="utf-8").partition("\n## Photos that are written\n")[0]
+    named = {f".{word}" for word in re.findall(r"\.([a-z0-9]+)\b", " ".join(SPAN.findall(read)))}
+
+    assert named == ENDINGS
 
 
 def test_the_readme_is_short() -> None:

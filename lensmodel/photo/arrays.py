@@ -28,7 +28,7 @@ def photo_from_array(
 
     Parameters
     ----------
-    planes : array_like, shape (3, height, width)
+    planes : array_like of float, shape (3, height, width)
         Red, green and blue in linear light: black 0, saturation at `clip`; kept as float32.
     noise : NoiseModel or sequence of three, optional
         Variance of the pixels against their level; None measures it on the flat places of each plane
@@ -36,9 +36,9 @@ def photo_from_array(
     clip : float
         Level at which the sensor saturates.
     aperture : float, optional
-        f-number; `focal_mm` in mm and `focus_m` in metres as far as they are known.
+        f-number, 0.5 to 128; `focal_mm` in mm and `focus_m` in metres as far as they are known.
     pixel_pitch_um : float, optional
-        Pitch of the pixels in micrometres.
+        Pitch of the pixels in micrometres, above 0.
 
     Returns
     -------

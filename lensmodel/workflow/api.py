@@ -103,7 +103,7 @@ def calibrate(
     InvalidInputError
         If a value is out of its range, or both `lens` and `model` are given.
     UnknownMethodError
-        If there is no estimator or model of that name.
+        If there is no estimator, selector or model of that name.
     NotEnoughEvidenceError
         If no photo could be used; the text says why for each.
     """
@@ -167,9 +167,13 @@ def correct(
 ) -> correction.Corrected:
     """Remove the blur of a lens from a photo: files in and out, or arrays.
 
+    Non-blind deconvolution with the PSF of each place (Hirsch and Schölkopf, ICCV 2015, section 7). How far
+    it goes where PSF or photo are unsure, and what it holds back, are rules of this project; with the method
+    "paper", a lens that was learned the paper's way is corrected without them.
+
     Parameters
     ----------
-    image : path, LinearPhoto, or ndarray of shape (3, height, width)
+    image : path, LinearPhoto, or ndarray of float, shape (3, height, width)
         A photo file; what `develop` or `photo_from_array` made; or planes of linear light, black 0 and
         saturation 1, in sensor orientation.
     lens : Lens or path
@@ -209,12 +213,19 @@ def correct(
 
     Raises
     ------
+    FileNotFoundError
+        If there is no such photo or profile, or no folder for `output`; another `OSError` if one cannot be
+        read or written.
     UnreadablePhotoError
         If the file cannot be decoded.
+    ImageTooLargeError
+        If the photo has more pixels than are read.
     InvalidInputError
         If a value is out of its range, the ending of `output` is unknown, or it is the photo itself.
     UnknownMethodError
         If there is no method of that name.
+    CancelledError
+        If `on_step` raised it.
     """
     require_workers(workers)
     given = LensSettings(aperture, focal_mm, focus_m)

@@ -16,7 +16,7 @@ def field_grid(
     Parameters
     ----------
     rows, cols : int
-        Number of cells.
+        Number of cells, at least 1.
     aspect : float
         Width over height of the picture.
 

@@ -67,15 +67,16 @@ class Lens:
 
         Parameters
         ----------
-        kernels : array_like, shape (n, k, k)
-            k odd; not negative. Each is normalized, and its center of mass moved to the middle pixel.
-        r, phi : array_like, shape (n,)
+        kernels : array_like of float, shape (n, k, k)
+            k odd; not negative, on the pixel grid of the sensor. Each is normalized, and its center of mass
+            moved to the middle pixel.
+        r, phi : array_like of float, shape (n,)
             Field positions: half diagonals 0..1, and radians.
-        aperture : array_like, shape (n,) or (), optional
+        aperture : array_like of float, shape (n,) or (), optional
             f-number of each, or of all; None where it is unknown.
         channel : {"r", "g", "b"} or sequence of them
             Color of each, or of all.
-        weight : array_like, shape (n,) or ()
+        weight : array_like of float, shape (n,) or ()
             Confidence 0..1, which scales the vote of a kernel.
         photo : str or sequence of str
             What each was measured on: kernels of one photo share its faults.
@@ -90,8 +91,10 @@ class Lens:
 
         Raises
         ------
+        InvalidKernelError
+            If a kernel cannot be a PSF.
         InvalidInputError
-            If shapes do not fit, or a value is out of its range.
+            If shapes do not fit, or another value is out of its range.
         NoSamplesError
             If there is no kernel, or none has a weight.
         """
@@ -200,6 +203,8 @@ class Lens:
         ------
         OSError
             If it cannot be written.
+        InvalidInputError
+            If it has more samples than a file may hold.
         """
         save_profile(path, self.profile)
 
@@ -267,8 +272,8 @@ class Lens:
 
         Parameters
         ----------
-        r, phi : array_like
-            Field positions, of shapes that broadcast to one shape S.
+        r, phi : array_like of float
+            Field positions, half diagonals 0..1 and radians, of shapes that broadcast to one shape S.
         aperture, channel, size
             As of `psf`.
 
@@ -301,9 +306,9 @@ class Lens:
 
         Parameters
         ----------
-        r, phi : array_like
-            Field positions, of shapes that broadcast to one shape S.
-        frequencies : array_like, shape (n,) or ()
+        r, phi : array_like of float
+            Field positions, half diagonals 0..1 and radians, of shapes that broadcast to one shape S.
+        frequencies : array_like of float, shape (n,) or ()
             Cycles/pixel; not negative.
         aperture, channel
             As of `psf`.

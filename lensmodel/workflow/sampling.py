@@ -51,6 +51,7 @@ class CalibrationEvent:
     Parameters
     ----------
     photo : Path
+        Its file.
     stage : {"developing", "selecting", "estimating", "counted", "skipped"}
         The last two end the work on a photo.
     done, total : int

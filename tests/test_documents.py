@@ -12,7 +12,10 @@ from lensmodel.photo.endings import ENDINGS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = sorted(page for page in DOCS.glob("*.md") if page.name != "changelog.md")
+FIRST = ("guide", "expect", "formats", "library", "service")
+"""The pages for users; what else they may want to know is in `topics`."""
+
+PAGES = sorted([*(DOCS / f"{page}.md" for page in FIRST), *(DOCS / "topics").glob("*.md")])
 """What users and operators read; the changelog grows with each version."""
 
 DOCUMENTS = sorted([*DOCS.rglob("*.md"), *ROOT.glob("*.md"), *(ROOT / "lensmodel").rglob("*.md")])
@@ -62,6 +65,10 @@ def broken(page: Path) -> list[str]:
         if not there.exists() or (anchor and anchor not in anchors(there)):
             lost.append(target)
     return lost
+
+
+def test_a_newcomer_sees_few_pages() -> None:
+    assert {page.stem for page in DOCS.glob("*.md")} == {*FIRST, "changelog"}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)

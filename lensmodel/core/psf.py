@@ -220,9 +220,9 @@ class PsfSample:
     ----------
     kernel : Kernel, float64, shape (k, k)
         k odd; finite, not negative and not all zero, on the sensor's pixel grid in sensor orientation. It is
-        copied, normalised and read-only here.
+        copied, normalized and read-only here.
     position : FieldPosition
-        Centre of the patch that it was seen in.
+        Center of the patch that it was seen in.
     settings : LensSettings
         Aperture, focal length, focus distance and channel of the photo.
     weight : float

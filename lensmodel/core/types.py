@@ -49,7 +49,7 @@ class FieldPosition:
     Parameters
     ----------
     r : float
-        Distance to the image centre over the half diagonal: 0 centre, 1 corner.
+        Distance to the image center over the half diagonal: 0 center, 1 corner.
     phi : float
         Angle in radians, counter-clockwise from the right: 0 right, +pi/2 towards row 0.
         Stored wrapped into (-pi, pi].
@@ -91,7 +91,7 @@ class LensSettings:
     focus_m : float or None
         Focus distance in metres, above 0; infinity is allowed.
     channel : {"r", "g", "b"}
-        Colour channel.
+        Color channel.
 
     Raises
     ------
@@ -124,7 +124,7 @@ class LensSettings:
         return None if self.aperture is None else 2.0 * math.log2(self.aperture)
 
     def with_channel(self, channel: Channel) -> LensSettings:
-        """Return the same settings for another colour channel.
+        """Return the same settings for another color channel.
 
         Parameters
         ----------

@@ -86,7 +86,7 @@ class PsfEstimator(Protocol):
         Parameters
         ----------
         patches : sequence of Plane, float32, each of shape (h, w)
-            Windows of 64 to 512 px of one colour plane, linear light.
+            Windows of 64 to 512 px of one color plane, linear light.
         noise : sequence of NoiseModel
             One for each patch.
         size : int
@@ -99,7 +99,7 @@ class PsfEstimator(Protocol):
         Returns
         -------
         PsfEstimate
-            Its kernel is float64 of shape (size, size), with sum 1 and its centre of mass in the middle.
+            Its kernel is float64 of shape (size, size), with sum 1 and its center of mass in the middle.
 
         Raises
         ------

@@ -123,7 +123,7 @@ class PsfAnswer:
     Parameters
     ----------
     kernel : Kernel, float64, shape (size, size)
-        In the image frame, centred, sum 1.
+        In the image frame, centered, sum 1.
     effective_samples : float
         1 / sum W^2 of the samples' parts in the answer, see `provenance`.
     photos : int

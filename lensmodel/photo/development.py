@@ -25,7 +25,7 @@ def develop(path: Path | str, *, limits: Limits | None = None, demosaic: Demosai
     """Develop a photo: RAW through LibRaw, TIFF, PNG and JPEG through their transfer curve.
 
     The planes are in sensor orientation, whatever the file says about turning them; RAW is in
-    camera colours before white balance, others in the primaries of their profile. Curves are those of
+    camera colors before white balance, others in the primaries of their profile. Curves are those of
     sRGB [1]_ or of the file's own profile [2]_; noise is measured on flat places, of RAW on its mosaic too.
 
     Parameters

@@ -191,7 +191,7 @@ class LinearPhoto:
     Parameters
     ----------
     planes : ndarray of float32, shape (3, height, width)
-        Black 0, saturation 1, not white balanced; RAW stays in the camera's own colours.
+        Black 0, saturation 1, not white balanced; RAW stays in the camera's own colors.
     frame : Frame
         Size of the planes.
     noise : tuple of three NoiseModel

@@ -11,7 +11,7 @@ from lensmodel.core.errors import InvalidInputError
 def field_grid(
     rows: int, cols: int, *, aspect: float = 1.5
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the field positions of the centres of equal cells of a picture.
+    """Return the field positions of the centers of equal cells of a picture.
 
     Parameters
     ----------

@@ -34,7 +34,7 @@ class Lens:
     """One copy of a lens: its PSF at every place of the picture, aperture and color.
 
     The PSF is the function f(u, v, r, phi, settings) of M. Hirsch and B. Schölkopf, "Self-Calibration of
-    Optical Lenses", ICCV 2015, section 6. Places are field positions: `r` is the distance to the centre over
+    Optical Lenses", ICCV 2015, section 6. Places are field positions: `r` is the distance to the center over
     the half diagonal (0 center, 1 corner), `phi` the angle in radians, counter-clockwise from the right, in
     sensor orientation. Kernels are float64, of odd side, not negative, of sum 1, on the pixel grid of the
     sensor that the lens was calibrated on.
@@ -108,13 +108,13 @@ class Lens:
             PsfSample(
                 centred(kernel),
                 FieldPosition(*place),
-                LensSettings(f_number, channel=colour),
+                LensSettings(f_number, channel=color),
                 weight=vote,
                 photo=name,
                 pixel_pitch_um=pixel_pitch_um,
                 estimator="given",
             )
-            for kernel, place, f_number, colour, vote, name in zip(
+            for kernel, place, f_number, color, vote, name in zip(
                 stack,
                 places,
                 apertures,

@@ -240,6 +240,18 @@ def test_what_a_public_name_raises_is_documented(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", DOCUMENTED)
+def test_a_public_name_and_its_documentation_spell_alike(name: str) -> None:
+    text = f"{name} {' '.join(arguments(name))} {inspect.getdoc(public(name))}"
+
+    assert re.findall(r"\w*(?:centre|colour|normalis)\w*", text, re.IGNORECASE) == []
+
+
+def arguments(name: str) -> list[str]:
+    code = code_of(public(name))
+    return [] if code is None else list(inspect.signature(code).parameters)
+
+
+@pytest.mark.parametrize("name", DOCUMENTED)
 def test_a_public_array_says_its_shape_and_dtype(name: str) -> None:
     value = public(name)
     text = inspect.getdoc(value) or ""

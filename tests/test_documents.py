@@ -8,9 +8,14 @@ from pathlib import Path
 
 import pytest
 
+from lensmodel.photo.endings import ENDINGS
+
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = sorted(page for page in DOCS.glob("*.md") if page.name != "changelog.md")
+FIRST = ("guide", "expect", "formats", "library", "service")
+"""The pages for users; what else they may want to know is in `topics`."""
+
+PAGES = sorted([*(DOCS / f"{page}.md" for page in FIRST), *(DOCS / "topics").glob("*.md")])
 """What users and operators read; the changelog grows with each version."""
 
 DOCUMENTS = sorted([*DOCS.rglob("*.md"), *ROOT.glob("*.md"), *(ROOT / "lensmodel").rglob("*.md")])
@@ -62,9 +67,20 @@ def broken(page: Path) -> list[str]:
     return lost
 
 
+def test_a_newcomer_sees_few_pages() -> None:
+    assert {page.stem for page in DOCS.glob("*.md")} == {*FIRST, "changelog"}
+
+
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_a_page_for_users_is_short(page: Path) -> None:
     assert len(page.read_text(encoding="utf-8").split()) < MOST_WORDS
+
+
+def test_the_page_of_formats_lists_the_endings_that_are_taken() -> None:
+    read = (DOCS / "formats.md").read_text(encoding="utf-8").partition("\n## Photos that are written\n")[0]
+    named = {f".{word}" for word in re.findall(r"\.([a-z0-9]+)\b", " ".join(SPAN.findall(read)))}
+
+    assert named == ENDINGS
 
 
 def test_the_readme_is_short() -> None:

@@ -57,7 +57,7 @@ def library() -> str:
 
 def client() -> str:
     """The two clients of the service."""
-    parts = ["# Client", "How they are used: [the service from Python](../client.md).", ""]
+    parts = ["# Client", "How they are used: [the service from Python](../topics/client.md).", ""]
     for name in CLIENTS:
         parts += [f"::: {name}", "    options:", "      heading_level: 2", ""]
     return "\n".join(parts)

@@ -23,7 +23,7 @@ from lensmodel.core.psf import PsfSample
 from lensmodel.model.sample_codec import PackedSamples, pack_samples, unpack_samples
 
 MAX_SIDE: Final = 255
-"""Pixels across a returned kernel at most (chosen): what a profile holds, see docs/profile-format.md."""
+"""Pixels across a returned kernel at most (chosen): as in a profile, docs/topics/profile-format.md."""
 
 DAMAGED: Final = (
     InvalidInputError,

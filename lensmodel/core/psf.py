@@ -214,12 +214,15 @@ def _centred_fft(kernel: npt.NDArray[np.float64], n: int) -> npt.NDArray[np.comp
 class PsfSample:
     """One local PSF estimate: what was seen, where, at which settings, how sure.
 
+    The samples of the regression [1]_; what makes one is up to `estimator`.
+
     Parameters
     ----------
-    kernel : Kernel, shape (k, k)
-        On the sensor's pixel grid in sensor orientation; normalised and read-only here.
+    kernel : Kernel, float64, shape (k, k)
+        k odd; finite, not negative and not all zero, on the sensor's pixel grid in sensor orientation. It is
+        copied, normalized and read-only here.
     position : FieldPosition
-        Centre of the patch that it was seen in.
+        Center of the patch that it was seen in.
     settings : LensSettings
         Aperture, focal length, focus distance and channel of the photo.
     weight : float
@@ -239,6 +242,17 @@ class PsfSample:
     darkest : float or None
         Light of the darkest places around the patch over that near them: what the share of light that the
         lens throws far cannot exceed (`lensmodel.model.far_light`); None where unknown.
+
+    Raises
+    ------
+    InvalidKernelError
+        If the kernel cannot be a PSF.
+    InvalidInputError
+        If another value is out of its range.
+
+    References
+    ----------
+    .. [1] M. Hirsch, B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, sections 5 and 6.
     """
 
     kernel: Kernel

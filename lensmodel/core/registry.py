@@ -47,6 +47,18 @@ class Registry(Generic[T]):
     def create(self, name: str, **params: object) -> T:
         """Build the entry called `name` from keyword parameters.
 
+        Parameters
+        ----------
+        name : str
+            One of those that iterating gives.
+        **params
+            Fields of the entry; the others keep their defaults.
+
+        Returns
+        -------
+        object
+            A deconvolver, estimator or selector, as the registry's kind says.
+
         Raises
         ------
         UnknownMethodError
@@ -81,6 +93,15 @@ class Registry(Generic[T]):
     def resolve(self, method: str | T) -> T:
         """Return an entry that was given by its name, with its default parameters, or as an object.
 
+        Parameters
+        ----------
+        method : str or object
+            A name, or what is returned as it is.
+
+        Returns
+        -------
+        object
+
         Raises
         ------
         UnknownMethodError
@@ -109,7 +130,17 @@ class Registry(Generic[T]):
         self.entries[name] = factory
 
     def extended(self, **entries: Callable[..., T]) -> Registry[T]:
-        """Return a registry with more entries; names with a hyphen are given with an underscore."""
+        """Return a registry with more entries; this one stays as it is.
+
+        Parameters
+        ----------
+        **entries : callable
+            Factories by name; a hyphen is given as an underscore. One of a name that is there replaces it.
+
+        Returns
+        -------
+        Registry
+        """
         added = {name.replace("_", "-"): factory for name, factory in entries.items()}
         return Registry(self.kind, {**self.entries, **added}, self.group)
 

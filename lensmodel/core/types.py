@@ -44,15 +44,24 @@ def ignore_step(done: int, total: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class FieldPosition:
-    """A place in the image field, in sensor orientation.
+    """A place in the image field, in sensor orientation: (r, phi) of the PSF function [1]_.
 
     Parameters
     ----------
     r : float
-        Distance to the image centre over the half diagonal: 0 centre, 1 corner.
+        Distance to the image center over the half diagonal: 0 center, 1 corner.
     phi : float
         Angle in radians, counter-clockwise from the right: 0 right, +pi/2 towards row 0.
         Stored wrapped into (-pi, pi].
+
+    Raises
+    ------
+    InvalidInputError
+        If `r` lies outside 0..1 or `phi` is not finite.
+
+    References
+    ----------
+    .. [1] M. Hirsch, B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, section 6.
     """
 
     r: float
@@ -69,7 +78,7 @@ class FieldPosition:
 
 @dataclass(frozen=True, slots=True)
 class LensSettings:
-    """How the lens was set: the variables Φ of the PSF function f(u, v, r, phi, Φ).
+    """How the lens was set: the variables Φ of the PSF function f(u, v, r, phi, Φ) [1]_.
 
     `None` means unknown, which is not zero: an unknown variable takes no part in distances.
 
@@ -78,11 +87,20 @@ class LensSettings:
     aperture : float or None
         The f-number N, 0.5 to 128.
     focal_mm : float or None
-        Focal length in millimetres.
+        Focal length in millimetres, 0.1 to 20000.
     focus_m : float or None
-        Focus distance in metres; infinity is allowed.
+        Focus distance in metres, above 0; infinity is allowed.
     channel : {"r", "g", "b"}
-        Colour channel.
+        Color channel.
+
+    Raises
+    ------
+    InvalidInputError
+        If a value is out of its range, or there is no such channel.
+
+    References
+    ----------
+    .. [1] M. Hirsch, B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, section 6.
     """
 
     aperture: float | None = None
@@ -106,7 +124,7 @@ class LensSettings:
         return None if self.aperture is None else 2.0 * math.log2(self.aperture)
 
     def with_channel(self, channel: Channel) -> LensSettings:
-        """Return the same settings for another colour channel.
+        """Return the same settings for another color channel.
 
         Parameters
         ----------
@@ -126,7 +144,7 @@ class LensSettings:
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """Variance of one plane's noise as a function of its level, var(y) = shot * y + read.
+    """Variance of one plane's noise as a function of its level, var(y) = shot * y + read [1]_.
 
     Both are in linear units where saturation is 1.
 
@@ -136,6 +154,11 @@ class NoiseModel:
         One over the full-well count in electrons; not negative.
     read : float
         Squared standard deviation of the read noise; not negative.
+
+    Raises
+    ------
+    InvalidInputError
+        If a term is negative or not finite.
 
     References
     ----------
@@ -157,7 +180,7 @@ class NoiseModel:
 
         Parameters
         ----------
-        level : ndarray
+        level : ndarray of float, any shape
             Linear light; below 0 counts as 0.
 
         Returns
@@ -192,6 +215,11 @@ class NoiseModel:
         Returns
         -------
         NoiseModel
+
+        Raises
+        ------
+        InvalidInputError
+            If it is not finite.
         """
         return cls(shot=0.0, read=sigma * sigma)
 

@@ -32,7 +32,7 @@ class Sensor:
         Variance against level.
     clip : float
         Level at and above which a value is only a lower bound; infinity where nothing clips.
-    measured : ndarray of bool or None
+    measured : ndarray of bool, shape (H, W), or None
         Where the sensor measured this plane; demosaicing filled in the rest. `None` for everywhere.
     surrounded : bool
         Whether a rim as wide as the reach of the blur will be cut off on all sides. What lies beyond the
@@ -40,6 +40,11 @@ class Sensor:
     edges : tuple of bool
         Which sides of the plane (top, bottom, left, right) are sides of the frame. The others are cuts:
         what lies beyond them was measured, but is not given.
+
+    Raises
+    ------
+    InvalidInputError
+        If `clip` is no positive level.
     """
 
     noise: NoiseModel = field(default_factory=lambda: NoiseModel.white(0.005))
@@ -57,7 +62,7 @@ class Sensor:
 
         Parameters
         ----------
-        plane : ndarray
+        plane : ndarray of float, any shape
             Linear light.
 
         Returns
@@ -73,8 +78,8 @@ class Restored:
 
     Parameters
     ----------
-    plane : Plane
-        The latent plane inside the frame.
+    plane : Plane, float32, shape (H, W)
+        The latent plane inside the frame, in linear light.
     steps : int
         Steps that were taken.
     """
@@ -84,7 +89,7 @@ class Restored:
 
 
 class Deconvolver(Protocol):
-    """Non-blind deconvolution of one plane."""
+    """Non-blind deconvolution of one plane: step 3 of Hirsch and Schölkopf (ICCV 2015, section 7)."""
 
     def deconvolve(
         self, blurred: Plane, blur: BlurOperator, *, sensor: Sensor, on_step: StepHook = ignore_step

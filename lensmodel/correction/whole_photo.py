@@ -49,16 +49,17 @@ class Corrected:
 
     Parameters
     ----------
-    planes : Planes
-        The photo, or the requested part of it.
-    zones : Mapping[Zone, ZoneReport]
-        What the correction is expected to have gained in each zone of the field.
+    planes : Planes, float32, shape (3, height, width)
+        The photo, or the requested part of it, in linear light; saturation is 1.
+    zones : dict of str to ZoneReport
+        What the correction is expected to have gained, in decibels, in each zone of the field that it
+        reaches: "center", "mid", "corner".
     audit : AuditReport
         How much was held back, why, and where most.
     chroma_step : tuple of int
         Rows and columns of pixels that share one value of chroma in the photo's file; where that is more than
         one pixel, chroma was corrected no more finely.
-    layers : tuple of Planes
+    layers : tuple of Planes, each float32 of the shape of `planes`
         The same within the other requested bounds.
     """
 

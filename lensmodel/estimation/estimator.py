@@ -29,17 +29,18 @@ class PsfEstimate:
 
     Parameters
     ----------
-    kernel : Kernel, shape (size, size)
+    kernel : Kernel, float64, shape (size, size)
+        Of sum 1, on the pixel grid of the patches.
     confidence : float
         0..1; ranks estimates by their true error.
-    reliability : ndarray, shape (rings,)
+    reliability : ndarray of float64, shape (rings,)
         Share of signal in the power of each ring of frequency, 0..1, low frequencies first.
     predicted_error : float
         Expected relative L2 distance to the true kernel.
     diagnostics : mapping of str to float
         What the estimator reports of itself.
     seconds : float
-        CPU time.
+        CPU time in seconds.
     no_blur : bool
         The kernel is too narrow to be told from none.
     """
@@ -54,7 +55,7 @@ class PsfEstimate:
 
 
 class PsfEstimator(Protocol):
-    """A blind estimator: patches of one field position in, one kernel out.
+    """A blind estimator: patches of one field position in, one kernel out [1]_.
 
     Attributes
     ----------
@@ -62,6 +63,10 @@ class PsfEstimator(Protocol):
         As in the registry; stored with each sample.
     version : int
         Grows when results change.
+
+    References
+    ----------
+    .. [1] M. Hirsch, B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, section 5.
     """
 
     name: str
@@ -80,8 +85,8 @@ class PsfEstimator(Protocol):
 
         Parameters
         ----------
-        patches : sequence of Plane
-            Windows of 64 to 512 px of one colour plane, linear light.
+        patches : sequence of Plane, float32, each of shape (h, w)
+            Windows of 64 to 512 px of one color plane, linear light.
         noise : sequence of NoiseModel
             One for each patch.
         size : int
@@ -94,7 +99,7 @@ class PsfEstimator(Protocol):
         Returns
         -------
         PsfEstimate
-            Its kernel is float64 of shape (size, size), with sum 1 and its centre of mass in the middle.
+            Its kernel is float64 of shape (size, size), with sum 1 and its center of mass in the middle.
 
         Raises
         ------
@@ -119,13 +124,13 @@ class PsfEstimator(Protocol):
 
         Parameters
         ----------
-        patches : sequence of Plane
+        patches : sequence of Plane, float32, each of shape (h, w)
             The windows in this channel, linear light.
         noise : sequence of NoiseModel
             One for each patch.
         reference : PsfEstimate
             What `estimate` gave for the first channel.
-        reference_patches : sequence of Plane
+        reference_patches : sequence of Plane, float32, each of shape (h, w)
             The same windows in the first channel.
         size, rng, on_step
             As of `estimate`.
@@ -138,6 +143,8 @@ class PsfEstimator(Protocol):
         ------
         NotEnoughEvidenceError
             If no patch determines a kernel in this channel.
+        InvalidInputError
+            For values that no photo has.
         """
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, UnknownMethodError
 from lensmodel.core.types import Kernel
+from lensmodel.model.field.smoothers import smoothers
 
 BOTH: Final = "both"
 KERNELS: Final = "kernels"
@@ -31,13 +32,13 @@ UNITS: Final = (MICROMETRE, HALF_DIAGONAL)
 
 @dataclass(frozen=True, slots=True)
 class ModelSettings:
-    """Choices of the regression; None means automatic.
+    """Choices of the regression [1]_; None means automatic.
 
     Parameters
     ----------
     r, phi, stops : float or None
-        Bandwidths in half-diagonals, chord of the unit circle, and stops. Automatic: eq. (8), and
-        from three photos on the factors on it with the least leave-one-photo-out error.
+        Bandwidths in half-diagonals, chord of the unit circle, and stops. Automatic: eq. (8) of the paper
+        [1]_, and from three photos on the factors on it with the least leave-one-photo-out error.
     method : str
         Name in `smoothers`.
     rotational : float or None
@@ -48,10 +49,29 @@ class ModelSettings:
         Whether photos and samples that do not fit the others count less.
     excluded : tuple of str
         Photos whose samples do not vote; they stay listed.
-    mode : str
-        What is made of the neighbours, one of `MODES`: see `modes`.
-    unit : str
-        In what (u, v) are the same for all bodies, one of `UNITS`. By default micrometres on the sensor.
+    mode : {"both", "kernels", "wavefront", "paper"}
+        What is made of the neighbours. "both": their kernels averaged, with the wavefront that the spectra of
+        all patches agree on where there is one. "kernels": without it, for lenses that no such wavefront
+        describes. "wavefront": it alone, wherever one could be fitted. "paper": the kernels averaged and
+        nothing else, to compare with.
+    unit : {"micrometre", "half-diagonal"}
+        In what (u, v) are the same for all bodies.
+
+    Raises
+    ------
+    InvalidInputError
+        If a value is out of its range.
+    UnknownMethodError
+        If there is no such regression, mode or unit.
+
+    Notes
+    -----
+    Symmetry, robustness, the factors on eq. (8) and the wavefront are this project's own; the mode "paper"
+    leaves them out.
+
+    References
+    ----------
+    .. [1] M. Hirsch, B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, section 6.2.
     """
 
     r: float | None = None
@@ -76,6 +96,7 @@ class ModelSettings:
             value = getattr(self, name)
             if value is not None and not 0.0 <= value <= 1.0:
                 raise InvalidInputError(f"{name} symmetry must lie in 0..1, or None, got {value}")
+        smoothers.create(self.method)  # refuses a name that there is not
         if self.mode not in MODES:
             why = "is gone" if self.mode in FORMER_MODES else "is not known"
             raise UnknownMethodError(
@@ -97,10 +118,12 @@ class ModelSettings:
 class PsfAnswer:
     """A PSF with how much stands behind it.
 
+    The kernel is that of the regression [1]_ or of a wavefront; the other figures are this project's own.
+
     Parameters
     ----------
-    kernel : Kernel, shape (size, size)
-        In the image frame, centred, sum 1.
+    kernel : Kernel, float64, shape (size, size)
+        In the image frame, centered, sum 1.
     effective_samples : float
         1 / sum W^2 of the samples' parts in the answer, see `provenance`.
     photos : int
@@ -113,11 +136,11 @@ class PsfAnswer:
         The part of it that all samples share, which no number of them makes smaller: what their estimators
         expect beyond what their scatter shows. 0 where they expect nothing.
     bandwidth : mapping of str to float
-        Bandwidths that were used.
+        Bandwidths that were used, in the units of `ModelSettings`.
     beyond : tuple of str
         Variables in which the question lies outside the samples.
     nearest : float
-        Distance to the nearest sample, in bandwidths of eq. (8).
+        Distance to the nearest sample, in bandwidths of eq. (8) of the paper [1]_.
     prior : str
         Name of the prior that the model leans on where it has seen little; empty without one.
     prior_share : float
@@ -131,8 +154,12 @@ class PsfAnswer:
         Which model answered: "regression", "wavefront and regression", "wavefront" or "paper".
     reason : str
         Why that one.
-    scatter : callable
-        Computes `std`.
+    scatter : callable or None
+        Computes `std`, float64 of the shape of the kernel.
+
+    References
+    ----------
+    .. [1] M. Hirsch, B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, section 6, eq. 4 to 8.
     """
 
     kernel: Kernel
@@ -154,7 +181,7 @@ class PsfAnswer:
 
     @property
     def std(self) -> NDArray[np.float64] | None:
-        """Standard error of each pixel from the scatter of the samples, shape (size, size).
+        """Standard error of each pixel from the scatter of the samples, float64 of shape (size, size).
 
         Computed when it is read: each neighbour is turned to the place alone. None where the model that made
         the answer is not at hand.

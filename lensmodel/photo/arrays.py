@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
-from lensmodel.core.types import CHANNELS, NoiseModel
+from lensmodel.core.types import CHANNELS, LensSettings, NoiseModel
 from lensmodel.photo import Encoding, LinearPhoto, PhotoInfo, PhotoMetadata, estimate_noise
 
 
@@ -27,7 +28,7 @@ def photo_from_array(
 
     Parameters
     ----------
-    planes : array_like, shape (3, height, width)
+    planes : array_like of float, shape (3, height, width)
         Red, green and blue in linear light: black 0, saturation at `clip`; kept as float32.
     noise : NoiseModel or sequence of three, optional
         Variance of the pixels against their level; None measures it on the flat places of each plane
@@ -35,9 +36,9 @@ def photo_from_array(
     clip : float
         Level at which the sensor saturates.
     aperture : float, optional
-        f-number; `focal_mm` in mm and `focus_m` in metres as far as they are known.
+        f-number, 0.5 to 128; `focal_mm` in mm and `focus_m` in metres as far as they are known.
     pixel_pitch_um : float, optional
-        Pitch of the pixels in micrometres.
+        Pitch of the pixels in micrometres, above 0.
 
     Returns
     -------
@@ -46,13 +47,20 @@ def photo_from_array(
     Raises
     ------
     InvalidInputError
-        If the shape is another, or a value is not finite.
+        If the shape is another, a pixel is not finite, or another value is out of its range.
     """
     array = np.ascontiguousarray(planes, dtype=np.float32)
     if array.ndim != 3 or array.shape[0] != len(CHANNELS) or array.size == 0:
         raise InvalidInputError(f"a photo must have the shape (3, height, width), got {array.shape}")
-    if not np.isfinite(array).all() or not clip > 0.0:
-        raise InvalidInputError("a photo must be finite, and clip a positive level")
+    if not np.isfinite(array).all():
+        raise InvalidInputError("a photo must be finite; mask or replace NaN and infinity first")
+    if not clip > 0.0:
+        raise InvalidInputError(f"clip must be a positive level, got {clip}")
+    LensSettings(aperture, focal_mm, focus_m)  # refuses what no lens has
+    if pixel_pitch_um is not None and not (math.isfinite(pixel_pitch_um) and pixel_pitch_um > 0.0):
+        raise InvalidInputError(
+            f"the pixel pitch must be positive micrometres, got {pixel_pitch_um}; leave it out if unknown"
+        )
     if isinstance(noise, NoiseModel):
         noise = (noise,) * 3
     known = tuple(noise) if noise is not None else tuple(estimate_noise(plane, clip) for plane in array)

@@ -25,7 +25,8 @@ def develop(path: Path | str, *, limits: Limits | None = None, demosaic: Demosai
     """Develop a photo: RAW through LibRaw, TIFF, PNG and JPEG through their transfer curve.
 
     The planes are in sensor orientation, whatever the file says about turning them; RAW is in
-    camera colours before white balance, others in the primaries of their profile.
+    camera colors before white balance, others in the primaries of their profile. Curves are those of
+    sRGB [1]_ or of the file's own profile [2]_; noise is measured on flat places, of RAW on its mosaic too.
 
     Parameters
     ----------
@@ -44,10 +45,19 @@ def develop(path: Path | str, *, limits: Limits | None = None, demosaic: Demosai
 
     Raises
     ------
+    FileNotFoundError
+        If there is no such file; another `OSError` if it may not be read.
     UnreadablePhotoError
-        One of its kinds, if the file cannot be read or holds no picture.
+        One of its kinds, if the file cannot be decoded or holds no picture.
     ImageTooLargeError
         If it is larger than the limits allow.
+    InvalidInputError
+        If there is no such demosaicing.
+
+    References
+    ----------
+    .. [1] IEC 61966-2-1:1999.
+    .. [2] ICC.1:2022, sections 10.6 and 10.18.
     """
     path, limits = Path(path), limits or Limits()
     with opened_header(path, limits) as header:

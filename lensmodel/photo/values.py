@@ -191,12 +191,12 @@ class LinearPhoto:
     Parameters
     ----------
     planes : ndarray of float32, shape (3, height, width)
-        Black 0, saturation 1, not white balanced; RAW stays in the camera's own colours.
+        Black 0, saturation 1, not white balanced; RAW stays in the camera's own colors.
     frame : Frame
         Size of the planes.
-    noise : tuple of NoiseModel
+    noise : tuple of three NoiseModel
         Variance of the pixels of each plane.
-    clip : tuple of float
+    clip : tuple of three float
         Level of each plane at which the sensor, or the file, clips.
     info : PhotoInfo
         What the file says.
@@ -243,6 +243,8 @@ class LinearPhoto:
     def coarse_noise(self) -> PlaneNoise:
         """Noise power of each plane at 0.1 to 0.4 cycles/pixel, above which detail tells of the lens.
 
+        Three `NoiseModel`, of r, g and b, in linear light where saturation is 1.
+
         Flat places of a photo that was denoised show little noise from pixel to pixel and all of it in
         coarser grain; what compression adds is seen only where there is detail.
         """
@@ -261,6 +263,8 @@ class LinearPhoto:
     @property
     def correction_noise(self) -> PlaneNoise:
         """Noise as a correction must count it, as if it were white.
+
+        Three `NoiseModel`, of r, g and b, in linear light where saturation is 1.
 
         That of the sensor where it is known. Demosaicing, denoising and compression leave less of it in
         a pixel than there is in a patch, and make errors of their own where there is detail. Where a

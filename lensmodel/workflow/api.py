@@ -19,6 +19,7 @@ from lensmodel.model import ModelSettings
 from lensmodel.photo.arrays import photo_from_array
 from lensmodel.photo.tags.xmp_block import sidecar_path, write_sidecar
 from lensmodel.workflow import pipeline
+from lensmodel.workflow.arguments import require_workers
 from lensmodel.workflow.lens import Lens
 from lensmodel.workflow.pipeline import CalibrationEvent, EventHook, ignore_event
 from lensmodel.workflow.ways import way_of
@@ -102,10 +103,11 @@ def calibrate(
     InvalidInputError
         If a value is out of its range, or both `lens` and `model` are given.
     UnknownMethodError
-        If there is no estimator or model of that name.
+        If there is no estimator, selector or model of that name.
     NotEnoughEvidenceError
         If no photo could be used; the text says why for each.
     """
+    require_workers(workers)
     paths = [Path(photos)] if isinstance(photos, str | Path) else [Path(path) for path in photos]
     for path in paths:
         path.stat()
@@ -165,9 +167,13 @@ def correct(
 ) -> correction.Corrected:
     """Remove the blur of a lens from a photo: files in and out, or arrays.
 
+    Non-blind deconvolution with the PSF of each place (Hirsch and Schölkopf, ICCV 2015, section 7). How far
+    it goes where PSF or photo are unsure, and what it holds back, are rules of this project; with the method
+    "paper", a lens that was learned the paper's way is corrected without them.
+
     Parameters
     ----------
-    image : path, LinearPhoto, or ndarray of shape (3, height, width)
+    image : path, LinearPhoto, or ndarray of float, shape (3, height, width)
         A photo file; what `develop` or `photo_from_array` made; or planes of linear light, black 0 and
         saturation 1, in sensor orientation.
     lens : Lens or path
@@ -207,13 +213,22 @@ def correct(
 
     Raises
     ------
+    FileNotFoundError
+        If there is no such photo or profile, or no folder for `output`; another `OSError` if one cannot be
+        read or written.
     UnreadablePhotoError
         If the file cannot be decoded.
+    ImageTooLargeError
+        If the photo has more pixels than are read.
     InvalidInputError
         If a value is out of its range, the ending of `output` is unknown, or it is the photo itself.
     UnknownMethodError
         If there is no method of that name.
+    CancelledError
+        If `on_step` raised it.
     """
+    require_workers(workers)
+    given = LensSettings(aperture, focal_mm, focus_m)
     target = None if output is None else Path(output)
     written = file_format or (None if target is None else _format_of(target))
     source = Path(image) if isinstance(image, str | Path) else None
@@ -232,7 +247,7 @@ def correct(
     corrected = pipeline.correct_photo(
         developed,
         known.model,
-        pipeline.settings_of(developed, LensSettings(aperture, focal_mm, focus_m)),
+        pipeline.settings_of(developed, given),
         method=method,
         strength=strength,
         bounds=bounds,

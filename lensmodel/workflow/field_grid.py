@@ -11,12 +11,12 @@ from lensmodel.core.errors import InvalidInputError
 def field_grid(
     rows: int, cols: int, *, aspect: float = 1.5
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the field positions of the centres of equal cells of a picture.
+    """Return the field positions of the centers of equal cells of a picture.
 
     Parameters
     ----------
     rows, cols : int
-        Number of cells.
+        Number of cells, at least 1.
     aspect : float
         Width over height of the picture.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +21,7 @@ from lensmodel.model import (
     save_profile,
 )
 from lensmodel.quality import mtf50_from_kernel, mtf_from_kernel
+from lensmodel.workflow.arguments import frequencies_of, named_each, one_each, places_joined
 from lensmodel.workflow.field_grid import field_grid
 from lensmodel.workflow.identity import Identity
 
@@ -34,7 +34,7 @@ class Lens:
     """One copy of a lens: its PSF at every place of the picture, aperture and color.
 
     The PSF is the function f(u, v, r, phi, settings) of M. Hirsch and B. Schölkopf, "Self-Calibration of
-    Optical Lenses", ICCV 2015, section 6. Places are field positions: `r` is the distance to the centre over
+    Optical Lenses", ICCV 2015, section 6. Places are field positions: `r` is the distance to the center over
     the half diagonal (0 center, 1 corner), `phi` the angle in radians, counter-clockwise from the right, in
     sensor orientation. Kernels are float64, of odd side, not negative, of sum 1, on the pixel grid of the
     sensor that the lens was calibrated on.
@@ -67,15 +67,16 @@ class Lens:
 
         Parameters
         ----------
-        kernels : array_like, shape (n, k, k)
-            k odd; not negative. Each is normalized, and its center of mass moved to the middle pixel.
-        r, phi : array_like, shape (n,)
+        kernels : array_like of float, shape (n, k, k)
+            k odd; not negative, on the pixel grid of the sensor. Each is normalized, and its center of mass
+            moved to the middle pixel.
+        r, phi : array_like of float, shape (n,)
             Field positions: half diagonals 0..1, and radians.
-        aperture : array_like, shape (n,) or (), optional
+        aperture : array_like of float, shape (n,) or (), optional
             f-number of each, or of all; None where it is unknown.
         channel : {"r", "g", "b"} or sequence of them
             Color of each, or of all.
-        weight : array_like, shape (n,) or ()
+        weight : array_like of float, shape (n,) or ()
             Confidence 0..1, which scales the vote of a kernel.
         photo : str or sequence of str
             What each was measured on: kernels of one photo share its faults.
@@ -90,8 +91,10 @@ class Lens:
 
         Raises
         ------
+        InvalidKernelError
+            If a kernel cannot be a PSF.
         InvalidInputError
-            If shapes do not fit, or a value is out of its range.
+            If shapes do not fit, or another value is out of its range.
         NoSamplesError
             If there is no kernel, or none has a weight.
         """
@@ -99,25 +102,25 @@ class Lens:
         if stack.ndim != 3:
             raise InvalidInputError(f"kernels must have the shape (n, k, k), got {stack.shape}")
         n = len(stack)
-        places = zip(_each(r, n, "r"), _each(phi, n, "phi"), strict=True)
-        apertures = [None] * n if aperture is None else _each(aperture, n, "aperture")
+        places = zip(one_each(r, n, "r"), one_each(phi, n, "phi"), strict=True)
+        apertures = [None] * n if aperture is None else one_each(aperture, n, "aperture")
         samples = [
             PsfSample(
                 centred(kernel),
                 FieldPosition(*place),
-                LensSettings(f_number, channel=colour),
+                LensSettings(f_number, channel=color),
                 weight=vote,
                 photo=name,
                 pixel_pitch_um=pixel_pitch_um,
                 estimator="given",
             )
-            for kernel, place, f_number, colour, vote, name in zip(
+            for kernel, place, f_number, color, vote, name in zip(
                 stack,
                 places,
                 apertures,
-                _named(channel, n, "channel"),
-                _each(weight, n, "weight"),
-                _named(photo, n, "photo"),
+                named_each(channel, n, "channel"),
+                one_each(weight, n, "weight"),
+                named_each(photo, n, "photo"),
                 strict=True,
             )
         ]
@@ -200,6 +203,8 @@ class Lens:
         ------
         OSError
             If it cannot be written.
+        InvalidInputError
+            If it has more samples than a file may hold.
         """
         save_profile(path, self.profile)
 
@@ -267,8 +272,8 @@ class Lens:
 
         Parameters
         ----------
-        r, phi : array_like
-            Field positions, of shapes that broadcast to one shape S.
+        r, phi : array_like of float
+            Field positions, half diagonals 0..1 and radians, of shapes that broadcast to one shape S.
         aperture, channel, size
             As of `psf`.
 
@@ -279,11 +284,9 @@ class Lens:
         Raises
         ------
         InvalidInputError
-            If a value is out of its range.
+            If the shapes of `r` and `phi` do not broadcast, or a value is out of its range.
         """
-        radii, angles = np.broadcast_arrays(
-            np.asarray(r, dtype=np.float64), np.asarray(phi, dtype=np.float64)
-        )
+        radii, angles = places_joined(r, phi)
         places = [
             FieldPosition(float(a), float(b)) for a, b in zip(radii.ravel(), angles.ravel(), strict=True)
         ]
@@ -303,10 +306,10 @@ class Lens:
 
         Parameters
         ----------
-        r, phi : array_like
-            Field positions, of shapes that broadcast to one shape S.
-        frequencies : array_like, shape (n,)
-            Cycles/pixel.
+        r, phi : array_like of float
+            Field positions, half diagonals 0..1 and radians, of shapes that broadcast to one shape S.
+        frequencies : array_like of float, shape (n,) or ()
+            Cycles/pixel; not negative.
         aperture, channel
             As of `psf`.
 
@@ -318,9 +321,10 @@ class Lens:
         Raises
         ------
         InvalidInputError
-            If a value is out of its range.
+            If the frequencies are no list of finite numbers from 0 on, the shapes of `r` and `phi` do not
+            broadcast, or a value is out of its range.
         """
-        wanted = np.atleast_1d(np.asarray(frequencies, dtype=np.float64))
+        wanted = frequencies_of(frequencies)
         kernels = self.kernels(r, phi, aperture=aperture, channel=channel)
         angles = np.broadcast_to(np.asarray(phi, dtype=np.float64), kernels.shape[:-2])
         out = np.empty((2, *angles.shape, len(wanted)))
@@ -383,17 +387,3 @@ class Lens:
         words = [self.profile.lens[key] for key in ("maker", "model") if self.profile.lens.get(key)]
         count = len(self.profile.photos)
         return f"{' '.join(words) or 'unknown lens'}, profile of {count} photo{'' if count == 1 else 's'}"
-
-
-def _each(values: ArrayLike, n: int, name: str) -> list[float]:
-    array = np.asarray(values, dtype=np.float64)
-    if array.shape not in {(), (n,)}:
-        raise InvalidInputError(f"{name} must be one number or {n}, one for each kernel, got {array.shape}")
-    return [float(value) for value in np.broadcast_to(array, (n,))]
-
-
-def _named(values: str | Sequence[str], n: int, name: str) -> list[Any]:
-    names = [values] * n if isinstance(values, str) else list(values)
-    if len(names) != n:
-        raise InvalidInputError(f"{name} must be one or {n}, one for each kernel, got {len(names)}")
-    return names

@@ -15,7 +15,7 @@ from typing import Literal, Protocol
 
 from lensmodel import estimation, photo
 from lensmodel.core import parallel, processes
-from lensmodel.core.errors import NotEnoughEvidenceError, NoUsablePatchesError
+from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError, NoUsablePatchesError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings
 from lensmodel.estimation import patches
@@ -51,6 +51,7 @@ class CalibrationEvent:
     Parameters
     ----------
     photo : Path
+        Its file.
     stage : {"developing", "selecting", "estimating", "counted", "skipped"}
         The last two end the work on a photo.
     done, total : int
@@ -117,13 +118,15 @@ class Recipe:
     @property
     def size(self) -> int:
         """The side of its kernels in pixels."""
-        return self.kernel_size or self.way.kernel_size
+        return self.way.kernel_size if self.kernel_size is None else self.kernel_size
 
     def check(self) -> None:
-        """Refuse names and sizes that there are not, before any work."""
+        """Refuse names, sizes and counts that there are not, before any work."""
         estimation.estimators.resolve(self.method)
         require_size(self.size)
         patches.selectors.resolve(self.selector)
+        if self.count < 1:
+            raise InvalidInputError(f"patches must be at least 1, got {self.count}")
 
 
 class PhotoSteps(Protocol):

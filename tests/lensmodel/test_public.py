@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import ast
+import builtins
 import inspect
 import json
+import re
 import subprocess
 import sys
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from types import FunctionType
@@ -155,6 +159,111 @@ def test_a_public_function_documents_its_errors(name: str) -> None:
     assert "Raises\n---" in (inspect.getdoc(public(name)) or "")
 
 
+DOCUMENTED = [
+    *(name for name in NAMES if inspect.isclass(public(name))),
+    *FUNCTIONS,
+    *(
+        f"{name}.{member}"
+        for name in NAMES
+        if inspect.isclass(public(name))
+        for member, value in vars(public(name)).items()
+        if isinstance(value, property)
+    ),
+    *(f"deconvolvers.{method}" for method in ("create", "resolve", "register", "extended")),
+]
+"""What has a docstring of its own: classes, functions, methods, properties, and the methods of registries."""
+
+ARRAY = re.compile(r"NDArray|ArrayLike|\b(Kernel|Planes?)\b")
+DTYPE = re.compile(r"\b(float|float32|float64|bool)\b")
+
+
+def code_of(value: Any) -> Any:
+    """Return what runs when a public name is called: of a class its check, of a property its getter."""
+    if inspect.isclass(value):
+        return vars(value).get("__post_init__", vars(value).get("__init__"))
+    return inspect.unwrap(value.fget if isinstance(value, property) else value)
+
+
+def raised_by(code: Any, *, deeper: bool = True) -> set[type[Exception]]:
+    """Return what a function of this library raises itself, and what the functions raise that it calls."""
+    code = getattr(code, "__func__", code)
+    if not (inspect.isfunction(code) and code.__module__.startswith("lensmodel") and is_written(code)):
+        return set()
+    known = {**vars(builtins), **code.__globals__}
+    found: set[type[Exception]] = set()
+    for node in ast.walk(ast.parse(textwrap.dedent(inspect.getsource(code)))):
+        call = node.exc if isinstance(node, ast.Raise) else node
+        if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name)):
+            continue
+        if isinstance(node, ast.Raise):
+            found.add(known[call.func.id])
+        elif deeper:
+            found |= raised_by(known.get(call.func.id), deeper=False)
+    return found
+
+
+def is_written(code: Any) -> bool:
+    """Whether a function stands in a file, and is not made by `dataclass` or `Protocol`."""
+    return code.__code__.co_filename == sys.modules[code.__module__].__file__
+
+
+def section(text: str, title: str) -> str:
+    """Return one section of a numpydoc docstring, empty where there is none."""
+    found = re.search(rf"^{title}\n-+\n(.*?)(?=^\w+\n-+\n|\Z)", text, re.MULTILINE | re.DOTALL)
+    return found.group(1) if found else ""
+
+
+def entry(text: str, name: str) -> str:
+    """Return what a section says of one name."""
+    found = re.search(rf"^(?:\w+, )*{name}\b.*?(?=^\S|\Z)", text, re.MULTILINE | re.DOTALL)
+    return found.group(0) if found else ""
+
+
+def test_what_is_raised_is_found_in_a_check_and_in_what_it_calls() -> None:
+    assert {error.__name__ for error in raised_by(code_of(lensmodel.PsfSample))} == {
+        "InvalidInputError",
+        "InvalidKernelError",
+    }
+
+
+@pytest.mark.parametrize("name", DOCUMENTED)
+def test_what_a_public_name_raises_is_documented(name: str) -> None:
+    value = public(name)
+    said = section(inspect.getdoc(value) or "", "Raises")
+
+    unsaid = [
+        error.__name__
+        for error in raised_by(code_of(value))
+        if not any(re.search(rf"^{kind.__name__}$", said, re.MULTILINE) for kind in error.__mro__)
+    ]
+    assert unsaid == []
+
+
+@pytest.mark.parametrize("name", DOCUMENTED)
+def test_a_public_name_and_its_documentation_spell_alike(name: str) -> None:
+    text = f"{name} {' '.join(arguments(name))} {inspect.getdoc(public(name))}"
+
+    assert re.findall(r"\w*(?:centre|colour|normalis)\w*", text, re.IGNORECASE) == []
+
+
+def arguments(name: str) -> list[str]:
+    code = code_of(public(name))
+    return [] if code is None else list(inspect.signature(code).parameters)
+
+
+@pytest.mark.parametrize("name", DOCUMENTED)
+def test_a_public_array_says_its_shape_and_dtype(name: str) -> None:
+    value = public(name)
+    text = inspect.getdoc(value) or ""
+    kinds = dict(getattr(value if inspect.isclass(value) else code_of(value), "__annotations__", {}))
+    returned, listed = str(kinds.pop("return", "")), section(text, "Parameters")
+    said = {one: entry(listed, one) for one, kind in kinds.items() if ARRAY.search(str(kind))}
+    if ARRAY.search(returned):
+        said["what it returns"] = section(text, "Returns") or text
+
+    assert [one for one, words in said.items() if "shape" not in words or not DTYPE.search(words)] == []
+
+
 def test_an_unknown_name_is_no_attribute() -> None:
     with pytest.raises(AttributeError, match="nonsense"):
         lensmodel.nonsense  # noqa: B018 - the access is the test
@@ -240,6 +349,30 @@ def test_arrays_that_do_not_fit_each_other_are_refused(change: dict[str, Any]) -
         Lens.from_kernels(**given)
 
 
+@pytest.mark.parametrize(
+    ("frequencies", "text"),
+    [
+        ([[0.1, 0.2]], r"\(1, 2\)"),
+        ([0.1, np.nan], "got nan"),
+        ([0.1, -0.2], r"got -0\.2"),
+        (np.inf, "got inf"),
+    ],
+    ids=str,
+)
+def test_frequencies_that_no_contrast_has_are_refused(frequencies: Any, text: str) -> None:
+    lens, _ = field_of_gaussians()
+
+    with pytest.raises(InvalidInputError, match=text):
+        lens.mtf(0.5, 0.0, frequencies)
+
+
+def test_places_whose_shapes_do_not_fit_are_refused() -> None:
+    lens, _ = field_of_gaussians()
+
+    with pytest.raises(InvalidInputError, match=r"\(2,\) and \(3,\)"):
+        lens.kernels([0.1, 0.2], [0.0, 1.0, 2.0])
+
+
 # --- arrays in, arrays out; methods of one's own ----------------------------------------------
 
 
@@ -273,8 +406,35 @@ def test_what_would_be_lost_work_is_refused_before_it() -> None:
         lensmodel.correct(planes, lens, method="nonsense")
     with pytest.raises(InvalidInputError, match="height, width"):
         lensmodel.correct(planes[0], lens)
+    with pytest.raises(InvalidInputError, match="workers must be at least 1, got 0"):
+        lensmodel.correct(planes, lens, workers=0)
     with pytest.raises(FileNotFoundError):
         lensmodel.calibrate("gone.dng")
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.0, float("nan")])
+def test_an_aperture_that_no_lens_has_is_refused_before_a_photo_is_read(value: float) -> None:
+    lens, _ = field_of_gaussians()
+
+    for refused in (
+        lambda: lensmodel.photo_from_array(np.zeros((3, 8, 8)), aperture=value),
+        lambda: lensmodel.correct("gone.dng", lens, aperture=value),
+        lambda: lensmodel.calibrate([], aperture=value),
+    ):
+        with pytest.raises(InvalidInputError, match=f"f-number in 0.5..128, got {value}"):
+            refused()
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.0, float("nan"), float("inf")])
+def test_a_pixel_pitch_that_no_sensor_has_is_refused(value: float) -> None:
+    with pytest.raises(InvalidInputError, match=f"positive micrometres, got {value}"):
+        lensmodel.photo_from_array(np.zeros((3, 8, 8)), pixel_pitch_um=value)
+
+
+@pytest.mark.parametrize("asked", [{"workers": 0}, {"patches": 0}, {"kernel_size": 0}], ids=str)
+def test_a_calibration_that_asks_for_nothing_is_refused_at_once(asked: dict[str, int]) -> None:
+    with pytest.raises(InvalidInputError, match=", got 0"):
+        lensmodel.calibrate([], **asked)  # type: ignore[arg-type]
 
 
 def test_a_photo_is_not_replaced_by_its_correction(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ _DARKEST, _DARKER = 0.5, 0.2
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """What a photographer lets a correction do.
+    """What a photographer lets a correction do: rules of this project.
 
     Parameters
     ----------
@@ -42,6 +42,11 @@ class Bounds:
         0 to 1: how much of what the correction leaves unexplained is added back: faint texture and grain.
     denoise : float
         0 to 1: how much of that is removed where it looks like noise alone.
+
+    Raises
+    ------
+    InvalidInputError
+        If `halo` is negative, or another value lies outside 0..1.
     """
 
     halo: float | None = None

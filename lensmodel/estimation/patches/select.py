@@ -57,7 +57,7 @@ _ADVICE: Final[dict[str, str]] = {
 
 
 class Selector(Protocol):
-    """Says how much each window tells about the PSF."""
+    """Says how much each window tells about the PSF (Hirsch and Schölkopf, ICCV 2015, section 5.2)."""
 
     def score(self, windows: Windows, looked: Details) -> NDArray[np.float64]:
         """Score the windows of a photo.

@@ -38,7 +38,7 @@ STEP: Final = 0.05
 photo of a point was up to 22 percent off the kernel that it is compared with at 0.1, and below 3 percent at
 0.05 at the places that were looked at."""
 
-CLOSED_F_NUMBER: Final = 8.0  # about f/8, as docs/measuring.md asks
+CLOSED_F_NUMBER: Final = 8.0  # about f/8, as docs/topics/measuring.md asks
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-PAGES = [Path(__file__).parents[3] / "docs" / name for name in ("service.md", "operating.md")]
+PAGES = [Path(__file__).parents[3] / "docs" / name for name in ("service.md", "topics/operating.md")]
 ELSEWHERE = "/var/lib/postgresql"
 """Commands about another machine's disk."""
 

@@ -89,7 +89,7 @@ def calibrate(
         Runs whole photos instead, on other machines too.
     on_event : callable
         Called as `on_event(event)` with a `CalibrationEvent`: `event.photo`, `event.stage`, `event.done` of
-        `event.total` patches, `event.detail`.
+        `event.total` patches, `event.detail`; raising `CancelledError` there stops the work.
 
     Returns
     -------
@@ -106,6 +106,8 @@ def calibrate(
         If there is no estimator, selector or model of that name.
     NotEnoughEvidenceError
         If no photo could be used; the text says why for each.
+    CancelledError
+        As `on_event` raised it.
     """
     require_workers(workers)
     paths = [Path(photos)] if isinstance(photos, str | Path) else [Path(path) for path in photos]

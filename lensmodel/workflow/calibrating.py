@@ -13,7 +13,7 @@ from typing import Any, Final, Protocol
 
 from lensmodel import photo
 from lensmodel.core import parallel
-from lensmodel.core.errors import InvalidInputError, LensModelError
+from lensmodel.core.errors import CancelledError, InvalidInputError, LensModelError
 from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import StepHook, ignore_step
 from lensmodel.model import LensModel, ModelSettings, Prior
@@ -135,7 +135,7 @@ class Calibration:
         ahead : int
             Photos that are sent at once.
         on_event : callable
-            Learns of each step that is done here.
+            Learns of each step that is done here; raising `CancelledError` there stops the work.
         """
 
         def sent(path: Path) -> tuple[Any, ...] | None:
@@ -147,6 +147,8 @@ class Calibration:
         for path, job in jobs:
             try:
                 verdict = PhotoVerdict(path, self.add(path, job, on_event=on_event))
+            except CancelledError:  # is of the whole work, not of one photo
+                raise
             except (LensModelError, OSError) as error:
                 verdict = PhotoVerdict(path, error=error)
             yield verdict

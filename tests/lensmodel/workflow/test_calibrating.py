@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import lensmodel
 from lensmodel import photo
-from lensmodel.core.errors import InvalidInputError, MetadataMissingError
+from lensmodel.core.errors import CancelledError, InvalidInputError, MetadataMissingError
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings, StepHook, ignore_step
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
@@ -173,3 +174,15 @@ def test_a_photo_takes_its_steps_in_order_and_none_after_a_refusal() -> None:
         *("inspect", "developing", "develop", "selecting", "select", "estimating", "estimate", "count")
     ]
     assert refused.taken == ["inspect"]
+
+
+def test_a_calibration_that_is_cancelled_is_no_photo_that_failed(
+    photos: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def cancelled(path: Path, recipe: pipeline.Recipe, **options: object) -> list[PsfSample]:
+        raise CancelledError("enough")
+
+    monkeypatch.setattr(calibrating, "samples_of_photo", cancelled)
+
+    with pytest.raises(CancelledError, match="enough"):
+        lensmodel.calibrate(photos)

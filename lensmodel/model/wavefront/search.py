@@ -8,6 +8,7 @@ another beginning, and the best lens with its field centred elsewhere.
 
 Of the minima that differ the likeliest is taken, and how well each foretells patches that were left out
 counts as much as how well it fits (`held_out`): a wrong lens can fit all patches and foretell none.
+A half is fitted on from the fit to all, so that patches left out had a say in where it begins.
 """
 
 from __future__ import annotations

@@ -30,6 +30,7 @@ from lensmodel.core.codec import to_json
 from lensmodel.core.files import write_atomically
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel
+from lensmodel.model.provenance import answerers_in_words
 from lensmodel.report import (
     Advice,
     LensReport,
@@ -211,10 +212,14 @@ def export_psfs(
             at=place,
         )
     export(output, psfs, written)
+    # here too: a bare matrix has no room for it
+    made = answerers_in_words(zip(psfs.answered_by, psfs.reason, strict=True))
     if json_output:
-        shown.document({"output": str(output), "format": written, "psfs": len(psfs.positions)})
+        number = len(psfs.positions)
+        shown.document({"output": str(output), "format": written, "psfs": number, "answered": made})
     else:
         shown.result(str(output))
+        shown.note(made)
 
 
 def _format(output: Path, named: str | None) -> str:

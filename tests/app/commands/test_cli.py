@@ -276,6 +276,19 @@ def test_psf_says_what_made_the_answer_and_why(folder: Path) -> None:
     assert "answered by regression: no patch has a spectrum" in " ".join(said.split())
 
 
+@pytest.mark.parametrize("suffix", ["tif", "png"])
+def test_a_picture_of_a_psf_says_what_made_it(folder: Path, suffix: str) -> None:
+    target = folder / f"corner.{suffix}"
+    result = CliRunner().invoke(app, ["psf", str(folder / PROFILE), "--size", "15", "-o", str(target)])
+
+    assert result.exit_code == 0, result.output
+    with Image.open(target) as picture:
+        text = picture.info["Description"] if suffix == "png" else picture.tag_v2[270]  # type: ignore[attr-defined]  # of a TIFF
+    about = json.loads(text)
+    assert about["support"]["answered_by"] == "regression"
+    assert "psf" not in about
+
+
 def test_two_runs_on_one_profile_drop_nothing_of_each_other(
     folder: Path, made: Path, here: Here, monkeypatch: pytest.MonkeyPatch
 ) -> None:

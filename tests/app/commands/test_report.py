@@ -123,6 +123,16 @@ def test_an_exported_stack_holds_the_answers_of_the_profile(folder: Path) -> Non
     assert pages[0] == pytest.approx(first.kernel, abs=1e-7)
 
 
+def test_a_bare_matrix_is_accompanied_by_words_on_who_answered(folder: Path) -> None:
+    place = ("export", NAME, "--r", "0.5", "-o")
+    result = CliRunner().invoke(app, [*place, "one.json"])
+    document = json.loads(run(*place, "two.json", "--json"))
+
+    assert result.stdout == "one.json\n"
+    assert result.stderr == "lensmodel: answered by regression: no patch has a spectrum\n"
+    assert document["answered"] == "answered by regression: no patch has a spectrum"
+
+
 def test_a_comparison_needs_a_folder(folder: Path) -> None:
     with pytest.raises(UsageError, match="--against needs --output"):
         run("report", NAME, "--against", NAME)

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import second_moments
-from lensmodel.core.types import ZONES, FieldPosition, Kernel, LensSettings, Zone
+from lensmodel.core.types import ZONES, FieldPosition, LensSettings, Zone
 from lensmodel.model import LensModel
 from lensmodel.quality import mtf_from_kernel, tangential_sagittal_mtf50
 from lensmodel.report.decentring import Decentring, decentring
+from lensmodel.report.field_shape import FieldShape, Ring, field_shape
 from lensmodel.report.places import DEFAULT_ASPECT, grid, ring
 from lensmodel.report.units import SensorGeometry
 
@@ -36,7 +36,6 @@ _RING: Final = 3  # places of a ring whose mean is its value (chosen)
 _MOST_APERTURES: Final = 12  # a page holds as many rows (chosen)
 # Half-diagonals (chosen: about the middle of each zone)
 _ZONE_RADIUS: Final[dict[Zone, float]] = {"center": 0.15, "mid": 0.5, "corner": 0.88}
-_EVEN_PX: Final = 0.1  # widths along u and v that differ by less count as alike (chosen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,32 +107,6 @@ class Curve:
     sagittal: tuple[float, ...]
     tangential_spread: tuple[float, ...]
     sagittal_spread: tuple[float, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class FieldShape:
-    """How blur along u and along v part over the radius, the mark of astigmatism and curved fields.
-
-    Parameters
-    ----------
-    along_u, along_v : tuple of float
-        Root mean square widths in pixels, one for each radius of the report, mean over angles.
-    difference : tuple of float
-        along_u - along_v: positive where points are drawn out radially.
-    text : str
-        The same as one sentence.
-
-    Notes
-    -----
-    Two foci that part with the field (Welford, "Aberrations of Optical Systems", 1986, sec. 8.3) show
-    as widths that part. How far each focal surface lies from the sensor cannot be told from photos
-    of one focus; a curved but stigmatic field shows as both widths growing alike.
-    """
-
-    along_u: tuple[float, ...]
-    along_v: tuple[float, ...]
-    difference: tuple[float, ...]
-    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,7 +197,7 @@ def lens_report(
         [(p, model.query(p, settings, options.size).kernel) for p in ring(r, _RING, options.aspect)]
         for r in _RADII
     ]
-    shape = _shape(rings)
+    shape = field_shape(_RADII, rings)
     rows = tuple(_aperture_row(model, settings, n, options) for n in apertures(model))
     best = {} if len(rows) < 2 else {zone: _best(rows, zone) for zone in (*ZONES, "whole")}
     centring = decentring(model, settings)
@@ -271,18 +244,6 @@ def map_point(model: LensModel, place: FieldPosition, settings: LensSettings, si
     )
 
 
-def widths_along(kernel: Kernel, phi: float) -> tuple[float, float]:
-    """Root mean square widths along u and along v of a kernel at field angle `phi`, pixels.
-
-    The variance along a unit vector a is a' M a, with M the second moments and u = (-sin, cos) as
-    (row, col).
-    """
-    moments = second_moments(kernel)
-    u = np.array([-math.sin(phi), math.cos(phi)])
-    v = np.array([-math.cos(phi), -math.sin(phi)])
-    return math.sqrt(max(float(u @ moments @ u), 0.0)), math.sqrt(max(float(v @ moments @ v), 0.0))
-
-
 def _pitch(model: LensModel) -> float | None:
     known = {s.pixel_pitch_um for s in model.samples}
     return next(iter(known)) if len(known) == 1 else None
@@ -300,10 +261,9 @@ def _frequencies(options: ReportSettings, pitch_um: float | None) -> list[tuple[
 
 
 _CYCLES: Final = SensorGeometry()
-_Ring = list[tuple[FieldPosition, Kernel]]
 
 
-def _curve(rings: list[_Ring], frequency: float, lp_mm: float | None) -> Curve:
+def _curve(rings: list[Ring], frequency: float, lp_mm: float | None) -> Curve:
     def contrast(turn: float) -> list[NDArray[np.float64]]:
         return [
             np.array([mtf_from_kernel(k, p.phi + turn, [frequency])[0] for p, k in places])
@@ -323,33 +283,6 @@ def _curve(rings: list[_Ring], frequency: float, lp_mm: float | None) -> Curve:
         tuple(float(c.std()) for c in tangential),
         tuple(float(c.std()) for c in sagittal),
     )
-
-
-def _shape(rings: list[_Ring]) -> FieldShape:
-    along_u, along_v = [], []
-    for places in rings:
-        squared = np.mean([np.square(widths_along(k, p.phi)) for p, k in places], axis=0)
-        if len(places) == 1:
-            squared[:] = squared.mean()  # u has no direction at the centre
-        along_u.append(float(math.sqrt(squared[0])))
-        along_v.append(float(math.sqrt(squared[1])))
-    apart = tuple(u - v for u, v in zip(along_u, along_v, strict=True))
-    largest = max(range(len(apart)), key=lambda i: abs(apart[i]))
-    center, corner = along_u[0] + along_v[0], along_u[-1] + along_v[-1]
-    if center < _EVEN_PX:  # a point within one pixel has no width to compare with
-        growth = f"in the centre a point stays within a pixel, in the corners it is {corner / 2:.1f} px wide"
-    else:
-        way = "grows" if corner >= center else "shrinks"
-        growth = f"towards the corners the blur {way} to {corner / center:.1f} times its width at the centre"
-    if abs(apart[largest]) < _EVEN_PX:
-        text = f"points stay round across the field; {growth}"
-    else:
-        along = "radially" if apart[largest] > 0 else "around the centre"
-        text = (
-            f"points are drawn out {along}, most at r = {_RADII[largest]:.2f} by "
-            f"{abs(apart[largest]):.2f} px; {growth}"
-        )
-    return FieldShape(tuple(along_u), tuple(along_v), apart, text)
 
 
 def _aperture_row(

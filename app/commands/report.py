@@ -261,11 +261,12 @@ def _words(measured: LensReport, recommended: Advice, output: Path | None) -> st
 def _map_csv(measured: LensReport) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(
-        ["row", "col", "r", "phi", "mtf50_tangential", "mtf50_sagittal", "predicted_error", "extrapolated"]
-    )
+    mtf50 = ("mtf50_tangential", "mtf50_sagittal")
+    known = ("predicted_error", "extrapolated", "answered_by", "reason")
+    writer.writerow(["row", "col", "r", "phi", *mtf50, *known])
     for i, point in enumerate(measured.field):
         values = (point.position.r, point.position.phi, point.tangential, point.sagittal)
         numbers = (f"{value:.6f}" for value in (*values, point.predicted_error))
-        writer.writerow([*divmod(i, measured.cols), *numbers, int(point.extrapolated)])
+        made = (point.answered_by, point.reason)
+        writer.writerow([*divmod(i, measured.cols), *numbers, int(point.extrapolated), *made])
     return out.getvalue()

@@ -8,6 +8,7 @@ Tangential is the contrast along u (of lines across the radius), sagittal along 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import ZONES, FieldPosition, LensSettings, Zone
 from lensmodel.model import LensModel
+from lensmodel.model.provenance import answerers_in_words
 from lensmodel.quality import mtf_from_kernel, tangential_sagittal_mtf50
 from lensmodel.report.decentring import Decentring, decentring
 from lensmodel.report.field_shape import FieldShape, Ring, field_shape
@@ -70,7 +72,7 @@ class ReportSettings:
 
 @dataclass(frozen=True, slots=True)
 class MapPoint:
-    """Sharpness at one place; MTF50 in cycles/pixel."""
+    """Sharpness at one place, MTF50 in cycles/pixel; which model answered there, and why that one."""
 
     position: FieldPosition
     tangential: float
@@ -78,6 +80,8 @@ class MapPoint:
     predicted_error: float
     effective_samples: float
     extrapolated: bool
+    answered_by: str = ""
+    reason: str = ""
 
     @property
     def mean(self) -> float:
@@ -111,13 +115,17 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class ApertureRow:
-    """MTF50 in cycles/pixel at one aperture at r = 0.15, 0.5 and 0.88; `whole` weighs them by area."""
+    """MTF50 in cycles/pixel at one aperture at r = 0.15, 0.5 and 0.88; `whole` weighs them by area.
+
+    `answered_by` says in words which models answered, and why.
+    """
 
     aperture: float
     center: float
     mid: float
     corner: float
     whole: float
+    answered_by: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +158,8 @@ class LensReport:
         Share of the map for which no sample is near, 0..1.
     summary : tuple of str
         The report in sentences.
+    curves_answered_by : str
+        Which models answered for the curves and the field's shape, and why, in words.
     """
 
     settings: LensSettings
@@ -168,6 +178,7 @@ class LensReport:
     decentring: Decentring
     extrapolated_share: float
     summary: tuple[str, ...]
+    curves_answered_by: str = ""
 
 
 def lens_report(
@@ -193,10 +204,11 @@ def lens_report(
         for place in grid(options.rows, options.cols, options.aspect)
     )
     pitch = _pitch(model)
-    rings = [
-        [(p, model.query(p, settings, options.size).kernel) for p in ring(r, _RING, options.aspect)]
-        for r in _RADII
+    answers = [
+        [(p, model.query(p, settings, options.size)) for p in ring(r, _RING, options.aspect)] for r in _RADII
     ]
+    rings = [[(place, answer.kernel) for place, answer in places] for places in answers]
+    made = [(answer.answered_by, answer.reason) for places in answers for _, answer in places]
     shape = field_shape(_RADII, rings)
     rows = tuple(_aperture_row(model, settings, n, options) for n in apertures(model))
     best = {} if len(rows) < 2 else {zone: _best(rows, zone) for zone in (*ZONES, "whole")}
@@ -219,6 +231,7 @@ def lens_report(
         decentring=centring,
         extrapolated_share=unseen,
         summary=_summary(field, shape, best, centring, unseen),
+        curves_answered_by=answerers_in_words(made),
     )
 
 
@@ -240,8 +253,20 @@ def map_point(model: LensModel, place: FieldPosition, settings: LensSettings, si
     answer = model.query(place, settings, size)
     tangential, sagittal = tangential_sagittal_mtf50(answer.kernel, place.phi)
     return MapPoint(
-        place, tangential, sagittal, answer.predicted_error, answer.effective_samples, answer.extrapolated
+        place,
+        tangential,
+        sagittal,
+        answer.predicted_error,
+        answer.effective_samples,
+        answer.extrapolated,
+        answer.answered_by,
+        answer.reason,
     )
+
+
+def answerers(points: Sequence[MapPoint]) -> str:
+    """Say which models answered at some places, and why."""
+    return answerers_in_words((point.answered_by, point.reason) for point in points)
 
 
 def _pitch(model: LensModel) -> float | None:
@@ -290,15 +315,15 @@ def _aperture_row(
 ) -> ApertureRow:
     asked = replace(settings, aperture=aperture)
 
-    def sharpness(r: float) -> float:
-        return float(
-            np.mean([map_point(model, p, asked, options.size).mean for p in ring(r, 1, options.aspect)])
-        )
-
-    by_zone = {zone: sharpness(r) for zone, r in _ZONE_RADIUS.items()}
+    points = {
+        zone: [map_point(model, p, asked, options.size) for p in ring(r, 1, options.aspect)]
+        for zone, r in _ZONE_RADIUS.items()
+    }
+    by_zone = {zone: float(np.mean([point.mean for point in own])) for zone, own in points.items()}
     # shares of a 3:2 picture's area: r < 0.3, between, r > 0.75
     whole = 0.15 * by_zone["center"] + 0.65 * by_zone["mid"] + 0.2 * by_zone["corner"]
-    return ApertureRow(aperture, by_zone["center"], by_zone["mid"], by_zone["corner"], whole)
+    made = answerers([point for own in points.values() for point in own])
+    return ApertureRow(aperture, by_zone["center"], by_zone["mid"], by_zone["corner"], whole, made)
 
 
 def _best(rows: tuple[ApertureRow, ...], zone: str) -> float:
@@ -330,4 +355,5 @@ def _summary(
             f"no photo shows {100.0 * unseen:.0f} % of the picture at these settings; "
             "the figures there are guesses"
         )
+    lines.append(answerers(field))
     return tuple(lines)

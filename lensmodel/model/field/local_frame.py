@@ -57,6 +57,13 @@ class Answers:
         """Samples of each question."""
         return np.diff(self.starts)
 
+    @property
+    def shares(self) -> NDArray[np.float64]:
+        """Weights of the samples of a single question, none below 0, of sum 1."""
+        weight = np.maximum(self.weights, 0.0)
+        weight /= weight.sum()
+        return weight
+
     def mean(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
         """Weighted means of values `(n,)` of the samples, one for each question; weights below 0 are 0."""
         weight, first = np.maximum(self.weights, 0.0), self.starts[:-1]

@@ -139,7 +139,7 @@ class SparseGradient:
         canvas: Canvas,
         loops: ModuleType | None,
         glow: Planes | None,
-    ) -> _Problem:
+    ) -> _SparseProblem:
         blocks = BlockMeans.of(blurred, light, loops)
         recorded = blocks if glow is None else BlockMeans.of(blurred + glow, light, loops)
         var = np.stack(
@@ -190,7 +190,7 @@ class SparseGradient:
             at = np.clip(np.arange(canvas.shape[axis]) - canvas.margin, 0, blurred.shape[1 + axis] - 1)
             return (at - (drift.origin[axis] if drift else 0.0)).astype(np.float32)
 
-        return _Problem(
+        return _SparseProblem(
             y=y,
             variance=variance,
             known=known,
@@ -221,7 +221,7 @@ _DARK = np.float32(0.02)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Problem:
+class _SparseProblem:
     """Everything that the half-quadratic steps need, on the canvas; see `SparseGradient`."""
 
     y: Planes
@@ -280,7 +280,7 @@ def _known(sensors: Sequence[Sensor], canvas: Canvas) -> NDArray[np.bool_]:
     return known
 
 
-def _half_quadratic(p: _Problem, on_step: StepHook) -> Planes:
+def _half_quadratic(p: _SparseProblem, on_step: StepHook) -> Planes:
     """The steps in NumPy; `compiled.half_quadratic` is their twin."""
     shape = (p.y.shape[1], p.y.shape[2])
     power = np.abs(p.K) ** 2
@@ -313,7 +313,7 @@ def _half_quadratic(p: _Problem, on_step: StepHook) -> Planes:
     return x
 
 
-def _compiled(p: _Problem, loops: ModuleType) -> Planes:
+def _compiled(p: _SparseProblem, loops: ModuleType) -> Planes:
     """The same in compiled code."""
     decay, prior_power = prior((p.y.shape[1], p.y.shape[2]))
     x = np.empty_like(p.y)

@@ -100,7 +100,9 @@ class PooledFit:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _State:
+class _PooledState:
+    """A lens with what its photos share, and how well it explains all patches."""
+
     lens: Floats
     shared: Floats  # what the patches of each photo share
     cost: float
@@ -134,7 +136,7 @@ def fit_spectra(
         Whether a coarse pupil does; such costs compare only among each other.
     """
     photos = sorted({patch.photo for patch in patches})
-    problem = _Problem(tuple(patches), {name: i for i, name in enumerate(photos)}, begin, coarse)
+    problem = _PooledProblem(tuple(patches), {name: i for i, name in enumerate(photos)}, begin, coarse)
     lens = np.concatenate([begin.terms, open_eye(np.asarray(begin.eye))])
     shared = np.zeros((len(photos), len(PATCHES.photo_spread)))
     held = np.zeros(_LENS + shared.size)
@@ -154,7 +156,7 @@ def fit_spectra(
 def held_cost(patches: Sequence[PatchView], front: Wavefront) -> float:
     """What patches cost behind a lens that was made without them; what those of a photo share is fitted."""
     photos = sorted({patch.photo for patch in patches})
-    problem = _Problem(tuple(patches), {name: i for i, name in enumerate(photos)}, front, coarse=False)
+    problem = _PooledProblem(tuple(patches), {name: i for i, name in enumerate(photos)}, front, coarse=False)
     lens = np.concatenate([front.terms, open_eye(np.asarray(front.eye))])
     shared = np.zeros((len(photos), len(PATCHES.photo_spread)))
     held = np.zeros(_LENS + shared.size)
@@ -190,7 +192,9 @@ def phase_costs(patches: Sequence[PatchView], front: Wavefront) -> tuple[float, 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Problem:
+class _PooledProblem:
+    """The patches of all photos, and where the fit to them begins."""
+
     patches: tuple[PatchView, ...]
     photos: dict[str, int]
     begin: Wavefront
@@ -201,14 +205,14 @@ class _Problem:
         eye = (float(lens[-2]), float(lens[-1]))
         return replace(self.begin, terms=lens[: len(NAMES)].copy(), eye=eye)
 
-    def moved(self, state: _State, step: Floats) -> _State:
+    def moved(self, state: _PooledState, step: Floats) -> _PooledState:
         """Where a step leads, made shorter if it is too bold."""
         step = step * min(1.0, _STRIDE_PX / max(float(np.abs(step[: len(NAMES)]).max()), 1e-9))
         lens = state.lens + step[:_LENS]
         lens[-2:] = open_eye(lens[-2:])
         return self.state(lens, state.shared + step[_LENS:].reshape(state.shared.shape), state.scenes)
 
-    def state(self, lens: Floats, shared: Floats, scenes: list[Floats] | None) -> _State:
+    def state(self, lens: Floats, shared: Floats, scenes: list[Floats] | None) -> _PooledState:
         """Cost with its normal equations; `scenes` are the patches' unknowns to begin with."""
         count = _LENS + shared.size
         normal, gradient = np.zeros((count, count)), np.zeros(count)
@@ -230,8 +234,8 @@ class _Problem:
             normal[np.ix_(places, places)] += weight * own_normal
             gradient[places] += weight * own_gradient
             for channel, (phase, by_phase) in phases.items():
-                told, by_both, downhill = phase_terms(patch.phases[channel], phase, by_phase)
-                cost += told
+                phase_cost, by_both, downhill = phase_terms(patch.phases[channel], phase, by_phase)
+                cost += phase_cost
                 normal[:_LENS, :_LENS] += by_both
                 gradient[:_LENS] += downhill
             scenes_after.append(fitted.z)
@@ -242,7 +246,7 @@ class _Problem:
         normal[:_LENS, :_LENS] += curvature
         normal[range(_LENS, count), range(_LENS, count)] += vote
         gradient -= np.concatenate([pull, vote * shared.ravel()])
-        return _State(lens, shared, cost, normal, gradient, scenes_after, np.array(trust))
+        return _PooledState(lens, shared, cost, normal, gradient, scenes_after, np.array(trust))
 
 
 def expected(

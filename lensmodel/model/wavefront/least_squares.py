@@ -31,7 +31,7 @@ _TRIES = 4  # steps with more damping before the fit ends (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _State:
+class _FrontFit:
     """A wavefront with the tilts of its samples, and which way down."""
 
     front: Wavefront
@@ -60,7 +60,7 @@ class WavefrontProblem:
         votes = np.array([s.weight for s in self.samples])
         designs = [design(s.position, s.settings) for s in self.samples]
 
-        def moved(state: _State, step: Floats) -> _State:
+        def moved(state: _FrontFit, step: Floats) -> _FrontFit:
             tilts = state.tilts + np.stack([-(a + b @ step) for a, b in state.follows])
             return self._linearised(_moved(state.front, step), tilts, designs, wanted, norms, votes)
 
@@ -92,7 +92,7 @@ class WavefrontProblem:
         wanted: Sequence[Floats],
         norms: Floats,
         votes: Floats,
-    ) -> _State:
+    ) -> _FrontFit:
         """Cost about a wavefront, and its normal equations."""
         slopes = np.empty(0) if front.slopes is None else front.slopes
         count = len(NAMES) + 3 + slopes.size  # log q and the cat's eye
@@ -127,7 +127,7 @@ class WavefrontProblem:
             cost += votes[i] * flat / _NOISE**2
             locals_.append((own, follows))
         assert normal.shape == (count, count)
-        return _State(front, tilts, cost, normal, -uphill, errors, locals_)
+        return _FrontFit(front, tilts, cost, normal, -uphill, errors, locals_)
 
     def _columns(
         self,

@@ -27,7 +27,9 @@ _LEVEL = 0.01  # of the peak: fainter pixels are noise to a second moment (chose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _State:
+class _SpotFit:
+    """Unknowns of a wavefront, and how well the moments of its ray spots are those of the samples."""
+
     terms: NDArray[np.float64]
     cost: float
     normal: NDArray[np.float64]
@@ -115,7 +117,7 @@ def _descended(
     ridge = 0.02 * np.sqrt(scale) / prior_px
     two, three = 1.0 / scale, 0.3 / scale**1.5
 
-    def about(t: NDArray[np.float64]) -> _State:
+    def about(t: NDArray[np.float64]) -> _SpotFit:
         x, y = np.einsum("nmr,m->nr", by_x, t), np.einsum("nmr,m->nr", by_y, t)
         pairs = [(x * x, [(2 * x, None)]), (y * y, [(None, 2 * y)]), (x * y, [(y, x)])]
         cubes = [
@@ -137,7 +139,7 @@ def _descended(
         values.append(ridge * t)
         slopes.append(np.diag(ridge))
         miss, change = np.concatenate(values), np.concatenate(slopes)
-        return _State(t, float(miss @ miss), change.T @ change, -(change.T @ miss))
+        return _SpotFit(t, float(miss @ miss), change.T @ change, -(change.T @ miss))
 
     descent = Descent(_TRIES, _TRIES, enough_of_cost=_ENOUGH, floor=_FLOOR, most_tries=_TRIES)
     state = descent.down(about(terms), lambda state, step: about(state.terms + step))

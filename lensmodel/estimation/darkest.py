@@ -75,5 +75,5 @@ def _convolved(plane: Plane, kernel: Plane) -> Plane:
     padded = np.zeros(shape, dtype=np.float32)
     padded[: kernel.shape[0], : kernel.shape[1]] = kernel
     H = scipy.fft.rfft2(np.roll(padded, (-(kernel.shape[0] // 2), -(kernel.shape[1] // 2)), axis=(0, 1)))
-    found = scipy.fft.irfft2(scipy.fft.rfft2(plane, shape) * H, shape)
-    return np.asarray(found[: plane.shape[0], : plane.shape[1]])
+    convolved = scipy.fft.irfft2(scipy.fft.rfft2(plane, shape) * H, shape)
+    return np.asarray(convolved[: plane.shape[0], : plane.shape[1]])

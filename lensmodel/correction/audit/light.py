@@ -18,10 +18,12 @@ _NEAR: Final = 9
 lens's point falls within 4 pixels."""
 _SURE: Final = 4.0
 _SPIKE: Final = 12.0
-"""Standard deviations of noise by which a value may move, and a pixel stand out, in any case (chosen, not
-measured)."""
+"""Standard deviations of noise by which a value may move, and a pixel stand out, in any case (chosen: of a
+million pixels some sixty move by 4 by chance; a correction amplifies noise pixel by pixel, so three times
+that before one is a fault)."""
 _ROOM: Final = 1.25
-"""Factor for points that lie a part of a pixel beside the middle of theirs (chosen, not measured)."""
+"""Factor for points that lie a part of a pixel beside the middle of theirs (chosen: the images of
+such points stand out less; much more room would let isolated pixels pass)."""
 _USUAL_GAIN: Final = 8.0
 """Gain of a point behind a PSF with a standard deviation of 1 pixel, and the largest gain to assume."""
 _NOTHING: Final = 2.0

@@ -209,15 +209,22 @@ class SparseGradient:
         )
 
 
-_RAMP = 0.1  # of the jump of the shrinkage: see `Shrinkage` (chosen, not measured)
-# Variance over squared light of a scene for which kappa is `weight` (chosen, not measured)
+_RAMP = 0.1
+"""Of the jump of the shrinkage, see `Shrinkage` (chosen: with none, rounding decides what is kept; a wide one
+is no longer the prior's own answer)."""
 _TYPICAL_CONTRAST = np.float32(0.02)
-_SCENE = 0.2  # variance over squared light of a cell of an average scene (chosen, not measured)
+"""Variance over squared light of a scene for which kappa is `weight` (chosen: detail of a seventh of the
+light. It only sets the unit of `weight`; see `_BUSIEST`, `_CALMEST` for how far others lie)."""
+_SCENE = 0.2
+"""Least variance over squared light of a cell when its determined share is asked for (chosen: that of a scene
+with objects of all brightnesses; with less, flat cells would count as undetermined, and the prior would leave
+them their noise)."""
 _OPEN, _SLOPE, _LEAST = 0.25, 0.87, 0.4  # chosen on lenses of development seeds: see `_reliance`
 # Range of the weight of the prior between texture and flat places (chosen on development lenses)
 _BUSIEST, _CALMEST = 0.7, 50.0
-# Share of a tile's mean light below which the prior stops following it (chosen, not measured)
 _DARK = np.float32(0.02)
+"""Share of a tile's mean light below which the prior stops following it (chosen: with none, all detail of
+black would be smoothed away; with more, shadows keep noise that lighter places lose)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

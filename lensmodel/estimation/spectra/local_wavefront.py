@@ -34,9 +34,11 @@ from lensmodel.scene.prior import TAILS
 
 _STRIDE_PX = 1.0  # pixels of blur: no term changes by more in one step (chosen)
 _ENOUGH = 0.05  # of the cost: less gained in a step ends the fit (chosen)
-_TRIES = 4  # steps with more damping before the fit ends (chosen)
+_TRIES = 4  # steps with more damping before the fit ends: after four they are too short to gain (chosen)
 _SIDES: Final = (31, 47)  # pixels of the kernel: for usual and for wide blur (chosen)
-_WIDE_PX = 2.8  # RMS width from which on the larger one is taken (chosen)
+_WIDE_PX = 2.8
+"""RMS width from which on the larger one is taken: five of them fit into half of the smaller side
+(chosen)."""
 
 _SEED = 0  # any number: fits repeat to the bit
 

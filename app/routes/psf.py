@@ -36,7 +36,8 @@ MAX_GRID: Final = 25
 """Columns and rows of a map at most (chosen): more kernels are too small to be looked at."""
 
 MAX_FIELD_PIXELS: Final = 2_000_000
-"""Pixels of all kernels of a map (chosen): 25 x 25 kernels of 55 pixels; with 255 pixels a map took 8.5 s."""
+"""Pixels of all kernels of a map (chosen): 25 x 25 kernels of 55 pixels; with 255 pixels a map took 8.5 s
+(measured once, no command repeats it)."""
 
 _PSF: Final = QueryModel(PsfQuery)
 _FIELD: Final = QueryModel(FieldQuery)

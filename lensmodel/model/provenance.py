@@ -39,7 +39,7 @@ _APART: Final[Mapping[str, str]] = MappingProxyType(
         SEVERAL_FOCAL_LENGTHS: "photos of several focal lengths, whose patches are not solved together",
     }
 )
-_LISTED = 1e-3  # share of the weight from which on a photo is counted (chosen)
+_LISTED = 1e-3  # share of the weight from which on a photo is counted: less shows in no digit (chosen)
 
 
 @dataclass(frozen=True, slots=True)

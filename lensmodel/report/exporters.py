@@ -34,7 +34,7 @@ FREQUENCIES: Final = tuple(round(0.05 * i, 2) for i in range(1, 11))
 """Cycles/pixel of the MTF table, up to the Nyquist frequency (chosen: ten rows)."""
 
 _MOST_BYTES: Final = 1 << 29  # of one file: against questions that fill the memory (chosen)
-_GAP: Final = 2  # pixels between two kernels of a sheet (chosen)
+_GAP: Final = 2  # pixels between two kernels of a sheet: seen, and little of it (chosen)
 _ABOUT: Final = "point spread functions by lensmodel; row 0 at the top, each sums to 1"
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from lensmodel.core.psf import second_moments
 from lensmodel.core.types import FieldPosition, Kernel
 
-_EVEN_PX: Final = 0.1  # widths along u and v that differ by less count as alike (chosen)
+_EVEN_PX: Final = 0.1  # widths along u and v that differ by less count as alike: nobody sees it (chosen)
 
 Ring: TypeAlias = list[tuple[FieldPosition, Kernel]]
 """Kernels at places of one radius."""

@@ -34,7 +34,7 @@ FALLBACK_FREQUENCIES: Final = (0.05, 0.1, 0.15, 0.2)
 
 # Half-diagonals (chosen: nothing is asked in the very corner, which no sample reaches)
 _RADII: Final = tuple(float(r) for r in np.linspace(0.0, 0.95, 11).round(4))
-_RING: Final = 3  # places of a ring whose mean is its value (chosen)
+_RING: Final = 3  # places in each quarter of a ring whose mean is its value: more hardly change it (chosen)
 _MOST_APERTURES: Final = 12  # a page holds as many rows (chosen)
 # Half-diagonals (chosen: about the middle of each zone)
 _ZONE_RADIUS: Final[dict[Zone, float]] = {"center": 0.15, "mid": 0.5, "corner": 0.88}

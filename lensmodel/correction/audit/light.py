@@ -32,7 +32,8 @@ estimate of black knows its bound."""
 _POSSIBLE, _IMPOSSIBLE = 0.25, 3.0
 """Weights of light below the photo's darkest and of light below zero. No scene has the latter, while dark
 lines finer than the PSF are darker than anything that the photo shows: with a weight of 1, pictures of slats
-and girders would need a limit 1.7 times that of others, with a quarter 1.1 times."""
+and girders would need a limit 1.7 times that of others, with a quarter 1.1 times. Measured once, no command
+repeats it."""
 
 
 def too_dark(pair: TilePair) -> Severity:

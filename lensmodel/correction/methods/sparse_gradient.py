@@ -219,8 +219,9 @@ _SCENE = 0.2
 """Least variance over squared light of a cell when its determined share is asked for (chosen: that of a scene
 with objects of all brightnesses; with less, flat cells would count as undetermined, and the prior would leave
 them their noise)."""
-_OPEN, _SLOPE, _LEAST = 0.25, 0.87, 0.4  # chosen on lenses of development seeds: see `_reliance`
-# Range of the weight of the prior between texture and flat places (chosen on development lenses)
+# See `_reliance` (chosen on lenses of development seeds: measured once, no command repeats it)
+_OPEN, _SLOPE, _LEAST = 0.25, 0.87, 0.4
+# Range of the weight of the prior between texture and flat places (chosen on the same lenses, as those)
 _BUSIEST, _CALMEST = 0.7, 50.0
 _DARK = np.float32(0.02)
 """Share of a tile's mean light below which the prior stops following it (chosen: with none, all detail of

@@ -30,7 +30,7 @@ SURFACE_LIMIT: Final = 0.19
 JUMP_SHARE: Final = 0.5
 """Of the range of log widths, see `smooth_widths`: a slope takes a sixth of it, a step of depth all
 (chosen)."""
-SURFACE_STEPS: Final = 12  # of reweighting, by which deviations have long settled (chosen)
+SURFACE_STEPS: Final = 12  # of reweighting, each a small system: later ones change less (chosen)
 MIN_FOR_SURFACE: Final = 40  # windows, for six coefficients: fewer let a surface follow the scene (chosen)
 QUARTER_ALLOWANCE: Final = 1.2
 """A quarter of a window has fewer edges, its width a larger error: 1 would call windows defocused by chance

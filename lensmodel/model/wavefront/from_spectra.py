@@ -57,8 +57,9 @@ PATCH_TAILS: Final = 3.0
 """Degrees of freedom of Student's t of a patch, in units of its bins (chosen): a patch that something else
 blurred loses its say, an unusual one keeps it."""
 
-_HELD_ROUNDS = 3  # steps of what photos share behind a lens that is known (chosen)
-_TRIES = 5  # steps with more damping before the fit ends (chosen)
+_HELD_ROUNDS = 3
+"""Steps of what photos share behind a lens that is known: few unknowns, and nearly linear (chosen)."""
+_TRIES = 5  # steps with more damping before the fit ends: by then they are too short to gain (chosen)
 _STRIDE_PX = 1.5  # pixels of blur: no term changes by more in one step (chosen)
 _ENOUGH = 0.2  # of the cost: less gained in a step ends the fit; minima differ by more (chosen)
 _SMALLEST_EYE, _FARTHEST_EYE = 0.5, 1.0  # radius, shift: the circles overlap all over the field (chosen)

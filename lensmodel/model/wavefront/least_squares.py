@@ -21,13 +21,15 @@ from lensmodel.optics.wavefront import NAMES, Wavefront, design, stopped
 
 Floats = NDArray[np.float64]
 
-_NOISE = 0.1  # relative L2 that a good sample has against the best wavefront (chosen)
+_NOISE = 0.1
+"""Relative L2 that a good sample has against the best wavefront: more gives the prior of aberrations a larger
+part, less none (chosen)."""
 _HUBER = 0.35  # relative error: that of a usual estimate (chosen)
 _ENOUGH = 2e-3  # of the cost: less gained in a step ends the fit (chosen)
 # Of the differences that stand for derivatives: by the cat's eye, whose edge is one sample of the pupil wide,
 # and by the width of diffraction (chosen)
 _EYE_STEP, _LOG_Q_STEP = 0.02, 0.05
-_TRIES = 4  # steps with more damping before the fit ends (chosen)
+_TRIES = 4  # steps with more damping before the fit ends: by then they are too short to gain (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,8 +18,12 @@ from lensmodel.core.descent import Descent
 from lensmodel.core.psf import PsfSample, second_moments
 from lensmodel.optics.pupil import ray_gradients
 
-_RAYS = 11  # across the pupil (chosen)
-_BEGINNINGS, _TRIES = 24, 25  # at random, and steps that are tried from each (chosen)
+_RAYS = 11
+"""Across the pupil: enough for moments that only give a beginning; the cost grows with its square
+(chosen)."""
+_BEGINNINGS, _TRIES = 24, 25
+"""At random, and steps that are tried from each: moments are cheap, and most descents end earlier
+(chosen)."""
 _ENOUGH = 1e-4  # of the cost: less gained in a step ends a descent (chosen)
 _SEED = 0  # any number: fits repeat to the bit
 _FLOOR = 1e-9  # of the diagonal that is damped: far below any that counts (chosen)

@@ -123,11 +123,11 @@ def _curl(
 
 
 def _required(schema: dict[str, Any], schemas: dict[str, Any]) -> Any:  # noqa: ANN401 - JSON
-    found = _resolved(schema, schemas)
+    resolved = _resolved(schema, schemas)
     whole = example(schema, schemas)
     if not isinstance(whole, dict):
         return whole
-    return {name: whole[name] for name in found.get("required", [])} or dict(list(whole.items())[:1])
+    return {name: whole[name] for name in resolved.get("required", [])} or dict(list(whole.items())[:1])
 
 
 def example(  # noqa: PLR0911 - one return for each kind of value
@@ -169,7 +169,7 @@ def _resolved(schema: dict[str, Any], schemas: dict[str, Any]) -> dict[str, Any]
 
 
 def _kind(schema: dict[str, Any], schemas: dict[str, Any]) -> str:
-    found = _resolved(schema, schemas)
-    if found.get("enum"):
-        return " or ".join(f"`{value}`" for value in found["enum"])
-    return str(found.get("type", "any"))
+    resolved = _resolved(schema, schemas)
+    if resolved.get("enum"):
+        return " or ".join(f"`{value}`" for value in resolved["enum"])
+    return str(resolved.get("type", "any"))

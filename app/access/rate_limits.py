@@ -8,7 +8,8 @@ from collections import OrderedDict
 from typing import Final
 
 MAX_BUCKETS: Final = 10_000
-"""Buckets that are kept (chosen); the one used least recently is dropped first, and is full again by then."""
+"""Buckets that are kept (chosen: a few MiB, more owners than ask at once); the one used least recently is
+dropped first, and is full again by then."""
 
 
 class Rates:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
 from app.blobs.storage import Storage
-from lensmodel.photo.tags.location import FoundLocation, Overwrite, find_location
+from lensmodel.photo.tags.location import LocationTraces, Overwrite, find_location
 
 log = logging.getLogger(__name__)
 
@@ -38,10 +38,10 @@ def remove(storage: Storage, key: str) -> Location:
     return "removed" if location.overwrites else "none"
 
 
-def _of_file(path: Path) -> FoundLocation:
+def _of_file(path: Path) -> LocationTraces:
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
         if mapped[6:14] == CIFF:
-            return FoundLocation((), complete=True)
+            return LocationTraces((), complete=True)
         return find_location(mapped)
 
 

@@ -14,7 +14,7 @@ from PIL import Image, ImageOps
 from lensmodel.photo import upright
 
 SIDE: Final = 480
-"""Longer side of a glance in pixels at most (chosen): sharp at 240 CSS pixels on a high-density screen."""
+"""Longer side of a thumbnail in pixels at most (chosen): sharp at 240 CSS pixels on a high-density screen."""
 
 _EXIF_OF_FLIP: Final = {3: 3, 5: 8, 6: 6}
 """LibRaw's `flip` as EXIF orientation."""
@@ -23,7 +23,7 @@ _PLAIN: Final = frozenset({"jpeg", "png"})
 _ORIENTATION: Final = 0x0112  # EXIF 2.3, tag Orientation
 
 
-def glance(path: Path, kind: str, orientation: int) -> bytes:
+def thumbnail(path: Path, kind: str, orientation: int) -> bytes:
     """Render a photo file as a small upright JPEG, as cheaply as its kind allows.
 
     Of RAW files the camera's embedded preview is used, or where there is none every second pixel.

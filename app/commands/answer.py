@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 import tifffile
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from app.commands.console import files
 from app.commands.console.display import Display
@@ -98,13 +99,18 @@ def _words(place: FieldPosition, answer: PsfAnswer, tangential: float, sagittal:
 
 
 def _write(path: Path, answer: PsfAnswer, document: dict[str, Any]) -> None:
+    """Write the kernel, and beside it what made it; NPY alone has no room for that, the command says it."""
     kernel = answer.kernel.astype(np.float32)
+    about = json.dumps(to_json({key: value for key, value in document.items() if key != "psf"}))
     match path.suffix.lower():
         case ".npy":
             np.save(path, kernel, allow_pickle=False)
         case ".json":
             path.write_text(json.dumps(to_json(document)), encoding="utf-8")
         case ".tif":
-            tifffile.imwrite(path, kernel)
+            tifffile.imwrite(path, kernel, description=about, metadata=None)
         case _:
-            Image.fromarray(np.rint(65535.0 * kernel / kernel.max()).astype(np.uint16)).save(path)
+            texts = PngInfo()
+            texts.add_text("Description", about)
+            scaled = np.rint(65535.0 * kernel / kernel.max()).astype(np.uint16)
+            Image.fromarray(scaled).save(path, pnginfo=texts)

@@ -147,7 +147,7 @@ def _refuse(target: Path, photos: Sequence[Path], options: CalibrationOptions) -
 
 
 class ProfileFile:
-    """The shelf of a lens that is kept in a file, with the options applied to it.
+    """The keeper of a lens in a file, with the options applied to it.
 
     Another run may add to the same file meanwhile: the profile is read again whenever the file has
     changed, so that no run drops what another one learned.

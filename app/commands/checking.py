@@ -22,7 +22,8 @@ from lensmodel.correction.audit import AuditReport
 from lensmodel.workflow import checking
 
 _GREY: Final = 0.5
-"""Brightness of the photo on the map (chosen), so that the red of what was held back stands out."""
+"""Brightness of the photo on the map (chosen: bright enough to be recognised, so dark that the red of what
+was held back stands out)."""
 
 
 def check(

@@ -30,6 +30,7 @@ from lensmodel.core.codec import to_json
 from lensmodel.core.files import write_atomically
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel
+from lensmodel.model.provenance import answerers_in_words
 from lensmodel.report import (
     Advice,
     LensReport,
@@ -211,10 +212,14 @@ def export_psfs(
             at=place,
         )
     export(output, psfs, written)
+    # here too: a bare matrix has no room for it
+    made = answerers_in_words(zip(psfs.answered_by, psfs.reason, strict=True))
     if json_output:
-        shown.document({"output": str(output), "format": written, "psfs": len(psfs.positions)})
+        number = len(psfs.positions)
+        shown.document({"output": str(output), "format": written, "psfs": number, "answered": made})
     else:
         shown.result(str(output))
+        shown.note(made)
 
 
 def _format(output: Path, named: str | None) -> str:
@@ -256,11 +261,12 @@ def _words(measured: LensReport, recommended: Advice, output: Path | None) -> st
 def _map_csv(measured: LensReport) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(
-        ["row", "col", "r", "phi", "mtf50_tangential", "mtf50_sagittal", "predicted_error", "extrapolated"]
-    )
+    mtf50 = ("mtf50_tangential", "mtf50_sagittal")
+    known = ("predicted_error", "extrapolated", "answered_by", "reason")
+    writer.writerow(["row", "col", "r", "phi", *mtf50, *known])
     for i, point in enumerate(measured.field):
         values = (point.position.r, point.position.phi, point.tangential, point.sagittal)
         numbers = (f"{value:.6f}" for value in (*values, point.predicted_error))
-        writer.writerow([*divmod(i, measured.cols), *numbers, int(point.extrapolated)])
+        made = (point.answered_by, point.reason)
+        writer.writerow([*divmod(i, measured.cols), *numbers, int(point.extrapolated), *made])
     return out.getvalue()

@@ -12,7 +12,7 @@ from lensmodel.core.files import write_atomically
 from lensmodel.report.drawing import COLOURS, Axes, Label, svg
 from lensmodel.report.photo_crops import Picture, crop_boxes
 
-_GAP, _LABEL = 6, 18  # pixels between crops and above them for a line of text (chosen)
+_GAP, _LABEL = 6, 18  # pixels between crops and above them: a line of text fits (chosen)
 
 
 def mosaic(rows: Mapping[str, Picture], path: Path, *, side: int = 220) -> None:

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict, defaultdict
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Callable, Mapping
+from typing import Final, NamedTuple
 
 MAX_BYTES: Final = 32 << 20
 """Memory of the cache (chosen): some hundred maps of a field."""
+
+
+class DrawnPicture(NamedTuple):
+    """A picture as it is sent, and the headers that say how it came about."""
+
+    data: bytes
+    headers: Mapping[str, str]
 
 
 class Drawn:
@@ -19,11 +26,11 @@ class Drawn:
 
     def __init__(self, max_bytes: int = MAX_BYTES) -> None:
         self._max_bytes = max_bytes
-        self._kept: OrderedDict[str, bytes] = OrderedDict()
+        self._kept: OrderedDict[str, DrawnPicture] = OrderedDict()
         self._guard = threading.Lock()
         self._drawing: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
 
-    def get(self, tag: str, draw: Callable[[], bytes]) -> bytes:
+    def get(self, tag: str, draw: Callable[[], DrawnPicture]) -> DrawnPicture:
         """Return the picture of a tag; render it if it is missing, once for simultaneous calls."""
         with self._guard:
             alone = self._drawing[tag]
@@ -39,6 +46,9 @@ class Drawn:
                     self._drawing.pop(tag, None)
             with self._guard:
                 self._kept[tag] = picture
-                while len(self._kept) > 1 and sum(map(len, self._kept.values())) > self._max_bytes:
+                while len(self._kept) > 1 and self._size() > self._max_bytes:
                     self._kept.popitem(last=False)
             return picture
+
+    def _size(self) -> int:
+        return sum(len(picture.data) for picture in self._kept.values())

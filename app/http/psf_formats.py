@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping
 from typing import Final, Literal, TypeAlias
 
 import numpy as np
@@ -12,10 +13,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from app.http.model_cache import Fitted
+from app.http.picture_cache import DrawnPicture
 from app.schemas import FamilyOut, KernelOut, PsfOut, QueryOut, Support, Units
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import PsfField
-from lensmodel.core.types import Channel, Kernel
+from lensmodel.core.types import FieldPosition, Kernel
 from lensmodel.model import PsfAnswer
 
 SIDE: Final = 1000
@@ -26,6 +27,17 @@ View: TypeAlias = tuple[float, float, float, float]
 
 DIGITS: Final = 10
 """Decimals of kernels, whose sum is 1, in JSON (chosen): float32 resolves no more of 0.001."""
+
+SCALE: Final = "X-PSF-Scale"
+ANSWERED_BY: Final = "X-PSF-Answered-By"
+REASON: Final = "X-PSF-Reason"
+HEADERS: Final = {
+    SCALE: "of one PSF as PNG: the value of white, and the gamma",
+    ANSWERED_BY: "what made the answer, as `support.answered_by` of the JSON, which has no such header; of a "
+    "map all that took part, those of most places first, with semicolons between",
+    REASON: "why that one, as `support.reason` of the JSON; of a map one for each, in the same order",
+}
+"""What headers say of pictures and arrays, which have no other room for it."""
 
 GAP_PX: Final = 2
 """Pixels between the kernels of a map (chosen for looks)."""
@@ -72,23 +84,22 @@ def psf(
     if form == "npy":
         buffer = io.BytesIO()
         np.save(buffer, kernel.astype("<f4"), allow_pickle=False)
-        return buffer.getvalue(), _named(described, "npy")
+        return buffer.getvalue(), _headers(described, "npy")
     if form == "tiff":
         buffer = io.BytesIO()
         text = described.model_dump_json(exclude={"psf"})  # tifffile would interpret a "shape" in it
         tifffile.imwrite(
             buffer, kernel.astype(np.float32), photometric="minisblack", description=text, metadata=None
         )
-        return buffer.getvalue(), _named(described, "tiff")
+        return buffer.getvalue(), _headers(described, "tiff")
     peak = float(kernel.max())
     scaled = np.round(kernel / peak * 65535).astype(np.uint16)
-    headers = {"X-PSF-Scale": f"max={peak:.9g}; gamma=1"}
-    return _png(Image.fromarray(scaled)), headers | _named(described, "png")
+    headers = {SCALE: f"max={peak:.9g}; gamma=1"}
+    return _png(Image.fromarray(scaled)), headers | _headers(described, "png")
 
 
 def field_map(
-    field: PsfField,
-    channel: Channel,
+    ask: Callable[[FieldPosition], PsfAnswer],
     *,
     columns: int,
     rows: int,
@@ -96,20 +107,25 @@ def field_map(
     gamma: float,
     aspect: float = 1.5,
     view: View = (0.0, 0.0, 1.0, 1.0),
-) -> bytes:
-    """Draw kernels on a grid over a part of the field as an 8-bit PNG, each scaled to its own peak."""
+) -> DrawnPicture:
+    """Draw kernels on a grid over a part of the field as an 8-bit PNG, each scaled to its own peak.
+
+    `ask` answers with a kernel of side `size`.
+    """
     frame = Frame(SIDE, round(SIDE * aspect))
     left_edge, top_edge, wide, high = view
     pitch = size + GAP_PX
     sheet = np.full((rows * pitch + GAP_PX, columns * pitch + GAP_PX), 40, dtype=np.uint8)
+    made: Counter[tuple[str, str]] = Counter()
     for row in range(rows):
         for column in range(columns):
             down, across = top_edge + (row + 0.5) / rows * high, left_edge + (column + 0.5) / columns * wide
             place = frame.position(down * (frame.height - 1), across * (frame.width - 1))
-            kernel = field.kernel_at(place, channel, size)
+            answer = ask(place)
+            made[answer.answered_by, answer.reason] += 1
             top, left = row * pitch + GAP_PX, column * pitch + GAP_PX
-            sheet[top : top + size, left : left + size] = _bright(kernel, gamma)
-    return _png(Image.fromarray(sheet))
+            sheet[top : top + size, left : left + size] = _bright(answer.kernel, gamma)
+    return DrawnPicture(_png(Image.fromarray(sheet)), _made(made))
 
 
 def _bright(kernel: Kernel, gamma: float) -> NDArray[np.uint8]:
@@ -122,8 +138,14 @@ def _png(image: Image.Image) -> bytes:
     return buffer.getvalue()
 
 
-def _named(described: PsfOut, suffix: str) -> dict[str, str]:
+def _made(counts: Counter[tuple[str, str]]) -> dict[str, str]:
+    names, reasons = zip(*(made for made, _ in counts.most_common()), strict=True)
+    return {ANSWERED_BY: "; ".join(names), REASON: "; ".join(reasons)}
+
+
+def _headers(described: PsfOut, suffix: str) -> dict[str, str]:
     at = described.query
     aperture = "" if at.aperture is None else f"-f{at.aperture:g}"
     name = f"psf-v{described.version}-r{at.r:.3f}-phi{at.phi:.3f}{aperture}-{at.channel}.{suffix}"
-    return {"Content-Disposition": f'inline; filename="{name}"'}
+    made = Counter([(described.support.answered_by, described.support.reason)])
+    return {"Content-Disposition": f'inline; filename="{name}"'} | _made(made)

@@ -24,7 +24,7 @@ WAIT_S: Final = 60.0
 seconds, unless many photos are before it."""
 
 _UNREAD: Final = ("received", "inspecting")
-_BYTES_A_PIXEL: Final = 96  # chosen, not measured: two mapped photos, a float64 plane of each, intermediates
+_BYTES_A_PIXEL: Final = 96  # chosen, by counting: two mapped photos, a float64 plane of each, intermediates
 
 
 class MeasurementWork:

@@ -21,7 +21,7 @@ from app.jobs.measurement_work import MeasurementWork
 from app.jobs.patch_plans import described, patch_of, plan_of, why_not
 from app.jobs.queue import Job, JobEngine
 from app.jobs.sample_files import DAMAGED, returned_samples
-from app.jobs.thumbnail_work import keep_glance
+from app.jobs.thumbnail_work import keep_thumbnail
 from app.sandbox.outcome import TaskLimits
 from app.store import LensName, NewSample, Store
 from app.store.photo_steps import stored_settings
@@ -134,7 +134,7 @@ class _Steps:
             info = self._context.attempt(
                 "inspect", arguments, folder=folder, limits=limits, wanted=self._wanted, reads=[path]
             )
-            keep_glance(self._context, self._photo, info, path, self._wanted)
+            keep_thumbnail(self._context, self._photo, info, path, self._wanted)
         self._record(info)
         self._photo = _row(self._store, self._photo.public_id)
         return self._identify()

@@ -33,8 +33,8 @@ PREVIEW: Final = "preview.jpg"
 R_MAP: Final = "r-map.png"
 """Pictures of a developed photo, by `app.blobs.previews`."""
 
-GLANCE: Final = "glance.jpg"
-"""Small picture of a photo that is not developed yet, by `app.blobs.thumbnails`."""
+THUMBNAIL: Final = "glance.jpg"
+"""Small picture of a photo before it is developed, by `app.blobs.thumbnails`; stored ones have this name."""
 
 SHOWN: Final = "shown.jpg"
 """The developed photo in full size, sRGB, in sensor orientation."""

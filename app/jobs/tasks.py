@@ -25,7 +25,6 @@ from app.jobs.task_files import (
     BEFORE,
     EARLIER,
     FAMILY,
-    GLANCE,
     LAYERS,
     LEARNED,
     PREVIEW,
@@ -33,6 +32,7 @@ from app.jobs.task_files import (
     REPORT,
     SHOWN,
     SUFFIX,
+    THUMBNAIL,
 )
 from app.sandbox.child import ProgressHook, Task
 from app.schemas import distances
@@ -79,11 +79,11 @@ def inspect(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     return header
 
 
-def glance(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
+def thumbnail(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     """Render a small picture of the photo at `path`."""
     del progress
-    picture = thumbnails.glance(Path(arguments["path"]), arguments["kind"], arguments["orientation"] or 1)
-    (folder / GLANCE).write_bytes(picture)
+    picture = thumbnails.thumbnail(Path(arguments["path"]), arguments["kind"], arguments["orientation"] or 1)
+    (folder / THUMBNAIL).write_bytes(picture)
     return {}
 
 
@@ -261,7 +261,7 @@ def measure_lens(arguments: dict[str, Any], folder: Path, progress: ProgressHook
 
 TASKS: Final[Mapping[str, Task]] = {
     "inspect": inspect,
-    "glance": glance,
+    "thumbnail": thumbnail,
     "develop": develop,
     "select": select,
     "estimate": estimate,

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from app.jobs.context import SPARE_MB, JobContext
-from app.jobs.task_files import GLANCE
+from app.jobs.task_files import THUMBNAIL
 from app.sandbox.outcome import TaskLimits
 from app.store.photo_steps import photo_folder
 from app.store.tables import PhotoRow
 
 
-def keep_glance(
+def keep_thumbnail(
     context: JobContext, photo: PhotoRow, info: dict[str, Any], path: Path, wanted: Callable[[], bool]
 ) -> None:
     """Store a small picture of the photo at `path`; none where it cannot be rendered."""
@@ -21,7 +21,7 @@ def keep_glance(
     arguments = {"path": str(path), "kind": info["kind"], "orientation": info["metadata"]["orientation"]}
     with context.sandbox.folder() as folder:
         outcome = context.sandbox.run(
-            "glance", arguments, folder=folder, limits=limits, reads=[path], wanted=wanted
+            "thumbnail", arguments, folder=folder, limits=limits, reads=[path], wanted=wanted
         )
-        if outcome.ending == "ok" and (folder / GLANCE).is_file():
-            context.storage.put_file(f"{photo_folder(photo)}{GLANCE}", folder / GLANCE)
+        if outcome.ending == "ok" and (folder / THUMBNAIL).is_file():
+            context.storage.put_file(f"{photo_folder(photo)}{THUMBNAIL}", folder / THUMBNAIL)

@@ -29,7 +29,7 @@ from app.jobs.job_log import JobRecord, accounted
 from app.jobs.missing_reports import ask_for_reports
 from app.jobs.photo_work import PhotoWork
 from app.jobs.queue import DbosEngine, Handler, Job, JobEngine
-from app.jobs.task_files import GLANCE, PREVIEW, R_MAP, SHOWN
+from app.jobs.task_files import PREVIEW, R_MAP, SHOWN, THUMBNAIL
 from app.runtime import logs, metrics
 from app.runtime.outage import CODE as OUTAGE
 from app.runtime.outage import LONGEST_PAUSE_S, Patience, is_outage
@@ -146,12 +146,12 @@ class Worker:
                 "measure": self._safe(corrections.measure, self._measure_broke),
             }
         )
-        self._bury_the_gone(host)
+        self._take_over_gone(host)
         self._start_thread(TIDY_S, self._tidy)  # deleting may take long
         self._start_thread(REPORTS_S, self._ask_for_reports)  # so may listing the blobs
         duties = (
             (self._settings.sweep_seconds, self._sweep),
-            (beat_s, self._bury_the_silent),
+            (beat_s, self._take_over_silent),
             (RECONCILE_S, self._reconcile),
             (beat_s, self._leave_metrics),
         )
@@ -296,7 +296,7 @@ class Worker:
             self._die("this worker was silent for too long and others took over its work")
         self._last_beat = time.monotonic()
 
-    def _bury_the_silent(self) -> None:
+    def _take_over_silent(self) -> None:
         """Take over from workers whose lease has expired."""
         for dead in self._store.workers.bury_stale(self._settings.lease_seconds):
             self._take_over(dead)
@@ -308,7 +308,7 @@ class Worker:
             metrics.TAKEN_OVER.inc()
             log.info("took over the work of worker %s", dead)
 
-    def _bury_the_gone(self, host: str) -> None:
+    def _take_over_gone(self, host: str) -> None:
         """Take over at once from workers of this machine whose process is gone."""
         for row in self._store.workers.all():
             if row.id != self.id and row.host == host and not is_running(row.pid, row.pid_started):
@@ -347,7 +347,7 @@ class Worker:
         for owner_key in self._store.accounts.to_erase():
             self._do(partial(erase, self._store.accounts, self._context.storage, owner_key))
         for photo_id in self._store.photos.unneeded(self._settings.keep_photos):
-            self._do(partial(self._store.photos.give_up_file, photo_id, (GLANCE, PREVIEW, R_MAP, SHOWN)))
+            self._do(partial(self._store.photos.give_up_file, photo_id, (THUMBNAIL, PREVIEW, R_MAP, SHOWN)))
         self._do(self._store.accounts.purge)
         self._do(self._store.idempotency.tidy)
         for prefix in self._store.workers.garbage():

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Path, Query, Response
 
 from app.errors import InvalidParameterError, NotReadyError
 from app.http.dependencies import Call, CallDep
-from app.jobs.task_files import AFTER, BEFORE, GLANCE, LAYERS, PREVIEW, R_MAP, SHOWN
+from app.jobs.task_files import AFTER, BEFORE, LAYERS, PREVIEW, R_MAP, SHOWN, THUMBNAIL
 from app.pages import pictures
 from app.routes import corrections as correction_routes
 from app.routes import photos as photo_routes
@@ -43,11 +43,11 @@ def _picture(data: bytes, media_type: str = "image/jpeg") -> Response:
 # --- a photo -------------------------------------------------------------------------------------
 
 
-@router.get("/ui/photos/{photo_id}/glance.jpg")
-def photo_glance(photo_id: str, call: CallDep) -> Response:
+@router.get("/ui/photos/{photo_id}/thumbnail.jpg")
+def photo_thumbnail(photo_id: str, call: CallDep) -> Response:
     """Show a photo as small as a list needs it: also before it is developed, and nothing where nothing is."""
     folder = photo_folder(photo_routes.find_photo(call, photo_id))
-    for name in (GLANCE, PREVIEW):
+    for name in (THUMBNAIL, PREVIEW):
         if pictures.exists(call.storage, f"{folder}{name}"):
             return _picture(pictures.shrunk_preview(pictures.stored(call.storage, f"{folder}{name}"), 480))
     return Response(NOTHING, media_type="image/svg+xml", headers={"Cache-Control": "no-store"})

@@ -13,6 +13,7 @@ from app.errors import InvalidParameterError, NotAcceptableError, UnknownLensErr
 from app.http import psf_formats
 from app.http.dependencies import Call, CallDep
 from app.http.model_cache import Fitted
+from app.http.picture_cache import DrawnPicture
 from app.http.questions import QueryModel
 from app.routes.common import Answers, matches_tag, problems
 from app.runtime import metrics
@@ -35,7 +36,8 @@ MAX_GRID: Final = 25
 """Columns and rows of a map at most (chosen): more kernels are too small to be looked at."""
 
 MAX_FIELD_PIXELS: Final = 2_000_000
-"""Pixels of all kernels of a map (chosen): 25 x 25 kernels of 55 pixels; with 255 pixels a map took 8.5 s."""
+"""Pixels of all kernels of a map (chosen): 25 x 25 kernels of 55 pixels; with 255 pixels a map took 8.5 s
+(measured once, no command repeats it)."""
 
 _PSF: Final = QueryModel(PsfQuery)
 _FIELD: Final = QueryModel(FieldQuery)
@@ -45,8 +47,11 @@ _CONTENT = {
     for name in MEDIA_TYPES.values()
     if "json" not in name
 }
+_HEADERS = {
+    name: {"description": text, "schema": {"type": "string"}} for name, text in psf_formats.HEADERS.items()
+}
 _ANSWERS: Final[Answers] = {
-    200: {"model": PsfOut, "content": _CONTENT, "description": "The PSF"},
+    200: {"model": PsfOut, "content": _CONTENT, "description": "The PSF", "headers": _HEADERS},
     304: {"description": "Not changed"},
 }
 
@@ -169,6 +174,7 @@ def etag(fitted: Fitted, question: str) -> str:
             200: {
                 "content": {"image/png": {"schema": {"type": "string", "format": "binary"}}},
                 "description": "Map",
+                "headers": _HEADERS,
             },
             304: {"description": "Not changed"},
         },
@@ -198,11 +204,9 @@ def read_field(lens_id: str, at: Annotated[FieldQuery, Depends(_FIELD)], call: C
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
     setting = LensSettings(at.aperture, at.focal_length_mm, at.focus_distance_m, at.channel)
 
-    def draw() -> bytes:
-        field = fitted.model.field(setting)
+    def draw() -> DrawnPicture:
         return psf_formats.field_map(
-            field,
-            at.channel,
+            lambda place: fitted.model.query(place, setting, at.size),
             columns=columns,
             rows=rows,
             size=at.size,
@@ -212,4 +216,4 @@ def read_field(lens_id: str, at: Annotated[FieldQuery, Depends(_FIELD)], call: C
         )
 
     picture = call.services.pictures.get(tag, draw)
-    return Response(picture, media_type="image/png", headers=headers)
+    return Response(picture.data, media_type="image/png", headers={**headers, **picture.headers})

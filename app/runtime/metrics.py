@@ -34,7 +34,8 @@ from app.store import Store
 CONTENT_TYPE: Final = CONTENT_TYPE_PLAIN_1_0_0
 FOLDER: Final = "metrics"
 KEEP_S: Final = 86400.0
-"""How long the metrics of a worker that has ended still count (chosen), lest sums fall with each restart."""
+"""How long the metrics of a worker that has ended still count (chosen: a day of restarts; shorter, sums fall
+with each, longer, files pile up)."""
 
 _QUICK: Final = (0.001, 0.0025, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 10.0)
 _LONG: Final = (0.1, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0)

@@ -24,7 +24,8 @@ FORMAT_VERSION: Final = 1
 """Raised when the layout of a stored kernel changes."""
 
 MAX_ESTIMATOR: Final = 60
-"""Characters kept of an estimator's name, which profiles and own estimators choose (chosen)."""
+"""Characters kept of an estimator's name, which profiles and own estimators choose (chosen: every name of
+ours fits, and no other fills the table)."""
 
 _Columns = Mapping[str, InstrumentedAttribute[Any]]
 _OWN: Final[_Columns] = {

@@ -9,7 +9,7 @@ import scipy  # its parts are loaded when they are needed
 from numpy.typing import NDArray
 
 _LEAST: Final = 1e-6  # of the largest eigenvalue: the least that is left (chosen, far below any noise)
-_FEW: Final = 256  # unknowns up to which all eigenvalues are as quick (chosen)
+_FEW: Final = 256  # unknowns up to which all eigenvalues take no longer than the largest and least (chosen)
 
 
 def nonnegative_least_squares(

@@ -38,13 +38,13 @@ PHASE_RINGS: Final = 7
 
 PHASE_BINS: Final = PHASE_RINGS * SECTORS
 
-_TILE = 64  # pixels of a tile (chosen)
+_TILE = 64  # pixels of a tile: two periods of the innermost ring; larger ones leave fewer to average (chosen)
 # Pixels: no derivative is taken finer than the pixel or wider than kernels are (chosen)
 _TAIL_SIGMA = (0.5, 3.0)
 _TAIL_POWER = 0.8  # of the gradients: photographs are about as sparse as that
 _TAIL_PHASE = 1.5  # radians at most: beyond, frequencies hold little but noise
 _TAIL_SOFT_PX = 0.3  # pixels: keeps noise next to Nyquist out of the third derivative (chosen)
-_TAIL_RIM = 16  # pixels of the patch's rim that its window fades (chosen)
+_TAIL_RIM = 16  # pixels of the patch's rim, where its window has faded the detail (chosen)
 _CORE_PX = (2, 4)  # nearer than this neighbours are alike: for the valley, for the peak
 _REPEATS = (-0.4, 0.9)  # correlation at the valley and the peak of what repeats
 _BYTES = 4 * (RINGS * SECTORS + 3)  # single precision: the bins, the noise and two asymmetries

@@ -14,7 +14,8 @@ from lensmodel.core.types import NoiseModel, Plane, Planes, StepHook, ignore_ste
 from lensmodel.correction.blur import BlurOperator, UniformBlur
 
 TINY = 1e-6
-"""Least light that is divided by, in units of saturation (chosen, not measured)."""
+"""Least light that is divided by, in units of saturation (chosen: far below the noise of any sensor, far
+above what single precision cannot divide by)."""
 
 LEAST_PREDICTED = 0.1
 """Least prediction in Richardson-Lucy, as a share of the datum, so that a step raises light tenfold at most

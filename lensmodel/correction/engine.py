@@ -15,7 +15,8 @@ from lensmodel.core import loops
 Engine = Literal["auto", "numpy"]
 
 COMPILE_S: Final = 30
-"""Seconds that compiling takes on a usual machine (chosen, not measured)."""
+"""Seconds that compiling takes on a usual machine (chosen: it is only said, lest the silence look like a
+fault; slow machines take longer)."""
 
 _KEPT: Final = 31 << 20
 """Bytes of the block to free: just below the 32 MiB up to which glibc adapts (see `keep_freed_memory`)."""

@@ -44,7 +44,9 @@ _BLOCKS: Final = 3  # along each side of a tile: enough for a mean (chosen)
 _GRID: Final = GRID
 _EVERY: Final = 3  # of the rows and columns suffices for a mean; odd, to meet all colours of a mosaic
 _LEAST: Final = 1e-30  # keeps divisions finite, far below any power
-_MOST: Final = 0.7  # largest share of the error that a change is credited with removing (chosen)
+_MOST: Final = 0.7
+"""Largest share of the error that a change is credited with removing (chosen: no correction takes all of it
+away, and a change that is larger than the error did something else)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,10 +26,11 @@ REACH: Final = 256  # pixels to all sides of a place that are looked at (chosen:
 _BLOCK: Final = 12  # pixels of a side: blocks apart by that do not show the same shadow (chosen)
 _SHADOW: Final = 3  # pixels of a side of the mean (chosen: a third of the noise)
 _LEAST_LIGHT: Final = 0.02  # around a place, full scale is 1: below, black level and noise decide (chosen)
-_FEWEST_BLOCKS: Final = 100  # (chosen) below, one in a hundred is none
+_FEWEST_BLOCKS: Final = 100  # below, one in a hundred is none, and chance decides (chosen)
 _LOWEST: Final = 3  # so many blocks may lie lower at least (chosen: no dead pixel decides)
 _CLIPPED: Final = 0.95  # of the level where a sensor clips (chosen): light beyond is not seen
-_MOST_CLIPPED: Final = 0.01  # share of the pixels around a place (chosen)
+_MOST_CLIPPED: Final = 0.01
+"""Share of the pixels around a place: more hide light that the bound would be too large without (chosen)."""
 
 
 def darkest_share(plane: Plane, clip: float, row: int, col: int) -> float | None:
@@ -75,5 +76,5 @@ def _convolved(plane: Plane, kernel: Plane) -> Plane:
     padded = np.zeros(shape, dtype=np.float32)
     padded[: kernel.shape[0], : kernel.shape[1]] = kernel
     H = scipy.fft.rfft2(np.roll(padded, (-(kernel.shape[0] // 2), -(kernel.shape[1] // 2)), axis=(0, 1)))
-    found = scipy.fft.irfft2(scipy.fft.rfft2(plane, shape) * H, shape)
-    return np.asarray(found[: plane.shape[0], : plane.shape[1]])
+    convolved = scipy.fft.irfft2(scipy.fft.rfft2(plane, shape) * H, shape)
+    return np.asarray(convolved[: plane.shape[0], : plane.shape[1]])

@@ -36,7 +36,9 @@ LITTLE, SOME, OFTEN = float(_FITTED["little"]), float(_FITTED["some"]), float(_F
 """Mean share of far light of lenses with little of it and of those with some, and how often these are."""
 
 _WEAKENS: Final = 0.2  # by which a bound weakens over half a diagonal (chosen: a half of how designs change)
-_ALIKE: Final = 1.0  # bandwidths of settings within which photos speak of each other (chosen)
+_ALIKE: Final = 1.0
+"""Bandwidths of settings within which photos speak of each other: a half more or less changes which aperture
+beside a given one counts (chosen)."""
 _AT_ONCE: Final = 2048  # bounds that are weighed at once (chosen: some megabytes)
 _LEAST: Final = 0.004  # bound of a photo (chosen: below, black level decides)
 _SHARES: Final = np.arange(0.0025, 0.7, 0.005)

@@ -25,19 +25,17 @@ from lensmodel.core.types import ZONES, FieldPosition, Kernel, LensSettings, Ste
 from lensmodel.model import learned as memory
 from lensmodel.model import pitch as pitches
 from lensmodel.model import variables as va
-from lensmodel.model.answer import BOTH, MICROMETRE, WAVEFRONT, ModelSettings, PsfAnswer
+from lensmodel.model.answer import MICROMETRE, WAVEFRONT, ModelSettings, PsfAnswer
 from lensmodel.model.answering import AnsweringModel, ModelField
 from lensmodel.model.field.robust import Flag
 from lensmodel.model.fitting import GROWTH, INCREMENT, Fit
 from lensmodel.model.predictor import Predictor
 from lensmodel.model.prior import Prior
 from lensmodel.model.provenance import provenance
-from lensmodel.model.trust.expected_error import SampleEvidence, expected_error, joint_error, with_prior
+from lensmodel.model.trust.expected_error import forecast
 from lensmodel.model.trust.misleading_photos import without_misleading
-from lensmodel.model.trust.support import standard_error, support
+from lensmodel.model.trust.support import standard_error
 from lensmodel.model.wavefront.physical_mean import Physics
-
-_LISTED = 1e-3  # share of the weight from which on a prior is named (chosen)
 
 
 class LensModel:
@@ -246,45 +244,27 @@ class LensModel:
         inside = self._predictor.pixels.inner_size(size, pixel)
         answers, mixture, prior_shares = self._predictor.ask([position], settings, inside)
         fit = self._fit
-        rows, weight = answers.rows, np.maximum(answers.weights, 0.0)
-        weight /= weight.sum()
-        per_photo = np.bincount(fit.roster.photo[rows], weight)
-        nearest, beyond = support(fit.index.points[rows], va.point(position, settings), fit.rule)
-        evidence = SampleEvidence(
-            scatter=float(weight @ fit.validation.noise[rows]),
-            expected=float(weight @ fit.expected[rows]),
-            independent=1.0 / float((per_photo**2).sum()),
-            nearest=nearest,
-            extrapolated=bool(beyond),
-            usual=fit.validation.usual,
-        )
-        physical = fit.physical_at(settings)
-        alone = fit.mode == WAVEFRONT and physical is not None and physical.agreed
-        if fit.mode == BOTH:
-            error = joint_error(evidence, mixture, position.r)
-        else:
-            error = expected_error(evidence, mixture, wavefront_alone=alone)
-        wavefront_share = float(mixture.shares[0])
+        share, wavefront_share = float(prior_shares[0]), float(mixture.shares[0])
+        prior = None if self.prior is None else (self.prior, share)
+        expected = forecast(fit, answers, mixture, position, settings, prior)
         takes = self._predictor.smoother.physical
         made = provenance(fit, answers, wavefront_share, settings, takes_wavefront=takes)
-        share = float(prior_shares[0])
-        if self.prior is not None and share > _LISTED:
-            error = with_prior(error, share, self.prior.error(position, settings))
 
         def scatter() -> NDArray[np.float64]:
-            apart = fit.local.apart(rows, position.phi, np.array(fit.widths.at(position, settings)), inside)
-            return standard_error(self._predictor.pixels.resampled(apart, size, pixel), weight)
+            widths = np.array(fit.widths.at(position, settings))
+            apart = fit.local.apart(answers.rows, position.phi, widths, inside)
+            return standard_error(self._predictor.pixels.resampled(apart, size, pixel), answers.shares)
 
         return PsfAnswer(
             kernel=self._predictor.pixels.resampled(mixture.kernels, size, pixel)[0],
             effective_samples=made.effective_samples,
             photos=made.photos,
-            extrapolated=bool(beyond),
-            predicted_error=min(error, 1.0),
+            extrapolated=bool(expected.beyond),
+            predicted_error=min(expected.error, 1.0),
             bandwidth=dict(fit.bandwidth),
-            shared_error=evidence.shared,
-            beyond=beyond,
-            nearest=nearest,
+            shared_error=expected.shared,
+            beyond=expected.beyond,
+            nearest=expected.nearest,
             prior="" if self.prior is None else self.prior.name,
             prior_share=share,
             wavefront_share=wavefront_share,

@@ -38,7 +38,7 @@ from lensmodel.model.sample_codec import PackedSamples, pack_samples, unpack_sam
 FORMAT = 1  # raised when older programs could not read a profile any more
 _MAX_BYTES = 1 << 30  # unpacked: against files made to fill the memory
 _MAX_SAMPLES = 200_000  # some 2,700 photos of 24 patches in three colours (chosen: memory)
-_MAX_SIDE = 255  # pixels (chosen)
+_MAX_SIDE = 255  # pixels: several times the widest kernels; larger files would fill the memory (chosen)
 _LEARNED = "learned.npz"
 _SPECTRA = "spectra.npy"
 _PHASES = "phases.npy"  # beside the spectra: older programs read those and pass over this

@@ -10,7 +10,8 @@ had the same::
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
@@ -38,7 +39,7 @@ _APART: Final[Mapping[str, str]] = MappingProxyType(
         SEVERAL_FOCAL_LENGTHS: "photos of several focal lengths, whose patches are not solved together",
     }
 )
-_LISTED = 1e-3  # share of the weight from which on a photo is counted (chosen)
+_LISTED = 1e-3  # share of the weight from which on a photo is counted: less shows in no digit (chosen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +59,23 @@ class Provenance:
     reason: str
     effective_samples: float
     photos: int
+
+
+def answerers_in_words(made: Iterable[tuple[str, str]]) -> str:
+    """Say which models answered at some places and why, those of most places first.
+
+    Parameters
+    ----------
+    made : iterable of tuple of str
+        `answered_by` and `reason` of each place.
+    """
+    counts = Counter(made)
+    if len(counts) == 1:
+        ((name, reason),) = counts
+        return f"answered by {name}: {reason}"
+    total = counts.total()
+    parts = (f"{n} of {total} places by {name}: {reason}" for (name, reason), n in counts.most_common())
+    return f"answered at {'; at '.join(parts)}"
 
 
 def provenance(

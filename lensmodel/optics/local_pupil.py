@@ -26,7 +26,7 @@ COMA: Final = (1, 2)
 """Terms that a turn by 180 degrees negates, but for the tilts."""
 
 _Q = 0.35  # q of `pupil` that is taken for all patches: f/2.9 at 4.5 um and 0.54 um (chosen)
-_FINE = 3  # samples per pixel (chosen)
+_FINE = 3  # samples per pixel: at 2 the pixel lets aliases pass, more cost time in each step (chosen)
 
 Floats = NDArray[np.float64]
 

@@ -36,7 +36,9 @@ _ALONE = 1.05  # period over the side of a kernel, at least: a twentieth between
 _PERIOD = 1.25  # of the discrete pupil over the side of the kernel: wings fade in between (chosen)
 # Light is band limited to 1 / q cycles/pixel; its last tenth may alias, the pixel kills it (chosen)
 _SAMPLING = 0.9
-_MIN_FINE, _MAX_FINE = 3, 8  # samples per pixel (chosen)
+_MIN_FINE, _MAX_FINE = 3, 8
+"""Samples per pixel: fewer cannot draw the rounded edges of a pixel, more than eight only cost memory
+(chosen)."""
 _RIM = 4  # samples: the pixel's box with its rounded edges
 
 

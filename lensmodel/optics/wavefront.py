@@ -42,12 +42,14 @@ NAMES: Final = (
 """The linear unknowns, in pixels of blur at the widest aperture."""
 
 _LARGEST_LOG_Q = 20.0  # far beyond all pixels and apertures
-_STEPS = 4  # of Newton at most (chosen)
+_STEPS = 4  # of Newton at most, each squaring what is left (chosen)
 _MOVES = 8  # at most: a centre of mass may go to and fro between two places (chosen)
 # Half the distance between the outer wavelengths of one channel (chosen: half a filter's width)
 _BAND_NM = 35.0
 _CENTRED_PX = 1e-3  # pixels: a thousandth moves no figure that is reported
-_SPARE = 1  # pixels around a kernel by which it may be moved without being rendered anew (chosen)
+_SPARE = 1
+"""Pixels around a kernel by which it may be moved without being rendered anew: Newton ends within one
+(chosen)."""
 
 
 def design(position: FieldPosition, settings: LensSettings) -> NDArray[np.float64]:

@@ -22,7 +22,8 @@ _POINTS = 5  # of each block of the frame: its strongest corners (chosen)
 _WINDOW = 48  # pixels that are correlated: more than any lateral colour, of one shift (chosen)
 _SEARCH = 8  # largest shift looked for, pixels
 _MIN_CORRELATION = 0.8  # of two channels: below, colours differ and edges do not match (chosen)
-_MIN_POINTS = 30  # that a polynomial of four terms is fitted to (chosen)
+_MIN_POINTS = 30
+"""That a polynomial of four terms is fitted to: some seven for each, of which a few may be wrong (chosen)."""
 _BAND = 1024  # rows at once: memory (chosen)
 
 

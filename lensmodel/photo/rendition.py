@@ -25,7 +25,7 @@ _BLOCKS: Final = 96
 """Blocks along the longer side: a few pixels of misplacement do not matter then, and 6,000 are enough."""
 
 _SMALLEST_JPEG: Final = 2 * _BLOCKS  # pixels; the shorter side may have half, one to a block (chosen)
-_MOST_JPEG_PIXELS: Final = 64_000_000  # against files made to fill the memory (chosen)
+_MOST_JPEG_PIXELS: Final = 64_000_000  # against files made to fill the memory: so many take 200 MB (chosen)
 _ASPECT: Final = 0.03
 """How much the shapes of the two may differ: JPEGs lack the rim that demosaicing needs."""
 

@@ -33,7 +33,7 @@ OVERSAMPLING: Final = 4
 """Bins a pixel of the edge spread function."""
 
 _MIN_SIDE: Final = 16  # pixels (chosen): over it an edge of 2 degrees moves by half a pixel
-_MIN_ROWS: Final = 10  # that a line is fitted to (chosen)
+_MIN_ROWS: Final = 10  # that a line is fitted to: fewer do not tell which of them is off (chosen)
 _REACH: Final = 48.0  # pixels of edge spread on each side; more only adds noise
 _MAX_CORRECTION: Final = 10.0  # ISO 12233: limit of the division by the difference's response
 _MIN_STEP_OVER_NOISE: Final = 3.0  # standard deviations: weaker steps are noise (chosen)

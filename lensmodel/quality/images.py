@@ -13,7 +13,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import CENTER_ZONE_R, CORNER_ZONE_R, Frame
 from lensmodel.core.types import ZONES, Zone
 
-_SHIFT_STEPS: Final = 6  # of Newton (chosen)
+_SHIFT_STEPS: Final = 6  # of Newton: it begins within a pixel, and each step gains digits (chosen)
 _SHIFT_PAD: Final = 8  # pixels: more than any shift that is looked for
 _LARGEST_SHIFT = 3.0  # pixels: larger ones are no shift but another picture (chosen)
 _SHIFT_WINDOW: Final = 1024  # pixels: the middle says as much as the whole

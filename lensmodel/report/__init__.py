@@ -7,10 +7,10 @@ one report, and none is of use to other rooms.
 from lensmodel.report.advice import Advice, Suggestion, advice
 from lensmodel.report.decentring import Asymmetry, Decentring, decentring
 from lensmodel.report.exporters import Exporter, PsfGrid, export, exporters, format_of, psf_grid
+from lensmodel.report.field_shape import FieldShape
 from lensmodel.report.lens_report import (
     ApertureRow,
     Curve,
-    FieldShape,
     LensReport,
     MapPoint,
     ReportSettings,

@@ -47,7 +47,8 @@ _FEWEST: Final = 12  # patches: a plane through fewer is chance (chosen)
 _SOFTER: Final = 0.10  # of the width: less is not seen between two sides of a print (chosen)
 _COMATIC: Final = 0.15  # third moment over width cubed, in the middle: a shorter tail is not seen (chosen)
 _UNSURE_PERCENT: Final = 40.0  # sides that may differ by more, error and all, are not called alike (chosen)
-_CHANCE: Final = 0.01  # one sound lens in a hundred is called decentred (chosen)
+_CHANCE: Final = 0.01
+"""One sound lens in a hundred is called decentred: rarer, and mild faults would go unnamed (chosen)."""
 _WING: Final = 0.01  # of the peak: fainter pixels are noise to a second moment (chosen)
 
 _Fit = Callable[[NDArray[np.intp]], NDArray[np.float64]]

@@ -20,6 +20,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import write_atomically
@@ -33,7 +34,7 @@ FREQUENCIES: Final = tuple(round(0.05 * i, 2) for i in range(1, 11))
 """Cycles/pixel of the MTF table, up to the Nyquist frequency (chosen: ten rows)."""
 
 _MOST_BYTES: Final = 1 << 29  # of one file: against questions that fill the memory (chosen)
-_GAP: Final = 2  # pixels between two kernels of a sheet (chosen)
+_GAP: Final = 2  # pixels between two kernels of a sheet: seen, and little of it (chosen)
 _ABOUT: Final = "point spread functions by lensmodel; row 0 at the top, each sums to 1"
 
 
@@ -152,11 +153,10 @@ class TiffStack:
         out = io.BytesIO()
         with tifffile.TiffWriter(out) as writer:
             for i, kernel in enumerate(psfs.kernels):
-                about = {"about": _ABOUT, **document(psfs, kernels=False)} if i == 0 else None
                 writer.write(
                     kernel,
                     photometric="minisblack",
-                    description=None if about is None else json.dumps(about),
+                    description=_about(psfs) if i == 0 else None,
                     metadata=None,
                     contiguous=False,
                 )
@@ -241,7 +241,10 @@ class Npz:
 
 @dataclass(frozen=True, slots=True)
 class JsonMatrix:
-    """JSON: a bare matrix, a list of rows, for a single place, as ART loads it; else an object."""
+    """JSON: a bare matrix, a list of rows, for a single place, as ART loads it; else an object.
+
+    A bare matrix cannot say which model answered; `PsfGrid` does.
+    """
 
     suffix: str = ".json"
 
@@ -256,7 +259,10 @@ class JsonMatrix:
 
 @dataclass(frozen=True, slots=True)
 class MtfTable:
-    """CSV of MTF50 and of contrast along u (tangential) and v (sagittal), a line for each place."""
+    """CSV of MTF50 and of contrast along u (tangential) and v (sagittal), a line for each place.
+
+    The last two columns say which model answered and why.
+    """
 
     suffix: str = ".csv"
 
@@ -265,19 +271,24 @@ class MtfTable:
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         heads = [f"{way}_{f:.2f}" for way in ("tangential", "sagittal") for f in FREQUENCIES]
-        writer.writerow(["row", "col", "r", "phi", "error", "mtf50_tangential", "mtf50_sagittal", *heads])
+        known = ["row", "col", "r", "phi", "error", "mtf50_tangential", "mtf50_sagittal"]
+        writer.writerow([*known, *heads, "answered_by", "reason"])
         for i, (place, kernel) in enumerate(zip(psfs.positions, psfs.kernels, strict=True)):
             exact = kernel.astype(np.float64)
             fifty = tangential_sagittal_mtf50(exact, place.phi)
             contrast = [mtf_from_kernel(exact, place.phi + turn, FREQUENCIES) for turn in (0, math.pi / 2)]
             values = [place.r, place.phi, psfs.predicted_error[i], *fifty, *np.concatenate(contrast)]
-            writer.writerow([*divmod(i, psfs.cols), *(f"{v:.6f}" for v in values)])
+            numbers = [*divmod(i, psfs.cols), *(f"{v:.6f}" for v in values)]
+            writer.writerow([*numbers, psfs.answered_by[i], psfs.reason[i]])
         return out.getvalue().encode()
 
 
 @dataclass(frozen=True, slots=True)
 class ContactSheet:
-    """16-bit grey PNG: every kernel at its place of the picture, its peak white; one place is plain."""
+    """16-bit grey PNG: every kernel at its place of the picture, its peak white; one place is plain.
+
+    The text `Description` is the same JSON as in a TIFF.
+    """
 
     suffix: str = ".png"
 
@@ -289,8 +300,9 @@ class ContactSheet:
         for i, kernel in enumerate(psfs.kernels):
             row, col = (step * k for k in divmod(i, psfs.cols))
             sheet[row : row + side, col : col + side] = np.rint(65535.0 * (kernel / kernel.max()))
-        out = io.BytesIO()
-        Image.fromarray(sheet).save(out, "PNG")
+        out, texts = io.BytesIO(), PngInfo()
+        texts.add_text("Description", _about(psfs))
+        Image.fromarray(sheet).save(out, "PNG", pnginfo=texts)
         return out.getvalue()
 
 
@@ -358,6 +370,11 @@ def document(psfs: PsfGrid, *, kernels: bool) -> dict[str, Any]:
         "cols": psfs.cols,
         "psfs": entries,
     }
+
+
+def _about(psfs: PsfGrid) -> str:
+    """What a picture of kernels says of them: JSON with the places and who answered there."""
+    return json.dumps({"about": _ABOUT, **document(psfs, kernels=False)})
 
 
 def _matrix(kernel: NDArray[np.float32]) -> list[list[float]]:

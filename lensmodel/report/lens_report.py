@@ -8,6 +8,7 @@ Tangential is the contrast along u (of lines across the radius), sagittal along 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -15,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import second_moments
-from lensmodel.core.types import ZONES, FieldPosition, Kernel, LensSettings, Zone
+from lensmodel.core.types import ZONES, FieldPosition, LensSettings, Zone
 from lensmodel.model import LensModel
+from lensmodel.model.provenance import answerers_in_words
 from lensmodel.quality import mtf_from_kernel, tangential_sagittal_mtf50
 from lensmodel.report.decentring import Decentring, decentring
+from lensmodel.report.field_shape import FieldShape, Ring, field_shape
 from lensmodel.report.places import DEFAULT_ASPECT, grid, ring
 from lensmodel.report.units import SensorGeometry
 
@@ -32,11 +34,10 @@ FALLBACK_FREQUENCIES: Final = (0.05, 0.1, 0.15, 0.2)
 
 # Half-diagonals (chosen: nothing is asked in the very corner, which no sample reaches)
 _RADII: Final = tuple(float(r) for r in np.linspace(0.0, 0.95, 11).round(4))
-_RING: Final = 3  # places of a ring whose mean is its value (chosen)
+_RING: Final = 3  # places in each quarter of a ring whose mean is its value: more hardly change it (chosen)
 _MOST_APERTURES: Final = 12  # a page holds as many rows (chosen)
 # Half-diagonals (chosen: about the middle of each zone)
 _ZONE_RADIUS: Final[dict[Zone, float]] = {"center": 0.15, "mid": 0.5, "corner": 0.88}
-_EVEN_PX: Final = 0.1  # widths along u and v that differ by less count as alike (chosen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +72,7 @@ class ReportSettings:
 
 @dataclass(frozen=True, slots=True)
 class MapPoint:
-    """Sharpness at one place; MTF50 in cycles/pixel."""
+    """Sharpness at one place, MTF50 in cycles/pixel; which model answered there, and why that one."""
 
     position: FieldPosition
     tangential: float
@@ -79,6 +80,8 @@ class MapPoint:
     predicted_error: float
     effective_samples: float
     extrapolated: bool
+    answered_by: str = ""
+    reason: str = ""
 
     @property
     def mean(self) -> float:
@@ -111,40 +114,18 @@ class Curve:
 
 
 @dataclass(frozen=True, slots=True)
-class FieldShape:
-    """How blur along u and along v part over the radius, the mark of astigmatism and curved fields.
-
-    Parameters
-    ----------
-    along_u, along_v : tuple of float
-        Root mean square widths in pixels, one for each radius of the report, mean over angles.
-    difference : tuple of float
-        along_u - along_v: positive where points are drawn out radially.
-    text : str
-        The same as one sentence.
-
-    Notes
-    -----
-    Two foci that part with the field (Welford, "Aberrations of Optical Systems", 1986, sec. 8.3) show
-    as widths that part. How far each focal surface lies from the sensor cannot be told from photos
-    of one focus; a curved but stigmatic field shows as both widths growing alike.
-    """
-
-    along_u: tuple[float, ...]
-    along_v: tuple[float, ...]
-    difference: tuple[float, ...]
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
 class ApertureRow:
-    """MTF50 in cycles/pixel at one aperture at r = 0.15, 0.5 and 0.88; `whole` weighs them by area."""
+    """MTF50 in cycles/pixel at one aperture at r = 0.15, 0.5 and 0.88; `whole` weighs them by area.
+
+    `answered_by` says in words which models answered, and why.
+    """
 
     aperture: float
     center: float
     mid: float
     corner: float
     whole: float
+    answered_by: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,6 +158,8 @@ class LensReport:
         Share of the map for which no sample is near, 0..1.
     summary : tuple of str
         The report in sentences.
+    curves_answered_by : str
+        Which models answered for the curves and the field's shape, and why, in words.
     """
 
     settings: LensSettings
@@ -195,6 +178,7 @@ class LensReport:
     decentring: Decentring
     extrapolated_share: float
     summary: tuple[str, ...]
+    curves_answered_by: str = ""
 
 
 def lens_report(
@@ -220,11 +204,12 @@ def lens_report(
         for place in grid(options.rows, options.cols, options.aspect)
     )
     pitch = _pitch(model)
-    rings = [
-        [(p, model.query(p, settings, options.size).kernel) for p in ring(r, _RING, options.aspect)]
-        for r in _RADII
+    answers = [
+        [(p, model.query(p, settings, options.size)) for p in ring(r, _RING, options.aspect)] for r in _RADII
     ]
-    shape = _shape(rings)
+    rings = [[(place, answer.kernel) for place, answer in places] for places in answers]
+    made = [(answer.answered_by, answer.reason) for places in answers for _, answer in places]
+    shape = field_shape(_RADII, rings)
     rows = tuple(_aperture_row(model, settings, n, options) for n in apertures(model))
     best = {} if len(rows) < 2 else {zone: _best(rows, zone) for zone in (*ZONES, "whole")}
     centring = decentring(model, settings)
@@ -246,6 +231,7 @@ def lens_report(
         decentring=centring,
         extrapolated_share=unseen,
         summary=_summary(field, shape, best, centring, unseen),
+        curves_answered_by=answerers_in_words(made),
     )
 
 
@@ -267,20 +253,20 @@ def map_point(model: LensModel, place: FieldPosition, settings: LensSettings, si
     answer = model.query(place, settings, size)
     tangential, sagittal = tangential_sagittal_mtf50(answer.kernel, place.phi)
     return MapPoint(
-        place, tangential, sagittal, answer.predicted_error, answer.effective_samples, answer.extrapolated
+        place,
+        tangential,
+        sagittal,
+        answer.predicted_error,
+        answer.effective_samples,
+        answer.extrapolated,
+        answer.answered_by,
+        answer.reason,
     )
 
 
-def widths_along(kernel: Kernel, phi: float) -> tuple[float, float]:
-    """Root mean square widths along u and along v of a kernel at field angle `phi`, pixels.
-
-    The variance along a unit vector a is a' M a, with M the second moments and u = (-sin, cos) as
-    (row, col).
-    """
-    moments = second_moments(kernel)
-    u = np.array([-math.sin(phi), math.cos(phi)])
-    v = np.array([-math.cos(phi), -math.sin(phi)])
-    return math.sqrt(max(float(u @ moments @ u), 0.0)), math.sqrt(max(float(v @ moments @ v), 0.0))
+def answerers(points: Sequence[MapPoint]) -> str:
+    """Say which models answered at some places, and why."""
+    return answerers_in_words((point.answered_by, point.reason) for point in points)
 
 
 def _pitch(model: LensModel) -> float | None:
@@ -300,10 +286,9 @@ def _frequencies(options: ReportSettings, pitch_um: float | None) -> list[tuple[
 
 
 _CYCLES: Final = SensorGeometry()
-_Ring = list[tuple[FieldPosition, Kernel]]
 
 
-def _curve(rings: list[_Ring], frequency: float, lp_mm: float | None) -> Curve:
+def _curve(rings: list[Ring], frequency: float, lp_mm: float | None) -> Curve:
     def contrast(turn: float) -> list[NDArray[np.float64]]:
         return [
             np.array([mtf_from_kernel(k, p.phi + turn, [frequency])[0] for p, k in places])
@@ -325,47 +310,20 @@ def _curve(rings: list[_Ring], frequency: float, lp_mm: float | None) -> Curve:
     )
 
 
-def _shape(rings: list[_Ring]) -> FieldShape:
-    along_u, along_v = [], []
-    for places in rings:
-        squared = np.mean([np.square(widths_along(k, p.phi)) for p, k in places], axis=0)
-        if len(places) == 1:
-            squared[:] = squared.mean()  # u has no direction at the centre
-        along_u.append(float(math.sqrt(squared[0])))
-        along_v.append(float(math.sqrt(squared[1])))
-    apart = tuple(u - v for u, v in zip(along_u, along_v, strict=True))
-    largest = max(range(len(apart)), key=lambda i: abs(apart[i]))
-    center, corner = along_u[0] + along_v[0], along_u[-1] + along_v[-1]
-    if center < _EVEN_PX:  # a point within one pixel has no width to compare with
-        growth = f"in the centre a point stays within a pixel, in the corners it is {corner / 2:.1f} px wide"
-    else:
-        way = "grows" if corner >= center else "shrinks"
-        growth = f"towards the corners the blur {way} to {corner / center:.1f} times its width at the centre"
-    if abs(apart[largest]) < _EVEN_PX:
-        text = f"points stay round across the field; {growth}"
-    else:
-        along = "radially" if apart[largest] > 0 else "around the centre"
-        text = (
-            f"points are drawn out {along}, most at r = {_RADII[largest]:.2f} by "
-            f"{abs(apart[largest]):.2f} px; {growth}"
-        )
-    return FieldShape(tuple(along_u), tuple(along_v), apart, text)
-
-
 def _aperture_row(
     model: LensModel, settings: LensSettings, aperture: float, options: ReportSettings
 ) -> ApertureRow:
     asked = replace(settings, aperture=aperture)
 
-    def sharpness(r: float) -> float:
-        return float(
-            np.mean([map_point(model, p, asked, options.size).mean for p in ring(r, 1, options.aspect)])
-        )
-
-    by_zone = {zone: sharpness(r) for zone, r in _ZONE_RADIUS.items()}
+    points = {
+        zone: [map_point(model, p, asked, options.size) for p in ring(r, 1, options.aspect)]
+        for zone, r in _ZONE_RADIUS.items()
+    }
+    by_zone = {zone: float(np.mean([point.mean for point in own])) for zone, own in points.items()}
     # shares of a 3:2 picture's area: r < 0.3, between, r > 0.75
     whole = 0.15 * by_zone["center"] + 0.65 * by_zone["mid"] + 0.2 * by_zone["corner"]
-    return ApertureRow(aperture, by_zone["center"], by_zone["mid"], by_zone["corner"], whole)
+    made = answerers([point for own in points.values() for point in own])
+    return ApertureRow(aperture, by_zone["center"], by_zone["mid"], by_zone["corner"], whole, made)
 
 
 def _best(rows: tuple[ApertureRow, ...], zone: str) -> float:
@@ -397,4 +355,5 @@ def _summary(
             f"no photo shows {100.0 * unseen:.0f} % of the picture at these settings; "
             "the figures there are guesses"
         )
+    lines.append(answerers(field))
     return tuple(lines)

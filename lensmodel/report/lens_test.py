@@ -21,7 +21,7 @@ from lensmodel.report.places import DEFAULT_ASPECT
 from lensmodel.report.units import SensorGeometry
 
 MOST_APERTURES: Final = 4  # a reader compares no more at once (chosen)
-ROWS: Final = 7  # of the grid of places (chosen)
+ROWS: Final = 7  # of the grid of places: zones have some each, and their figures are still readable (chosen)
 
 _EVEN, _NEARLY, _SOFTER = 0.95, 0.8, 0.5
 """Shares of the centre's MTF50 above which corners are called as good, nearly as good, and clearly softer

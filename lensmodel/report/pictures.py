@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import textwrap
+from collections.abc import Sequence
 from typing import Final
 
 from lensmodel.core.types import ZONE_WORDS, ZONES
 from lensmodel.report.drawing import COLOURS, GREY, Axes, Box, Label, Part, svg
-from lensmodel.report.lens_report import LensReport
+from lensmodel.report.lens_report import LensReport, answerers
 from lensmodel.report.palette import colour, ink, rgb
 
 # Layout in points of the picture (chosen: keys and numbers beside the axes are not cut off); axes have five
@@ -17,6 +18,7 @@ WIDTH: Final = 640
 HEIGHT: Final = 400
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 170, 40, 52
 _MARGIN: Final = 20
+_LINE: Final = 18  # from one line of notes to the next
 _LINE_CHARACTERS: Final = 100  # so many fit into the width at the size of the font (chosen)
 _TICKS: Final = tuple((i / 5, f"{i / 5:.1f}") for i in range(6))
 
@@ -49,10 +51,8 @@ def mtf_map_svg(report: LensReport) -> str:
     notes = [f"from {low:.3f} (red) to {top:.3f} (blue)"]
     if any(point.extrapolated for point in report.field):
         notes[0] += "; ? no photo shows this place, guessed"
-    notes += textwrap.wrap(report.decentring.text, _LINE_CHARACTERS)
-    for number, note in enumerate(notes):
-        parts.append(Label(_MARGIN, _TOP + high + 20 + 18 * number, note, GREY))
-    return svg(title, WIDTH, round(_TOP + high + 32 + 18 * len(notes)), parts)
+    notes += [report.decentring.text, answerers(report.field)]
+    return _noted(title, _TOP + high, parts, notes)
 
 
 def curves_svg(report: LensReport) -> str:
@@ -74,7 +74,7 @@ def curves_svg(report: LensReport) -> str:
         parts.append(axes.curve(report.radii, curve.tangential, own, dashed=True))
         parts += axes.key(2 * i, f"{name} sagittal", own)
         parts += axes.key(2 * i + 1, f"{name} tangential", own, dashed=True)
-    return svg(title, WIDTH, HEIGHT, parts)
+    return _noted(title, HEIGHT, parts, [report.curves_answered_by])
 
 
 def apertures_svg(report: LensReport) -> str:
@@ -97,7 +97,14 @@ def apertures_svg(report: LensReport) -> str:
     for number, zone in enumerate(ZONES):
         parts.append(axes.curve(range(len(rows)), [getattr(row, zone) for row in rows], COLOURS[number]))
         parts += axes.key(number, ZONE_WORDS[zone], COLOURS[number])
-    return svg(title, WIDTH, HEIGHT, parts)
+    return _noted(title, HEIGHT, parts, [f"f/{row.aperture:g} {row.answered_by}" for row in rows])
+
+
+def _noted(title: str, bottom: float, parts: Sequence[Part], notes: Sequence[str]) -> str:
+    """Write a picture with notes below its drawing, each of as many lines as it needs."""
+    lines = [line for note in notes for line in textwrap.wrap(note, _LINE_CHARACTERS)]
+    labels = [Label(_MARGIN, bottom + 20 + _LINE * k, line, GREY) for k, line in enumerate(lines)]
+    return svg(title, WIDTH, round(bottom + 32 + _LINE * len(lines)), [*parts, *labels])
 
 
 def _at(report: LensReport) -> str:

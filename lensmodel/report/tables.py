@@ -12,7 +12,7 @@ from lensmodel.report.units import UNIT_NAMES
 
 _HEAD: Final = (
     *("quantity", "aperture", "channel", "r", "phi", "row", "col", "frequency_c_px", "frequency_lp_mm"),
-    *("direction", "value", "unit", "standard_error", "extrapolated"),
+    *("direction", "value", "unit", "standard_error", "extrapolated", "answered_by", "reason"),
 )
 
 
@@ -53,6 +53,8 @@ def _rows(tested: Tested) -> Iterator[dict[str, str]]:
             "row": str(row),
             "col": str(col),
             "extrapolated": str(int(point.extrapolated)),
+            "answered_by": point.answered_by,
+            "reason": point.reason,
             "unit": UNIT_NAMES["c/px"],
         }
         for name, value, errors in (

@@ -33,7 +33,7 @@ AHEAD: Final = 32
 """Photos that are sent to an executor at once (chosen): a gigabyte of them, work for some dozen processes."""
 
 
-class Shelf(Protocol):
+class LensKeeper(Protocol):
     """Where a lens is kept while it learns: in memory, or in a file that other runs may add to."""
 
     @property
@@ -48,7 +48,7 @@ class Shelf(Protocol):
 
 
 class InMemory:
-    """The shelf of a single run."""
+    """The keeper of a single run, which forgets the lens with it."""
 
     settled = True
 
@@ -79,7 +79,7 @@ class Calibration:
 
     Parameters
     ----------
-    shelf : Shelf
+    keeper : LensKeeper
         Keeps the lens after each photo.
     recipe : Recipe
         How each is estimated.
@@ -100,7 +100,7 @@ class Calibration:
 
     def __init__(
         self,
-        shelf: Shelf,
+        keeper: LensKeeper,
         recipe: Recipe,
         *,
         begin: ModelSettings | None = None,
@@ -108,10 +108,10 @@ class Calibration:
         any_lens: bool = False,
         workers: int | None = None,
     ) -> None:
-        self._shelf, self._recipe = shelf, recipe
+        self._keeper, self._recipe = keeper, recipe
         self._begin, self._prior = begin or ModelSettings(mode=recipe.way.mode), prior
         self._any_lens, self._workers = any_lens, workers
-        self._base = self._current = shelf.lens()
+        self._base = self._current = keeper.lens()
         self._new: list[PsfSample] = []  # in `_current`, and not in `_base`
         self._joined = False
         recipe.of_lens(self._current).check()
@@ -178,7 +178,7 @@ class Calibration:
         self._require_same_lens(lens, identity)
         model = self._fitted(samples) if lens is None else lens.model.grown(samples)
         grown = Lens.grown(lens, model, {key: path.name}, [identity], any_lens=self._any_lens)
-        self._shelf.keep(grown, whole=False)
+        self._keeper.keep(grown, whole=False)
         self._current, self._joined = grown, True
         self._new += samples
         return len(samples)
@@ -186,12 +186,12 @@ class Calibration:
     def finish(self, on_step: StepHook = ignore_step) -> Lens | None:
         """Fit what was learned, once; return the lens, None where no photo could be used."""
         lens = self._lens()
-        if lens is None or (self._shelf.settled and not self._joined):
+        if lens is None or (self._keeper.settled and not self._joined):
             return lens
         model = self._fitted(self._new) if self._base is None else self._base.model.added(self._new)
         whole = replace(lens, profile=replace(lens.profile, model=model.warmed(on_step)))
         if self._lens() is lens:  # else another run is adding photos, and fits them all at its end
-            self._shelf.keep(whole, whole=True)
+            self._keeper.keep(whole, whole=True)
             self._base, self._current, self._new = whole, whole, []
         return self._current
 
@@ -207,7 +207,7 @@ class Calibration:
 
     def _lens(self) -> Lens | None:
         """Return what is known; where another run has changed it, that contains what this one kept."""
-        lens = self._shelf.lens()
+        lens = self._keeper.lens()
         if lens is not self._current:
             self._base = self._current = lens
             self._new = []

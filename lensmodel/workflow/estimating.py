@@ -35,7 +35,9 @@ log = logging.getLogger(__name__)
 DEFAULT_PATCHES: Final = 24
 """Patches asked for in one photo: enough for every ring and octant of the field to get one."""
 
-DEFAULT_KERNEL_SIZE: Final = 31  # pixels (chosen); the paper's largest has 55
+DEFAULT_KERNEL_SIZE: Final = 31
+"""Pixels: holds the blur of usual lenses, while the cost grows with the square of it; the paper's largest has
+55 (chosen)."""
 _PATCH_SIZE: Final = 192  # pixels: room for a kernel, few enough for one blur (chosen)
 _SMALLEST_PATCH: Final = 64  # pixels: one tile of a patch's spectrum
 

@@ -79,11 +79,11 @@ def test_an_upload_that_was_refused_is_not_sent_from_its_middle() -> None:
 def test_an_upload_says_how_far_it_is(client: TestClient, tmp_path: Path) -> None:
     path = tmp_path / "a.tif"
     path.write_bytes(b"II*\x00" + bytes(600_000))
-    told: list[tuple[int, int]] = []
+    progress: list[tuple[int, int]] = []
 
-    Client(http=client).upload(path, calibrate=False, on_progress=lambda *far: told.append(far))
+    Client(http=client).upload(path, calibrate=False, on_progress=lambda *far: progress.append(far))
 
-    assert told == [(600_004, 600_004)]
+    assert progress == [(600_004, 600_004)]
 
 
 def test_coroutines_do_what_the_client_does(client: TestClient, tmp_path: Path) -> None:

@@ -12,11 +12,12 @@ from lensmodel.core.types import ZONES, Zone
 from lensmodel.correction.audit.check import TileAudit
 
 HELD: Final = 0.1
-"""Share of a correction; a tile of which more was held back counts as held back (chosen, not measured)."""
+"""Share of a correction; a tile of which more was held back counts as held back (chosen: a hundredth, which
+is only just seen, would count nearly every tile with a fault at its rim, a half only what is spoilt)."""
 MAPPED: Final = 0.01
 """Least share held back at which a tile is on the map: less is not seen (chosen)."""
 PLACES: Final = 12
-"""Number of worst places to name (chosen)."""
+"""Number of worst places to name (chosen: as many as a person looks at; the map shows all)."""
 
 
 @dataclass(frozen=True, slots=True)

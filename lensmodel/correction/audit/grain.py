@@ -13,7 +13,8 @@ from lensmodel.correction.audit.check import Severity, TilePair
 from lensmodel.correction.audit.tolerances import LIMITS
 
 _CALM: Final = 1.5
-"""Standard deviation of a block over that of the noise, up to which it is flat (chosen, not measured)."""
+"""Standard deviation of a block over that of the noise, up to which it is flat (chosen: with less, noise by
+chance leaves no flat block; with more, faint texture that a correction may sharpen counts as grain)."""
 _SCALES: Final = (1, 2)
 """Distances of the second differences in pixels: grain of a period of 2 pixels and of 4."""
 

@@ -12,18 +12,25 @@ from lensmodel.correction.audit import blocks, nearby
 from lensmodel.correction.audit.check import Severity, TilePair
 from lensmodel.correction.audit.tolerances import limit
 
-_SIDE: Final = 7  # of the neighbourhood in pixels (chosen, not measured)
-_LEAST: Final = 0.02  # range of colours that every neighbourhood is given (chosen, not measured)
-# What a colour may leave the range nearby by: so much, and so many times the range (chosen, not measured)
+_SIDE: Final = 7
+"""Of the neighbourhood in pixels (chosen: a narrower one holds only the mixed colours of an edge's blur, a
+wider one the colours of other things)."""
+_LEAST: Final = 0.02
+"""Range of colours that every neighbourhood is given (chosen: in a grey one any change at all would else be
+infinitely large; a fiftieth is not seen)."""
 _FREE, _SHARE = 0.25, 2.0
+"""What a colour may leave the range nearby by: so much, and so many times the range (chosen: a speck smaller
+than its blur is more colourful than the photo shows, and less room would hold it back; with more, foreign
+colours would pass)."""
 _WHITE, _BESIDE = 0.95, 5
 """Share of saturation at and above which light is white, and side in pixels of the square around it that is
-beside it (chosen, not measured)."""
+beside it (chosen: demosaicing mixes light over about two pixels to either side; far below the limit, light
+has a colour of its own)."""
 _FREE_WHITE, _SHARE_WHITE = 0.04, 0.5
 """The same beside white. Chosen: a fifth of one colour of white missing is -0.07, which a limit of 1.8
 allows."""
 _NOISE: Final = 4.0  # standard deviations (chosen): noise alone exceeds them once in 16,000
-_FLOOR: Final = 12.0  # standard deviations of light below which hue is noise (chosen)
+_FLOOR: Final = 12.0  # standard deviations that dampen hue (chosen: at 12, noise alone moves it by a tenth)
 
 
 def foreign_spots(pair: TilePair) -> Severity:

@@ -18,10 +18,12 @@ _NEAR: Final = 9
 lens's point falls within 4 pixels."""
 _SURE: Final = 4.0
 _SPIKE: Final = 12.0
-"""Standard deviations of noise by which a value may move, and a pixel stand out, in any case (chosen, not
-measured)."""
+"""Standard deviations of noise by which a value may move, and a pixel stand out, in any case (chosen: of a
+million pixels some sixty move by 4 by chance; a correction amplifies noise pixel by pixel, so three times
+that before one is a fault)."""
 _ROOM: Final = 1.25
-"""Factor for points that lie a part of a pixel beside the middle of theirs (chosen, not measured)."""
+"""Factor for points that lie a part of a pixel beside the middle of theirs (chosen: the images of
+such points stand out less; much more room would let isolated pixels pass)."""
 _USUAL_GAIN: Final = 8.0
 """Gain of a point behind a PSF with a standard deviation of 1 pixel, and the largest gain to assume."""
 _NOTHING: Final = 2.0
@@ -30,7 +32,8 @@ estimate of black knows its bound."""
 _POSSIBLE, _IMPOSSIBLE = 0.25, 3.0
 """Weights of light below the photo's darkest and of light below zero. No scene has the latter, while dark
 lines finer than the PSF are darker than anything that the photo shows: with a weight of 1, pictures of slats
-and girders would need a limit 1.7 times that of others, with a quarter 1.1 times."""
+and girders would need a limit 1.7 times that of others, with a quarter 1.1 times. Measured once, no command
+repeats it."""
 
 
 def too_dark(pair: TilePair) -> Severity:

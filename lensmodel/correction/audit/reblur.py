@@ -22,7 +22,9 @@ MODEL_ERROR: Final = 0.1
 """Share of what the blur changes that may remain on top of the noise: PSFs change within a tile, and a prior
 gives way at edges (chosen)."""
 _CLIPPED: Final = 0.98
-"""Share of the clipping level at and above which a pixel counts as clipped (chosen, not measured)."""
+"""Share of the clipping level at and above which a pixel counts as clipped (chosen: noise and demosaicing
+leave clipped light a little below the level; much lower, bright light that was measured would not be
+checked)."""
 _GLOW: Final = 0.005
 """Share of the light of a clipped pixel; a pixel that receives more of it does not count: of a lamp the file
 holds no more than white, and a lamp is up to a hundred times brighter or so (chosen)."""

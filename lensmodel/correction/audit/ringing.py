@@ -11,12 +11,19 @@ from lensmodel.correction.audit import blocks, nearby
 from lensmodel.correction.audit.check import Severity, TilePair
 from lensmodel.correction.audit.tolerances import LIMITS
 
-# Sides in pixels of a place that should be flat, and of the window in which its edge may lie (chosen)
 _SMALL, _WIDE = 5, 15
-_FLAT: Final = 0.08  # share of the step nearby up to which a place passes for flat (chosen)
-# Standard deviations between the extremes of 25 pixels of noise, with some to spare (chosen)
+"""Sides in pixels of a place that should be flat, and of the window in which its edge may lie (chosen: the
+first holds a whole wave near the limit of the grid, the second an edge from which waves have not yet died
+away; in wider ones few places are flat, and steps belong to something else)."""
+_FLAT: Final = 0.08
+"""Share of the step nearby up to which a place passes for flat (chosen: with less, hardly a
+place beside an edge is flat; with more, the edge's own slope counts as a wave)."""
 _NOISE: Final = 8.0
-_STRONG: Final = 40.0  # standard deviations of a step that can ring visibly (chosen)
+"""Standard deviations between the extremes of 25 pixels of noise: four on average, and twice that, so that no
+noisy place is left out for its noise (chosen)."""
+_STRONG: Final = 40.0
+"""Standard deviations of a step that can ring visibly (chosen: a wave of a tenth of it is as large as the
+range of 25 pixels of noise, that of a smaller step is lost in it)."""
 
 
 def swing(pair: TilePair) -> Severity:

@@ -20,16 +20,20 @@ SLOPE: Final = 2.2
 categories", Network 14, 2003: 1.9 to 2.6 by category."""
 
 SIDE, HOP = 32, 16
-"""Side of the windows in pixels, and the step between them, so that each pixel lies in four (chosen)."""
+"""Side of the windows in pixels, and the step between them, so that each pixel lies in four (chosen: smaller
+windows do not hold two periods of the low band, larger ones mix places of the picture)."""
 _LOW: Final = (0.05, 0.11)
 _HIGHER: Final = ((0.18, 0.28), (0.3, 0.45))
-"""Bands in cycles/pixel (chosen). Lenses leave the first alone; it holds 2 to 3 periods of a window."""
+"""Bands in cycles/pixel (chosen: lenses leave the first alone, it holds 2 to 3 periods of a window; the
+others begin where lenses do take away, and end short of the limit of the grid)."""
 _LIMIT: Final = 0.29
 """Frequency along an axis beyond which to look for lines, cycles/pixel: periods below 3.5 pixels (chosen)."""
 _SHARES: Final = tuple(np.float32((sum(band) / sum(_LOW)) ** -SLOPE) for band in _HIGHER)
 """Power predicted in each of the higher bands, over that in the low one."""
 _SECTORS: Final = 4  # directions: along, across and both diagonals
-_NOISE: Final = 4.0  # times the noise's power, below which no slope is seen (chosen)
+_NOISE: Final = 4.0
+"""Times the noise's power, below which no slope is seen (chosen: with less, noise that a correction amplifies
+would count as detail that no slope foretells; with more, faint false detail would pass)."""
 
 
 def overcorrected(pair: TilePair) -> Severity:

@@ -18,7 +18,8 @@ from lensmodel.correction.audit.tile import audit_tile
 TILE: Final = 192
 HALO: Final = 48
 """Side of a tile in pixels, and the margin seen around it. Both are multiples of the step of the checks'
-windows, so that neighbouring tiles see the same windows and no seam shows (chosen)."""
+windows, so that neighbouring tiles see the same windows and no seam shows (chosen: a margin of three steps
+holds every window that touches a tile; larger tiles take more memory, smaller ones more margin)."""
 
 Window: TypeAlias = tuple[slice, slice]
 EvidenceAt: TypeAlias = Callable[[FieldPosition, Window], Evidence]

@@ -31,7 +31,8 @@ _BRIGHTER: Final = np.float32(4.0)
 """Brightness of a broad clipped area, in units of saturation: sunlit paint and white skies (chosen)."""
 
 _FADE: Final = 3
-"""Pixels over which the bounds end (chosen)."""
+"""Pixels over which the bounds end (chosen: at once would draw an edge of its own, wider would bind places
+that no light reaches)."""
 
 
 def held_beside_clipped(

@@ -19,20 +19,29 @@ from lensmodel.correction.engine import Engine, compiled
 from lensmodel.correction.lights.clipped import ClippedRegion, regions, span_around
 from lensmodel.correction.methods.richardson_lucy import climbed, first_guess
 
-_LEAST_SEEN: Final = 0.02  # least share of a point's light that counts as measured (chosen, not measured)
-_UNSEEN: Final = 1e-3  # share of a point's light below which it is unknown (chosen, not measured)
-# Standard deviations of noise by which glow may exceed the photo (chosen, not measured)
+_LEAST_SEEN: Final = 0.02
+"""Least share of a point's light that counts as measured (chosen: a step divides by it, so that with less a
+few pixels of noise would make a light of any strength; with more, broad lights would come up too slowly)."""
+_UNSEEN: Final = 1e-3
+"""Share of a point's light below which it is unknown (chosen: no more than the kernel's far wings, which are
+known no better)."""
 _SIGMAS: Final = np.float32(3.0)
-# Times that bound: steps that converge leave less glow (chosen, not measured)
+"""Standard deviations of noise by which glow may exceed the photo (chosen: noise alone exceeds it in one
+pixel of 700; with less, chance would dim the lights; with more, their glow would leave holes)."""
 _ABSURD: Final = np.float32(2.0)
+"""Times that bound beyond which the glow is no answer (chosen: steps that converge leave less)."""
 _ENERGY: Final = 0.98
 """Share of a kernel's light within its reach: of a light at saturation, a fiftieth falls further out and is
 hardly seen (chosen)."""
-# Least share of the darkest light nearby that remains, times what a kernel spreads (chosen, not measured)
 _DARKEST: Final = 0.9
-_DUBIOUS: Final = np.float32(0.25)  # share of the glow that may be scene light instead (chosen, not measured)
-# Share of glow in the photo's light at and above which the bound holds in full (chosen, not measured)
+"""Least share of the darkest light nearby that remains, times what a kernel spreads (chosen: 1 would allow no
+dark detail in a glow at all, much less the dark ring that it is there to prevent)."""
+_DUBIOUS: Final = np.float32(0.25)
+"""Share of the glow that may be scene light instead (chosen: 0 lets an error of the glow make a black ring, 1
+would leave all glow in place)."""
 _GLARE: Final = np.float32(0.5)
+"""Share of glow in the photo's light at and above which the bound holds in full (chosen: from there on more
+of a pixel is subtracted than is left)."""
 _NO_GLARE: Final = np.float32(0.02)  # of `_GLARE`: less is rounding errors of transforms
 
 

@@ -17,14 +17,15 @@ from lensmodel.correction.engine import compiled
 from lensmodel.correction.limits.plateaus import plateau_reach, plateaus_held
 
 WINDOW: Final = 2
-"""Radius in pixels of the window of the photo that bounds a pixel (chosen, not measured)."""
+"""Radius in pixels of the window of the photo that bounds a pixel (chosen: within one pixel only the blur of
+a thin line is seen and not its surroundings; further away lies another object)."""
 _SIDE: Final = 2 * WINDOW + 1
 _FREE: Final = 0.16
 """Error of a kernel at which a result may leave the photo's range by the width of that range: the least that
 costs no gain behind a lens that is known to a quarter (chosen)."""
 _WIDEST: Final = 4.0  # share of the range beyond which a bound would cut nothing but noise (chosen)
-# Least share of the darkest light nearby at no room beyond the range, and its decrease per room (chosen, not
-# measured)
+# Least share of the darkest light nearby at no room beyond the range, and its decrease per room (chosen: a
+# half is one stop, by which detail finer than the blur may be darker than it looks; the more room, the less)
 _DARKEST, _DARKER = 0.5, 0.2
 
 

@@ -19,10 +19,12 @@ _UNSURE: Final = 0.1
 (chosen)."""
 
 _NEAR: Final = 2
-"""Radius in pixels of the window whose hues a pixel may have (chosen)."""
+"""Radius in pixels of the window whose hues a pixel may have (chosen: demosaicing mixes hues over as much; a
+wider one holds the hues of other things)."""
 
 _LEAST_LIGHT: Final = 3.0
-"""Standard deviations of the noise below which light has no hue (chosen)."""
+"""Standard deviations of the noise below which light has no hue (chosen: below, noise decides which colour is
+the largest)."""
 
 _STILL_WHITE: Final = np.float32(0.8)
 """Share of a clipped pixel's light at and above which it counts as white: white balance hides what is missing

@@ -30,7 +30,9 @@ from lensmodel.correction.tiles.local_statistics import (
 from lensmodel.correction.tiles.transfers import transfers
 
 _FINE: Final = 1.0 / 16.0  # cycles per pixel: a window of 13 pixels sees frequencies above this
-_LEAST_COLOUR: Final = 0.02  # least variance of chroma over that of luma in a scene (chosen, not measured)
+_LEAST_COLOUR: Final = 0.02
+"""Least variance of chroma over that of luma in a scene (chosen: with none, a scene that looks grey in its
+noise would lose every colour; with much more, noise would pass for colour)."""
 
 
 def _steps() -> Deconvolver:

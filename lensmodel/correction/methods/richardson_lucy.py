@@ -26,7 +26,9 @@ ALPHA_MAX = 0.9
 """Cap of the fixed extrapolation; above it the noise is accelerated as well."""
 
 SHARPNESS = 50.0
-"""a of the sensor response, per clipping level: how sharply it bends where it clips. Chosen, not measured."""
+"""a of the sensor response, per clipping level: how sharply it bends where it clips (chosen: the bend is then
+a tenth of the level wide; a sharper one gives steps no slope to follow, a softer one bends what the sensor
+records in proportion)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,9 +156,11 @@ class SaturationAwareRichardsonLucy:
 
 
 _REACH_FLOOR = 0.05
-"""Least F^T 1, as a share of its largest value: see `first_guess` (chosen, not measured)."""
+"""Least F^T 1, as a share of its largest value: see `first_guess` (chosen: a pixel with less of its light
+in the frame would be divided by little, and noise would explode; with more, the rim would be too dark)."""
 _LIGHT = 0.9
-"""Share of the clipping level above which a sharp pixel counts as a light (chosen)."""
+"""Share of the clipping level above which a sharp pixel counts as a light (chosen: blur leaves the rim of a
+light a little below the level; much lower, ordinary bright places would be treated as lights)."""
 
 
 def climbed(

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
 
-DEGREE = 9  # of the polynomial that stands for the shrinkage function (chosen)
-_REACH = 24.0  # largest argument, in widths of the shrinkage; beyond it hardly anything is taken off (chosen)
+DEGREE = 9  # of the polynomial: a shorter one misses the bend at the jump, each term costs a step (chosen)
+_REACH = 24.0  # largest argument, in widths of the shrinkage: beyond, hardly anything is taken off (chosen)
 _SHARP = 1e-6  # share of a jump that float32 resolves
 
 

@@ -139,7 +139,7 @@ class SparseGradient:
         canvas: Canvas,
         loops: ModuleType | None,
         glow: Planes | None,
-    ) -> _Problem:
+    ) -> _SparseProblem:
         blocks = BlockMeans.of(blurred, light, loops)
         recorded = blocks if glow is None else BlockMeans.of(blurred + glow, light, loops)
         var = np.stack(
@@ -190,7 +190,7 @@ class SparseGradient:
             at = np.clip(np.arange(canvas.shape[axis]) - canvas.margin, 0, blurred.shape[1 + axis] - 1)
             return (at - (drift.origin[axis] if drift else 0.0)).astype(np.float32)
 
-        return _Problem(
+        return _SparseProblem(
             y=y,
             variance=variance,
             known=known,
@@ -209,19 +209,27 @@ class SparseGradient:
         )
 
 
-_RAMP = 0.1  # of the jump of the shrinkage: see `Shrinkage` (chosen, not measured)
-# Variance over squared light of a scene for which kappa is `weight` (chosen, not measured)
+_RAMP = 0.1
+"""Of the jump of the shrinkage, see `Shrinkage` (chosen: with none, rounding decides what is kept; a wide one
+is no longer the prior's own answer)."""
 _TYPICAL_CONTRAST = np.float32(0.02)
-_SCENE = 0.2  # variance over squared light of a cell of an average scene (chosen, not measured)
-_OPEN, _SLOPE, _LEAST = 0.25, 0.87, 0.4  # chosen on lenses of development seeds: see `_reliance`
-# Range of the weight of the prior between texture and flat places (chosen on development lenses)
+"""Variance over squared light of a scene for which kappa is `weight` (chosen: detail of a seventh of the
+light. It only sets the unit of `weight`; see `_BUSIEST`, `_CALMEST` for how far others lie)."""
+_SCENE = 0.2
+"""Least variance over squared light of a cell when its determined share is asked for (chosen: that of a scene
+with objects of all brightnesses; with less, flat cells would count as undetermined, and the prior would leave
+them their noise)."""
+# See `_reliance` (chosen on lenses of development seeds: measured once, no command repeats it)
+_OPEN, _SLOPE, _LEAST = 0.25, 0.87, 0.4
+# Range of the weight of the prior between texture and flat places (chosen on the same lenses, as those)
 _BUSIEST, _CALMEST = 0.7, 50.0
-# Share of a tile's mean light below which the prior stops following it (chosen, not measured)
 _DARK = np.float32(0.02)
+"""Share of a tile's mean light below which the prior stops following it (chosen: with none, all detail of
+black would be smoothed away; with more, shadows keep noise that lighter places lose)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Problem:
+class _SparseProblem:
     """Everything that the half-quadratic steps need, on the canvas; see `SparseGradient`."""
 
     y: Planes
@@ -280,7 +288,7 @@ def _known(sensors: Sequence[Sensor], canvas: Canvas) -> NDArray[np.bool_]:
     return known
 
 
-def _half_quadratic(p: _Problem, on_step: StepHook) -> Planes:
+def _half_quadratic(p: _SparseProblem, on_step: StepHook) -> Planes:
     """The steps in NumPy; `compiled.half_quadratic` is their twin."""
     shape = (p.y.shape[1], p.y.shape[2])
     power = np.abs(p.K) ** 2
@@ -313,7 +321,7 @@ def _half_quadratic(p: _Problem, on_step: StepHook) -> Planes:
     return x
 
 
-def _compiled(p: _Problem, loops: ModuleType) -> Planes:
+def _compiled(p: _SparseProblem, loops: ModuleType) -> Planes:
     """The same in compiled code."""
     decay, prior_power = prior((p.y.shape[1], p.y.shape[2]))
     x = np.empty_like(p.y)

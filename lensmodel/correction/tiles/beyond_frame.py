@@ -20,7 +20,8 @@ from lensmodel.correction.tiles.canvas import Canvas, seam
 
 _DEPTH, _MORE = 4, 8
 """Depth of the strip of data that predicts what lies beyond a side: so many reaches of the blur, plus so many
-pixels (chosen, not measured)."""
+pixels (chosen: those within two reaches share light with the outside, as many again share it with them; more
+costs time and says nothing of the outside)."""
 
 
 def fill_outside(

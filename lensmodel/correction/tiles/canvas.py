@@ -15,8 +15,9 @@ from lensmodel.core.types import Planes
 from lensmodel.correction.blur import UniformBlur
 from lensmodel.correction.deconvolver import Sensor
 
-# Pixels over which the ends of a tile fade into each other where its rim is cut off (chosen, not measured)
 _JOINT: Final = 4
+"""Pixels over which the ends of a tile fade into each other where its rim is cut off (chosen: with none, the
+step between the ends rings inwards; more is computed for nothing)."""
 
 
 @dataclass(frozen=True, slots=True)

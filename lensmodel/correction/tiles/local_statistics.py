@@ -14,7 +14,9 @@ from lensmodel.core.types import Planes
 from lensmodel.correction.tiles.canvas import Canvas
 
 BLOCK = 4  # pixels: coarser than detail, finer than objects (chosen)
-_UNSURE = np.float32(0.1)  # share of the noise that a variance over so few pixels cannot resolve (chosen)
+_UNSURE = np.float32(0.1)
+"""Share of the noise that a variance over so few pixels cannot resolve, and that counts as signal (chosen: at
+0, places without detail would be smoothed without limit)."""
 
 
 def coarse(plane: NDArray[np.float32]) -> NDArray[np.float32]:

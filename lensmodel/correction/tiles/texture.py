@@ -28,10 +28,12 @@ _SMOOTH: Final = 1.2
 
 
 _GRAIN: Final = 3.0
-"""Standard deviations of the noise within which a residual is grain (chosen, not measured)."""
+"""Standard deviations of the noise within which a residual is grain (chosen: noise exceeds them in one pixel
+of 400; further out, it is an error of the PSF that must not be added back)."""
 
 _WINDOW: Final = 7
-"""Side in pixels of the window in which the residual is compared with the noise (chosen)."""
+"""Side in pixels of the window in which the residual is compared with the noise (chosen: the power of fewer
+pixels is known too badly, a wider window mixes texture with what is beside it)."""
 _NOISE, _TEXTURE = 1.5, 4.0
 """Power of the residual over that of the noise: up to the first it is noise alone, from the second it is
 texture. The first is more than chance makes of a variance over so few pixels (chosen)."""

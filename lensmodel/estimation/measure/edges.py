@@ -44,10 +44,14 @@ a core and its aberrations differs by that much from its own two slices' Gaussia
 _FREQUENCIES: Final = np.linspace(0.02, 0.5, 25)
 _SLICE_ERROR: Final = 0.01  # s: of an edge of 64 lines at 1 percent noise
 _PIXEL_SPREAD: Final = 0.02  # t: a pixel's light differs so much from a Gaussian's
-_CROSSING: Final = math.radians(45.0)  # edges closer in direction say the same of a kernel (chosen)
+_CROSSING: Final = math.radians(45.0)
+"""Edges closer in direction say nearly the same of a kernel; those of a chart cross at 90 degrees
+(chosen)."""
 _NEAR: Final = 0.3  # half diagonals between two edges of one constraint: kernels hardly change (chosen)
-_REACH_PX: Final = 16.0  # pixels from an edge that its line spread is read at (chosen)
-_TAPER_PX: Final = 4.0  # pixels over which it fades (chosen)
+_REACH_PX: Final = 16.0
+"""Pixels from an edge that its line spread is read at: further out is noise; nearer, halos are cut
+(chosen)."""
+_TAPER_PX: Final = 4.0  # pixels over which it fades: a sudden end would ring (chosen)
 
 
 @dataclass(frozen=True, slots=True)

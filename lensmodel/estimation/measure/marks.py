@@ -15,12 +15,18 @@ from lensmodel.core.errors import NotEnoughEvidenceError
 _LOOKED_AT: Final = 1000  # pixels along the long side: noise has turned to grey, discs are 15 across
 # Of the surroundings' mean level, which is grey as the noise is (chosen: discs are black)
 _DARK: Final = 0.45
-_ROUND: Final = 0.85  # area over that of the ellipse of the same second moments, 1 of an ellipse (chosen)
+_ROUND: Final = 0.85
+"""Area over that of the ellipse of the same second moments, 1 of an ellipse: noise frays discs, letters and
+corners have less (chosen)."""
 _LEAST_PX: Final = 20  # area of a disc: below it no shape is seen (chosen)
 _MOST_SHARE: Final = 0.004  # same, of the picture: a page that fills it has less than a tenth (chosen)
-_CANDIDATES: Final = 14  # largest discs that are looked at for the four marks (chosen)
+_CANDIDATES: Final = 14
+"""Clearest discs that are looked at for the four marks: ten others in the picture do no harm, and their
+thousand choices of four are still quick (chosen)."""
 _ALIKE: Final = 4.0  # the largest disc over the smallest in area: a page seen very much aslant
-_PAPER_OVER_DISC: Final = 2.0  # least ratio of the light of paper and print (chosen)
+_PAPER_OVER_DISC: Final = 2.0
+"""Least ratio of the light of paper and print: far more on any print, less on shadows and patterns
+(chosen)."""
 
 
 def find_marks(plane: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -42,8 +42,11 @@ CONTRAST: Final = 0.17
 """Standard deviation of the noise as a share of the paper's white: 3 of them reach ink and paper."""
 
 _SEED: Final = 20120  # any number: printed pages depend on it, so it stays
-_LARGEST: Final = 8000  # samples along the long side (chosen)
-_SMALLEST: Final = 200  # samples along the long side (chosen)
+_LARGEST: Final = 8000
+"""Samples along the long side: 0.07 mm each on the largest paper, about as fine as greys are printed
+(chosen)."""
+_SMALLEST: Final = 200
+"""Samples along the long side: coarser noise holds no frequency that a lens takes away (chosen)."""
 
 
 @dataclass(frozen=True)

@@ -43,20 +43,27 @@ USUAL_F_NUMBER: Final = 8.0
 
 _USUAL_PITCH_UM: Final = 4.5  # where the photo does not say; as for `FLOOR`
 _CLEAR: Final = 8.0  # standard deviations, as in `target`, for the same reason
-_SIDE: Final = 160  # pixels of a window (chosen, not measured)
+_SIDE: Final = 160
+"""Pixels of a window: the kernel changes within a larger one, a smaller one determines it too badly
+(chosen)."""
 _SPARE: Final = 24  # pixels around a window: deconvolution and interpolation spoil the rim
 _DAMPING: Final = 0.004  # of the squared transfer function: noise is not raised more than eightfold
-_STOPS_APART: Final = 2.0  # least difference of the apertures (chosen, not measured)
-_SURE: Final = 0.3  # expected relative L2 from which on a window is dropped (chosen, not measured)
-_COARSE: Final = 4  # factor by which photos are shrunk for the first match (chosen, not measured)
-# Frequencies along an axis (chosen, not measured); its lags have to hold two kernels
+_STOPS_APART: Final = 2.0
+"""Least difference of the apertures: blur that both photos share is missing in the kernel (chosen)."""
+_SURE: Final = 0.3
+"""Expected relative L2 from which on a window is dropped: a blind kernel is as good (chosen)."""
+_COARSE: Final = 4
+"""Factor by which photos are shrunk for the first match: a nudged tripod is within reach, and the blur is
+gone (chosen)."""
 _NOISE_GRID: Final = 128
-_RINGS: Final = 16  # of frequency, 0 to 0.5 cycles/pixel (chosen, not measured)
+"""Frequencies along an axis: its lags have to hold two kernels, and the spectra are smooth (chosen)."""
+_RINGS: Final = 16
+"""Of frequency, 0 to 0.5 cycles/pixel: a window has few frequencies for each of more (chosen)."""
 _ALIASED: Final = 0.03
 """Share of its alias that a demosaiced colour of a mosaic holds: of 0.03, 0.06 and 0.1 the one with the least
-error for the lens of development (third order, 4)."""
+error for the lens of development (third order, 4). Measured once, no command repeats it."""
 _SMOOTH_PX: Final = 6.0  # pixels: slower changes are light, not detail (chosen)
-_FEWEST: Final = 64  # points that a fit of brightness takes (chosen)
+_FEWEST: Final = 64  # points that a fit of brightness takes: some ten for each of its six terms (chosen)
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,10 +36,13 @@ a gamma of 1.3 has a q of 0.3)."""
 _POWERS: Final = ((1.0, 0.0, 0.0), (-2.0 * MEAN, 1.0, 0.0), (3.0 * MEAN**2, -3.0 * MEAN, 1.0))
 """z, z² and z³ of `tones_of` in powers of R, less their constants."""
 _TINY: Final = 1e-20  # keeps a division finite
-# Samples a pixel that the page is drawn with before it is cut at the pixels' frequencies (chosen)
 _FINE: Final = 2
-_SPARE: Final = 16  # pixels around a window, where the taper is (chosen)
-_LIGHT_ROUNDS: Final = 2  # of fitting light and tones in turn (chosen)
+"""Samples a pixel that the page is drawn with before it is cut at the pixels' frequencies: at 1, its dots
+would alias, more costs time (chosen)."""
+_SPARE: Final = 16
+"""Pixels around a window, where the taper is: half of the largest kernel comes nearly as far (chosen)."""
+_LIGHT_ROUNDS: Final = 2
+"""Of fitting light and tones in turn: the second corrects what the first took for the other (chosen)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

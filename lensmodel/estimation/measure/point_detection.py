@@ -24,7 +24,9 @@ DETECTORS: Final = ("auto", "sep", "photutils", "own")
 REMEDY: Final = "pip install 'lensmodel[stars]' finds faint and crowded lights better"
 
 _SIGMAS: Final = 8.0  # of the sky's scatter, that a light stands out by: fainter ones add noise (chosen)
-_NEIGHBOUR: Final = 0.1  # of its flux, that another light beside it may have (chosen)
+_NEIGHBOUR: Final = 0.1
+"""Of its flux, that another light beside it may have: a fainter one is an error like those of noise
+(chosen)."""
 _SKY_CELL: Final = 64  # pixels of a cell in which the sky is one value, as SExtractor's default
 
 

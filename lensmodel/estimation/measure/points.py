@@ -38,8 +38,11 @@ over a dark sky, 0.02 to 0.03, since a kernel that changes within a cell shows i
 _FEWEST: Final = 2
 """Lights a cell must have: one alone may be a double star."""
 _MOST: Final = 12  # lights of a cell: more lower the noise no further (chosen)
-_ROUNDS: Final = 3  # of stacking at improved centres (chosen)
-_SURE: Final = 0.45  # expected relative error beyond which a kernel helps no model (chosen)
+_ROUNDS: Final = 3
+"""Of stacking at improved centres: each stack is sharper by the centres before it, and soon they rest
+(chosen)."""
+_SURE: Final = 0.45
+"""Expected relative error beyond which a kernel helps no model, whose blind ones are no worse (chosen)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ PAPERS: Final = {"a2": (594.0, 420.0), "a3": (420.0, 297.0), "a4": (297.0, 210.0
 
 SUFFIXES: Final = (".pdf", ".png", ".svg")
 
-_GREYS: Final = 64  # levels of print (chosen)
+_GREYS: Final = 64  # levels of print: finer than a printer renders, and a small file (chosen)
 _POINTS_PER_MM: Final = 72.0 / 25.4  # a point is 1/72 inch
 
 

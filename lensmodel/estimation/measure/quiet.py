@@ -20,12 +20,13 @@ from lensmodel.core.types import CHANNELS, NoiseModel
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import PlaneNoise
 
-_BLOCK: Final = 64  # pixels, side of a place (chosen, not measured)
+_BLOCK: Final = 64
+"""Pixels, side of a place: a larger one is nowhere without detail, a smaller one by chance too quiet
+(chosen)."""
 _FINE: Final = (0.4, 0.5)
 """Frequencies in cycles/pixel: above them grids of pixels hold nothing, below them lenses leave more."""
 
-_DARK: Final = 0.02
-"""Of saturation; darker blocks show the black level rather than light (chosen)."""
+_DARK: Final = 0.02  # of saturation: darker blocks show the black level rather than light (chosen)
 
 
 def with_bounded_noise(photos: list[LinearPhoto]) -> list[LinearPhoto]:

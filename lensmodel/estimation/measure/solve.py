@@ -47,7 +47,9 @@ REACH: Final = 2.5
 """D in pixels: light 10 px away is expected below 3 percent a pixel, ten times what wide halos have."""
 
 _ROWS: Final = 4096  # at once: the design matrix of a window would take hundreds of megabytes
-_STEPS: Final = 300  # of the projected gradient at most (chosen)
+_STEPS: Final = 300
+"""Of the projected gradient, whose error falls with the square of their number: more only cost time
+(chosen)."""
 _STILL: Final = 1e-7  # of the light: no value moves by more
 _WORST: Final = 1.0  # an error beyond it says that nothing was measured
 

@@ -33,15 +33,19 @@ FLOOR: Final = 0.02
 (chosen)."""
 
 EXPLAINED: Final = 1.15
-"""Residuals over the noise above which its kernel changes too much for a window (chosen)."""
+"""Residuals over the noise above which a kernel changes too much for a window: noise that is stated a tenth
+too low is no reason to cut it (chosen)."""
 
 _CLEAR: Final = 8.0  # of the standard deviation: peaks of 10 000 lags of noise reach 4 to 5
 # Pixels of a window: wide enough for the largest kernel, small enough for one blur (chosen)
 _SIDE: Final = 144
 _SURE: Final = 0.3  # error beyond which a measurement is not worth having
-_SMALLER: Final = (2 / 3, 1 / 2)  # shares of the side, tried where whole windows do not fit (chosen)
+_SMALLER: Final = (2 / 3, 1 / 2)
+"""Shares of the side, tried where whole windows do not fit: a change of the kernel falls with the side
+(chosen)."""
 _LEAST_PIXELS: Final = 2.0  # for each of the kernel: fewer leave it to the prior (chosen)
-_TONE_WINDOWS: Final = 6  # in the middle of the frame, where the lens is sharpest (chosen)
+_TONE_WINDOWS: Final = 6
+"""In the middle of the frame, where the lens is sharpest: more lie further out (chosen)."""
 _TRIED: Final = 6  # windows looked at along each axis for one that is measured: the page may end anywhere
 
 

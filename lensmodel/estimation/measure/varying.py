@@ -41,17 +41,22 @@ from lensmodel.estimation.measure.solve import (
 )
 
 CHANGE: Final = 0.3
-"""Width of the prior of k_u and k_v over that of k (chosen): at three times as much nothing changed."""
+"""Width of the prior of k_u and k_v over that of k (chosen: at three times as much nothing changed;
+measured once, no command repeats it)."""
 
 CENTRED_PX: Final = 0.3
-"""How far from the middle the centre of mass is expected, where the misfit does not tell (chosen)."""
+"""How far from the middle the centre of mass is expected, where the misfit does not tell: the match before it
+is as sure; much more and the phase is left open (chosen)."""
 
-_ROWS: Final = 2048  # of the design matrix at once, to bound memory (chosen, not measured)
-_STEPS_PX: Final = (0.25, 0.1, 0.04)  # of the search for the phase, coarse to fine (chosen, not measured)
-_MOST_PX: Final = 1.0  # largest phase along an axis (chosen, not measured)
-_MOST_MOVES: Final = 24  # with one step, at most (chosen, not measured)
+_ROWS: Final = 2048  # of the design matrix at once: a whole window would take hundreds of megabytes (chosen)
+_STEPS_PX: Final = (0.25, 0.1, 0.04)
+"""Of the search for the phase, coarse to fine: the first crosses a pixel in four, each next one looks around
+where the last ended (chosen)."""
+_MOST_PX: Final = 1.0
+"""Largest phase along an axis: kernels come here centred, a whole pixel is another match (chosen)."""
+_MOST_MOVES: Final = 24  # with one step, at most: enough to cross the whole square of phases (chosen)
 _SEARCHED: Final = 100
-"""Steps from one phase to the next, whose kernels are alike (chosen)."""
+"""Steps from one phase to the next: their kernels are alike, and only their order counts (chosen)."""
 
 
 @dataclass(frozen=True, slots=True)

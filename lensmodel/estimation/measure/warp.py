@@ -25,7 +25,9 @@ DEGREE: Final = 5
 """Radial distortion up to the fifth power of the radius: two coefficients and a decentred middle."""
 
 _FEWEST: Final = 6  # points, twice as many as a polynomial of first order needs (chosen)
-_TRUSTED_PX: Final = 1.0  # a match that lies so far from the smooth field of all others is wrong (chosen)
+_TRUSTED_PX: Final = 1.0
+"""Matches that lie so far from the smooth field of all others are wrong, those within a tenth pass in any
+case: less would drop good ones where nearly all are (chosen)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,13 +22,15 @@ from lensmodel.estimation.spectra.scene_spectra import SceneSpectra
 from lensmodel.estimation.steps.finish import confidence_of, signal_share
 from lensmodel.estimation.steps.recurrence import QUICK
 
-# Side of the kernel, alternations, side of the patches, where many are pooled (chosen, not measured)
 _POOLED_SUPPORT, _POOLED_ITERATIONS, _POOLED_SIDE = 21, 3, 160
+"""Side of the kernel, alternations, side of the patches, where many are pooled: only the phase is wanted of
+them, so that the cheapest that tells it is enough; less does not hold a usual kernel (chosen)."""
 _USUAL_SIZE = 31  # pixels: who asks for larger kernels knows of blur that reaches far (chosen)
 # Half the side in widths of the Gaussian, which sees the core of wide blur alone, and the least side: first
 # for usual kernels, then for larger ones (chosen: a disc of 19 pixels looks like a Gaussian of 2.1)
 _REACH, _LEAST_SUPPORT = (3.0, 9.0), (15, 31)
-_STARTS, _STARTS_OF_CHANNEL = 10, 6  # random wavefronts for few patches (chosen, not measured)
+_STARTS, _STARTS_OF_CHANNEL = 10, 6
+"""Random wavefronts for few patches: each costs a descent; a colour begins at that of green too (chosen)."""
 _PIXEL_SIGMA = 0.29  # pixels: standard deviation of a uniform pixel, 1/sqrt(12)
 _LEAST_ERROR = 0.05  # relative: no blind kernel was nearer to the truth (chosen)
 _PER_WIDTH = 40.0

@@ -41,7 +41,9 @@ from lensmodel.estimation.steps.recurrence import (
 
 log = logging.getLogger(__name__)
 
-_BORDER = 3  # pixels left out along the rim (chosen, not measured)
+_BORDER = 3
+"""Pixels left out along the rim: fewer patches overlap there, so that the latent picture is worse
+(chosen)."""
 _ERROR: Final[Mapping[str, float]] = fitted("estimation")["recurrence_error"]
 """Expected relative L2 error by the disagreement of the halves of the patches: a line through 24 patches,
 whose halves lie 0.14 apart and whose mean error is 0.61, see `data/README.md`. It ranks patches weakly (rank

@@ -41,7 +41,9 @@ _FINE_ANGLES = 30  # to which the six are interpolated, as in the paper
 _TAIL = 1e-4  # quantile that stands for black and white, as in the paper
 _SATURATED = 0.97  # of white: clipped edges are steeper than the lens made them (chosen)
 _STEEPEST = 5  # gradients whose mean stands for the largest: one alone is noise (chosen)
-_PROBE_PX = 0.7  # pixels of the derivative of a Gaussian (chosen)
+_PROBE_PX = 0.7
+"""Pixels of the derivative of a Gaussian: less and noise is the steepest slope, more and sharp edges look
+soft (chosen)."""
 _VARIANCES = (0.09, 16.0)  # squared pixels, as in the paper (sigma 0.3 to 4)
 
 _LAW: Final[Mapping[str, float]] = fitted("estimation")["polyblur"]

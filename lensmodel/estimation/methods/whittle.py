@@ -25,16 +25,19 @@ from lensmodel.estimation.estimator import PsfEstimate, is_no_blur, usable
 
 _TILE = 64  # pixels: neighbouring bins are nearly independent, blur nearly the same (chosen)
 _BAND = (0.05, 0.5)  # cycles/pixel: below, few bins and uneven light (chosen)
-# Scenes fall off with 2.0 to 4.0; a prior that expects too little makes kernels too wide (chosen).
 _SLOPE, _SLOPE_SD = 2.5, 0.25
-_ORIENTATION_SD = 0.5  # of how much a scene prefers a direction (chosen)
-# Of the priors against a patch's likelihood, whose bins are not independent (chosen)
+"""Scenes fall off with 2.0 to 4.0: a prior that expects too little makes kernels too wide, a wider one leaves
+the blur open (chosen)."""
+_ORIENTATION_SD = 0.5
+"""Of how much a scene prefers a direction: less takes every such scene for motion, more hides it (chosen)."""
 _PRIOR_WEIGHT = 1.0 / 100.0
+"""Of the priors against a patch's likelihood, whose bins are not independent: these are averaged, so that
+with 1 the priors would decide alone; with 0 slope and blur could stand for each other (chosen)."""
 _STARTS_PX = (0.7, 1.5, 3.0)  # widths to begin with, pixels: sharp, usual, soft (chosen)
 _ERROR: Final = float(fitted("estimation")["whittle_error"])
 """Expected relative L2 error, see `data/README.md`; the likelihood does not rank its errors."""
 
-_CONFIDENCE = 0.35  # about `confidence_of` that error (chosen)
+_CONFIDENCE = 0.35  # about `confidence_of` that error, the same for all its answers (chosen)
 _PER_PATCH = 4  # unknowns: amplitude, slope, two of direction
 
 Floats = NDArray[np.float64]

@@ -22,24 +22,33 @@ from lensmodel.estimation.patches.rmap import (
 )
 
 ORIENTATIONS: Final = 8
-"""Bins of gradient direction over half a turn (chosen)."""
+"""Bins of gradient direction over half a turn: corners need a few directions, each must hold edges enough for
+a histogram (chosen)."""
 
 BLOCKS_A_SIDE: Final = 4
-"""A window is this many blocks wide; windows start at every block (chosen)."""
+"""A window is this many blocks wide, and windows start at every block: finer starts cost time and find nearly
+the same windows (chosen)."""
 
 WIDTH_BINS: Final = 28
 WIDTH_STEP_PX: Final = 0.2
 """Histogram of edge widths, 0 to 5.6 px (chosen: finer than the widths of sharp and soft photos differ)."""
 
-EDGE_SIGMAS: Final = 4.0  # of a gradient's noise, above which a pixel is an edge (chosen, not measured)
-WIDTH_SIGMAS: Final = 10.0  # the same where a width is measured (chosen, not measured)
-CLIP_SHARE: Final = 0.98  # of the clipping level, above which a pixel is clipped (chosen, not measured)
+EDGE_SIGMAS: Final = 4.0
+"""Of a gradient's noise, above which a pixel is an edge: noise alone exceeds it in one pixel of 3000
+(chosen)."""
+WIDTH_SIGMAS: Final = 10.0
+"""The same where a width is measured: noise must not move the places where an edge begins and ends
+(chosen)."""
+CLIP_SHARE: Final = 0.98
+"""Of the clipping level, above which a pixel is clipped: noise and demosaicing leave it a little lower
+(chosen)."""
 DARK_SNR: Final = 5.0
 """A pixel below this ratio of level to noise counts as dark. One percent of full range is the noise of
 the published lens-blur benchmark; ten times that level would already throw out half a photo there."""
 
 _MARGIN = 18  # half an r-map window and the smoothing
-_STRIP_PIXELS = 2_000_000  # pixels at once, 8 MB a plane of float32 (chosen)
+_STRIP_PIXELS = 2_000_000
+"""Pixels at once, 8 MB a plane of float32: the calls cost little beside the work (chosen)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

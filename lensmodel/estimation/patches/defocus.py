@@ -11,24 +11,38 @@ from numpy.typing import NDArray
 from lensmodel.estimation.patches.blocks import BLOCKS_A_SIDE
 from lensmodel.estimation.patches.windows import Windows
 
-RINGS: Final = 8  # of equal width in r (chosen, not measured)
-ENVELOPE_PERCENTILE: Final = 15.0  # of a ring's widths, see `width_envelope` (chosen, not measured)
-ENVELOPE_RATIO: Final = 1.25  # of width to envelope, above which a window is defocused (chosen, not measured)
+RINGS: Final = 8
+"""Of equal width in r: blur changes little within one, and each holds windows enough (chosen)."""
+ENVELOPE_PERCENTILE: Final = 15.0
+"""Of a ring's widths, see `width_envelope`: lower is a single window's error, higher needs more of the photo
+in focus (chosen)."""
+ENVELOPE_RATIO: Final = 1.25
+"""Of width to envelope, above which a window is defocused: widths scatter by some of it in focus, and a
+quarter wider harms a kernel (chosen)."""
 CORNER_ALLOWANCE: Final = 0.2
 """The allowed ratio grows with r²: copies of a lens differ, and a decentred one is not out of focus."""
-GROWTH: Final = 4.0  # of the envelope with r², see `width_envelope` (chosen, not measured)
-SURFACE_LIMIT: Final = 0.19  # of the log width, see `smooth_widths` (chosen, not measured)
-JUMP_SHARE: Final = 0.5  # of the range of log widths, see `smooth_widths` (chosen, not measured)
-SURFACE_STEPS: Final = 12  # of reweighting (chosen, not measured)
-MIN_FOR_SURFACE: Final = 40  # windows, for six coefficients (chosen, not measured)
+GROWTH: Final = 4.0
+"""Of the envelope with r², see `width_envelope`: corners five times as wide as the centre are as bad as
+lenses get (chosen)."""
+SURFACE_LIMIT: Final = 0.19
+"""Of the log width, see `smooth_widths`: less and no real photo is smooth, more and depths pass for a lens
+(chosen)."""
+JUMP_SHARE: Final = 0.5
+"""Of the range of log widths, see `smooth_widths`: a slope takes a sixth of it, a step of depth all
+(chosen)."""
+SURFACE_STEPS: Final = 12  # of reweighting, each a small system: later ones change less (chosen)
+MIN_FOR_SURFACE: Final = 40  # windows, for six coefficients: fewer let a surface follow the scene (chosen)
 QUARTER_ALLOWANCE: Final = 1.2
-"""A quarter of a window has fewer edges, its width a larger error (chosen, not measured)."""
+"""A quarter of a window has fewer edges, its width a larger error: 1 would call windows defocused by chance
+(chosen)."""
 SHARP_PX: Final = 0.6
 """Edges of a sharp photo measure about this wide; a smaller width carries no information."""
 MIN_IN_RING: Final = 4  # windows (chosen): fewer have no median worth the name
 
-MOTION_LIMIT: Final = 0.45  # relative elongation above which `select` warns (chosen, not measured)
-MIN_FOR_MOTION: Final = 6  # windows (chosen)
+MOTION_LIMIT: Final = 0.45
+"""Relative elongation above which `select` warns: that of a lens averages out over the field, a scene of one
+direction has some (chosen)."""
+MIN_FOR_MOTION: Final = 6  # windows: twice the three unknowns of the fit (chosen)
 
 
 def width_envelope(windows: Windows) -> NDArray[np.float64]:

@@ -35,7 +35,8 @@ rounding or denoising."""
 
 _JPEG_BLOCK = 8  # pixels: ITU-T T.81
 _MAIN_LOBE_PX = 8  # pixels: nearer peaks of the autocorrelation are the blur itself (chosen)
-_ON_THE_WAY = 24  # points between a peak and the middle (chosen)
+_ON_THE_WAY = 24
+"""Points between a peak and the middle: a valley is wider than a twentieth of the way (chosen)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

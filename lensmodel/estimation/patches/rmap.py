@@ -20,7 +20,8 @@ FLAT_CONSTANT: Final = 0.5
 
 FLAT_WINDOW: Final = 25  # pixels: the window for which Xu and Jia's 0.5 was chosen, see `FLAT_CONSTANT`
 
-R_BINS: Final = 16  # of the histogram of r (chosen)
+R_BINS: Final = 16
+"""Of the histogram of r: finer than its threshold has to be, and cheap to keep for each block (chosen)."""
 GROUPS: Final = 4  # of gradient directions: Xu and Jia 2010, sec. 3.1
 
 

@@ -24,23 +24,32 @@ from lensmodel.estimation.patches.windows import Windows, windows_of
 logger = logging.getLogger(__name__)
 
 SMALLEST_PATCH: Final = 64  # pixels: the least that estimators take
-CLIPPED_LIMIT: Final = 0.005  # share of a window's pixels (chosen, not measured)
-BLOB_LIMIT: Final = 20  # connected clipped pixels (chosen, not measured)
-DARK_LIMIT: Final = 0.5  # share of a window's pixels (chosen, not measured)
-FLAT_CONTRAST: Final = 4.0  # variance of signal over that of noise (chosen, not measured)
+CLIPPED_LIMIT: Final = 0.005
+"""Share of a window's pixels: a few specular points do little harm, and none at all would leave sunlit scenes
+out (chosen)."""
+BLOB_LIMIT: Final = 20
+"""Connected clipped pixels: a larger area has an edge whose profile is cut off (chosen)."""
+DARK_LIMIT: Final = 0.5  # share of a window's pixels: the other half still has edges (chosen)
+FLAT_CONTRAST: Final = 4.0
+"""Variance of signal over that of noise: below, noise decides the estimate (chosen)."""
 FLAT_EIGENVALUE: Final = 10.0
-"""Smaller eigenvalue of the structure tensor over that of noise (chosen, not measured)."""
-# Smaller eigenvalue of the structure tensor over the larger (chosen, not measured)
+"""Smaller eigenvalue of the structure tensor over that of noise: ten times what a window without edges has by
+chance (chosen)."""
 ONE_DIRECTION_RATIO: Final = 0.05
+"""Smaller eigenvalue of the structure tensor over the larger: a single line has next to nothing across
+(chosen)."""
 SECTOR_INFORMATION: Final = float(np.log(2.0))  # power twice that of noise, signal as strong as noise
-PERIOD_LIMIT: Final = 0.8  # see `Details.period` (chosen, not measured)
-BLOCKINESS_LIMIT: Final = 1.8  # see `Details.blockiness` (chosen, not measured)
+PERIOD_LIMIT: Final = 0.8
+"""See `Details.period`: a repetition is as alike as that, other scenes seldom (chosen)."""
+BLOCKINESS_LIMIT: Final = 1.8
+"""See `Details.blockiness`, 1 without any: chance gives a little more, and twice is plain to see (chosen)."""
 JPEG_WEIGHT: Final = 0.3
 """JPEG files were sharpened and gamma-coded: their patches count for less."""
 EVIDENCE_FLOOR: Final = 0.25
 """Bits a frequency between 0.1 and 0.4 cycles/pixel that a patch needs: signal as strong as the noise over a
 quarter of them, or 1.4 times as strong over the lowest fifth, which is all that a soft corner leaves."""
-SHORTLIST_A_SECTOR: Final = 8  # windows that the costlier scores look at (chosen)
+SHORTLIST_A_SECTOR: Final = 8
+"""Windows that the costlier scores look at: several times as many as are taken (chosen)."""
 # Of the logarithm of the width over the envelope: where the weight is 1/e (chosen)
 FOCUS_SOFTNESS: Final = 0.33
 

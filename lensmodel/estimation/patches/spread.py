@@ -10,19 +10,21 @@ from numpy.typing import NDArray
 
 from lensmodel.estimation.patches.windows import Windows
 
-RINGS: Final = 8  # of equal width in r (chosen, not measured)
+RINGS: Final = 8  # of equal width in r: as many as are needed to follow blur along the radius (chosen)
 OCTANTS: Final = 8  # eighths of a turn, by definition
 PATCHES_A_CELL: Final = 3
-"""Of all that were asked for, on average (chosen)."""
+"""Of all that were asked for, on average: more leave places of the field without any, one alone is a poor
+estimate (chosen)."""
 MOST_A_CELL: Final = 4
 """Pooling the normal equations of four patches is worth most of what twelve give."""
 CELL_R: Final = 0.12  # half-diagonals (chosen): nearer windows tell of the same PSF
-CELL_ANGLE: Final = math.radians(24.0)  # the same around the centre (chosen)
+CELL_ANGLE: Final = math.radians(24.0)  # the same around the centre, where blur changes less (chosen)
 MOST_APART: Final = 3.0  # window sides: farther ones are never of one cell (chosen)
 
-SPREAD_STEP: Final = 1.0  # window sides (chosen)
+SPREAD_STEP: Final = 1.0  # window sides: nearer windows share pixels (chosen)
 MOST_STEPS: Final = 4
-"""Distances to the nearest seed count in steps of one window, up to four (chosen)."""
+"""Distances to the nearest seed count in steps of one window, up to four: beyond, any other window is far
+enough, and the better one is taken (chosen)."""
 
 
 def sector_of(windows: Windows) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -34,9 +34,11 @@ from lensmodel.scene.prior import TAILS
 
 _STRIDE_PX = 1.0  # pixels of blur: no term changes by more in one step (chosen)
 _ENOUGH = 0.05  # of the cost: less gained in a step ends the fit (chosen)
-_TRIES = 4  # steps with more damping before the fit ends (chosen)
+_TRIES = 4  # steps with more damping before the fit ends: after four they are too short to gain (chosen)
 _SIDES: Final = (31, 47)  # pixels of the kernel: for usual and for wide blur (chosen)
-_WIDE_PX = 2.8  # RMS width from which on the larger one is taken (chosen)
+_WIDE_PX = 2.8
+"""RMS width from which on the larger one is taken: five of them fit into half of the smaller side
+(chosen)."""
 
 _SEED = 0  # any number: fits repeat to the bit
 
@@ -122,7 +124,7 @@ class AberrationFit:
     def _descend(
         self, pupil: Pupil, target: Kernel, terms: Floats, evidence: _Evidence, rounds: int
     ) -> LocalWavefront:
-        def moved(state: _State, step: Floats) -> _State:
+        def moved(state: _PatchFit, step: Floats) -> _PatchFit:
             step = step * min(1.0, _STRIDE_PX / max(float(np.abs(step[:TERMS]).max()), 1e-9))
             after, levels = state.terms + step[:TERMS], state.levels + step[TERMS:]
             return self._state(pupil, target, after, evidence, levels)
@@ -133,13 +135,13 @@ class AberrationFit:
 
     def _state(
         self, pupil: Pupil, target: Kernel, terms: Floats, evidence: _Evidence, levels: Floats | None
-    ) -> _State:
+    ) -> _PatchFit:
         kernel, changes = pupil.kernel(terms)
         off, flat = (kernel - target).ravel(), changes.reshape(TERMS, -1)
         weight = self.weight / float((target**2).sum())
         spread = ABERRATIONS.at_place
         usual = terms / spread
-        state = _State(
+        state = _PatchFit(
             terms,
             np.zeros(0),
             kernel,
@@ -159,8 +161,8 @@ class AberrationFit:
         return state
 
     def _with_whole(
-        self, state: _State, changes: Floats, spectra: SceneSpectra, amplitudes: Floats | None
-    ) -> _State:
+        self, state: _PatchFit, changes: Floats, spectra: SceneSpectra, amplitudes: Floats | None
+    ) -> _PatchFit:
         """Add what whole spectra say; the amplitudes of the scenes become unknowns."""
         blur, by_terms = log_power(state.kernel, changes)
         if amplitudes is None:
@@ -171,11 +173,11 @@ class AberrationFit:
         normal[:TERMS, :TERMS] += state.normal
         gradient[:TERMS] += state.gradient
         cost = state.cost + self.temper * (TAILS + 1.0) * float(np.log1p(left**2 / TAILS).sum())
-        return _State(state.terms, amplitudes, state.kernel, cost, normal, gradient)
+        return _PatchFit(state.terms, amplitudes, state.kernel, cost, normal, gradient)
 
     def _with_local(
-        self, state: _State, changes: Floats, local: LocalSpectra, gains: Floats | None
-    ) -> _State:
+        self, state: _PatchFit, changes: Floats, local: LocalSpectra, gains: Floats | None
+    ) -> _PatchFit:
         """Add what local spectra say; the gains of the patches become unknowns."""
         power, by_terms = log_local_power(state.kernel, changes)
         if gains is None:
@@ -192,7 +194,7 @@ class AberrationFit:
             normal[np.ix_(at, at)] += self.parts * (moved.T * curvature) @ moved
             gradient[at] += self.parts * (moved.T @ slope)
         levels = np.concatenate([state.levels, gains])
-        return _State(state.terms, levels, state.kernel, cost, normal, gradient)
+        return _PatchFit(state.terms, levels, state.kernel, cost, normal, gradient)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,7 +228,7 @@ class _Evidence:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _State:
+class _PatchFit:
     """Where a descent is: the terms, the amplitudes and gains of the patches, and which way down."""
 
     terms: Floats

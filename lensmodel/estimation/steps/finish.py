@@ -14,7 +14,8 @@ from lensmodel.core.spectrum import binned_spectrum
 from lensmodel.core.types import Kernel, NoiseModel, Plane
 from lensmodel.estimation.estimator import PsfEstimate, is_no_blur
 
-_HALF_CONFIDENT = 0.4  # relative error at which a kernel's weight is a half (chosen)
+_HALF_CONFIDENT = 0.4
+"""Relative error at which a kernel's weight is a half: that of a usual blind one (chosen)."""
 
 
 def signal_share(kept: Sequence[tuple[Plane, NoiseModel]]) -> NDArray[np.float64]:

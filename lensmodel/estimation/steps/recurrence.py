@@ -23,9 +23,10 @@ ALPHA = 4.0 / 3.0
 """Ratio between levels: smaller and copies are hardly sharper, larger and patches do not recur."""
 
 SIDE = 5  # pixels: Michaeli and Irani 2014, sec. 5
-# Principal ones by which neighbours are found; they hold nearly all of a patch's power (chosen)
 _COMPONENTS = 10
-_NEIGHBOURS = 5  # per patch (chosen)
+"""Principal ones by which neighbours are found: they hold nearly all of a patch's power, more slow the search
+(chosen)."""
+_NEIGHBOURS = 5  # per patch: one alone may be chance, further ones are less alike (chosen)
 
 Image = NDArray[np.float64]
 

@@ -1,7 +1,9 @@
 """Two non-blind deconvolvers that judge kernels: the same solver and settings for every kernel.
 
 They are kept apart from `lensmodel.correction` on purpose: a judge must not change when the product
-does.
+does. So there is a second shrinkage here, a table in float64 beside the polynomial in float32 of
+`lensmodel.correction.methods.shrinkage`, and a second `deconvolve` by the mixture of
+`lensmodel.lab.correction.methods`, of patches as they are and not of photos.
 """
 
 from __future__ import annotations
@@ -109,7 +111,7 @@ class HyperLaplacian:
             total = np.zeros_like(spectrum)
             for d in (dr, dc):
                 gradient = fft.irfft2(d * spectrum, s=x.shape)
-                total += np.conj(d) * fft.rfft2(_shrink(gradient, betas[turn], self.exponent))
+                total += np.conj(d) * fft.rfft2(_tabled_shrinkage(gradient, betas[turn], self.exponent))
             return total
 
         return _inner(half_quadratic(y, data, power, betas, led_back, curvature=laplacian, floor=1e-12))
@@ -119,7 +121,7 @@ _TABLE_REACH: Final = 1.5  # where tables end at least: gradients of scenes in 0
 
 
 @lru_cache(maxsize=32)
-def _shrink_table(beta: float, exponent: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _shrinkage_table(beta: float, exponent: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Minimiser of |w|^a + beta/2 (w - v)² where it is not 0: from the jump upwards.
 
     With s = beta^(-1 / (2 - a)), both minima cost the same at w = s (2 - 2a)^(1 / (2 - a)). Nothing may be
@@ -137,8 +139,8 @@ def _shrink_table(beta: float, exponent: float) -> tuple[NDArray[np.float64], ND
     return v, w
 
 
-def _shrink(v: NDArray[np.float64], beta: float, exponent: float) -> NDArray[np.float64]:
-    grid, value = _shrink_table(beta, exponent)
+def _tabled_shrinkage(v: NDArray[np.float64], beta: float, exponent: float) -> NDArray[np.float64]:
+    grid, value = _shrinkage_table(beta, exponent)
     size = np.abs(v)
     # Beyond the table the power hardly moves the minimum.
     beyond = size - exponent / beta * np.maximum(size, grid[-1]) ** (exponent - 1.0)
@@ -152,11 +154,9 @@ def _inner(x: NDArray[np.float64]) -> Plane:
 
 @dataclass(frozen=True, slots=True)
 class Epll:
-    """Expected patch log likelihood under a Gaussian mixture, by half-quadratic splitting.
+    """Expected patch log likelihood [1]_ of one patch, see `PatchMixture.restored`.
 
-    For growing beta: clean all windows under the mixture for noise of variance 1/beta, average
-    them to z, then solve ``(|K|²/sigma² + beta) X = conj(K) Y/sigma² + beta Z``. One window in
-    `step`² is used, on a grid moved each time.
+    `lab.correction.methods.EpllDeconvolver` restores whole planes by the same steps.
 
     References
     ----------
@@ -172,10 +172,7 @@ class Epll:
         """Return the sharp patch; see `Judge`."""
         y = tapered(patch, BORDER)
         otf = shifted_otf(kernel, (y.shape[0], y.shape[1]), shift)
-        weight = 1.0 / (sigma * sigma)
-        data, power = weight * np.conj(otf) * fft.rfft2(y), weight * np.square(np.abs(otf))
-        target = shipped_mixture().spectrum_of_cleaned(self.betas, self.step)
-        return _inner(half_quadratic(y, data, power, self.betas, target))
+        return _inner(shipped_mixture().restored(y, otf, 1.0 / (sigma * sigma), self.betas, self.step))
 
 
 judges: Registry[Judge] = Registry("non-blind judge", {"hyper-laplacian": HyperLaplacian, "epll": Epll})

@@ -19,9 +19,12 @@ from lensmodel.model.field.local_frame import LocalKernels
 from lensmodel.model.field.robust import Flag
 from lensmodel.model.wavefront.from_kernels import ONE_FOCAL_LENGTH
 
-_CV_PHOTOS = 3  # photos from which on leaving one out tells of bandwidths (chosen)
+_CV_PHOTOS = 3
+"""Photos from which on leaving one out tells of bandwidths: of two, each would be foretold by one alone
+(chosen)."""
 _CV_SAMPLES = 300  # that the search looks at: its cost grows with their square (chosen)
-_SCORED = 800  # samples whose held-out error is found, for the same reason (chosen)
+_SCORED = 800
+"""Samples whose held-out error is measured, for the same reason; the others get the median (chosen)."""
 _ROTATIONAL = 10.0  # chords of the circle: so wide that phi does not count
 _UNKNOWN_ERROR = 0.5  # of samples that no other one foretells (chosen: halfway to no knowledge)
 _FEWEST = 2  # one sample cannot be left out

@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from lensmodel.model import variables as va
 
 _BLOCK = 64  # samples of the smallest tree: fewer are searched one by one faster (chosen)
-_TIGHT, _LOOSE = 0.6, 1.6  # stretch of the scale within which a built tree is still used (chosen)
+_TIGHT, _LOOSE = 0.6, 1.6
+"""Stretch of the scale within which a built tree is still used: beyond, its ball holds many samples that do
+not count, or too much has to be looked through; a narrower range builds more often (chosen)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

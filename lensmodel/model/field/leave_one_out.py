@@ -20,9 +20,11 @@ from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
 
-MULTIPLES = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)  # of the bandwidth by the normal reference rule (chosen)
-# The same around the centre; 20 means rotational symmetry (chosen)
+MULTIPLES = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
+"""Of the bandwidth by the normal reference rule: in steps of a root of two, up to which errors hardly differ
+(chosen)."""
 PHI_MULTIPLES = (0.5, 0.7, 1.0, 1.4, 2.0, 4.0, 20.0)
+"""The same around the centre; 20 means rotational symmetry, and 4 is halfway to it (chosen)."""
 MIRRORS = (0.0, 0.3, 1.0)  # weights of mirror images: none, some, full (chosen)
 _CAP = 1.5  # relative errors beyond count no more than this: one outlier chooses nothing (chosen)
 _AS_GOOD, _NEGLIGIBLE = 1.01, 1e-3  # errors nearer than this are equal: their difference is noise (chosen)

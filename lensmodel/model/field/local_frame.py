@@ -27,8 +27,10 @@ from lensmodel.model.field.splines import FINER, Engine
 from lensmodel.model.field.transport import WidthField
 
 _CENTRED_PX = 1e-3  # pixels: a thousandth moves no figure that is reported
-_STEPS = 6  # of centring at most (chosen)
-_ROOM = 1.35  # side over that of an answer, for kernels that are scaled down to it (chosen)
+_STEPS = 6
+"""Of centring at most: each lowers what is left many times over, and it ends when little is (chosen)."""
+_ROOM = 1.35
+"""Side over that of an answer, for kernels that are scaled down to it: few are scaled by more (chosen)."""
 _MOST_BYTES = 1 << 29  # beyond, kernels are kept no finer than their pixels
 MIRRORED = np.array([1.0, -1.0])
 """Factor on the scales that turns a map into that of the mirror image about the meridional plane."""
@@ -56,6 +58,13 @@ class Answers:
     def counts(self) -> NDArray[np.intp]:
         """Samples of each question."""
         return np.diff(self.starts)
+
+    @property
+    def shares(self) -> NDArray[np.float64]:
+        """Weights of the samples of a single question, none below 0, of sum 1."""
+        weight = np.maximum(self.weights, 0.0)
+        weight /= weight.sum()
+        return weight
 
     def mean(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
         """Weighted means of values `(n,)` of the samples, one for each question; weights below 0 are 0."""

@@ -20,7 +20,7 @@ DROPPED = 3e-5
 """Samples that together weigh less are left out; what they would change is a small part of that
 (chosen: below what a kernel in single precision holds)."""
 
-_FEW = 8  # neighbours at least, however far (chosen)
+_FEW = 8  # neighbours at least, however far: a mean of fewer is no better than its worst (chosen)
 _WIDER, _MANY = 3, 4096  # growth of a search; fewer samples are looked through as fast as trees (chosen)
 _PAIRS = 1 << 19  # gaps at once: 29 MB of doubles (chosen)
 

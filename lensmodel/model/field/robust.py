@@ -22,9 +22,10 @@ from lensmodel.core.psf import PsfSample, second_moments
 from lensmodel.model.field.leave_one_out import HeldOut
 
 _TUKEY = 4.685  # 95 % efficiency for normal errors (P. J. Huber, "Robust Statistics", 1981: Tukey's biweight)
-_ROUNDS = 4  # of reweighting (chosen)
+_ROUNDS = 4  # of reweighting: each costs as much, and later ones change the votes less (chosen)
 _MIN_PHOTOS = 3  # with two nobody knows which one is wrong
-_LISTED = 0.5  # weight below which a photo is named (chosen)
+_LISTED = 0.5
+"""Weight below which a photo is named: it then counts for less than half of what it claims (chosen)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,8 +10,83 @@ from typing import Final
 import numpy as np
 
 from lensmodel.core.files import fitted
+from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.model import variables as va
+from lensmodel.model.answer import BOTH, WAVEFRONT
+from lensmodel.model.field.local_frame import Answers
+from lensmodel.model.fitting import Fit
 from lensmodel.model.modes import WAVEFRONT_SHARE, Mixture
-from lensmodel.model.trust.support import field_error, shared_error
+from lensmodel.model.prior import Prior
+from lensmodel.model.trust.support import field_error, shared_error, support
+
+_PRIOR_COUNTS = 1e-3
+"""Share of the answer from which on a prior is asked for its error (chosen: less shows in no digit)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Forecast:
+    """What an answer expects of itself.
+
+    Parameters
+    ----------
+    error : float
+        Relative L2, the prior's part included.
+    shared : float
+        The part of it that all samples share.
+    nearest : float
+        Distance to the nearest sample in bandwidths.
+    beyond : tuple of str
+        Variables in which the question lies outside the samples.
+    """
+
+    error: float
+    shared: float
+    nearest: float
+    beyond: tuple[str, ...]
+
+
+def forecast(
+    fit: Fit,
+    near: Answers,
+    mixture: Mixture,
+    position: FieldPosition,
+    settings: LensSettings,
+    prior: tuple[Prior, float] | None = None,
+) -> Forecast:
+    """Foretell how far the answer to one question is from the truth, in the mode of its fit.
+
+    Parameters
+    ----------
+    fit : Fit
+    near : Answers
+        Neighbours of the place and their weights.
+    mixture : Mixture
+        What they answer.
+    position, settings : FieldPosition, LensSettings
+        Of the question.
+    prior : tuple of Prior and float, optional
+        The prior with its share of the answer, 0..1.
+    """
+    weight = near.shares
+    distance, beyond = support(fit.index.points[near.rows], va.point(position, settings), fit.rule)
+    per_photo = np.bincount(fit.roster.photo[near.rows], weight)
+    evidence = SampleEvidence(
+        scatter=float(weight @ fit.validation.noise[near.rows]),
+        expected=float(weight @ fit.expected[near.rows]),
+        independent=1.0 / float((per_photo**2).sum()),
+        nearest=distance,
+        extrapolated=bool(beyond),
+        usual=fit.validation.usual,
+    )
+    if fit.mode == BOTH:
+        error = joint_error(evidence, mixture, position.r)
+    else:
+        physical = fit.physical_at(settings)
+        alone = fit.mode == WAVEFRONT and physical is not None and physical.agreed
+        error = expected_error(evidence, mixture, wavefront_alone=alone)
+    if prior is not None and prior[1] > _PRIOR_COUNTS:
+        error = with_prior(error, prior[1], prior[0].error(position, settings))
+    return Forecast(error, evidence.shared, distance, beyond)
 
 
 @dataclass(frozen=True, slots=True)

@@ -68,7 +68,8 @@ _AGAINST, _FOR = 12.0, 6.0
 """Bounds of what one patch says, from the first alternative on (chosen: no patch speaks for all)."""
 _RADIUS: Final = 0.3  # half-diagonals (chosen: a mean over several patches, so that one overrules nothing)
 _FEWEST: Final = 5.0  # patches whose mean counts in full (chosen: one alone overrules nothing)
-_FEWEST_VOTES: Final = 0.5  # patches; with fewer near a place the witness says nothing (chosen)
+_FEWEST_VOTES: Final = 0.5
+"""Patches: with fewer near a place the witness says nothing, since none of them is close (chosen)."""
 _MOST: Final = 96  # patches of a model that are asked (chosen: each costs some milliseconds)
 _TINY: Final = 1e-12  # keeps a division finite where no patch speaks
 _ALIKE: Final = 0.05  # least weight by settings (chosen: patches of others say little of these)

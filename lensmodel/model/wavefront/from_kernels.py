@@ -23,14 +23,18 @@ _LARGEST = 55  # pixels: the largest side that estimators give
 # Samples of the search and of the fit: 36 kernels over-determine 22 unknowns (chosen)
 _COARSE, _FINE = 12, 36
 _COARSE_ROUNDS, _FINE_ROUNDS = 8, 12  # steps at most: only the last fit has to end (chosen)
-_STARTS, _REFINED = 4, 2  # beginnings by moments, and those of them that are fitted in full (chosen)
-_REFINING_ROUNDS = 6  # steps at most of a fit that begins near its end (chosen)
+_STARTS, _REFINED = 4, 2
+"""Beginnings by moments, and those of them that are fitted in full: signs of the odd terms leave a few
+minima; each costs a fit (chosen)."""
+_REFINING_ROUNDS = 6  # steps at most of a fit that begins near its end: half of a whole one (chosen)
 _KNOWN, _PITCH_GUESSED, _APERTURE_GUESSED = 0.03, 0.3, 0.5
 """Standard deviation of the logarithm of diffraction's width q: with aperture and pitch known, without the
 pitch, and without both (chosen: f-numbers are rounded to 3 percent, most pitches lie within a third)."""
 _BLUR_PX = 1.0  # of kernels in the search: minima that differ by less in their kernels become one (chosen)
 _LEAST_HALF = 5  # pixels: half the side of the smallest kernel that is fitted (chosen: 11 x 11 hold a core)
-_HELD_LIGHT = 0.98  # share that the fitted square holds; the rest is noise of estimates (chosen)
+_HELD_LIGHT = 0.98
+"""Share that the fitted square holds: with more, noise of estimates counts as wings, with less, wings are cut
+(chosen)."""
 MIN_SAMPLES = 12
 """Fewer samples make no wavefront (chosen: half the patches of one photo)."""
 

@@ -57,8 +57,9 @@ PATCH_TAILS: Final = 3.0
 """Degrees of freedom of Student's t of a patch, in units of its bins (chosen): a patch that something else
 blurred loses its say, an unusual one keeps it."""
 
-_HELD_ROUNDS = 3  # steps of what photos share behind a lens that is known (chosen)
-_TRIES = 5  # steps with more damping before the fit ends (chosen)
+_HELD_ROUNDS = 3
+"""Steps of what photos share behind a lens that is known: few unknowns, and nearly linear (chosen)."""
+_TRIES = 5  # steps with more damping before the fit ends: by then they are too short to gain (chosen)
 _STRIDE_PX = 1.5  # pixels of blur: no term changes by more in one step (chosen)
 _ENOUGH = 0.2  # of the cost: less gained in a step ends the fit; minima differ by more (chosen)
 _SMALLEST_EYE, _FARTHEST_EYE = 0.5, 1.0  # radius, shift: the circles overlap all over the field (chosen)
@@ -100,7 +101,9 @@ class PooledFit:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _State:
+class _PooledState:
+    """A lens with what its photos share, and how well it explains all patches."""
+
     lens: Floats
     shared: Floats  # what the patches of each photo share
     cost: float
@@ -134,7 +137,7 @@ def fit_spectra(
         Whether a coarse pupil does; such costs compare only among each other.
     """
     photos = sorted({patch.photo for patch in patches})
-    problem = _Problem(tuple(patches), {name: i for i, name in enumerate(photos)}, begin, coarse)
+    problem = _PooledProblem(tuple(patches), {name: i for i, name in enumerate(photos)}, begin, coarse)
     lens = np.concatenate([begin.terms, open_eye(np.asarray(begin.eye))])
     shared = np.zeros((len(photos), len(PATCHES.photo_spread)))
     held = np.zeros(_LENS + shared.size)
@@ -154,7 +157,7 @@ def fit_spectra(
 def held_cost(patches: Sequence[PatchView], front: Wavefront) -> float:
     """What patches cost behind a lens that was made without them; what those of a photo share is fitted."""
     photos = sorted({patch.photo for patch in patches})
-    problem = _Problem(tuple(patches), {name: i for i, name in enumerate(photos)}, front, coarse=False)
+    problem = _PooledProblem(tuple(patches), {name: i for i, name in enumerate(photos)}, front, coarse=False)
     lens = np.concatenate([front.terms, open_eye(np.asarray(front.eye))])
     shared = np.zeros((len(photos), len(PATCHES.photo_spread)))
     held = np.zeros(_LENS + shared.size)
@@ -190,7 +193,9 @@ def phase_costs(patches: Sequence[PatchView], front: Wavefront) -> tuple[float, 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Problem:
+class _PooledProblem:
+    """The patches of all photos, and where the fit to them begins."""
+
     patches: tuple[PatchView, ...]
     photos: dict[str, int]
     begin: Wavefront
@@ -201,14 +206,14 @@ class _Problem:
         eye = (float(lens[-2]), float(lens[-1]))
         return replace(self.begin, terms=lens[: len(NAMES)].copy(), eye=eye)
 
-    def moved(self, state: _State, step: Floats) -> _State:
+    def moved(self, state: _PooledState, step: Floats) -> _PooledState:
         """Where a step leads, made shorter if it is too bold."""
         step = step * min(1.0, _STRIDE_PX / max(float(np.abs(step[: len(NAMES)]).max()), 1e-9))
         lens = state.lens + step[:_LENS]
         lens[-2:] = open_eye(lens[-2:])
         return self.state(lens, state.shared + step[_LENS:].reshape(state.shared.shape), state.scenes)
 
-    def state(self, lens: Floats, shared: Floats, scenes: list[Floats] | None) -> _State:
+    def state(self, lens: Floats, shared: Floats, scenes: list[Floats] | None) -> _PooledState:
         """Cost with its normal equations; `scenes` are the patches' unknowns to begin with."""
         count = _LENS + shared.size
         normal, gradient = np.zeros((count, count)), np.zeros(count)
@@ -230,8 +235,8 @@ class _Problem:
             normal[np.ix_(places, places)] += weight * own_normal
             gradient[places] += weight * own_gradient
             for channel, (phase, by_phase) in phases.items():
-                told, by_both, downhill = phase_terms(patch.phases[channel], phase, by_phase)
-                cost += told
+                phase_cost, by_both, downhill = phase_terms(patch.phases[channel], phase, by_phase)
+                cost += phase_cost
                 normal[:_LENS, :_LENS] += by_both
                 gradient[:_LENS] += downhill
             scenes_after.append(fitted.z)
@@ -242,7 +247,7 @@ class _Problem:
         normal[:_LENS, :_LENS] += curvature
         normal[range(_LENS, count), range(_LENS, count)] += vote
         gradient -= np.concatenate([pull, vote * shared.ravel()])
-        return _State(lens, shared, cost, normal, gradient, scenes_after, np.array(trust))
+        return _PooledState(lens, shared, cost, normal, gradient, scenes_after, np.array(trust))
 
 
 def expected(

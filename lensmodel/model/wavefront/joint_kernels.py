@@ -51,12 +51,13 @@ MIN_PLACES: Final = 8
 _NARROW_PLACES, _STOPPED_DOWN = 24, 2.0
 """Patches at most of photos stopped down, and the multiple of the widest f-number from which on they are (two
 stops). With all of them, five such photos take back what one adds (`lensmodel.lab.chain.stopped_down`)."""
-_STARTS = 6  # by moments, for the search (chosen)
-_FIRST = 16  # samples of the first fit to kernels (chosen)
+_STARTS = 6  # by moments, for the search: each further one is less likely and costs as much (chosen)
+_FIRST = 16  # samples of the first fit to kernels: it only gives a place to begin (chosen)
 _MOST_SINGLE = 2  # photos that are fitted alone (chosen: each costs as much as a whole fit of one)
 _JUDGED = 4  # minima that are judged by patches left out (chosen: each costs some seconds)
 _JUDGEMENT = 15  # steps of a fit that judging one is worth, for the progress
-_LAST_ROUNDS = 10  # steps of the fit with phases at most, from where it ended without them (chosen)
+_LAST_ROUNDS = 10
+"""Steps of the fit with phases at most: it begins where it ended without them, near its end (chosen)."""
 _TAIL_SIDE = 31  # pixels of kernels whose third moments count: wider wings are noise to them (chosen)
 # Places and draws that tell the scatter: each draw costs a kernel a place (chosen)
 _ERROR_PLACES, _DRAWS = 14, 6

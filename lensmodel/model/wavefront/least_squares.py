@@ -21,17 +21,19 @@ from lensmodel.optics.wavefront import NAMES, Wavefront, design, stopped
 
 Floats = NDArray[np.float64]
 
-_NOISE = 0.1  # relative L2 that a good sample has against the best wavefront (chosen)
+_NOISE = 0.1
+"""Relative L2 that a good sample has against the best wavefront: more gives the prior of aberrations a larger
+part, less none (chosen)."""
 _HUBER = 0.35  # relative error: that of a usual estimate (chosen)
 _ENOUGH = 2e-3  # of the cost: less gained in a step ends the fit (chosen)
 # Of the differences that stand for derivatives: by the cat's eye, whose edge is one sample of the pupil wide,
 # and by the width of diffraction (chosen)
 _EYE_STEP, _LOG_Q_STEP = 0.02, 0.05
-_TRIES = 4  # steps with more damping before the fit ends (chosen)
+_TRIES = 4  # steps with more damping before the fit ends: by then they are too short to gain (chosen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _State:
+class _FrontFit:
     """A wavefront with the tilts of its samples, and which way down."""
 
     front: Wavefront
@@ -60,7 +62,7 @@ class WavefrontProblem:
         votes = np.array([s.weight for s in self.samples])
         designs = [design(s.position, s.settings) for s in self.samples]
 
-        def moved(state: _State, step: Floats) -> _State:
+        def moved(state: _FrontFit, step: Floats) -> _FrontFit:
             tilts = state.tilts + np.stack([-(a + b @ step) for a, b in state.follows])
             return self._linearised(_moved(state.front, step), tilts, designs, wanted, norms, votes)
 
@@ -92,7 +94,7 @@ class WavefrontProblem:
         wanted: Sequence[Floats],
         norms: Floats,
         votes: Floats,
-    ) -> _State:
+    ) -> _FrontFit:
         """Cost about a wavefront, and its normal equations."""
         slopes = np.empty(0) if front.slopes is None else front.slopes
         count = len(NAMES) + 3 + slopes.size  # log q and the cat's eye
@@ -127,7 +129,7 @@ class WavefrontProblem:
             cost += votes[i] * flat / _NOISE**2
             locals_.append((own, follows))
         assert normal.shape == (count, count)
-        return _State(front, tilts, cost, normal, -uphill, errors, locals_)
+        return _FrontFit(front, tilts, cost, normal, -uphill, errors, locals_)
 
     def _columns(
         self,

@@ -41,7 +41,9 @@ from lensmodel.optics.wavefront import Wavefront
 
 _MOST = 240  # samples of the remainder's process: its cost grows with their cube (chosen)
 _USUAL_SIDE = 31  # pixels: larger kernels are estimated where blur is known to reach far (chosen)
-_AROUND = 6  # pixels beyond the side that was fitted, for corners wider than every sample (chosen)
+_AROUND = 6
+"""Pixels beyond the side that was fitted, for corners wider than every sample: more is rendered for nothing
+(chosen)."""
 _NOTHING_LEFT = 1e3  # a nugget so large that the wavefront answers alone (chosen: rests count a thousandth)
 _WORST = 1.5  # relative errors beyond count no more than this: one outlier chooses nothing (chosen)
 _ALIKE = 1e-7  # covariance below which a sample is left out of an answer: below single precision (chosen)

@@ -42,9 +42,13 @@ _COARSE_ROUNDS, _MEDIUM_ROUNDS, _FINE_ROUNDS, _HELD_ROUNDS = 7, 6, 16, 5
 # Minima kept of the coarse search, and those fitted in full (chosen: each of the last costs seconds)
 _KEPT, _REFINED, _REFINED_OF_PAIR = 12, 4, 2
 _FEWEST_PAIRED, _MOST_PAIRS = 3, 2  # photos, and pairs of them (chosen: two photos are a pair themselves)
-_RANDOM = 24  # random wavefronts to begin with (chosen)
+_RANDOM = 24
+"""Random wavefronts to begin with: enough to meet minima that nothing else leads to; each costs a few steps
+(chosen)."""
 _SAME_PX = 0.4  # pixels of blur: terms nearer than that lie in one minimum (chosen)
-_ASIDE, _DIRECTIONS = 0.35, 8  # half-diagonals by which a field is centred elsewhere, and ways to go (chosen)
+_ASIDE, _DIRECTIONS = 0.35, 8
+"""Half-diagonals by which a field is centred elsewhere, and ways to go: as much as a badly decentred lens is
+off, in steps of 45 degrees (chosen)."""
 _SEED = 0  # any number: fits repeat to the bit
 
 

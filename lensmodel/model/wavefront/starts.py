@@ -18,8 +18,12 @@ from lensmodel.core.descent import Descent
 from lensmodel.core.psf import PsfSample, second_moments
 from lensmodel.optics.pupil import ray_gradients
 
-_RAYS = 11  # across the pupil (chosen)
-_BEGINNINGS, _TRIES = 24, 25  # at random, and steps that are tried from each (chosen)
+_RAYS = 11
+"""Across the pupil: enough for moments that only give a beginning; the cost grows with its square
+(chosen)."""
+_BEGINNINGS, _TRIES = 24, 25
+"""At random, and steps that are tried from each: moments are cheap, and most descents end earlier
+(chosen)."""
 _ENOUGH = 1e-4  # of the cost: less gained in a step ends a descent (chosen)
 _SEED = 0  # any number: fits repeat to the bit
 _FLOOR = 1e-9  # of the diagonal that is damped: far below any that counts (chosen)
@@ -27,7 +31,9 @@ _LEVEL = 0.01  # of the peak: fainter pixels are noise to a second moment (chose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _State:
+class _SpotFit:
+    """Unknowns of a wavefront, and how well the moments of its ray spots are those of the samples."""
+
     terms: NDArray[np.float64]
     cost: float
     normal: NDArray[np.float64]
@@ -115,7 +121,7 @@ def _descended(
     ridge = 0.02 * np.sqrt(scale) / prior_px
     two, three = 1.0 / scale, 0.3 / scale**1.5
 
-    def about(t: NDArray[np.float64]) -> _State:
+    def about(t: NDArray[np.float64]) -> _SpotFit:
         x, y = np.einsum("nmr,m->nr", by_x, t), np.einsum("nmr,m->nr", by_y, t)
         pairs = [(x * x, [(2 * x, None)]), (y * y, [(None, 2 * y)]), (x * y, [(y, x)])]
         cubes = [
@@ -137,7 +143,7 @@ def _descended(
         values.append(ridge * t)
         slopes.append(np.diag(ridge))
         miss, change = np.concatenate(values), np.concatenate(slopes)
-        return _State(t, float(miss @ miss), change.T @ change, -(change.T @ miss))
+        return _SpotFit(t, float(miss @ miss), change.T @ change, -(change.T @ miss))
 
     descent = Descent(_TRIES, _TRIES, enough_of_cost=_ENOUGH, floor=_FLOOR, most_tries=_TRIES)
     state = descent.down(about(terms), lambda state, step: about(state.terms + step))

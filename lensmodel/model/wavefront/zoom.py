@@ -22,7 +22,9 @@ from lensmodel.model.wavefront.from_kernels import MIN_SAMPLES, ONE_FOCAL_LENGTH
 from lensmodel.model.wavefront.physical_mean import Physics
 from lensmodel.optics.wavefront import Wavefront
 
-_REACH_OCTAVES, _SILENT = 0.15, 1e-3  # Gaussian width of an end's say, and a say that is none (chosen)
+_REACH_OCTAVES, _SILENT = 0.15, 1e-3
+"""Gaussian width of an end's say: a tenth of a focal length, over which a zoom changes little; and a say that
+is none, since it changes nothing that is seen (chosen)."""
 _HALVES = 2  # of the samples, each foretold by the other (chosen: the fewest fits)
 _CLEARLY = 0.9  # of the error alone: others must help by a tenth (chosen)
 

@@ -59,7 +59,7 @@ class Overwrite:
 
 
 @dataclass(frozen=True, slots=True)
-class FoundLocation:
+class LocationTraces:
     """Where a file says where it was taken.
 
     Parameters
@@ -74,7 +74,7 @@ class FoundLocation:
     complete: bool
 
 
-def find_location(buffer: Buffer) -> FoundLocation:
+def find_location(buffer: Buffer) -> LocationTraces:
     """Find what a photo file says of the place where it was taken.
 
     Parameters
@@ -84,7 +84,7 @@ def find_location(buffer: Buffer) -> FoundLocation:
 
     Returns
     -------
-    FoundLocation
+    LocationTraces
         What to write over it; applied, the same search finds nothing.
 
     Notes
@@ -119,7 +119,7 @@ def find_location(buffer: Buffer) -> FoundLocation:
     spans = [span for span in spans if bytes(buffer[span.start : span.start + len(span.data)]) != span.data]
     if chunks:
         spans = _with_checksums(buffer, chunks, spans)
-    return FoundLocation(tuple(spans), complete)
+    return LocationTraces(tuple(spans), complete)
 
 
 def _places(buffer: Buffer, mark: bytes) -> Iterator[int]:

@@ -136,9 +136,9 @@ def test_a_second_owner_finds_nothing_of_the_first_on_any_route(
         named = any(value in address for value in ids.values())
         if named:
             assert answer.status_code in {404, 405}, (method, address, answer.text)
-        told = {word for word in secrets if word in answer.text}
+        shown = {word for word in secrets if word in answer.text}
         asked = {word for word in ids.values() if word in address or word in str(options)}
-        assert told <= asked, (method, address, answer.text)
+        assert shown <= asked, (method, address, answer.text)
     assert len({address for _, address, _ in walked}) >= 40
     assert sum(any(value in address for value in ids.values()) for _, address, _ in walked) >= 100
 

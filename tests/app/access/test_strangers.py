@@ -23,6 +23,7 @@ sys.path.remove(str(HERE))
 
 from app.http import psf_formats  # noqa: E402
 from app.http.bodies import MAX_JSON_BYTES  # noqa: E402
+from app.http.picture_cache import DrawnPicture  # noqa: E402
 from app.main import create_app  # noqa: E402
 from app.runtime import logs  # noqa: E402
 from app.runtime.settings import Settings  # noqa: E402
@@ -361,7 +362,7 @@ def test_a_map_of_the_field_is_drawn_once_for_each_version(
     lens, drawn = steps.lens_id(steps.counted()), []
     really = psf_formats.field_map
 
-    def field_map(*arguments: Any, **options: Any) -> bytes:
+    def field_map(*arguments: Any, **options: Any) -> DrawnPicture:
         drawn.append(options["columns"])
         return really(*arguments, **options)
 

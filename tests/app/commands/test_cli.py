@@ -269,11 +269,24 @@ def test_psf_writes_files_that_open(folder: Path, suffix: str) -> None:
 
 def test_psf_says_what_made_the_answer_and_why(folder: Path) -> None:
     words = ["psf", str(folder / PROFILE), "--size", "15"]
-    said, told = (CliRunner().invoke(app, [*words, *more]).output for more in ([], ["--json"]))
+    said, document = (CliRunner().invoke(app, [*words, *more]).output for more in ([], ["--json"]))
 
-    support = json.loads(told)["support"]
+    support = json.loads(document)["support"]
     assert (support["answered_by"], support["reason"]) == ("regression", "no patch has a spectrum")
     assert "answered by regression: no patch has a spectrum" in " ".join(said.split())
+
+
+@pytest.mark.parametrize("suffix", ["tif", "png"])
+def test_a_picture_of_a_psf_says_what_made_it(folder: Path, suffix: str) -> None:
+    target = folder / f"corner.{suffix}"
+    result = CliRunner().invoke(app, ["psf", str(folder / PROFILE), "--size", "15", "-o", str(target)])
+
+    assert result.exit_code == 0, result.output
+    with Image.open(target) as picture:
+        text = picture.info["Description"] if suffix == "png" else picture.tag_v2[270]  # type: ignore[attr-defined]  # of a TIFF
+    about = json.loads(text)
+    assert about["support"]["answered_by"] == "regression"
+    assert "psf" not in about
 
 
 def test_two_runs_on_one_profile_drop_nothing_of_each_other(
@@ -574,13 +587,13 @@ def test_a_profile_keeps_the_unit_that_it_was_told_and_modes_are_gone(
     folder: Path, here: Here, few_patches: None, estimated_here: None, short_search: None
 ) -> None:
     words = ("calibrate", "one.dng", "-p", PROFILE, "--estimator", "whittle", "--workers", "1", "--json")
-    told = json.loads(here(*words, "--any-lens", "--unit", "half-diagonal").stdout)
+    result = json.loads(here(*words, "--any-lens", "--unit", "half-diagonal").stdout)
 
     kept = load_profile(folder / PROFILE).model
     assert (kept.settings.mode, kept.settings.unit) == ("both", "half-diagonal")
     again = json.loads(here(*words, "--any-lens").stdout)
     assert again["results"][0]["state"] == "known"
-    assert again["model"] == told["model"] == "default"
+    assert again["model"] == result["model"] == "default"
     refused = here(*words, "--mode", "kernels")
     assert refused.returncode == 2
     assert "--model" in refused.stderr
@@ -592,11 +605,11 @@ def test_a_lens_learned_the_papers_way_stays_so_and_is_corrected_so(
     new = "paper.lensprofile"
     words = ("calibrate", "one.dng", "-p", new, "--workers", "1", "--any-lens", "--json")
     quick = ("--estimator", "whittle", "--kernel-size", "21")
-    told = json.loads(here(*words, *quick, "--model", "paper").stdout)
+    result = json.loads(here(*words, *quick, "--model", "paper").stdout)
 
     kept = load_profile(folder / new).model
     sides = {sample.kernel.shape for sample in kept.samples}
-    assert (told["model"], kept.settings.mode, max(sides)) == ("paper", "paper", (21, 21))
+    assert (result["model"], kept.settings.mode, max(sides)) == ("paper", "paper", (21, 21))
     assert json.loads(here(*words, *quick).stdout)["model"] == "paper"
     assert here("correct", "one.dng", "-p", new, "-o", "out").returncode == 0
     with Image.open(folder / "out" / "one-corrected.tif") as written:

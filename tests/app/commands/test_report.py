@@ -59,7 +59,14 @@ def test_the_report_speaks_of_sharpness_centring_aperture_and_the_next_photo(fol
     text = run("report", NAME)
 
     assert text.startswith("3 photos, 60 samples; f/2, channel g\n")
-    for words in ("MTF50 lies between", "centred", "sharpest at f/5.6", "something with fine detail"):
+    answered = "answered by regression: no patch has a spectrum"
+    for words in (
+        "MTF50 lies between",
+        "centred",
+        "sharpest at f/5.6",
+        "something with fine detail",
+        answered,
+    ):
         assert words in text
 
 
@@ -94,6 +101,11 @@ def test_the_report_folder_holds_numbers_and_pictures_that_agree(folder: Path, g
     for name in names:
         if name.endswith(".svg"):
             ET.fromstring((folder / "out" / name).read_text(encoding="utf-8"))
+    with (folder / "out" / "lens-test.csv").open(encoding="utf-8", newline="") as file:
+        tested = [row for row in csv.DictReader(file) if row["quantity"] == "MTF50"]
+    made = {("regression", "no patch has a spectrum")}
+    for places in (rows, stored["report"]["field"], tested):
+        assert {(place["answered_by"], place["reason"]) for place in places} == made
 
 
 def test_files_that_are_there_are_kept_without_force(folder: Path) -> None:
@@ -121,6 +133,16 @@ def test_an_exported_stack_holds_the_answers_of_the_profile(folder: Path) -> Non
     first = model.query(FieldPosition(math.hypot(x, y), math.atan2(y, x)), LensSettings(aperture=2.0), 15)
     assert pages.shape == (6, 15, 15)
     assert pages[0] == pytest.approx(first.kernel, abs=1e-7)
+
+
+def test_a_bare_matrix_is_accompanied_by_words_on_who_answered(folder: Path) -> None:
+    place = ("export", NAME, "--r", "0.5", "-o")
+    result = CliRunner().invoke(app, [*place, "one.json"])
+    document = json.loads(run(*place, "two.json", "--json"))
+
+    assert result.stdout == "one.json\n"
+    assert result.stderr == "lensmodel: answered by regression: no patch has a spectrum\n"
+    assert document["answered"] == "answered by regression: no patch has a spectrum"
 
 
 def test_a_comparison_needs_a_folder(folder: Path) -> None:

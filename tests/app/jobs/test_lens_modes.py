@@ -177,8 +177,8 @@ def test_warm_answers_cost_one_read_of_the_tables(client: TestClient, taken: Cal
     services.models.get(lens)
     statements: list[str] = []
 
-    def note(*told: Any) -> None:
-        statements.append(str(told[2]))
+    def note(*arguments: Any) -> None:
+        statements.append(str(arguments[2]))
 
     event.listen(services.store.database.reader, "before_cursor_execute", note)
     psf(client, lens, r=0.7)

@@ -175,7 +175,7 @@ def test_a_worker_keeps_its_lease_while_its_engine_starts(
     monkeypatch.setattr(worker, "_engine", Slow())
     monkeypatch.setattr(worker, "_settings", worker._settings.model_copy(update={"lease_seconds": 1.0}))
     monkeypatch.setattr(worker, "_leave", lambda: None)
-    monkeypatch.setattr(worker, "_bury_the_gone", lambda _: None)
+    monkeypatch.setattr(worker, "_take_over_gone", lambda _: None)
 
     worker.run()
 

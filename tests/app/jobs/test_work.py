@@ -107,7 +107,7 @@ class Scripted:
         self.files: set[str] = set()
         self.answers: dict[str, list[Answer]] = {
             "inspect": [ok(INFO)],
-            "glance": [refused("unsupported_format")],  # a photo without a small picture goes on
+            "thumbnail": [refused("unsupported_format")],  # a photo without a small picture goes on
             "report": [refused("no_samples")],  # and so does a lens without a report
             "develop": [develop],
             "select": [ok({"patches": [patch(0), patch(1)], "rejected": [], "lateral": None})],
@@ -386,7 +386,7 @@ def test_a_photo_without_serial_waits_for_its_owner(
     waiting = steps.fresh(photo)
     assert (waiting.state, waiting.error_code) == ("needs_lens", "metadata_missing")
     assert "choose a lens" in waiting.error_detail
-    assert sandbox.ran == ["inspect", "glance"]
+    assert sandbox.ran == ["inspect", "thumbnail"]
 
 
 def test_a_photo_without_aperture_waits_and_says_so(
@@ -409,7 +409,7 @@ def test_a_photo_to_be_stored_only_is_not_developed(
     work.photo(photo.public_id, 1)
 
     assert steps.fresh(photo).state == "stored"
-    assert sandbox.ran == ["inspect", "glance"]
+    assert sandbox.ran == ["inspect", "thumbnail"]
 
 
 @pytest.mark.parametrize(
@@ -706,31 +706,31 @@ def test_a_family_is_fitted_once_until_one_of_its_copies_changes(
 def test_a_photographers_bounds_reach_the_correction_and_its_tag(
     context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any
 ) -> None:
-    told: list[dict[str, Any]] = []
+    given: list[dict[str, Any]] = []
 
     def keep(arguments: dict[str, Any], folder: Path) -> Outcome:
-        told.append(arguments)
+        given.append(arguments)
         return write_result(arguments, folder)
 
     sandbox.answers["correct"] = [keep, keep]
     for bounds in ({}, {"halo": 0.2, "denoise": 0.5}):
         CorrectionWork(context).correction(ask(context, counted, steps, **bounds))
 
-    assert [one["bounds"] for one in told] == [{}, {"halo": 0.2, "denoise": 0.5}]
-    assert told[0]["description"].endswith("strength 1")
-    assert told[1]["description"].endswith("strength 1, halo 0.2, denoised 0.5")
+    assert [one["bounds"] for one in given] == [{}, {"halo": 0.2, "denoise": 0.5}]
+    assert given[0]["description"].endswith("strength 1")
+    assert given[1]["description"].endswith("strength 1, halo 0.2, denoised 0.5")
 
 
 def test_the_model_of_a_lens_decides_how_its_photos_are_estimated(
     work: PhotoWork, context: JobContext, sandbox: Scripted, steps: Any
 ) -> None:
-    told = []
+    used = []
     for photo in (received(context, steps), received(context, steps, model="paper", lens_serial="other")):
         work.photo(photo.public_id, 1)
         assert steps.fresh(photo).state == "counted"
-        told.append((sandbox.seen["estimate"]["estimator"], sandbox.seen["estimate"]["size"]))
+        used.append((sandbox.seen["estimate"]["estimator"], sandbox.seen["estimate"]["size"]))
 
-    assert told == [("default", 31), ("michaeli-irani", 55)]
+    assert used == [("default", 31), ("michaeli-irani", 55)]
 
 
 def test_a_photo_that_asks_for_another_model_than_its_lens_has_says_what_to_do(

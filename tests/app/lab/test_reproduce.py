@@ -106,11 +106,11 @@ def test_lens_is_learned_and_corrected_by_a_real_service(tmp_path: Path) -> None
     chosen = Reproduction(
         (one,), estimator="whittle", methods=("standard",), size="quick", paper=False, general=False
     )
-    told: list[str] = []
+    messages: list[str] = []
 
     def on_work(words: str, done: float, total: float, *, fresh: bool) -> None:
         del done, total, fresh
-        told.append(words)
+        messages.append(words)
 
     made = run_reproduction(
         chosen,
@@ -128,7 +128,7 @@ def test_lens_is_learned_and_corrected_by_a_real_service(tmp_path: Path) -> None
     assert after["edges"]["center"]["mtf50"] > before["edges"]["center"]["mtf50"]
     assert after["psnr"]["center"] > before["psnr"]["center"]
     assert unit["psf"]["rel_l2"]["g"]["center"] < 1.0
-    assert any(re.search("learned from photo-00", words) for words in told)
+    assert any(re.search("learned from photo-00", words) for words in messages)
     assert not list(tmp_path.rglob("service"))
 
 

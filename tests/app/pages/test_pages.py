@@ -277,10 +277,10 @@ def test_an_aperture_is_asked_for_where_photos_do_not_say_it(
     group = page.locator("[data-group]")
     group.get_by_label("Or a new one, called").fill("Old 50 mm")
 
-    for given, told in (("", "such as 2.8"), ("1000", "between 0.5 and 128"), ("wide", "must be a number")):
+    for given, hint in (("", "such as 2.8"), ("1000", "between 0.5 and 128"), ("wide", "must be a number")):
         group.get_by_label("Aperture, f/").fill(given)
         group.get_by_role("button", name="Continue").click()
-        expect(group.locator(".alert")).to_contain_text(told)
+        expect(group.locator(".alert")).to_contain_text(hint)
     assert service.http.delete(f"/v1/photos/{sent['id']}").status_code == 204
 
 
@@ -349,10 +349,12 @@ def test_a_lens_shows_its_blur_at_any_place_aperture_and_colour(page: Page, lear
     with page.expect_response(lambda answer: "view=" in answer.url and "0.5" in answer.url) as closer:
         page.locator("#field-controls").get_by_role("button", name="Larger").click()
     assert closer.value.ok
-    with page.expect_response(lambda answer: "channel=b" in answer.url and "field.png" in answer.url) as told:
+    with page.expect_response(
+        lambda answer: "channel=b" in answer.url and "field.png" in answer.url
+    ) as answered:
         page.get_by_label("Colour").select_option("b")
 
-    assert told.value.ok
+    assert answered.value.ok
     expect(page.locator("#psf-numbers")).to_contain_text("Width of a point")
     expect(page.locator("#psf-npy")).to_have_attribute("href", re.compile("channel=b"))
 

@@ -18,7 +18,7 @@ from starlette.testclient import TestClient
 from app.blobs.storage import Storage
 from app.jobs import tasks
 from app.jobs.body_keys import body_key
-from app.jobs.task_files import AFTER, BEFORE, GLANCE, PREVIEW, R_MAP
+from app.jobs.task_files import AFTER, BEFORE, PREVIEW, R_MAP, THUMBNAIL
 from app.pages.groups import grouped
 from app.pages.pictures import in_sensor, upright_point
 from app.runtime.settings import Settings
@@ -152,24 +152,24 @@ def test_a_part_of_the_upright_photo_is_found_on_the_sensor(orientation: int) ->
     assert turned[row, col] == sensor[found.y, found.x]
 
 
-def test_a_photo_is_glanced_at_before_it_is_developed(
+def test_a_photo_has_a_thumbnail_before_it_is_developed(
     client: TestClient, steps: Steps, settings: Settings, tmp_path: Path
 ) -> None:
     photo = steps.receive()
-    address = f"/ui/photos/{photo.public_id}/glance.jpg"
+    address = f"/ui/photos/{photo.public_id}/thumbnail.jpg"
     assert client.get(address).headers["content-type"] == "image/svg+xml"  # nothing to see yet
     exif = Image.Exif()
     exif[0x0112] = 6
     Image.fromarray(a_picture()).save(tmp_path / "p.jpg", exif=exif)
     arguments = {"path": str(tmp_path / "p.jpg"), "kind": "jpeg", "orientation": 6}
-    tasks.glance(arguments, tmp_path, ignore_step)
-    Storage(settings.storage).put_file(f"{photo_folder(photo)}{GLANCE}", tmp_path / GLANCE)
+    tasks.thumbnail(arguments, tmp_path, ignore_step)
+    Storage(settings.storage).put_file(f"{photo_folder(photo)}{THUMBNAIL}", tmp_path / THUMBNAIL)
 
     assert opened(client, address).size == (258, 480)
 
 
 @pytest.mark.parametrize("kind", ["tiff", "png", "dng"])
-def test_every_kind_of_photo_has_a_glance(kind: str, tmp_path: Path) -> None:
+def test_every_kind_of_photo_has_a_thumbnail(kind: str, tmp_path: Path) -> None:
     path = tmp_path / f"p.{kind}"
     if kind == "tiff":
         tifffile.imwrite(path, a_picture().astype(np.uint16) * 257)
@@ -178,9 +178,9 @@ def test_every_kind_of_photo_has_a_glance(kind: str, tmp_path: Path) -> None:
     else:
         write_bayer_dng(path, np.full((64, 96), 3000, np.uint16), black=512, white=15512)
 
-    tasks.glance({"path": str(path), "kind": kind, "orientation": 1}, tmp_path, ignore_step)
+    tasks.thumbnail({"path": str(path), "kind": kind, "orientation": 1}, tmp_path, ignore_step)
 
-    with Image.open(tmp_path / GLANCE) as picture:
+    with Image.open(tmp_path / THUMBNAIL) as picture:
         assert picture.width > picture.height > 16
 
 

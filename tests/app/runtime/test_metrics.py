@@ -37,14 +37,14 @@ def test_depth_and_age_of_the_queue_are_those_of_the_tables(client: TestClient, 
     begun = steps.receive()
     steps.inspect(begun)
 
-    told = asked(client)
+    values = asked(client)
 
-    assert told["lensmodel_queue_jobs{'kind': 'photo', 'state': 'received'}"] == 1
-    assert told["lensmodel_queue_jobs{'kind': 'photo', 'state': 'inspecting'}"] == 1
-    assert told["lensmodel_queue_jobs{'kind': 'correction', 'state': 'queued'}"] == 0
-    assert 0 < told["lensmodel_queue_oldest_seconds{'kind': 'photo'}"] < 60
-    assert told["lensmodel_workers{}"] == 0
-    assert told["lensmodel_rows{'table': 'photo'}"] == 2
+    assert values["lensmodel_queue_jobs{'kind': 'photo', 'state': 'received'}"] == 1
+    assert values["lensmodel_queue_jobs{'kind': 'photo', 'state': 'inspecting'}"] == 1
+    assert values["lensmodel_queue_jobs{'kind': 'correction', 'state': 'queued'}"] == 0
+    assert 0 < values["lensmodel_queue_oldest_seconds{'kind': 'photo'}"] < 60
+    assert values["lensmodel_workers{}"] == 0
+    assert values["lensmodel_rows{'table': 'photo'}"] == 2
 
 
 def test_requests_and_psf_queries_are_counted_by_route_and_never_by_id(
@@ -79,14 +79,14 @@ def test_what_workers_leave_in_files_is_told_by_the_api_and_added_up(
     for worker in ("one", "two"):
         metrics.leave(settings.data_dir, worker)
 
-    told = asked(client)
+    values = asked(client)
 
     for name in (
         "lensmodel_job_seconds_count{'ending': 'done', 'kind': 'photo'}",
         "lensmodel_job_retries_total{'cause': 'outage', 'kind': 'photo'}",
     ):
         assert own[name] >= 1
-        assert told[name] == 2 * own[name]
+        assert values[name] == 2 * own[name]
 
 
 def test_numbers_of_workers_long_gone_are_forgotten(tmp_path: Path) -> None:

@@ -114,23 +114,23 @@ def test_postgresql_tells_of_changes_by_itself_and_again_after_it_was_away(
 ) -> None:
     _, there, _ = far
     upgrade(there.database)
-    busy, told = type(steps)(there), threading.Event()
-    notices = Notices(there.database, told.set)
+    busy, notified = type(steps)(there), threading.Event()
+    notices = Notices(there.database, notified.set)
 
     def hears_of(change: Callable[[], object]) -> bool:
-        told.clear()
+        notified.clear()
         change()
-        return told.wait(stretched(60))
+        return notified.wait(stretched(60))
 
     notices.start()
     try:
-        assert told.wait(stretched(60))  # it listens
+        assert notified.wait(stretched(60))  # it listens
         photo = busy.receive()
         assert hears_of(lambda: there.photos.cancel(photo.public_id))
-        told.clear()
+        notified.clear()
         servers[0].stop()
         servers[0].start()
-        assert told.wait(stretched(60))
+        assert notified.wait(stretched(60))
         assert hears_of(busy.receive)
     finally:
         notices.stop()

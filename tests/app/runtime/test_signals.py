@@ -13,11 +13,11 @@ import pytest
 WAITS = """
 import threading
 from app.runtime.signals import on_signals
-told = threading.Event()
-on_signals(lambda number: (print(number.name, flush=True), told.set()))
+arrived = threading.Event()
+on_signals(lambda number: (print(number.name, flush=True), arrived.set()))
 print("ready", flush=True)
-while not told.is_set():
-    told.wait(1e-7)
+while not arrived.is_set():
+    arrived.wait(1e-7)
 """
 
 

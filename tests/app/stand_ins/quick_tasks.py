@@ -63,8 +63,8 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) ->
         for channel in CHANNELS
     ]
     write_samples(folder, samples)
-    told = {"worker": float(os.getppid())}  # its fork server: one of each worker
-    return [{"idx": arguments["numbers"][0], "diagnostics": told} for _ in samples]
+    origin = {"worker": float(os.getppid())}  # its fork server: one of each worker
+    return [{"idx": arguments["numbers"][0], "diagnostics": origin} for _ in samples]
 
 
 def measure(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:

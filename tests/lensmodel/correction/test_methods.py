@@ -396,12 +396,12 @@ def test_standard_method_does_not_ring_around_clipped_lights(light: float) -> No
     far = ~ndimage.binary_dilation(photo > 0.98, iterations=8)
     noise = NoiseModel(1e-5, 1e-6)
 
-    told = SparseGradient().deconvolve(photo, blur, sensor=Sensor(noise, clip=0.98)).plane
-    untold = SparseGradient().deconvolve(photo, blur, sensor=Sensor(noise)).plane
+    aware = SparseGradient().deconvolve(photo, blur, sensor=Sensor(noise, clip=0.98)).plane
+    unaware = SparseGradient().deconvolve(photo, blur, sensor=Sensor(noise)).plane
 
-    assert rmse(told[dark], truth[dark]) < rmse(photo[dark], truth[dark])
-    assert rmse(told[far], truth[far]) < 0.85 * rmse(photo[far], truth[far])
-    assert rmse(told[dark], truth[dark]) < rmse(untold[dark], truth[dark])
+    assert rmse(aware[dark], truth[dark]) < rmse(photo[dark], truth[dark])
+    assert rmse(aware[far], truth[far]) < 0.85 * rmse(photo[far], truth[far])
+    assert rmse(aware[dark], truth[dark]) < rmse(unaware[dark], truth[dark])
 
 
 @pytest.mark.parametrize("alpha", [0.5, 2 / 3, 0.8, 1.0])

@@ -14,6 +14,7 @@ from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
 from lensmodel.model import LensModel, ModelSettings
 from lensmodel.model.fitting import Fit
 from lensmodel.model.modes import WAVEFRONT_SHARE
+from lensmodel.model.provenance import answerers_in_words
 from lensmodel.model.wavefront.physical_mean import FEW_SPECTRA, NO_AGREEMENT, SEVERAL_FOCAL_LENGTHS, Physics
 from lensmodel.model.wavefront.zoom import End
 from lensmodel.optics.wavefront import NAMES, Wavefront
@@ -164,3 +165,13 @@ def test_one_end_of_a_zoom_rests_on_its_own_photos() -> None:
     assert (there.answered_by, there.photos) == ("wavefront and regression", 1)
     assert (here.answered_by, here.photos) == ("regression", 1)
     assert "several focal lengths" in here.reason
+
+
+def test_words_name_one_answerer_alone_and_count_the_places_of_several() -> None:
+    one, other = ("regression", "fewer than 12 samples"), ("wavefront", "it was asked for")
+
+    assert answerers_in_words([one, one]) == "answered by regression: fewer than 12 samples"
+    assert answerers_in_words([one, other, other]) == (
+        "answered at 2 of 3 places by wavefront: it was asked for; at 1 of 3 places by regression: "
+        "fewer than 12 samples"
+    )

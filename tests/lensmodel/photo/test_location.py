@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image, PngImagePlugin
 
-from lensmodel.photo.tags.location import FoundLocation, find_location
+from lensmodel.photo.tags.location import LocationTraces, find_location
 
 LATITUDE = (47.0, 13.0, 14.159)
 SECRET = struct.pack(">II", 14159, 1000), struct.pack("<II", 14159, 1000)
@@ -41,7 +41,7 @@ def saved(kind: str, **options: Any) -> bytes:
     return out.getvalue()
 
 
-def cleaned(data: bytes) -> tuple[bytes, FoundLocation]:
+def cleaned(data: bytes) -> tuple[bytes, LocationTraces]:
     found = find_location(data)
     changed = bytearray(data)
     for one in found.overwrites:
@@ -154,8 +154,8 @@ def test_photos_that_say_nothing_are_not_touched(tmp_path: Path) -> None:
     path = tmp_path / "plain.tif"
     tifffile.imwrite(path, PIXELS)
 
-    assert find_location(path.read_bytes()) == FoundLocation((), complete=True)
-    assert find_location(saved("jpeg")) == FoundLocation((), complete=True)
+    assert find_location(path.read_bytes()) == LocationTraces((), complete=True)
+    assert find_location(saved("jpeg")) == LocationTraces((), complete=True)
 
 
 def test_a_file_of_nothing_but_exif_blocks_is_said_to_be_more_than_was_looked_at() -> None:

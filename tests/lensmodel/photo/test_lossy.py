@@ -60,7 +60,7 @@ def write_lossy_dng(
 
 @pytest.mark.parametrize(("fine", "coarse"), [(97, 85), (85, 60)])
 def test_the_tables_of_a_lossy_dng_say_its_noise(tmp_path: Path, fine: int, coarse: int) -> None:
-    told = []
+    variances = []
     for quality in (fine, coarse):
         write_lossy_dng(tmp_path / "x.dng", scene(), quality)
         developed = photo.develop(tmp_path / "x.dng")
@@ -68,15 +68,17 @@ def test_the_tables_of_a_lossy_dng_say_its_noise(tmp_path: Path, fine: int, coar
         assert developed.lossy
         coded = developed.coding_noise
         assert coded is not None
-        told.append(float(coded.variance(np.array(0.2))))
+        variances.append(float(coded.variance(np.array(0.2))))
         for noise in (*developed.correction_noise, *developed.coarse_noise):
-            assert noise.variance(np.array(0.2)) >= 0.999 * told[-1]
+            assert noise.variance(np.array(0.2)) >= 0.999 * variances[-1]
 
     def median_step(quality: int) -> float:
         table = Image.open(io.BytesIO(jpeg_tile(scene(), quality))).quantization[0]  # type: ignore[attr-defined]
         return float(np.median(table))
 
-    assert told[1] / told[0] == pytest.approx((median_step(coarse) / median_step(fine)) ** 2, rel=0.2)
+    assert variances[1] / variances[0] == pytest.approx(
+        (median_step(coarse) / median_step(fine)) ** 2, rel=0.2
+    )
 
 
 def test_the_noise_of_a_lossy_dng_is_the_error_that_rounding_made(tmp_path: Path) -> None:

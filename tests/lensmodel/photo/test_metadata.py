@@ -222,11 +222,11 @@ def test_the_pitch_of_a_photo_that_was_scaled_down_is_unknown(metadata_of: Read)
     assert metadata_of(jpeg_with({}, {0xA20E: IFDRational(5728, 1), 0xA210: 2})).pixel_pitch_um is None
 
 
-@pytest.mark.parametrize(("told", "pitch"), [(4.5, 4.5), (59.0, 59.0), (352.8, None)])
+@pytest.mark.parametrize(("written", "pitch"), [(4.5, 4.5), (59.0, 59.0), (352.8, None)])
 def test_the_pitch_of_a_small_mosaic_is_known_because_it_was_never_scaled(
-    told: float, pitch: float | None, tmp_path: Path
+    written: float, pitch: float | None, tmp_path: Path
 ) -> None:
-    shot, path = ShotInfo(pixel_pitch_um=told), tmp_path / "mosaic.dng"
+    shot, path = ShotInfo(pixel_pitch_um=written), tmp_path / "mosaic.dng"
     write_bayer_dng(path, np.full((64, 96), 600, np.uint16), black=512, white=4095, shot=shot)
 
     # 72 pixels to the inch, as some cameras write, is a sensor of nothing
@@ -347,13 +347,15 @@ def test_metadata_of_real_files_agree_with_exiftool(shared_data: Path) -> None:
     listing = subprocess.run(
         [program, "-j", "-n", *tags, *map(str, paths)], capture_output=True, check=True, text=True
     ).stdout
-    for path, told in zip(paths, json.loads(listing), strict=True):
+    for path, tags_read in zip(paths, json.loads(listing), strict=True):
         seen = photo.read_metadata(path)
-        assert (seen.aperture or 0) == pytest.approx(float(told.get("FNumber", 0))), path.name
-        assert (seen.focal_mm or 0) == pytest.approx(float(told.get("FocalLength", 0))), path.name
-        assert (seen.exposure_s or 0) == pytest.approx(float(told.get("ExposureTime", 0)), rel=1e-3), (
+        assert (seen.aperture or 0) == pytest.approx(float(tags_read.get("FNumber", 0))), path.name
+        assert (seen.focal_mm or 0) == pytest.approx(float(tags_read.get("FocalLength", 0))), path.name
+        assert (seen.exposure_s or 0) == pytest.approx(float(tags_read.get("ExposureTime", 0)), rel=1e-3), (
             path.name
         )
-        assert seen.orientation == told.get("Orientation", 1), path.name
+        assert seen.orientation == tags_read.get("Orientation", 1), path.name
         if seen.taken_at is not None:
-            assert seen.taken_at.strftime("%Y:%m:%d %H:%M:%S") == told["DateTimeOriginal"][:19], path.name
+            assert seen.taken_at.strftime("%Y:%m:%d %H:%M:%S") == tags_read["DateTimeOriginal"][:19], (
+                path.name
+            )

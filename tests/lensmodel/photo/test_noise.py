@@ -200,16 +200,16 @@ def test_the_coarseness_of_correlated_noise_is_what_its_spectrum_says(width: flo
 def test_noise_that_denoising_left_coarse_counts_more_than_that_of_demosaicing(tmp_path: Path) -> None:
     rng = np.random.default_rng(10)
     noise = [ndimage.gaussian_filter(rng.standard_normal((400, 400, 3)), (s, s, 0)) for s in (0.0, 1.6)]
-    told = []
+    ratios = []
     for grain in noise:
         numbers = np.rint(np.clip(30000 + 600 * grain / grain.std(), 0, 65535)).astype(np.uint16)
         tifffile.imwrite(tmp_path / "x.tif", numbers, photometric="rgb")
         developed = photo.develop(tmp_path / "x.tif")
         levels = np.array(0.2)
-        told.append([developed.correction_noise[1].variance(levels) / developed.noise[1].variance(levels)])
+        ratios.append([developed.correction_noise[1].variance(levels) / developed.noise[1].variance(levels)])
 
-    assert told[0] == pytest.approx([16.0])
-    assert told[1] == pytest.approx([64.0])
+    assert ratios[0] == pytest.approx([16.0])
+    assert ratios[1] == pytest.approx([64.0])
 
 
 def test_a_photo_with_its_mosaic_is_corrected_by_the_noise_of_the_sensor(tmp_path: Path) -> None:

@@ -312,7 +312,7 @@ def test_serials_positions_and_maker_notes_are_not_written(
 
 
 @pytest.fixture(scope="module")
-def told_by_exiftool(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
+def read_by_exiftool(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
     """What it says of a file of each format: to start it takes longer than to read one more."""
     program = shutil.which("exiftool")
     if program is None:
@@ -323,23 +323,23 @@ def told_by_exiftool(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict
         photo.write_image(folder / output, planes(), turned, format=output, description="corrected")
     files = [str(folder / output) for output in FORMATS]
     run = subprocess.run([program, "-j", "-n", *files], capture_output=True, check=True, text=True)
-    return {Path(told["SourceFile"]).name: told for told in json.loads(run.stdout)}
+    return {Path(read["SourceFile"]).name: read for read in json.loads(run.stdout)}
 
 
 @pytest.mark.tools
 @pytest.mark.parametrize("output", FORMATS)
 def test_exiftool_finds_no_fault_and_the_same_values(
-    told_by_exiftool: dict[str, dict[str, Any]], output: photo.OutputFormat
+    read_by_exiftool: dict[str, dict[str, Any]], output: photo.OutputFormat
 ) -> None:
-    told = told_by_exiftool[output]
+    read = read_by_exiftool[output]
 
-    assert "Error" not in told
-    assert "Warning" not in told
-    assert (told["FNumber"], told["FocalLength"], told["ISO"]) == (2.8, 24, 400)
-    assert told["LensModel"] == "EF24mm f/1.4L"
-    assert told["DateTimeOriginal"] == "2020:02:03 04:05:06"
-    assert told["Orientation"] == (1 if output.startswith("png") else 6)
-    assert "SerialNumber" not in told
+    assert "Error" not in read
+    assert "Warning" not in read
+    assert (read["FNumber"], read["FocalLength"], read["ISO"]) == (2.8, 24, 400)
+    assert read["LensModel"] == "EF24mm f/1.4L"
+    assert read["DateTimeOriginal"] == "2020:02:03 04:05:06"
+    assert read["Orientation"] == (1 if output.startswith("png") else 6)
+    assert "SerialNumber" not in read
 
 
 def test_skimage_and_pillow_read_the_numbers_that_we_read(tmp_path: Path) -> None:

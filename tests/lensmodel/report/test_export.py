@@ -124,17 +124,20 @@ def test_json_of_a_grid_holds_every_kernel_to_the_last_bit(psfs: PsfGrid, tmp_pa
 def test_each_place_says_which_model_answered_and_why(psfs: PsfGrid, tmp_path: Path) -> None:
     fits = importlib.import_module("astropy.io.fits")
     made = list(zip(psfs.answered_by, psfs.reason, strict=True))
-    for name in ("json", "tiff", "npz", "fits"):
+    for name in exporters:
         export(tmp_path / name, psfs, name)
 
-    with tifffile.TiffFile(tmp_path / "tiff") as written:
+    with tifffile.TiffFile(tmp_path / "tiff") as written, Image.open(tmp_path / "png") as sheet:
         texts = [(tmp_path / "json").read_text("utf-8"), written.pages.first.description]
+        texts.append(sheet.info["Description"])
     for text in texts:
         assert [(p["answered_by"], p["reason"]) for p in json.loads(text)["psfs"]] == made
     with np.load(tmp_path / "npz", allow_pickle=False) as stored, fits.open(tmp_path / "fits") as file:
         assert list(zip(stored["answered_by"], stored["reason"], strict=True)) == made
         table = file["POSITIONS"].data
         assert list(zip(table["ANSWERER"], table["REASON"], strict=True)) == made
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "csv").read_text("utf-8"))))
+    assert [(row["answered_by"], row["reason"]) for row in rows] == made
     assert made[0] == ("regression", "no patch has a spectrum")
 
 

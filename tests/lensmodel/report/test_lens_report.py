@@ -19,7 +19,7 @@ from lensmodel.model import LensModel, ModelSettings
 from lensmodel.quality import mtf50_from_kernel
 from lensmodel.report import LensReport, ReportSettings, decentring, lens_report
 from lensmodel.report.decentring import _CHANCE, EDGE_R, _exceeded_by_chance
-from lensmodel.report.lens_report import widths_along
+from lensmodel.report.field_shape import widths_along
 from lensmodel.report.places import grid, half_sides, ring
 from lensmodel.simulate import SimulatedLens, draw_lens
 

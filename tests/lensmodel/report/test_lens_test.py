@@ -161,8 +161,8 @@ def test_all_documents_hold_the_same_figures(soft: LensTest) -> None:
     assert {row["channel"] for row in rows} == {"r", "g", "b"}
     means = {f"MTF50, mean of {zone}": value for zone, value in soft.tested[0].zones.items()}
     assert {row["quantity"] for row in rows} == {"MTF50", "MTF", "width of a point", *means}
-    told = {row["quantity"]: float(row["value"]) for row in rows[:3]}
-    assert told == pytest.approx(means, rel=1e-5)
+    written = {row["quantity"]: float(row["value"]) for row in rows[:3]}
+    assert written == pytest.approx(means, rel=1e-5)
     assert soft.tested[0].zones == zone_means(soft.tested[0].report)
     pdf = to_pdf(soft)
     assert pdf.startswith(b"%PDF-")

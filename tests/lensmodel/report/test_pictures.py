@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -58,6 +59,21 @@ def test_the_map_marks_guesses_and_tells_of_the_centring(report: LensReport) -> 
     assert sum(text.endswith("?") for text in texts) == sum(p.extrapolated for p in report.field)
     assert report.decentring.text in " ".join(texts)
     assert max(len(text) for text in texts) <= 100
+
+
+@pytest.mark.parametrize(
+    ("draw", "begun"), [(mtf_map_svg, ("",)), (curves_svg, ("",)), (apertures_svg, ("f/2 ", "f/4 "))]
+)
+def test_pictures_say_which_model_answered(
+    report: LensReport, draw: Callable[[LensReport], str], begun: tuple[str, ...]
+) -> None:
+    root = ET.fromstring(draw(report))
+    texts = [e.text or "" for e in root.findall(f"{SVG}text")]
+    lowest = max(float(e.get("y", "")) for e in root.findall(f"{SVG}text"))
+
+    for words in begun:
+        assert f"{words}answered by regression: no patch has a spectrum" in texts
+    assert lowest < float(root.get("viewBox", "").split()[3])
 
 
 def test_curves_are_solid_sagittal_and_dashed_tangential_at_their_values(report: LensReport) -> None:

@@ -67,8 +67,8 @@ def test_a_lens_is_kept_after_each_photo_and_fitted_once_at_the_end(
         return model
 
     monkeypatch.setattr(LensModel, "warmed", warmed)
-    shelf = Noting()
-    calibration = pipeline.Calibration(shelf, pipeline.Recipe())
+    keeper = Noting()
+    calibration = pipeline.Calibration(keeper, pipeline.Recipe())
 
     verdicts = list(calibration.learn([*photos, photos[0]]))
     lens = calibration.finish()
@@ -76,31 +76,31 @@ def test_a_lens_is_kept_after_each_photo_and_fitted_once_at_the_end(
     assert [verdict.samples for verdict in verdicts] == [9, 9, None]
     assert lens is not None
     assert sorted(lens.profile.photos.values()) == ["a.dng", "b.dng"]
-    assert shelf.kept == [False, False, True]
+    assert keeper.kept == [False, False, True]
     assert fitted == [18]
 
 
 def test_nothing_is_kept_where_nothing_was_learned(photos: list[Path]) -> None:
     key = pipeline.photo_id(photos[0])
-    shelf = Noting(Lens(LensProfile(LensModel.fit(samples_of(key)), {}, {key: "a.dng"})))
-    calibration = pipeline.Calibration(shelf, pipeline.Recipe())
+    keeper = Noting(Lens(LensProfile(LensModel.fit(samples_of(key)), {}, {key: "a.dng"})))
+    calibration = pipeline.Calibration(keeper, pipeline.Recipe())
 
     assert calibration.add(photos[0]) is None
-    assert calibration.finish() is shelf.lens()
-    assert shelf.kept == []
+    assert calibration.finish() is keeper.lens()
+    assert keeper.kept == []
 
 
 def test_what_another_run_added_meanwhile_stays(photos: list[Path]) -> None:
-    shelf = Noting()
-    calibration = pipeline.Calibration(shelf, pipeline.Recipe())
+    keeper = Noting()
+    calibration = pipeline.Calibration(keeper, pipeline.Recipe())
     calibration.add(photos[0])
-    kept = shelf.lens()
+    kept = keeper.lens()
     assert kept is not None
     others = Lens(
         replace(kept.profile, model=LensModel.fit([*kept.samples, *samples_of("x")]), photos={"x": "x.dng"})
     )
 
-    shelf.keep(others, whole=False)
+    keeper.keep(others, whole=False)
     calibration.add(photos[1])
     lens = calibration.finish()
 

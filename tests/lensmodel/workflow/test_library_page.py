@@ -1,21 +1,27 @@
-"""docs/library.md: every code block runs, from top to bottom, on simulated photos."""
+"""docs/library.md: its five lines run, and every code block does, from top to bottom, on simulated photos."""
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 import lensmodel
 from lensmodel.core.types import LensSettings
+from lensmodel.photo import develop
+from lensmodel.photo.dng import ShotInfo, write_bayer_dng
+from lensmodel.quality import mtf50_from_kernel
 from lensmodel.simulate import BlurOptions, SimulatedCamera, demo_scene, draw_lens, photograph, write_photo
 
 PAGE = Path(__file__).parents[3] / "docs" / "library.md"
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 CAMERA = SimulatedCamera(height=384, width=576, pitch_um=9.0)
+WIDTH_PX = 1.2
 SHOTS = {"a.dng": ("tea-gardens", 400), "b.dng": ("lake", 400), "c.dng": ("city", 500)}
 
 
@@ -30,6 +36,43 @@ def photos(tmp_path: Path) -> Path:
         shot = photograph(np.ascontiguousarray(whole), lens, settings, CAMERA, rng, options=options)
         write_photo(tmp_path / file, shot)
     return tmp_path
+
+
+@pytest.fixture
+def smallest_photos(tmp_path: Path) -> Path:
+    """Grey photos behind one Gaussian blur, as small as ones that a lens is learned from can be."""
+    rows, cols = 192, 288
+    for seed, (file, (scene, left)) in enumerate(SHOTS.items()):
+        whole = demo_scene(scene)[1, 200 : 200 + 2 * rows, left : left + 2 * cols]
+        sharp = whole.reshape(rows, 2, cols, 2).mean(axis=(1, 3))  # than the photograph itself
+        light = ndimage.gaussian_filter(sharp, WIDTH_PX)
+        electrons = np.random.default_rng(seed).poisson(20000.0 * np.clip(light, 0.0, 1.0))
+        mosaic = np.rint(np.clip(512.0 + 0.75 * electrons, 0.0, 16383.0)).astype(np.uint16)
+        shot = ShotInfo(aperture=1.4, pixel_pitch_um=9.0)
+        write_bayer_dng(tmp_path / file, mosaic, black=512, white=16383, shot=shot)
+    return tmp_path
+
+
+def test_the_five_lines_run(
+    smallest_photos: Path, monkeypatch: pytest.MonkeyPatch, estimated_here: None, short_search: None
+) -> None:
+    monkeypatch.chdir(smallest_photos)
+    # two patches of each photo: an estimate of each costs a third of a second
+    monkeypatch.setitem(lensmodel.calibrate.__kwdefaults__, "patches", 2)
+    names: dict[str, Any] = {}
+
+    exec(BLOCK.findall(PAGE.read_text(encoding="utf-8"))[0], names)
+
+    lens, kernel, corrected = names["lens"], names["kernel"], names["photo"].planes
+    assert sorted(lens.profile.photos.values()) == ["a.dng", "b.dng"]
+    assert (kernel.shape, kernel.sum()) == ((55, 55), pytest.approx(1.0))
+    # of a Gaussian: exp(-2 (pi s f)^2) = 1/2
+    half = math.sqrt(math.log(2.0) / 2.0) / (math.pi * WIDTH_PX)
+    assert mtf50_from_kernel(kernel, 0.0) == pytest.approx(half, rel=0.35)
+    before = develop("c.dng").planes
+    assert np.abs(np.diff(corrected[1])).mean() > 1.05 * np.abs(np.diff(before[1])).mean()
+    assert Path("c.tif").stat().st_size > 6 * corrected[0].size
+    assert len(lensmodel.Lens.load("my-24mm.lensprofile").samples) == len(lens.samples) == 12
 
 
 @pytest.mark.slow

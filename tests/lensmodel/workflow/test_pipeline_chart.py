@@ -90,12 +90,12 @@ def test_photo_that_is_sharper_than_the_model_says_is_corrected_with_care(
     scene = np.fft.irfft2(np.fft.rfft2(rng.normal(size=(FRAME.height, FRAME.width))) * fall)
     soft = 0.4 + 0.06 * ndimage.gaussian_filter(scene, 0.6) / scene.std()
     seen = np.stack([soft + rng.normal(0.0, 0.003, soft.shape) for _ in range(3)]).astype(np.float32)
-    told: dict[str, tuple[float, float]] = {}
+    beliefs: dict[str, tuple[float, float]] = {}
     name = ""
 
     def record(planes: Planes, field: UncertainField, *_: object, **__: object) -> Corrected:
         belief = field.belief_at(FieldPosition(0.3, 0.5), "g", 31)
-        told[name] = rms_width(belief.kernel), belief.error
+        beliefs[name] = rms_width(belief.kernel), belief.error
         return Corrected(planes, {})
 
     monkeypatch.setattr(correcting.correction, "correct_planes", record)
@@ -104,5 +104,5 @@ def test_photo_that_is_sharper_than_the_model_says_is_corrected_with_care(
         info = photo.PhotoInfo(name, FRAME.width, FRAME.height)  # type: ignore[arg-type] # of a tuple
         pipeline.correct_photo(replace(picture, info=info), model, LensSettings())
 
-    assert told["tiff"][0] < 0.85 * told["jpeg"][0]
-    assert told["tiff"][1] > told["jpeg"][1] + 0.1
+    assert beliefs["tiff"][0] < 0.85 * beliefs["jpeg"][0]
+    assert beliefs["tiff"][1] > beliefs["jpeg"][1] + 0.1

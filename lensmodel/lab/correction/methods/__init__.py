@@ -7,7 +7,7 @@ from typing import Final
 
 from lensmodel.core.registry import Registry
 from lensmodel.correction import Deconvolver, SaturationAwareRichardsonLucy, deconvolvers
-from lensmodel.lab.correction.methods.epll import Epll
+from lensmodel.lab.correction.methods.epll import EpllDeconvolver
 from lensmodel.lab.correction.methods.krishnan_fergus import KrishnanFergus
 from lensmodel.lab.correction.methods.wiener import Wiener
 
@@ -17,7 +17,7 @@ def _whyte(iterations: int = 50) -> SaturationAwareRichardsonLucy:
 
 
 compared: Final[Registry[Deconvolver]] = deconvolvers.extended(
-    epll=Epll, krishnan_fergus=KrishnanFergus, whyte=_whyte, wiener=Wiener
+    epll=EpllDeconvolver, krishnan_fergus=KrishnanFergus, whyte=_whyte, wiener=Wiener
 )
 
-__all__ = ["Epll", "KrishnanFergus", "Wiener", "compared"]
+__all__ = ["EpllDeconvolver", "KrishnanFergus", "Wiener", "compared"]

@@ -5,25 +5,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft
 
 from lensmodel.core.types import Plane, StepHook, ignore_step
 from lensmodel.correction.blur import BlurOperator
 from lensmodel.correction.deconvolver import Restored, Sensor, uniform
 from lensmodel.correction.tiles.canvas import Canvas
-from lensmodel.lab.correction.methods.half_quadratic import half_quadratic
 from lensmodel.lab.correction.methods.mixture import shipped_mixture
 
 _WHITE = 0.9  # of the photographs that the mixture was fitted to, see `lensmodel.lab.cases`
 
 
 @dataclass(frozen=True, slots=True)
-class Epll:
-    """Expected patch log likelihood [1]_, by half-quadratic splitting, with the mixture of the benchmark.
+class EpllDeconvolver:
+    """Expected patch log likelihood [1]_ of a whole plane, with the mixture of the benchmark.
 
-    For growing beta: clean all windows under the mixture for noise of variance 1/beta, average
-    them to z, then solve ``(|K|²/var + beta) X = conj(K) Y/var + beta Z``. The plane is scaled as the
-    photographs were that the mixture was fitted to. Slow: minutes per megapixel.
+    `PatchMixture.restored` on a canvas that reaches beyond the frame, the plane scaled as the photographs
+    were that the mixture was fitted to. The judge `lab.blind.judges.Epll` takes a patch in their own light,
+    padded by mirror images. Slow: minutes per megapixel.
 
     Parameters
     ----------
@@ -51,8 +49,6 @@ class Epll:
         y = canvas.fill(np.asarray(blurred / np.float32(light), dtype=np.float32))
         K = kernel.spectrum(canvas.shape)
         weight = light * light / max(float(sensor.variance(blurred).mean()), 1e-9)
-        data, power = weight * np.conj(K) * fft.rfft2(y), weight * np.abs(K) ** 2
-        target = shipped_mixture().spectrum_of_cleaned(self.betas, self.stride)
-        x = half_quadratic(y, data, power, self.betas, target, on_step)
+        x = shipped_mixture().restored(y, K, weight, self.betas, self.stride, on_step)
         restored = np.ascontiguousarray(canvas.cut(x) * np.float32(light))
         return Restored(restored, steps=len(self.betas))

@@ -13,6 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from lensmodel.core.types import StepHook, ignore_step
+from lensmodel.lab.correction.methods.half_quadratic import half_quadratic
+
 _SHIPPED = Path(__file__).parents[2] / "data" / "epll.npz"
 
 
@@ -96,6 +99,43 @@ class PatchMixture:
                 total[at] += clean[:, :, i, j]
                 count[at] += 1.0
         return total / count
+
+    def restored(
+        self,
+        y: NDArray[Any],
+        transfer: NDArray[np.complexfloating[Any, Any]],
+        weight: float,
+        betas: Sequence[float],
+        step: int,
+        on_step: StepHook = ignore_step,
+    ) -> NDArray[Any]:
+        """Restore a blurred grid by its expected patch log likelihood [1]_, with half-quadratic splitting.
+
+        For growing beta: clean all windows for noise of variance 1/beta, average them to z, then solve::
+
+            (w |K|² + beta) X = w conj(K) Y + beta Z
+
+        Parameters
+        ----------
+        y : ndarray, shape (rows, cols)
+            The grid, a torus.
+        transfer : ndarray, shape (rows, cols // 2 + 1)
+            K.
+        weight : float
+            w, one over the variance of the noise.
+        betas : sequence of float
+            Couplings of the steps.
+        step : int
+            One window in `step`² is used, on a grid moved each time.
+        on_step : callable
+
+        References
+        ----------
+        .. [1] D. Zoran and Y. Weiss, "From learning models of natural image patches to whole image
+           restoration", ICCV 2011, eq. (4) to (6).
+        """
+        data, power = weight * np.conj(transfer) * fft.rfft2(y), weight * np.square(np.abs(transfer))
+        return half_quadratic(y, data, power, betas, self.spectrum_of_cleaned(betas, step), on_step)
 
     def spectrum_of_cleaned(
         self, betas: Sequence[float], step: int

@@ -57,12 +57,12 @@ def page(folder: Path, names: set[str], kept: set[str], summary: str) -> int:
         else:
             shutil.copyfile(source, shown / name)
         blocks.append(f"![{words}](pictures/{name})")
-    told = [
+    with_content = [
         block
         for block, after in zip(blocks, [*blocks[1:], "#"], strict=True)
         if not (block.startswith("### ") and after.startswith("#"))
     ]
-    title, *rest = told
+    title, *rest = with_content
     (PAGE / "reproduction.md").write_text("\n\n".join([title, summary, *rest]) + "\n", encoding="utf-8")
     return count
 

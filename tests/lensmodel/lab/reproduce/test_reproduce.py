@@ -931,7 +931,7 @@ def quick_photos(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def reproduced(
     folder: Path, route: Nothing, chosen: Reproduction, results: Path | None = None
 ) -> dict[str, Any]:
-    told: list[tuple[float, float]] = []
+    announced: list[tuple[float, float]] = []
 
     @contextmanager
     def opened(one: Case, work: Path) -> Iterator[Nothing]:
@@ -941,7 +941,7 @@ def reproduced(
 
     def on_work(words: str, done: float, total: float, *, fresh: bool) -> None:
         del words, fresh
-        told.append((done, total))
+        announced.append((done, total))
 
     made = run_reproduction(
         chosen,
@@ -953,7 +953,7 @@ def reproduced(
         results=results,
         on_work=on_work,
     )
-    assert told[-1][0] == pytest.approx(told[-1][1])  # all the work that was announced is over
+    assert announced[-1][0] == pytest.approx(announced[-1][1])  # all the work that was announced is over
     return made
 
 

@@ -94,14 +94,16 @@ def test_patches_left_out_cost_less_behind_the_lens_than_behind_another(groups: 
 
 
 def test_a_search_ends_where_a_known_lens_leads_and_tells_how_far_it_is(groups: list[Group]) -> None:
-    told: list[tuple[int, int]] = []
+    steps: list[tuple[int, int]] = []
 
-    minima = search(groups, [], [replace(FRONT, terms=0.2 * FRONT.terms)], [FRONT], lambda *s: told.append(s))
+    minima = search(
+        groups, [], [replace(FRONT, terms=0.2 * FRONT.terms)], [FRONT], lambda *s: steps.append(s)
+    )
 
     kernel, true = (front.kernel(FieldPosition(0.7, 0.4), SETTINGS, 31) for front in (minima[0].front, FRONT))
     # powers know nothing of the side of tails
     assert min(distance(kernel, true).rel_l2, distance(kernel[::-1, ::-1], true).rel_l2) < 0.15
     assert [fit.cost for fit in minima] == sorted(fit.cost for fit in minima)
-    done, total = zip(*told, strict=True)
+    done, total = zip(*steps, strict=True)
     assert list(done) == sorted(done)
     assert done[-1] == total[0] == max(total)

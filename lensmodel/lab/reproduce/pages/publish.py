@@ -1,11 +1,10 @@
-"""Put the output of `lensmodel reproduce` into the documentation: the page with a summary, README's picture.
+"""Put the output of `lensmodel reproduce` into the documentation: the page with a summary.
 
-    python -m lensmodel.lab.reproduce.pages.publish reproduction figures.json --lenses 3 --seed 1002
+    python -m lensmodel.lab.reproduce.pages.publish reproduction figures.json [--lenses 3] [--name NAME]
 
 `reproduction` is the output folder of the run, `figures.json` what `--json` wrote. Written are
-`docs/lab/results/reproduction.md`, a table of means of each family first, with its pictures (of each family
-those of the first lenses only that have any, crops as JPEG), and the picture `docs/images/before-after.jpg`
-if the run made crops of its lens.
+`docs/lab/results/NAME.md`, a table of means of each family first, and its pictures (of each family those of
+the first lenses only that have any, crops as JPEG).
 """
 
 from __future__ import annotations
@@ -20,23 +19,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageDraw
+from PIL import Image
 
 from lensmodel.core.types import ZONES, Zone
 
 ROOT = Path(__file__).resolve().parents[4]
-PAGE, PICTURE = ROOT / "docs/lab/results", ROOT / "docs/images/before-after.jpg"
+RESULTS = ROOT / "docs/lab/results"
 SHOWN: tuple[Zone, ...] = ("center", "corner")
 METHOD = "standard"
 _QUALITY = 90  # of JPEG (chosen)
-_LABEL_PX = 96  # column of the labels (chosen)
 
 
-def page(folder: Path, names: set[str], kept: set[str], summary: str) -> int:
+def page(folder: Path, written: Path, names: set[str], kept: set[str], summary: str) -> int:
     """Copy the page, a summary under its title, with some of the pictures; return how many pictures."""
-    shown = PAGE / "pictures"
-    shutil.rmtree(PAGE, ignore_errors=True)
-    shown.mkdir(parents=True)
+    shown = written.with_name(f"{written.stem}-pictures")
+    shutil.rmtree(shown, ignore_errors=True)
     blocks: list[str] = []
     count = 0
     for block in (folder / "reproduction.md").read_text(encoding="utf-8").rstrip().split("\n\n"):
@@ -50,39 +47,22 @@ def page(folder: Path, names: set[str], kept: set[str], summary: str) -> int:
             blocks.pop()  # the line that tells what it would show
             continue
         source, count = folder / "pictures" / name, count + 1
+        shown.mkdir(parents=True, exist_ok=True)
         if own:
             name = f"{Path(name).stem}.jpg"
             with Image.open(source) as opened:
                 opened.convert("RGB").save(shown / name, quality=_QUALITY, subsampling=0)
         else:
             shutil.copyfile(source, shown / name)
-        blocks.append(f"![{words}](pictures/{name})")
+        blocks.append(f"![{words}]({shown.name}/{name})")
     with_content = [
         block
         for block, after in zip(blocks, [*blocks[1:], "#"], strict=True)
         if not (block.startswith("### ") and after.startswith("#"))
     ]
     title, *rest = with_content
-    (PAGE / "reproduction.md").write_text("\n\n".join([title, summary, *rest]) + "\n", encoding="utf-8")
+    written.write_text("\n\n".join([title, summary, *rest]) + "\n", encoding="utf-8")
     return count
-
-
-def picture(folder: Path, case: Mapping[str, Any]) -> None:
-    """Lay the photo as it was, corrected after the most photos, and the scene below each other."""
-    most = max(case["learned"], key=int)
-    names = {
-        "as it was": case["truth"]["pictures"]["before"],
-        "corrected": case["learned"][most]["pictures"][f"n{most}-{METHOD}"],
-        "the scene": case["truth"]["pictures"]["scene"],
-    }
-    rows = []
-    for label, name in names.items():
-        with Image.open(folder / "pictures" / name) as opened:
-            row = Image.new("RGB", (opened.width + _LABEL_PX, opened.height + 6), "white")
-            row.paste(opened.convert("RGB"), (_LABEL_PX, 0))
-        ImageDraw.Draw(row).text((6, row.height // 2 - 8), label, fill="black", font_size=15)
-        rows.append(np.asarray(row))
-    Image.fromarray(np.concatenate(rows)).save(PICTURE, quality=_QUALITY, subsampling=0)
 
 
 def table(cases: list[Mapping[str, Any]]) -> str:
@@ -157,24 +137,21 @@ def shown_lenses(cases: Sequence[Mapping[str, Any]], count: int) -> set[str]:
 
 
 def main() -> None:
-    """Write page and picture."""
+    """Write the page."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("folder", type=Path)
     parser.add_argument("figures", type=Path)
     parser.add_argument("--lenses", type=int, default=3, help="so many lenses of a family keep pictures")
-    parser.add_argument("--seed", type=int, default=1000, help="of the lens whose crops README shows")
+    parser.add_argument("--name", default="reproduction", help="of the page")
     asked = parser.parse_args()
     result = json.loads(asked.figures.read_text(encoding="utf-8"))
     cases = result["cases"]
     names = {case["name"] for case in (*cases, *result["hard"])}
-    count = page(asked.folder, names, shown_lenses(cases, asked.lenses), by_family(result))
-    print(f"{count} pictures; {PAGE / 'reproduction.md'}")
-    for case in cases:
-        if case["settings"]["seed"] == asked.seed and case["truth"]["pictures"]:
-            picture(asked.folder, case)
-            print(PICTURE)
+    written = RESULTS / f"{asked.name}.md"
+    count = page(asked.folder, written, names, shown_lenses(cases, asked.lenses), by_family(result))
+    print(f"{count} pictures; {written}")
 
 
 if __name__ == "__main__":

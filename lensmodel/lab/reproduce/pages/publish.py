@@ -1,9 +1,9 @@
 """Put the output of `lensmodel reproduce` into the documentation: the page with a summary.
 
-    python -m lensmodel.lab.reproduce.pages.publish reproduction figures.json [--lenses 3] [--name NAME]
+    python -m lensmodel.lab.reproduce.pages.publish reproduction figures.json --lenses 3
 
-`reproduction` is the output folder of the run, `figures.json` what `--json` wrote. Written are
-`docs/lab/results/NAME.md`, a table of means of each family first, and its pictures (of each family those of
+`reproduction` is the output folder of the run, `figures.json` what `--json` wrote. Written are the page of that
+name in `docs/lab/results`, a table of means of each family first, and its pictures (of each family those of
 the first lenses only that have any, crops as JPEG).
 """
 

@@ -2,9 +2,9 @@
 
     python -m lensmodel.lab.reproduce.pages.publish reproduction figures.json --lenses 3
 
-`reproduction` is the output folder of the run, `figures.json` what `--json` wrote. Written are the page of that
-name in `docs/lab/results`, a table of means of each family first, and its pictures (of each family those of
-the first lenses only that have any, crops as JPEG).
+`reproduction` is the output folder of the run, `figures.json` what `--json` wrote. Written are the page
+of that name in `docs/lab/results`, a table of means of each family first, and its pictures (of each
+family those of the first lenses only that have any, crops as JPEG).
 """
 
 from __future__ import annotations

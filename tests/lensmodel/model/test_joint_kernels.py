@@ -330,7 +330,7 @@ def test_plain_gaussian_comes_back_as_one_by_default(width: float, seed: int, sh
 
 
 @pytest.mark.slow
-def test_blur_that_no_wavefront_makes_is_left_to_the_kernels() -> None:
+def test_blur_that_kernels_agree_on_all_over_the_field_is_left_to_them() -> None:
     blur, rng = gaussian(41, 1.3**2 * np.eye(2)), np.random.default_rng(4)
     known = [
         PsfSample(gaussian(31, 1.3**2 * np.eye(2)), place, settings, 0.5, "photo", PITCH, spectrum=seen[c])
@@ -342,7 +342,11 @@ def test_blur_that_no_wavefront_makes_is_left_to_the_kernels() -> None:
 
     answer = LensModel.fit(known).warmed().query(FieldPosition(0.5, 0.4), SETTINGS, 31)
 
-    assert (answer.answered_by, answer.reason) == ("regression", "no wavefront agrees with all patches")
+    # with much spherical aberration a wavefront comes near to a Gaussian, and is not asked
+    assert (answer.answered_by, answer.reason) == (
+        "regression",
+        "kernels agree with each other all over the field",
+    )
     assert distance(answer.kernel, gaussian(31, 1.3**2 * np.eye(2))).rel_l2 < 0.05
 
 

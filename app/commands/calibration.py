@@ -164,8 +164,8 @@ class ProfileFile:
         stamp = _stamp(self._target)
         if stamp not in {None, self._stamp_read}:
             profile = _opened(self._target)
-            learned, asked = way_of(profile.model).name, self._options.model or way_of(profile.model).name
-            if asked != learned:  # its kernels are the other model's: the two would be mixed
+            learned, asked = way_of(profile.model).name, self._options.model
+            if asked not in {None, learned}:  # its kernels are the other model's: the two would be mixed
                 raise InvalidInputError(
                     f"the lens in {self._target.name} has the model {learned}, not {asked}: name a new file "
                     "after --profile and give its photos again, or replace the file with --force"

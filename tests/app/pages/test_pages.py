@@ -634,6 +634,12 @@ def test_a_lens_page_changes_the_model_and_back(page: Page, service: Service, tm
 def test_a_page_says_when_the_service_is_away(visitor: Visitor, page: Page) -> None:
     page.goto("/")
     expect(page.locator("#away")).to_be_hidden()
+    with page.expect_response(lambda answer: "/ui/events" in answer.url) as asked_anew:
+        page.evaluate(
+            "dispatchEvent(new Event('offline'))"
+        )  # no network, but the service is on this computer
+    assert asked_anew.value.ok
+    expect(page.locator("#away")).to_be_hidden()
     page.context.set_offline(True)
     page.evaluate("dispatchEvent(new Event('offline'))")
     expect(page.locator("#away")).to_be_visible()

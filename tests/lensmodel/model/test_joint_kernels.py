@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
-from lensmodel.core.psf import PsfSample, distance, gaussian, rms_width
+from lensmodel.core.psf import PsfSample, as_kernel, distance, gaussian, rms_width
 from lensmodel.core.spectrum import RINGS, SECTORS, PatchSpectrum, bin_frequencies
 from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel, LensSettings, NoiseModel
 from lensmodel.model import LensModel, LensProfile, ModelSettings, load_profile, save_profile
@@ -348,6 +349,27 @@ def test_blur_that_kernels_agree_on_all_over_the_field_is_left_to_them() -> None
         "kernels agree with each other all over the field",
     )
     assert distance(answer.kernel, gaussian(31, 1.3**2 * np.eye(2))).rel_l2 < 0.05
+
+
+@pytest.mark.slow
+def test_a_double_image_which_no_wavefront_makes_is_left_to_the_kernels() -> None:
+    def twice(size: int) -> Kernel:
+        light = np.zeros((size, size))
+        light[size // 2, [size // 2 - 3, size // 2 + 3]] = 0.5
+        return as_kernel(ndimage.gaussian_filter(light, 0.6))
+
+    rng = np.random.default_rng(4)
+    known = [
+        PsfSample(twice(31), place, settings, 0.5, "photo", PITCH, spectrum=seen[c])
+        for place in places(MIN_PLACES + 2, 6)
+        for seen in [seen_at(place, rng, 0.15, twice(41))]
+        for c in CHANNELS
+        for settings in [SETTINGS.with_channel(c)]
+    ]
+
+    answer = LensModel.fit(known).warmed().query(FieldPosition(0.5, 0.4), SETTINGS, 31)
+
+    assert (answer.answered_by, answer.reason) == ("regression", "no wavefront agrees with all patches")
 
 
 def test_corner_ratio_is_that_of_the_spots_of_a_curved_field() -> None:

@@ -165,6 +165,10 @@ def test_fewer_photos_leave_larger_frames() -> None:
     assert {one.photos[-1] for one in two.cases} == {1}
     assert two.cases[0].height * two.cases[0].width > 1.5 * five.cases[0].height * five.cases[0].width
     assert (two.rivals, bool(planned("default", lenses=1).rivals)) == ((), True)
+    least = planned("default", lenses=1, photos=1, default_only=True)
+    assert (least.methods, least.rivals, least.programs) == (("standard",), (), ())
+    assert (least.paper, least.general, least.target) == (False, False, False)
+    assert [one.name for one in least.cases] == [one.name for one in two.cases]
     with pytest.raises(InvalidInputError, match="at most 2 photos of size quick"):
         planned("quick", photos=2)
 

@@ -84,9 +84,13 @@ def reproduce(
             "runs on several machines make one page. Default: cache in the output folder.",
         ),
     ] = None,
-    no_paper: Annotated[
-        bool, typer.Option("--no-paper", help="Leave out the paper's own way from end to end, which is slow.")
-    ] = False,
+    paper: Annotated[
+        bool | None,
+        typer.Option(
+            "--paper/--no-paper",
+            help="The paper's own way from end to end, which is slow. Default: but for --default-only.",
+        ),
+    ] = None,
     no_target: Annotated[
         bool, typer.Option("--no-target", help="Leave out the lens measured with a target, which is slow.")
     ] = False,
@@ -98,6 +102,13 @@ def reproduce(
         typer.Option(
             "--default-only",
             help="Only the default correction, beside the true PSF: what the bars ask for, in less time.",
+        ),
+    ] = False,
+    assert_bars: Annotated[
+        bool,
+        typer.Option(
+            "--assert-bars",
+            help="Fail where a bar is missed, and name each: the lens and zone of a fall too.",
         ),
     ] = False,
     no_figures: Annotated[
@@ -136,7 +147,8 @@ def reproduce(
 
         lensmodel reproduce --only 1003 --results figures-so-far --no-figures -o sitting
 
-    Exit status: 0 the page is written, 1 something failed, 2 called wrongly.
+    Exit status: 0 the page is written, 1 something failed or, with --assert-bars, a bar is missed; 2 called
+    wrongly.
     """
     shown = display.of(context, quiet=quiet, verbose=verbose)
     if quick + small + full > 1:
@@ -147,6 +159,7 @@ def reproduce(
     from app.lab.service_route import CODE, ServiceRoutes  # noqa: PLC0415 - only this command needs them
     from lensmodel.lab.reproduce import (  # noqa: PLC0415 - as above: the simulation is slow to import
         collected,
+        missed,
         planned,
         run_reproduction,
         write_json,
@@ -163,7 +176,7 @@ def reproduce(
         grids=grids or None,
         only=only or (),
         photos=photos,
-        paper=not no_paper,
+        paper=paper,
         target=not no_target,
         rivals=not no_rivals,
         default_only=default_only,
@@ -183,6 +196,9 @@ def reproduce(
     if json_output is not None:
         written.append(write_json(result, json_output))
     shown.result(f"Code {result['code']}. Written: " + ", ".join(str(path) for path in written))
+    if assert_bars and (lines := missed(result)):
+        shown.error("\n".join(["these bars are missed:", *lines]))
+        raise typer.Exit(1)
 
 
 class WorkLines:

@@ -102,11 +102,24 @@ def coherence(planes: Planes, cfa: BayerPattern, channel: Channel) -> Floats:
 
 
 def _coherent_in_bins(planes: Planes, cfa: BayerPattern, channel: Channel) -> Waves:
+    cross, own, green = spectra_in_bins(planes, cfa, channel)
+    return cross / np.sqrt(np.maximum(own * green, 1e-30))
+
+
+def spectra_in_bins(planes: Planes, cfa: BayerPattern, channel: Channel) -> tuple[Waves, Floats, Floats]:
+    """Sums of `cross_spectra` in the bins, each (PHASE_BINS,), after the shift by which both agree best."""
     cross, own, green = cross_spectra(planes, cfa, channel)
     coherent = cross / np.sqrt(np.maximum(own * green, 1e-30))
     cross = cross * np.exp(-2j * math.pi * (_FREQUENCY @ _shift(coherent)))
-    power = binned(own).real * binned(green).real
-    return binned(cross) / np.sqrt(np.maximum(power, 1e-30))
+    return binned(cross), binned(own).real, binned(green).real
+
+
+def noise_in_bins(cfa: BayerPattern, channel: Channel) -> Floats:
+    """What `spectra_in_bins` gives as power of white noise of variance 1, shape (PHASE_BINS,)."""
+    index = CHANNELS.index(channel)
+    sites = ((row, col) for row in (0, 1) for col in (0, 1) if cfa[row][col] == index)
+    energy = sum(float((_window(*first) ** 2).sum()) for first in sites)
+    return np.asarray(energy * _COUNT, dtype=np.float64)
 
 
 def cross_spectra(planes: Planes, cfa: BayerPattern, channel: Channel) -> tuple[Waves, Floats, Floats]:
@@ -167,6 +180,14 @@ def mean_in_bins(values: Waves) -> Waves:
     return binned(values[rows, cols]) / np.maximum(_COUNT, 1)
 
 
+def _window(row: int, col: int) -> Floats:
+    """Hann window of a tile at the sites of the lattice that begins at (row, col)."""
+    down, right = (
+        0.5 - 0.5 * np.cos(2.0 * math.pi * (np.arange(first, _TILE, 2) + 0.5) / _TILE) for first in (row, col)
+    )
+    return np.asarray(down[:, None] * right[None, :])
+
+
 def _transform(tile: Floats, cfa: BayerPattern, channel: int) -> Waves:
     """Transform of one colour's own sites at the frequencies that count."""
     total = np.zeros(len(_KEPT), dtype=complex)
@@ -174,9 +195,7 @@ def _transform(tile: Floats, cfa: BayerPattern, channel: int) -> Waves:
         for col in (0, 1):
             if cfa[row][col] != channel:
                 continue
-            across = np.arange(row, _TILE, 2), np.arange(col, _TILE, 2)
-            down, right = (0.5 - 0.5 * np.cos(2.0 * math.pi * (n + 0.5) / _TILE) for n in across)
-            window = down[:, None] * right[None, :]
+            window = _window(row, col)
             sites = tile[row::2, col::2]
             light = (sites - (sites * window).sum() / window.sum()) * window
             ramp = np.exp(-2j * math.pi * (_FREQUENCY @ (row, col)))

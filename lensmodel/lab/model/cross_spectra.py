@@ -1,4 +1,4 @@
-r"""What the phase between two colours of a mosaic tells of a lens, free of the scene.
+r"""What phase and gain between two colours of a mosaic tell of a lens, free of the scene.
 
     LENSMODEL_TEST_DATA=... python -m lensmodel.lab.model.cross_spectra --seeds 0 1 3 --grids GRID.npz ... \
         [--photos 2]
@@ -14,7 +14,12 @@ Printed are, by ring: the coherence of blue and red with green, the scatter of t
 lens: by how many standard deviations of its noise the phase tells the true lens from the turned one, for a
 patch (median) and for a photo, as it should by what is known of the noise and as it did; the same for the
 lens whose coma is negated (third order only); and the vote of the tails (`joint_kernels.tail_vote`) of the
-same patches at the true kernels. A vote above zero is right. Some ten seconds a photo.
+same patches at the true kernels. A vote above zero is right.
+
+Then, by ring, how far the gain is off: ln |H_C / H_G| by the cross spectrum over green's power, by the root
+of the ratio of powers and by their mean, and that root in the demosaiced planes, each less the true one; the
+level of each patch, the colour of its scene, is taken off first. Bias is the median, scatter the robust
+standard deviation of bins, slope that of the patches' slopes over ln f. Some ten seconds a photo.
 """
 
 from __future__ import annotations
@@ -37,12 +42,22 @@ from lensmodel.core.cross_phase import (
     cross_phase,
     log_likelihood,
     mean_in_bins,
+    noise_in_bins,
+    spectra_in_bins,
     unshifted,
 )
 from lensmodel.core.errors import NoUsablePatchesError
 from lensmodel.core.psf import PsfSample, delta, rms_width
-from lensmodel.core.spectrum import PHASE_RINGS, SECTORS, CrossPhase, PatchSpectrum, binned_spectrum, tail_of
-from lensmodel.core.types import CHANNELS, Channel, FieldPosition, Kernel
+from lensmodel.core.spectrum import (
+    FIRST_PHASE_RING,
+    PHASE_RINGS,
+    SECTORS,
+    CrossPhase,
+    PatchSpectrum,
+    binned_spectrum,
+    tail_of,
+)
+from lensmodel.core.types import CHANNELS, BayerPattern, Channel, FieldPosition, Kernel, NoiseModel, Planes
 from lensmodel.lab.chain.blind_gain import CAMERA, KnownLens, lenses, shot, written
 from lensmodel.lab.traced import GridLens
 from lensmodel.model.wavefront.joint_kernels import tail_vote
@@ -52,6 +67,9 @@ from lensmodel.workflow import pipeline
 _SIDE: Final = 55  # pixels of a true kernel: what the grids hold
 OTHERS: Final[tuple[Channel, ...]] = ("b", "r")
 """Channels that are compared with green."""
+
+GAINS: Final = ("cross over green", "powers", "their mean", "powers, demosaiced")
+"""Ways to measure a gain."""
 
 Floats = NDArray[np.float64]
 
@@ -71,6 +89,8 @@ class MeasuredPatch:
         The phases behind the lens.
     mirrored : dict or None
         Those with its coma negated.
+    gain_errors : dict
+        Of blue and red, by each of `GAINS`: measured gain less the true one, shape (PHASE_BINS,).
     sample : PsfSample
         Its tail, in green.
     kernel : Kernel
@@ -83,6 +103,7 @@ class MeasuredPatch:
     coherence: dict[Channel, Floats]
     true: dict[Channel, Floats]
     mirrored: dict[Channel, Floats] | None
+    gain_errors: dict[Channel, tuple[Floats, ...]]
     sample: PsfSample
     kernel: Kernel
 
@@ -115,6 +136,35 @@ def phases_of(
     return {c: np.angle(mean_in_bins(waves[c] * waves["g"].conj())) for c in OTHERS}
 
 
+def gain_errors_of(
+    lens: KnownLens, place: FieldPosition, planes: Planes, cfa: BayerPattern, noise: Sequence[float]
+) -> dict[Channel, tuple[Floats, ...]]:
+    """Gains of a patch by each of `GAINS` less the true ones, see `MeasuredPatch`."""
+    field = lens.lens.field(lens.settings)
+    true = {
+        c: np.log(mean_in_bins(np.abs(transfer_of(field.kernel_at(place, c, _SIDE))) ** 2).real + 1e-12)
+        for c in CHANNELS
+    }
+    demosaiced = {}
+    for number, c in enumerate(CHANNELS):
+        power, floor = binned_spectrum(np.ascontiguousarray(planes[number]), NoiseModel(0.0, noise[number]))
+        rings = power[FIRST_PHASE_RING : FIRST_PHASE_RING + PHASE_RINGS].ravel().astype(np.float64)
+        demosaiced[c] = np.log(np.maximum(rings - floor, 0.05 * rings))
+    errors: dict[Channel, tuple[Floats, ...]] = {}
+    for channel in OTHERS:
+        cross, own, green = spectra_in_bins(planes, cfa, channel)
+        own, green = (
+            np.maximum(power - noise[CHANNELS.index(c)] * noise_in_bins(cfa, c), 0.05 * power)
+            for c, power in ((channel, own), ("g", green))
+        )
+        logs = [np.log(np.maximum(part, 1e-30)) for part in (np.abs(cross), own, green)]
+        both = logs[0] - logs[2], 0.5 * (logs[1] - logs[2])
+        known = 0.5 * (true[channel] - true["g"])
+        ways = (*both, np.mean(both, axis=0), 0.5 * (demosaiced[channel] - demosaiced["g"]))
+        errors[channel] = tuple(np.asarray(way - known) for way in ways)
+    return errors
+
+
 def patches_of(lens: KnownLens, number: int, folder: Path) -> Iterator[MeasuredPatch]:
     """Measure the patches of one photo."""
     path = written(folder / "photo.dng", shot(lens, number), tiff=False)
@@ -133,6 +183,10 @@ def patches_of(lens: KnownLens, number: int, folder: Path) -> Iterator[MeasuredP
         spectrum = PatchSpectrum(
             *binned_spectrum(green, developed.noise[1]), tail_of(green, rms_width(kernel))
         )
+        noise = [
+            float(model.sigma_at(float(plane.mean())) ** 2)
+            for model, plane in zip(developed.noise, planes, strict=True)
+        ]
         yield MeasuredPatch(
             lens.name,
             number,
@@ -140,6 +194,7 @@ def patches_of(lens: KnownLens, number: int, folder: Path) -> Iterator[MeasuredP
             {c: coherence(planes, cfa, c) for c in OTHERS},
             phases_of(lens, lens.lens, patch.position),
             None if turned is None else phases_of(lens, turned, patch.position),
+            gain_errors_of(lens, patch.position, planes, cfa, noise),
             PsfSample(delta(3), patch.position, lens.settings, photo=str(number), spectrum=spectrum),
             kernel,
         )
@@ -189,6 +244,29 @@ def report_rings(patches: Sequence[MeasuredPatch]) -> None:
                 f"| {middle:.3f} | {channel} | {np.median(coherent[ring][used]):.2f} | {scatter:.3f} "
                 f"| {over:.2f} | {math.sqrt(np.mean(signal[ring][used] ** 2)):.3f} |"
             )
+
+
+def report_gains(patches: Sequence[MeasuredPatch]) -> None:
+    """Print bias and scatter of each way to measure a gain, by ring."""
+    rings = np.hypot(*MIDDLES.reshape(PHASE_RINGS, SECTORS, 2).transpose(2, 0, 1))
+    used = rings > 0
+    middle = [float(np.median(ring[here])) for ring, here in zip(rings, used, strict=True)]
+    print("\n| channel, way | " + " | ".join(f"{f:.2f}" for f in middle) + " | slope |")
+    print("|---" * (PHASE_RINGS + 2) + "|")
+    slopes = np.log(np.where(used, rings, 1.0)).ravel()
+    inside = used.ravel()
+    for channel in OTHERS:
+        for number, way in enumerate(GAINS):
+            off = np.stack([p.gain_errors[channel][number] for p in patches])
+            off = off - np.median(off[:, inside], axis=1, keepdims=True)
+            slope = [np.polyfit(slopes[inside], row[inside], 1)[0] for row in off]
+            cells = []
+            for ring in range(PHASE_RINGS):
+                values = off.reshape(-1, PHASE_RINGS, SECTORS)[:, ring, used[ring]].ravel()
+                bias = float(np.median(values))
+                cells.append(f"{bias:+.2f}, {1.4826 * float(np.median(np.abs(values - bias))):.2f}")
+            scatter = 1.4826 * float(np.median(np.abs(slope - np.median(slope))))
+            print(f"| {channel}, {way} | {' | '.join(cells)} | {np.median(slope):+.2f}, {scatter:.2f} |")
 
 
 def _by_ring(values: Sequence[Floats]) -> Floats:
@@ -259,6 +337,7 @@ def main() -> None:
                 print(f"{lens.name}, photo {number}: {len(patches)} patches so far", flush=True)
     report_rings(patches)
     report_lenses(patches)
+    report_gains(patches)
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ There are more than fifteen modules because each figure, kind of lens and step o
 """
 
 from lensmodel.lab.reproduce.cases import Case, Reproduction, Size
+from lensmodel.lab.reproduce.pages.bars import missed
 from lensmodel.lab.reproduce.pages.blind_curve import collected
 from lensmodel.lab.reproduce.pages.page import write_json, write_page
 from lensmodel.lab.reproduce.planning import planned
@@ -21,6 +22,7 @@ __all__ = [
     "Route",
     "Size",
     "collected",
+    "missed",
     "planned",
     "run_reproduction",
     "write_json",

@@ -35,7 +35,7 @@ def planned(
     grids: Sequence[Path] | None = None,
     only: Sequence[str] = (),
     photos: int | None = None,
-    paper: bool = True,
+    paper: bool | None = None,
     target: bool = True,
     rivals: bool = True,
     default_only: bool = False,
@@ -66,7 +66,9 @@ def planned(
     photos : int or None
         Each lens learns from at most so many: the fewer, the larger the frames that photographs are
         composed to. Only of the default size, and of its photos at base ISO.
-    paper, target : bool
+    paper : bool or None
+        See `Reproduction`; None leaves it out with `default_only`.
+    target : bool
         See `Reproduction`.
     rivals : bool
         Whether the paper's blind rivals are run where the size has them.
@@ -128,7 +130,7 @@ def planned(
         rivals=RIVALS if rivals and size != "small" and not default_only else (),
         programs=() if default_only else programs.installed(),
         size=size,
-        paper=paper and not default_only,
+        paper=not default_only if paper is None else paper,
         general=not default_only,
         target=target and not default_only,
     )

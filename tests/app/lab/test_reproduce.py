@@ -145,3 +145,23 @@ def test_scenes_that_hurt_are_taken_when_asked_for(tmp_path: Path, monkeypatch: 
     without, hard = ({case.condition for case in plan.cases} for plan in planned_for)
     assert without == {"base"}
     assert {"base", "high-iso", "tiff", "jpeg", "depth", "motion", "night", "text", "foliage"} < hard
+
+
+@pytest.mark.parametrize(("lines", "status"), [([], 0), (["n = 5: relative L2 of the PSF"], 1)])
+def test_missed_bars_fail_a_run_that_asserts_them(
+    lines: list[str], status: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: dict[str, Any] = {"code": "0", "figures": {}}
+    for name, value in {
+        "planned": None,
+        "run_reproduction": made,
+        "write_page": (),
+        "collected": None,
+        "missed": lines,
+    }.items():
+        monkeypatch.setattr(f"lensmodel.lab.reproduce.{name}", lambda *_, value=value, **__: value)
+    arguments = ["reproduce", "--direct", "-o", str(tmp_path)]
+
+    asserted = CliRunner().invoke(app, [*arguments, "--assert-bars"])
+    assert (asserted.exit_code, CliRunner().invoke(app, arguments).exit_code) == (status, 0)
+    assert all(line in asserted.stderr for line in lines)

@@ -238,3 +238,30 @@ def held(found: Sequence[Bar]) -> dict[str, int]:
         "missed": sum(bar.met is False for bar in found),
         "unknown": sum(bar.met is None for bar in found),
     }
+
+
+def missed(result: Mapping[str, Any]) -> list[str]:
+    """Say which bars are missed, a line each, and of five photos that are worse than two, where.
+
+    Parameters
+    ----------
+    result : mapping
+        What `run_reproduction` returned.
+    """
+    lines = []
+    for bar in bars(result):
+        if bar.met is False:
+            asked = " and ".join(
+                f"{words} {limit:g}"
+                for words, limit in (("at least", bar.low), ("at most", bar.high))
+                if limit is not None
+            )
+            family = f"{bar.family}, " if bar.family else ""
+            lines.append(f"{family}n = {bar.n}: {bar.name}, {bar.place}: {bar.value:.2f}, {asked} is asked")
+    methods = result["plan"]["methods"]
+    more = more_photos(result["cases"], DECONVOLUTION if DECONVOLUTION in methods else methods[0])
+    for row in more["rows"]:
+        psf = "" if row["psf"] is None else f"PSF error {row['psf'][0]:.2f} to {row['psf'][1]:.2f}, "
+        gained = row["psnr"][1] - row["psnr"][0]
+        lines.append(f"five photos worse than two: {row['lens']}, {row['zone']}: {psf}PSNR {gained:+.2f} dB")
+    return lines

@@ -48,7 +48,7 @@ from lensmodel.lab.reproduce.general import (
     general_words,
 )
 from lensmodel.lab.reproduce.interpolation import Flow
-from lensmodel.lab.reproduce.pages.bars import bars, held
+from lensmodel.lab.reproduce.pages.bars import bars, held, missed
 from lensmodel.lab.reproduce.pages.tables import groups, hard_rows, kept, shares, summary
 from lensmodel.lab.reproduce.planning import in_turn
 from lensmodel.lab.reproduce.routes import paper_way
@@ -168,6 +168,7 @@ def test_fewer_photos_leave_larger_frames() -> None:
     least = planned("default", lenses=1, photos=1, default_only=True)
     assert (least.methods, least.rivals, least.programs) == (("standard",), (), ())
     assert (least.paper, least.general, least.target) == (False, False, False)
+    assert planned("default", lenses=1, photos=1, default_only=True, paper=True).paper
     assert [one.name for one in least.cases] == [one.name for one in two.cases]
     with pytest.raises(InvalidInputError, match="at most 2 photos of size quick"):
         planned("quick", photos=2)
@@ -617,6 +618,15 @@ def test_five_photos_are_never_worse_than_two(
     text = write_page(made, tmp_path)[0].read_text(encoding="utf-8")
     row = f"| Lens <0> | corner | 0.200 to {five[0]:.3f} | {two[1]:.2f} to {five[1]:.2f} |"
     assert (row in text) is bool(psf_worse or psnr_worse)
+    where = [line for line in missed(made) if line.startswith("five photos worse than two: Lens <0>, corner")]
+    assert len(where) == (psf_worse or psnr_worse)
+
+
+def test_each_missed_bar_is_named_with_what_is_asked() -> None:
+    made = after((0.20, 33.0), (0.15, 33.5))
+    lines = missed(made)
+    assert len(lines) == held(bars(made))["missed"] > 0
+    assert all("is asked" in line and "third order, n = " in line for line in lines)
 
 
 def test_run_without_five_photos_does_not_tell_whether_they_are_worse() -> None:

@@ -147,8 +147,7 @@ def reproduce(
 
         lensmodel reproduce --only 1003 --results figures-so-far --no-figures -o sitting
 
-    Exit status: 0 the page is written, 1 something failed or, with --assert-bars, a bar is missed; 2 called
-    wrongly.
+    Exit status: 0 the page is written, 1 something failed or an asserted bar is missed, 2 called wrongly.
     """
     shown = display.of(context, quiet=quiet, verbose=verbose)
     if quick + small + full > 1:

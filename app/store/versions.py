@@ -38,7 +38,7 @@ def new_version(session: Session, lens_id: int, *, rebuild: bool = False) -> int
 
 LEARNED_ROOT: Final = "models/"
 
-LEARNED_VERSION: Final = 19
+LEARNED_VERSION: Final = 18
 """That of `lensmodel.model.learned`, which takes seconds to import.
 
 What another version of the program fitted is not looked for, and fitted anew.

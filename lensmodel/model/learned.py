@@ -34,7 +34,7 @@ from lensmodel.model.wavefront.physical_mean import REASONS_APART, Physics
 from lensmodel.model.wavefront.zoom import End
 from lensmodel.optics.wavefront import NAMES, Wavefront
 
-VERSION: Final = 19
+VERSION: Final = 18
 """Raised whenever the same samples would be fitted otherwise."""
 
 _MOST_BYTES = 1 << 27  # unpacked: against files made to fill the memory

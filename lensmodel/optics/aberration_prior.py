@@ -43,7 +43,7 @@ class AberrationPrior:
 
     Parameters
     ----------
-    with_kernels, with_spectra : ndarray of float64, shape (23,)
+    with_kernels, with_spectra : ndarray of float64, shape (19,)
         Of the terms of a lens (`wavefront.NAMES`), fitted to kernels and fitted to spectra.
     at_place : ndarray of float64, shape (8,)
         Of the terms of one field position (`local_pupil`), fitted to spectra.
@@ -104,7 +104,7 @@ class AberrationPrior:
 
     @property
     def slopes(self) -> Floats:
-        """Spread of the change of each term of a zoom by octave of focal length, shape (23,)."""
+        """Spread of the change of each term of a zoom by octave of focal length, shape (19,)."""
         return self.per_octave * self.with_kernels
 
 
@@ -119,15 +119,15 @@ def unlikeliness(lens: Floats) -> tuple[float, Floats, Floats]:
 
     Parameters
     ----------
-    lens : ndarray, shape (25,)
+    lens : ndarray, shape (21,)
         The terms of a wavefront and the cat's eye.
 
     Returns
     -------
     cost : float
-    curvature : ndarray, shape (25, 25)
+    curvature : ndarray, shape (21, 21)
         Half its second derivatives, by Gauss and Newton.
-    slope : ndarray, shape (25,)
+    slope : ndarray, shape (21,)
         Half its first derivatives.
     """
     off = lens - _USUAL
@@ -144,7 +144,7 @@ def corner_ratio(terms: Floats) -> tuple[float, Floats]:
 
     Parameters
     ----------
-    terms : ndarray, shape (23,)
+    terms : ndarray, shape (19,)
         Of a wavefront, pixels.
     """
     center, corner = _spots()

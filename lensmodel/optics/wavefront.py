@@ -3,13 +3,10 @@
 With the field vector h = (x, y) (right, up), r = |h|, and the terms of `pupil`, blur in pixels at the
 widest aperture N0 is linear in the unknowns::
 
-    |p|^4        a0 + a1 r^2 + at t                                 spherical
-    p |p|^2      C h + k + C5 r^2 h + Ct t h                        coma, with that of a decentred copy
+    |p|^4        a0 + a1 r^2                                        spherical
+    p |p|^2      C h + k + C5 r^2 h                                 coma, with that of a decentred copy
     |p|^2        d0 + d.h + d2 r^2 + d4 r^4 + c1 t + c2 t^2         focus, tilt, field curvature, colour
-                 + dt t r^2
-    astigmatism  w h^2 + L h + K + w4 r^2 h^2 + wt t h^2 (complex)  two nodes, where the copy is decentred
-
-with t the wavelength beyond that of green in units of 100 nm.
+    astigmatism  w h^2 + L h + K + w4 r^2 h^2  (complex)            two nodes, where the copy is decentred
 
 Stopping down to N scales the blur of a term of degree n by (N0 / N)^(n - 1). Besides: q0, the width of
 diffraction, and the cat's eye, a second circle that moves over the pupil with h. The unknowns of a zoom
@@ -41,7 +38,6 @@ NAMES: Final = (
     *("focus", "tilt x", "tilt y", "field curvature", "field curvature r4", "colour 1", "colour 2"),
     *("astigmatism", "linear astigmatism 1", "linear astigmatism 2"),
     *("uniform astigmatism 1", "uniform astigmatism 2", "astigmatism r4"),
-    *("spherical colour", "coma colour", "field curvature colour", "astigmatism colour"),
 )
 """The linear unknowns, in pixels of blur at the widest aperture."""
 
@@ -67,7 +63,7 @@ def design(position: FieldPosition, settings: LensSettings) -> NDArray[np.float6
 
     Returns
     -------
-    ndarray of float64, shape (6, 23)
+    ndarray of float64, shape (6, 19)
         The equations above, row by row; times `Wavefront.terms` it is blur in pixels.
     """
     x, y = position.r * math.cos(position.phi), position.r * math.sin(position.phi)
@@ -78,12 +74,8 @@ def design(position: FieldPosition, settings: LensSettings) -> NDArray[np.float6
     rows[1, 2:6] = x, 1.0, 0.0, r2 * x
     rows[2, 2:6] = y, 0.0, 1.0, r2 * y
     rows[3, 6:13] = 1.0, x, y, r2, r2 * r2, t, t * t
-    rows[4, 13:19] = xx, x, -y, 1.0, 0.0, r2 * xx
-    rows[5, 13:19] = xy, y, x, 0.0, 1.0, r2 * xy
-    rows[0, 19] = t
-    rows[1, 20], rows[2, 20] = t * x, t * y
-    rows[3, 21] = t * r2
-    rows[4, 22], rows[5, 22] = t * xx, t * xy
+    rows[4, 13:] = xx, x, -y, 1.0, 0.0, r2 * xx
+    rows[5, 13:] = xy, y, x, 0.0, 1.0, r2 * xy
     return rows
 
 
@@ -93,7 +85,7 @@ class Wavefront:
 
     Parameters
     ----------
-    terms : ndarray, shape (23,)
+    terms : ndarray, shape (19,)
         Values of `NAMES`, pixels.
     log_q : float
         Logarithm of wavelength x f-number / pixel pitch at 540 nm and the widest aperture.
@@ -105,7 +97,7 @@ class Wavefront:
         Odd side in pixels of the kernels that it was fitted to.
     error : float
         Median relative L2 of the samples against it.
-    slopes : ndarray, shape (23,), or None
+    slopes : ndarray, shape (19,), or None
         Of a zoom: change of the terms by octave of focal length.
     focal_octaves : float
         Of a zoom: log2 of the focal length, in mm, that `terms` belong to.

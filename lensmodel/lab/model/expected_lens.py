@@ -33,7 +33,7 @@ _SIZE: Final = 41  # pixels
 
 
 def terms_of(optics: Aberrations) -> NDArray[np.float64]:
-    """Terms of a simulated lens in the unknowns of the fit, pixels, shape (23,).
+    """Terms of a simulated lens in the unknowns of the fit, pixels, shape (19,).
 
     W = sum_k g_k B_k / (2 q), and the field counts from the centre of symmetry: h' = h - decentring.
     """
@@ -62,7 +62,7 @@ def terms_of(optics: Aberrations) -> NDArray[np.float64]:
 
 
 def terms_of_traced(path: Path) -> tuple[NDArray[np.float64], tuple[float, float]]:
-    """Terms of the wavefront nearest to a ray-traced lens, shape (23,), and its cat's eye."""
+    """Terms of the wavefront nearest to a ray-traced lens, shape (19,), and its cat's eye."""
     lens = GridLens.read(path)
     field, rng = lens.field(), np.random.default_rng(0)
     settings = LensSettings(aperture=lens.widest(), focal_mm=lens.focal_mm[0])
@@ -79,7 +79,7 @@ def terms_of_traced(path: Path) -> tuple[NDArray[np.float64], tuple[float, float
 
 
 def print_terms(words: str, terms: NDArray[np.float64], eyes: NDArray[np.float64]) -> None:
-    """Print what lenses have, terms of shape (n, 23) and cat's eyes (n, 2)."""
+    """Print what lenses have, terms of shape (n, 19) and cat's eyes (n, 2)."""
     print(f"\n{len(terms)} {words} lenses; pixels of blur: rms, median, expected with spectra, with kernels")
     usual, middle = np.sqrt((terms**2).mean(axis=0)), np.median(np.abs(terms), axis=0)
     rows = zip(NAMES, usual, middle, ABERRATIONS.with_spectra, ABERRATIONS.with_kernels, strict=True)

@@ -88,8 +88,8 @@ class PooledFit:
     front : Wavefront
     cost : float
         What was minimised; fits to the same patches compare by it.
-    covariance : ndarray, shape (25, 25)
-        Of the 23 terms and the cat's eye, by the curvature of the cost.
+    covariance : ndarray, shape (21, 21)
+        Of the 19 terms and the cat's eye, by the curvature of the cost.
     trust : ndarray, shape (n,)
         Weight of each patch, 1 where it fits; near 0 for one that was blurred by something else.
     """
@@ -259,7 +259,7 @@ def expected(
     ----------
     begin : Wavefront
         Its width of diffraction and widest aperture count.
-    lens : ndarray, shape (25,)
+    lens : ndarray, shape (21,)
         Terms and cat's eye.
     patch : PatchView
     coarse : bool
@@ -269,10 +269,10 @@ def expected(
     -------
     power : ndarray, shape (BINS, c)
         |OTF|^2.
-    by_lens : ndarray, shape (BINS, c, 25)
+    by_lens : ndarray, shape (BINS, c, 21)
         Derivatives of its logarithm.
     phases : dict
-        Of each channel compared with green: phases, (PHASE_BINS,), and derivatives, (PHASE_BINS, 25).
+        Of each channel compared with green: phases, (PHASE_BINS,), and derivatives, (PHASE_BINS, 21).
     """
     x = patch.position.r * math.cos(patch.position.phi)
     y = patch.position.r * math.sin(patch.position.phi)

@@ -19,12 +19,7 @@ Floats = NDArray[np.float64]
 
 _FLOOR_RANGE = (-12.0, -1.0)  # of its logarithm: below it nothing is seen, above it no lens (chosen)
 # Of Gauss and Newton: at first, and from where the last step left a scene (chosen)
-_ROUNDS, _ROUNDS_AGAIN = 5, 3
-_ENOUGH = 0.05  # of the cost of a patch: less gained in a step is below what fits of lenses tell (chosen)
-_LARGEST_STEP = 3.0  # of a natural logarithm: beyond it no fit is linear (chosen)
-_SHORTER = 0.25
-"""Factor on a step after one that led uphill (chosen). A scene that is left worse than it was keeps the fit
-of the lens from every step: behind the Heliar, fits to two photos ended 50 to 70 of the cost too high."""
+_ROUNDS, _ROUNDS_AGAIN = 3, 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +73,7 @@ class SceneState:
 
     @classmethod
     def fitted(cls, view: SceneView, power: Floats, rest: Floats, begin: Floats | None) -> SceneState:
-        """Solve for the patch's own unknowns by Gauss and Newton, never uphill."""
+        """Solve for the patch's own unknowns by Gauss-Newton."""
         rounds = _ROUNDS_AGAIN
         if begin is None:
             rounds = _ROUNDS
@@ -87,17 +82,12 @@ class SceneState:
             z[PATCH_SHAPES.shape[1] : -1 : 3] += np.median(left, axis=0)
         else:
             z = begin
-        best, share = cls._about(view, power, rest, z), 1.0
+        state = cls._about(view, power, rest, z)
         for _ in range(rounds):
-            step = np.clip(np.linalg.solve(best.normal, best.gradient), -_LARGEST_STEP, _LARGEST_STEP)
-            z = best.z + share * step
+            z = z + np.clip(np.linalg.solve(state.normal, state.gradient), -3.0, 3.0)
             z[-1] = np.clip(z[-1], *_FLOOR_RANGE)
             state = cls._about(view, power, rest, z)
-            gained = best.cost - state.cost
-            best, share = (state, 1.0) if gained > 0.0 else (best, _SHORTER * share)
-            if 0.0 <= gained < _ENOUGH:
-                break
-        return best
+        return state
 
     @classmethod
     def _about(cls, view: SceneView, power: Floats, rest: Floats, z: Floats) -> SceneState:

@@ -104,7 +104,7 @@ def test_a_fit_is_turned_to_the_side_that_phases_speak_for() -> None:
     turned = replace(FRONT, terms=-FRONT.terms)
     heads = [samples(FRONT, place)["g"] for place in PLACES]
     for front in (FRONT, turned):
-        fit = PooledFit(front, 10.0, np.eye(len(NAMES) + 2), np.ones(len(PLACES)))
+        fit = PooledFit(front, 10.0, np.eye(21), np.ones(len(PLACES)))
         sided, vote = _sided(fit, heads, views(FRONT))
 
         assert np.array_equal(sided.front.terms, FRONT.terms)
@@ -116,9 +116,7 @@ def test_a_lens_whose_coma_is_negated_is_turned_back() -> None:
     mirrored = replace(FRONT, terms=sign * FRONT.terms)
     heads = [samples(FRONT, place)["g"] for place in PLACES]
 
-    sided, vote = _sided(
-        PooledFit(mirrored, 10.0, np.eye(len(NAMES) + 2), np.ones(len(PLACES))), heads, views(FRONT)
-    )
+    sided, vote = _sided(PooledFit(mirrored, 10.0, np.eye(21), np.ones(len(PLACES))), heads, views(FRONT))
 
     true, before, after = (front.kernel(PLACES[2], SETTINGS, 31) for front in (FRONT, mirrored, sided.front))
     assert vote < 0

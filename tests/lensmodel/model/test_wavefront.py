@@ -13,11 +13,11 @@ import pytest
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfSample, as_kernel, centroid, distance
-from lensmodel.core.types import CHANNELS, WAVELENGTH_NM, Channel, FieldPosition, Kernel, LensSettings
+from lensmodel.core.types import FieldPosition, Kernel, LensSettings
 from lensmodel.model import LensModel, ModelSettings
 from lensmodel.model.wavefront.from_kernels import fit_wavefront, side_of_light, spread_samples
 from lensmodel.optics.pupil import TERMS, PupilGrid
-from lensmodel.optics.wavefront import NAMES, Wavefront, design
+from lensmodel.optics.wavefront import Wavefront
 from lensmodel.simulate import draw_lens
 
 
@@ -91,11 +91,11 @@ def test_light_beyond_35_pixels_is_part_of_what_is_fitted() -> None:
 )
 def test_impossible_wavefronts_are_refused(change: dict[str, Any]) -> None:
     with pytest.raises(InvalidInputError, match="wavefront"):
-        replace(Wavefront(np.zeros(len(NAMES)), -0.5, (1.0, 0.1), 2.0, 15), **change)
+        replace(Wavefront(np.zeros(19), -0.5, (1.0, 0.1), 2.0, 15), **change)
 
 
 def test_in_huge_pixels_the_light_is_in_one() -> None:
-    front = Wavefront(np.zeros(len(NAMES)), math.log(1e-3), (1.0, 0.1), 2.0, 15)
+    front = Wavefront(np.zeros(19), math.log(1e-3), (1.0, 0.1), 2.0, 15)
 
     kernel = front.kernel(FieldPosition(0.0, 0.0), LensSettings(), 5)
 
@@ -216,7 +216,7 @@ class TestWavefrontAlone:
 
 def test_a_kernel_whose_centre_goes_to_and_fro_is_rendered_all_the_same() -> None:
     terms = [-0.389, -0.137, -0.445, 0.017, -0.369, -0.038, -0.193, 0.012, 0.068, 0.215]
-    terms += [-0.054, -0.56, 1.086, -0.005, 0.012, -0.054, -0.044, 0.006, -0.009, 0.0, 0.0, 0.0, 0.0]
+    terms += [-0.054, -0.56, 1.086, -0.005, 0.012, -0.054, -0.044, 0.006, -0.009]
     front = Wavefront(np.array(terms), -1.53, (1.16, 0.2), 1.8, 13)
 
     kernel = front.kernel(FieldPosition(0.71, 0.53), LensSettings(aperture=1.8, focal_mm=35.0), 31)
@@ -227,22 +227,10 @@ def test_a_kernel_whose_centre_goes_to_and_fro_is_rendered_all_the_same() -> Non
 
 def test_light_narrower_than_the_fine_grid_is_never_negative() -> None:
     terms = [-0.045, 0.106, -0.494, 0.164, 0.032, 0.081, -0.174, 0.053, -0.465, -0.503]
-    terms += [-0.114, 0.113, 0.222, -0.165, 0.015, -0.159, -0.065, 0.186, -0.176, 0.0, 0.0, 0.0, 0.0]
+    terms += [-0.114, 0.113, 0.222, -0.165, 0.015, -0.159, -0.065, 0.186, -0.176]
     front = Wavefront(np.array(terms), -1.532, (0.901, 0.124), 1.8, 11)
 
     kernel = front.kernel(FieldPosition(0.9, -2.58), LensSettings(aperture=1.8, focal_mm=35.0), 31)
 
     assert kernel.min() >= 0.0
     assert math.hypot(*centroid(kernel)) < 0.01
-
-
-@pytest.mark.parametrize("term", ["spherical", "coma", "field curvature", "astigmatism"])
-@pytest.mark.parametrize("channel", CHANNELS)
-def test_an_aberration_of_colour_is_that_aberration_as_far_as_the_colour_is_from_green(
-    term: str, channel: Channel
-) -> None:
-    blur = design(FieldPosition(0.7, 0.9), LensSettings(channel=channel))
-    off = (WAVELENGTH_NM[channel] - WAVELENGTH_NM["g"]) / 100.0
-
-    colour = blur[:, NAMES.index(f"{term} colour")]
-    assert colour == pytest.approx(off * blur[:, NAMES.index(term)], abs=1e-12)

@@ -88,7 +88,7 @@ def reproduce(
         bool | None,
         typer.Option(
             "--paper/--no-paper",
-            help="The paper's own way from end to end, which is slow. Default: but for --default-only.",
+            help="The paper's own way too, which is slow. Default: yes, without --default-only.",
         ),
     ] = None,
     no_target: Annotated[

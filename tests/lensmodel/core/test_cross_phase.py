@@ -13,12 +13,14 @@ from lensmodel.core.cross_phase import (
     cross_phase,
     log_likelihood,
     mean_in_bins,
+    noise_in_bins,
+    spectra_in_bins,
     unshifted,
     without_linear,
 )
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.spectrum import PHASE_BINS, CrossPhase
-from lensmodel.core.types import BayerPattern
+from lensmodel.core.types import CHANNELS, BayerPattern, Channel
 
 RGGB: BayerPattern = ((0, 1), (1, 2))
 PATTERNS: tuple[BayerPattern, ...] = (RGGB, ((2, 1), (1, 0)), ((1, 0), (2, 1)), ((1, 2), (0, 1)))
@@ -114,6 +116,31 @@ def test_noise_makes_phases_less_precise() -> None:
 
     clean, grainy = (cross_phase(each, RGGB, "b").precision.sum() for each in (seen, noisy))
     assert grainy < 0.3 * clean
+
+
+def test_cross_spectrum_over_green_is_the_gain_of_the_two_kernels() -> None:
+    inside = np.hypot(*MIDDLES.T) > 0.05
+    cross, own, green = (part[inside] for part in spectra_in_bins(planes(BLUE, GREEN), RGGB, "b"))
+    blue, other = (
+        np.abs(mean_in_bins(trail(64, right, down)))[inside] for right, down in ((6.0, 3.0), (2.0, 0.0))
+    )
+
+    true = np.log(blue / other)
+    for measured in (np.log(np.abs(cross) / green), 0.5 * np.log(own / green)):
+        off = measured - true
+        assert np.std(true) > 0.15
+        assert np.std(off) < 0.4 * np.std(true)
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+def test_power_of_noise_in_the_bins_is_known(channel: Channel) -> None:
+    noise = np.random.default_rng(3).normal(0.0, 2.0, (3, 320, 320)).astype(np.float32)
+    other: Channel = "b" if channel == "g" else channel
+    _, own, green = spectra_in_bins(noise, RGGB, other)
+
+    seen, known = (green if channel == "g" else own), 4.0 * noise_in_bins(RGGB, channel)
+    assert seen.sum() == pytest.approx(known.sum(), rel=0.03)
+    assert (known > 0).sum() == (np.hypot(*MIDDLES.T) > 0).sum()
 
 
 def test_a_shift_is_taken_from_columns() -> None:

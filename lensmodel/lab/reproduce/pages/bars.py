@@ -257,7 +257,7 @@ def missed(result: Mapping[str, Any]) -> list[str]:
                 if limit is not None
             )
             family = f"{bar.family}, " if bar.family else ""
-            lines.append(f"{family}n = {bar.n}: {bar.name}, {bar.place}: {bar.value:.2f}, {asked} is asked")
+            lines.append(f"{family}n = {bar.n}: {bar.name}, {bar.place}: {bar.value:.4g}, {asked} is asked")
     methods = result["plan"]["methods"]
     more = more_photos(result["cases"], DECONVOLUTION if DECONVOLUTION in methods else methods[0])
     for row in more["rows"]:

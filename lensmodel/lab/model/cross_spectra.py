@@ -20,6 +20,9 @@ Then, by ring, how far the gain is off: ln |H_C / H_G| by the cross spectrum ove
 of the ratio of powers and by their mean, and that root in the demosaiced planes, each less the true one; the
 level of each patch, the colour of its scene, is taken off first. Bias is the median, scatter the robust
 standard deviation of bins, slope that of the patches' slopes over ln f. Some ten seconds a photo.
+
+Source of the first: J. S. Bendat, A. G. Piersol, "Random Data", 4th ed., 2010, ch. 6, where the transfer
+function of a system is the cross spectrum of what leaves and enters it over the power of what enters.
 """
 
 from __future__ import annotations
@@ -34,6 +37,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from lensmodel import photo
 from lensmodel.core.cross_phase import (
@@ -70,6 +74,9 @@ OTHERS: Final[tuple[Channel, ...]] = ("b", "r")
 
 GAINS: Final = ("cross over green", "powers", "their mean", "powers, demosaiced")
 """Ways to measure a gain."""
+
+_LEAST_SIGNAL = 0.05  # of the power: what is left of it at least when the noise is taken off (chosen)
+_TINY = 1e-30  # keeps logarithms finite, far below any power
 
 Floats = NDArray[np.float64]
 
@@ -139,25 +146,35 @@ def phases_of(
 def gain_errors_of(
     lens: KnownLens, place: FieldPosition, planes: Planes, cfa: BayerPattern, noise: Sequence[float]
 ) -> dict[Channel, tuple[Floats, ...]]:
-    """Gains of a patch by each of `GAINS` less the true ones, see `MeasuredPatch`."""
+    """Gains of a patch by each of `GAINS` less the true ones, see `MeasuredPatch`.
+
+    Parameters
+    ----------
+    planes : Planes, shape (3, h, w)
+        Developed, the samples of the mosaic at their own sites.
+    cfa : BayerPattern
+        Of the patch's top left 2 x 2 pixels.
+    noise : sequence of float
+        Variance of the noise of r, g and b.
+    """
     field = lens.lens.field(lens.settings)
     true = {
-        c: np.log(mean_in_bins(np.abs(transfer_of(field.kernel_at(place, c, _SIDE))) ** 2).real + 1e-12)
+        c: np.log(mean_in_bins(np.abs(transfer_of(field.kernel_at(place, c, _SIDE))) ** 2).real + _TINY)
         for c in CHANNELS
     }
     demosaiced = {}
     for number, c in enumerate(CHANNELS):
         power, floor = binned_spectrum(np.ascontiguousarray(planes[number]), NoiseModel(0.0, noise[number]))
         rings = power[FIRST_PHASE_RING : FIRST_PHASE_RING + PHASE_RINGS].ravel().astype(np.float64)
-        demosaiced[c] = np.log(np.maximum(rings - floor, 0.05 * rings))
+        demosaiced[c] = np.log(np.maximum(rings - floor, _LEAST_SIGNAL * rings))
     errors: dict[Channel, tuple[Floats, ...]] = {}
     for channel in OTHERS:
         cross, own, green = spectra_in_bins(planes, cfa, channel)
         own, green = (
-            np.maximum(power - noise[CHANNELS.index(c)] * noise_in_bins(cfa, c), 0.05 * power)
+            np.maximum(power - noise[CHANNELS.index(c)] * noise_in_bins(cfa, c), _LEAST_SIGNAL * power)
             for c, power in ((channel, own), ("g", green))
         )
-        logs = [np.log(np.maximum(part, 1e-30)) for part in (np.abs(cross), own, green)]
+        logs = [np.log(np.maximum(part, _TINY)) for part in (np.abs(cross), own, green)]
         both = logs[0] - logs[2], 0.5 * (logs[1] - logs[2])
         known = 0.5 * (true[channel] - true["g"])
         ways = (*both, np.mean(both, axis=0), 0.5 * (demosaiced[channel] - demosaiced["g"]))
@@ -263,9 +280,9 @@ def report_gains(patches: Sequence[MeasuredPatch]) -> None:
             cells = []
             for ring in range(PHASE_RINGS):
                 values = off.reshape(-1, PHASE_RINGS, SECTORS)[:, ring, used[ring]].ravel()
-                bias = float(np.median(values))
-                cells.append(f"{bias:+.2f}, {1.4826 * float(np.median(np.abs(values - bias))):.2f}")
-            scatter = 1.4826 * float(np.median(np.abs(slope - np.median(slope))))
+                scatter = stats.median_abs_deviation(values, scale="normal")
+                cells.append(f"{np.median(values):+.2f}, {scatter:.2f}")
+            scatter = stats.median_abs_deviation(slope, scale="normal")
             print(f"| {channel}, {way} | {' | '.join(cells)} | {np.median(slope):+.2f}, {scatter:.2f} |")
 
 

@@ -104,8 +104,7 @@ def bars(result: Mapping[str, Any]) -> list[Bar]:
         What `run_reproduction` returned.
     """
     found: list[Bar] = []
-    methods = result["plan"]["methods"]
-    method = DECONVOLUTION if DECONVOLUTION in methods else methods[0]
+    method = _method(result)
     for family in FAMILIES:
         cases = [case for case in result["cases"] if case["family"] == family]
         if not cases:
@@ -122,6 +121,12 @@ def bars(result: Mapping[str, Any]) -> list[Bar]:
         )
         found += [replace(bar, family=family) for part in parts for bar in part]
     return [*found, *_hard(result)]
+
+
+def _method(result: Mapping[str, Any]) -> str:
+    """Deconvolution that bars are of; the first of a run without it."""
+    methods: Sequence[str] = result["plan"]["methods"]
+    return DECONVOLUTION if DECONVOLUTION in methods else methods[0]
 
 
 def _psf(made: Mapping[str, Any]) -> Iterator[Bar]:
@@ -258,9 +263,7 @@ def missed(result: Mapping[str, Any]) -> list[str]:
             )
             family = f"{bar.family}, " if bar.family else ""
             lines.append(f"{family}n = {bar.n}: {bar.name}, {bar.place}: {bar.value:.4g}, {asked} is asked")
-    methods = result["plan"]["methods"]
-    more = more_photos(result["cases"], DECONVOLUTION if DECONVOLUTION in methods else methods[0])
-    for row in more["rows"]:
+    for row in more_photos(result["cases"], _method(result))["rows"]:
         psf = "" if row["psf"] is None else f"PSF error {row['psf'][0]:.2f} to {row['psf'][1]:.2f}, "
         gained = row["psnr"][1] - row["psnr"][0]
         lines.append(f"five photos worse than two: {row['lens']}, {row['zone']}: {psf}PSNR {gained:+.2f} dB")

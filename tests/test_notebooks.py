@@ -19,10 +19,6 @@ def cells(path: Path) -> list[dict[str, Any]]:
     return [cell for cell in found if cell["cell_type"] == "code"]
 
 
-def test_there_are_three() -> None:
-    assert len(NOTEBOOKS) == 3
-
-
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_was_executed_from_top_to_bottom(path: Path) -> None:
     assert [cell["execution_count"] for cell in cells(path)] == list(range(1, len(cells(path)) + 1))

@@ -19,15 +19,10 @@ import httpx2
 import numpy as np
 import pytest
 import tifffile
+from deadline import Deadline, stretched
+from in_process import lensmodel
 from PIL import Image
-
-from lensmodel.core.psf import rms_width
-
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE))
-from deadline import Deadline, stretched  # noqa: E402 - beside this file
-from in_process import lensmodel  # noqa: E402 - same
-from running import (  # noqa: E402 - same
+from running import (
     BRIEF,
     OWN_ACCOUNT,
     PATIENCE_S,
@@ -37,7 +32,7 @@ from running import (  # noqa: E402 - same
     write_photo,
 )
 
-sys.path.remove(str(HERE))
+from lensmodel.core.psf import rms_width
 
 SIGMA = 1.3
 

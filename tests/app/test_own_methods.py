@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from running import Service, write_photo
 
 import lensmodel
 from lensmodel.core import registry
@@ -18,11 +19,6 @@ from lensmodel.core.errors import UnknownMethodError
 from lensmodel.core.registry import Registry
 
 HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE))
-from running import Service, write_photo  # noqa: E402 - beside this file
-
-sys.path.remove(str(HERE))
-
 MODULE = '''
 from dataclasses import dataclass
 

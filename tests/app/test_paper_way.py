@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 import io
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
+from running import running, write_photo
 
 from lensmodel.model.profile import read_profile
-
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE))
-from running import running, write_photo  # noqa: E402 - beside this file
-
-sys.path.remove(str(HERE))
 
 
 @pytest.mark.slow  # the paper's estimator on the smallest photo, and loops to compile: a minute and a half

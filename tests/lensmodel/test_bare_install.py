@@ -57,10 +57,6 @@ def five_lines() -> str:
     return found.group(1)
 
 
-def test_the_first_lines_of_the_library_page_are_five(five_lines: str) -> None:
-    assert len([line for line in five_lines.splitlines() if line]) == 5
-
-
 def test_the_package_itself_begins_with_the_same_lines(five_lines: str) -> None:
     assert lensmodel.__doc__ is not None
     assert textwrap.indent(five_lines, "    ") in lensmodel.__doc__

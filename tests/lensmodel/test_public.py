@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import ast
-import builtins
 import inspect
 import json
-import re
 import subprocess
 import sys
-import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from types import FunctionType
@@ -117,151 +113,6 @@ def test_a_public_name_exists_and_is_documented(name: str) -> None:
 
 def test_public_signatures_and_defaults_are_as_announced() -> None:
     assert list(interface()) == SIGNATURES.read_text(encoding="utf-8").splitlines()
-
-
-FUNCTIONS = [name for name in NAMES if inspect.isfunction(public(name))] + [
-    f"{name}.{method}"
-    for name in NAMES
-    if inspect.isclass(public(name))
-    for method, value in vars(public(name)).items()
-    if not method.startswith("_") and isinstance(value, METHODS)
-]
-"""The public functions and methods."""
-
-
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_a_public_function_documents_each_parameter_and_what_it_returns(name: str) -> None:
-    text, signature = inspect.getdoc(public(name)) or "", inspect.signature(public(name))
-    given = set(signature.parameters) - {"self"}
-
-    assert [parameter for parameter in sorted(given) if parameter not in text] == []
-    assert "Parameters\n---" in text or not given
-    assert "Returns\n---" in text or signature.return_annotation in {"None", "Self"}
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("calibrate", "correct", "develop", "field_grid", "photo_from_array"),
-        *("Deconvolver.deconvolve", "PsfEstimator.estimate", "PsfEstimator.estimate_channel"),
-        *(
-            "Lens.from_kernels",
-            "Lens.kernels",
-            "Lens.load",
-            "Lens.mtf",
-            "Lens.mtf50_map",
-            "Lens.psf",
-            "Lens.save",
-        ),
-    ],
-)
-def test_a_public_function_documents_its_errors(name: str) -> None:
-    assert "Raises\n---" in (inspect.getdoc(public(name)) or "")
-
-
-DOCUMENTED = [
-    *(name for name in NAMES if inspect.isclass(public(name))),
-    *FUNCTIONS,
-    *(
-        f"{name}.{member}"
-        for name in NAMES
-        if inspect.isclass(public(name))
-        for member, value in vars(public(name)).items()
-        if isinstance(value, property)
-    ),
-    *(f"deconvolvers.{method}" for method in ("create", "resolve", "register", "extended")),
-]
-"""What has a docstring of its own: classes, functions, methods, properties, and the methods of registries."""
-
-ARRAY = re.compile(r"NDArray|ArrayLike|\b(Kernel|Planes?)\b")
-DTYPE = re.compile(r"\b(float|float32|float64|bool)\b")
-
-
-def code_of(value: Any) -> Any:
-    """Return what runs when a public name is called: of a class its check, of a property its getter."""
-    if inspect.isclass(value):
-        return vars(value).get("__post_init__", vars(value).get("__init__"))
-    return inspect.unwrap(value.fget if isinstance(value, property) else value)
-
-
-def raised_by(code: Any, *, deeper: bool = True) -> set[type[Exception]]:
-    """Return what a function of this library raises itself, and what the functions raise that it calls."""
-    code = getattr(code, "__func__", code)
-    if not (inspect.isfunction(code) and code.__module__.startswith("lensmodel") and is_written(code)):
-        return set()
-    known = {**vars(builtins), **code.__globals__}
-    found: set[type[Exception]] = set()
-    for node in ast.walk(ast.parse(textwrap.dedent(inspect.getsource(code)))):
-        call = node.exc if isinstance(node, ast.Raise) else node
-        if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name)):
-            continue
-        if isinstance(node, ast.Raise):
-            found.add(known[call.func.id])
-        elif deeper:
-            found |= raised_by(known.get(call.func.id), deeper=False)
-    return found
-
-
-def is_written(code: Any) -> bool:
-    """Whether a function stands in a file, and is not made by `dataclass` or `Protocol`."""
-    return code.__code__.co_filename == sys.modules[code.__module__].__file__
-
-
-def section(text: str, title: str) -> str:
-    """Return one section of a numpydoc docstring, empty where there is none."""
-    found = re.search(rf"^{title}\n-+\n(.*?)(?=^\w+\n-+\n|\Z)", text, re.MULTILINE | re.DOTALL)
-    return found.group(1) if found else ""
-
-
-def entry(text: str, name: str) -> str:
-    """Return what a section says of one name."""
-    found = re.search(rf"^(?:\w+, )*{name}\b.*?(?=^\S|\Z)", text, re.MULTILINE | re.DOTALL)
-    return found.group(0) if found else ""
-
-
-def test_what_is_raised_is_found_in_a_check_and_in_what_it_calls() -> None:
-    assert {error.__name__ for error in raised_by(code_of(lensmodel.PsfSample))} == {
-        "InvalidInputError",
-        "InvalidKernelError",
-    }
-
-
-@pytest.mark.parametrize("name", DOCUMENTED)
-def test_what_a_public_name_raises_is_documented(name: str) -> None:
-    value = public(name)
-    said = section(inspect.getdoc(value) or "", "Raises")
-
-    unsaid = [
-        error.__name__
-        for error in raised_by(code_of(value))
-        if not any(re.search(rf"^{kind.__name__}$", said, re.MULTILINE) for kind in error.__mro__)
-    ]
-    assert unsaid == []
-
-
-@pytest.mark.parametrize("name", DOCUMENTED)
-def test_a_public_name_and_its_documentation_spell_alike(name: str) -> None:
-    text = f"{name} {' '.join(arguments(name))} {inspect.getdoc(public(name))}"
-
-    assert re.findall(r"\w*(?:centre|colour|normalis)\w*", text, re.IGNORECASE) == []
-
-
-def arguments(name: str) -> list[str]:
-    code = code_of(public(name))
-    return [] if code is None else list(inspect.signature(code).parameters)
-
-
-@pytest.mark.parametrize("name", DOCUMENTED)
-def test_a_public_array_says_its_shape_and_dtype(name: str) -> None:
-    value = public(name)
-    text = inspect.getdoc(value) or ""
-    kinds = dict(getattr(value if inspect.isclass(value) else code_of(value), "__annotations__", {}))
-    returned, listed = str(kinds.pop("return", "")), section(text, "Parameters")
-    said = {one: entry(listed, one) for one, kind in kinds.items() if ARRAY.search(str(kind))}
-    if ARRAY.search(returned):
-        said["what it returns"] = section(text, "Returns") or text
-
-    assert [one for one, words in said.items() if "shape" not in words or not DTYPE.search(words)] == []
 
 
 def test_an_unknown_name_is_no_attribute() -> None:

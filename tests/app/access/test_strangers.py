@@ -5,29 +5,22 @@ from __future__ import annotations
 import logging
 import re
 import socket
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from pathlib import Path
 from typing import Any
 
 import pytest
+from running import served
 from starlette.testclient import TestClient
 
-HERE = Path(__file__).parents[1]
-sys.path.insert(0, str(HERE))
-from running import served  # noqa: E402 - beside this file
-
-sys.path.remove(str(HERE))
-
-from app.http import psf_formats  # noqa: E402
-from app.http.bodies import MAX_JSON_BYTES  # noqa: E402
-from app.http.picture_cache import DrawnPicture  # noqa: E402
-from app.main import create_app  # noqa: E402
-from app.runtime import logs  # noqa: E402
-from app.runtime.settings import Settings  # noqa: E402
-from app.store import Store  # noqa: E402
+from app.http import psf_formats
+from app.http.bodies import MAX_JSON_BYTES
+from app.http.picture_cache import DrawnPicture
+from app.main import create_app
+from app.runtime import logs
+from app.runtime.settings import Settings
+from app.store import Store
 
 TIFF = b"II*\x00" + bytes(9000)
 JSON = {"Content-Type": "application/json"}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import sys
 import threading
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from running import SMALL, write_photo
 from typer.testing import CliRunner
 
 import lensmodel
@@ -19,12 +19,6 @@ from lensmodel.core import parallel
 from lensmodel.core.psf import PsfSample
 from lensmodel.model import load_profile
 from lensmodel.workflow import pipeline
-
-HERE = Path(__file__).parents[1]
-sys.path.insert(0, str(HERE))
-from running import SMALL, write_photo  # noqa: E402 - beside this file
-
-sys.path.remove(str(HERE))
 
 
 def test_the_calling_thread_is_an_executor_that_hands_on_errors() -> None:

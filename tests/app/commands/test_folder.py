@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from in_process import lensmodel
+from running import SMALL, write_photo
 
 from app.commands.grouping import Shot, groups
 from lensmodel.core.psf import PsfSample, gaussian
@@ -19,13 +20,6 @@ from lensmodel.model.profile import Camera
 from lensmodel.photo.tags.xmp import read_xmp
 from lensmodel.photo.values import LensIdentity, PhotoMetadata
 from lensmodel.workflow.pipeline import photo_id
-
-HERE = Path(__file__).parents[1]
-sys.path.insert(0, str(HERE))
-from in_process import lensmodel  # noqa: E402 - same
-from running import SMALL, write_photo  # noqa: E402 - beside this file
-
-sys.path.remove(str(HERE))
 
 AUTO = (
     "correct",

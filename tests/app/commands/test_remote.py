@@ -3,17 +3,11 @@
 from __future__ import annotations
 
 import socket
-import sys
 from pathlib import Path
 
 import pytest
-
-HERE = Path(__file__).parents[1]
-sys.path.insert(0, str(HERE))
-from in_process import lensmodel  # noqa: E402 - beside this folder
-from running import Service, write_photo  # noqa: E402 - same
-
-sys.path.remove(str(HERE))
+from in_process import lensmodel
+from running import Service, write_photo
 
 
 def test_a_service_that_does_not_answer_is_wrong_usage(tmp_path: Path) -> None:

@@ -10,17 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from running import write_photo
 
 import lensmodel
 from app.cli import main
 from lensmodel.core.errors import NotEnoughEvidenceError, NoUsablePatchesError
 from lensmodel.workflow import sampling
-
-HERE = Path(__file__).parents[1]
-sys.path.insert(0, str(HERE))
-from running import write_photo  # noqa: E402 - beside this file
-
-sys.path.remove(str(HERE))
 
 
 @pytest.fixture

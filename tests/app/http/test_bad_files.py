@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import struct
-import sys
 import time
 import zlib
 from collections.abc import Iterator
@@ -13,20 +12,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from deadline import Deadline
 from PIL import Image
+from running import LIGHT, PATIENCE_S, Service, running, write_photo
 
 from lensmodel.core import parallel
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.types import LensSettings
 from lensmodel.simulate import demo_data_path
 from lensmodel.workflow import pipeline
-
-HERE = Path(__file__).parents[1]
-sys.path.insert(0, str(HERE))
-from deadline import Deadline  # noqa: E402 - beside these files
-from running import LIGHT, PATIENCE_S, Service, running, write_photo  # noqa: E402 - beside this file
-
-sys.path.remove(str(HERE))
 
 KNOWN_CODES = {
     "malformed_upload",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-import sys
 import threading
 import time
 from collections import Counter
@@ -13,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import small_disk as disks
+from servers import postgres
 from starlette.testclient import TestClient
 
 from app.blobs.storage import MARK
@@ -23,13 +24,6 @@ from app.store import Store
 from app.store import photos as photo_store
 from app.store.tables import PhotoRow
 from app.store.upkeep.migrate import upgrade
-
-HERE = Path(__file__).parents[1]
-sys.path.insert(0, str(HERE))
-import small_disk as disks  # noqa: E402 - beside this file
-from servers import postgres  # noqa: E402
-
-sys.path.remove(str(HERE))
 
 TIFF = b"II*\x00" + bytes(9000)
 

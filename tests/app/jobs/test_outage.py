@@ -16,7 +16,9 @@ from typing import Any
 
 import psycopg
 import pytest
+from deadline import Deadline
 from obstore import exceptions as stored
+from servers import postgres
 from sqlalchemy import exc, func, select
 from starlette.testclient import TestClient
 
@@ -32,12 +34,6 @@ from app.store.upkeep.migrate import upgrade
 
 HERE = Path(__file__).parents[1]
 STAND_INS = HERE / "stand_ins"
-sys.path.insert(0, str(HERE))
-from deadline import Deadline  # noqa: E402 - beside these files
-from servers import postgres  # noqa: E402 - same
-
-sys.path.remove(str(HERE))
-
 CELLS = 8
 PATIENCE_S = 180.0
 """Of an idle machine, see `deadline`."""

@@ -14,14 +14,9 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
+from deadline import Deadline, stretched
 
 from app.jobs.queue import MAX_STARTS, DbosEngine, Handler, Job, Kind
-
-HERE = Path(__file__).parents[1]
-sys.path.insert(0, str(HERE))
-from deadline import Deadline, stretched  # noqa: E402 - beside these files
-
-sys.path.remove(str(HERE))
 
 DEAD = "a-worker-that-died"
 

@@ -17,6 +17,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from deadline import Deadline, stretched
 from sqlalchemy import func, select
 
 from app.blobs.storage import Storage
@@ -29,11 +30,6 @@ from app.store.upkeep.invariants import INVARIANTS
 
 HERE = Path(__file__).parents[1]
 STAND_INS = HERE / "stand_ins"
-sys.path.insert(0, str(HERE))
-from deadline import Deadline, stretched  # noqa: E402 - beside these files
-
-sys.path.remove(str(HERE))
-
 CELLS = 8
 LEASE_S = 3.0
 

@@ -6,7 +6,6 @@ import base64
 import os
 import re
 import shutil
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe  # type: ignore[import-untyped]  # has no types
+from deadline import stretched
 from playwright.sync_api import (
     Browser,
     ConsoleMessage,
@@ -23,13 +23,7 @@ from playwright.sync_api import (
     expect,
     sync_playwright,
 )
-
-HERE = Path(__file__).parents[1]
-sys.path.insert(0, str(HERE))
-from deadline import stretched  # noqa: E402 - beside these files
-from running import BRIEF, OWN_ACCOUNT, SMALL, Service, running, write_photo  # noqa: E402 - beside this file
-
-sys.path.remove(str(HERE))
+from running import BRIEF, OWN_ACCOUNT, SMALL, Service, running, write_photo
 
 PATIENCE_MS = 120_000.0
 FLAGS = [

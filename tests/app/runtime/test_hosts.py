@@ -18,27 +18,21 @@ from typing import Any
 
 import httpx2
 import pytest
+from deadline import stretched
+from quick_tasks import CELLS
+from servers import missing, moto, postgres
 from sqlalchemy import select
+from torture import in_environment
+
+from app.blobs.storage import Storage
+from app.runtime.doctor import examine
+from app.runtime.settings import Settings
+from app.store import Store
+from app.store.tables import PhotoRow, SampleRow
+from app.store.upkeep.migrate import upgrade
 
 HERE = Path(__file__).parents[1]
 STAND_INS = HERE / "stand_ins"
-BESIDE = [str(HERE), str(STAND_INS), str(HERE / "endurance")]
-sys.path[:0] = BESIDE
-from deadline import stretched  # noqa: E402 - beside this file
-from quick_tasks import CELLS  # noqa: E402
-from servers import missing, moto, postgres  # noqa: E402
-from torture import in_environment  # noqa: E402
-
-for folder in BESIDE:
-    sys.path.remove(folder)
-
-from app.blobs.storage import Storage  # noqa: E402
-from app.runtime.doctor import examine  # noqa: E402
-from app.runtime.settings import Settings  # noqa: E402
-from app.store import Store  # noqa: E402
-from app.store.tables import PhotoRow, SampleRow  # noqa: E402
-from app.store.upkeep.migrate import upgrade  # noqa: E402
-
 PATIENCE_S = 240.0
 LEASE_S = 5.0
 FENCED = 70

@@ -6,25 +6,18 @@ import contextvars
 import io
 import json
 import logging
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import httpx2
 import pytest
+from running import served
 from starlette.testclient import TestClient
 
 from app.jobs.job_log import accounted
 from app.runtime import logs
 from app.runtime.settings import Settings
 from app.store import Store
-
-HERE = Path(__file__).parents[1]
-sys.path.insert(0, str(HERE))
-from running import served  # noqa: E402 - beside this file
-
-sys.path.remove(str(HERE))
 
 
 @pytest.fixture

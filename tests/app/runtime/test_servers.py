@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -11,26 +10,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from deadline import stretched
+from servers import Moto, Postgres, moto, postgres
+from torture import Plan, in_environment, torture
 
-HERE = Path(__file__).parents[1]
-BESIDE = [str(HERE), str(HERE / "endurance")]
-sys.path[:0] = BESIDE
-from deadline import stretched  # noqa: E402 - beside this file
-from servers import Moto, Postgres, moto, postgres  # noqa: E402
-from torture import Plan, in_environment, torture  # noqa: E402
-
-for folder in BESIDE:
-    sys.path.remove(folder)
-
-from app.blobs.storage import Storage  # noqa: E402
-from app.runtime import backup as copies  # noqa: E402
-from app.runtime.doctor import examine  # noqa: E402
-from app.runtime.metrics import Tables  # noqa: E402
-from app.runtime.settings import Settings  # noqa: E402
-from app.store import Store  # noqa: E402
-from app.store.notices import Notices  # noqa: E402
-from app.store.tables import PhotoRow  # noqa: E402
-from app.store.upkeep.migrate import upgrade  # noqa: E402
+from app.blobs.storage import Storage
+from app.runtime import backup as copies
+from app.runtime.doctor import examine
+from app.runtime.metrics import Tables
+from app.runtime.settings import Settings
+from app.store import Store
+from app.store.notices import Notices
+from app.store.tables import PhotoRow
+from app.store.upkeep.migrate import upgrade
 
 pytestmark = pytest.mark.tools
 

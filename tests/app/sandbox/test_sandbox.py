@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from deadline import Deadline, stretched
 
 from app.sandbox import confine
 from app.sandbox.budget import Budget
@@ -27,11 +28,6 @@ from app.sandbox.runner import Sandbox
 
 OWN = Path(__file__).parent
 HERE = OWN.parent
-sys.path.insert(0, str(HERE))
-from deadline import Deadline, stretched  # noqa: E402 - beside these files
-
-sys.path.remove(str(HERE))
-
 LIMITS = TaskLimits(memory_mb=512, wall_s=stretched(30))
 Run = Callable[..., Outcome]
 

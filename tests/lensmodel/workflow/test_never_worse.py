@@ -1,8 +1,7 @@
-"""The whole chain, blind: a photo of a lens known from one other photo comes back better or as it was.
+"""The whole chain, blind: a photo of a lens known from one other photo comes back better, and nowhere worse.
 
 Two lenses of two kinds of optics: one of third-order theory that is nearly perfect, where kernels are easily
-too wide, and one traced through a published design. `python -m lensmodel.lab.chain.blind_gain` asks the same
-of many.
+too wide, and one traced through a published design.
 """
 
 from __future__ import annotations
@@ -27,6 +26,8 @@ SCENES = Path(sys.modules["lensmodel"].__path__[0]) / "demo_data"
 GRID = Path(__file__).parents[1] / "data" / "traced-heliar-f3.5.npz"
 NEARLY_PERFECT = 6
 BLOCK, RIM, MARGIN = 128, 8, 64
+LEAST_DB = {"nearly perfect": 1.3, "traced": 0.7}
+"""Half of the gain on the day that this was written: a correction that does nothing fails."""
 
 
 def lens_of(name: str) -> tuple[simulate.SimulatedLens | GridLens, float]:
@@ -55,7 +56,7 @@ def shot(lens: simulate.SimulatedLens | GridLens, f_number: float, number: int) 
 
 
 @pytest.mark.parametrize("name", ["nearly perfect", "traced"])
-def test_photo_of_a_lens_known_from_one_other_photo_is_not_worse(name: str, tmp_path: Path) -> None:
+def test_photo_of_a_lens_known_from_one_other_photo_is_better_and_nowhere_worse(name: str, tmp_path: Path) -> None:
     lens, f_number = lens_of(name)
     known, asked = shot(lens, f_number, 0), shot(lens, f_number, 1)
     simulate.write_photo(tmp_path / "known.dng", known)
@@ -86,6 +87,5 @@ def test_photo_of_a_lens_known_from_one_other_photo_is_not_worse(name: str, tmp_
             for left in range(RIM, truth.shape[2] - BLOCK, BLOCK)
         ]
     )
-    assert gain(everywhere, everywhere) > -0.05
-    assert (blocks < -0.5).mean() <= 0.05
-    assert blocks.min() > -1.5
+    assert gain(everywhere, everywhere) > LEAST_DB[name]
+    assert blocks.min() > -0.25

@@ -56,7 +56,9 @@ def shot(lens: simulate.SimulatedLens | GridLens, f_number: float, number: int) 
 
 
 @pytest.mark.parametrize("name", ["nearly perfect", "traced"])
-def test_photo_of_a_lens_known_from_one_other_photo_is_better_and_nowhere_worse(name: str, tmp_path: Path) -> None:
+def test_photo_of_a_lens_known_from_one_other_photo_is_better_and_nowhere_worse(
+    name: str, tmp_path: Path
+) -> None:
     lens, f_number = lens_of(name)
     known, asked = shot(lens, f_number, 0), shot(lens, f_number, 1)
     simulate.write_photo(tmp_path / "known.dng", known)

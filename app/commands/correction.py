@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -22,17 +23,18 @@ from lensmodel.core.types import ZONE_WORDS, LensSettings, StepHook, Zone
 from lensmodel.correction.audit import HELD, AuditReport
 from lensmodel.photo import OutputFormat, inspect
 from lensmodel.photo.endings import CORRECTED
+from lensmodel.workflow.api import FORMATS
 from lensmodel.workflow.identity import Identity, difference
 from lensmodel.workflow.lens import Lens
 
-EXTENSION: Final[dict[OutputFormat, str]] = {
+EXTENSION: Final[dict[OutputFormat | None, str]] = {
+    None: ".tif",
     "tiff16": ".tif",
     "png16": ".png",
     "png8": ".png",
     "jpeg": ".jpg",
     "dng": ".dng",
 }
-
 
 FOLDER: Final = "corrected"
 """Default folder of results, beside the photos."""
@@ -46,7 +48,7 @@ class CorrectionOptions:
     method: str | None
     strength: float
     bounds: correction.Bounds
-    file_format: OutputFormat
+    file_format: OutputFormat | None
     workers: int | None
     any_lens: bool
     force: bool
@@ -57,14 +59,14 @@ class CorrectionOptions:
 def run(
     names: Sequence[str],
     source: Path,
-    output: Path | None,
+    output: str | None,
     options: CorrectionOptions,
     display: Display,
     *,
     as_json: bool,
 ) -> None:
-    """Correct photos into a folder, one after the other."""
-    targets = targets_of(files.photos(names), output, EXTENSION[options.file_format])
+    """Correct photos, one after the other."""
+    targets = targets_of(files.photos(names), output, options.file_format)
     with files.as_usage():
         if options.method is not None:
             correction.deconvolvers.create(options.method)
@@ -98,11 +100,24 @@ def run(
         raise typer.Exit(1)
 
 
-def targets_of(paths: Sequence[Path], output: Path | None, extension: str) -> dict[Path, Path]:
-    """Return the photos by the file that each becomes; no two may become the same."""
+def targets_of(
+    paths: Sequence[Path], output: str | None, file_format: OutputFormat | None
+) -> dict[Path, Path]:
+    """Return the photos by the file that each becomes; no two may become the same.
+
+    `output` is that file itself where there is one photo and the name ends as a picture's does; where it ends
+    in a separator or is a folder already, it is a folder.
+    """
+    extension = EXTENSION[file_format]
+    if output is not None and len(paths) == 1 and _names_a_picture(output):
+        target = Path(output).expanduser()
+        named = EXTENSION[FORMATS[target.suffix.lower()]]
+        if file_format is not None and named != extension:
+            raise UsageError(f"{target.name} is no name for --format {file_format}; end it in {extension}")
+        return {target: paths[0]}
     targets: dict[Path, Path] = {}
     for path in paths:
-        folder = path.parent / FOLDER if output is None else output
+        folder = path.parent / FOLDER if output is None else Path(output).expanduser()
         if folder.exists() and not folder.is_dir():
             raise UsageError(f"{folder} is a file; give a folder to -o")
         target = folder / f"{path.stem}{CORRECTED}{extension}"
@@ -113,6 +128,14 @@ def targets_of(paths: Sequence[Path], output: Path | None, extension: str) -> di
             )
         targets[target] = path
     return targets
+
+
+def _names_a_picture(output: str) -> bool:
+    return (
+        Path(output).suffix.lower() in FORMATS
+        and not output.endswith(tuple(filter(None, (os.sep, os.altsep))))
+        and not Path(output).expanduser().is_dir()
+    )
 
 
 def correct_one(

@@ -72,7 +72,7 @@ class GroupResult:
 
 def run(
     names: Sequence[str],
-    output: Path | None,
+    output: str | None,
     options: correction.CorrectionOptions,
     learning: Learning,
     display: Display,
@@ -81,14 +81,14 @@ def run(
 ) -> None:
     """Learn the lens of every group of photos and correct them all."""
     paths = files.photos(names)
-    targets = correction.targets_of(paths, output, correction.EXTENSION[options.file_format])
+    targets = correction.targets_of(paths, output, options.file_format)
     with files.as_usage():
         estimation.estimators.create(learning.estimator)
         estimation.patches.selectors.create(learning.selector)
         if options.method is not None:
             corrections.deconvolvers.create(options.method)
         LensSettings(aperture=options.aperture)
-    base = output or paths[0].parent / correction.FOLDER
+    base = next(iter(targets)).parent
     options = replace(options, least_gain_db=WORTH_DB)
     work = _Folder(base, learning.profiles or base / PROFILES, options, learning, display)
     shots, results = _read(paths, display)

@@ -157,12 +157,13 @@ def correct(
         ),
     ] = None,
     output: Annotated[
-        Path | None,
+        str | None,
         typer.Option(
             "--output",
             "-o",
-            metavar="DIR",
-            help="Folder for the corrected photos; default: `corrected` beside each photo.",
+            metavar="DIR|FILE",
+            help="Folder for the corrected photos, or of one photo a file such as sharp.tif; default: "
+            "`corrected` beside each photo.",
         ),
     ] = None,
     profiles: Annotated[
@@ -212,12 +213,19 @@ def correct(
         typer.Option(min=0.0, max=1.0, metavar="0..1", help="How much of the photo's grain to take away."),
     ] = 0.0,
     file_format: Annotated[
-        OutputFormat, choice("--format", get_args(OutputFormat), "dng: linear, for a raw converter.")
-    ] = "tiff16",
+        OutputFormat | None,
+        choice(
+            "--format",
+            get_args(OutputFormat),
+            "dng: linear, for a raw converter. Default: by the name after -o, else tiff16.",
+        ),
+    ] = None,
     sidecar: Annotated[
         bool,
         typer.Option(
-            "--sidecar", help="Write an XMP file beside each photo, saying what was done and with which lens."
+            "--sidecar",
+            help="Write an XMP file beside each corrected photo, NAME.tif.xmp, saying what was done and with "
+            "which lens.",
         ),
     ] = False,
     aperture: Aperture = None,
@@ -243,7 +251,7 @@ def correct(
 
         lensmodel correct holiday --profile my-24mm.lensprofile -o corrected
 
-        lensmodel correct one.dng --profile my-24mm.lensprofile -o web --format jpeg --strength 0.7
+        lensmodel correct one.dng --profile my-24mm.lensprofile -o sharp.jpg --strength 0.7
 
         lensmodel correct one.dng --profile my-24mm.lensprofile -o soft --halo 0.2 --denoise 0.5
 

@@ -18,6 +18,7 @@ from app.commands.console.failure import UsageError
 from app.words import gain_words
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.types import ZONE_WORDS
+from lensmodel.workflow.api import FORMATS
 
 if TYPE_CHECKING:
     from app.client import Client
@@ -30,7 +31,7 @@ def run(
     names: Sequence[str],
     url: str,
     lens: str,
-    output: Path | None,
+    output: str | None,
     options: correction.CorrectionOptions,
     display: Display,
     *,
@@ -53,7 +54,7 @@ def run(
 
     from app.client import Client  # noqa: PLC0415 - same
 
-    targets = correction.targets_of(files.photos(names), output, correction.EXTENSION[options.file_format])
+    targets = correction.targets_of(files.photos(names), output, options.file_format)
     if options.sidecar:
         raise UsageError("--sidecar is for corrections made here; leave it out with --server")
     results: list[dict[str, Any]] = []
@@ -122,7 +123,7 @@ class _Remote:
                     raise
                 # it taught nothing; other photos may have, and it may be corrected all the same
                 self._display.detail(f"{path}: {ended}")
-            wanted = self._client.correct(sent, **self._request())
+            wanted = self._client.correct(sent, **self._request(target))
             self._client.wait(wanted, on_change=partial(on_change, f"correcting {path.name}"))
             report = self._client.correction(wanted.id).report or {}
             if report.get("nothing_to_correct"):
@@ -133,14 +134,14 @@ class _Remote:
             return files.failed(error)
         return {"state": "corrected", "lens_id": wanted.lens_id, "report": report}
 
-    def _request(self) -> dict[str, Any]:
+    def _request(self, target: Path) -> dict[str, Any]:
         bounds = self._options.bounds
         request = {
             "method": self._options.method or "standard",
             "strength": self._options.strength,
             "texture": bounds.texture,
             "denoise": bounds.denoise,
-            "output": {"format": self._options.file_format},
+            "output": {"format": self._options.file_format or FORMATS[target.suffix.lower()]},
         }
         if bounds.halo is not None and math.isfinite(bounds.halo):
             request["halo"] = bounds.halo

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage
+from scipy import fft, ndimage, optimize
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
@@ -24,6 +24,9 @@ _SEARCH = 8  # largest shift looked for, pixels
 _MIN_CORRELATION = 0.8  # of two channels: below, colours differ and edges do not match (chosen)
 _MIN_POINTS = 30
 """That a polynomial of four terms is fitted to: some seven for each, of which a few may be wrong (chosen)."""
+_LARGEST = 0.1
+"""Of each term, relative to the radius (chosen): lenses stay below a hundredth."""
+
 _BAND = 1024  # rows at once: memory (chosen)
 
 
@@ -56,7 +59,7 @@ class LateralColour:
         terms = (*self.red, *self.blue, self.half_diagonal)
         if not all(math.isfinite(term) for term in terms) or self.half_diagonal <= 0.0:
             raise InvalidInputError(f"lateral colour needs finite terms and a positive size, got {self}")
-        if max(abs(self.red[3] - 1.0), abs(self.blue[3] - 1.0)) > 0.1:
+        if max(abs(self.red[3] - 1.0), abs(self.blue[3] - 1.0)) > _LARGEST + 1e-9:
             raise InvalidInputError(f"v must be near 1, got {self.red[3]} (red) and {self.blue[3]} (blue)")
 
     def displacement(self, r: float, channel: Channel) -> float:
@@ -284,8 +287,9 @@ def _huber(
         if columns is None:
             break
         root = np.sqrt(weight)
-        coefficients = np.linalg.lstsq(columns * root[:, None], shift * root, rcond=None)[0]
-        solution = np.asarray(coefficients, dtype=np.float64)
+        # few pixels and noise may ask for more than any lens does
+        inside = optimize.lsq_linear(columns * root[:, None], shift * root, bounds=(-_LARGEST, _LARGEST))
+        solution = np.asarray(inside.x, dtype=np.float64)
         residual = np.asarray(shift - columns @ solution, dtype=np.float64)
     size = np.minimum(np.abs(residual), 3.0 * scale)  # gross outliers count once, not squared
     return solution, float(np.mean(size**2)) + 1e-8

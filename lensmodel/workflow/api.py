@@ -17,7 +17,7 @@ from lensmodel.estimation import PsfEstimator
 from lensmodel.estimation.patches import Selector
 from lensmodel.model import ModelSettings
 from lensmodel.photo.arrays import photo_from_array
-from lensmodel.photo.tags.xmp_block import sidecar_path, write_sidecar
+from lensmodel.photo.tags.xmp_block import sidecar_for, write_sidecar
 from lensmodel.workflow import pipeline
 from lensmodel.workflow.arguments import require_workers
 from lensmodel.workflow.lens import Lens
@@ -201,7 +201,7 @@ def correct(
     least_gain_db : float, optional
         Write nothing where a lesser gain is expected (`Corrected.expected_gain_db`); None always writes.
     sidecar : bool
-        Write an XMP file beside the corrected photo too, which tells what was done.
+        Write an XMP file beside the corrected photo too, `c.tif.xmp` of `c.tif`, which tells what was done.
     workers : int, optional
         Threads; all cores by default. The result does not depend on it.
     on_step : callable
@@ -223,7 +223,8 @@ def correct(
     ImageTooLargeError
         If the photo has more pixels than are read.
     InvalidInputError
-        If a value is out of its range, the ending of `output` is unknown, or it is the photo itself.
+        If a value is out of its range, the ending of `output` is unknown, it is the photo itself, or another
+        program wrote the sidecar that is there.
     UnknownMethodError
         If there is no method of that name.
     CancelledError
@@ -236,6 +237,7 @@ def correct(
     source = Path(image) if isinstance(image, str | Path) else None
     if target is not None and source is not None and target.exists() and target.samefile(source):
         raise InvalidInputError(f"{target} is the photo itself; name another file for the corrected one")
+    beside = None if target is None or not sidecar else sidecar_for(target)  # refused before any work
     known = (lens if isinstance(lens, Lens) else Lens.load(lens)).warmed()
     method = way_of(known.model).method if method is None else method
     correction.deconvolvers.resolve(method)  # before the work of developing
@@ -276,9 +278,9 @@ def correct(
         quality=quality,
         description=description,
     )
-    if sidecar:
+    if beside is not None:
         write_sidecar(
-            sidecar_path(target),
+            beside,
             metadata,
             source="" if source is None else source.name,
             description=description,

@@ -265,6 +265,8 @@ class Lens:
         phi: ArrayLike,
         *,
         aperture: float | None = None,
+        focal_mm: float | None = None,
+        focus_m: float | None = None,
         channel: Channel = "g",
         size: int = DEFAULT_SIZE,
     ) -> NDArray[np.float64]:
@@ -274,7 +276,7 @@ class Lens:
         ----------
         r, phi : array_like of float
             Field positions, half diagonals 0..1 and radians, of shapes that broadcast to one shape S.
-        aperture, channel, size
+        aperture, focal_mm, focus_m, channel, size
             As of `psf`.
 
         Returns
@@ -290,7 +292,7 @@ class Lens:
         places = [
             FieldPosition(float(a), float(b)) for a, b in zip(radii.ravel(), angles.ravel(), strict=True)
         ]
-        flat = self.model.kernels(places, LensSettings(aperture, channel=channel), size)
+        flat = self.model.kernels(places, LensSettings(aperture, focal_mm, focus_m, channel), size)
         return flat.reshape(*radii.shape, size, size)
 
     def mtf(
@@ -300,6 +302,8 @@ class Lens:
         frequencies: ArrayLike,
         *,
         aperture: float | None = None,
+        focal_mm: float | None = None,
+        focus_m: float | None = None,
         channel: Channel = "g",
     ) -> NDArray[np.float64]:
         """Return the contrast that the lens leaves of fine lines (`mtf_from_kernel` gives the equation).
@@ -310,7 +314,7 @@ class Lens:
             Field positions, half diagonals 0..1 and radians, of shapes that broadcast to one shape S.
         frequencies : array_like of float, shape (n,) or ()
             Cycles/pixel; not negative.
-        aperture, channel
+        aperture, focal_mm, focus_m, channel
             As of `psf`.
 
         Returns
@@ -325,7 +329,7 @@ class Lens:
             broadcast, or a value is out of its range.
         """
         wanted = frequencies_of(frequencies)
-        kernels = self.kernels(r, phi, aperture=aperture, channel=channel)
+        kernels = self.kernels(r, phi, aperture=aperture, focal_mm=focal_mm, focus_m=focus_m, channel=channel)
         angles = np.broadcast_to(np.asarray(phi, dtype=np.float64), kernels.shape[:-2])
         out = np.empty((2, *angles.shape, len(wanted)))
         for index in np.ndindex(angles.shape):
@@ -340,6 +344,8 @@ class Lens:
         *,
         aspect: float = 1.5,
         aperture: float | None = None,
+        focal_mm: float | None = None,
+        focus_m: float | None = None,
         channel: Channel = "g",
     ) -> NDArray[np.float64]:
         """Return where contrast falls to one half, over the picture.
@@ -350,7 +356,7 @@ class Lens:
             Equal cells of the picture; each value is that of its cell's center.
         aspect : float
             Width over height of the picture.
-        aperture, channel
+        aperture, focal_mm, focus_m, channel
             As of `psf`.
 
         Returns
@@ -364,7 +370,7 @@ class Lens:
             If there are no cells, or a value is out of its range.
         """
         r, phi = field_grid(rows, cols, aspect=aspect)
-        kernels = self.kernels(r, phi, aperture=aperture, channel=channel)
+        kernels = self.kernels(r, phi, aperture=aperture, focal_mm=focal_mm, focus_m=focus_m, channel=channel)
         out = np.empty((2, rows, cols))
         for index in np.ndindex(rows, cols):
             for along, turn in enumerate((0.0, np.pi / 2.0)):

@@ -17,9 +17,10 @@ import pytest
 import lensmodel
 from lensmodel.core import processes
 from lensmodel.core.errors import InvalidInputError, UnknownMethodError
-from lensmodel.core.psf import centroid, gaussian
+from lensmodel.core.psf import PsfSample, centroid, gaussian
 from lensmodel.core.registry import Registry
 from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.model import LensModel, LensProfile
 from lensmodel.workflow.field_grid import field_grid
 from lensmodel.workflow.lens import Lens
 
@@ -157,6 +158,29 @@ def test_many_kernels_at_once_are_those_of_single_questions() -> None:
 
     assert many.shape == (2, 3, 15, 15)
     assert many[1, 2] == pytest.approx(lens.psf(0.8, -1.0, aperture=2.0, size=15).kernel)
+
+
+def test_every_question_to_a_zoom_can_name_its_focal_length_and_focus() -> None:
+    settings = [LensSettings(2.8, focal, focus) for focal in (24.0, 70.0) for focus in (0.5, 20.0)]
+    samples = [
+        PsfSample(
+            gaussian(15, np.eye(2) * (0.6 if at.focal_mm == 24.0 else 2.5)),
+            FieldPosition(r, phi),
+            at,
+            photo="x",
+        )
+        for at in settings
+        for r in (0.1, 0.5, 0.9)
+        for phi in (-2.0, 0.5, 2.5)
+    ]
+    lens = Lens(LensProfile(LensModel.fit(samples)))
+    wide, long = ({"aperture": 2.8, "focal_mm": focal, "focus_m": 0.5} for focal in (24.0, 70.0))
+
+    assert lens.kernels(0.5, 0.5, size=15, **wide) == pytest.approx(
+        lens.psf(0.5, 0.5, size=15, **wide).kernel
+    )
+    assert lens.mtf(0.5, 0.5, 0.2, **wide).min() > lens.mtf(0.5, 0.5, 0.2, **long).max() + 0.1
+    assert lens.mtf50_map(1, 2, **wide).min() > lens.mtf50_map(1, 2, **long).max()
 
 
 def test_a_kernel_that_is_given_off_center_is_centered() -> None:

@@ -19,17 +19,13 @@ from rich.progress import (
     SpinnerColumn,
     TextColumn,
     TimeElapsedColumn,
-    TimeRemainingColumn,
 )
 
-from app.commands.console.progress_lines import ProgressLines, clock
+from app.commands.console.progress_lines import ProgressLines, TimeLeft, clock
 from lensmodel.core.codec import to_json
 
 COMPILING = "lensmodel.correction.engine.first_use"
 """Logs when loops are compiled, once on a machine."""
-
-LONG_S = 3600.0
-"""Speed is taken over so many seconds: one step may take minutes, and the default forgets in 30 s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,13 +102,11 @@ class Display:
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
-            TextColumn("ETA"),
-            TimeRemainingColumn(),
+            TimeLeft(),
             console=Console(file=sys.stderr),
             disable=self.quiet,
             transient=True,
             redirect_stdout=sys.stdout.isatty(),  # a pipe or file gets its results untouched
-            speed_estimate_period=LONG_S,
         )
         with bars:
             yield bars

@@ -12,6 +12,7 @@ from types import MappingProxyType
 from typing import Final
 from xml.etree import ElementTree as ET
 
+from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import atomic
 from lensmodel.photo.tags.exif_block import SOFTWARE
 from lensmodel.photo.values import PhotoMetadata
@@ -40,19 +41,36 @@ for _prefix, _uri in _SPACES.items():
     ET.register_namespace(_prefix, _uri)  # else they are written as ns0, ns1: legal, and unreadable
 
 _PACKET: Final = '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>\n{}\n<?xpacket end="{}"?>'
+_HEAD_BYTES: Final = 1024  # of a packet, in which its first element says who wrote it
 _CHARACTERS: Final = str.maketrans(dict.fromkeys((*range(9), 11, 12, *range(14, 32), 0xFFFE, 0xFFFF), " "))
 """What XML has no way to write; cameras put it into names."""
 
 
-def sidecar_path(photo: Path) -> Path:
-    """Name the sidecar of a photo: its own name, ending in `.xmp`."""
-    return photo.with_suffix(".xmp")
+def sidecar_for(photo: Path) -> Path:
+    """Name the sidecar of a photo: `c.tif.xmp` of `c.tif`, since `c.xmp` may be that of a `c.dng`.
+
+    Raises
+    ------
+    InvalidInputError
+        If another program has written a file of that name, or changed ours: what it holds is somebody's work.
+    """
+    path = photo.with_name(f"{photo.name}.xmp")
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except FileNotFoundError:
+        return path
+    if f'xmptk="{SOFTWARE}"'.encode() not in head:
+        raise InvalidInputError(
+            f"{path.name} is there already and another program wrote it; move it away or ask for no sidecar"
+        )
+    return path
 
 
 def write_sidecar(
     path: Path, metadata: PhotoMetadata, *, source: str, description: str, done: Mapping[str, str]
 ) -> None:
-    """Write a packet as a file of its own, complete or not at all; an existing one is replaced.
+    """Write a packet as a file, complete or not at all; an existing one is replaced (`sidecar_for`).
 
     Parameters
     ----------

@@ -31,7 +31,9 @@ from scipy import ndimage
 from typer.testing import CliRunner
 
 from app.cli import app, main
-from app.commands.console.progress_lines import EVERY_S, ProgressLines
+from app.commands import correction
+from app.commands.console.progress_lines import EVERY_S, Pace, ProgressLines
+from lensmodel import photo
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
@@ -201,6 +203,51 @@ def test_correct_leaves_what_is_there_alone_unless_forced(folder: Path, here: He
     assert forced.stdout == forced.stderr == ""
 
 
+@pytest.mark.parametrize(
+    ("output", "written"),
+    [
+        ("sharp.tif", "sharp.tif"),
+        ("new/sharp.JPG", "new/sharp.JPG"),
+        ("sharp.v2", "sharp.v2/one-corrected.tif"),
+        ("sharp.tif/", "sharp.tif/one-corrected.tif"),
+        ("there.png", "there.png/one-corrected.tif"),
+    ],
+)
+def test_a_name_that_ends_as_a_pictures_is_a_file_and_any_other_a_folder(
+    output: str, written: str, folder: Path, here: Here
+) -> None:
+    (folder / "there.png").mkdir()
+
+    done = here("correct", "one.dng", "-p", PROFILE, "-o", output, "--method", "fast", "-q")
+
+    assert done.returncode == 0, done.stderr
+    assert photo.inspect(folder / written).kind == ("jpeg" if written.endswith(".JPG") else "tiff")
+
+
+def test_of_several_photos_the_output_is_a_folder_whatever_its_name(made: Path) -> None:
+    targets = correction.targets_of([made / "a.dng", made / "b.dng"], "out.tif", None)
+
+    assert [str(target) for target in targets] == ["out.tif/a-corrected.tif", "out.tif/b-corrected.tif"]
+
+
+@pytest.mark.parametrize("foreign", [b"<x:xmpmeta x:xmptk='XMP Core 4.4.0-Exiv2'/>", b"", b"any words"])
+def test_a_sidecar_of_another_program_stays_as_it_is(foreign: bytes, folder: Path, here: Here) -> None:
+    words = ("correct", "one.dng", "-p", PROFILE, "-o", "one.tif", "--method", "fast", "--sidecar", "-q")
+    (folder / "one.xmp").write_bytes(foreign)  # a raw editor's, of one.dng
+    beside = folder / "one.tif.xmp"
+
+    first = here(*words)
+    ours = beside.read_bytes()
+    again = here(*words, "--force")
+    beside.write_bytes(foreign)
+    refused = here(*words, "--force")
+
+    assert (first.returncode, again.returncode, refused.returncode) == (0, 0, 1)
+    assert b"expectedgaindb" in ours.lower()
+    assert "one.tif.xmp is there already and another program wrote it" in one_sentence(refused.stderr)
+    assert beside.read_bytes() == (folder / "one.xmp").read_bytes() == foreign
+
+
 def test_photographer_bounds_halos_and_takes_the_grain_away(folder: Path, here: Here) -> None:
     words = ("correct", "one.dng", "-p", PROFILE, "--method", "fast")
     here(*words, "-o", "plain", "--strength", "0")
@@ -361,6 +408,11 @@ REFUSED = {
         ["correct", "one.dng", "-p", PROFILE, "-o", "o", "--halo", "nan"],
         2,
         "halo must not be negative.*nan",
+    ),
+    "a name of another format": (
+        ["correct", "one.dng", "-p", PROFILE, "-o", "o.png", "--format", "jpeg"],
+        2,
+        "o.png is no name for --format jpeg; end it in .jpg",
     ),
     "nearly a format": (
         ["correct", "one.dng", "-p", PROFILE, "-o", "o", "--format", "tiff"],
@@ -697,11 +749,14 @@ def on_a_terminal(here: Here, monkeypatch: pytest.MonkeyPatch) -> Seen:
     return run
 
 
-def test_progress_with_time_left_is_on_a_terminal_and_results_are_in_the_pipe(on_a_terminal: Seen) -> None:
+def test_progress_with_time_left_is_on_a_terminal_and_results_are_in_the_pipe(
+    on_a_terminal: Seen, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Pace, "left", lambda *_: 83.0)  # the photo is too quick for any to be told
     said, seen = on_a_terminal("correct", "one.dng", "-p", PROFILE, "-o", "out", "--method", "fast")
 
     assert said.splitlines() == [str(Path("out/one-corrected.tif"))]
-    assert "ETA" in seen
+    assert "ETA 1:23" in seen
     assert "one.dng" in seen
 
 
@@ -712,7 +767,6 @@ def test_a_benchmark_of_the_lens_model_says_how_far_it_is(on_a_terminal: Seen) -
     )
 
     assert said.startswith("| method |")
-    assert "ETA" in seen
     assert "3/3" in seen
 
 

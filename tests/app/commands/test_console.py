@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from app.commands.console import progress_lines
-from app.commands.console.progress_lines import ProgressLines, clock
+from app.commands.console.progress_lines import Pace, ProgressLines, clock
 from app.commands.console.table import aligned
 from app.words import mtf50_words
 
@@ -40,19 +40,40 @@ def test_without_a_terminal_progress_is_told_in_lines() -> None:
         task = lines.add_task("learning from a.dng", total=4)
         lines.update(task, completed=1)
 
-    assert said == ["[0:00]  25 % learning from a.dng, about 0:00 left"]
+    assert said == ["[0:00]  25 % learning from a.dng"]
 
 
 def test_time_left_is_told_by_the_pace_of_the_stage_that_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
-    clock_s = iter((0.0, 60.0, 61.0, 62.0))
+    clock_s = iter((0.0, 60.0, 61.0, 64.0, 67.0))
     monkeypatch.setattr(progress_lines.time, "monotonic", lambda: next(clock_s))
     lines = ProgressLines(said.append, every_s=0.0)
-    task = lines.add_task("estimating", total=4)
-    for done in (4, 0, 1):  # a minute of one stage, then a second of the next
+    task = lines.add_task("estimating", total=8)
+    for done in (8, 0, 1, 2):  # a minute of one stage, then a photo each three seconds
         lines.update(task, completed=done)
 
-    assert said[-1] == "[1:02]  25 % estimating, about 0:03 left"
+    assert said[-1] == "[1:07]  25 % estimating, about 0:18 left"
+
+
+PACES = {
+    "even": lambda s: s / 100,
+    "a slow start": lambda s: 0.01 * min(s, 20) / 20 + 0.99 * max(s - 20, 0) / 80,
+    "a slow end": lambda s: 0.6 * min(s, 50) / 50 + 0.4 * max(s - 50, 0) / 50,
+    "whole photos": lambda s: (s // 10) / 10,
+    "two photos": lambda s: (s // 50) / 2,
+}
+
+
+@pytest.mark.parametrize("pace", PACES)
+def test_no_time_left_is_told_before_it_is_right_within_a_factor_of_two(pace: str) -> None:
+    past, told = Pace(), []
+    for tenth in range(900):
+        past.mark(tenth / 10, PACES[pace](tenth / 10), 1.0)
+        left = past.left(tenth / 10)
+        told += [] if left is None else [left / (100 - tenth / 10)]
+
+    assert all(0.5 <= ratio <= 2.0 for ratio in told)
+    assert told or pace == "two photos"
 
 
 def test_quick_work_says_nothing() -> None:

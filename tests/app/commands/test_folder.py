@@ -96,7 +96,7 @@ def test_corrected_photos_and_sidecars_are_beside_the_originals(journey: Path) -
     out = journey / "holiday" / "corrected"
 
     assert sorted(path.name for path in out.glob("*.tif")) == ["a-corrected.tif", "b-corrected.tif"]
-    said = (out / "a-corrected.xmp").read_text()
+    said = (out / "a-corrected.tif.xmp").read_text()
     assert 'exifEX:LensModel="Test 35mm f/1.8"' in said
     assert 'stRef:filePath="a.dng"' in said
     assert "L-42" not in said

@@ -1,4 +1,5 @@
 import json
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -8,6 +9,7 @@ from scipy import ndimage
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import Planes
+from lensmodel.photo import lateral
 from lensmodel.photo.lateral import IDENTITY, LateralColour, estimate_lateral, resample
 
 FRAME = Frame(640, 900)
@@ -132,6 +134,17 @@ def test_json_of_something_else_is_refused(values: dict) -> None:
 def test_absurd_scale_is_refused() -> None:
     with pytest.raises(InvalidInputError, match="near 1"):
         LateralColour((0.0, 0.0, 0.0, 2.0), IDENTITY, 100.0)
+
+
+@pytest.mark.parametrize("pixels", [lambda r: 50.0 * r, lambda r: -40.0 * r, lambda r: 7.0 + 0.0 * r])
+@pytest.mark.parametrize("side", [150, 200])
+def test_what_a_small_photo_cannot_tell_is_bounded(pixels: Callable, side: int) -> None:
+    rng, frame = np.random.default_rng(0), Frame(side, side + 40)
+    r = rng.uniform(0.02, 0.15, 40)  # corners near the centre only, and matched wrongly
+    red = lateral._fit(r, pixels(r) + rng.normal(0.0, 0.3, r.size), frame.half_diagonal)
+
+    assert np.abs(np.subtract(red, IDENTITY)).max() == pytest.approx(0.1)
+    LateralColour(red, IDENTITY, frame.half_diagonal)
 
 
 def test_planes_of_another_size_are_refused() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -9,7 +10,7 @@ import numpy as np
 import rawpy
 from numpy.typing import NDArray
 
-from lensmodel.core.errors import RawDecodeError, TruncatedImageError
+from lensmodel.core.errors import RawDecodeError, TruncatedImageError, UnsupportedFormatError
 from lensmodel.core.types import BayerPattern, Plane
 
 _BAND: Final = 16
@@ -27,6 +28,32 @@ _EDGE: Final = 0.02
 
 _LOWEST_PILE: Final = 0.8
 """Lowest level, relative to the stated one, at which sensors were seen to clip."""
+
+
+def require_known_mosaic(rows: Sequence[str]) -> None:
+    """Refuse every mosaic but those of Bayer, 2 x 2, and of X-Trans, 6 x 6.
+
+    Parameters
+    ----------
+    rows : sequence of str
+        Letters of the colours of the part that repeats.
+
+    Raises
+    ------
+    UnsupportedFormatError
+        Naming the pattern.
+    """
+    height, width = len(rows), len(rows[0]) if rows else 0
+    if (height, width) == (6, 6):
+        return
+    if (height, width) == (2, 2):
+        diagonals = {"".join(sorted(rows[0][k] + rows[1][1 - k])) for k in (0, 1)}
+        if diagonals == {"GG", "BR"}:
+            return
+    raise UnsupportedFormatError(
+        f"the colours of the sensor repeat every {height} x {width} pixels ({' '.join(rows)}); only Bayer "
+        "mosaics of 2 x 2 and X-Trans are read: have the camera or a raw converter bin or develop it"
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,9 +82,17 @@ class Mosaic:
 
     @classmethod
     def of(cls, raw: rawpy.RawPy) -> Mosaic | None:
-        """Take the mosaic of an opened file; `None` where each pixel has all colours already."""
+        """Take the mosaic of an opened file; `None` where each pixel has all colours already.
+
+        Raises
+        ------
+        UnsupportedFormatError
+            If it is neither Bayer's nor X-Trans.
+        """
         if raw.raw_type != rawpy.RawType.Flat or raw.raw_pattern is None:
             return None
+        letters = raw.color_desc.decode("ascii", "replace")
+        require_known_mosaic(["".join(letters[colour] for colour in row) for row in raw.raw_pattern])
         black = tuple(float(level) for level in raw.black_level_per_channel)
         return cls(
             raw.raw_image_visible,

@@ -44,7 +44,7 @@ def read_pixels(path: Path, header: Header) -> Pixels:
         If the pixel data end early or are damaged.
     """
     if header.kind == "tiff":
-        pixels = _read_tiff(path)
+        pixels = _read_tiff(path, header.directory)
     elif header.kind == "png" and header.bits == 16:
         pixels = _guarded(lambda: imagecodecs.png_decode(path.read_bytes()), "PNG")
     else:
@@ -87,34 +87,51 @@ def _guarded(decoder: Callable[[], Pixels], name: str) -> Pixels:
         raise NotAnImageError(f"the {name}'s pixel data are damaged ({error})") from error
 
 
-def _read_tiff(path: Path) -> Pixels:
+def _read_tiff(path: Path, directory: int) -> Pixels:
     def decoded() -> Pixels:
         with tifffile.TiffFile(path) as file:
-            page = file.pages[0]
-            assert isinstance(page, tifffile.TiffPage)  # the first is always read in full
-            return _tiff_page(page)
+            file.filehandle.seek(directory)
+            return _tiff_page(tifffile.TiffPage(file, 0))
 
     return _guarded(decoded, "TIFF")
 
 
 def _tiff_page(page: tifffile.TiffPage) -> Pixels:
-    kind = page.photometric
-    if kind not in {0, 1, 2, 3, 6}:
-        raise UnsupportedFormatError(
-            f"TIFFs of kind {getattr(kind, 'name', kind)} are not read; convert it to RGB"
-        )
-    pixels = page.asarray()
+    kind, pixels = page.photometric, page.asarray()
     if pixels.ndim == 3 and page.planarconfig == 2:
         pixels = np.moveaxis(pixels, 0, -1)
     if pixels.dtype == np.bool_:
-        pixels = pixels.astype(np.uint8) * 255
+        pixels = pixels.astype(np.uint8) * (1 if kind == 3 else 255)
     elif kind != 3 and pixels.dtype.kind == "u" and page.bitspersample not in {8, 16, 32}:
         pixels = _widened(pixels, page.bitspersample)
     if kind == 0:
         pixels = np.invert(pixels) if pixels.dtype.kind == "u" else 1 - pixels
     if kind == 3 and page.colormap is not None:
-        pixels = _colours_of(page.colormap)[pixels]
+        indices = pixels if pixels.ndim == 2 else pixels[:, :, 0]  # what follows them is alpha
+        pixels = _colours_of(page.colormap)[indices]
+    if kind == 6 and page.compression not in {6, 7}:  # JPEG's own decoder has converted them
+        pixels = _from_ycbcr(pixels, page)
     return pixels
+
+
+def _from_ycbcr(pixels: Pixels, page: tifffile.TiffPage) -> Pixels:
+    """Convert Y, Cb, Cr to R, G, B by the file's luma weights and ranges: TIFF 6.0, section 21."""
+
+    def numbers(tag: int, default: tuple[float, ...]) -> NDArray[np.float64]:
+        entry = page.tags.get(tag)
+        if entry is None:
+            return np.array(default)
+        pairs = np.asarray(entry.value, dtype=np.float64)  # rationals, or plain numbers
+        return pairs[::2] / pairs[1::2] if len(pairs) == 2 * len(default) else pairs
+
+    top = float(np.iinfo(pixels.dtype).max)
+    red, green, blue = numbers(529, (0.299, 0.587, 0.114))
+    low, high = numbers(532, (0, top, (top + 1) / 2, top, (top + 1) / 2, top)).reshape(3, 2).T
+    full = np.array([1.0, 0.5 - 0.5 / top, 0.5 - 0.5 / top])  # "CodingRange": 255, 127, 127 of 8 bits
+    y, cb, cr = np.moveaxis((pixels[:, :, :3] - low) / (high - low) * full, -1, 0)
+    r, b = y + cr * (2.0 - 2.0 * red), y + cb * (2.0 - 2.0 * blue)
+    rgb = np.stack([r, (y - red * r - blue * b) / green, b], axis=-1)
+    return np.rint(np.clip(rgb, 0.0, 1.0) * top).astype(pixels.dtype)
 
 
 def _colours_of(table: NDArray[np.uint16]) -> Pixels:

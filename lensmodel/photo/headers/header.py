@@ -39,6 +39,8 @@ class Header:
         Bits of a sample; 0 unknown.
     compression : int
         TIFF tag 259; 1 is none.
+    directory : int
+        Offset of the directory of a TIFF's picture; 0 where it is not said which.
     tiff : tuple of TiffReader
         TIFF structures with EXIF in them.
     ciff : CiffShot or None
@@ -60,6 +62,7 @@ class Header:
     channels: int = 0
     bits: int = 0
     compression: int = 1
+    directory: int = 0
     tiff: tuple[TiffReader, ...] = ()
     ciff: CiffShot | None = None
     xmp: bytes | None = None

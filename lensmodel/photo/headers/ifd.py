@@ -164,14 +164,15 @@ class TiffReader:
         complete = count <= MAX_ENTRIES and len(tail) == word_size
         return entries, struct.unpack(self.order + word, tail)[0] if complete else 0
 
-    def chain(self, first: int | None = None) -> Iterator[dict[int, IfdEntry]]:
-        """Yield the directories linked from the first one; a loop ends the chain."""
-        offset, seen = self.first if first is None else first, set[int]()
+    def chain(self) -> Iterator[tuple[int, dict[int, IfdEntry]]]:
+        """Yield place and tags of the directories linked from the first one; a loop ends the chain."""
+        offset, seen = self.first, set[int]()
         while offset and offset not in seen and len(seen) < MAX_DIRECTORIES:
             seen.add(offset)
-            entries, offset = self.directory(offset)
+            entries, following = self.directory(offset)
             if entries:
-                yield entries
+                yield offset, entries
+            offset = following
 
     def below(self, entry: IfdEntry | None) -> dict[int, IfdEntry]:
         """Read the directory that a pointer tag (EXIF, maker note part) points to; empty without one."""

@@ -18,6 +18,9 @@ _START_OF_SCAN: Final = 0xDA
 _END_OF_IMAGE: Final = 0xD9
 _TABLES: Final = 0xDB
 
+_BARE: Final = {0x00, 0x01, *range(0xD0, 0xD9), 0xFF}
+"""What is no segment: a stuffed byte, markers without a length, and fill bytes."""
+
 _NO_FRAMES: Final = {0xC4, 0xC8, 0xCC}
 """Markers in the range of the frame headers that are none: tables and an extension."""
 
@@ -86,18 +89,21 @@ def _coarseness(tables: bytes) -> float:
 
 
 def _segments(buffer: Buffer) -> Iterator[tuple[int, bytes]]:
-    """Yield marker code and content of each segment before the first scan."""
+    """Yield marker code and content of each segment before the first scan.
+
+    Stray bytes between them are passed over, as viewers do (libjpeg, `next_marker`).
+    """
     at = 2
     for _ in range(MAX_SEGMENTS):
-        while bytes(buffer[at : at + 2]) == b"\xff\xff":  # fill bytes
-            at += 1
-        marker = bytes(buffer[at : at + 4])
+        at = buffer.find(b"\xff", at)
+        marker = b"" if at < 0 else bytes(buffer[at : at + 4])
         if len(marker) < 4:
             raise TruncatedImageError("the JPEG ends inside its header; the upload was cut off")
-        if marker[0] != 0xFF:
-            raise NotAnImageError(f"the JPEG is damaged at byte {at}: no marker where one must be")
         code, length = marker[1], struct.unpack(">H", marker[2:])[0]
         if code in {_START_OF_SCAN, _END_OF_IMAGE}:
             return
+        if code in _BARE:
+            at += 1
+            continue
         yield code, bytes(buffer[at + 4 : at + 2 + length])
         at += 2 + length

@@ -17,12 +17,20 @@ from lensmodel.photo.headers.ciff import read_ciff
 from lensmodel.photo.headers.header import MAX_BLOCK_BYTES, Header, check_size
 from lensmodel.photo.headers.ifd import MAX_DIRECTORIES, Buffer, Directory, TiffReader
 from lensmodel.photo.headers.jpeg import read_jpeg
+from lensmodel.photo.mosaic import require_known_mosaic
 from lensmodel.photo.values import Limits
 
 _DNG_VERSION: Final = 0xC612  # tag, DNG 1.6, chapter 4
 
 _RAW_PHOTOMETRIC: Final = {32803, 34892}
 """PhotometricInterpretation: colour filter array (TIFF/EP) and linear RAW (DNG 1.6, chapter 3)."""
+
+_READ_COLOURS: Final = {0, 1, 2, 3, 6}
+"""PhotometricInterpretation: two kinds of grey, RGB, palette and YCbCr (TIFF 6.0, sections 3 to 6 and 21)."""
+
+_OTHER_COLOURS: Final = {4: "a mask", 5: "CMYK, made for print", 8: "CIE Lab", 9: "CIE Lab", 10: "CIE Lab"}
+_JPEG: Final = {6, 7}  # Compression, of TIFF 6.0 and of its technical note 2
+_FILTERS: Final = "RGBCMYW"  # CFAPattern: TIFF/EP, section 5.2.1
 
 _LOSSY: Final = 34892
 """Compression of a DNG by baseline JPEG, eight bits a sample: DNG 1.4, "Compression"."""
@@ -44,26 +52,26 @@ def read_tiff(buffer: Buffer, limits: Limits) -> Header:
     reader = TiffReader.open(buffer)
     if reader is None:
         raise TruncatedImageError("the TIFF ends inside its header; the upload was cut off")
-    directories = list(reader.chain())
-    if not directories:
+    chain = list(reader.chain())
+    if not chain:
         raise TruncatedImageError("the TIFF has no readable directory; the upload was cut off")
-    first = directories[0]
+    first, every = chain[0][1], list(_with_children(reader, chain))
     header = Header("tiff", tiff=(reader,), xmp=_block(first, 700), icc=_block(first, 34675))
-    if _DNG_VERSION in first:
-        largest = _largest(reader, directories)
-        header = _sized(replace(header, kind="dng"), largest)
-        if header.compression == _LOSSY:
+    if _DNG_VERSION in first or _looks_raw(every):
+        _, largest = max(every, key=_pixels)
+        header = _sized(replace(header, kind="dng" if _DNG_VERSION in first else "raw"), largest)
+        if header.kind == "dng" and header.compression == _LOSSY:
             header = replace(header, coarseness=_coarseness(buffer, largest, limits))
-    elif _looks_raw(reader, directories):
-        header = _sized(replace(header, kind="raw"), _largest(reader, directories))
-    else:
-        header = _sized(header, first)
-    check_size(header.width, header.height, len(buffer), limits)
-    if header.kind != "tiff":
+        check_size(header.width, header.height, len(buffer), limits)
+        _check_mosaic(largest)
         return header
-    if len(directories) >= MAX_DIRECTORIES:
+    place, photo = max(every, key=lambda at: (not _is_derived(at[1]), _pixels(at)))
+    header = replace(_sized(header, photo), directory=place, icc=_block(photo, 34675))
+    check_size(header.width, header.height, len(buffer), limits)
+    if len(chain) >= MAX_DIRECTORIES:
         raise UnsupportedFormatError(f"the TIFF has more than {MAX_DIRECTORIES - 1} pictures; give one photo")
-    _check_strips(first, len(buffer))
+    _check_strips(photo, len(buffer))
+    _check_colours(photo)
     return header
 
 
@@ -89,23 +97,38 @@ def _sized(header: Header, directory: Directory) -> Header:
     )
 
 
-def _with_children(reader: TiffReader, directories: Sequence[Directory]) -> Iterator[Directory]:
-    for directory in directories[:MAX_DIRECTORIES]:
-        yield directory
+def _with_children(
+    reader: TiffReader, chain: Sequence[tuple[int, Directory]]
+) -> Iterator[tuple[int, Directory]]:
+    for offset, directory in chain:
+        yield offset, directory
         children = directory.get(330)
-        for offset in () if children is None else children.integers(16):
-            yield reader.directory(offset)[0]
+        for below in () if children is None else children.integers(16):
+            yield below, reader.directory(below)[0]
 
 
-def _looks_raw(reader: TiffReader, directories: Sequence[Directory]) -> bool:
+def _looks_raw(every: Sequence[tuple[int, Directory]]) -> bool:
     return any(
-        _value(d, 262, 0) in _RAW_PHOTOMETRIC or _value(d, 259, 0) in _RAW_COMPRESSION
-        for d in _with_children(reader, directories)
+        _value(d, 262, 0) in _RAW_PHOTOMETRIC or _value(d, 259, 0) in _RAW_COMPRESSION for _, d in every
     )
 
 
-def _largest(reader: TiffReader, directories: Sequence[Directory]) -> Directory:
-    return max(_with_children(reader, directories), key=lambda d: _value(d, 256, 0) * _value(d, 257, 0))
+def _pixels(at: tuple[int, Directory]) -> int:
+    return _value(at[1], 256, 0) * _value(at[1], 257, 0)
+
+
+def _is_derived(directory: Directory) -> bool:
+    """Whether a picture is a reduced one or a mask of another: NewSubfileType, or SubfileType before it."""
+    return bool(_value(directory, 254, 0) & 0b101) or _value(directory, 255, 1) == 2
+
+
+def _check_mosaic(directory: Directory) -> None:
+    """Refuse a colour filter array that no demosaicing here is made for: LibRaw would take it for another."""
+    size, colours = directory.get(33421), directory.get(33422)
+    if size is None or colours is None or len(shape := size.integers(2)) != 2:
+        return
+    letters = "".join(_FILTERS[number] if number < len(_FILTERS) else "?" for number in colours.raw()[:256])
+    require_known_mosaic([letters[k * shape[1] : (k + 1) * shape[1]] for k in range(shape[0])])
 
 
 def _coarseness(buffer: Buffer, directory: Directory, limits: Limits) -> float:
@@ -150,6 +173,30 @@ def _check_strips(directory: Directory, file_bytes: int) -> None:
         )
 
 
+def _check_colours(directory: Directory) -> None:
+    """Refuse numbers that stand for other things than light of three colours, before they are stored.
+
+    Raises
+    ------
+    UnsupportedFormatError
+        Naming what they are.
+    """
+    kind, samples = _value(directory, 262, 1), _value(directory, 277, 1)
+    named = _OTHER_COLOURS.get(kind, f"kind {kind}")
+    if kind not in _READ_COLOURS:
+        raise UnsupportedFormatError(f"the TIFF's colours are {named}; convert it to RGB")
+    if samples > 4 or (kind == 2 and samples < 3):
+        raise UnsupportedFormatError(f"a picture of {samples} channels is no photo; give RGB")
+    if _value(directory, 339, 1) not in {1, 3, 4}:
+        raise UnsupportedFormatError("the TIFF's numbers are signed or complex; save it with 8 or 16 bits")
+    chroma = directory.get(530)
+    steps = (2, 2) if chroma is None else chroma.integers(2)
+    if kind == 6 and _value(directory, 259, 1) not in _JPEG and steps != (1, 1):
+        raise UnsupportedFormatError(
+            f"the TIFF stores one colour (YCbCr) for {' x '.join(map(str, steps))} pixels; convert it to RGB"
+        )
+
+
 def read_raw(buffer: Buffer, limits: Limits) -> Header:
     """Find the TIFF structures of RAW files that are not plain TIFF; LibRaw tells their size."""
     head = bytes(buffer[:12])
@@ -162,9 +209,10 @@ def read_raw(buffer: Buffer, limits: Limits) -> Header:
     reader = TiffReader.open(buffer)
     if reader is None:
         return Header("raw")
-    header, directories = Header("raw", tiff=(reader,)), list(reader.chain())
-    if directories:
-        header = _sized(replace(header, xmp=_block(directories[0], 700)), _largest(reader, directories))
+    header, chain = Header("raw", tiff=(reader,)), list(reader.chain())
+    if chain:
+        _, largest = max(_with_children(reader, chain), key=_pixels)
+        header = _sized(replace(header, xmp=_block(chain[0][1], 700)), largest)
     check_size(header.width, header.height, len(buffer), limits)
     return header
 

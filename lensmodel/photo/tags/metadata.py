@@ -136,6 +136,8 @@ class _Exif:
         block = 0
         for index, reader in enumerate(header.tiff):
             main, _ = reader.directory(reader.first)
+            if header.directory:  # a preview may stand before the photo
+                main |= reader.directory(header.directory)[0]
             directory = {**main, **reader.below(main.get(0x8769))}
             if 0x927C in directory:
                 block = index

@@ -1,0 +1,282 @@
+"""Which picture of a file is the photo, and what its numbers are; what is no photo is refused by name."""
+
+from __future__ import annotations
+
+import struct
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from lensmodel import photo
+from lensmodel.core.errors import NotAnImageError, UnsupportedFormatError
+from lensmodel.photo.dng import write_bayer_dng
+
+REPORTS = Path(__file__).parents[2] / "data" / "reports"
+RNG = np.random.default_rng(5)
+PIXELS = np.kron(RNG.integers(20, 230, (12, 16, 3), dtype=np.uint8), np.ones((4, 4, 1), np.uint8))
+
+
+def numbers(path: Path) -> np.ndarray:
+    """The sRGB numbers of a developed photo, for comparison by eye and by sum."""
+    developed = photo.develop(path)
+    assert developed.planes.shape[1:] == (developed.info.height, developed.info.width)
+    return photo.shown(developed.planes, developed.encoding)
+
+
+def test_a_preview_before_the_photo_is_not_the_photo() -> None:
+    shown = numbers(REPORTS / "thumbnail-first.tif")
+
+    with tifffile.TiffFile(REPORTS / "thumbnail-first.tif") as file:
+        assert np.abs(shown.astype(int) - file.pages[1].asarray()).max() <= 1
+
+
+def _previews_without_a_mark(path: Path) -> None:
+    with tifffile.TiffWriter(path) as file:
+        file.write(PIXELS[::4, ::4], photometric="rgb", metadata=None)
+        file.write(PIXELS, photometric="rgb", metadata=None)
+
+
+def _photo_below_its_preview(path: Path) -> None:
+    with tifffile.TiffWriter(path) as file:
+        file.write(PIXELS[::2, ::2], photometric="rgb", metadata=None, subifds=1, subfiletype=1)
+        file.write(PIXELS, photometric="rgb", metadata=None, subfiletype=0)
+
+
+def _larger_mask(path: Path) -> None:
+    with tifffile.TiffWriter(path) as file:
+        file.write(PIXELS, photometric="rgb", metadata=None)
+        mask = np.ones((96, 128), dtype=bool)
+        file.write(mask, photometric="mask", subfiletype=4, metadata=None)
+
+
+def _enlarged_copy(path: Path) -> None:
+    with tifffile.TiffWriter(path) as file:
+        file.write(PIXELS, photometric="rgb", metadata=None, subfiletype=0)
+        file.write(
+            np.kron(PIXELS, np.ones((2, 2, 1), np.uint8)), photometric="rgb", subfiletype=1, metadata=None
+        )
+
+
+@pytest.mark.parametrize(
+    "write", [_previews_without_a_mark, _photo_below_its_preview, _larger_mask, _enlarged_copy]
+)
+def test_the_largest_picture_that_derives_from_no_other_is_the_photo(
+    write: Callable[[Path], None], tmp_path: Path
+) -> None:
+    write(tmp_path / "x.tif")
+
+    assert (numbers(tmp_path / "x.tif") == PIXELS).all()
+
+
+def test_what_the_photos_own_directory_says_goes_before_the_previews(tmp_path: Path) -> None:
+    with tifffile.TiffWriter(tmp_path / "x.tif") as file:
+        file.write(
+            PIXELS[::4, ::4],
+            photometric="rgb",
+            metadata=None,
+            subfiletype=1,
+            extratags=[(272, 2, 0, "T-1", True)],
+        )
+        file.write(PIXELS, photometric="rgb", metadata=None, extratags=[(274, 3, 1, 6, True)])
+
+    said = photo.inspect(tmp_path / "x.tif").metadata
+
+    assert (said.camera_model, said.orientation) == ("T-1", 6)
+
+
+def test_ycbcr_without_jpeg_is_converted() -> None:
+    shown = numbers(REPORTS / "ycbcr-lzw.tif")
+
+    with tifffile.TiffFile(REPORTS / "ycbcr-lzw.tif") as file:
+        truth = np.asarray(Image.fromarray(file.pages[0].asarray(), "YCbCr").convert("RGB"))
+    assert np.abs(shown.astype(int) - truth).max() <= 2
+
+
+def _ycbcr(
+    rgb: np.ndarray, weights: tuple[float, float, float], low: np.ndarray, high: np.ndarray, top: int
+) -> np.ndarray:
+    share = rgb / 255.0
+    y = share @ np.array(weights)
+    chroma = [(share[..., k] - y) / (2.0 - 2.0 * weights[k]) for k in (2, 0)]
+    unit = np.stack([y, *(c / (0.5 - 0.5 / top) for c in chroma)], axis=-1)
+    return np.rint(unit * (high - low) + low)
+
+
+@pytest.mark.parametrize(
+    ("weights", "low", "high", "top"),
+    [
+        ((0.2126, 0.7152, 0.0722), (0, 128, 128), (255, 255, 255), 255),
+        ((0.299, 0.587, 0.114), (16, 128, 128), (235, 240, 240), 255),
+        ((0.299, 0.587, 0.114), (0, 32768, 32768), (65535, 65535, 65535), 65535),
+    ],
+)
+def test_ycbcr_of_other_weights_ranges_and_depths_is_converted_by_them(
+    weights: tuple[float, float, float], low: tuple[int, ...], high: tuple[int, ...], top: int, tmp_path: Path
+) -> None:
+    coded = _ycbcr(PIXELS, weights, np.array(low), np.array(high), top)
+    tifffile.imwrite(
+        tmp_path / "x.tif",
+        coded.astype(np.uint8 if top == 255 else np.uint16),
+        photometric="ycbcr",
+        metadata=None,
+        extratags=[
+            (529, 5, 3, tuple(int(v) for w in weights for v in (w * 10000, 10000)), True),
+            (530, 3, 2, (1, 1), True),
+            (
+                532,
+                5,
+                6,
+                tuple(int(v) for pair in zip(low, high, strict=True) for n in pair for v in (n, 1)),
+                True,
+            ),
+        ],
+    )
+
+    assert np.abs(numbers(tmp_path / "x.tif").astype(int) - PIXELS).max() <= 2
+
+
+@pytest.mark.parametrize(
+    ("pixels", "options", "word"),
+    [
+        (np.zeros((48, 64, 4), np.uint8), {"photometric": "separated"}, "CMYK"),
+        (np.zeros((48, 64, 3), np.uint8), {"photometric": "cielab"}, "Lab"),
+        (np.zeros((48, 64, 6), np.uint8), {"photometric": "rgb", "planarconfig": "contig"}, "6 channels"),
+        (np.zeros((48, 64), np.int16), {"photometric": "minisblack"}, "signed"),
+        (np.zeros((48, 64), np.complex64), {"photometric": "minisblack"}, "complex"),
+    ],
+)
+def test_a_tiff_that_could_only_fail_is_refused_before_it_is_stored(
+    pixels: np.ndarray, options: dict, word: str, tmp_path: Path
+) -> None:
+    tifffile.imwrite(tmp_path / "x.tif", pixels, metadata=None, **options)
+
+    with pytest.raises(UnsupportedFormatError, match=word):
+        photo.inspect(tmp_path / "x.tif")
+
+
+def test_chroma_that_is_shared_by_pixels_is_refused_where_no_jpeg_decoder_unpacks_it(tmp_path: Path) -> None:
+    tags = {
+        256: [64],
+        257: [48],
+        258: [8] * 3,
+        259: [1],
+        262: [6],
+        273: [0],
+        277: [3],
+        278: [48],
+        530: [2, 1],
+    }
+    size = 64 * 48 * 2
+    every = {tag: (4 if tag == 273 else 3, values) for tag, values in {**tags, 279: [size]}.items()}
+    (tmp_path / "x.tif").write_bytes(plain_tiff(every, bytes(size)))
+
+    with pytest.raises(UnsupportedFormatError, match="2 x 1 pixels"):
+        photo.inspect(tmp_path / "x.tif")
+
+
+@pytest.mark.parametrize("bits", [1, 2, 4, 8])
+def test_a_palette_of_any_depth_is_applied(bits: int, tmp_path: Path) -> None:
+    colours = RNG.integers(0, 255, (2**bits, 3), dtype=np.uint8)
+    indices = np.kron(RNG.integers(0, 2**bits, (12, 16)), np.ones((4, 4), int))
+    packed = np.packbits(
+        ((indices[..., None] >> np.arange(bits)[::-1]) & 1).reshape(48, 64 * bits).astype(np.uint8), axis=1
+    )
+    tags = {
+        256: (4, [64]),
+        257: (4, [48]),
+        258: (3, [bits]),
+        259: (3, [1]),
+        262: (3, [3]),
+        273: (4, [0]),
+        277: (3, [1]),
+        278: (4, [48]),
+        279: (4, [packed.size]),
+        320: (3, (colours.T.astype(int) * 257).ravel().tolist()),
+    }
+    (tmp_path / "x.tif").write_bytes(plain_tiff(tags, packed.tobytes()))
+
+    assert (numbers(tmp_path / "x.tif") == colours[indices]).all()
+
+
+def plain_tiff(tags: dict[int, tuple[int, list[int]]], pixels: bytes) -> bytes:
+    """Lay out a TIFF of one strip, as no library writes it."""
+    width = {3: 2, 4: 4}
+    at = 8 + 2 + 12 * len(tags) + 4
+    table, values = struct.pack("<H", len(tags)), b""
+    far = {tag: value for tag, value in tags.items() if len(value[1]) * width[value[0]] > 4}
+    tags = {**tags, 273: (4, [at + sum(len(v) * width[k] for k, v in far.values())])}
+    for tag, (kind, numbers_) in sorted(tags.items()):
+        packed = struct.pack(f"<{len(numbers_)}{'H' if kind == 3 else 'I'}", *numbers_)
+        inline = packed.ljust(4, b"\0") if len(packed) <= 4 else struct.pack("<I", at + len(values))
+        values += b"" if len(packed) <= 4 else packed
+        table += struct.pack("<HHI", tag, kind, len(numbers_)) + inline
+    return b"II*\0\x08\0\0\0" + table + bytes(4) + values + pixels
+
+
+def test_a_quad_bayer_mosaic_is_refused_by_its_pattern_and_nothing_is_printed() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for read in (photo.inspect, photo.develop):
+            with pytest.raises(UnsupportedFormatError, match=r"4 x 4 pixels \(RRGG RRGG GGBB GGBB\)"):
+                read(REPORTS / "quad-bayer.dng")
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "colours"),
+    [(2, 2, "RGRG"), (2, 4, "RGGBGRBG"), (2, 2, "CYGM"), (2, 2, "RWGB"), (8, 2, "RGGBRGGBRGGBRGGB")],
+)
+def test_every_mosaic_that_is_not_demosaiced_here_is_refused(
+    rows: int, columns: int, colours: str, tmp_path: Path
+) -> None:
+    mosaic = RNG.integers(600, 9000, (48, 64), dtype=np.uint16)
+    write_bayer_dng(tmp_path / "x.dng", mosaic, black=512, white=15000)
+    data = bytearray((tmp_path / "x.dng").read_bytes())
+    pattern = bytes("RGBCMYW".index(letter) for letter in colours)
+    for tag, entry in (
+        (33421, struct.pack("<HHIHH", 33421, 3, 2, rows, columns)),
+        (33422, struct.pack("<HHII", 33422, 1, len(pattern), len(data))),
+    ):
+        at = next(i for i in range(10, 600, 12) if data[i : i + 2] == struct.pack("<H", tag))
+        data[at : at + 12] = entry
+    if len(pattern) == 4:
+        data[at + 8 : at + 12] = pattern
+    (tmp_path / "x.dng").write_bytes(bytes(data) + pattern)
+
+    with pytest.raises(UnsupportedFormatError, match=f"{rows} x {columns} pixels"):
+        photo.inspect(tmp_path / "x.dng")
+
+
+def test_stray_bytes_between_segments_are_passed_over_as_viewers_do() -> None:
+    with Image.open(REPORTS / "stray-bytes-between-segments.jpg") as image:
+        truth = np.asarray(image.convert("RGB"))
+
+    assert np.abs(numbers(REPORTS / "stray-bytes-between-segments.jpg").astype(int) - truth).max() <= 1
+
+
+@pytest.mark.parametrize("stray", [b"\0", b"ab\0c", b"\xff\xff\xff", b"\xff\0\0", b"\xff\xd0"])
+@pytest.mark.parametrize("segment", [1, 2])
+def test_stray_bytes_hide_nothing_that_follows_them(stray: bytes, segment: int, tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0110] = "T-1"
+    Image.fromarray(PIXELS).save(tmp_path / "x.jpg", exif=exif, quality=95)
+    data = (tmp_path / "x.jpg").read_bytes()
+    at = 2
+    for _ in range(segment):
+        at += 2 + struct.unpack(">H", data[at + 2 : at + 4])[0]
+    (tmp_path / "x.jpg").write_bytes(data[:at] + stray + data[at:])
+
+    info = photo.inspect(tmp_path / "x.jpg")
+
+    assert (info.width, info.height, info.metadata.camera_model) == (64, 48, "T-1")
+
+
+def test_a_jpeg_of_stray_bytes_alone_is_no_photo(tmp_path: Path) -> None:
+    (tmp_path / "x.jpg").write_bytes(b"\xff\xd8\xff\xe0\0\x04ab" + b"\0\xff\0" * 20_000)
+
+    with pytest.raises(NotAnImageError):
+        photo.inspect(tmp_path / "x.jpg")

@@ -93,7 +93,7 @@ def blind(
     psfs: Annotated[Path | None, typer.Option(help="npz with the key psf, shape (n, k, k).")] = None,
     noise: Annotated[str, typer.Option(help="Standard deviations, comma separated.")] = NOISE,
     methods: Annotated[
-        str, typer.Option(help="Estimators, comma separated; also cho-lee, edges, l0, sun, xu-jia and zhang.")
+        str, typer.Option(help="Estimators, comma separated; also cho-lee, edges, sun, xu-jia and zhang.")
     ] = ESTIMATORS,
     patch: Annotated[int, typer.Option(help="Side of a patch.")] = 256,
     cases: Annotated[int | None, typer.Option(help="At most so many.")] = None,
@@ -182,7 +182,7 @@ def model(
     photos: Annotated[str, typer.Option(help="Numbers of photos, comma separated.")] = "1,5",
     methods: Annotated[str | None, typer.Option(help="Names, comma separated; default: all.")] = None,
     psf_field: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Measured instead: npz of PSFs, or TIFF of stars.")
+        Path | None, typer.Option(metavar="FILE", help="Measured instead: npz of PSFs.")
     ] = None,
     photographs: Annotated[
         Path | None,

@@ -6,23 +6,34 @@ import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from app.commands.console import display
-from app.commands.console.failure import UsageError
 from app.commands.console.files import refuse_existing
-from app.commands.console.method_options import Estimator
 from app.commands.console.options import Force, Quiet, Verbose
 
 if TYPE_CHECKING:
-    from lensmodel.lab.reproduce import Case, DirectRoute, OpenRoute, Size
+    from lensmodel.lab.reproduce import Case, DirectRoute
 
 DATA_VARIABLE = "LENSMODEL_TEST_DATA"
-PAGE = ("reproduction.md", "reproduction.html")
+PAGE = ("reproduction.md", "reproduction.html", "reproduction.json")
 """What is in the folder of a finished reproduction, beside pictures and stored results."""
+
+BENCHMARK = Path("bench-output")
+"""Where `lensmodel bench blind` leaves what Fig. 1 is drawn from."""
+
+
+class Size(StrEnum):
+    """How much is run."""
+
+    QUICK = "quick"
+    SMALL = "small"
+    DEFAULT = "default"
+    FULL = "full"
 
 
 def reproduce(
@@ -30,30 +41,17 @@ def reproduce(
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for the page, its pictures and stored results.")
     ] = Path("reproduction"),
-    json_output: Annotated[
-        Path | None, typer.Option("--json", help="Also write every figure to this file.")
-    ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Two lenses, small photos, n = 1, 2: minutes.")
-    ] = False,
-    full: Annotated[
-        bool, typer.Option("--full", help="Two apertures a lens, n up to 20: takes all night.")
-    ] = False,
-    small: Annotated[
-        bool, typer.Option("--small", help="All lenses, photos of a megapixel, no rivals: some hours.")
-    ] = False,
-    hard: Annotated[
-        bool,
-        typer.Option("--hard", help="Add difficult scenes: depth, motion, night, sky, snow, text, foliage."),
-    ] = False,
-    lenses: Annotated[
-        int | None,
+    size: Annotated[
+        Size,
         typer.Option(
-            "--lenses",
-            metavar="N",
-            min=1,
-            help="Only the first N lenses of each family; a later run adds others.",
+            help="quick: four lenses on small photos, minutes. small: all lenses on a megapixel, hours. "
+            "default: large frames, other files and the rivals too. full: two apertures a lens, up to twenty "
+            "photos and scenes that hurt, all night.",
         ),
+    ] = Size.DEFAULT,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Only lenses whose name begins so: 1003, heliar; again for more."),
     ] = None,
     grids: Annotated[
         list[Path] | None,
@@ -63,17 +61,11 @@ def reproduce(
             "Default: the two of the repository.",
         ),
     ] = None,
-    only: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME", help="Only lenses whose name begins so: 1003, heliar; again for more."),
-    ] = None,
-    photos: Annotated[
-        int | None,
+    scenes: Annotated[
+        Path | None,
         typer.Option(
-            "--photos",
-            metavar="N",
-            min=1,
-            help="Learn from at most N photos: the fewer, the larger the frames that the photographs allow.",
+            help="Folder of sharp photographs; its test half is used. Default: the folder sharp of "
+            f"${DATA_VARIABLE} where that is set, else the library's five."
         ),
     ] = None,
     results: Annotated[
@@ -84,19 +76,6 @@ def reproduce(
             "runs on several machines make one page. Default: cache in the output folder.",
         ),
     ] = None,
-    paper: Annotated[
-        bool | None,
-        typer.Option(
-            "--paper/--no-paper",
-            help="The paper's own way too, which is slow. Default: yes, without --default-only.",
-        ),
-    ] = None,
-    no_target: Annotated[
-        bool, typer.Option("--no-target", help="Leave out the lens measured with a target, which is slow.")
-    ] = False,
-    no_rivals: Annotated[
-        bool, typer.Option("--no-rivals", help="Leave out the paper's blind rivals, which are slow.")
-    ] = False,
     default_only: Annotated[
         bool,
         typer.Option(
@@ -111,52 +90,28 @@ def reproduce(
             help="Fail where a bar is missed, and name each: the lens and zone of a fall too.",
         ),
     ] = False,
-    no_figures: Annotated[
-        bool, typer.Option("--no-figures", help="Leave Figs. 2 and 4 to a later run.")
-    ] = False,
-    direct: Annotated[
-        bool, typer.Option("--direct", help="Use the library in this process, not a service.")
-    ] = False,
-    scenes: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of sharp photographs; its test half is used. Default: the folder sharp of "
-            f"${DATA_VARIABLE} where that is set, else the library's five."
-        ),
-    ] = None,
-    benchmark: Annotated[
-        Path, typer.Option(help="Output of `lensmodel bench blind`: for Fig. 1, if it exists.")
-    ] = Path("bench-output"),
-    estimator: Estimator = "default",
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = 0,
 ) -> None:
     """Make the paper's figures and its Table 1 on simulated lenses that nothing was tuned on.
 
-    Each lens learns from Bayer DNG files uploaded to a service started for it; what the service
-    answers and corrects is measured against the truth. Finished results are kept: a run that was
-    stopped goes on, and a change of code or settings computes anew. A finished page is replaced
-    only with --force.
+    Each lens learns from Bayer DNG files as a user's does; what it answers and corrects is measured
+    against the truth. Finished results are kept: a run that was stopped goes on, and a change of code
+    or settings computes anew. A finished page is replaced only with --force.
 
     Examples:
 
-        lensmodel reproduce --quick -o reproduction
+        lensmodel reproduce --size quick -o reproduction
 
-        lensmodel reproduce --json reproduction.json
-
-        lensmodel reproduce --only 1003 --results figures-so-far --no-figures -o sitting
+        lensmodel reproduce --only 1003 --results figures-so-far -o sitting
 
     Exit status: 0 the page is written, 1 something failed or an asserted bar is missed, 2 called wrongly.
     """
     shown = display.of(context, quiet=quiet, verbose=verbose)
-    if quick + small + full > 1:
-        raise UsageError("--quick, --small and --full exclude each other; give one of them")
-    if photos is not None and quick + small + full:
-        raise UsageError("--photos is for the default size; leave out --quick, --small and --full")
-    refuse_existing(json_output, *(output / name for name in PAGE), force=force)
-    from app.lab.service_route import CODE, ServiceRoutes  # noqa: PLC0415 - only this command needs them
-    from lensmodel.lab.reproduce import (  # noqa: PLC0415 - as above: the simulation is slow to import
+    refuse_existing(*(output / name for name in PAGE), force=force)
+    from lensmodel.lab.reproduce import (  # noqa: PLC0415 - the simulation is slow to import
+        DirectRoute,
         collected,
         missed,
         planned,
@@ -165,35 +120,18 @@ def reproduce(
         write_page,
     )
 
-    size: Size = "quick" if quick else "small" if small else "full" if full else "default"
+    @contextmanager
+    def library(case: Case, folder: Path) -> Iterator[DirectRoute]:
+        del case
+        yield DirectRoute(folder / "models")
+
     plan = planned(
-        size,
-        scenes=scenes or _external(),
-        estimator=estimator,
-        hard=hard,
-        lenses=lenses,
-        grids=grids or None,
-        only=only or (),
-        photos=photos,
-        paper=paper,
-        target=not no_target,
-        rivals=not no_rivals,
-        default_only=default_only,
+        size.value, scenes=scenes or _external(), grids=grids, only=only or (), default_only=default_only
     )
-    result = run_reproduction(
-        plan,
-        _direct(estimator) if direct else ServiceRoutes(estimator),
-        output,
-        route="in the library" if direct else "by the service",
-        code=() if direct else CODE,
-        with_figures=not no_figures,
-        results=results,
-        on_work=WorkLines(quiet=shown.quiet),
-    )
-    result["figures"]["fig1"] = collected(benchmark, output / "pictures")
-    written = [*write_page(result, output)]
-    if json_output is not None:
-        written.append(write_json(result, json_output))
+    work = WorkLines(quiet=shown.quiet)
+    result = run_reproduction(plan, library, output, route="in the library", results=results, on_work=work)
+    result["figures"]["fig1"] = collected(BENCHMARK, output / "pictures")
+    written = [*write_page(result, output), write_json(result, output / PAGE[-1])]
     shown.result(f"Code {result['code']}. Written: " + ", ".join(str(path) for path in written))
     if assert_bars and (lines := missed(result)):
         shown.error("\n".join(["these bars are missed:", *lines]))
@@ -237,14 +175,3 @@ def _external() -> Path | None:
         return None
     folder = Path(named) / "sharp"
     return folder if folder.is_dir() else None
-
-
-def _direct(estimator: str) -> OpenRoute:
-    from lensmodel.lab.reproduce import DirectRoute  # noqa: PLC0415 - as above
-
-    @contextmanager
-    def opened(case: Case, folder: Path) -> Iterator[DirectRoute]:
-        del case
-        yield DirectRoute(folder / "models", estimator)
-
-    return opened

@@ -89,7 +89,7 @@ class Peer:
         Raises
         ------
         InvalidInputError
-            If the program is missing, fails or writes nothing.
+            If the program is missing, fails, writes nothing or does not end.
         """
         if not self.installed:
             raise InvalidInputError(f"{self.program} is not installed; install it to compare with it")
@@ -97,13 +97,16 @@ class Peer:
         target.unlink(missing_ok=True)
         words = self.command(source, target, folder, setting)
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        done = subprocess.run(
-            words,
-            capture_output=True,
-            check=False,
-            timeout=_LIMIT_S,
-            env=os.environ | {"HOME": str(folder), "OMP_NUM_THREADS": "2"},
-        )
+        try:
+            done = subprocess.run(
+                words,
+                capture_output=True,
+                check=False,
+                timeout=_LIMIT_S,
+                env=os.environ | {"HOME": str(folder), "OMP_NUM_THREADS": "2"},
+            )
+        except subprocess.TimeoutExpired as error:
+            raise InvalidInputError(f"{self.program} did not end within {_LIMIT_S} s") from error
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         if done.returncode != 0 or not target.exists():
             said = done.stderr.decode(errors="replace")[-300:]

@@ -7,7 +7,7 @@ Three kinds of input:
 * the same lenses behind photographs whose patches are estimated blindly (`--photographs FOLDER`): there the
   ways to answer from kernels and from one wavefront can be compared;
 * a file of measured PSFs (`--psf-field FILE.npz`, keys psf (n, k, k), r, phi, and optionally
-  aperture and group) or a TIFF of a star field: groups are held out in turn.
+  aperture and group): groups are held out in turn.
 
 Compared with two ways of the trade: linear interpolation between PSFs of the image plane, which is
 what efficient filter flow does, and a polynomial of the place for each pixel, as PSFEx fits.
@@ -39,7 +39,6 @@ from lensmodel.lab.cases import list_photos, photo_half
 from lensmodel.lab.model.estimated import estimated_samples
 from lensmodel.lab.model.exact import PaperModel
 from lensmodel.lab.model.smoothers import make_known
-from lensmodel.lab.model.stars import stars_of
 from lensmodel.model import LensModel, ModelSettings, fit_wavefront, smoothers
 from lensmodel.model.answer import KERNELS, MODES
 from lensmodel.simulate import draw_lens
@@ -207,15 +206,13 @@ def predictor(method: str, samples: Sequence[PsfSample]) -> Predictor:
 
 
 def load_field(path: Path) -> list[PsfSample]:
-    """Read measured PSFs from an npz, or find stars in a TIFF; negative pixels are noise and become zero.
+    """Read measured PSFs from an npz; negative pixels are noise and become zero.
 
     Raises
     ------
     InvalidInputError
         If a key is missing or shapes differ.
     """
-    if path.suffix.lower() in {".tif", ".tiff"}:
-        return stars_of(path)
     try:
         with np.load(path, allow_pickle=False) as stored:
             psf, r, phi = stored["psf"], stored["r"], stored["phi"]
@@ -377,7 +374,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", default="1000:1004", help="first:last, the last excluded")
     parser.add_argument("--photos", default="1,5", help="numbers of photos, with commas")
     parser.add_argument("--methods", default=None, help="names with commas; all by default")
-    parser.add_argument("--psf-field", type=Path, default=None, help="npz of measured PSFs, or TIFF of stars")
+    parser.add_argument("--psf-field", type=Path, default=None, help="npz of measured PSFs")
     parser.add_argument("--spoiled", type=float, default=0.0, help="relative L2 of the kernels fed")
     parser.add_argument("--photographs", type=Path, default=None, help="folder; estimate patches of those")
     parser.add_argument("--json", type=Path, default=None, help="also write the result there")

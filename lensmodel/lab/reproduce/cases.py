@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
 import numpy as np
 
-import lensmodel
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import PsfField
 from lensmodel.core.types import LensSettings
+from lensmodel.lab.code_version import version_of
 from lensmodel.lab.reproduce import families
 from lensmodel.lab.reproduce.conditions import BASE, Condition, condition
 from lensmodel.lab.reproduce.families import FIRST_SEED, Family
@@ -33,32 +32,6 @@ HARD_METHODS: Final = ("standard",)
 """Of the correction of scenes and paths that hurt: what a user gets who chooses nothing."""
 
 RIVALS: Final = ("schuler", "kee")
-
-_PARTS: Final = (
-    "core",
-    "photo",
-    "optics",
-    "scene",
-    "estimation",
-    "model",
-    "correction",
-    "quality",
-    "simulate",
-    "workflow",
-)
-_MEASURING: Final = (
-    "conditions",
-    "fidelity",
-    "general",
-    "job",
-    "measure",
-    "measured",
-    "routes",
-    "scenes",
-    "shots",
-)
-_NO_PART: Final = ("api", "checking", "joining")
-"""Modules that no route from a photo to a corrected one goes through."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,31 +188,18 @@ class Reproduction:
         return scene_files(self.scenes)
 
 
-def fingerprint(extra: Sequence[Path] = ()) -> str:
-    """Hash of the code and data that figures depend on, and `extra`.
+def fingerprint() -> str:
+    """Hash of the code and data that figures depend on: all that is behind the work on one case.
 
-    Those are the steps from a photo to a corrected one, the simulation and what measures; not reports, pages,
-    plans and other benchmarks, whose change leaves stored results as they are.
-
-    Parameters
-    ----------
-    extra : sequence of Path
-        Further folders or files of Python code.
+    Rivals and programs have hashes of their own; plans and pages leave stored results as they are.
     """
-    own = Path(__file__).parent
-    root = Path(lensmodel.__file__).parent
-    code = [
-        path
-        for part in _PARTS
-        for path in (root / part).rglob("*")
-        if path.suffix in {".py", ".npz", ".json"} and path.stem not in _NO_PART
-    ]
-    code += [own / f"{name}.py" for name in _MEASURING]
-    code += [p for path in extra for p in ([path] if path.is_file() else path.rglob("*.py"))]
-    total = hashlib.sha256()
-    for path in sorted(code, key=lambda path: (path.name, path.as_posix())):
-        total.update(path.name.encode() + b"\0" + path.read_bytes())
-    return total.hexdigest()[:16]
+    apart = (
+        "lensmodel.lab.rivals",
+        "lensmodel.lab.reproduce.programs",
+        "lensmodel.lab.peers",
+        "lensmodel.report",
+    )
+    return version_of("lensmodel.lab.reproduce.job", without=apart)
 
 
 def key_of(case: Case, plan: Reproduction, route: str, code: str) -> str:

@@ -105,7 +105,10 @@ class CaseJob:
             self._beside(files["rivals"], shots)
             self._programs(files["programs"], shots)
             shutil.rmtree(self.work)
-        units = {part: {name: read(path) for name, path in paths.items()} for part, paths in files.items()}
+        units = {
+            part: {name: read(path) for name, path in paths.items() if part != "programs" or path.exists()}
+            for part, paths in files.items()
+        }
         return {
             "name": case.name,
             "title": case.title,
@@ -265,8 +268,14 @@ class CaseJob:
 
     def _programs(self, targets: Mapping[str, Path], shots: Shots) -> None:
         for name, path in targets.items():
-            _, fresh = stored(path, partial(self._measured_program, name, shots))
-            self.progress.tell(f"{self.case.title}: {name}", PROGRAM, fresh=fresh)
+            words, fresh = f"{self.case.title}: {name}", True
+            try:
+                _, fresh = stored(path, partial(self._measured_program, name, shots))
+            except (
+                LensModelError
+            ) as error:  # of another program: the page goes without, the next run tries again
+                words = f"{words} left out: {error}"
+            self.progress.tell(words, PROGRAM, fresh=fresh)
 
     def _measured_program(self, name: str, shots: Shots) -> Unit:
         """What a program of others makes of chart and photo, at its best setting."""

@@ -20,8 +20,8 @@ _QUICK_FRAME = (640, 960)  # rows and columns (chosen): 0.6 megapixels
 _HARD_FRAME = (840, 1260)  # rows and columns (chosen): a megapixel
 _STOPPED_DOWN = 2.0  # two stops
 
-_DRAWN_EACH: Final = {"quick": 1, "small": 2, "default": 2, "full": 4}
-_TRACED_EACH: Final = {"quick": 1, "small": 2, "default": 2, "full": 2}
+_DRAWN_EACH: Final = {"default": 2, "full": 4}
+_TRACED_EACH: Final = {"default": 2, "full": 2}
 """Lenses of a family behind each other kind of file, by size of the run (chosen: a night)."""
 
 
@@ -29,15 +29,8 @@ def planned(
     size: Size,
     *,
     scenes: Path | None = None,
-    estimator: str = "default",
-    hard: bool = False,
-    lenses: int | None = None,
     grids: Sequence[Path] | None = None,
     only: Sequence[str] = (),
-    photos: int | None = None,
-    paper: bool | None = None,
-    target: bool = True,
-    rivals: bool = True,
     default_only: bool = False,
 ) -> Reproduction:
     """Plan a run of one of four sizes.
@@ -45,62 +38,38 @@ def planned(
     Parameters
     ----------
     size : {"quick", "small", "default", "full"}
-        Two lenses, small photos, n = 1, 2; all lenses wide open on frames of a megapixel, n = 1, 2, 5,
-        without rivals; eight lenses of different kind, wide open, n = 1, 2, 5;
-        the same stopped down too, the zoom also at its long end, and n = 10, 20 on smaller frames.
+        Four lenses, small photos, n = 1, 2, without rivals and the paper's own way; all lenses wide open on
+        frames of a megapixel, n = 1, 2, 5, without rivals; eight lenses of different kind, wide open,
+        n = 1, 2, 5; the same stopped down too, the zoom also at its long end, and n = 10, 20 on smaller frames.
         The default size takes the other paths (high ISO, TIFF, JPEG) with two lenses of each family, the
         full size takes them and the scenes that hurt with four of third order.
     scenes : Path or None
         See `Reproduction`.
-    estimator : str
-        See `Reproduction`.
-    hard : bool
-        Take the scenes that hurt too, each with two lenses of third order (quick: one).
-    lenses : int or None
-        Only so many of the lenses of each family, the first ones; results of a smaller run serve a larger
-        one.
     grids : sequence of Path, optional
         Grids of ray-traced lenses, one lens each; None takes those of the repository.
     only : sequence of str
         Only lenses whose name begins so, such as "1003" or "heliar"; for sittings on several machines.
-    photos : int or None
-        Each lens learns from at most so many: the fewer, the larger the frames that photographs are
-        composed to. Only of the default size, and of its photos at base ISO.
-    paper : bool or None
-        See `Reproduction`; None leaves it out with `default_only`.
-    target : bool
-        See `Reproduction`.
-    rivals : bool
-        Whether the paper's blind rivals are run where the size has them.
     default_only : bool
         Only what a user gets who chooses nothing is measured, beside the photo as it was and the true PSF.
 
     Raises
     ------
     InvalidInputError
-        If `lenses` or `photos` is below one, `photos` is given for another size, two grids are of one design
-        and aperture, or no lens has such a name.
+        If two grids are of one design and aperture, or no lens has such a name.
 
     Notes
     -----
     With few photographs the largest n shrinks to what they allow without using one twice.
     """
     files = scene_files(scenes)
-    if lenses is not None and lenses < 1:
-        raise InvalidInputError(f"a reproduction takes at least one lens, not {lenses}")
-    if photos is not None and (photos < 1 or size != "default"):
-        raise InvalidInputError(
-            f"at most {photos} photos of size {size}: give one or more, without another size beside it"
-        )
-    seeds = families.SEEDS[:lenses]
-    paths = tuple(families.repository_grids() if grids is None else grids)[:lenses]
+    seeds = families.SEEDS
+    paths = tuple(families.repository_grids() if grids is None else grids)
     if size == "quick":
-        two = (families.SEEDS[0], families.SEEDS[4])[:lenses]
+        two = (families.SEEDS[0], families.SEEDS[4])
         cases = tuple(_case(seed, (1, 2), files, _QUICK_FRAME) for seed in two)
         cases += tuple(_traced(path, (1, 2), files, _QUICK_FRAME) for path in paths)
     else:
-        wanted = tuple(n for n in (1, 2, 5) if photos is None or n <= photos)
-        few, frame = _allowed(wanted, len(files)), _HARD_FRAME if size == "small" else None
+        few, frame = _allowed((1, 2, 5), len(files)), _HARD_FRAME if size == "small" else None
         cases = tuple(_case(seed, few, files, frame) for seed in seeds)
         cases += tuple(_traced(path, few, files, frame) for path in paths)
     if size == "full":
@@ -109,30 +78,28 @@ def planned(
         cases += tuple(_case(seed, few, files, stopped=_STOPPED_DOWN) for seed in seeds)
         many = _allowed((10, 20), 2 * len(files))
         cases += tuple(_case(seed, many, files) for seed in seeds if many != few)
-    names: tuple[str, ...] = PATHS if hard or size in {"default", "full"} else ()
-    names += SCENES_THAT_HURT if hard or size == "full" else ()
-    frame = _QUICK_FRAME if size == "quick" else _HARD_FRAME
+    names: tuple[str, ...] = PATHS if size in {"default", "full"} else ()
+    names += SCENES_THAT_HURT if size == "full" else ()
     for number, name in enumerate(names):
         cases += tuple(
-            replace(_case(seed, (1,), files, frame), condition=name)
+            replace(_case(seed, (1,), files, _HARD_FRAME), condition=name)
             for seed in in_turn(seeds, number, _DRAWN_EACH[size])
         )
         if name in PATHS:
             cases += tuple(
-                replace(_traced(path, (1,), files, frame), condition=name)
+                replace(_traced(path, (1,), files, _HARD_FRAME), condition=name)
                 for path in in_turn(paths, number, _TRACED_EACH[size])
             )
     return Reproduction(
         _chosen(cases, only),
         scenes,
-        estimator,
         methods=HARD_METHODS if default_only else METHODS,
-        rivals=RIVALS if rivals and size != "small" and not default_only else (),
+        rivals=RIVALS if size in {"default", "full"} and not default_only else (),
         programs=() if default_only else programs.installed(),
         size=size,
-        paper=not default_only if paper is None else paper,
+        paper=size != "quick" and not default_only,
         general=not default_only,
-        target=target and not default_only,
+        target=not default_only,
     )
 
 

@@ -6,7 +6,6 @@ chart is corrected with that setting too.
 
 from __future__ import annotations
 
-import hashlib
 import re
 import tempfile
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 
 from lensmodel.core.types import Planes
 from lensmodel.lab import peers
+from lensmodel.lab.code_version import version_of
 from lensmodel.lab.images import psnr
 from lensmodel.photo.colour import srgb_to_linear
 from lensmodel.quality.images import to_srgb
@@ -44,10 +44,7 @@ def label_of(name: str) -> str:
 
 def version() -> str:
     """Hash of the code: what a program made by another version is made again."""
-    total = hashlib.sha256()
-    for path in (Path(__file__), Path(peers.__file__)):
-        total.update(path.read_bytes())
-    return total.hexdigest()[:8]
+    return version_of("lensmodel.lab.reproduce.programs")[:8]
 
 
 def best_setting(peer: peers.Peer, photo: Planes, truth: Planes, gains: Gains) -> tuple[float, Planes]:

@@ -16,15 +16,14 @@ and models of an unfinished case lie in `work` of the output folder, pictures in
 
 from __future__ import annotations
 
-import hashlib
 import os
-from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from lensmodel.lab.cases import photo_half
+from lensmodel.lab.code_version import version_of
 from lensmodel.lab.reproduce import figures
 from lensmodel.lab.reproduce.cases import Reproduction, fingerprint, key_of
 from lensmodel.lab.reproduce.conditions import BASE
@@ -32,8 +31,7 @@ from lensmodel.lab.reproduce.job import CaseJob
 from lensmodel.lab.reproduce.progress import FIGURES, OnWork, Progress, weight_of, with_paper
 from lensmodel.lab.reproduce.routes import OpenRoute, paper_way
 from lensmodel.lab.reproduce.store import Unit, stored
-from lensmodel.lab.rivals import kee, rivals
-from lensmodel.lab.rivals.basis import STORED
+from lensmodel.lab.rivals import rivals
 
 
 def run_reproduction(
@@ -42,7 +40,6 @@ def run_reproduction(
     folder: Path,
     *,
     route: str,
-    code: Sequence[Path] = (),
     workers: int | None = None,
     with_figures: bool = True,
     results: Path | None = None,
@@ -59,8 +56,6 @@ def run_reproduction(
         Pictures go to `pictures` in it.
     route : str
         Name of the route: part of the keys and of the report.
-    code : sequence of Path
-        Code of the route outside the library; a change of it makes stored results void.
     workers : int or None
         Processes that take photos; None means all cores.
     with_figures : bool
@@ -76,7 +71,7 @@ def run_reproduction(
         Plain values: `plan`, `route`, `code`, `scenes`, `cases`, `hard` (scenes and paths that
         hurt), `figures`.
     """
-    version = fingerprint(code)
+    version = fingerprint()
     cache, shown = results or folder / "cache", folder / "pictures"
     shown.mkdir(parents=True, exist_ok=True)
     keys = [key_of(case, plan, route, version) for case in plan.cases]
@@ -145,8 +140,4 @@ def _with_pictures_there(case: Unit, shown: Path) -> Unit:
 
 def rivals_version() -> str:
     """Hash of the rivals' code and basis: they are no part of what a case's key depends on."""
-    folder = Path(kee.__file__).parent
-    total = hashlib.sha256(STORED.read_bytes())
-    for path in sorted(folder.glob("*.py")):
-        total.update(path.read_bytes())
-    return total.hexdigest()[:8]
+    return version_of("lensmodel.lab.rivals")[:8]

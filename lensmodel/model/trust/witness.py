@@ -50,7 +50,7 @@ OF_BOTH: Final = (tuple(_FITTED["kernels"]), tuple(_FITTED["wavefront"]))
 
 Chosen on lenses of development (third order 0 to 3 and 6, and three ray-traced designs; one, two and five
 photos each) for the error that a linear filter by such a belief would leave. Surer ones gain 0.1 to 0.8 dB
-more on most of them (`lensmodel.lab.chain.caution`), and in a real photograph of a tree corners out of focus
+more on most of them, and in a real photograph of a tree corners out of focus
 get ragged lights and dots. So these stay.
 """
 SPREAD_OF_BOTH: Final = float(_FITTED["spread"])

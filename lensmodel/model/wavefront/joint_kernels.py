@@ -50,7 +50,7 @@ MIN_PLACES: Final = 8
 
 _NARROW_PLACES, _STOPPED_DOWN = 24, 2.0
 """Patches at most of photos stopped down, and the multiple of the widest f-number from which on they are (two
-stops). With all of them, five such photos take back what one adds (`lensmodel.lab.chain.stopped_down`)."""
+stops). With all of them, five such photos take back what one adds."""
 _STARTS = 6  # by moments, for the search: each further one is less likely and costs as much (chosen)
 _FIRST = 16  # samples of the first fit to kernels: it only gives a place to begin (chosen)
 _MOST_SINGLE = 2  # photos that are fitted alone (chosen: each costs as much as a whole fit of one)

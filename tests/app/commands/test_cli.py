@@ -428,7 +428,7 @@ REFUSED = {
     "degrees": (["psf", PROFILE, "--phi", "90"], 2, "--phi is in radians; 90 degrees are 1.571"),
     "aperture in words": (["psf", PROFILE, "--aperture", "wide"], 2, "such as 2.8 or f/2.8, got 'wide'"),
     "psf format": (["psf", PROFILE, "-o", "psf.xyz"], 2, "psf.xyz"),
-    "quick and full": (["reproduce", "--quick", "--full"], 2, "exclude each other"),
+    "no such size": (["reproduce", "--size", "huge"], 2, "quick"),
     "noise in words": (["bench", "blind", "--noise", "much"], 2, "numbers such as 0.01,0.003, got 'much'"),
     "photo to time": (["bench", "correct", "--photo", "gone.jpg"], 2, "no photo called gone.jpg"),
     "photos to blur": (["bench", "blind", "--photos", "empty", "-o", "o"], 2, "empty holds no PNG, JPEG"),
@@ -579,7 +579,7 @@ def test_a_file_of_mine_stays_mine_after_a_forced_demo(
     ("words", "finished"),
     [
         (("bench", "blind", "-o", "out"), "out/blind.md"),
-        (("reproduce", "--quick", "-o", "out"), "out/reproduction.md"),
+        (("reproduce", "--size", "quick", "-o", "out"), "out/reproduction.md"),
         (("reproduce", "--json", "out/figures.json"), "out/figures.json"),
     ],
 )

@@ -96,7 +96,7 @@ def test_an_option_that_does_not_exist_would_be_noticed() -> None:
 
 SHORTER = {
     "calibrate": ["--estimator", "whittle"],
-    "reproduce": ["--quick", "--direct", "--estimator", "whittle", "--no-paper"],
+    "reproduce": ["--size", "quick"],
 }
 """What is added so that an example takes minutes at most; the estimators have tests of their own."""
 

@@ -8,6 +8,7 @@ import pytest
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import Planes
+from lensmodel.lab import peers
 from lensmodel.lab.peers import PEERS, Peer, read_picture, skimage_results
 from lensmodel.lab.reproduce import programs
 
@@ -40,6 +41,14 @@ def test_missing_program_is_named() -> None:
     assert not peer.installed
     with pytest.raises(InvalidInputError, match="no-such-program is not installed"):
         peer.run(Path("in.tif"), Path(), 1.0)
+
+
+def test_program_that_does_not_end_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(peers, "_LIMIT_S", 0.2)
+    peer = Peer("sleeper", "sleep", lambda *_: ["sleep", "30"], (1.0,), 1.0)
+
+    with pytest.raises(InvalidInputError, match=r"sleep did not end within 0\.2 s"):
+        peer.run(Path("in.tif"), tmp_path, 1.0)
 
 
 def test_mosaic_for_raw_peers_keeps_each_colour_at_its_place(tmp_path: Path) -> None:

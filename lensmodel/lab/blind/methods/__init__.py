@@ -9,13 +9,12 @@ from lensmodel.core.registry import Registry
 from lensmodel.estimation import PsfEstimator, estimators
 from lensmodel.lab.blind.methods.cho_lee import ChoLee
 from lensmodel.lab.blind.methods.edges import Edges
-from lensmodel.lab.blind.methods.l0 import L0
 from lensmodel.lab.blind.methods.sun import Sun
 from lensmodel.lab.blind.methods.xu_jia import XuJia
 from lensmodel.lab.blind.methods.zhang import Zhang
 
 compared: Final[Registry[PsfEstimator]] = estimators.extended(
-    cho_lee=ChoLee, edges=Edges, l0=L0, sun=Sun, xu_jia=XuJia, zhang=Zhang
+    cho_lee=ChoLee, edges=Edges, sun=Sun, xu_jia=XuJia, zhang=Zhang
 )
 
-__all__ = ["L0", "ChoLee", "Edges", "Sun", "XuJia", "Zhang", "compared"]
+__all__ = ["ChoLee", "Edges", "Sun", "XuJia", "Zhang", "compared"]

@@ -34,7 +34,7 @@ class Method:
         return self.estimator.estimate(patches, [noise] * len(patches), size=size).kernel
 
 
-@pytest.fixture(scope="module", params=[("cho-lee", 0.85), ("xu-jia", 0.75), ("l0", 0.8)], ids=lambda p: p[0])
+@pytest.fixture(scope="module", params=[("cho-lee", 0.85), ("xu-jia", 0.75)], ids=lambda p: p[0])
 def method(request: pytest.FixtureRequest) -> Method:
     name, ncc = request.param
     return Method(compared.create(name), ncc)

@@ -20,6 +20,7 @@ from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.psf import as_kernel, distance
 from lensmodel.core.types import CHANNELS, ZONES, FieldPosition, LensSettings, Planes
+from lensmodel.lab.code_version import code_of, version_of
 from lensmodel.lab.figure_parts import strip
 from lensmodel.lab.reproduce import (
     Answer,
@@ -37,7 +38,7 @@ from lensmodel.lab.reproduce import (
     write_json,
     write_page,
 )
-from lensmodel.lab.reproduce.cases import FIRST_SEED, Size, fingerprint, key_of
+from lensmodel.lab.reproduce.cases import FIRST_SEED, Size, key_of
 from lensmodel.lab.reproduce.conditions import BASE, CONDITIONS, PATHS, SCENES_THAT_HURT
 from lensmodel.lab.reproduce.fidelity import EVERY, blocks, fidelity
 from lensmodel.lab.reproduce.general import (
@@ -115,23 +116,10 @@ def test_each_condition_takes_other_lenses_as_unlike_as_they_come() -> None:
     assert in_turn((), 0, 2) == []
 
 
-@pytest.mark.parametrize(("size", "hard"), [("full", False), ("default", True), ("quick", True)])
-def test_scenes_that_hurt_are_taken_when_asked_for_and_in_full(size: Size, hard: bool) -> None:
-    cases = planned(size, hard=hard).cases
+def test_scenes_that_hurt_are_taken_in_full() -> None:
+    cases = planned("full").cases
     assert {one.condition for one in cases} == {BASE, *PATHS, *SCENES_THAT_HURT}
     assert {one.family for one in cases if one.condition in SCENES_THAT_HURT} == {"third order"}
-
-
-def test_fewer_lenses_are_the_first_ones_and_their_results_serve_more() -> None:
-    some, every = planned("default", lenses=3, grids=()), planned("default", grids=())
-    base = [one for one in some.cases if one.condition == BASE]
-
-    assert base == [one for one in every.cases if one.condition == BASE][:3]
-    assert {one.seed for one in some.cases} == {1008, 1001, 1002}
-    assert key_of(base[0], some, "direct", "abc") == key_of(every.cases[0], every, "direct", "abc")
-    assert len(planned("quick", lenses=1, grids=()).cases) == 1
-    with pytest.raises(InvalidInputError, match="at least one lens"):
-        planned("quick", lenses=0)
 
 
 def test_unknown_condition_is_refused() -> None:
@@ -156,22 +144,16 @@ HELIAR, TELEPHOTO = families.repository_grids()
 
 
 def traced(path: Path = HELIAR, **changes: Any) -> Case:
-    (one,) = [c for c in planned("quick", lenses=1, grids=[path]).cases if c.grid is not None]
+    (one,) = [c for c in planned("quick", grids=[path]).cases if c.grid is not None]
     return replace(one, height=480, width=640, **changes)
 
 
-def test_fewer_photos_leave_larger_frames() -> None:
-    two, five = (planned("default", lenses=1, photos=n, rivals=False) for n in (1, None))
-    assert {one.photos[-1] for one in two.cases} == {1}
-    assert two.cases[0].height * two.cases[0].width > 1.5 * five.cases[0].height * five.cases[0].width
-    assert (two.rivals, bool(planned("default", lenses=1).rivals)) == ((), True)
-    least = planned("default", lenses=1, photos=1, default_only=True)
+def test_default_only_leaves_out_all_that_bars_do_not_ask_for() -> None:
+    least, usual = planned("default", default_only=True), planned("default")
     assert (least.methods, least.rivals, least.programs) == (("standard",), (), ())
     assert (least.paper, least.general, least.target) == (False, False, False)
-    assert planned("default", lenses=1, photos=1, default_only=True, paper=True).paper
-    assert [one.name for one in least.cases] == [one.name for one in two.cases]
-    with pytest.raises(InvalidInputError, match="at most 2 photos of size quick"):
-        planned("quick", photos=2)
+    assert (usual.rivals, usual.paper, usual.general, usual.target) == (("schuler", "kee"), True, True, True)
+    assert [one.name for one in least.cases] == [one.name for one in usual.cases]
 
 
 def test_plan_has_lenses_of_both_families_and_says_which_were_looked_at() -> None:
@@ -353,13 +335,30 @@ def test_key_changes_with_settings_route_and_code() -> None:
     assert key_of(case(), plan(), "a", "1") in keys
 
 
-def test_fingerprint_follows_the_code_given_to_it(tmp_path: Path) -> None:
-    code = tmp_path / "code.py"
-    code.write_text("one = 1")
-    before = fingerprint([tmp_path])
-    assert fingerprint([tmp_path]) == before
-    code.write_text("one = 2")
-    assert fingerprint([tmp_path]) != before
+def test_fingerprint_covers_all_behind_the_work_on_a_case_and_leaves_out_pages() -> None:
+    names = {path.stem for path in code_of("lensmodel.lab.reproduce.job", without=["lensmodel.report"])}
+    assert {"job", "scenes", "model_benchmark", "richardson_lucy", "fitted"} <= names
+    assert not names & {"bars", "page_tables", "planning"}
+    rivals = {path.stem for path in code_of("lensmodel.lab.rivals")}
+    assert {"kee", "schuler", "gradients", "pyramid"} <= rivals
+
+
+def test_version_follows_what_is_imported_anywhere(tmp_path: Path) -> None:
+    for name, text in {
+        "a": "from pkg import b\n",
+        "b": "def f():\n    import pkg.c\n",
+        "c": "",
+        "d": "",
+    }.items():
+        path = tmp_path / "pkg" / f"{name}.py"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+    first = version_of("pkg.a", root=tmp_path)
+    (tmp_path / "pkg" / "d.py").write_text("changed = 1")
+    assert version_of("pkg.a", root=tmp_path) == first
+    (tmp_path / "pkg" / "c.py").write_text("changed = 1")
+    assert version_of("pkg.a", root=tmp_path) != first
+    assert version_of("pkg.a", without=["pkg.b"], root=tmp_path) not in {first, ""}
 
 
 # --- tables and page, from made-up results -----------------------------------------------------
@@ -1084,6 +1083,28 @@ def test_new_version_of_the_rivals_computes_them_alone(
     assert asked == ["kee", "kee"]
     assert again.learned == []
     assert set(made["cases"][0]["rivals"]) == {"kee"}
+
+
+def test_program_that_fails_is_left_out_and_tried_again(
+    tmp_path: Path, quick_photos: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    del quick_photos
+    asked: list[str] = []
+
+    def fails(self: job.CaseJob, name: str, shots: Shots) -> dict[str, Any]:
+        del self, shots
+        asked.append(name)
+        raise InvalidInputError(f"{name} failed with status 1")
+
+    monkeypatch.setattr(job.CaseJob, "_measured_program", fails)
+    monkeypatch.setattr(
+        job.CaseJob, "_measured_rival", lambda *_: {"refused": "", "psf": None, "methods": {}}
+    )
+    chosen = replace(plan(case(photos=(1,))), rivals=("kee",), programs=("G'MIC Richardson-Lucy",))
+    for _ in range(2):
+        made = reproduced(tmp_path, Nothing(), chosen)
+        assert made["cases"][0]["programs"] == {}
+    assert len(asked) == 2
 
 
 def test_other_settings_are_computed_anew(tmp_path: Path, quick_photos: list[str]) -> None:

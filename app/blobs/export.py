@@ -32,7 +32,7 @@ README: Final = """What lensmodel keeps of one owner.
                photos.jsonl, lenses.jsonl and patches.jsonl; `public_id` is the id of the HTTP interface.
 samples.jsonl  `psf`: base64 of little-endian float32, size x size, row by row; `spectrum`: base64 of the
                format of lensmodel.core.spectrum.
-originals/     the photos as they are stored: without the place where they were taken.
+originals/     the photos as they are stored: without the place where they were taken, once they were read.
 corrections/   corrected photos.
 """
 

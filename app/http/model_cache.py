@@ -16,9 +16,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, TypeAlias
 
+from obstore.exceptions import BaseError
+
 from app.blobs.storage import Storage
 from app.errors import ConflictError, UnknownLensError
 from app.runtime import metrics
+from app.runtime.outage import is_outage
 from app.schemas import PsfModel
 from app.store import Store, StoredSample
 from app.store.samples import Family, LensState
@@ -32,6 +35,9 @@ log = logging.getLogger(__name__)
 
 LOOK_S = 1.0
 """Seconds between two looks for the fit of a worker (chosen): each is a request to the storage."""
+
+MAX_STORED = 1000
+"""Keys of stored fits that are remembered (chosen): until they are loaded, which the next request does."""
 
 BYTES_FACTOR = 4
 """Size of a fitted model over that of its kernels (chosen): it also holds splines of them."""
@@ -95,6 +101,8 @@ class ModelCache:
         self._store, self._max_bytes, self._storage = store, max_bytes, storage
         self._family, self._settings = family, settings or ModelSettings()
         self._looked_at: dict[str, float] = {}
+        self._stored: set[str] = set()
+        self._looking = False
         self._models: OrderedDict[_Key, Fitted] = OrderedDict()
         self._guard = threading.Lock()
         self._building: dict[str, threading.Lock] = {}
@@ -163,22 +171,36 @@ class ModelCache:
             return self._keep(key, replace(own, model=leaning, size_bytes=size, family=family, own=own.model))
 
     def _superseded(self, fitted: Fitted) -> bool:
-        """Whether a worker has stored its fit of these samples; looked up every `LOOK_S`."""
+        """Whether a worker has stored its fit of these samples, as far as is known by now.
+
+        It is looked up every `LOOK_S` in a thread of its own: no answer waits for the storage.
+        """
         if fitted.learned or self._storage is None:
             return False
         key = learned_key(fitted.lens_id, fitted.state.version, fitted.state.rebuild_epoch)
         now = time.monotonic()
         with self._guard:
-            if now - self._looked_at.get(key, -math.inf) < LOOK_S:
+            if key in self._stored:
+                return True
+            if now - self._looked_at.get(key, -math.inf) < LOOK_S or self._looking:
                 return False
             self._looked_at = {key: now, **{k: t for k, t in self._looked_at.items() if now - t < LOOK_S}}
+            self._looking = True
+        threading.Thread(target=self._look, args=(self._storage, key), daemon=True).start()
+        return False
+
+    def _look(self, storage: Storage, key: str) -> None:
         try:
-            self._storage.info(key)
+            storage.info(key)
+            self._stored = {key, *list(self._stored)[:MAX_STORED]}
         except FileNotFoundError:
-            return False
-        with self._guard:
-            self._looked_at.pop(key, None)
-        return True
+            pass
+        except Exception as error:
+            if not is_outage(error):
+                raise
+            log.info("whether %s is stored is not known: %s", key, error)
+        finally:
+            self._looking = False
 
     def _build(self, lens_id: str, old: Fitted | None) -> Fitted:
         if old is not None:
@@ -221,10 +243,17 @@ class ModelCache:
     def _restored(self, lens_id: str, state: LensState, samples: Sequence[PsfSample]) -> LensModel | None:
         if self._storage is None:
             return None
+        key = learned_key(lens_id, state.version, state.rebuild_epoch)
+        self._stored = self._stored - {key}  # looked for again if it cannot be used
         try:
-            stored = self._storage.get(learned_key(lens_id, state.version, state.rebuild_epoch))
+            stored = self._storage.get(key)
             return LensModel.restored(samples, stored, self._settings_of(state))
         except FileNotFoundError:
+            return None
+        except (BaseError, OSError) as error:
+            if not is_outage(error):
+                raise
+            log.warning("model of lens %s is fitted here, the storage is away: %s", lens_id, error)
             return None
         except InvalidInputError as error:
             log.info("model of lens %s is fitted here: %s", lens_id, error)

@@ -25,10 +25,9 @@ from app.jobs.task_files import AFTER, BEFORE, EARLIER, FAMILY, LAYERS, LEARNED,
 from app.runtime.outage import missable
 from app.sandbox.child import ProgressHook
 from app.sandbox.outcome import TaskLimits
-from app.store.corrections import CorrectionPlan, Result, correction_folder
+from app.store.corrections import CorrectionPlan, Result, Run, run_folder
 from app.store.photo_steps import stored_settings
 from app.store.samples import LensState, Relative
-from app.store.tables import CorrectionRow
 from app.store.versions import learned_key, report_key
 from app.ways import of_models
 from lensmodel.correction import Bounds
@@ -70,23 +69,22 @@ class CorrectionWork:
         def wanted() -> bool:
             return self._corrections.is_live(correction_id, epoch)
 
-        if not self._corrections.start(correction_id, epoch):
-            return
-        plan = self._corrections.plan(correction_id)
-        if plan is None:
+        run = self._corrections.start(correction_id, epoch)
+        plan = None if run is None else self._corrections.plan(correction_id)
+        if run is None or plan is None:
             return
         try:
-            self._correct(plan, wanted)
+            self._correct(run, plan, wanted)
         except NotWantedError:
             log.info("correction %s is not wanted any more", correction_id)
         except JobFailedError as error:
             self._corrections.fail(correction_id, error.code, error.detail, epoch=epoch)
 
-    def _correct(self, plan: CorrectionPlan, wanted: Callable[[], bool]) -> None:
-        key, photo, params = plan.correction.public_id, plan.photo, plan.correction.params
-        self._corrections.progress(key, 0, 0, "developing")
+    def _correct(self, run: Run, plan: CorrectionPlan, wanted: Callable[[], bool]) -> None:
+        photo, params = plan.photo, plan.correction.params
+        self._corrections.progress(run, 0, 0, "developing")
         developed = self._context.developed(photo, wanted)
-        self._corrections.progress(key, 0, 0, "correcting")
+        self._corrections.progress(run, 0, 0, "correcting")
         settings = self._context.settings
         limits = self._context.limits(photo, settings.correct_seconds, 120)
         limits = replace(
@@ -123,13 +121,13 @@ class CorrectionWork:
                 wanted=wanted,
                 reads=[developed],
                 compiles=True,
-                on_progress=self._progress_of(key),
+                on_progress=self._progress_of(run),
             )
             if not known and self._is_newest(lens_id, version):
                 self._keep_learned(lens_id, version, state, folder / LEARNED)
             self._keep_family(fitted, folder / FAMILY / LEARNED)
             report = done["report"] | ({"family": {"lenses": leaning}} if leaning else {})
-            self._store_result(plan, folder / Path(done["file"]).name, report)
+            self._store_result(run, plan, folder / Path(done["file"]).name, report)
 
     def _family(
         self, relatives: list[dict[str, Any]], model: dict[str, str], folder: Path
@@ -170,7 +168,7 @@ class CorrectionWork:
                 break
         return state
 
-    def _progress_of(self, correction_id: str) -> ProgressHook:
+    def _progress_of(self, run: Run) -> ProgressHook:
         last = 0.0
 
         def tell(done: int, total: int) -> None:
@@ -178,16 +176,16 @@ class CorrectionWork:
             if time.monotonic() - last > PROGRESS_S or done == total:
                 last = time.monotonic()
                 with missable():
-                    self._corrections.progress(correction_id, done, total)
+                    self._corrections.progress(run, done, total)
 
         return tell
 
-    def _store_result(self, plan: CorrectionPlan, path: Path, report: dict[str, Any]) -> None:
+    def _store_result(self, run: Run, plan: CorrectionPlan, path: Path, report: dict[str, Any]) -> None:
         if path.suffix != SUFFIX[plan.correction.params["output"]["format"]] or not path.is_file():
             raise JobFailedError("internal_error", "the correction wrote no file; retry, or report the photo")
         with path.open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
-        base = correction_folder(plan.correction)
+        base = run_folder(plan.correction)
         key = f"{base}result{path.suffix}"
         self._context.storage.put_file(key, path)
         for shown in (BEFORE, AFTER, *LAYERS):
@@ -201,14 +199,8 @@ class CorrectionWork:
             size=path.stat().st_size,
             name=f"{stem}-corrected{path.suffix}",
         )
-        if not self._corrections.finish(plan.correction.public_id, result, report):
-            self._drop_unless_done(plan.correction)
-
-    def _drop_unless_done(self, correction: CorrectionRow) -> None:
-        """Delete the files of a correction that was cancelled or deleted while they were stored."""
-        row = self._corrections.get(correction.public_id)
-        if row is None or row.state != "succeeded":  # another worker may have finished it
-            self._context.storage.delete(correction_folder(correction))
+        if not self._corrections.finish(run, result, report):
+            self._context.storage.delete(base)  # cancelled, deleted or begun again: nobody else writes there
 
     def measure(self, lens_id: str, version: int, _again: int = 0) -> None:
         """Measure how well one version of a lens predicts held-out photos, and write its report.

@@ -17,6 +17,7 @@ from typing import Any, Final
 
 from app.jobs.body_keys import body_key
 from app.jobs.context import SPARE_MB, JobContext, JobFailedError, NotWantedError
+from app.jobs.location_work import remove_location
 from app.jobs.measurement_work import MeasurementWork
 from app.jobs.patch_plans import described, patch_of, plan_of, why_not
 from app.jobs.queue import Job, JobEngine
@@ -128,6 +129,7 @@ class _Steps:
         """Read the header and assign the lens; return whether to go on and calibrate it."""
         if self._photo.state != "inspecting":
             return True
+        self._photo = remove_location(self._context, self._photo, self._wanted)
         limits = TaskLimits(memory_mb=SPARE_MB, wall_s=self._context.settings.inspect_seconds)
         with self._context.original(self._photo) as path, self._context.sandbox.folder() as folder:
             arguments = {"path": str(path), "max_megapixels": self._context.settings.max_megapixels}
@@ -220,7 +222,7 @@ class _Steps:
                 text = f"the photo of {size} pixels is too small to tell about its lens; send it in full size"
                 raise JobFailedError("no_usable_patches", text) from error
         if selection["lateral"] is not None:
-            self._store.photos.record_lateral(photo.public_id, selection["lateral"])
+            self._store.photos.record_lateral(photo.public_id, photo.epoch, selection["lateral"])
         self._store.patches.add(photo.public_id, photo.epoch, plan_of(selection))
 
     def estimate(self) -> None:

@@ -26,6 +26,9 @@ LEARNED: Final = "learned.npz"
 EARLIER: Final = "earlier.npz"
 """What an earlier version of the lens was fitted to be, where a new fit may begin; absent without one."""
 
+CLEANED: Final = "cleaned"
+"""The file of a photo without the place where it was taken."""
+
 REPORT: Final = "report.json"
 """The report of a lens test."""
 

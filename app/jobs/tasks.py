@@ -11,6 +11,8 @@ import importlib
 import json
 import logging
 import math
+import mmap
+import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +25,7 @@ from app.jobs.sample_files import read_samples, write_samples
 from app.jobs.task_files import (
     AFTER,
     BEFORE,
+    CLEANED,
     EARLIER,
     FAMILY,
     LAYERS,
@@ -46,10 +49,14 @@ from lensmodel.estimation import measure as lens_measure
 from lensmodel.estimation.patches import Patch, selectors
 from lensmodel.model import LensModel, ModelSettings
 from lensmodel.photo.lateral import LateralColour
+from lensmodel.photo.tags.location import find_location
 from lensmodel.report.lens_test import lens_test
 from lensmodel.workflow import pipeline
 
 log = logging.getLogger(__name__)
+
+CIFF: Final = b"HEAPCCDR"
+"""Signature of Canon's CRW at byte 6: not TIFF, and from cameras without GPS."""
 
 LATE: Final = ("scipy.interpolate", "scipy.optimize", "lensmodel.core.jit")
 """What the library imports where it is used: here the fork server does it once, not each of its children."""
@@ -77,6 +84,28 @@ def inspect(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     header: dict[str, Any] = codec.to_json(info)
     header["metadata"]["focus_m"] = distances.written(info.metadata.focus_m)
     return header
+
+
+def location(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> str:
+    """Say whether the file at `path` tells where it was taken: none, removed or unknown.
+
+    Without the place it is written to the folder, of the same length.
+    """
+    del progress
+    path = Path(arguments["path"])
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
+        if mapped[6:14] == CIFF:
+            return "none"
+        traces = find_location(mapped)
+    if traces.overwrites:
+        shutil.copyfile(path, folder / CLEANED)
+        with (folder / CLEANED).open("r+b") as copy:
+            for overwrite in traces.overwrites:
+                copy.seek(overwrite.start)
+                copy.write(overwrite.data)
+    if not traces.complete:
+        return "unknown"
+    return "removed" if traces.overwrites else "none"
 
 
 def thumbnail(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
@@ -260,6 +289,7 @@ def measure_lens(arguments: dict[str, Any], folder: Path, progress: ProgressHook
 
 
 TASKS: Final[Mapping[str, Task]] = {
+    "location": location,
     "inspect": inspect,
     "thumbnail": thumbnail,
     "develop": develop,

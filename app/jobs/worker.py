@@ -17,22 +17,21 @@ from functools import partial
 from pathlib import Path
 from typing import Final, TypeAlias
 
-from sqlalchemy.exc import OperationalError
-
 from app.blobs.erasure import erase
 from app.blobs.folder_creation import settle_folder
 from app.blobs.storage import Storage
-from app.jobs.context import JobContext
+from app.jobs.context import JobContext, JobFailedError
 from app.jobs.correction_work import CorrectionWork
 from app.jobs.developed_cache import drop_developed
 from app.jobs.job_log import JobRecord, accounted
+from app.jobs.location_work import remove_location
 from app.jobs.missing_reports import ask_for_reports
 from app.jobs.photo_work import PhotoWork
 from app.jobs.queue import DbosEngine, Handler, Job, JobEngine
 from app.jobs.task_files import PREVIEW, R_MAP, SHOWN, THUMBNAIL
 from app.runtime import logs, metrics
 from app.runtime.outage import CODE as OUTAGE
-from app.runtime.outage import LONGEST_PAUSE_S, Patience, is_outage
+from app.runtime.outage import Patience, is_outage
 from app.runtime.parent_watch import on_parents_end
 from app.runtime.processes import is_running, started_at
 from app.runtime.settings import Settings
@@ -42,6 +41,7 @@ from app.sandbox.budget import Budget
 from app.sandbox.runner import Sandbox
 from app.store import Store
 from app.store.ids import new_id
+from app.store.tables import PhotoRow
 
 log = logging.getLogger(__name__)
 
@@ -210,6 +210,11 @@ class Worker:
             else:
                 return
 
+    def _hold_while_stopping(self) -> None:
+        """Keep the thread of a job until the process ends: returning would report the job as done."""
+        while self._stop.is_set():
+            time.sleep(1.0)
+
     def _safe(self, handler: Handler, broke: Broke) -> Handler:
         """Wrap a job: failures are retried, and the last one ends the job with a reason."""
 
@@ -223,6 +228,7 @@ class Worker:
                 try:
                     handler(*arguments)
                 except Exception as error:
+                    self._hold_while_stopping()
                     pause = patience.pause_after(error)
                     name = f"{handler.__name__}{arguments}"
                     if is_outage(error):
@@ -238,13 +244,14 @@ class Worker:
                 else:
                     return
             self._insist(lambda: broke(ending, *arguments))
+            self._hold_while_stopping()
 
         return run
 
     def _rest(self, seconds: float) -> None:
-        """Wait; during shutdown until the process ends, since the job must not look finished."""
-        if self._stop.wait(seconds):
-            time.sleep(LONGEST_PAUSE_S)
+        """Wait before the next try."""
+        self._stop.wait(seconds)
+        self._hold_while_stopping()
 
     def _photo_broke(self, ending: Ending, photo_id: str, epoch: int) -> None:
         self._store.photos.fail(photo_id, epoch, ending.code, ending.detail)
@@ -288,8 +295,9 @@ class Worker:
                 self._die(f"{path} was replaced while this worker ran")
         try:
             alive = self._store.workers.beat(self.id)
-        except OperationalError:
-            if time.monotonic() - self._last_beat > self._settings.lease_seconds:
+        except Exception as error:
+            late = time.monotonic() - self._last_beat > self._settings.lease_seconds
+            if late and is_outage(error):
                 self._die("the database did not answer for a whole lease")
             raise
         if not alive:
@@ -348,6 +356,8 @@ class Worker:
             self._do(partial(erase, self._store.accounts, self._context.storage, owner_key))
         for photo_id in self._store.photos.unneeded(self._settings.keep_photos):
             self._do(partial(self._store.photos.give_up_file, photo_id, (THUMBNAIL, PREVIEW, R_MAP, SHOWN)))
+        for photo in self._store.photos.unsearched():
+            self._do(partial(self._search, photo))
         self._do(self._store.accounts.purge)
         self._do(self._store.idempotency.tidy)
         for prefix in self._store.workers.garbage():
@@ -356,7 +366,15 @@ class Worker:
         developed = self._context.developed_folder("x").parent
         drop_developed(developed, self._context.jobs.existing_photos, self._settings.correct_seconds)
 
+    def _search(self, photo: PhotoRow) -> None:
+        try:
+            remove_location(self._context, photo, lambda: True)
+        except JobFailedError:  # its file is lost, which the doctor reports
+            self._store.photos.record_location(photo, "unknown")
+
     def _delete(self, prefix: str) -> None:
+        if not self._store.workers.claim_garbage(prefix):
+            return  # an upload that ended meanwhile has kept it
         if prefix.endswith("/"):
             self._context.storage.delete(prefix)
         else:

@@ -19,7 +19,7 @@ from app.routes import corrections as correction_routes
 from app.routes import lenses as lens_routes
 from app.routes import photos as photo_routes
 from app.schemas import CorrectionIn, Id, PhotoOut, Region
-from app.store.corrections import correction_folder
+from app.store.corrections import run_folder
 from app.store.photo_steps import photo_folder
 from app.store.tables import PhotoRow
 
@@ -114,7 +114,7 @@ def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
     report = correction.report or {}
     photo, row = photo_routes.described_photo(call, plan.photo), plan.photo
     can_look = correction.roi is None and pictures.exists(
-        call.storage, f"{correction_folder(plan.correction)}{AFTER}"
+        call.storage, f"{run_folder(plan.correction)}{AFTER}"
     )
     size = (row.height or 1, row.width or 1, row.orientation or 1)
     return page(

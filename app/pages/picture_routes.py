@@ -12,7 +12,7 @@ from app.jobs.task_files import AFTER, BEFORE, LAYERS, PREVIEW, R_MAP, SHOWN, TH
 from app.pages import pictures
 from app.routes import corrections as correction_routes
 from app.routes import photos as photo_routes
-from app.store.corrections import CorrectionPlan, correction_folder
+from app.store.corrections import CorrectionPlan, run_folder
 from app.store.photo_steps import photo_folder
 
 Share = Annotated[float, Query(ge=0, le=1, allow_inf_nan=False)]
@@ -105,7 +105,7 @@ def _compared(call: Call, correction_id: str) -> CorrectionPlan:
 
 def _side(call: Call, correction_id: str, which: Which, half: int) -> pictures.Picture:
     plan = _compared(call, correction_id)
-    key = f"{correction_folder(plan.correction)}{_OF[which]}"
+    key = f"{run_folder(plan.correction)}{_OF[which]}"
     return pictures.level(call.storage, key, "image/jpeg", plan.photo.orientation or 1, half)
 
 
@@ -144,7 +144,7 @@ def correction_layer(
     plan = _compared(call, correction_id)
     if name in {"smooth", "clean"} and not plan.correction.params.get("layers"):
         raise InvalidParameterError(f"correction {correction_id} has no layers")
-    key = f"{correction_folder(plan.correction)}{_OF[name]}"
+    key = f"{run_folder(plan.correction)}{_OF[name]}"
     media_type = "image/jpeg" if name in {"before", "after"} else "image/png"
     picture = pictures.decoded(call.storage, key, media_type, plan.photo.orientation or 1)
     return _picture(pictures.png(picture), "image/png")

@@ -11,8 +11,8 @@ from app.http.dependencies import CallDep
 from app.routes.common import named_lens, problems
 from app.routes.photos import described_photo, find_photo
 from app.schemas import PhotoPage, PhotosChange
-from app.store import LensName
 from app.store.photo_steps import GIVEN_SETTINGS
+from app.store.photos import NewCopy
 
 router = APIRouter(tags=["photos"])
 
@@ -21,7 +21,7 @@ router = APIRouter(tags=["photos"])
 def change_photos(change: PhotosChange, call: CallDep) -> PhotoPage:
     """Name the lens of several photos, or correct their settings; a new lens becomes that of them all.
 
-    Each photo changes as by itself; where one is gone nothing changes.
+    Each photo changes as by itself; where one is gone or refuses nothing changes.
     """
     if (change.lens_id is None) == (change.new_lens is None) and not change.model_fields_set & {
         *GIVEN_SETTINGS
@@ -31,15 +31,9 @@ def change_photos(change: PhotosChange, call: CallDep) -> PhotoPage:
         raise InvalidParameterError("lens_id and new_lens each name the lens: send one of them")
     if change.lens_id is not None:
         named_lens(call, change.lens_id)
-    photos = [find_photo(call, key) for key in dict.fromkeys(change.photo_ids)]
+    keys = list(dict.fromkeys(change.photo_ids))
     given: dict[str, Any] = change.model_dump(include=set(GIVEN_SETTINGS), exclude_none=True)
-    lens: LensName | str | None = change.lens_id
-    for photo in photos:
-        if change.new_lens is not None and lens is None:
-            new = LensName(photo.lens_maker, photo.lens_model, None, label=change.new_lens.label)
-            call.store.photos.change(photo.public_id, call.owner, given, lens=new)
-            lens = find_photo(call, photo.public_id).given.get("lens_id")
-        else:
-            call.store.photos.change(photo.public_id, call.owner, given, lens=lens)
-    items = [described_photo(call, find_photo(call, photo.public_id)) for photo in photos]
+    lens = change.lens_id if change.new_lens is None else NewCopy(change.new_lens.label)
+    call.store.photos.change_several(keys, call.owner, given, lens)
+    items = [described_photo(call, find_photo(call, key)) for key in keys]
     return PhotoPage(items=items, next=None)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import timedelta
+from functools import partial
 from typing import Any, Final
 
 from fastapi import APIRouter, Response, status
 from starlette.concurrency import run_in_threadpool
 from structlog.contextvars import bind_contextvars
 
-from app.blobs import location
 from app.errors import (
     BusyError,
     ConflictError,
@@ -127,7 +128,8 @@ async def _received(once: Once, lens_id: str | None = None) -> PhotoOut | Respon
         bind_contextvars(photo_id=public_id)
         prefix = f"photos/{public_id}/"
         key = f"{prefix}original"
-        await run_in_threadpool(call.store.photos.expect, prefix)
+        within = timedelta(seconds=limits.upload_seconds)
+        await run_in_threadpool(partial(call.store.photos.expect, prefix, within=within))
         uploaded = await upload.receive(
             call.request,
             call.storage,
@@ -151,8 +153,7 @@ def _take(
     def record() -> PhotoOut:
         _check_kind(call, uploaded.fields, measured=measured)
         check_selector(uploaded.fields)
-        where = location.remove(call.storage, f"{prefix}original")
-        photo, fresh = _record(call, public_id, uploaded, prefix, where)
+        photo, fresh = _record(call, public_id, uploaded, prefix)
         call.response.status_code = status.HTTP_202_ACCEPTED if fresh else status.HTTP_200_OK
         call.response.headers["Location"] = photo.links.self
         return photo
@@ -221,9 +222,7 @@ def most(settings: Settings, quota: Quota) -> tuple[int, int]:
     )
 
 
-def _record(
-    call: Call, public_id: str, uploaded: upload.Uploaded, prefix: str, where: location.Location
-) -> tuple[PhotoOut, bool]:
+def _record(call: Call, public_id: str, uploaded: upload.Uploaded, prefix: str) -> tuple[PhotoOut, bool]:
     fields = uploaded.fields
     given = fields.model_dump(exclude={"calibrate"}, exclude_none=True)
     if fields.lens_id is not None:
@@ -238,7 +237,6 @@ def _record(
         blob_key=f"{prefix}original",
         calibrate=fields.calibrate,
         given=given,
-        location=where,
         may_be_new=call.who.key_id is None,
     )
     if received.photo.public_id != public_id:
@@ -247,7 +245,7 @@ def _record(
         if received.wants_file:  # its file was given up: this is the same one
             key = f"{photo_folder(received.photo)}original-{public_id}"
             call.storage.rename(f"{prefix}original", key)
-            call.store.photos.restore_file(received.photo.public_id, key, where, again=received.fresh)
+            call.store.photos.restore_file(received.photo.public_id, key, again=received.fresh)
         call.storage.delete(prefix)  # the same bytes are stored already
     # another request may have deleted it meanwhile: then it is told as it was received
     photo = call.store.photos.get(received.photo.public_id, call.owner) or received.photo

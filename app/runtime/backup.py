@@ -116,7 +116,7 @@ def _rows(database: Database, part: Path) -> tuple[dict[str, int], set[str]]:
 
 def _named(rows: Connection) -> set[str]:
     """Return the blobs that cannot be made again: photos, and results of corrections."""
-    alive = select(PhotoRow.blob_key).where(PhotoRow.deleted_at.is_(None))
+    alive = select(PhotoRow.blob_key).where(PhotoRow.deleted_at.is_(None), PhotoRow.file_gone_at.is_(None))
     results = select(CorrectionRow.result_key).where(
         CorrectionRow.state == "succeeded", CorrectionRow.result_key.is_not(None)
     )

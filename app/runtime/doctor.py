@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import timedelta
 from typing import Final
 
-from sqlalchemy import select, update
+from sqlalchemy import func, select, update
 
 from app.blobs.storage import Storage
 from app.runtime.outage import CODE as OUTAGE
@@ -26,6 +26,8 @@ from app.store.upkeep.invariants import INVARIANTS
 
 STILL_COMING: Final = timedelta(minutes=30)
 """Age of a blob without a row before it is deleted (chosen): its row may still be written."""
+
+_WITH_FILE: Final = (PhotoRow.deleted_at.is_(None), PhotoRow.file_gone_at.is_(None))
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,16 +113,15 @@ def _blobs(store: Store, storage: Storage, *, repair: bool) -> Iterator[Violatio
     sizes = dict(storage.listed())
     with store.database.reading() as session:
         photos = session.execute(
-            select(PhotoRow.public_id, PhotoRow.blob_key, PhotoRow.byte_size).where(
-                PhotoRow.deleted_at.is_(None)
-            )
+            select(PhotoRow.public_id, PhotoRow.blob_key, PhotoRow.byte_size).where(*_WITH_FILE)
         ).all()
         results = session.execute(
             select(CorrectionRow.public_id, CorrectionRow.result_key, CorrectionRow.result_bytes).where(
                 CorrectionRow.state == "succeeded"
             )
         ).all()
-        known = {f"photos/{public_id}/" for public_id, _, _ in photos}
+        alive = select(PhotoRow.public_id).where(PhotoRow.deleted_at.is_(None))
+        known = {f"photos/{key}/" for key in session.scalars(alive)}
         known |= {f"corrections/{key}/" for key in session.scalars(select(CorrectionRow.public_id))}
         lens_ids = select(LensRow.public_id).where(LensRow.deleted_at.is_(None))
         known |= {f"models/{key}/" for key in session.scalars(lens_ids)}
@@ -192,9 +193,12 @@ def _kernels(store: Store) -> Iterator[Violation]:
 def _photos(store: Store, storage: Storage) -> Iterator[Violation]:
     with store.database.reading() as session:
         rows = session.execute(
-            select(PhotoRow.public_id, PhotoRow.blob_key, PhotoRow.sha256, PhotoRow.byte_size).where(
-                PhotoRow.deleted_at.is_(None)
-            )
+            select(
+                PhotoRow.public_id,
+                PhotoRow.blob_key,
+                func.coalesce(PhotoRow.file_sha256, PhotoRow.sha256),
+                PhotoRow.byte_size,
+            ).where(*_WITH_FILE)
         ).all()
     for public_id, key, sha256, size in rows:
         digest = hashlib.sha256()

@@ -10,13 +10,25 @@ from typing import Any
 
 from sqlalchemy import Select, select, update
 
-from app.errors import ConflictError, UnknownPhotoError
-from app.store.access.owners import find_owned, find_to_change, is_id, now, owned
+from app.errors import BusyError, ConflictError, UnknownPhotoError
+from app.store.access.owners import LATE, find_owned, find_to_change, is_id, now, owned
 from app.store.database import Database, insert_new
 from app.store.ids import new_id
 from app.store.tables import CorrectionRow, GarbageRow, LensRow, OwnerRow, PhotoRow
 
 ACTIVE = ("queued", "running")
+
+TRIES = 10
+"""How often to look again for the same correction that ended between insert and select (chosen)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One run of a correction: a worker that lost its lease, or was begun before a retry, has another."""
+
+    correction_id: str
+    epoch: int
+    attempt: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +59,11 @@ def params_hash(params: Mapping[str, Any]) -> str:
 def correction_folder(correction: CorrectionRow) -> str:
     """Return the prefix of a correction's blobs."""
     return f"corrections/{correction.public_id}/"
+
+
+def run_folder(correction: CorrectionRow) -> str:
+    """Return the prefix of the files of a correction's last run: no other run writes there."""
+    return f"{correction_folder(correction)}{correction.epoch}-{correction.attempt}/"
 
 
 def _plans(owner: str | None) -> Select[Any]:
@@ -91,17 +108,19 @@ class CorrectionStore:
                 raise UnknownPhotoError(f"photo {photo.public_id} was deleted meanwhile: send it again")
             if current.file_gone_at is not None:
                 raise ConflictError(f"the file of photo {photo.public_id} is no longer kept: send it again")
-            created = insert_new(session, CorrectionRow, [fresh]) == 1
-            row = session.scalars(
-                select(CorrectionRow).where(
-                    CorrectionRow.photo_id == photo.id,
-                    CorrectionRow.lens_id == lens.id,
-                    CorrectionRow.lens_version == version,
-                    CorrectionRow.params_hash == fresh["params_hash"],
-                    CorrectionRow.state.not_in(("failed", "cancelled")),
-                )
-            ).one()
-            return row, created
+            same = select(CorrectionRow).where(
+                CorrectionRow.photo_id == photo.id,
+                CorrectionRow.lens_id == lens.id,
+                CorrectionRow.lens_version == version,
+                CorrectionRow.params_hash == fresh["params_hash"],
+                CorrectionRow.state.not_in(("failed", "cancelled")),
+            )
+            for _ in range(TRIES):
+                created = insert_new(session, CorrectionRow, [fresh]) == 1
+                row = session.scalar(same)
+                if row is not None:
+                    return row, created
+        raise BusyError(f"{TRIES} times the same correction ended just then: ask for it again")
 
     def get(self, correction_id: str, owner: str | None = None) -> CorrectionRow | None:
         """Return one correction, or None."""
@@ -160,23 +179,35 @@ class CorrectionStore:
         to: str,
         *,
         epoch: int | None = None,
+        run: Run | None = None,
         **fields: object,
     ) -> bool:
         """Move a correction from one of `from_states` to `to`; False where it was in none of them.
 
-        With `epoch` only if it was not started anew since.
+        With `epoch` only if it was not started anew since, with `run` only if that is its last one.
         """
         conditions = [CorrectionRow.public_id == correction_id, CorrectionRow.state.in_(from_states)]
         if epoch is not None:
             conditions.append(CorrectionRow.epoch == epoch)
+        if run is not None:
+            conditions += [CorrectionRow.epoch == run.epoch, CorrectionRow.attempt == run.attempt]
         with self._db.writing() as session:
             statement = update(CorrectionRow).where(*conditions).values(state=to, **fields)
             return session.connection().execute(statement).rowcount == 1
 
-    def start(self, correction_id: str, epoch: int | None = None) -> bool:
-        """Begin, or begin again after the death of a worker."""
-        begun = {"started_at": now(), "attempt": CorrectionRow.attempt + 1}
-        return self.set_state(correction_id, ACTIVE, "running", epoch=epoch, **begun)
+    def start(self, correction_id: str, epoch: int | None = None) -> Run | None:
+        """Begin, or begin again after the death of a worker; None if it is not to be done any more.
+
+        What an earlier run has stored becomes garbage.
+        """
+        with self._db.writing() as session:
+            row = find_to_change(session, CorrectionRow, correction_id, None)
+            if row is None or row.state not in ACTIVE or epoch not in {None, row.epoch}:
+                return None
+            if row.attempt:
+                insert_new(session, GarbageRow, [{"prefix": run_folder(row), "not_before": now() + LATE}])
+            row.state, row.started_at, row.attempt = "running", now(), row.attempt + 1
+            return Run(row.public_id, row.epoch, row.attempt)
 
     def retry(self, correction_id: str, owner: str | None = None) -> bool:
         """Start a failed or cancelled correction anew; False if it is in another state.
@@ -196,6 +227,7 @@ class CorrectionStore:
             )
             if session.scalar(twin) is not None:
                 return False
+            insert_new(session, GarbageRow, [{"prefix": run_folder(row), "not_before": now() + LATE}])
             row.epoch += 1
             row.state, row.stage = "queued", None
             row.error_code = row.error_detail = row.started_at = row.finished_at = None
@@ -213,18 +245,25 @@ class CorrectionStore:
         with self._db.reading() as session:
             return [row.public_id for row in session.scalars(query)]
 
-    def progress(self, correction_id: str, done: int, total: int, stage: str = "correcting") -> None:
+    def progress(self, run: Run, done: int, total: int, stage: str = "correcting") -> None:
         """Record how far a running correction is."""
         self.set_state(
-            correction_id, ("running",), "running", progress_done=done, progress_total=total, stage=stage
+            run.correction_id,
+            ("running",),
+            "running",
+            run=run,
+            progress_done=done,
+            progress_total=total,
+            stage=stage,
         )
 
-    def finish(self, correction_id: str, result: Result, report: Mapping[str, Any]) -> bool:
-        """End with a file; False if it was cancelled meanwhile."""
+    def finish(self, run: Run, result: Result, report: Mapping[str, Any]) -> bool:
+        """End with a file; False if it was cancelled, or begun again by another worker, meanwhile."""
         return self.set_state(
-            correction_id,
-            ACTIVE,
+            run.correction_id,
+            ("running",),
             "succeeded",
+            run=run,
             report=dict(report),
             result_key=result.key,
             result_etag=result.etag,
@@ -236,8 +275,15 @@ class CorrectionStore:
 
     def fail(self, correction_id: str, code: str, detail: str, *, epoch: int | None = None) -> bool:
         """End with a reason."""
-        fields = {"error_code": code, "error_detail": detail, "finished_at": now()}
-        return self.set_state(correction_id, ACTIVE, "failed", epoch=epoch, **fields)
+        return self.set_state(
+            correction_id,
+            ACTIVE,
+            "failed",
+            epoch=epoch,
+            error_code=code,
+            error_detail=detail,
+            finished_at=now(),
+        )
 
     def cancel(self, correction_id: str, owner: str | None = None) -> bool:
         """Cancel an unfinished correction; False if it was finished already."""
@@ -252,6 +298,6 @@ class CorrectionStore:
             if row is None:
                 return None
             prefix = correction_folder(row)
-            insert_new(session, GarbageRow, [{"prefix": prefix, "not_before": now()}])
+            insert_new(session, GarbageRow, [{"prefix": prefix, "not_before": now() + LATE}])
             session.delete(row)
             return prefix

@@ -59,7 +59,10 @@ class Database:
             self.writer = self.durable = create_engine(
                 url, pool_pre_ping=True, hide_parameters=True, connect_args=SERVER_DEADLINES
             )
-            self.reader = self.writer.execution_options(postgresql_readonly=True)
+            # one snapshot for each reading transaction, as on SQLite: what is read together is of one moment
+            self.reader = self.writer.execution_options(
+                postgresql_readonly=True, isolation_level="REPEATABLE READ"
+            )
 
     @contextmanager
     def reading(self) -> Iterator[Session]:

@@ -11,10 +11,10 @@ from __future__ import annotations
 from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session
 
-from app.store.access.owners import now
+from app.store.access.owners import LATE, now
 from app.store.database import insert_new
 from app.store.patches import recount_patches
-from app.store.photo_steps import LATE, WORKED_ON, drop_patches, restart
+from app.store.photo_steps import WORKED_ON, drop_patches, restart
 from app.store.removal import statistics_of
 from app.store.tables import PHOTO_RUNNING, EventRow, GarbageRow, LensRow, PatchRow, PhotoRow
 from app.store.versions import new_version, record_event, recount_samples, take_samples

@@ -9,7 +9,8 @@ from typing import Any, Final
 from sqlalchemy import and_, delete, func, or_, select, update
 from sqlalchemy.orm import Session
 
-from app.store.access.owners import find_owned, now, owned
+from app.errors import BusyError
+from app.store.access.owners import LATE, find_owned, now, owned
 from app.store.database import Database, insert_new
 from app.store.ids import new_id
 from app.store.kinds import identity_key, kind_key
@@ -121,18 +122,21 @@ def named(session: Session, owner_id: int, name: LensName, *, way: str | None = 
     )
     if name.label:
         fresh |= {"label": name.label, "serial_source": "user"}
-    insert_new(session, LensRow, [fresh])
-    return session.scalars(
-        select(LensRow).where(
-            LensRow.owner_id == owner_id, LensRow.identity_key == key, LensRow.deleted_at.is_(None)
-        )
-    ).one()
+    same = select(LensRow).where(
+        LensRow.owner_id == owner_id, LensRow.identity_key == key, LensRow.deleted_at.is_(None)
+    )
+    for _ in range(TRIES):
+        insert_new(session, LensRow, [fresh])
+        lens = session.scalar(same.with_for_update())
+        if lens is not None:
+            return lens
+    raise BusyError(f"{TRIES} times the lens was forgotten just then: name it again")
 
 
 def delete_corrections(session: Session, photo: PhotoRow) -> None:
     """Remove a photo's corrections; their blobs become garbage."""
     keys = session.scalars(select(CorrectionRow.public_id).where(CorrectionRow.photo_id == photo.id))
-    rows = [{"prefix": f"corrections/{key}/", "not_before": now()} for key in keys]
+    rows = [{"prefix": f"corrections/{key}/", "not_before": now() + LATE} for key in keys]
     insert_new(session, GarbageRow, rows)
     session.execute(delete(CorrectionRow).where(CorrectionRow.photo_id == photo.id))
 

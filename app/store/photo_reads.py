@@ -133,6 +133,26 @@ class PhotoReads:
         with self._db.reading() as session:
             return list(session.scalars(query))
 
+    def unsearched(self, limit: int = 100) -> list[PhotoRow]:
+        """Return photos nobody works on whose file may still say where they were taken.
+
+        Such are those that failed before they were searched, and files that came again.
+        """
+        query = (
+            select(PhotoRow)
+            .where(
+                *(
+                    PhotoRow.deleted_at.is_(None),
+                    PhotoRow.file_gone_at.is_(None),
+                    PhotoRow.location.is_(None),
+                ),
+                PhotoRow.state.not_in(WORKED_ON),
+            )
+            .limit(limit)
+        )
+        with self._db.reading() as session:
+            return list(session.scalars(query))
+
     def is_live(self, photo_id: str, epoch: int) -> bool:
         """Say whether work for this epoch of the photo is still wanted: the cancel poll."""
         with self._db.reading() as session:

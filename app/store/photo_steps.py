@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from datetime import timedelta
 from typing import Any, Final, Protocol
 
 from sqlalchemy import case, delete, select, update
 from sqlalchemy.orm import Session
 
-from app.store.access.owners import now
+from app.store.access.owners import LATE, now
 from app.store.database import insert_new
 from app.store.removal import forget_if_empty, statistics_of
 from app.store.tables import PHOTO_RUNNING, GarbageRow, LensRow, PatchRow, PhotoRow
@@ -57,10 +56,6 @@ class CopyIdentity(Protocol):
     @property
     def serial_source(self) -> str:
         """Where the serial was found."""
-
-
-LATE = timedelta(minutes=10)
-"""Deleted blobs are deleted once more after this time (chosen): a worker may have written another one."""
 
 
 def photo_folder(photo: PhotoRow) -> str:

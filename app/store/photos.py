@@ -10,16 +10,15 @@ from typing import Any, Final
 from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session
 
-from app.errors import BusyError
+from app.errors import BusyError, ConflictError, UnknownPhotoError
 from app.store import lens_ways, lenses, sample_moves
 from app.store.access.idempotency import forget_answers
-from app.store.access.owners import ensure_owner, find_owned, find_to_change, now
+from app.store.access.owners import LATE, ensure_owner, find_owned, find_to_change, now
 from app.store.database import insert_new
 from app.store.lenses import LensName
 from app.store.photo_reads import PhotoReads
 from app.store.photo_steps import (
     GIVEN_SETTINGS,
-    LATE,
     UNFINISHED,
     CopyIdentity,
     change_state,
@@ -48,6 +47,18 @@ TRIES: Final = 100
 (chosen: 80 simultaneous uploads and deletions of the same bytes on PostgreSQL all end)."""
 
 
+SPARE: Final = timedelta(hours=1)
+"""Time between the end of the longest upload and the deletion of one that was broken off (chosen): clocks of
+several machines differ by less."""
+
+
+@dataclass(frozen=True, slots=True)
+class NewCopy:
+    """A new copy of the lens that photos say they were taken with, by the name that its owner gives it."""
+
+    label: str
+
+
 @dataclass(frozen=True, slots=True)
 class Received:
     """Result of an upload: the photo, and whether there is work to do for it."""
@@ -61,10 +72,10 @@ class Received:
 class PhotoStore(PhotoReads):
     """Photos of all owners. `owner=None` asks as the service itself."""
 
-    def expect(self, prefix: str) -> None:
-        """Announce blobs below `prefix`: garbage in an hour (chosen) unless a photo claims them."""
+    def expect(self, prefix: str, *, within: timedelta) -> None:
+        """Announce blobs below `prefix`: garbage an hour after that time unless a photo claims them."""
         with self._db.writing() as session:
-            due = now() + timedelta(hours=1)
+            due = now() + within + SPARE
             insert_new(session, GarbageRow, [{"prefix": prefix, "not_before": due}])
 
     def receive(
@@ -79,10 +90,9 @@ class PhotoStore(PhotoReads):
         blob_key: str,
         calibrate: bool,
         given: Mapping[str, Any],
-        location: str | None = None,
         may_be_new: bool = True,
     ) -> Received:
-        """Store an upload, or find the photo with the same bytes.
+        """Store an upload that was announced by `expect`, or find the photo with the same bytes.
 
         A known photo starts again where that makes sense: it had failed or was cancelled, it is now to
         calibrate its lens and was not before, or it waited for settings that are now given.
@@ -102,13 +112,11 @@ class PhotoStore(PhotoReads):
                 "state": "received",
                 "received_at": now(),
                 "stage_at": now(),
-                "location": location,
                 **{column: given.get(field) for field, column in GIVEN_SETTINGS.items()},
             }
             known, created = _insert_or_find(session, fresh)
             if created:
-                prefix = f"{blob_key.rpartition('/')[0]}/"
-                session.execute(delete(GarbageRow).where(GarbageRow.prefix == prefix))
+                _keep_announced(session, f"{blob_key.rpartition('/')[0]}/")
                 return Received(known, fresh=True)
             merged = of_upload(given, known.given)
             again = (
@@ -141,15 +149,14 @@ class PhotoStore(PhotoReads):
             insert_new(session, GarbageRow, [{"prefix": key, "not_before": now()} for key in keys])
             return True
 
-    def restore_file(
-        self, photo_id: str, blob_key: str, location: str | None, *, again: bool = False
-    ) -> None:
+    def restore_file(self, photo_id: str, blob_key: str, *, again: bool = False) -> None:
         """Record that the file of a photo was stored again under a new key; with `again` start it anew."""
         with self._db.writing(durable=True) as session:
             photo = find_to_change(session, PhotoRow, photo_id, None)
             if photo is None:
                 return
-            photo.blob_key, photo.file_gone_at, photo.location = blob_key, None, location
+            photo.blob_key, photo.file_gone_at = blob_key, None
+            photo.location = photo.file_sha256 = None
             if again:
                 restart(session, photo)
 
@@ -211,10 +218,31 @@ class PhotoStore(PhotoReads):
             photo.lens_serial_source = "user" if serial else identity.serial_source
             photo.iso, photo.exposure_s, photo.taken_at = iso, exposure_s, taken_at
 
-    def record_lateral(self, photo_id: str, lateral: dict[str, Any]) -> None:
-        """Store the lateral colour that a photo shows."""
+    def record_lateral(self, photo_id: str, epoch: int, lateral: dict[str, Any]) -> None:
+        """Store the lateral colour that a photo shows, unless it was deleted or started anew meanwhile."""
+        current = (PhotoRow.public_id == photo_id, PhotoRow.epoch == epoch, PhotoRow.deleted_at.is_(None))
         with self._db.writing() as session:
-            session.execute(update(PhotoRow).where(PhotoRow.public_id == photo_id).values(lateral=lateral))
+            session.execute(update(PhotoRow).where(*current).values(lateral=lateral))
+
+    def record_location(
+        self, photo: PhotoRow, location: str, *, key: str | None = None, digest: str | None = None
+    ) -> bool:
+        """Record whether the file of a photo said where it was taken; False if it has another file by now.
+
+        With `key` and `digest` a file without the place, of that SHA-256, is stored there: it becomes the
+        file of the photo, and the one before garbage once nobody reads it any more.
+        """
+        current = (PhotoRow.public_id == photo.public_id, PhotoRow.blob_key == photo.blob_key)
+        changed = {} if key is None else {"blob_key": key, "file_sha256": digest}
+        with self._db.writing(durable=True) as session:
+            statement = update(PhotoRow).where(*current, PhotoRow.deleted_at.is_(None))
+            recorded = session.connection().execute(statement.values(location=location, **changed))
+            if recorded.rowcount != 1:
+                return False
+            if key is not None:
+                old = {"prefix": photo.blob_key, "not_before": now() + LATE}
+                insert_new(session, GarbageRow, [old])
+            return True
 
     def assign_lens(self, photo_id: str, *, single_copy: bool = False) -> LensRow | None:
         """Return the lens of an inspected photo, created if need be; None if its copy is unknown.
@@ -264,18 +292,33 @@ class PhotoStore(PhotoReads):
             begins = calibrate and not photo.calibrate
             if begins and photo.file_gone_at is not None:
                 return False
-            if chosen is not None and not sample_moves.may_move(photo, chosen):
-                return False
-            columns = {GIVEN_SETTINGS[name]: value for name, value in given.items()}
-            photo.calibrate |= begins
-            if photo.state in {"counted", "stored", "excluded"} and not begins:
-                if given:
-                    sample_moves.change_settings(session, photo, given, columns)
-                if chosen is not None:
-                    sample_moves.move_photo(session, photo, chosen)
-            elif begins or given or chosen is not None:
-                sample_moves.begin_again(session, photo, given, columns, chosen)
-            return True
+            return _changed(session, photo, given, chosen, begins=begins)
+
+    def change_several(
+        self, photo_ids: Sequence[str], owner: str, given: Mapping[str, Any], lens: str | NewCopy | None
+    ) -> None:
+        """Apply the same settings and lens to several photos: to all or, where one refuses, to none.
+
+        A new copy becomes the lens of them all.
+        """
+        with self._db.writing() as session:
+            # always locked in the same order: two such changes must not wait for each other
+            rows = {key: find_to_change(session, PhotoRow, key, owner) for key in sorted(set(photo_ids))}
+            chosen: LensRow | None = None
+            for key in photo_ids:
+                photo = rows[key]
+                if photo is None:
+                    raise UnknownPhotoError(f"there is no photo {key[:60]}: nothing was changed")
+                if chosen is None and isinstance(lens, NewCopy):
+                    name = LensName(photo.lens_maker, photo.lens_model, None, label=lens.label)
+                    chosen = _chosen(session, photo, name, owner)
+                elif chosen is None and isinstance(lens, str):
+                    chosen = _chosen(session, photo, lens, owner)
+                if not _changed(session, photo, given, chosen):
+                    raise ConflictError(
+                        f"photo {key} was learned from for another model than that of the lens, and its file "
+                        "is no longer kept: leave it out; nothing was changed"
+                    )
 
     def fail(self, photo_id: str, epoch: int, code: str, detail: str) -> bool:
         """End a photo that is being worked on with a reason; its samples never count."""
@@ -359,6 +402,13 @@ class PhotoStore(PhotoReads):
             return prefix
 
 
+def _keep_announced(session: Session, prefix: str) -> None:
+    """Let blobs be garbage no longer; refuse those that a worker deletes already."""
+    announced = (GarbageRow.prefix == prefix, GarbageRow.claimed.is_(False))
+    if session.scalar(delete(GarbageRow).where(*announced).returning(GarbageRow.prefix)) is None:
+        raise BusyError("the upload took too long, and what had come of it was deleted: send it again")
+
+
 def _insert_or_find(session: Session, fresh: dict[str, Any]) -> tuple[PhotoRow, bool]:
     """Insert a photo, or find the one with the same bytes; True if inserted.
 
@@ -378,6 +428,29 @@ def _known(session: Session, owner_key: int, sha256: str) -> PhotoRow | None:
         .where(PhotoRow.owner_id == owner_key, PhotoRow.sha256 == sha256, PhotoRow.deleted_at.is_(None))
         .with_for_update()
     )
+
+
+def _changed(
+    session: Session,
+    photo: PhotoRow,
+    given: Mapping[str, Any],
+    chosen: LensRow | None,
+    *,
+    begins: bool = False,
+) -> bool:
+    """Change the settings and the lens of a photo; False where it cannot be given to that lens."""
+    if chosen is not None and not sample_moves.may_move(photo, chosen):
+        return False
+    columns = {GIVEN_SETTINGS[name]: value for name, value in given.items()}
+    photo.calibrate |= begins
+    if photo.state in {"counted", "stored", "excluded"} and not begins:
+        if given:
+            sample_moves.change_settings(session, photo, given, columns)
+        if chosen is not None:
+            sample_moves.move_photo(session, photo, chosen)
+    elif begins or given or chosen is not None:
+        sample_moves.begin_again(session, photo, given, columns, chosen)
+    return True
 
 
 def _ended(session: Session, photo_id: str) -> None:

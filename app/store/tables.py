@@ -92,7 +92,8 @@ class LensRow(Base):
             sqlite_where=text("deleted_at IS NULL"),
             postgresql_where=text("deleted_at IS NULL"),
         ),
-        Index("ix_lens_kind", "owner_id", "kind_key"),
+        Index("ix_lens_kind", "owner_id", "kind_key", "public_id"),
+        Index("ix_lens_page", "owner_id", "public_id"),
     )
 
     id: Mapped[int] = mapped_column(primary_key=True)
@@ -139,6 +140,7 @@ class PhotoRow(Base):
             postgresql_where=text("deleted_at IS NULL"),
         ),
         Index("ix_photo_state", "state"),
+        Index("ix_photo_page", "owner_id", "public_id"),
         Index("ix_photo_lens_id_state", "lens_id", "state"),
     )
 
@@ -210,7 +212,10 @@ class PhotoRow(Base):
     counted_at: Mapped[datetime | None]
     deleted_at: Mapped[datetime | None]
     location: Mapped[str | None] = mapped_column(String(10))
-    """Whether the file said where it was taken: a word of `app.blobs.location`; None for old photos."""
+    """Whether the file said where it was taken: none, removed, or unknown; None until it was searched."""
+
+    file_sha256: Mapped[str | None] = mapped_column(String(64))
+    """Hash of the stored file where it differs from what was sent, whose hash is `sha256`."""
 
     file_gone_at: Mapped[datetime | None]
     """When the file was deleted, see the setting `keep_photos`."""
@@ -328,6 +333,8 @@ class CorrectionRow(Base):
             postgresql_where=text("state NOT IN ('failed', 'cancelled')"),
         ),
         Index("ix_correction_state", "state"),
+        Index("ix_correction_page", "owner_id", "public_id"),
+        Index("ix_correction_lens_id", "lens_id"),
     )
 
     id: Mapped[int] = mapped_column(primary_key=True)
@@ -385,3 +392,5 @@ class GarbageRow(Base):
 
     prefix: Mapped[str] = mapped_column(primary_key=True)
     not_before: Mapped[datetime]
+    claimed: Mapped[bool] = mapped_column(default=False, server_default=false())
+    """Whether a worker has begun to delete them: from then on no upload may keep them."""

@@ -92,6 +92,15 @@ class WorkerStore:
         with self._db.reading() as session:
             return list(session.scalars(query))
 
+    def claim_garbage(self, prefix: str, *, at: datetime | None = None) -> bool:
+        """Say whether blobs are still garbage, and to be deleted now: no upload can keep them any more."""
+        due = (GarbageRow.prefix == prefix, GarbageRow.not_before <= (at or now()))
+        with self._db.writing() as session:
+            return (
+                session.connection().execute(update(GarbageRow).where(*due).values(claimed=True)).rowcount
+                == 1
+            )
+
     def forget_garbage(self, prefix: str) -> None:
         """Record that the blobs of a prefix are deleted."""
         with self._db.writing() as session:

@@ -19,6 +19,7 @@ def upgrade() -> None:
         "blob_garbage",
         sa.Column("prefix", sa.Text(), nullable=False),
         sa.Column("not_before", sa.DateTime(timezone=True), nullable=False),
+        sa.Column("claimed", sa.Boolean(), server_default=sa.false(), nullable=False),
         sa.PrimaryKeyConstraint("prefix", name=op.f("pk_blob_garbage")),
     )
     op.create_table(
@@ -159,6 +160,7 @@ def upgrade() -> None:
     with op.batch_alter_table("photo", schema=None) as batch_op:
         batch_op.create_index("ix_photo_lens_id_state", ["lens_id", "state"], unique=False)
         batch_op.create_index("ix_photo_state", ["state"], unique=False)
+        batch_op.create_index("ix_photo_page", ["owner_id", "public_id"], unique=False)
         batch_op.create_index(
             "uq_photo_bytes",
             ["owner_id", "sha256"],
@@ -207,6 +209,8 @@ def upgrade() -> None:
     )
     with op.batch_alter_table("correction", schema=None) as batch_op:
         batch_op.create_index("ix_correction_state", ["state"], unique=False)
+        batch_op.create_index("ix_correction_page", ["owner_id", "public_id"], unique=False)
+        batch_op.create_index("ix_correction_lens_id", ["lens_id"], unique=False)
         batch_op.create_index(
             "uq_correction_params",
             ["photo_id", "lens_id", "lens_version", "params_hash"],
@@ -292,6 +296,8 @@ def downgrade() -> None:
             sqlite_where=sa.text("state NOT IN ('failed', 'cancelled')"),
             postgresql_where=sa.text("state NOT IN ('failed', 'cancelled')"),
         )
+        batch_op.drop_index("ix_correction_lens_id")
+        batch_op.drop_index("ix_correction_page")
         batch_op.drop_index("ix_correction_state")
 
     op.drop_table("correction")
@@ -301,6 +307,7 @@ def downgrade() -> None:
             sqlite_where=sa.text("deleted_at IS NULL"),
             postgresql_where=sa.text("deleted_at IS NULL"),
         )
+        batch_op.drop_index("ix_photo_page")
         batch_op.drop_index("ix_photo_state")
         batch_op.drop_index("ix_photo_lens_id_state")
 

@@ -22,6 +22,7 @@ def upgrade() -> None:
     op.add_column("owner", sa.Column("erased_at", TIME, nullable=True))
     op.add_column("photo", sa.Column("location", sa.String(length=10), nullable=True))
     op.add_column("photo", sa.Column("file_gone_at", TIME, nullable=True))
+    op.add_column("photo", sa.Column("file_sha256", sa.String(length=64), nullable=True))
     op.create_table(
         "api_key",
         sa.Column("id", sa.Integer(), nullable=False),
@@ -51,6 +52,7 @@ def upgrade() -> None:
         ),
         sa.PrimaryKeyConstraint("token_hash", name=op.f("pk_session")),
     )
+    op.create_index("ix_session_key_id", "session", ["key_id"])
     op.create_table(
         "idempotency_key",
         sa.Column("owner_id", sa.Integer(), nullable=False),
@@ -73,6 +75,7 @@ def downgrade() -> None:
     op.drop_table("api_key")
     with op.batch_alter_table("photo", schema=None) as batch_op:
         batch_op.drop_column("file_gone_at")
+        batch_op.drop_column("file_sha256")
         batch_op.drop_column("location")
     with op.batch_alter_table("owner", schema=None) as batch_op:
         batch_op.drop_column("erased_at")

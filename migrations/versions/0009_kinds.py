@@ -33,10 +33,12 @@ def upgrade() -> None:
         connection.execute(
             lens.update().where(same_maker, lens.c.model == model).values(kind_key=_kind(maker, model))
         )
-    op.create_index("ix_lens_kind", "lens", ["owner_id", "kind_key"])
+    op.create_index("ix_lens_kind", "lens", ["owner_id", "kind_key", "public_id"])
+    op.create_index("ix_lens_page", "lens", ["owner_id", "public_id"])
 
 
 def downgrade() -> None:
+    op.drop_index("ix_lens_page", "lens")
     op.drop_index("ix_lens_kind", "lens")
     with op.batch_alter_table("lens", schema=None) as batch_op:
         batch_op.drop_column("kind_key")

@@ -6,6 +6,7 @@ import itertools
 import os
 import shutil
 from collections.abc import Iterator
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ class Steps:
 
     def _receive(self, sha256: str, *, calibrate: bool, given: dict[str, Any]) -> PhotoRow:
         public_id = new_id()
+        self.store.photos.expect(f"photos/{public_id}/", within=timedelta(minutes=1))
         return self.store.photos.receive(
             self.owner,
             public_id=public_id,

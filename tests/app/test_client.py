@@ -148,8 +148,9 @@ def test_a_corrected_photo_is_saved_whole_or_not_at_all(
     assert not list(tmp_path.glob("*.p*"))
 
     Storage(settings.storage).put("corrections/x/result", b"the file")
-    store.corrections.start(correction.id)
-    store.corrections.finish(correction.id, Result("corrections/x/result", "e", "image/png", 8, "o.png"), {})
+    run = store.corrections.start(correction.id)
+    assert run is not None
+    store.corrections.finish(run, Result("corrections/x/result", "e", "image/png", 8, "o.png"), {})
 
     assert api.wait(correction).links.result is not None
     assert api.download(correction.id, target).read_bytes() == b"the file"

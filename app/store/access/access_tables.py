@@ -35,6 +35,7 @@ class SessionRow(Base):
     """One browser that has signed in with a key; it ends with the key."""
 
     __tablename__ = "session"
+    __table_args__ = (Index("ix_session_key_id", "key_id"),)
 
     token_hash: Mapped[str] = mapped_column(String(64), primary_key=True)
     key_id: Mapped[int] = mapped_column(ForeignKey("api_key.id", ondelete="CASCADE"))

@@ -11,10 +11,10 @@ from sqlalchemy import ColumnElement, Table, delete, func, select, update
 from sqlalchemy.orm import Session
 
 from app.store.access.access_tables import IdempotencyRow, KeyRow, SessionRow
-from app.store.access.owners import now, owner_id
+from app.store.access.owners import LATE, now, owner_id
 from app.store.database import Database, insert_new
 from app.store.ids import new_id
-from app.store.photo_steps import LATE, photo_folder
+from app.store.photo_steps import photo_folder
 from app.store.tables import (
     Base,
     CorrectionRow,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Final, TypeVar
 
 from sqlalchemy import Select, select
@@ -14,6 +14,9 @@ from app.store.tables import CorrectionRow, LensRow, OwnerRow, PhotoRow
 
 LOCAL: Final = "local"
 """The one owner in a service without sign-in."""
+
+LATE: Final = timedelta(minutes=10)
+"""Deleted blobs are deleted once more after this time (chosen): a worker may have written another one."""
 
 Owned = TypeVar("Owned", PhotoRow, LensRow, CorrectionRow)
 

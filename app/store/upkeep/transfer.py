@@ -23,10 +23,7 @@ _OF_PROCESSES: Final = {WorkerRow.__tablename__}
 @contextmanager
 def snapshot(database: Database) -> Iterator[Connection]:
     """Give a connection that sees one moment of all tables, while others go on to write."""
-    reader = database.reader
-    if not database.is_sqlite:  # a reading transaction of SQLite is a snapshot already
-        reader = reader.execution_options(isolation_level="REPEATABLE READ")
-    with reader.begin() as connection:
+    with database.reader.begin() as connection:
         yield connection
 
 

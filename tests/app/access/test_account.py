@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 from sqlalchemy import func, select, update
 from starlette.testclient import TestClient
 
@@ -324,31 +323,6 @@ def test_a_photo_whose_file_is_gone_takes_no_room(client: TestClient, store: Sto
 
     assert (before, client.get("/v1/account").json()["stored_bytes"]) == (len(JPEG), 0)
     assert store.photos.load_of("local") == (0, 0, 1)
-
-
-def test_where_a_photo_was_taken_is_gone_from_the_stored_file_at_once(
-    client: TestClient, store: Store
-) -> None:
-    picture = Image.fromarray(np.arange(64 * 48, dtype=np.uint8).reshape(48, 64))
-    exif = Image.Exif()
-    exif.get_ifd(0x8825).update({1: "N", 2: (47.0, 13.0, 14.159), 3: "E", 4: (11.0, 22.0, 33.0)})
-    out = io.BytesIO()
-    picture.save(out, "jpeg", exif=exif)
-    assert Image.open(out).getexif().get_ifd(0x8825)
-
-    sent = client.post("/v1/photos?filename=a.jpg", content=out.getvalue())
-    row = store.photos.get(sent.json()["id"])
-
-    assert sent.status_code == 202
-    assert row is not None
-    assert row.location == "removed"
-    kept = storage_of(client).get(row.blob_key)
-    assert len(kept) == len(out.getvalue())
-    read = Image.open(io.BytesIO(kept))
-    assert not read.getexif().get_ifd(0x8825)
-    assert np.array_equal(np.asarray(read), np.asarray(Image.open(out)))
-    again = client.post("/v1/photos?filename=a.jpg", content=out.getvalue())
-    assert (again.status_code, again.json()["id"]) == (200, sent.json()["id"])  # by the hash of what was sent
 
 
 def test_garbage_of_an_erased_owner_is_deleted_once_more_later(store: Store, steps: Any) -> None:

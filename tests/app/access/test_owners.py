@@ -54,12 +54,11 @@ def furnish(store: Store, steps: Any, storage: Any, owner: str) -> dict[str, str
     assert lens is not None
     params = {"method": "fast", "strength": 1.0, "output": {"format": "dng"}, "roi": None}
     row, _ = store.corrections.create(photo, lens, 1, params)
-    store.corrections.start(row.public_id)
+    run = store.corrections.start(row.public_id)
+    assert run is not None
     key = f"corrections/{row.public_id}/result.dng"
     storage.put(key, b"result")
-    assert store.corrections.finish(
-        row.public_id, Result(key, "tag", "image/x-adobe-dng", 6, "p-corrected.dng"), {}
-    )
+    assert store.corrections.finish(run, Result(key, "tag", "image/x-adobe-dng", 6, "p-corrected.dng"), {})
     return {
         "photo_id": photo.public_id,
         "lens_id": lens.public_id,

@@ -4,7 +4,8 @@
     python tests/app/endurance/torture.py --seeds 20 --servers    # PostgreSQL and S3 (moto)
 
 Three workers estimate the photos of two owners while, as the seed says, workers are killed (alone, or with
-their children), the database server crashes, the storage goes away, and disks are full: that of the data
+their children) or paused for longer than their lease, uploads end while they are due for deletion, the
+database server crashes, the storage goes away, and disks are full: that of the data
 folder, and that of the database server. What must hold afterwards is what `lensmodel doctor` checks, and the
 exact numbers of photos, samples and versions. Disks are filled where this may mount small ones, as root.
 """
@@ -16,16 +17,20 @@ import contextlib
 import os
 import random
 import signal
+import sqlite3
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 from typing import TypeAlias
 
-from sqlalchemy import func, select
+from obstore.exceptions import BaseError
+from sqlalchemy import exc, func, select
 
 HERE = Path(__file__).parents[1]
 STAND_INS = HERE / "stand_ins"
@@ -36,6 +41,7 @@ from servers import Postgres, moto, postgres  # noqa: E402
 from small_disk import kept_full, small_disk  # noqa: E402
 
 from app.blobs.storage import Storage  # noqa: E402
+from app.errors import BusyError  # noqa: E402
 from app.runtime.doctor import examine  # noqa: E402
 from app.runtime.settings import Settings  # noqa: E402
 from app.runtime.supervisor import environment  # noqa: E402
@@ -58,6 +64,8 @@ class Plan:
     kills: int = 20
     outages: int = 3
     full_disks: int = 3
+    pauses: int = 2
+    late: int = 4
     patience_s: float = 300.0
 
 
@@ -94,6 +102,21 @@ class Crew:
         self.bury(chance.choice(self.processes), group=chance.random() < 0.5)
         self.hire()
 
+    @contextlib.contextmanager
+    def paused(self, chance: random.Random, files: list[Path]) -> Iterator[None]:
+        """Pause one of them, outside of transactions: with the lock of a file it would stop all of them."""
+        pid = chance.choice(self.processes).pid
+        while True:
+            os.kill(pid, signal.SIGSTOP)
+            if all(_unlocked(path) for path in files):
+                break
+            os.kill(pid, signal.SIGCONT)
+            time.sleep(0.02)
+        try:
+            yield
+        finally:
+            os.kill(pid, signal.SIGCONT)
+
     def replace_the_dead(self) -> None:
         """Hire for those that ended themselves: fenced, or without their database for a lease."""
         for process in [p for p in self.processes if p.poll() is not None]:
@@ -104,6 +127,16 @@ class Crew:
         for process in self.processes:
             process.kill()
             process.wait()
+
+
+def _unlocked(path: Path) -> bool:
+    try:
+        with contextlib.closing(sqlite3.connect(path, timeout=0, isolation_level=None)) as opened:
+            opened.execute("BEGIN IMMEDIATE")
+            opened.execute("ROLLBACK")
+    except sqlite3.OperationalError:
+        return False
+    return True
 
 
 @contextlib.contextmanager
@@ -192,9 +225,29 @@ def in_environment(values: dict[str, str]) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def send(store: Store, storage: Storage, number: int) -> None:
+def send_late(store: Store, storage: Storage, number: int, chance: random.Random) -> None:
+    """Send a photo whose upload takes so long that it is due for deletion, until one is accepted."""
+    while True:
+        try:
+            send(store, storage, number, within=timedelta(hours=-2), pause_s=chance.uniform(0.0, 1.0))
+        except (BusyError, exc.DBAPIError, BaseError, OSError):
+            time.sleep(0.2)
+        else:
+            return
+
+
+def send(
+    store: Store,
+    storage: Storage,
+    number: int,
+    *,
+    within: timedelta = timedelta(minutes=1),
+    pause_s: float = 0.0,
+) -> None:
     public_id = new_id()
+    store.photos.expect(f"photos/{public_id}/", within=within)
     storage.put(f"photos/{public_id}/original", PHOTO)
+    time.sleep(pause_s)
     store.photos.receive(
         OWNERS[number % len(OWNERS)],
         public_id=public_id,
@@ -243,16 +296,28 @@ def torture(folder: Path, seed: int, *, servers: bool, plan: Plan | None = None)
         crew = Crew(settings, given.extra, folder / "workers.log")
         full_disks = plan.full_disks if given.full_disks else 0
         try:
-            for number in range(plan.photos):
+            for number in range(plan.photos - plan.late):
                 send(store, storage, number)
+            numbers = range(plan.photos - plan.late, plan.photos)
+            chances = [random.Random(chance.random()) for _ in numbers]
+            each = zip(numbers, chances, strict=True)
+            late = threading.Thread(
+                target=lambda: [send_late(store, storage, *one) for one in each], daemon=True
+            )
+            late.start()
             for _ in range(plan.workers):
                 crew.hire()
             deeds = ["kill"] * plan.kills + ["outage"] * plan.outages + ["full disk"] * full_disks
+            deeds += ["pause"] * plan.pauses
+            files = [] if servers else [settings.data_dir / name for name in ("app.db", "jobs.db")]
             chance.shuffle(deeds)
             for deed in deeds:
                 time.sleep(chance.uniform(0.2, 1.5))
                 if deed == "kill":
                     crew.lose_one(chance)
+                elif deed == "pause":
+                    with crew.paused(chance, files):
+                        time.sleep(settings.lease_seconds + 2.0)
                 elif deed == "outage":
                     with chance.choice(given.outages)():
                         time.sleep(chance.uniform(1.0, 5.0))
@@ -263,7 +328,8 @@ def torture(folder: Path, seed: int, *, servers: bool, plan: Plan | None = None)
                         time.sleep(chance.uniform(0.5, 2.5))
                 crew.replace_the_dead()
             end = time.monotonic() + stretched(plan.patience_s)
-            while (now := set(states(store))) != {"counted"}:
+            while late.is_alive() or (now := set(states(store))) != {"counted"}:
+                now = set(states(store))
                 crew.replace_the_dead()
                 assert not now & {"failed", "cancelled", "needs_lens"}, f"{said(store)}\n{faults(crew.log)}"
                 assert time.monotonic() < end, f"{states(store)}\n{crew.log.read_text()[-4000:]}"
@@ -275,7 +341,7 @@ def torture(folder: Path, seed: int, *, servers: bool, plan: Plan | None = None)
     return (
         f"seed {seed}: {plan.photos} of {plan.photos} photos counted once, "
         f"{plan.photos * CELLS * CHANNELS} samples, {plan.kills} kills, {plan.outages} outages, "
-        f"{full_disks} full disks, "
+        f"{plan.pauses} pauses, {full_disks} full disks, "
         f"{time.monotonic() - began:.0f} s"
     )
 

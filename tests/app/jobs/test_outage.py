@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import random
 import sqlite3
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -278,6 +281,7 @@ def send(store: Store, storage: Storage, count: int, first: int = 0) -> list[str
     ids = []
     for number in range(first, first + count):
         public_id = new_id()
+        store.photos.expect(f"photos/{public_id}/", within=timedelta(minutes=1))
         storage.put(f"photos/{public_id}/original", b"a photo")
         store.photos.receive(
             "local",
@@ -392,3 +396,33 @@ def test_a_lens_named_by_hand_keeps_its_name_after_a_retry(
     client.post(f"/v1/jobs/{photo.public_id}/retry")
 
     assert steps.fresh(photo).given["lens_id"] == lens_id
+
+
+def test_a_job_that_breaks_while_its_worker_stops_does_not_look_done(worker: Worker, steps: Any) -> None:
+    photo = steps.receive()
+    job = worker._safe(Away(KeyError("a bug"), times=10), worker._photo_broke)
+    worker.stop()
+
+    thread = threading.Thread(target=job, args=(photo.public_id, 1), daemon=True)
+    thread.start()
+    thread.join(2.0)
+
+    assert thread.is_alive()
+    assert steps.fresh(photo).state == "received"
+
+
+def test_a_worker_that_gets_no_connection_for_a_lease_stops(
+    worker: Worker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def beat(_: str) -> bool:
+        raise exc.TimeoutError("QueuePool limit reached")
+
+    stopped: list[str] = []
+    monkeypatch.setattr(worker._store.workers, "beat", beat)
+    monkeypatch.setattr(worker, "_die", stopped.append)
+    monkeypatch.setattr(worker, "_last_beat", time.monotonic() - 1000.0)
+
+    with contextlib.suppress(exc.TimeoutError):
+        worker._keep_lease()
+
+    assert stopped == ["the database did not answer for a whole lease"]

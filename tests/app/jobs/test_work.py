@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from datetime import datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import pytest
+from PIL import Image
+from sqlalchemy import update
 
 from app.blobs.storage import Storage
 from app.http import views
+from app.jobs import tasks
 from app.jobs.context import JobContext, JobFailedError, NotWantedError
 from app.jobs.correction_work import CorrectionWork
+from app.jobs.location_work import remove_location
 from app.jobs.missing_reports import ask_for_reports
 from app.jobs.photo_work import PhotoWork
 from app.jobs.queue import Handler, Job, Kind, Status
@@ -106,6 +112,7 @@ class Scripted:
         self.seen: dict[str, dict[str, Any]] = {}
         self.files: set[str] = set()
         self.answers: dict[str, list[Answer]] = {
+            "location": [ok("none")],
             "inspect": [ok(INFO)],
             "thumbnail": [refused("unsupported_format")],  # a photo without a small picture goes on
             "report": [refused("no_samples")],  # and so does a lens without a report
@@ -386,7 +393,7 @@ def test_a_photo_without_serial_waits_for_its_owner(
     waiting = steps.fresh(photo)
     assert (waiting.state, waiting.error_code) == ("needs_lens", "metadata_missing")
     assert "choose a lens" in waiting.error_detail
-    assert sandbox.ran == ["inspect", "thumbnail"]
+    assert sandbox.ran == ["location", "inspect", "thumbnail"]
 
 
 def test_a_photo_without_aperture_waits_and_says_so(
@@ -409,7 +416,7 @@ def test_a_photo_to_be_stored_only_is_not_developed(
     work.photo(photo.public_id, 1)
 
     assert steps.fresh(photo).state == "stored"
-    assert sandbox.ran == ["inspect", "thumbnail"]
+    assert sandbox.ran == ["location", "inspect", "thumbnail"]
 
 
 @pytest.mark.parametrize(
@@ -888,3 +895,84 @@ def test_a_lens_that_was_measured_before_there_were_reports_gets_one(
     assert ask_for_reports(context.store, context.storage, engine) == 1
     context.storage.put(learned_key(lens_id, 1, lens.rebuild_epoch), b"fitted")
     assert ask_for_reports(context.store, context.storage, engine) == 0
+
+
+def test_a_worker_that_was_paused_changes_nothing_of_what_another_finished(
+    context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any
+) -> None:
+    key = ask(context, counted, steps)
+
+    def paused(arguments: dict[str, Any], folder: Path) -> Outcome:
+        CorrectionWork(context).correction(key)  # of the worker that took over
+        (folder / "result.jpg").write_bytes(b"another picture")
+        return Outcome("ok", value={"file": "result.jpg", "report": {"zones": {}}})
+
+    sandbox.answers["correct"] = [paused, write_result]
+    CorrectionWork(context).correction(key)
+
+    row = context.store.corrections.get(key)
+    assert row is not None
+    assert (row.state, row.attempt, row.report) == (
+        "succeeded",
+        2,
+        {"zones": {"center": {"expected_gain_db": 3.0}}},
+    )
+    assert context.storage.get(row.result_key or "") == b"a picture"
+
+
+def test_a_run_of_before_a_retry_reports_nothing(
+    context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any
+) -> None:
+    key = ask(context, counted, steps)
+
+    def retried(arguments: dict[str, Any], folder: Path) -> Outcome:
+        context.store.corrections.cancel(key)
+        assert context.store.corrections.retry(key)
+        return write_result(arguments, folder)
+
+    sandbox.answers["correct"] = [retried]
+    CorrectionWork(context).correction(key)
+
+    row = context.store.corrections.get(key)
+    assert row is not None
+    assert (row.state, row.epoch, row.result_key) == ("queued", 2, None)
+
+
+def test_where_a_photo_was_taken_is_gone_from_its_file_before_anything_else(
+    context: JobContext, sandbox: Scripted, steps: Any
+) -> None:
+    picture = Image.fromarray(np.arange(64 * 48, dtype=np.uint8).reshape(48, 64))
+    exif, out = Image.Exif(), io.BytesIO()
+    exif.get_ifd(0x8825).update({1: "N", 2: (47.0, 13.0, 14.159), 3: "E", 4: (11.0, 22.0, 33.0)})
+    picture.save(out, "jpeg", exif=exif)
+    photo, sent = steps.receive(), out.getvalue()
+    with context.store.database.writing() as session:
+        session.execute(update(PhotoRow).values(byte_size=len(sent)))
+    context.storage.put(photo.blob_key, sent)
+    sandbox.answers["location"] = [
+        lambda arguments, folder: Outcome("ok", value=tasks.location(arguments, folder, ignore_step))
+    ]
+
+    cleaned = remove_location(context, steps.fresh(photo), lambda: True)
+
+    kept = context.storage.get(cleaned.blob_key)
+    read = Image.open(io.BytesIO(kept))
+    assert (cleaned.location, len(kept)) == ("removed", len(sent))
+    assert not read.getexif().get_ifd(0x8825)
+    assert np.array_equal(np.asarray(read), np.asarray(Image.open(out)))
+    assert cleaned.file_sha256 == hashlib.sha256(kept).hexdigest()
+    due = datetime.now(UTC) + timedelta(hours=1)
+    assert photo.blob_key in context.store.workers.garbage(at=due)
+    assert remove_location(context, cleaned, lambda: True) is cleaned  # once
+
+
+def test_a_file_that_cannot_be_searched_is_processed_nevertheless(
+    context: JobContext, sandbox: Scripted, steps: Any
+) -> None:
+    photo = steps.receive()
+    context.storage.put(photo.blob_key, b"the file")
+    sandbox.answers["location"] = [refused("time_limit")]
+
+    searched = remove_location(context, photo, lambda: True)
+
+    assert (searched.location, searched.blob_key) == ("unknown", photo.blob_key)

@@ -18,14 +18,14 @@ from typing import Any
 
 import pytest
 from deadline import Deadline, stretched
-from sqlalchemy import func, select
+from sqlalchemy import func, select, update
 
 from app.blobs.storage import Storage
 from app.jobs.worker import Worker
 from app.runtime.settings import Settings
 from app.runtime.supervisor import environment
 from app.store import Store
-from app.store.tables import EventRow, PatchRow, PhotoRow, SampleRow
+from app.store.tables import EventRow, GarbageRow, PatchRow, PhotoRow, SampleRow
 from app.store.upkeep.invariants import INVARIANTS
 
 HERE = Path(__file__).parents[1]
@@ -166,6 +166,8 @@ def test_blobs_that_cannot_be_deleted_keep_no_others(
 ) -> None:
     photos = [steps.receive() for _ in range(2)]
     stuck, other = (store.photos.delete(photo.public_id, "local") for photo in photos)
+    with store.database.writing() as session:
+        session.execute(update(GarbageRow).values(not_before=datetime.now(UTC)))
     worker = Worker(settings)
 
     def delete(prefix: str) -> None:
@@ -297,3 +299,34 @@ def test_twenty_random_deaths_lose_nothing_and_count_nothing_twice(
     until(lambda: set(states(store)) == {"counted"}, within_s=240)
 
     check_counts(store, photos)
+
+
+def test_an_upload_that_ends_while_garbage_is_cleared_keeps_its_file(
+    settings: Settings, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prefix, storage = "photos/slow/", Storage(settings.storage)
+    store.photos.expect(prefix, within=timedelta(hours=-3))  # as if it had begun hours ago
+    storage.put(f"{prefix}original", b"a photo")
+    worker = Worker(settings)
+    listed = store.workers.garbage()
+
+    def receive_meanwhile() -> list[str]:
+        store.photos.receive(
+            "local",
+            public_id="slow",
+            sha256="slow",
+            filename="p.dng",
+            kind="dng",
+            byte_size=7,
+            blob_key=f"{prefix}original",
+            calibrate=True,
+            given={},
+        )
+        return listed
+
+    monkeypatch.setattr(worker._store.workers, "garbage", receive_meanwhile)
+    monkeypatch.setattr(worker, "_engine", SimpleNamespace(forget=lambda _: 0))
+    worker._tidy()
+
+    assert listed == [prefix]
+    assert storage.get(f"{prefix}original") == b"a photo"

@@ -82,11 +82,12 @@ def corrected(client: TestClient, steps: Steps, store: Store, settings: Settings
     """A correction to a DNG that has changed nothing."""
     wish = {"photo_id": steps.counted().public_id, "output": {"format": "dng"}}
     made: dict[str, Any] = client.post("/v1/corrections", json=wish).json()
-    blobs, folder = Storage(settings.storage), f"corrections/{made['id']}/"
+    blobs, folder = Storage(settings.storage), f"corrections/{made['id']}/1-1/"
     blobs.put(f"{folder}result.dng", b"a file that the pages never open")
     for name in (BEFORE, AFTER):
         blobs.put(f"{folder}{name}", encoded(a_picture()))
-    store.corrections.start(made["id"])
+    run = store.corrections.start(made["id"])
+    assert run is not None
     audit = {
         "zones": {"center": {"tiles": 4, "tiles_held": 1, "held_back": 0.1, "checks": {"grain": 0.1}}},
         "worst": [
@@ -97,7 +98,7 @@ def corrected(client: TestClient, steps: Steps, store: Store, settings: Settings
     }
     result = Result(f"{folder}result.dng", "etag", "image/x-adobe-dng", 1, "p.dng")
     report = {"zones": {}, "nothing_to_correct": True, "audit": audit}
-    assert store.corrections.finish(made["id"], result, report)
+    assert store.corrections.finish(run, result, report)
     return made
 
 

@@ -26,10 +26,11 @@ def finish(store: Store, settings: Settings, correction_id: str) -> None:
     key = f"corrections/{correction_id}/result"
     Storage(settings.storage).put(key, FILE)
     etag = hashlib.sha256(FILE).hexdigest()
-    store.corrections.start(correction_id)
+    run = store.corrections.start(correction_id)
+    assert run is not None
     result = Result(key, etag, "image/tiff", len(FILE), "Größe p1-corrected.tif")
     report = {"zones": {"corner": {"expected_gain_db": 2.0}}}
-    assert store.corrections.finish(correction_id, result, report)
+    assert store.corrections.finish(run, result, report)
 
 
 @pytest.fixture
@@ -202,8 +203,9 @@ def test_an_unknown_method_lists_the_known_ones(client: TestClient, steps: Steps
 
 def test_the_result_waits_for_the_work(client: TestClient, steps: Steps, store: Store) -> None:
     made = post(client, photo_id=steps.counted().public_id).json()
-    store.corrections.start(made["id"])
-    store.corrections.progress(made["id"], 3, 8)
+    run = store.corrections.start(made["id"])
+    assert run is not None
+    store.corrections.progress(run, 3, 8)
 
     early = client.get(f"/v1/corrections/{made['id']}/result")
     job = client.get(made["links"]["job"]).json()

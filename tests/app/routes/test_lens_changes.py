@@ -154,3 +154,19 @@ def test_the_page_of_a_lens_shows_its_test(client: TestClient, reported: str) ->
         answer = client.get(f"/ui/lenses/{reported}/charts", params=wrong)
         assert answer.status_code == 422, (wrong, answer.text)
     assert "PATCH" not in page
+
+
+def test_photos_that_cannot_all_change_stay_as_they_are(client: TestClient, store: Store, steps: Any) -> None:
+    paper = steps.receive(model="paper")
+    steps.inspect(paper, serial="7")
+    lens = steps.lens_id(paper)
+    before, gone = steps.counted(), steps.counted(width=1.3)
+    assert store.photos.give_up_file(gone.public_id, ())  # it cannot be estimated anew for another model
+    keys = [before.public_id, gone.public_id]
+
+    answer = client.patch("/v1/photos", json={"photo_ids": keys, "lens_id": lens})
+
+    assert (answer.status_code, answer.json()["code"]) == (409, "conflict")
+    assert gone.public_id in answer.json()["detail"]
+    assert [steps.fresh(photo).state for photo in (before, gone)] == ["counted", "counted"]
+    assert steps.lens_id(before) == steps.lens_id(gone) != lens

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
+from obstore.exceptions import GenericError
 from starlette.testclient import TestClient
 
+from app.blobs.storage import Storage
 from app.client import Client
 from app.client_async import AsyncClient
+from app.http import model_cache
 from app.http.model_cache import ModelCache
 from app.runtime.settings import Settings
 from app.store import Store
@@ -234,3 +238,25 @@ def test_both_clients_ask_for_a_model(client: TestClient, steps: Steps, store: S
     assert api.choose_model(lens.id, "paper") == lens
     assert api.calibrations(lens.id)[0].model == "paper"
     assert api.correct(sent.id).method == "paper"
+
+
+def test_a_model_in_memory_answers_while_the_object_store_is_away(
+    store: Store, steps: Steps, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lens = steps.lens_id(steps.counted(patches=6))
+    storage = Storage(settings.storage)
+    cache = ModelCache(store, 1 << 30, storage)
+    known = cache.get(lens)
+
+    def away(*_: Any) -> Any:
+        time.sleep(3.0)
+        raise GenericError("error sending request")
+
+    monkeypatch.setattr(storage, "info", away)
+    monkeypatch.setattr(storage, "get", away)
+    monkeypatch.setattr(model_cache, "LOOK_S", 0.0)
+    began = time.monotonic()
+
+    assert all(cache.get(lens).model is known.model for _ in range(5))
+
+    assert time.monotonic() - began < 1.0

@@ -205,3 +205,12 @@ def test_nothing_is_moved_while_a_worker_lives(
     )
 
     assert "stop them all" in str(result.exception)
+
+
+def test_photos_whose_file_is_not_kept_are_no_hindrance(
+    photos: list[PhotoRow], store: Store, storage: Storage, tmp_path: Path
+) -> None:
+    assert store.photos.give_up_file(photos[0].public_id, ())
+    storage.delete(f"photos/{photos[0].public_id}/")
+
+    assert copies.backup(store.database, storage, tmp_path / "backup").blobs == 2

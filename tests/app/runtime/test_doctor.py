@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
@@ -193,3 +194,28 @@ def test_the_command_tells_and_ends_with_the_state_of_things(
     assert "no row names these blobs" in ill.output
     assert nothing.exit_code != 0
     assert not (tmp_path / "nothing").exists()
+
+
+def test_photos_whose_file_is_not_kept_are_sound(
+    sound: list[PhotoRow], store: Store, settings: Settings, examined: Callable[..., DoctorReport]
+) -> None:
+    assert store.photos.give_up_file(sound[0].public_id, ())
+    Storage(settings.storage).delete(f"photos/{sound[0].public_id}/")
+    with store.database.writing() as session:  # that other photos have made-up hashes is not asked here
+        session.execute(update(PhotoRow).where(PhotoRow.id != sound[0].id).values(file_gone_at=now()))
+
+    assert examined(deep=True).findings == ()
+
+
+def test_a_photo_without_its_place_is_compared_with_what_is_stored(
+    store: Store, steps: Any, settings: Settings, examined: Callable[..., DoctorReport]
+) -> None:
+    photo, kept = steps.counted(), b"without a place".ljust(1000)
+    key = f"photos/{photo.public_id}/cleaned"
+    Storage(settings.storage).put(key, kept)
+    store.photos.record_location(photo, "removed", key=key, digest=hashlib.sha256(kept).hexdigest())
+    assert examined(deep=True).findings == ()
+
+    Storage(settings.storage).put(key, b"changed since".ljust(1000))
+
+    assert [finding.check for finding in examined(deep=True).findings] == ["photos"]

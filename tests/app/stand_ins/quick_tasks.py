@@ -29,6 +29,10 @@ METADATA = {
 }
 
 
+def location(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> str:
+    return "none"
+
+
 def inspect(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     return {"kind": "dng", "width": 64, "height": 48, "metadata": METADATA}
 
@@ -71,4 +75,4 @@ def measure(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     return {"error": {}, "coverage": {}}
 
 
-TASKS = {f.__name__: f for f in (inspect, develop, select, estimate, measure)}
+TASKS = {f.__name__: f for f in (location, inspect, develop, select, estimate, measure)}

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import threading
 import zlib
+from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
 import pytest
+from servers import postgres
 from sqlalchemy import Text, cast, event, func, select, text
 from sqlalchemy.exc import DBAPIError, IntegrityError
 
+from app.errors import BusyError
 from app.runtime.settings import Settings
-from app.store import NewPatch, Store
+from app.store import LensName, NewPatch, Store, corrections, lenses
 from app.store.corrections import Result
 from app.store.database import Database
 from app.store.tables import Base, EventRow, LensRow, OwnerRow, PatchRow, PhotoRow, SampleRow
@@ -384,12 +387,13 @@ def test_a_cancelled_correction_cannot_finish(store: Store, steps: Steps) -> Non
     lens = store.photos.lens_of(photo)
     assert lens is not None
     row, _ = store.corrections.create(photo, lens, 1, {})
-    assert store.corrections.start(row.public_id)
-    store.corrections.progress(row.public_id, 1, 2)
+    run = store.corrections.start(row.public_id)
+    assert run is not None
+    store.corrections.progress(run, 1, 2)
 
     assert store.corrections.cancel(row.public_id, OWNER)
 
-    assert not store.corrections.finish(row.public_id, Result("k", "e", "image/tiff", 1, "n"), {})
+    assert not store.corrections.finish(run, Result("k", "e", "image/tiff", 1, "n"), {})
     assert not store.corrections.start(row.public_id)
     assert not store.corrections.is_live(row.public_id)
 
@@ -562,3 +566,134 @@ def test_a_database_of_a_newer_program_is_refused(store: Store) -> None:
 
     with pytest.raises(InvalidInputError, match="newer program, schema 9999"):
         upgrade(store.database)
+
+
+@pytest.mark.tools
+def test_on_a_server_too_samples_are_of_the_version_that_comes_with_them(
+    settings: Settings, steps: Steps
+) -> None:
+    with (
+        postgres() as server,
+        closing(Store(settings.model_copy(update={"database_url": server.url("app")}))) as on,
+    ):
+        upgrade(on.database)
+        samples_are_of_their_version(on, type(steps)(on))
+
+
+def test_the_samples_of_a_lens_are_of_the_version_that_comes_with_them(store: Store, steps: Steps) -> None:
+    samples_are_of_their_version(store, steps)
+
+
+def samples_are_of_their_version(store: Store, steps: Steps) -> None:
+    """Let a photo be counted between the two statements that read the version and the samples."""
+    lens = steps.lens_id(steps.counted())
+    during: list[PhotoRow] = []
+
+    def count_another(connection: Any, cursor: Any, statement: str, *_: Any) -> None:
+        if "rebuild_epoch" in statement and not during:
+            during.append(steps.receive())  # first: what follows reads the version as well
+            during[0] = steps.counted()
+
+    event.listen(store.database.reader, "after_cursor_execute", count_another)
+    try:
+        state, samples = store.samples.of_lens(lens)
+    finally:
+        event.remove(store.database.reader, "after_cursor_execute", count_another)
+
+    again, later = store.samples.of_lens(lens, after_version=state.version)
+    assert (state.version, again.version) == (1, 2)
+    assert {stored.version_added for stored in samples} == {1}
+    assert not {stored.id for stored in samples} & {stored.id for stored in later}
+
+
+def blocked_once(monkeypatch: pytest.MonkeyPatch, module: Any) -> None:
+    """Let the first insert meet a row that is gone by the time it is looked for."""
+    really, calls = module.insert_new, []
+
+    def insert(session: Any, table: Any, rows: Any) -> int:
+        calls.append(table)
+        return 0 if len(calls) == 1 else int(really(session, table, rows))
+
+    monkeypatch.setattr(module, "insert_new", insert)
+
+
+def test_a_correction_whose_twin_ends_meanwhile_is_created(
+    store: Store, steps: Steps, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photo = steps.counted()
+    lens = store.photos.lens_of(photo)
+    assert lens is not None
+    blocked_once(monkeypatch, corrections)
+
+    row, created = store.corrections.create(photo, lens, 1, {"method": "fast"})
+
+    assert (row.state, created) == ("queued", True)
+
+
+def test_a_lens_that_is_forgotten_meanwhile_is_created_again(
+    store: Store, steps: Steps, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photo = steps.counted()
+    blocked_once(monkeypatch, lenses)
+
+    assert store.photos.change(photo.public_id, OWNER, {}, lens=LensName("Canon", "EF24mm f/1.4L", "77"))
+
+    assert steps.lens_id(photo) != steps.lens_id(steps.counted())
+
+
+def test_nothing_is_written_to_a_photo_that_is_deleted_or_started_anew(store: Store, steps: Steps) -> None:
+    photo, other = steps.receive(), steps.receive()
+    store.photos.delete(photo.public_id, OWNER)
+    store.photos.change(other.public_id, OWNER, {"aperture": 2.0})
+
+    store.photos.record_lateral(photo.public_id, 1, {"red": [0, 0, 0, 1]})
+    store.photos.record_lateral(other.public_id, 1, {"red": [0, 0, 0, 1]})
+
+    with store.database.reading() as session:
+        assert list(session.scalars(select(PhotoRow.lateral))) == [None, None]
+
+
+def test_an_upload_has_all_its_time_and_either_keeps_its_file_or_is_refused(
+    store: Store, steps: Steps
+) -> None:
+    def receive(public_id: str) -> Any:
+        return store.photos.receive(
+            OWNER,
+            public_id=public_id,
+            sha256=public_id,
+            filename="p.dng",
+            kind="dng",
+            byte_size=1,
+            blob_key=f"photos/{public_id}/original",
+            calibrate=True,
+            given={},
+        )
+
+    hour, late = timedelta(hours=1), datetime.now(UTC) + timedelta(hours=3)
+    for public_id in ("early", "late"):
+        store.photos.expect(f"photos/{public_id}/", within=hour)
+    assert store.workers.garbage(at=datetime.now(UTC) + hour) == []
+    assert store.workers.garbage(at=late) == ["photos/early/", "photos/late/"]
+
+    receive("early")
+    assert not store.workers.claim_garbage("photos/early/", at=late)
+    assert store.workers.claim_garbage("photos/late/", at=late)
+    with pytest.raises(BusyError, match="too long"):
+        receive("late")
+
+    assert store.workers.garbage(at=late) == ["photos/late/"]  # still, until its blobs are deleted
+
+
+def test_what_is_written_after_a_deletion_is_deleted_later(store: Store, steps: Steps) -> None:
+    photo = steps.counted()
+    lens = store.photos.lens_of(photo)
+    assert lens is not None
+    one, _ = store.corrections.create(photo, lens, 1, {"method": "fast"})
+    two, _ = store.corrections.create(photo, lens, 1, {"method": "paper"})
+    prefixes = [f"corrections/{row.public_id}/" for row in (one, two)]
+
+    assert store.corrections.delete(one.public_id, OWNER) == prefixes[0]
+    store.photos.delete(photo.public_id, OWNER)
+
+    assert not set(prefixes) & set(store.workers.garbage())
+    assert set(prefixes) <= set(store.workers.garbage(at=datetime.now(UTC) + timedelta(hours=1)))

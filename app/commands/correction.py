@@ -30,6 +30,7 @@ from lensmodel.workflow.lens import Lens
 EXTENSION: Final[dict[OutputFormat | None, str]] = {
     None: ".tif",
     "tiff16": ".tif",
+    "tiff32": ".tif",
     "png16": ".png",
     "png8": ".png",
     "jpeg": ".jpg",

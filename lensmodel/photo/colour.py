@@ -3,22 +3,32 @@
 A curve is a table of linear light at evenly spaced file values, one entry for each of 65536
 codes, so that 8 and 16 bit files are decoded by look-up and encoded by the inverse.
 
-Sources: IEC 61966-2-1:1999 (sRGB); ICC.1:2022 (curve types, section 10.6 and 10.18).
+Profiles are read and made by LittleCMS, but for one with primaries that no chromaticities give.
+Sources: IEC 61966-2-1:1999 (sRGB); ICC.1:2022.
 """
 
 from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final, TypeAlias
+from typing import Final, Literal, TypeAlias
 
+import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.photo.values import Matrix3, Transfer
 
 CODES: Final = 65536  # of 16 bits
+_CURVE_POINTS: Final = 4096  # of a profile's table: the most that all programs read
+_LEAST_COLUMN: Final = 1e-3  # of XYZ: a channel that gives no light has no curve
+_ADDITIVE: Final = 2e-3
+"""Error in XYZ, white is 1, up to which channels add up (chosen): what is rounded to 16 bits stays a tenth
+of it."""
+
 Curve: TypeAlias = NDArray[np.float32]
 """Linear light at the codes k / 65535, shape (65536,), not decreasing."""
 
@@ -46,8 +56,8 @@ def curves_of(transfer: Transfer, icc: bytes | None = None) -> tuple[Curve, Curv
     codes = np.linspace(0.0, 1.0, CODES)
     if transfer == "linear":
         return (codes.astype(np.float32),) * 3
-    if transfer == "icc" and icc is not None and (curves := icc_curves(icc)):
-        return curves
+    if transfer == "icc" and icc is not None and (profile := matrix_profile(icc)) is not None:
+        return profile.curves
     return (srgb_to_linear(codes).astype(np.float32),) * 3
 
 
@@ -85,16 +95,19 @@ def encode(linear: NDArray[np.float32], table: NDArray[np.float32]) -> NDArray[n
 # --- ICC profiles ------------------------------------------------------------------------------
 
 
-def _tag(icc: bytes, name: bytes) -> bytes:
-    if len(icc) < 132:
-        return b""
-    count = struct.unpack(">I", icc[128:132])[0]
-    for k in range(min(count, 100)):
-        row = icc[132 + 12 * k : 144 + 12 * k]
-        if len(row) == 12 and row[:4] == name:
-            at, size = struct.unpack(">II", row[4:])
-            return icc[at : at + size]
-    return b""
+@dataclass(frozen=True, slots=True, eq=False)
+class MatrixProfile:
+    """What a profile of RGB or grey says by three curves and a matrix.
+
+    Parameters
+    ----------
+    curves : tuple of three Curve
+    to_xyz : ndarray, shape (3, 3)
+        Linear RGB to XYZ under D50.
+    """
+
+    curves: tuple[Curve, Curve, Curve]
+    to_xyz: Matrix
 
 
 def icc_space(icc: bytes) -> str:
@@ -102,68 +115,90 @@ def icc_space(icc: bytes) -> str:
     return icc[16:20].decode("latin-1").strip()
 
 
-def icc_curves(icc: bytes) -> tuple[Curve, Curve, Curve] | None:
-    """Tone curves of a matrix or grey profile; `None` where it has none that can be inverted."""
-    names = (b"kTRC",) * 3 if icc_space(icc) == "GRAY" else (b"rTRC", b"gTRC", b"bTRC")
-    curves = [_curve(_tag(icc, name)) for name in names]
-    if any(curve is None for curve in curves):
+@lru_cache(maxsize=8)
+def matrix_profile(icc: bytes) -> MatrixProfile | None:
+    """Ask LittleCMS for the XYZ of each channel's levels alone; None where the channels do not just add up.
+
+    So it is with profiles of printers and those made of tables, and with nonsense.
+    """
+    space = {"RGB": "rgb", "GRAY": "gray"}.get(icc_space(icc))
+    if space is None:
         return None
-    red, green, blue = (curve for curve in curves if curve is not None)
-    return red, green, blue
-
-
-def _curve(tag: bytes) -> Curve | None:
-    x = np.linspace(0.0, 1.0, CODES)
-    if tag[:4] == b"curv" and len(tag) >= 12:
-        count = struct.unpack(">I", tag[8:12])[0]
-        points = np.frombuffer(tag[12 : 12 + 2 * min(count, CODES)], dtype=">u2")
-        if len(points) != count:
-            return None
-        if count == 0:
-            y = x
-        elif count == 1:
-            y = x ** max(points[0] / 256.0, 0.1)
-        else:
-            y = np.interp(x, np.linspace(0.0, 1.0, count), points / 65535.0)
-    elif tag[:4] == b"para" and len(tag) >= 12:
-        kind = struct.unpack(">H", tag[8:10])[0]
-        size = {0: 1, 1: 3, 2: 4, 3: 5, 4: 7}.get(kind, 0)
-        raw = tag[12 : 12 + 4 * size]
-        if not size or len(raw) < 4 * size:
-            return None
-        y = _parametric(x, [v / 65536.0 for v in struct.unpack(f">{size}i", raw)])
-    else:
+    codes = np.linspace(0.0, 1.0, CODES)
+    channels = 3 if space == "rgb" else 1
+    mixed = np.random.default_rng(0).random((1, 64, channels))
+    try:
+        ramps = np.zeros((channels, CODES, channels))
+        for k in range(channels):
+            ramps[k, :, k] = codes
+        xyz, of_mixed = _to_xyz(ramps, icc, space), _to_xyz(mixed, icc, space)[0]
+    except (imagecodecs.CmsError, ValueError):
         return None
-    y = np.maximum.accumulate(np.clip(np.nan_to_num(y), 0.0, 1.0))
-    return y.astype(np.float32) if y[-1] > 0.5 else None
+    columns = xyz[:, -1, :].T  # of the full channels
+    power = (columns**2).sum(axis=0)
+    if not np.isfinite(xyz).all() or power.min() < _LEAST_COLUMN**2:
+        return None
+    levels = np.einsum("knx,xk->kn", xyz, columns) / power[:, None]
+    levels = np.maximum.accumulate(np.clip(levels, 0.0, 1.0), axis=1)
+    at = np.stack([np.interp(mixed[0, :, k], codes, levels[k]) for k in range(channels)], axis=-1)
+    if np.abs(at @ columns.T - of_mixed).max() > _ADDITIVE:
+        return None
+    red, green, blue = np.broadcast_to(levels, (3, CODES)).astype(np.float32)
+    if channels == 1:
+        return MatrixProfile((red, green, blue), D65_TO_D50 @ SRGB_TO_XYZ_D65)
+    return MatrixProfile((red, green, blue), columns) if abs(np.linalg.det(columns)) > 1e-6 else None
 
 
-def _parametric(x: NDArray[np.float64], p: list[float]) -> NDArray[np.float64]:
-    """Parametric curve of 1, 3, 4, 5 or 7 parameters: y = (a x + b)^g + c, or c x + f below d."""
-    g = p[0]
-    a, b = (p[1], p[2]) if len(p) > 1 else (1.0, 0.0)
-    upper = np.maximum(a * x + b, 0.0) ** g
-    if len(p) == 1:
-        return upper
-    if len(p) == 3:
-        return np.where(a * x + b >= 0, upper, 0.0)
-    if len(p) == 4:
-        return upper + p[3]  # below -b/a the base is 0: y = c
-    if len(p) == 5:
-        return np.where(x >= p[4], upper, p[3] * x)
-    return np.where(x >= p[4], upper + p[5], p[3] * x + p[6])
+def _to_xyz(values: NDArray[np.float64], icc: bytes, space: str) -> NDArray[np.float64]:
+    return np.asarray(
+        imagecodecs.cms_transform(
+            np.ascontiguousarray(values),
+            icc,
+            imagecodecs.cms_profile("xyz"),
+            colorspace=space,
+            outcolorspace="xyz",
+            outdtype=np.float64,
+            intent=1,  # relative colorimetric: white is that of D50
+        ),
+        dtype=np.float64,
+    ).reshape(*values.shape[:2], 3)
 
 
-def icc_to_xyz(icc: bytes) -> Matrix | None:
-    """Matrix from the profile's linear RGB to XYZ under D50; `None` where it has none."""
-    columns = []
-    for name in (b"rXYZ", b"gXYZ", b"bXYZ"):
-        tag = _tag(icc, name)
-        if len(tag) < 20 or tag[:4] != b"XYZ ":
-            return None
-        columns.append([v / 65536.0 for v in struct.unpack(">3i", tag[8:20])])
-    matrix = np.array(columns).T
-    return matrix if abs(np.linalg.det(matrix)) > 1e-6 else None
+def declared_profile(
+    white: tuple[float, float], primaries: Sequence[float], curve: float | NDArray[np.float64] | None
+) -> bytes:
+    """Make the profile of a colour space that a file declares by numbers.
+
+    Parameters
+    ----------
+    white : tuple of float
+        Chromaticity x, y.
+    primaries : sequence of six float
+        x, y of red, green and blue.
+    curve : float, ndarray or None
+        Exponent from the file's numbers to linear light; or linear light 0..1 at evenly spaced numbers, shape
+        (n,) or (3, n), n at most 4096; None is the curve of sRGB.
+    """
+    if curve is None:
+        curve = srgb_to_linear(np.linspace(0.0, 1.0, _CURVE_POINTS))
+    chosen = (
+        {"gamma": curve}
+        if isinstance(curve, float)
+        else {"transferfunction": np.rint(np.asarray(curve) * 65535.0).astype(np.uint16)}
+    )
+    xy = np.asarray(primaries, dtype=np.float64).reshape(3, 2)
+    places = [*white, 1.0], np.hstack([xy, np.ones((3, 1))]).ravel().tolist()
+    return _undated(imagecodecs.cms_profile("rgb", whitepoint=places[0], primaries=places[1], **chosen))
+
+
+def named_profile(name: Literal["srgb", "adobergb"]) -> bytes:
+    """Return the profile of a standard colour space."""
+    return _undated(imagecodecs.cms_profile(name))
+
+
+def _undated(icc: bytes) -> bytes:
+    """Fix the date of a profile, so that it is the same bytes each time."""
+    return icc[:24] + struct.pack(">6H", 2025, 1, 1, 0, 0, 0) + icc[36:]
 
 
 def linear_profile(to_xyz_d50: Matrix, name: str) -> bytes:

@@ -10,15 +10,23 @@ import numpy as np
 from lensmodel.core.errors import UnreadablePhotoError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import NoiseModel, Planes
-from lensmodel.photo.colour import CODES, curves_of, decode, icc_curves, icc_space
+from lensmodel.photo.colour import CODES, curves_of, decode, icc_space, matrix_profile
 from lensmodel.photo.headers.header import Header
 from lensmodel.photo.headers.opening import opened_header
 from lensmodel.photo.inspection import info_of
 from lensmodel.photo.noise import coding_noise, estimate_noise, graininess
 from lensmodel.photo.raster import Pixels, read_pixels
 from lensmodel.photo.raw import Demosaic, develop_raw, stored_levels
-from lensmodel.photo.tags.metadata import baseline_exposure_of
-from lensmodel.photo.values import Encoding, Limits, LinearPhoto, PhotoInfo, PlaneNoise, Transfer
+from lensmodel.photo.tags.metadata import baseline_exposure_of, declared_by_tags
+from lensmodel.photo.values import (
+    Encoding,
+    Limits,
+    LinearPhoto,
+    PhotoInfo,
+    PlaneNoise,
+    Transfer,
+    remarks_log,
+)
 
 
 def develop(path: Path | str, *, limits: Limits | None = None, demosaic: Demosaic = "default") -> LinearPhoto:
@@ -63,12 +71,16 @@ def develop(path: Path | str, *, limits: Limits | None = None, demosaic: Demosai
     with opened_header(path, limits) as header:
         info = info_of(path, header, limits)
         if info.kind in {"raw", "dng"}:
-            return _develop_raw(path, header, info, demosaic)
-        return _develop_raster(path, header, info)
+            developed = _develop_raw(path, header, info, demosaic)
+        else:
+            developed = _develop_raster(path, header, info)
+    for remark in developed.remarks:
+        remarks_log.warning("%s: %s", path.name, remark)
+    return developed
 
 
 def _develop_raw(path: Path, header: Header, info: PhotoInfo, demosaic: Demosaic) -> LinearPhoto:
-    raw = develop_raw(path, demosaic)
+    raw = develop_raw(path, demosaic, header.white)
     _, height, width = raw.planes.shape
     metadata, binned = info.metadata, max(round(info.width / width), 1)
     if metadata.pixel_pitch_um is not None:
@@ -109,7 +121,7 @@ def _coding_noise(planes: Planes, coarseness: float) -> NoiseModel | None:
 
 
 def _develop_raster(path: Path, header: Header, info: PhotoInfo) -> LinearPhoto:
-    pixels = read_pixels(path, header)
+    pixels, transparent = read_pixels(path, header)
     height, width = pixels.shape[:2]
     if (height, width) != (info.height, info.width):
         raise UnreadablePhotoError(
@@ -139,6 +151,7 @@ def _develop_raster(path: Path, header: Header, info: PhotoInfo) -> LinearPhoto:
         grain=_grain(planes, (noise[0], noise[1], noise[2]), (clip,) * 3),
         coding_noise=coding_noise(header.coarseness, curve[::257]) if header.coarseness else None,
         chroma_step=header.chroma_step,
+        remarks=("its transparency is dropped",) if transparent else (),
     )
 
 
@@ -149,11 +162,14 @@ def _grain(planes: Planes, noise: PlaneNoise, clip: tuple[float, float, float]) 
 
 def _transfer_of(header: Header, pixels: Pixels) -> tuple[Transfer, bytes | None]:
     """Which curve the file's numbers follow, and the profile that goes back into the output."""
-    if header.icc is not None and icc_space(header.icc) in {"RGB", "GRAY"} and icc_curves(header.icc):
-        return "icc", header.icc
-    if header.linear or pixels.dtype.kind == "f":
+    icc = header.icc
+    if icc is not None and matrix_profile(icc) is not None:
+        return "icc", icc
+    if pixels.dtype.kind == "f":
         return "linear", None
-    return "srgb", header.icc if header.icc is not None and icc_space(header.icc) == "RGB" else None
+    if icc is None and (declared := declared_by_tags(header)) is not None:
+        return "icc", declared
+    return "srgb", icc if icc is not None and icc_space(icc) == "RGB" else None
 
 
 def _linear(pixels: Pixels, transfer: Transfer, icc: bytes | None) -> Planes:

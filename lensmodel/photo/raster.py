@@ -28,13 +28,15 @@ Pixels: TypeAlias = NDArray[Any]
 _PLAIN_MODES: Final = {"1", "L", "LA", "P", "PA", "RGB", "RGBA"}
 
 
-def read_pixels(path: Path, header: Header) -> Pixels:
+def read_pixels(path: Path, header: Header) -> tuple[Pixels, bool]:
     """Decode a TIFF, PNG or JPEG.
 
     Returns
     -------
-    ndarray, shape (height, width, 3)
+    pixels : ndarray, shape (height, width, 3)
         uint8, uint16 or float32; grey as three equal planes, alpha dropped, palettes applied.
+    transparent : bool
+        Whether the alpha that was dropped was anything but opaque.
 
     Raises
     ------
@@ -49,7 +51,8 @@ def read_pixels(path: Path, header: Header) -> Pixels:
         pixels = _guarded(lambda: imagecodecs.png_decode(path.read_bytes()), "PNG")
     else:
         pixels = _read_with_pillow(path, header)
-    return _three_channels(pixels)
+    alpha = pixels[:, :, -1] if pixels.ndim == 3 and pixels.shape[2] in {2, 4} else None
+    return _three_channels(pixels), alpha is not None and bool((alpha != alpha.max()).any())
 
 
 def _read_with_pillow(path: Path, header: Header) -> Pixels:
@@ -64,7 +67,8 @@ def _read_with_pillow(path: Path, header: Header) -> Pixels:
                     raise UnsupportedFormatError(
                         f"pictures of kind {image.mode} are not read; convert it to RGB"
                     )
-                return np.asarray(image.convert("RGB"))
+                opaque = "transparency" not in image.info and not image.mode.endswith("A")
+                return np.asarray(image.convert("RGB" if opaque else "RGBA"))
     except Image.DecompressionBombError as error:
         raise ImageTooLargeError(
             f"{header.width} x {header.height} pixels are more than the decoder takes"
@@ -151,7 +155,9 @@ def _three_channels(pixels: Pixels) -> Pixels:
     if pixels.dtype == np.uint32:
         pixels = (pixels >> 16).astype(np.uint16)
     elif pixels.dtype.kind == "f":
-        pixels = np.nan_to_num(pixels.astype(np.float32), posinf=1.0, neginf=0.0)
+        pixels = pixels.astype(np.float32)
+        known = pixels[np.isfinite(pixels)]
+        pixels = np.nan_to_num(pixels, posinf=max(1.0, float(known.max(initial=0.0))), neginf=0.0)
     elif pixels.dtype not in {np.dtype(np.uint8), np.dtype(np.uint16)}:
         raise UnsupportedFormatError(
             f"samples of type {pixels.dtype} are not read; save it with 8 or 16 bits"

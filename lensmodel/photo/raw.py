@@ -115,11 +115,14 @@ def raw_size(path: Path) -> tuple[int, int]:
         return raw.sizes.width, raw.sizes.height
 
 
-def develop_raw(path: Path, demosaic: Demosaic = "default") -> DevelopedRaw:
+def develop_raw(
+    path: Path, demosaic: Demosaic = "default", linear_white: tuple[int, ...] = ()
+) -> DevelopedRaw:
     """Develop a RAW file to linear camera RGB.
 
     No white balance, no colour matrix, no rotation and no stretching to the brightest pixel:
-    1.0 is the level at which the sensor saturates.
+    1.0 is the level at which the sensor saturates. `linear_white` are the levels that a DNG without mosaic
+    states, of all channels or of each.
 
     Raises
     ------
@@ -141,7 +144,8 @@ def develop_raw(path: Path, demosaic: Demosaic = "default") -> DevelopedRaw:
             white, clip = mosaic.saturation()
         sensor_noise = _sensor_noise(mosaic, white)
         balance = _white_balance(raw, mosaic)
-        planes = _developed(raw, method, white, balance)
+        spans = _spans(raw, linear_white) if mosaic is None and linear_white else None
+        planes = _developed(raw, method, white, balance, spans)
         to_srgb, xyz_to_camera = _colour(raw, balance)
         return DevelopedRaw(
             planes=planes,
@@ -163,7 +167,23 @@ def _pipeline_step(mosaic: Mosaic | None, method: str) -> str:
     return method if mosaic.is_bayer else "xtrans"  # for which LibRaw has one method only
 
 
-def _developed(raw: rawpy.RawPy, method: str, white: int, balance: tuple[float, float, float]) -> Planes:
+def _spans(raw: rawpy.RawPy, white: tuple[int, ...]) -> NDArray[np.float64] | None:
+    """Levels from black to white of each channel without a mosaic; None where they make no sense.
+
+    LibRaw takes the black of such files off their values, but not off their white.
+    """
+    colours = min(raw.num_colors, 3)
+    spans = np.resize(np.resize(white, colours) - np.array(raw.black_level_per_channel[:colours], float), 3)
+    return spans if spans.min() > 0.0 else None
+
+
+def _developed(
+    raw: rawpy.RawPy,
+    method: str,
+    white: int,
+    balance: tuple[float, float, float],
+    spans: NDArray[np.float64] | None,
+) -> Planes:
     """Demosaic with white balance, then take the balance off again.
 
     Demosaicing fills in the fine detail of red and blue from green, as if their contrasts were
@@ -172,6 +192,10 @@ def _developed(raw: rawpy.RawPy, method: str, white: int, balance: tuple[float, 
     """
     share = np.asarray(balance) / max(balance)
     share = np.maximum(share, _LEAST_SHARE)
+    # LibRaw applies this after it took the black level off, so it counts from black.
+    saturation = None if white == raw.white_level else white - min(raw.black_level_per_channel)
+    if spans is not None:
+        saturation = round(spans.max())
     developed = raw.postprocess(
         demosaic_algorithm=_ALGORITHMS[method],
         half_size=method == "half",
@@ -181,8 +205,7 @@ def _developed(raw: rawpy.RawPy, method: str, white: int, balance: tuple[float, 
         output_color=rawpy.ColorSpace.raw,
         user_wb=[float(share[0]), float(share[1]), float(share[2]), float(share[1])],
         user_flip=0,
-        # LibRaw applies this after it took the black level off, so it counts from black.
-        user_sat=None if white == raw.white_level else white - min(raw.black_level_per_channel),
+        user_sat=saturation,
         adjust_maximum_thr=0.0,  # else LibRaw makes the brightest pixel of each photo the white
         highlight_mode=rawpy.HighlightMode.Ignore,  # the strongest channel reaches 65535, none is cut
         median_filter_passes=0,
@@ -193,7 +216,7 @@ def _developed(raw: rawpy.RawPy, method: str, white: int, balance: tuple[float, 
         raise UnsupportedFormatError("only RAW files of three colours, or none, are read")
     planes: Planes = np.empty((3, *rgb.shape[:2]), dtype=np.float32)
     # LibRaw rounds down, and so do we: saturated pixels become 1.0 and not a little less.
-    saturated = np.floor(_FULL * share)
+    saturated = np.floor(_FULL * share * (1.0 if spans is None else spans / spans.max()))
     for k, plane in enumerate(planes):
         np.multiply(rgb[:, :, min(k, rgb.shape[2] - 1)], np.float32(1 / saturated[k]), out=plane)
         np.minimum(plane, np.float32(1.0), out=plane)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Final, Literal, TypeAlias
@@ -13,9 +14,12 @@ from lensmodel.core.types import BayerPattern, NoiseModel, Planes
 FileKind: TypeAlias = Literal["raw", "dng", "tiff", "png", "jpeg"]
 SerialSource: TypeAlias = Literal["exif", "makernote", "xmp", "user", "none"]
 Transfer: TypeAlias = Literal["srgb", "linear", "icc"]
-OutputFormat: TypeAlias = Literal["tiff16", "png16", "png8", "jpeg", "dng"]
+OutputFormat: TypeAlias = Literal["tiff16", "png16", "png8", "jpeg", "tiff32", "dng"]
 ColorSpace: TypeAlias = Literal["same", "srgb", "camera-linear"]
 PlaneNoise: TypeAlias = tuple[NoiseModel, NoiseModel, NoiseModel]
+remarks_log = logging.getLogger("lensmodel.remarks")
+"""Where what was left out of a photo or replaced in it is told, with the name of its file."""
+
 Matrix3: TypeAlias = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 
 _PROCESSED: Final = 16.0
@@ -218,6 +222,8 @@ class LinearPhoto:
     cfa : BayerPattern or None
         Which pixels of each plane were measured, and not filled in by demosaicing. `None` where
         the planes are no longer on the sensor's grid, or there was no Bayer mosaic.
+    remarks : tuple of str
+        What was left out of the file or replaced in it, each a clause about "it".
     """
 
     planes: Planes
@@ -233,6 +239,7 @@ class LinearPhoto:
     cfa: BayerPattern | None = None
     grain: tuple[float, float, float] = (1.0, 1.0, 1.0)
     chroma_step: tuple[int, int] = (1, 1)
+    remarks: tuple[str, ...] = ()
 
     @property
     def lossy(self) -> bool:

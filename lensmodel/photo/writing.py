@@ -14,7 +14,7 @@ import imagecodecs
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
-from PIL import Image, ImageCms
+from PIL import Image
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import atomic
@@ -27,16 +27,17 @@ from lensmodel.photo.colour import (
     curves_of,
     encode,
     icc_space,
-    icc_to_xyz,
     inverse,
     linear_profile,
     matrix3,
+    matrix_profile,
+    named_profile,
 )
 from lensmodel.photo.dng import ShotInfo, write_linear_dng
 from lensmodel.photo.headers.ifd import TiffReader
 from lensmodel.photo.tags import exif_block
 from lensmodel.photo.tags.xmp_block import xmp_packet
-from lensmodel.photo.values import ColorSpace, Encoding, OutputFormat
+from lensmodel.photo.values import ColorSpace, Encoding, OutputFormat, remarks_log
 
 _ROWS: Final = 256
 """Rows that are encoded at a time: bounds the memory of the conversion."""
@@ -82,11 +83,12 @@ def write_image(
     path : Path or str
         Where to; an existing file is replaced.
     planes : ndarray of float32, shape (3, height, width)
-        Linear light in sensor orientation; clipped to 0..1 here.
+        Linear light in sensor orientation; clipped to 0..1 here, but in "tiff32".
     encoding : Encoding
         Of the photo that the planes came from.
-    format : {"tiff16", "png16", "png8", "jpeg", "dng"}
-        Kind of file. TIFF, JPEG and DNG keep the sensor orientation and say how to turn it;
+    format : {"tiff16", "tiff32", "png16", "png8", "jpeg", "dng"}
+        Kind of file; "tiff32" holds floating-point numbers, and light beyond white. TIFF, JPEG and DNG keep
+        the sensor orientation and say how to turn it;
         PNG, where programs ignore that, is written upright.
     color_space : {"same", "srgb", "camera-linear"}
         "same": profile and curve of the input, and for RAW sRGB with the camera's white
@@ -117,25 +119,28 @@ def write_image(
     if format == "dng":
         _write_dng(Path(path), planes, encoding, description, xmp)
         return
+    if encoding.bit_depth == 32 and format != "tiff32" and (beyond := float((planes > 1.0).mean())) > 0.0:
+        remarks_log.warning(
+            "%s: %.1f %% of its samples lie beyond white and are clipped; only tiff32 keeps them",
+            Path(path).name,
+            100.0 * beyond,
+        )
+    if format == "tiff32" and color_space == "same" and encoding.transfer == "linear":
+        color_space = "camera-linear"
     target = _target(encoding, color_space)
     with atomic(Path(path)) as file:
         if format == "jpeg":
             pixels = _encoded(planes, target, 255)
             _write_jpeg(file, pixels, target.icc, encoding, description, xmp, quality=quality)
-        elif format == "tiff16":
-            _write_tiff(file, _encoded(planes, target, 65535), target.icc, encoding, description, xmp)
+        elif format in {"tiff16", "tiff32"}:
+            pixels = _encoded(planes, target, 65535 if format == "tiff16" else None)
+            _write_tiff(file, pixels, target.icc, encoding, description, xmp)
         else:
             top = 255 if format == "png8" else 65535
             _write_png(file, _encoded(planes, target, top), target.icc, encoding, description, xmp)
 
 
 # --- colour ------------------------------------------------------------------------------------
-
-
-def srgb_profile() -> bytes:
-    """ICC profile of sRGB, the same bytes each time: LittleCMS would put the time of day in."""
-    made = bytes(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
-    return made[:24] + struct.pack(">6H", 2025, 1, 1, 0, 0, 0) + made[36:]
 
 
 def _target(encoding: Encoding, color_space: ColorSpace) -> _Target:
@@ -148,14 +153,14 @@ def _target(encoding: Encoding, color_space: ColorSpace) -> _Target:
         return _Target((1.0, 1.0, 1.0), None, curves, rgb_icc)
     # White must stay white: where all channels clip, no multiplier may be below 1.
     r, g, b = (float(w) / min(encoding.white_balance) for w in encoding.white_balance)
-    return _Target((r, g, b), _to_srgb(encoding, rgb_icc), curves_of("srgb"), srgb_profile())
+    return _Target((r, g, b), _to_srgb(encoding, rgb_icc), curves_of("srgb"), named_profile("srgb"))
 
 
 def _to_srgb(encoding: Encoding, rgb_icc: bytes | None) -> Matrix | None:
     if encoding.to_srgb is not None:
         return np.asarray(encoding.to_srgb)
-    primaries = None if rgb_icc is None else icc_to_xyz(rgb_icc)
-    return None if primaries is None else np.linalg.inv(D65_TO_D50 @ SRGB_TO_XYZ_D65) @ primaries
+    profile = None if rgb_icc is None else matrix_profile(rgb_icc)
+    return None if profile is None else np.linalg.inv(D65_TO_D50 @ SRGB_TO_XYZ_D65) @ profile.to_xyz
 
 
 def _to_xyz_d50(encoding: Encoding, rgb_icc: bytes | None) -> Matrix:
@@ -166,18 +171,26 @@ def _to_xyz_d50(encoding: Encoding, rgb_icc: bytes | None) -> Matrix:
     return matrix
 
 
-def _encoded(planes: Planes, target: _Target, top: int) -> Pixels:
-    """File numbers `(row, col, channel)` of planes."""
+def _encoded(planes: Planes, target: _Target, top: int | None) -> Pixels:
+    """File numbers `(row, col, channel)` of planes; whole ones up to `top`, else any, of any size."""
     _, height, width = planes.shape
-    out: Pixels = np.empty((height, width, 3), dtype=np.uint8 if top == 255 else np.uint16)
+    kind = {255: np.uint8, 65535: np.uint16, None: np.float32}[top]
+    out: Pixels = np.empty((height, width, 3), dtype=kind)
     tables = [inverse(curve) for curve in target.curves]
     gain = np.asarray(target.gain, dtype=np.float32)[:, None, None]
     for row in range(0, height, _ROWS):
-        part = np.clip(planes[:, row : row + _ROWS] * gain, 0.0, 1.0)
+        part = planes[:, row : row + _ROWS] * gain
+        if top is not None:
+            np.clip(part, 0.0, 1.0, out=part)
         if target.matrix is not None:
             part = np.tensordot(target.matrix.astype(np.float32), part, axes=1)
         for k, table in enumerate(tables):
-            out[row : row + _ROWS, :, k] = np.rint(encode(part[k], table) * np.float32(top))
+            numbers = encode(part[k], table)
+            if top is None:  # as `decode` takes them
+                numbers = np.where((part[k] < 0.0) | (part[k] > 1.0), part[k], numbers)
+            else:
+                numbers = np.rint(numbers * np.float32(top))
+            out[row : row + _ROWS, :, k] = numbers
     return out
 
 

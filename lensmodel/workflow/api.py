@@ -192,8 +192,9 @@ def correct(
         0 leaves the photo as it is, 1 removes all that its noise allows.
     bounds : Bounds, optional
         What to allow beside edges and in flat areas.
-    file_format : {"tiff16", "png16", "png8", "jpeg", "dng"}, optional
-        By default what the ending of `output` says (`FORMATS`).
+    file_format : {"tiff16", "tiff32", "png16", "png8", "jpeg", "dng"}, optional
+        By default what the ending of `output` says (`FORMATS`), and for a TIFF of floating-point numbers the
+        same again.
     color_space : {"same", "srgb", "camera-linear"}
         Colors of the written file.
     quality : int
@@ -263,6 +264,8 @@ def correct(
     if target is None or too_little:
         return corrected
     encoding, metadata = developed.encoding, developed.info.metadata
+    if file_format is None and source is not None and written == "tiff16" and encoding.bit_depth == 32:
+        written = "tiff32"  # what came as floating-point numbers may hold light beyond white
     del developed  # its planes are as large as the result: at 100 megapixels, 1.1 GiB
     name = method if isinstance(method, str) else type(method).__name__
     description = (

@@ -24,8 +24,19 @@ from rich.progress import (
 from app.commands.console.progress_lines import ProgressLines, TimeLeft, clock
 from lensmodel.core.codec import to_json
 
+REMARKS = "lensmodel.remarks"
+"""Logs what was left out of a photo or replaced in it."""
+
 COMPILING = "lensmodel.correction.engine.first_use"
 """Logs when loops are compiled, once on a machine."""
+
+
+class _Lines(logging.Formatter):
+    """What is told of a photo reads as all that a command tells."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line of a record."""
+        return f"lensmodel: {record.getMessage()}" if record.name == REMARKS else super().format(record)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,12 +63,9 @@ class Display:
     def configure(self) -> None:
         """Let the log lines of this process through to standard error."""
         level = (logging.WARNING, logging.INFO, logging.DEBUG)[min(self.verbose, 2)]
-        logging.basicConfig(
-            level=logging.ERROR if self.quiet else level,
-            format="%(levelname)s %(name)s: %(message)s",
-            stream=sys.stderr,
-            force=True,
-        )
+        handler = logging.StreamHandler(sys.stderr)
+        handler.setFormatter(_Lines("%(levelname)s %(name)s: %(message)s"))
+        logging.basicConfig(level=logging.ERROR if self.quiet else level, handlers=[handler], force=True)
         if not self.quiet and sys.stderr.isatty():  # so long a silence looks like a fault
             logging.getLogger(COMPILING).setLevel(logging.INFO)
 

@@ -21,8 +21,11 @@ def choice(name: str, kinds: Iterable[str], words: str) -> Any:  # noqa: ANN401 
     def parsed(text: str) -> str:
         if text in known:
             return text
-        near = difflib.get_close_matches(text, known, n=1, cutoff=0.5)
-        hint = f"; did you mean {near[0]}?" if near else ""
+        near = difflib.get_close_matches(text, known, n=len(known), cutoff=0.5)
+        likeness = {word: difflib.SequenceMatcher(None, text, word).ratio() for word in near}
+        hint = (
+            f"; did you mean {max(sorted(near, key=known.index), key=likeness.__getitem__)}?" if near else ""
+        )
         raise UsageError(f"{name} must be {', '.join(known[:-1])} or {known[-1]}, got {text!r}{hint}")
 
     return typer.Option(name, metavar=f"<{'|'.join(known)}>", parser=parsed, help=words)

@@ -46,12 +46,12 @@ class Header:
     ciff : CiffShot or None
         What the heap of a CRW file says, which has no TIFF structure.
     xmp, icc : bytes or None
-        XMP packet and ICC profile.
-    linear : bool
-        The file declares its numbers to be linear light (PNG gamma 1).
+        XMP packet, and ICC profile: of a PNG also one made of what its chunks declare.
     coarseness : float
         Median step of the quantised cosine coefficients of luma in a JPEG, or in the tiles of a lossy DNG,
         in 8-bit numbers; 0 unknown, or not compressed so.
+    white : tuple of int
+        WhiteLevel of a DNG, of all channels or of each; empty where it does not say.
     chroma_step : tuple of int
         Rows and columns of pixels that share one value of a JPEG's chroma.
     """
@@ -67,8 +67,8 @@ class Header:
     ciff: CiffShot | None = None
     xmp: bytes | None = None
     icc: bytes | None = None
-    linear: bool = False
     coarseness: float = 0.0
+    white: tuple[int, ...] = ()
     chroma_step: tuple[int, int] = (1, 1)
 
 

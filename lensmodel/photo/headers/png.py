@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from lensmodel.core.errors import NotAnImageError, TruncatedImageError
+from lensmodel.photo.declared import by_chunks
 from lensmodel.photo.headers.header import MAX_BLOCK_BYTES, MAX_SEGMENTS, Header, check_size
 from lensmodel.photo.headers.ifd import Buffer, TiffReader
 from lensmodel.photo.values import Limits
@@ -18,8 +19,8 @@ def read_png(buffer: Buffer, limits: Limits) -> Header:
 
     Raises
     ------
-    TruncatedImageError, NotAnImageError
-        If the file ends early or its header makes no sense.
+    TruncatedImageError, NotAnImageError, UnsupportedFormatError
+        If the file ends early, its header makes no sense, or its colours are not read.
     ImageTooLargeError
         See `check_size`.
     """
@@ -35,14 +36,16 @@ def read_png(buffer: Buffer, limits: Limits) -> Header:
             f"the PNG's header is impossible: {width} x {height}, {bits} bits, type {colour}"
         )
     check_size(width, height, len(buffer), limits)
-    header, has_data = Header("png", width, height, channels, bits), False
+    header, has_data, colour = Header("png", width, height, channels, bits), False, dict[bytes, bytes]()
     for name, start, length in _chunks(buffer):
         has_data = has_data or name == b"IDAT"
-        if name in {b"eXIf", b"iTXt", b"iCCP", b"gAMA"} and length <= MAX_BLOCK_BYTES:
+        if name in {b"eXIf", b"iTXt", b"iCCP"} and length <= MAX_BLOCK_BYTES:
             header = _with_chunk(header, name, bytes(buffer[start : start + length]))
+        elif name in {b"cICP", b"sRGB", b"gAMA", b"cHRM"} and length <= 32:
+            colour[name] = bytes(buffer[start : start + length])
     if not has_data:
         raise TruncatedImageError("the PNG has no image data")
-    return header
+    return replace(header, icc=by_chunks(header.icc, colour))
 
 
 def _chunks(buffer: Buffer) -> Iterator[tuple[bytes, int, int]]:
@@ -66,8 +69,6 @@ def _chunks(buffer: Buffer) -> Iterator[tuple[bytes, int, int]]:
 def _with_chunk(header: Header, name: bytes, body: bytes) -> Header:
     if name == b"eXIf" and (reader := TiffReader.open(body)):
         return replace(header, tiff=(*header.tiff, reader))
-    if name == b"gAMA" and len(body) == 4:
-        return replace(header, linear=struct.unpack(">I", body)[0] == 100000)
     if name == b"iCCP":
         rest = body.partition(b"\0")[2]
         return replace(header, icc=_inflated(rest[1:]))

@@ -62,6 +62,10 @@ def read_tiff(buffer: Buffer, limits: Limits) -> Header:
         header = _sized(replace(header, kind="dng" if _DNG_VERSION in first else "raw"), largest)
         if header.kind == "dng" and header.compression == _LOSSY:
             header = replace(header, coarseness=_coarseness(buffer, largest, limits))
+        elif (
+            header.kind == "dng" and (white := largest.get(50717)) is not None
+        ):  # LibRaw stretches lossy ones
+            header = replace(header, white=tuple(int(level) for level in white.numbers(3)))
         check_size(header.width, header.height, len(buffer), limits)
         _check_mosaic(largest)
         return header

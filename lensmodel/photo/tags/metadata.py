@@ -18,6 +18,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Final
 
+from lensmodel.photo.declared import by_tags
 from lensmodel.photo.headers.ciff import CiffShot
 from lensmodel.photo.headers.header import Header
 from lensmodel.photo.headers.ifd import Directory, IfdEntry
@@ -121,6 +122,30 @@ def _of_ciff(shot: CiffShot) -> PhotoMetadata:
 def baseline_exposure_of(header: Header) -> float | None:
     """Stops by which a DNG asks to be brightened (tag 50730), None where it does not say or is absurd."""
     return _first_within(-10.0, 10.0, _Exif.of(header).number(0xC62A))
+
+
+def declared_by_tags(header: Header) -> bytes | None:
+    """Profile of the colour space that a TIFF or JPEG declares by its tags; None is sRGB."""
+    exif = _Exif.of(header)
+    interoperability = [
+        entry.text()
+        for reader in header.tiff
+        if (entry := reader.below(exif.tags.get(0xA005)).get(1)) is not None
+    ]
+
+    def numbers(tag: int) -> tuple[float, ...]:
+        entry = exif.tags.get(tag)
+        return () if entry is None else entry.numbers()
+
+    space = exif.number(0xA001)
+    return by_tags(
+        None if space is None else int(space),
+        next(iter(interoperability), None),
+        numbers(318),
+        numbers(319),
+        exif.number(0xA500),
+        numbers(301),
+    )
 
 
 @dataclass(frozen=True, slots=True)

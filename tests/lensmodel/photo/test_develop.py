@@ -225,6 +225,34 @@ def test_a_linear_dng_keeps_its_planes(tmp_path: Path) -> None:
     assert developed.sensor_noise is None
 
 
+@pytest.mark.parametrize("black", [(512,) * 3, (2048,) * 3, (512, 600, 700)])
+@pytest.mark.parametrize("white", [(15872,), (15872, 16000, 15000)])
+def test_white_of_a_linear_dng_with_black_levels_is_one(
+    tmp_path: Path, black: tuple[int, ...], white: tuple[int, ...]
+) -> None:
+    planes = np.stack([textured(64, 96, seed) for seed in range(3)])
+    planes[:, 10:20, 10:20] = 1.0
+    low, high = np.array(black), np.resize(white, 3)
+    codes = np.rint(low + np.moveaxis(planes, 0, -1) * (high - low)).astype(np.uint16)
+    tifffile.imwrite(
+        tmp_path / "x.dng",
+        codes,
+        photometric=34892,
+        metadata=None,
+        extratags=[
+            (50706, 1, 4, b"\1\4\0\0", True),
+            (50708, 2, 0, "T-1", True),
+            (50714, 3, 3, black, True),
+            (50717, 3, len(white), white, True),
+            (50721, 10, 9, [n for v in np.eye(3).ravel() for n in (int(v), 1)], True),
+        ],
+    )
+    developed = photo.develop(tmp_path / "x.dng")
+
+    agree(developed.planes, planes, atol=2e-4)
+    assert developed.planes[:, 15, 15] == pytest.approx(1.0, abs=1e-4)
+
+
 def test_raw_data_without_a_picture_are_refused(tmp_path: Path) -> None:
     write_bayer_dng(tmp_path / "x.dng", np.full((64, 64), 3000, dtype=np.uint16), black=BLACK, white=WHITE)
     with pytest.raises(RawDecodeError, match="3000"):
@@ -309,13 +337,33 @@ def test_grey_becomes_three_equal_planes(tmp_path: Path, kind: str, dtype: type)
 
 @pytest.mark.parametrize("kind", ["tiff", "png"])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_alpha_is_dropped_and_changes_no_colour(tmp_path: Path, kind: str, dtype: type) -> None:
+def test_alpha_is_dropped_with_a_word_and_changes_no_colour(
+    tmp_path: Path, kind: str, dtype: type, caplog: pytest.LogCaptureFixture
+) -> None:
     pixels = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, (40, 60, 4), dtype=dtype)
     options = {"photometric": "rgb", "extrasamples": ["unassalpha"]} if kind == "tiff" else {}
-    planes = photo.develop(save(tmp_path, kind, pixels, **options)).planes
+    developed = photo.develop(save(tmp_path, kind, pixels, **options))
 
     truth = srgb_to_linear(np.moveaxis(pixels[..., :3], -1, 0) / np.iinfo(dtype).max)
-    agree(planes, truth, atol=1e-6)
+    agree(developed.planes, truth, atol=1e-6)
+    assert developed.remarks == ("its transparency is dropped",)
+    assert f"x.{kind}: its transparency" in caplog.text
+
+
+@pytest.mark.parametrize("mode", ["P", "RGB", "L", "opaque", "LA"])
+def test_transparency_said_in_other_ways_is_told_too(tmp_path: Path, mode: str) -> None:
+    image = Image.fromarray(np.random.default_rng(0).integers(0, 255, (40, 60, 3), dtype=np.uint8))
+    if mode in {"opaque", "LA"}:
+        image = image.convert("LA" if mode == "LA" else "RGBA")
+        if mode == "LA":
+            image.putpixel((3, 3), (7, 0))
+        image.save(tmp_path / "x.png")
+    else:
+        image = image.convert(mode)
+        clear = image.getpixel((5, 5))
+        image.save(tmp_path / "x.png", transparency=clear)
+
+    assert bool(photo.develop(tmp_path / "x.png").remarks) == (mode != "opaque")
 
 
 def test_palettes_are_applied(tmp_path: Path) -> None:
@@ -349,6 +397,26 @@ def test_float_tiffs_are_linear_light(tmp_path: Path) -> None:
     agree(developed.planes[:, 2:], np.moveaxis(pixels, -1, 0)[:, 2:], rtol=1e-6)
     assert np.isfinite(developed.planes).all()
     assert developed.clip == (3.0, 3.0, 3.0)
+
+
+@pytest.mark.parametrize("profile", [False, True])
+def test_light_beyond_white_is_kept_in_a_float_tiff_and_told_of_where_it_is_clipped(
+    tmp_path: Path, profile: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    pixels = np.stack([2.0 * textured(40, 60, k) for k in range(3)], axis=-1).astype(np.float32)
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    options = {"iccprofile": srgb} if profile else {}
+    developed = photo.develop(save(tmp_path, "tiff", pixels, photometric="rgb", **options))
+
+    photo.write_image(tmp_path / "out.tif", developed.planes, developed.encoding, format="tiff32")
+    kept = tifffile.imread(tmp_path / "out.tif")
+    again = photo.develop(tmp_path / "out.tif").planes
+    quiet = caplog.text
+    photo.write_image(tmp_path / "out.jpg", developed.planes, developed.encoding, format="jpeg")
+
+    agree(kept, pixels, atol=1e-4)
+    agree(again, developed.planes, atol=1e-4)
+    assert (quiet, f"{100 * (pixels > 1).mean():.1f} % of its samples" in caplog.text) == ("", True)
 
 
 def test_only_the_first_of_several_pages_is_the_photo(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from app.jobs.context import (
     NotWantedError,
 )
 from app.jobs.sample_files import write_samples
-from app.jobs.task_files import AFTER, BEFORE, EARLIER, FAMILY, LAYERS, LEARNED, REPORT, SUFFIX
+from app.jobs.task_files import EARLIER, FAMILY, LAYER_FILES, LEARNED, REPORT, SIDES, SUFFIX
 from app.runtime.outage import missable
 from app.sandbox.child import ProgressHook
 from app.sandbox.outcome import TaskLimits
@@ -188,7 +188,7 @@ class CorrectionWork:
         base = run_folder(plan.correction)
         key = f"{base}result{path.suffix}"
         self._context.storage.put_file(key, path)
-        for shown in (BEFORE, AFTER, *LAYERS):
+        for shown in (*SIDES.values(), *LAYER_FILES.values()):
             if (path.parent / shown).is_file():
                 self._context.storage.put_file(f"{base}{shown}", path.parent / shown)
         stem = PurePath(plan.photo.filename).stem or "photo"

@@ -39,15 +39,19 @@ R_MAP: Final = "r-map.png"
 THUMBNAIL: Final = "glance.jpg"
 """Small picture of a photo before it is developed, by `app.blobs.thumbnails`; stored ones have this name."""
 
-SHOWN: Final = "shown.jpg"
-"""The developed photo in full size, sRGB, in sensor orientation."""
+SHOWN: Final = "shown.tiles"
+"""The developed photo in full size, by `app.blobs.tiles`."""
 
-BEFORE: Final = "before.jpg"
-AFTER: Final = "after.jpg"
-"""The part of the photo in a corrected file, before and after correction: sRGB, sensor orientation."""
+SIDES: Final[Mapping[str, str]] = {"before": "before.tiles", "after": "after.tiles"}
+"""A whole photo before and after its correction, by `app.blobs.tiles`."""
 
-LAYERS: Final = ("smooth.png", "clean.png")
-"""A part of a photo corrected without its faint texture, and without its grain: layers for sliders."""
+LAYER_FILES: Final[Mapping[str, str]] = {
+    "before": "before.png",
+    "after": "after.png",
+    "smooth": "smooth.png",
+    "clean": "clean.png",
+}
+"""A part of a photo before and after its correction; for sliders also without texture or grain."""
 
 SUFFIX: Final[Mapping[str, str]] = {
     "tiff16": ".tif",

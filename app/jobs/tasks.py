@@ -21,19 +21,19 @@ from typing import Any, Final
 import numpy as np
 
 from app.blobs import previews, thumbnails
+from app.blobs.tiles import write_tiles
 from app.jobs.sample_files import read_samples, write_samples
 from app.jobs.task_files import (
-    AFTER,
-    BEFORE,
     CLEANED,
     EARLIER,
     FAMILY,
-    LAYERS,
+    LAYER_FILES,
     LEARNED,
     PREVIEW,
     R_MAP,
     REPORT,
     SHOWN,
+    SIDES,
     SUFFIX,
     THUMBNAIL,
 )
@@ -222,10 +222,13 @@ def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     height, width = corrected.planes.shape[1:]
     top, left = (0, 0) if roi is None else (roi["y"], roi["x"])
     part = np.ascontiguousarray(developed.planes[:, top : top + height, left : left + width])
-    _show(folder / BEFORE, part, developed)
-    _show(folder / AFTER, corrected.planes, developed)
-    if corrected.layers:
-        for layer, planes in zip(LAYERS, corrected.layers, strict=True):
+    if roi is None:
+        _show(folder / SIDES["before"], part, developed)
+        _show(folder / SIDES["after"], corrected.planes, developed)
+    else:
+        for layer, planes in zip(
+            LAYER_FILES.values(), (part, corrected.planes, *corrected.layers), strict=False
+        ):
             photo.write_image(folder / layer, planes, developed.encoding, format="png8", color_space="srgb")
     report = {
         "zones": corrected.zones,
@@ -306,8 +309,9 @@ for _registry in (estimators, selectors, correction.deconvolvers):
 
 
 def _show(path: Path, planes: Planes, developed: photo.LinearPhoto) -> None:
-    """Write planes as an sRGB JPEG."""
-    photo.write_image(path, planes, developed.encoding, format="jpeg", color_space="srgb", quality=95)
+    """Write planes as upright sRGB tiles."""
+    upright = photo.upright(photo.shown(planes, developed.encoding), developed.encoding.orientation)
+    write_tiles(path, upright)
 
 
 def _log_compiling() -> None:

@@ -8,10 +8,11 @@ from typing import Final
 from fastapi import APIRouter
 from fastapi.responses import HTMLResponse
 
+from app.blobs import tiles
 from app.errors import InvalidParameterError
 from app.http import views
 from app.http.dependencies import CallDep
-from app.jobs.task_files import AFTER, SHOWN
+from app.jobs.task_files import SHOWN, SIDES
 from app.pages import pictures, shown, words
 from app.pages.audit_words import held_places, held_squares
 from app.pages.rendering import page
@@ -23,14 +24,12 @@ from app.store.corrections import run_folder
 from app.store.photo_steps import photo_folder
 from app.store.tables import PhotoRow
 
-ROWS: Final = (("upper", 0.0), ("", 0.5), ("lower", 1.0))
-COLUMNS: Final = (("left", 0.0), ("middle", 0.5), ("right", 1.0))
-PLACES: Final = tuple(
-    (f"{above} {beside}".strip() if (above or beside != "middle") else "centre", row, col)
-    for above, row in ROWS
-    for beside, col in COLUMNS
+NAMES: Final = (
+    *("upper left", "upper middle", "upper right"),
+    *("left", "centre", "right"),
+    *("lower left", "lower middle", "lower right"),
 )
-"""Nine places of a picture, with their fractions of its height and width."""
+"""Of the nine places of a picture."""
 
 MAX_PREVIEW_PIXELS: Final = 1_500_000
 """Pixels of a preview at most (chosen): a second or two of work while the user waits."""
@@ -70,7 +69,7 @@ def photo_page(photo_id: str, call: CallDep) -> HTMLResponse:
         candidates=candidates,
         lens=None if photo.lens_id is None else lens_routes.read_lens(photo.lens_id, call),
         corrections=[correction for correction in corrections if correction.roi is None],
-        places=PLACES,
+        places=[(name, *place) for name, place in zip(NAMES, tiles.PLACES, strict=True)],
     )
 
 
@@ -114,7 +113,7 @@ def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
     report = correction.report or {}
     photo, row = photo_routes.described_photo(call, plan.photo), plan.photo
     can_look = correction.roi is None and pictures.exists(
-        call.storage, f"{run_folder(plan.correction)}{AFTER}"
+        call.storage, f"{run_folder(plan.correction)}{SIDES['after']}"
     )
     size = (row.height or 1, row.width or 1, row.orientation or 1)
     return page(
@@ -126,5 +125,5 @@ def correction_page(correction_id: str, call: CallDep) -> HTMLResponse:
         zones=words.gain_bars(report.get("zones") or {}),
         audit=held_places(report.get("audit") or {}, *size),
         held=held_squares(report.get("audit") or {}, *size) if can_look else None,
-        places=PLACES,
+        places=[(name, *place) for name, place in zip(NAMES, tiles.PLACES, strict=True)],
     )

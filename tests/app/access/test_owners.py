@@ -29,7 +29,6 @@ OPEN = {"/healthz", "/readyz", "/sign-in", "/v1/session"}
 NEEDED = {
     "psf": {"r": 0.5},
     "psf.{suffix}": {"r": 0.5},
-    "crop.png": {"row": 0.5, "col": 0.5},
 }
 
 
@@ -93,6 +92,7 @@ PARTS = {
     "half": "0",
     "col": "0",
     "row": "0",
+    "place": "0",
 }
 """Parts of paths that name nobody's thing."""
 
@@ -111,8 +111,6 @@ def requests(client: TestClient, ids: dict[str, str]) -> Iterator[tuple[str, str
                 continue  # of the one who asks; it would end the walk
             options = body_of(path, method, ids)
             params = {**options.pop("params", {}), **NEEDED.get(name, {})}
-            if name == "crop.png":
-                params["correction"] = ids["correction_id"]
             yield (
                 method,
                 re.sub(r"\{(\w+)\}", lambda found: ids.get(found[1]) or PARTS[found[1]], path),
@@ -172,7 +170,7 @@ def test_ids_in_bodies_and_queries_of_another_owner_are_unknown_too(
     assert refused("GET", f"/v1/corrections?photo_id={theirs['photo_id']}") == 404
     listed = guarded.get(f"/v1/photos?lens_id={theirs['lens_id']}", headers=ben).json()
     assert listed["items"] == []
-    crop = f"/ui/corrections/{theirs['correction_id']}/crop.png?row=0.5&col=0.5"
+    crop = f"/ui/corrections/{theirs['correction_id']}/tiles/after/places/4.jpg"
     assert refused("GET", crop) == 404
 
 

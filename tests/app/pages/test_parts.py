@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import re
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +15,10 @@ from PIL import Image
 from starlette.testclient import TestClient
 
 from app.blobs.storage import Storage
+from app.blobs.tiles import tile, whole, write_tiles
 from app.jobs import tasks
 from app.jobs.body_keys import body_key
-from app.jobs.task_files import AFTER, BEFORE, PREVIEW, R_MAP, THUMBNAIL
+from app.jobs.task_files import PREVIEW, R_MAP, SIDES, THUMBNAIL
 from app.pages.groups import grouped
 from app.pages.pictures import in_sensor, upright_point
 from app.runtime.settings import Settings
@@ -39,7 +39,7 @@ def opened(client: TestClient, path: str) -> Image.Image:
     return Image.open(io.BytesIO(answer.content))
 
 
-def test_a_preview_and_an_r_map_come_from_the_blobs_upright_in_any_size(
+def test_a_preview_and_an_r_map_come_from_the_blobs_upright(
     client: TestClient, steps: Steps, settings: Settings, tmp_path: Path
 ) -> None:
     scene = np.random.default_rng(1).integers(0, 255, (90, 120, 3), dtype=np.uint8)
@@ -53,7 +53,6 @@ def test_a_preview_and_an_r_map_come_from_the_blobs_upright_in_any_size(
 
     for name in (PREVIEW, R_MAP):
         assert opened(client, f"/ui/photos/{photo.public_id}/{name}").size == (90, 120)
-        assert opened(client, f"/ui/photos/{photo.public_id}/{name}?size=40").size == (30, 40)
 
 
 def test_no_photo_is_too_long_for_a_preview(tmp_path: Path) -> None:
@@ -71,12 +70,6 @@ def a_picture() -> NDArray[np.uint8]:
     return scene
 
 
-def encoded(scene: NDArray[np.uint8]) -> bytes:
-    file = io.BytesIO()
-    Image.fromarray(scene).save(file, "JPEG", quality=95, subsampling=0)
-    return file.getvalue()
-
-
 @pytest.fixture
 def corrected(client: TestClient, steps: Steps, store: Store, settings: Settings) -> dict[str, Any]:
     """A correction to a DNG that has changed nothing."""
@@ -84,8 +77,9 @@ def corrected(client: TestClient, steps: Steps, store: Store, settings: Settings
     made: dict[str, Any] = client.post("/v1/corrections", json=wish).json()
     blobs, folder = Storage(settings.storage), f"corrections/{made['id']}/1-1/"
     blobs.put(f"{folder}result.dng", b"a file that the pages never open")
-    for name in (BEFORE, AFTER):
-        blobs.put(f"{folder}{name}", encoded(a_picture()))
+    for name in SIDES.values():
+        write_tiles(settings.data_dir / name, a_picture())
+        blobs.put_file(f"{folder}{name}", settings.data_dir / name)
     run = store.corrections.start(made["id"])
     assert run is not None
     audit = {
@@ -102,27 +96,71 @@ def corrected(client: TestClient, steps: Steps, store: Store, settings: Settings
     return made
 
 
-def test_tiles_before_and_after_show_one_place_and_are_decoded_once(
+def no_decoder(*_: Any) -> Any:
+    raise AssertionError("a picture is decoded beside the keys of all owners")
+
+
+def test_tiles_before_and_after_show_one_place_and_are_not_decoded(
     client: TestClient, corrected: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    storage = client.app.state.services.storage  # type: ignore[attr-defined] # Starlette's own attribute
-    read, get = list[str](), storage.get
-    monkeypatch.setattr(storage, "get", lambda key: read.append(key) or get(key))
     base = f"/ui/corrections/{corrected['id']}/tiles"
     paths = [f"{base}/{side}/0/0_0.jpg" for side in ("before", "after")]
+    others = ("0/2_1", "1/1_0", "2/0_0", "whole", "places/0", "places/8")
+    paths += [f"{base}/after/{name}.jpg" for name in others]
 
-    with ThreadPoolExecutor(4) as pool:
-        tiles = list(pool.map(lambda path: opened(client, path), paths * 4))
+    with monkeypatch.context() as patch:
+        patch.setattr(Image, "open", no_decoder)
+        patch.setattr(Image, "fromarray", no_decoder)
+        answers = [client.get(path) for path in paths]
 
-    assert len(read) == 2
-    shown = [np.asarray(tile).astype(float) for tile in tiles]
-    assert all(np.abs(tile - shown[0]).max() < 8 for tile in shown)
-    assert shown[0].shape == (512, 512, 3)
+    assert [answer.status_code for answer in answers] == [200] * len(paths)
+    shown = [np.asarray(Image.open(io.BytesIO(answer.content))).astype(float) for answer in answers]
+    assert np.array_equal(shown[0], shown[1])
     assert shown[0][5, 5].min() > 245
-    assert opened(client, f"{base}/after/0/2_1.jpg").size == (1300 - 1024, 700 - 512)
-    assert opened(client, f"{base}/after/1/1_0.jpg").size == (650 - 512, 350)
-    assert opened(client, f"{base}/after/whole.jpg").size == (1300, 700)
-    assert client.get(f"{base}/after/0/9_9.jpg").status_code == 404
+    assert [picture.shape[:2] for picture in shown[2:]] == [
+        (700 - 512, 1300 - 1024),
+        (350, 650 - 512),
+        (175, 325),
+        (700, 1300),
+        (170, 255),
+        (170, 255),
+    ]
+    assert (shown[6][5, 5].min() > 245, shown[7][5, 5].max() < 60) == (True, True)
+    missing = ("0/9_9", "3/0_0", "places/9")
+    assert [client.get(f"{base}/after/{name}.jpg").status_code for name in missing] == [404] * 3
+
+
+@pytest.mark.parametrize("change", ["empty", "cut", "count", "offsets", "size"])
+def test_tiles_that_a_child_wrote_wrongly_are_refused(
+    client: TestClient, corrected: dict[str, Any], settings: Settings, change: str
+) -> None:
+    blobs, key = Storage(settings.storage), f"corrections/{corrected['id']}/1-1/{SIDES['after']}"
+    data = bytearray(blobs.get(key))
+    if change == "empty":
+        data = bytearray()
+    elif change == "cut":
+        del data[3000:]
+    elif change == "count":
+        data[12:16] = (2**32 - 1).to_bytes(4, "little")
+    elif change == "offsets":
+        data[24:32] = (2**63).to_bytes(8, "little")
+    else:
+        data[4:12] = (2**32 - 1).to_bytes(4, "little") * 2
+    blobs.put(key, bytes(data))
+
+    answers = [
+        client.get(f"/ui/corrections/{corrected['id']}/tiles/after/{name}.jpg") for name in ("whole", "0/0_0")
+    ]
+
+    assert {answer.status_code for answer in answers} == {409}
+
+
+def test_the_smallest_and_longest_pictures_have_tiles(tmp_path: Path) -> None:
+    for height, width in ((1, 1), (2, 30000), (513, 512)):
+        write_tiles(tmp_path / "x.tiles", np.zeros((height, width, 3), np.uint8))
+        storage = Storage(f"file://{tmp_path}")
+        assert Image.open(io.BytesIO(whole(storage, "x.tiles"))).width <= 1600
+        assert Image.open(io.BytesIO(tile(storage, "x.tiles", 0, 0, 0))).height == min(height, 512)
 
 
 def test_a_corrected_dng_is_looked_at_and_its_audit_told(

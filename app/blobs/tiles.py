@@ -1,0 +1,157 @@
+"""A picture for the pages as one file: JPEG tiles of each size, after a table of where each one lies.
+
+A child writes it, since only children decode photos; the API hands out its bytes and decodes nothing. It
+begins with `_HEAD`, then the offsets of its pictures and the end of the last, 8 bytes each, little-endian.
+Its pictures are the whole one, small parts at nine places, and the tiles row by row, first those pixel
+by pixel, then those of half the size, until one tile holds all.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from app.blobs.storage import Storage
+from app.errors import NotReadyError, UnknownPictureError
+
+TILE: Final = 512
+"""Side of a tile in pixels, as `static/tiles.js` has it."""
+
+WHOLE: Final = 1600
+"""Longer side of the whole picture in pixels at most (chosen): fills most screens until there are tiles."""
+
+PLACES: Final = tuple((row, col) for row in (0.0, 0.5, 1.0) for col in (0.0, 0.5, 1.0))
+"""Places of the small parts, as fractions of height and width."""
+
+PART: Final = (170, 255)
+"""Height and width of a small part in pixels (chosen): nine of them fill the width of a page."""
+
+MAX_PICTURE: Final = 4 << 20
+"""Bytes of one picture at most (chosen): JPEG of noise takes 1 MiB for a tile, 3 MiB for the whole."""
+
+_HEAD: Final = struct.Struct("<4sIII")  # signature, height, width, number of pictures
+_SIGNATURE: Final = b"LTL1"
+_FIRST_TILE: Final = 1 + len(PLACES)
+
+
+def write_tiles(path: Path, picture: NDArray[np.uint8]) -> None:
+    """Write the tiles of an upright picture, `(row, col, 3)`."""
+    height, width = picture.shape[:2]
+    count = _FIRST_TILE + sum(rows * cols for rows, cols in _levels(height, width))
+    ends = [_HEAD.size + 8 * (count + 1)]
+    with path.open("wb") as file:
+        file.seek(ends[0])
+        for part in _pictures(picture):
+            ends.append(ends[-1] + file.write(_jpeg(part)))
+        file.seek(0)
+        file.write(_HEAD.pack(_SIGNATURE, height, width, count) + struct.pack(f"<{count + 1}Q", *ends))
+
+
+def _levels(height: int, width: int) -> list[tuple[int, int]]:
+    """Return how many rows and columns of tiles each size has."""
+    levels = []
+    while height and width:
+        levels.append((-(-height // TILE), -(-width // TILE)))
+        if max(height, width) <= TILE:
+            break
+        height, width = height // 2, width // 2
+    return levels
+
+
+def _pictures(picture: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
+    height, width = picture.shape[:2]
+    step = -(-max(height, width) // WHOLE)
+    pictures = [_shrunk(picture, step)]
+    for row, col in PLACES:
+        top = max(0, min(round(row * height - PART[0] / 2), height - PART[0]))
+        left = max(0, min(round(col * width - PART[1] / 2), width - PART[1]))
+        pictures.append(picture[top : top + PART[0], left : left + PART[1]])
+    for rows, cols in _levels(height, width):
+        pictures += [
+            picture[row * TILE : (row + 1) * TILE, col * TILE : (col + 1) * TILE]
+            for row in range(rows)
+            for col in range(cols)
+        ]
+        picture = _shrunk(picture, 2)
+    return pictures
+
+
+def _shrunk(picture: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
+    """Return the means of squares of pixels, of at least one row and column."""
+    height, width = (max(size // step, 1) for size in picture.shape[:2])
+    high, wide = (min(step, size) for size in picture.shape[:2])
+    squares = picture[: height * high, : width * wide].reshape(height, high, width, wide, 3)
+    mean = squares.astype(np.uint16).mean(axis=(1, 3), dtype=np.float32)
+    return np.rint(mean).astype(np.uint8)
+
+
+def _jpeg(picture: NDArray[np.uint8]) -> bytes:
+    out = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(picture)).save(out, "JPEG", quality=92, subsampling=0)
+    return out.getvalue()
+
+
+def whole(storage: Storage, key: str) -> bytes:
+    """Return the whole picture of stored tiles."""
+    return _read(storage, key, 0)
+
+
+def part(storage: Storage, key: str, place: int) -> bytes:
+    """Return the small part at one of `PLACES`."""
+    if not 0 <= place < len(PLACES):
+        raise UnknownPictureError(f"the picture has {len(PLACES)} places, not one of number {place}")
+    return _read(storage, key, 1 + place)
+
+
+def tile(storage: Storage, key: str, level: int, col: int, row: int) -> bytes:
+    """Return a tile of the picture halved `level` times."""
+    height, width, _ = _table(storage, key)
+    levels = _levels(height, width)
+    if not (level < len(levels) and row < levels[level][0] and col < levels[level][1]):
+        raise UnknownPictureError(f"the picture has no tile {level}/{col}_{row}")
+    before = sum(rows * cols for rows, cols in levels[:level])
+    return _read(storage, key, _FIRST_TILE + before + row * levels[level][1] + col)
+
+
+def _read(storage: Storage, key: str, number: int) -> bytes:
+    offsets = _table(storage, key)[2]
+    return b"".join(storage.stream(key, offsets[number], offsets[number + 1]))
+
+
+def _table(storage: Storage, key: str) -> tuple[int, int, tuple[int, ...]]:
+    """Return height, width and offsets."""
+    try:
+        return _checked(storage, key, storage.info(key).size)  # made anew it has another size
+    except FileNotFoundError as error:
+        raise NotReadyError("there is no such picture yet: wait for the job that makes it") from error
+
+
+@lru_cache(maxsize=256)
+def _checked(storage: Storage, key: str, size: int) -> tuple[int, int, tuple[int, ...]]:
+    """Read the table as untrusted, since a child wrote it."""
+    try:
+        head = b"".join(storage.stream(key, 0, min(size, _HEAD.size)))
+        signature, height, width, count = _HEAD.unpack(head)
+        expected = _FIRST_TILE + sum(rows * cols for rows, cols in _levels(height, width))
+        start = _HEAD.size + 8 * (count + 1)
+        if signature != _SIGNATURE or count != expected or start > size:
+            raise _damaged()
+        offsets = struct.unpack(f"<{count + 1}Q", b"".join(storage.stream(key, _HEAD.size, start)))
+    except struct.error as error:
+        raise _damaged() from error
+    lengths = [end - begin for begin, end in pairwise(offsets)]
+    if offsets[0] != start or offsets[-1] > size or not all(0 < n <= MAX_PICTURE for n in lengths):
+        raise _damaged()
+    return height, width, offsets
+
+
+def _damaged() -> NotReadyError:
+    return NotReadyError("this picture is damaged: ask for the work anew")

@@ -1,0 +1,69 @@
+"""`python -m lensmodel.lab.population`: make scenes and lenses, look at the population, train the network."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from itertools import chain
+from pathlib import Path
+
+from lensmodel.lab.population import library, scenes
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m lensmodel.lab.population")
+    parser.add_argument("--folder", type=Path, default=Path("population"), help="where scenes and lenses lie")
+    commands = parser.add_subparsers(dest="command", required=True)
+    make = commands.add_parser("scenes", help="scale photographs down to sharp scenes, draw others")
+    make.add_argument("--photos", type=Path, required=True, help="folder of sharp photographs (PNG)")
+    make.add_argument(
+        "--git", type=Path, nargs="*", default=[], help="git repositories of photographs (JPEG)"
+    )
+    lenses = commands.add_parser("lenses", help="draw lenses and take photos through them; resumable")
+    lenses.add_argument("--family", choices=library.FAMILIES, default="wavefront")
+    lenses.add_argument("--first", type=int, default=0, help="first shard of 25 lenses")
+    lenses.add_argument("--shards", type=int, default=400)
+    lenses.add_argument("--held-out", action="store_true", help="lenses, designs and scenes to judge by")
+    lenses.add_argument("--processes", type=int, default=2)
+    train = commands.add_parser("train", help="train the network; goes on where it was ended")
+    train.add_argument("--minutes", type=float, default=60.0, help="of this sitting")
+    train.add_argument("--total-minutes", type=float, default=60.0, help="of all sittings")
+    train.add_argument("--rate", type=float, default=1e-3)
+    train.add_argument("--threads", type=int, default=2)
+    train.add_argument("--seed", type=int, default=0)
+    train.add_argument("--code", default="", help="what made the library, for the provenance")
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Run the command that was asked for."""
+    asked = _arguments()
+    if asked.command == "scenes":
+        from lensmodel.lab.cases import photo_half  # noqa: PLC0415 - brings all of the library
+
+        trained = (source for source in scenes.files_of(asked.photos) if photo_half(source.name) == "dev")
+        others = chain.from_iterable(scenes.objects_of(repository, ".") for repository in asked.git)
+        print(len(scenes.build(asked.folder / "scenes", chain(trained, others))), "scenes")
+        return
+    if asked.command == "train":
+        from lensmodel.lab.population.training import train  # noqa: PLC0415 - needs PyTorch
+
+        train(
+            asked.folder, asked.minutes, total_minutes=asked.total_minutes, rate=asked.rate,
+            threads=asked.threads, seed=asked.seed, code=asked.code,
+        )  # fmt: skip
+        return
+    began, count = time.monotonic(), 0
+    name = "held-out" if asked.held_out else "lenses"
+    shards = range(asked.first, asked.first + asked.shards)
+    for made in library.generate(
+        asked.folder / name, asked.folder / "scenes", asked.family, shards,
+        held_out=asked.held_out, processes=asked.processes,
+    ):  # fmt: skip
+        count += made
+        if made:
+            print(f"{asked.family}: {count} lenses in {time.monotonic() - began:.0f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main()

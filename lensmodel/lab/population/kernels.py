@@ -1,0 +1,235 @@
+"""From a wavefront to a PSF on pixels, fast: the transform of the pupil, integrated over pixels.
+
+The incoherent PSF of a pupil P(x) = A(x) exp(2 pi i W(x) / lambda) of radius 1 and f-number N is the squared
+modulus of its Fourier transform (J. W. Goodman, "Introduction to Fourier Optics", 3rd ed., 2005, section
+6.3); its samples at half of lambda N determine it. Integrating over square pixels is a product with sinc(f
+pitch) in frequency.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from functools import cache
+from math import factorial
+from typing import Final, Protocol
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from lensmodel.core.types import Channel
+
+FINE: Final = 33
+"""Pixels: side of the part of a kernel that is given pixel by pixel."""
+COARSE: Final = 25
+"""Cells of `BLOCK` x `BLOCK` pixels on a side of the whole kernel."""
+BLOCK: Final = 3
+SIDE: Final = COARSE * BLOCK
+"""Pixels: side of the whole kernel."""
+
+WAVELENGTHS_UM: Final[dict[Channel, tuple[float, float]]] = {
+    "r": (0.59, 0.63),
+    "g": (0.52, 0.555),
+    "b": (0.45, 0.485),
+}
+"""Two for each colour: its band of a Bayer filter."""
+
+TERMS: Final = tuple((n, m) for n in range(2, 11) for m in range(n % 2, min(n, 6) + 1, 2))
+"""Zernike terms (n, m) of a wavefront; each has a cosine and a sine."""
+COLUMNS: Final = 2 * len(TERMS)
+
+_AIRY_RINGS: Final = 9.0  # beyond so many a perfect PSF has 2 % of its light, which is left out
+_CENTRED: Final = 0.05  # pixels: how near to the middle the centre of mass must lie
+_SIDES: Final = tuple(range(48, 257, 16)) + tuple(range(288, 577, 32))  # samples across the pupil
+
+
+class PopulationLens(Protocol):
+    """A lens of the population: its wavefronts at any place, wavelength and aperture."""
+
+    f_number: float
+    pitch_um: float
+    focal_mm: float
+
+    def wavefronts(
+        self, xy: NDArray[np.float64], wavelengths_um: NDArray[np.float64], f_number: float | None = None
+    ) -> NDArray[np.float64]:
+        """Coefficients (place, wavelength, COLUMNS) in micrometres, of terms of unit r.m.s."""
+
+    def aperture(self, xy: NDArray[np.float64], f_number: float | None = None) -> NDArray[np.float64]:
+        """Circles (place, circle, 3), as (x, y, radius) in pupil radii, that all light has passed."""
+
+
+def radial(n: int, m: int, rho: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Radial polynomial of Zernike, scaled so that the term has unit r.m.s. on the disc."""
+    total = np.zeros_like(rho)
+    for k in range((n - m) // 2 + 1):
+        part = factorial(k) * factorial((n + m) // 2 - k) * factorial((n - m) // 2 - k)
+        total = total + (-1) ** k * factorial(n - k) / part * rho ** (n - 2 * k)
+    return total * np.sqrt((n + 1) * (2 if m else 1))
+
+
+def basis(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """All terms at points of the pupil, shape (COLUMNS, *x.shape)."""
+    rho, angle = np.hypot(x, y), np.arctan2(y, x)
+    columns = []
+    for n, m in TERMS:
+        r = radial(n, m, rho)
+        columns += [r * np.cos(m * angle), r * np.sin(m * angle) if m else np.zeros_like(r)]
+    return np.array(columns)
+
+
+@dataclass(frozen=True, slots=True)
+class _Pupil:
+    """Points of the unit disc on a grid of n x n, with the terms and their slopes there."""
+
+    rows: NDArray[np.int64]
+    cols: NDArray[np.int64]
+    x: NDArray[np.float32]
+    y: NDArray[np.float32]
+    terms: NDArray[np.float32]
+
+
+@cache
+def _pupil(n: int) -> _Pupil:
+    g = (np.arange(n) + 0.5) / n * 2.0 - 1.0
+    y, x = np.meshgrid(-g, g, indexing="ij")
+    rows, cols = np.nonzero(x * x + y * y <= 1.0)
+    x, y = x[rows, cols], y[rows, cols]
+    return _Pupil(rows, cols, x.astype(np.float32), y.astype(np.float32), basis(x, y).astype(np.float32))
+
+
+@cache
+def _slopes() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """A coarse grid of the pupil and the terms' derivatives there, by central differences."""
+    g = (np.arange(20) + 0.5) / 10.0 - 1.0
+    y, x = np.meshgrid(g, g, indexing="ij")
+    inside = x * x + y * y <= 0.98
+    x, y = x[inside], y[inside]
+    h = 1e-4
+    return x, y, (basis(x + h, y) - basis(x - h, y)) / (2 * h), (basis(x, y + h) - basis(x, y - h)) / (2 * h)
+
+
+def stopped_down(ratio: float) -> NDArray[np.float64]:
+    """Matrix by which rows of coefficients become those of the inner part, `ratio` of the radius."""
+    g = (np.arange(40) + 0.5) / 20.0 - 1.0
+    y, x = np.meshgrid(g, g, indexing="ij")
+    inside = x * x + y * y <= 1.0
+    x, y = x[inside], y[inside]
+    flat = np.vstack([basis(x, y), np.ones_like(x)[None], x[None], y[None]])
+    return np.linalg.lstsq(flat.T, basis(ratio * x, ratio * y).T, rcond=None)[0][:COLUMNS].T
+
+
+def spots(
+    coefficients: NDArray[np.float64], f_number: float, circles: NDArray[np.float64] | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Centroid (n, 2) and r.m.s. radius along one axis (n,) of ray spots, micrometres.
+
+    A ray of the pupil point (x, y) lands at 2 N grad W.
+    """
+    x, y, dx, dy = _slopes()
+    rays = np.stack([coefficients @ dx, coefficients @ dy], -1) * (2.0 * f_number)
+    weight = np.ones(rays.shape[:2])
+    if circles is not None:
+        for c in range(circles.shape[1]):
+            cx, cy, radius = circles[:, c, :].T
+            weight *= (x - cx[:, None]) ** 2 + (y - cy[:, None]) ** 2 <= radius[:, None] ** 2
+    weight /= np.maximum(weight.sum(1, keepdims=True), 1.0)
+    centre = (rays * weight[..., None]).sum(1)
+    spread = ((rays - centre[:, None]) ** 2 * weight[..., None]).sum((1, 2))
+    return centre, np.sqrt(spread / 2.0)
+
+
+class Renderer:
+    """Makes kernels of one pixel pitch and f-number; keeps the matrices that integrate over pixels."""
+
+    def __init__(self, f_number: float, pitch_um: float) -> None:
+        self._f_number, self._pitch = f_number, pitch_um
+        self._matrices: OrderedDict[tuple[int, float, int], NDArray[np.float32]] = OrderedDict()
+
+    def kernel(
+        self, coefficients: NDArray[np.float64], circles: NDArray[np.float64], wavelength_um: float
+    ) -> NDArray[np.float32]:
+        """Kernel of shape (SIDE, SIDE) with its ray centroid in the middle; sum 1 of what falls inside."""
+        x, y, dx, dy = _slopes()
+        rays = np.stack([coefficients @ dx, coefficients @ dy], -1) * (2.0 * self._f_number)
+        open_ = np.ones(x.size, bool)
+        for cx, cy, radius in circles:
+            open_ &= (x - cx) ** 2 + (y - cy) ** 2 <= radius * radius
+        if not open_.any():
+            open_[:] = True
+        centre = rays[open_].mean(0)
+        step = wavelength_um * self._f_number  # um: period of the PSF is n steps
+        reach = 1.12 * np.abs(rays[open_] - centre).max() + _AIRY_RINGS * step + self._pitch
+        side = SIDE if reach > 0.45 * FINE * self._pitch else FINE
+        period = min(2.0 * reach, 1.06 * side * self._pitch)
+        n = next((s for s in _SIDES if s * step >= period), _SIDES[-1])
+        pupil = _pupil(n)
+        inside = np.ones(pupil.x.size, bool)
+        for cx, cy, radius in circles:
+            inside &= (pupil.x - cx) ** 2 + (pupil.y - cy) ** 2 <= radius * radius
+        path = coefficients.astype(np.float32) @ pupil.terms
+        matrix = self._matrix(n, wavelength_um, side)
+        at = np.arange(side) - (side - 1) / 2.0
+        for _ in range(3):  # tails outside the window move the centre of mass: the second pass mends that
+            tilt = (centre[0] * pupil.x + centre[1] * pupil.y) / np.float32(2.0 * self._f_number)
+            phase = (path - tilt) * np.float32(2.0 * np.pi / wavelength_um)
+            field = np.zeros((n, 2 * n), np.complex64)
+            field[pupil.rows, pupil.cols] = np.where(inside, np.exp(1j * phase), 0)
+            # a ray at +2 N grad W: the transform with exp(-i) moves light towards the slope
+            amplitude = scipy.fft.fft(scipy.fft.fft(field, axis=1).T.copy(), 2 * n, axis=1).T
+            kernel = np.maximum(matrix @ (amplitude.real**2 + amplitude.imag**2) @ matrix.T, 0.0)
+            kernel /= kernel.sum()
+            off = np.array([kernel.sum(0) @ at, -(kernel.sum(1) @ at)])
+            if np.abs(off).max() < _CENTRED:
+                break
+            centre = centre + off * self._pitch
+        out = np.zeros((SIDE, SIDE), np.float32)
+        margin = (SIDE - side) // 2
+        out[margin : SIDE - margin, margin : SIDE - margin] = kernel
+        return out
+
+    def _matrix(self, n: int, wavelength_um: float, side: int) -> NDArray[np.float32]:
+        """Integrals over `side` pixels of the trigonometric interpolation of 2n samples, one row a pixel."""
+        key = (n, wavelength_um, side)
+        if key not in self._matrices:
+            period = n * wavelength_um * self._f_number
+            at = (np.arange(side) - (side - 1) / 2.0) * self._pitch
+            samples = np.arange(2 * n) * period / (2 * n)
+            f = np.arange(1, n) / period
+            gain = np.sinc(f * self._pitch)
+            a, b = 2 * np.pi * np.outer(at, f), 2 * np.pi * np.outer(samples, f)
+            matrix = 1.0 + 2.0 * ((np.cos(a) * gain) @ np.cos(b).T + (np.sin(a) * gain) @ np.sin(b).T)
+            matrix[np.abs(at) + 0.5 * self._pitch > 0.5 * period] = 0.0  # there the next period begins
+            self._matrices[key] = matrix.astype(np.float32)
+            if len(self._matrices) > 24:
+                self._matrices.popitem(last=False)
+        return self._matrices[key]
+
+
+def kernels_of(
+    lens: PopulationLens, xy: NDArray[np.float64], f_number: float | None = None
+) -> NDArray[np.float32]:
+    """Kernels of a lens, shape (place, 3, SIDE, SIDE): red, green, blue; each centred on its own centroid."""
+    used = lens.f_number if f_number is None else f_number
+    wavelengths = np.array([w for pair in WAVELENGTHS_UM.values() for w in pair])
+    coefficients = lens.wavefronts(xy, wavelengths, f_number)
+    circles = lens.aperture(xy, f_number)
+    renderer = Renderer(used, lens.pitch_um)
+    out = np.zeros((len(xy), 3, SIDE, SIDE), np.float32)
+    for p in range(len(xy)):
+        for w, wavelength in enumerate(wavelengths):
+            out[p, w // 2] += 0.5 * renderer.kernel(coefficients[p, w], circles[p], float(wavelength))
+    return out
+
+
+def coarse_of(kernels: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Sums over cells of `BLOCK` x `BLOCK` pixels: (..., SIDE, SIDE) to (..., COARSE, COARSE)."""
+    shape = (*kernels.shape[:-2], COARSE, BLOCK, COARSE, BLOCK)
+    return kernels.reshape(shape).sum((-3, -1))
+
+
+def fine_of(kernels: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Inner part: (..., SIDE, SIDE) to (..., FINE, FINE)."""
+    margin = (SIDE - FINE) // 2
+    return kernels[..., margin : SIDE - margin, margin : SIDE - margin]

@@ -1,0 +1,212 @@
+"""Sharp scenes in linear light: photographs scaled down until their own blur is gone, and drawn ones.
+
+A photograph enters by its bytes, from files or from the objects of a git repository, so that whole
+collections serve without being unpacked. Photographs of the laboratory's test half (`photo_half`) are never
+trained on.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from lensmodel.core.files import write_atomically
+
+Scene = NDArray[np.float16]  # (height, width, 3), linear light, white 1
+
+_LONGEST: Final = 1800  # pixels of the longer side after scaling down: most cameras' own blur is then gone
+_LEAST_FACTOR: Final = (
+    2.2  # a photograph is scaled down by at least this (chosen: blur below a third of a pixel)
+)
+_SHARPEST: Final = 0.10  # least share of gradient energy in the finest band; below it a photograph is soft
+_SCALES: Final = (1.0, 1.5, 2.3)  # further factors that each photograph is scaled down by
+
+TEST_HALF: Final = (
+    "beacon-street-sunset",
+    "canyon-wren",
+    "perched-osprey",
+    "roman-colosseum",
+    "singaporean-cityscape",
+    "jad-limcaco-183877",
+    "spacex-81773",
+    "jared-evans-119758",
+    "Apple iPhone 4S",
+    "Kodak PIXPRO AZ521",
+    "Oppo R7 Plus",
+    "Samsung SM-N900A (Galaxy Note 3)",
+)
+"""Originals of the photographs of the test half, as their collections name them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """One photograph: where it comes from, its bytes, and whether it may be scaled down less."""
+
+    name: str
+    data: bytes
+    ready: bool = False  # scaled down already
+
+
+def files_of(folder: Path) -> Iterator[Source]:
+    """Photographs of a folder that are sharp already."""
+    for path in sorted(folder.glob("*.png")):
+        yield Source(path.stem, path.read_bytes(), ready=True)
+
+
+def objects_of(repository: Path, under: str) -> Iterator[Source]:
+    """Photographs in the newest commit of a git repository; those whose objects are absent are left out."""
+    listed = subprocess.run(
+        ["git", "-C", str(repository), "ls-tree", "-r", "-l", "HEAD", "--", under],
+        capture_output=True, text=True, check=True,
+    ).stdout  # fmt: skip
+    for line in listed.splitlines():
+        facts, _, name = line.partition("\t")
+        size = facts.split()[3]
+        if size.isdigit() and int(size) > 300_000 and name.lower().endswith((".jpg", ".jpeg")):
+            blob = facts.split()[2]
+            data = subprocess.run(
+                ["git", "-C", str(repository), "cat-file", "blob", blob], capture_output=True, check=True
+            ).stdout
+            yield Source(Path(name).stem, data)
+
+
+def linear(data: bytes) -> NDArray[np.float32]:
+    """Decode a picture to linear light (sRGB), float32 of shape (height, width, 3)."""
+    with Image.open(io.BytesIO(data)) as picture:
+        v = np.asarray(picture.convert("RGB"), np.float32) / 255.0
+    return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def scaled_down(scene: NDArray[np.float32], factor: float) -> NDArray[np.float32]:
+    """Average areas of `factor` x `factor` pixels, which need not be whole."""
+    if factor == 1.0:
+        return scene
+    for axis in (0, 1):
+        count = int(scene.shape[axis] // factor)
+        total = np.cumsum(scene, axis, dtype=np.float64)
+        total = np.concatenate([np.zeros_like(np.take(total, [0], axis)), total], axis)
+        edges = np.arange(count + 1) * factor
+        whole = np.minimum(edges.astype(int), scene.shape[axis] - 1)
+        shape = [-1 if k == axis else 1 for k in range(3)]
+        part = (edges - whole).reshape(shape)
+        at = np.take(total, whole, axis) * (1 - part) + np.take(total, whole + 1, axis) * part
+        scene = (np.diff(at, axis=axis) / factor).astype(np.float32)
+    return scene
+
+
+def sharpness(scene: NDArray[np.float32]) -> float:
+    """Energy of the sharpest tiles' second differences over that of their differences at twice the step."""
+    green = np.sqrt(np.maximum(scene[..., 1], 0.0))
+    fine = np.abs(green[:, 1:-1] * 2 - green[:, :-2] - green[:, 2:])[:, 1:-1]
+    wide = np.abs(green[:, 2:-2] * 2 - green[:, :-4] - green[:, 4:])
+    tile = 64
+    rows, cols = (n // tile for n in wide.shape)
+    parts = [
+        v[: rows * tile, : cols * tile]
+        .reshape(rows, tile, cols, tile)
+        .swapaxes(1, 2)
+        .reshape(-1, tile * tile)
+        for v in (fine, wide)
+    ]
+    energy = [np.square(v).mean(1) for v in parts]
+    busy = energy[1] > np.quantile(energy[1], 0.7)
+    return float(np.median(energy[0][busy] / energy[1][busy]))
+
+
+def leaves(rng: np.random.Generator, side: int = 1100) -> NDArray[np.float32]:
+    """Dead leaves: opaque shapes of a power law of sizes, each in front of those before, some shaded."""
+    oversampled = 2 * side
+    picture = np.empty((oversampled, oversampled, 3), np.float32)
+    picture[:] = rng.uniform(0.05, 0.9, 3)
+    radii = np.sort(np.exp(rng.uniform(np.log(3.0), np.log(220.0), 6000)))[::-1]
+    shaded = rng.random() < 0.7
+    for radius in radii:
+        cx, cy = rng.uniform(0, oversampled, 2)
+        x0, x1 = int(max(cx - radius, 0)), int(min(cx + radius + 1, oversampled))
+        y0, y1 = int(max(cy - radius, 0)), int(min(cy + radius + 1, oversampled))
+        if y1 <= y0 or x1 <= x0:
+            continue
+        x = np.arange(x0, x1, dtype=np.float32)[None] - cx
+        y = np.arange(y0, y1, dtype=np.float32)[:, None] - cy
+        if rng.random() < 0.6:
+            inside = x * x + y * y < radius * radius
+        else:
+            t, thin = rng.uniform(0, np.pi), rng.uniform(0.1, 0.7)
+            u, v = x * np.cos(t) + y * np.sin(t), -x * np.sin(t) + y * np.cos(t)
+            inside = (np.abs(u) < 0.7 * radius) & (np.abs(v) < thin * radius)
+        colour = np.clip(np.exp(rng.normal(-1.2, 0.9)) * (1 + rng.normal(0, 0.25, 3)), 0.004, 1.0)
+        paint = np.broadcast_to(colour, (*inside.shape, 3))
+        if shaded and radius > 6:
+            slope = 1 + (rng.normal(0, 0.15) * x + rng.normal(0, 0.15) * y) / radius
+            paint = paint * slope[..., None]
+        picture[y0:y1, x0:x1] = np.where(inside[..., None], paint, picture[y0:y1, x0:x1])
+    return scaled_down(np.clip(picture, 0, 1), 2.0)
+
+
+def text(rng: np.random.Generator, side: int = 1100) -> NDArray[np.float32]:
+    """A printed page: lines of letters of several sizes, dark on light or light on dark, at an angle."""
+    size = 2 * side
+    page = Image.new("L", (size, size), 255)
+    draw, y = ImageDraw.Draw(page), 0
+    letters = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789.,;:-()  "
+    while y < size:
+        height = int(np.exp(rng.uniform(np.log(14), np.log(120))))
+        line = "".join(rng.choice(list(letters), size // max(height // 3, 1)))
+        draw.text(
+            (int(rng.uniform(-40, 40)), y),
+            line,
+            fill=int(rng.uniform(0, 90)),
+            font=ImageFont.load_default(height),
+        )
+        y += int(1.25 * height)
+    turned = page.rotate(float(rng.uniform(-20, 20)), Image.Resampling.BICUBIC, fillcolor=255)
+    v = np.asarray(turned, np.float32) / 255.0
+    dark, light = rng.uniform(0.01, 0.08, 3), rng.uniform(0.5, 0.95, 3)
+    if rng.random() < 0.3:
+        dark, light = light, dark
+    return scaled_down((dark + v[..., None] ** 2.2 * (light - dark)).astype(np.float32), 2.0)
+
+
+def build(folder: Path, sources: Iterator[Source], drawn: int = 8, seed: int = 7) -> list[dict[str, object]]:
+    """Write every scene at all scales as `folder/*.npy` (float16) with `index.json`; return the index.
+
+    Soft photographs (`sharpness`) are left out, those of the test half always.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    index: list[dict[str, object]] = []
+
+    def keep(name: str, scene: NDArray[np.float32], scale: float) -> None:
+        if min(scene.shape[:2]) < 260:
+            return
+        file = f"{len(index):04d}.npy"
+        np.save(folder / file, scene.astype(np.float16))
+        index.append({"file": file, "name": name, "scale": scale, "shape": scene.shape[:2]})
+
+    for source in sources:
+        if source.name in TEST_HALF:
+            continue
+        try:
+            scene = linear(source.data)
+        except OSError:  # a damaged file of a test collection
+            continue
+        if not source.ready:
+            scene = scaled_down(scene, max(_LEAST_FACTOR, max(scene.shape[:2]) / _LONGEST))
+        if min(scene.shape[:2]) < 400 or sharpness(scene) < _SHARPEST:
+            continue
+        for scale in _SCALES:
+            keep(source.name, scaled_down(scene, scale), scale)
+    rng = np.random.default_rng(seed)
+    for number in range(drawn):
+        keep(f"leaves {number}", leaves(rng), 1.0)
+        keep(f"text {number}", text(rng), 1.0)
+    write_atomically(folder / "index.json", json.dumps(index, indent=1).encode())
+    return index

@@ -1,0 +1,340 @@
+"""The regression with learned kernels: patches of a photo in, the PSF at any place and settings out.
+
+A sample's statistics become a token; patches of one photo look at each other (a patch out of focus shows
+beside sharp ones), photos never do, so that a new photo leaves the tokens of others as they are. A query, a
+place and settings, starts from what is usual there and takes up the samples by attention::
+
+    a = softmax_j( q k_j / sqrt(d) + (q P) phi_j - g |distances_j| ),    out = sum_j a_j (v_j + phi_j R)
+
+which is eq. (4) of the paper [1]_ with learned weights and values; phi_j tells how sample j lies to the
+query. One more logit, of nothing, lets few or far samples count little. The answer are logits of a kernel at
+two scales, a softmax of which is non-negative with sum 1, and the expected error. Here in NumPy; trained by
+`lab.population`.
+
+References
+----------
+.. [1] M. Hirsch, B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, section 6, eq. 3 to 7.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from hashlib import sha256
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+from lensmodel.core.errors import InvalidInputError, NoSamplesError
+from lensmodel.neural.features import (
+    DISTANCES,
+    Conditions,
+    condition_features,
+    place_features,
+    relation_features,
+)
+from lensmodel.neural.statistics import LENGTH
+from lensmodel.neural.symmetry import from_octant_image, octant_of
+
+Array = NDArray[np.float32]
+
+FINE: Final = 33
+"""Pixels: side of the part of a kernel that is told pixel by pixel."""
+COARSE: Final = 25
+BLOCK: Final = 3
+SIDE: Final = COARSE * BLOCK
+"""Pixels: side of a kernel. Beyond the fine part it is told in cells of BLOCK x BLOCK pixels."""
+RINGS: Final = 8
+"""Rings of frequency, 1/16 cycles/pixel wide, for which the error of the transfer function is told."""
+
+_WEIGHTS: Final = Path(__file__).parent / "data" / "weights.npz"
+_CLAMP: Final = 6.0  # standard deviations that a statistic may lie off the population's mean
+_LAYER_EPSILON: Final = 1e-5
+
+
+def outer_cells() -> NDArray[np.bool_]:
+    """Cells of the coarse grid that lie outside the fine part, shape (COARSE, COARSE)."""
+    edge = (COARSE - FINE // BLOCK) // 2
+    outer = np.ones((COARSE, COARSE), bool)
+    outer[edge:-edge, edge:-edge] = False
+    return outer
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Memory:
+    """Samples as the queries see them: places, settings, and keys and values of each attention.
+
+    Parameters
+    ----------
+    xy : ndarray, shape (n, 2)
+    settings : ndarray, shape (n, SETTINGS)
+    keys, values : ndarray of float32, shape (blocks, heads, n, width)
+    """
+
+    xy: NDArray[np.float64]
+    settings: NDArray[np.float64]
+    keys: Array
+    values: Array
+
+    def part(self, index: NDArray[np.int64]) -> Memory:
+        """Return some of the samples."""
+        return Memory(self.xy[index], self.settings[index], self.keys[:, :, index], self.values[:, :, index])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FieldAnswer:
+    """The PSF at a place and settings.
+
+    Parameters
+    ----------
+    kernels : ndarray of float64, shape (3, SIDE, SIDE)
+        Of red, green and blue; non-negative, of sum 1, centre of mass in the middle.
+    error : ndarray of float64, shape (3,)
+        Expected relative L2 distance to the true kernels.
+    ring_error : ndarray of float64, shape (3, RINGS)
+        Expected r.m.s. error of the transfer function in each ring of frequency.
+    weights : ndarray of float64, shape (n,)
+        How much each sample counted, of sum 1: the mean over the attention of all blocks and heads.
+    """
+
+    kernels: NDArray[np.float64]
+    error: NDArray[np.float64]
+    ring_error: NDArray[np.float64]
+    weights: NDArray[np.float64]
+
+
+def _gelu(x: Array) -> Array:
+    return (0.5 * x * (1.0 + erf(x / np.float32(np.sqrt(2.0))))).astype(np.float32)
+
+
+def _softmax(x: Array, axis: int = -1) -> Array:
+    e = np.exp(x - x.max(axis, keepdims=True))
+    return e / e.sum(axis, keepdims=True)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FieldNetwork:
+    """Encoder and decoder with their weights; see the module.
+
+    Parameters
+    ----------
+    weights : mapping of str to ndarray of float32
+    provenance : mapping
+        Of the weights: code, seeds, population, figures.
+    name : str
+        Fingerprint of the weights.
+    """
+
+    weights: Mapping[str, Array]
+    provenance: Mapping[str, Any]
+    name: str
+
+    @classmethod
+    def load(cls) -> FieldNetwork:
+        """Return the network with the weights of the package; read once a process."""
+        return _packaged()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> FieldNetwork:
+        """Read weights: npz of float16 with a JSON text of their provenance, as `lab.population` writes.
+
+        Raises
+        ------
+        InvalidInputError
+            If they are of another network.
+        """
+        with np.load(BytesIO(data)) as stored:
+            provenance = json.loads(bytes(stored["provenance"]).decode())
+            weights = {n: stored[n].astype(np.float32) for n in stored.files if n != "provenance"}
+        if weights["mean"].shape != (LENGTH,):
+            raise InvalidInputError(
+                f"weights are of {weights['mean'].size} statistics, not {LENGTH}; train anew"
+            )
+        return cls(weights, provenance, sha256(data).hexdigest()[:12])
+
+    def _linear(self, name: str, x: Array) -> Array:
+        return x @ self.weights[name + ".weight"].T + self.weights[name + ".bias"]
+
+    def _normal(self, name: str, x: Array) -> Array:
+        centred = x - x.mean(-1, keepdims=True)
+        scale = np.sqrt(np.square(centred).mean(-1, keepdims=True) + np.float32(_LAYER_EPSILON))
+        return centred / scale * self.weights[name + ".weight"] + self.weights[name + ".bias"]
+
+    def _heads(self, x: Array) -> Array:
+        """(n, heads * width) to (heads, n, width)."""
+        heads = len(self.weights["decoder.0.nothing"])
+        return x.reshape(len(x), heads, -1).transpose(1, 0, 2)
+
+    def _keys(self, block: str, tokens: Array) -> tuple[Array, Array]:
+        both = self._linear(f"{block}.kv", self._normal(f"{block}.normal_memory", tokens))
+        key, value = np.split(both, 2, axis=-1)
+        return self._heads(key), self._heads(value)
+
+    def _block(self, block: str, x: Array, key: Array, value: Array, relation: Array) -> tuple[Array, Array]:
+        """Attention of x (q, d) to keys and values (heads, n, width), then two layers; and the attention."""
+        w = self.weights
+        query = self._heads(self._linear(f"{block}.q", self._normal(f"{block}.normal_query", x)))
+        score = query @ key.transpose(0, 2, 1) / np.float32(np.sqrt(query.shape[-1]))
+        directed = query @ w[f"{block}.relation_key"]  # (heads, q, RELATION)
+        score += np.einsum("hqf,qnf->hqn", directed, relation, optimize=True)
+        score -= np.einsum(
+            "qnf,fh->hqn", relation[..., :DISTANCES], np.abs(w[f"{block}.distance"]), optimize=True
+        )
+        nothing = np.broadcast_to(w[f"{block}.nothing"][:, None, None], (*score.shape[:2], 1))
+        attention = _softmax(np.concatenate([score, nothing], -1))[..., :-1]
+        taken = attention @ value
+        seen = np.einsum("hqn,qnf->hqf", attention, relation, optimize=True)
+        taken += seen @ w[f"{block}.relation_value"]
+        x = x + self._linear(f"{block}.out", taken.transpose(1, 0, 2).reshape(len(x), -1))
+        inner = _gelu(self._linear(f"{block}.inner", self._normal(f"{block}.normal_inner", x)))
+        return x + self._linear(f"{block}.outer", inner), attention
+
+    def _blocks(self, part: str) -> list[str]:
+        return sorted({".".join(name.split(".")[:2]) for name in self.weights if name.startswith(part + ".")})
+
+    def encode(
+        self, statistics: NDArray[np.floating], xy: NDArray[np.floating], conditions: Conditions
+    ) -> NDArray[np.float32]:
+        """Tokens of the patches of one photo.
+
+        Parameters
+        ----------
+        statistics : ndarray, shape (n, LENGTH)
+            Of `patch_statistics`, turned by `to_octant`.
+        xy : ndarray, shape (n, 2)
+            Places in half diagonals, x to the right, y upwards.
+        conditions : Conditions
+            Of the photo.
+
+        Returns
+        -------
+        ndarray of float32, shape (n, d)
+            In the order of the patches; that order does not matter to any of them.
+
+        Raises
+        ------
+        InvalidInputError
+            If shapes do not fit, or a value is not finite.
+        """
+        statistics, xy = np.asarray(statistics, np.float32), np.asarray(xy, np.float64)
+        if statistics.ndim != 2 or statistics.shape[1] != LENGTH or xy.shape != (len(statistics), 2):
+            raise InvalidInputError(
+                f"statistics must be (n, {LENGTH}) and places (n, 2), got {statistics.shape} and {xy.shape}"
+            )
+        if not (np.isfinite(statistics).all() and np.isfinite(xy).all()):
+            raise InvalidInputError("statistics and places must be finite; leave patches out that are not")
+        rows = np.broadcast_to(conditions.row(), (len(xy), conditions.row().size))
+        x = np.clip((statistics - self.weights["mean"]) / self.weights["spread"], -_CLAMP, _CLAMP)
+        x = np.concatenate([x, condition_features(rows), place_features(xy)], -1)
+        t = _gelu(self._linear("enter", x))
+        t = t + self._linear("widen.1", _gelu(self._linear("widen.0", self._normal("widen.normal", t))))
+        t = self._linear("narrow", self._normal("narrow.normal", t))
+        relation = relation_features(xy, rows, xy, rows)
+        for block in self._blocks("encoder"):
+            t, _ = self._block(block, t, *self._keys(block, t), relation)
+        return t
+
+    def memory(
+        self, tokens: NDArray[np.floating], xy: NDArray[np.floating], conditions: Sequence[Conditions]
+    ) -> Memory:
+        """Keys and values of samples of any photos; they do not depend on what will be asked.
+
+        Parameters
+        ----------
+        tokens : ndarray, shape (n, d)
+        xy : ndarray, shape (n, 2)
+        conditions : sequence of Conditions, n
+
+        Raises
+        ------
+        NoSamplesError
+            If there are none.
+        """
+        if not len(tokens):
+            raise NoSamplesError("no sample of the lens; calibrate it with photos first")
+        tokens = np.asarray(tokens, np.float32)
+        pairs = [self._keys(block, tokens) for block in self._blocks("decoder")]
+        rows = np.array([c.row() for c in conditions])
+        return Memory(
+            np.asarray(xy, np.float64), rows, np.stack([k for k, _ in pairs]), np.stack([v for _, v in pairs])
+        )
+
+    def query(self, memory: Memory, xy: NDArray[np.floating], conditions: Conditions) -> FieldAnswer:
+        """Answer at one place.
+
+        Parameters
+        ----------
+        memory : Memory
+        xy : ndarray, shape (2,)
+            Place in half diagonals, x to the right, y upwards.
+        conditions : Conditions
+            What is asked for.
+
+        Returns
+        -------
+        FieldAnswer
+        """
+        place, rows = np.asarray(xy, np.float64)[None], conditions.row()[None]
+        x = np.concatenate([place_features(place), condition_features(rows)], -1)
+        x = self._linear("ask.1", _gelu(self._linear("ask.0", x)))
+        relation = relation_features(place, rows, memory.xy, memory.settings)
+        weights = np.zeros(len(memory.xy))
+        for i, block in enumerate(self._blocks("decoder")):
+            x, attention = self._block(block, x, memory.keys[i], memory.values[i], relation)
+            weights += attention[:, 0].sum(0)
+        hidden = _gelu(self._linear("kernel.0", self._normal("kernel.normal", x)))
+        logits = self._linear("kernel.2", self._linear("kernel.1", hidden)).reshape(3, -1)
+        told = self._linear("error.1", _gelu(self._linear("error.0", self._normal("error.normal", x))))[0]
+        kernels = from_octant_image(int(octant_of(place)[0]), assembled(_softmax(logits)))
+        return FieldAnswer(
+            centred_kernels(kernels),
+            np.exp(told[:3]).astype(np.float64),
+            np.exp(told[3:]).reshape(3, RINGS).astype(np.float64),
+            weights / max(weights.sum(), 1e-30),
+        )
+
+
+def assembled(parts: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Kernels (..., SIDE, SIDE) of shares (..., FINE^2 + outer cells); cells are smoothed at borders."""
+    parts = np.asarray(parts, np.float64)
+    lead = parts.shape[:-1]
+    coarse = np.zeros((*lead, COARSE, COARSE))
+    coarse[..., outer_cells()] = parts[..., FINE * FINE :]
+    total = coarse.sum((-1, -2))
+    wide = np.repeat(np.repeat(coarse, BLOCK, -2), BLOCK, -1)
+    for axis in (-2, -1):
+        wide = wide + np.roll(wide, 1, axis) + np.roll(wide, -1, axis)
+    margin = (SIDE - FINE) // 2
+    inner = slice(margin, SIDE - margin)
+    wide[..., inner, inner] = 0.0
+    rest = wide.sum((-1, -2))
+    wide *= (total / np.maximum(rest, 1e-30))[..., None, None]
+    wide[..., inner, inner] = parts[..., : FINE * FINE].reshape(*lead, FINE, FINE)
+    whole: NDArray[np.float64] = wide / wide.sum((-1, -2), keepdims=True)
+    return whole
+
+
+def centred_kernels(kernels: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Kernels (..., n, n) with their centre of mass in the middle, shifted by linear interpolation.
+
+    The network is trained on centred kernels: what is left is a small part of a pixel.
+    """
+    moving: NDArray[np.float64] = np.asarray(kernels, np.float64)
+    at = np.arange(moving.shape[-1]) - moving.shape[-1] // 2
+    for axis, sums in ((-1, -2), (-2, -1)):
+        shift = -(moving.sum(sums) @ at)[..., None, None]
+        moved = np.where(shift > 0, np.roll(moving, 1, axis), np.roll(moving, -1, axis))
+        part = np.clip(np.abs(shift), 0.0, 1.0)
+        moving = (1 - part) * moving + part * moved
+    return moving
+
+
+@cache
+def _packaged() -> FieldNetwork:
+    return FieldNetwork.from_bytes(_WEIGHTS.read_bytes())

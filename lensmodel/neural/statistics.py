@@ -1,0 +1,276 @@
+"""What one patch of a photo tells about the blur, as numbers that the network reads.
+
+Scenes have power spectra that fall as a power law, and edges that are steps; a lens bends both. The numbers
+are, for the samples of each colour in the mosaic, the logarithm of the noise-corrected power spectrum in
+rings and directions, and for interpolated green how the gradient across edges correlates with itself along
+eight directions. The correlation of its third and seventh power with itself belongs to the strongest edges,
+is signed (a halo is negative) and differs between the two sides of an edge where the PSF is one-sided
+(coma).
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from lensmodel.core.jit import jit
+from lensmodel.core.types import Plane
+from lensmodel.neural.symmetry import DIRECTIONS, direction_order, octant_of
+
+WINDOW: Final = 128
+"""Pixels: side of a patch; holds several times the widest kernel, and little of the field (chosen)."""
+
+_RINGS: Final = (
+    0.022, 0.04, 0.056, 0.075, 0.1, 0.128, 0.158, 0.19, 0.225, 0.265, 0.31, 0.36, 0.43,
+)  # fmt: skip
+"""Edges of rings, cycles/pixel: from three periods in a window to where green of a Bayer mosaic still
+tells."""
+_GREEN_RINGS, _COLOUR_RINGS, _LOW_RINGS = 12, 9, 2
+_SHIFTS: Final = (1, 2, 3, 4, 6, 9, 13)  # pixels between correlated gradients
+_POWERS: Final = 3  # first (of magnitudes), third and seventh (signed)
+_HALF: Final = DIRECTIONS // 2
+_FLOOR: Final = 0.1  # of the noise power: least power that is left when the noise is taken away (chosen)
+_TINY: Final = 1e-12
+
+_SIZES: Final = {
+    "red": _COLOUR_RINGS * _HALF,
+    "green": _GREEN_RINGS * _HALF,
+    "blue": _COLOUR_RINGS * _HALF,
+    "magnitude": len(_SHIFTS) * _HALF,
+    "cubed_even": len(_SHIFTS) * _HALF,
+    "cubed_odd": len(_SHIFTS) * _HALF,
+    "seventh_even": len(_SHIFTS) * _HALF,
+    "seventh_odd": len(_SHIFTS) * _HALF,
+    "kurtosis": 3 * _HALF,
+    "level": 6,
+}
+"""Groups of numbers in their order; all but `level` have eight directions fastest."""
+
+LENGTH: Final = sum(_SIZES.values())
+
+
+def group(name: str) -> slice:
+    """Where a group of numbers lies."""
+    names = list(_SIZES)
+    start = sum(_SIZES[n] for n in names[: names.index(name)])
+    return slice(start, start + _SIZES[name])
+
+
+def _bins() -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Ring and direction of each frequency of `rfft2` (-1: none), and how many fall into each."""
+    fx = scipy.fft.rfftfreq(WINDOW)[None]
+    fy = -scipy.fft.fftfreq(WINDOW)[:, None]  # upwards
+    radius = np.hypot(fx, fy)
+    direction = np.round(np.arctan2(fy, fx) / (np.pi / _HALF)).astype(int) % _HALF
+    ring = np.digitize(radius, _RINGS) - 1
+    inside = (ring >= 0) & (ring < _GREEN_RINGS) & ((fx > 0) | (fy > 0))  # each pair of f and -f once
+    index = np.where(inside, ring * _HALF + direction, -1).astype(np.int32)
+    count = np.bincount(index[inside], minlength=_GREEN_RINGS * _HALF).astype(np.float32)
+    return index, count
+
+
+_BIN, _COUNT = _bins()
+_HANN: Final = np.outer(np.hanning(WINDOW), np.hanning(WINDOW)).astype(np.float32)
+
+
+@jit
+def _ring_means(
+    spectrum: NDArray[np.complex64], index: NDArray[np.int32], count: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Mean of |F|^2 in each bin."""
+    total = np.zeros(count.size, np.float64)
+    for i in range(index.shape[0]):
+        for j in range(index.shape[1]):
+            k = index[i, j]
+            if k >= 0:
+                value = spectrum[i, j]
+                total[k] += value.real * value.real + value.imag * value.imag
+    return (total / count).astype(np.float32)
+
+
+@jit
+def _green_everywhere(mosaic: Plane, colours: NDArray[np.int8]) -> Plane:
+    """Green at every pixel but those of the border: its sample, else the mean of green neighbours."""
+    rows, cols = mosaic.shape
+    green = np.zeros((rows, cols), np.float32)
+    for i in range(1, rows - 1):
+        for j in range(1, cols - 1):
+            if colours[i, j] == 1:
+                green[i, j] = mosaic[i, j]
+                continue
+            total, count = np.float32(0), 0
+            for di, dj in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+                if colours[i + di, j + dj] == 1:
+                    total += mosaic[i + di, j + dj]
+                    count += 1
+            green[i, j] = total / max(count, 1)
+    return green
+
+
+@jit
+def _edge_correlations(
+    green: Plane, cosines: NDArray[np.float32], sines: NDArray[np.float32],
+    dx: NDArray[np.int64], dy: NDArray[np.int64],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
+    """Correlations (direction, shift, power, side) and kurtoses (direction, 3) of the gradient of green.
+
+    c_p(d) = <|g|^p s g(x + d)> / <|g|^(p+1)> with s the sign of g: p = 1 of magnitudes, 3 and 7 signed; the
+    gradient g is across edges of one direction, by Sobel differences; rows grow downwards, y upwards.
+    """
+    rows, cols = green.shape
+    reach = 13
+    directions, shifts = cosines.size, dx.shape[1]
+    gx = np.zeros((rows, cols), np.float32)
+    gy = np.zeros((rows, cols), np.float32)
+    for i in range(2, rows - 2):
+        for j in range(2, cols - 2):
+            gx[i, j] = (
+                0.5 * (green[i, j + 1] - green[i, j - 1])
+                + 0.25 * (green[i - 1, j + 1] - green[i - 1, j - 1])
+                + 0.25 * (green[i + 1, j + 1] - green[i + 1, j - 1])
+            )
+            gy[i, j] = (
+                0.5 * (green[i - 1, j] - green[i + 1, j])
+                + 0.25 * (green[i - 1, j - 1] - green[i + 1, j - 1])
+                + 0.25 * (green[i - 1, j + 1] - green[i + 1, j + 1])
+            )
+    low, high_row, high_col = reach + 2, rows - reach - 2, cols - reach - 2
+    out = np.zeros((directions, shifts, 3, 2), np.float32)
+    kurtosis = np.zeros((directions, 3), np.float32)
+    g = np.zeros((rows, cols), np.float32)
+    third = np.zeros((rows, cols), np.float32)
+    seventh = np.zeros((rows, cols), np.float32)
+    for k in range(directions):
+        c, s = cosines[k], sines[k]
+        m1, m2, m4, m8 = np.float64(0), np.float64(0), np.float64(0), np.float64(0)
+        for i in range(2, rows - 2):
+            for j in range(2, cols - 2):
+                g[i, j] = c * gx[i, j] + s * gy[i, j]
+        largest = np.float32(1e-9)
+        for i in range(low, high_row):
+            for j in range(low, high_col):
+                largest = max(largest, abs(g[i, j]))
+        for i in range(2, rows - 2):
+            for j in range(2, cols - 2):
+                g[i, j] /= largest
+        for i in range(low, high_row):
+            for j in range(low, high_col):
+                v = g[i, j]
+                v2 = v * v
+                third[i, j] = v2 * v
+                seventh[i, j] = v2 * v2 * v2 * v
+                m1 += abs(v)
+                m2 += v2
+                m4 += v2 * v2
+                m8 += v2 * v2 * v2 * v2
+        count = (high_row - low) * (high_col - low)
+        m2, m4, m8 = m2 + 1e-12, m4 + 1e-12, m8 + 1e-12
+        kurtosis[k, 0] = np.log(m4 * count / (m2 * m2))
+        kurtosis[k, 1] = np.log(m2 * count / (m1 * m1 + 1e-12))
+        kurtosis[k, 2] = np.log(m8 * count / (m4 * m4))
+        for d in range(shifts):
+            for side in range(2):
+                sign = 1 - 2 * side
+                right, up = sign * dx[k, d], sign * dy[k, d]
+                a, b, e = np.float64(0), np.float64(0), np.float64(0)
+                for i in range(low, high_row):
+                    ra, rb, re = np.float32(0), np.float32(0), np.float32(0)
+                    for j in range(low, high_col):
+                        v = g[i - up, j + right]
+                        ra += abs(g[i, j]) * abs(v)
+                        rb += third[i, j] * v
+                        re += seventh[i, j] * v
+                    a += ra
+                    b += rb
+                    e += re
+                out[k, d, 0, side] = a / m2
+                out[k, d, 1, side] = b / m4
+                out[k, d, 2, side] = e / m8
+    return out, kurtosis
+
+
+_ANGLES: Final = np.arange(_HALF) * np.pi / _HALF
+_COSINES: Final = np.cos(_ANGLES).astype(np.float32)
+_SINES: Final = np.sin(_ANGLES).astype(np.float32)
+_DX: Final = np.round(np.outer(np.cos(_ANGLES), _SHIFTS)).astype(np.int64)
+_DY: Final = np.round(np.outer(np.sin(_ANGLES), _SHIFTS)).astype(np.int64)
+
+
+def patch_statistics(
+    mosaic: Plane, colours: NDArray[np.int8], read: float, shot: float
+) -> NDArray[np.float32]:
+    """Statistics of a patch, in the frame of the image.
+
+    Parameters
+    ----------
+    mosaic : Plane, float32, shape (WINDOW, WINDOW)
+        Samples of a mosaic in linear light, black 0, white 1. Planes of a developed photo are sampled by a
+        mosaic first, so that one kind of input serves all files.
+    colours : ndarray of int8, shape (WINDOW, WINDOW)
+        Colour of each sample: 0 red, 1 green, 2 blue.
+    read, shot : float
+        The variance of the noise is read^2 + shot * value.
+
+    Returns
+    -------
+    ndarray of float32, shape (LENGTH,)
+        Finite for every finite input.
+    """
+    powers, level = [], []
+    for colour, rings in ((0, _COLOUR_RINGS), (1, _GREEN_RINGS), (2, _COLOUR_RINGS)):
+        mask = (colours == colour).astype(np.float32)
+        weight = _HANN * mask
+        mean = float((mosaic * mask).sum() / max(float(mask.sum()), 1.0))
+        middle = float((mosaic * weight).sum() / max(float(weight.sum()), _TINY))
+        spectrum = scipy.fft.rfft2((mosaic - np.float32(middle)) * weight)
+        noise = float((_HANN * weight).sum()) * (read * read + shot * max(mean, 0.0)) + _TINY
+        power = np.maximum(_ring_means(spectrum, _BIN, _COUNT) - noise, 0.0) + _FLOOR * noise
+        log_power = np.log(power)
+        low = float(np.log(power[: _LOW_RINGS * _HALF].mean()))
+        powers.append(log_power[: rings * _HALF] - low)
+        level += [np.log(noise) - low, 0.5 * low - np.log(max(mean, 0.0) + 1e-3) - 3.0]
+    sides, kurtosis = _edge_correlations(_green_everywhere(mosaic, colours), _COSINES, _SINES, _DX, _DY)
+    even, odd = 0.5 * (sides[..., 0] + sides[..., 1]), sides[..., 0] - sides[..., 1]
+    edges = [even[..., 0], even[..., 1], odd[..., 1], even[..., 2], odd[..., 2], kurtosis]
+    return np.concatenate([*powers, *(edge.T.ravel() for edge in edges), np.array(level)]).astype(np.float32)
+
+
+def to_octant(statistics: NDArray[np.float32], xy: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Turn statistics into the frame of the octant of their place.
+
+    Parameters
+    ----------
+    statistics : ndarray of float32, shape (n, LENGTH)
+        As `patch_statistics` gives them.
+    xy : ndarray of float, shape (n, 2)
+        Places in half diagonals, x to the right, y upwards.
+
+    Returns
+    -------
+    ndarray of float32, shape (n, LENGTH)
+    """
+    octants = octant_of(np.asarray(xy))
+    out = np.empty_like(statistics)
+    for octant in np.unique(octants):
+        index, sign = _order(int(octant))
+        out[octants == octant] = statistics[octants == octant][:, index] * sign
+    return out
+
+
+def _order(octant: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Where each number is found in the frame of the image, and its sign there."""
+    found = direction_order(octant)[:_HALF]
+    place, sign = found % _HALF, np.where(found < _HALF, 1.0, -1.0)
+    index, signs = np.arange(LENGTH), np.ones(LENGTH, np.float32)
+    for name, size in _SIZES.items():
+        if name == "level":
+            continue
+        part = group(name)
+        rows = size // _HALF
+        index[part] = (part.start + np.arange(rows)[:, None] * _HALF + place).ravel()
+        if name.endswith("_odd"):
+            signs[part] = np.tile(sign, rows)
+    return index, signs

@@ -55,6 +55,7 @@ class CorrectionOptions:
     force: bool
     sidecar: bool = False
     least_gain_db: float | None = None
+    keep_location: bool = False
 
 
 def run(
@@ -176,6 +177,7 @@ def correct_one(
         file_format=options.file_format,
         least_gain_db=options.least_gain_db,
         sidecar=options.sidecar,
+        keep_location=options.keep_location,
         workers=options.workers,
         on_step=on_step,
     )

@@ -228,6 +228,9 @@ def correct(
             "which lens.",
         ),
     ] = False,
+    keep_location: Annotated[
+        bool, typer.Option("--keep-location", help="Keep where the photo was taken (GPS); default: left out.")
+    ] = False,
     aperture: Aperture = None,
     workers: Workers = None,
     any_lens: AnyLens = False,
@@ -272,6 +275,7 @@ def correct(
         any_lens=any_lens,
         force=force,
         sidecar=sidecar,
+        keep_location=keep_location,
     )
     if server is not None:
         if profile is not None:

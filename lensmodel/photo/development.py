@@ -10,6 +10,7 @@ import numpy as np
 from lensmodel.core.errors import UnreadablePhotoError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import NoiseModel, Planes
+from lensmodel.photo import opcodes
 from lensmodel.photo.colour import CODES, curves_of, decode, icc_space, matrix_profile
 from lensmodel.photo.headers.header import Header
 from lensmodel.photo.headers.opening import opened_header
@@ -85,6 +86,9 @@ def _develop_raw(path: Path, header: Header, info: PhotoInfo, demosaic: Demosaic
     metadata, binned = info.metadata, max(round(info.width / width), 1)
     if metadata.pixel_pitch_um is not None:
         metadata = replace(metadata, pixel_pitch_um=binned * metadata.pixel_pitch_um)
+    # LibRaw has done the steps of a lossy DNG, without which its numbers mean nothing
+    steps = [] if header.coarseness else opcodes.read(header.opcodes_2)
+    kept, lost = (steps, []) if raw.pipeline.startswith("raw/none") else opcodes.demosaiced(steps, raw.cfa)
     encoding = Encoding(
         bit_depth=raw.bits,
         metadata=metadata.without_serials(),
@@ -92,6 +96,8 @@ def _develop_raw(path: Path, header: Header, info: PhotoInfo, demosaic: Demosaic
         to_srgb=raw.to_srgb,
         xyz_to_camera=raw.xyz_to_camera,
         baseline_exposure=baseline_exposure_of(header),
+        opcodes_2=opcodes.written(kept),
+        opcodes_3=opcodes.written(opcodes.read(header.opcodes_3)),
     )
     return LinearPhoto(
         planes=raw.planes,
@@ -106,6 +112,7 @@ def _develop_raw(path: Path, header: Header, info: PhotoInfo, demosaic: Demosaic
         coding_noise=_coding_noise(raw.planes, header.coarseness),
         cfa=raw.cfa,
         grain=(1.0, 1.0, 1.0) if raw.sensor_noise is not None else _grain(raw.planes, raw.noise, raw.clip),
+        remarks=tuple(f"its {step.name} is for the mosaic only and is dropped" for step in lost),
     )
 
 

@@ -1,26 +1,33 @@
 """Write DNG: a Bayer mosaic as a camera would, and a linear image for any raw converter.
 
-A small TIFF writer of our own, because the general ones do not write the EXIF directory that says
-which lens a photo was taken with. Sources: Adobe, "Digital Negative (DNG) Specification" 1.4,
-2012; TIFF revision 6.0, 1992; CIPA DC-008 (Exif 2.32), 2019.
+Source: Adobe, "Digital Negative (DNG) Specification" 1.4, 2012, and 1.6, 2021.
 """
 
 from __future__ import annotations
 
 import math
-import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from fractions import Fraction
 from pathlib import Path
-from typing import Final
+from typing import BinaryIO, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import atomic
+from lensmodel.photo.tags.exif_block import (
+    BYTE,
+    EXIF_POINTER,
+    GPS_POINTER,
+    UNDEFINED,
+    Directory,
+    exif_directory,
+    laid_out,
+    main_directory,
+)
+from lensmodel.photo.values import LensIdentity, PhotoMetadata
 
 BAYER_PATTERNS: Final = ("RGGB", "BGGR", "GRBG", "GBRG")
 
@@ -31,13 +38,8 @@ XYZ_TO_SRGB: Final = (
 )
 """CIE XYZ (D65) to linear sRGB, IEC 61966-2-1."""
 
-# Types of TIFF 6.0, section 2, and their bytes.
-_BYTE, _ASCII, _SHORT, _LONG, _RATIONAL, _UNDEFINED, _SRATIONAL = 1, 2, 3, 4, 5, 7, 10
-_SIZES: Final = {_BYTE: 1, _ASCII: 1, _SHORT: 2, _LONG: 4, _RATIONAL: 8, _UNDEFINED: 1, _SRATIONAL: 8}
-
-_EXIF_IFD: Final = 34665  # tag, Exif 2.32, section 4.6.3
 _STRIP_OFFSETS: Final = 273  # tag, TIFF 6.0, section 8
-_MAX_UINT32: Final = 2**32 - 1  # largest number of a LONG
+_OPCODE_LISTS: Final = (51009, 51022)  # OpcodeList2 and 3: DNG 1.6, chapter 7
 _CFA, _LINEAR_RAW = 32803, 34892  # PhotometricInterpretation of TIFF/EP and of DNG 1.6, chapter 3
 _D65: Final = 21  # CalibrationIlluminant1 of DNG 1.6, chapter 4, in the numbers of Exif's LightSource
 
@@ -72,10 +74,12 @@ class ShotInfo:
         Written as the focal plane resolution.
     orientation : int
         EXIF orientation, 1 to 8.
-    software, description : str
-        Free texts.
+    description : str
+        Free text.
     baseline_exposure : float or None
         Stops by which a raw converter is asked to brighten the picture.
+    artist, copyright : str or None
+    rating : int or None
     """
 
     camera_maker: str = ""
@@ -94,9 +98,11 @@ class ShotInfo:
     taken_at: datetime | None = None
     pixel_pitch_um: float | None = None
     orientation: int = 1
-    software: str = "lensmodel"
     description: str = ""
     baseline_exposure: float | None = None
+    artist: str | None = None
+    copyright: str | None = None
+    rating: int | None = None
 
     def __post_init__(self) -> None:
         if self.orientation not in range(1, 9):
@@ -107,6 +113,25 @@ class ShotInfo:
                 raise InvalidInputError(f"{name} must be positive or None, got {value}")
         if self.focus_m is not None and not self.focus_m > 0:
             raise InvalidInputError(f"focus_m must be positive metres or None, got {self.focus_m}")
+
+    @property
+    def metadata(self) -> PhotoMetadata:
+        """What is written of it into any file."""
+        return PhotoMetadata(
+            camera_maker=self.camera_maker,
+            camera_model=self.camera_model,
+            lens=LensIdentity(self.lens_maker, self.lens_model),
+            aperture=self.aperture,
+            focal_mm=self.focal_mm,
+            focus_m=self.focus_m,
+            iso=self.iso,
+            exposure_s=self.exposure_s,
+            taken_at=self.taken_at,
+            pixel_pitch_um=self.pixel_pitch_um,
+            artist=self.artist,
+            copyright=self.copyright,
+            rating=self.rating,
+        )
 
 
 def write_bayer_dng(
@@ -150,15 +175,15 @@ def write_bayer_dng(
         raise InvalidInputError(f"pattern must be one of {', '.join(BAYER_PATTERNS)}, got {pattern!r}")
     shot = shot or ShotInfo()
     colours = bytes("RGB".index(letter) for letter in pattern)
-    tags = _Directory(_common_tags(mosaic.shape[0], mosaic.shape[1], 1, _CFA, shot))
+    tags = _common_tags(1, _CFA, shot)
     tags.shorts(33421, 2, 2)  # CFARepeatPatternDim
-    tags.raw(33422, _BYTE, colours)  # CFAPattern
-    tags.raw(50710, _BYTE, b"\x00\x01\x02")  # CFAPlaneColor: red, green, blue
+    tags.raw(33422, BYTE, colours)  # CFAPattern
+    tags.raw(50710, BYTE, b"\x00\x01\x02")  # CFAPlaneColor: red, green, blue
     tags.shorts(50711, 1)  # CFALayout: rectangular
     _colour_tags(
         tags, 1, black=black, white=white, color_matrix=color_matrix, as_shot_neutral=as_shot_neutral
     )
-    _write(Path(path), tags, _exif(shot), mosaic)
+    _write(Path(path), tags, {EXIF_POINTER: _exif(shot)}, mosaic)
 
 
 def write_linear_dng(
@@ -170,6 +195,9 @@ def write_linear_dng(
     as_shot_neutral: Sequence[float] = (1.0, 1.0, 1.0),
     shot: ShotInfo | None = None,
     xmp: bytes = b"",
+    opcodes_2: bytes = b"",
+    opcodes_3: bytes = b"",
+    gps: Directory | None = None,
 ) -> None:
     """Write a demosaiced linear image as a DNG (LinearRaw); the file appears whole or not at all.
 
@@ -184,6 +212,10 @@ def write_linear_dng(
         See `write_bayer_dng`.
     xmp : bytes
         A packet to put in.
+    opcodes_2, opcodes_3 : bytes
+        What raw converters are to do with the linear image, and with the developed one.
+    gps : Directory, optional
+        Where it was taken.
 
     Raises
     ------
@@ -193,97 +225,27 @@ def write_linear_dng(
     if planes.ndim != 3 or planes.shape[0] != 3 or planes.dtype != np.uint16:
         raise InvalidInputError(f"planes are uint16 of shape (3, H, W), got {planes.dtype} {planes.shape}")
     shot = shot or ShotInfo()
-    tags = _Directory(_common_tags(planes.shape[1], planes.shape[2], 3, _LINEAR_RAW, shot))
+    tags = _common_tags(3, _LINEAR_RAW, shot)
     _colour_tags(tags, 3, black=0, white=white, color_matrix=color_matrix, as_shot_neutral=as_shot_neutral)
     if xmp:
-        tags.raw(700, _BYTE, xmp)
-    _write(Path(path), tags, _exif(shot), planes.transpose(1, 2, 0))
+        tags.raw(700, BYTE, xmp)
+    for tag, opcodes in zip(_OPCODE_LISTS, (opcodes_2, opcodes_3), strict=True):
+        if opcodes:
+            tags.raw(tag, UNDEFINED, opcodes)
+    below = {EXIF_POINTER: _exif(shot), GPS_POINTER: gps or Directory()}
+    _write(Path(path), tags, below, planes.transpose(1, 2, 0))
 
 
-class _Directory:
-    """Entries of one image file directory, by tag."""
-
-    def __init__(self, other: _Directory | None = None) -> None:
-        self.entries: dict[int, tuple[int, bytes]] = dict(other.entries) if other else {}
-
-    def raw(self, tag: int, kind: int, data: bytes) -> None:
-        self.entries[tag] = (kind, data)
-
-    def shorts(self, tag: int, *values: int) -> None:
-        self.raw(tag, _SHORT, struct.pack(f"<{len(values)}H", *values))
-
-    def longs(self, tag: int, *values: int) -> None:
-        self.raw(tag, _LONG, struct.pack(f"<{len(values)}I", *values))
-
-    def text(self, tag: int, value: str) -> None:
-        """Texts are ASCII by the standard; what does not fit becomes a question mark."""
-        if value:
-            self.raw(tag, _ASCII, value.encode("ascii", "replace") + b"\x00")
-
-    def rationals(self, tag: int, *values: float | None) -> None:
-        parts = [_rational(value) for value in values if value is not None]
-        if len(parts) == len(values):
-            self.raw(tag, _RATIONAL, b"".join(struct.pack("<2I", *part) for part in parts))
-
-    def signed_rationals(self, tag: int, values: Sequence[float]) -> None:
-        parts = [Fraction(float(value)).limit_denominator(1_000_000) for value in values]
-        self.raw(
-            tag, _SRATIONAL, b"".join(struct.pack("<2i", part.numerator, part.denominator) for part in parts)
-        )
-
-    def size(self) -> int:
-        return 2 + 12 * len(self.entries) + 4
-
-    def packed(self, offset: int) -> bytes:
-        """Directory that starts at `offset` of the file, its longer values right behind it."""
-        position = offset + self.size()
-        head, tail = [struct.pack("<H", len(self.entries))], b""
-        for tag in sorted(self.entries):
-            kind, data = self.entries[tag]
-            count = len(data) // _SIZES[kind]
-            if len(data) <= 4:
-                field = data.ljust(4, b"\x00")
-            else:
-                tail += b"\x00" * (len(tail) % 2)  # values begin on a word boundary
-                field = struct.pack("<I", position + len(tail))
-                tail += data
-            head.append(struct.pack("<HHI", tag, kind, count) + field)
-        return b"".join(head) + struct.pack("<I", 0) + tail
-
-
-def _rational(value: float) -> tuple[int, int]:
-    if math.isinf(value):
-        return _MAX_UINT32, 1  # Exif 2.32: a distance of infinity
-    for largest in (1_000_000, 10_000, 100, 1):
-        part = Fraction(value).limit_denominator(largest)
-        if part.numerator <= _MAX_UINT32:
-            return part.numerator, part.denominator
-    raise InvalidInputError(f"{value} does not fit a TIFF rational")
-
-
-def _common_tags(height: int, width: int, samples: int, photometric: int, shot: ShotInfo) -> _Directory:
-    tags = _Directory()
+def _common_tags(samples: int, photometric: int, shot: ShotInfo) -> Directory:
+    tags = main_directory(shot.metadata, shot.orientation, shot.description)
     tags.longs(254, 0)  # NewSubfileType: the full image
-    tags.longs(256, width)
-    tags.longs(257, height)
     tags.shorts(258, *(16,) * samples)
     tags.shorts(259, 1)  # not compressed
     tags.shorts(262, photometric)
-    tags.text(270, shot.description)
-    tags.text(271, shot.camera_maker)
-    tags.text(272, shot.camera_model)
-    tags.longs(_STRIP_OFFSETS, 0)
-    tags.shorts(274, shot.orientation)
     tags.shorts(277, samples)
-    tags.longs(278, height)  # one strip
-    tags.longs(279, height * width * samples * 2)
     tags.shorts(284, 1)  # interleaved
-    tags.text(305, shot.software)
-    if shot.taken_at is not None:
-        tags.text(306, shot.taken_at.strftime("%Y:%m:%d %H:%M:%S"))
-    tags.longs(_EXIF_IFD, 0)
-    tags.raw(50706, _BYTE, bytes((1, 4, 0, 0)))  # DNGVersion
-    tags.raw(50707, _BYTE, bytes((1, 1, 0, 0)))  # DNGBackwardVersion
+    tags.raw(50706, BYTE, bytes((1, 4, 0, 0)))  # DNGVersion
+    tags.raw(50707, BYTE, bytes((1, 1, 0, 0)))  # DNGBackwardVersion
     # Most models carry their maker already; programs look cameras up by this name.
     named = shot.camera_model.lower().startswith(shot.camera_maker.lower())
     unique = shot.camera_model if named else f"{shot.camera_maker} {shot.camera_model}"
@@ -295,7 +257,7 @@ def _common_tags(height: int, width: int, samples: int, photometric: int, shot: 
 
 
 def _colour_tags(
-    tags: _Directory,
+    tags: Directory,
     samples: int,
     *,
     black: int,
@@ -318,41 +280,41 @@ def _colour_tags(
     tags.shorts(50778, _D65)  # CalibrationIlluminant1
 
 
-def _exif(shot: ShotInfo) -> _Directory:
-    tags = _Directory()
-    tags.raw(0x9000, _UNDEFINED, b"0232")  # ExifVersion
-    tags.rationals(0x829A, shot.exposure_s)
-    tags.rationals(0x829D, shot.aperture)
-    if shot.iso is not None:
-        tags.shorts(0x8827, min(shot.iso, 65535))
-    if shot.taken_at is not None:
-        tags.text(0x9003, shot.taken_at.strftime("%Y:%m:%d %H:%M:%S"))
-    tags.rationals(0x9206, shot.focus_m)
-    tags.rationals(0x920A, shot.focal_mm)
-    if shot.pixel_pitch_um is not None:
-        per_cm = 10_000.0 / shot.pixel_pitch_um
-        tags.rationals(0xA20E, per_cm)  # FocalPlaneXResolution
-        tags.rationals(0xA20F, per_cm)
-        tags.shorts(0xA210, 3)  # per centimetre
+def _exif(shot: ShotInfo) -> Directory:
+    tags = exif_directory(shot.metadata)
     tags.text(0xA431, shot.body_serial)
     if shot.focal_range_mm is not None:
         tags.rationals(0xA432, *shot.focal_range_mm, *(shot.widest_aperture or (0.0, 0.0)))
-    tags.text(0xA433, shot.lens_maker)
-    tags.text(0xA434, shot.lens_model)
     tags.text(0xA435, shot.lens_serial)
     return tags
 
 
-def _write(path: Path, tags: _Directory, exif: _Directory, pixels: NDArray[np.uint16]) -> None:
-    start = 8
-    exif_at = start + len(tags.packed(start))
-    exif_at += exif_at % 2
-    tags.longs(_EXIF_IFD, exif_at)
-    pixels_at = exif_at + len(exif.packed(exif_at))
-    pixels_at += -pixels_at % 16
-    tags.longs(_STRIP_OFFSETS, pixels_at)
-    head = (struct.pack("<2sHI", b"II", 42, start) + tags.packed(start)).ljust(exif_at, b"\x00")
-    head = (head + exif.packed(exif_at)).ljust(pixels_at, b"\x00")
+def _write(path: Path, tags: Directory, below: Mapping[int, Directory], pixels: NDArray[np.uint16]) -> None:
     with atomic(path) as file:
-        file.write(head)
-        file.write(np.ascontiguousarray(pixels).astype("<u2", copy=False).data)
+        write_strip(file, tags, below, pixels)
+
+
+def write_strip(
+    file: BinaryIO, tags: Directory, below: Mapping[int, Directory], pixels: NDArray[np.generic]
+) -> None:
+    """Write a TIFF structure and the pixels that it describes, as one strip that is not compressed.
+
+    Parameters
+    ----------
+    tags : Directory
+        All of the picture but size and place of the strip, and pointers.
+    below
+        As `laid_out` takes it.
+    pixels : ndarray, shape (H, W) or (H, W, samples)
+    """
+    height, width = pixels.shape[:2]
+    tags.longs(256, width)
+    tags.longs(257, height)
+    tags.longs(278, height)
+    tags.longs(279, pixels.nbytes)
+    tags.longs(_STRIP_OFFSETS, 0)
+    at = len(laid_out(tags, below))
+    at += -at % 16
+    tags.longs(_STRIP_OFFSETS, at)
+    file.write(laid_out(tags, below).ljust(at, b"\0"))
+    file.write(np.ascontiguousarray(pixels).astype(pixels.dtype.newbyteorder("<"), copy=False).data)

@@ -103,6 +103,11 @@ class PhotoMetadata:
         EXIF orientation 1 to 8; the planes are always in sensor orientation, whatever it says.
     pixel_pitch_um : float or None
         Pitch of the pixels of this file in micrometres.
+    artist, copyright : str or None
+        Who made it, and who holds which rights.
+    rating : int or None
+        Stars 0 to 5, or -1 for rejected.
+    keywords : tuple of str
     """
 
     camera_maker: str | None = None
@@ -117,6 +122,10 @@ class PhotoMetadata:
     taken_at: datetime | None = None
     orientation: int = 1
     pixel_pitch_um: float | None = None
+    artist: str | None = None
+    copyright: str | None = None
+    rating: int | None = None
+    keywords: tuple[str, ...] = ()
 
     def without_serials(self) -> PhotoMetadata:
         """Return the same without the serials of body and lens, which are personal data.
@@ -171,6 +180,8 @@ class Encoding:
         CIE XYZ (D65) to camera RGB, for DNG output.
     baseline_exposure : float or None
         Stops by which a DNG asks raw converters to brighten it; `None` where the file does not say.
+    opcodes_2, opcodes_3 : bytes
+        What a DNG asks raw converters to do with a linear image of three colours, and with the developed one.
     """
 
     bit_depth: int = 8
@@ -181,6 +192,8 @@ class Encoding:
     to_srgb: Matrix3 | None = None
     xyz_to_camera: Matrix3 | None = None
     baseline_exposure: float | None = None
+    opcodes_2: bytes = b""
+    opcodes_3: bytes = b""
 
     @property
     def orientation(self) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import struct
 import zlib
 from collections.abc import Callable, Mapping
@@ -12,13 +11,13 @@ from typing import Any, BinaryIO, Final, TypeAlias, get_args
 
 import imagecodecs
 import numpy as np
-import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import atomic
 from lensmodel.core.types import Planes
+from lensmodel.photo import opcodes
 from lensmodel.photo.colour import (
     D65_TO_D50,
     SRGB_TO_XYZ_D65,
@@ -33,9 +32,17 @@ from lensmodel.photo.colour import (
     matrix_profile,
     named_profile,
 )
-from lensmodel.photo.dng import ShotInfo, write_linear_dng
-from lensmodel.photo.headers.ifd import TiffReader
-from lensmodel.photo.tags import exif_block
+from lensmodel.photo.dng import ShotInfo, write_linear_dng, write_strip
+from lensmodel.photo.tags.exif_block import (
+    BYTE,
+    EXIF_POINTER,
+    GPS_POINTER,
+    UNDEFINED,
+    Directory,
+    exif_block,
+    exif_directory,
+    main_directory,
+)
 from lensmodel.photo.tags.xmp_block import xmp_packet
 from lensmodel.photo.values import ColorSpace, Encoding, OutputFormat, remarks_log
 
@@ -46,7 +53,7 @@ _PNG_OPTIONS: Final = {"level": 2, "strategy": 3, "filter": 128}
 """Paeth filter and run lengths: on photos as small as the default search, three times faster."""
 
 XMP_TAG: Final = 700  # XMP specification, part 3
-_PLACE_OF_POINTER: Final = exif_block.EXIF_POINTER - 1  # keeps the pointer's place among the ascending tags
+ICC_TAG: Final = 34675  # ICC.1:2022, annex B.4
 
 Pixels: TypeAlias = NDArray[Any]
 """Numbers of a file, `(row, col, channel)`, uint8 or uint16."""
@@ -72,11 +79,12 @@ def write_image(
     quality: int = 95,
     description: str = "",
     lens: str = "",
+    gps: Directory | None = None,
 ) -> None:
     """Write planes as a file that shows the picture as its input did.
 
-    The file appears complete or not at all. It carries an ICC profile, and of the metadata
-    camera, lens, exposure and time; never GPS, maker notes or serials.
+    The file appears complete or not at all. It carries an ICC profile, and of the metadata camera, lens,
+    exposure, time, maker, rights, rating and keywords; never maker notes or serials.
 
     Parameters
     ----------
@@ -100,6 +108,8 @@ def write_image(
         Text for the file's description tag, and for the history of its XMP packet.
     lens : str
         What the owner calls the lens; by default the packet names it as the photo does.
+    gps : Directory, optional
+        Where it was taken, as `location.gps_directory` reads it: kept only where its owner wants it.
 
     Raises
     ------
@@ -117,8 +127,19 @@ def write_image(
         raise InvalidInputError(f"JPEG quality must lie in 1..100, got {quality}")
     xmp = xmp_packet(encoding.metadata, description, lens)
     if format == "dng":
-        _write_dng(Path(path), planes, encoding, description, xmp)
+        _write_dng(Path(path), planes, encoding, description, xmp, gps)
         return
+    if encoding.opcodes_2 or encoding.opcodes_3:
+        remarks_log.warning(
+            "%s: the corrections that the DNG leaves to raw converters (%s) are not in it; only DNG output "
+            "keeps them",
+            Path(path).name,
+            ", ".join(
+                step.name
+                for block in (encoding.opcodes_2, encoding.opcodes_3)
+                for step in opcodes.read(block)
+            ),
+        )
     if encoding.bit_depth == 32 and format != "tiff32" and (beyond := float((planes > 1.0).mean())) > 0.0:
         remarks_log.warning(
             "%s: %.1f %% of its samples lie beyond white and are clipped; only tiff32 keeps them",
@@ -131,13 +152,13 @@ def write_image(
     with atomic(Path(path)) as file:
         if format == "jpeg":
             pixels = _encoded(planes, target, 255)
-            _write_jpeg(file, pixels, target.icc, encoding, description, xmp, quality=quality)
+            _write_jpeg(file, pixels, target.icc, encoding, description, xmp, gps, quality=quality)
         elif format in {"tiff16", "tiff32"}:
             pixels = _encoded(planes, target, 65535 if format == "tiff16" else None)
-            _write_tiff(file, pixels, target.icc, encoding, description, xmp)
+            _write_tiff(file, pixels, target.icc, encoding, description, xmp, gps)
         else:
             top = 255 if format == "png8" else 65535
-            _write_png(file, _encoded(planes, target, top), target.icc, encoding, description, xmp)
+            _write_png(file, _encoded(planes, target, top), target.icc, encoding, description, xmp, gps)
 
 
 # --- colour ------------------------------------------------------------------------------------
@@ -198,37 +219,25 @@ def _encoded(planes: Planes, target: _Target, top: int | None) -> Pixels:
 
 
 def _write_tiff(
-    file: BinaryIO, pixels: Pixels, icc: bytes, encoding: Encoding, description: str, xmp: bytes
+    file: BinaryIO,
+    pixels: Pixels,
+    icc: bytes,
+    encoding: Encoding,
+    description: str,
+    xmp: bytes,
+    gps: Directory | None,
 ) -> None:
-    fields = exif_block.main_fields(encoding.metadata, encoding.orientation, description)
-    extra: list[tuple[int, int, int, bytes | int, bool]] = [
-        (f.tag, f.kind, f.count, f.data, True) for f in fields if f.tag != exif_block.SOFTWARE_TAG
-    ]
-    extra.append((XMP_TAG, 1, len(xmp), xmp, True))
-    extra.append((_PLACE_OF_POINTER, 4, 1, 0, True))
-    tifffile.imwrite(
-        file,
-        pixels,
-        photometric="rgb",
-        byteorder="<",
-        metadata=None,
-        software=exif_block.SOFTWARE,
-        iccprofile=icc,
-        extratags=extra,
-    )
-    # The EXIF directory goes behind the pixels; tifffile refuses to write the pointer to it, so
-    # a tag with the next lower number keeps its place in the order until the offset is known.
-    offset = file.seek(0, io.SEEK_END)
-    offset += offset % 2
-    file.seek(offset)
-    file.write(exif_block.directory(exif_block.exif_fields(encoding.metadata), offset))
-    file.seek(0)
-    head = file.read(1 << 16)
-    reader = TiffReader.open(head)
-    assert reader is not None
-    place = reader.directory(reader.first)[0][_PLACE_OF_POINTER].offset
-    file.seek(place - 8)
-    file.write(struct.pack("<HHII", exif_block.EXIF_POINTER, 4, 1, offset))
+    tags = main_directory(encoding.metadata, encoding.orientation, description)
+    tags.shorts(258, *(8 * pixels.dtype.itemsize,) * 3)
+    tags.shorts(259, 1)  # not compressed
+    tags.shorts(262, 2)  # RGB
+    tags.shorts(277, 3)
+    tags.shorts(284, 1)  # interleaved
+    tags.shorts(339, *(3 if pixels.dtype.kind == "f" else 1,) * 3)  # SampleFormat
+    tags.raw(XMP_TAG, BYTE, xmp)
+    tags.raw(ICC_TAG, UNDEFINED, icc)
+    below = {EXIF_POINTER: exif_directory(encoding.metadata), GPS_POINTER: gps or Directory()}
+    write_strip(file, tags, below, pixels)
 
 
 def _write_jpeg(
@@ -238,10 +247,11 @@ def _write_jpeg(
     encoding: Encoding,
     description: str,
     xmp: bytes,
+    gps: Directory | None,
     *,
     quality: int,
 ) -> None:
-    block = exif_block.exif_block(encoding.metadata, encoding.orientation, description)
+    block = exif_block(encoding.metadata, encoding.orientation, description, gps)
     Image.fromarray(pixels).save(
         file,
         "JPEG",
@@ -255,21 +265,29 @@ def _write_jpeg(
 
 
 def _write_png(
-    file: BinaryIO, pixels: Pixels, icc: bytes, encoding: Encoding, description: str, xmp: bytes
+    file: BinaryIO,
+    pixels: Pixels,
+    icc: bytes,
+    encoding: Encoding,
+    description: str,
+    xmp: bytes,
+    gps: Directory | None,
 ) -> None:
     turned = np.ascontiguousarray(upright(pixels, encoding.orientation))
     data = imagecodecs.png_encode(turned, **_PNG_OPTIONS)
     header_end = 33  # signature and IHDR; the profile must come before the pixels
     file.write(data[:header_end])
     file.write(_chunk(b"iCCP", b"ICC\0\0" + zlib.compress(icc)))
-    file.write(_chunk(b"eXIf", exif_block.exif_block(encoding.metadata, 1, description)))
+    file.write(_chunk(b"eXIf", exif_block(encoding.metadata, 1, description, gps)))
     file.write(_chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + xmp))
     if description:
         file.write(_chunk(b"tEXt", b"Description\0" + description.encode("latin-1", "replace")))
     file.write(data[header_end:])
 
 
-def _write_dng(path: Path, planes: Planes, encoding: Encoding, description: str, xmp: bytes) -> None:
+def _write_dng(
+    path: Path, planes: Planes, encoding: Encoding, description: str, xmp: bytes, gps: Directory | None
+) -> None:
     metadata = encoding.metadata
     rgb_icc = encoding.icc if encoding.icc is not None and icc_space(encoding.icc) == "RGB" else None
     to_camera = encoding.xyz_to_camera
@@ -292,6 +310,9 @@ def _write_dng(path: Path, planes: Planes, encoding: Encoding, description: str,
         orientation=encoding.orientation,
         description=description,
         baseline_exposure=encoding.baseline_exposure,
+        artist=metadata.artist,
+        copyright=metadata.copyright,
+        rating=metadata.rating,
     )
     r, g, b = encoding.white_balance
     numbers = np.empty(planes.shape, dtype=np.uint16)
@@ -299,7 +320,15 @@ def _write_dng(path: Path, planes: Planes, encoding: Encoding, description: str,
         part = np.clip(planes[:, row : row + _ROWS], 0.0, 1.0)
         numbers[:, row : row + _ROWS] = np.rint(part * np.float32(65535))
     write_linear_dng(
-        path, numbers, color_matrix=to_camera, as_shot_neutral=(1 / r, 1 / g, 1 / b), shot=shot, xmp=xmp
+        path,
+        numbers,
+        color_matrix=to_camera,
+        as_shot_neutral=(1 / r, 1 / g, 1 / b),
+        shot=shot,
+        xmp=xmp,
+        opcodes_2=encoding.opcodes_2,
+        opcodes_3=encoding.opcodes_3,
+        gps=gps,
     )
 
 

@@ -17,6 +17,7 @@ from lensmodel.estimation import PsfEstimator
 from lensmodel.estimation.patches import Selector
 from lensmodel.model import ModelSettings
 from lensmodel.photo.arrays import photo_from_array
+from lensmodel.photo.tags.location import gps_directory
 from lensmodel.photo.tags.xmp_block import sidecar_for, write_sidecar
 from lensmodel.workflow import pipeline
 from lensmodel.workflow.arguments import require_workers
@@ -164,6 +165,7 @@ def correct(
     quality: int = 95,
     least_gain_db: float | None = None,
     sidecar: bool = False,
+    keep_location: bool = False,
     workers: int | None = None,
     on_step: StepHook = ignore_step,
 ) -> correction.Corrected:
@@ -203,6 +205,8 @@ def correct(
         Write nothing where a lesser gain is expected (`Corrected.expected_gain_db`); None always writes.
     sidecar : bool
         Write an XMP file beside the corrected photo too, `c.tif.xmp` of `c.tif`, which tells what was done.
+    keep_location : bool
+        Write where the photo was taken (GPS) into the corrected one too.
     workers : int, optional
         Threads; all cores by default. The result does not depend on it.
     on_step : callable
@@ -280,6 +284,7 @@ def correct(
         color_space=color_space,
         quality=quality,
         description=description,
+        gps=gps_directory(source) if keep_location and source is not None else None,
     )
     if beside is not None:
         write_sidecar(

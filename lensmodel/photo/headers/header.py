@@ -52,6 +52,8 @@ class Header:
         in 8-bit numbers; 0 unknown, or not compressed so.
     white : tuple of int
         WhiteLevel of a DNG, of all channels or of each; empty where it does not say.
+    opcodes_2, opcodes_3 : bytes
+        OpcodeList2 and 3 of a DNG.
     chroma_step : tuple of int
         Rows and columns of pixels that share one value of a JPEG's chroma.
     """
@@ -69,6 +71,8 @@ class Header:
     icc: bytes | None = None
     coarseness: float = 0.0
     white: tuple[int, ...] = ()
+    opcodes_2: bytes = b""
+    opcodes_3: bytes = b""
     chroma_step: tuple[int, int] = (1, 1)
 
 

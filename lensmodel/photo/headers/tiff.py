@@ -60,6 +60,10 @@ def read_tiff(buffer: Buffer, limits: Limits) -> Header:
     if _DNG_VERSION in first or _looks_raw(every):
         _, largest = max(every, key=_pixels)
         header = _sized(replace(header, kind="dng" if _DNG_VERSION in first else "raw"), largest)
+        if header.kind == "dng":
+            header = replace(
+                header, opcodes_2=_block(largest, 51009) or b"", opcodes_3=_block(largest, 51022) or b""
+            )
         if header.kind == "dng" and header.compression == _LOSSY:
             header = replace(header, coarseness=_coarseness(buffer, largest, limits))
         elif (

@@ -15,14 +15,22 @@ import struct
 import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from lensmodel.photo.headers.ifd import MAX_DIRECTORIES, Buffer, TiffReader
+from lensmodel.photo.headers.opening import opened_header
+from lensmodel.photo.tags.exif_block import Directory
+from lensmodel.photo.values import Limits
 
 # Tags that point to directories: of Exif 3.0, section 4.6.3, and of TIFF/EP.
 GPS: Final = 0x8825
 EXIF: Final = 0x8769
 SUB_DIRECTORIES: Final = 0x014A
+
+_GPS_KINDS: Final = {1, 2, 3, 4, 5, 7, 10}  # types that its tags have
 
 MAX_BLOCKS: Final = 64
 """Exif blocks of one file: the photo's, and one for each preview."""
@@ -120,6 +128,26 @@ def find_location(buffer: Buffer) -> LocationTraces:
     if chunks:
         spans = _with_checksums(buffer, chunks, spans)
     return LocationTraces(tuple(spans), complete)
+
+
+def gps_directory(path: Path) -> Directory | None:
+    """Read the GPS directory of a photo, to be written into another file of it; None without one."""
+    with opened_header(path, Limits()) as header:
+        for reader in header.tiff:
+            entries = reader.below(reader.directory(reader.first)[0].get(GPS))
+            found = Directory()
+            for tag, entry in entries.items():
+                width = {3: 2, 4: 4, 5: 4, 8: 2, 9: 4, 10: 4}.get(entry.kind, 1)
+                raw = entry.raw()
+                if tag < MAX_TAGS and raw and len(raw) <= MAX_VALUE and entry.kind in _GPS_KINDS:
+                    found.raw(
+                        tag,
+                        entry.kind,
+                        np.frombuffer(raw, f"{entry.order}u{width}").astype(f"<u{width}").tobytes(),
+                    )
+            if found.entries:
+                return found
+    return None
 
 
 def _places(buffer: Buffer, mark: bytes) -> Iterator[int]:

@@ -98,7 +98,21 @@ def metadata_of(header: Header) -> PhotoMetadata:
         taken_at=exif.taken_at(),
         orientation=exif.orientation(),
         pixel_pitch_um=exif.pixel_pitch_um(header),
+        artist=exif.text(0x013B) or ", ".join(_lines(xmp.get("dc:creator"))) or exif.wide_text(0x9C9D),
+        copyright=exif.text(0x8298) or xmp.get("dc:rights"),
+        rating=_rating(xmp.get("xmp:Rating"), exif.number(0x4746)),
+        keywords=tuple(_lines(xmp.get("dc:subject")) or _lines(exif.wide_text(0x9C9E), ";")),
     )
+
+
+def _lines(text: str | None, separator: str = "\n") -> list[str]:
+    return [word for part in (text or "").split(separator) if (word := part.strip())]
+
+
+def _rating(said: str | None, tag: float | None) -> int | None:
+    """Stars by XMP, where -1 is rejected, else by the tag that Windows writes."""
+    stars = tag if (of_xmp := _quotient(said)) is None else of_xmp
+    return int(stars) if stars is not None and -1 <= stars <= 5 else None
 
 
 def _of_ciff(shot: CiffShot) -> PhotoMetadata:
@@ -172,6 +186,11 @@ class _Exif:
     def text(self, tag: int) -> str | None:
         entry = self.tags.get(tag)
         return None if entry is None else entry.text() or None
+
+    def wide_text(self, tag: int) -> str | None:
+        """Text in two bytes a sign, as Windows writes it."""
+        entry = self.tags.get(tag)
+        return None if entry is None else entry.raw().decode("utf-16-le", "replace").strip("\0 ") or None
 
     def number(self, tag: int) -> float | None:
         entry = self.tags.get(tag)

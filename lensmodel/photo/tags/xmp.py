@@ -25,8 +25,14 @@ _PREFIXES: Final[Mapping[str, str]] = MappingProxyType(
         "http://ns.adobe.com/exif/1.0/": "exif",
         "http://cipa.jp/exif/1.0/": "exifEX",
         "http://ns.adobe.com/tiff/1.0/": "tiff",
+        "http://ns.adobe.com/xap/1.0/": "xmp",
+        "http://purl.org/dc/elements/1.1/": "dc",
     }
 )
+
+
+_LISTS: Final = {"dc:creator", "dc:subject"}
+_MOST_OF_A_LIST: Final = 16_384  # characters (chosen): some hundred keywords
 
 
 class _RefusedPacketError(Exception):
@@ -65,14 +71,19 @@ class _Collector:
     def _keep(self, qualified: str, value: str) -> None:
         space, _, local = qualified.rpartition("|")
         if space in _PREFIXES and value.strip():
-            self.properties.setdefault(f"{_PREFIXES[space]}:{local}", value.strip()[:1024])
+            name, text = f"{_PREFIXES[space]}:{local}", value.strip()[:1024]
+            if name in _LISTS and name in self.properties and len(self.properties[name]) < _MOST_OF_A_LIST:
+                self.properties[name] += f"\n{text}"
+            self.properties.setdefault(name, text)
 
     def refuse(self, *_: object) -> None:
         raise _RefusedPacketError("a document type declaration")
 
 
 def read_xmp(packet: bytes | None) -> Mapping[str, str]:
-    """Read the `aux:`, `exif:`, `exifEX:` and `tiff:` properties of a packet.
+    """Read the `aux:`, `dc:`, `exif:`, `exifEX:`, `tiff:` and `xmp:` properties of a packet.
+
+    Of a list the first item counts, of the authors and keywords all, one a line.
 
     A packet that is damaged gives what came before the damage, a refused one nothing:
     metadata that cannot be read are unknown, and no reason to refuse the photo.

@@ -6,7 +6,7 @@ Sources: ISO 16684-1:2019, sections 7 and 8 (packet, `dc`, `xmp`, `xmpMM`); Adob
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
@@ -116,10 +116,11 @@ def xmp_packet(
         whole.set(_name(key), _plain(value))
     for key, value in done.items():
         whole.set(f"{{{OWN}}}{key}", _plain(value))
+    _list(whole, "dc:rights", "rdf:Alt", [metadata.copyright] if metadata.copyright else [])
+    _list(whole, "dc:creator", "rdf:Seq", [metadata.artist] if metadata.artist else [])
+    _list(whole, "dc:subject", "rdf:Bag", metadata.keywords)
+    _list(whole, "dc:description", "rdf:Alt", [description] if description else [])
     if description:
-        words = ET.SubElement(ET.SubElement(whole, _name("dc:description")), _name("rdf:Alt"))
-        text = ET.SubElement(words, _name("rdf:li"), {_name("xml:lang"): "x-default"})
-        text.text = _plain(description)
         steps = ET.SubElement(ET.SubElement(whole, _name("xmpMM:History")), _name("rdf:Seq"))
         step = ET.SubElement(steps, _name("rdf:li"))
         step.set(_name("stEvt:action"), "filtered")
@@ -131,10 +132,22 @@ def xmp_packet(
     return _PACKET.format(ET.tostring(root, encoding="unicode"), "w" if writable else "r").encode()
 
 
+def _list(whole: ET.Element, name: str, kind: str, items: Sequence[str]) -> None:
+    if not items:
+        return
+    container = ET.SubElement(ET.SubElement(whole, _name(name)), _name(kind))
+    for item in items:
+        entry = ET.SubElement(container, _name("rdf:li"))
+        if kind == "rdf:Alt":
+            entry.set(_name("xml:lang"), "x-default")
+        entry.text = _plain(item)
+
+
 def _taken(metadata: PhotoMetadata, lens: str) -> dict[str, str]:
     named = lens or metadata.lens.model
     values = {
         "xmp:CreatorTool": SOFTWARE,
+        "xmp:Rating": None if metadata.rating is None else str(metadata.rating),
         "tiff:Make": metadata.camera_maker,
         "tiff:Model": metadata.camera_model,
         "exifEX:LensMake": metadata.lens.maker,

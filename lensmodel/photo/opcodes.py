@@ -1,0 +1,121 @@
+"""Opcode lists of a DNG: what raw converters are to do with its image, kept for a demosaiced one.
+
+Source: Adobe, "Digital Negative (DNG) Specification" 1.6, 2021, chapter 7.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from lensmodel.core.types import BayerPattern
+
+_NAMES: Final = (
+    *("", "WarpRectilinear", "WarpFisheye", "FixVignetteRadial", "FixBadPixelsConstant", "FixBadPixelsList"),
+    *("TrimBounds", "MapTable", "MapPolynomial", "GainMap", "DeltaPerRow", "DeltaPerColumn", "ScalePerRow"),
+    *("ScalePerColumn", "WarpRectilinear2"),
+)
+_GAIN_MAP: Final = 9
+_GAIN_HEAD: Final = ">10I4dI"
+_MOST: Final = 64  # opcodes of a list (chosen): cameras write below ten
+
+
+@dataclass(frozen=True, slots=True)
+class Opcode:
+    """One step: its number, the DNG version it asks for, flags, and parameters."""
+
+    number: int
+    version: int
+    flags: int
+    data: bytes
+
+    @property
+    def name(self) -> str:
+        """Name by the specification."""
+        return _NAMES[self.number] if 0 < self.number < len(_NAMES) else f"opcode {self.number}"
+
+
+def read(block: bytes) -> list[Opcode]:
+    """Take a list apart; one that is damaged gives what came before the damage."""
+    return list(_steps(block))
+
+
+def _steps(block: bytes) -> Iterator[Opcode]:
+    at = 4
+    for _ in range(min(struct.unpack(">I", block[:4])[0], _MOST) if len(block) >= 4 else 0):
+        if at + 16 > len(block):
+            return
+        number, version, flags, size = struct.unpack_from(">4I", block, at)
+        if at + 16 + size > len(block):
+            return
+        yield Opcode(number, version, flags, block[at + 16 : at + 16 + size])
+        at += 16 + size
+
+
+def written(steps: list[Opcode]) -> bytes:
+    """Put a list together; nothing for no step."""
+    body = b"".join(struct.pack(">4I", s.number, s.version, s.flags, len(s.data)) + s.data for s in steps)
+    return struct.pack(">I", len(steps)) + body if steps else b""
+
+
+def demosaiced(steps: list[Opcode], cfa: BayerPattern | None) -> tuple[list[Opcode], list[Opcode]]:
+    """Rewrite the steps of OpcodeList2, which are for a mosaic, for an image of three colours.
+
+    A gain map of every second pixel of a mosaic is that of a colour; of the two greens the mean is taken.
+
+    Parameters
+    ----------
+    steps : list of Opcode
+    cfa : BayerPattern or None
+        Colours of the mosaic; None where it is no Bayer mosaic.
+
+    Returns
+    -------
+    kept, lost : list of Opcode
+    """
+    kept: list[Opcode] = []
+    lost: list[Opcode] = []
+    greens: list[int] = []
+    for step in steps:
+        mapped = _gain_of_colours(step, cfa) if step.number == _GAIN_MAP else None
+        if mapped is None:
+            lost.append(step)
+            continue
+        colour, whole = mapped
+        if colour == 1 and greens and len(kept[greens[-1]].data) == len(whole.data):
+            kept[greens[-1]] = _mean(kept[greens[-1]], whole)
+            continue
+        if colour == 1:
+            greens.append(len(kept))
+        kept.append(whole)
+    return kept, lost
+
+
+def _gain_of_colours(step: Opcode, cfa: BayerPattern | None) -> tuple[int | None, Opcode] | None:
+    """Return the colour that a gain map of a mosaic is for, None for all, and the map for planes."""
+    size = struct.calcsize(_GAIN_HEAD)
+    if len(step.data) < size:
+        return None
+    top, left, bottom, right, _, _, row_pitch, col_pitch, *rest = struct.unpack(_GAIN_HEAD, step.data[:size])
+    if (row_pitch, col_pitch) == (1, 1):
+        colour, planes = None, (0, 3)
+    elif (row_pitch, col_pitch) == (2, 2) and cfa is not None:
+        colour = cfa[top % 2][left % 2]
+        planes = (colour, 1)
+    else:
+        return None
+    if colour is not None:  # the two rows and columns between whose pixels the others stood
+        top, left, bottom, right = top - top % 2, left - left % 2, bottom + bottom % 2, right + right % 2
+    head = struct.pack(_GAIN_HEAD, top, left, bottom, right, *planes, 1, 1, *rest)
+    return colour, Opcode(step.number, step.version, step.flags, head + step.data[size:])
+
+
+def _mean(one: Opcode, other: Opcode) -> Opcode:
+    size = struct.calcsize(_GAIN_HEAD)
+    gains = [np.frombuffer(step.data[size:], dtype=">f4").astype(np.float64) for step in (one, other)]
+    middle = ((gains[0] + gains[1]) / 2.0).astype(">f4").tobytes()
+    return Opcode(one.number, one.version, one.flags, one.data[:size] + middle)

@@ -68,14 +68,14 @@ def run(
     as_json: bool,
 ) -> None:
     """Correct photos, one after the other."""
-    targets = targets_of(files.photos(names), output, options.file_format)
+    targets, twice = targets_of(files.photos(names), output, options.file_format)
     with files.as_usage():
         if options.method is not None:
             correction.deconvolvers.create(options.method)
         settings = LensSettings(aperture=options.aperture)
     lens = Lens(files.profile_at(source))
     lens = lens.warmed()  # once for all photos, if an interrupted run left it undone
-    results: list[dict[str, Any]] = []
+    results = clashes(twice, display)
     with display.progress() as bars:
         task = bars.add_task("", total=len(targets))
         for number, (target, path) in enumerate(targets.items()):
@@ -104,8 +104,8 @@ def run(
 
 def targets_of(
     paths: Sequence[Path], output: str | None, file_format: OutputFormat | None
-) -> dict[Path, Path]:
-    """Return the photos by the file that each becomes; no two may become the same.
+) -> tuple[dict[Path, Path], dict[Path, list[Path]]]:
+    """Return the photos by the file that each becomes; and those of which several would become the same.
 
     `output` is that file itself where there is one photo and the name ends as a picture's does; where it ends
     in a separator or is a folder already, it is a folder.
@@ -116,20 +116,29 @@ def targets_of(
         named = EXTENSION[FORMATS[target.suffix.lower()]]
         if file_format is not None and named != extension:
             raise UsageError(f"{target.name} is no name for --format {file_format}; end it in {extension}")
-        return {target: paths[0]}
-    targets: dict[Path, Path] = {}
+        return {target: paths[0]}, {}
+    sources: dict[Path, list[Path]] = {}
     for path in paths:
         folder = path.parent / FOLDER if output is None else Path(output).expanduser()
         if folder.exists() and not folder.is_dir():
             raise UsageError(f"{folder} is a file; give a folder to -o")
-        target = folder / f"{path.stem}{CORRECTED}{extension}"
-        if target in targets:
-            raise UsageError(
-                f"{targets[target]} and {path} would both become {target}; "
-                "name each by itself, and correct them into different folders"
-            )
-        targets[target] = path
-    return targets
+        sources.setdefault(folder / f"{path.stem}{CORRECTED}{extension}", []).append(path)
+    twice = {target: group for target, group in sources.items() if len(group) > 1}
+    return {target: group[0] for target, group in sources.items() if target not in twice}, twice
+
+
+def clashes(twice: Mapping[Path, Sequence[Path]], display: Display) -> list[dict[str, Any]]:
+    """Tell which photos would become the same file; return a failed result for each of them."""
+    results = []
+    for target, paths in twice.items():
+        why = (
+            f"{' and '.join(map(str, paths))} would {'both' if len(paths) == 2 else 'all'} become {target}; "
+            "name each by itself, and correct them into different folders"
+        )
+        display.error(why)
+        state = {"state": "failed", "code": InvalidInputError.code, "reason": why}
+        results += [{"photo": str(path), "output": str(target), **state} for path in paths]
+    return results
 
 
 def _names_a_picture(output: str) -> bool:

@@ -81,17 +81,18 @@ def run(
 ) -> None:
     """Learn the lens of every group of photos and correct them all."""
     paths = files.photos(names)
-    targets = correction.targets_of(paths, output, options.file_format)
+    targets, twice = correction.targets_of(paths, output, options.file_format)
     with files.as_usage():
         estimation.estimators.create(learning.estimator)
         estimation.patches.selectors.create(learning.selector)
         if options.method is not None:
             corrections.deconvolvers.create(options.method)
         LensSettings(aperture=options.aperture)
-    base = next(iter(targets)).parent
+    base = next(iter({**targets, **twice})).parent
     options = replace(options, least_gain_db=WORTH_DB)
     work = _Folder(base, learning.profiles or base / PROFILES, options, learning, display)
-    shots, results = _read(paths, display)
+    shots, failed = _read(list(targets.values()), display)
+    results = [*correction.clashes(twice, display), *failed]
     lens_groups = groups(shots)
     by_path = {path: target for target, path in targets.items()}
     with display.progress() as bars:
@@ -147,7 +148,7 @@ class _Folder:
         if target not in self._calibrations:
             self._calibrations[target] = self._calibration(target)
         calibrated = self._calibrations[target]
-        counted, most = 0, min(self._learning.most, len(group.shots))
+        counted, most = 0, min(self._learning.most, group.scenes)
         task = bars.add_task(f"learning {group.lens}", total=most)
         for shot in group.to_learn_from():
             if counted == most:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Final
 
@@ -16,6 +17,9 @@ from lensmodel.workflow.identity import Identity
 SAME_FOCAL: Final = 1.19
 """Focal lengths up to this ratio count as one: 2^(1/4), the reach of the lens model over focal lengths
 (`focal_octaves` in `lensmodel.model.variables`)."""
+
+BURST: Final = timedelta(seconds=2)
+"""Photos at the same settings that follow each other within this time show the same (chosen)."""
 
 MOST_IN_NAME: Final = 80
 """Characters of a file name (chosen): file systems take 255 bytes, and the ending needs some."""
@@ -85,17 +89,43 @@ class PhotoGroup:
         low, high = f"{min(known):.3g}", f"{max(known):.3g}"
         return f"{low} mm" if low == high else f"{low}-{high} mm"
 
+    @property
+    def scenes(self) -> int:
+        """How many different things the photos show: the frames of a burst are one."""
+        return len(_bursts(self.shots)[0])
+
     def to_learn_from(self) -> list[Shot]:
         """Return the photos in the order in which they tell most: each aperture's first one, then the second.
 
-        A photo whose aperture is unknown comes last.
+        A photo whose aperture is unknown comes last, and later frames of a burst after all (`scenes`).
         """
-        by_aperture: dict[float, list[Shot]] = {}
-        for shot in self.shots:
-            by_aperture.setdefault(shot.metadata.aperture or float("inf"), []).append(shot)
-        ordered = [by_aperture[aperture] for aperture in sorted(by_aperture)]
-        longest = max(map(len, ordered))
-        return [shots[i] for i in range(longest) for shots in ordered if i < len(shots)]
+        first, again = _bursts(self.shots)
+        return [*_by_aperture(first), *_by_aperture(again)]
+
+
+def _by_aperture(shots: Sequence[Shot]) -> list[Shot]:
+    by_aperture: dict[float, list[Shot]] = {}
+    for shot in shots:
+        by_aperture.setdefault(shot.metadata.aperture or float("inf"), []).append(shot)
+    ordered = [by_aperture[aperture] for aperture in sorted(by_aperture)]
+    longest = max(map(len, ordered), default=0)
+    return [group[i] for i in range(longest) for group in ordered if i < len(group)]
+
+
+def _bursts(shots: Sequence[Shot]) -> tuple[list[Shot], list[Shot]]:
+    """Part the photos into the first of each burst, and those that follow it at the same settings."""
+    first: list[Shot] = []
+    again: list[Shot] = []
+    last: dict[tuple[float | None, float | None], datetime] = {}
+    for shot in sorted(shots, key=lambda shot: (shot.metadata.taken_at or datetime.min, shot.path)):  # noqa: DTZ901  cameras' clocks have no zone
+        said = shot.metadata
+        settings = said.aperture, said.focal_mm
+        before = last.get(settings)
+        follows = said.taken_at is not None and before is not None and said.taken_at - before <= BURST
+        (again if follows else first).append(shot)
+        if said.taken_at is not None:
+            last[settings] = said.taken_at
+    return sorted(first, key=lambda shot: shot.path), sorted(again, key=lambda shot: shot.path)
 
 
 def groups(shots: Iterable[Shot]) -> list[PhotoGroup]:

@@ -3,29 +3,33 @@
 from __future__ import annotations
 
 import glob
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from app.commands.console.failure import UsageError
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.model import LensProfile, load_profile
 from lensmodel.photo.endings import CORRECTED, ENDINGS, RAW_ENDINGS
 
+_PART_OF_SHOT: Final = re.compile(r"\.RAW-\d+(\.[A-Z]+)*$", re.IGNORECASE)
+"""What phones add to the names of the files of one shot."""
+
 
 def photos(names: Iterable[str]) -> list[Path]:
     """Turn files, folders and patterns into a list of photos without repeats.
 
-    Of folders and patterns, corrected photos are left out, and what is no RAW file beside a RAW file
-    of the same name, which shows the same exposure again.
+    Of one shot the RAW file counts, and no other picture of it. Of folders and patterns, corrected photos are
+    left out.
     """
     unique: dict[Path, None] = {}
     for name in names:
         path = Path(name).expanduser()
         if path.is_dir():
             inside = (p for p in path.iterdir() if p.suffix.lower() in ENDINGS and not p.name.startswith("."))
-            matches = _sources(p for p in inside if p.is_file())
+            matches = _originals(inside)
             if not matches:
                 raise UsageError(
                     f"no photo in the folder {name}; give one that holds RAW, TIFF, PNG or JPEG files"
@@ -33,18 +37,31 @@ def photos(names: Iterable[str]) -> list[Path]:
         elif path.is_file():
             matches = [path]
         else:
-            every = (Path(p) for p in glob.glob(str(path), recursive=True))  # noqa: PTH207 - absolute patterns too
-            matches = _sources(p for p in every if p.is_file())
+            matches = _originals(Path(p) for p in glob.glob(_pattern(path), recursive=True))  # noqa: PTH207 - absolute patterns too
             if not matches:
                 raise UsageError(f"no photo called {name}; check the name and the folder")
         unique.update(dict.fromkeys(matches))
-    return list(unique)
+    raw = {_shot(p) for p in unique if p.suffix.lower() in RAW_ENDINGS}
+    return [p for p in unique if p.suffix.lower() in RAW_ENDINGS or _shot(p) not in raw]
 
 
-def _sources(paths: Iterable[Path]) -> list[Path]:
-    given = sorted(p for p in paths if not p.stem.endswith(CORRECTED))
-    raw = {p.with_suffix("") for p in given if p.suffix.lower() in RAW_ENDINGS}
-    return [p for p in given if p.suffix.lower() in RAW_ENDINGS or p.with_suffix("") not in raw]
+def _originals(paths: Iterable[Path]) -> list[Path]:
+    return sorted(p for p in paths if p.is_file() and not p.stem.endswith(CORRECTED))
+
+
+def _pattern(path: Path) -> str:
+    """Take the part of a pattern that is there, such as a folder "[2024] trip", by its letters."""
+    there = next(parent for parent in (path, *path.parents) if parent.is_dir() or parent == parent.parent)
+    rest = path.relative_to(there)
+    return str(Path(glob.escape(str(there))) / rest)
+
+
+def _shot(path: Path) -> tuple[Path, str]:
+    """Name the shot of a file: IMG_1.DNG and img_1.jpg, x.RAW-02.ORIGINAL.dng and x.RAW-01.COVER.jpg."""
+    stem = path.stem
+    if Path(stem).suffix.lower() in RAW_ENDINGS:  # IMG_1.CR2.jpg
+        stem = Path(stem).stem
+    return path.parent, _PART_OF_SHOT.sub("", stem).casefold()
 
 
 def same(first: Path, second: Path) -> bool:

@@ -30,6 +30,14 @@ from lensmodel.photo.values import LensIdentity, Limits, PhotoMetadata, SerialSo
 _PLACEHOLDER: Final = re.compile(
     r"[0.\-_ x?]*|(.)\1{5,}|none|no lens|n/?a|unknown|null|manual", re.IGNORECASE
 )
+_NO_LENS: Final = re.compile(
+    r"(?<![\d.])0+(\.0+)?(-0+(\.0+)?)?\s*mm|-{2,}\s*mm"
+    r"|\b(no (cpu|lens|data)|not attached|(unknown|manual) lens)\b"
+    r"|^\W*(none|n/?a|unknown|null|undefined)\b[\W\d]*$|^\W*lens\W*$|^65535$",
+    re.IGNORECASE,
+)
+"""Focal lengths of zero, and the words in which cameras say that they know no lens."""
+
 _SENSOR_WIDTHS_MM: Final = (
     (12.8, 13.4),
     (17.2, 18.1),
@@ -72,6 +80,11 @@ def read_metadata(path: Path | str) -> PhotoMetadata:
 def is_placeholder(serial: str) -> bool:
     """Tell whether a serial is only what a camera writes when it knows none."""
     return _PLACEHOLDER.fullmatch(serial.strip()) is not None
+
+
+def names_no_lens(model: str) -> bool:
+    """Tell whether a lens's name is only what a camera writes when it knows none, such as "DT 0mm F0 SAM"."""
+    return is_placeholder(model) or _NO_LENS.search(model) is not None
 
 
 def metadata_of(header: Header) -> PhotoMetadata:
@@ -255,8 +268,10 @@ class _Exif:
 
 
 def _lens(exif: _Exif, note: MakerNote, xmp: Mapping[str, str]) -> LensIdentity:
-    model = exif.text(0xA434) or note.lens_model or xmp.get("aux:Lens") or xmp.get("exifEX:LensModel")
-    maker = exif.text(0xA433) or xmp.get("exifEX:LensMake")
+    models = exif.text(0xA434), note.lens_model, xmp.get("aux:Lens"), xmp.get("exifEX:LensModel")
+    model = next((name for name in models if name and not names_no_lens(name)), None)
+    makers = exif.text(0xA433), xmp.get("exifEX:LensMake")
+    maker = next((name for name in makers if name and not is_placeholder(name)), None)
     serial, source = _serial(exif, note, xmp)
     return LensIdentity(maker, model, serial, source)
 

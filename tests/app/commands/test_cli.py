@@ -32,6 +32,7 @@ from typer.testing import CliRunner
 
 from app.cli import app, main
 from app.commands import correction
+from app.commands.console import files
 from app.commands.console.progress_lines import EVERY_S, Pace, ProgressLines
 from lensmodel import photo
 from lensmodel.core.psf import PsfSample, gaussian
@@ -225,9 +226,77 @@ def test_a_name_that_ends_as_a_pictures_is_a_file_and_any_other_a_folder(
 
 
 def test_of_several_photos_the_output_is_a_folder_whatever_its_name(made: Path) -> None:
-    targets = correction.targets_of([made / "a.dng", made / "b.dng"], "out.tif", None)
+    targets, twice = correction.targets_of([made / "a.dng", made / "b.dng"], "out.tif", None)
 
     assert [str(target) for target in targets] == ["out.tif/a-corrected.tif", "out.tif/b-corrected.tif"]
+    assert not twice
+
+
+def test_two_photos_that_would_become_one_file_are_named_and_the_rest_is_done(
+    folder: Path, here: Here
+) -> None:
+    (folder / "holiday").mkdir()
+    shutil.copy(folder / "one.dng", folder / "holiday" / "b.dng")
+    for name in ("a.jpg", "a.png"):
+        Image.fromarray(_picture()).save(folder / "holiday" / name)
+
+    done = here("correct", "holiday", "-p", PROFILE, "--method", "fast", "--json")
+
+    states = {Path(r["photo"]).name: r["state"] for r in json.loads(done.stdout)["results"]}
+    assert states == {"a.jpg": "failed", "a.png": "failed", "b.dng": "corrected"}
+    assert (done.returncode, one_sentence(done.stderr).count("a.")) == (1, 2)
+    assert [p.name for p in (folder / "holiday" / "corrected").iterdir()] == ["b-corrected.tif"]
+
+
+SHOTS = {
+    "ending in capitals": (["IMG_1.DNG", "img_1.jpg"], ["IMG_1.DNG"]),
+    "phone": (["P.RAW-01.COVER.jpg", "P.RAW-02.ORIGINAL.dng"], ["P.RAW-02.ORIGINAL.dng"]),
+    "phone, other order": (
+        ["P.RAW-01.MP.COVER.jpg", "P.RAW-02.ORIGINAL.dng", "P2.jpg"],
+        ["P.RAW-02.ORIGINAL.dng", "P2.jpg"],
+    ),
+    "both endings": (["a.CR2", "a.CR2.jpg", "A.cr2.tif"], ["a.CR2"]),
+    "others": (["a.jpg", "a1.dng", "b.RAWS.jpg"], ["a.jpg", "a1.dng", "b.RAWS.jpg"]),
+    "corrected": (["a.jpg", "a-corrected.dng"], ["a.jpg"]),
+}
+
+
+@pytest.mark.parametrize("case", SHOTS)
+@pytest.mark.parametrize("given", ["folder", "[2024] trip/*", "all"])
+def test_raw_and_other_files_of_one_shot_are_one_photo(case: str, given: str, tmp_path: Path) -> None:
+    names, expected = SHOTS[case]
+    trip = tmp_path / "[2024] trip"
+    trip.mkdir()
+    for name in names:
+        (trip / name).touch()
+    words = {
+        "folder": [str(trip)],
+        "[2024] trip/*": [f"{trip}/*"],
+        "all": [str(trip / name) for name in names],
+    }
+
+    found = files.photos(words[given])
+
+    if given == "all" and case == "corrected":  # who names it will be told
+        expected = names
+    assert sorted(path.name for path in found) == sorted(expected)
+
+
+@pytest.mark.parametrize(
+    "pattern",
+    ["[2024] trip/*.dng", "[2024] trip/[ab].dng", "[2024]*/a.dng", "[[]2024] trip/a.dng", "**/a.dng"],
+)
+def test_patterns_find_their_files_in_folders_whose_names_look_like_patterns(
+    pattern: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "[2024] trip").mkdir()
+    (tmp_path / "[2024] trip" / "a.dng").touch()
+    (tmp_path / "2 x").mkdir()
+    monkeypatch.chdir(tmp_path)
+
+    if pattern == "[2024]*/a.dng":  # a pattern after all: of folders that begin with one of these digits
+        (tmp_path / "2 x" / "a.dng").touch()
+    assert [path.name for path in files.photos([pattern])] == ["a.dng"]
 
 
 @pytest.mark.parametrize("foreign", [b"<x:xmpmeta x:xmptk='XMP Core 4.4.0-Exiv2'/>", b"", b"any words"])
@@ -422,7 +491,7 @@ REFUSED = {
     "unknown method": (["correct", "one.dng", "-p", PROFILE, "-o", "o", "--method", "x"], 2, "known: .*fast"),
     "unknown estimator": (["calibrate", "one.dng", "-p", "new", "--estimator", "x"], 2, "known: .*whittle"),
     "aperture": (["calibrate", "one.dng", "-p", "new", "--aperture", "-2"], 2, "-2"),
-    "same name twice": (["correct", "one.dng", "sub/one.dng", "-p", PROFILE, "-o", "o"], 2, "would both"),
+    "same name twice": (["correct", "one.dng", "sub/one.dng", "-p", PROFILE, "-o", "o"], 1, "would both"),
     "even size": (["psf", PROFILE, "--size", "20"], 2, "must be odd, got 20"),
     "psf file there": (["psf", PROFILE, "-o", "there.npy"], 2, "there.npy is there already; --force"),
     "degrees": (["psf", PROFILE, "--phi", "90"], 2, "--phi is in radians; 90 degrees are 1.571"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import replace
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -201,6 +202,30 @@ def test_a_name_of_a_lens_is_never_a_path() -> None:
 
     assert not set("/\\") & set(group.name)
     assert not group.name.startswith(".")
+
+
+def test_the_frames_of_a_burst_are_one_scene_and_others_are_learned_from_first() -> None:
+    start = datetime(2024, 5, 1, 12, 0, 0)  # noqa: DTZ001 - cameras' clocks have no zone
+    seconds = [0, 1, 2, 3, 60, 62, 90, 91]
+    wide = [2.8] * 6 + [8.0, 2.8]  # the last two are of two apertures: no burst
+    (group,) = groups(
+        shots(
+            *(
+                replace(ZOOM, taken_at=start + timedelta(seconds=s), aperture=n)
+                for s, n in zip(seconds, wide, strict=True)
+            )
+        )
+    )
+
+    assert group.scenes == 4
+    assert [shot.path.name for shot in group.to_learn_from()[:4]] == ["0.dng", "6.dng", "4.dng", "7.dng"]
+    assert len(group.to_learn_from()) == 8
+
+
+def test_photos_without_a_time_are_no_burst() -> None:
+    (group,) = groups(shots(ZOOM, ZOOM, ZOOM))
+
+    assert group.scenes == 3
 
 
 def test_every_aperture_is_learned_from_before_any_is_twice() -> None:

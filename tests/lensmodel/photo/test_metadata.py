@@ -117,6 +117,38 @@ def test_a_placeholder_is_no_serial(serial: str) -> None:
     assert photo.is_placeholder(serial)
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(
+            "----",
+            "None",
+            "n/a",
+            "0.0 mm f/0.0",
+            "Manual Lens No CPU",
+            "DT 0mm F0 SAM",
+            "0-0mm f/0-0",
+            "--- mm f/--",
+        ),
+        *("E 0mm F0", "Unknown (0)", "(none)", "Unknown lens", "Lens not attached", "65535", "  "),
+    ],
+)
+def test_a_placeholder_is_no_name_of_a_lens_and_the_next_place_is_asked(name: str, metadata_of: Read) -> None:
+    seen = metadata_of(jpeg_with({}, {0xA434: name}))
+    other = metadata_of(jpeg_with({}, {0xA434: name, 0xA433: "----"}, xmp_with('aux:Lens="EF50mm f/1.8"')))
+
+    assert seen.lens == photo.LensIdentity()
+    assert (other.lens.maker, other.lens.model) == (None, "EF50mm f/1.8")
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["EF50mm f/1.8", "10.0 mm f/2.8", "E 20mm F0.95", "XF100-400mm", "61182", "Nokton 40mm", "70.0-200.0 mm"],
+)
+def test_what_names_a_lens_is_its_name(name: str, metadata_of: Read) -> None:
+    assert metadata_of(jpeg_with({}, {0xA434: name})).lens.model == name
+
+
 @pytest.mark.parametrize("serial", ["00009f8eeb", "AC1205545", "100000", "0000129324", "7", "N123456"])
 def test_a_serial_with_zeros_in_it_is_a_serial(serial: str) -> None:
     assert not photo.is_placeholder(serial)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 
-from app.commands import lens_test
 from app.commands.console import display, files
 from app.commands.console.failure import UsageError
 from app.commands.console.options import (
@@ -30,29 +28,29 @@ from lensmodel.core.codec import to_json
 from lensmodel.core.files import write_atomically
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel
-from lensmodel.model.provenance import answerers_in_words
+from lensmodel.photo import develop
 from lensmodel.report import (
-    Advice,
     LensReport,
-    ReportSettings,
-    advice,
-    apertures_svg,
-    curves_svg,
+    Side,
+    compare,
     export,
     exporters,
     format_of,
     lens_report,
-    mtf_map_svg,
     psf_grid,
+    widest,
 )
-from lensmodel.report.lens_report import widest
+from lensmodel.report.documents import comparison_html, to_csv, to_html
+from lensmodel.report.errors import DRAWS
+from lensmodel.workflow.pipeline import lateral_of
 
 Aperture = Annotated[float | None, aperture_option("f-number; default: the widest that a photo had.")]
 Aspect = Annotated[
     float, typer.Option(min=0.2, max=5.0, metavar="RATIO", help="Width over height of the picture.")
 ]
 
-_FILES: Final = ("report.json", "mtf.csv", "mtf-map.svg", "mtf-curves.svg", "apertures.svg")
+FILES: Final = ("report.html", "report.pdf", "report.png", "report.csv", "report.json")
+COMPARED: Final = ("comparison.html", "comparison.pdf")
 
 
 def report(
@@ -60,12 +58,9 @@ def report(
     profile: ProfileFile,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output", "-o", metavar="DIR", help="Folder for the report, the lens test and pictures."
-        ),
+        typer.Option("--output", "-o", metavar="DIR", help="Folder for the report: page, print, figures."),
     ] = None,
     aperture: Aperture = None,
-    channel: Channel = "g",
     aspect: Aspect = 1.5,
     against: Annotated[
         Path | None,
@@ -104,54 +99,81 @@ def report(
     """
     shown = display.of(context, quiet=quiet, verbose=verbose)
     if output is not None:
-        names = (*_FILES, *lens_test.FILES, *(lens_test.COMPARED if against else ()))
+        names = (*FILES, *(COMPARED if against else ()))
         files.refuse_existing(*(output / name for name in names), force=force)
     elif against is not None or photo:
         option = "--photo" if against is None else "--against"
         raise UsageError(f"{option} needs --output: what it adds is written to files")
     with shown.busy("asking the lens at 200 places"):
-        model = files.profile_at(profile).model
-        measured = lens_report(model, _settings(model, aperture, channel), ReportSettings(aspect=aspect))
-        recommended = advice(model)
-    document = json.dumps({"report": to_json(measured), "advice": to_json(recommended)}, indent=2)
+        found = measured(profile, aperture, aspect, photo or [], whole=output is not None)
+    document = json.dumps(to_json(found), indent=1)
     if output is not None:
-        texts = {
-            "report.json": document + "\n",
-            "mtf.csv": _map_csv(measured),
-            "mtf-map.svg": mtf_map_svg(measured),
-            "mtf-curves.svg": curves_svg(measured),
-        }
-        if len(measured.apertures) > 1:
-            texts["apertures.svg"] = apertures_svg(measured)
-        output.mkdir(parents=True, exist_ok=True)
-        for name, text in texts.items():
-            write_atomically(output / name, text.encode())
-        missing = _tested(shown, profile, against, output, aspect, aperture, photo or [])
-        if missing:
-            shown.note(f"not written: {', '.join(missing)}; pip install 'lensmodel[report]' brings PDF")
+        with shown.busy("drawing"):
+            write(output, found, document)
+            if against is not None:
+                other = measured(against, aperture, aspect, [], whole=True)
+                write_comparison(output, found, other)
     if json_output:
         typer.echo(document)
     else:
-        shown.result(_words(measured, recommended, output))
+        at = found.tested[0].at or "unknown aperture"
+        lines = [f"{found.name}: {found.facts}; {at}", *(f"- {line}" for line in found.summary)]
+        shown.result("\n".join([*lines, *([] if output is None else [f"written: {output}"])]))
 
 
-def _tested(
-    shown: display.Display,
-    profile: Path,
-    against: Path | None,
-    output: Path,
-    aspect: float,
-    aperture: float | None,
-    photos: Sequence[Path],
-) -> list[str]:
-    """Write the lens test; return the files that were left out."""
-    with shown.busy("testing the lens"):
-        first = lens_test.tested(files.profile_at(profile), profile, aspect, photos)
-        missing = lens_test.write(output, first)
-        if against is not None:
-            second = lens_test.tested(files.profile_at(against), against, aspect, [])
-            missing += lens_test.write_comparison(output, first, second, aperture)
-    return missing
+def measured(
+    profile: Path, aperture: float | None, aspect: float, photos: Sequence[Path], *, whole: bool
+) -> LensReport:
+    """Report on the lens of a profile: whole, with errors and all colours, or only what the screen shows."""
+    known = files.profile_at(profile)
+    words = [known.lens[key] for key in ("maker", "model") if known.lens.get(key)]
+    names = sorted(known.photos.values())
+    details = {
+        "Serial number": str(known.lens.get("serial") or ""),
+        "Photos": ", ".join(names[:_NAMED])
+        + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""),
+        "Written": f"{datetime.now(UTC):%Y-%m-%d}",
+    }
+    with files.as_usage():
+        asked = None if aperture is None else [LensSettings(aperture=aperture).aperture]
+        return lens_report(
+            known.model,
+            known.lens.get("label") or " ".join(words) or profile.stem,
+            aspect=aspect,
+            apertures=None if asked is None else [n for n in asked if n is not None],
+            lateral=[lateral_of(develop(path)) for path in photos],
+            channels=("g", "r", "b") if whole else ("g",),
+            details={name: words for name, words in details.items() if words},
+            draws=DRAWS if whole else 0,
+        )
+
+
+_NAMED: Final = 8  # photos that the page names (chosen: two lines)
+
+
+def write(folder: Path, found: LensReport, document: str) -> None:
+    """Write a report in each form."""
+    from lensmodel.report.plots import pages, save, to_pdf  # noqa: PLC0415 - matplotlib, an extra
+
+    folder.mkdir(parents=True, exist_ok=True)
+    drawn = pages(found)
+    save(drawn[0], folder / "report.png")
+    for name, content in (
+        ("report.pdf", to_pdf(drawn)),
+        ("report.html", to_html(found).encode()),
+        ("report.csv", to_csv(found).encode()),
+        ("report.json", document.encode()),
+    ):
+        write_atomically(folder / name, content)
+
+
+def write_comparison(folder: Path, one: LensReport, two: LensReport) -> None:
+    """Write two reports beside each other."""
+    from lensmodel.report.plots import comparison_page, to_pdf  # noqa: PLC0415 - as above
+
+    both = compare(*(Side(one_of.name, one_of.tested[0], one_of.facts) for one_of in (one, two)))
+    write_atomically(folder / COMPARED[0], comparison_html(both).encode())
+    write_atomically(folder / COMPARED[1], to_pdf([comparison_page(both)]))
 
 
 def export_psfs(
@@ -185,7 +207,7 @@ def export_psfs(
 
     Examples:
 
-        lensmodel export my-24mm.lensprofile -o my-24mm.tif
+        lensmodel export my-24mm.lensprofile -o my-24mm.npz
 
         lensmodel export my-24mm.lensprofile --format json --r 0.9 --phi 0.6 -o corner-for-art.json
 
@@ -212,14 +234,10 @@ def export_psfs(
             at=place,
         )
     export(output, psfs, written)
-    # here too: a bare matrix has no room for it
-    made = answerers_in_words(zip(psfs.answered_by, psfs.reason, strict=True))
     if json_output:
-        number = len(psfs.positions)
-        shown.document({"output": str(output), "format": written, "psfs": number, "answered": made})
+        shown.document({"output": str(output), "format": written, "psfs": len(psfs.positions)})
     else:
         shown.result(str(output))
-        shown.note(made)
 
 
 def _format(output: Path, named: str | None) -> str:
@@ -244,29 +262,3 @@ def _settings(model: LensModel, aperture: float | None, channel: Channel) -> Len
     with files.as_usage():
         chosen = widest(model) if aperture is None else LensSettings(aperture=aperture)
     return chosen.with_channel(channel)
-
-
-def _words(measured: LensReport, recommended: Advice, output: Path | None) -> str:
-    settings = measured.settings
-    at = "unknown aperture" if settings.aperture is None else f"f/{settings.aperture:g}"
-    photos = "1 photo" if measured.photos == 1 else f"{measured.photos} photos"
-    lines = [f"{photos}, {measured.samples} samples; {at}, channel {settings.channel}"]
-    lines += [f"- {line}" for line in measured.summary]
-    lines.append(f"- {recommended.text}")
-    if output is not None:
-        lines.append(f"written: {output}")
-    return "\n".join(lines)
-
-
-def _map_csv(measured: LensReport) -> str:
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    mtf50 = ("mtf50_tangential", "mtf50_sagittal")
-    known = ("predicted_error", "extrapolated", "answered_by", "reason")
-    writer.writerow(["row", "col", "r", "phi", *mtf50, *known])
-    for i, point in enumerate(measured.field):
-        values = (point.position.r, point.position.phi, point.tangential, point.sagittal)
-        numbers = (f"{value:.6f}" for value in (*values, point.predicted_error))
-        made = (point.answered_by, point.reason)
-        writer.writerow([*divmod(i, measured.cols), *numbers, int(point.extrapolated), *made])
-    return out.getvalue()

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from lensmodel.core.files import write_atomically
-from lensmodel.report.drawing import COLOURS, Axes, Label, svg
-from lensmodel.report.photo_crops import Picture, crop_boxes
+from lensmodel.quality.images import Picture, crop_boxes
 
 _GAP, _LABEL = 6, 18  # pixels between crops and above them: a line of text fits (chosen)
 
@@ -38,16 +37,16 @@ def mosaic(rows: Mapping[str, Picture], path: Path, *, side: int = 220) -> None:
 
 def curve(path: Path, *, title: str, x_label: str, series: Mapping[str, Sequence[float]], unit: str) -> None:
     """Write a small SVG line chart; x counts 1, 2, 3 ... along each series."""
-    values = [v for line in series.values() for v in line]
-    low, high = min(0.0, *values), max(values) * 1.08 or 1.0
-    count = max(len(line) for line in series.values())
-    axes = Axes(52, 34, 340, 220, (1.0, max(float(count), 2.0)), (low, high))
-    ticks = [(float(tick), f"{tick:.2f}") for tick in np.linspace(low, high, 5)]
-    parts = [
-        Label(52, 18, title),
-        *axes.grid([(float(k), str(k)) for k in range(1, count + 1)], ticks, x_label),
-    ]
-    for number, (name, line) in enumerate(series.items()):
-        parts.append(axes.curve(range(1, len(line) + 1), line, COLOURS[number]))
-        parts += axes.key(number, f"{name} {unit}", COLOURS[number])
-    write_atomically(path, svg(title, 520, 264, parts).encode())
+    from matplotlib.figure import Figure  # noqa: PLC0415 - an extra, and slow to import
+
+    figure = Figure(figsize=(6.5, 3.3), layout="constrained")
+    ax = figure.add_subplot()
+    for name, line in series.items():
+        ax.plot(range(1, len(line) + 1), line, "o-", label=f"{name} {unit}".strip())
+    ax.set(xlabel=x_label, xticks=range(1, max(map(len, series.values())) + 1))
+    ax.set_ylim(bottom=min(0.0, *(v for line in series.values() for v in line)))
+    ax.set_title(title, loc="left", fontsize=10)
+    ax.legend(frameon=False)
+    out = io.BytesIO()
+    figure.savefig(out, format="svg", metadata={"Date": None})
+    write_atomically(path, out.getvalue())

@@ -15,7 +15,7 @@ from app.demo.own_service import own_service
 from app.demo.report import DemoReport
 from app.demo.service_tasks import corrected, follow, planes_of
 from app.demo.stages import Stages, Tell
-from lensmodel.report.photo_crops import as_shown
+from lensmodel.quality.images import as_shown
 from lensmodel.simulate import demo_data_path
 
 REAL_RAW = "canon_kissx4_colorchart.dng"

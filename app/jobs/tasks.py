@@ -50,7 +50,7 @@ from lensmodel.estimation.patches import Patch, selectors
 from lensmodel.model import LensModel, ModelSettings
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.photo.tags.location import find_location
-from lensmodel.report.lens_test import lens_test
+from lensmodel.report import lens_report
 from lensmodel.workflow import pipeline
 
 log = logging.getLogger(__name__)
@@ -254,7 +254,7 @@ def report(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> d
     model = _model(folder, ModelSettings(**arguments["model"])).warmed()
     about = arguments["about"]
     lateral = [codec.from_json(LateralColour, stored) for stored in about["lateral"]]
-    result = lens_test(
+    result = lens_report(
         model,
         about["name"],
         aspect=about["aspect"],

@@ -21,11 +21,8 @@ from app.schemas.fields import Aperture
 from app.store.tables import LensRow
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.types import FieldPosition
-from lensmodel.report.charts import apertures_chart, charts_of, lateral_chart
-from lensmodel.report.comparison import Side, compare
-from lensmodel.report.documents import error_map_words, zone_table
-from lensmodel.report.lens_test import LensTest
-from lensmodel.report.units import Unit
+from lensmodel.report import LensReport, Side, Unit, compare
+from lensmodel.report.documents import zone_table
 
 SHOWN_VERSIONS: Final = 200
 """Versions of the history on the page (chosen): the newest of them."""
@@ -68,7 +65,7 @@ def lens_page(lens_id: str, call: CallDep) -> HTMLResponse:
         others=[other for other in shown.lenses(call) if other.id != lens_id],
         comparable=[other for other in shown.lenses(call) if other.id != lens_id and other.samples],
         test=test,
-        centring=None if test is None else test.tested[0].report.decentring,
+        centring=None if test is None else test.tested[0].centring,
         **({} if test is None else _charts(test, None, "c/px")),
     )
 
@@ -82,6 +79,8 @@ def lens_charts(
     against: Annotated[str, Query(max_length=60)] = "",
 ) -> HTMLResponse:
     """Show the charts of one aperture, or two lenses or apertures in one."""
+    from lensmodel.report.plots import comparison_charts  # noqa: PLC0415 - matplotlib is slow to import
+
     test = stored_report(call, lens_routes.find_lens(call, lens_id))
     chosen = _aperture(aperture)
     with_itself = against.startswith("at ") and _aperture(against.removeprefix("at ")) == chosen
@@ -97,14 +96,14 @@ def lens_charts(
         query = {"aperture": aperture, "against": against}
     first_tested, second_tested = test.at(chosen), second_test.at(second_aperture)
     sides = [
-        Side(
-            name if second_test is not test else words.f_stop(tested.report.settings.aperture or 0.0), tested
-        )
+        Side(name if second_test is not test else words.f_stop(tested.settings.aperture or 0.0), tested)
         for name, tested in ((test.name, first_tested), (second_test.name, second_tested))
     ]
+    comparison = compare(*sides)
     return page(
         "_charts.html",
-        comparison=compare(*sides),
+        comparison=comparison,
+        charts=comparison_charts(comparison),
         comparison_link=f"/v1/lenses/{lens_id}/report",
         comparison_query=urlencode({name: value for name, value in query.items() if value}),
     )
@@ -120,19 +119,17 @@ def _aperture(text: str) -> float | None:
         ) from error
 
 
-def _charts(test: LensTest, aperture: float | None, unit: Unit) -> dict[str, Any]:
-    charts = [
-        *charts_of(test, aperture, unit),
-        *(chart for chart in (apertures_chart(test, unit), lateral_chart(test)) if chart is not None),
-    ]
+def _charts(test: LensReport, aperture: float | None, unit: Unit) -> dict[str, Any]:
+    from lensmodel.report.plots import charts  # noqa: PLC0415 - as above
+
     return {
-        "charts": charts,
+        "charts": charts(test, aperture, unit),
         "table": zone_table(test),
-        "error_note": error_map_words(test.at(aperture)),
+        "error_note": test.error_words,
     }
 
 
-def _test(call: Call, lens: LensRow) -> LensTest | None:
+def _test(call: Call, lens: LensRow) -> LensReport | None:
     try:
         return stored_report(call, lens)
     except (NotReadyError, NoSamplesError):

@@ -11,8 +11,7 @@ from app.schemas import CalibrationOut, CorrectionOut, LensOut, PatchOut, PhotoO
 from app.words import gain_words
 from lensmodel.core.types import FieldPosition
 from lensmodel.correction.audit import HELD
-from lensmodel.report import Decentring, little_seen, place_in_words
-from lensmodel.report.units import Unit
+from lensmodel.report import Centring, Unit, little_seen, place_in_words
 
 PHOTO_STATES: Final[Mapping[str, str]] = {
     "received": "Waiting its turn",
@@ -247,16 +246,16 @@ def changing_words(lens: LensOut, left: int) -> str:
     return f"None of its photos could be measured for the model {lens.psf_model}, so {answers} still."
 
 
-def centring_verdict(decentring: Decentring) -> str:
+def centring_verdict(centring: Centring) -> str:
     """Say in a word or two whether a lens is centred."""
     return {"centred": "Yes, as far as can be told.", "decentred": "No.", "unknown": "Undecided."}[
-        decentring.verdict
+        centring.verdict
     ]
 
 
-def centring_words(decentring: Decentring) -> str:
+def centring_words(centring: Centring) -> str:
     """Write why, with its error."""
-    return f"{decentring.text[:1].upper()}{decentring.text[1:]}."
+    return f"{centring.text[:1].upper()}{centring.text[1:]}."
 
 
 def unit_name(unit: Unit) -> str:

@@ -20,11 +20,8 @@ from app.store.versions import report_key
 from lensmodel.core.codec import from_json, to_json
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.core.types import Channel
-from lensmodel.report.comparison import Comparison, Side, compare
-from lensmodel.report.documents import comparison_html, to_html
-from lensmodel.report.lens_test import LensTest
-from lensmodel.report.pdf import comparison_pdf, to_pdf
-from lensmodel.report.tables import to_csv
+from lensmodel.report import Comparison, LensReport, Side, compare
+from lensmodel.report.documents import comparison_html, to_csv, to_html
 
 router = APIRouter(tags=["lenses"])
 
@@ -41,7 +38,7 @@ POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; f
 _CONTENT: Final = {kind.partition(";")[0]: {"schema": {"type": "string"}} for kind in MEDIA_TYPES.values()}
 
 
-def stored_report(call: Call, lens: LensRow) -> LensTest:
+def stored_report(call: Call, lens: LensRow) -> LensReport:
     """Return the report of the newest version of a lens."""
     if lens.sample_count == 0:
         raise NoSamplesError(f"lens {lens.public_id} has no samples yet: upload photos taken with it")
@@ -52,7 +49,7 @@ def stored_report(call: Call, lens: LensRow) -> LensTest:
             f"the report of version {lens.version} is not made yet: it comes when that version is measured",
             headers={"Retry-After": "2"},
         ) from error
-    return from_json(LensTest, json.loads(stored))
+    return from_json(LensReport, json.loads(stored))
 
 
 @router.get(
@@ -104,17 +101,21 @@ def read_report(
     return Response(body, media_type=MEDIA_TYPES[form], headers=headers)
 
 
-def _written(test: LensTest, form: Form) -> bytes:
+def _written(test: LensReport, form: Form) -> bytes:
     if form == "json":
         return json.dumps(to_json(test)).encode()
     if form == "csv":
         return to_csv(test).encode()
-    return to_html(test).encode() if form == "html" else to_pdf(test)
+    if form == "html":
+        return to_html(test).encode()
+    from lensmodel.report.plots import pages, to_pdf  # noqa: PLC0415 - matplotlib is slow to import
+
+    return to_pdf(pages(test))
 
 
 def _compared(
-    first: LensTest,
-    second: LensTest,
+    first: LensReport,
+    second: LensReport,
     aperture: float | None,
     second_aperture: float | None,
     channel: Channel,
@@ -125,13 +126,15 @@ def _compared(
         second.at(second_aperture if second_aperture is not None else aperture, channel),
     )
     comparison = compare(
-        Side(_named(first, first_curves.report.settings.aperture, second), first_curves),
-        Side(_named(second, second_curves.report.settings.aperture, first), second_curves),
+        Side(_named(first, first_curves.settings.aperture, second), first_curves, first.facts),
+        Side(_named(second, second_curves.settings.aperture, first), second_curves, second.facts),
     )
     if form == "html":
         return comparison_html(comparison).encode()
     if form == "pdf":
-        return comparison_pdf(comparison)
+        from lensmodel.report.plots import comparison_page, to_pdf  # noqa: PLC0415 - as above
+
+        return to_pdf([comparison_page(comparison)])
     if form == "json":
         return json.dumps(_figures(comparison)).encode()
     rows = ["zone,first_c_px,second_c_px,difference,standard_error"]
@@ -143,7 +146,7 @@ def _compared(
     return ("\n".join(rows) + "\n").encode()
 
 
-def _named(test: LensTest, aperture: float | None, other: LensTest) -> str:
+def _named(test: LensReport, aperture: float | None, other: LensReport) -> str:
     at = "" if aperture is None else f"f/{aperture:g}"
     if test.name == other.name:
         return at or test.name

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.types import Kernel
-from lensmodel.report.photo_crops import Picture, crop_boxes
+from lensmodel.quality.images import Picture, crop_boxes
 
 
 def strip(picture: Picture, side: int, gap: int = 6) -> Picture:

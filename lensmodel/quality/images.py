@@ -17,6 +17,10 @@ _SHIFT_STEPS: Final = 6  # of Newton: it begins within a pixel, and each step ga
 _SHIFT_PAD: Final = 8  # pixels: more than any shift that is looked for
 _LARGEST_SHIFT = 3.0  # pixels: larger ones are no shift but another picture (chosen)
 _SHIFT_WINDOW: Final = 1024  # pixels: the middle says as much as the whole
+_CROP_EDGE: Final = 4  # pixels of the border that demosaicing leaves unsure (chosen)
+
+Picture = NDArray[np.uint8]
+"""`(row, col, 3)` sRGB, as shown."""
 
 
 def to_srgb(linear: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -187,3 +191,21 @@ def shifted(image: NDArray[np.floating], row: float, col: float) -> NDArray[np.f
 def _same_shape(image: NDArray[np.floating], reference: NDArray[np.floating]) -> None:
     if image.shape != reference.shape or image.ndim < 2:
         raise InvalidInputError(f"pictures must have the same shape, got {image.shape} and {reference.shape}")
+
+
+def as_shown(planes: NDArray[np.floating], gain: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Picture:
+    """Encode linear planes `(3, row, col)` to 8-bit sRGB `(row, col, 3)`, each channel times its gain."""
+    shown = to_srgb(planes * np.asarray(gain, dtype=np.float32)[:, None, None])
+    return np.ascontiguousarray(np.moveaxis(np.rint(shown * 255), 0, -1).astype(np.uint8))
+
+
+def crop_boxes(height: int, width: int, side: int) -> dict[str, tuple[int, int]]:
+    """Top-left pixels of five crops: the centre and the four corners, clear of the border."""
+    bottom, right = height - side - _CROP_EDGE, width - side - _CROP_EDGE
+    return {
+        "center": ((height - side) // 2, (width - side) // 2),
+        "upper left": (_CROP_EDGE, _CROP_EDGE),
+        "upper right": (_CROP_EDGE, right),
+        "lower left": (bottom, _CROP_EDGE),
+        "lower right": (bottom, right),
+    }

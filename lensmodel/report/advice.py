@@ -6,7 +6,7 @@ detail at a place is therefore worth::
     gain = e (1 - sqrt(n / (n + 1)))
 
 with e the error predicted there and n the photos that speak for the place; none do where the model
-extrapolates, so that its whole error can be gained. The place and setting of the largest gain wins.
+extrapolates, so that its whole error can be gained. The place and aperture of the largest gain wins.
 """
 
 from __future__ import annotations
@@ -16,22 +16,13 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Final
 
-from lensmodel.core.types import CHANNELS, Channel, FieldPosition, LensSettings
-from lensmodel.model import LensModel, PsfAnswer
+from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.model import LensModel
 from lensmodel.report.places import landmarks, little_seen, place_in_words
 
 _SIZE: Final = 15  # pixels (chosen: quick to ask for; the kernel itself plays no part)
-_SETTINGS: Final = 24  # settings that are asked about, those of the most samples (chosen: for time)
+_SETTINGS: Final = 12  # settings that are asked about, those of the most samples (chosen: for time)
 _SATISFIED: Final = 0.01  # of the kernel's norm: less gain is not worth another photo (chosen)
-_WEIGHT: Final[dict[Channel, float]] = {"g": 1.0, "r": 0.5, "b": 0.5}
-"""Sharpness is seen in luminance, to which red and blue together give about as much as green
-(chosen: round numbers)."""
-
-_COLOURS: Final[dict[Channel, str]] = {
-    "g": "fine detail",
-    "r": "fine detail in red or neutral colours",
-    "b": "fine detail in blue or neutral colours",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,15 +38,9 @@ class Suggestion:
     position : FieldPosition
         Where the detail should lie, in sensor orientation.
     settings : LensSettings
-        Aperture, focal length and channel that are short of evidence.
+        Aperture and focal length that are short of evidence.
     gain : float
-        Drop of the predicted relative L2 error that one photo is worth, red and blue at half weight.
-    predicted_error : float
-        Expected relative L2 there now.
-    effective_samples : float
-    photos : int
-        Photos that speak for the place now; 0 where the model extrapolates.
-    extrapolated : bool
+        Drop of the predicted relative L2 error that one photo is worth.
     """
 
     text: str
@@ -63,10 +48,6 @@ class Suggestion:
     position: FieldPosition
     settings: LensSettings
     gain: float
-    predicted_error: float
-    effective_samples: float
-    photos: int
-    extrapolated: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,66 +77,42 @@ def advice(model: LensModel, settings: LensSettings | None = None) -> Advice:
     ----------
     model : LensModel
     settings : LensSettings, optional
-        Settings that the owner cares for; None looks at all settings that any photo had. The
-        channel plays no part: a photo tells about all three.
+        Settings that the owner cares for; None looks at those that photos had.
 
     Returns
     -------
     Advice
         The same for the same model, whatever the order of its samples.
     """
-    wanted = _settings(model) if settings is None else [replace(settings, channel="g")]
-    shots = [
-        _suggestion(model, place, each.with_channel(channel))
-        for each in wanted
-        for channel in CHANNELS
-        for place in landmarks()
-    ]
-    # green before red and blue, near before far, right before left: ties must not depend on anything else
+    own = [s for s in model.samples if s.photo not in model.settings.excluded and s.settings.channel == "g"]
+    count = Counter(s.settings for s in own)
+    ordered = sorted(count, key=lambda asked: (-count[asked], _order(asked)))
+    wanted = ordered[:_SETTINGS] if settings is None else [replace(settings, channel="g")]
+    shots = [_suggestion(model, place, asked) for asked in wanted for place in landmarks()]
+    # near before far, right before left: ties must not depend on anything else
     shots.sort(
-        key=lambda w: (
-            -round(w.gain, 6),
-            w.settings.channel != "g",
-            w.settings.stops or 0.0,
-            w.position.r,
-            abs(w.position.phi),
-            w.position.phi,
+        key=lambda s: (
+            -round(s.gain, 6),
+            _order(s.settings),
+            s.position.r,
+            abs(s.position.phi),
+            s.position.phi,
         )
     )
     best: list[Suggestion] = []
-    for suggestion in shots:
-        known = {(w.position, w.settings.aperture) for w in best}
-        if len(best) < 3 and (suggestion.position, suggestion.settings.aperture) not in known:
-            best.append(suggestion)
-    satisfied = best[0].gain < _SATISFIED
-    dark = little_seen(_estimated_places(model)) if satisfied else []
-    enough = satisfied and not dark
-    if dark:
-        first = next(w for w in shots if w.position == dark[0])
-        text = f"Most useful next: a photo of {first.text}. Little fine detail was seen there yet."
-    elif enough:
-        text = (
-            "The photos cover the picture well; another one would change little. "
-            f"If you add one, make it {best[0].text}."
+    for shot in shots:
+        known = {(s.position, s.settings.aperture) for s in best}
+        if len(best) < 3 and (shot.position, shot.settings.aperture) not in known:
+            best.append(shot)
+    if best[0].gain >= _SATISFIED:
+        return Advice(
+            f"Next, a photo of {best[0].text}, because {best[0].reason}.", tuple(best), enough=False
         )
-    else:
-        text = f"Most useful next: a photo of {best[0].text}, because {best[0].reason}."
-    return Advice(text, tuple(best), enough)
-
-
-def _estimated_places(model: LensModel) -> list[FieldPosition]:
-    """Where patches of photos that vote gave a PSF."""
-    voting = (s for s in model.samples if s.photo not in model.settings.excluded)
-    return [s.position for s in voting if s.settings.channel == "g"]
-
-
-def _settings(model: LensModel) -> list[LensSettings]:
-    """Settings of the photos that vote, each once, in order; the most used where there are many."""
-    count = Counter(
-        replace(s.settings, channel="g") for s in model.samples if s.photo not in model.settings.excluded
-    )
-    ordered = sorted(count.items(), key=lambda item: (-item[1], _order(item[0])))
-    return sorted((settings for settings, _ in ordered[:_SETTINGS]), key=_order)
+    if unseen := little_seen(s.position for s in own):
+        shot = _suggestion(model, unseen[0], wanted[0])
+        text = f"Next, a photo of {shot.text}, because little is seen of that place."
+        return Advice(text, (shot, *best[:2]), enough=False)
+    return Advice("The lens is well known by now; another photo would add little.", tuple(best), enough=True)
 
 
 def _order(settings: LensSettings) -> tuple[float, float, float]:
@@ -165,32 +122,17 @@ def _order(settings: LensSettings) -> tuple[float, float, float]:
 def _suggestion(model: LensModel, place: FieldPosition, settings: LensSettings) -> Suggestion:
     answer = model.query(place, settings, _SIZE)
     photos = 0 if answer.extrapolated else answer.photos
-    gain = answer.predicted_error * (1.0 - math.sqrt(photos / (photos + 1.0)))
-    return Suggestion(
-        text=_text(place, settings),
-        reason=_reason(answer, photos),
-        position=place,
-        settings=settings,
-        gain=_WEIGHT[settings.channel] * gain,
-        predicted_error=answer.predicted_error,
-        effective_samples=answer.effective_samples,
-        photos=photos,
-        extrapolated=answer.extrapolated,
-    )
-
-
-def _text(place: FieldPosition, settings: LensSettings) -> str:
-    words = f"something with {_COLOURS[settings.channel]} at {place_in_words(place)}"
+    text = f"something with fine detail at {place_in_words(place)}"
     if settings.aperture is not None:
-        words += f", at f/{settings.aperture:g}"
+        text += f", at f/{settings.aperture:g}"
     if settings.focal_mm is not None:
-        words += f", at {settings.focal_mm:g} mm"
-    return words
-
-
-def _reason(answer: PsfAnswer, photos: int) -> str:
-    error = f"its blur is expected to be wrong by {100 * answer.predicted_error:.0f} %"
+        text += f", at {settings.focal_mm:g} mm"
+    error = f"its blur is expected to be wrong by {answer.predicted_error:.0%}"
     if photos == 0:
-        return f"no photo shows that place at these settings yet, and {error}"
-    some = "one photo speaks" if photos == 1 else f"{photos} photos speak"
-    return f"{some} for that place, and {error}"
+        reason = f"no photo shows that place at these settings yet, and {error}"
+    else:
+        reason = (
+            f"{'one photo speaks' if photos == 1 else f'{photos} photos speak'} for that place, and {error}"
+        )
+    gain = answer.predicted_error * (1.0 - math.sqrt(photos / (photos + 1.0)))
+    return Suggestion(text, reason, place, settings, gain)

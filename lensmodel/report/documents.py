@@ -1,99 +1,77 @@
-"""A lens test as one HTML file: text, tables and drawings, nothing loaded from elsewhere."""
+"""A report as files: one HTML page that loads nothing from elsewhere, and one line for each figure as CSV."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import csv
+import io
+from collections.abc import Iterable, Iterator, Sequence
 from html import escape
-from typing import Final
+from typing import Any, Final
 
 from lensmodel.core.types import ZONES
-from lensmodel.report.charts import apertures_chart, charts_of, lateral_chart
 from lensmodel.report.comparison import Comparison
-from lensmodel.report.drawing import ReportChart
-from lensmodel.report.lens_test import LensTest, Tested
-from lensmodel.report.units import UNIT_NAMES
+from lensmodel.report.lens_report import UNIT_NAMES, ApertureReport, LensReport
 
+_HEAD: Final = (
+    *("quantity", "aperture", "channel", "r", "phi", "row", "col", "frequency_c_px", "frequency_lp_mm"),
+    *("direction", "value", "unit", "standard_error", "predicted_error", "extrapolated"),
+)
 _STYLE: Final = """
-:root { color-scheme: light dark; }
-body { margin: 0 auto; max-width: 84rem; padding: 1.5rem; font: 16px/1.55 system-ui, sans-serif;
-  background: light-dark(#fff, #131416); color: light-dark(#191a1c, #eeeeec); }
+:root { color-scheme: light; }
+body { margin: 0 auto; max-width: 84rem; padding: 1.5rem; font: 16px/1.55 system-ui, sans-serif; color:
+#191a1c;
+  background: #fff; }
 h1 { line-height: 1.2; margin: 0; } h2 { margin: 2.2rem 0 .6rem; }
-.verdict { font-size: 1.25rem; max-width: 46rem; }
-.facts, .note { color: light-dark(#55585d, #b1b4b9); max-width: 60rem; }
-.charts { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fill, minmax(min(100%, 34rem), 1fr));
-  align-items: start; }
-figure { margin: 0; border: 1px solid light-dark(#dcdcd8, #363a3f); border-radius: .5rem; overflow-x: auto; }
-svg { display: block; width: 100%; min-width: 33rem; height: auto; }
+.verdict { font-size: 1.25rem; max-width: 46rem; } .facts, .note { color: #55585d; max-width: 60rem; }
+.charts { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fill, minmax(min(100%, 34rem), 1fr)); }
+figure { margin: 0; overflow-x: auto; } img { display: block; width: 100%; min-width: 33rem; height: auto; }
+img.page { max-width: 56rem; }
 table { border-collapse: collapse; } th, td { text-align: left; padding: .3rem 1.4rem .3rem 0;
-  border-bottom: 1px solid light-dark(#dcdcd8, #363a3f); font-variant-numeric: tabular-nums; }
-.scroll { overflow-x: auto; }
-@media print { body { background: #fff; color: #000; } figure { break-inside: avoid; } }
+  border-bottom: 1px solid #dcdcd8; font-variant-numeric: tabular-nums; }
+.scroll { overflow-x: auto; } @media print { figure { break-inside: avoid; } }
 """
 
 
-def facts(test: LensTest) -> str:
-    """Say what a test rests on."""
-    photos = "1 photo" if test.photos == 1 else f"{test.photos} photos"
-    parts = [photos, f"{test.samples} blur samples"]
-    if test.sensor.pixel_pitch_um is not None:
-        pitch = test.sensor.pixel_pitch_um
-        parts.append(f"pixels of {pitch:.2f} micrometres, Nyquist frequency {500.0 / pitch:.0f} lp/mm")
-    if test.sensor.height_px is not None:
-        parts.append(f"{test.sensor.height_px} pixels high")
-    return ", ".join(parts)
-
-
-def error_map_words(tested: Tested) -> str:
-    """Say what the bands and error maps of a report are."""
-    if tested.spread is None:
-        return "Too little is known to estimate the error of these figures."
-    again = f"{tested.spread.draws} random redraws of the {tested.spread.drawn}"
-    words = (
-        f"Bands and error maps: one standard error, from {again}. "
-        "Errors that all photos share are not included."
-    )
-    if tested.spread.drawn == "patches":
-        words += " With fewer than three photos this error is too small: patches of a photo share its focus."
-    return words
-
-
-def zone_table(test: LensTest) -> tuple[list[str], list[list[str]]]:
-    """Return head and rows of MTF50 by aperture and zone, in each unit that is known."""
-    units = test.sensor.units
+def zone_table(report: LensReport) -> tuple[list[str], list[list[str]]]:
+    """Return head and rows of MTF50 by aperture, zone and worst corner, in each unit that is known."""
+    units = report.sensor.units
     head = ["Aperture", "Zone", *(f"MTF50, {UNIT_NAMES[unit]}" for unit in units)]
     rows = []
-    for aperture in test.apertures:
-        tested = test.at(aperture)
-        name = "unknown" if aperture is None else f"f/{aperture:g}"
-        for zone in ZONES:
-            value = tested.zones[zone]
-            rows.append([name, zone, *(test.sensor.words(value, unit) for unit in units)])
+    for aperture in report.apertures:
+        found = report.at(aperture)
+        worst = found.worst
+        own: list[tuple[str, float]] = [(zone, found.zones[zone]) for zone in ZONES]
+        own += [(f"worst corner, {worst.side}", worst.mean)]
+        for zone, value in own:
+            rows.append([found.at or "unknown", zone, *(report.sensor.words(value, unit) for unit in units)])
     return head, rows
 
 
-def to_html(test: LensTest) -> str:
-    """Write a lens test as a page."""
+def to_html(report: LensReport) -> str:
+    """Write a report as a page."""
+    from lensmodel.report.plots import charts  # noqa: PLC0415 - matplotlib, an extra, takes a second to import
+
     parts = [
-        f"<h1>{escape(test.name)}</h1>",
-        f'<p class="verdict">{escape(test.verdict)}</p>',
-        f'<p class="facts">{escape(facts(test))}.</p>',
-        _table(*zone_table(test)),
+        f"<h1>{escape(report.name)}</h1>",
+        f'<p class="verdict">{escape(report.verdict)}</p>',
+        f'<p class="facts">{escape(report.facts)}.</p>',
+        *(f'<p class="facts">{escape(name)}: {escape(words)}</p>' for name, words in report.details.items()),
+        _table(*zone_table(report)),
     ]
-    whole = [chart for chart in (apertures_chart(test), lateral_chart(test)) if chart is not None]
-    if whole:
-        parts += ["<h2>Over apertures and colours</h2>", _figures(whole)]
-    for aperture in test.apertures:
-        tested = test.at(aperture)
-        parts.append(f"<h2>{'At ' + f'f/{aperture:g}' if aperture is not None else 'Aperture unknown'}</h2>")
-        parts.append(_list(tested.report.summary))
-        parts.append(_figures(charts_of(test, aperture)))
-        parts.append(f'<p class="note">{escape(error_map_words(tested))}</p>')
-    parts += ["<h2>What would help most</h2>", f"<p>{escape(test.advice.text)}</p>"]
-    return _page(test.name, parts)
+    for aperture in report.apertures:
+        found = report.at(aperture)
+        parts.append(f"<h2>{'At ' + found.at if found.at else 'Aperture unknown'}</h2>")
+        parts.append(f"<p>{escape(found.centring.text[:1].upper() + found.centring.text[1:])}.</p>")
+        parts.append(_figures(charts(report, aperture)))
+        parts.append(f'<p class="note">{escape(report.error_words)}</p>')
+    parts += ["<h2>What would help most</h2>", f"<p>{escape(report.advice.text)}</p>"]
+    return _page(report.name, parts)
 
 
 def comparison_html(comparison: Comparison) -> str:
     """Write a comparison as a page."""
+    from lensmodel.report.plots import comparison_charts  # noqa: PLC0415 - as above
+
     first, second = comparison.first, comparison.second
     title = f"{first.name} and {second.name}"
     rows = [
@@ -110,34 +88,94 @@ def comparison_html(comparison: Comparison) -> str:
     parts = [
         f"<h1>{escape(title)}</h1>",
         f'<p class="verdict">{escape(comparison.verdict)}</p>',
-        *(f'<p class="facts">{escape(side.facts)}.</p>' for side in (first, second)),
+        *(f'<p class="facts">{escape(s.name)}: {escape(s.facts)}.</p>' for s in (first, second) if s.facts),
         _table(head, rows),
-        _figures(comparison.charts),
-        f'<p class="note">{escape(error_map_words(first.tested))}</p>',
+        _figures(comparison_charts(comparison)),
     ]
     return _page(title, parts)
 
 
+def to_csv(report: LensReport) -> str:
+    """Write a report as CSV: MTF50 over the picture, contrast by radius, widths, lateral colour."""
+    out = io.StringIO()
+    writer = csv.DictWriter(out, _HEAD, restval="", lineterminator="\n")
+    writer.writeheader()
+    for found in report.tested:
+        known = {"aperture": _number(found.settings.aperture), "channel": found.settings.channel}
+        writer.writerows(known | row for row in _rows(found))
+    if report.lateral is not None:
+        for channel, values in (("r", report.lateral.red), ("b", report.lateral.blue)):
+            for r, value in zip(report.lateral.radii, values, strict=True):
+                row = {
+                    "quantity": "lateral colour",
+                    "channel": channel,
+                    "r": _number(r),
+                    "value": _number(value),
+                }
+                writer.writerow(row | {"unit": "px"})
+    return out.getvalue()
+
+
+def _rows(found: ApertureReport) -> Iterator[dict[str, str]]:
+    for zone, value in found.zones.items():
+        yield {"quantity": f"MTF50, mean of {zone}", "value": _number(value), "unit": "c/px"}
+    for direction, values, errors in (
+        ("tangential", found.tangential, found.tangential_error),
+        ("sagittal", found.sagittal, found.sagittal_error),
+    ):
+        for i, (place, value) in enumerate(zip(found.positions, values, strict=True)):
+            row, col = divmod(i, found.cols)
+            yield {
+                "quantity": "MTF50",
+                "direction": direction,
+                "r": _number(place.r),
+                "phi": _number(place.phi),
+                "row": str(row),
+                "col": str(col),
+                "value": _number(value),
+                "unit": "c/px",
+                "standard_error": _number(errors[i]) if errors else "",
+                "predicted_error": _number(found.predicted_error[i]),
+                "extrapolated": str(int(found.extrapolated[i])),
+            }
+    for curve in found.curves:
+        for direction, values, errors in (
+            ("tangential", curve.tangential, curve.tangential_error),
+            ("sagittal", curve.sagittal, curve.sagittal_error),
+        ):
+            for k, r in enumerate(found.radii):
+                yield {
+                    "quantity": "MTF",
+                    "r": _number(r),
+                    "frequency_c_px": _number(curve.frequency),
+                    "frequency_lp_mm": _number(curve.lp_mm),
+                    "direction": direction,
+                    "value": _number(values[k]),
+                    "standard_error": _number(errors[k]) if errors else "",
+                }
+    for direction, widths in (("radial", found.along_u), ("around", found.along_v)):
+        for r, width in zip(found.radii, widths, strict=True):
+            row_ = {"quantity": "width of a point", "r": _number(r), "direction": direction}
+            yield row_ | {"value": _number(width), "unit": "px"}
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.6g}"
+
+
 def _page(title: str, parts: Iterable[str]) -> str:
-    return "\n".join(
-        [
-            '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f"<title>{escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n<main>",
-            *parts,
-            "</main>\n</body>\n</html>\n",
-        ]
-    )
+    head = [
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f"<title>{escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n<main>",
+    ]
+    return "\n".join([*head, *parts, "</main>\n</body>\n</html>\n"])
 
 
-def _figures(charts: Sequence[ReportChart]) -> str:
+def _figures(drawn: Sequence[Any]) -> str:
     # lettering of a chart stays large enough to read; on a narrow screen the chart scrolls, by keys as well
-    figures = "".join(f'<figure tabindex="0">{chart.svg()}</figure>' for chart in charts)
-    return f'<div class="charts">{figures}</div>'
-
-
-def _list(lines: Iterable[str]) -> str:
-    return f"<ul>{''.join(f'<li>{escape(line[:1].upper() + line[1:])}.</li>' for line in lines)}</ul>"
+    images = (f'<img src="{chart.source}" alt="{escape(chart.title)}">' for chart in drawn)
+    return f'<div class="charts">{"".join(f"<figure tabindex=0>{image}</figure>" for image in images)}</div>'
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -1,359 +1,613 @@
-"""The report on one copy of a lens: sharpness over the field, best aperture, centring.
+"""The report on one copy of a lens: how sharp it is where, at which apertures and colours, with errors.
 
-Everything follows from the model and its samples. Frequencies are cycles/pixel; where the samples
-know their pixel pitch, the curves are drawn at 10 to 40 line pairs per millimetre, as lens tests are.
-Tangential is the contrast along u (of lines across the radius), sagittal along v.
+Everything follows from the model and its samples. Frequencies are cycles/pixel. Tangential is the contrast
+along u (of lines across the radius), sagittal along v; the two are never mixed but where "mean" says so.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Final
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from statistics import median
+from typing import Final, Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.types import ZONES, FieldPosition, LensSettings, Zone
+from lensmodel.core.geometry import zone_of
+from lensmodel.core.psf import second_moments
+from lensmodel.core.types import (
+    ZONES,
+    Channel,
+    FieldPosition,
+    Kernel,
+    LensSettings,
+    StepHook,
+    Zone,
+    ignore_step,
+)
 from lensmodel.model import LensModel
-from lensmodel.model.provenance import answerers_in_words
+from lensmodel.photo.lateral import LateralColour
 from lensmodel.quality import mtf_from_kernel, tangential_sagittal_mtf50
-from lensmodel.report.decentring import Decentring, decentring
-from lensmodel.report.field_shape import FieldShape, Ring, field_shape
-from lensmodel.report.places import DEFAULT_ASPECT, grid, ring
-from lensmodel.report.units import SensorGeometry
+from lensmodel.report.advice import Advice, advice
+from lensmodel.report.centring import Centring, centring
+from lensmodel.report.errors import DRAWS, redrawn_models
+from lensmodel.report.places import DEFAULT_ASPECT, corner_places, grid, place_in_words, ring
+
+Unit = Literal["c/px", "lp/ph", "lp/mm"]
+UNIT_NAMES: Final[dict[Unit, str]] = {"c/px": "c/px", "lp/ph": "LP/PH", "lp/mm": "lp/mm"}
+
+NYQUIST: Final = 0.5
+"""Cycles/pixel: beyond it a sensor shows no finer lines, and a measured MTF50 says only "at least"."""
+
+MOST_APERTURES: Final = 4  # a reader compares no more at once (chosen)
+ROWS: Final = 7  # of the grid of places: zones have some each, and their figures are still readable (chosen)
 
 _STEPS_MM: Final = (50.0, 20.0, 10.0)
 """Curves are drawn at one to four times such a step in lp/mm: 10 to 40, as lens tests are, and for sensors
 with small pixels at the largest of which four lie below half of the Nyquist frequency (chosen)."""
 
-FALLBACK_FREQUENCIES: Final = (0.05, 0.1, 0.15, 0.2)
+_FREQUENCIES: Final = (0.05, 0.1, 0.15, 0.2)
 """Cycles/pixel of the curves where no pixel pitch is known: 10 to 40 lp/mm at 5 micrometres (chosen)."""
 
 # Half-diagonals (chosen: nothing is asked in the very corner, which no sample reaches)
-_RADII: Final = tuple(float(r) for r in np.linspace(0.0, 0.95, 11).round(4))
-_RING: Final = 3  # places in each quarter of a ring whose mean is its value: more hardly change it (chosen)
-_MOST_APERTURES: Final = 12  # a page holds as many rows (chosen)
-# Half-diagonals (chosen: about the middle of each zone)
-_ZONE_RADIUS: Final[dict[Zone, float]] = {"center": 0.15, "mid": 0.5, "corner": 0.88}
+RADII: Final = tuple(float(r) for r in np.linspace(0.0, 0.95, 11).round(4))
+_RING: Final = 2  # places in each quarter of a ring whose mean is its value (chosen: for time)
+_LATERAL_R: Final = tuple(round(0.1 * k, 1) for k in range(11))  # half-diagonals (chosen: curves are smooth)
+
+_EVEN, _NEARLY, _SOFTER = 0.95, 0.8, 0.5
+"""Shares of the centre's MTF50 above which a place is called as sharp, nearly as sharp, and clearly softer
+(chosen: a fifth less is hardly seen in a print, half as much at a glance)."""
+
+_CRISP, _SHARP, _SOFT = 0.35, 0.2, 0.1
+"""MTF50 in cycles/pixel of the centre above which a lens is called as sharp as a sensor shows, sharp, and
+a little soft (chosen: an ideal pixel behind an ideal lens reaches .6, a demosaiced photo about .3)."""
+
+UNKNOWN: Final = 0.5
+"""Expected relative L2 of a kernel from which on a place is drawn as unknown (chosen: half may be wrong)."""
+
+_Pairs: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
 
 
 @dataclass(frozen=True, slots=True)
-class ReportSettings:
-    """What a report looks at.
+class SensorGeometry:
+    """What turns cycles/pixel into other units.
 
     Parameters
     ----------
-    rows, cols : int
-        Cells of the map.
-    aspect : float
-        Width over height of the picture.
-    size : int
-        Odd side of the kernels, pixels.
-    frequencies : tuple of float
-        Of the curves, cycles/pixel; empty: 10, 20, 30 and 40 lp/mm
-        by the samples' pixel pitch, or 0.05 to 0.2.
+    pixel_pitch_um : float or None
+        Micrometres from pixel to pixel.
+    height_px : int or None
+        Pixels of the shorter side of the picture.
     """
 
-    rows: int = 7
-    cols: int = 11
-    aspect: float = DEFAULT_ASPECT
-    size: int = 31
-    frequencies: tuple[float, ...] = ()
+    pixel_pitch_um: float | None = None
+    height_px: int | None = None
 
-    def __post_init__(self) -> None:
-        if not 3 <= self.size <= 255 or self.size % 2 == 0:
-            raise InvalidInputError(f"size must be odd and lie in 3..255, got {self.size}")
-        if any(not 0.0 < f <= 0.5 for f in self.frequencies):
-            raise InvalidInputError(f"frequencies must lie in 0..0.5 cycles/pixel, got {self.frequencies}")
-
-
-@dataclass(frozen=True, slots=True)
-class MapPoint:
-    """Sharpness at one place, MTF50 in cycles/pixel; which model answered there, and why that one."""
-
-    position: FieldPosition
-    tangential: float
-    sagittal: float
-    predicted_error: float
-    effective_samples: float
-    extrapolated: bool
-    answered_by: str = ""
-    reason: str = ""
+    def factor(self, unit: Unit) -> float | None:
+        """What cycles/pixel are multiplied with: LP/PH = H f, lp/mm = 1000 f / p; None where unknown."""
+        if unit == "lp/mm":
+            return None if self.pixel_pitch_um is None else 1000.0 / self.pixel_pitch_um
+        if unit == "lp/ph":
+            return None if self.height_px is None else float(self.height_px)
+        return 1.0
 
     @property
-    def mean(self) -> float:
-        """Mean of both MTF50."""
-        return (self.tangential + self.sagittal) / 2.0
+    def units(self) -> tuple[Unit, ...]:
+        """The units that are known."""
+        return tuple(unit for unit in UNIT_NAMES if self.factor(unit) is not None)
+
+    def words(self, frequency: float, unit: Unit = "c/px") -> str:
+        """Write a frequency given in cycles/pixel; beyond the Nyquist frequency only "at least" it."""
+        factor = self.factor(unit)
+        if factor is None:
+            return "unknown"
+        value = min(frequency, NYQUIST) * factor
+        digits = f"{value:.3f}".removeprefix("0") if unit == "c/px" else f"{value:.0f}"
+        return f"at least {digits}" if frequency >= NYQUIST else digits
 
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Contrast at one frequency over the radius.
+    """Contrast at one frequency over the radii of a report, mean over the angles that lie on the picture.
 
-    Parameters
-    ----------
-    frequency : float
-        Cycles/pixel.
-    lp_mm : float or None
-        The same in line pairs per millimetre, where the pixel pitch is known.
-    tangential, sagittal : tuple of float
-        Mean over the angles that lie on the picture, one value for each radius of the report.
-    tangential_spread, sagittal_spread : tuple of float
-        Standard deviation over the angles: zero in a centred lens.
+    `lp_mm` is the frequency in line pairs per millimetre, where the pixel pitch is known; errors are standard
+    errors, empty where there are none.
     """
 
     frequency: float
     lp_mm: float | None
     tangential: tuple[float, ...]
     sagittal: tuple[float, ...]
-    tangential_spread: tuple[float, ...]
-    sagittal_spread: tuple[float, ...]
+    tangential_error: tuple[float, ...] = ()
+    sagittal_error: tuple[float, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """The frequency in words."""
+        return f"{self.frequency:.3g} c/px" if self.lp_mm is None else f"{self.lp_mm:.3g} lp/mm"
 
 
 @dataclass(frozen=True, slots=True)
-class ApertureRow:
-    """MTF50 in cycles/pixel at one aperture at r = 0.15, 0.5 and 0.88; `whole` weighs them by area.
+class Spot:
+    """What the lens makes of a point at one place: MTF50 in cycles/pixel, and the kernel's rows."""
 
-    `answered_by` says in words which models answered, and why.
-    """
+    place: str
+    position: FieldPosition
+    tangential: float
+    sagittal: float
+    kernel: tuple[tuple[float, ...], ...]
 
-    aperture: float
-    center: float
-    mid: float
-    corner: float
-    whole: float
-    answered_by: str = ""
+    @property
+    def mean(self) -> float:
+        """Mean of both MTF50."""
+        return (self.tangential + self.sagittal) / 2.0
+
+    @property
+    def side(self) -> str:
+        """The place without the word corner: "the upper left"."""
+        return self.place.removesuffix(" corner")
 
 
 @dataclass(frozen=True, slots=True)
-class LensReport:
-    """What a model says of its lens, at some settings.
+class ApertureReport:
+    """What was found at one aperture, in one colour.
 
     Parameters
     ----------
     settings : LensSettings
-    photos, samples : int
-        Behind the model, of all settings.
-    pixel_pitch_um : float or None
-        Of the samples, where they agree.
     aspect : float
         Width over height of the map.
     rows, cols : int
-    field : tuple of MapPoint
-        rows x cols places, row by row from the top left.
+    positions : tuple of FieldPosition
+        Of the map, row by row from the top left.
+    tangential, sagittal : tuple of float
+        MTF50 at each place, cycles/pixel.
+    tangential_error, sagittal_error : tuple of float
+        Their standard errors; empty where they are not known.
+    predicted_error : tuple of float
+        Expected relative L2 of the kernel at each place.
+    extrapolated : tuple of bool
+        Whether no photo shows a place.
     radii : tuple of float
-        Of the curves and the field's shape.
     curves : tuple of Curve
-    shape : FieldShape
-    apertures : tuple of ApertureRow
-        One for each aperture that a photo had; empty where none is known.
-    best_aperture : mapping of str to float
-        f-number of the largest MTF50 for "center", "mid", "corner" and "whole"; empty with fewer
-        than two apertures.
-    decentring : Decentring
-    extrapolated_share : float
-        Share of the map for which no sample is near, 0..1.
-    summary : tuple of str
-        The report in sentences.
-    curves_answered_by : str
-        Which models answered for the curves and the field's shape, and why, in words.
+    along_u, along_v : tuple of float
+        Root mean square widths of a point by radius, pixels. Where they part there is astigmatism (W. T.
+        Welford, "Aberrations of Optical Systems", 1986, sec. 8.3); photos of one focus cannot tell how far
+        each focal surface lies from the sensor.
+    spots : tuple of Spot
+        The centre and the four corners.
+    centring : Centring
     """
 
     settings: LensSettings
-    photos: int
-    samples: int
-    pixel_pitch_um: float | None
     aspect: float
     rows: int
     cols: int
-    field: tuple[MapPoint, ...]
+    positions: tuple[FieldPosition, ...]
+    tangential: tuple[float, ...]
+    sagittal: tuple[float, ...]
+    tangential_error: tuple[float, ...]
+    sagittal_error: tuple[float, ...]
+    predicted_error: tuple[float, ...]
+    extrapolated: tuple[bool, ...]
     radii: tuple[float, ...]
     curves: tuple[Curve, ...]
-    shape: FieldShape
-    apertures: tuple[ApertureRow, ...]
-    best_aperture: dict[str, float]
-    decentring: Decentring
-    extrapolated_share: float
-    summary: tuple[str, ...]
-    curves_answered_by: str = ""
+    along_u: tuple[float, ...]
+    along_v: tuple[float, ...]
+    spots: tuple[Spot, ...]
+    centring: Centring
+
+    @property
+    def mean(self) -> tuple[float, ...]:
+        """Mean of tangential and sagittal MTF50 at each place, none beyond what a sensor shows."""
+        pairs = zip(self.tangential, self.sagittal, strict=True)
+        return tuple((min(t, NYQUIST) + min(s, NYQUIST)) / 2.0 for t, s in pairs)
+
+    @property
+    def unknown(self) -> tuple[bool, ...]:
+        """Whether too little is known of a place to draw it as if it were the lens."""
+        known = zip(self.predicted_error, self.extrapolated, strict=True)
+        return tuple(gone or not error < UNKNOWN for error, gone in known)
+
+    @property
+    def zones(self) -> dict[Zone, float]:
+        """Mean MTF50 of the map's places in each zone, cycles/pixel."""
+        return {zone: _mean_in(zone, self.positions, self.mean) for zone in ZONES}
+
+    @property
+    def zone_errors(self) -> dict[Zone, float] | None:
+        """Standard errors of `zones`, their places taken to err together: they share their photos."""
+        if not self.tangential_error:
+            return None
+        both = [(t + s) / 2.0 for t, s in zip(self.tangential_error, self.sagittal_error, strict=True)]
+        return {zone: _mean_in(zone, self.positions, both) for zone in ZONES}
+
+    @property
+    def worst(self) -> Spot:
+        """The softest corner."""
+        return min(self.spots[1:], key=lambda spot: spot.mean)
+
+    @property
+    def at(self) -> str:
+        """The aperture in words, empty where it is unknown."""
+        return "" if self.settings.aperture is None else f"f/{self.settings.aperture:g}"
+
+
+@dataclass(frozen=True, slots=True)
+class LateralColourCurve:
+    """Pixels outwards by which red and blue images lie beyond the green one, by radius."""
+
+    radii: tuple[float, ...]
+    red: tuple[float, ...]
+    blue: tuple[float, ...]
+    photos: int
+
+
+@dataclass(frozen=True, slots=True)
+class LensReport:
+    """A whole report.
+
+    Parameters
+    ----------
+    name : str
+        Of the lens.
+    verdict : str
+        For photographers.
+    photos, samples : int
+        That it rests on.
+    sensor : SensorGeometry
+        For other units than cycles/pixel.
+    tested : tuple of ApertureReport
+        By aperture, ascending, and by colour, green first.
+    lateral : LateralColourCurve or None
+        None where no photo showed it.
+    advice : Advice
+        Which photo would help most.
+    drawn : {"photos", "patches", ""}
+        What was drawn again for the standard errors; with fewer than three photos patches, which share their
+        photo's focus, so that errors come out too small.
+    details : mapping of str to str
+        What else stands on the page: camera, serial, names of photos.
+    """
+
+    name: str
+    verdict: str
+    photos: int
+    samples: int
+    sensor: SensorGeometry
+    tested: tuple[ApertureReport, ...]
+    lateral: LateralColourCurve | None
+    advice: Advice
+    drawn: str = ""
+    details: Mapping[str, str] = field(default_factory=dict)
+
+    def at(self, aperture: float | None, channel: Channel = "g") -> ApertureReport:
+        """Return what was found at an aperture that was tested; the widest for None or another one."""
+        own = [one for one in self.tested if one.settings.channel == channel]
+        return next((one for one in own if one.settings.aperture == aperture), own[0])
+
+    @property
+    def apertures(self) -> tuple[float | None, ...]:
+        """Those that were tested."""
+        return tuple(dict.fromkeys(one.settings.aperture for one in self.tested))
+
+    @property
+    def facts(self) -> str:
+        """What it rests on, in words."""
+        parts = ["1 photo" if self.photos == 1 else f"{self.photos} photos", f"{self.samples} blur samples"]
+        if (pitch := self.sensor.pixel_pitch_um) is not None:
+            parts.append(f"pixels of {pitch:.2f} micrometres, Nyquist frequency {500.0 / pitch:.0f} lp/mm")
+        if self.sensor.height_px is not None:
+            parts.append(f"{self.sensor.height_px} pixels high")
+        return ", ".join(parts)
+
+    @property
+    def error_words(self) -> str:
+        """What the bands and error maps are."""
+        if not self.drawn:
+            return "Too little is known to estimate the error of these figures."
+        words = (
+            f"Bands and error maps: one standard error, from random redraws of the {self.drawn}. "
+            "Errors that all photos share are not included."
+        )
+        return words + (
+            " With fewer than three photos this error is too small." if self.drawn == "patches" else ""
+        )
+
+    @property
+    def summary(self) -> tuple[str, ...]:
+        """The report in sentences, those of its first aperture."""
+        first = self.tested[0]
+        lines = [self.verdict, f"{first.centring.text[:1].upper()}{first.centring.text[1:]}."]
+        if any(first.unknown):
+            share = sum(first.unknown) / len(first.unknown)
+            lines.append(f"Too little is known of {share:.0%} of the picture; those figures are guesses.")
+        return (*lines, self.advice.text)
 
 
 def lens_report(
-    model: LensModel, settings: LensSettings | None = None, options: ReportSettings | None = None
+    model: LensModel,
+    name: str,
+    *,
+    aspect: float = DEFAULT_ASPECT,
+    height_px: int | None = None,
+    lateral: Sequence[LateralColour] = (),
+    channels: Sequence[Channel] = ("g", "r", "b"),
+    apertures: Sequence[float] | None = None,
+    draws: int = DRAWS,
+    rows: int = ROWS,
+    size: int = 31,
+    details: Mapping[str, str] | None = None,
+    on_step: StepHook = ignore_step,
 ) -> LensReport:
-    """Report on a lens at some settings.
+    """Report on a lens at the apertures that its photos had.
 
     Parameters
     ----------
     model : LensModel
-    settings : LensSettings, optional
-        Default: the widest aperture that a photo had, where faults show most; green.
-    options : ReportSettings, optional
+    name : str
+        Of the lens.
+    aspect : float
+        Width over height of its photos.
+    height_px : int, optional
+        Height of its photos in pixels; by default what the samples say.
+    lateral : sequence of LateralColour
+        What its photos show of lateral colour.
+    channels : sequence of {"r", "g", "b"}
+    apertures : sequence of float, optional
+        f-numbers instead of those of the photos.
+    draws : int
+        Of the bootstrap; 0 makes no errors.
+    rows : int
+        Of the maps.
+    size : int
+        Odd side of the kernels in pixels.
+    details : mapping of str to str, optional
+        Shown on the page as they are.
+    on_step : StepHook
+        Called after each aperture and colour.
 
-    Notes
-    -----
-    About 200 questions to the model, and 12 more for each aperture: a second or two.
+    Raises
+    ------
+    InvalidInputError
+        If `size` is even or out of range.
     """
-    settings = widest(model) if settings is None else settings
-    options = options or ReportSettings()
-    field = tuple(
-        map_point(model, place, settings, options.size)
-        for place in grid(options.rows, options.cols, options.aspect)
-    )
-    pitch = _pitch(model)
-    answers = [
-        [(p, model.query(p, settings, options.size)) for p in ring(r, _RING, options.aspect)] for r in _RADII
-    ]
-    rings = [[(place, answer.kernel) for place, answer in places] for places in answers]
-    made = [(answer.answered_by, answer.reason) for places in answers for _, answer in places]
-    shape = field_shape(_RADII, rings)
-    rows = tuple(_aperture_row(model, settings, n, options) for n in apertures(model))
-    best = {} if len(rows) < 2 else {zone: _best(rows, zone) for zone in (*ZONES, "whole")}
-    centring = decentring(model, settings)
-    unseen = sum(point.extrapolated for point in field) / len(field)
+    if not 3 <= size <= 255 or size % 2 == 0:
+        raise InvalidInputError(f"size must be odd and lie in 3..255, got {size}")
+    pitch = _shared(s.pixel_pitch_um for s in model.samples)
+    cols = max(3, round(rows * aspect))
+    numbers = list(apertures) if apertures is not None else _chosen(model)
+    wanted = [LensSettings(aperture=n) for n in numbers] or [widest(model)]
+    redrawn, drawn = redrawn_models(model, np.random.default_rng(0), draws)  # same photos, same report
+    questions = [settings.with_channel(channel) for settings in wanted for channel in channels]
+    tested = []
+    for settings in questions:
+        again = redrawn if settings.channel == channels[0] else []
+        tested.append(_tested(model, again, settings, (rows, cols, aspect, size), pitch))
+        on_step(len(tested), len(questions))
+    first = tested[0]
     return LensReport(
-        settings=settings,
+        name=name,
+        verdict=verdict(first, _best(tested)),
         photos=len({s.photo for s in model.samples}),
         samples=len(model.samples),
-        pixel_pitch_um=pitch,
-        aspect=options.aspect,
-        rows=options.rows,
-        cols=options.cols,
-        field=field,
-        radii=_RADII,
-        curves=tuple(_curve(rings, f, lp) for f, lp in _frequencies(options, pitch)),
-        shape=shape,
-        apertures=rows,
-        best_aperture=best,
-        decentring=centring,
-        extrapolated_share=unseen,
-        summary=_summary(field, shape, best, centring, unseen),
-        curves_answered_by=answerers_in_words(made),
+        sensor=SensorGeometry(pitch, height_px or _height(model, aspect)),
+        tested=tuple(tested),
+        lateral=_lateral(lateral),
+        advice=advice(model),
+        drawn=drawn if first.tangential_error else "",
+        details=dict(details or {}),
     )
 
 
-def apertures(model: LensModel) -> tuple[float, ...]:
-    """The f-numbers that photos had, ascending; the twelve with most samples."""
-    known = [s.settings.aperture for s in model.samples if s.settings.aperture is not None]
-    ranked = sorted(set(known), key=lambda n: (-known.count(n), n))
-    return tuple(sorted(ranked[:_MOST_APERTURES]))
+def _tested(
+    model: LensModel,
+    redrawn: Sequence[LensModel],
+    settings: LensSettings,
+    shape: tuple[int, int, float, int],
+    pitch: float | None,
+) -> ApertureReport:
+    rows, cols, aspect, size = shape
+    places = grid(rows, cols, aspect)
+    rings = [ring(r, _RING, aspect) for r in RADII]
+    around = [place for ring_places in rings for place in ring_places]
+    frequencies = _frequencies(pitch)
+    answers = [model.query(place, settings, size) for place in places]
+    tangential, sagittal = _mtf50([answer.kernel for answer in answers], places)
+    kernels = list(model.kernels(around, settings, size))
+    curves = _contrast(kernels, rings, [f for f, _ in frequencies])
+    maps, contrasts = [], []
+    for replica in redrawn:
+        both = list(replica.kernels([*places, *around], settings, size))
+        maps.append(_mtf50(both[: len(places)], places))
+        contrasts.append(_contrast(both[len(places) :], rings, [f for f, _ in frequencies]))
+    errors: _Pairs = ((), ())
+    spread = np.empty((0,))
+    if len(maps) > 1:
+        deviations = np.std(np.array(maps), axis=0, ddof=1)
+        errors = tuple(deviations[0].tolist()), tuple(deviations[1].tolist())
+        spread = np.std(np.array(contrasts), axis=0, ddof=1)
+    along_u, along_v = _widths(kernels, rings)
+    corners = [("the centre", FieldPosition(0.0, 0.0))]
+    corners += [(place_in_words(place), place) for place in corner_places(aspect)]
+    return ApertureReport(
+        settings=settings,
+        aspect=aspect,
+        rows=rows,
+        cols=cols,
+        positions=places,
+        tangential=tangential,
+        sagittal=sagittal,
+        tangential_error=errors[0],
+        sagittal_error=errors[1],
+        predicted_error=tuple(float(answer.predicted_error) for answer in answers),
+        extrapolated=tuple(bool(answer.extrapolated) for answer in answers),
+        radii=RADII,
+        curves=tuple(
+            Curve(f, lp, *(tuple(v.tolist()) for v in (*curves[i], *(spread[i] if spread.size else ()))))
+            for i, (f, lp) in enumerate(frequencies)
+        ),
+        along_u=along_u,
+        along_v=along_v,
+        spots=tuple(_spot(model, words, place, settings, size) for words, place in corners),
+        centring=centring(model, settings),
+    )
+
+
+def _spot(model: LensModel, words: str, place: FieldPosition, settings: LensSettings, size: int) -> Spot:
+    kernel = model.query(place, settings, size).kernel
+    tangential, sagittal = tangential_sagittal_mtf50(kernel, place.phi)
+    return Spot(
+        words,
+        place,
+        float(tangential),
+        float(sagittal),
+        tuple(tuple(row) for row in kernel.round(7).tolist()),
+    )
+
+
+def _mtf50(kernels: Sequence[Kernel], places: Sequence[FieldPosition]) -> _Pairs:
+    pairs = [tangential_sagittal_mtf50(k, p.phi) for k, p in zip(kernels, places, strict=True)]
+    return tuple(float(t) for t, _ in pairs), tuple(float(s) for _, s in pairs)
+
+
+def _contrast(
+    kernels: Sequence[Kernel], rings: Sequence[Sequence[FieldPosition]], frequencies: Sequence[float]
+) -> np.ndarray:
+    """Contrast `(frequency, 2, radius)`, tangential first, mean over the places of a radius."""
+    left = iter(kernels)
+    out = np.empty((len(frequencies), 2, len(rings)))
+    for column, places in enumerate(rings):
+        own = [(next(left), place) for place in places]
+        for row, turn in enumerate((0.0, math.pi / 2.0)):
+            out[:, row, column] = np.mean(
+                [mtf_from_kernel(k, p.phi + turn, frequencies) for k, p in own], axis=0
+            )
+        if len(places) == 1:
+            out[:, :, column] = out[:, :, column].mean(axis=1, keepdims=True)  # u has no direction there
+    return out
+
+
+def _widths(kernels: Sequence[Kernel], rings: Sequence[Sequence[FieldPosition]]) -> _Pairs:
+    """Root mean square widths along u and v by radius; the variance along a unit vector a is a' M a."""
+    left = iter(kernels)
+    along_u, along_v = [], []
+    for places in rings:
+        squares = []
+        for place in places:
+            moments = second_moments(next(left))
+            u = np.array([-math.sin(place.phi), math.cos(place.phi)])  # (row, col)
+            v = np.array([-math.cos(place.phi), -math.sin(place.phi)])
+            squares.append((float(u @ moments @ u), float(v @ moments @ v)))
+        squared = np.maximum(np.mean(squares, axis=0), 0.0)
+        if len(places) == 1:
+            squared[:] = squared.mean()
+        along_u.append(float(math.sqrt(squared[0])))
+        along_v.append(float(math.sqrt(squared[1])))
+    return tuple(along_u), tuple(along_v)
+
+
+def verdict(found: ApertureReport, best: float | None = None) -> str:
+    """Say what a photographer wants to know: centre, worst corner, centring, best aperture."""
+    center, worst = found.spots[0].mean, found.worst
+    if center >= _CRISP:
+        level = "as sharp as the sensor can show"
+    else:
+        level = "sharp" if center >= _SHARP else "a little soft" if center >= _SOFT else "soft"
+    sharpness = f"this copy is {level} in the centre (MTF50 {_figure(center)})"
+    share = min(worst.mean, NYQUIST) / max(min(center, NYQUIST), 1e-6)
+    if share >= _EVEN:
+        fall = "its corners are just as sharp"
+    else:
+        how = (
+            "nearly as sharp" if share >= _NEARLY else "clearly softer" if share >= _SOFTER else "much softer"
+        )
+        fall = f"its worst corner, {worst.side}, is {how} ({_figure(worst.mean)})"
+    begin = f"At {found.at} {sharpness}" if found.at else f"{sharpness[0].upper()}{sharpness[1:]}"
+    words = [f"{begin}, and {fall}."]
+    if best is not None and best != found.settings.aperture:
+        words.append(f"It is sharpest over the whole picture at f/{best:g}.")
+    side = found.centring.side
+    words.append(
+        {
+            "centred": "It is well centred.",
+            "decentred": f"It is decentred: {side} is softer than the opposite side."
+            if side
+            else "It is decentred: points in the middle of the picture have tails.",
+            "unknown": "It is not yet possible to say whether it is centred.",
+        }[found.centring.verdict]
+    )
+    if not float(np.mean(found.predicted_error)) < UNKNOWN:
+        words.append("Much of this is still a guess; more photos will help.")
+    return " ".join(words)
+
+
+def _figure(value: float) -> str:
+    return SensorGeometry().words(value)
 
 
 def widest(model: LensModel) -> LensSettings:
     """The widest aperture that a photo had, green; focal length and distance as unknown."""
-    known = apertures(model)
-    return LensSettings(aperture=known[0] if known else None)
+    known = [s.settings.aperture for s in model.samples if s.settings.aperture is not None]
+    return LensSettings(aperture=min(known, default=None))
 
 
-def map_point(model: LensModel, place: FieldPosition, settings: LensSettings, size: int) -> MapPoint:
-    """Sharpness at one place, with the evidence behind it."""
-    answer = model.query(place, settings, size)
-    tangential, sagittal = tangential_sagittal_mtf50(answer.kernel, place.phi)
-    return MapPoint(
-        place,
-        tangential,
-        sagittal,
-        answer.predicted_error,
-        answer.effective_samples,
-        answer.extrapolated,
-        answer.answered_by,
-        answer.reason,
-    )
+def _chosen(model: LensModel) -> list[float]:
+    """Apertures to test: all, or where there are many the ends and those between with most samples."""
+    numbers = [s.settings.aperture for s in model.samples if s.settings.aperture is not None]
+    known = sorted(set(numbers))
+    if len(known) <= MOST_APERTURES:
+        return known
+    inner = sorted(known[1:-1], key=lambda n: -numbers.count(n))
+    return sorted([known[0], known[-1], *inner[: MOST_APERTURES - 2]])
 
 
-def answerers(points: Sequence[MapPoint]) -> str:
-    """Say which models answered at some places, and why."""
-    return answerers_in_words((point.answered_by, point.reason) for point in points)
+def _best(tested: Sequence[ApertureReport]) -> float | None:
+    """Aperture with the largest mean MTF50 over the picture; None where one was tested."""
+    own = [one for one in tested if one.settings.channel == tested[0].settings.channel]
+    if len(own) < 2:
+        return None
+    return max(own, key=lambda one: (np.mean(one.mean), -(one.settings.aperture or 0.0))).settings.aperture
 
 
-def _pitch(model: LensModel) -> float | None:
-    known = {s.pixel_pitch_um for s in model.samples}
+def _shared(values: object) -> float | None:
+    known = set(values)  # type: ignore[call-overload]
     return next(iter(known)) if len(known) == 1 else None
 
 
-def _frequencies(options: ReportSettings, pitch_um: float | None) -> list[tuple[float, float | None]]:
-    """Cycles/pixel and lp/mm of the curves, only those below the Nyquist frequency of the sensor."""
-    if options.frequencies or pitch_um is None:
-        chosen = options.frequencies or FALLBACK_FREQUENCIES
-        return [(f, None if pitch_um is None else f * 1000.0 / pitch_um) for f in chosen]
+def _height(model: LensModel, aspect: float) -> int | None:
+    """Height of the photos by their half diagonals, where the samples know and agree."""
+    half = _shared(s.half_diagonal_px for s in model.samples)
+    long = max(aspect, 1.0 / aspect)
+    return None if half is None else round(2.0 * half / math.hypot(long, 1.0))
+
+
+def _frequencies(pitch_um: float | None) -> list[tuple[float, float | None]]:
+    """Cycles/pixel and lp/mm of the curves, only those up to the Nyquist frequency of the sensor."""
+    if pitch_um is None:
+        return [(f, None) for f in _FREQUENCIES]
     nyquist = 500.0 / pitch_um
     step = next((step for step in _STEPS_MM if 4.0 * step <= nyquist / 2.0), _STEPS_MM[-1])
     pairs = [(k * step * pitch_um / 1000.0, k * step) for k in range(1, 5)]
-    return [(f, lp) for f, lp in pairs if f <= 0.5]
+    return [(f, lp) for f, lp in pairs if f <= NYQUIST]
 
 
-_CYCLES: Final = SensorGeometry()
-
-
-def _curve(rings: list[Ring], frequency: float, lp_mm: float | None) -> Curve:
-    def contrast(turn: float) -> list[NDArray[np.float64]]:
-        return [
-            np.array([mtf_from_kernel(k, p.phi + turn, [frequency])[0] for p, k in places])
-            for places in rings
-        ]
-
-    tangential, sagittal = contrast(0.0), contrast(math.pi / 2.0)
-    if len(rings[0]) == 1:
-        # u has no direction at the centre: both are the mean over all, as they are just beside it
-        both = np.concatenate([tangential[0], sagittal[0]])
-        tangential[0] = sagittal[0] = np.array([both.mean()])
-    return Curve(
-        frequency,
-        lp_mm,
-        tuple(float(c.mean()) for c in tangential),
-        tuple(float(c.mean()) for c in sagittal),
-        tuple(float(c.std()) for c in tangential),
-        tuple(float(c.std()) for c in sagittal),
+def _lateral(measured: Sequence[LateralColour]) -> LateralColourCurve | None:
+    """Median displacement over the photos that could tell: one without edges cannot spoil it."""
+    red = [each for each in measured if each.red_points > 0]
+    blue = [each for each in measured if each.blue_points > 0]
+    if not red or not blue:
+        return None
+    return LateralColourCurve(
+        _LATERAL_R,
+        tuple(median(each.displacement(r, "r") for each in red) for r in _LATERAL_R),
+        tuple(median(each.displacement(r, "b") for each in blue) for r in _LATERAL_R),
+        min(len(red), len(blue)),
     )
 
 
-def _aperture_row(
-    model: LensModel, settings: LensSettings, aperture: float, options: ReportSettings
-) -> ApertureRow:
-    asked = replace(settings, aperture=aperture)
-
-    points = {
-        zone: [map_point(model, p, asked, options.size) for p in ring(r, 1, options.aspect)]
-        for zone, r in _ZONE_RADIUS.items()
-    }
-    by_zone = {zone: float(np.mean([point.mean for point in own])) for zone, own in points.items()}
-    # shares of a 3:2 picture's area: r < 0.3, between, r > 0.75
-    whole = 0.15 * by_zone["center"] + 0.65 * by_zone["mid"] + 0.2 * by_zone["corner"]
-    made = answerers([point for own in points.values() for point in own])
-    return ApertureRow(aperture, by_zone["center"], by_zone["mid"], by_zone["corner"], whole, made)
-
-
-def _best(rows: tuple[ApertureRow, ...], zone: str) -> float:
-    return max(rows, key=lambda row: (getattr(row, zone), -row.aperture)).aperture
-
-
-def _summary(
-    field: tuple[MapPoint, ...],
-    shape: FieldShape,
-    best: dict[str, float],
-    centring: Decentring,
-    unseen: float,
-) -> tuple[str, ...]:
-    sharpest = max(field, key=lambda point: point.mean)
-    softest = min(field, key=lambda point: point.mean)
-    lines = [
-        f"MTF50 lies between {_CYCLES.words(softest.mean)} and {_CYCLES.words(sharpest.mean)} cycles/px "
-        "over the picture",
-        shape.text,
-        centring.text,
-    ]
-    if best:
-        lines.append(
-            f"sharpest at f/{best['center']:g} in the centre, at f/{best['corner']:g} in the corners, "
-            f"at f/{best['whole']:g} over the whole picture"
-        )
-    if unseen > 0:
-        lines.append(
-            f"no photo shows {100.0 * unseen:.0f} % of the picture at these settings; "
-            "the figures there are guesses"
-        )
-    lines.append(answerers(field))
-    return tuple(lines)
+def _mean_in(zone: Zone, positions: Sequence[FieldPosition], values: Sequence[float]) -> float:
+    own = [value for place, value in zip(positions, values, strict=True) if zone_of(place.r) == zone]
+    return float(np.mean(own)) if own else math.nan

@@ -106,15 +106,21 @@ def ring(r: float, count: int, aspect: float) -> tuple[FieldPosition, ...]:
     return tuple(FieldPosition(r, a) for a in angles)
 
 
+def corner_places(aspect: float) -> tuple[FieldPosition, ...]:
+    """The four corners, upper left first, as far out as samples reach."""
+    width, height = half_sides(aspect)
+    corner = math.atan2(height, width)
+    return tuple(FieldPosition(0.9, phi) for phi in (math.pi - corner, corner, corner - math.pi, -corner))
+
+
 def landmarks() -> list[FieldPosition]:
     """The centre, the four corners, the four quarters between, and the middles of the four edges."""
     width, height = half_sides(DEFAULT_ASPECT)
-    corner = math.atan2(height, width)
-    diagonals = (corner, math.pi - corner, corner - math.pi, -corner)
+    corners = corner_places(DEFAULT_ASPECT)
     return [
         FieldPosition(0.0, 0.0),
-        *(FieldPosition(0.9, phi) for phi in diagonals),
-        *(FieldPosition(0.5, phi) for phi in diagonals),
+        *corners,
+        *(FieldPosition(0.5, place.phi) for place in corners),
         *(FieldPosition(0.8 * width, phi) for phi in (0.0, math.pi)),
         *(FieldPosition(0.8 * height, phi) for phi in (math.pi / 2, -math.pi / 2)),
     ]

@@ -23,7 +23,7 @@ EXTRAS: Final = {
         "structlog",
         "uvicorn",
     ),
-    "report": ("reportlab",),
+    "report": ("matplotlib",),
     "lab": ("optiland", "skimage"),
     "train": ("sklearn",),
 }
@@ -31,7 +31,7 @@ EXTRAS: Final = {
 
 _WHAT: Final = {
     "service": "the service",
-    "report": "reports as PDF",
+    "report": "drawing",
     "lab": "the laboratory",
     "train": "training",
 }

@@ -24,7 +24,7 @@ from lensmodel.lab.reproduce.conditions import BASE
 from lensmodel.lab.reproduce.shots import take
 from lensmodel.model import LensModel
 from lensmodel.photo import develop
-from lensmodel.report.photo_crops import as_shown
+from lensmodel.quality.images import as_shown
 from lensmodel.workflow import pipeline
 
 # Layout (chosen): places that are shown, pixels of a kernel and of a photo's width, PSFs down and across.

@@ -53,7 +53,7 @@ from lensmodel.lab.reproduce.shots import Shots, take
 from lensmodel.lab.reproduce.store import Unit, read, stored
 from lensmodel.lab.rivals import rivals
 from lensmodel.photo import LinearPhoto, develop
-from lensmodel.report import photo_crops
+from lensmodel.quality import images
 from lensmodel.workflow.ways import WAYS
 
 CROP_PX = 128  # side of a crop in a strip (chosen)
@@ -361,6 +361,6 @@ class CaseJob:
     def _picture(self, label: str, planes: Planes) -> str:
         name = f"{self.folder.name}-{label}.png"
         gains = self.case.camera.white_balance if self._raw else (1.0, 1.0, 1.0)
-        crops = strip(photo_crops.as_shown(planes, gains), CROP_PX)
+        crops = strip(images.as_shown(planes, gains), CROP_PX)
         Image.fromarray(crops).save(self.shown / name, optimize=True)
         return name

@@ -41,9 +41,8 @@ def planned(
         Four lenses, small photos, n = 1, 2, without rivals and the paper's own way; all lenses wide open on
         frames of a megapixel, n = 1, 2, 5, without rivals; eight lenses of different kind, wide open,
         n = 1, 2, 5; the same stopped down too, the zoom also at its long end, and n = 10, 20 on smaller
-        frames.
-        The default size takes the other paths (high ISO, TIFF, JPEG) with two lenses of each family, the
-        full size takes them and the scenes that hurt with four of third order.
+        frames. The default size takes the other paths (high ISO, TIFF, JPEG) with two lenses of each
+        family, the full size takes them and the scenes that hurt with four of third order.
     scenes : Path or None
         See `Reproduction`.
     grids : sequence of Path, optional

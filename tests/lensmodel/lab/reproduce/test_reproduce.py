@@ -57,7 +57,7 @@ from lensmodel.lab.reproduce.scenes import centred_cut, frame_scene, layout_for,
 from lensmodel.lab.reproduce.shots import Shots, guard_of, take
 from lensmodel.lab.traced import read_grid
 from lensmodel.photo import develop
-from lensmodel.report.photo_crops import as_shown
+from lensmodel.quality.images import as_shown
 from lensmodel.simulate import LENS_KINDS, edge_chart
 from lensmodel.workflow.ways import Way
 

@@ -17,10 +17,7 @@ from types import ModuleType
 from typing import Any, Final, Protocol
 
 import numpy as np
-import tifffile
 from numpy.typing import NDArray
-from PIL import Image
-from PIL.PngImagePlugin import PngInfo
 
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import write_atomically
@@ -34,8 +31,6 @@ FREQUENCIES: Final = tuple(round(0.05 * i, 2) for i in range(1, 11))
 """Cycles/pixel of the MTF table, up to the Nyquist frequency (chosen: ten rows)."""
 
 _MOST_BYTES: Final = 1 << 29  # of one file: against questions that fill the memory (chosen)
-_GAP: Final = 2  # pixels between two kernels of a sheet: seen, and little of it (chosen)
-_ABOUT: Final = "point spread functions by lensmodel; row 0 at the top, each sums to 1"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,8 +46,6 @@ class PsfGrid:
     settings : LensSettings
     predicted_error : tuple of float
         Expected relative L2 of each kernel.
-    answered_by, reason : tuple of str
-        Which model answered for each kernel, and why that one.
     """
 
     kernels: NDArray[np.float32]
@@ -61,8 +54,6 @@ class PsfGrid:
     cols: int
     settings: LensSettings
     predicted_error: tuple[float, ...]
-    answered_by: tuple[str, ...]
-    reason: tuple[str, ...]
 
     def __post_init__(self) -> None:
         n = len(self.positions)
@@ -70,13 +61,8 @@ class PsfGrid:
             raise InvalidInputError(
                 f"{self.rows} x {self.cols} places need as many kernels, got shape {self.kernels.shape}"
             )
-        for what, given in (
-            ("errors", self.predicted_error),
-            ("answerers", self.answered_by),
-            ("reasons", self.reason),
-        ):
-            if len(given) != n:
-                raise InvalidInputError(f"{n} kernels need as many {what}, got {len(given)}")
+        if len(self.predicted_error) != n:
+            raise InvalidInputError(f"{n} kernels need as many errors, got {len(self.predicted_error)}")
 
 
 def psf_grid(
@@ -125,9 +111,7 @@ def psf_grid(
         rows,
         cols,
         settings,
-        predicted_error=tuple(answer.predicted_error for answer in answers),
-        answered_by=tuple(answer.answered_by for answer in answers),
-        reason=tuple(answer.reason for answer in answers),
+        predicted_error=tuple(float(answer.predicted_error) for answer in answers),
     )
 
 
@@ -143,35 +127,13 @@ class Exporter(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class TiffStack:
-    """32-bit float TIFF, a page for each place, as ImageJ opens it; a single place is a plain image."""
-
-    suffix: str = ".tif"
-
-    def encode(self, psfs: PsfGrid) -> bytes:
-        """Return the content of the file; the description of the first page is JSON."""
-        out = io.BytesIO()
-        with tifffile.TiffWriter(out) as writer:
-            for i, kernel in enumerate(psfs.kernels):
-                writer.write(
-                    kernel,
-                    photometric="minisblack",
-                    description=_about(psfs) if i == 0 else None,
-                    metadata=None,
-                    contiguous=False,
-                )
-        return out.getvalue()
-
-
-@dataclass(frozen=True, slots=True)
 class Fits:
     """FITS, 32-bit float: a cube (place, row, col), or an image for a single place, as Siril loads it.
 
     Notes
     -----
     Rows are stored from the bottom, as is the custom of the format, and ROWORDER says so. The
-    extension POSITIONS lists r, phi (radians, counter-clockwise from the right), the expected error, which
-    model answered and why.
+    extension POSITIONS lists r, phi (radians, counter-clockwise from the right) and the expected error.
     Source: "Definition of the Flexible Image Transport System", version 4.0, 2018, sec. 3.3 and 7.3.
     """
 
@@ -202,10 +164,6 @@ class Fits:
                 fits.Column("R", "D", unit="half-diagonal", array=[p.r for p in psfs.positions]),
                 fits.Column("PHI", "D", unit="rad", array=[p.phi for p in psfs.positions]),
                 fits.Column("ERROR", "D", array=list(psfs.predicted_error)),
-                *(
-                    fits.Column(name, f"{max(map(len, words))}A", array=list(words))
-                    for name, words in (("ANSWERER", psfs.answered_by), ("REASON", psfs.reason))
-                ),
             ],
             name="POSITIONS",
         )
@@ -230,8 +188,6 @@ class Npz:
             r=np.array([p.r for p in psfs.positions]),
             phi=np.array([p.phi for p in psfs.positions]),
             error=np.array(psfs.predicted_error),
-            answered_by=np.array(psfs.answered_by),
-            reason=np.array(psfs.reason),
             shape=np.array([psfs.rows, psfs.cols]),
             aperture=np.full(len(psfs.positions), aperture),
             channel=np.array(psfs.settings.channel),
@@ -241,10 +197,7 @@ class Npz:
 
 @dataclass(frozen=True, slots=True)
 class JsonMatrix:
-    """JSON: a bare matrix, a list of rows, for a single place, as ART loads it; else an object.
-
-    A bare matrix cannot say which model answered; `PsfGrid` does.
-    """
+    """JSON: a bare matrix, a list of rows, for a single place, as ART loads it; else an object."""
 
     suffix: str = ".json"
 
@@ -253,16 +206,13 @@ class JsonMatrix:
         if len(psfs.positions) == 1:
             content: Any = _matrix(psfs.kernels[0])
         else:
-            content = document(psfs, kernels=True)
+            content = document(psfs)
         return json.dumps(content, allow_nan=False).encode()
 
 
 @dataclass(frozen=True, slots=True)
 class MtfTable:
-    """CSV of MTF50 and of contrast along u (tangential) and v (sagittal), a line for each place.
-
-    The last two columns say which model answered and why.
-    """
+    """CSV of MTF50 and of contrast along u (tangential) and v (sagittal), a line for each place."""
 
     suffix: str = ".csv"
 
@@ -272,38 +222,14 @@ class MtfTable:
         writer = csv.writer(out, lineterminator="\n")
         heads = [f"{way}_{f:.2f}" for way in ("tangential", "sagittal") for f in FREQUENCIES]
         known = ["row", "col", "r", "phi", "error", "mtf50_tangential", "mtf50_sagittal"]
-        writer.writerow([*known, *heads, "answered_by", "reason"])
+        writer.writerow([*known, *heads])
         for i, (place, kernel) in enumerate(zip(psfs.positions, psfs.kernels, strict=True)):
             exact = kernel.astype(np.float64)
             fifty = tangential_sagittal_mtf50(exact, place.phi)
             contrast = [mtf_from_kernel(exact, place.phi + turn, FREQUENCIES) for turn in (0, math.pi / 2)]
             values = [place.r, place.phi, psfs.predicted_error[i], *fifty, *np.concatenate(contrast)]
-            numbers = [*divmod(i, psfs.cols), *(f"{v:.6f}" for v in values)]
-            writer.writerow([*numbers, psfs.answered_by[i], psfs.reason[i]])
+            writer.writerow([*divmod(i, psfs.cols), *(f"{v:.6f}" for v in values)])
         return out.getvalue().encode()
-
-
-@dataclass(frozen=True, slots=True)
-class ContactSheet:
-    """16-bit grey PNG: every kernel at its place of the picture, its peak white; one place is plain.
-
-    The text `Description` is the same JSON as in a TIFF.
-    """
-
-    suffix: str = ".png"
-
-    def encode(self, psfs: PsfGrid) -> bytes:
-        """Return the content of the file; values are linear, kernels part by two dark pixels."""
-        side = psfs.kernels.shape[1]
-        step = side + _GAP
-        sheet = np.zeros((psfs.rows * step - _GAP, psfs.cols * step - _GAP), dtype=np.uint16)
-        for i, kernel in enumerate(psfs.kernels):
-            row, col = (step * k for k in divmod(i, psfs.cols))
-            sheet[row : row + side, col : col + side] = np.rint(65535.0 * (kernel / kernel.max()))
-        out, texts = io.BytesIO(), PngInfo()
-        texts.add_text("Description", _about(psfs))
-        Image.fromarray(sheet).save(out, "PNG", pnginfo=texts)
-        return out.getvalue()
 
 
 exporters: Registry[Exporter] = Registry(
@@ -313,8 +239,6 @@ exporters: Registry[Exporter] = Registry(
         "fits": Fits,
         "json": JsonMatrix,
         "npz": Npz,
-        "png": ContactSheet,
-        "tiff": TiffStack,
     },
 )
 
@@ -346,20 +270,8 @@ def export(path: Path | str, psfs: PsfGrid, file_format: str) -> None:
     write_atomically(Path(path), exporters.create(file_format).encode(psfs))
 
 
-def document(psfs: PsfGrid, *, kernels: bool) -> dict[str, Any]:
-    """A grid as what `json` can write, with its units; kernels as lists of rows on request."""
-    entries = []
-    for i, place in enumerate(psfs.positions):
-        entry: dict[str, Any] = {
-            "r": place.r,
-            "phi": place.phi,
-            "predicted_error": psfs.predicted_error[i],
-            "answered_by": psfs.answered_by[i],
-            "reason": psfs.reason[i],
-        }
-        if kernels:
-            entry["kernel"] = _matrix(psfs.kernels[i])
-        entries.append(entry)
+def document(psfs: PsfGrid) -> dict[str, Any]:
+    """A grid as what `json` can write, with its units."""
     settings = psfs.settings
     return {
         "units": {"r": "half-diagonal", "phi": "radian, counter-clockwise from the right", "kernel": "pixel"},
@@ -368,13 +280,11 @@ def document(psfs: PsfGrid, *, kernels: bool) -> dict[str, Any]:
         "channel": settings.channel,
         "rows": psfs.rows,
         "cols": psfs.cols,
-        "psfs": entries,
+        "psfs": [
+            {"r": place.r, "phi": place.phi, "predicted_error": error, "kernel": _matrix(kernel)}
+            for place, error, kernel in zip(psfs.positions, psfs.predicted_error, psfs.kernels, strict=True)
+        ],
     }
-
-
-def _about(psfs: PsfGrid) -> str:
-    """What a picture of kernels says of them: JSON with the places and who answered there."""
-    return json.dumps({"about": _ABOUT, **document(psfs, kernels=False)})
 
 
 def _matrix(kernel: NDArray[np.float32]) -> list[list[float]]:
@@ -388,5 +298,5 @@ def _astropy_fits() -> ModuleType:
     except ImportError as error:
         raise InvalidInputError(
             "writing FITS needs astropy; install it with `pip install '.[fits]'` in this program's folder, "
-            "or export tiff instead"
+            "or export npz instead"
         ) from error

@@ -1,0 +1,242 @@
+"""Is the lens centred? What breaks the symmetry of its blur, where to, and how sure that is.
+
+A centred lens blurs alike all around its axis. Two signs of a fault in one copy are looked for in the samples
+themselves, not in the smoothed field, so that their errors are known:
+
+* one side is softer. The log of the width w of a sample (root mean square, pixels) is fitted by a part that
+is alike
+  all around and a slope over the field h = r (cos phi, sin phi)::
+
+      ln w = a + b r^2 + c r^4 + g.h
+
+  g points to the softer side; w at the edge r there is exp(2 |g| r) times that of the opposite side.
+* coma where there should be none. The third moment of a kernel, m = <|x|^2 x> / w^3, grows from zero with
+the field
+  in a centred lens; a part that is the same in the whole middle of the picture is the sign of a shifted
+  element (K. P. Thompson, JOSA A 22, 2005, eq. 11)::
+
+      m = m0 + k h        for r < 0.5
+
+Errors come from leaving one photo out at a time (jackknife; B. Efron, "The Jackknife, the Bootstrap and Other
+Resampling Plans", SIAM 1982, eq. 3.3): patches of a photo share its focus and a tilted subject, so that many
+patches of one photo do not prove a fault of the lens.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.core.psf import PsfSample, second_moments
+from lensmodel.core.types import LensSettings
+from lensmodel.model import LensModel
+from lensmodel.report.places import direction_in_words
+
+EDGE_R: Final = 0.85
+"""Field radius at which opposite sides are compared (chosen: the short sides of a 3:2 frame are at 0.83)."""
+
+_MIDDLE_R: Final = 0.5  # half-diagonals: inside, opposite sides are next to each other (chosen)
+_NEAR_STOPS: Final = 0.7  # stops: photos of one aperture as far as blur is concerned (chosen)
+_FEWEST: Final = 12  # patches: a plane through fewer is chance (chosen)
+_SOFTER: Final = 0.10  # of the width: less is not seen between two sides of a print (chosen)
+_COMATIC: Final = 0.15  # third moment over width cubed, in the middle: a shorter tail is not seen (chosen)
+_UNSURE: Final = 0.4  # sides that may differ by more, error and all, are not called alike (chosen)
+_CHANCE: Final = 0.01
+"""One sound lens in a hundred is called decentred: rarer, and mild faults would go unnamed (chosen)."""
+_WING: Final = 0.01  # of the peak: fainter pixels are noise to a second moment (chosen)
+
+_Array = NDArray[np.float64]
+_Fit = Callable[[NDArray[np.intp]], _Array]
+
+
+@dataclass(frozen=True, slots=True)
+class Asymmetry:
+    """A vector over the picture with its error.
+
+    Parameters
+    ----------
+    amount : float
+        Length; what it counts is said where it stands.
+    direction : float
+        Radians, counter-clockwise from the right.
+    error : float
+        Standard error of each component of the vector, in the unit of `amount`.
+    significant : bool
+        Whether chance makes a vector so long in less than one of a hundred centred lenses.
+    """
+
+    amount: float
+    direction: float
+    error: float
+    significant: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Centring:
+    """How well centred a copy is, by what its photos show.
+
+    Parameters
+    ----------
+    verdict : {"centred", "decentred", "unknown"}
+    text : str
+        The verdict as one sentence, without a full stop.
+    softer : Asymmetry or None
+        Towards the softer side; amount = ln of the ratio of widths of opposite sides at r = 0.85. None where
+        there are too few samples.
+    coma : Asymmetry or None
+        Towards the tail of the blur in the middle of the picture; amount = |m0|.
+    """
+
+    verdict: Literal["centred", "decentred", "unknown"]
+    text: str
+    softer: Asymmetry | None = None
+    coma: Asymmetry | None = None
+
+    @property
+    def side(self) -> str:
+        """The softer side in words where that is sure, else empty."""
+        if self.softer is None or not self.softer.significant or self.softer.amount <= _SOFTER:
+            return ""
+        return f"the {direction_in_words(self.softer.direction)}"
+
+
+def centring(model: LensModel, settings: LensSettings) -> Centring:
+    """Judge the centring of a copy from the samples near some settings.
+
+    Parameters
+    ----------
+    model : LensModel
+    settings : LensSettings
+        Channel, and aperture within 0.7 stop; wide open shows most.
+    """
+    samples = _near(model, settings)
+    if len(samples) < _FEWEST:
+        few = f"{len(samples)} sample{'' if len(samples) == 1 else 's'}"
+        return Centring("unknown", f"{few} cannot tell whether the lens is centred; it takes {_FEWEST}")
+    r = np.array([s.position.r for s in samples])
+    phi = np.array([s.position.phi for s in samples])
+    h = np.stack([r * np.cos(phi), r * np.sin(phi)], axis=1)  # (right, up)
+    widths = [math.sqrt(float(np.trace(second_moments(s.kernel, _WING))) / 2) for s in samples]
+    photos = np.unique([s.photo for s in samples], return_inverse=True)[1]
+    weight = np.sqrt(np.array([s.weight for s in samples]))
+    slope = np.concatenate([h, np.stack([r ** (2 * k) for k in range(3)], axis=1)], axis=1)
+    log_w = np.log(np.maximum(widths, 1e-3))
+    softer = _asymmetry(lambda rows: _solved(slope[rows], log_w[rows], weight[rows]), photos, 2.0 * EDGE_R)
+    coma = None
+    inner = np.flatnonzero(r < _MIDDLE_R)
+    if len(inner) >= _FEWEST // 2:
+        third = np.array([_third_moment(samples[i]) for i in inner])
+        coma = _asymmetry(_constant(h[inner], third, weight[inner]), photos[inner], 1.0)
+    return _verdict(softer, coma, int(photos.max()) + 1)
+
+
+def _near(model: LensModel, settings: LensSettings) -> list[PsfSample]:
+    """Samples near the settings, without those that the model has flagged."""
+    flagged = {flag.sample for flag in model.flags() if flag.sample is not None}
+    spoilt = {flag.photo for flag in model.flags() if flag.sample is None} | set(model.settings.excluded)
+
+    def near(sample: PsfSample) -> bool:
+        own, a, b = sample.settings, sample.settings.stops, settings.stops
+        if own.channel != settings.channel or sample.weight <= 0 or sample.photo in spoilt:
+            return False
+        if a is not None and b is not None and abs(a - b) > _NEAR_STOPS:
+            return False
+        both = own.focal_mm and settings.focal_mm
+        return not both or abs(math.log2(own.focal_mm / settings.focal_mm)) <= 0.25  # type: ignore[operator]
+
+    return [sample for i, sample in enumerate(model.samples) if i not in flagged and near(sample)]
+
+
+def _constant(h: _Array, value: _Array, weight: _Array) -> _Fit:
+    """Fit of the vector value = m0 + k h to some rows; returns m0 first."""
+
+    def fit(rows: NDArray[np.intp]) -> _Array:
+        one, none = np.ones(len(rows)), np.zeros(len(rows))
+        right, up = (np.stack(c, axis=1) for c in ((one, none, h[rows, 0]), (none, one, h[rows, 1])))
+        both = np.concatenate([value[rows, 0], value[rows, 1]])
+        return _solved(np.concatenate([right, up]), both, np.tile(weight[rows], 2))
+
+    return fit
+
+
+def _solved(design: _Array, value: _Array, weight: _Array) -> _Array:
+    """Weighted least squares; the first two unknowns are the vector that is asked for."""
+    return np.asarray(np.linalg.lstsq(design * weight[:, None], value * weight, rcond=None)[0])[:2]
+
+
+def _third_moment(sample: PsfSample) -> _Array:
+    """<|x|^2 x> / w^3 as (right, up), about the centre of mass, wings below a hundredth cut."""
+    kernel = np.where(sample.kernel > _WING * sample.kernel.max(), sample.kernel, 0.0)
+    kernel = kernel / kernel.sum()
+    t = np.arange(kernel.shape[0]) - kernel.shape[0] // 2
+    up, right = -t[:, None] + 0.0 * t[None, :], t[None, :] + 0.0 * t[:, None]
+    up, right = up - (kernel * up).sum(), right - (kernel * right).sum()
+    squared = up**2 + right**2
+    width = math.sqrt(max(float((kernel * squared).sum()) / 2.0, 1e-6))
+    return np.array([(kernel * squared * right).sum(), (kernel * squared * up).sum()]) / width**3
+
+
+def _asymmetry(fit: _Fit, groups: NDArray[np.intp], scale: float) -> Asymmetry:
+    """The fitted vector times `scale`, with the larger error of leaving out photos and samples."""
+    rows = np.arange(len(groups))
+    vector = fit(rows)
+    error, freedom = _jackknife(fit, rows)
+    if len(np.unique(groups)) > 1:
+        error, freedom = max((error, freedom), _jackknife(fit, groups))
+    length = float(np.hypot(*vector))
+    # |g|^2 / (2 s^2) is distributed as F with 2 and 2 (n - 1) degrees where there is only chance
+    limit = math.sqrt(2.0 * _exceeded_by_chance(max(freedom, 1)))
+    direction = math.atan2(float(vector[1]), float(vector[0]))
+    return Asymmetry(scale * length, direction, scale * error, significant=length > limit * error)
+
+
+def _exceeded_by_chance(half_freedom: int) -> float:
+    """Value that F with 2 and 2 m degrees exceeds by chance; its survival function is (1 + x / m)^-m."""
+    return half_freedom * (_CHANCE ** (-1.0 / half_freedom) - 1.0)
+
+
+def _jackknife(fit: _Fit, groups: NDArray[np.intp]) -> tuple[float, int]:
+    """Standard error of a component and the degrees of freedom, leaving out one group at a time."""
+    names = np.unique(groups)
+    others = np.array([fit(np.flatnonzero(groups != name)) for name in names])
+    n = len(names)
+    variance = (n - 1) / n * ((others - others.mean(axis=0)) ** 2).sum(axis=0)
+    return math.sqrt(float(variance.mean())), n - 1
+
+
+def _verdict(softer: Asymmetry, coma: Asymmetry | None, photos: int) -> Centring:
+    photographs = "one photo" if photos == 1 else f"{photos} photos"
+    signs = []
+    if softer.significant and softer.amount > _SOFTER:
+        ratio, more = math.exp(softer.amount), math.exp(softer.amount + softer.error)
+        signs.append(
+            f"the {direction_in_words(softer.direction)} is softer than the opposite side, "
+            f"its blur {ratio:.2f} times as wide, give or take {more - ratio:.2f}"
+        )
+    if coma is not None and coma.significant and coma.amount > _COMATIC:
+        tails = direction_in_words(coma.direction)
+        signs.append(f"points in the middle of the picture have tails towards the {tails}")
+    if signs and photos == 1:
+        text = (
+            f"perhaps decentred: {'; '.join(signs)}; one photo cannot tell this from a subject at a slant; "
+            "a second one can"
+        )
+        return Centring("unknown", text, softer, coma)
+    if signs:
+        return Centring("decentred", f"decentred: {'; '.join(signs)}", softer, coma)
+    sides, spread = math.expm1(softer.amount), math.expm1(2.0 * softer.error)
+    figures = f"opposite sides differ by {sides:.0%}, give or take {spread:.0%}"
+    if sides + spread <= _UNSURE:
+        return Centring(
+            "centred", f"well centred within what {photographs} can tell: {figures}", softer, coma
+        )
+    if spread >= 1.0:  # such figures mean nothing
+        figures = "its samples differ too much from photo to photo"
+    return Centring(
+        "unknown", f"{photographs} cannot tell whether the lens is centred: {figures}", softer, coma
+    )

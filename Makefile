@@ -11,7 +11,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Tests start hundreds of processes: whatever the surroundings say, each module is compiled once.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help install demo test test-all serve check security torture fuzz format bench docs notebooks \
+.PHONY: help install demo test test-slow test-tools test-all serve check security torture fuzz format bench docs notebooks \
   wheel-check gallery lock \
   container-check clean
 
@@ -31,11 +31,16 @@ demo: install ## photos in, lens calibrated, corrected photo out: see demo-outpu
 	@$(BIN)/lensmodel demo --output demo-output
 
 # a file at a time: its services and photos are made once, not once for each of the two processes
-test: install ## the tests that need nothing but this repository
-	@$(BIN)/python -m pytest -q -n 2 --dist loadfile -m "not slow"
+test: install ## the tests that need nothing but this repository: minutes
+	@$(BIN)/python -m pytest -q -n 2 --dist loadfile -m "not slow and not tools"
 
-test-all: install ## every test, the slow ones included
-	@$(BIN)/python -m pytest -q -n 2
+test-slow: install ## the slow ones of those
+	@$(BIN)/python -m pytest -q -n 2 -m "slow and not tools"
+
+test-tools: install ## those with servers, a browser, programs and data beyond the repository
+	@$(BIN)/python -m pytest -q -n 2 --dist loadfile -m tools
+
+test-all: test test-slow test-tools ## all three
 
 serve: install ## run the service until interrupted
 	@$(BIN)/lensmodel serve
@@ -79,10 +84,10 @@ wheel-check: ## build the wheel and use it in clean environments (asks the netwo
 gallery: install ## pictures to look at, gallery-output/index.html (real ones with LENSMODEL_TEST_DATA)
 	@$(BIN)/lensmodel bench gallery --output gallery-output
 
-LOCK := uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --no-annotate
+LOCK := uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header
 lock: ## renew the files of requirements/ from pyproject.toml (needs uv)
-	$(LOCK) --extra dev --output-file requirements/lock.txt pyproject.toml
-	$(LOCK) --extra service --extra fast --output-file requirements/run.txt pyproject.toml
+	$(LOCK) --extra service --extra fits --extra cluster --group dev --output-file requirements/lock.txt pyproject.toml
+	$(LOCK) --extra service --output-file requirements/run.txt pyproject.toml
 	echo hatchling | $(LOCK) --output-file requirements/build.txt -
 
 container-check: ## build the image without an engine, start it and use it (root; Debian's buildah and debootstrap)

@@ -38,7 +38,7 @@ from lensmodel.core.types import LensSettings
 from lensmodel.simulate import BlurOptions, SimulatedCamera, draw_lens, load_scene, photograph, write_photo
 
 assert "site-packages" in lensmodel.__file__, lensmodel.__file__
-extras = [name for name in ("fastapi", "sqlalchemy", "numba", "sklearn", "matplotlib") if find_spec(name)]
+extras = [name for name in ("fastapi", "sqlalchemy", "sklearn", "matplotlib") if find_spec(name)]
 assert not extras, extras
 source = Path(sys.argv[1])
 camera = SimulatedCamera(height=384, width=576, pitch_um=9.0)
@@ -63,7 +63,7 @@ PYTHON
 echo "without extras: the help, and the five lines of the library"
 
 "$python" -m venv "$work/venv"
-"$work/venv/bin/pip" install --quiet "$wheel[service,fast]"
+"$work/venv/bin/pip" install --quiet "$wheel[service]"
 export PATH="$work/venv/bin:$PATH"
 
 lensmodel --version

@@ -111,7 +111,8 @@ def advice(model: LensModel, settings: LensSettings | None = None) -> Advice:
     if unseen := little_seen(s.position for s in own):
         shot = _suggestion(model, unseen[0], wanted[0])
         text = f"Next, a photo of {shot.text}, because little is seen of that place."
-        return Advice(text, (shot, *best[:2]), enough=False)
+        others = sorted((shot, *best[:2]), key=lambda each: -each.gain)
+        return Advice(text, tuple(others), enough=False)
     return Advice("The lens is well known by now; another photo would add little.", tuple(best), enough=True)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import httpx2
 import numpy as np
 import pytest
+from lensmodel.report.lens_test import lens_test
 from starlette.testclient import TestClient
 
 from app.blobs.storage import Storage
@@ -23,7 +24,6 @@ from app.store.versions import report_key
 from lensmodel.core.codec import to_json
 from lensmodel.core.errors import LensModelError
 from lensmodel.model import LensModel
-from lensmodel.report.lens_test import lens_test
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 

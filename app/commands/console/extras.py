@@ -24,16 +24,12 @@ EXTRAS: Final = {
         "uvicorn",
     ),
     "report": ("matplotlib",),
-    "lab": ("optiland", "skimage"),
-    "train": ("sklearn",),
 }
 """Modules by extra, as far as commands import them."""
 
 _WHAT: Final = {
     "service": "the service",
     "report": "drawing",
-    "lab": "the laboratory",
-    "train": "training",
 }
 
 

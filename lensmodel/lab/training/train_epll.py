@@ -68,7 +68,7 @@ def train_epll(
     try:
         from sklearn.mixture import GaussianMixture  # noqa: PLC0415  # needed for training only
     except ImportError as error:
-        raise InvalidInputError("training needs scikit-learn; pip install '.[train]'") from error
+        raise InvalidInputError("training needs scikit-learn; pip install --group lab") from error
     rng = np.random.default_rng(seed)
     data = np.concatenate([windows_of(photo, windows // len(photos), rng) for photo in photos])
     model = GaussianMixture(

@@ -170,7 +170,7 @@ def fit(table: Path, model: Path, seed: int = 0) -> RegionsReport:
     try:
         from sklearn.ensemble import GradientBoostingRegressor  # noqa: PLC0415  # needed for training only
     except ImportError as error:
-        raise InvalidInputError("training needs scikit-learn; pip install '.[train]'") from error
+        raise InvalidInputError("training needs scikit-learn; pip install --group lab") from error
     rows = read_table(table)
     learn, held = ([row for row in rows if row.half == half] for half in ("dev", "test"))
     if not learn or not held:

@@ -107,7 +107,7 @@ def read_xmp(packet: bytes | None) -> Mapping[str, str]:
     parser.StartDoctypeDeclHandler = collector.refuse
     parser.EntityDeclHandler = collector.refuse
     try:
-        parser.Parse(packet.strip(b"\0 \r\n"), True)  # noqa: FBT003  expat takes it by position only
+        parser.Parse(packet.strip(b"\0 \r\n"), True)
     except _RefusedPacketError as reason:
         log.warning("an XMP packet was refused: %s", reason)
         return {}

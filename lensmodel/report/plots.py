@@ -411,9 +411,10 @@ def _two_maps(
     for ax, name, values in zip(axes, ("tangential", "sagittal"), kinds, strict=True):
         image = sharpness_map(ax, found, values, factor=factor, top=top, error=error)
         ax.set_xlabel(name)
-    where = {"cax": below, "orientation": "horizontal"} if below is not None else {"ax": axes}
-    usual = {} if below is not None else {"location": "bottom", "fraction": 0.05, "aspect": 50}
-    scale = figure.colorbar(image, **where, **usual)
+    where: dict[str, Any] = {"ax": axes, "location": "bottom", "fraction": 0.05, "aspect": 50}
+    if below is not None:
+        where = {"cax": below, "orientation": "horizontal"}
+    scale = figure.colorbar(image, **where)
     ticks = np.linspace(0.0, top, 6)
     scale.set_ticks(ticks.tolist(), labels=[_number(t, factor) for t in ticks])
 

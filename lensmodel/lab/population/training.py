@@ -12,7 +12,7 @@ import json
 import math
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -45,6 +45,8 @@ _LOGITS: Final = FINE * FINE + _OUTER
 _SET_SIZES: Final = ((1, 2, 4, 8, 16, 32, 64, 110), (0.05, 0.04, 0.06, 0.12, 0.18, 0.22, 0.2, 0.13))
 _GREEN_WEIGHT: Final = 1.4
 _TOLD_WEIGHT, _RING_WEIGHT = 0.1, 0.05
+_AVERAGED: Final = 0.004  # pace of the moving average of weights
+_SAVED_SECONDS: Final = 240.0
 _UNKNOWN: Final = 0.08  # share of sets whose aperture, and of those whose pitch, is not known
 
 
@@ -133,7 +135,7 @@ class Network(nn.Module):
         )
         for block in self.decoder:
             q = block(q, t, batch["relation"], batch["unused"])
-        with torch.autocast("cpu", enabled=False):
+        with torch.autocast(q.device.type, enabled=False):
             q = q.float()
             hidden = self.kernel["1"](functional.gelu(self.kernel["0"](self.kernel["normal"](q))))
             shares = self.kernel["2"](hidden).view(*q.shape[:2], 3, _LOGITS).softmax(-1)
@@ -187,7 +189,9 @@ def losses(shares: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     (inner, wide), (true_inner, true_wide) = transforms(shares), transforms(truth)
     mtf = torch.sqrt((inner.abs() - true_inner.abs()).square().mean((-1, -2)) + 1e-6)
     mtf = mtf + 0.5 * torch.sqrt((wide.abs() - true_wide.abs()).square().mean((-1, -2)) + 1e-6)
-    rings = torch.sqrt((inner - true_inner).abs().square().flatten(-2) @ _RING_MATRIX.T + 1e-7)
+    rings = torch.sqrt(
+        (inner - true_inner).abs().square().flatten(-2) @ _RING_MATRIX.T.to(shares.device) + 1e-7
+    )
     return relative, mtf, rings
 
 
@@ -391,15 +395,98 @@ def export(network: Network, provenance: Mapping[str, Any], path: Path) -> None:
     write_atomically(path, data.getvalue())
 
 
+@dataclass
+class Sitting:
+    """The state of training, which outlives the process: it goes on where the last sitting ended."""
+
+    folder: Path
+    device: torch.device
+    network: Network
+    average: Network  # moving average of the weights: what is judged and exported
+    optimiser: torch.optim.Optimizer
+    minutes: float = 0.0
+    step: int = 0
+    curve: list[dict[str, Any]] = field(default_factory=list)
+
+    @classmethod
+    def begin(cls, folder: Path, lenses: list[Lens], rate: float) -> Sitting:
+        """Read the state in the folder, or start anew."""
+        device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        network, average = Network(), Network()
+        stored = folder / "state.pt"
+        state = torch.load(stored, weights_only=False, map_location="cpu") if stored.exists() else None
+        if state is None:
+            start(network, lenses)
+        else:
+            network.load_state_dict(state["network"])
+        average.load_state_dict(network.state_dict() if state is None else state["average"])
+        network.to(device)
+        optimiser = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=0.03, betas=(0.9, 0.98))
+        sitting = cls(folder, device, network, average.to(device), optimiser)
+        if state is not None:
+            optimiser.load_state_dict(state["optimiser"])
+            sitting.minutes, sitting.step, sitting.curve = state["minutes"], state["step"], state["curve"]
+        return sitting
+
+    def learn(self, batch: Mapping[str, Tensor], rate: float) -> float:
+        """Take one step; returns the mean relative error of green."""
+        for part in self.optimiser.param_groups:
+            part["lr"] = rate * min(1.0, (self.step + 1) / 200)
+        batch = {name: value.to(self.device) for name, value in batch.items()}
+        with torch.autocast(self.device.type, torch.bfloat16):
+            shares, told = self.network(batch)
+        relative, mtf, rings = losses(shares, batch["truth"])
+        weight = relative.new_tensor([1.0, _GREEN_WEIGHT, 1.0])
+        loss = (relative * weight).mean() + (mtf * weight).mean()
+        loss = loss + _TOLD_WEIGHT * (told[..., :3] - relative.detach().log()).abs().mean()
+        ring_told = told[..., 3:].unflatten(-1, (3, RINGS))
+        loss = loss + _RING_WEIGHT * (ring_told - rings.detach().log()).abs().mean()
+        self.optimiser.zero_grad()
+        loss.backward()
+        if torch.isfinite(nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)):
+            self.optimiser.step()
+        pace = _AVERAGED if self.step > 1 / _AVERAGED else 0.05
+        with torch.no_grad():
+            for slow, fast in zip(self.average.parameters(), self.network.parameters(), strict=True):
+                slow.lerp_(fast, pace)
+        self.step += 1
+        return float(relative.detach()[..., 1].mean())
+
+    def save(self, apart: list[Lens], facts: Mapping[str, Any]) -> None:
+        """Judge, and write `state.pt` to go on from and `weights.npz` as the product reads them."""
+        average = self.average.to("cpu")
+        figures = {n: judge(average, apart, n) for n in (1, 8, 64)}
+        for n, values in figures.items():
+            print(
+                f"  held out, {n} samples: " + " ".join(f"{k} {v:.3f}" for k, v in values.items()), flush=True
+            )
+        self.curve.append(
+            {"minutes": self.minutes, "step": self.step, "lenses": facts["lenses"], "figures": figures}
+        )
+        part = self.folder / "state.part"
+        torch.save(
+            {
+                "network": self.network.state_dict(), "average": average.state_dict(),
+                "optimiser": self.optimiser.state_dict(), "minutes": self.minutes, "step": self.step,
+                "curve": self.curve,
+            },
+            part,
+        )  # fmt: skip
+        part.replace(self.folder / "state.pt")
+        provenance = {**facts, "steps": self.step, "minutes": round(self.minutes, 1), "curve": self.curve}
+        export(average, provenance, self.folder / "weights.npz")
+        self.average = average.to(self.device)
+
+
 def train(
     folder: Path, minutes: float, *, total_minutes: float, rate: float, threads: int, seed: int, code: str
 ) -> None:
-    """Train from where the last sitting ended; writes `state.pt` and `weights.npz` every few minutes.
+    """Train from where the last sitting ended; saves every few minutes.
 
     Parameters
     ----------
     folder : Path
-        With `lenses` and `held-out`.
+        With `lenses` and `held-out`; lenses that are added meanwhile are trained on, too.
     minutes : float
         Length of this sitting.
     total_minutes : float
@@ -413,84 +500,36 @@ def train(
     """
     torch.set_num_threads(threads)
     torch.manual_seed(seed)
-    network, average = Network(), Network()
     known: set[str] = set()
     lenses = load_library(folder / "lenses", known)
     apart = load_library(folder / "held-out", set())
-    path, spent, step, history = folder / "state.pt", 0.0, 0, []
-    optimiser = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=0.03, betas=(0.9, 0.98))
-    if path.exists():
-        state = torch.load(path, weights_only=False)
-        network.load_state_dict(state["network"])
-        average.load_state_dict(state["average"])
-        optimiser.load_state_dict(state["optimiser"])
-        spent, step, history = state["spent"], state["step"], state["history"]
-    else:
-        start(network, lenses)
-        average.load_state_dict(network.state_dict())
-    print(f"{len(lenses)} lenses, {len(apart)} held out")
-    rng = np.random.default_rng([seed, step])
-    source = batches(lenses, rng)
-    weight = torch.tensor([1.0, _GREEN_WEIGHT, 1.0])
-    began = reported = saved = time.monotonic()
+    sitting = Sitting.begin(folder, lenses, rate)
+    print(f"{len(lenses)} lenses, {len(apart)} held out, on {sitting.device}", flush=True)
+    source = batches(lenses, np.random.default_rng([seed, sitting.step]))
+    before, began = sitting.minutes, time.monotonic()
+    reported = saved = began
     recent: list[tuple[int, float]] = []
-    while True:
-        now = time.monotonic()
-        ended = now - began >= 60 * minutes
-        if now - saved > 240 or ended:
-            figures = {n: judge(average, apart, n) for n in (1, 8, 64)}
-            minutes_spent = spent + (now - began) / 60
-            history.append(
-                {"minutes": minutes_spent, "step": step, "lenses": len(lenses), "figures": figures}
-            )
-            for n, f in figures.items():
-                print(
-                    f"  held out, {n} samples: " + " ".join(f"{k} {v:.3f}" for k, v in f.items()), flush=True
-                )
-            torch.save(
-                {"network": network.state_dict(), "average": average.state_dict(),
-                 "optimiser": optimiser.state_dict(),
-                 "spent": minutes_spent, "step": step, "history": history}, path.with_suffix(".part"),
-            )  # fmt: skip
-            path.with_suffix(".part").replace(path)
-            provenance = {"code": code, "seed": seed, "lenses": len(lenses), "shards": sorted(known),
-                          "steps": step,
-                          "minutes": minutes_spent, "curve": history}  # fmt: skip
-            export(average, provenance, folder / "weights.npz")
-            saved = time.monotonic()
-            lenses += load_library(folder / "lenses", known)
-        if ended:
-            return
-        share = min((spent + (now - began) / 60) / total_minutes, 1.0)
-        for part in optimiser.param_groups:
-            part["lr"] = (
-                rate * min(1.0, (step + 1) / 200) * (0.5 * (1 + math.cos(math.pi * share)) * 0.98 + 0.02)
-            )
+    while sitting.minutes < before + minutes:
+        share = min(sitting.minutes / total_minutes, 1.0)
         batch = next(source)
-        with torch.autocast("cpu", torch.bfloat16):
-            shares, told = network(batch)
-        relative, mtf, rings = losses(shares, batch["truth"])
-        loss = (relative * weight).mean() + (mtf * weight).mean()
-        loss = loss + _TOLD_WEIGHT * (told[..., :3] - relative.detach().log()).abs().mean()
-        ring_told = told[..., 3:].unflatten(-1, (3, RINGS))
-        loss = loss + _RING_WEIGHT * (ring_told - rings.detach().log()).abs().mean()
-        optimiser.zero_grad()
-        loss.backward()
-        norm = nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        if torch.isfinite(norm):
-            optimiser.step()
-        step += 1
-        recent.append((batch["statistics"].shape[1], float(relative.detach()[..., 1].mean())))
-        with torch.no_grad():
-            for a, b in zip(average.parameters(), network.parameters(), strict=True):
-                a.lerp_(b, 0.004 if step > 600 else 0.05)
-            if step == 1:
-                average.load_state_dict(network.state_dict())
+        error = sitting.learn(batch, rate * (0.49 * (1 + math.cos(math.pi * share)) + 0.02))
+        recent.append((batch["statistics"].shape[1], error))
+        now = time.monotonic()
+        sitting.minutes = before + (now - began) / 60
         if now - reported > 60:
             reported = now
-            few = [v for n, v in recent[-300:] if n <= 4]
-            many = [v for n, v in recent[-300:] if n > 24]
-            print(
-                f"{(now - began) / 60:.1f} min, step {step}, {len(lenses)} lenses, rate {part['lr']:.1e}, "
-                f"green: few {np.mean(few):.3f}, many {np.mean(many):.3f}", flush=True,
-            )  # fmt: skip
+            print(_progress(sitting, len(lenses), recent[-300:]), flush=True)
+        if now - saved > _SAVED_SECONDS or sitting.minutes >= before + minutes:
+            facts = {"code": code, "seed": seed, "lenses": len(lenses), "shards": sorted(known)}
+            sitting.save(apart, facts)
+            saved = time.monotonic()
+            lenses += load_library(folder / "lenses", known)
+
+
+def _progress(sitting: Sitting, lenses: int, recent: list[tuple[int, float]]) -> str:
+    few = [error for n, error in recent if n <= 4]
+    many = [error for n, error in recent if n > 24]
+    return (
+        f"{sitting.minutes:.1f} min, step {sitting.step}, {lenses} lenses, "
+        f"green: few {np.mean(few or [math.nan]):.3f}, many {np.mean(many or [math.nan]):.3f}"
+    )

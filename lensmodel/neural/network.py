@@ -323,12 +323,12 @@ def assembled(parts: NDArray[np.floating]) -> NDArray[np.float64]:
 def centred_kernels(kernels: NDArray[np.floating]) -> NDArray[np.float64]:
     """Kernels (..., n, n) with their centre of mass in the middle, shifted by linear interpolation.
 
-    The network is trained on centred kernels: what is left is a small part of a pixel.
+    The network is trained on centred kernels: what is left to do is a small part of a pixel.
     """
     moving: NDArray[np.float64] = np.asarray(kernels, np.float64)
     at = np.arange(moving.shape[-1]) - moving.shape[-1] // 2
-    for axis, sums in ((-1, -2), (-2, -1)):
-        shift = -(moving.sum(sums) @ at)[..., None, None]
+    for axis, other in ((-1, -2), (-2, -1)):
+        shift = -(moving.sum(other) @ at)[..., None, None]
         moved = np.where(shift > 0, np.roll(moving, 1, axis), np.roll(moving, -1, axis))
         part = np.clip(np.abs(shift), 0.0, 1.0)
         moving = (1 - part) * moving + part * moved

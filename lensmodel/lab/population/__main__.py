@@ -7,7 +7,8 @@ import time
 from itertools import chain
 from pathlib import Path
 
-from lensmodel.lab.population import library, scenes
+from lensmodel.lab.population import library, scenes, sets
+from lensmodel.neural import FieldNetwork
 
 
 def _arguments() -> argparse.Namespace:
@@ -32,7 +33,24 @@ def _arguments() -> argparse.Namespace:
     train.add_argument("--threads", type=int, default=2)
     train.add_argument("--seed", type=int, default=0)
     train.add_argument("--code", default="", help="what made the library, for the provenance")
+    judged = commands.add_parser("judge", help="errors of the packaged weights on lenses held out")
+    judged.add_argument("--family", choices=library.FAMILIES, default="traced")
+    judged.add_argument("--weights", type=Path, help="others than those of the package")
     return parser.parse_args()
+
+
+def _judge(asked: argparse.Namespace) -> None:
+    network = (
+        FieldNetwork.load() if asked.weights is None else FieldNetwork.from_bytes(asked.weights.read_bytes())
+    )
+    lenses = sets.load_library(asked.folder / "held-out", set(), families=(asked.family,))
+    print(f"{asked.family}, {len(lenses)} lenses, weights {network.name}: relative L2 of PSFs")
+    for samples in (1, 8, 32, 64, 128):
+        figures = sets.judge(network, lenses, samples)
+        print(
+            f"{samples:4d} samples: " + "  ".join(f"{name} {value:.3f}" for name, value in figures.items()),
+            flush=True,
+        )
 
 
 def main() -> None:
@@ -52,6 +70,9 @@ def main() -> None:
             asked.folder, asked.minutes, total_minutes=asked.total_minutes, rate=asked.rate,
             threads=asked.threads, seed=asked.seed, code=asked.code,
         )  # fmt: skip
+        return
+    if asked.command == "judge":
+        _judge(asked)
         return
     began, count = time.monotonic(), 0
     name = "held-out" if asked.held_out else "lenses"

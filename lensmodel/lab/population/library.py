@@ -62,7 +62,8 @@ def draw_lens(
     if family == "traced":
         designs = importlib.import_module("lensmodel.lab.population.prescriptions")
         traced = importlib.import_module("lensmodel.lab.population.traced")
-        names = sorted(name for name in designs.PRESCRIPTIONS if (name in designs.HELD_OUT) == held_out)
+        apart = designs.held_out()
+        names = sorted(name for name in designs.prescriptions() if (name in apart) == held_out)
         lens: PopulationLens = traced.draw(rng, names)
         zooms = [0.0]
     else:

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lensmodel.core.files import write_atomically
-from lensmodel.lab.population.library import FAMILIES, load_shard
+from lensmodel.lab.population.sets import Lens, Set, draw_set, load_library
 from lensmodel.neural.features import (
     CONDITION,
     DISTANCES,
@@ -34,8 +34,7 @@ from lensmodel.neural.features import (
     relation_features,
 )
 from lensmodel.neural.network import BLOCK, COARSE, FINE, RINGS, outer_cells
-from lensmodel.neural.statistics import LENGTH, group
-from lensmodel.neural.symmetry import octant_of, to_octant_image
+from lensmodel.neural.statistics import LENGTH
 
 WIDTH, HEADS, HIDDEN, COMPONENTS = 192, 6, 384, 224
 ENCODER_BLOCKS, DECODER_BLOCKS = 2, 3
@@ -47,7 +46,6 @@ _GREEN_WEIGHT: Final = 1.4
 _TOLD_WEIGHT, _RING_WEIGHT = 0.1, 0.05
 _AVERAGED: Final = 0.004  # pace of the moving average of weights
 _SAVED_SECONDS: Final = 240.0
-_UNKNOWN: Final = 0.08  # share of sets whose aperture, and of those whose pitch, is not known
 
 
 class Attention(nn.Module):
@@ -195,117 +193,6 @@ def losses(shares: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return relative, mtf, rings
 
 
-@dataclass(slots=True)
-class Lens:
-    """One lens of the library, ready for sets."""
-
-    statistics: NDArray[np.float16]
-    place: NDArray[np.int64]
-    photo: NDArray[np.int64]
-    state: NDArray[np.int64]
-    xy: NDArray[np.float64]
-    settings: NDArray[np.float64]  # (states, SETTINGS)
-    truth: NDArray[np.float16]  # (states, places, 3, _LOGITS), in the octants' frames
-
-    @classmethod
-    def of(cls, stored: Mapping[str, NDArray[Any]]) -> Lens:
-        """Make one of what a shard holds."""
-        xy = stored["xy"].astype(np.float64)
-        pitch, kind = stored["facts"]
-        states = stored["states"].astype(np.float64)
-        settings = np.full((len(states), 5), np.nan)
-        settings[:, 0] = np.log(states[:, 0])
-        settings[:, 1] = np.log(0.54 * states[:, 0] / pitch)
-        settings[:, 2] = np.log(states[:, 1])
-        settings[:, 4] = kind
-        octants = octant_of(xy)
-        turned = []
-        for name in ("fine", "coarse"):
-            kernels = stored[name]
-            parts = np.stack([to_octant_image(int(o), kernels[:, p]) for p, o in enumerate(octants)], 1)
-            turned.append(
-                parts[..., outer_cells()] if name == "coarse" else parts.reshape(*parts.shape[:3], -1)
-            )
-        return cls(
-            np.nan_to_num(stored["statistics"]), stored["place"].astype(int), stored["photo"].astype(int),
-            stored["state"].astype(int), xy, settings, np.concatenate(turned, -1),
-        )  # fmt: skip
-
-
-def load_library(folder: Path, known: set[str], limit: int = 10**9) -> list[Lens]:
-    """Lenses of the shards that are not known yet; adds their names."""
-    lenses: list[Lens] = []
-    for family in FAMILIES:
-        for path in sorted(folder.glob(f"{family}-*.npz")):
-            if path.name in known or len(lenses) >= limit or path.name.startswith("."):
-                continue
-            known.add(path.name)
-            lenses += [Lens.of(stored) for stored in load_shard(path)]
-    return lenses
-
-
-@dataclass(slots=True)
-class Set:
-    """Some samples of one lens, and queries with their truth."""
-
-    statistics: NDArray[np.float32]
-    xy: NDArray[np.float64]
-    settings: NDArray[np.float64]
-    photo: NDArray[np.int64]
-    query_xy: NDArray[np.float64]
-    query_settings: NDArray[np.float64]
-    truth: NDArray[np.float16]
-
-
-def _swapped(
-    statistics: NDArray[np.float32], truth: NDArray[np.float16]
-) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Exchange red and blue: no network should know which is which."""
-    out = statistics.copy()
-    red, blue, level = group("red"), group("blue"), group("level").start
-    out[:, red], out[:, blue] = statistics[:, blue], statistics[:, red]
-    out[:, level : level + 2], out[:, level + 4 : level + 6] = (
-        statistics[:, level + 4 : level + 6],
-        statistics[:, level : level + 2],
-    )
-    return out, truth[:, ::-1]
-
-
-def draw_set(lens: Lens, samples: int, queries: int, rng: np.random.Generator, *, swap: bool = True) -> Set:
-    """Draw samples of one to all photos, and queries; half the time with no sample at their places."""
-    index = np.arange(len(lens.place))
-    if samples <= 24 and rng.random() < 0.5:
-        index = index[lens.photo == rng.choice(lens.photo)]
-    asked = rng.choice(len(lens.xy), queries, replace=False)
-    state = (
-        int(rng.integers(len(lens.settings))) if rng.random() < 0.5 else int(rng.choice(lens.state[index]))
-    )
-    if samples <= 2:
-        asked[0] = lens.place[rng.choice(index)]
-        index = np.concatenate([index[lens.place[index] == asked[0]], index]) if samples == 1 else index
-        chosen = index[:1] if samples == 1 else rng.permutation(index)[:samples]
-        if rng.random() < 0.7:
-            state = int(lens.state[chosen[0]])
-    else:
-        if rng.random() < 0.5 and len(apart := index[~np.isin(lens.place[index], asked[: queries // 2])]) > 2:
-            index = apart
-        chosen = rng.permutation(index)[:samples]
-    settings = lens.settings.copy()
-    if rng.random() < _UNKNOWN:
-        settings[:, :2] = np.nan
-    elif rng.random() < _UNKNOWN:
-        settings[:, 1] = np.nan
-    if len(np.unique(settings[:, 2])) == 1 or rng.random() < 0.2:
-        settings[:, 2] = np.nan
-    statistics, truth = lens.statistics[chosen].astype(np.float32), lens.truth[state][asked]
-    if swap and rng.random() < 0.5:
-        statistics, truth = _swapped(statistics, truth)
-    return Set(
-        statistics, lens.xy[lens.place[chosen]], settings[lens.state[chosen]], lens.photo[chosen],
-        lens.xy[asked], np.repeat(settings[state][None], queries, 0), truth,
-    )  # fmt: skip
-
-
 def collate(sets: list[Set]) -> dict[str, Tensor]:
     """One batch of sets of any sizes; missing samples are masked."""
     size = max(len(s.xy) for s in sets)
@@ -364,13 +251,13 @@ def start(network: Network, lenses: list[Lens]) -> None:
 
 
 @torch.no_grad()
-def judge(network: Network, lenses: list[Lens], samples: int, seed: int = 1) -> dict[str, float]:
+def held_out(network: Network, lenses: list[Lens], samples: int, seed: int = 1) -> dict[str, float]:
     """Errors on lenses that were not trained on: of each colour, of green by zone, and as told."""
     rng = np.random.default_rng(seed)
     relative, told, radius = [], [], []
     for first in range(0, len(lenses), 20):
         sets = [
-            draw_set(lens, samples, 1 if samples == 1 else 24, rng, swap=False)
+            draw_set(lens, samples, 1 if samples == 1 else 24, rng, varied=False)
             for lens in lenses[first : first + 20]
         ]
         batch = collate(sets)
@@ -455,7 +342,7 @@ class Sitting:
     def save(self, apart: list[Lens], facts: Mapping[str, Any]) -> None:
         """Judge, and write `state.pt` to go on from and `weights.npz` as the product reads them."""
         average = self.average.to("cpu")
-        figures = {n: judge(average, apart, n) for n in (1, 8, 64)}
+        figures = {n: held_out(average, apart, n) for n in (1, 8, 64)}
         for n, values in figures.items():
             print(
                 f"  held out, {n} samples: " + " ".join(f"{k} {v:.3f}" for k, v in values.items()), flush=True

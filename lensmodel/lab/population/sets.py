@@ -1,0 +1,198 @@
+"""Lenses of a library as sets of samples and queries, for training and judging."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lensmodel.lab.population.library import FAMILIES, Family, load_shard
+from lensmodel.neural import Conditions, FieldNetwork
+from lensmodel.neural.features import KINDS
+from lensmodel.neural.network import assembled, outer_cells
+from lensmodel.neural.statistics import group
+from lensmodel.neural.symmetry import from_octant_image, octant_of, to_octant_image
+
+_UNKNOWN: Final = 0.08  # share of sets whose aperture, and of those whose pitch, is not known
+ZONES: Final = ("center", "mid", "corner")
+
+
+@dataclass(slots=True)
+class Lens:
+    """One lens of the library, ready for sets."""
+
+    statistics: NDArray[np.float16]
+    place: NDArray[np.int64]
+    photo: NDArray[np.int64]
+    state: NDArray[np.int64]
+    xy: NDArray[np.float64]
+    settings: NDArray[np.float64]  # (states, SETTINGS)
+    truth: NDArray[np.float16]  # (states, places, 3, _LOGITS), in the octants' frames
+
+    @classmethod
+    def of(cls, stored: Mapping[str, NDArray[Any]]) -> Lens:
+        """Make one of what a shard holds."""
+        xy = stored["xy"].astype(np.float64)
+        pitch, kind = stored["facts"]
+        states = stored["states"].astype(np.float64)
+        settings = np.full((len(states), 5), np.nan)
+        settings[:, 0] = np.log(states[:, 0])
+        settings[:, 1] = np.log(0.54 * states[:, 0] / pitch)
+        settings[:, 2] = np.log(states[:, 1])
+        settings[:, 4] = kind
+        octants = octant_of(xy)
+        turned = []
+        for name in ("fine", "coarse"):
+            kernels = stored[name]
+            parts = np.stack([to_octant_image(int(o), kernels[:, p]) for p, o in enumerate(octants)], 1)
+            turned.append(
+                parts[..., outer_cells()] if name == "coarse" else parts.reshape(*parts.shape[:3], -1)
+            )
+        return cls(
+            np.nan_to_num(stored["statistics"]), stored["place"].astype(int), stored["photo"].astype(int),
+            stored["state"].astype(int), xy, settings, np.concatenate(turned, -1),
+        )  # fmt: skip
+
+
+def load_library(folder: Path, known: set[str], families: Sequence[Family] = FAMILIES) -> list[Lens]:
+    """Lenses of the shards that are not known yet; adds their names."""
+    lenses: list[Lens] = []
+    for family in families:
+        for path in sorted(folder.glob(f"{family}-*.npz")):
+            if path.name in known:
+                continue
+            known.add(path.name)
+            lenses += [Lens.of(stored) for stored in load_shard(path)]
+    return lenses
+
+
+@dataclass(slots=True)
+class Set:
+    """Some samples of one lens, and queries with their truth."""
+
+    statistics: NDArray[np.float32]
+    xy: NDArray[np.float64]
+    settings: NDArray[np.float64]
+    photo: NDArray[np.int64]
+    query_xy: NDArray[np.float64]
+    query_settings: NDArray[np.float64]
+    truth: NDArray[np.float16]
+
+
+def _swapped(
+    statistics: NDArray[np.float32], truth: NDArray[np.float16]
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Exchange red and blue: no network should know which is which."""
+    out = statistics.copy()
+    red, blue, level = group("red"), group("blue"), group("level").start
+    out[:, red], out[:, blue] = statistics[:, blue], statistics[:, red]
+    out[:, level : level + 2], out[:, level + 4 : level + 6] = (
+        statistics[:, level + 4 : level + 6],
+        statistics[:, level : level + 2],
+    )
+    return out, truth[:, ::-1]
+
+
+def draw_set(lens: Lens, samples: int, queries: int, rng: np.random.Generator, *, varied: bool = True) -> Set:
+    """Draw samples of one to all photos, and queries; half the time with no sample at their places."""
+    index = np.arange(len(lens.place))
+    if samples <= 24 and rng.random() < 0.5:
+        index = index[lens.photo == rng.choice(lens.photo)]
+    asked = rng.choice(len(lens.xy), queries, replace=False)
+    state = (
+        int(rng.integers(len(lens.settings))) if rng.random() < 0.5 else int(rng.choice(lens.state[index]))
+    )
+    if samples <= 2:
+        asked[0] = lens.place[rng.choice(index)]
+        index = np.concatenate([index[lens.place[index] == asked[0]], index]) if samples == 1 else index
+        chosen = index[:1] if samples == 1 else rng.permutation(index)[:samples]
+        if rng.random() < 0.7:
+            state = int(lens.state[chosen[0]])
+    else:
+        if rng.random() < 0.5 and len(apart := index[~np.isin(lens.place[index], asked[: queries // 2])]) > 2:
+            index = apart
+        chosen = rng.permutation(index)[:samples]
+    settings = lens.settings.copy()
+    if varied and rng.random() < _UNKNOWN:
+        settings[:, :2] = np.nan
+    elif varied and rng.random() < _UNKNOWN:
+        settings[:, 1] = np.nan
+    if len(np.unique(settings[:, 2])) == 1 or rng.random() < 0.2:
+        settings[:, 2] = np.nan
+    statistics, truth = lens.statistics[chosen].astype(np.float32), lens.truth[state][asked]
+    if varied and rng.random() < 0.5:
+        statistics, truth = _swapped(statistics, truth)
+    return Set(
+        statistics, lens.xy[lens.place[chosen]], settings[lens.state[chosen]], lens.photo[chosen],
+        lens.xy[asked], np.repeat(settings[state][None], queries, 0), truth,
+    )  # fmt: skip
+
+
+def conditions_of(settings: NDArray[np.float64]) -> Conditions:
+    """Turn a row of settings back into what it was made of."""
+    f_number, width, focal, focus = (None if math.isnan(v) else math.exp(v) for v in settings[:4])
+    pitch = None if None in (f_number, width) else 0.54 * f_number / width  # type: ignore[operator]
+    return Conditions(f_number, pitch, focal, focus, KINDS[int(settings[4])])
+
+
+def answered(network: FieldNetwork, drawn: Set) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Relative L2 errors of the network's kernels on a set, and those it expects; both (queries, 3)."""
+    tokens = np.empty((len(drawn.xy), 0), np.float32)
+    for photo in np.unique(drawn.photo):
+        part = drawn.photo == photo
+        known = conditions_of(drawn.settings[part][0])
+        encoded = network.encode(drawn.statistics[part], drawn.xy[part], known)
+        if not tokens.size:
+            tokens = np.empty((len(drawn.xy), encoded.shape[1]), np.float32)
+        tokens[part] = encoded
+    memory = network.memory(tokens, drawn.xy, [conditions_of(row) for row in drawn.settings])
+    made, told = [], []
+    for xy, row, shares in zip(drawn.query_xy, drawn.query_settings, drawn.truth, strict=True):
+        answer = network.query(memory, xy, conditions_of(row))
+        truth = from_octant_image(int(octant_of(xy)), assembled(shares))
+        power = np.square(truth).sum((1, 2))
+        made.append(np.sqrt(np.square(answer.kernels - truth).sum((1, 2)) / power))
+        told.append(answer.error)
+    return np.array(made), np.array(told)
+
+
+def judge(
+    network: FieldNetwork, lenses: list[Lens], samples: int, *, queries: int = 12, seed: int = 1
+) -> dict[str, float]:
+    """Errors on lenses that were not trained on: of each colour, of green by zone, and how true the told are.
+
+    Parameters
+    ----------
+    network : FieldNetwork
+    lenses : list of Lens
+    samples : int
+        Patches of each lens, from all of its photos.
+    queries : int
+        Places that are asked of each.
+    seed : int
+
+    Returns
+    -------
+    dict of str to float
+        Mean relative L2 distance of "r", "g", "b", of green in "center" (r < 0.3), "mid" and "corner"
+        (r > 0.75), and "told_right", the share of places whose told error is within a factor of 1.5.
+    """
+    rng = np.random.default_rng(seed)
+    made, told, radius = [], [], []
+    for lens in lenses:
+        drawn = draw_set(lens, samples, queries, rng, varied=False)
+        errors, expected = answered(network, drawn)
+        made.append(errors)
+        told.append(expected)
+        radius.append(np.hypot(*drawn.query_xy.T))
+    e, t, r = np.concatenate(made), np.concatenate(told), np.concatenate(radius)
+    zones = {"center": r < 0.3, "mid": (r >= 0.3) & (r <= 0.75), "corner": r > 0.75}
+    figures = {colour: float(e[:, i].mean()) for i, colour in enumerate("rgb")}
+    figures |= {zone: float(e[inside, 1].mean()) for zone, inside in zones.items() if inside.any()}
+    right = np.abs(np.log(t[:, 1] / e[:, 1])) < math.log(1.5)
+    return {**figures, "told_right": float(right.mean())}

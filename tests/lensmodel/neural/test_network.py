@@ -1,0 +1,149 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from importlib.resources import files
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy import ndimage
+
+from lensmodel.core.errors import InvalidInputError, NoSamplesError
+from lensmodel.neural import Conditions, FieldAnswer, FieldNetwork, patch_statistics, to_octant
+from lensmodel.neural.statistics import LENGTH, WINDOW
+from lensmodel.neural.symmetry import OCTANTS, to_octant_image, to_octant_place
+
+COLOURS = np.tile(np.array([[0, 1], [1, 2]], np.int8), (WINDOW // 2, WINDOW // 2))
+WIDE_OPEN = Conditions(f_number=2.8, pitch_um=4.5)
+PLACES = np.array([(x, y) for x in (-0.7, -0.25, 0.3, 0.75) for y in (-0.4, 0.05, 0.45)])
+
+
+@cache
+def scene(name: str) -> np.ndarray:
+    """A demonstration photograph in linear light, scaled down until it is sharp; (rows, cols, 3)."""
+    with Image.open(files("lensmodel") / "demo_data" / f"{name}.jpg") as picture:
+        half = picture.convert("RGB").reduce(2)
+        return (np.asarray(half, np.float64) / 255) ** 2.2
+
+
+def photo(blur: float, *, noise: float = 1e-3, seed: int = 0, name: str = "spices") -> np.ndarray:
+    """Statistics of patches of a photograph behind a Gaussian blur, one a place."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for _ in PLACES:
+        row, col = (int(rng.integers(0, n - WINDOW)) // 2 * 2 for n in scene(name).shape[:2])
+        planes = scene(name)[row : row + WINDOW, col : col + WINDOW]
+        blurred = ndimage.gaussian_filter(planes, (blur, blur, 0))
+        mosaic = np.take_along_axis(blurred, COLOURS[..., None].astype(int), 2)[..., 0]
+        mosaic = mosaic + noise * rng.standard_normal(mosaic.shape)
+        out.append(patch_statistics(mosaic.astype(np.float32), COLOURS, noise, 0.0))
+    return to_octant(np.array(out), PLACES)
+
+
+def ask(
+    statistics: np.ndarray, xy: np.ndarray, place: tuple[float, float], conditions: Conditions = WIDE_OPEN
+) -> FieldAnswer:
+    network = FieldNetwork.load()
+    tokens = network.encode(statistics, xy, WIDE_OPEN)
+    return network.query(network.memory(tokens, xy, [WIDE_OPEN] * len(xy)), np.array(place), conditions)
+
+
+@pytest.fixture(scope="module")
+def sharp() -> np.ndarray:
+    return photo(0.8)
+
+
+def width(answer: FieldAnswer) -> float:
+    at = np.arange(answer.kernels.shape[-1]) - answer.kernels.shape[-1] // 2
+    green = answer.kernels[1]
+    return float(np.sqrt((green.sum(0) @ at**2 + green.sum(1) @ at**2) / 2))
+
+
+def test_kernels_are_not_negative_of_sum_one_and_centred(sharp: np.ndarray) -> None:
+    kernels = ask(sharp, PLACES, (0.4, -0.2)).kernels
+    at = np.arange(kernels.shape[-1]) - kernels.shape[-1] // 2
+    assert (kernels >= 0).all()
+    np.testing.assert_allclose(kernels.sum((1, 2)), 1.0, atol=1e-9)
+    assert np.abs(kernels.sum(1) @ at).max() < 0.01
+    assert np.abs(kernels.sum(2) @ at).max() < 0.01
+
+
+def test_order_of_samples_does_not_matter(sharp: np.ndarray) -> None:
+    order = np.random.default_rng(1).permutation(len(PLACES))
+    there = ask(sharp, PLACES, (0.2, 0.3))
+    again = ask(sharp[order], PLACES[order], (0.2, 0.3))
+    np.testing.assert_allclose(again.kernels, there.kernels, atol=1e-6)
+    np.testing.assert_allclose(again.weights, there.weights[order], atol=1e-5)
+
+
+@pytest.mark.parametrize("symmetry", range(OCTANTS))
+def test_a_lens_that_is_turned_has_its_psf_turned(sharp: np.ndarray, symmetry: int) -> None:
+    turn = np.array(symmetry)
+    place = np.array([0.35, 0.1])
+    before = ask(sharp, PLACES, (0.35, 0.1)).kernels
+    after = ask(sharp, to_octant_place(turn, PLACES), tuple(to_octant_place(turn, place))).kernels
+    np.testing.assert_allclose(after, to_octant_image(symmetry, before), atol=1e-9)
+
+
+def test_a_new_photo_leaves_the_tokens_of_others_as_they_are(sharp: np.ndarray) -> None:
+    network = FieldNetwork.load()
+    alone = network.encode(sharp, PLACES, WIDE_OPEN)
+    np.testing.assert_array_equal(network.encode(sharp, PLACES, WIDE_OPEN), alone)
+    both = np.concatenate([alone, network.encode(photo(0.8, seed=5), PLACES, WIDE_OPEN)])
+    memory = network.memory(both, np.tile(PLACES, (2, 1)), [WIDE_OPEN] * len(both))
+    part = network.memory(alone, PLACES, [WIDE_OPEN] * len(alone))
+    np.testing.assert_allclose(memory.part(np.arange(len(alone))).keys, part.keys, atol=1e-5)
+
+
+def test_softer_photos_give_wider_kernels() -> None:
+    widths = [width(ask(photo(blur), PLACES, (0.3, 0.1))) for blur in (0.5, 1.2, 2.5)]
+    assert widths[0] < widths[1] < widths[2]
+
+
+def test_a_question_at_another_aperture_uses_these_samples(sharp: np.ndarray) -> None:
+    closed = replace(WIDE_OPEN, f_number=5.6)
+    soft = photo(2.5)
+    assert width(ask(soft, PLACES, (0.3, 0.1), closed)) > width(ask(sharp, PLACES, (0.3, 0.1), closed))
+
+
+def told(statistics: np.ndarray, xy: np.ndarray) -> float:
+    """Mean error of green that is told over places of the field."""
+    asked = ((0.7, 0.4), (0.1, 0.05), (-0.5, 0.3), (0.3, -0.4), (-0.75, -0.45))
+    return float(np.mean([ask(statistics, xy, place).error[1] for place in asked]))
+
+
+def test_told_error_grows_where_samples_are_few_far_noisy_or_soft(sharp: np.ndarray) -> None:
+    all_of_them = told(sharp, PLACES)
+    left = PLACES[:, 0] < 0
+    assert told(sharp[4:5], PLACES[4:5]) > all_of_them
+    assert ask(sharp[left], PLACES[left], (0.74, 0.44)).error[1] > ask(sharp, PLACES, (0.74, 0.44)).error[1]
+    assert told(photo(0.8, noise=0.03), PLACES) > all_of_them
+
+
+def test_no_samples_are_refused() -> None:
+    with pytest.raises(NoSamplesError, match="calibrate"):
+        FieldNetwork.load().memory(np.empty((0, 192)), np.empty((0, 2)), [])
+
+
+def test_statistics_of_a_wrong_shape_or_not_finite_are_refused(sharp: np.ndarray) -> None:
+    network = FieldNetwork.load()
+    with pytest.raises(InvalidInputError, match=str(LENGTH)):
+        network.encode(sharp[:, :-1], PLACES, WIDE_OPEN)
+    broken = sharp.copy()
+    broken[0, 0] = np.nan
+    with pytest.raises(InvalidInputError, match="finite"):
+        network.encode(broken, PLACES, WIDE_OPEN)
+
+
+@pytest.mark.parametrize("values", [{"f_number": -1.0}, {"pitch_um": float("nan")}, {"kind": "gif"}])
+def test_conditions_that_no_photo_has_are_refused(values: dict[str, object]) -> None:
+    with pytest.raises(InvalidInputError):
+        Conditions(**values)  # type: ignore[arg-type]
+
+
+def test_weights_say_where_they_come_from() -> None:
+    network = FieldNetwork.load()
+    assert network.provenance["lenses"] > 500
+    assert network.provenance["curve"][-1]["figures"]
+    assert len(network.name) == 12

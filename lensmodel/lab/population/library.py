@@ -96,7 +96,7 @@ def make_lens(family: Family, number: int, scenes: Scenes, *, held_out: bool) ->
     kind: Kind = KINDS[int(rng.choice(len(KINDS), p=_KIND_SHARES))]
     camera = Camera(rng, scenes, kind, xy, stacked)
     photos = int(rng.choice(_PHOTO_COUNTS[0], p=_PHOTO_COUNTS[1]))
-    count = int(rng.choice([40, 72, 128], p=[0.4, 0.35, 0.25]))
+    count = int(rng.choice([32, 56, 110], p=[0.5, 0.35, 0.15]))
     patches = camera.take(photos, count)
     if len(patches.place) < 8:
         return None

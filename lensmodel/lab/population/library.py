@@ -28,6 +28,7 @@ SHARD: Final = 25
 
 _KIND_SHARES: Final = (0.64, 0.12, 0.24)
 _PHOTO_COUNTS: Final = ((1, 2, 3, 5), (0.3, 0.2, 0.2, 0.3))
+_PLAIN_PATCHES: Final = 72  # of each photo
 _OFF_CENTRE: Final = 0.08  # share of lenses whose pictures are cut out of a larger one
 
 
@@ -79,13 +80,20 @@ def draw_lens(
     ]
 
 
-def make_lens(family: Family, number: int, scenes: Scenes, *, held_out: bool) -> dict[str, Any] | None:
-    """Make one lens with the statistics of its photos; None where it blurs beyond what a kernel holds."""
+def make_lens(
+    family: Family, number: int, scenes: Scenes, *, held_out: bool, plain: bool = False
+) -> dict[str, Any] | None:
+    """Make one lens with the statistics of its photos; None where they hardly show anything.
+
+    Plain lenses have five RAW photos that nothing spoils.
+    """
     rng = np.random.default_rng([number, FAMILIES.index(family), int(held_out)])
     lens, states = draw_lens(family, rng, held_out=held_out)
+    if plain:
+        states = states[:1]
     xy = places(rng)
     on_lens = xy
-    if rng.random() < _OFF_CENTRE:
+    if rng.random() < _OFF_CENTRE and not plain:
         size = rng.uniform(0.45, 0.95)
         on_lens = size * xy + rng.uniform(-1, 1, 2) * (1 - size) * np.array([0.8, 0.5])
     kernels = []
@@ -93,11 +101,11 @@ def make_lens(family: Family, number: int, scenes: Scenes, *, held_out: bool) ->
         at = lens.at_state(state.zoom, 1.0) if isinstance(lens, RandomLens) and state.zoom else lens
         kernels.append(kernels_of(at, on_lens, state.f_number))
     stacked = np.array(kernels)
-    kind: Kind = KINDS[int(rng.choice(len(KINDS), p=_KIND_SHARES))]
-    camera = Camera(rng, scenes, kind, xy, stacked)
+    kind: Kind = "raw" if plain else KINDS[int(rng.choice(len(KINDS), p=_KIND_SHARES))]
+    camera = Camera(rng, scenes, kind, xy, stacked, plain)
     photos = int(rng.choice(_PHOTO_COUNTS[0], p=_PHOTO_COUNTS[1]))
     count = int(rng.choice([32, 56, 110], p=[0.5, 0.35, 0.15]))
-    patches = camera.take(photos, count)
+    patches = camera.take(5, 5 * _PLAIN_PATCHES) if plain else camera.take(photos, count)
     if len(patches.place) < 8:
         return None
     if camera.processing is not None:
@@ -116,7 +124,9 @@ def make_lens(family: Family, number: int, scenes: Scenes, *, held_out: bool) ->
     }
 
 
-def _make_shard(folder: Path, scenes: Path, family: Family, shard: int, held_out: bool) -> int:
+def _make_shard(
+    folder: Path, scenes: Path, family: Family, shard: int, *, held_out: bool, plain: bool
+) -> int:
     path = folder / f"{family}-{shard:05d}.npz"
     if path.exists():
         return 0
@@ -124,7 +134,7 @@ def _make_shard(folder: Path, scenes: Path, family: Family, shard: int, held_out
     made: dict[str, Any] = {}
     count = 0
     for number in range(shard * SHARD, (shard + 1) * SHARD):
-        lens = make_lens(family, number, crops, held_out=held_out)
+        lens = make_lens(family, number, crops, held_out=held_out, plain=plain)
         if lens is not None:
             made.update({f"{count}/{name}": value for name, value in lens.items()})
             count += 1
@@ -134,12 +144,22 @@ def _make_shard(folder: Path, scenes: Path, family: Family, shard: int, held_out
 
 
 def generate(
-    folder: Path, scenes: Path, family: Family, shards: Sequence[int], *, held_out: bool, processes: int
+    folder: Path,
+    scenes: Path,
+    family: Family,
+    shards: Sequence[int],
+    *,
+    held_out: bool,
+    plain: bool,
+    processes: int,
 ) -> Iterator[int]:
     """Make the shards that are not there yet; yield how many lenses each has got."""
     folder.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(processes) as pool:
-        jobs = [pool.submit(_make_shard, folder, scenes, family, shard, held_out) for shard in shards]
+        jobs = [
+            pool.submit(_make_shard, folder, scenes, family, shard, held_out=held_out, plain=plain)
+            for shard in shards
+        ]
         for job in jobs:
             yield job.result()
 

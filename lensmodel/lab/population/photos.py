@@ -242,6 +242,8 @@ class Camera:
     xy : ndarray, shape (places, 2)
     kernels : ndarray of float32, shape (states, places, 3, SIDE, SIDE)
         Of the lens alone.
+    plain : bool
+        Base sensitivity, all in focus and still: what the best photos are like.
     """
 
     rng: np.random.Generator
@@ -249,6 +251,7 @@ class Camera:
     kind: Kind
     xy: NDArray[np.float64]
     kernels: NDArray[np.float32]
+    plain: bool = False
     processing: Processing | None = field(init=False)
 
     def __post_init__(self) -> None:
@@ -265,7 +268,9 @@ class Camera:
             self._balance = np.ones(3)
         self._lateral = rng.normal(0, 0.6, 2) * (1 if rng.random() < 0.8 else 2.5)
         self._offset = rng.normal(0, 0.1, (2, 2))
-        self._noise = rng.uniform(0, 1) if rng.random() < 0.6 else 0.0  # 0 base sensitivity, 1 the highest
+        self._noise = (
+            rng.uniform(0, 1) if rng.random() < 0.6 and not self.plain else 0.0
+        )  # 0 base sensitivity, 1 the highest
         self._window = WINDOW + (0 if self.kind == "raw" else 2 * _MARGIN)
         outside = 1.0 - self.kernels[..., 21:-21, 21:-21].sum((-1, -2)).min()
         self._reach = (FINE if outside < 2e-3 else SIDE) // 2
@@ -293,7 +298,7 @@ class Camera:
             np.log(45_000) - self._noise * np.log(56) + rng.normal(0, 0.3)
         )  # 45,000 down to 800
         error, normal, shake = 0.0, (0.0, 0.0, 1.0), (0.0, 0.0)
-        lot = rng.random()
+        lot = 1.0 if self.plain else rng.random()
         if lot < 0.25:
             error = float(np.exp(rng.uniform(np.log(0.5), np.log(7.0))))
             t = rng.uniform(0, 2 * np.pi)

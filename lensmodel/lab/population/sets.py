@@ -161,20 +161,25 @@ def answered(network: FieldNetwork, drawn: Set) -> tuple[NDArray[np.float64], ND
     return np.array(made), np.array(told)
 
 
-def judge(
-    network: FieldNetwork, lenses: list[Lens], samples: int, *, queries: int = 12, seed: int = 1
-) -> dict[str, float]:
+def of_photos(lens: Lens, photos: int) -> Set:
+    """All samples of the first photos, and all places at the first state as queries."""
+    chosen = np.nonzero((lens.photo < photos) & (lens.state == 0))[0]
+    places = np.arange(len(lens.xy))
+    return Set(
+        lens.statistics[chosen].astype(np.float32), lens.xy[lens.place[chosen]],
+        lens.settings[lens.state[chosen]], lens.photo[chosen], lens.xy, np.repeat(lens.settings[:1], len(places), 0), lens.truth[0],
+    )  # fmt: skip
+
+
+def judge(network: FieldNetwork, lenses: Sequence[Lens], photos: int) -> dict[str, float]:
     """Errors on lenses that were not trained on: of each colour, of green by zone, and how true the told are.
 
     Parameters
     ----------
     network : FieldNetwork
-    lenses : list of Lens
-    samples : int
-        Patches of each lens, from all of its photos.
-    queries : int
-        Places that are asked of each.
-    seed : int
+    lenses : sequence of Lens
+    photos : int
+        How many of each lens are known.
 
     Returns
     -------
@@ -182,10 +187,11 @@ def judge(
         Mean relative L2 distance of "r", "g", "b", of green in "center" (r < 0.3), "mid" and "corner"
         (r > 0.75), and "told_right", the share of places whose told error is within a factor of 1.5.
     """
-    rng = np.random.default_rng(seed)
     made, told, radius = [], [], []
     for lens in lenses:
-        drawn = draw_set(lens, samples, queries, rng, varied=False)
+        drawn = of_photos(lens, photos)
+        if not len(drawn.xy):
+            continue
         errors, expected = answered(network, drawn)
         made.append(errors)
         told.append(expected)

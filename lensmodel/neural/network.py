@@ -53,7 +53,8 @@ SIDE: Final = COARSE * BLOCK
 RINGS: Final = 8
 """Rings of frequency, 1/16 cycles/pixel wide, for which the error of the transfer function is told."""
 
-_WEIGHTS: Final = Path(__file__).parent / "data" / "weights.npz"
+WEIGHTS: Final = Path(__file__).parent / "data" / "weights.npz"
+"""The weights of the package."""
 _CLAMP: Final = 6.0  # standard deviations that a statistic may lie off the population's mean
 _LAYER_EPSILON: Final = 1e-5
 
@@ -337,4 +338,15 @@ def centred_kernels(kernels: NDArray[np.floating]) -> NDArray[np.float64]:
 
 @cache
 def _packaged() -> FieldNetwork:
-    return FieldNetwork.from_bytes(_WEIGHTS.read_bytes())
+    return FieldNetwork.from_bytes(WEIGHTS.read_bytes())
+
+
+def with_provenance(data: bytes, **facts: object) -> bytes:
+    """Weights with more facts in their provenance."""
+    with np.load(BytesIO(data)) as stored:
+        arrays: dict[str, Any] = dict(stored)
+    told = {**json.loads(bytes(arrays["provenance"]).decode()), **facts}
+    arrays["provenance"] = np.frombuffer(json.dumps(told).encode(), np.uint8)
+    out = BytesIO()
+    np.savez_compressed(out, **arrays)
+    return out.getvalue()

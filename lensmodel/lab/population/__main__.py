@@ -7,8 +7,10 @@ import time
 from itertools import chain
 from pathlib import Path
 
+from lensmodel.core.files import write_atomically
 from lensmodel.lab.population import library, scenes, sets
 from lensmodel.neural import FieldNetwork
+from lensmodel.neural.network import WEIGHTS, with_provenance
 
 
 def _arguments() -> argparse.Namespace:
@@ -39,6 +41,11 @@ def _arguments() -> argparse.Namespace:
     judged = commands.add_parser("judge", help="errors on plain lenses by number of photos")
     judged.add_argument("--family", choices=library.FAMILIES, default="traced")
     judged.add_argument("--weights", type=Path, help="others than those of the package")
+    publish = commands.add_parser("publish", help="put trained weights into the package, with their figures")
+    publish.add_argument("weights", type=Path)
+    publish.add_argument(
+        "--fixed", type=Path, required=True, help="small set to hold them by; made if missing"
+    )
     return parser.parse_args()
 
 
@@ -49,8 +56,20 @@ def _judge(asked: argparse.Namespace) -> None:
     lenses = sets.load_library(asked.folder / "plain", set(), families=(asked.family,))
     print(f"{asked.family}, {len(lenses)} lenses, weights {network.name}: relative L2 of PSFs")
     for photos in (1, 2, 5):
-        figures = sets.judge(network, lenses, photos)
+        figures = sets.judge(network, (sets.of_photos(lens, photos) for lens in lenses))
         print(f"{photos} photos: " + "  ".join(f"{name} {value:.3f}" for name, value in figures.items()))
+
+
+def _publish(asked: argparse.Namespace) -> None:
+    if not asked.fixed.exists():
+        lenses = sets.load_library(asked.folder / "plain", set(), families=("traced",))
+        sets.save_sets(sets.fixed_set(lenses), asked.fixed)
+    data = asked.weights.read_bytes()
+    figures = sets.judge(FieldNetwork.from_bytes(data), sets.load_sets(asked.fixed))
+    published = with_provenance(data, fixed_set={name: round(value, 4) for name, value in figures.items()})
+    write_atomically(WEIGHTS, published)
+    print(f"{WEIGHTS}: {len(published) / 2**20:.1f} MiB, {FieldNetwork.from_bytes(published).name}")
+    print("  ".join(f"{name} {value:.4f}" for name, value in figures.items()))
 
 
 def main() -> None:
@@ -70,6 +89,9 @@ def main() -> None:
             asked.folder, asked.minutes, total_minutes=asked.total_minutes, rate=asked.rate,
             threads=asked.threads, seed=asked.seed, code=asked.code,
         )  # fmt: skip
+        return
+    if asked.command == "publish":
+        _publish(asked)
         return
     if asked.command == "judge":
         _judge(asked)

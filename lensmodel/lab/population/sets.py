@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.core.files import atomic
 from lensmodel.lab.population.library import FAMILIES, Family, load_shard
 from lensmodel.neural import Conditions, FieldNetwork
 from lensmodel.neural.features import KINDS
@@ -19,7 +20,6 @@ from lensmodel.neural.statistics import group
 from lensmodel.neural.symmetry import from_octant_image, octant_of, to_octant_image
 
 _UNKNOWN: Final = 0.08  # share of sets whose aperture, and of those whose pitch, is not known
-ZONES: Final = ("center", "mid", "corner")
 
 
 @dataclass(slots=True)
@@ -167,19 +167,19 @@ def of_photos(lens: Lens, photos: int) -> Set:
     places = np.arange(len(lens.xy))
     return Set(
         lens.statistics[chosen].astype(np.float32), lens.xy[lens.place[chosen]],
-        lens.settings[lens.state[chosen]], lens.photo[chosen], lens.xy, np.repeat(lens.settings[:1], len(places), 0), lens.truth[0],
+        lens.settings[lens.state[chosen]], lens.photo[chosen],
+        lens.xy, np.repeat(lens.settings[:1], len(places), 0), lens.truth[0],
     )  # fmt: skip
 
 
-def judge(network: FieldNetwork, lenses: Sequence[Lens], photos: int) -> dict[str, float]:
-    """Errors on lenses that were not trained on: of each colour, of green by zone, and how true the told are.
+def judge(network: FieldNetwork, sets: Iterable[Set]) -> dict[str, float]:
+    """Errors of kernels, of each colour, of green by zone, and how true the told errors are.
 
     Parameters
     ----------
     network : FieldNetwork
-    lenses : sequence of Lens
-    photos : int
-        How many of each lens are known.
+    sets : iterable of Set
+        Of lenses that were not trained on.
 
     Returns
     -------
@@ -188,10 +188,7 @@ def judge(network: FieldNetwork, lenses: Sequence[Lens], photos: int) -> dict[st
         (r > 0.75), and "told_right", the share of places whose told error is within a factor of 1.5.
     """
     made, told, radius = [], [], []
-    for lens in lenses:
-        drawn = of_photos(lens, photos)
-        if not len(drawn.xy):
-            continue
+    for drawn in sets:
         errors, expected = answered(network, drawn)
         made.append(errors)
         told.append(expected)
@@ -202,3 +199,41 @@ def judge(network: FieldNetwork, lenses: Sequence[Lens], photos: int) -> dict[st
     figures |= {zone: float(e[inside, 1].mean()) for zone, inside in zones.items() if inside.any()}
     right = np.abs(np.log(t[:, 1] / e[:, 1])) < math.log(1.5)
     return {**figures, "told_right": float(right.mean())}
+
+
+def save_sets(sets: Sequence[Set], path: Path) -> None:
+    """Write sets to one file."""
+    arrays = {f"{i}/{f.name}": getattr(one, f.name) for i, one in enumerate(sets) for f in fields(Set)}
+    arrays = {name: a.astype(np.float16) if name.endswith("statistics") else a for name, a in arrays.items()}
+    with atomic(path) as file:
+        np.savez_compressed(file, **arrays)
+
+
+def load_sets(path: Path) -> list[Set]:
+    """Read what `save_sets` wrote."""
+    sets: dict[str, dict[str, NDArray[Any]]] = {}
+    with np.load(path) as stored:
+        for key in stored.files:
+            number, name = key.split("/")
+            sets.setdefault(number, {})[name] = stored[key]
+    return [Set(**{**one, "statistics": one["statistics"].astype(np.float32)}) for one in sets.values()]
+
+
+def fixed_set(lenses: Sequence[Lens], *, samples: int = 48, queries: int = 7, count: int = 8) -> list[Set]:
+    """A small set to hold weights by: the first photos of some lenses, every few of their places."""
+    chosen = []
+    for lens in lenses[:: max(len(lenses) // count, 1)][:count]:
+        whole = of_photos(lens, 1)
+        kept, asked = slice(None, samples), slice(None, None, len(whole.query_xy) // queries)
+        chosen.append(
+            Set(
+                whole.statistics[kept],
+                whole.xy[kept],
+                whole.settings[kept],
+                whole.photo[kept],
+                whole.query_xy[asked],
+                whole.query_settings[asked],
+                whole.truth[asked],
+            )  # fmt: skip
+        )
+    return chosen

@@ -3,6 +3,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from PIL import Image
 from scipy import ndimage
 
 from lensmodel.core.errors import InvalidInputError, NoSamplesError
+from lensmodel.lab.population.sets import judge, load_sets
 from lensmodel.neural import Conditions, FieldAnswer, FieldNetwork, patch_statistics, to_octant
 from lensmodel.neural.statistics import LENGTH, WINDOW
 from lensmodel.neural.symmetry import OCTANTS, to_octant_image, to_octant_place
@@ -147,3 +149,9 @@ def test_weights_say_where_they_come_from() -> None:
     assert network.provenance["lenses"] > 500
     assert network.provenance["curve"][-1]["figures"]
     assert len(network.name) == 12
+
+
+def test_packaged_weights_give_their_published_figures() -> None:
+    sets = load_sets(Path(__file__).parent / "data" / "fixed-set.npz")
+    figures = judge(FieldNetwork.load(), sets)
+    assert figures == pytest.approx(dict(FieldNetwork.load().provenance["fixed_set"]), abs=2e-3)

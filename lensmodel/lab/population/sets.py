@@ -224,16 +224,9 @@ def fixed_set(lenses: Sequence[Lens], *, samples: int = 48, queries: int = 7, co
     chosen = []
     for lens in lenses[:: max(len(lenses) // count, 1)][:count]:
         whole = of_photos(lens, 1)
-        kept, asked = slice(None, samples), slice(None, None, len(whole.query_xy) // queries)
+        asked = slice(None, None, len(whole.query_xy) // queries)
+        kept = {f.name: getattr(whole, f.name) for f in fields(Set)}
         chosen.append(
-            Set(
-                whole.statistics[kept],
-                whole.xy[kept],
-                whole.settings[kept],
-                whole.photo[kept],
-                whole.query_xy[asked],
-                whole.query_settings[asked],
-                whole.truth[asked],
-            )  # fmt: skip
+            Set(**{n: v[asked] if n.startswith(("query", "truth")) else v[:samples] for n, v in kept.items()})
         )
     return chosen

@@ -182,16 +182,13 @@ class FieldNetwork:
         w = self.weights
         query = self._heads(self._linear(f"{block}.q", self._normal(f"{block}.normal_query", x)))
         score = query @ key.transpose(0, 2, 1) / np.float32(np.sqrt(query.shape[-1]))
-        directed = query @ w[f"{block}.relation_key"]  # (heads, q, RELATION)
-        score += np.einsum("hqf,qnf->hqn", directed, relation, optimize=True)
-        score -= np.einsum(
-            "qnf,fh->hqn", relation[..., :DISTANCES], np.abs(w[f"{block}.distance"]), optimize=True
-        )
+        directed = (query @ w[f"{block}.relation_key"]).transpose(1, 0, 2)  # (q, heads, RELATION)
+        near = relation[..., :DISTANCES] @ np.abs(w[f"{block}.distance"])  # (q, n, heads)
+        score += (directed @ relation.transpose(0, 2, 1) - near.transpose(0, 2, 1)).transpose(1, 0, 2)
         nothing = np.broadcast_to(w[f"{block}.nothing"][:, None, None], (*score.shape[:2], 1))
         attention = _softmax(np.concatenate([score, nothing], -1))[..., :-1]
-        taken = attention @ value
-        seen = np.einsum("hqn,qnf->hqf", attention, relation, optimize=True)
-        taken += seen @ w[f"{block}.relation_value"]
+        seen = (attention.transpose(1, 0, 2) @ relation).transpose(1, 0, 2)  # (heads, q, RELATION)
+        taken = attention @ value + seen @ w[f"{block}.relation_value"]
         x = x + self._linear(f"{block}.out", taken.transpose(1, 0, 2).reshape(len(x), -1))
         inner = _gelu(self._linear(f"{block}.inner", self._normal(f"{block}.normal_inner", x)))
         return x + self._linear(f"{block}.outer", inner), attention

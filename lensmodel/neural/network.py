@@ -188,7 +188,7 @@ class FieldNetwork:
         nothing = np.broadcast_to(w[f"{block}.nothing"][:, None, None], (*score.shape[:2], 1))
         attention = _softmax(np.concatenate([score, nothing], -1))[..., :-1]
         seen = (attention.transpose(1, 0, 2) @ relation).transpose(1, 0, 2)  # (heads, q, RELATION)
-        taken = attention @ value + seen @ w[f"{block}.relation_value"]
+        taken = (attention @ value + seen @ w[f"{block}.relation_value"]).astype(np.float32)
         x = x + self._linear(f"{block}.out", taken.transpose(1, 0, 2).reshape(len(x), -1))
         inner = _gelu(self._linear(f"{block}.inner", self._normal(f"{block}.normal_inner", x)))
         return x + self._linear(f"{block}.outer", inner), attention

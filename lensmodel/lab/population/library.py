@@ -5,7 +5,6 @@ A lens is drawn from its number alone, so that a library is the same however oft
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -16,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.files import atomic
+from lensmodel.lab.population import traced
 from lensmodel.lab.population.kernels import PopulationLens, coarse_of, fine_of, kernels_of
 from lensmodel.lab.population.photos import KINDS, Camera, Kind, Scenes
+from lensmodel.lab.population.prescriptions import HELD_OUT, PRESCRIPTIONS
 from lensmodel.lab.population.wavefronts import RandomLens
 from lensmodel.neural.statistics import to_octant
 
@@ -61,10 +62,7 @@ def draw_lens(
 ) -> tuple[PopulationLens, list[State]]:
     """Draw a lens and the states it is photographed at."""
     if family == "traced":
-        designs = importlib.import_module("lensmodel.lab.population.prescriptions")
-        traced = importlib.import_module("lensmodel.lab.population.traced")
-        apart = designs.held_out()
-        names = sorted(name for name in designs.prescriptions() if (name in apart) == held_out)
+        names = sorted(name for name in PRESCRIPTIONS if (name in HELD_OUT) == held_out)
         lens: PopulationLens = traced.draw(rng, names)
         zooms = [0.0]
     else:

@@ -6,9 +6,11 @@ import argparse
 import time
 from itertools import chain
 from pathlib import Path
+from typing import Final
 
 from lensmodel.core.files import write_atomically
 from lensmodel.lab.population import library, scenes, sets
+from lensmodel.lab.population.describe import describe
 from lensmodel.neural import FieldNetwork
 from lensmodel.neural.network import WEIGHTS, with_provenance
 
@@ -41,6 +43,8 @@ def _arguments() -> argparse.Namespace:
     judged = commands.add_parser("judge", help="errors on plain lenses by number of photos")
     judged.add_argument("--family", choices=library.FAMILIES, default="traced")
     judged.add_argument("--weights", type=Path, help="others than those of the package")
+    described = commands.add_parser("describe", help="percentiles of what the lenses of a library are like")
+    described.add_argument("--limit", type=int, default=500, help="lenses of each family")
     publish = commands.add_parser("publish", help="put trained weights into the package, with their figures")
     publish.add_argument("weights", type=Path)
     publish.add_argument(
@@ -60,6 +64,15 @@ def _judge(asked: argparse.Namespace) -> None:
         print(f"{photos} photos: " + "  ".join(f"{name} {value:.3f}" for name, value in figures.items()))
 
 
+def _describe(asked: argparse.Namespace) -> None:
+    for family in library.FAMILIES:
+        lenses = sets.load_library(asked.folder / "lenses", set(), families=(family,), limit=asked.limit)
+        if lenses:
+            print(f"{family}, {len(lenses)} lenses: 10, 50 and 90 in a hundred are below")
+            for name, values in describe(lenses).items():
+                print(f"  {name:9s}" + "".join(f"{value:8.2f}" for value in values))
+
+
 def _publish(asked: argparse.Namespace) -> None:
     if not asked.fixed.exists():
         lenses = sets.load_library(asked.folder / "plain", set(), families=("traced",))
@@ -70,6 +83,9 @@ def _publish(asked: argparse.Namespace) -> None:
     write_atomically(WEIGHTS, published)
     print(f"{WEIGHTS}: {len(published) / 2**20:.1f} MiB, {FieldNetwork.from_bytes(published).name}")
     print("  ".join(f"{name} {value:.4f}" for name, value in figures.items()))
+
+
+_OTHERS: Final = {"judge": _judge, "describe": _describe, "publish": _publish}
 
 
 def main() -> None:
@@ -90,11 +106,8 @@ def main() -> None:
             threads=asked.threads, seed=asked.seed, code=asked.code,
         )  # fmt: skip
         return
-    if asked.command == "publish":
-        _publish(asked)
-        return
-    if asked.command == "judge":
-        _judge(asked)
+    if asked.command in _OTHERS:
+        _OTHERS[asked.command](asked)
         return
     began, count = time.monotonic(), 0
     name = "plain" if asked.plain else "held-out" if asked.held_out else "lenses"

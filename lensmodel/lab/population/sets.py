@@ -59,12 +59,14 @@ class Lens:
         )  # fmt: skip
 
 
-def load_library(folder: Path, known: set[str], families: Sequence[Family] = FAMILIES) -> list[Lens]:
+def load_library(
+    folder: Path, known: set[str], families: Sequence[Family] = FAMILIES, limit: int = 10**9
+) -> list[Lens]:
     """Lenses of the shards that are not known yet; adds their names."""
     lenses: list[Lens] = []
     for family in families:
         for path in sorted(folder.glob(f"{family}-*.npz")):
-            if path.name in known:
+            if path.name in known or len(lenses) >= limit:
                 continue
             known.add(path.name)
             lenses += [Lens.of(stored) for stored in load_shard(path)]

@@ -47,16 +47,24 @@ _SIDES: Final = tuple(range(48, 257, 16)) + tuple(range(288, 577, 32))  # sample
 class PopulationLens(Protocol):
     """A lens of the population: its wavefronts at any place, wavelength and aperture."""
 
-    f_number: float
-    pitch_um: float
-    focal_mm: float
+    @property
+    def f_number(self) -> float:
+        """Widest aperture."""
+
+    @property
+    def pitch_um(self) -> float:
+        """Pixel pitch of the sensor behind it, micrometres."""
+
+    @property
+    def focal_mm(self) -> float:
+        """Focal length."""
 
     def wavefronts(
         self, xy: NDArray[np.float64], wavelengths_um: NDArray[np.float64], f_number: float | None = None
-    ) -> NDArray[np.float64]:
+    ) -> NDArray[np.floating]:
         """Coefficients (place, wavelength, COLUMNS) in micrometres, of terms of unit r.m.s."""
 
-    def aperture(self, xy: NDArray[np.float64], f_number: float | None = None) -> NDArray[np.float64]:
+    def aperture(self, xy: NDArray[np.float64], f_number: float | None = None) -> NDArray[np.floating]:
         """Circles (place, circle, 3), as (x, y, radius) in pupil radii, that all light has passed."""
 
 
@@ -148,7 +156,7 @@ class Renderer:
         self._matrices: OrderedDict[tuple[int, float, int], NDArray[np.float32]] = OrderedDict()
 
     def kernel(
-        self, coefficients: NDArray[np.float64], circles: NDArray[np.float64], wavelength_um: float
+        self, coefficients: NDArray[np.floating], circles: NDArray[np.floating], wavelength_um: float
     ) -> NDArray[np.float32]:
         """Kernel of shape (SIDE, SIDE) with its ray centroid in the middle; sum 1 of what falls inside."""
         x, y, dx, dy = _slopes()

@@ -124,7 +124,7 @@ def relation_features(
         squared, along**2, change[..., 0] ** 2, change[..., 2] ** 2, change[..., 3] ** 2,
         offset[..., 0], offset[..., 1], place[..., 0], place[..., 1], radius, along,
         np.exp(-squared / 0.05), np.exp(-squared / 0.3), np.exp(-(along**2) / 0.02),
-        change[..., 0], change[..., 1], change[..., 2], change[..., 3],
+        change[..., 0], change[..., 1], change[..., 2], np.zeros_like(squared),
         known[..., 0].astype(float), known[..., 1].astype(float), same_kind,
     ]  # fmt: skip
     one_hot = turn[..., None] == np.arange(OCTANTS)

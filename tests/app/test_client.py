@@ -9,7 +9,6 @@ from typing import Any
 import httpx2
 import numpy as np
 import pytest
-from lensmodel.report.lens_test import lens_test
 from starlette.testclient import TestClient
 
 from app.blobs.storage import Storage
@@ -24,6 +23,7 @@ from app.store.versions import report_key
 from lensmodel.core.codec import to_json
 from lensmodel.core.errors import LensModelError
 from lensmodel.model import LensModel
+from lensmodel.report import lens_report
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 
@@ -188,7 +188,7 @@ def test_a_report_that_is_not_made_yet_is_refused_and_one_that_is_there_saved(
         api.save_report(lens_id, tmp_path / "report.html")
     _, stored = store.samples.of_lens(lens_id)
     model = LensModel.fit([one.sample for one in stored])
-    test = lens_test(model, "A lens", draws=0, rows=5, size=15, channels=("g",))
+    test = lens_report(model, "A lens", draws=0, rows=5, size=15, channels=("g",))
     lens = store.lenses.get(lens_id)
     assert lens is not None
     key = report_key(lens_id, lens.version, lens.rebuild_epoch)

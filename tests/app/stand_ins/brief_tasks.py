@@ -7,10 +7,9 @@ from __future__ import annotations
 
 from functools import partial
 
-from lensmodel.report.lens_test import lens_test
-
 from app.jobs import tasks
+from lensmodel.report import lens_report
 
-tasks.lens_test = partial(lens_test, draws=2, rows=5, size=15)  # instead of 16, 7 and 31
+tasks.lens_report = partial(lens_report, draws=2, rows=5, size=15)  # instead of 16, 7 and 31
 
 TASKS = tasks.TASKS

@@ -8,9 +8,14 @@ from itertools import chain
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from lensmodel.core.files import write_atomically
 from lensmodel.lab.population import library, scenes, sets
 from lensmodel.lab.population.describe import describe
+from lensmodel.lab.population.grids import grid_of
+from lensmodel.lab.population.prescriptions import HELD_OUT, PRESCRIPTIONS
+from lensmodel.lab.population.traced import draw
 from lensmodel.neural import FieldNetwork
 from lensmodel.neural.network import WEIGHTS, with_provenance
 
@@ -45,6 +50,9 @@ def _arguments() -> argparse.Namespace:
     judged.add_argument("--weights", type=Path, help="others than those of the package")
     described = commands.add_parser("describe", help="percentiles of what the lenses of a library are like")
     described.add_argument("--limit", type=int, default=500, help="lenses of each family")
+    grid = commands.add_parser("grid", help="PSFs of a copy of a design, to take photos through")
+    grid.add_argument("design", nargs="+", choices=sorted(PRESCRIPTIONS), metavar="DESIGN")
+    grid.add_argument("--copy", type=int, default=0, help="seed of the copy")
     publish = commands.add_parser("publish", help="put trained weights into the package, with their figures")
     publish.add_argument("weights", type=Path)
     publish.add_argument(
@@ -73,6 +81,14 @@ def _describe(asked: argparse.Namespace) -> None:
                 print(f"  {name:9s}" + "".join(f"{value:8.2f}" for value in values))
 
 
+def _grid(asked: argparse.Namespace) -> None:
+    for design in asked.design:
+        lens = draw(np.random.default_rng([asked.copy, *design.encode()]), [design])
+        path = asked.folder / f"{design.replace('@', '-')}-f{lens.f_number:.2g}.npz"
+        grid_of(lens).write(path)
+        print(path, "held out" if design in HELD_OUT else "trained on")
+
+
 def _publish(asked: argparse.Namespace) -> None:
     if not asked.fixed.exists():
         lenses = sets.load_library(asked.folder / "plain", set(), families=("traced",))
@@ -85,7 +101,7 @@ def _publish(asked: argparse.Namespace) -> None:
     print("  ".join(f"{name} {value:.4f}" for name, value in figures.items()))
 
 
-_OTHERS: Final = {"judge": _judge, "describe": _describe, "publish": _publish}
+_OTHERS: Final = {"judge": _judge, "describe": _describe, "grid": _grid, "publish": _publish}
 
 
 def main() -> None:

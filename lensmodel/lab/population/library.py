@@ -125,6 +125,7 @@ def make_lens(
 def _make_shard(
     folder: Path, scenes: Path, family: Family, shard: int, *, held_out: bool, plain: bool
 ) -> int:
+    folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{family}-{shard:05d}.npz"
     if path.exists():
         return 0
@@ -152,7 +153,6 @@ def generate(
     processes: int,
 ) -> Iterator[int]:
     """Make the shards that are not there yet; yield how many lenses each has got."""
-    folder.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(processes) as pool:
         jobs = [
             pool.submit(_make_shard, folder, scenes, family, shard, held_out=held_out, plain=plain)

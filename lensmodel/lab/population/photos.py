@@ -115,13 +115,19 @@ class Processing:
 
     def applied(self, kernels: NDArray[np.float32]) -> NDArray[np.float32]:
         """Kernels (..., n, n) of the lens together with smoothing and sharpening, halos cut, sum 1."""
-        n = kernels.shape[-1]
-        f = np.hypot(scipy.fft.fftfreq(n)[:, None], scipy.fft.rfftfreq(n)[None])
-        smooth = np.exp(-2 * (np.pi * f * self.smoothing) ** 2)
-        gain = smooth * (1 + self.amount * (1 - np.exp(-2 * (np.pi * f * self.radius) ** 2)))
-        changed = scipy.fft.irfft2(scipy.fft.rfft2(kernels) * gain.astype(np.float32), s=(n, n))
-        changed = np.maximum(changed, 0.0)
+        changed = np.maximum(self._sharpened(kernels), 0.0)
         return changed / changed.sum((-1, -2), keepdims=True)
+
+    def _sharpened(self, luma: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Smooth and sharpen planes (..., rows, cols)."""
+        flat = (0.0,) * (luma.ndim - 2)
+        if self.smoothing:
+            luma = scipy.ndimage.gaussian_filter(luma, (*flat, self.smoothing, self.smoothing))
+        if self.amount:
+            luma = luma + self.amount * (
+                luma - scipy.ndimage.gaussian_filter(luma, (*flat, self.radius, self.radius))
+            )
+        return luma
 
     def develop(self, mosaic: NDArray[np.float32], planes: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return linear planes (3, n, n) as read back from the file; `planes` where it was scaled down."""
@@ -133,10 +139,7 @@ class Processing:
         chroma = v - luma
         if self.chroma_smoothing:
             chroma = scipy.ndimage.gaussian_filter(chroma, (0, self.chroma_smoothing, self.chroma_smoothing))
-        if self.smoothing:
-            luma = scipy.ndimage.gaussian_filter(luma, self.smoothing)
-        if self.amount:
-            luma = luma + self.amount * (luma - scipy.ndimage.gaussian_filter(luma, self.radius))
+        luma = self._sharpened(luma)
         v = np.clip(luma + chroma, 0.0, 1.0)
         if not self.quality:
             return _linear(v)

@@ -122,7 +122,7 @@ def sharpness(scene: NDArray[np.float32]) -> float:
     return float(np.median(energy[0][busy] / energy[1][busy]))
 
 
-def leaves(rng: np.random.Generator, side: int = 1100) -> NDArray[np.float32]:
+def leaves(rng: np.random.Generator, side: int) -> NDArray[np.float32]:
     """Dead leaves: opaque shapes of a power law of sizes, each in front of those before, some shaded."""
     oversampled = 2 * side
     picture = np.empty((oversampled, oversampled, 3), np.float32)
@@ -152,7 +152,7 @@ def leaves(rng: np.random.Generator, side: int = 1100) -> NDArray[np.float32]:
     return scaled_down(np.clip(picture, 0, 1), 2.0)
 
 
-def text(rng: np.random.Generator, side: int = 1100) -> NDArray[np.float32]:
+def text(rng: np.random.Generator, side: int) -> NDArray[np.float32]:
     """A printed page: lines of letters of several sizes, dark on light or light on dark, at an angle."""
     size = 2 * side
     page = Image.new("L", (size, size), 255)
@@ -176,7 +176,9 @@ def text(rng: np.random.Generator, side: int = 1100) -> NDArray[np.float32]:
     return scaled_down((dark + v[..., None] ** 2.2 * (light - dark)).astype(np.float32), 2.0)
 
 
-def build(folder: Path, sources: Iterator[Source], drawn: int = 8, seed: int = 7) -> list[dict[str, object]]:
+def build(
+    folder: Path, sources: Iterator[Source], drawn: int = 8, side: int = 1100, seed: int = 7
+) -> list[dict[str, object]]:
     """Write every scene at all scales as `folder/*.npy` (float16) with `index.json`; return the index.
 
     Soft photographs (`sharpness`) are left out, those of the test half always.
@@ -206,7 +208,7 @@ def build(folder: Path, sources: Iterator[Source], drawn: int = 8, seed: int = 7
             keep(source.name, scaled_down(scene, scale), scale)
     rng = np.random.default_rng(seed)
     for number in range(drawn):
-        keep(f"leaves {number}", leaves(rng), 1.0)
-        keep(f"text {number}", text(rng), 1.0)
+        keep(f"leaves {number}", leaves(rng, side), 1.0)
+        keep(f"text {number}", text(rng, side), 1.0)
     write_atomically(folder / "index.json", json.dumps(index, indent=1).encode())
     return index

@@ -112,7 +112,10 @@ def _develop_raw(path: Path, header: Header, info: PhotoInfo, demosaic: Demosaic
         coding_noise=_coding_noise(raw.planes, header.coarseness),
         cfa=raw.cfa,
         grain=(1.0, 1.0, 1.0) if raw.sensor_noise is not None else _grain(raw.planes, raw.noise, raw.clip),
-        remarks=tuple(f"its {step.name} is for the mosaic only and is dropped" for step in lost),
+        remarks=(
+            *(f"its {step.name} is for the mosaic only and is dropped" for step in lost),
+            *((f"{raw.defects} defective pixels of its sensor are replaced",) if raw.defects else ()),
+        ),
     )
 
 

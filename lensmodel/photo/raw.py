@@ -62,7 +62,7 @@ _LEAST_SHARE: Final = 0.25
 
 @dataclass(frozen=True, slots=True)
 class DevelopedRaw:
-    """What LibRaw made of a file; fields as in `LinearPhoto`."""
+    """What LibRaw made of a file, once its defective pixels were replaced; fields as in `LinearPhoto`."""
 
     planes: Planes
     noise: PlaneNoise
@@ -74,6 +74,7 @@ class DevelopedRaw:
     bits: int
     pipeline: str
     cfa: BayerPattern | None
+    defects: int
 
 
 @contextmanager
@@ -143,6 +144,7 @@ def develop_raw(
             mosaic.check()
             white, clip = mosaic.saturation()
         sensor_noise = _sensor_noise(mosaic, white)
+        defects = 0 if mosaic is None or sensor_noise is None else mosaic.repair(sensor_noise, white)
         balance = _white_balance(raw, mosaic)
         spans = _spans(raw, linear_white) if mosaic is None and linear_white else None
         planes = _developed(raw, method, white, balance, spans)
@@ -158,6 +160,7 @@ def develop_raw(
             bits=max(1, white.bit_length()),
             pipeline=f"raw/{_pipeline_step(mosaic, method)}/1",
             cfa=None if mosaic is None or method == "half" else mosaic.bayer_pattern(),
+            defects=defects,
         )
 
 

@@ -19,7 +19,7 @@ References
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
@@ -338,12 +338,30 @@ def _packaged() -> FieldNetwork:
     return FieldNetwork.from_bytes(WEIGHTS.read_bytes())
 
 
-def with_provenance(data: bytes, **facts: object) -> bytes:
-    """Weights with more facts in their provenance."""
+def _changed(data: bytes, change: Callable[[dict[str, Any]], None]) -> bytes:
+    """Weights of which `change` has changed some."""
     with np.load(BytesIO(data)) as stored:
         arrays: dict[str, Any] = dict(stored)
-    told = {**json.loads(bytes(arrays["provenance"]).decode()), **facts}
-    arrays["provenance"] = np.frombuffer(json.dumps(told).encode(), np.uint8)
+    change(arrays)
     out = BytesIO()
     np.savez_compressed(out, **arrays)
     return out.getvalue()
+
+
+def with_errors_raised(data: bytes, shift: float) -> bytes:
+    """Weights whose told errors are exp(shift) times as large."""
+
+    def change(arrays: dict[str, Any]) -> None:
+        arrays["error.1.bias"] = (arrays["error.1.bias"].astype(np.float32) + shift).astype(np.float16)
+
+    return _changed(data, change)
+
+
+def with_provenance(data: bytes, **facts: object) -> bytes:
+    """Weights with more facts in their provenance."""
+
+    def change(arrays: dict[str, Any]) -> None:
+        told = {**json.loads(bytes(arrays["provenance"]).decode()), **facts}
+        arrays["provenance"] = np.frombuffer(json.dumps(told).encode(), np.uint8)
+
+    return _changed(data, change)

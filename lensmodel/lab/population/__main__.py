@@ -17,7 +17,7 @@ from lensmodel.lab.population.grids import grid_of
 from lensmodel.lab.population.prescriptions import HELD_OUT, PRESCRIPTIONS
 from lensmodel.lab.population.traced import draw
 from lensmodel.neural import FieldNetwork
-from lensmodel.neural.network import WEIGHTS, with_provenance
+from lensmodel.neural.network import WEIGHTS, with_errors_raised, with_provenance
 
 
 def _arguments() -> argparse.Namespace:
@@ -94,9 +94,19 @@ def _publish(asked: argparse.Namespace) -> None:
         lenses = sets.load_library(asked.folder / "plain", set(), families=("traced",))
         sets.save_sets(sets.fixed_set(lenses), asked.fixed)
     data = asked.weights.read_bytes()
+    rng = np.random.default_rng(0)
+    apart = sets.load_library(asked.folder / "held-out", set())
+    drawn = (sets.draw_set(lens, 64, 8, rng, varied=False) for lens in apart)
+    shift = sets.understated(FieldNetwork.from_bytes(data), drawn)
+    data = with_errors_raised(data, shift)
     figures = sets.judge(FieldNetwork.from_bytes(data), sets.load_sets(asked.fixed))
-    published = with_provenance(data, fixed_set={name: round(value, 4) for name, value in figures.items()})
+    published = with_provenance(
+        data,
+        fixed_set={name: round(value, 4) for name, value in figures.items()},
+        errors_raised=round(shift, 4),
+    )
     write_atomically(WEIGHTS, published)
+    print(f"errors that were told on lenses of training are raised by {np.exp(shift):.2f}")
     print(f"{WEIGHTS}: {len(published) / 2**20:.1f} MiB, {FieldNetwork.from_bytes(published).name}")
     print("  ".join(f"{name} {value:.4f}" for name, value in figures.items()))
 

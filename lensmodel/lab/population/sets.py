@@ -174,6 +174,13 @@ def of_photos(lens: Lens, photos: int) -> Set:
     )  # fmt: skip
 
 
+def understated(network: FieldNetwork, sets: Iterable[Set]) -> float:
+    """How much the errors of kernels are understated: median of the logarithm of made over told errors."""
+    pairs = [answered(network, drawn) for drawn in sets]
+    made, told = (np.concatenate([pair[i] for pair in pairs]) for i in (0, 1))
+    return float(np.median(np.log(made / told)))
+
+
 def judge(network: FieldNetwork, sets: Iterable[Set]) -> dict[str, float]:
     """Errors of kernels, of each colour, of green by zone, and how true the told errors are.
 
@@ -186,19 +193,26 @@ def judge(network: FieldNetwork, sets: Iterable[Set]) -> dict[str, float]:
     Returns
     -------
     dict of str to float
-        Mean relative L2 distance of "r", "g", "b", of green in "center" (r < 0.3), "mid" and "corner"
-        (r > 0.75), and "told_right", the share of places whose told error is within a factor of 1.5.
+        Relative L2 distance: mean of "r", "g", "b", and of green in "center" (r < 0.3), "mid" and "corner"
+        (r > 0.75); of the means that each lens has there, the medians; and "told_right", the share of places
+        whose told error is within a factor of 1.5.
     """
-    made, told, radius = [], [], []
+    made, told = [], []
+    of_lens: dict[str, list[float]] = {"center": [], "mid": [], "corner": []}
+    of_place: dict[str, list[float]] = {zone: [] for zone in of_lens}
     for drawn in sets:
         errors, expected = answered(network, drawn)
         made.append(errors)
         told.append(expected)
-        radius.append(np.hypot(*drawn.query_xy.T))
-    e, t, r = np.concatenate(made), np.concatenate(told), np.concatenate(radius)
-    zones = {"center": r < 0.3, "mid": (r >= 0.3) & (r <= 0.75), "corner": r > 0.75}
+        r = np.hypot(*drawn.query_xy.T)
+        for zone, inside in (("center", r < 0.3), ("mid", (r >= 0.3) & (r <= 0.75)), ("corner", r > 0.75)):
+            if inside.any():
+                of_lens[zone].append(float(errors[inside, 1].mean()))
+                of_place[zone] += errors[inside, 1].tolist()
+    e, t = np.concatenate(made), np.concatenate(told)
     figures = {colour: float(e[:, i].mean()) for i, colour in enumerate("rgb")}
-    figures |= {zone: float(e[inside, 1].mean()) for zone, inside in zones.items() if inside.any()}
+    figures |= {zone: float(np.mean(values)) for zone, values in of_place.items()}
+    figures |= {f"{zone}_median": float(np.median(values)) for zone, values in of_lens.items()}
     right = np.abs(np.log(t[:, 1] / e[:, 1])) < math.log(1.5)
     return {**figures, "told_right": float(right.mean())}
 

@@ -12,7 +12,7 @@ from collections import OrderedDict
 from dataclasses import dataclass
 from functools import cache
 from math import factorial
-from typing import Final, Protocol
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 import scipy.fft
@@ -66,6 +66,16 @@ class PopulationLens(Protocol):
 
     def aperture(self, xy: NDArray[np.float64], f_number: float | None = None) -> NDArray[np.floating]:
         """Circles (place, circle, 3), as (x, y, radius) in pupil radii, that all light has passed."""
+
+
+@runtime_checkable
+class LateralColour(Protocol):
+    """A lens that knows where its wavelengths land; see `kernels_of`."""
+
+    def lateral_um(
+        self, xy: NDArray[np.float64], wavelengths_um: NDArray[np.float64], f_number: float | None = None
+    ) -> NDArray[np.floating]:
+        """Shift (place, wavelength, 2) of the image in each wavelength against their mean."""
 
 
 def radial(n: int, m: int, rho: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -129,7 +139,7 @@ def stopped_down(ratio: float) -> NDArray[np.float64]:
 
 
 def spots(
-    coefficients: NDArray[np.float64], f_number: float, circles: NDArray[np.float64] | None = None
+    coefficients: NDArray[np.floating], f_number: float, circles: NDArray[np.floating] | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Centroid (n, 2) and r.m.s. radius along one axis (n,) of ray spots, micrometres.
 
@@ -156,9 +166,13 @@ class Renderer:
         self._matrices: OrderedDict[tuple[int, float, int], NDArray[np.float32]] = OrderedDict()
 
     def kernel(
-        self, coefficients: NDArray[np.floating], circles: NDArray[np.floating], wavelength_um: float
+        self,
+        coefficients: NDArray[np.floating],
+        circles: NDArray[np.floating],
+        wavelength_um: float,
+        offset_px: NDArray[np.floating] | tuple[float, float] = (0.0, 0.0),
     ) -> NDArray[np.float32]:
-        """Kernel of shape (SIDE, SIDE) with its ray centroid in the middle; sum 1 of what falls inside."""
+        """Kernel (SIDE, SIDE), its centre of mass so far right and up; sum 1 of what falls inside."""
         x, y, dx, dy = _slopes()
         rays = np.stack([coefficients @ dx, coefficients @ dy], -1) * (2.0 * self._f_number)
         open_ = np.ones(x.size, bool)
@@ -166,7 +180,7 @@ class Renderer:
             open_ &= (x - cx) ** 2 + (y - cy) ** 2 <= radius * radius
         if not open_.any():
             open_[:] = True
-        centre = rays[open_].mean(0)
+        centre = rays[open_].mean(0) - np.asarray(offset_px) * self._pitch
         step = wavelength_um * self._f_number  # um: period of the PSF is n steps
         reach = 1.12 * np.abs(rays[open_] - centre).max() + _AIRY_RINGS * step + self._pitch
         side = SIDE if reach > 0.45 * FINE * self._pitch else FINE
@@ -188,7 +202,7 @@ class Renderer:
             amplitude = scipy.fft.fft(scipy.fft.fft(field, axis=1).T.copy(), 2 * n, axis=1).T
             kernel = np.maximum(matrix @ (amplitude.real**2 + amplitude.imag**2) @ matrix.T, 0.0)
             kernel /= kernel.sum()
-            off = np.array([kernel.sum(0) @ at, -(kernel.sum(1) @ at)])
+            off = np.array([kernel.sum(0) @ at, -(kernel.sum(1) @ at)]) - offset_px
             if np.abs(off).max() < _CENTRED:
                 break
             centre = centre + off * self._pitch
@@ -223,11 +237,20 @@ def kernels_of(
     wavelengths = np.array([w for pair in WAVELENGTHS_UM.values() for w in pair])
     coefficients = lens.wavefronts(xy, wavelengths, f_number)
     circles = lens.aperture(xy, f_number)
+    if isinstance(lens, LateralColour):  # light of one channel lands side by side: a blur along the radius
+        rays = np.stack([spots(coefficients[:, w], used, circles)[0] for w in range(len(wavelengths))], 1)
+        at = (lens.lateral_um(xy, wavelengths, f_number) + rays) / lens.pitch_um
+        pairs = at.reshape(len(xy), -1, 2, 2)
+        offsets = (pairs - pairs.mean(2, keepdims=True)).reshape(at.shape)
+    else:
+        offsets = np.zeros((len(xy), len(wavelengths), 2))
     renderer = Renderer(used, lens.pitch_um)
     out = np.zeros((len(xy), 3, SIDE, SIDE), np.float32)
     for p in range(len(xy)):
         for w, wavelength in enumerate(wavelengths):
-            out[p, w // 2] += 0.5 * renderer.kernel(coefficients[p, w], circles[p], float(wavelength))
+            out[p, w // 2] += 0.5 * renderer.kernel(
+                coefficients[p, w], circles[p], float(wavelength), offsets[p, w]
+            )
     return out
 
 

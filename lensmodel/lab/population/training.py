@@ -44,6 +44,9 @@ _LOGITS: Final = FINE * FINE + _OUTER
 _SET_SIZES: Final = ((1, 2, 4, 8, 16, 32, 64, 110), (0.05, 0.04, 0.06, 0.12, 0.18, 0.22, 0.2, 0.13))
 _GREEN_WEIGHT: Final = 1.4
 _TOLD_WEIGHT, _RING_WEIGHT = 0.1, 0.05
+_DROPPED: Final = 0.1
+"""Share of statistics, tokens and hidden values that are left out at random in training, so that lenses are not
+recognised by a few of their numbers."""
 _AVERAGED: Final = 0.004  # pace of the moving average of weights
 _SAVED_SECONDS: Final = 240.0
 
@@ -123,9 +126,10 @@ class Network(nn.Module):
     def forward(self, batch: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Shares of kernels (b, q, 3, _LOGITS) and told log errors (b, q, 3 + 3 RINGS)."""
         x = ((batch["statistics"] - self.mean) / self.spread).clamp(-6, 6)
+        x = functional.dropout(x, _DROPPED, self.training)
         t = functional.gelu(self.enter(torch.cat([x, batch["condition"], batch["place"]], -1)))
         t = t + self.widen["1"](functional.gelu(self.widen["0"](self.widen["normal"](t))))
-        t = self.narrow["linear"](self.narrow["normal"](t))
+        t = functional.dropout(self.narrow["linear"](self.narrow["normal"](t)), _DROPPED, self.training)
         for block in self.encoder:
             t = block(t, t, batch["among"], batch["apart"])
         q = self.ask["1"](
@@ -135,7 +139,8 @@ class Network(nn.Module):
             q = block(q, t, batch["relation"], batch["unused"])
         with torch.autocast(q.device.type, enabled=False):
             q = q.float()
-            hidden = self.kernel["1"](functional.gelu(self.kernel["0"](self.kernel["normal"](q))))
+            hidden = functional.gelu(self.kernel["0"](self.kernel["normal"](q)))
+            hidden = self.kernel["1"](functional.dropout(hidden, _DROPPED, self.training))
             shares = self.kernel["2"](hidden).view(*q.shape[:2], 3, _LOGITS).softmax(-1)
             told = self.error["1"](functional.gelu(self.error["0"](self.error["normal"](q))))
         return shares, told
@@ -341,7 +346,7 @@ class Sitting:
 
     def save(self, apart: list[Lens], facts: Mapping[str, Any]) -> None:
         """Judge, and write `state.pt` to go on from and `weights.npz` as the product reads them."""
-        average = self.average.to("cpu")
+        average = self.average.to("cpu").eval()
         figures = {n: held_out(average, apart, n) for n in (1, 8, 64)}
         for n, values in figures.items():
             print(

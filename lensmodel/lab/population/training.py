@@ -45,8 +45,8 @@ _SET_SIZES: Final = ((1, 2, 4, 8, 16, 32, 64, 110), (0.05, 0.04, 0.06, 0.12, 0.1
 _GREEN_WEIGHT: Final = 1.4
 _TOLD_WEIGHT, _RING_WEIGHT = 0.1, 0.05
 _DROPPED: Final = 0.1
-"""Share of statistics, tokens and hidden values that are left out at random in training, so that lenses are not
-recognised by a few of their numbers."""
+"""Share of statistics, tokens and hidden values that are left out at random in training, so that no lens is
+recognised by a few of its numbers."""
 _AVERAGED: Final = 0.004  # pace of the moving average of weights
 _SAVED_SECONDS: Final = 240.0
 

@@ -46,7 +46,6 @@ from app.runtime.settings import MIB, Settings
 from app.store import Store
 from app.store.jobs import JobStore
 from app.store.notices import Notices
-from lensmodel.model import ModelSettings
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
@@ -63,13 +62,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         storage = Storage(chosen.storage, patience_s=chosen.storage_seconds, create=False)
         with missable():  # /readyz tries again
             settle_folder(store, storage)
-        cache = ModelCache(
-            store,
-            chosen.model_cache_mb * MIB,
-            storage,
-            family=chosen.family,
-            settings=ModelSettings(unit=chosen.model_unit),
-        )
+        cache = ModelCache(store, chosen.model_cache_mb * MIB)
         reserve = Reserve(store.database.path.with_name("reserve") if store.database.is_sqlite else None)
         rows = JobStore(store.database)
         loop = asyncio.get_running_loop()

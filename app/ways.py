@@ -5,19 +5,22 @@ from __future__ import annotations
 from dataclasses import replace
 
 from app.runtime.settings import Settings
-from lensmodel.workflow.ways import WAYS, Way
+from lensmodel.workflow.ways import KERNEL_PATCHES, WAYS, Way
 
 
 def configured_way(settings: Settings, name: str) -> Way:
-    """Return the estimator, kernel size, model mode and correction method of a model.
+    """Return estimator, kernel size, patches, model mode and correction method of a model.
 
-    The settings of the service choose estimator and kernel size of the model `default`; all else is fixed.
+    The settings of the service choose estimator and kernel size of the model `default`, and the patches of
+    both.
     """
-    if name != "default":
-        return WAYS[name]
-    return replace(WAYS[name], estimator=settings.estimator, kernel_size=settings.kernel_size)
-
-
-def of_models(settings: Settings, name: str) -> dict[str, str]:
-    """Return the arguments of `ModelSettings` for lenses of a model."""
-    return {"mode": configured_way(settings, name).mode, "unit": settings.model_unit}
+    way = WAYS[name]
+    if name == "default":
+        own = settings.estimator != way.estimator
+        way = replace(
+            way,
+            estimator=settings.estimator,
+            kernel_size=settings.kernel_size,
+            patches=KERNEL_PATCHES if own else way.patches,
+        )
+    return replace(way, patches=settings.patches or way.patches)

@@ -9,9 +9,9 @@ import threading
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -56,48 +56,6 @@ def _take_turns_at_compiling(folder: Path) -> None:
                 depth -= 1
 
     Dispatcher.compile = alone
-
-
-@contextmanager
-def _searching_shortly() -> Iterator[None]:
-    # not for tests of the service
-    from lensmodel.model.wavefront import from_kernels, joint_kernels, search, starts  # noqa: PLC0415
-
-    counts = {
-        joint_kernels: {"_STARTS": 2, "_MOST_SINGLE": 0, "_JUDGED": 1, "_LAST_ROUNDS": 2},
-        search: {
-            "_RANDOM": 0,
-            "_KEPT": 2,
-            "_REFINED": 1,
-            "_DIRECTIONS": 1,
-            "_COARSE_ROUNDS": 3,
-            "_MEDIUM_ROUNDS": 3,
-            "_HELD_ROUNDS": 1,
-        },
-        from_kernels: {"_STARTS": 2, "_REFINED": 1, "_COARSE_ROUNDS": 3, "_FINE_ROUNDS": 4},
-        starts: {"_BEGINNINGS": 8},
-    }
-    with pytest.MonkeyPatch.context() as patch:
-        for module, names in counts.items():
-            for name, count in names.items():
-                patch.setattr(module, name, count)
-        yield
-
-
-@pytest.fixture(scope="session")
-def searching_shortly() -> Callable[[], AbstractContextManager[None]]:
-    """Fits wavefronts from a few beginnings, where a test asks what is made of the best of them.
-
-    That takes seconds instead of twenty. Whether the lens itself is found is asked with the whole search.
-    """
-    return _searching_shortly
-
-
-@pytest.fixture
-def short_search() -> Iterator[None]:
-    """Search so during a whole test."""
-    with _searching_shortly():
-        yield
 
 
 @pytest.fixture

@@ -30,8 +30,8 @@ README: Final = """What lensmodel keeps of one owner.
 
 *.jsonl        one JSON object a line, as in the tables; `photo_id`, `lens_id` and `patch_id` name the `id` of
                photos.jsonl, lenses.jsonl and patches.jsonl; `public_id` is the id of the HTTP interface.
-samples.jsonl  `psf`: base64 of little-endian float32, size x size, row by row; `spectrum`: base64 of the
-               format of lensmodel.core.spectrum.
+samples.jsonl  `psf`: base64 of little-endian float32, size x size, row by row.
+patches.jsonl  `encoded`: base64 of the format of lensmodel.core.psf.EncodedPatch.
 originals/     the photos as they are stored: without the place where they were taken, once they were read.
 corrections/   corrected photos.
 """

@@ -64,11 +64,9 @@ def run(
             "photos": answer.photos,
             "extrapolated": answer.extrapolated,
             "predicted_error": answer.predicted_error,
-            "prior": answer.prior,
-            "prior_share": answer.prior_share,
+            "nearest": answer.nearest,
             "answered_by": answer.answered_by,
-            "reason": answer.reason,
-            "far_light": answer.far_light,
+            "weights": answer.weights,
         },
         "rms_width_px": rms_width(answer.kernel),
         "mtf50": {"tangential": tangential, "sagittal": sagittal},
@@ -86,15 +84,12 @@ def run(
 
 def _words(place: FieldPosition, answer: PsfAnswer, tangential: float, sagittal: float) -> str:
     beyond = " (beyond what the photos cover)" if answer.extrapolated else ""
-    prior = f", {100 * answer.prior_share:.0f} % from {answer.prior}" if answer.prior else ""
-    percent = round(100 * answer.far_light)
-    far = f", {percent} % of the light far from the core" if percent else ""
     photos = "1 photo" if answer.photos == 1 else f"{answer.photos} photos"
     return (
         f"{ZONE_WORDS[zone_of(place.r)]}, r {place.r:g}: rms width {rms_width(answer.kernel):.2f} px, "
-        f"MTF50 tangential {mtf50_words(tangential)}, sagittal {mtf50_words(sagittal)} cycles/px{far}; "
+        f"MTF50 tangential {mtf50_words(tangential)}, sagittal {mtf50_words(sagittal)} cycles/px; "
         f"{photos}, {answer.effective_samples:.1f} effective samples, expected error "
-        f"{answer.predicted_error:.2f}{beyond}{prior}; answered by {answer.answered_by}: {answer.reason}"
+        f"{answer.predicted_error:.2f}{beyond}; answered by {answer.answered_by}"
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,8 +15,7 @@ from app.commands.console.display import Display
 from app.commands.console.failure import UsageError
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import ZONE_WORDS, LensSettings
-from lensmodel.model import LensModel, LensProfile, ModelSettings, Prior, save_profile
-from lensmodel.model.answer import MICROMETRE
+from lensmodel.model import LensProfile, save_profile
 from lensmodel.photo.endings import ENDINGS
 from lensmodel.workflow import pipeline
 from lensmodel.workflow.lens import Lens
@@ -35,9 +34,6 @@ class CalibrationOptions:
     workers: int | None
     any_lens: bool
     force: bool
-    family: Path | None
-    no_family: bool
-    unit: str | None
     scheduler: str | None = None
     selector: str = "r-map"
     model: str | None = None
@@ -49,11 +45,10 @@ def run(
 ) -> None:
     """Add photos to a profile, one after the other, and save it after each."""
     paths = files.photos(names)
-    _refuse(target, paths, options)
+    _refuse(target, paths)
     with files.as_usage():
         _recipe(options).check()
-        family = None if options.family is None else files.profile_at(options.family)
-    calibration = calibration_of(target, options, family)
+    calibration = calibration_of(target, options)
     results: list[dict[str, Any]] = []
     with display.progress() as bars:
         task = bars.add_task("", total=len(paths))
@@ -69,9 +64,7 @@ def run(
                 result = _result(verdict, display)
                 results.append({"photo": str(verdict.photo), **result})
                 bars.update(task, completed=len(results))
-        bars.remove_task(task)
-        whole = bars.add_task("joining what all photos say", total=None)
-        lens = calibration.finish(lambda done, total: bars.update(whole, completed=done, total=total))
+    lens = calibration.known
     coverage = {} if lens is None else lens.model.coverage()
     summary = {
         "profile": str(target) if lens else None,
@@ -94,16 +87,12 @@ def run(
         raise typer.Exit(1)
 
 
-def calibration_of(
-    target: Path, options: CalibrationOptions, family: LensProfile | None = None
-) -> pipeline.Calibration:
+def calibration_of(target: Path, options: CalibrationOptions) -> pipeline.Calibration:
     """Return the work on a profile, which may be there already."""
     recipe = _recipe(options)
     return pipeline.Calibration(
-        ProfileFile(target, options, family),
+        ProfileFile(target, options),
         recipe,
-        begin=ModelSettings(mode=recipe.way.mode, unit=options.unit or MICROMETRE),
-        prior=None if family is None else Prior(family.model, name=_name_of(family)),
         any_lens=options.any_lens,
         workers=options.workers,
     )
@@ -131,8 +120,8 @@ def _result(verdict: pipeline.PhotoVerdict, display: Display) -> dict[str, Any]:
     return {"state": "counted", "samples": verdict.samples}
 
 
-def _refuse(target: Path, photos: Sequence[Path], options: CalibrationOptions) -> None:
-    """Refuse to replace a photo, and options that contradict each other."""
+def _refuse(target: Path, photos: Sequence[Path]) -> None:
+    """Refuse to replace a folder or a photo."""
     if target.is_dir():
         raise UsageError(f"{target} is a folder; give the file of a lens profile")
     # a shell expands `--profile holiday/*.dng` to a profile and photos
@@ -140,22 +129,17 @@ def _refuse(target: Path, photos: Sequence[Path], options: CalibrationOptions) -
         raise UsageError(
             f"{target.name} is a photo; name a new file after --profile, for example my-24mm.lensprofile"
         )
-    if options.family is not None and options.no_family:
-        raise UsageError("--family and --no-family exclude each other; give one of them")
-    if options.family is not None and files.same(target, options.family):
-        raise UsageError(f"{options.family} is the profile itself; give that of another copy after --family")
 
 
 class ProfileFile:
-    """The keeper of a lens in a file, with the options applied to it.
+    """The keeper of a lens in a file.
 
     Another run may add to the same file meanwhile: the profile is read again whenever the file has
     changed, so that no run drops what another one learned.
     """
 
-    def __init__(self, target: Path, options: CalibrationOptions, family: LensProfile | None) -> None:
-        self.settled = True
-        self._target, self._options, self._family = target, options, family
+    def __init__(self, target: Path, options: CalibrationOptions) -> None:
+        self._target, self._options = target, options
         self._lens: Lens | None = None
         self._stamp_read = _stamp(target) if options.force else None
 
@@ -170,31 +154,14 @@ class ProfileFile:
                     f"the lens in {self._target.name} has the model {learned}, not {asked}: name a new file "
                     "after --profile and give its photos again, or replace the file with --force"
                 )
-            model = self._with_family(profile.model.answering(unit=self._options.unit))
-            self._lens, self._stamp_read = Lens(replace(profile, model=model)), stamp
-            # a run that was stopped left no fit: the next one makes it, whether it has photos or not
-            self.settled = self.settled and model is profile.model and model.warm
+            self._lens, self._stamp_read = Lens(profile), stamp
         return self._lens
 
-    def keep(self, lens: Lens, *, whole: bool) -> None:
-        """Save the lens; what was learned of the samples only once all of them are there."""
+    def keep(self, lens: Lens) -> None:
+        """Save the lens."""
         self._target.parent.mkdir(parents=True, exist_ok=True)
-        save_profile(self._target, lens.profile, learned=whole)
+        save_profile(self._target, lens.profile)
         self._lens, self._stamp_read = lens, _stamp(self._target)
-        self.settled = whole
-
-    def _with_family(self, model: LensModel) -> LensModel:
-        """Add the profile of another copy as a prior, as the options say."""
-        if self._options.no_family:
-            return model.with_prior(None)
-        if self._family is None:
-            return model
-        return model.with_prior(self._family.model, name=_name_of(self._family))
-
-
-def _name_of(family: LensProfile) -> str:
-    words = [family.lens[key] for key in ("maker", "model", "serial") if family.lens.get(key)]
-    return " ".join(words) or "another copy"
 
 
 def _opened(target: Path) -> LensProfile:

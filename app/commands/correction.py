@@ -74,7 +74,6 @@ def run(
             correction.deconvolvers.create(options.method)
         settings = LensSettings(aperture=options.aperture)
     lens = Lens(files.profile_at(source))
-    lens = lens.warmed()  # once for all photos, if an interrupted run left it undone
     results = clashes(twice, display)
     with display.progress() as bars:
         task = bars.add_task("", total=len(targets))

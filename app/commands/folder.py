@@ -98,7 +98,6 @@ def run(
     with display.progress() as bars:
         for group in lens_groups:
             work.learn(group, bars)
-        work.finish(bars)
         rows = [work.correct(group, by_path, bars, results, as_json=as_json) for group in lens_groups]
     if as_json:
         display.document({"groups": [_document(row) for row in rows], "results": results})
@@ -161,13 +160,6 @@ class _Folder:
         bars.remove_task(task)
         self._learned[group.name, group.focal] = counted
 
-    def finish(self, bars: Progress) -> None:
-        """Fit what takes long, once for each lens."""
-        task = bars.add_task("joining what all photos say", total=len(self._calibrations))
-        for number, calibrated in enumerate(self._calibrations.values()):
-            calibrated.finish(partial(correction.show_share, bars, task, number))
-        bars.remove_task(task)
-
     def _calibration(self, target: Path) -> pipeline.Calibration:
         options = calibration.CalibrationOptions(
             aperture=self._options.aperture,
@@ -175,9 +167,6 @@ class _Folder:
             workers=self._options.workers,
             any_lens=self._options.any_lens,
             force=False,
-            family=None,
-            no_family=False,
-            unit=None,
             selector=self._learning.selector,
         )
         return calibration.calibration_of(target, options)
@@ -215,7 +204,7 @@ class _Folder:
     ) -> GroupResult:
         """Correct the photos of a group that gain from it; leave the others."""
         profile = self.profile_of(group)
-        lens = Lens(files.profile_at(profile)).warmed() if profile.exists() else None
+        lens = Lens(files.profile_at(profile)) if profile.exists() else None
         states: Counter[str] = Counter()
         gains: list[float] = []
         task = bars.add_task(f"correcting {group.lens}", total=len(group.shots))

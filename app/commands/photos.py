@@ -34,7 +34,6 @@ from app.commands.console.options import (
 )
 from lensmodel.correction import Bounds, deconvolvers
 from lensmodel.estimation import estimators
-from lensmodel.model.answer import UNITS
 from lensmodel.photo import OutputFormat
 from lensmodel.workflow.ways import WAYS
 
@@ -74,22 +73,6 @@ def calibrate(
     ] = None,
     any_lens: AnyLens = False,
     force: Annotated[bool, typer.Option("--force", help="Forget what the profile knew; begin anew.")] = False,
-    family: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Profile of another copy, to borrow from where this one lacks photos."
-        ),
-    ] = None,
-    no_family: Annotated[bool, typer.Option("--no-family", help="Stop borrowing from another copy.")] = False,
-    unit: Annotated[
-        str | None,
-        choice(
-            "--unit",
-            UNITS,
-            "Unit in which the blur is the same on bodies with different pixels: micrometre (default), or "
-            "half-diagonal where the pixel size is unknown. Kept from then on.",
-        ),
-    ] = None,
     json_output: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = 0,
@@ -109,8 +92,6 @@ def calibrate(
 
         lensmodel calibrate scan.tif --aperture 2.8 --profile old-lens.lensprofile
 
-        lensmodel calibrate first.dng --profile second-copy.lensprofile --family my-24mm.lensprofile
-
     Exit status: 0 all photos counted, 1 some did not, 2 called wrongly.
     """
     shown = display.of(context, quiet=quiet, verbose=verbose)
@@ -123,9 +104,6 @@ def calibrate(
             workers,
             any_lens=any_lens,
             force=force,
-            family=family,
-            no_family=no_family,
-            unit=unit,
             model=model,
             kernel_size=kernel_size,
             scheduler=scheduler,

@@ -14,7 +14,7 @@ from PIL import Image
 
 from app.http.model_cache import Fitted
 from app.http.picture_cache import DrawnPicture
-from app.schemas import FamilyOut, KernelOut, PsfOut, QueryOut, Support, Units
+from app.schemas import KernelOut, PsfOut, QueryOut, Support, Units
 from lensmodel.core.geometry import Frame
 from lensmodel.core.types import FieldPosition, Kernel
 from lensmodel.model import PsfAnswer
@@ -30,12 +30,10 @@ DIGITS: Final = 10
 
 SCALE: Final = "X-PSF-Scale"
 ANSWERED_BY: Final = "X-PSF-Answered-By"
-REASON: Final = "X-PSF-Reason"
 HEADERS: Final = {
     SCALE: "of one PSF as PNG: the value of white, and the gamma",
     ANSWERED_BY: "what made the answer, as `support.answered_by` of the JSON, which has no such header; of a "
     "map all that took part, those of most places first, with semicolons between",
-    REASON: "why that one, as `support.reason` of the JSON; of a map one for each, in the same order",
 }
 """What headers say of pictures and arrays, which have no other room for it."""
 
@@ -62,13 +60,10 @@ def describe(
             predicted_error=error if np.isfinite(error) else None,
             model=fitted.way,
             answered_by=answer.answered_by,
-            reason=answer.reason,
-            far_light=float(answer.far_light),
-            family=FamilyOut(lenses=len(fitted.family), weight=float(answer.prior_share))
-            if fitted.family
-            else None,
+            weights=answer.weights,
+            nearest=answer.nearest,
         ),
-        bandwidth={name: float(value) for name, value in answer.bandwidth.items()},
+        bandwidth=fitted.model.bandwidth,
         units=Units(pixel_pitch_um=pixel_pitch_um),
     )
 
@@ -116,13 +111,13 @@ def field_map(
     left_edge, top_edge, wide, high = view
     pitch = size + GAP_PX
     sheet = np.full((rows * pitch + GAP_PX, columns * pitch + GAP_PX), 40, dtype=np.uint8)
-    made: Counter[tuple[str, str]] = Counter()
+    made: Counter[str] = Counter()
     for row in range(rows):
         for column in range(columns):
             down, across = top_edge + (row + 0.5) / rows * high, left_edge + (column + 0.5) / columns * wide
             place = frame.position(down * (frame.height - 1), across * (frame.width - 1))
             answer = ask(place)
-            made[answer.answered_by, answer.reason] += 1
+            made[answer.answered_by] += 1
             top, left = row * pitch + GAP_PX, column * pitch + GAP_PX
             sheet[top : top + size, left : left + size] = _bright(answer.kernel, gamma)
     return DrawnPicture(_png(Image.fromarray(sheet)), _made(made))
@@ -138,14 +133,13 @@ def _png(image: Image.Image) -> bytes:
     return buffer.getvalue()
 
 
-def _made(counts: Counter[tuple[str, str]]) -> dict[str, str]:
-    names, reasons = zip(*(made for made, _ in counts.most_common()), strict=True)
-    return {ANSWERED_BY: "; ".join(names), REASON: "; ".join(reasons)}
+def _made(counts: Counter[str]) -> dict[str, str]:
+    return {ANSWERED_BY: "; ".join(name for name, _ in counts.most_common())}
 
 
 def _headers(described: PsfOut, suffix: str) -> dict[str, str]:
     at = described.query
     aperture = "" if at.aperture is None else f"-f{at.aperture:g}"
     name = f"psf-v{described.version}-r{at.r:.3f}-phi{at.phi:.3f}{aperture}-{at.channel}.{suffix}"
-    made = Counter([(described.support.answered_by, described.support.reason)])
+    made = Counter([described.support.answered_by])
     return {"Content-Disposition": f'inline; filename="{name}"'} | _made(made)

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
 import math
 import time
-from collections import OrderedDict
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any, Final
@@ -21,16 +18,17 @@ from app.jobs.context import (
     NotWantedError,
 )
 from app.jobs.sample_files import write_samples
-from app.jobs.task_files import EARLIER, FAMILY, LAYER_FILES, LEARNED, REPORT, SIDES, SUFFIX
+from app.jobs.task_files import LAYER_FILES, REPORT, SIDES, SUFFIX
 from app.runtime.outage import missable
 from app.sandbox.child import ProgressHook
 from app.sandbox.outcome import TaskLimits
 from app.store.corrections import CorrectionPlan, Result, Run, run_folder
 from app.store.photo_steps import stored_settings
-from app.store.samples import LensState, Relative
-from app.store.versions import learned_key, report_key
-from app.ways import of_models
+from app.store.samples import LensState
+from app.store.versions import report_key
+from lensmodel.core.errors import NoSamplesError
 from lensmodel.correction import Bounds
+from lensmodel.workflow.ways import WAYS
 
 log = logging.getLogger(__name__)
 
@@ -47,13 +45,6 @@ THREAD_MB: Final = 136
 """Address space in MiB that a thread reserves: 8 of stack and 128 that glibc maps for the heap of an arena,
 most of it never touched."""
 
-EARLIER_VERSIONS: Final = 8
-"""Versions back in which a fit is looked for that a new one may begin with (chosen): photos that come
-together are fitted together, and few lenses get more at a time."""
-
-FAMILIES: Final = 8
-"""Fitted families in memory (chosen): those of the lenses whose previews are being looked at."""
-
 
 class CorrectionWork:
     """Jobs of corrections and of lens versions."""
@@ -61,7 +52,6 @@ class CorrectionWork:
     def __init__(self, context: JobContext) -> None:
         self._context = context
         self._corrections = context.store.corrections
-        self._families: OrderedDict[str, bytes] = OrderedDict()
 
     def correction(self, correction_id: str, epoch: int = 1) -> None:
         """Make the corrected file."""
@@ -94,6 +84,7 @@ class CorrectionWork:
         )
         arguments: dict[str, Any] = {
             "developed": str(developed),
+            "photo": photo.public_id,
             "settings": params.get("settings")
             or stored_settings(photo),  # as they were when the correction was requested
             "lateral": photo.lateral,
@@ -110,9 +101,7 @@ class CorrectionWork:
         with self._context.sandbox.folder() as folder:
             lens_id, version = plan.lens.public_id, plan.correction.lens_version
             state = self._samples(lens_id, version, folder)
-            arguments["model"] = of_models(settings, state.way)
-            known = (folder / LEARNED).is_file()
-            leaning, fitted = self._family(params.get("family", []), arguments["model"], folder)
+            arguments["mode"] = WAYS[state.way].mode
             done = self._context.attempt(
                 "correct",
                 arguments,
@@ -123,49 +112,17 @@ class CorrectionWork:
                 compiles=True,
                 on_progress=self._progress_of(run),
             )
-            if not known and self._is_newest(lens_id, version):
-                self._keep_learned(lens_id, version, state, folder / LEARNED)
-            self._keep_family(fitted, folder / FAMILY / LEARNED)
-            report = done["report"] | ({"family": {"lenses": leaning}} if leaning else {})
-            self._store_result(run, plan, folder / Path(done["file"]).name, report)
-
-    def _family(
-        self, relatives: list[dict[str, Any]], model: dict[str, str], folder: Path
-    ) -> tuple[int, str]:
-        """Pass the samples of other copies of the lens to the task, and their fit if it is in memory."""
-        family = [Relative(entry["lens_id"], LensState(**entry["state"])) for entry in relatives]
-        stored = self._context.store.samples.of_family(family)
-        if not stored:
-            return 0, ""
-        (folder / FAMILY).mkdir()
-        write_samples(folder / FAMILY, [entry.sample for entry in stored])
-        key = json.dumps([relatives, model], sort_keys=True)
-        fitted = self._families.get(key)
-        if fitted is not None:
-            (folder / FAMILY / LEARNED).write_bytes(fitted)
-        return len(family), key
-
-    def _keep_family(self, key: str, path: Path) -> None:
-        """Keep the fit of a family for the next correction: previews come in rows."""
-        if not path.is_file():
-            return
-        self._families.pop(key, None)
-        self._families[key] = path.read_bytes()
-        while len(self._families) > FAMILIES:
-            self._families.popitem(last=False)
+            self._store_result(run, plan, folder / Path(done["file"]).name, done["report"])
 
     def _samples(self, lens_id: str, version: int, folder: Path) -> LensState:
-        state, stored = self._context.store.samples.of_lens(lens_id, up_to_version=version)
+        try:
+            state, stored = self._context.store.samples.of_lens(lens_id, up_to_version=version)
+        except NoSamplesError as error:
+            raise JobFailedError(error.code, str(error)) from error
         if not stored:
             text = f"version {version} of lens {lens_id} has no samples any more; ask for the newest version"
             raise JobFailedError("no_samples", text)
         write_samples(folder, [entry.sample for entry in stored])
-        for number in range(version, max(version - EARLIER_VERSIONS, 1) - 1, -1):
-            # not fitted yet: the task does it, beginning with what an earlier version came to
-            with suppress(FileNotFoundError):
-                learned = self._context.storage.get(learned_key(lens_id, number, state.rebuild_epoch))
-                (folder / (LEARNED if number == version else EARLIER)).write_bytes(learned)
-                break
         return state
 
     def _progress_of(self, run: Run) -> ProgressHook:
@@ -203,7 +160,7 @@ class CorrectionWork:
             self._context.storage.delete(base)  # cancelled, deleted or begun again: nobody else writes there
 
     def measure(self, lens_id: str, version: int, _again: int = 0) -> None:
-        """Measure how well one version of a lens predicts held-out photos, and write its report.
+        """Note the errors that one version of a lens expects, and write its report.
 
         When repeated for a missing report it keeps the figures that were measured first.
         """
@@ -216,13 +173,12 @@ class CorrectionWork:
         try:
             with self._context.sandbox.folder() as folder:
                 state = self._samples(lens_id, version, folder)
-                model = of_models(self._context.settings, state.way)
+                mode = WAYS[state.way].mode
                 metrics = self._context.attempt(
-                    "measure", {"model": model}, folder=folder, limits=limits, wanted=wanted, compiles=True
+                    "measure", {"mode": mode}, folder=folder, limits=limits, wanted=wanted, compiles=True
                 )
-                self._keep_learned(lens_id, version, state, folder / LEARNED)
                 key = report_key(lens_id, version, state.rebuild_epoch)
-                self._report(lens_id, key, model, folder, wanted)
+                self._report(lens_id, key, mode, folder, wanted)
         except NotWantedError:
             return
         except JobFailedError as error:
@@ -230,13 +186,11 @@ class CorrectionWork:
             metrics = {"error": None, "coverage": None, "problem": error.code}
         lenses.record_metrics(lens_id, version, metrics)
 
-    def _report(
-        self, lens_id: str, key: str, model: dict[str, str], folder: Path, wanted: Callable[[], bool]
-    ) -> None:
+    def _report(self, lens_id: str, key: str, mode: str, folder: Path, wanted: Callable[[], bool]) -> None:
         """Write the report of the lens whose samples lie in a folder; a failure is only logged."""
         settings = self._context.settings
         limits = TaskLimits(memory_mb=2 * SPARE_MB, wall_s=settings.correct_seconds)
-        arguments = {"model": model, "about": self._about(lens_id)}
+        arguments = {"mode": mode, "about": self._about(lens_id)}
         try:
             self._context.attempt(
                 "report", arguments, folder=folder, limits=limits, wanted=wanted, compiles=True
@@ -261,15 +215,9 @@ class CorrectionWork:
         }
 
     def _is_newest(self, lens_id: str, version: int) -> bool:
-        """Whether a version is the current one; fitted models of earlier ones have been deleted."""
+        """Whether a version is the current one; reports of earlier ones have been deleted."""
         lens = self._context.store.lenses.get(lens_id)
         return lens is not None and lens.version == version
-
-    def _keep_learned(self, lens_id: str, version: int, state: LensState, path: Path) -> None:
-        """Store the fitted model of the newest version for all processes that answer requests."""
-        if path.is_file():
-            key = learned_key(lens_id, version, state.rebuild_epoch)
-            self._context.storage.put_file(key, path)
 
 
 def _bounds(params: dict[str, Any]) -> dict[str, float]:

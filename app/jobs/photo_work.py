@@ -31,6 +31,7 @@ from app.ways import configured_way
 from lensmodel.core.errors import NoUsablePatchesError
 from lensmodel.core.types import FieldPosition
 from lensmodel.workflow import pipeline
+from lensmodel.workflow.ways import Way
 
 log = logging.getLogger(__name__)
 
@@ -122,6 +123,10 @@ class _Steps:
         self._store = context.store
         self._developed = Path()
 
+    @property
+    def _way(self) -> Way:
+        return configured_way(self._context.settings, self._photo.way)
+
     def _wanted(self) -> bool:
         return self._store.photos.is_live(self._photo.public_id, self._photo.epoch)
 
@@ -207,7 +212,8 @@ class _Steps:
         limits = self._context.limits(photo, self._context.settings.develop_seconds, 120)
         arguments = {
             "developed": str(developed),
-            "count": self._context.settings.patches,
+            "count": self._way.patches,
+            "estimator": self._way.estimator,
             "selector": photo.given.get("selector") or self._context.settings.selector,
         }
         with self._context.sandbox.folder() as folder:
@@ -268,7 +274,7 @@ class _Steps:
         done = [row for row in tried if row.state == "done"]
         if done:
             try:
-                pipeline.require_spread([patch_of(row) for row in done], count=settings.patches)
+                pipeline.require_spread([patch_of(row) for row in done], count=self._way.patches)
             except NoUsablePatchesError as error:
                 raise JobFailedError(error.code, str(error)) from error
         if len(done) < settings.min_good_patches:

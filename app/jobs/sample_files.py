@@ -1,6 +1,6 @@
 """PSF samples between workers and their tasks: what the codec of samples makes of them, as files of a folder.
 
-In the folder `KERNELS`, `SPECTRA` and `PHASES` are npy files, `SAMPLES` is JSON; see `PackedSamples`.
+In the folder `KERNELS` and `ENCODED` are npy files, `SAMPLES` is JSON; see `PackedSamples`.
 """
 
 from __future__ import annotations
@@ -9,13 +9,13 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 from tokenize import TokenError
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.lib.format import open_memmap
 from numpy.typing import NDArray
 
-from app.jobs.task_files import KERNELS, PHASES, SAMPLES, SPECTRA
+from app.jobs.task_files import ENCODED, KERNELS, SAMPLES
 from app.sandbox.outcome import MAX_RESULT
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import save_array
@@ -46,10 +46,11 @@ def write_samples(folder: Path, samples: Sequence[PsfSample]) -> None:
         One at least.
     """
     packed = pack_samples(samples)
-    for name, array in ((KERNELS, packed.kernels), (SPECTRA, packed.spectra), (PHASES, packed.phases)):
-        if array is not None:
-            with (folder / name).open("wb") as file:
-                save_array(file, array)
+    with (folder / KERNELS).open("wb") as file:
+        save_array(file, packed.kernels)
+    if packed.encoded.size:
+        with (folder / ENCODED).open("wb") as file:
+            save_array(file, packed.encoded)
     (folder / SAMPLES).write_text(json.dumps(packed.entries), encoding="utf-8")
 
 
@@ -103,12 +104,11 @@ def returned_samples(folder: Path, *, count: int) -> list[PsfSample]:
 
 def _packed(folder: Path) -> PackedSamples:
     entries = json.loads((folder / SAMPLES).read_text(encoding="utf-8"))
-    spectra, phases = (
-        _mapped(folder / name) if (folder / name).is_file() else None for name in (SPECTRA, PHASES)
-    )
-    return PackedSamples(entries, _mapped(folder / KERNELS), spectra, phases)
+    path = folder / ENCODED
+    encoded = _mapped(path) if path.is_file() else np.empty((0, 0), dtype=np.uint8)
+    return PackedSamples(entries, _mapped(folder / KERNELS), encoded)
 
 
-def _mapped(path: Path) -> NDArray[np.float32]:
+def _mapped(path: Path) -> NDArray[Any]:
     """Map an npy file, since its header may claim any size; never an archive or a pickle in its place."""
     return open_memmap(path, mode="r")

@@ -11,20 +11,8 @@ KERNELS: Final = "kernels.npy"
 SAMPLES: Final = "samples.json"
 """Position, settings, weight and origin of each kernel."""
 
-SPECTRA: Final = "spectra.npy"
-"""What the patch of each kernel says without one; absent where none says anything."""
-
-PHASES: Final = "phases.npy"
-"""Phases of that patch's colours against green; absent where none has any."""
-
-FAMILY: Final = "family"
-"""Folder of the samples of other copies that the model leans on; absent without any."""
-
-LEARNED: Final = "learned.npz"
-"""The model fitted to the samples."""
-
-EARLIER: Final = "earlier.npz"
-"""What an earlier version of the lens was fitted to be, where a new fit may begin; absent without one."""
+ENCODED: Final = "encoded.npy"
+"""What patches say without a kernel, one a row."""
 
 CLEANED: Final = "cleaned"
 """The file of a photo without the place where it was taken."""

@@ -25,10 +25,7 @@ from app.blobs.tiles import write_tiles
 from app.jobs.sample_files import read_samples, write_samples
 from app.jobs.task_files import (
     CLEANED,
-    EARLIER,
-    FAMILY,
     LAYER_FILES,
-    LEARNED,
     PREVIEW,
     R_MAP,
     REPORT,
@@ -41,13 +38,14 @@ from app.sandbox.child import ProgressHook, Task
 from app.schemas import distances
 from lensmodel import correction, photo
 from lensmodel.core import codec
-from lensmodel.core.errors import InvalidInputError, LensModelError
+from lensmodel.core.errors import LensModelError
 from lensmodel.core.types import LensSettings, Planes
 from lensmodel.correction.engine import first_use
 from lensmodel.estimation import estimators
 from lensmodel.estimation import measure as lens_measure
 from lensmodel.estimation.patches import Patch, selectors
 from lensmodel.model import LensModel, ModelSettings
+from lensmodel.neural import FieldNetwork
 from lensmodel.photo.lateral import LateralColour
 from lensmodel.photo.tags.location import find_location
 from lensmodel.report import lens_report
@@ -122,7 +120,6 @@ def develop(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     limits = photo.Limits(max_megapixels=arguments["max_megapixels"])
     developed = photo.develop(Path(arguments["path"]), limits=limits)
     pipeline.save_developed(developed, folder)
-    pipeline.save_seen(pipeline.seen_patches(developed), folder)
     (folder / PREVIEW).write_bytes(previews.preview(developed))
     (folder / R_MAP).write_bytes(previews.confidence_map(developed))
     _show(folder / SHOWN, developed.planes, developed)
@@ -134,7 +131,11 @@ def select(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> d
     del folder
     developed = pipeline.load_developed(Path(arguments["developed"]))
     selection = pipeline.find_patches(
-        developed, count=arguments["count"], selector=arguments["selector"], on_step=progress
+        developed,
+        count=arguments["count"],
+        selector=arguments["selector"],
+        estimator=arguments["estimator"],
+        on_step=progress,
     )
     rejected = []
     for window in selection.rejected:
@@ -180,7 +181,7 @@ def estimate(arguments: dict[str, Any], folder: Path, progress: ProgressHook) ->
 def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     """Correct the photo in `developed` with the samples in the folder; write the result there.
 
-    The fitted model is written there as well, unless it was given.
+    The photo's own samples join them, unless they are there already: `photo` is what they are called.
     """
     _log_compiling()
     developed = pipeline.load_developed(Path(arguments["developed"]))
@@ -188,10 +189,8 @@ def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
     lateral = _lateral(developed) if stored is None else codec.from_json(LateralColour, stored)
     output = arguments["output"]
     roi = arguments["roi"]
-    model = _with_family(folder, ModelSettings(**arguments["model"]))
+    model = _model(folder, arguments["mode"])
     settings = _settings(arguments["settings"])
-    patches = pipeline.load_seen(Path(arguments["developed"]))
-    psfs = pipeline.psfs_for(developed, model, settings, method=arguments["method"], patches=patches)
     bounds = correction.Bounds(**arguments["bounds"])
     extremes = (replace(bounds, texture=0.0), replace(bounds, texture=1.0, denoise=1.0))
     corrected = pipeline.correct_photo(
@@ -199,7 +198,7 @@ def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
         model,
         settings,
         method=arguments["method"],
-        known=psfs,
+        photo=arguments["photo"],
         strength=arguments["strength"],
         bounds=bounds,
         layers=extremes if arguments.get("layers") else (),
@@ -239,19 +238,16 @@ def correct(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> 
 
 
 def measure(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
-    """Return how well the model of the samples in the folder predicts held-out photos.
-
-    The fitted model, including the wavefront of the lens, is written to the folder.
-    """
-    model = _model(folder, ModelSettings(**arguments["model"])).warmed(progress)
-    (folder / LEARNED).write_bytes(model.learned())
-    error = codec.to_json(model.cross_validate())
+    """Return the error that the model of the samples in the folder expects in each zone."""
+    del progress
+    model = _model(folder, arguments["mode"])
+    error = codec.to_json(model.expected_errors())
     return {"error": _numbers(error), "coverage": _numbers(codec.to_json(model.coverage()))}
 
 
 def report(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, Any]:
     """Write the report of the lens of the samples in the folder; `about` has its name and photo shape."""
-    model = _model(folder, ModelSettings(**arguments["model"])).warmed()
+    model = _model(folder, arguments["mode"])
     about = arguments["about"]
     lateral = [codec.from_json(LateralColour, stored) for stored in about["lateral"]]
     result = lens_report(
@@ -306,6 +302,7 @@ TASKS: Final[Mapping[str, Task]] = {
 
 for _registry in (estimators, selectors, correction.deconvolvers):
     _registry.load_installed()  # in the fork server: a confined child may no longer read their files
+FieldNetwork.load()  # nor the weights, which all children share
 
 
 def _show(path: Path, planes: Planes, developed: photo.LinearPhoto) -> None:
@@ -331,35 +328,9 @@ def _lateral(developed: photo.LinearPhoto) -> LateralColour | None:
         return None
 
 
-def _model(folder: Path, settings: ModelSettings) -> LensModel:
+def _model(folder: Path, mode: str) -> LensModel:
     """Build the model of the samples in a folder."""
-    samples = read_samples(folder)
-    learned = folder / LEARNED
-    if learned.is_file():
-        try:
-            return LensModel.restored(samples, learned.read_bytes(), settings)
-        except InvalidInputError as error:
-            log.info("the model is fitted anew: %s", error)
-            learned.unlink()
-    model, earlier = LensModel.fit(samples, settings), folder / EARLIER
-    return model.begun_with(earlier.read_bytes()) if earlier.is_file() else model
-
-
-def _with_family(folder: Path, settings: ModelSettings) -> LensModel:
-    """Fit the model of the samples in a folder, with other copies as its prior if they are given.
-
-    Fits that were not given are written beside their samples.
-    """
-    model, family = _model(folder, settings), folder / FAMILY
-    if not (folder / LEARNED).is_file():
-        model = model.warmed()
-        (folder / LEARNED).write_bytes(model.learned())
-    if not family.is_dir():
-        return model
-    prior = _model(family, settings)
-    if not (family / LEARNED).is_file():
-        (family / LEARNED).write_bytes(prior.learned())
-    return model.with_prior(prior)
+    return LensModel.fit(read_samples(folder), ModelSettings(mode=mode))
 
 
 def _settings(stored: Mapping[str, Any]) -> LensSettings:

@@ -69,10 +69,6 @@ def create(options: CorrectionIn, call: Call) -> CorrectionOut:
     params |= options.model_dump(
         mode="json", include={"halo", "texture", "denoise", "layers"}, exclude_defaults=True
     )
-    if options.family and options.lens_version is None and call.settings.family:
-        # the present copies and versions: after one of them learned the same request is a new correction
-        relatives = call.store.samples.family_of(lens.public_id)
-        params |= {"family": [relative.named() for relative in relatives]} if relatives else {}
     row, created = call.store.corrections.create(photo, lens, version, params)
     finished = not created and row.state == "succeeded"
     call.response.status_code = status.HTTP_200_OK if finished else status.HTTP_202_ACCEPTED

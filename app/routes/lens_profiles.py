@@ -41,7 +41,7 @@ _FILE: Final = {"application/zip": {"schema": {"type": "string", "format": "bina
 def read_lens_profile(lens_id: str, call: CallDep) -> Response:
     """Return all that was learned of a lens as one file, which the command line reads too."""
     lens = find_lens(call, lens_id)
-    model = call.models.get(lens_id, family=False).model
+    model = call.models.get(lens_id).model
     named = {"maker": lens.maker, "model": lens.model, "serial": lens.serial, "label": lens.label}
     profile = LensProfile(
         model,

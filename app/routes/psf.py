@@ -6,7 +6,6 @@ import hashlib
 import math
 from typing import Annotated, Final, Literal
 
-import numpy as np
 from fastapi import APIRouter, Depends, Response, status
 
 from app.errors import InvalidParameterError, NotAcceptableError, UnknownLensError
@@ -18,10 +17,9 @@ from app.http.questions import QueryModel
 from app.routes.common import Answers, matches_tag, problems
 from app.runtime import metrics
 from app.schemas import FieldQuery, PsfOut, PsfQuery, QueryOut
-from app.store.samples import Family, LensState
+from app.store.samples import LensState
 from lensmodel.core.errors import OutsideSupportError
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model.answer import MICROMETRE
 
 router = APIRouter(tags=["psf"])
 
@@ -102,9 +100,8 @@ def accepted(header: str) -> Format:
 
 
 def _answer(lens_id: str, at: PsfQuery, form: Format, call: Call) -> Response:
-    state, relatives = _known(call, lens_id)
-    fitted = call.models.get(lens_id, at.version, state=state, family=at.family, relatives=relatives)
-    pinned = at.version is not None and fitted.learned
+    fitted = call.models.get(lens_id, at.version, state=_known(call, lens_id))
+    pinned = at.version is not None
     tag = etag(fitted, f"{at.model_dump_json()}{form}")
     headers = {
         "ETag": tag,
@@ -115,9 +112,7 @@ def _answer(lens_id: str, at: PsfQuery, form: Format, call: Call) -> Response:
         return Response(status_code=status.HTTP_304_NOT_MODIFIED, headers=headers)
     position = FieldPosition(at.r, at.phi)
     setting = LensSettings(at.aperture, at.focal_length_mm, at.focus_distance_m, at.channel)
-    answer = fitted.model.query(
-        position, setting, size=at.size, pitch_um=at.pixel_pitch_um, half_diagonal_px=at.half_diagonal_px
-    )
+    answer = fitted.model.query(position, setting, size=at.size, pitch_um=at.pixel_pitch_um)
     if at.strict and answer.extrapolated:
         raise OutsideSupportError(
             f"r={at.r}, phi={at.phi}, aperture={at.aperture} lies outside what the samples of lens {lens_id} "
@@ -132,16 +127,13 @@ def _answer(lens_id: str, at: PsfQuery, form: Format, call: Call) -> Response:
         focal_length_mm=at.focal_length_mm,
         focus_distance_m=at.focus_distance_m,
     )
-    in_micrometres = fitted.model.settings.unit == MICROMETRE
-    pitch = (at.pixel_pitch_um if in_micrometres else None) or fitted.pixel_pitch_um
+    pitch = at.pixel_pitch_um or fitted.model.pitch_um
     described = psf_formats.describe(lens_id, fitted, question, answer, pitch)
-    if at.std and form == "json" and answer.std is not None:
-        described = described.model_copy(update={"std": np.round(answer.std, psf_formats.DIGITS).tolist()})
     body, more = psf_formats.psf(form, answer.kernel, described)
     return Response(body, media_type=MEDIA_TYPES[form], headers={**headers, **more})
 
 
-def _known(call: Call, lens_id: str) -> tuple[LensState, Family]:
+def _known(call: Call, lens_id: str) -> LensState:
     known = call.store.samples.known_of(lens_id, call.owner)
     if known is None:
         raise UnknownLensError(f"there is no lens {lens_id[:60]}: GET /v1/lenses lists those there are")
@@ -149,16 +141,9 @@ def _known(call: Call, lens_id: str) -> tuple[LensState, Family]:
 
 
 def etag(fitted: Fitted, question: str) -> str:
-    """Return a strong tag: the same query to the same model of the same samples has the same answer.
-
-    The samples are those of the lens and of the other copies that it leans on.
-    """
-    relatives = [
-        (relative.lens_id, relative.state.version, relative.state.rebuild_epoch) for relative in fitted.family
-    ]
-    digest = hashlib.sha256(f"{question}{relatives}".encode()).hexdigest()[:12]
-    state, sort = fitted.state, "l" if fitted.learned else "p"
-    return f'"{fitted.lens_id}-v{state.version}-e{state.rebuild_epoch}-{sort}-{digest}"'
+    """Return a strong tag: the same query to the same samples and weights has the same answer."""
+    digest = hashlib.sha256(f"{question}{fitted.model.weights}".encode()).hexdigest()[:12]
+    return f'"{fitted.lens_id}-v{fitted.state.version}-e{fitted.state.rebuild_epoch}-{digest}"'
 
 
 @router.get(
@@ -191,13 +176,13 @@ def read_field(lens_id: str, at: Annotated[FieldQuery, Depends(_FIELD)], call: C
             f"grid {at.grid} of size {at.size} are {pixels / 1e6:.1f} million pixels, "
             f"{MAX_FIELD_PIXELS / 1e6:g} may be: ask for fewer or smaller kernels"
         )
-    state, relatives = _known(call, lens_id)
+    state = _known(call, lens_id)
     left, top, wide, high = (float(share) for share in at.view.split(","))
     if not (wide > 0 and high > 0 and left + wide <= 1.000001 and top + high <= 1.000001):
         raise InvalidParameterError(
             f"view {at.view} is no part of the picture: left, top, width, height in 0..1"
         )
-    fitted = call.models.get(lens_id, at.version, state=state, family=at.family, relatives=relatives)
+    fitted = call.models.get(lens_id, at.version, state=state)
     tag = etag(fitted, at.model_dump_json())
     headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
     if matches_tag(call, tag):

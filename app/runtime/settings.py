@@ -145,10 +145,15 @@ class Settings(BaseSettings):
         default=3600.0, gt=0, description="Longest that correcting a photo may take."
     )
 
-    patches: int = Field(default=24, ge=1, le=1000, description="Patches that are used of one photo.")
+    patches: int = Field(
+        default=0,
+        ge=0,
+        le=1000,
+        description="Patches that are used of one photo; 0: as the model of its lens.",
+    )
     min_good_patches: int = Field(default=1, ge=1, description="Fewer than this and the photo fails.")
     kernel_size: int = Field(
-        default=31, ge=3, le=55, description="Side of the estimated kernels in pixels, odd."
+        default=55, ge=3, le=55, description="Largest side of the estimated kernels in pixels, odd."
     )
     estimator: str = Field(default="default", description="Name in the registry of blind estimators.")
     selector: str = Field(
@@ -159,13 +164,6 @@ class Settings(BaseSettings):
         default=False, description="Photos without a serial belong to the one lens of that model."
     )
 
-    family: bool = Field(
-        default=True,
-        description="A lens that has seen little leans on its owner's other copies of the same model.",
-    )
-    model_unit: Literal["micrometre", "half-diagonal"] = Field(
-        default="micrometre", description="In what the kernels of bodies with different pixels agree."
-    )
     model_cache_mb: int = Field(
         default=1024, ge=1, description="Memory for fitted lens models in one process, in MiB."
     )

@@ -55,7 +55,7 @@ from app.schemas.photos import (
     PhotoState,
     UploadFields,
 )
-from app.schemas.psf import FamilyOut, FieldQuery, KernelOut, PsfOut, PsfQuery, QueryOut, Support, Units
+from app.schemas.psf import FieldQuery, KernelOut, PsfOut, PsfQuery, QueryOut, Support, Units
 from app.schemas.service import FormatsOut, Health, LimitsOut, Readiness, VersionOut
 
 __all__ = [
@@ -70,7 +70,6 @@ __all__ = [
     "CorrectionOut",
     "CorrectionPage",
     "CorrectionState",
-    "FamilyOut",
     "FieldError",
     "FieldQuery",
     "FocalLength",

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from app.schemas.fields import FAMILY_HELP, MAX_VERSION, Id, Model, Problem, Question
+from app.schemas.fields import MAX_VERSION, Id, Model, Problem, Question
 
 CorrectionState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 
@@ -66,7 +66,6 @@ class CorrectionIn(Question):
         default=False,
         description="with roi: keep it without faint texture and without grain as well, for a preview to mix",
     )
-    family: bool = Field(default=True, description=FAMILY_HELP)
 
 
 class CorrectionLinks(Model):

@@ -111,9 +111,3 @@ class Problem(Model):
     errors: list[FieldError] = []
     request_id: str | None = None
     candidates: list[str] | None = Field(default=None, description="Lenses that the photo may belong to.")
-
-
-FAMILY_HELP: Final = (
-    "lean on the owner's other copies of this lens model where this one has seen little; "
-    "a version that is named never does"
-)

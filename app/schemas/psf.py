@@ -7,7 +7,6 @@ from typing import Literal
 from pydantic import Field
 
 from app.schemas.fields import (
-    FAMILY_HELP,
     MAX_VERSION,
     Aperture,
     FocalLength,
@@ -39,17 +38,8 @@ class PsfQuery(Question):
         allow_inf_nan=False,
         description="pixel of the answer; that of most photos by default",
     )
-    half_diagonal_px: float | None = Field(
-        None,
-        ge=10,
-        le=1e6,
-        allow_inf_nan=False,
-        description="half the diagonal of the frame, if bodies agree in those",
-    )
     version: int | None = Field(None, ge=1, le=MAX_VERSION, description="an earlier version of the lens")
     strict: bool = Field(default=False, description="refuse answers outside what the samples cover")
-    std: bool = Field(default=False, description="JSON only: the standard error of each pixel as well")
-    family: bool = Field(default=True, description=FAMILY_HELP)
 
 
 class KernelOut(Model):
@@ -72,13 +62,6 @@ class QueryOut(Model):
     focus_distance_m: float | None
 
 
-class FamilyOut(Model):
-    """Other copies of the lens that an answer leans on: how many, and their weight in it, 0..1."""
-
-    lenses: int
-    weight: float
-
-
 class Support(Model):
     """What an answer rests on."""
 
@@ -91,15 +74,15 @@ class Support(Model):
     predicted_error: float | None
     model: PsfModel = Field(default="default", description="the model of the lens that answered")
     answered_by: str = Field(
-        description="what made the answer: regression, wavefront and regression, wavefront, or paper; the "
+        description="what made the answer: network, regression, network and regression, or paper; the "
         "numbers here are of that"
     )
-    reason: str = Field(description="why that one, in plain words")
-    far_light: float = Field(
+    weights: str = Field(default="", description="fingerprint of the network's weights")
+    nearest: float = Field(
         default=0.0,
-        description="share of the light that lies far from the core, as shadows of the photos allow, 0..1",
+        description="distance to the nearest sample: 1 is a fifth of the half diagonal, a stop, or half an "
+        "octave of focal length",
     )
-    family: FamilyOut | None = None
 
 
 class Units(Model):
@@ -117,7 +100,6 @@ class PsfOut(Model):
     version: int
     query: QueryOut
     psf: KernelOut
-    std: list[list[float]] | None = None
     support: Support
     bandwidth: dict[str, float]
     units: Units
@@ -142,4 +124,3 @@ class FieldQuery(Question):
     gamma: float = Field(0.5, ge=0.1, le=2, allow_inf_nan=False, description="brightness ~ value^gamma")
     focal_length_mm: FocalLength | None = None
     focus_distance_m: FocusDistance | None = None
-    family: bool = Field(default=True, description=FAMILY_HELP)

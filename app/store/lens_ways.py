@@ -11,12 +11,10 @@ from __future__ import annotations
 from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session
 
-from app.store.access.owners import LATE, now
-from app.store.database import insert_new
+from app.store.access.owners import now
 from app.store.patches import recount_patches
 from app.store.photo_steps import WORKED_ON, drop_patches, restart
-from app.store.removal import statistics_of
-from app.store.tables import PHOTO_RUNNING, EventRow, GarbageRow, LensRow, PatchRow, PhotoRow
+from app.store.tables import PHOTO_RUNNING, EventRow, LensRow, PatchRow, PhotoRow
 from app.store.versions import new_version, record_event, recount_samples, take_samples
 
 
@@ -155,6 +153,5 @@ def _take_back(session: Session, photo: PhotoRow, way: str) -> None:
 def forget_before(session: Session, photo: PhotoRow) -> None:
     """Delete the patches and samples of a photo that are not of this epoch."""
     session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id, PatchRow.epoch != photo.epoch))
-    insert_new(session, GarbageRow, [{"prefix": statistics_of(photo), "not_before": now() + LATE}])
     photo.relearning = False
     session.flush()

@@ -8,10 +8,9 @@ from typing import Any, Final, Protocol
 from sqlalchemy import case, delete, select, update
 from sqlalchemy.orm import Session
 
-from app.store.access.owners import LATE, now
-from app.store.database import insert_new
-from app.store.removal import forget_if_empty, statistics_of
-from app.store.tables import PHOTO_RUNNING, GarbageRow, LensRow, PatchRow, PhotoRow
+from app.store.access.owners import now
+from app.store.removal import forget_if_empty
+from app.store.tables import PHOTO_RUNNING, LensRow, PatchRow, PhotoRow
 
 WORKED_ON = ("received", *PHOTO_RUNNING)
 """States that cost computing time; a photo that waits for its owner costs space only."""
@@ -102,7 +101,6 @@ def drop_patches(session: Session, photo: PhotoRow) -> None:
     """Delete the patches of a photo with their samples; earlier epochs stay while they still count."""
     of_photo = [PatchRow.photo_id == photo.id, *([PatchRow.epoch == photo.epoch] if photo.relearning else [])]
     session.execute(delete(PatchRow).where(*of_photo))
-    insert_new(session, GarbageRow, [{"prefix": statistics_of(photo), "not_before": now() + LATE}])
 
 
 def restart(session: Session, photo: PhotoRow) -> None:

@@ -90,16 +90,10 @@ def _unlearn(session: Session, photo: PhotoRow) -> None:
     photo.windows, photo.windows_rejected = None, 0
     session.execute(delete(SampleRow).where(SampleRow.photo_id == photo.id))
     session.execute(delete(PatchRow).where(PatchRow.photo_id == photo.id))
-    insert_new(session, GarbageRow, [{"prefix": statistics_of(photo), "not_before": now() + STILL_WRITTEN}])
-
-
-def statistics_of(photo: PhotoRow) -> str:
-    """Return the prefix under which earlier versions of the program stored statistics of patches."""
-    return f"{photo.blob_key.rpartition('/')[0]}/statistics/"
 
 
 def forget(session: Session, lens: LensRow) -> None:
-    """Empty the row of a lens that no photo belongs to any more; its fitted models become garbage."""
+    """Empty the row of a lens that no photo belongs to any more; its reports become garbage."""
     session.execute(delete(EventRow).where(EventRow.lens_id == lens.id))
     lens.serial = lens.label = None
     lens.serial_source = "none"

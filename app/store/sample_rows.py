@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -14,14 +15,13 @@ from sqlalchemy.orm import InstrumentedAttribute
 from app.schemas import distances
 from app.store.access.owners import now
 from app.store.tables import PatchRow, PhotoRow, SampleRow
-from lensmodel.core.errors import LensModelError
-from lensmodel.core.psf import PsfSample
-from lensmodel.core.spectrum import PatchSpectrum
+from lensmodel.core.errors import LensModelError, NoSamplesError
+from lensmodel.core.psf import EncodedPatch, PsfSample
 from lensmodel.model.sample_codec import entry_of, sample_of
 
 DTYPE: Final = "<f4"
-FORMAT_VERSION: Final = 1
-"""Raised when the layout of a stored kernel changes."""
+FORMAT_VERSION: Final = 2
+"""Raised when samples of before mean nothing to the model any more."""
 
 MAX_ESTIMATOR: Final = 60
 """Characters kept of an estimator's name, which profiles and own estimators choose (chosen: every name of
@@ -35,7 +35,6 @@ _OWN: Final[_Columns] = {
     "size": SampleRow.size,
     "estimator": SampleRow.estimator,
     "error": SampleRow.predicted_error,
-    "darkest": SampleRow.darkest,
 }
 _OF_PHOTO: Final[_Columns] = {"photo": PhotoRow.public_id, "pixel_pitch_um": PhotoRow.pixel_pitch_um}
 _SETTINGS: Final[_Columns] = {
@@ -44,13 +43,20 @@ _SETTINGS: Final[_Columns] = {
     "focal_mm": PhotoRow.focal_mm,
     "focus_m": PhotoRow.focus_m,
 }
-_BESIDE: Final = (SampleRow.crc32, SampleRow.psf, SampleRow.spectrum, PhotoRow.width, PhotoRow.height)
+_BESIDE: Final = (
+    *(SampleRow.crc32, SampleRow.format_version, SampleRow.psf),
+    *(PatchRow.encoded, PhotoRow.width, PhotoRow.height),
+)
 
 COLUMNS: Final = (
     *(column.label(name) for name, column in {**_OWN, **_OF_PHOTO, **_SETTINGS}.items()),
     *_BESIDE,
 )
-"""What `sample_in` reads: of samples joined with their photos."""
+"""What `sample_in` reads: of samples joined with their patches and photos."""
+
+
+class OutdatedSampleError(NoSamplesError):
+    """A sample was made by an estimator of an earlier version of the program."""
 
 
 class CorruptSampleError(LensModelError):
@@ -62,9 +68,11 @@ class CorruptSampleError(LensModelError):
 def columns_of(
     sample: PsfSample, photo: PhotoRow, patch: PatchRow, diagnostics: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return a sample as a row; what its photo knows, its photo's row keeps."""
+    """Return a sample as a row; what its photo knows, its photo's row keeps, and `patch` what it encodes."""
     entry = entry_of(sample)
     entry["estimator"] = entry["estimator"][:MAX_ESTIMATOR] or "profile"
+    if sample.encoded is not None:
+        patch.encoded = sample.encoded.to_bytes()
     blob = np.ascontiguousarray(sample.kernel, dtype=DTYPE).tobytes()
     return {
         "photo_id": photo.id,
@@ -75,7 +83,6 @@ def columns_of(
         "format_version": FORMAT_VERSION,
         "crc32": zlib.crc32(blob),
         "psf": blob,
-        "spectrum": None if sample.spectrum is None else sample.spectrum.to_bytes(),
         "diagnostics": dict(diagnostics),
         "created_at": now(),
     }
@@ -83,6 +90,11 @@ def columns_of(
 
 def sample_in(row: Row[*tuple[Any, ...]]) -> PsfSample:
     """Build the sample of a row of `COLUMNS`."""
+    if row.format_version != FORMAT_VERSION:
+        raise OutdatedSampleError(
+            "the samples of this lens were made by an earlier version of the program: calibrate it again, by "
+            "retrying its photos"
+        )
     if zlib.crc32(row.psf) != row.crc32:
         raise CorruptSampleError(f"sample {row.id} differs from what was written: restore the database")
     settings = {name: getattr(row, name) for name in _SETTINGS}
@@ -92,5 +104,11 @@ def sample_in(row: Row[*tuple[Any, ...]]) -> PsfSample:
     return sample_of(
         {**entry, "settings": settings},
         np.frombuffer(row.psf, dtype=DTYPE).reshape(row.size, row.size),
-        None if row.spectrum is None else PatchSpectrum.from_bytes(row.spectrum),
+        None if row.encoded is None else _encoded(row.encoded),
     )
+
+
+@lru_cache(maxsize=16)
+def _encoded(data: bytes) -> EncodedPatch:
+    """Decode a patch once for its three channels."""
+    return EncodedPatch.from_bytes(data)

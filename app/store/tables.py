@@ -245,6 +245,8 @@ class PatchRow(Base):
     reason: Mapped[str | None] = mapped_column(String(60))
     attempts: Mapped[int] = mapped_column(default=0)
     finished_at: Mapped[datetime | None]
+    encoded: Mapped[bytes | None] = mapped_column(LargeBinary, deferred=True)
+    """What it says without a kernel, for all three channels: `EncodedPatch.to_bytes`."""
 
 
 class SampleRow(Base):
@@ -272,14 +274,11 @@ class SampleRow(Base):
     phi: Mapped[float]
     weight: Mapped[float]
     predicted_error: Mapped[float | None]
-    darkest: Mapped[float | None]  # see `PsfSample`
     size: Mapped[int]
     dtype: Mapped[str] = mapped_column(String(10))
     format_version: Mapped[int]
     crc32: Mapped[int] = mapped_column(BigInteger)
     psf: Mapped[bytes] = mapped_column(LargeBinary, deferred=True)
-    spectrum: Mapped[bytes | None] = mapped_column(LargeBinary)
-    statistics_key: Mapped[str | None]  # a blob of earlier versions of the program, no longer read
     estimator: Mapped[str]
     diagnostics: Mapped[dict[str, Any]]
     created_at: Mapped[datetime]

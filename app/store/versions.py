@@ -13,7 +13,7 @@ from app.store.database import insert_new
 from app.store.tables import EventRow, GarbageRow, LensRow, PatchRow, PhotoRow, SampleRow
 
 STILL_WRITTEN: Final = timedelta(minutes=30)
-"""How long the previous version is kept (chosen): a worker may still be learning from it."""
+"""How long the previous version is kept (chosen): a worker may still be reporting of it."""
 
 
 def new_version(session: Session, lens_id: int, *, rebuild: bool = False) -> int:
@@ -30,34 +30,23 @@ def new_version(session: Session, lens_id: int, *, rebuild: bool = False) -> int
         .values(version=LensRow.version + 1, rebuild_epoch=LensRow.rebuild_epoch + raised)
         .returning(LensRow.version, LensRow.rebuild_epoch, LensRow.public_id)
     ).one()
-    if version > 1:  # before the first there was nothing to learn from
-        outdated = learned_prefix(public_id, version - 1, epoch - raised)
+    if version > 1:  # before the first there was nothing to report
+        outdated = reports_prefix(public_id, version - 1, epoch - raised)
         insert_new(session, GarbageRow, [{"prefix": outdated, "not_before": now() + STILL_WRITTEN}])
     return int(version)
 
 
-LEARNED_ROOT: Final = "models/"
-
-LEARNED_VERSION: Final = 18
-"""That of `lensmodel.model.learned`, which takes seconds to import.
-
-What another version of the program fitted is not looked for, and fitted anew.
-"""
+REPORTS_ROOT: Final = "models/"
 
 
-def learned_prefix(lens_id: str, version: int, epoch: int) -> str:
-    """Return the prefix of the models that workers fit to the samples of one version of a lens."""
-    return f"{LEARNED_ROOT}{lens_id}/{version}-{epoch}/"
-
-
-def learned_key(lens_id: str, version: int, epoch: int) -> str:
-    """Return the key of the fitted models in `learned_prefix`."""
-    return f"{learned_prefix(lens_id, version, epoch)}learned-{LEARNED_VERSION}.npz"
+def reports_prefix(lens_id: str, version: int, epoch: int) -> str:
+    """Return the prefix of what workers make of the samples of one version of a lens."""
+    return f"{REPORTS_ROOT}{lens_id}/{version}-{epoch}/"
 
 
 def report_key(lens_id: str, version: int, epoch: int) -> str:
-    """Return the key of the report of that version, in `learned_prefix`."""
-    return f"{learned_prefix(lens_id, version, epoch)}report.json"
+    """Return the key of the report of that version."""
+    return f"{reports_prefix(lens_id, version, epoch)}report.json"
 
 
 def take_samples(session: Session, photo: PhotoRow, version: int) -> int:

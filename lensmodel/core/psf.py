@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Final, Literal, Protocol, TypeAlias, get_args
 
 import numpy as np
 import numpy.typing as npt
 import scipy  # its parts are loaded when they are needed: processes that compute nothing do not wait
 
 from lensmodel.core.errors import InvalidInputError, InvalidKernelError
-from lensmodel.core.spectrum import PatchSpectrum
 from lensmodel.core.types import Channel, FieldPosition, Kernel, LensSettings
 
 WING_LEVEL = 0.01
 """Moments count values above this share of the peak: the width of faint wings is not the width."""
+
+PatchKind: TypeAlias = Literal["raw", "tiff", "jpeg"]
+"""How the pixels of a patch were made: by the sensor alone, by a raw converter, by a camera."""
 
 _CENTRED_PX = 1e-3  # pixels: a thousandth moves no figure that is reported
 
@@ -210,6 +212,67 @@ def _centred_fft(kernel: npt.NDArray[np.float64], n: int) -> npt.NDArray[np.comp
     return scipy.fft.fft2(np.roll(grid, (-half, -half), axis=(0, 1)))
 
 
+TOKEN_LENGTH: Final = 192
+"""Numbers of the token of a patch."""
+
+KINDS: Final[tuple[PatchKind, ...]] = get_args(PatchKind)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EncodedPatch:
+    """What a patch of a photo says of the lens without a kernel: the input of attention over many patches.
+
+    Parameters
+    ----------
+    statistics : ndarray of float16, shape (n,)
+        Statistics of its pixels (`lensmodel.neural.statistics`), turned into the octant of its place.
+    token : ndarray of float16, shape (192,)
+        What the network made of them beside the other patches of the photo.
+    kind : {"raw", "tiff", "jpeg"}
+        Kind of file, which tells how its pixels were made.
+
+    Raises
+    ------
+    InvalidInputError
+        If a number is not finite, the token has another length, or there is no such kind.
+    """
+
+    statistics: npt.NDArray[np.float16]
+    token: npt.NDArray[np.float16]
+    kind: PatchKind = "raw"
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise InvalidInputError(f"kind must be one of {', '.join(KINDS)}, got {self.kind!r}")
+        for name, values in (("statistics", self.statistics), ("token", self.token)):
+            own = np.array(values, dtype=np.float16)
+            if own.ndim != 1 or not np.isfinite(own).all():
+                raise InvalidInputError(f"the {name} of a patch must be a row of finite numbers")
+            own.setflags(write=False)
+            object.__setattr__(self, name, own)
+        if self.token.size != TOKEN_LENGTH:
+            raise InvalidInputError(f"a token has {TOKEN_LENGTH} numbers, got {self.token.size}")
+
+    def to_bytes(self) -> bytes:
+        """Serialise: number of the kind, then token and statistics as little-endian float16."""
+        numbers = np.concatenate([self.token, self.statistics]).astype("<f2")
+        return bytes([KINDS.index(self.kind)]) + numbers.tobytes()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> EncodedPatch:
+        """Read what `to_bytes` wrote.
+
+        Raises
+        ------
+        InvalidInputError
+            For anything else.
+        """
+        if len(data) % 2 == 0 or len(data) <= 2 * TOKEN_LENGTH or data[0] >= len(KINDS):
+            raise InvalidInputError(f"an encoded patch was not written by this program ({len(data)} bytes)")
+        numbers = np.frombuffer(data, dtype="<f2", offset=1)
+        return cls(numbers[TOKEN_LENGTH:], numbers[:TOKEN_LENGTH], KINDS[data[0]])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PsfSample:
     """One local PSF estimate: what was seen, where, at which settings, how sure.
@@ -233,15 +296,13 @@ class PsfSample:
         Size of a sensor pixel in micrometres; None where unknown.
     estimator : str
         Name and version of the method that made it.
-    spectrum : PatchSpectrum or None
-        What the patch says without a kernel, so that all patches of a lens can be solved together.
+    encoded : EncodedPatch or None
+        What the patch says without a kernel, the same for its three channels; None of samples that were
+        measured, or made by an estimator that knows kernels alone.
     error : float or None
         Relative L2 distance to the truth that the method expects of it; None where it says nothing.
     half_diagonal_px : float or None
         Half the diagonal of the frame in pixels; None where unknown.
-    darkest : float or None
-        Light of the darkest places around the patch over that near them: what the share of light that the
-        lens throws far cannot exceed (`lensmodel.model.far_light`); None where unknown.
 
     Raises
     ------
@@ -262,10 +323,9 @@ class PsfSample:
     photo: str = ""
     pixel_pitch_um: float | None = None
     estimator: str = ""
-    spectrum: PatchSpectrum | None = None
+    encoded: EncodedPatch | None = None
     error: float | None = None
     half_diagonal_px: float | None = None
-    darkest: float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kernel", as_kernel(self.kernel))
@@ -279,8 +339,6 @@ class PsfSample:
                 raise InvalidInputError(f"the {name} must be positive {unit}, got {size}")
         if self.error is not None and not (math.isfinite(self.error) and self.error >= 0.0):
             raise InvalidInputError(f"the expected error must be finite and not negative, got {self.error}")
-        if self.darkest is not None and not (math.isfinite(self.darkest) and self.darkest >= 0.0):
-            raise InvalidInputError(f"the darkest share must be finite and not negative, got {self.darkest}")
 
     def with_weight(self, weight: float) -> PsfSample:
         """Return the same sample with another vote.

@@ -75,6 +75,11 @@ class FieldPosition:
         wrapped = math.pi - (math.pi - self.phi) % (2.0 * math.pi)
         object.__setattr__(self, "phi", wrapped)
 
+    @property
+    def xy(self) -> tuple[float, float]:
+        """The place as half diagonals to the right and up."""
+        return self.r * math.cos(self.phi), self.r * math.sin(self.phi)
+
 
 @dataclass(frozen=True, slots=True)
 class LensSettings:

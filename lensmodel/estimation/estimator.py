@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
-from lensmodel.core.psf import second_moments
+from lensmodel.core.psf import PsfSample, second_moments
 from lensmodel.core.spectrum import repeats
-from lensmodel.core.types import Kernel, NoiseModel, Plane, StepHook, ignore_step
+from lensmodel.core.types import Kernel, LensSettings, NoiseModel, Plane, StepHook, ignore_step
+from lensmodel.estimation.patches.selector import Patch, Selection
+from lensmodel.photo.values import LinearPhoto
 
 NO_BLUR_PX2 = 0.3
 """Below this mean second moment the pixel and the scene's own softness hide a kernel (chosen: a pixel alone
@@ -57,20 +59,20 @@ class PsfEstimate:
 class PsfEstimator(Protocol):
     """A blind estimator: patches of one field position in, one kernel out [1]_.
 
-    Attributes
-    ----------
-    name : str
-        As in the registry; stored with each sample.
-    version : int
-        Grows when results change.
+    Name and version are stored with each sample.
 
     References
     ----------
     .. [1] M. Hirsch, B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, section 5.
     """
 
-    name: str
-    version: int
+    @property
+    def name(self) -> str:
+        """As in the registry."""
+
+    @property
+    def version(self) -> int | str:
+        """Grows, or changes, when results change."""
 
     def estimate(
         self,
@@ -146,6 +148,26 @@ class PsfEstimator(Protocol):
         InvalidInputError
             For values that no photo has.
         """
+
+
+@runtime_checkable
+class PhotoEstimator(Protocol):
+    """An estimator that chooses windows of a whole photo and learns from each beside the others."""
+
+    def select(self, developed: LinearPhoto, *, count: int) -> Selection:
+        """Choose at most `count` windows."""
+
+    def samples(
+        self,
+        developed: LinearPhoto,
+        patches: Sequence[Patch],
+        *,
+        settings: LensSettings,
+        photo: str,
+        size: int,
+        on_step: StepHook = ignore_step,
+    ) -> list[PsfSample]:
+        """Return the samples of the windows, three of each in the order of `CHANNELS`."""
 
 
 LARGEST: Final = 55

@@ -1,219 +1,114 @@
-"""The PSF of one lens as a continuous function of place and settings.
-
-Nadaraya-Watson regression in rotated local frames (paper, section 6.2, eq. 4-8). The weight of a
-sample factorises into one of place and settings, common to all its pixels, and one of (u, v). So
-the sum over all pixels of all samples is one of kernels::
-
-    f(u, v) = sum_i W_i C_i(u, v) / sum_i W_i
-
-with C_i the sample's kernel in its own radial frame. Departures from the paper: n in eq. (8) counts
-PSFs, not pixels; the smoothing over (u, v) is that of the spline, because a bandwidth of pixels
-would widen the PSF; kernels are scaled to the width of the place before averaging (`transport`).
-"""
+"""The PSF of one lens as a continuous function of place and settings."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import math
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lensmodel.core.errors import InvalidInputError, NoSamplesError
 from lensmodel.core.geometry import zone_of
-from lensmodel.core.psf import PsfField, PsfSample
-from lensmodel.core.types import ZONES, FieldPosition, Kernel, LensSettings, StepHook, Zone, ignore_step
-from lensmodel.model import learned as memory
+from lensmodel.core.psf import PsfSample, as_kernel
+from lensmodel.core.types import CHANNELS, ZONES, Channel, FieldPosition, Kernel, LensSettings, Zone
 from lensmodel.model import pitch as pitches
-from lensmodel.model import variables as va
-from lensmodel.model.answer import MICROMETRE, WAVEFRONT, ModelSettings, PsfAnswer
-from lensmodel.model.answering import AnsweringModel, ModelField
+from lensmodel.model import support
+from lensmodel.model.answer import PAPER, AnsweredBy, ModelSettings, PsfAnswer
 from lensmodel.model.field.robust import Flag
-from lensmodel.model.fitting import GROWTH, INCREMENT, Fit
-from lensmodel.model.predictor import Predictor
-from lensmodel.model.prior import Prior
-from lensmodel.model.provenance import provenance
-from lensmodel.model.trust.expected_error import forecast
-from lensmodel.model.trust.misleading_photos import without_misleading
-from lensmodel.model.trust.support import standard_error
-from lensmodel.model.wavefront.physical_mean import Physics
+from lensmodel.model.learned_field import LearnedField
+from lensmodel.model.regression import Regression
+
+_LEAST_ERROR: Final = 0.01
+"""Relative L2 error below which no part of an answer is believed (chosen: of an answer of several parts one
+would silence the others)."""
+
+_LISTED: Final = 1e-3
+"""Share of the weight from which on a photo is counted: less shows in no digit (chosen)."""
+
+_ZONE_RADII: Final[dict[Zone, tuple[float, ...]]] = {
+    "center": (0.1, 0.25),
+    "mid": (0.4, 0.6),
+    "corner": (0.8, 0.95),
+}
+_ZONE_ANGLES: Final = np.arange(4) * np.pi / 2.0 + 0.6  # towards the corners of most pictures
 
 
 class LensModel:
-    """PSF samples of one lens as a continuous function: a value, which `added` and the like keep.
+    """PSF samples of one lens as a continuous function: a value, which `added` keeps.
 
-    Made by `fit` or `restored`, which say what samples, settings and prior are; `fit` is what was learned.
+    Encoded patches of photos are attended to by the network (`learned_field`); kernels that were measured,
+    or estimated otherwise, are averaged by the regression of the paper (`regression`). Where there are both,
+    each part counts with the inverse of its squared expected error::
+
+        K = (K_a / e_a^2 + K_b / e_b^2) / (1 / e_a^2 + 1 / e_b^2),    1 / e^2 = 1 / e_a^2 + 1 / e_b^2
+
+    In the mode "paper" all kernels are averaged by the regression and nothing else is done.
     """
 
     def __init__(
         self,
         samples: tuple[PsfSample, ...],
         settings: ModelSettings,
-        fit: Fit,
-        *,
-        prior: Prior | None = None,
+        attention: LearnedField | None,
+        regression: Regression | None,
     ) -> None:
         self.samples = samples
         self.settings = settings
-        self.prior = prior
-        self._fit = fit
-        self._predictor = Predictor(fit, settings.regression.method, prior)
+        self._attention, self._regression = attention, regression
 
     # --- building -------------------------------------------------------------------------------
 
     @classmethod
-    def fit(
-        cls,
-        samples: Sequence[PsfSample],
-        settings: ModelSettings | None = None,
-        *,
-        prior: Prior | None = None,
-    ) -> LensModel:
+    def fit(cls, samples: Sequence[PsfSample], settings: ModelSettings | None = None) -> LensModel:
         """Build a model from samples.
 
         Parameters
         ----------
         samples : sequence of PsfSample
+            One that is there already, of the same photo and place, is not counted again.
         settings : ModelSettings, optional
-        prior : Prior, optional
-            What answers lean on where there are few samples.
 
         Raises
         ------
         NoSamplesError
-            If there are none, or none may vote.
-        UnknownMethodError
-            If `settings.method` is in no registry.
+            If there are none, or all photos are excluded.
         """
-        settings, kept = settings or ModelSettings(), tuple(samples)
-        return cls(kept, settings, Fit.of(kept, settings), prior=prior)
+        settings, kept = settings or ModelSettings(), _distinct((), samples)
+        if not kept:
+            raise NoSamplesError("the lens has no PSF samples yet; calibrate it with a photo first")
+        encoded, kernels = _parted(kept, settings)
+        if not (encoded or kernels):
+            raise NoSamplesError(f"all photos of the {len(kept)} samples are excluded; include one again")
+        return cls(
+            kept,
+            settings,
+            LearnedField.of(encoded) if encoded else None,
+            Regression.of(kernels, settings) if kernels else None,
+        )
 
     def added(self, samples: Sequence[PsfSample]) -> LensModel:
-        """Return the model with more samples.
+        """Return the model with more samples, those of other photos untouched.
 
-        A handful is put in place without touching the others, until the model has grown by a twentieth; then
-        all is fitted anew, and wants to be `warmed` again: that begins where this fit ended, too.
+        A regression is fitted anew when it has grown by a twentieth.
         """
-        return self._with(samples, INCREMENT)
-
-    def grown(self, samples: Sequence[PsfSample]) -> LensModel:
-        """Return the model with more samples in place, for answers until it has been fitted anew elsewhere.
-
-        As `added`, but up to twice the samples that it was fitted to: from the second photo on only the trees
-        and the store of kernels grow.
-        """
-        return self._with(samples, GROWTH)
-
-    def _with(self, samples: Sequence[PsfSample], increment: float) -> LensModel:
-        new = tuple(samples)
+        new = _distinct(self.samples, samples)
         if not new:
             return self
-        if not self._fit.takes(new, increment):
-            every = (*self.samples, *new)
-            fit = Fit.of(every, self.settings).begun_with(self._fit)
-            return LensModel(every, self.settings, fit, prior=self.prior)
-        fit = self._fit.extended(new, self.settings)
-        return LensModel((*self.samples, *new), self.settings, fit, prior=self.prior)
-
-    def refitted(self, samples: Sequence[PsfSample]) -> LensModel:
-        """Return a model of other samples with the settings and prior of this one."""
-        return LensModel.fit(samples, self.settings, prior=self.prior)
-
-    @classmethod
-    def restored(
-        cls,
-        samples: Sequence[PsfSample],
-        learned: bytes,
-        settings: ModelSettings | None = None,
-        *,
-        prior: Prior | None = None,
-    ) -> LensModel:
-        """Build the model that `learned` was taken from, without fitting anything.
-
-        Raises
-        ------
-        InvalidInputError
-            If `learned` is damaged, or belongs to other samples, settings or another version.
-        """
-        settings, kept = settings or ModelSettings(), tuple(samples)
-        return cls(kept, settings, memory.load(learned, kept, settings), prior=prior)
-
-    def begun_with(self, learned: bytes) -> LensModel:
-        """Return the model whose fit begins where `learned` of fewer samples ended, besides all other places.
-
-        Bytes that are damaged or of another version are no beginning.
-        """
-        fit = replace(self._fit, former=memory.fronts(learned))
-        return LensModel(self.samples, self.settings, fit, prior=self.prior)
-
-    def learned(self) -> bytes:
-        """What was learned from the samples, the wavefront included if `warm`; see `restored`."""
-        return memory.dump(self._fit, self.samples, self.settings)
-
-    @property
-    def warm(self) -> bool:
-        """Whether nothing is left for `warmed` to do."""
-        if self.prior is not None and not self.prior.warm:
-            return False
-        return self._fit.physical is not None or not self._wants_wavefront
-
-    @property
-    def _wants_wavefront(self) -> bool:
-        """Whether answers need a wavefront, or patches can judge it as a second opinion."""
-        if self.settings.mode == WAVEFRONT:
-            return True
-        return self._predictor.smoother.physical and any(s.spectrum is not None for s in self.samples)
-
-    def warmed(self, on_step: StepHook = ignore_step) -> LensModel:
-        """Return the model with the wavefront fitted to its samples, if its method or mode has one.
-
-        That takes seconds of CPU, and the answers are good without it: call it once when the samples are
-        complete. The same samples give the same model, if none of them was fitted before. A correction hears
-        the wavefront as a second opinion (`witness`). Photos that make the patches of the others less likely
-        lose their votes here (`misleading`).
-        """
-        if self.warm:
-            return self
-        prior = None if self.prior is None else self.prior.warmed()
-        judged = without_misleading(self._fit, self.samples, self.settings)
-        fit = judged.warmed(self.samples, on_step)
-        return LensModel(self.samples, self.settings, fit, prior=prior)
-
-    def answering(self, *, mode: str | None = None, unit: str | None = None) -> LensModel:
-        """Return the model of the same samples in another mode or unit; None keeps what it has."""
-        chosen = replace(self.settings, mode=mode or self.settings.mode, unit=unit or self.settings.unit)
-        return self if chosen == self.settings else LensModel.fit(self.samples, chosen, prior=self.prior)
-
-    def opinion(self, mode: str) -> LensModel | None:
-        """Return the model of the same fit that answers in another mode; None without a wavefront for it."""
-        if mode == WAVEFRONT and self._fit.physical is None:
-            return None
-        return LensModel(self.samples, self.settings, replace(self._fit, mode=mode), prior=self.prior)
-
-    def hearing(self, patches: Sequence[PsfSample]) -> LensModel:
-        """Return the model that also heeds how dark a photo gets, which is to be corrected: `Fit.heard`."""
-        fit = replace(self._fit, heard=tuple(patches))
-        return LensModel(self.samples, self.settings, fit, prior=self.prior)
-
-    def with_prior(
-        self, source: PsfField | AnsweringModel | None, strength: float = 2.0, name: str = "other copies"
-    ) -> LensModel:
-        """Return the model that leans on a prior where it has seen little; None switches it off.
-
-        Parameters
-        ----------
-        source : LensModel or PsfField
-            Usually the model of other copies of the lens. A prior that it has itself does not count.
-        strength : float
-            Number of samples that the prior is worth.
-        name : str
-            What answers call it.
-        """
-        prior = None if source is None else Prior(source, strength, name)
-        return LensModel(self.samples, self.settings, self._fit, prior=prior)
-
-    def without_prior(self) -> LensModel:
-        """Return the model that leans on nothing but its own samples."""
-        return self if self.prior is None else self.with_prior(None)
+        every = (*self.samples, *new)
+        encoded, kernels = _parted(new, self.settings)
+        attention, regression = self._attention, self._regression
+        if encoded:
+            attention = LearnedField.of(encoded) if attention is None else attention.added(encoded)
+        if kernels:
+            if regression is not None and regression.takes(kernels):
+                regression = regression.extended(kernels)
+            else:
+                regression = Regression.of(_parted(every, self.settings)[1], self.settings)
+        return LensModel(every, self.settings, attention, regression)
 
     # --- asking ---------------------------------------------------------------------------------
 
@@ -224,9 +119,8 @@ class LensModel:
         size: int = 55,
         *,
         pitch_um: float | None = None,
-        half_diagonal_px: float | None = None,
     ) -> PsfAnswer:
-        """Return the PSF at a place, with the evidence behind it.
+        """Return the PSF at a place, with what stands behind it.
 
         Parameters
         ----------
@@ -237,42 +131,66 @@ class LensModel:
             Odd side in pixels.
         pitch_um : float, optional
             Size of a pixel of the body that asks, in micrometres; that of the samples if unknown.
-        half_diagonal_px : float, optional
-            Half the diagonal of its frame in pixels, which counts where the unit is the half-diagonal.
+
+        Raises
+        ------
+        InvalidInputError
+            If the size is even or not positive, or the pitch is not positive.
         """
-        pixel = self._predictor.pixels.asked(pitch_um, half_diagonal_px)
-        inside = self._predictor.pixels.inner_size(size, pixel)
-        answers, mixture, prior_shares = self._predictor.ask([position], settings, inside)
-        fit = self._fit
-        share, wavefront_share = float(prior_shares[0]), float(mixture.shares[0])
-        prior = None if self.prior is None else (self.prior, share)
-        expected = forecast(fit, answers, mixture, position, settings, prior)
-        takes = self._predictor.smoother.physical
-        made = provenance(fit, answers, wavefront_share, settings, takes_wavefront=takes)
-
-        def scatter() -> NDArray[np.float64]:
-            widths = np.array(fit.widths.at(position, settings))
-            apart = fit.local.apart(answers.rows, position.phi, widths, inside)
-            return standard_error(self._predictor.pixels.resampled(apart, size, pixel), answers.shares)
-
+        pitch_um = self._asked(size, pitch_um)
+        parts = self._parts(position, settings, size, pitch_um)
+        precision = np.array([part.error**-2 for part in parts])
+        shares = precision / precision.sum()
+        kernel = parts[0].kernel
+        if len(parts) > 1:
+            kernel = as_kernel(sum(share * part.kernel for share, part in zip(shares, parts, strict=True)))
+        weights = np.concatenate([s * part.weights for s, part in zip(shares, parts, strict=True)])
+        photos = np.concatenate([part.photos for part in parts])
+        names, number = np.unique(photos.astype(str), return_inverse=True)
+        nearest = min(parts, key=lambda part: part.support.nearest).support
+        beyond = set.intersection(*(set(part.support.beyond) for part in parts))
         return PsfAnswer(
-            kernel=self._predictor.pixels.resampled(mixture.kernels, size, pixel)[0],
-            effective_samples=made.effective_samples,
-            photos=made.photos,
-            extrapolated=bool(expected.beyond),
-            predicted_error=min(expected.error, 1.0),
-            bandwidth=dict(fit.bandwidth),
-            shared_error=expected.shared,
-            beyond=expected.beyond,
-            nearest=expected.nearest,
-            prior="" if self.prior is None else self.prior.name,
-            prior_share=share,
-            wavefront_share=wavefront_share,
-            far_light=float(mixture.far_light[0]),
-            answered_by=made.answered_by,
-            reason=made.reason,
-            scatter=scatter,
+            kernel=kernel,
+            predicted_error=min(float(precision.sum() ** -0.5), 1.0),
+            effective_samples=1.0 / float(weights @ weights),
+            photos=int(np.count_nonzero(np.bincount(number, weights, len(names)) > _LISTED)),
+            nearest=nearest.nearest,
+            beyond=tuple(name for name in support.VARIABLES if name in beyond),
+            answered_by=self._answered_by,
+            weights=self.weights,
+            ring_error=parts[0].ring_error,
         )
+
+    def _parts(
+        self, position: FieldPosition, settings: LensSettings, size: int, pitch_um: float | None
+    ) -> list[_Part]:
+        parts = []
+        if self._attention is not None:
+            found = self._attention.ask(position, settings.with_channel("g"), pitch_um)
+            parts.append(
+                _Part(
+                    found.kernel(settings.channel, size, pitch_um),
+                    max(found.error(settings.channel), _LEAST_ERROR),
+                    np.asarray(found.answer.weights, dtype=np.float64),
+                    self._attention.patches.photos[found.rows],
+                    found.support,
+                    np.asarray(found.answer.ring_error[CHANNELS.index(settings.channel)], dtype=np.float64),
+                )
+            )
+        if self._regression is not None:
+            regression = self._regression
+            near = regression.near([position], settings)
+            around = support.support(regression.where[near.rows], support.point(position, settings))
+            parts.append(
+                _Part(
+                    regression.kernels(near, [position], settings, size, pitch_um)[0],
+                    max(regression.error(near, around), _LEAST_ERROR),
+                    near.shares,
+                    regression.photos[near.rows],
+                    around,
+                )
+            )
+        return parts
 
     def kernels(
         self,
@@ -281,100 +199,167 @@ class LensModel:
         size: int = 55,
         *,
         pitch_um: float | None = None,
-        half_diagonal_px: float | None = None,
     ) -> NDArray[np.float64]:
         """Return the PSFs of many places at one setting, float64 of shape (n, size, size).
 
-        The same numbers as of `query`, whose parameters it takes, several times faster: for grids and maps.
+        The same numbers as of `query`, whose parameters it takes; a regression alone is several times faster.
         """
+        pitch_um = self._asked(size, pitch_um)
         if not positions:
             return np.empty((0, size, size))
-        pixel = self._predictor.pixels.asked(pitch_um, half_diagonal_px)
-        inside = self._predictor.pixels.inner_size(size, pixel)
-        _, mixture, _ = self._predictor.ask(positions, settings, inside)
-        return self._predictor.pixels.resampled(mixture.kernels, size, pixel)
+        if self._attention is None and self._regression is not None:
+            near = self._regression.near(positions, settings)
+            return self._regression.kernels(near, positions, settings, size, pitch_um)
+        return np.stack([self.query(place, settings, size, pitch_um=pitch_um).kernel for place in positions])
 
     def kernel_of(self, sample: PsfSample) -> Kernel:
         """Return the PSF at the place and settings of a sample, in its pixels and of its size."""
-        pixels = {"pitch_um": sample.pixel_pitch_um, "half_diagonal_px": sample.half_diagonal_px}
-        size = sample.kernel.shape[0]
-        return np.asarray(self.kernels([sample.position], sample.settings, size, **pixels)[0])
+        size, pitch_um = sample.kernel.shape[0], sample.pixel_pitch_um
+        return np.asarray(self.kernels([sample.position], sample.settings, size, pitch_um=pitch_um)[0])
 
-    def weights(
-        self, position: FieldPosition, settings: LensSettings
-    ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
-        """Weights of sum 1 that a question gives to samples.
-
-        Returns
-        -------
-        rows : ndarray of int, shape (m,)
-            Samples that take part.
-        gaps : ndarray, shape (m, 7)
-            Their distances in bandwidths, by variable.
-        weights : ndarray, shape (m,)
-            Those that hardly weigh anything are left out.
-        """
-        near = self._predictor.near([position], settings)
-        asked, scale = va.point(position, settings), va.scales(self._fit.bandwidth)
-        return near.rows, va.gaps(self._fit.index.points[near.rows], asked, scale), near.weights
-
-    def field(
-        self, settings: LensSettings, *, pitch_um: float | None = None, half_diagonal_px: float | None = None
-    ) -> ModelField:
+    def field(self, settings: LensSettings, *, pitch_um: float | None = None) -> ModelField:
         """Return the PSF of every place and channel at these settings, for pixels of some size."""
-        return ModelField(self, settings, pitch_um, half_diagonal_px)
+        return ModelField(self, settings, pitch_um)
+
+    def _asked(self, size: int, pitch_um: float | None) -> float | None:
+        """The pitch of an answer, after refusing questions that have none."""
+        if size < 1 or size % 2 == 0:
+            raise InvalidInputError(f"size must be odd and positive, got {size}")
+        if pitch_um is not None and not (math.isfinite(pitch_um) and pitch_um > 0):
+            raise InvalidInputError(f"the pixel pitch must be positive micrometres, got {pitch_um}")
+        return self.pitch_um if pitch_um is None else pitch_um
 
     # --- what it is made of ---------------------------------------------------------------------
 
     @property
-    def bandwidth(self) -> dict[str, float]:
-        """Bandwidths in use, by variable."""
-        return self._fit.bandwidth
+    def mode(self) -> str:
+        """Which of `answer.MODES` answers."""
+        return self.settings.mode
 
     @property
+    def weights(self) -> str:
+        """Fingerprint of the weights of the network; empty where none takes part."""
+        return "" if self._attention is None else self._attention.network.name
+
+    @property
+    def _answered_by(self) -> AnsweredBy:
+        if self.mode == PAPER:
+            return "paper"
+        if self._regression is None:
+            return "network"
+        return "regression" if self._attention is None else "network and regression"
+
+    @cached_property
     def pitch_um(self) -> float | None:
         """Pixel pitch that answers are for unless another is asked for; None where no sample knows."""
-        fit = self._fit
-        return fit.pixel if fit.unit == MICROMETRE else pitches.usual_pixel(self.samples, MICROMETRE)
+        return pitches.usual_pitch(self.samples)
 
     @property
-    def mode(self) -> str:
-        """Which of `MODES` answers."""
-        return self._fit.mode
-
-    @property
-    def physical(self) -> Physics | None:
-        """The wavefront that was fitted to the samples; None before `warmed`, or if it takes no part."""
-        return self._fit.physical
-
-    @property
-    def votes(self) -> NDArray[np.float64]:
-        """Votes of the samples after robust weighting, shape (n,); 0 of photos that are excluded."""
-        return self._fit.validation.votes
+    def bandwidth(self) -> dict[str, float]:
+        """Bandwidths of the regression in use, by variable; empty without one."""
+        return {} if self._regression is None else self._regression.bandwidth
 
     def flags(self) -> tuple[Flag, ...]:
-        """Photos and samples that count less than they claim, with reasons."""
-        return self._fit.validation.flags
+        """Photos and samples of the regression that count less than they claim, with reasons."""
+        return () if self._regression is None else self._regression.validation.flags
 
     def coverage(self) -> dict[Zone, int]:
         """Number of green samples in each zone."""
         zones = [zone_of(s.position.r) for s in self.samples if s.settings.channel == "g"]
         return {zone: zones.count(zone) for zone in ZONES}
 
-    def cross_validate(self) -> dict[Zone, float]:
-        """Median relative L2 of green samples against a model of the other photos, by zone.
-
-        Empty with fewer than two photos.
-        """
-        if len(self._fit.roster.numbers) < 2:
-            return {}
-        errors: dict[Zone, list[float]] = {zone: [] for zone in ZONES}
-        for sample, error in zip(self.samples, self._fit.validation.errors, strict=True):
-            if sample.settings.channel == "g" and sample.photo not in self.settings.excluded:
-                errors[zone_of(sample.position.r)].append(float(error))
-        return {zone: float(np.median(values)) for zone, values in errors.items() if values}
+    def expected_errors(self) -> dict[Zone, float]:
+        """Mean error that green answers expect of themselves in each zone, at the commonest settings."""
+        kinds = [s.settings.with_channel("g") for s in self.samples if s.photo not in self.settings.excluded]
+        settings = max(dict.fromkeys(kinds), key=kinds.count)
+        return {
+            zone: float(
+                np.mean(
+                    [
+                        self.query(FieldPosition(r, float(phi)), settings, 15).predicted_error
+                        for r in radii
+                        for phi in _ZONE_ANGLES
+                    ]
+                )
+            )
+            for zone, radii in _ZONE_RADII.items()
+        }
 
     @property
     def nbytes(self) -> int:
-        """Bytes of stored kernels, those of the samples included."""
-        return self._fit.nbytes + sum(s.kernel.nbytes for s in self.samples)
+        """Bytes kept, the kernels of the samples included."""
+        parts = (part.nbytes for part in (self._attention, self._regression) if part is not None)
+        return sum(parts) + sum(s.kernel.nbytes for s in self.samples)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelField:
+    """The PSF field of a model at one setting, and the error that it expects: what a correction needs."""
+
+    model: LensModel
+    settings: LensSettings
+    pitch_um: float | None = None
+
+    def kernel_at(self, position: FieldPosition, channel: Channel, size: int) -> Kernel:
+        """Return the kernel of odd side `size` at a field position, in the image frame."""
+        return np.asarray(self.kernels_at([position], channel, size)[0])
+
+    def kernels_at(
+        self, positions: Sequence[FieldPosition], channel: Channel, size: int
+    ) -> NDArray[np.float64]:
+        """Return the kernels of many places, shape (n, size, size)."""
+        return self.model.kernels(
+            positions, self.settings.with_channel(channel), size, pitch_um=self.pitch_um
+        )
+
+    def error_at(self, position: FieldPosition, channel: Channel) -> float:
+        """Return the relative L2 error that is expected of the kernel at a field position."""
+        settings = self.settings.with_channel(channel)
+        return self.model.query(position, settings, pitch_um=self.pitch_um).predicted_error
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Part:
+    """What one way of answering says."""
+
+    kernel: Kernel
+    error: float
+    weights: NDArray[np.float64]
+    photos: NDArray[np.object_]
+    support: support.Support
+    ring_error: NDArray[np.float64] | None = None
+
+
+def _parted(samples: Sequence[PsfSample], settings: ModelSettings) -> tuple[list[PsfSample], list[PsfSample]]:
+    """One sample of each encoded patch, and those whose kernels are averaged; no excluded photos."""
+    counted = [s for s in samples if s.photo not in settings.excluded]
+    if settings.mode == PAPER:
+        return [], counted
+    encoded: dict[Hashable, PsfSample] = {}
+    for sample in counted:
+        if sample.encoded is not None:
+            encoded.setdefault(_place_of(sample), sample)
+    return list(encoded.values()), [s for s in counted if s.encoded is None]
+
+
+def _place_of(sample: PsfSample) -> Hashable:
+    return sample.photo, sample.position, sample.settings.with_channel("g")
+
+
+def _distinct(known: Sequence[PsfSample], samples: Sequence[PsfSample]) -> tuple[PsfSample, ...]:
+    """Samples that are new: no encoded ones of a known photo, none of one place and estimator twice."""
+    photos = {s.photo for s in known if s.encoded is not None}
+    seen = {_key_of(s) for s in known}
+    new = []
+    for sample in samples:
+        key = _key_of(sample)
+        repeated = key in seen or (sample.encoded is not None and sample.photo in photos)
+        if not sample.photo or not repeated:
+            new.append(sample)
+        seen.add(key)
+    return tuple(new)
+
+
+def _key_of(sample: PsfSample) -> Hashable:
+    estimator = "" if sample.encoded is not None else sample.estimator
+    return _place_of(sample), sample.settings.channel, estimator

@@ -1,15 +1,12 @@
 """The portable lens profile: a zip of JSON and npy that opens anywhere and gives the same PSFs.
 
-Layout of a `.lensprofile`, format 1::
+Layout of a `.lensprofile`, format 2::
 
-    profile.json    format, lens, cameras, provenance, settings of the model, one entry for each sample
+    profile.json    format, lens, cameras, settings of the model, one entry for each sample
     kernels.npy     (n, k, k) float32, sum 1, centred, in the order of the entries
-    spectra.npy     optional: what each patch says without a kernel, see `PatchSpectrum`
-    phases.npy      optional: phase of red and blue against green, a part of that, see `CrossPhase`
-    learned.npz     optional: what the model has learned from them, see `learned`
-    family.lensprofile  optional: the profile of other copies that the model leans on, without one of its own
+    encoded.npy     (m, bytes) uint8: what patches say without a kernel, see `EncodedPatch`
 
-Other files, as the `evidence/` of earlier versions, are passed over. Nothing in it can run code: no pickle,
+The model is built from them when the file is opened. Nothing in it can run code: no pickle,
 sizes bounded before arrays are made.
 """
 
@@ -17,7 +14,6 @@ from __future__ import annotations
 
 import io
 import json
-import logging
 import zipfile
 import zlib
 from dataclasses import asdict, dataclass, field
@@ -29,22 +25,16 @@ from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.files import atomic
-from lensmodel.core.psf import PsfSample
-from lensmodel.model.answer import FORMER_MODES, ModelSettings
-from lensmodel.model.field.smoothers import FORMER_METHODS
+from lensmodel.model.answer import ModelSettings
 from lensmodel.model.lens_model import LensModel
 from lensmodel.model.sample_codec import PackedSamples, pack_samples, unpack_samples
 
-FORMAT = 1  # raised when older programs could not read a profile any more
+FORMAT = 2  # raised when samples of before mean nothing to the model any more
 _MAX_BYTES = 1 << 30  # unpacked: against files made to fill the memory
-_MAX_SAMPLES = 200_000  # some 2,700 photos of 24 patches in three colours (chosen: memory)
+_MAX_SAMPLES = 200_000  # some 700 photos of 96 patches in three colours (chosen: memory)
 _MAX_SIDE = 255  # pixels: several times the widest kernels; larger files would fill the memory (chosen)
-_LEARNED = "learned.npz"
-_SPECTRA = "spectra.npy"
-_PHASES = "phases.npy"  # beside the spectra: older programs read those and pass over this
-_FAMILY = "family.lensprofile"
+_ENCODED = "encoded.npy"
 
-log = logging.getLogger(__name__)
 _UNREADABLE = (
     OSError,
     ValueError,
@@ -55,6 +45,7 @@ _UNREADABLE = (
     RuntimeError,  # encrypted, or packed by a method that zipfile does not know
     zipfile.BadZipFile,
     zlib.error,
+    TypeError,  # JSON of another shape
 )
 
 
@@ -85,7 +76,7 @@ class LensProfile:
     photos : dict
         File name of each photo by the id that samples carry.
     cameras : tuple of Camera
-        What these were taken with, each once; empty where no photo says, and in older profiles.
+        What these were taken with, each once; empty where no photo says.
     """
 
     model: LensModel
@@ -94,7 +85,7 @@ class LensProfile:
     cameras: tuple[Camera, ...] = ()
 
 
-def save_profile(path: Path | str, profile: LensProfile, *, learned: bool = True) -> None:
+def save_profile(path: Path | str, profile: LensProfile) -> None:
     """Write a profile; the file appears complete or not at all.
 
     Parameters
@@ -102,8 +93,6 @@ def save_profile(path: Path | str, profile: LensProfile, *, learned: bool = True
     path : Path or str
         Replaced if it is there.
     profile : LensProfile
-    learned : bool
-        Whether what was learned is kept; without it, whoever opens the file fits it anew.
 
     Raises
     ------
@@ -113,25 +102,23 @@ def save_profile(path: Path | str, profile: LensProfile, *, learned: bool = True
         If the file cannot be written.
     """
     with atomic(Path(path)) as file:
-        write_profile(file, profile, learned=learned)
+        write_profile(file, profile)
 
 
-def write_profile(file: IO[bytes], profile: LensProfile, *, learned: bool = True) -> None:
+def write_profile(file: IO[bytes], profile: LensProfile) -> None:
     """Write a profile to an open file.
 
     Parameters
     ----------
     file : binary file, open for writing
     profile : LensProfile
-    learned : bool
-        As of `save_profile`.
 
     Raises
     ------
     InvalidInputError
         If it has more samples, or larger ones, than a profile holds.
     """
-    samples, prior = profile.model.samples, profile.model.prior
+    samples = profile.model.samples
     side = max(sample.kernel.shape[0] for sample in samples)
     if not _within_limits(len(samples), side):
         raise InvalidInputError(
@@ -147,34 +134,21 @@ def write_profile(file: IO[bytes], profile: LensProfile, *, learned: bool = True
         "model": asdict(profile.model.settings),
         "samples": packed.entries,
     }
-    if prior is not None and isinstance(prior.source, LensModel):
-        document["family"] = {"name": prior.name, "strength": prior.strength}
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("profile.json", json.dumps(document, allow_nan=False))
         archive.writestr("kernels.npy", _saved(packed.kernels))
-        for part, rows in ((_SPECTRA, packed.spectra), (_PHASES, packed.phases)):
-            if rows is not None:
-                archive.writestr(part, _saved(rows))
-        if learned:
-            archive.writestr(_LEARNED, profile.model.learned(), zipfile.ZIP_STORED)
-        if prior is not None and isinstance(prior.source, LensModel):
-            family = io.BytesIO()
-            write_profile(family, LensProfile(prior.source))
-            archive.writestr(_FAMILY, family.getvalue(), zipfile.ZIP_STORED)
+        archive.writestr(_ENCODED, _saved(packed.encoded))
         if _unpacked(archive) > _MAX_BYTES:
             raise InvalidInputError(f"a profile holds {_MAX_BYTES >> 20} MiB at most; save fewer samples")
 
 
-def _saved(array: NDArray[np.float32]) -> bytes:
+def _saved(array: NDArray[Any]) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, array, allow_pickle=False)
     return buffer.getvalue()
 
 
-def _opened(archive: zipfile.ZipFile, part: str) -> NDArray[np.float32] | None:
-    """Read an array that a profile may lack."""
-    if part not in archive.namelist():
-        return None
+def _opened(archive: zipfile.ZipFile, part: str) -> NDArray[Any]:
     return np.asarray(np.load(io.BytesIO(archive.read(part)), allow_pickle=False))
 
 
@@ -196,12 +170,11 @@ def load_profile(path: Path | str) -> LensProfile:
     Returns
     -------
     LensProfile
-        Its model answers at once: nothing is fitted again where the file holds what was learned.
 
     Raises
     ------
     InvalidInputError
-        If the file is no profile, or one of a newer format; the text says which.
+        If the file is no profile, or one of another format; the text says which.
     """
     return _read(path, Path(path).name)
 
@@ -227,20 +200,16 @@ def read_profile(file: IO[bytes], name: str) -> LensProfile:
     return _read(file, name)
 
 
-def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> LensProfile:
-    """Open a profile; `alone` passes over the family, which has none of its own."""
+def _read(source: Path | str | IO[bytes], name: str) -> LensProfile:
     try:
         with zipfile.ZipFile(source) as archive:
-            names = set(archive.namelist())
             if _unpacked(archive) > _MAX_BYTES:
                 raise InvalidInputError(
                     f"{name} unpacks to more than {_MAX_BYTES >> 20} MiB; it is no lens profile"
                 )
             document = json.loads(archive.read("profile.json"))
-            stack = np.load(io.BytesIO(archive.read("kernels.npy")), allow_pickle=False)
-            spectra, phases = (_opened(archive, part) for part in (_SPECTRA, _PHASES))
-            learned = archive.read(_LEARNED) if _LEARNED in names else None
-            family = archive.read(_FAMILY) if _FAMILY in names and not alone else None
+            if document["format"] == FORMAT:
+                stack, encoded = _opened(archive, "kernels.npy"), _opened(archive, _ENCODED)
     except FileNotFoundError:
         raise
     except _UNREADABLE as error:
@@ -250,8 +219,8 @@ def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> 
     try:
         if document["format"] != FORMAT:
             raise InvalidInputError(
-                f"{name} has profile format {document['format']}, this program reads {FORMAT}; "
-                "update the program"
+                f"{name} has profile format {document['format']}, this program reads {FORMAT}: its samples "
+                "are not those of this program; calibrate again with the photos of the lens"
             )
         entries = document["samples"]
         fits = (
@@ -264,39 +233,14 @@ def _read(source: Path | str | IO[bytes], name: str, *, alone: bool = False) -> 
                 f"{name} holds {len(entries)} samples but kernels of shape {stack.shape}; "
                 f"one is needed for each, of side {_MAX_SIDE} at most"
             )
-        samples = unpack_samples(PackedSamples(entries, stack, spectra, phases))
-        model = _model(samples, _settings(document["model"]), learned)
-        if family is not None:
-            other = _read(io.BytesIO(family), f"the family in {name}", alone=True)
-            leaning = document["family"]
-            model = model.with_prior(other.model, float(leaning["strength"]), str(leaning["name"])[:200])
+        samples = unpack_samples(PackedSamples(entries, stack, encoded))
+        model = LensModel.fit(samples, ModelSettings(**document["model"]))
         cameras = tuple(_camera(_texts(camera)) for camera in document.get("cameras", []))
         return LensProfile(model, _texts(document["lens"]), _texts(document["photos"]), cameras)
     except LensModelError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise InvalidInputError(f"{name} is damaged: {error}") from error
-
-
-def _model(samples: list[PsfSample], settings: ModelSettings, learned: bytes | None) -> LensModel:
-    if learned is not None:
-        try:
-            return LensModel.restored(samples, learned, settings)
-        except InvalidInputError as error:
-            log.info("the profile's model is fitted anew: %s", error)
-    return LensModel.fit(samples, settings)
-
-
-def _settings(values: dict[str, Any]) -> ModelSettings:
-    # written until 0.2; it changed how finely kernels were kept, and no answer
-    known = {key: value for key, value in values.items() if key != "oversampling"}
-    if known.get("mode") in FORMER_MODES:
-        log.info("the mode %s of the profile is gone: the usual one answers", known["mode"])
-        del known["mode"]
-    if known.get("method") in FORMER_METHODS:
-        log.info("the regression %s of the profile is gone: the usual one answers", known["method"])
-        del known["method"]
-    return ModelSettings(**known)
 
 
 def _named(values: dict[str, Any]) -> dict[str, Any]:

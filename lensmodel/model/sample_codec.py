@@ -10,16 +10,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.core.psf import PsfSample
-from lensmodel.core.spectrum import PHASE_BINS, RINGS, SECTORS, PatchSpectrum
+from lensmodel.core.psf import EncodedPatch, PsfSample
 from lensmodel.core.types import FieldPosition, LensSettings
 
 _INFINITY: Final = "infinity"
 """A focus distance for which JSON has no number."""
-_SPECTRUM: Final = RINGS * SECTORS + 3
-"""Numbers of a spectrum: power, noise and two of the tail."""
-_PHASES: Final = 2 * PHASE_BINS
-"""Numbers of what a spectrum says of phases: each with its precision."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,19 +24,17 @@ class PackedSamples:
     Parameters
     ----------
     entries : list of dict
-        Named fields of each sample, of what `json` can write; `size` is the side of its kernel.
+        Named fields of each sample, of what `json` can write; `size` is the side of its kernel, `encoded` the
+        row of its patch in `encoded`, which the channels of one patch share, or None.
     kernels : ndarray of float32, shape (n, k, k)
         Zeros around kernels that are smaller than the largest.
-    spectra : ndarray of float32, shape (n, 171), or None
-        `PatchSpectrum.to_bytes` without phases, NaN where a sample has none; None where none has.
-    phases : ndarray of float32, shape (n, 168), or None
-        The phases alike; kept apart, since earlier programs read spectra without.
+    encoded : ndarray of uint8, shape (m, bytes)
+        `EncodedPatch.to_bytes` of the patches.
     """
 
     entries: list[dict[str, Any]]
     kernels: NDArray[np.float32]
-    spectra: NDArray[np.float32] | None
-    phases: NDArray[np.float32] | None = None
+    encoded: NDArray[np.uint8]
 
 
 def pack_samples(samples: Sequence[PsfSample]) -> PackedSamples:
@@ -59,56 +52,42 @@ def pack_samples(samples: Sequence[PsfSample]) -> PackedSamples:
     """
     side = max(sample.kernel.shape[0] for sample in samples)
     kernels = np.zeros((len(samples), side, side), dtype=np.float32)
-    numbers = np.full((len(samples), _SPECTRUM + _PHASES), np.nan, dtype="<f4")
+    patches: dict[bytes, int] = {}
+    entries = []
     for number, sample in enumerate(samples):
         kernels[number][_middle(side, sample.kernel.shape[0])] = sample.kernel
-        if sample.spectrum is not None:
-            own = np.frombuffer(sample.spectrum.to_bytes(), dtype="<f4")
-            numbers[number, : own.size] = own
-    parts = (
-        None if np.isnan(rows).all() else np.ascontiguousarray(rows)
-        for rows in np.split(numbers, [_SPECTRUM], axis=1)
-    )
-    return PackedSamples([entry_of(sample) for sample in samples], kernels, *parts)
+        row = None if sample.encoded is None else patches.setdefault(sample.encoded.to_bytes(), len(patches))
+        entries.append({**entry_of(sample), "encoded": row})
+    rows = [np.frombuffer(data, dtype=np.uint8) for data in patches]
+    return PackedSamples(entries, kernels, np.stack(rows) if rows else np.empty((0, 0), dtype=np.uint8))
 
 
 def unpack_samples(packed: PackedSamples) -> list[PsfSample]:
     """Build the samples that `pack_samples` was given.
 
-    Parameters
-    ----------
-    packed : PackedSamples
-        Entries without `size`, of profiles of earlier versions, have kernels as large as the array.
-
-    Returns
-    -------
-    list of PsfSample
-
     Raises
     ------
     InvalidInputError
         If a value is out of its range.
-    KeyError, TypeError, ValueError
+    KeyError, TypeError, ValueError, IndexError
         If entries and arrays are not those of `pack_samples`.
     """
-    count, side = len(packed.entries), packed.kernels.shape[1]
-    spectra, phases = _rows(packed.spectra, count, _SPECTRUM), _rows(packed.phases, count, _PHASES)
+    if packed.encoded.ndim != 2 or packed.encoded.dtype != np.uint8:
+        raise ValueError(f"encoded patches of shape {packed.encoded.shape}")
+    patches = [EncodedPatch.from_bytes(row.tobytes()) for row in packed.encoded]
+    side = packed.kernels.shape[1]
     samples = []
-    for number, (entry, kernel) in enumerate(zip(packed.entries, packed.kernels, strict=True)):
-        row = spectra[number] + phases[number] if spectra[number] else None
-        size = int(entry["size"]) if "size" in entry else side
-        own = kernel[_middle(side, size)]
-        samples.append(sample_of(entry, own, None if row is None else PatchSpectrum.from_bytes(row)))
+    for entry, kernel in zip(packed.entries, packed.kernels, strict=True):
+        row = entry["encoded"]
+        own = kernel[_middle(side, int(entry["size"]))]
+        samples.append(sample_of(entry, own, None if row is None else patches[_row(row, len(patches))]))
     return samples
 
 
-def _rows(array: NDArray[np.float32] | None, count: int, numbers: int) -> list[bytes]:
-    """Bytes of each sample; none where there are no numbers."""
-    if array is None:
-        return [b""] * count
-    if array.shape != (count, numbers) or array.dtype != np.float32:
-        raise ValueError(f"spectra of shape {array.shape} for {count} samples")
-    return [b"" if np.isnan(row).all() else row.tobytes() for row in array]
+def _row(number: Any, count: int) -> int:  # noqa: ANN401 - of a JSON document
+    if not isinstance(number, int) or not 0 <= number < count:
+        raise ValueError(f"no encoded patch {number!r}, there are {count}")
+    return number
 
 
 def _middle(side: int, size: int) -> tuple[slice, slice]:
@@ -120,7 +99,7 @@ def _middle(side: int, size: int) -> tuple[slice, slice]:
 
 
 def entry_of(sample: PsfSample) -> dict[str, Any]:
-    """Return the named fields of a sample: all of it but the kernel and the spectrum."""
+    """Return the named fields of a sample: all of it but the kernel and the encoded patch."""
     settings = asdict(sample.settings)
     if settings["focus_m"] is not None and math.isinf(settings["focus_m"]):
         settings["focus_m"] = _INFINITY
@@ -135,12 +114,11 @@ def entry_of(sample: PsfSample) -> dict[str, Any]:
         "half_diagonal_px": sample.half_diagonal_px,
         "estimator": sample.estimator,
         "error": sample.error,
-        "darkest": sample.darkest,
     }
 
 
 def sample_of(
-    entry: Mapping[str, Any], kernel: NDArray[np.float32], spectrum: PatchSpectrum | None
+    entry: Mapping[str, Any], kernel: NDArray[np.float32], encoded: EncodedPatch | None
 ) -> PsfSample:
     """Build the sample of which `entry_of` returned the fields."""
     settings = dict(entry["settings"])
@@ -154,8 +132,7 @@ def sample_of(
         photo=str(entry["photo"]),
         pixel_pitch_um=entry["pixel_pitch_um"],
         estimator=str(entry["estimator"]),
-        spectrum=spectrum,
-        error=entry.get("error"),
-        half_diagonal_px=entry.get("half_diagonal_px"),
-        darkest=entry.get("darkest"),
+        encoded=encoded,
+        error=entry["error"],
+        half_diagonal_px=entry["half_diagonal_px"],
     )

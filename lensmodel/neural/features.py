@@ -14,10 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
+from lensmodel.core.types import LensSettings
 from lensmodel.neural.symmetry import OCTANTS, octant_of, relative_octant, to_octant_place
 
 Kind = Literal["raw", "tiff", "jpeg"]
 KINDS: Final[tuple[Kind, ...]] = ("raw", "tiff", "jpeg")
+
+FAR_M: Final = 1000.0
+"""Metres: focus farther away is as good as infinite (by the depth of field of any lens)."""
 
 _GREEN_UM: Final = 0.54
 SETTINGS: Final = 5
@@ -49,6 +53,12 @@ class Conditions:
     focal_mm: float | None = None
     focus_m: float | None = None
     kind: Kind = "raw"
+
+    @classmethod
+    def of(cls, settings: LensSettings, pitch_um: float | None, kind: Kind) -> Conditions:
+        """Take them from settings of a lens; infinite focus is that of `FAR_M`."""
+        focus_m = None if settings.focus_m is None else min(settings.focus_m, FAR_M)
+        return cls(settings.aperture, pitch_um, settings.focal_mm, focus_m, kind)
 
     def __post_init__(self) -> None:
         for name in ("f_number", "pitch_um", "focal_mm", "focus_m"):

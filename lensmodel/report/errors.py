@@ -7,11 +7,13 @@ common, such as a bias of the estimate, does not show.
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Hashable
+from collections import Counter, defaultdict
+from collections.abc import Hashable, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.psf import PsfSample
@@ -42,7 +44,18 @@ def redrawn_models(model: LensModel, rng: np.random.Generator, draws: int) -> tu
     for _ in range(draws if len(each) >= FEWEST else 0):
         chosen = rng.integers(0, len(each), len(each))
         try:
-            models.append(LensModel.fit([s for k in chosen for s in each[k]], model.settings))
+            models.append(LensModel.fit(_copies(each, chosen), model.settings))
         except LensModelError:
             continue
     return (models if len(models) >= max(draws // 2, 2) else []), drawn
+
+
+def _copies(groups: Sequence[list[PsfSample]], chosen: NDArray[np.integer]) -> list[PsfSample]:
+    """Samples of the chosen groups; one that is drawn again is of another photo, or it would not count."""
+    seen: Counter[int] = Counter()
+    samples = []
+    for number in map(int, chosen):
+        copy = seen[number]
+        samples += [s if copy == 0 else replace(s, photo=f"{s.photo} {copy}") for s in groups[number]]
+        seen[number] += 1
+    return samples

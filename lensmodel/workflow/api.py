@@ -48,7 +48,7 @@ def calibrate(
     model: str | ModelSettings | None = None,
     kernel_size: int | None = None,
     any_lens: bool = False,
-    patches: int = pipeline.DEFAULT_PATCHES,
+    patches: int | None = None,
     workers: int | None = None,
     executor: Executor | None = None,
     on_event: EventHook = ignore_event,
@@ -79,11 +79,13 @@ def calibrate(
         to compare with, not for photos to keep. Or the choices of the regression. A lens that is given keeps
         its own.
     kernel_size : int, optional
-        Odd side of the estimated kernels in pixels, 3 to 55; by default 31, and 55 the paper's way.
+        Largest odd side of the estimated kernels in pixels, 3 to 55; by default 55, and 31 of an estimator of
+        one's own.
     any_lens : bool
         Take photos that seem to be of another lens as well.
-    patches : int
-        Parts of a photo that are looked at; fewer are faster and know less.
+    patches : int, optional
+        Parts of a photo that are looked at; fewer are faster and know less. By default 96, and 24 where
+        kernels are estimated one by one.
     workers : int, optional
         Processes; all cores by default. The result does not depend on it.
     executor : concurrent.futures.Executor, optional
@@ -95,7 +97,6 @@ def calibrate(
     Returns
     -------
     Lens
-        With all fitted that takes long: it answers and corrects at once.
 
     Raises
     ------
@@ -141,12 +142,12 @@ def calibrate(
         else:
             event = CalibrationEvent(path, "counted", count, count)
         on_event(event)
-    learned = calibration.finish()
+    learned = calibration.known
     if learned is None:
         raise NotEnoughEvidenceError(
             "no photo could be used:\n  " + "\n  ".join(reasons or ["none was given"])
         )
-    return learned.warmed()
+    return learned
 
 
 def correct(
@@ -172,8 +173,9 @@ def correct(
     """Remove the blur of a lens from a photo: files in and out, or arrays.
 
     Non-blind deconvolution with the PSF of each place (Hirsch and Schölkopf, ICCV 2015, section 7). How far
-    it goes where PSF or photo are unsure, and what it holds back, are rules of this project; with the method
-    "paper", a lens that was learned the paper's way is corrected without them.
+    it goes where PSF or photo are unsure, and what it holds back, are rules of this project. The photo itself
+    tells of its lens too: its patches join the samples for its own correction. With the method "paper", a
+    lens that was learned the paper's way is corrected without all of that.
 
     Parameters
     ----------
@@ -243,7 +245,7 @@ def correct(
     if target is not None and source is not None and target.exists() and target.samefile(source):
         raise InvalidInputError(f"{target} is the photo itself; name another file for the corrected one")
     beside = None if target is None or not sidecar else sidecar_for(target)  # refused before any work
-    known = (lens if isinstance(lens, Lens) else Lens.load(lens)).warmed()
+    known = lens if isinstance(lens, Lens) else Lens.load(lens)
     method = way_of(known.model).method if method is None else method
     correction.deconvolvers.resolve(method)  # before the work of developing
     developed = (
@@ -261,6 +263,7 @@ def correct(
         strength=strength,
         bounds=bounds,
         lateral=pipeline.lateral_of(developed),
+        photo="" if source is None else pipeline.photo_id(source),
         workers=workers or os.cpu_count() or 1,
         on_step=on_step,
     )

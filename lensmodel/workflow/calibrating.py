@@ -1,13 +1,13 @@
 """Steps 1 and 2: from photos to a lens. One loop over photos for library and commands.
 
-photo, photo, ... -> samples of each (`sampling`) -> fitted once
+photo, photo, ... -> samples of each (`sampling`) -> added to the model
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -15,8 +15,7 @@ from lensmodel import photo
 from lensmodel.core import parallel
 from lensmodel.core.errors import CancelledError, InvalidInputError, LensModelError
 from lensmodel.core.psf import PsfSample
-from lensmodel.core.types import StepHook, ignore_step
-from lensmodel.model import LensModel, ModelSettings, Prior
+from lensmodel.model import LensModel, ModelSettings
 from lensmodel.photo.endings import CORRECTED
 from lensmodel.workflow.developed import photo_id, require_aperture
 from lensmodel.workflow.identity import Identity, difference
@@ -36,21 +35,15 @@ AHEAD: Final = 32
 class LensKeeper(Protocol):
     """Where a lens is kept while it learns: in memory, or in a file that other runs may add to."""
 
-    @property
-    def settled(self) -> bool:
-        """Whether what `lens` returns is kept already."""
-
     def lens(self) -> Lens | None:
         """Return the newest lens: the same object until another run has changed it."""
 
-    def keep(self, lens: Lens, *, whole: bool) -> None:
-        """Keep a lens that has learned from one photo more, or is `whole`: completely fitted."""
+    def keep(self, lens: Lens) -> None:
+        """Keep a lens that has learned from one photo more."""
 
 
 class InMemory:
     """The keeper of a single run, which forgets the lens with it."""
-
-    settled = True
 
     def __init__(self, lens: Lens | None) -> None:
         self._lens = lens
@@ -59,9 +52,8 @@ class InMemory:
         """Return the lens that was kept last."""
         return self._lens
 
-    def keep(self, lens: Lens, *, whole: bool) -> None:
+    def keep(self, lens: Lens) -> None:
         """Keep a lens."""
-        del whole
         self._lens = lens
 
 
@@ -75,7 +67,7 @@ class PhotoVerdict:
 
 
 class Calibration:
-    """A lens that learns from one photo after the other, and is fitted once when all are there.
+    """A lens that learns from one photo after the other.
 
     Parameters
     ----------
@@ -85,8 +77,6 @@ class Calibration:
         How each is estimated.
     begin : ModelSettings, optional
         Choices of the regression of a new lens; a known one keeps its own.
-    prior : Prior, optional
-        What a new lens leans on.
     any_lens : bool
         Take photos that seem to be of another lens as well.
     workers : int, optional
@@ -104,16 +94,13 @@ class Calibration:
         recipe: Recipe,
         *,
         begin: ModelSettings | None = None,
-        prior: Prior | None = None,
         any_lens: bool = False,
         workers: int | None = None,
     ) -> None:
         self._keeper, self._recipe = keeper, recipe
-        self._begin, self._prior = begin or ModelSettings(mode=recipe.way.mode), prior
+        self._begin = begin or ModelSettings(mode=recipe.way.mode)
         self._any_lens, self._workers = any_lens, workers
-        self._base = self._current = keeper.lens()
-        self._new: list[PsfSample] = []  # in `_current`, and not in `_base`
-        self._joined = False
+        self._current = keeper.lens()
         recipe.of_lens(self._current).check()
 
     def learn(
@@ -176,24 +163,16 @@ class Calibration:
             return None
         lens = self._lens()
         self._require_same_lens(lens, identity)
-        model = self._fitted(samples) if lens is None else lens.model.grown(samples)
+        model = LensModel.fit(samples, self._begin) if lens is None else lens.model.added(samples)
         grown = Lens.grown(lens, model, {key: path.name}, [identity], any_lens=self._any_lens)
-        self._keeper.keep(grown, whole=False)
-        self._current, self._joined = grown, True
-        self._new += samples
+        self._keeper.keep(grown)
+        self._current = grown
         return len(samples)
 
-    def finish(self, on_step: StepHook = ignore_step) -> Lens | None:
-        """Fit what was learned, once; return the lens, None where no photo could be used."""
-        lens = self._lens()
-        if lens is None or (self._keeper.settled and not self._joined):
-            return lens
-        model = self._fitted(self._new) if self._base is None else self._base.model.added(self._new)
-        whole = replace(lens, profile=replace(lens.profile, model=model.warmed(on_step)))
-        if self._lens() is lens:  # else another run is adding photos, and fits them all at its end
-            self._keeper.keep(whole, whole=True)
-            self._base, self._current, self._new = whole, whole, []
-        return self._current
+    @property
+    def known(self) -> Lens | None:
+        """The lens as it is now; None where no photo could be used."""
+        return self._lens()
 
     def _order(self, path: Path) -> tuple[str, bytes, Recipe] | None:
         """Return what an executor needs to estimate a photo; None if there is nothing to estimate."""
@@ -208,9 +187,7 @@ class Calibration:
     def _lens(self) -> Lens | None:
         """Return what is known; where another run has changed it, that contains what this one kept."""
         lens = self._keeper.lens()
-        if lens is not self._current:
-            self._base = self._current = lens
-            self._new = []
+        self._current = lens
         return lens
 
     def _knows(self, key: str) -> bool:
@@ -218,9 +195,6 @@ class Calibration:
         return lens is not None and (
             key in lens.profile.photos or any(sample.photo == key for sample in lens.samples)
         )
-
-    def _fitted(self, samples: list[PsfSample]) -> LensModel:
-        return LensModel.fit(samples, self._begin, prior=self._prior)
 
     def _admitted(self, path: Path) -> Identity:
         """Return what a photo says of lens and camera, after refusing one that cannot teach this lens."""

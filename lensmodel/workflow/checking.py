@@ -5,7 +5,6 @@ develop both -> same light -> audit
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -123,15 +122,8 @@ def _evidence(
     original: LinearPhoto, model: LensModel | None, settings: LensSettings | None
 ) -> Callable[[FieldPosition, Window], Evidence]:
     chosen = settings_of(original, settings)
-    pitch_um, half_px = original.info.metadata.pixel_pitch_um, original.frame.half_diagonal
-    model = None if model is None else model.warmed()
-    field = None if model is None else model.field(chosen, pitch_um=pitch_um, half_diagonal_px=half_px)
-
-    def error(position: FieldPosition, channel: int) -> float:
-        assert model is not None
-        asked = chosen.with_channel(CHANNELS[channel])
-        answer = model.query(position, asked, size=15, pitch_um=pitch_um, half_diagonal_px=half_px)
-        return answer.predicted_error if math.isfinite(answer.predicted_error) else 1.0
+    pitch_um = original.info.metadata.pixel_pitch_um
+    field = None if model is None else model.field(chosen, pitch_um=pitch_um)
 
     def measured(channel: int, window: Window) -> NDArray[np.bool_] | None:
         if original.cfa is None:
@@ -147,7 +139,7 @@ def _evidence(
             original.correction_noise,
             original.clip,
             blurs,
-            [error(position, c) for c in range(3)] if blurs else (0.0, 0.0, 0.0),
+            (0.0, 0.0, 0.0) if field is None else [field.error_at(position, c) for c in CHANNELS],
             [measured(c, window) for c in range(3)],
         )
 

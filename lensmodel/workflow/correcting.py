@@ -8,14 +8,14 @@ from collections.abc import Sequence
 from typing import Final
 
 from lensmodel import correction, quality
-from lensmodel.core.belief import UncertainField
-from lensmodel.core.psf import PsfField
+from lensmodel.core.errors import NotEnoughEvidenceError, NoUsablePatchesError
+from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings, StepHook, ignore_step
-from lensmodel.model import LensModel, WitnessedField
+from lensmodel.model import LensModel, ModelField
 from lensmodel.model.answer import PAPER
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.lateral import LateralColour, estimate_lateral, resample
-from lensmodel.workflow.estimating import SeenPatch, witnesses_of
+from lensmodel.workflow.estimating import estimate_cell, find_patches
 from lensmodel.workflow.ways import way_of
 
 log = logging.getLogger(__name__)
@@ -42,16 +42,16 @@ def correct_photo(
     layers: Sequence[correction.Bounds] = (),
     lateral: LateralColour | None = None,
     roi: tuple[int, int, int, int] | None = None,
-    known: PsfField | UncertainField | None = None,
+    photo: str = "",
+    known: ModelField | None = None,
     workers: int = 1,
     on_step: StepHook = ignore_step,
 ) -> correction.Corrected:
     """Remove the blur of the lens from a developed photo.
 
-    What is thought of each PSF, its mean and its uncertainty, comes from two opinions of the model and from
-    the patches of the lens and of this photo (`lensmodel.model.trust.witness`); the less sure, the gentler.
-    A lens that was learned the paper's way is corrected the paper's way: its PSFs are taken as right, and
-    Richardson-Lucy deconvolution is all that is done.
+    The less sure a PSF is, by the error that the model expects, the gentler the correction. A lens that was
+    learned the paper's way is corrected the paper's way: its PSFs are taken as right, and Richardson-Lucy
+    deconvolution is all that is done.
 
     Parameters
     ----------
@@ -65,7 +65,9 @@ def correct_photo(
         Others to correct it within as well, in little more than the time of one.
     roi : tuple of int, optional
         `(row, col, height, width)` in sensor orientation; only that part is corrected.
-    known : PsfField or UncertainField, optional
+    photo : str
+        What samples of this photo are called, see `psfs_for`.
+    known : ModelField, optional
         What `psfs_for` found for this photo; hand it over where the same photo is corrected several times.
 
     Returns
@@ -74,7 +76,7 @@ def correct_photo(
         Of a chart, with what was measured on its edges (`find_edges`) in each zone.
     """
     wanted, plain = _way(model, method)
-    field = psfs_for(developed, model, settings, method=method) if known is None else known
+    field = known or psfs_for(developed, model, settings, method=method, photo=photo)
     planes, cfa = developed.planes, developed.cfa
     if developed.lossy and not plain:
         strength *= LOSSY_SHARE
@@ -89,6 +91,7 @@ def correct_photo(
         strength=strength,
         noise=developed.correction_noise,
         clip=developed.clip,
+        psf_error=None if plain else field.error_at,
         lateral=lateral,
         cfa=cfa,
         bounds=bounds,
@@ -116,23 +119,44 @@ def psfs_for(
     settings: LensSettings,
     *,
     method: str | correction.Deconvolver | None = None,
-    patches: Sequence[SeenPatch] | None = None,
-) -> PsfField | UncertainField:
-    """Return what a correction of a photo is to think of the PSFs of its lens, see `correct_photo`.
+    photo: str = "",
+) -> ModelField:
+    """Return the PSFs of a lens for the correction of a photo, whose own patches join the samples.
 
-    `patches` are the photo's `seen_patches` where they are known already.
+    Only the way of the paper, and lenses of measured kernels alone, take no patches of the photo.
+
+    Parameters
+    ----------
+    photo : str
+        What samples of this photo are called: they count once if the lens was learned from it.
     """
-    pitch_um, half_diagonal_px = developed.info.metadata.pixel_pitch_um, developed.frame.half_diagonal
     _, plain = _way(model, method)
-    if plain:
-        return model.field(settings, pitch_um=pitch_um, half_diagonal_px=half_diagonal_px)
-    return WitnessedField.of(
-        model.warmed(),
-        settings,
-        witnesses_of(developed, settings, patches),
-        pitch_um=pitch_um,
-        half_diagonal_px=half_diagonal_px,
-    )
+    if not plain and model.weights:
+        model = model.added(_own_samples(developed, model, settings, photo))
+    return model.field(settings, pitch_um=developed.info.metadata.pixel_pitch_um)
+
+
+def _own_samples(
+    developed: LinearPhoto, model: LensModel, settings: LensSettings, photo: str
+) -> list[PsfSample]:
+    """Samples of a photo, unless the model has them already or the photo shows too little."""
+    if photo and any(sample.photo == photo and sample.encoded is not None for sample in model.samples):
+        return []
+    way = way_of(model)
+    try:
+        chosen = find_patches(developed, count=way.patches, estimator=way.estimator).patches
+        made = estimate_cell(
+            developed,
+            chosen,
+            settings=settings,
+            photo_id=photo,
+            estimator=way.estimator,
+            size=way.kernel_size,
+        )
+    except (NoUsablePatchesError, NotEnoughEvidenceError) as error:
+        log.info("the photo adds nothing to what is known of its lens: %s", error)
+        return []
+    return [one.sample for one in made]
 
 
 def _with_measured_gain(

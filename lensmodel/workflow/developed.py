@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +12,8 @@ import numpy as np
 from lensmodel.core import codec
 from lensmodel.core.errors import InvalidInputError, MetadataMissingError
 from lensmodel.core.files import atomic, save_array
-from lensmodel.core.spectrum import PatchSpectrum
-from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.core.types import LensSettings
 from lensmodel.photo import LinearPhoto, PhotoMetadata
-from lensmodel.workflow.estimating import SeenPatch
 
 
 def save_developed(developed: LinearPhoto, folder: Path) -> None:
@@ -41,30 +38,6 @@ def load_developed(folder: Path) -> LinearPhoto:
     except (OSError, ValueError) as error:
         raise InvalidInputError(f"{folder} holds no developed photo; develop it again") from error
     return codec.from_json(LinearPhoto, {**stored, "planes": planes})
-
-
-def save_seen(patches: Sequence[SeenPatch], folder: Path) -> None:
-    """Keep what `seen_patches` found in a developed photo beside it: seen.json."""
-    with atomic(folder / "seen.json") as file:
-        file.write(json.dumps(codec.to_json(list(patches))).encode())
-
-
-def load_seen(folder: Path) -> list[SeenPatch] | None:
-    """Read what `save_seen` kept; None where nothing was, or nothing that can be read."""
-    try:
-        stored = json.loads((folder / "seen.json").read_text(encoding="utf-8"))
-        return [
-            SeenPatch(
-                codec.from_json(FieldPosition, one["position"]),
-                PatchSpectrum(
-                    np.asarray(one["spectrum"]["power"], dtype=np.float32), one["spectrum"]["noise"]
-                ),
-                None if one["darkest"] is None else float(one["darkest"]),
-            )
-            for one in stored
-        ]
-    except (OSError, ValueError, TypeError, KeyError):
-        return None
 
 
 def settings_of(developed: LinearPhoto, given: LensSettings | None = None) -> LensSettings:

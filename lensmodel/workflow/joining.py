@@ -40,7 +40,7 @@ def joined(
     if not replace:
         return model.added(samples)
     kept = [old for old in model.samples if is_measured(old) or not any(_alike(old, new) for new in samples)]
-    return LensModel.fit([*kept, *samples], model.settings, prior=model.prior)
+    return LensModel.fit([*kept, *samples], model.settings)
 
 
 def _alike(old: PsfSample, new: PsfSample) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -124,7 +124,7 @@ class Lens:
                 strict=True,
             )
         ]
-        return cls(LensProfile(LensModel.fit(samples, model).warmed()))
+        return cls(LensProfile(LensModel.fit(samples, model)))
 
     @classmethod
     def grown(
@@ -183,7 +183,7 @@ class Lens:
         Raises
         ------
         InvalidInputError
-            If the file is no profile, or one of a newer format.
+            If the file is no profile, or one of another format.
         FileNotFoundError
             If there is none.
         """
@@ -207,18 +207,6 @@ class Lens:
             If it has more samples than a file may hold.
         """
         save_profile(path, self.profile)
-
-    def warmed(self) -> Lens:
-        """Return the lens with all fitted that takes long and is fitted once; `calibrate` did so.
-
-        Returns
-        -------
-        Lens
-            This one if nothing is left to fit.
-        """
-        if self.model.warm:
-            return self
-        return replace(self, profile=replace(self.profile, model=self.model.warmed()))
 
     def psf(
         self,
@@ -249,7 +237,7 @@ class Lens:
         -------
         PsfAnswer
             `.kernel` is the array, shape (size, size), float64; `.predicted_error` its expected relative L2;
-            `.answered_by` what made it, `.reason` why; `.photos` and `.effective_samples` what of.
+            `.answered_by` what made it; `.photos` and `.effective_samples` what of.
 
         Raises
         ------

@@ -12,23 +12,18 @@ from lensmodel.workflow.calibrating import AHEAD, Calibration, InMemory, PhotoVe
 from lensmodel.workflow.correcting import correct_photo, lateral_of, psfs_for
 from lensmodel.workflow.developed import (
     load_developed,
-    load_seen,
     photo_id,
     require_aperture,
     save_developed,
-    save_seen,
     settings_of,
 )
 from lensmodel.workflow.estimating import (
     DEFAULT_KERNEL_SIZE,
-    DEFAULT_PATCHES,
     CellSample,
     estimate_cell,
     find_patches,
     patches_by_cell,
     require_spread,
-    seen_patches,
-    witnesses_of,
 )
 from lensmodel.workflow.sampling import (
     CalibrationEvent,
@@ -45,7 +40,6 @@ from lensmodel.workflow.sampling import (
 __all__ = [
     "AHEAD",
     "DEFAULT_KERNEL_SIZE",
-    "DEFAULT_PATCHES",
     "Calibration",
     "CalibrationEvent",
     "CellSample",
@@ -61,7 +55,6 @@ __all__ = [
     "ignore_event",
     "lateral_of",
     "load_developed",
-    "load_seen",
     "patches_by_cell",
     "photo_id",
     "psfs_for",
@@ -70,9 +63,6 @@ __all__ = [
     "samples_of_bytes",
     "samples_of_photo",
     "save_developed",
-    "save_seen",
-    "seen_patches",
     "settings_of",
     "take",
-    "witnesses_of",
 ]

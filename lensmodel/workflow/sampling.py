@@ -29,7 +29,7 @@ from lensmodel.workflow.developed import (
     settings_of,
 )
 from lensmodel.workflow.estimating import (
-    DEFAULT_PATCHES,
+    DEFAULT_KERNEL_SIZE,
     CellSample,
     estimate_cell,
     find_patches,
@@ -37,7 +37,7 @@ from lensmodel.workflow.estimating import (
     require_spread,
 )
 from lensmodel.workflow.lens import Lens
-from lensmodel.workflow.ways import Way, chosen_way, way_named
+from lensmodel.workflow.ways import KERNEL_PATCHES, Way, chosen_way, way_named
 
 log = logging.getLogger(__name__)
 
@@ -90,7 +90,7 @@ class Recipe:
         Odd side of the kernels in pixels.
     selector : str or Selector
         Name in `selectors`, or an object of one's own.
-    count : int
+    count : int, optional
         Patches asked for.
     """
 
@@ -99,7 +99,7 @@ class Recipe:
     estimator: str | estimation.PsfEstimator | None = None
     kernel_size: int | None = None
     selector: str | patches.Selector = "r-map"
-    count: int = DEFAULT_PATCHES
+    count: int | None = None
 
     def of_lens(self, lens: Lens | None) -> Recipe:
         """Return it as it holds for a lens."""
@@ -118,15 +118,32 @@ class Recipe:
     @property
     def size(self) -> int:
         """The side of its kernels in pixels."""
-        return self.way.kernel_size if self.kernel_size is None else self.kernel_size
+        if self.kernel_size is not None:
+            return self.kernel_size
+        return DEFAULT_KERNEL_SIZE if self._of_own_kernels else self.way.kernel_size
+
+    @property
+    def patches(self) -> int:
+        """How many patches of a photo it looks at."""
+        if self.count is not None:
+            return self.count
+        return KERNEL_PATCHES if self._of_own_kernels else self.way.patches
+
+    @property
+    def _of_own_kernels(self) -> bool:
+        """Whether an estimator of kernels takes the place of one that reads whole photos."""
+        own = estimation.estimators.resolve(self.way.estimator)
+        return isinstance(own, estimation.PhotoEstimator) and not isinstance(
+            estimation.estimators.resolve(self.method), estimation.PhotoEstimator
+        )
 
     def check(self) -> None:
         """Refuse names, sizes and counts that there are not, before any work."""
         estimation.estimators.resolve(self.method)
         require_size(self.size)
         patches.selectors.resolve(self.selector)
-        if self.count < 1:
-            raise InvalidInputError(f"patches must be at least 1, got {self.count}")
+        if self.patches < 1:
+            raise InvalidInputError(f"patches must be at least 1, got {self.patches}")
 
 
 class PhotoSteps(Protocol):
@@ -199,14 +216,18 @@ class _StepsHere:
     def select(self) -> None:
         developed = load_developed(self._folder)
         recipe = self._recipe
-        self._groups = patches_by_cell(find_patches(developed, count=recipe.count, selector=recipe.selector))
+        selection = find_patches(
+            developed, count=recipe.patches, selector=recipe.selector, estimator=recipe.method
+        )
+        self._groups = patches_by_cell(selection)
 
     def estimate(self) -> None:
         recipe, done = self._recipe, 0
         settings = settings_of(load_developed(self._folder), recipe.settings)
         method = estimation.estimators.resolve(recipe.method)
         order = (settings, photo_id(self._path), method, recipe.size)
-        with processes.pool(self._executor, self._workers, method) as pool:
+        alone = parallel.Here() if len(self._groups) == 1 else self._executor
+        with processes.pool(alone, self._workers, method) as pool:
             jobs = {
                 pool.submit(_cell_from_folder, self._folder, group, *order): index
                 for index, group in enumerate(self._groups)
@@ -232,7 +253,7 @@ class _StepsHere:
                 f"none of the {self._total} patches of {self._path.name} determines a PSF; "
                 "use a photo with more fine detail in focus"
             )
-        require_spread([cell.patch for cell in made if cell.channel == "g"], count=self._recipe.count)
+        require_spread([cell.patch for cell in made if cell.channel == "g"], count=self._recipe.patches)
         self.samples = [cell.sample for cell in made]
 
 

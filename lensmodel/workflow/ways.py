@@ -9,7 +9,7 @@ from typing import Final
 
 from lensmodel.core.errors import UnknownMethodError
 from lensmodel.model import LensModel
-from lensmodel.model.answer import BOTH, PAPER
+from lensmodel.model.answer import DEFAULT, PAPER
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,9 @@ class Way:
     estimator : str
         Of `estimators`.
     kernel_size : int
-        Odd side of the estimated kernels in pixels.
+        Largest odd side of the estimated kernels in pixels.
+    patches : int
+        Parts of a photo that are looked at.
     mode : str
         Of `answer.MODES`.
     method : str
@@ -33,19 +35,25 @@ class Way:
     name: str
     estimator: str
     kernel_size: int
+    patches: int
     mode: str
     method: str
 
 
+KERNEL_PATCHES: Final = 24
+"""Patches that an estimator of kernels looks at: enough for every ring and octant of the field to get one,
+while each costs a second."""
+
 WAYS: Final[Mapping[str, Way]] = MappingProxyType(
     {
-        "default": Way("default", "default", 31, BOTH, "standard"),
-        "paper": Way("paper", "michaeli-irani", 55, PAPER, "paper"),
+        "default": Way("default", "default", 55, 96, DEFAULT, "standard"),
+        "paper": Way("paper", "michaeli-irani", 55, KERNEL_PATCHES, PAPER, "paper"),
     }
 )
-"""`paper` is that of M. Hirsch and B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, sections 4
-to 7, to be compared with: kernels by T. Michaeli and M. Irani, their Nadaraya-Watson regression, and
-Richardson-Lucy deconvolution, without what guards photos from errors of any of them."""
+"""`default` encodes patches of whole photos and attends to them. `paper` is that of M. Hirsch and
+B. Schölkopf, "Self-Calibration of Optical Lenses", ICCV 2015, sections 4 to 7, to be compared with: kernels
+by T. Michaeli and M. Irani, their Nadaraya-Watson regression, and Richardson-Lucy deconvolution, without
+what guards photos from errors of any of them."""
 
 
 def way_named(name: str) -> Way:

@@ -32,7 +32,7 @@ PATIENCE_S = 120.0
 """Of an idle machine, see `deadline`."""
 
 SETTINGS = {
-    "LENS_ESTIMATOR": "whittle",
+    "LENS_ESTIMATOR": "default",
     "LENS_PATCHES": "2",  # of so few no wavefront is fitted, which takes longer than all the rest
     "LENS_KERNEL_SIZE": "15",
     "LENS_SWEEP_SECONDS": "0.25",  # oftener, and a busy machine spends its time on looking

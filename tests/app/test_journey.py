@@ -283,28 +283,6 @@ def test_the_parts_run_alone_for_installations_on_many_machines(tmp_path: Path) 
     assert statuses == [0, 0]
 
 
-@pytest.mark.slow
-def test_a_second_copy_leans_on_the_first_and_says_so(
-    service: Service, first: dict[str, Any], tmp_path: Path
-) -> None:
-    second = service.calibrated(write_photo(tmp_path / "second.dng", 30, serial="L-43", sigma=1.6))
-    reports, results = [], []
-    for family in (True, False):
-        wish = {"photo_id": second["id"], "method": "fast", "family": family}
-        made = service.http.post("/v1/corrections", json=wish).json()
-        assert service.job(made["id"])["state"] == "succeeded"
-        reports.append(service.get(f"/v1/corrections/{made['id']}")["report"])
-        results.append(service.http.get(f"/v1/corrections/{made['id']}/result").content)
-    place = {"r": 0.9, "phi": 0.6, "aperture": 2.8}
-    answer = service.get(f"/v1/lenses/{second['lens_id']}/psf.json", params=place)
-
-    assert first["lens_id"] != second["lens_id"]
-    assert reports[0]["family"] == {"lenses": 1}
-    assert "family" not in reports[1]
-    assert results[0] != results[1]
-    assert answer["support"]["family"]["lenses"] == 1
-
-
 def test_work_that_a_stop_interrupted_goes_on_at_the_next_start_and_a_killed_supervisor_leaves_no_process(
     service: Service, photos: Path
 ) -> None:

@@ -27,13 +27,13 @@ import lensmodel
 
 @dataclass(frozen=True)
 class Careful:
-    """The estimator "whittle", trusted half as much."""
+    """The estimator "default", trusted half as much."""
 
     name: str = "careful"
     version: int = 1
 
     def estimate(self, patches, noise, **options):
-        found = lensmodel.estimators.create("whittle").estimate(patches, noise, **options)
+        found = lensmodel.estimators.create("default").estimate(patches, noise, **options)
         return type(found)(
             found.kernel, found.confidence / 2, found.reliability, found.predicted_error, {}, found.seconds
         )

@@ -26,12 +26,12 @@ from scipy import fft, ndimage
 
 from lensmodel.core.errors import InvalidInputError, NotEnoughEvidenceError
 from lensmodel.core.types import CHANNELS, Channel, StepHook, ignore_step
+from lensmodel.estimation.measure.diffraction import diffraction_otf
 from lensmodel.estimation.measure.measurer import MeasuredPsf, require_photos
 from lensmodel.estimation.measure.quiet import with_bounded_noise
 from lensmodel.estimation.measure.smooth import quadratic
 from lensmodel.estimation.measure.warp import Warp, match, matched
 from lensmodel.estimation.measure.windows import measured_pixels, window_corners, window_psf
-from lensmodel.optics.diffraction import diffraction_otf
 from lensmodel.photo import LinearPhoto
 
 FLOOR: Final = 0.05

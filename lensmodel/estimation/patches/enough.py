@@ -12,7 +12,7 @@ from lensmodel.core.types import FieldPosition
 from lensmodel.estimation.patches.selector import Patch
 
 LEAST_PATCHES: Final = 6
-"""Patches without common pixels. A plane over the field, which is the least that tells a centred lens from a
+"""Patches that lie apart. A plane over the field, which is the least that tells a centred lens from a
 decentred one, has three unknowns; so many again tell whether the first three agree."""
 
 LEAST_PARTS: Final = 3
@@ -32,10 +32,10 @@ def part_of(position: FieldPosition) -> int:
 
 
 def apart(patches: Sequence[Patch]) -> list[Patch]:
-    """Patches that share no pixel, taken greedily in their order."""
+    """Patches half a side or more from each other, taken greedily in their order."""
     kept: list[Patch] = []
     for patch in patches:
-        if all(max(abs(patch.row - k.row), abs(patch.col - k.col)) >= patch.size for k in kept):
+        if all(max(abs(patch.row - k.row), abs(patch.col - k.col)) >= patch.size / 2 for k in kept):
             kept.append(patch)
     return kept
 
@@ -48,7 +48,7 @@ def require_enough(patches: Sequence[Patch], *, least: int = LEAST_PATCHES) -> N
     patches : sequence of Patch
         Those that tell about the PSF.
     least : int
-        How many without common pixels are needed.
+        How many that lie apart are needed.
 
     Raises
     ------

@@ -38,7 +38,7 @@ from lensmodel.lab.cases import list_photos, photo_half
 from lensmodel.lab.gallery.truth import Gains, gains
 from lensmodel.lab.images import psnr
 from lensmodel.lab.traced import GridLens, read_grid
-from lensmodel.model import LensModel, ModelSettings
+from lensmodel.model import LensModel
 from lensmodel.quality.images import to_srgb
 from lensmodel.simulate import (
     SimulatedCamera,
@@ -197,7 +197,7 @@ def outcomes(
         if not known:
             yield count, "its photos show too little"
             continue
-        model = LensModel.fit(known, ModelSettings()).warmed()
+        model = LensModel.fit(known)
         made: correction.Corrected = pipeline.correct_photo(
             developed, model, lens.settings, lateral=pipeline.lateral_of(developed)
         )

@@ -14,14 +14,15 @@ from lensmodel.core.psf import PsfSample
 from lensmodel.core.types import LensSettings
 from lensmodel.simulate import SimulatedCamera, SimulatedLens, load_scene, photograph, write_photo
 from lensmodel.workflow import pipeline
+from lensmodel.workflow.ways import WAYS
 
 _MARGIN = 56  # pixels of the scene beyond the frame, which a wide kernel brings into it
 
 
 def estimated_samples(
-    lens: SimulatedLens, files: Sequence[Path], seed: int, *, count: int = pipeline.DEFAULT_PATCHES
+    lens: SimulatedLens, files: Sequence[Path], seed: int, *, count: int = WAYS["default"].patches
 ) -> list[PsfSample]:
-    """Green samples of photographs taken wide open, with their spectra.
+    """Green samples of photographs taken wide open.
 
     Parameters
     ----------
@@ -35,7 +36,7 @@ def estimated_samples(
 
     Notes
     -----
-    Cost: about a minute of CPU for each photograph.
+    Cost: some seconds of CPU for each photograph.
     """
     settings = LensSettings(aperture=lens.at_focal().f_number, focal_mm=lens.focal_mm[0])
     found: list[PsfSample] = []
@@ -51,9 +52,9 @@ def estimated_samples(
             for group in pipeline.patches_by_cell(pipeline.find_patches(developed, count=count)):
                 try:
                     estimates = pipeline.estimate_cell(
-                        developed, group, settings=settings, photo_id=f"photo{number}", channels=("g",)
+                        developed, group, settings=settings, photo_id=f"photo{number}"
                     )
                 except NotEnoughEvidenceError:
                     continue
-                found += [estimate.sample for estimate in estimates]
+                found += [estimate.sample for estimate in estimates if estimate.channel == "g"]
     return found

@@ -5,7 +5,7 @@ Three kinds of input:
 * lenses of `draw_lens` whose kernels are known: models are fed with true kernels at the patches of
   n photos and asked at places in between and beyond;
 * the same lenses behind photographs whose patches are estimated blindly (`--photographs FOLDER`): there the
-  ways to answer from kernels and from one wavefront can be compared;
+  ways to answer can be compared;
 * a file of measured PSFs (`--psf-field FILE.npz`, keys psf (n, k, k), r, phi, and optionally
   aperture and group): groups are held out in turn.
 
@@ -39,8 +39,8 @@ from lensmodel.lab.cases import list_photos, photo_half
 from lensmodel.lab.model.estimated import estimated_samples
 from lensmodel.lab.model.exact import PaperModel
 from lensmodel.lab.model.smoothers import make_known
-from lensmodel.model import LensModel, ModelSettings, fit_wavefront, smoothers
-from lensmodel.model.answer import KERNELS, MODES
+from lensmodel.model import LensModel, ModelSettings, smoothers
+from lensmodel.model.answer import MODES
 from lensmodel.simulate import draw_lens
 
 FRAME = Frame(2832, 4256)  # 12 megapixels, 3:2 (chosen)
@@ -130,9 +130,8 @@ def run_model_benchmark(
     photos : sequence of int
         How many photos of 24 patches a model sees.
     methods : sequence of str, optional
-        Names in `smoothers`, those of `lab.model.smoothers` included (each in mode "kernels"), "eff-linear",
-        "polynomial", "wavefront", "paper", or the modes "mode-both", "mode-kernels", "mode-wavefront",
-        "mode-paper"; by default all, but modes only of `photographs`.
+        Names in `smoothers`, those of `lab.model.smoothers` included "eff-linear", "polynomial", "paper", or
+        the modes "mode-default" and "mode-paper"; by default all, but modes only of `photographs`.
     psf_field : Path, optional
         Measured PSFs; then `seeds` and `photos` play no part.
     spoiled : float
@@ -251,8 +250,7 @@ def _fits(methods: Sequence[str] | None, *, modes: bool = False) -> dict[str, Fi
         "eff-linear": _linear,
         "polynomial": _polynomial,
         "paper": _paper,
-        "wavefront": _wavefront,
-        **{name: _regression(ModelSettings(method=name, mode=KERNELS)) for name in smoothers},
+        **{name: _regression(ModelSettings(method=name)) for name in smoothers},
         **{f"mode-{mode}": _regression(ModelSettings(mode=mode)) for mode in MODES},
     }
     unknown = [name for name in methods or () if name not in known]
@@ -264,7 +262,7 @@ def _fits(methods: Sequence[str] | None, *, modes: bool = False) -> dict[str, Fi
 
 def _regression(chosen: ModelSettings) -> Fit:
     def fit(samples: Sequence[PsfSample]) -> Predictor:
-        model = LensModel.fit(samples, chosen).warmed()
+        model = LensModel.fit(samples, chosen)
         settings, size = samples[0].settings, samples[0].kernel.shape[0]
         return lambda place: model.query(place, settings, size).kernel
 
@@ -275,14 +273,6 @@ def _paper(samples: Sequence[PsfSample]) -> Predictor:
     model = PaperModel.fit(samples)
     settings, size = samples[0].settings, samples[0].kernel.shape[0]
     return lambda place: model.kernel_at_settings(place, settings, size)
-
-
-def _wavefront(samples: Sequence[PsfSample]) -> Predictor:
-    front = fit_wavefront(samples)
-    if front is None:
-        raise InvalidInputError(f"{len(samples)} samples make no wavefront; give more")
-    settings, size = samples[0].settings, samples[0].kernel.shape[0]
-    return lambda place: front.kernel(place, settings, size)
 
 
 def _xy(places: Sequence[FieldPosition]) -> NDArray[np.float64]:

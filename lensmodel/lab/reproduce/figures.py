@@ -98,16 +98,15 @@ def _fig4(plan: Reproduction, case: Case, folder: Path, workers: int | None) -> 
     with TemporaryDirectory(prefix="lensmodel-figure-") as work:
         shots = take(case, plan.files(), Path(work), first=1)
         developed = develop(shots.learn[0])
-        chosen = pipeline.find_patches(developed)
+        recipe = pipeline.Recipe(estimator=plan.estimator)
+        chosen = pipeline.find_patches(developed, count=recipe.patches, estimator=recipe.method)
         try:
-            samples = pipeline.samples_of_photo(
-                shots.learn[0], pipeline.Recipe(estimator=plan.estimator), workers=workers
-            )
+            samples = pipeline.samples_of_photo(shots.learn[0], recipe, workers=workers)
         except LensModelError as error:
             return {"failed": str(error)}
     green = [s for s in samples if s.settings.channel == "g"]
     frame, settings = developed.frame, case.settings
-    model = LensModel.fit(samples).warmed()
+    model = LensModel.fit(samples)
     boxes = [(p.row, p.col, p.size) for p in chosen.patches]
     Image.fromarray(_small_photo(as_shown(developed.planes, case.camera.white_balance), boxes)).save(
         folder / "fig4-patches.png", optimize=True

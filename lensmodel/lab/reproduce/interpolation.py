@@ -20,7 +20,7 @@ from lensmodel.lab.model.model_benchmark import PATCHES, asked_places, patch_pla
 from lensmodel.lab.reproduce.cases import Case
 
 EFF: Final = "efficient filter flow"
-REGRESSIONS: Final = {"the paper's regression": "paper", "regression of today's default": "mode-kernels"}
+REGRESSIONS: Final = {"the paper's regression": "paper", "regression of today's default": "combined"}
 SIZE: Final = 31  # pixels of a kernel: that of an estimate
 FRAME: Final = Frame(288, 432)
 """Of the flow. Weights depend on the place in the field alone: a small frame is as good as a large one."""

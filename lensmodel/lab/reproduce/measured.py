@@ -56,5 +56,4 @@ def measured_field(case: Case, path: Path, *, on_step: StepHook = ignore_step) -
     found = method.measure([photo], size=SIZE, on_step=on_step)
     samples = measure.samples_of(found, method, photo, photo_id="target", settings=case.settings)
     model = LensModel.fit(samples)
-    pitch, half = case.camera.pitch_um, case.camera.frame.half_diagonal
-    return model.field(case.settings, pitch_um=pitch, half_diagonal_px=half)
+    return model.field(case.settings, pitch_um=case.camera.pitch_um)

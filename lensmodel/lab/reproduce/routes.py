@@ -92,7 +92,7 @@ def paper_way(case: Case) -> Way:
     """Return the paper's own way from end to end, as it suits the frames of a case."""
     if case.height * case.width >= _SMALL_FRAME:
         return WAYS["paper"]
-    return replace(WAYS["paper"], kernel_size=WAYS["default"].kernel_size)
+    return replace(WAYS["paper"], kernel_size=pipeline.DEFAULT_KERNEL_SIZE)
 
 
 OpenRoute: TypeAlias = Callable[[Case, Path], AbstractContextManager[Route]]
@@ -182,7 +182,6 @@ class DirectRoute:
     def _known(self) -> LensModel:
         if self._model is None:
             raise NoSamplesError("no photo has counted yet: learn from one with fine detail in focus")
-        self._model = self._model.warmed()  # only where something is asked: every fit costs half a minute
         return self._model
 
 

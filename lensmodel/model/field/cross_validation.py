@@ -17,7 +17,6 @@ from lensmodel.model.field import robust
 from lensmodel.model.field.leave_one_out import Choice, HeldOut, choose_factors
 from lensmodel.model.field.local_frame import LocalKernels
 from lensmodel.model.field.robust import Flag
-from lensmodel.model.wavefront.from_kernels import ONE_FOCAL_LENGTH
 
 _CV_PHOTOS = 3
 """Photos from which on leaving one out tells of bandwidths: of two, each would be foretold by one alone
@@ -25,6 +24,8 @@ _CV_PHOTOS = 3
 _CV_SAMPLES = 300  # that the search looks at: its cost grows with their square (chosen)
 _SCORED = 800
 """Samples whose held-out error is measured, for the same reason; the others get the median (chosen)."""
+ONE_FOCAL_LENGTH = 0.25
+"""Octaves within which focal lengths are one (chosen: over a fifth of it lenses hardly change)."""
 _ROTATIONAL = 10.0  # chords of the circle: so wide that phi does not count
 _UNKNOWN_ERROR = 0.5  # of samples that no other one foretells (chosen: halfway to no knowledge)
 _FEWEST = 2  # one sample cannot be left out

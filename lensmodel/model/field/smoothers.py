@@ -8,7 +8,7 @@ one measure of what stands behind an answer.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,10 +48,6 @@ class Smoother(Protocol):
     def reach(self) -> float:
         """Distance in bandwidths beyond which samples are left out."""
 
-    @property
-    def physical(self) -> bool:
-        """Whether a wavefront may be fitted to the samples and take part in the answer."""
-
     def weights(self, near: Neighbours) -> NDArray[np.float64]:
         """Weights of sum 1, shape (m,)."""
 
@@ -73,7 +69,6 @@ class NadarayaWatson:
 
     transport: bool = False
     reach: float = 5.0
-    physical: bool = False
 
     def weights(self, near: Neighbours) -> NDArray[np.float64]:
         """Weights of sum 1."""
@@ -83,16 +78,8 @@ class NadarayaWatson:
 smoothers: Registry[Smoother] = Registry(
     "regression",
     {
-        "combined": lambda **params: NadarayaWatson(transport=True, physical=True, **params),
+        "combined": lambda **params: NadarayaWatson(transport=True, **params),
         "nadaraya-watson": NadarayaWatson,
     },
 )
 """Methods of regression by name, the usual one and the paper's; `register` adds others."""
-
-FORMER_METHODS: Final = frozenset(
-    {
-        *("abramson", "blended", "blended-gaussian-process", "gaussian-process", "local-linear", "nearest"),
-        *("transport", "transport-gaussian-process", "transport-local-linear", "transport-nearest"),
-    }
-)
-"""Methods that profiles of earlier versions may name; the usual one answers then."""

@@ -168,7 +168,7 @@ def few_patches(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_calibrate_learns_once_from_each_photo_and_says_so_in_json(
     folder: Path, here: Here, few_patches: None
 ) -> None:
-    words = ("calibrate", "one.dng", "--profile", "new/lens.lensprofile", "--estimator", "whittle", "--json")
+    words = ("calibrate", "one.dng", "--profile", "new/lens.lensprofile", "--estimator", "default", "--json")
     first = here(*words, "--workers", "1")
     again = here(*words)
 
@@ -182,7 +182,7 @@ def test_calibrate_learns_once_from_each_photo_and_says_so_in_json(
 
 @pytest.mark.slow
 def test_calibrate_force_begins_anew(folder: Path) -> None:
-    done = lensmodel("calibrate", "one.dng", "-p", PROFILE, "--estimator", "whittle", "--force", cwd=folder)
+    done = lensmodel("calibrate", "one.dng", "-p", PROFILE, "--estimator", "default", "--force", cwd=folder)
 
     assert done.returncode == 0, done.stderr
     assert list(load_profile(folder / PROFILE).photos.values()) == ["one.dng"]
@@ -379,13 +379,13 @@ def test_psf_writes_files_that_open(folder: Path, suffix: str) -> None:
     assert shape == (15, 15)
 
 
-def test_psf_says_what_made_the_answer_and_why(folder: Path) -> None:
+def test_psf_says_what_made_the_answer(folder: Path) -> None:
     words = ["psf", str(folder / PROFILE), "--size", "15"]
     said, document = (CliRunner().invoke(app, [*words, *more]).output for more in ([], ["--json"]))
 
     support = json.loads(document)["support"]
-    assert (support["answered_by"], support["reason"]) == ("regression", "no patch has a spectrum")
-    assert "answered by regression: no patch has a spectrum" in " ".join(said.split())
+    assert (support["answered_by"], support["weights"]) == ("regression", "")
+    assert "answered by regression" in " ".join(said.split())
 
 
 @pytest.mark.parametrize("suffix", ["tif", "png"])
@@ -460,16 +460,6 @@ REFUSED = {
         1,
         "no lens profile.*new file after",
     ),
-    "family and none": (
-        ["calibrate", "one.dng", "-p", "n", "--family", PROFILE, "--no-family"],
-        2,
-        "exclude",
-    ),
-    "family of itself": (
-        ["calibrate", "one.dng", "-p", PROFILE, "--family", PROFILE],
-        2,
-        "the profile itself",
-    ),
     "profile is a folder": (["calibrate", "one.dng", "-p", "empty"], 2, "empty is a folder"),
     "output is a file": (["correct", "one.dng", "-p", PROFILE, "-o", "bad"], 2, "bad is a file"),
     "negative halo": (["correct", "one.dng", "-p", PROFILE, "-o", "o", "--halo", "-1"], 2, "must not be neg"),
@@ -489,7 +479,11 @@ REFUSED = {
         "must be tiff16, .* or dng, got 'tiff'; did you mean tiff16",
     ),
     "unknown method": (["correct", "one.dng", "-p", PROFILE, "-o", "o", "--method", "x"], 2, "known: .*fast"),
-    "unknown estimator": (["calibrate", "one.dng", "-p", "new", "--estimator", "x"], 2, "known: .*whittle"),
+    "unknown estimator": (
+        ["calibrate", "one.dng", "-p", "new", "--estimator", "x"],
+        2,
+        "known: .*michaeli-irani",
+    ),
     "aperture": (["calibrate", "one.dng", "-p", "new", "--aperture", "-2"], 2, "-2"),
     "same name twice": (["correct", "one.dng", "sub/one.dng", "-p", PROFILE, "-o", "o"], 1, "would both"),
     "even size": (["psf", PROFILE, "--size", "20"], 2, "must be odd, got 20"),
@@ -670,7 +664,7 @@ def test_aperture_of_the_command_line_is_for_photos_that_do_not_say_their_own(
     folder: Path, here: Here
 ) -> None:
     Image.fromarray(_picture()).save(folder / "scan.tif")
-    words = ("calibrate", "one.dng", "scan.tif", "-p", "new", "--any-lens", "--estimator", "whittle")
+    words = ("calibrate", "one.dng", "scan.tif", "-p", "new", "--any-lens", "--estimator", "default")
     done = here(*words, "--aperture", "8", "--workers", "1")
 
     assert done.returncode == 0, done.stderr
@@ -678,47 +672,18 @@ def test_aperture_of_the_command_line_is_for_photos_that_do_not_say_their_own(
     assert seen == {2.8, 8.0}
 
 
-@pytest.mark.slow
-def test_a_new_copy_starts_from_another_and_can_leave_it(folder: Path, here: Here) -> None:
-    words = ("calibrate", "one.dng", "-p", "new", "--estimator", "whittle", "--workers", "1")
-    done = here(*words, "--family", PROFILE)
-
-    assert done.returncode == 0, done.stderr
-    asked = json.loads(here("psf", "new", "--r", "0.95", "--phi", "1", "--json").stdout)
-    assert asked["support"]["prior"]
-    assert asked["support"]["prior_share"] > 0
-
-    assert here(*words, "--no-family").returncode == 0
-    assert load_profile(folder / "new").model.prior is None
-
-
-def test_a_profile_keeps_the_unit_that_it_was_told_and_modes_are_gone(
-    folder: Path, here: Here, few_patches: None, estimated_here: None, short_search: None
-) -> None:
-    words = ("calibrate", "one.dng", "-p", PROFILE, "--estimator", "whittle", "--workers", "1", "--json")
-    result = json.loads(here(*words, "--any-lens", "--unit", "half-diagonal").stdout)
-
-    kept = load_profile(folder / PROFILE).model
-    assert (kept.settings.mode, kept.settings.unit) == ("both", "half-diagonal")
-    again = json.loads(here(*words, "--any-lens").stdout)
-    assert again["results"][0]["state"] == "known"
-    assert again["model"] == result["model"] == "default"
-    refused = here(*words, "--mode", "kernels")
-    assert refused.returncode == 2
-    assert "--model" in refused.stderr
-
-
 def test_a_lens_learned_the_papers_way_stays_so_and_is_corrected_so(
-    folder: Path, here: Here, few_patches: None, estimated_here: None, short_search: None
+    folder: Path, here: Here, few_patches: None, estimated_here: None
 ) -> None:
     new = "paper.lensprofile"
     words = ("calibrate", "one.dng", "-p", new, "--workers", "1", "--any-lens", "--json")
-    quick = ("--estimator", "whittle", "--kernel-size", "21")
+    quick = ("--estimator", "default", "--kernel-size", "21")
     result = json.loads(here(*words, *quick, "--model", "paper").stdout)
 
     kept = load_profile(folder / new).model
     sides = {sample.kernel.shape for sample in kept.samples}
-    assert (result["model"], kept.settings.mode, max(sides)) == ("paper", "paper", (21, 21))
+    assert (result["model"], kept.settings.mode) == ("paper", "paper")
+    assert max(sides) <= (21, 21)
     assert json.loads(here(*words, *quick).stdout)["model"] == "paper"
     assert here("correct", "one.dng", "-p", new, "-o", "out").returncode == 0
     with Image.open(folder / "out" / "one-corrected.tif") as written:
@@ -760,7 +725,7 @@ def test_stopped_calibration_keeps_finished_photos_and_goes_on(
     for seed, name in enumerate(("one.jpg", "two.jpg")):
         write_jpeg(folder / name, seed)
     profile = folder / "new.lensprofile"
-    words = ("calibrate", "one.jpg", "two.jpg", "-p", "new.lensprofile", "--estimator", "whittle", "--json")
+    words = ("calibrate", "one.jpg", "two.jpg", "-p", "new.lensprofile", "--estimator", "default", "--json")
     process = start(*words, "-q", cwd=folder)  # on a slow machine it would tell how far it is
     wait_for(profile.exists)
     os.killpg(process.pid, number)  # the whole group, as a terminal does

@@ -77,7 +77,7 @@ def stacked(samples: list[PsfSample]) -> np.ndarray:
 
 
 def test_a_photo_gives_the_same_samples_wherever_it_is_estimated(photo: Path) -> None:
-    recipe = pipeline.Recipe(estimator="whittle", count=4)
+    recipe = pipeline.Recipe(estimator="default", count=4)
     here = pipeline.samples_of_photo(photo, recipe, executor=parallel.Here())
     with ThreadPoolExecutor(2) as threads:
         beside = pipeline.samples_of_photo(photo, recipe, executor=threads)
@@ -88,14 +88,14 @@ def test_a_photo_gives_the_same_samples_wherever_it_is_estimated(photo: Path) ->
     assert [sample.photo for sample in sent] == [sample.photo for sample in here]
 
 
-def test_whole_photos_are_calibrated_by_an_executor(photo: Path, tmp_path: Path, short_search: None) -> None:
+def test_whole_photos_are_calibrated_by_an_executor(photo: Path, tmp_path: Path) -> None:
     broken = tmp_path / "broken.dng"
     broken.write_bytes(photo.read_bytes()[:2000])
     events: list[pipeline.CalibrationEvent] = []
 
     with ThreadPoolExecutor(2) as threads:
         lens = lensmodel.calibrate(
-            [photo, broken, photo], estimator="whittle", patches=4, executor=threads, on_event=events.append
+            [photo, broken, photo], estimator="default", patches=4, executor=threads, on_event=events.append
         )
 
     assert [event.stage for event in events] == ["counted", "skipped", "skipped"]
@@ -110,7 +110,7 @@ def test_a_cluster_of_two_processes_calibrates_the_same_profile(tmp_path: Path) 
 
     for k in range(4):
         write_photo(tmp_path / f"{k}.dng", k)
-    common = [str(tmp_path / f"{k}.dng") for k in range(4)] + ["--estimator", "whittle", "--quiet"]
+    common = [str(tmp_path / f"{k}.dng") for k in range(4)] + ["--estimator", "default", "--quiet"]
     with LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, protocol="tcp"
     ) as cluster:

@@ -95,7 +95,7 @@ def test_an_option_that_does_not_exist_would_be_noticed() -> None:
 # --- each example ------------------------------------------------------------------------------
 
 SHORTER = {
-    "calibrate": ["--estimator", "whittle"],
+    "calibrate": ["--estimator", "default"],
     "reproduce": ["--size", "quick"],
 }
 """What is added so that an example takes minutes at most; the estimators have tests of their own."""
@@ -257,7 +257,7 @@ def test_example_runs(
 ) -> None:
     words = [*shlex.split(line), *SHORTER.get(EXAMPLES[line], [])]
     if "auto" in words:
-        words += ["--estimator", "whittle", "--learn-from", "1"]
+        words += ["--estimator", "default", "--learn-from", "1"]
     if EXAMPLES[line] == "measure":
         write_what_measures(folder)
     kept = KEPT.get(EXAMPLES[line])

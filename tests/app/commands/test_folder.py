@@ -30,7 +30,7 @@ AUTO = (
     "--profiles",
     "lenses",
     "--estimator",
-    "whittle",
+    "default",
     "--method",
     "fast",
 )
@@ -57,7 +57,7 @@ def card(tmp_path_factory: pytest.TempPathFactory) -> Path:
     lenses = here / "lenses"
     lenses.mkdir()
     group = groups([Shot.of(photos / "a.dng")])[0]
-    profile = LensProfile(LensModel.fit(samples).warmed(), names, known, (camera,))
+    profile = LensProfile(LensModel.fit(samples), names, known, (camera,))
     save_profile(lenses / f"{group.name}.lensprofile", profile)
     return here
 

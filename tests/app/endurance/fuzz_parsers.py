@@ -29,8 +29,7 @@ from python_multipart.exceptions import FormParserError
 from app.http.upload import _Form
 from lensmodel import photo
 from lensmodel.core.errors import LensModelError
-from lensmodel.core.psf import PsfSample, gaussian
-from lensmodel.core.spectrum import PatchSpectrum
+from lensmodel.core.psf import EncodedPatch, PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
 from lensmodel.photo.dng import ShotInfo, write_bayer_dng
@@ -60,7 +59,7 @@ READERS: dict[str, tuple[str, Reader]] = {
     "inspect png": ("a.png", photo.inspect),
     "sniff": ("a.dng", lambda path: photo.sniff(path.read_bytes()[: photo.HEAD_BYTES])),
     "profile": ("a.lensprofile", load_profile),
-    "spectrum": ("spectrum", lambda path: PatchSpectrum.from_bytes(path.read_bytes())),
+    "encoded": ("encoded", lambda path: EncodedPatch.from_bytes(path.read_bytes())),
     "multipart": ("multipart", _multipart),
 }
 
@@ -90,7 +89,7 @@ def write_seeds(folder: Path) -> None:
     save_profile(
         folder / "a.lensprofile", LensProfile(LensModel.fit(samples), {"model": "x"}, {"0" * 16: "x.dng"})
     )
-    (folder / "spectrum").write_bytes(rng.bytes(256))
+    (folder / "encoded").write_bytes(b"\x00" + rng.bytes(1024))
     (folder / "multipart").write_bytes(
         b'--lens\r\nContent-Disposition: form-data; name="aperture"\r\n\r\n2.8\r\n'
         b'--lens\r\nContent-Disposition: form-data; name="file"; filename="a.dng"\r\n\r\nII*\0\r\n'

@@ -43,7 +43,7 @@ OURS, THEIRS = application(Depends(ASKED)), application(Query())
     ("query", "status"),
     [
         ("r=0.5", 200),
-        ("r=0.5&phi=-1.25&size=31&channel=b&strict=true&std=1&version=3", 200),
+        ("r=0.5&phi=-1.25&size=31&channel=b&strict=true&version=3", 200),
         ("r=0.5&r=0.25", 200),
         ("r=%30%2e5&channel=%72", 200),
         ("r=0.5&aperture=2.8&focal_length_mm=&channel=g", 422),

@@ -12,20 +12,19 @@ import pytest
 
 from app.jobs import sample_files
 from app.jobs.sample_files import DAMAGED, MAX_SIDE, read_samples, returned_samples, write_samples
-from app.jobs.task_files import KERNELS, PHASES, SAMPLES, SPECTRA
+from app.jobs.task_files import ENCODED, KERNELS, SAMPLES
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import PsfSample, delta, gaussian
-from lensmodel.core.spectrum import RINGS, SECTORS, PatchSpectrum
+from lensmodel.core.psf import TOKEN_LENGTH, EncodedPatch, PsfSample, delta, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
 
-SPECTRUM = PatchSpectrum(np.ones((RINGS, SECTORS), dtype=np.float32), 0.5, (1.0, 2.0))
+PATCH = EncodedPatch(np.ones(9, dtype=np.float16), np.ones(TOKEN_LENGTH, dtype=np.float16))
 SAMPLE = PsfSample(
     gaussian(5, np.eye(2)),
     FieldPosition(0.4, 0.3),
     LensSettings(2.8, channel="b"),
     weight=0.25,
     estimator="quick/1",
-    spectrum=SPECTRUM,
+    encoded=PATCH,
     error=0.2,
 )
 Damage = Callable[[Path], object]
@@ -37,11 +36,11 @@ def test_a_returned_sample_is_that_of_the_task(tmp_path: Path) -> None:
     first, second = returned_samples(tmp_path, count=2)
 
     np.testing.assert_allclose(first.kernel, SAMPLE.kernel, atol=1e-7)
-    assert first.spectrum is not None
-    assert first.spectrum.to_bytes() == SPECTRUM.to_bytes()
+    assert first.encoded is not None
+    assert first.encoded.to_bytes() == PATCH.to_bytes()
     assert (first.position, first.settings, first.weight) == (SAMPLE.position, SAMPLE.settings, 0.25)
     assert (first.estimator, first.error) == ("quick/1", 0.2)
-    assert (second.kernel.shape, second.spectrum) == ((3, 3), None)
+    assert (second.kernel.shape, second.encoded) == ((3, 3), None)
     assert [sample.error for sample in read_samples(tmp_path)] == [0.2, None]
 
 
@@ -89,8 +88,11 @@ def boundless(folder: Path) -> None:
         array(KERNELS, np.ones((5, 5), dtype=np.float32)),
         array(KERNELS, np.full((1, 5, 5), np.nan, dtype=np.float32)),
         array(KERNELS, np.ones((1, MAX_SIDE + 2, MAX_SIDE + 2), dtype=np.float32)),
-        array(SPECTRA, np.ones((1, 3), dtype=np.float32)),
-        array(PHASES, np.ones((4, 168), dtype=np.float32)),
+        array(ENCODED, np.ones((1, 3), dtype=np.uint8)),
+        array(ENCODED, np.ones((1, 403), dtype=np.float32)),
+        array(ENCODED, np.full((1, 403), 255, dtype=np.uint8)),
+        changed(encoded=1),
+        changed(encoded="0"),
         changed(size=float("inf")),
         changed(size=7),
         changed(weight=2.0),

@@ -91,7 +91,7 @@ def test_a_profile_goes_out_and_comes_back(client: TestClient, steps: Steps, sto
     assert taken.status_code == 200, taken.text
     assert (taken.json()["photos"], taken.json()["samples"]) == (1, 12)
     assert again.json() == taken.json()
-    question = {"r": 0.5, "phi": 0.4, "aperture": 1.4, "family": False}
+    question = {"r": 0.5, "phi": 0.4, "aperture": 1.4}
     kernels = [
         client.get(f"/v1/lenses/{key}/psf.json", params=question).json()["psf"] for key in (lens, other)
     ]

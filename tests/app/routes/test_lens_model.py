@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from obstore.exceptions import GenericError
 from starlette.testclient import TestClient
 
-from app.blobs.storage import Storage
 from app.client import Client
 from app.client_async import AsyncClient
-from app.http import model_cache
 from app.http.model_cache import ModelCache
 from app.runtime.settings import Settings
 from app.store import Store
@@ -85,17 +82,6 @@ def test_every_answer_names_the_model_that_gave_it(client: TestClient, steps: St
     assert (gone.status_code, gone.json()["code"]) == (409, "conflict")
 
 
-def test_a_lens_of_the_paper_leans_on_no_other_copy(client: TestClient, steps: Steps) -> None:
-    one, two = (steps.counted(serial=serial, patches=6) for serial in ("1", "2"))
-    first, second = steps.lens_id(one), steps.lens_id(two)
-    assert support(client, first)["family"] is not None
-
-    change(client, first, "paper")
-    learn(steps, one, serial="1")
-
-    assert support(client, first)["family"] is support(client, second)["family"] is None
-
-
 def test_a_model_in_memory_does_not_survive_a_change(store: Store, steps: Steps) -> None:
     photo = steps.counted(patches=6)
     lens = steps.lens_id(photo)
@@ -113,11 +99,11 @@ def test_a_model_in_memory_does_not_survive_a_change(store: Store, steps: Steps)
 
 
 def test_the_settings_of_the_service_decide_for_the_default_model_only(settings: Settings) -> None:
-    chosen = settings.model_copy(update={"estimator": "whittle", "kernel_size": 21})
+    chosen = settings.model_copy(update={"estimator": "michaeli-irani", "kernel_size": 21})
 
     default = configured_way(chosen, "default")
-    assert (default.estimator, default.kernel_size) == ("whittle", 21)
-    assert configured_way(chosen, "paper") == WAYS["paper"]
+    assert (default.estimator, default.kernel_size) == ("michaeli-irani", 21)
+    assert configured_way(chosen, "paper") == replace(WAYS["paper"], patches=chosen.patches)
 
 
 def test_photos_of_the_paper_are_corrected_its_way_unless_asked_otherwise(
@@ -238,25 +224,3 @@ def test_both_clients_ask_for_a_model(client: TestClient, steps: Steps, store: S
     assert api.choose_model(lens.id, "paper") == lens
     assert api.calibrations(lens.id)[0].model == "paper"
     assert api.correct(sent.id).method == "paper"
-
-
-def test_a_model_in_memory_answers_while_the_object_store_is_away(
-    store: Store, steps: Steps, settings: Settings, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lens = steps.lens_id(steps.counted(patches=6))
-    storage = Storage(settings.storage)
-    cache = ModelCache(store, 1 << 30, storage)
-    known = cache.get(lens)
-
-    def away(*_: Any) -> Any:
-        time.sleep(3.0)
-        raise GenericError("error sending request")
-
-    monkeypatch.setattr(storage, "info", away)
-    monkeypatch.setattr(storage, "get", away)
-    monkeypatch.setattr(model_cache, "LOOK_S", 0.0)
-    began = time.monotonic()
-
-    assert all(cache.get(lens).model is known.model for _ in range(5))
-
-    assert time.monotonic() - began < 1.0

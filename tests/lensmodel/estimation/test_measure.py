@@ -17,6 +17,7 @@ from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import as_kernel, centred, distance, gaussian, resized
 from lensmodel.core.types import Kernel, LensSettings, NoiseModel
 from lensmodel.estimation import measure
+from lensmodel.estimation.measure.diffraction import diffraction_otf
 from lensmodel.estimation.measure.edges import SlantedEdges, constrained
 from lensmodel.estimation.measure.page import TargetPage
 from lensmodel.estimation.measure.pair import AperturePair
@@ -28,7 +29,6 @@ from lensmodel.estimation.measure.target import Target
 from lensmodel.estimation.measure.warp import homography_of, match
 from lensmodel.lab.measured import scenes
 from lensmodel.model import LensModel
-from lensmodel.optics.diffraction import diffraction_otf
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.values import Encoding, PhotoInfo, PhotoMetadata
 from lensmodel.quality.edge import slanted_edge

@@ -16,7 +16,6 @@ from lensmodel.model import variables as va
 from lensmodel.model.field.index import SampleIndex
 from lensmodel.model.field.local_frame import Answers, LocalKernels
 from lensmodel.model.field.transport import WidthField
-from lensmodel.model.fitting import Fit
 
 SIZE = 21
 GREEN = LensSettings(aperture=2.0)
@@ -149,27 +148,6 @@ def test_samples_added_one_by_one_answer_as_all_at_once() -> None:
         a, b = grown.query(where, GREEN, SIZE), at_once.query(where, GREEN, SIZE)
         assert difference(a.kernel, b.kernel) < 1e-6
         assert a.effective_samples == pytest.approx(b.effective_samples, rel=1e-6)
-
-
-def test_from_the_second_photo_on_a_grown_model_answers_nearly_as_one_fitted_anew(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    samples = photos(3)
-    first, second, third = (samples[24 * k : 24 * (k + 1)] for k in range(3))
-    anew = LensModel.fit([*first, *second])
-    old = LensModel.fit(first)
-    fits: list[int] = []
-    whole = Fit.of
-    monkeypatch.setattr(Fit, "of", lambda kept, settings: fits.append(len(kept)) or whole(kept, settings))
-
-    grown = old.grown(second)
-    beyond = grown.grown(third)
-
-    assert fits == [72]  # more than twice what it was fitted to
-    assert len(beyond.samples) == 72
-    for where in places(5, 7):
-        a, b = grown.query(where, GREEN, SIZE), anew.query(where, GREEN, SIZE)
-        assert difference(a.kernel, b.kernel) < 0.05
 
 
 def test_older_model_is_untouched_by_samples_added_later() -> None:

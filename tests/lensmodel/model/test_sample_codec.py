@@ -11,10 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lensmodel.core.cross_phase import CrossPhase
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.core.psf import PsfSample, delta, gaussian
-from lensmodel.core.spectrum import PHASE_BINS, RINGS, SECTORS, PatchSpectrum
+from lensmodel.core.psf import TOKEN_LENGTH, EncodedPatch, PsfSample, delta
 from lensmodel.core.types import CHANNELS, FieldPosition, LensSettings
 from lensmodel.model.sample_codec import PackedSamples, pack_samples, unpack_samples
 
@@ -22,13 +20,13 @@ finite = {"allow_nan": False, "allow_infinity": False}
 
 
 @st.composite
-def spectra(draw: st.DrawFn) -> PatchSpectrum:
+def patches(draw: st.DrawFn) -> EncodedPatch:
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    tail = (draw(st.floats(-9, 9, width=32)), draw(st.floats(-9, 9, width=32)))
-    numbers = [rng.random(PHASE_BINS, dtype=np.float32) for _ in range(2)]
-    cross = CrossPhase(*numbers) if draw(st.booleans()) else None
-    return PatchSpectrum(
-        rng.random((RINGS, SECTORS), dtype=np.float32), draw(st.floats(0, 1, width=32)), tail, cross
+    statistics, token = rng.normal(size=9), rng.normal(size=TOKEN_LENGTH)
+    return EncodedPatch(
+        statistics.astype(np.float16),
+        token.astype(np.float16),
+        draw(st.sampled_from(("raw", "tiff", "jpeg"))),
     )
 
 
@@ -50,7 +48,7 @@ def samples(draw: st.DrawFn) -> PsfSample:
         photo=draw(st.text(max_size=5)),
         pixel_pitch_um=draw(st.none() | st.floats(0.5, 20.0)),
         estimator=draw(st.text(max_size=5)),
-        spectrum=draw(st.none() | spectra()),
+        encoded=draw(st.none() | patches()),
         error=draw(st.none() | st.floats(0.0, 1.0)),
         half_diagonal_px=draw(st.none() | st.floats(10.0, 1e5)),
     )
@@ -70,21 +68,24 @@ def test_samples_come_back_as_they_were(given_samples: list[PsfSample]) -> None:
     for one, other in zip(given_samples, back, strict=True):
         assert one.kernel.shape == other.kernel.shape
         np.testing.assert_allclose(other.kernel, one.kernel, rtol=1e-6)
-        for name in PsfSample.__dataclass_fields__.keys() - {"kernel", "spectrum"}:
+        for name in PsfSample.__dataclass_fields__.keys() - {"kernel", "encoded"}:
             assert getattr(other, name) == getattr(one, name), name
-        assert (one.spectrum is None) == (other.spectrum is None)
-        if one.spectrum is not None and other.spectrum is not None:
-            assert one.spectrum.to_bytes() == other.spectrum.to_bytes()
+        assert (one.encoded is None) == (other.encoded is None)
+        if one.encoded is not None and other.encoded is not None:
+            assert one.encoded.to_bytes() == other.encoded.to_bytes()
 
 
-def test_entries_of_earlier_profiles_have_kernels_as_large_as_the_array() -> None:
-    packed = pack_samples([PsfSample(gaussian(5, np.eye(2)), FieldPosition(0.5, 0.0))])
-    old = [{k: v for k, v in packed.entries[0].items() if k not in {"size", "error", "half_diagonal_px"}}]
+def test_the_channels_of_a_patch_share_what_it_encodes() -> None:
+    patch = EncodedPatch(np.ones(700, np.float16), np.ones(TOKEN_LENGTH, np.float16))
+    own = [
+        PsfSample(delta(5), FieldPosition(0.5, 0.0), LensSettings(channel=c), encoded=patch) for c in CHANNELS
+    ]
+    packed = pack_samples(own)
+    back = unpack_samples(packed)
 
-    (sample,) = unpack_samples(replace(packed, entries=old))
-
-    assert sample.kernel.shape == (5, 5)
-    assert (sample.error, sample.half_diagonal_px, sample.spectrum) == (None, None, None)
+    assert len(packed.encoded) == 1
+    assert packed.encoded.shape[1] <= 4096
+    assert back[0].encoded is back[1].encoded is back[2].encoded
 
 
 @pytest.mark.parametrize("size", [0, 2, 7, -3])
@@ -95,11 +96,20 @@ def test_a_side_that_does_not_fit_is_refused(size: int) -> None:
         unpack_samples(replace(packed, entries=[{**packed.entries[0], "size": size}]))
 
 
-def test_spectra_of_another_shape_are_refused() -> None:
+@pytest.mark.parametrize("change", [{"encoded": 3}, {"encoded": -1}, {"encoded": "0"}])
+def test_patches_that_are_not_there_are_refused(change: dict[str, object]) -> None:
     packed = pack_samples([PsfSample(delta(5), FieldPosition(0.5, 0.0))])
 
-    with pytest.raises(ValueError, match="spectra of shape"):
-        unpack_samples(replace(packed, spectra=np.zeros((1, 3), dtype=np.float32)))
+    with pytest.raises(ValueError, match="encoded patch"):
+        unpack_samples(replace(packed, entries=[{**packed.entries[0], **change}]))
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\x00", b"\x07" + bytes(400), bytes(401)[:-1], b"\x00" + b"\x00\x7c" * 300]
+)
+def test_other_bytes_are_no_encoded_patch(data: bytes) -> None:
+    with pytest.raises(InvalidInputError):
+        EncodedPatch.from_bytes(data)
 
 
 def test_values_out_of_range_are_refused() -> None:

@@ -12,8 +12,8 @@ import lensmodel
 from lensmodel import photo
 from lensmodel.core.errors import CancelledError, InvalidInputError, MetadataMissingError
 from lensmodel.core.psf import PsfSample, gaussian
-from lensmodel.core.types import FieldPosition, LensSettings, StepHook, ignore_step
-from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
+from lensmodel.core.types import FieldPosition, LensSettings
+from lensmodel.model import LensModel, LensProfile
 from lensmodel.workflow import calibrating, pipeline
 from lensmodel.workflow.lens import Lens
 
@@ -46,38 +46,28 @@ def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
 
 
 class Noting(pipeline.InMemory):
-    """Notes how often a lens is kept, and which of them is whole."""
+    """Notes how many samples a lens has whenever it is kept."""
 
     def __init__(self, lens: Lens | None = None) -> None:
         super().__init__(lens)
-        self.kept: list[bool] = []
+        self.kept: list[int] = []
 
-    def keep(self, lens: Lens, *, whole: bool) -> None:
-        super().keep(lens, whole=whole)
-        self.kept.append(whole)
+    def keep(self, lens: Lens) -> None:
+        super().keep(lens)
+        self.kept.append(len(lens.samples))
 
 
-def test_a_lens_is_kept_after_each_photo_and_fitted_once_at_the_end(
-    photos: list[Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fitted: list[int] = []
-
-    def warmed(model: LensModel, on_step: StepHook = ignore_step) -> LensModel:
-        fitted.append(len(model.samples))
-        return model
-
-    monkeypatch.setattr(LensModel, "warmed", warmed)
+def test_a_lens_is_kept_after_each_photo(photos: list[Path]) -> None:
     keeper = Noting()
     calibration = pipeline.Calibration(keeper, pipeline.Recipe())
 
     verdicts = list(calibration.learn([*photos, photos[0]]))
-    lens = calibration.finish()
+    lens = calibration.known
 
     assert [verdict.samples for verdict in verdicts] == [9, 9, None]
     assert lens is not None
     assert sorted(lens.profile.photos.values()) == ["a.dng", "b.dng"]
-    assert keeper.kept == [False, False, True]
-    assert fitted == [18]
+    assert keeper.kept == [9, 18]
 
 
 def test_nothing_is_kept_where_nothing_was_learned(photos: list[Path]) -> None:
@@ -86,7 +76,7 @@ def test_nothing_is_kept_where_nothing_was_learned(photos: list[Path]) -> None:
     calibration = pipeline.Calibration(keeper, pipeline.Recipe())
 
     assert calibration.add(photos[0]) is None
-    assert calibration.finish() is keeper.lens()
+    assert calibration.known is keeper.lens()
     assert keeper.kept == []
 
 
@@ -100,9 +90,9 @@ def test_what_another_run_added_meanwhile_stays(photos: list[Path]) -> None:
         replace(kept.profile, model=LensModel.fit([*kept.samples, *samples_of("x")]), photos={"x": "x.dng"})
     )
 
-    keeper.keep(others, whole=False)
+    keeper.keep(others)
     calibration.add(photos[1])
-    lens = calibration.finish()
+    lens = calibration.known
 
     assert lens is not None
     assert len(lens.samples) == 27
@@ -121,20 +111,7 @@ def test_photos_that_cannot_teach_a_lens_are_refused_before_any_work(
     with pytest.raises(MetadataMissingError, match="--aperture"):
         calibration.add(tmp_path / "unknown.dng")
 
-    assert calibration.finish() is None
-
-
-def test_a_profile_without_a_fit_opens_with_the_same_answers(tmp_path: Path) -> None:
-    profile = LensProfile(LensModel.fit(samples_of("x")), {}, {"x": "x.dng"})
-    save_profile(tmp_path / "whole", profile)
-    save_profile(tmp_path / "between", profile, learned=False)
-
-    whole, between = (
-        load_profile(tmp_path / name).model.query(FieldPosition(0.4, 0.3), LensSettings(2.8))
-        for name in ("whole", "between")
-    )
-
-    np.testing.assert_allclose(between.kernel, whole.kernel, atol=1e-6)
+    assert calibration.known is None
 
 
 class Written:

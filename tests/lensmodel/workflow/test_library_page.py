@@ -41,9 +41,9 @@ def photos(tmp_path: Path) -> Path:
 @pytest.fixture
 def smallest_photos(tmp_path: Path) -> Path:
     """Grey photos behind one Gaussian blur, as small as ones that a lens is learned from can be."""
-    rows, cols = 192, 288
+    rows, cols = 320, 448
     for seed, (file, (scene, left)) in enumerate(SHOTS.items()):
-        whole = demo_scene(scene)[1, 200 : 200 + 2 * rows, left : left + 2 * cols]
+        whole = demo_scene(scene)[1, 100 : 100 + 2 * rows, left : left + 2 * cols]
         sharp = whole.reshape(rows, 2, cols, 2).mean(axis=(1, 3))  # than the photograph itself
         light = ndimage.gaussian_filter(sharp, WIDTH_PX)
         electrons = np.random.default_rng(seed).poisson(20000.0 * np.clip(light, 0.0, 1.0))
@@ -54,11 +54,9 @@ def smallest_photos(tmp_path: Path) -> Path:
 
 
 def test_the_five_lines_run(
-    smallest_photos: Path, monkeypatch: pytest.MonkeyPatch, estimated_here: None, short_search: None
+    smallest_photos: Path, monkeypatch: pytest.MonkeyPatch, estimated_here: None
 ) -> None:
     monkeypatch.chdir(smallest_photos)
-    # two patches of each photo: an estimate of each costs a third of a second
-    monkeypatch.setitem(lensmodel.calibrate.__kwdefaults__, "patches", 2)
     names: dict[str, Any] = {}
 
     exec(BLOCK.findall(PAGE.read_text(encoding="utf-8"))[0], names)
@@ -72,7 +70,7 @@ def test_the_five_lines_run(
     before = develop("c.dng").planes
     assert np.abs(np.diff(corrected[1])).mean() > 1.05 * np.abs(np.diff(before[1])).mean()
     assert Path("c.tif").stat().st_size > 6 * corrected[0].size
-    assert len(lensmodel.Lens.load("my-24mm.lensprofile").samples) == len(lens.samples) == 12
+    assert len(lensmodel.Lens.load("my-24mm.lensprofile").samples) == len(lens.samples)
 
 
 @pytest.mark.slow

@@ -9,11 +9,9 @@ import pytest
 import lensmodel
 from lensmodel import correction, photo, quality
 from lensmodel.core import codec
-from lensmodel.core.cross_phase import log_likelihood, mean_in_bins
 from lensmodel.core.errors import InvalidInputError, MetadataMissingError, NotEnoughEvidenceError
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample
-from lensmodel.core.spectrum import PatchSpectrum
 from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel
 from lensmodel.estimation.patches import Patch, Selection
 from lensmodel.model import LensModel
@@ -28,7 +26,6 @@ from lensmodel.simulate import (
     write_photo,
 )
 from lensmodel.workflow import correcting, pipeline
-from lensmodel.workflow.estimating import SeenPatch
 
 LENS = draw_lens(5, "soft-fast")  # blurred in the center too: there is something to gain everywhere
 CAMERA = SimulatedCamera(height=320, width=480, pitch_um=9.0)
@@ -64,27 +61,6 @@ def test_developed_photo_comes_back_from_disk_as_it_was(city: LinearPhoto, tmp_p
     assert back.planes.flags.writeable is False
     assert (back.frame, back.noise, back.clip) == (city.frame, city.noise, city.clip)
     assert (back.info, back.encoding) == (city.info, city.encoding)
-
-
-def test_the_patches_that_judge_a_model_come_back_from_disk_as_they_were(tmp_path: Path) -> None:
-    rng = np.random.default_rng(3)
-    seen = [
-        SeenPatch(FieldPosition(r, -2.0), PatchSpectrum(rng.random((14, 12), dtype=np.float32), r / 7.0))
-        for r in (0.1, 0.8)
-    ]
-    assert pipeline.load_seen(tmp_path) is None
-    pipeline.save_seen(seen, tmp_path)
-    back = pipeline.load_seen(tmp_path)
-
-    assert back is not None
-    assert len(back) == len(seen)
-    for one, other in zip(back, seen, strict=True):
-        assert one.position == other.position
-        assert one.spectrum.noise == other.spectrum.noise
-        assert one.spectrum.power.dtype == other.spectrum.power.dtype
-        np.testing.assert_array_equal(one.spectrum.power, other.spectrum.power)
-    (tmp_path / "seen.json").write_text('[{"position": null}]', encoding="utf-8")
-    assert pipeline.load_seen(tmp_path) is None
 
 
 def test_half_written_folder_is_no_developed_photo(tmp_path: Path) -> None:
@@ -126,22 +102,13 @@ def test_cells_hold_every_patch_once_largest_first() -> None:
     assert sorted(p.row for group in groups for p in group) == list(range(6))
 
 
-@pytest.mark.parametrize(  # of so few patches as the first no wavefront is fitted: that takes the longest
-    ("method", "estimator", "count"),
-    [("fast", "whittle", 7), pytest.param("standard", "default", 12, marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize("method", ["fast", pytest.param("standard", marks=pytest.mark.slow)])
 def test_calibrated_lens_makes_another_photo_sharper(
-    method: str,
-    estimator: str,
-    count: int,
-    photos: dict[str, tuple[Path, SimulatedPhoto]],
-    tmp_path: Path,
-    short_search: None,
-    estimated_here: None,
+    method: str, photos: dict[str, tuple[Path, SimulatedPhoto]], tmp_path: Path
 ) -> None:
     events: list[pipeline.CalibrationEvent] = []
     city = photos["city"][0]
-    lens = lensmodel.calibrate(city, estimator=estimator, patches=count, workers=1, on_event=events.append)
+    lens = lensmodel.calibrate(city, on_event=events.append)
     path, shot = photos["lake"]
     output = tmp_path / "corrected.tif"
 
@@ -157,57 +124,6 @@ def test_calibrated_lens_makes_another_photo_sharper(
     assert stages[-1] == "counted"
     assert lensmodel.calibrate([city] * 2, lens=lens, on_event=events.append) is lens
     assert [event.stage for event in events][len(stages) :] == ["skipped"] * 2
-
-
-@pytest.mark.parametrize(("kind", "kept"), [("dng", True), ("tiff", True), ("jpeg", False)])
-def test_spectra_of_photos_that_a_camera_sharpened_are_not_kept(
-    kind: photo.FileKind, kept: bool, city: LinearPhoto
-) -> None:
-    developed = replace(city, info=replace(city.info, kind=kind))
-    patch = Patch(128, 192, 128, developed.frame.position(192, 256), 1.0, 0)
-
-    found = pipeline.estimate_cell(
-        developed, [patch], settings=SETTINGS, photo_id="a", estimator="whittle", channels=("g",)
-    )
-
-    assert (found[0].sample.spectrum is not None) == kept
-
-
-def test_the_mosaic_s_phases_tell_the_lens_from_the_one_turned_by_180_degrees(
-    photos: dict[str, tuple[Path, SimulatedPhoto]],
-) -> None:
-    lake = photo.develop(photos["lake"][0])
-    places = ((1, 319), (80, 2), (159, 319))  # the pattern begins with each of its rows and columns
-    group = [Patch(row, col, 160, lake.frame.position(row + 79.5, col + 79.5), 1.0, 0) for row, col in places]
-    found = pipeline.estimate_cell(
-        lake, group, settings=SETTINGS, photo_id="a", estimator="whittle", channels=("g", "b")
-    )
-    field, more = LENS.field(SETTINGS, pitch_um=CAMERA.pitch_um), []
-    for cell in found:
-        assert cell.sample.spectrum is not None
-        cross = cell.sample.spectrum.cross
-        assert (cross is None) == (cell.channel == "g")
-        if cross is not None:
-            waves = []
-            for channel in ("b", "g"):
-                grid = np.zeros((64, 64))
-                grid[:31, :31] = field.kernel_at(cell.patch.position, channel, 31)
-                waves.append(np.fft.fft2(np.roll(grid, (-15, -15), axis=(0, 1))))
-            true = np.angle(mean_in_bins(waves[0] * waves[1].conj()))
-            more.append(log_likelihood(cross, true) - log_likelihood(cross, -true))
-
-    assert len(more) == 3
-    assert min(more) > 5.0
-
-
-def test_planes_without_a_mosaic_have_no_phases(city: LinearPhoto) -> None:
-    patch = Patch(128, 192, 128, city.frame.position(192, 256), 1.0, 0)
-    found = pipeline.estimate_cell(
-        replace(city, cfa=None), [patch], settings=SETTINGS, photo_id="a", estimator="whittle"
-    )
-
-    assert all(cell.sample.spectrum is not None for cell in found)
-    assert all(cell.sample.spectrum.cross is None for cell in found if cell.sample.spectrum is not None)
 
 
 def test_a_patch_that_took_no_part_becomes_a_sample_all_the_same(city: LinearPhoto) -> None:
@@ -297,3 +213,19 @@ def test_paper_method_warps_the_channels_before_it_corrects(monkeypatch: pytest.
 
         assert bool(np.asarray(seen["planes"]).any()) is warped
         assert seen["lateral"] == (None if warped else "shift")
+
+
+def test_the_photo_that_is_corrected_joins_the_samples_once(
+    photos: dict[str, tuple[Path, SimulatedPhoto]],
+) -> None:
+    paths = {name: path for name, (path, _) in photos.items()}
+    model = lensmodel.calibrate(paths["city"]).model
+    lake, city = (photo.develop(paths[name]) for name in ("lake", "city"))
+
+    other = pipeline.psfs_for(lake, model, SETTINGS, photo=pipeline.photo_id(paths["lake"]))
+    same = pipeline.psfs_for(city, model, SETTINGS, photo=pipeline.photo_id(paths["city"]))
+
+    assert len(other.model.samples) > len(model.samples)
+    assert {sample.photo for sample in other.model.samples} == {pipeline.photo_id(p) for p in paths.values()}
+    assert same.model is model
+    assert 0.0 < other.error_at(FieldPosition(0.5, 0.3), "g") <= 1.0

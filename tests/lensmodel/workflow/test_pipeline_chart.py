@@ -10,15 +10,13 @@ from scipy import ndimage
 
 from lensmodel import photo
 from lensmodel.core import codec
-from lensmodel.core.belief import UncertainField
 from lensmodel.core.geometry import Frame
-from lensmodel.core.psf import PsfSample, gaussian, rms_width
+from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings, NoiseModel, Planes
-from lensmodel.correction import Corrected
 from lensmodel.model import LensModel
 from lensmodel.photo import LinearPhoto
 from lensmodel.simulate import edge_chart
-from lensmodel.workflow import correcting, pipeline
+from lensmodel.workflow import pipeline
 
 FRAME = Frame(900, 1200)
 SMALL = Frame(480, 720)  # large enough for a chart still
@@ -79,30 +77,3 @@ def test_corrected_photo_without_a_chart_has_no_measured_gain(model: LensModel) 
     )
 
     assert {report.measured for report in found.zones.values()} == {None}
-
-
-def test_photo_that_is_sharper_than_the_model_says_is_corrected_with_care(
-    model: LensModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rng = np.random.default_rng(4)
-    rows, cols = np.fft.fftfreq(FRAME.height)[:, None], np.fft.rfftfreq(FRAME.width)
-    fall = np.maximum(np.hypot(rows, cols), 1e-3) ** -1.05
-    scene = np.fft.irfft2(np.fft.rfft2(rng.normal(size=(FRAME.height, FRAME.width))) * fall)
-    soft = 0.4 + 0.06 * ndimage.gaussian_filter(scene, 0.6) / scene.std()
-    seen = np.stack([soft + rng.normal(0.0, 0.003, soft.shape) for _ in range(3)]).astype(np.float32)
-    beliefs: dict[str, tuple[float, float]] = {}
-    name = ""
-
-    def record(planes: Planes, field: UncertainField, *_: object, **__: object) -> Corrected:
-        belief = field.belief_at(FieldPosition(0.3, 0.5), "g", 31)
-        beliefs[name] = rms_width(belief.kernel), belief.error
-        return Corrected(planes, {})
-
-    monkeypatch.setattr(correcting.correction, "correct_planes", record)
-    for name in ("tiff", "jpeg"):
-        picture = developed(seen)
-        info = photo.PhotoInfo(name, FRAME.width, FRAME.height)  # type: ignore[arg-type] # of a tuple
-        pipeline.correct_photo(replace(picture, info=info), model, LensSettings())
-
-    assert beliefs["tiff"][0] < 0.85 * beliefs["jpeg"][0]
-    assert beliefs["tiff"][1] > beliefs["jpeg"][1] + 0.1

@@ -11,33 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lensmodel.lab.blind.polyblur_law import SIGMAS_PX, law_of, slopes_behind
 from lensmodel.lab.blind.recurrence_line import is_of, line_through, readings, rows_of
-
-
-def test_the_law_of_slopes_is_recovered_from_slopes_that_follow_it() -> None:
-    sigmas = np.array(SIGMAS_PX)
-
-    c, b = law_of(sigmas, 0.3 / np.hypot(sigmas, 0.9))
-
-    assert (c, b) == pytest.approx((0.3, 0.9), rel=1e-6)
-
-
-def test_the_law_of_slopes_is_that_of_a_step_where_windows_hold_one() -> None:
-    """A step of height 1, square pixels and a probe of 0.7 px: c = 1 / sqrt(2 pi), b² = 0.49 + 1/12 + 1/4.
-
-    The edge lies between two pixels; half a pixel beside it the slope is that of a variance larger by 1/4, to
-    first order.
-    """
-    step = np.tile(np.where(np.arange(122) < 61, 0.05, 0.85), (122, 1))
-    sigmas = np.array(SIGMAS_PX[4:])
-    rng = np.random.default_rng(0)
-
-    across = [np.median(slopes_behind([step], sigma, rng)[:, 3]) for sigma in sigmas]
-
-    c, b = law_of(sigmas, np.array(across))
-    assert c == pytest.approx(1 / math.sqrt(2 * math.pi), rel=0.05)
-    assert b == pytest.approx(math.sqrt(0.49 + 1 / 12 + 1 / 4), rel=0.15)
 
 
 def test_the_line_of_recurrence_is_recovered_from_points_that_lie_beside_it() -> None:

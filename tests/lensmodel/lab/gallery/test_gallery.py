@@ -451,7 +451,7 @@ def test_the_page_shows_a_corrected_picture_and_its_figures(
     monkeypatch.setattr(working.peers.Peer, "installed", property(lambda _: False))
     output = tmp_path / "gallery"
 
-    entries = list(hang(real_pictures(folder), output, Wishes(mode="kernels", workers=1), on_picture=ignore))
+    entries = list(hang(real_pictures(folder), output, Wishes(mode="default", workers=1), on_picture=ignore))
     page = write_page(entries, output).read_text(encoding="utf-8")
 
     assert entries[0].work["state"] == "corrected"
@@ -480,7 +480,7 @@ def test_the_audits_map_and_its_worst_places_are_shown_where_there_is_an_audit(
     monkeypatch.setattr(working.peers.Peer, "installed", property(lambda _: False))
     output = tmp_path / "gallery"
 
-    entries = list(hang(real_pictures(folder), output, Wishes(mode="kernels", workers=1), on_picture=ignore))
+    entries = list(hang(real_pictures(folder), output, Wishes(mode="default", workers=1), on_picture=ignore))
 
     worst = next(place for place in entries[0].places if place.name == "audit 1")
     assert (worst.row, worst.col) == (120 - 48, 72 - 48)

@@ -11,7 +11,6 @@ from lensmodel.core.psf import PsfSample, centroid, distance, gaussian
 from lensmodel.core.types import FieldPosition, Kernel, LensSettings
 from lensmodel.lab.model.smoothers import COMPARED, make_known
 from lensmodel.model import LensModel, ModelSettings, smoothers
-from lensmodel.model.field.smoothers import FORMER_METHODS
 
 SIZE = 21
 GREEN = LensSettings(aperture=2.0)
@@ -39,10 +38,9 @@ def fitted(method: str, photos: int) -> LensModel:
     return LensModel.fit(samples, ModelSettings(method=method))
 
 
-def test_the_names_are_among_those_that_profiles_of_earlier_versions_may_hold() -> None:
+def test_the_names_join_those_of_the_product() -> None:
     make_known()
 
-    assert set(COMPARED) < FORMER_METHODS
     assert set(smoothers) > set(COMPARED)
 
 

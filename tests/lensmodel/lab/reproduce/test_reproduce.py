@@ -68,7 +68,7 @@ def case(**changes: Any) -> Case:
 
 def plan(*cases: Case) -> Reproduction:
     return Reproduction(
-        cases or (case(),), estimator="whittle", rivals=(), size="quick", paper=False, general=False
+        cases or (case(),), estimator="default", rivals=(), size="quick", paper=False, general=False
     )
 
 
@@ -329,7 +329,7 @@ def test_key_changes_with_settings_route_and_code() -> None:
         key_of(one, plan(), "b", "1"),
         key_of(replace(one, aperture=2.8), plan(), "a", "1"),
         key_of(replace(one, condition="jpeg"), plan(), "a", "1"),
-        key_of(one, replace(plan(), estimator="default"), "a", "1"),
+        key_of(one, replace(plan(), estimator="michaeli-irani"), "a", "1"),
     }
     assert len(keys) == 6
     assert key_of(case(), plan(), "a", "1") in keys
@@ -437,7 +437,7 @@ def result(*lenses: tuple[float, float]) -> dict[str, Any]:
         "code": "abc",
         "plan": {
             "size": "quick",
-            "estimator": "whittle",
+            "estimator": "default",
             "methods": ["paper"],
             "rivals": {"kee": "Kee et al. 2011"},
             "programs": ["G'MIC Richardson-Lucy"],
@@ -778,7 +778,7 @@ def test_fig1_comes_from_a_stored_benchmark(tmp_path: Path) -> None:
     bench = tmp_path / "bench"
     bench.mkdir()
     assert collected(bench, tmp_path) is None
-    row = {"method": "whittle", "noise": 0.01, "cases": 4, "improved": 0.5, "er_lt_3": 0.25}
+    row = {"method": "default", "noise": 0.01, "cases": 4, "improved": 0.5, "er_lt_3": 0.25}
     settings = {"noise": [0.01], "half": "test", "patch": 128, "variant": "bayer", "judge": "epll", "seed": 0}
     stored = {"settings": settings, "summary": [{**row, "er_median": 3.0, "rel_l2": 0.4}]}
     (bench / "blind.json").write_text(json.dumps(stored))
@@ -786,7 +786,7 @@ def test_fig1_comes_from_a_stored_benchmark(tmp_path: Path) -> None:
     made = result((160, 32.0))
     made["figures"]["fig1"] = collected(bench, tmp_path / "pictures")
     markdown, _ = write_page(made, tmp_path)
-    assert "| whittle | 1 % | 4 | 50 | 25 | 3.00 | 0.40 |" in markdown.read_text(encoding="utf-8")
+    assert "| default | 1 % | 4 | 50 | 25 | 3.00 | 0.40 |" in markdown.read_text(encoding="utf-8")
     assert (tmp_path / "pictures" / "fig1-blind-er-1percent.png").exists()
 
 
@@ -1142,7 +1142,7 @@ def test_lens_is_learned_and_corrected_from_end_to_end(tmp_path: Path) -> None:
     @contextmanager
     def opened(of: Case, folder: Path) -> Iterator[DirectRoute]:
         del of
-        yield DirectRoute(folder / "models", "whittle", workers=1)
+        yield DirectRoute(folder / "models", "default", workers=1)
 
     made = run_reproduction(
         replace(plan(one, replace(one, condition="high-iso")), rivals=("schuler",)),

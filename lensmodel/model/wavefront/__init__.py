@@ -1,1 +1,0 @@
-"""The PSF as one wavefront for the whole lens, fitted to the kernels or the spectra of all samples."""

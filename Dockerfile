@@ -12,9 +12,7 @@ RUN python3 -m venv /opt/lensmodel \
  && python3 -m venv /opt/build \
  && /opt/build/bin/pip install --require-hashes --requirement requirements/build.txt
 COPY pyproject.toml README.md LICENSE ./
-COPY migrations migrations
 COPY lensmodel lensmodel
-COPY app app
 RUN /opt/build/bin/python -m hatchling build --target wheel --directory /wheels \
  && /opt/lensmodel/bin/pip install --no-deps --no-index /wheels/*.whl
 
@@ -26,12 +24,16 @@ RUN groupadd --gid 10001 lens \
  && usermod --append --groups lens-task lens \
  && install --directory --owner=lens --group=lens --mode=0750 /data
 COPY --from=build /opt/lensmodel /opt/lensmodel
+# The service is an application: it runs from its tree and is never installed among other packages.
+COPY app /srv/lensmodel/app
+COPY migrations /srv/lensmodel/migrations
 COPY --chmod=755 tools/container_entry.sh /usr/local/bin/lensmodel-entry
 # Listening on every address of a container reaches nobody: publishing its port does, and that is
 # the host's decision (compose.yaml publishes it on loopback). LENS_PUBLIC has it ask for keys; the first
 # is made by the command "keys create" in a container with the same volume. Whoever publishes it under a
 # name gives that name in LENS_ALLOWED_HOSTS; addresses and local names are answered to anyway.
 ENV PATH=/opt/lensmodel/bin:$PATH \
+    PYTHONPATH=/srv/lensmodel \
     HOME=/data \
     LENS_DATA_DIR=/data \
     LENS_HOST=0.0.0.0 \

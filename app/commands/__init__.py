@@ -1,4 +1,1 @@
-"""The subcommands of `lensmodel`, one module for each group.
-
-There are more than fifteen modules because each is imported only when one of its commands is called.
-"""
+"""Commands of the service, which `lensmodel` has where this package can be imported."""

@@ -10,11 +10,11 @@ from typing import Annotated, Final
 
 import typer
 
-from app.commands.console import display, files
-from app.commands.console.failure import UsageError
-from app.commands.console.method_options import Estimator
-from app.commands.console.options import Quiet, Verbose
 from lensmodel import estimation
+from lensmodel.cli.console import display, files
+from lensmodel.cli.console.failure import UsageError
+from lensmodel.cli.console.method_options import Estimator
+from lensmodel.cli.console.options import Quiet, Verbose
 from lensmodel.core.files import write_atomically
 
 MARKER: Final = ".lensmodel-demo.json"

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from app.commands.console.failure import UsageError
-from app.commands.console.options import Json, choice
 from app.commands.service import Data, settings_from
+from lensmodel.cli.console.failure import UsageError
+from lensmodel.cli.console.options import Json, choice
 from lensmodel.core.errors import InvalidInputError
 
 if TYPE_CHECKING:

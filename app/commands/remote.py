@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import typer
 from rich.progress import Progress, TaskID
 
-from app.commands import correction
-from app.commands.console import files
-from app.commands.console.display import Display
-from app.commands.console.failure import UsageError
-from app.words import gain_words
+from lensmodel.cli import correction
+from lensmodel.cli.console import files
+from lensmodel.cli.console.display import Display
+from lensmodel.cli.console.failure import UsageError
+from lensmodel.cli.words import gain_words
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.types import ZONE_WORDS
 from lensmodel.workflow.api import FORMATS

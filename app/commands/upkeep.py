@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.commands.console import display
-from app.commands.console.failure import UsageError
-from app.commands.console.options import Json, Quiet
 from app.commands.service import Data, settings_from
+from lensmodel.cli.console import display
+from lensmodel.cli.console.failure import UsageError
+from lensmodel.cli.console.options import Json, Quiet
 
 if TYPE_CHECKING:
     from app.blobs.storage import Storage

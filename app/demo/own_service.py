@@ -44,7 +44,7 @@ def own_service(data: Path, log_file: Path, settings: Mapping[str, str] | None =
     data.mkdir(parents=True, exist_ok=True)
     with log_file.open("wb") as log:
         process = subprocess.Popen(  # noqa: S603 - our own program, with arguments of our own
-            [sys.executable, "-m", "app.cli", "serve", "--port", "0", "--data", str(data)],
+            [sys.executable, "-m", "lensmodel", "serve", "--port", "0", "--data", str(data)],
             stdout=log,
             stderr=subprocess.STDOUT,
             env=environment,

@@ -24,7 +24,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from app.commands.console.failure import UsageError
 from app.runtime import server
 from app.runtime.parent_watch import VARIABLE as PARENT_PIPE
 from app.runtime.settings import PREFIX, Settings
@@ -33,6 +32,7 @@ from app.sandbox import confine
 from app.store.access.keys import KeyStore
 from app.store.database import Database
 from app.store.upkeep import migrate
+from lensmodel.cli.console.failure import UsageError
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.files import write_atomically
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from app.cli import main
+from lensmodel.cli.main import main
 
 
 def lensmodel(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:

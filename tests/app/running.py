@@ -41,7 +41,7 @@ SETTINGS = {
     "LENS_INSPECT_SECONDS": f"{stretched(20.0):.0f}",
     "LENS_TASK_NICENESS": "0",  # tests wait for photos too: beside other programs they would starve
 }
-PROGRAM = [sys.executable, "-m", "app.cli"]
+PROGRAM = [sys.executable, "-m", "lensmodel"]
 OWN_ACCOUNT = {"LENS_TASK_USER": "none"}
 """Tasks with the account of the tests find the loops that were compiled before: each other service that is
 started by root compiles them anew, half a minute of it, into a folder of its own."""

@@ -254,7 +254,7 @@ def test_a_second_service_on_the_same_data_is_refused(service: Service) -> None:
 
 @pytest.mark.slow
 def test_the_parts_run_alone_for_installations_on_many_machines(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "app.cli"]
+    command = [sys.executable, "-m", "lensmodel"]
     data = ["--data", str(tmp_path / "data")]
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

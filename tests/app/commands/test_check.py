@@ -11,8 +11,8 @@ import tifffile
 from PIL import Image
 from typer.testing import CliRunner
 
-from app.cli import app
-from app.commands.console.failure import UsageError
+from lensmodel.cli.console.failure import UsageError
+from lensmodel.cli.main import app
 from lensmodel.core.errors import LensModelError
 
 ROWS, COLS = 200, 240

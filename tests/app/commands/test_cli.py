@@ -30,11 +30,11 @@ from running import SMALL, scene, write_photo
 from scipy import ndimage
 from typer.testing import CliRunner
 
-from app.cli import app, main
-from app.commands import correction
-from app.commands.console import files
-from app.commands.console.progress_lines import EVERY_S, Pace, ProgressLines
 from lensmodel import photo
+from lensmodel.cli import correction
+from lensmodel.cli.console import files
+from lensmodel.cli.console.progress_lines import EVERY_S, Pace, ProgressLines
+from lensmodel.cli.main import app, main
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
@@ -48,7 +48,7 @@ ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.sta
 
 
 def command(*words: str | Path) -> list[str]:
-    return [sys.executable, "-m", "app.cli", *map(str, words)]
+    return [sys.executable, "-m", "lensmodel", *map(str, words)]
 
 
 def lensmodel(*words: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -491,19 +491,23 @@ REFUSED = {
     "degrees": (["psf", PROFILE, "--phi", "90"], 2, "--phi is in radians; 90 degrees are 1.571"),
     "aperture in words": (["psf", PROFILE, "--aperture", "wide"], 2, "such as 2.8 or f/2.8, got 'wide'"),
     "psf format": (["psf", PROFILE, "-o", "psf.xyz"], 2, "psf.xyz"),
-    "no such size": (["reproduce", "--size", "huge"], 2, "quick"),
+    "no such size": (
+        ["reproduce", "--size", "huge"],
+        2,
+        "--size must be quick, small, default or full, got 'huge'",
+    ),
     "noise in words": (["bench", "blind", "--noise", "much"], 2, "numbers such as 0.01,0.003, got 'much'"),
     "photo to time": (["bench", "correct", "--photo", "gone.jpg"], 2, "no photo called gone.jpg"),
     "photos to blur": (["bench", "blind", "--photos", "empty", "-o", "o"], 2, "empty holds no PNG, JPEG"),
     "no such picture": (["bench", "gallery", "--only", "rose", "-o", "o"], 2, "no picture is called 'rose'"),
     "unknown half": (["bench", "blind", "--half", "x"], 2, "half must be one of .*got 'x'"),
-    "report there": (["report", PROFILE, "-o", "reported"], 2, "mtf.csv is there already; --force"),
+    "report there": (["report", PROFILE, "-o", "reported"], 2, "report.csv is there already; --force"),
     "export format": (["export", PROFILE, "-o", "new.bmp", "--format", "bmp"], 2, "known: csv, fits, json"),
     "export by no format": (["export", PROFILE, "-o", "new.bmp"], 2, "ends in .csv, .fits, .json"),
     "export by two formats": (
-        ["export", PROFILE, "-o", "new.fits", "--format", "tiff"],
+        ["export", PROFILE, "-o", "new.fits", "--format", "npz"],
         2,
-        "fits does, .* tiff",
+        "fits does, .* npz",
     ),
     "half a place": (["export", PROFILE, "-o", "new.csv", "--phi", "1"], 2, "--phi needs --r"),
     "report of nothing": (["report", "gone"], 2, "no lens profile at gone; make it"),
@@ -526,7 +530,7 @@ def test_refusal_is_one_sentence_with_the_value_and_a_remedy(
     (folder / "bad").write_bytes((folder / PROFILE).read_bytes()[:-200])
     (folder / "there.npy").write_bytes(b"mine")
     (folder / "reported").mkdir()
-    (folder / "reported" / "mtf.csv").write_bytes(b"mine")
+    (folder / "reported" / "report.csv").write_bytes(b"mine")
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
     done = here(*words)
@@ -643,7 +647,6 @@ def test_a_file_of_mine_stays_mine_after_a_forced_demo(
     [
         (("bench", "blind", "-o", "out"), "out/blind.md"),
         (("reproduce", "--size", "quick", "-o", "out"), "out/reproduction.md"),
-        (("reproduce", "--json", "out/figures.json"), "out/figures.json"),
     ],
 )
 def test_a_finished_report_is_refused_before_any_work(

@@ -14,7 +14,7 @@ from running import SMALL, write_photo
 from typer.testing import CliRunner
 
 import lensmodel
-from app.cli import app
+from lensmodel.cli.main import app
 from lensmodel.core import parallel
 from lensmodel.core.psf import PsfSample
 from lensmodel.model import load_profile
@@ -132,7 +132,7 @@ def test_a_cluster_that_does_not_answer_is_said(
     photo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr("app.commands.cluster.CONNECT_S", 0.5)
+    monkeypatch.setattr("lensmodel.cli.cluster.CONNECT_S", 0.5)
 
     result = CliRunner().invoke(
         app,

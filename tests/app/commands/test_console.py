@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from app.commands.console import progress_lines
-from app.commands.console.progress_lines import Pace, ProgressLines, clock
-from app.commands.console.table import aligned
-from app.words import mtf50_words
+from lensmodel.cli.console import progress_lines
+from lensmodel.cli.console.progress_lines import Pace, ProgressLines, clock
+from lensmodel.cli.console.table import aligned
+from lensmodel.cli.words import mtf50_words
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_times_are_those_of_a_clock(seconds: float, words: str) -> None:
 
 
 def test_commands_of_the_service_and_the_list_of_commands_do_not_wait_for_scipy() -> None:
-    modules = "app.cli", "app.commands.keys", "app.commands.service", "app.commands.upkeep"
+    modules = "lensmodel.cli.main", "app.commands.keys", "app.commands.service", "app.commands.upkeep"
     script = f"import sys, {', '.join(modules)}\nprint(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
 

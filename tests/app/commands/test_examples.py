@@ -29,8 +29,6 @@ from sqlalchemy import update
 from typer.core import TyperCommand, TyperGroup
 
 from app.blobs.storage import Storage
-from app.cli import app, main
-from app.commands.console.on_demand import OnDemand
 from app.runtime.backup import backup
 from app.runtime.settings import Settings
 from app.store import Store
@@ -38,6 +36,8 @@ from app.store.access.access_tables import KeyRow
 from app.store.access.keys import KeyStore
 from app.store.database import Database
 from app.store.upkeep.migrate import upgrade
+from lensmodel.cli.console.on_demand import OnDemand
+from lensmodel.cli.main import app, main
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.estimation.measure.page import TargetPage
@@ -230,7 +230,7 @@ def in_this_process(
 
 def in_a_process(words: list[str], folder: Path) -> tuple[int, str, str]:
     done = subprocess.run(
-        [sys.executable, "-m", "app.cli", *words],
+        [sys.executable, "-m", "lensmodel", *words],
         cwd=folder,
         env=environment(folder),
         capture_output=True,
@@ -284,7 +284,7 @@ def test_example_runs(
 def test_example_serves_until_it_is_told_to_stop(line: str, folder: Path) -> None:
     words = [word.replace("~", str(folder)) for word in shlex.split(line)]
     with subprocess.Popen(
-        [sys.executable, "-m", "app.cli", *words, *([] if "--port" in words else ["--port", "0"])],
+        [sys.executable, "-m", "lensmodel", *words, *([] if "--port" in words else ["--port", "0"])],
         cwd=folder,
         env=environment(folder),
         stdout=subprocess.PIPE,

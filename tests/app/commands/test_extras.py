@@ -8,13 +8,13 @@ import sys
 
 import pytest
 
-from app.commands.console import extras
+from lensmodel.cli.console import extras
 
 COMMANDS = ["serve", "doctor", "keys list", "calibrate gone.dng --profile new.lensprofile"]
 WITHOUT = """
 import contextlib, io, json, sys
 sys.modules.update(dict.fromkeys({missing!r}))
-from app.cli import main
+from lensmodel.cli.main import main
 for command in {commands!r}:
     sys.argv, status, errors = ["lensmodel", *command.split()], 0, io.StringIO()
     with contextlib.redirect_stderr(errors):
@@ -53,6 +53,11 @@ def test_commands_on_files_do_without_the_service(ended: dict[str, tuple[int, st
     status, errors = ended[COMMANDS[3]]
 
     assert (status, "no photo called gone.dng" in errors) == (2, True)
+
+
+@pytest.mark.parametrize(("module", "where"), [("app", "container image"), ("lensmodel.lab", "source tree")])
+def test_a_command_that_is_no_part_of_the_wheel_says_where_it_runs(module: str, where: str) -> None:
+    assert where in str(extras.remedy(ModuleNotFoundError("no", name=module)))
 
 
 def test_a_module_that_no_extra_brings_is_no_extra() -> None:

@@ -13,7 +13,7 @@ import pytest
 from in_process import lensmodel
 from running import SMALL, write_photo
 
-from app.commands.grouping import Shot, groups
+from lensmodel.cli.grouping import Shot, groups
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile

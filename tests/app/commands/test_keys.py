@@ -9,9 +9,9 @@ import httpx2
 import pytest
 from typer.testing import CliRunner
 
-from app.cli import app
 from app.client import Client
-from app.commands.console.failure import UsageError
+from lensmodel.cli.console.failure import UsageError
+from lensmodel.cli.main import app
 from lensmodel.core.errors import InvalidInputError
 
 RUNNER = CliRunner()

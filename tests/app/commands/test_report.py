@@ -14,12 +14,14 @@ import tifffile
 from scipy import ndimage
 from typer.testing import CliRunner
 
-from app.cli import app
-from app.commands.console.failure import UsageError
+from lensmodel.cli.console.failure import UsageError
+from lensmodel.cli.main import app
+from lensmodel.cli.report import details_of, name_of
 from lensmodel.core.codec import from_json
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.types import FieldPosition, LensSettings
 from lensmodel.model import LensModel, LensProfile, load_profile, save_profile
+from lensmodel.model.profile import Camera
 from lensmodel.report import LensReport, lens_report
 
 NAME = "my-24mm.lensprofile"
@@ -47,7 +49,7 @@ def green_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     def quick(*given: Any, **options: Any) -> LensReport:
         return lens_report(*given, **options | {"channels": ("g",), "rows": 3, "draws": 2})
 
-    monkeypatch.setattr("app.commands.report.lens_report", quick)
+    monkeypatch.setattr("lensmodel.cli.report.lens_report", quick)
 
 
 def run(*words: str) -> str:
@@ -91,6 +93,24 @@ def test_the_report_folder_holds_numbers_and_pictures_that_agree(folder: Path, g
         rows = [row for row in csv.DictReader(file) if row["quantity"] == "MTF50"]
     found = [row for row in rows if row["aperture"] == "2" and row["direction"] == "sagittal"]
     assert [float(row["value"]) for row in found] == pytest.approx(stored["tested"][0]["sagittal"], rel=1e-4)
+
+
+def test_the_page_says_what_it_rests_on_and_names_a_maker_once() -> None:
+    model = LensModel.fit([PsfSample(gaussian(15, np.eye(2)), FieldPosition(0.1, 0.0))])
+    cameras = (Camera("Canon", "EOS 6D"), Camera("Canon", "EOS 6D", "7"))
+    known = LensProfile(model, {"serial": "12"}, {"1": "a.jpg", "2": "b.dng"}, cameras)
+
+    found = details_of(known)
+
+    assert (found["Serial number"], found["Camera"], found["Photos"]) == (
+        "12",
+        "Canon EOS 6D",
+        "a.jpg, b.dng",
+    )
+    assert found["Caution"].startswith("1 of the photos")
+    assert "Caution" not in details_of(LensProfile(model, {}, {"2": "b.dng"}))
+    assert name_of({"maker": "Acme", "model": "ACME 42mm"}) == "ACME 42mm"
+    assert name_of({"maker": "Acme", "model": "42mm"}) == "Acme 42mm"
 
 
 def test_files_that_are_there_are_kept_without_force(folder: Path) -> None:

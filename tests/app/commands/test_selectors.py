@@ -13,7 +13,7 @@ import pytest
 from running import write_photo
 
 import lensmodel
-from app.cli import main
+from lensmodel.cli.main import main
 from lensmodel.core.errors import NotEnoughEvidenceError, NoUsablePatchesError
 from lensmodel.workflow import sampling
 

@@ -14,12 +14,12 @@ import pytest
 from typer.testing import CliRunner
 
 from app.blobs.storage import Storage
-from app.cli import app
 from app.runtime import backup as copies
 from app.runtime.doctor import examine
 from app.runtime.settings import Settings
 from app.store import Store
 from app.store.tables import PhotoRow
+from lensmodel.cli.main import app
 from lensmodel.core.errors import InvalidInputError
 
 

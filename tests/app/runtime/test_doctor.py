@@ -13,13 +13,13 @@ from sqlalchemy import delete, update
 from typer.testing import CliRunner
 
 from app.blobs.storage import Storage
-from app.cli import app
 from app.runtime.doctor import DoctorReport, examine
 from app.runtime.settings import Settings
 from app.store import Store
 from app.store.access.owners import now
 from app.store.tables import EventRow, LensRow, PatchRow, PhotoRow, SampleRow
 from app.store.upkeep.invariants import INVARIANTS
+from lensmodel.cli.main import app
 
 
 @pytest.fixture

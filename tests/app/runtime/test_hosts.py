@@ -204,7 +204,7 @@ def installed(hosts: list[Host], tmp_path: Path) -> Iterator[Installation]:
                     [str(STAND_INS), os.environ.get("PYTHONPATH", str(HERE.parents[1]))]
                 ),
             }
-            host.run(["-m", "app.cli", "api"], environment)
+            host.run(["-m", "lensmodel", "api"], environment)
             site.workers.append(host.run([str(STAND_INS / "quick_worker.py")], environment))
         try:
             site.until(site.all_run)

@@ -21,7 +21,7 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
-from app.commands.console.progress_lines import ProgressLines, TimeLeft, clock
+from lensmodel.cli.console.progress_lines import ProgressLines, TimeLeft, clock
 from lensmodel.core.codec import to_json
 
 REMARKS = "lensmodel.remarks"

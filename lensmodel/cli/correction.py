@@ -13,11 +13,11 @@ import typer
 from rich.progress import Progress, TaskID
 
 import lensmodel
-from app.commands.console import files
-from app.commands.console.display import Display
-from app.commands.console.failure import UsageError
-from app.words import gain_words, mtf50_words
 from lensmodel import correction
+from lensmodel.cli.console import files
+from lensmodel.cli.console.display import Display
+from lensmodel.cli.console.failure import UsageError
+from lensmodel.cli.words import gain_words, mtf50_words
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.types import ZONE_WORDS, LensSettings, StepHook, Zone
 from lensmodel.correction.audit import HELD, AuditReport

@@ -14,7 +14,7 @@ import time
 from types import FrameType
 from typing import Final
 
-from app.commands.console.failure import InterruptedByUser
+from lensmodel.cli.console.failure import InterruptedByUser
 
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 _PATIENCE_S: Final = 10.0

@@ -9,9 +9,9 @@ from typing import Annotated, Final
 
 import typer
 
-from app.commands.console import display
-from app.commands.console.files import as_usage
-from app.commands.console.options import Quiet, Verbose
+from lensmodel.cli.console import display
+from lensmodel.cli.console.files import as_usage
+from lensmodel.cli.console.options import Quiet, Verbose
 
 DATA_VARIABLE: Final = "LENSMODEL_TEST_DATA"
 

@@ -9,10 +9,10 @@ from typing import Any, Final
 
 import typer
 
-from app.commands import cluster
-from app.commands.console import files
-from app.commands.console.display import Display
-from app.commands.console.failure import UsageError
+from lensmodel.cli import cluster
+from lensmodel.cli.console import files
+from lensmodel.cli.console.display import Display
+from lensmodel.cli.console.failure import UsageError
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.types import ZONE_WORDS, LensSettings
 from lensmodel.model import LensProfile, save_profile

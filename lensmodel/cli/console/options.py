@@ -10,7 +10,7 @@ from typing import Annotated, Any, get_args
 
 import typer
 
-from app.commands.console.failure import UsageError
+from lensmodel.cli.console.failure import UsageError
 from lensmodel.core import types
 
 

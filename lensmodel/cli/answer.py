@@ -12,11 +12,11 @@ import tifffile
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from app.commands.console import files
-from app.commands.console.display import Display
-from app.commands.console.failure import UsageError
-from app.words import mtf50_words
 from lensmodel import quality
+from lensmodel.cli.console import files
+from lensmodel.cli.console.display import Display
+from lensmodel.cli.console.failure import UsageError
+from lensmodel.cli.words import mtf50_words
 from lensmodel.core.codec import to_json
 from lensmodel.core.files import replacing
 from lensmodel.core.geometry import zone_of

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from app.commands.console import display
-from app.commands.console.display import Display
-from app.commands.console.failure import UsageError
-from app.commands.console.files import as_usage, refuse_existing
-from app.commands.console.options import Force, Quiet, Verbose
-from app.lab.gallery import gallery
+from lensmodel.cli.console import display
+from lensmodel.cli.console.display import Display
+from lensmodel.cli.console.failure import UsageError
+from lensmodel.cli.console.files import as_usage, refuse_existing
+from lensmodel.cli.console.options import Force, Quiet, Verbose
 from lensmodel.core.codec import to_json
 from lensmodel.core.files import write_atomically
+from lensmodel.lab.commands.gallery import gallery
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -15,9 +15,9 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 import typer
 
-from app.commands.console import display, extras, interrupt
-from app.commands.console.failure import InterruptedByUser, UsageError
-from app.commands.console.on_demand import CommandEntry, OnDemand
+from lensmodel.cli.console import display, extras, interrupt
+from lensmodel.cli.console.failure import InterruptedByUser, UsageError
+from lensmodel.cli.console.on_demand import CommandEntry, OnDemand
 from lensmodel.core.errors import LensModelError
 
 interrupt.workers_ignore_it()
@@ -28,30 +28,30 @@ class Commands(OnDemand):
 
     entries: ClassVar[Mapping[str, CommandEntry]] = {
         "calibrate": CommandEntry(
-            "app.commands.photos:calibrate", "Learn the blur of one lens from photos, into a profile."
+            "lensmodel.cli.photos:calibrate", "Learn the blur of one lens from photos, into a profile."
         ),
-        "correct": CommandEntry("app.commands.photos:correct", "Remove the blur of the lens from photos."),
+        "correct": CommandEntry("lensmodel.cli.photos:correct", "Remove the blur of the lens from photos."),
         "check": CommandEntry(
-            "app.commands.checking:check",
+            "lensmodel.cli.checking:check",
             "Find where a photo corrected by any program shows what the original cannot have contained.",
         ),
         "psf": CommandEntry(
-            "app.commands.photos:psf",
+            "lensmodel.cli.photos:psf",
             "Show what the lens makes of a point of light at one place in the picture.",
         ),
         "measure": CommandEntry(
-            "app.commands.measurement:measure",
+            "lensmodel.cli.measurement:measure",
             "Measure the blur of a lens from photos made for the purpose, into a profile.",
         ),
         "target": CommandEntry(
-            "app.commands.measurement:target", "Write the page to print for `lensmodel measure target`."
+            "lensmodel.cli.measurement:target", "Write the page to print for `lensmodel measure target`."
         ),
         "report": CommandEntry(
-            "app.commands.report:report",
+            "lensmodel.cli.report:report",
             "Say how sharp a lens is, whether it is centred, and which photo would help most.",
         ),
         "export": CommandEntry(
-            "app.commands.report:export_psfs",
+            "lensmodel.cli.report:export_psfs",
             "Write PSFs for other programs: a grid over the picture, or a single place with --r and --phi.",
         ),
         "serve": CommandEntry(
@@ -90,13 +90,13 @@ class Commands(OnDemand):
             "Run the whole process on a real RAW file and on a simulated lens whose true blur is known.",
         ),
         "reproduce": CommandEntry(
-            "app.lab.reproduce:reproduce",
+            "lensmodel.lab.commands.reproduce:reproduce",
             "Make the paper's figures and its Table 1 on simulated lenses that nothing was tuned on.",
         ),
         "keys": CommandEntry(
             "app.commands.keys:keys", "Make, list, renew and end the keys of a service that others can reach."
         ),
-        "bench": CommandEntry("app.lab.benchmarks:bench", "Measure quality and speed."),
+        "bench": CommandEntry("lensmodel.lab.commands.benchmarks:bench", "Measure quality and speed."),
     }
 
 

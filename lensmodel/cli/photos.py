@@ -5,16 +5,17 @@ Here stand the options and the help; the work is in the modules of the same subj
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, get_args
 
 import typer
 
-from app.commands import answer, calibration, correction, folder, remote
-from app.commands.console import display
-from app.commands.console.failure import UsageError
-from app.commands.console.method_options import Estimator, Selector
-from app.commands.console.options import (
+from lensmodel.cli import answer, calibration, correction, folder
+from lensmodel.cli.console import display
+from lensmodel.cli.console.failure import UsageError
+from lensmodel.cli.console.method_options import Estimator, Selector
+from lensmodel.cli.console.options import (
     ANGLE,
     RADIUS,
     AnyLens,
@@ -258,6 +259,8 @@ def correct(
     if server is not None:
         if profile is not None:
             raise UsageError("--server has lenses of its own; leave out --profile, or give --lens ID")
+        # the client stands beside the service, above this package
+        remote = import_module("app.commands.remote")
         remote.run(photos, server, lens or remote.AUTO, output, options, shown, as_json=json_output)
         return
     if (profile is None) == (lens is None):

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from app.commands.console.failure import UsageError
+from lensmodel.cli.console.failure import UsageError
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.model import LensProfile, load_profile
 from lensmodel.photo.endings import CORRECTED, ENDINGS, RAW_ENDINGS

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from rich.progress import Progress, TaskID
 
-from app.commands.console import display, files
-from app.commands.console.failure import UsageError
-from app.commands.console.options import Aperture, Force, Json, Quiet, Verbose
 from lensmodel import photo
+from lensmodel.cli.console import display, files
+from lensmodel.cli.console.failure import UsageError
+from lensmodel.cli.console.options import Aperture, Force, Json, Quiet, Verbose
 from lensmodel.core.files import replacing
 from lensmodel.core.types import ZONE_WORDS, LensSettings
 from lensmodel.correction.audit import AuditReport

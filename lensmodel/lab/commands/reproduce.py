@@ -6,34 +6,25 @@ import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
 
 import typer
 
-from app.commands.console import display
-from app.commands.console.files import refuse_existing
-from app.commands.console.options import Force, Quiet, Verbose
+from lensmodel.cli.console import display
+from lensmodel.cli.console.files import refuse_existing
+from lensmodel.cli.console.options import Force, Quiet, Verbose, choice
 
 if TYPE_CHECKING:
     from lensmodel.lab.reproduce import Case, DirectRoute
 
 DATA_VARIABLE = "LENSMODEL_TEST_DATA"
+Size = Literal["quick", "small", "default", "full"]
 PAGE = ("reproduction.md", "reproduction.html", "reproduction.json")
 """What is in the folder of a finished reproduction, beside pictures and stored results."""
 
 BENCHMARK = Path("bench-output")
 """Where `lensmodel bench blind` leaves what Fig. 1 is drawn from."""
-
-
-class Size(StrEnum):
-    """How much is run."""
-
-    QUICK = "quick"
-    SMALL = "small"
-    DEFAULT = "default"
-    FULL = "full"
 
 
 def reproduce(
@@ -42,13 +33,15 @@ def reproduce(
         Path, typer.Option("--output", "-o", help="Folder for the page, its pictures and stored results.")
     ] = Path("reproduction"),
     size: Annotated[
-        Size,
-        typer.Option(
-            help="quick: four lenses on small photos, minutes. small: all lenses on a megapixel, hours. "
+        str,
+        choice(
+            "--size",
+            get_args(Size),
+            "quick: four lenses on small photos, minutes. small: all lenses on a megapixel, hours. "
             "default: large frames, other files and the rivals too. full: two apertures a lens, up to twenty "
             "photos and scenes that hurt, all night.",
         ),
-    ] = Size.DEFAULT,
+    ] = "default",
     only: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME", help="Only lenses whose name begins so: 1003, heliar; again for more."),
@@ -126,7 +119,11 @@ def reproduce(
         yield DirectRoute(folder / "models")
 
     plan = planned(
-        size.value, scenes=scenes or _external(), grids=grids, only=only or (), default_only=default_only
+        cast("Size", size),
+        scenes=scenes or _external(),
+        grids=grids,
+        only=only or (),
+        default_only=default_only,
     )
     work = WorkLines(quiet=shown.quiet)
     result = run_reproduction(plan, library, output, route="in the library", results=results, on_work=work)

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
-from app.commands.console.failure import UsageError
+from lensmodel.cli.console.failure import UsageError
 from lensmodel.workflow.pipeline import AHEAD
 
 CONNECT_S = 10.0

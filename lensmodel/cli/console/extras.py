@@ -35,7 +35,12 @@ _WHAT: Final = {
 
 def remedy(missing: ModuleNotFoundError) -> str | None:
     """Say what to install for a missing module; None where no extra brings it."""
-    top = (missing.name or "").partition(".")[0]
+    name = missing.name or ""
+    if name == "app" or name.startswith("lensmodel.lab"):
+        return "this command is no part of the package: it runs in the source tree" + (
+            " or in the container image" if name == "app" else ""
+        )
+    top = name.partition(".")[0]
     for extra, modules in EXTRAS.items():
         if top in modules:
             return (

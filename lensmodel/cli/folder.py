@@ -12,15 +12,15 @@ from typing import Any, Final
 import typer
 from rich.progress import Progress, TaskID
 
-from app.commands import calibration, correction
-from app.commands.console import files
-from app.commands.console.display import Display
-from app.commands.console.table import aligned
-from app.commands.grouping import PhotoGroup, Shot, groups
-from app.commands.journal import Journal
-from app.words import gain_words
 from lensmodel import correction as corrections
 from lensmodel import estimation
+from lensmodel.cli import calibration, correction
+from lensmodel.cli.console import files
+from lensmodel.cli.console.display import Display
+from lensmodel.cli.console.table import aligned
+from lensmodel.cli.grouping import PhotoGroup, Shot, groups
+from lensmodel.cli.journal import Journal
+from lensmodel.cli.words import gain_words
 from lensmodel.core.errors import LensModelError
 from lensmodel.core.types import LensSettings
 from lensmodel.correction.expected_gain import WORTH_DB

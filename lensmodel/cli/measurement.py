@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Final, get_args
+from typing import Annotated, Any, Final
 
 import typer
 
-from app.commands.console import display, files
-from app.commands.console.display import Display
-from app.commands.console.failure import UsageError
-from app.commands.console.options import (
+from lensmodel.cli.console import display, files
+from lensmodel.cli.console.display import Display
+from lensmodel.cli.console.failure import UsageError
+from lensmodel.cli.console.options import (
     AnyLens,
     Aperture,
     Force,
@@ -22,7 +22,6 @@ from app.commands.console.options import (
     Verbose,
     choice,
 )
-from app.schemas import MeasurementKind
 from lensmodel.core.errors import InvalidInputError, LensModelError
 from lensmodel.core.types import LensSettings
 from lensmodel.model import save_profile
@@ -32,6 +31,7 @@ from lensmodel.workflow import pipeline
 from lensmodel.workflow.identity import Identity, difference
 from lensmodel.workflow.lens import Lens
 
+KINDS: Final = ("target", "pair", "points", "edges")
 PAPERS: Final = ("a2", "a3", "a4")
 USUAL_DETAIL: Final = 4000
 """Default of `target --detail` (chosen): for a page that spans most of a 24-megapixel photo."""
@@ -92,8 +92,8 @@ def measure(
     Exit status: 0 all photos were used, 1 some were not, 2 called wrongly.
     """
     shown = display.of(context, quiet=quiet, verbose=verbose)
-    if kind not in get_args(MeasurementKind):
-        raise UsageError(f"measure one of {', '.join(get_args(MeasurementKind))}, not {kind!r}")
+    if kind not in KINDS:
+        raise UsageError(f"measure one of {', '.join(KINDS)}, not {kind!r}")
     if size % 2 == 0:
         raise UsageError(f"--size must be odd, got {size}; a PSF has one middle pixel")
     options = MeasurementOptions(kind, aperture, size, replace_blind, any_lens)

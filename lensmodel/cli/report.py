@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 
-from app.commands.console import display, files
-from app.commands.console.failure import UsageError
-from app.commands.console.options import (
+from lensmodel.cli.console import display, files
+from lensmodel.cli.console.failure import UsageError
+from lensmodel.cli.console.options import (
     ANGLE,
     RADIUS,
     Channel,
@@ -27,7 +28,7 @@ from app.commands.console.options import (
 from lensmodel.core.codec import to_json
 from lensmodel.core.files import write_atomically
 from lensmodel.core.types import FieldPosition, LensSettings
-from lensmodel.model import LensModel
+from lensmodel.model import LensModel, LensProfile
 from lensmodel.photo import develop
 from lensmodel.report import (
     LensReport,
@@ -51,6 +52,7 @@ Aspect = Annotated[
 
 FILES: Final = ("report.html", "report.pdf", "report.png", "report.csv", "report.json")
 COMPARED: Final = ("comparison.html", "comparison.pdf")
+_NAMED: Final = 8  # photos that the page names (chosen: two lines)
 
 
 def report(
@@ -126,29 +128,44 @@ def measured(
 ) -> LensReport:
     """Report on the lens of a profile: whole, with errors and all colours, or only what the screen shows."""
     known = files.profile_at(profile)
-    words = [known.lens[key] for key in ("maker", "model") if known.lens.get(key)]
-    names = sorted(known.photos.values())
-    details = {
-        "Serial number": str(known.lens.get("serial") or ""),
-        "Photos": ", ".join(names[:_NAMED])
-        + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""),
-        "Written": f"{datetime.now(UTC):%Y-%m-%d}",
-    }
     with files.as_usage():
-        asked = None if aperture is None else [LensSettings(aperture=aperture).aperture]
+        asked = None if aperture is None else [LensSettings(aperture=aperture).aperture or aperture]
         return lens_report(
             known.model,
-            known.lens.get("label") or " ".join(words) or profile.stem,
+            name_of(known.lens) or profile.stem,
             aspect=aspect,
-            apertures=None if asked is None else [n for n in asked if n is not None],
+            apertures=asked,
             lateral=[lateral_of(develop(path)) for path in photos],
             channels=("g", "r", "b") if whole else ("g",),
-            details={name: words for name, words in details.items() if words},
+            details=details_of(known),
             draws=DRAWS if whole else 0,
         )
 
 
-_NAMED: Final = 8  # photos that the page names (chosen: two lines)
+def name_of(lens: Mapping[str, str]) -> str:
+    """What to call a lens: its label, or maker and model without saying the maker twice."""
+    maker, model = lens.get("maker", ""), lens.get("model", "")
+    if model.casefold().startswith(maker.casefold()):
+        maker = ""
+    return lens.get("label") or f"{maker} {model}".strip()
+
+
+def details_of(known: LensProfile) -> dict[str, str]:
+    """What else stands on the page: copy, cameras, photos, the day, the program; and a caveat for JPEG."""
+    names = sorted(known.photos.values())
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    cameras = (f"{c.maker or ''} {c.model or ''}".strip() for c in known.cameras)
+    jpegs = sum(name.lower().endswith((".jpg", ".jpeg")) for name in names)
+    details = {
+        "Serial number": str(known.lens.get("serial") or ""),
+        "Camera": ", ".join(dict.fromkeys(filter(None, cameras))),
+        "Photos": ", ".join(names[:_NAMED]) + more,
+        "Caution": f"{jpegs} of the photos are JPEG files: a camera's sharpening makes a lens look sharper"
+        if jpegs
+        else "",
+        "Written": f"{datetime.now(UTC):%Y-%m-%d} by lensmodel {version('lensmodel')}",
+    }
+    return {name: words for name, words in details.items() if words}
 
 
 def write(folder: Path, found: LensReport, document: str) -> None:

@@ -1,7 +1,8 @@
-"""A folder of photos, sorted by what took them: one body, one lens, one focal length."""
+"""A folder of photos, sorted by what took them: one copy of a lens, one focal length."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -31,19 +32,23 @@ class Shot:
 
     path: Path
     metadata: PhotoMetadata
+    half_diagonal_mm: float = 0.0
 
     @classmethod
     def of(cls, path: Path) -> Shot:
         """Read the header of a photo."""
-        return cls(path, inspect(path).metadata)
+        info = inspect(path)
+        pitch = info.metadata.pixel_pitch_um or 0.0
+        return cls(path, info.metadata, math.hypot(info.width, info.height) / 2.0 * pitch / 1000.0)
 
     @property
     def owner(self) -> tuple[str, ...]:
-        """What two photos of one copy of a lens on one body agree in."""
+        """What two photos of one copy of a lens agree in: its serial, or that of the body it was on."""
         said = self.metadata
-        body = (name_key(said.camera_model), serial_key(said.body_serial))
         lens = (name_key(said.lens.model), serial_key(said.lens.serial))
-        return (*body, *lens)
+        if said.lens.serial:
+            return lens
+        return (*lens, name_key(said.camera_model), serial_key(said.body_serial))
 
     @property
     def names_lens(self) -> bool:
@@ -53,7 +58,7 @@ class Shot:
 
 @dataclass(frozen=True, slots=True)
 class PhotoGroup:
-    """Photos of one body, one lens and about one focal length.
+    """Photos of one lens, of one body where the lens has no serial, and of about one focal length.
 
     Parameters
     ----------
@@ -105,7 +110,8 @@ class PhotoGroup:
 
 def _by_aperture(shots: Sequence[Shot]) -> list[Shot]:
     by_aperture: dict[float, list[Shot]] = {}
-    for shot in shots:
+    # a smaller frame is the middle of what the lens draws: the largest ones tell of all of it
+    for shot in sorted(shots, key=lambda shot: -round(shot.half_diagonal_mm)):
         by_aperture.setdefault(shot.metadata.aperture or float("inf"), []).append(shot)
     ordered = [by_aperture[aperture] for aperture in sorted(by_aperture)]
     longest = max(map(len, ordered), default=0)

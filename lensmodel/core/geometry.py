@@ -39,14 +39,22 @@ class Frame:
     ----------
     height, width : int
         Size in pixels.
+    circle_px : float, optional
+        Half diagonal in pixels of the larger frame of which this one is the middle, as in crop mode: r is
+        counted in it. None where this is the whole frame.
     """
 
     height: int
     width: int
+    circle_px: float | None = None
 
     def __post_init__(self) -> None:
         if self.height < 1 or self.width < 1:
             raise InvalidInputError(f"a frame needs at least one pixel, got {self.height} x {self.width}")
+        if self.circle_px is not None and not self.circle_px >= math.hypot(self.height, self.width) / 2.0:
+            raise InvalidInputError(
+                f"{self.height} x {self.width} pixels do not lie in a half diagonal of {self.circle_px}"
+            )
 
     @property
     def center(self) -> tuple[float, float]:
@@ -55,8 +63,8 @@ class Frame:
 
     @property
     def half_diagonal(self) -> float:
-        """Distance in pixels from the centre to the outer corner of the corner pixel."""
-        return math.hypot(self.height, self.width) / 2.0
+        """Distance in pixels from the centre to the outer corner of the corner pixel, of the whole frame."""
+        return self.circle_px or math.hypot(self.height, self.width) / 2.0
 
     def position(self, row: float, col: float) -> FieldPosition:
         """Field position of a pixel; places outside the frame are drawn in to r = 1."""

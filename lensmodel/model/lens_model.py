@@ -18,6 +18,7 @@ from lensmodel.core.types import CHANNELS, ZONES, Channel, FieldPosition, Kernel
 from lensmodel.model import pitch as pitches
 from lensmodel.model import support
 from lensmodel.model.answer import PAPER, AnsweredBy, ModelSettings, PsfAnswer
+from lensmodel.model.circle import on_one_circle
 from lensmodel.model.field.robust import Flag
 from lensmodel.model.learned_field import LearnedField
 from lensmodel.model.regression import Regression
@@ -77,7 +78,7 @@ class LensModel:
         NoSamplesError
             If there are none, or all photos are excluded.
         """
-        settings, kept = settings or ModelSettings(), _distinct((), samples)
+        settings, kept = settings or ModelSettings(), _distinct((), on_one_circle(samples))
         if not kept:
             raise NoSamplesError("the lens has no PSF samples yet; calibrate it with a photo first")
         encoded, kernels = _parted(kept, settings)
@@ -95,10 +96,14 @@ class LensModel:
 
         A regression is fitted anew when it has grown by a twentieth.
         """
-        new = _distinct(self.samples, samples)
+        placed = on_one_circle((*self.samples, *samples))
+        known = placed[: len(self.samples)]
+        new = _distinct(known, placed[len(known) :])
         if not new:
             return self
-        every = (*self.samples, *new)
+        every = (*known, *new)
+        if any(sample is not before for sample, before in zip(known, self.samples, strict=True)):
+            return LensModel.fit(every, self.settings)  # a larger frame: all places are counted anew
         encoded, kernels = _parted(new, self.settings)
         attention, regression = self._attention, self._regression
         if encoded:

@@ -9,7 +9,7 @@ from lensmodel.core.errors import NotAnImageError, UnsupportedFormatError
 from lensmodel.photo.headers.header import Header, check_size
 from lensmodel.photo.headers.opening import opened_header
 from lensmodel.photo.raw import raw_size
-from lensmodel.photo.tags.metadata import metadata_of
+from lensmodel.photo.tags.metadata import is_centred, metadata_of
 from lensmodel.photo.values import Limits, PhotoInfo
 
 MIN_SIDE = 16
@@ -60,4 +60,5 @@ def info_of(path: Path, header: Header, limits: Limits) -> PhotoInfo:
         raise NotAnImageError(
             f"{width} x {height} pixels are no photo; the smallest side allowed is {MIN_SIDE}"
         )
-    return PhotoInfo(header.kind, width, height, metadata_of(header))
+    metadata = metadata_of(header)
+    return PhotoInfo(header.kind, width, height, metadata, centred=is_centred(header, metadata))

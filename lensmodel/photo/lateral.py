@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +68,12 @@ class LateralColour:
             return 0.0
         a, b, c, v = self.red if channel == "r" else self.blue
         return float(r * ((v - 1.0) + c * r + b * r**2 + a * r**3) * self.half_diagonal)
+
+    def counted_in(self, half_diagonal: float) -> LateralColour:
+        """Return the same displacement of the same pixels, with r in another half diagonal."""
+        k = half_diagonal / self.half_diagonal
+        red, blue = ((a * k**3, b * k**2, c * k, v) for a, b, c, v in (self.red, self.blue))
+        return replace(self, red=red, blue=blue, half_diagonal=half_diagonal)
 
     def to_json(self) -> dict[str, object]:
         """Return plain values for JSON."""

@@ -149,12 +149,15 @@ class PhotoInfo:
         Size as developed, in sensor orientation.
     metadata : PhotoMetadata
         What the file says.
+    centred : bool
+        Whether it shows the middle of its sensor, or all of it; false for what a program has cut.
     """
 
     kind: FileKind
     width: int
     height: int
     metadata: PhotoMetadata = PhotoMetadata()
+    centred: bool = True
 
 
 @dataclass(frozen=True, slots=True)

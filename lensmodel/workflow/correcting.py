@@ -16,6 +16,7 @@ from lensmodel.model.answer import PAPER
 from lensmodel.photo import LinearPhoto
 from lensmodel.photo.lateral import LateralColour, estimate_lateral, resample
 from lensmodel.workflow.estimating import estimate_cell, find_patches
+from lensmodel.workflow.placing import placed
 from lensmodel.workflow.ways import way_of
 
 log = logging.getLogger(__name__)
@@ -75,6 +76,9 @@ def correct_photo(
     Corrected
         Of a chart, with what was measured on its edges (`find_edges`) in each zone.
     """
+    whole, developed = developed.frame, placed(developed, model)
+    if lateral is not None and developed.frame != whole:
+        lateral = lateral.counted_in(developed.frame.half_diagonal)
     wanted, plain = _way(model, method)
     field = known or psfs_for(developed, model, settings, method=method, photo=photo)
     planes, cfa = developed.planes, developed.cfa
@@ -130,6 +134,7 @@ def psfs_for(
     photo : str
         What samples of this photo are called: they count once if the lens was learned from it.
     """
+    developed = placed(developed, model)
     _, plain = _way(model, method)
     if not plain and model.weights:
         model = model.added(_own_samples(developed, model, settings, photo))

@@ -82,6 +82,26 @@ def is_placeholder(serial: str) -> bool:
     return _PLACEHOLDER.fullmatch(serial.strip()) is not None
 
 
+def is_centred(header: Header, metadata: PhotoMetadata) -> bool:
+    """Tell whether a picture shows its whole sensor or the middle of it, not what a program cut.
+
+    Cameras leave widths of common sensors (DX, APS-C, 16:9), a square of the full height, or a digital zoom.
+    """
+    pitch = metadata.pixel_pitch_um
+    if header.kind in {"raw", "dng"} or pitch is None:
+        return True
+    if read_xmp(header.xmp).get("crs:HasCrop") == "True":
+        return False
+    width_mm = max(header.width, header.height) * pitch / 1000.0
+    exif = _Exif.of(header)
+    film = exif.film_pitch_um(math.hypot(header.width, header.height))
+    whole = film is not None and abs(pitch / film - 1.0) < 0.05
+    square = abs(header.width / header.height - 1.0) < 0.01
+    widths = [width_mm, *((width_mm * 3.0 / 2.0, width_mm * 4.0 / 3.0) if square else ())]
+    common = any(low <= width <= high for low, high in _SENSOR_WIDTHS_MM for width in widths)
+    return whole or common or exif.zoom() > 1.01
+
+
 def names_no_lens(model: str) -> bool:
     """Tell whether a lens's name is only what a camera writes when it knows none, such as "DT 0mm F0 SAM"."""
     return is_placeholder(model) or _NO_LENS.search(model) is not None
@@ -110,7 +130,7 @@ def metadata_of(header: Header) -> PhotoMetadata:
         exposure_s=_first_within(*_EXPOSURES_S, exif.number(0x829A), _quotient(xmp.get("exif:ExposureTime"))),
         taken_at=exif.taken_at(),
         orientation=exif.orientation(),
-        pixel_pitch_um=exif.pixel_pitch_um(header),
+        pixel_pitch_um=exif.pixel_pitch_um(header, cut=xmp.get("crs:HasCrop") == "True"),
         artist=exif.text(0x013B) or ", ".join(_lines(xmp.get("dc:creator"))) or exif.wide_text(0x9C9D),
         copyright=exif.text(0x8298) or xmp.get("dc:rights"),
         rating=_rating(xmp.get("xmp:Rating"), exif.number(0x4746)),
@@ -233,7 +253,11 @@ class _Exif:
                 continue
         return None
 
-    def pixel_pitch_um(self, header: Header) -> float | None:
+    def zoom(self) -> float:
+        """How much of the picture is enlarged from the middle of the sensor: DigitalZoomRatio."""
+        return _first_within(1.0, 20.0, self.number(0xA404)) or 1.0
+
+    def pixel_pitch_um(self, header: Header, *, cut: bool = False) -> float | None:
         """Pitch from the focal plane resolution, else from the focal length for 35 mm film.
 
         Programs that scale a photo down rarely correct the former; then width times pitch is the
@@ -243,20 +267,25 @@ class _Exif:
         """
         pitch = _first_within(*_PITCHES_UM, self._focal_plane_pitch_um())
         if pitch is not None:
+            pitch /= self.zoom()
             width_mm = max(header.width, header.height) * pitch / 1000.0
             mosaic = header.kind == "raw" or (header.kind == "dng" and header.channels == 1)
             if mosaic and width_mm <= _LARGEST_SENSOR_MM:
                 return pitch
             if any(low <= width_mm <= high for low, high in _SENSOR_WIDTHS_MM):
                 return pitch
-        return self._film_pitch_um(math.hypot(header.width, header.height))
+            whole = _is_shape_of_sensor(header.width, header.height)
+            if width_mm <= _LARGEST_SENSOR_MM and not mosaic and (cut or not whole):
+                return pitch  # cut by a program, which left the pixels as they were
+        film = self.film_pitch_um(math.hypot(header.width, header.height))
+        return None if film is None else film / self.zoom()
 
     def _focal_plane_pitch_um(self) -> float | None:
         per_unit, unit = self.number(0xA20E), self.number(0xA210) or 2.0
         unit_um = {2.0: 25400.0, 3.0: 10000.0, 4.0: 1000.0, 5.0: 1.0}.get(unit)
         return None if not per_unit or per_unit <= 0 or unit_um is None else unit_um / per_unit
 
-    def _film_pitch_um(self, diagonal_px: float) -> float | None:
+    def film_pitch_um(self, diagonal_px: float) -> float | None:
         """Pitch of a frame whose diagonal is that of 35 mm film over the crop factor."""
         focal, film = self.number(0x920A), self.number(0xA405)
         if not focal or not film or focal <= 0 or film <= 0 or diagonal_px <= 0:
@@ -265,6 +294,12 @@ class _Exif:
         if crop is None:
             return None
         return _first_within(*_PITCHES_UM, 1000.0 * _FILM_DIAGONAL_MM / crop / diagonal_px)
+
+
+def _is_shape_of_sensor(width: int, height: int) -> bool:
+    """Whether a picture has the shape of a sensor, 3 : 2 or 4 : 3: scaled down, it keeps it."""
+    shape = max(width, height) / max(min(width, height), 1)
+    return any(abs(shape / whole - 1.0) < 0.01 for whole in (3.0 / 2.0, 4.0 / 3.0))
 
 
 def _lens(exif: _Exif, note: MakerNote, xmp: Mapping[str, str]) -> LensIdentity:

@@ -26,6 +26,7 @@ _PREFIXES: Final[Mapping[str, str]] = MappingProxyType(
         "http://cipa.jp/exif/1.0/": "exifEX",
         "http://ns.adobe.com/tiff/1.0/": "tiff",
         "http://ns.adobe.com/xap/1.0/": "xmp",
+        "http://ns.adobe.com/camera-raw-settings/1.0/": "crs",
         "http://purl.org/dc/elements/1.1/": "dc",
     }
 )
@@ -81,7 +82,7 @@ class _Collector:
 
 
 def read_xmp(packet: bytes | None) -> Mapping[str, str]:
-    """Read the `aux:`, `dc:`, `exif:`, `exifEX:`, `tiff:` and `xmp:` properties of a packet.
+    """Read the `aux:`, `crs:`, `dc:`, `exif:`, `exifEX:`, `tiff:` and `xmp:` properties of a packet.
 
     Of a list the first item counts, of the authors and keywords all, one a line.
 

@@ -181,11 +181,24 @@ def test_photos_that_name_no_lens_are_of_as_many_lenses_as_focal_lengths() -> No
     assert len({group.name for group in found}) == 2
 
 
-def test_two_bodies_and_two_copies_are_kept_apart() -> None:
+def test_two_copies_are_kept_apart_and_two_bodies_where_the_lens_has_no_serial() -> None:
     copy = replace(ZOOM, lens=LensIdentity("Test", "24-70mm", "8", "exif"))
-    body = replace(ZOOM, body_serial="1")
+    unnumbered = replace(ZOOM, lens=LensIdentity("Test", "24-70mm"))
+    body = replace(unnumbered, body_serial="1")
 
-    assert len(groups(shots(ZOOM, copy, body, ZOOM))) == 3
+    assert len(groups(shots(ZOOM, copy, body, unnumbered, ZOOM))) == 4
+
+
+def test_a_lens_on_two_bodies_is_one_lens_and_the_larger_frames_are_learned_from_first() -> None:
+    small = replace(ZOOM, camera_model="T-2", body_serial="1")
+    cropped, whole, other = (
+        Shot(Path(name), said, half)
+        for name, said, half in (("a.dng", ZOOM, 14.2), ("b.dng", ZOOM, 21.6), ("c.dng", small, 14.1))
+    )
+
+    (group,) = groups([cropped, whole, other])
+
+    assert [shot.path.name for shot in group.to_learn_from()] == ["b.dng", "a.dng", "c.dng"]
 
 
 def test_copies_whose_serials_end_alike_have_profiles_of_their_own() -> None:

@@ -38,7 +38,6 @@ from lensmodel.core.types import ZONES, FieldPosition, Kernel, LensSettings, Ste
 from lensmodel.lab.cases import list_photos, photo_half
 from lensmodel.lab.model.estimated import estimated_samples
 from lensmodel.lab.model.exact import PaperModel
-from lensmodel.lab.model.smoothers import make_known
 from lensmodel.model import LensModel, ModelSettings, smoothers
 from lensmodel.model.answer import MODES
 from lensmodel.simulate import draw_lens
@@ -130,8 +129,8 @@ def run_model_benchmark(
     photos : sequence of int
         How many photos of 24 patches a model sees.
     methods : sequence of str, optional
-        Names in `smoothers`, those of `lab.model.smoothers` included "eff-linear", "polynomial", "paper", or
-        the modes "mode-default" and "mode-paper"; by default all, but modes only of `photographs`.
+        Names in `smoothers`, "eff-linear", "polynomial", "paper", or the modes "mode-default" and "mode-paper";
+        by default all, but modes only of `photographs`.
     psf_field : Path, optional
         Measured PSFs; then `seeds` and `photos` play no part.
     spoiled : float
@@ -245,7 +244,6 @@ def _drawn(folder: Path, seed: int, count: int) -> list[Path]:
 
 
 def _fits(methods: Sequence[str] | None, *, modes: bool = False) -> dict[str, Fit]:
-    make_known()
     known: dict[str, Fit] = {
         "eff-linear": _linear,
         "polynomial": _polynomial,

@@ -135,6 +135,8 @@ class LearnedField:
     def __init__(self, network: FieldNetwork, patches: Patches) -> None:
         self.network, self.patches = network, patches
         _, self._photo = np.unique(patches.photos.astype(str), return_inverse=True)
+        known = patches.pitch[~np.isnan(patches.pitch)]
+        self._pitches, self._counts = np.unique(known, return_counts=True)
         self._group = lru_cache(maxsize=4)(self._group_of)
         self._memory = lru_cache(maxsize=_MEMORIES)(self._memory_of)
         self.ask = lru_cache(maxsize=_ANSWERS)(self._ask)
@@ -162,13 +164,21 @@ class LearnedField:
         pitch_um : float or None
             Pixels of who asks: samples of the same ones answer where there are any.
         """
-        group = self._group(_nearest_pitch(self.patches.pitch, pitch_um))
+        group = self._group(self._pitch_of(pitch_um))
         asked = support.point(position, settings)
         cell = tuple(None if np.isnan(value) else float(value) for value in np.round(asked / _CELL))
         rows, memory, kind = self._memory(group.pitch_um, () if len(group.rows) <= NEAREST else cell)
         conditions = Conditions.of(settings, group.pitch_um, kind)
         answer = self.network.query(memory, np.array(position.xy), conditions)
         return Attended(answer, rows, group.pitch_um, support.support(self.patches.where[rows], asked))
+
+    def _pitch_of(self, asked: float | None) -> float | None:
+        """The pitch of the samples that answer: the one asked for if there are such, else the commonest."""
+        if not self._pitches.size:
+            return None
+        if asked is not None and (np.abs(self._pitches / asked - 1.0) <= pitches.SAME).any():
+            return asked
+        return float(self._pitches[self._counts.argmax()])
 
     def _memory_of(
         self, pitch_um: float | None, cell: tuple[float | None, ...]
@@ -253,14 +263,3 @@ def _conditions(samples: Sequence[PsfSample]) -> tuple[Conditions, ...]:
         for s in samples
     )
     return tuple(known.setdefault(conditions, conditions) for conditions in made)
-
-
-def _nearest_pitch(pitch: NDArray[np.float64], asked: float | None) -> float | None:
-    """The pitch of the samples that answer: the one asked for if there are such, else that of the most."""
-    known = pitch[~np.isnan(pitch)]
-    if not known.size:
-        return None
-    if asked is not None and (np.abs(known / asked - 1.0) <= pitches.SAME).any():
-        return asked
-    values, counts = np.unique(known, return_counts=True)
-    return float(values[counts.argmax()])

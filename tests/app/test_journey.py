@@ -97,7 +97,7 @@ def test_the_psf_has_the_width_of_the_blur_and_the_same_numbers_in_each_format(
 ) -> None:
     place: dict[str, str | float] = {"r": 0.4, "phi": 0.3, "aperture": 2.8, "channel": "g", "size": 21}
     base = f"/v1/lenses/{first['lens_id']}/psf"
-    answer = service.settled(f"{base}.json", params=place)
+    answer = service.http.get(f"{base}.json", params=place)
     kernel = np.array(answer.json()["psf"]["data"])
     raw = np.load(io.BytesIO(service.http.get(f"{base}.npy", params=place).content))
     tiff = tifffile.imread(io.BytesIO(service.http.get(f"{base}.tiff", params=place).content))

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from lensmodel.lab.blind.results import BlindBenchmark, BlindReport
 
 NOISE: Final = "0.01,0.003"
-ESTIMATORS: Final = "default,michaeli-irani,whittle"
+ESTIMATORS: Final = "default,michaeli-irani"
 BLIND_OUTPUT: Final = Path("bench-output")
 STANDARD_OUTPUT: Final = Path("-")
 FINISHED: Final = ("blind.json", "blind.csv", "blind.md")

@@ -4,8 +4,8 @@ if __name__ == "__main__":
     import os
     from pathlib import Path
 
-    from app import cli
     from app.runtime import supervisor
+    from lensmodel.cli import main as cli
 
     here = str(Path(__file__).parent)
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))

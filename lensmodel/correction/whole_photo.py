@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
 
-from lensmodel.core.belief import Belief, UncertainField
+from lensmodel.core.belief import Belief
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.geometry import Frame, zone_of
 from lensmodel.core.psf import PsfField
@@ -87,7 +87,7 @@ class Corrected:
 
 def correct_planes(
     planes: Planes,
-    field: PsfField | UncertainField,
+    field: PsfField,
     frame: Frame,
     *,
     noise: Sequence[NoiseModel],
@@ -118,7 +118,7 @@ def correct_planes(
     ----------
     planes : Planes, shape (3, height, width)
         Linear light, saturation 1; may be memory-mapped.
-    field : PsfField or UncertainField
+    field : PsfField
         The lens.
     frame : Frame
         Size of the photo.
@@ -132,7 +132,7 @@ def correct_planes(
         0 leaves the photo as it is, 1 applies what the noise allows.
     psf_error : float, callable or None
         Expected relative L2 error of the PSF: the larger, the more of a point is mixed into it, and the less
-        is allowed beside edges. None takes the error of an `UncertainField`, and 0 for any other field.
+        is allowed beside edges. None is 0.
     lateral : LateralColourShift or None
         Lateral colour to remove in the same step: it becomes part of the red and blue PSFs, so
         nothing is interpolated. Leave it out where the planes were resampled before.
@@ -227,9 +227,7 @@ def _zeroed(out: Planes | None, shape: tuple[int, int, int]) -> Planes:
     return out
 
 
-def _beliefs_of(
-    field: PsfField | UncertainField, psf_error: PsfError | None
-) -> Callable[[FieldPosition, Channel], Belief]:
+def _beliefs_of(field: PsfField, psf_error: PsfError | None) -> Callable[[FieldPosition, Channel], Belief]:
     """The belief about the PSF of one channel at one place, cached.
 
     Each serves its own cell and its neighbours; the cache holds three rows of cells of 100 megapixels.
@@ -237,9 +235,6 @@ def _beliefs_of(
 
     @lru_cache(maxsize=640)
     def belief(position: FieldPosition, channel: Channel) -> Belief:
-        if psf_error is None and isinstance(field, UncertainField):
-            uncropped = field.belief_at(position, channel, KERNEL_SIZE)
-            return replace(uncropped, kernel=crop_to_support(uncropped.kernel))
         error = psf_error(position, channel) if callable(psf_error) else psf_error or 0.0
         return Belief.of_error(crop_to_support(field.kernel_at(position, channel, KERNEL_SIZE)), float(error))
 

@@ -129,8 +129,8 @@ def run_model_benchmark(
     photos : sequence of int
         How many photos of 24 patches a model sees.
     methods : sequence of str, optional
-        Names in `smoothers`, "eff-linear", "polynomial", "paper", or the modes "mode-default" and "mode-paper";
-        by default all, but modes only of `photographs`.
+        Names in `smoothers`, "eff-linear", "polynomial", "paper", or the modes "mode-default" and
+        "mode-paper"; by default all, but modes only of `photographs`.
     psf_field : Path, optional
         Measured PSFs; then `seeds` and `photos` play no part.
     spoiled : float

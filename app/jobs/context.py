@@ -78,14 +78,15 @@ class JobContext:
         limits: TaskLimits,
         wanted: Callable[[], bool],
         reads: Sequence[Path] = (),
-        compiles: bool = False,
+        compiles_for: int | None = None,
         on_progress: ProgressHook = ignore_step,
     ) -> Any:  # noqa: ANN401 - JSON of any shape
         """Run a task, with retries where they can help; return its result.
 
         After a death by signal the task is retried after a pause, after too little memory once with twice
         as much. What the library refuses with a reason would be refused again. Ends by `NotWantedError`,
-        `JobFailedError`, or `OutageError` where the machine lacks disk space or memory.
+        `JobFailedError`, or `OutageError` where the machine lacks disk space or memory. `compiles_for` is
+        the owner whose compiled code it may use and add to.
         """
         wanted = _patient(wanted)
         crashes = 0
@@ -97,7 +98,7 @@ class JobContext:
                 folder=folder,
                 limits=limits,
                 reads=reads,
-                compiles=compiles,
+                compiles=None if compiles_for is None else str(compiles_for),
                 wanted=wanted,
                 on_progress=on_progress,
             )

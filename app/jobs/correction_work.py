@@ -25,6 +25,7 @@ from app.sandbox.outcome import TaskLimits
 from app.store.corrections import CorrectionPlan, Result, Run, run_folder
 from app.store.photo_steps import stored_settings
 from app.store.samples import LensState
+from app.store.tables import LensRow
 from app.store.versions import report_key
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.correction import Bounds
@@ -109,7 +110,7 @@ class CorrectionWork:
                 limits=limits,
                 wanted=wanted,
                 reads=[developed],
-                compiles=True,
+                compiles_for=photo.owner_id,
                 on_progress=self._progress_of(run),
             )
             self._store_result(run, plan, folder / Path(done["file"]).name, done["report"])
@@ -175,7 +176,12 @@ class CorrectionWork:
                 state = self._samples(lens_id, version, folder)
                 mode = WAYS[state.way].mode
                 metrics = self._context.attempt(
-                    "measure", {"mode": mode}, folder=folder, limits=limits, wanted=wanted, compiles=True
+                    "measure",
+                    {"mode": mode},
+                    folder=folder,
+                    limits=limits,
+                    wanted=wanted,
+                    compiles_for=self._lens(lens_id).owner_id,
                 )
                 key = report_key(lens_id, version, state.rebuild_epoch)
                 self._report(lens_id, key, mode, folder, wanted)
@@ -190,21 +196,30 @@ class CorrectionWork:
         """Write the report of the lens whose samples lie in a folder; a failure is only logged."""
         settings = self._context.settings
         limits = TaskLimits(memory_mb=2 * SPARE_MB, wall_s=settings.correct_seconds)
-        arguments = {"mode": mode, "about": self._about(lens_id)}
+        lens = self._lens(lens_id)
+        arguments = {"mode": mode, "about": self._about(lens)}
         try:
             self._context.attempt(
-                "report", arguments, folder=folder, limits=limits, wanted=wanted, compiles=True
+                "report",
+                arguments,
+                folder=folder,
+                limits=limits,
+                wanted=wanted,
+                compiles_for=lens.owner_id,
             )
             self._context.storage.put_file(key, folder / REPORT)
         except (JobFailedError, FileNotFoundError) as error:
             log.warning("lens %s has no report: %s", lens_id, error)
 
-    def _about(self, lens_id: str) -> dict[str, Any]:
-        """Return what the report needs besides the samples: name, shape of the photos, lateral colour."""
-        lenses = self._context.store.lenses
-        lens = lenses.get(lens_id)
+    def _lens(self, lens_id: str) -> LensRow:
+        lens = self._context.store.lenses.get(lens_id)
         if lens is None:
             raise NotWantedError
+        return lens
+
+    def _about(self, lens: LensRow) -> dict[str, Any]:
+        """Return what the report needs besides the samples: name, shape of the photos, lateral colour."""
+        lenses = self._context.store.lenses
         full_name = " ".join(word for word in (lens.maker, lens.model) if word)
         height, width = lenses.shape_of(lens) or (2, 3)
         return {

@@ -109,7 +109,7 @@ class PhotoWork:
                 limits=limits,
                 wanted=wanted,
                 reads=[developed],
-                compiles=True,
+                compiles_for=photo.owner_id,
             )
             places = {row.idx: FieldPosition(row.r, row.phi) for row in rows}
             return _checked(listed, folder, places)

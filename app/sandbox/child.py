@@ -54,15 +54,20 @@ _KEPT_ENVIRONMENT: Final = (
 _ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
-def main(order: dict[str, Any], line: Connection) -> None:
+def main(order: dict[str, Any], line: Connection, said: Connection) -> None:
     """Run one order: `module`, `task`, `arguments` (JSON), `folder`, `limits`, `niceness`, permissions.
 
-    `reads` are files and folders that it may read, `writes` folders that it may write besides its own;
-    None in place of `reads` leaves the file system, the network and other programs open to it. `account`
-    holds the uid and gid that it changes to, if any.
+    `reads` are files and folders that it may read; None leaves the file system, the network and other
+    programs open to it. `cache` is a folder for compiled code that it may write besides its own, `account`
+    the uid and gid that it changes to, if any. What it prints goes to `said`.
     """
+    for stream in (1, 2):
+        os.dup2(said.fileno(), stream)
+    said.close()
     folder = Path(order["folder"])
     tasks = importlib.import_module(order["module"])  # our own code, not readable after this
+    if order["cache"]:
+        _keep_compiled(order["cache"])
     contain(folder, order["limits"], order["niceness"])
     if order["reads"] is not None:
         _confine(folder, order)
@@ -76,10 +81,14 @@ def main(order: dict[str, Any], line: Connection) -> None:
             last = time.monotonic()
             _tell(line, done=int(done), total=int(total))
 
+    function: Task = tasks.TASKS[order["task"]]
+    _report(line, folder, lambda: function(json.loads(order["arguments"]), folder, progress))
+
+
+def _report(line: Connection, folder: Path, work: Callable[[], Any]) -> None:
+    """Do the work, write what it returns to a file, and tell how it ended."""
     try:
-        function: Task = tasks.TASKS[order["task"]]
-        result = json.dumps(function(json.loads(order["arguments"]), folder, progress), allow_nan=False)
-        (folder / RESULT).write_text(result, encoding="utf-8")
+        (folder / RESULT).write_text(json.dumps(work(), allow_nan=False), encoding="utf-8")
         _tell(line, end="ok")
     except LensModelError as error:
         _tell(line, end="error", code=error.code, text=str(error))
@@ -96,10 +105,28 @@ def main(order: dict[str, Any], line: Connection) -> None:
         _tell(line, end="bug", code=type(error).__name__, text=_last_lines())
     finally:
         sys.stdout.flush()
+        sys.stderr.flush()
+
+
+def _keep_compiled(folder: str) -> None:
+    """Let Numba keep its code in a folder of the owner, also that of loops that the fork server has imported.
+
+    Code that one owner's photo could write must not run beside the photos of another.
+    """
+    try:
+        dispatcher = importlib.import_module("numba.core.dispatcher")
+    except ImportError:
+        return
+    vars(importlib.import_module("numba.core.config"))["CACHE_DIR"] = folder
+    for name, module in list(sys.modules.items()):
+        if not name.startswith(("numba", "numpy", "scipy")):
+            for value in list(vars(module).values()) if module is not None else ():
+                if isinstance(value, dispatcher.Dispatcher):
+                    value.enable_caching()
 
 
 def _confine(folder: Path, order: dict[str, Any]) -> None:
-    writes = [folder, *map(Path, order["writes"])]
+    writes = [folder, *([Path(order["cache"])] if order["cache"] else [])]
     account = SystemAccount(*order["account"]) if order["account"] else None
     if account is not None:
         os.umask(0o007)  # the worker reads its files as a member of its group

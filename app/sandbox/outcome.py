@@ -34,6 +34,10 @@ class TaskLimits:
         Seconds of processor time; by default a little more than `wall_s`.
     file_mb : int
         Largest file it may write, in MiB.
+    scratch_mb : int
+        All that lies in its folder, in MiB.
+    files : int
+        Files in its folder.
     open_files : int
         Files it may have open at once.
     """
@@ -42,6 +46,8 @@ class TaskLimits:
     wall_s: float
     cpu_s: int | None = None
     file_mb: int = 8192
+    scratch_mb: int = 8192
+    files: int = 10_000
     open_files: int = 256
 
     def with_memory(self, memory_mb: int) -> TaskLimits:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import math
 import multiprocessing
 import os
@@ -38,18 +39,49 @@ from lensmodel.core.types import ignore_step
 MAX_MESSAGE: Final = 64 * 1024
 """Bytes of one message from a child at most (chosen): `child.MAX_TEXT` characters fit, escaped or not."""
 
+MAX_NUMBER: Final = 2**31 - 1
+
 TASKS_MODULE = "app.jobs.tasks"
 """Default module of the tasks; tests of the workers replace it."""
 
 
+MAX_SAID: Final = 64 * 1024
+"""Bytes of the standard error of a task that are logged at most (chosen): an honest one says a few lines."""
+
+log = logging.getLogger(__name__)
+
+
 @dataclass(slots=True)
 class _Watched:
-    """One running child: its process, the connection to it, its deadline, its last message."""
+    """One running child: its process, the connections to it, its folder, its deadline, its last message."""
 
     process: ForkServerProcess
     line: Connection
+    said: Connection
+    folder: Path
     deadline: float
     ended: dict[str, Any] | None = None
+    text: bytes = b""
+    logged: int = 0
+
+    def listen(self, on_progress: child.ProgressHook) -> bool:
+        """Take the next message; False at the end of the connection, or if it is invalid."""
+        message = _read(self.line)
+        if message is not None and "end" in message:
+            self.ended = message
+        elif message is not None:
+            on_progress(_number(message.get("done")), _number(message.get("total")))
+        return message is not None
+
+    def hear(self) -> bool:
+        """Log what the task printed, whole lines of it; False once it has closed its end."""
+        data = os.read(self.said.fileno(), MAX_SAID)
+        self.logged += len(data)
+        self.text += data if self.logged <= MAX_SAID else b""
+        *lines, self.text = [*self.text.split(b"\n")] if data else [self.text, b""]
+        for said in filter(None, lines):  # the formatter lets no line look like a record of ours
+            log.info("%s: %s", self.process.name, said.decode("utf-8", "backslashreplace"))
+        return bool(data)
 
 
 class Sandbox:
@@ -105,7 +137,7 @@ class Sandbox:
         if self.account is not None:
             self.account.lets_through(scratch)
             if self._cache is not None:
-                self.account.may_change(self._cache)
+                self.account.lets_through(self._cache)
         self._serve()
 
     def _serve(self) -> None:
@@ -157,7 +189,7 @@ class Sandbox:
         folder: Path,
         limits: TaskLimits,
         reads: Sequence[Path] = (),
-        compiles: bool = False,
+        compiles: str | None = None,
         wanted: Callable[[], bool] = lambda: True,
         on_progress: child.ProgressHook = ignore_step,
     ) -> Outcome:
@@ -173,8 +205,8 @@ class Sandbox:
             The task's own folder, from `folder()`.
         reads : sequence of Path
             Files and folders that the task may read besides its own.
-        compiles : bool
-            Whether it may add to the shared cache of compiled code: not if it decodes an untrusted file.
+        compiles : str, optional
+            Owner whose cache of compiled code it may use and add to: a name for a folder.
         wanted : callable
             Called every `POLL_S`; once it returns False, the child is killed.
         on_progress : callable
@@ -188,20 +220,32 @@ class Sandbox:
             if not entered:
                 return cancelled()
             line, far_end = self._context.Pipe(duplex=True)
-            with line:
+            said, far_said = self._context.Pipe(duplex=False)
+            with line, said:
                 order = self._order(task, arguments, folder, limits)
                 order["reads"] = [str(path.resolve()) for path in reads] if self._confined else None
-                order["writes"] = [str(self._cache)] if compiles and self._cache else []
+                order["cache"] = self._cache_of(compiles)
                 self._open_to_child(folder, reads)
-                process = self._start(order, far_end)
+                process = self._start(order, far_end, far_said)
                 try:
-                    watched = _Watched(process, line, time.monotonic() + limits.wall_s)
+                    watched = _Watched(process, line, said, folder, time.monotonic() + limits.wall_s)
                     cut = self._watch(watched, limits, still_wanted, on_progress)
                     status = 0 if cut else self._exit_status(process)
                 finally:
                     self._end(process)
+                while said.poll() and watched.hear():  # not until all ends are closed: one may live on
+                    pass
                 _leave_plain_files(folder)
                 return cut or outcome_of(watched.ended, status, folder, limits)
+
+    def _cache_of(self, owner: str | None) -> str | None:
+        if owner is None or self._cache is None:
+            return None
+        folder = (self._cache / owner).resolve()
+        folder.mkdir(parents=True, exist_ok=True)
+        if self.account is not None:
+            self.account.may_change(folder)
+        return str(folder)
 
     def _open_to_child(self, folder: Path, reads: Sequence[Path]) -> None:
         if self.account is not None:
@@ -224,12 +268,12 @@ class Sandbox:
             "account": [self.account.uid, self.account.gid] if self.account else None,
         }
 
-    def _start(self, order: dict[str, Any], far_end: Connection) -> ForkServerProcess:
+    def _start(self, order: dict[str, Any], *far_ends: Connection) -> ForkServerProcess:
         process = self._context.Process(
-            target=child.main, args=(order, far_end), name=f"task-{order['task']}", daemon=True
+            target=child.main, args=(order, *far_ends), name=f"task {order['task']}", daemon=True
         )
         self._serve()
-        with far_end, self._alone:
+        with far_ends[0], far_ends[1], self._alone:
             process.start()
         return process
 
@@ -242,23 +286,22 @@ class Sandbox:
     ) -> Outcome | None:
         """Read messages until the child has ended; or return the outcome if it must be killed."""
         last_check = 0.0
-        waiting: list[Any] = [watched.line, watched.process.sentinel]
+        waiting: list[Any] = [watched.line, watched.said, watched.process.sentinel]
         while True:
             ready = wait(waiting, timeout=POLL_S)
-            if watched.line in ready:
-                message = _read(watched.line)
-                if message is None:
-                    waiting.remove(watched.line)
-                elif "end" in message:
-                    watched.ended = message
-                else:
-                    on_progress(int(message.get("done", 0)), int(message.get("total", 0)))
-            elif watched.process.sentinel in ready:
+            if watched.line in ready and not watched.listen(on_progress):
+                waiting.remove(watched.line)
+            if watched.said in ready and not watched.hear():
+                waiting.remove(watched.said)
+            if ready == [watched.process.sentinel]:  # and all messages are read
                 return None
             if time.monotonic() - last_check > POLL_S:
                 last_check = time.monotonic()
                 if not wanted():
                     return cancelled()
+                if _overflows(watched.folder, limits):
+                    text = f"wrote more than {limits.scratch_mb} MiB or {limits.files} files"
+                    return Outcome("error", code="memory_limit", detail=f"{text}; give a smaller photo")
             if time.monotonic() > watched.deadline:
                 text = f"stopped after {limits.wall_s:g} s; give a smaller photo or raise the time limit"
                 return Outcome("time_limit", code="time_limit", detail=text)
@@ -278,6 +321,24 @@ class Sandbox:
                 process.kill()
             process.join()
             process.close()
+
+
+def _number(value: object) -> int:
+    """Return a number of a progress message as an INTEGER column can hold it."""
+    return min(max(value, 0), MAX_NUMBER) if isinstance(value, int) else 0
+
+
+def _overflows(folder: Path, limits: TaskLimits) -> bool:
+    """Say whether a task has written more to its folder than it may."""
+    files = blocks = 0
+    for place, folders, names in os.walk(folder):
+        for name in [*folders, *names]:
+            with contextlib.suppress(OSError):  # gone meanwhile
+                blocks += Path(place, name).lstat().st_blocks
+            files += 1
+            if files > limits.files or blocks * 512 > limits.scratch_mb << 20:
+                return True
+    return False
 
 
 def _leave_plain_files(folder: Path) -> None:

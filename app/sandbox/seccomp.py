@@ -39,8 +39,13 @@ REFUSED: Final = (
     *("init_module", "finit_module", "delete_module", "kexec_load", "kexec_file_load", "reboot"),
     *("swapon", "swapoff", "settimeofday", "clock_settime", "sethostname", "setdomainname", "acct"),
     *("fanotify_init", "shmget", "msgget", "semget", "mq_open", "personality", "syslog"),
+    *("tkill", "rt_sigqueueinfo", "rt_tgsigqueueinfo", "pidfd_send_signal"),
 )
 """Calls that a task does not need; all fail with "not permitted"."""
+
+
+OWN: Final = ("kill", "tgkill", "prlimit64")
+"""Calls that name a process, which must be the task itself: it may abort, and lower its own limits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +62,7 @@ def _table(text: str) -> dict[str, int]:
 _CLONE3: Final = 435  # the same on both processors
 _COMMON: Final = _table(
     "pidfd_open=434 pidfd_getfd=438 io_uring_setup=425 io_uring_enter=426 io_uring_register=427 "
-    "open_tree=428 move_mount=429 fsopen=430"
+    "open_tree=428 move_mount=429 fsopen=430 pidfd_send_signal=424"
 )
 _PROCESSORS: Final = {
     "x86_64": _Processor(
@@ -72,7 +77,8 @@ _PROCESSORS: Final = {
             "request_key=249 open_by_handle_at=304 name_to_handle_at=303 init_module=175 "
             "finit_module=313 delete_module=176 kexec_load=246 kexec_file_load=320 reboot=169 swapon=167 "
             "swapoff=168 settimeofday=164 clock_settime=227 sethostname=170 setdomainname=171 acct=163 "
-            "fanotify_init=300 shmget=29 msgget=68 semget=64 mq_open=240 personality=135 syslog=103"
+            "fanotify_init=300 shmget=29 msgget=68 semget=64 mq_open=240 personality=135 syslog=103 kill=62 "
+            "tkill=200 tgkill=234 rt_sigqueueinfo=129 rt_tgsigqueueinfo=297 prlimit64=302"
         ),
     ),
     "aarch64": _Processor(
@@ -87,7 +93,8 @@ _PROCESSORS: Final = {
             "open_by_handle_at=265 name_to_handle_at=264 init_module=105 finit_module=273 "
             "delete_module=106 kexec_load=104 kexec_file_load=294 reboot=142 swapon=224 swapoff=225 "
             "settimeofday=170 clock_settime=112 sethostname=161 setdomainname=162 acct=89 "
-            "fanotify_init=262 shmget=194 msgget=186 semget=190 mq_open=180 personality=92 syslog=116"
+            "fanotify_init=262 shmget=194 msgget=186 semget=190 mq_open=180 personality=92 syslog=116 "
+            "kill=129 tkill=130 tgkill=131 rt_sigqueueinfo=138 rt_tgsigqueueinfo=240 prlimit64=261"
         ),
     ),
 }
@@ -137,6 +144,15 @@ def _steps(processor: _Processor) -> list[tuple[int, int, int, int]]:
     for name in REFUSED:
         if name in processor.numbers:
             steps += [(_EQUAL, 0, 1, processor.numbers[name]), (_RETURN, 0, 0, no)]
+    for name in OWN:
+        itself = 0 if name == "prlimit64" else os.getpid()
+        steps += [
+            (_EQUAL, 0, 4, processor.numbers[name]),
+            (_LOAD, 0, 0, _FIRST_ARGUMENT),
+            (_EQUAL, 0, 1, itself),
+            (_RETURN, 0, 0, _ALLOW),
+            (_RETURN, 0, 0, no),
+        ]
     return [
         *steps,
         (_EQUAL, 0, 3, processor.clone),  # threads yes, processes no

@@ -136,7 +136,7 @@ class Scripted:
         limits: TaskLimits,
         reads: Sequence[Path],
         wanted: Callable[[], bool],
-        compiles: bool = False,
+        compiles: str | None = None,
         on_progress: ProgressHook = ignore_step,
     ) -> Outcome:
         self.ran.append(task)

@@ -167,6 +167,56 @@ def probe(  # noqa: C901 - one try each
     return found
 
 
+def sabotage(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> dict[str, str]:
+    """Try to end, slow down or limit other processes; say how far each try came."""
+    libc, others = ctypes.CDLL(None, use_errno=True), arguments["pid"]
+    call = {"tkill": (200, 130), "tgkill": (234, 131), "sigqueue": (129, 138), "prlimit": (302, 261)}
+    number = {name: both[os.uname().machine != "x86_64"] for name, both in call.items()}
+    space = ctypes.create_string_buffer(256)
+    tries: dict[str, Callable[[], int]] = {
+        "kill": lambda: libc.kill(others, 0),
+        "kill all": lambda: libc.kill(-1, 0),
+        "kill the group": lambda: libc.kill(0, 0),
+        "tkill": lambda: libc.syscall(number["tkill"], others, 0),
+        "tgkill": lambda: libc.syscall(number["tgkill"], others, others, 0),
+        "sigqueue": lambda: libc.syscall(number["sigqueue"], others, 0, space),
+        "prlimit": lambda: libc.syscall(number["prlimit"], others, 7, None, space),
+        "own limits": lambda: libc.syscall(number["prlimit"], 0, 7, None, space),
+        "own signal": lambda: libc.kill(os.getpid(), 0),
+    }
+    return {
+        name: "done" if attempt() == 0 else errno.errorcode[ctypes.get_errno()]
+        for name, attempt in tries.items()
+    }
+
+
+def abort(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
+    ctypes.CDLL(None).abort()
+
+
+def litter(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
+    for number in range(arguments["files"]):
+        (folder / str(number)).write_bytes(bytes(arguments["bytes"]))
+    time.sleep(60)
+
+
+def forge(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
+    """Print what looks like a record of the service."""
+    os.write(2, b"harmless\n2026-01-01 00:00:00,000 CRITICAL worker app.jobs.worker: all is lost\n\x1b[2J")
+    os.write(1, b"x" * arguments.get("bytes", 0))
+
+
+def compile_one(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> list[str]:
+    import numba  # noqa: PLC0415 - others need it not
+
+    try:
+        Path(arguments["theirs"], "planted").touch()
+        planted = "planted"
+    except OSError:
+        planted = "refused"
+    return [planted, str(numba.config.CACHE_DIR)]
+
+
 def link(arguments: dict[str, Any], folder: Path, progress: ProgressHook) -> None:
     """Leave links where the worker expects what the task made."""
     (folder / "preview.jpg").symlink_to(arguments["database"])
@@ -198,5 +248,10 @@ TASKS = {
         probe,
         link,
         shout,
+        sabotage,
+        abort,
+        litter,
+        forge,
+        compile_one,
     )
 }

@@ -24,7 +24,7 @@ from app.sandbox import confine
 from app.sandbox.budget import Budget
 from app.sandbox.child import NICENESS
 from app.sandbox.outcome import Outcome, TaskLimits
-from app.sandbox.runner import Sandbox
+from app.sandbox.runner import MAX_SAID, Sandbox
 
 OWN = Path(__file__).parent
 HERE = OWN.parent
@@ -242,7 +242,7 @@ def test_a_child_dies_with_its_killed_parent(tmp_path: Path) -> None:
         sys.path.insert(0, {str(OWN)!r})
         from app.sandbox.budget import Budget
         from app.sandbox.outcome import TaskLimits
-        from app.sandbox.runner import Sandbox
+        from app.sandbox.runner import MAX_SAID, Sandbox
         if __name__ == "__main__":
             scratch, shared = Path({str(tmp_path / "scratch")!r}), Path({str(pid_file.parent)!r})
             box = Sandbox(scratch, Budget(1, 1024), module="hostile_tasks", preload=[], cache=shared)
@@ -273,7 +273,7 @@ def test_the_fork_server_listens_where_files_may_be_made(tmp_path: Path) -> None
         from multiprocessing import forkserver
         from pathlib import Path
         from app.sandbox.budget import Budget
-        from app.sandbox.runner import Sandbox
+        from app.sandbox.runner import MAX_SAID, Sandbox
         if __name__ == "__main__":
             Sandbox(Path({str(tmp_path)!r}), Budget(1, 64), preload=[])
             print(forkserver._forkserver._forkserver_address)
@@ -294,7 +294,7 @@ from app.sandbox import confine
 from app.sandbox.account import find
 from app.sandbox.budget import Budget
 from app.sandbox.outcome import TaskLimits
-from app.sandbox.runner import Sandbox
+from app.sandbox.runner import MAX_SAID, Sandbox
 if __name__ == "__main__":
     data = Path({data!r})
     confine.keep_private()
@@ -490,3 +490,63 @@ def test_waiting_for_the_budget_ends_with_the_interest_in_it() -> None:
 def _enter(budget: Budget, memory_mb: int, name: str, order: list[str]) -> None:
     with budget.share(memory_mb, lambda: True):
         order.append(name)
+
+
+def in_force(*names: str) -> None:
+    measures = confine.available("none", Path("/tmp"))
+    missing = [name for name in names if not measures[name]]
+    if missing:
+        pytest.skip(f"this kernel, or this container, has no {', '.join(missing)}")
+
+
+def test_a_task_can_signal_and_limit_nobody_but_itself(run: Run) -> None:
+    in_force("system_calls")
+    with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(300)"]) as other:
+        try:
+            found = run("sabotage", arguments={"pid": other.pid}).value
+        finally:
+            other.kill()
+
+    allowed = {name for name, said in found.items() if said == "done"}
+    assert allowed == {"own limits", "own signal"}
+    assert set(found.values()) == {"done", "EPERM"}
+    assert "SIGABRT" in run("abort").detail
+
+
+@pytest.mark.parametrize(("files", "size"), [(3, 1 << 20), (50, 1)])
+def test_a_task_that_fills_its_folder_is_killed(run: Run, files: int, size: int) -> None:
+    limits = TaskLimits(memory_mb=512, wall_s=stretched(30), scratch_mb=2, files=40)
+
+    outcome = run("litter", arguments={"files": files, "bytes": size}, limits=limits)
+
+    assert (outcome.ending, outcome.code) == ("error", "memory_limit")
+    assert "2 MiB or 40 files" in outcome.detail
+
+
+def test_what_a_task_prints_is_logged_and_looks_like_no_record_of_ours(
+    run: Run, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with caplog.at_level("INFO", "app.sandbox.runner"):
+        assert run("forge").ending == "ok"
+        assert run("forge", arguments={"bytes": 10_000_000}).ending == "ok"
+
+    printed = capfd.readouterr()
+    assert "all is lost" not in printed.out + printed.err
+    lines = [record.getMessage() for record in caplog.records if record.name == "app.sandbox.runner"]
+    assert lines[:2] == [
+        "task forge: harmless",
+        "task forge: 2026-01-01 00:00:00,000 CRITICAL worker app.jobs.worker: all is lost",
+    ]
+    assert sum(map(len, lines)) < 3 * MAX_SAID
+
+
+def test_compiled_code_of_one_owner_is_out_of_reach_of_another(
+    sandbox: Sandbox, run: Run, tmp_path: Path
+) -> None:
+    in_force("files")
+    theirs = tmp_path / "shared" / "1"
+    theirs.mkdir(parents=True)
+
+    planted, own = run("compile_one", arguments={"theirs": str(theirs)}, compiles="2").value
+
+    assert (planted, own) == ("refused", str(tmp_path / "shared" / "2"))

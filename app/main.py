@@ -18,7 +18,7 @@ from app.blobs.folder_creation import settle_folder
 from app.blobs.storage import Storage
 from app.http import errors
 from app.http.bodies import JsonBodies
-from app.http.dependencies import Places, Services, call_of
+from app.http.dependencies import Fresh, Places, Services, call_of
 from app.http.job_watch import Watch
 from app.http.middleware import Heads, OwnNames, RequestLog, SameSite
 from app.http.model_cache import ModelCache
@@ -87,6 +87,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             watch,
             OpenPages(owners),
             Gate(chosen, store.keys),
+            Fresh(health.FRESH_S),
         )
         yield
         await run_in_threadpool(notices.stop)

@@ -216,11 +216,14 @@ class Storage:
             for piece in pieces:
                 sink.write(bytes(piece))
 
-    def check_writable(self) -> None:
-        """Write and delete a small blob; raise the error if that fails."""
-        prefix = f"probe/{new_id()}/"
-        self.put(f"{prefix}x", b"x")
-        self.delete(prefix)
+    def check_usable(self) -> None:
+        """Raise an error if folder or bucket is away, or a folder cannot take more; nothing is written."""
+        if self.folder is None:
+            next(iter(obstore.list(self._store, chunk_size=1)), None)
+        elif not self.free_bytes():
+            raise OSError(errno.ENODEV, "the folder of the blobs is away, or full", str(self.folder))
+        elif not os.access(self.folder, os.W_OK):
+            raise PermissionError(errno.EACCES, "the folder of the blobs is read-only", str(self.folder))
 
     def free_bytes(self) -> int | None:
         """Return the free bytes of the disk; None for an object store."""

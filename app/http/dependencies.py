@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Generic, TypeVar
 
 from fastapi import Depends, Request, Response, Security
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
@@ -19,7 +22,10 @@ from app.http.open_pages import OpenPages
 from app.http.picture_cache import Drawn
 from app.runtime.disk_reserve import Reserve
 from app.runtime.settings import Settings
+from app.schemas import Readiness
 from app.store import Store
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +42,24 @@ class Services:
     watch: Watch
     pages: OpenPages
     gate: Gate
+    readiness: Fresh[Readiness]
+
+
+class Fresh(Generic[T]):
+    """A value that is made anew after some seconds, once for all who ask at the same time."""
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds, self._until = seconds, -math.inf
+        self._value: T | None = None
+        self._guard = threading.Lock()
+
+    def get(self, make: Callable[[], T]) -> T:
+        """Return the value; make it where it is missing or too old."""
+        with self._guard:
+            if self._value is None or time.monotonic() > self._until:
+                self._value = make()
+                self._until = time.monotonic() + self._seconds
+            return self._value
 
 
 class Places:

@@ -17,6 +17,7 @@ from app.errors import ConflictError, UnknownLensError
 from app.runtime import metrics
 from app.schemas import PsfModel
 from app.store import Store, StoredSample
+from app.store.access.owners import ANY_OWNER
 from app.store.samples import LensState
 from lensmodel.core.errors import NoSamplesError
 from lensmodel.model import LensModel, ModelSettings
@@ -132,7 +133,7 @@ def _fit(lens_id: str, state: LensState, samples: list[StoredSample]) -> Fitted:
 
 def check_version(store: Store, lens_id: str, version: int, state: LensState) -> None:
     """Check that the samples of an earlier version are still complete."""
-    lens = store.lenses.get(lens_id)
+    lens = store.lenses.get(lens_id, ANY_OWNER)
     later = [] if lens is None else store.lenses.history(lens, after=version)
     if version > state.version:
         raise ConflictError(f"lens {lens_id} has no version {version} yet: the newest is {state.version}")

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any, Final
 
+from app.jobs.answers import Corrected, Measured, checked
 from app.jobs.context import (
     SPARE_MB,
     JobContext,
@@ -22,6 +23,7 @@ from app.jobs.task_files import LAYER_FILES, REPORT, SIDES, SUFFIX
 from app.runtime.outage import missable
 from app.sandbox.child import ProgressHook
 from app.sandbox.outcome import TaskLimits
+from app.store.access.owners import ANY_OWNER
 from app.store.corrections import CorrectionPlan, Result, Run, run_folder
 from app.store.photo_steps import stored_settings
 from app.store.samples import LensState
@@ -61,7 +63,7 @@ class CorrectionWork:
             return self._corrections.is_live(correction_id, epoch)
 
         run = self._corrections.start(correction_id, epoch)
-        plan = None if run is None else self._corrections.plan(correction_id)
+        plan = None if run is None else self._corrections.plan(correction_id, ANY_OWNER)
         if run is None or plan is None:
             return
         try:
@@ -113,6 +115,7 @@ class CorrectionWork:
                 compiles_for=photo.owner_id,
                 on_progress=self._progress_of(run),
             )
+            done = checked(Corrected, done)
             self._store_result(run, plan, folder / Path(done["file"]).name, done["report"])
 
     def _samples(self, lens_id: str, version: int, folder: Path) -> LensState:
@@ -183,6 +186,7 @@ class CorrectionWork:
                     wanted=wanted,
                     compiles_for=self._lens(lens_id).owner_id,
                 )
+                metrics = checked(Measured, metrics)
                 key = report_key(lens_id, version, state.rebuild_epoch)
                 self._report(lens_id, key, mode, folder, wanted)
         except NotWantedError:
@@ -212,7 +216,7 @@ class CorrectionWork:
             log.warning("lens %s has no report: %s", lens_id, error)
 
     def _lens(self, lens_id: str) -> LensRow:
-        lens = self._context.store.lenses.get(lens_id)
+        lens = self._context.store.lenses.get(lens_id, ANY_OWNER)
         if lens is None:
             raise NotWantedError
         return lens
@@ -231,7 +235,7 @@ class CorrectionWork:
 
     def _is_newest(self, lens_id: str, version: int) -> bool:
         """Whether a version is the current one; reports of earlier ones have been deleted."""
-        lens = self._context.store.lenses.get(lens_id)
+        lens = self._context.store.lenses.get(lens_id, ANY_OWNER)
         return lens is not None and lens.version == version
 
 

@@ -15,6 +15,7 @@ from typing import Any
 from app.jobs.context import SPARE_MB, JobContext, JobFailedError
 from app.jobs.task_files import CLEANED
 from app.sandbox.outcome import TaskLimits
+from app.store.access.owners import ANY_OWNER
 from app.store.photo_steps import photo_folder
 from app.store.tables import PhotoRow
 
@@ -35,7 +36,7 @@ def remove_location(context: JobContext, photo: PhotoRow, wanted: Callable[[], b
             log.warning("photo %s was not searched for its place: %s", photo.public_id, error.detail)
             found = "unknown"
         _record(context, photo, found, folder / CLEANED)
-    return context.store.photos.get(photo.public_id) or photo
+    return context.store.photos.get(photo.public_id, ANY_OWNER) or photo
 
 
 def _record(context: JobContext, photo: PhotoRow, found: Any, cleaned: Path) -> None:  # noqa: ANN401 - a child's JSON

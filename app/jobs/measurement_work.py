@@ -10,6 +10,7 @@ from typing import Any, Final
 from app.jobs.context import JobContext, JobFailedError
 from app.jobs.sample_files import DAMAGED, returned_samples
 from app.store import NewPatch, NewSample
+from app.store.access.owners import ANY_OWNER
 from app.store.photo_steps import stored_settings
 from app.store.tables import PhotoRow
 from app.ways import configured_way
@@ -63,11 +64,11 @@ class MeasurementWork:
         name = photo.given.get("reference_id")
         if name is None:
             return []
-        row = self._context.store.photos.get(name)
+        row = self._context.store.photos.get(name, ANY_OWNER)
         end = time.monotonic() + WAIT_S
         while row is not None and row.state in _UNREAD and time.monotonic() < end and wanted():
             time.sleep(0.2)
-            row = self._context.store.photos.get(name)
+            row = self._context.store.photos.get(name, ANY_OWNER)
         if row is None or row.owner_id != photo.owner_id:
             raise JobFailedError(
                 "unknown_photo", f"the reference photo {name} is not there any more; send both photos again"

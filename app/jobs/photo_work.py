@@ -15,6 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
+from app.jobs.answers import Inspected, Selected, checked
 from app.jobs.body_keys import body_key
 from app.jobs.context import SPARE_MB, JobContext, JobFailedError, NotWantedError
 from app.jobs.location_work import remove_location
@@ -25,6 +26,7 @@ from app.jobs.sample_files import DAMAGED, returned_samples
 from app.jobs.thumbnail_work import keep_thumbnail
 from app.sandbox.outcome import TaskLimits
 from app.store import LensName, NewSample, Store
+from app.store.access.owners import ANY_OWNER
 from app.store.photo_steps import stored_settings
 from app.store.tables import PHOTO_RUNNING, LensRow, PatchRow, PhotoRow
 from app.ways import configured_way
@@ -141,6 +143,7 @@ class _Steps:
             info = self._context.attempt(
                 "inspect", arguments, folder=folder, limits=limits, wanted=self._wanted, reads=[path]
             )
+            info = checked(Inspected, info)
             keep_thumbnail(self._context, self._photo, info, path, self._wanted)
         self._record(info)
         self._photo = _row(self._store, self._photo.public_id)
@@ -227,6 +230,7 @@ class _Steps:
                 size = f"{photo.width}x{photo.height}"
                 text = f"the photo of {size} pixels is too small to tell about its lens; send it in full size"
                 raise JobFailedError("no_usable_patches", text) from error
+        selection = checked(Selected, selection)
         if selection["lateral"] is not None:
             self._store.photos.record_lateral(photo.public_id, photo.epoch, selection["lateral"])
         self._store.patches.add(photo.public_id, photo.epoch, plan_of(selection))
@@ -311,7 +315,7 @@ _BEFORE: Final[Mapping[str, str]] = {
 
 
 def _row(store: Store, photo_id: str) -> PhotoRow:
-    photo = store.photos.get(photo_id)
+    photo = store.photos.get(photo_id, ANY_OWNER)
     if photo is None:
         raise NotWantedError
     return photo

@@ -40,6 +40,7 @@ from app.sandbox import account, confine
 from app.sandbox.budget import Budget
 from app.sandbox.runner import Sandbox
 from app.store import Store
+from app.store.access.owners import ANY_OWNER
 from app.store.ids import new_id
 from app.store.tables import PhotoRow
 
@@ -358,6 +359,9 @@ class Worker:
             self._do(partial(self._store.photos.give_up_file, photo_id, (THUMBNAIL, PREVIEW, R_MAP, SHOWN)))
         for photo in self._store.photos.unsearched():
             self._do(partial(self._search, photo))
+        expired = datetime.now(UTC) - timedelta(days=self._settings.keep_results_days)
+        for correction_id in self._store.corrections.ended_before(expired):
+            self._do(partial(self._store.corrections.delete, correction_id, ANY_OWNER))
         self._do(self._store.accounts.purge)
         self._do(self._store.idempotency.tidy)
         for prefix in self._store.workers.garbage():
@@ -411,7 +415,7 @@ def main() -> None:
     logs.begin("worker", settings.log_level, settings.log_format)
     confine.keep_private()
     if settings.metrics_port:
-        metrics.publish(settings.metrics_port, settings.host, settings.data_dir.resolve())
+        metrics.publish(settings.metrics_port, settings.metrics_host, settings.data_dir.resolve())
     worker = Worker(settings)
     on_signals(lambda _: worker.stop())
     on_parents_end(worker.stop)

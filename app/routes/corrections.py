@@ -13,6 +13,7 @@ from app.errors import (
     ConflictError,
     InvalidParameterError,
     NotReadyError,
+    QuotaError,
     RangeError,
     UnknownCorrectionError,
 )
@@ -22,7 +23,7 @@ from app.http.idempotency import OnceDep
 from app.http.middleware import ONLY_HEAD
 from app.http.model_cache import check_version
 from app.routes.common import Cursor, Limit, OnlyId, matches_tag, named_lens, next_link, problems
-from app.routes.photos import SEND_AGAIN, find_photo
+from app.routes.photos import SEND_AGAIN, check_stored, find_photo, most
 from app.schemas import CorrectionIn, CorrectionOut, CorrectionPage
 from app.store.corrections import CorrectionPlan
 from app.store.photo_steps import stored_settings
@@ -42,7 +43,11 @@ _RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.ASCII)
     status_code=status.HTTP_202_ACCEPTED,
     response_model=CorrectionOut,
     responses=problems(
-        404, 409, 422, also={200: {"model": CorrectionOut, "description": "The same correction is finished"}}
+        404,
+        409,
+        422,
+        429,
+        also={200: {"model": CorrectionOut, "description": "The same correction is finished"}},
     ),
 )
 def create_correction(options: CorrectionIn, call: CallDep, once: OnceDep) -> CorrectionOut | Response:
@@ -61,6 +66,7 @@ def create(options: CorrectionIn, call: Call) -> CorrectionOut:
     _check_region(photo, options)
     lens = _lens_for(call, photo, options.lens_id)
     version = _version_for(call, lens, options.lens_version)
+    _admit(call)
     params = options.model_dump(mode="json", include={"strength", "output", "roi"})
     params["method"] = options.method or configured_way(call.settings, lens.answering_way).method
     # with other settings of the photo the same request is a new correction
@@ -74,6 +80,18 @@ def create(options: CorrectionIn, call: Call) -> CorrectionOut:
     call.response.status_code = status.HTTP_200_OK if finished else status.HTTP_202_ACCEPTED
     call.response.headers["Location"] = f"{views.V1}/corrections/{row.public_id}"
     return views.correction_out(CorrectionPlan(row, photo, lens))
+
+
+def _admit(call: Call) -> None:
+    """Refuse a correction whose owner has too many unfinished ones, or stores too much."""
+    most_bytes, _ = most(call.settings, call.store.accounts.quota_of(call.owner))
+    check_stored(call.store.photos.load_of(call.owner)[1], most_bytes)
+    unfinished = call.store.corrections.unfinished_of(call.owner)
+    if unfinished >= call.settings.max_queued_photos:
+        raise QuotaError(
+            f"{unfinished} corrections are unfinished, {call.settings.max_queued_photos} may be: wait",
+            headers={"Retry-After": "30"},
+        )
 
 
 def _check_read(photo: PhotoRow) -> None:

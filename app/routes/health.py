@@ -11,7 +11,6 @@ from typing import Final, get_args
 
 from fastapi import APIRouter, Response, status
 
-from app.blobs.folder_creation import settle_folder
 from app.http.dependencies import Call, CallDep, ProbeDep
 from app.routes.common import problems
 from app.routes.photos import GIB
@@ -33,6 +32,9 @@ from lensmodel.correction import deconvolvers
 from lensmodel.estimation import estimators
 from lensmodel.estimation.patches import selectors
 
+FRESH_S: Final = 2.0
+"""Seconds for which `/readyz` repeats its answer (chosen): strangers who ask often cost nothing."""
+
 READY_S: Final = 3.0
 """Seconds for all checks (chosen): less than the 5 s that container engines usually wait."""
 
@@ -53,6 +55,13 @@ def healthz() -> Health:
 )
 def readyz(call: ProbeDep) -> Readiness:
     """Say whether work can be taken: schema, storage and a worker are there."""
+    readiness = call.services.readiness.get(lambda: _readiness(call))
+    if readiness.status != "ready":
+        call.response.status_code = status.HTTP_503_SERVICE_UNAVAILABLE
+    return readiness
+
+
+def _readiness(call: Call) -> Readiness:
     confined: dict[str, bool] = {}
     tried: dict[str, Callable[[], None]] = {
         "schema": lambda: _schema(call),
@@ -65,8 +74,6 @@ def readyz(call: ProbeDep) -> Readiness:
     if call.settings.needs_keys:  # strangers learn what is wrong, but no addresses
         checks = {name: outcome.partition(":")[0] for name, outcome in checks.items()}
     ready = all(outcome == "ok" for outcome in checks.values())
-    if not ready:
-        call.response.status_code = status.HTTP_503_SERVICE_UNAVAILABLE
     return Readiness(status="ready" if ready else "not ready", checks=checks, sandbox=confined)
 
 
@@ -103,8 +110,7 @@ def _schema(call: Call) -> None:
 
 
 def _storage(call: Call) -> None:
-    settle_folder(call.store, call.storage)
-    call.storage.check_writable()
+    call.storage.check_usable()
 
 
 def _worker(call: Call) -> dict[str, bool]:
@@ -157,4 +163,5 @@ def read_limits(call: CallDep) -> LimitsOut:
         max_stored_bytes=int(settings.max_stored_gb * GIB),
         max_psf_size=MAX_PSF_SIZE,
         long_poll_seconds=settings.long_poll_seconds,
+        keep_results_days=settings.keep_results_days,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import zipfile
 from typing import Final
 
 from fastapi import APIRouter, Response
@@ -25,6 +26,9 @@ router = APIRouter(tags=["lenses"])
 
 MAX_BYTES: Final = 64 << 20
 """Largest profile that is accepted (chosen): twenty times that of a hundred photos."""
+
+MAX_UNPACKED: Final = 256 << 20
+"""Bytes to which a profile may unpack (chosen): kernels of 20,000 samples of 55 pixels, which no lens has."""
 
 _PAGE: Final = 200
 """Photos that are read at once (chosen): bounds the memory that a large lens takes."""
@@ -92,7 +96,21 @@ async def _received(call: Call) -> bytes:
     return bytes(data)
 
 
+def _check_unpacked(data: bytes) -> None:
+    """Refuse a profile that unpacks to more than a lens can need, before anything of it is unpacked."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            unpacked = sum(entry.file_size for entry in archive.infolist())
+    except (zipfile.BadZipFile, ValueError, OSError) as error:
+        raise MalformedUploadError("this is no lens profile: send one that ends in .lensprofile") from error
+    if unpacked > MAX_UNPACKED:
+        raise TooLargeError(
+            f"the profile unpacks to {unpacked >> 20} MiB, {MAX_UNPACKED >> 20} MiB may be: send less"
+        )
+
+
 def _add(lens_id: str, data: bytes, call: Call) -> LensOut:
+    _check_unpacked(data)
     try:
         profile = read_profile(io.BytesIO(data), "This file")
     except InvalidInputError as error:

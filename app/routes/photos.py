@@ -203,14 +203,20 @@ def _admit(call: Call) -> None:
             "wait for some to finish",
             headers={"Retry-After": "30"},
         )
-    if stored >= most_bytes:
-        raise QuotaError(
-            f"{stored / GIB:.1f} GiB of photos are stored, {most_bytes / GIB:g} GiB may be: delete some",
-            headers={"Retry-After": "3600"},
-        )
+    check_stored(stored, most_bytes)
     if kept >= most_photos:
         raise QuotaError(
             f"{kept} photos are there, {most_photos} may be: delete some", headers={"Retry-After": "3600"}
+        )
+
+
+def check_stored(stored: int, most_bytes: int) -> None:
+    """Refuse more where an owner stores as many bytes of photos and results as he may."""
+    if stored >= most_bytes:
+        raise QuotaError(
+            f"{stored / GIB:.1f} GiB of photos and results are stored, {most_bytes / GIB:g} GiB may be: "
+            "delete some",
+            headers={"Retry-After": "3600"},
         )
 
 

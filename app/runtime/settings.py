@@ -89,7 +89,9 @@ class Settings(BaseSettings):
     max_queued_photos: int = Field(
         default=500, ge=1, description="Unfinished photos of one owner; more are refused."
     )
-    max_stored_gb: float = Field(default=200.0, gt=0, description="Photo bytes of one owner, in GiB.")
+    max_stored_gb: float = Field(
+        default=200.0, gt=0, description="Bytes of photos and results of one owner, in GiB."
+    )
     max_photos: int = Field(default=100_000, ge=1, description="Photos of one owner.")
     keep_photos: Literal["never", "corrections", "always"] = Field(
         default="always",
@@ -97,6 +99,9 @@ class Settings(BaseSettings):
             "How long the files of photos stay: never = until their work is done; corrections = only of "
             "photos that are there to be corrected; always = until they are deleted."
         ),
+    )
+    keep_results_days: float = Field(
+        default=30.0, gt=0, description="How long corrections and their files stay after their end."
     )
     min_free_mb: int = Field(
         default=256, ge=0, description="Free disk below which uploads are refused, in MiB."
@@ -119,6 +124,13 @@ class Settings(BaseSettings):
         description=(
             "Account of the processes that decode photos, where a worker may change to it: a name; auto = "
             "lens-task if there is one, else nobody; none = that of the worker."
+        ),
+    )
+    sandbox: Literal["auto", "require", "try"] = Field(
+        default="auto",
+        description=(
+            "Whether workers refuse to start where nothing keeps a hostile photo from other files: require; "
+            "try = they take what there is; auto = require where keys are asked for."
         ),
     )
     lease_seconds: float = Field(
@@ -178,6 +190,9 @@ class Settings(BaseSettings):
     )
     metrics_port: int = Field(
         default=0, ge=0, le=65535, description="Port of a worker's own /metrics; 0 = none, the API has them."
+    )
+    metrics_host: str = Field(
+        default="127.0.0.1", description="Address of that port: it asks nobody for a key."
     )
 
     @model_validator(mode="before")
@@ -269,6 +284,11 @@ class Settings(BaseSettings):
     def needs_keys(self) -> bool:
         """Whether everybody needs a key, whether or not there is one yet."""
         return self.auth == "keys" or (self.auth == "auto" and self.is_open_to_others)
+
+    @property
+    def needs_sandbox(self) -> bool:
+        """Whether a worker must not start without an account for its children, and Landlock."""
+        return self.sandbox == "require" or (self.sandbox == "auto" and self.needs_keys)
 
     @property
     def hosts(self) -> frozenset[str]:

@@ -64,6 +64,7 @@ def serve(settings: Settings) -> int:
     """Run the whole service until SIGTERM or Ctrl-C; return the exit status."""
     confine.keep_private()
     settings.data_dir.mkdir(parents=True, exist_ok=True)
+    require_sandbox(settings)
     with alone(settings.data_dir), contextlib.closing(_listener(settings)) as listener:
         _prepare(settings)
         return _Supervisor(settings, listener).run()
@@ -84,6 +85,7 @@ def run_worker(settings: Settings) -> None:
     that of a worker is small for this reason.
     """
     confine.keep_private()
+    require_sandbox(settings)
     _migrate(settings)
     os.environ.update(ONE_THREAD | environment(settings))
     os.execv(sys.executable, [sys.executable, "-m", "app.runtime.worker_main"])  # noqa: S606 - no shell is wanted
@@ -104,6 +106,28 @@ def _prepare(settings: Settings) -> None:
         f"LENS_AUTH={settings.auth}) and there is no valid key yet: make one by `lensmodel keys create "
         "--owner NAME` with the same settings, or listen on 127.0.0.1 without LENS_PUBLIC"
     )
+
+
+def require_sandbox(settings: Settings) -> None:
+    """Refuse to start where children must be kept from other files, and something for that is missing."""
+    if not settings.needs_sandbox:
+        return
+    in_force = confine.available(settings.task_user, settings.data_dir)
+    missing = [remedy for name, remedy in _REMEDIES.items() if not in_force[name]]
+    if missing:
+        raise UsageError(
+            "nothing would keep a hostile photo from the photos of others: "
+            + "; ".join(missing)
+            + "; or accept that by LENS_SANDBOX=try"
+        )
+
+
+_REMEDIES: Final = {
+    "account": "no account to change to: start as root, or with the capabilities SETUID, SETGID, KILL, and "
+    "make an account lens-task that can read the program (the container image has one)",
+    "files": "no Landlock: use Linux 5.13 or newer with it switched on (lsm=landlock,...), and a container "
+    "engine that allows its system calls",
+}
 
 
 def _migrate(settings: Settings) -> None:

@@ -55,3 +55,4 @@ class LimitsOut(Model):
     max_stored_bytes: int
     max_psf_size: int
     long_poll_seconds: float
+    keep_results_days: float

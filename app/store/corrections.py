@@ -6,12 +6,13 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Any
 
-from sqlalchemy import Select, select, update
+from sqlalchemy import Select, func, select, update
 
 from app.errors import BusyError, ConflictError, UnknownPhotoError
-from app.store.access.owners import LATE, find_owned, find_to_change, is_id, now, owned
+from app.store.access.owners import ANY_OWNER, LATE, Owner, find_owned, find_to_change, is_id, now, owned
 from app.store.database import Database, insert_new
 from app.store.ids import new_id
 from app.store.tables import CorrectionRow, GarbageRow, LensRow, OwnerRow, PhotoRow
@@ -66,7 +67,7 @@ def run_folder(correction: CorrectionRow) -> str:
     return f"{correction_folder(correction)}{correction.epoch}-{correction.attempt}/"
 
 
-def _plans(owner: str | None) -> Select[Any]:
+def _plans(owner: Owner) -> Select[Any]:
     """Select an owner's corrections, each with its photo and lens."""
     return (
         owned(CorrectionRow, owner)
@@ -77,7 +78,7 @@ def _plans(owner: str | None) -> Select[Any]:
 
 
 class CorrectionStore:
-    """Corrections of all owners. `owner=None` asks as the service itself."""
+    """Corrections of all owners. `ANY_OWNER` asks as the service itself."""
 
     def __init__(self, database: Database) -> None:
         self._db = database
@@ -101,7 +102,7 @@ class CorrectionStore:
             "created_at": now(),
         }
         with self._db.writing(durable=True) as session:
-            query = owned(PhotoRow, None).where(PhotoRow.public_id == photo.public_id)
+            query = owned(PhotoRow, ANY_OWNER).where(PhotoRow.public_id == photo.public_id)
             current = session.scalar(query.with_for_update())
             # by its public id: SQLite may have given the key of a deleted photo to another one
             if current is None or (current.id, current.owner_id) != (photo.id, photo.owner_id):
@@ -122,12 +123,12 @@ class CorrectionStore:
                     return row, created
         raise BusyError(f"{TRIES} times the same correction ended just then: ask for it again")
 
-    def get(self, correction_id: str, owner: str | None = None) -> CorrectionRow | None:
+    def get(self, correction_id: str, owner: Owner) -> CorrectionRow | None:
         """Return one correction, or None."""
         with self._db.reading() as session:
             return find_owned(session, CorrectionRow, correction_id, owner)
 
-    def plan(self, correction_id: str, owner: str | None = None) -> CorrectionPlan | None:
+    def plan(self, correction_id: str, owner: Owner) -> CorrectionPlan | None:
         """Return a correction with its photo and lens, or None."""
         if not is_id(correction_id):
             return None
@@ -169,7 +170,7 @@ class CorrectionStore:
 
     def is_live(self, correction_id: str, epoch: int | None = None) -> bool:
         """Say whether the correction is still wanted: the cancel poll."""
-        row = self.get(correction_id)
+        row = self.get(correction_id, ANY_OWNER)
         return row is not None and row.state in ACTIVE and epoch in {None, row.epoch}
 
     def set_state(
@@ -201,7 +202,7 @@ class CorrectionStore:
         What an earlier run has stored becomes garbage.
         """
         with self._db.writing() as session:
-            row = find_to_change(session, CorrectionRow, correction_id, None)
+            row = find_to_change(session, CorrectionRow, correction_id, ANY_OWNER)
             if row is None or row.state not in ACTIVE or epoch not in {None, row.epoch}:
                 return None
             if row.attempt:
@@ -209,7 +210,7 @@ class CorrectionStore:
             row.state, row.started_at, row.attempt = "running", now(), row.attempt + 1
             return Run(row.public_id, row.epoch, row.attempt)
 
-    def retry(self, correction_id: str, owner: str | None = None) -> bool:
+    def retry(self, correction_id: str, owner: Owner) -> bool:
         """Start a failed or cancelled correction anew; False if it is in another state.
 
         False as well if the same correction was requested again meanwhile: that one will do.
@@ -285,13 +286,29 @@ class CorrectionStore:
             finished_at=now(),
         )
 
-    def cancel(self, correction_id: str, owner: str | None = None) -> bool:
+    def cancel(self, correction_id: str, owner: Owner) -> bool:
         """Cancel an unfinished correction; False if it was finished already."""
         if self.get(correction_id, owner) is None:
             return False
         return self.set_state(correction_id, ACTIVE, "cancelled", finished_at=now())
 
-    def delete(self, correction_id: str, owner: str) -> str | None:
+    def unfinished_of(self, owner: str) -> int:
+        """Return how many corrections of an owner wait or run."""
+        query = owned(CorrectionRow, owner).where(CorrectionRow.state.in_(ACTIVE))
+        with self._db.reading() as session:
+            return session.scalar(select(func.count()).select_from(query.subquery())) or 0
+
+    def ended_before(self, moment: datetime, limit: int = 100) -> list[str]:
+        """Return corrections that ended before a moment, whatever came of them."""
+        query = (
+            select(CorrectionRow.public_id)
+            .where(CorrectionRow.state.not_in(ACTIVE), CorrectionRow.finished_at < moment)
+            .limit(limit)
+        )
+        with self._db.reading() as session:
+            return list(session.scalars(query))
+
+    def delete(self, correction_id: str, owner: Owner) -> str | None:
         """Forget a correction; return the prefix of its blobs, None if there is no such correction."""
         with self._db.writing() as session:
             row = find_owned(session, CorrectionRow, correction_id, owner)

@@ -10,7 +10,7 @@ from sqlalchemy import and_, delete, func, or_, select, update
 from sqlalchemy.orm import Session
 
 from app.errors import BusyError
-from app.store.access.owners import LATE, find_owned, now, owned
+from app.store.access.owners import ANY_OWNER, LATE, Owner, find_owned, now, owned
 from app.store.database import Database, insert_new
 from app.store.ids import new_id
 from app.store.kinds import identity_key, kind_key
@@ -142,12 +142,12 @@ def delete_corrections(session: Session, photo: PhotoRow) -> None:
 
 
 class LensStore:
-    """Lenses of all owners. `owner=None` asks as the service itself."""
+    """Lenses of all owners. `ANY_OWNER` asks as the service itself."""
 
     def __init__(self, database: Database) -> None:
         self._db = database
 
-    def get(self, lens_id: str, owner: str | None = None) -> LensRow | None:
+    def get(self, lens_id: str, owner: Owner) -> LensRow | None:
         """Return one lens, or None."""
         with self._db.reading() as session:
             return find_owned(session, LensRow, lens_id, owner)
@@ -257,7 +257,7 @@ class LensStore:
     def record_metrics(self, lens_id: str, version: int, metrics: dict[str, Any]) -> None:
         """Store the metrics of one version, once: held-out `error`, `coverage`, `bandwidth`."""
         with self._db.writing() as session:
-            lens = find_owned(session, LensRow, lens_id, None)
+            lens = find_owned(session, LensRow, lens_id, ANY_OWNER)
             if lens is not None:
                 session.execute(
                     update(EventRow)

@@ -8,7 +8,7 @@ from typing import Final
 
 from sqlalchemy import func, select
 
-from app.store.access.owners import find_owned, now, owned
+from app.store.access.owners import Owner, find_owned, now, owned
 from app.store.database import Database
 from app.store.photo_steps import WORKED_ON
 from app.store.tables import PHOTO_FINAL, PHOTO_RUNNING, CorrectionRow, LensRow, OwnerRow, PhotoRow
@@ -23,12 +23,12 @@ GRACE: Final = timedelta(hours=1)
 
 
 class PhotoReads:
-    """Photos of all owners as they are. `owner=None` asks as the service itself."""
+    """Photos of all owners as they are. `ANY_OWNER` asks as the service itself."""
 
     def __init__(self, database: Database) -> None:
         self._db = database
 
-    def get(self, photo_id: str, owner: str | None = None) -> PhotoRow | None:
+    def get(self, photo_id: str, owner: Owner) -> PhotoRow | None:
         """Return one photo, or None."""
         with self._db.reading() as session:
             return find_owned(session, PhotoRow, photo_id, owner)
@@ -76,8 +76,14 @@ class PhotoReads:
             return {row.id: row.public_id for row in rows}
 
     def load_of(self, owner: str) -> tuple[int, int, int]:
-        """Return `(unfinished photos, bytes of stored files, all photos)` of an owner."""
+        """Return `(unfinished photos, bytes of stored files and results, all photos)` of an owner."""
+        results = (
+            select(func.coalesce(func.sum(CorrectionRow.result_bytes), 0))
+            .join(OwnerRow, OwnerRow.id == CorrectionRow.owner_id)
+            .where(OwnerRow.name == owner, CorrectionRow.state == "succeeded")
+        )
         with self._db.reading() as session:
+            made = session.scalar(results) or 0
             row = session.execute(
                 select(
                     func.count().filter(PhotoRow.state.in_(WORKED_ON)),
@@ -87,7 +93,7 @@ class PhotoReads:
                 .join(OwnerRow, OwnerRow.id == PhotoRow.owner_id)
                 .where(OwnerRow.name == owner, PhotoRow.deleted_at.is_(None))
             ).one()
-            return int(row[0]), int(row[1]), int(row[2])
+            return int(row[0]), int(row[1]) + int(made), int(row[2])
 
     def to_do(self, limit: int = 100) -> list[tuple[str, int, str]]:
         """Return `(photo_id, epoch, owner)` of received photos, oldest first: the intent sweep."""

@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 from app.errors import BusyError, ConflictError, UnknownPhotoError
 from app.store import lens_ways, lenses, sample_moves
 from app.store.access.idempotency import forget_answers
-from app.store.access.owners import LATE, ensure_owner, find_owned, find_to_change, now
+from app.store.access.owners import ANY_OWNER, LATE, Owner, ensure_owner, find_owned, find_to_change, now
 from app.store.database import insert_new
 from app.store.lenses import LensName
 from app.store.photo_reads import PhotoReads
@@ -70,7 +70,7 @@ class Received:
 
 
 class PhotoStore(PhotoReads):
-    """Photos of all owners. `owner=None` asks as the service itself."""
+    """Photos of all owners. `ANY_OWNER` asks as the service itself."""
 
     def expect(self, prefix: str, *, within: timedelta) -> None:
         """Announce blobs below `prefix`: garbage an hour after that time unless a photo claims them."""
@@ -137,7 +137,7 @@ class PhotoStore(PhotoReads):
         The row says so before the blobs are deleted, and their keys become garbage: no blob is left behind.
         """
         with self._db.writing() as session:
-            photo = find_to_change(session, PhotoRow, photo_id, None)
+            photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
             busy = CorrectionRow.state.in_(("queued", "running"))
             if photo is None or photo.file_gone_at is not None or photo.state in UNFINISHED:
                 return False
@@ -152,7 +152,7 @@ class PhotoStore(PhotoReads):
     def restore_file(self, photo_id: str, blob_key: str, *, again: bool = False) -> None:
         """Record that the file of a photo was stored again under a new key; with `again` start it anew."""
         with self._db.writing(durable=True) as session:
-            photo = find_to_change(session, PhotoRow, photo_id, None)
+            photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
             if photo is None:
                 return
             photo.blob_key, photo.file_gone_at = blob_key, None
@@ -204,7 +204,7 @@ class PhotoStore(PhotoReads):
             "pixel_pitch_um": pixel_pitch_um,
         }
         with self._db.writing() as session:
-            photo = find_to_change(session, PhotoRow, photo_id, None)
+            photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
             if photo is None:
                 return
             for field, column in GIVEN_SETTINGS.items():
@@ -252,7 +252,7 @@ class PhotoStore(PhotoReads):
         but create none.
         """
         with self._db.writing() as session:
-            photo = find_to_change(session, PhotoRow, photo_id, None)
+            photo = find_to_change(session, PhotoRow, photo_id, ANY_OWNER)
             if photo is None:
                 return None
             lens = lenses.lens_of_photo(session, photo, single_copy=single_copy)
@@ -331,7 +331,7 @@ class PhotoStore(PhotoReads):
                 _ended(session, photo_id)
             return failed
 
-    def retry(self, photo_id: str, owner: str | None = None) -> bool:
+    def retry(self, photo_id: str, owner: Owner) -> bool:
         """Start a failed or cancelled photo anew; False if it is in another state."""
         with self._db.writing() as session:
             photo = find_to_change(session, PhotoRow, photo_id, owner)
@@ -340,7 +340,7 @@ class PhotoStore(PhotoReads):
             restart(session, photo)
             return True
 
-    def cancel(self, photo_id: str, owner: str | None = None) -> bool:
+    def cancel(self, photo_id: str, owner: Owner) -> bool:
         """Cancel an unfinished photo; False if it was finished already.
 
         Work that still runs sees the state and changes nothing.

@@ -9,7 +9,7 @@ from __future__ import annotations
 from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session
 
-from app.store.access.owners import find_to_change, now
+from app.store.access.owners import Owner, find_to_change, now
 from app.store.database import Database, insert_new
 from app.store.tables import (
     PHOTO_RUNNING,
@@ -27,12 +27,12 @@ NO_RESULT = ("failed", "cancelled")
 
 
 class RemovalStore:
-    """Removes lenses of all owners. `owner=None` asks as the service itself."""
+    """Removes lenses of all owners. `ANY_OWNER` asks as the service itself."""
 
     def __init__(self, database: Database) -> None:
         self._db = database
 
-    def lens(self, lens_id: str, owner: str | None = None) -> bool:
+    def lens(self, lens_id: str, owner: Owner) -> bool:
         """Delete a lens with all that was learned of it; its photos stay and can be corrected with another.
 
         Work on photos that would teach it is cancelled. False if there is no such lens.

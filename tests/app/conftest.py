@@ -19,6 +19,7 @@ from app.blobs.folder_creation import settle_folder
 from app.blobs.storage import Storage
 from app.runtime.settings import Settings
 from app.store import LensName, NewPatch, NewSample, Store, database
+from app.store.access.owners import ANY_OWNER
 from app.store.database import Database
 from app.store.ids import new_id
 from app.store.tables import PhotoRow
@@ -115,7 +116,7 @@ class Steps:
         return self.fresh(photo)
 
     def fresh(self, photo: PhotoRow) -> PhotoRow:
-        found = self.store.photos.get(photo.public_id)
+        found = self.store.photos.get(photo.public_id, ANY_OWNER)
         assert found is not None
         return found
 

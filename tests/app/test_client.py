@@ -18,6 +18,7 @@ from app.main import create_app
 from app.runtime.settings import Settings
 from app.schemas import JobOut
 from app.store import Store
+from app.store.access.owners import ANY_OWNER
 from app.store.corrections import Result
 from app.store.versions import report_key
 from lensmodel.core.codec import to_json
@@ -189,7 +190,7 @@ def test_a_report_that_is_not_made_yet_is_refused_and_one_that_is_there_saved(
     _, stored = store.samples.of_lens(lens_id)
     model = LensModel.fit([one.sample for one in stored])
     test = lens_report(model, "A lens", draws=0, rows=5, size=15, channels=("g",))
-    lens = store.lenses.get(lens_id)
+    lens = store.lenses.get(lens_id, ANY_OWNER)
     assert lens is not None
     key = report_key(lens_id, lens.version, lens.rebuild_epoch)
     Storage(settings.storage).put(key, json.dumps(to_json(test)).encode())

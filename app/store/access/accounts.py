@@ -78,9 +78,14 @@ class AccountStore:
                 select(func.count(), func.coalesce(kept, 0)).select_from(PhotoRow).where(photo)
             ).one()
             lens = (LensRow.owner_id == row.id) & LensRow.deleted_at.is_(None)
+            made = session.scalar(
+                select(func.coalesce(func.sum(CorrectionRow.result_bytes), 0)).where(
+                    CorrectionRow.owner_id == row.id, CorrectionRow.state == "succeeded"
+                )
+            )
             return Holdings(
                 photos,
-                int(stored),
+                int(stored) + int(made or 0),
                 _count(session, LensRow, lens),
                 _count(session, CorrectionRow, CorrectionRow.owner_id == row.id),
                 row.created_at,

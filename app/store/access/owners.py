@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime, timedelta
-from typing import Final, TypeVar
+from enum import Enum
+from typing import Final, TypeAlias, TypeVar
 
 from sqlalchemy import Select, select
 from sqlalchemy.orm import Session
@@ -17,6 +18,17 @@ LOCAL: Final = "local"
 
 LATE: Final = timedelta(minutes=10)
 """Deleted blobs are deleted once more after this time (chosen): a worker may have written another one."""
+
+
+class AnyOwner(Enum):
+    """Stands for all owners: workers and the operator's commands ask so, no request ever does."""
+
+    ANY = "any"
+
+
+ANY_OWNER: Final = AnyOwner.ANY
+Owner: TypeAlias = str | AnyOwner
+"""Whose rows are asked for; there is no default, so that nobody asks for everybody's by leaving it out."""
 
 Owned = TypeVar("Owned", PhotoRow, LensRow, CorrectionRow)
 
@@ -43,22 +55,22 @@ def ensure_owner(session: Session, name: str, *, may_be_new: bool = True) -> int
     return key
 
 
-def owned(table: type[Owned], owner: str | None) -> Select[Owned]:
-    """Select the rows of one owner that are not deleted; `None` = of all, for the workers."""
+def owned(table: type[Owned], owner: Owner) -> Select[Owned]:
+    """Select the rows of one owner, or of `ANY_OWNER`, that are not deleted."""
     query: Select[Owned] = select(table)
     if issubclass(table, PhotoRow | LensRow):  # corrections are removed outright
         query = query.where(table.deleted_at.is_(None))
-    if owner is not None:
+    if owner is not ANY_OWNER:
         query = query.join(OwnerRow, OwnerRow.id == table.owner_id).where(OwnerRow.name == owner)
     return query
 
 
-def find_owned(session: Session, table: type[Owned], public_id: str, owner: str | None) -> Owned | None:
+def find_owned(session: Session, table: type[Owned], public_id: str, owner: Owner) -> Owned | None:
     """Return one row by its public id if it is this owner's."""
     return None if not is_id(public_id) else session.scalar(_by_id(table, public_id, owner))
 
 
-def find_to_change(session: Session, table: type[Owned], public_id: str, owner: str | None) -> Owned | None:
+def find_to_change(session: Session, table: type[Owned], public_id: str, owner: Owner) -> Owned | None:
     """Return as `find_owned`, locked until the transaction ends: what is read still holds when it is changed.
 
     SQLite has one writer at a time anyway.
@@ -73,5 +85,5 @@ def is_id(text: str) -> bool:
     return text.isascii() and text.isalnum()
 
 
-def _by_id(table: type[Owned], public_id: str, owner: str | None) -> Select[Owned]:
+def _by_id(table: type[Owned], public_id: str, owner: Owner) -> Select[Owned]:
     return owned(table, owner).where(table.public_id == public_id)

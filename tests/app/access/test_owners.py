@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 from collections.abc import Iterator
@@ -20,7 +21,7 @@ from app.pages import routes as page_routes
 from app.runtime.settings import Settings
 from app.store import Store
 from app.store.access.access_tables import KeyRow, SessionRow
-from app.store.access.owners import now
+from app.store.access.owners import ANY_OWNER, now
 from app.store.corrections import Result
 from app.store.upkeep.migrate import upgrade
 
@@ -186,7 +187,7 @@ def test_the_same_bytes_of_two_owners_are_two_photos_and_one_goes_without_the_ot
 
     assert (first.status_code, second.status_code) == (202, 202)  # 200 would say that somebody has it
     storage = guarded.app.state.services.storage  # type: ignore[attr-defined]  # as above
-    left = store.photos.get(second.json()["id"])
+    left = store.photos.get(second.json()["id"], ANY_OWNER)
     assert left is not None
     assert storage.get(left.blob_key) == jpeg
     assert guarded.get(f"/v1/photos/{second.json()['id']}", headers=ben).status_code == 200
@@ -407,3 +408,12 @@ def test_what_others_can_reach_does_not_start_without_a_key(
     store.keys.revoke(made.prefix)
     with pytest.raises(UsageError, match="no valid key"):
         supervisor._prepare(open_settings)
+
+
+def test_nobody_asks_for_the_rows_of_all_by_leaving_the_owner_out(store: Store) -> None:
+    parts = [part for name, part in vars(store).items() if name not in {"database", "keys"}]
+    methods = [method for part in parts for _, method in inspect.getmembers(part, inspect.ismethod)]
+    owners = [inspect.signature(method).parameters.get("owner") for method in methods]
+
+    assert len([owner for owner in owners if owner is not None]) > 10
+    assert all(owner is None or owner.default is inspect.Parameter.empty for owner in owners)

@@ -16,6 +16,7 @@ from app.main import create_app
 from app.routes import jobs
 from app.runtime.settings import Settings
 from app.store import Store
+from app.store.access.owners import ANY_OWNER
 from app.store.jobs import JobStore
 
 
@@ -67,7 +68,7 @@ def test_a_change_of_any_job_is_seen(store: Store, steps: Any) -> None:
     seen.append(marks([photo.public_id]))
     steps.estimate(photo, (0,))
     seen.append(marks([photo.public_id]))
-    store.photos.cancel(photo.public_id)
+    store.photos.cancel(photo.public_id, ANY_OWNER)
     seen.append(marks([photo.public_id]))
     store.photos.delete(photo.public_id, "local")
 
@@ -100,7 +101,7 @@ def test_waiting_clients_read_their_job_only_when_it_changes(
             time.sleep(0.01)
         time.sleep(0.5)
         before = len(reads)
-        store.photos.cancel(photo.public_id)
+        store.photos.cancel(photo.public_id, ANY_OWNER)
         for thread in threads:
             thread.join()
 

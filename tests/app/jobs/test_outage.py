@@ -31,6 +31,7 @@ from app.runtime.outage import Patience, is_outage
 from app.runtime.settings import Settings
 from app.runtime.supervisor import environment
 from app.store import LensName, Store
+from app.store.access.owners import ANY_OWNER
 from app.store.ids import new_id
 from app.store.tables import EventRow, PhotoRow, SampleRow
 from app.store.upkeep.migrate import upgrade
@@ -225,7 +226,7 @@ def test_a_failed_correction_is_retried_as_another_job_of_the_engine(
 
 def test_a_retry_gives_way_to_the_same_wish_made_again(client: TestClient, store: Store, steps: Any) -> None:
     correction = failed_correction(store, steps)
-    plan = store.corrections.plan(correction)
+    plan = store.corrections.plan(correction, ANY_OWNER)
     assert plan is not None
     store.corrections.create(plan.photo, plan.lens, plan.correction.lens_version, plan.correction.params)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -32,6 +33,7 @@ from app.sandbox.budget import Budget
 from app.sandbox.child import ProgressHook
 from app.sandbox.outcome import Outcome, TaskLimits
 from app.store import Store
+from app.store.access.owners import ANY_OWNER
 from app.store.tables import PhotoRow
 from app.store.versions import report_key
 from lensmodel.core.psf import PsfSample, gaussian
@@ -502,7 +504,7 @@ def test_cancelling_in_the_middle_of_a_task_ends_the_photo_and_nothing_counts(
     work: PhotoWork, photo: PhotoRow, sandbox: Scripted, steps: Any, task: str
 ) -> None:
     def cancel(arguments: dict[str, Any], folder: Path) -> Outcome:
-        assert steps.store.photos.cancel(photo.public_id)
+        assert steps.store.photos.cancel(photo.public_id, ANY_OWNER)
         return Outcome("cancelled")
 
     sandbox.answers[task].insert(0, cancel)
@@ -594,7 +596,7 @@ def counted(context: JobContext, steps: Any) -> PhotoRow:
 
 
 def ask(context: JobContext, photo: PhotoRow, steps: Any, version: int = 1, **params: Any) -> str:
-    lens = context.store.lenses.get(steps.lens_id(photo))
+    lens = context.store.lenses.get(steps.lens_id(photo), ANY_OWNER)
     assert lens is not None
     output = {"format": "jpeg", "color_space": "srgb", "quality": 90}
     wish = {"method": "standard", "strength": 1.0, "output": output, "roi": None, **params}
@@ -616,7 +618,7 @@ def test_a_correction_ends_with_a_file(
 
     CorrectionWork(context).correction(key)
 
-    row = context.store.corrections.get(key)
+    row = context.store.corrections.get(key, ANY_OWNER)
     assert row is not None
     assert (row.state, row.result_media_type, row.result_bytes) == ("succeeded", "image/jpeg", 9)
     assert row.report == {"zones": {"center": {"expected_gain_db": 3.0}}}
@@ -665,7 +667,7 @@ def test_a_photo_that_asks_for_another_model_than_its_lens_has_says_what_to_do(
     assert (refused.state, refused.error_code) == ("failed", "conflict")
     assert f"PATCH /v1/lenses/{steps.lens_id(photo)}" in refused.error_detail
     context.store.lens_changes.choose_way(steps.lens_id(photo), "local", "paper")
-    assert context.store.photos.retry(asking.public_id)
+    assert context.store.photos.retry(asking.public_id, ANY_OWNER)
     for one in (photo, asking):
         work.photo(one.public_id, 2)
     assert [steps.fresh(one).state for one in (photo, asking)] == ["counted", "counted"]
@@ -697,7 +699,7 @@ def test_a_correction_with_a_version_without_samples_fails(
 
     CorrectionWork(context).correction(key)
 
-    row = context.store.corrections.get(key)
+    row = context.store.corrections.get(key, ANY_OWNER)
     assert row is not None
     assert (row.state, row.error_code) == ("failed", "no_samples")
 
@@ -708,13 +710,13 @@ def test_a_cancelled_correction_stays_cancelled(
     key = ask(context, counted, steps)
 
     def cancel(arguments: dict[str, Any], folder: Path) -> Outcome:
-        context.store.corrections.cancel(key)
+        context.store.corrections.cancel(key, ANY_OWNER)
         return write_result(arguments, folder)
 
     sandbox.answers["correct"] = [cancel]
     CorrectionWork(context).correction(key)
 
-    row = context.store.corrections.get(key)
+    row = context.store.corrections.get(key, ANY_OWNER)
     assert row is not None
     assert (row.state, row.result_key) == ("cancelled", None)
 
@@ -726,7 +728,7 @@ def test_a_correction_cancelled_while_its_file_was_stored_leaves_no_file(
 
     def cancelled_meanwhile(blob: str, path: Path) -> None:
         put_file(blob, path)
-        context.store.corrections.cancel(key)
+        context.store.corrections.cancel(key, ANY_OWNER)
 
     monkeypatch.setattr(context.storage, "put_file", cancelled_meanwhile)
     sandbox.answers["correct"] = [write_result]
@@ -745,7 +747,7 @@ def test_a_child_cannot_hand_in_a_file_from_elsewhere(
 
     CorrectionWork(context).correction(key)
 
-    row = context.store.corrections.get(key)
+    row = context.store.corrections.get(key, ANY_OWNER)
     assert row is not None
     assert (row.state, row.error_code) == ("failed", "internal_error")
 
@@ -797,7 +799,7 @@ def test_a_lens_that_was_measured_before_there_were_reports_gets_one(
     assert job.id != Job("measure", (lens_id, 1)).id
 
     work.measure(*job.arguments)
-    lens = context.store.lenses.get(lens_id)
+    lens = context.store.lenses.get(lens_id, ANY_OWNER)
     assert lens is not None
     assert context.store.lenses.history(lens)[-1].metrics == first
     context.storage.put(report_key(lens_id, 1, lens.rebuild_epoch), b"{}")
@@ -817,7 +819,7 @@ def test_a_worker_that_was_paused_changes_nothing_of_what_another_finished(
     sandbox.answers["correct"] = [paused, write_result]
     CorrectionWork(context).correction(key)
 
-    row = context.store.corrections.get(key)
+    row = context.store.corrections.get(key, ANY_OWNER)
     assert row is not None
     assert (row.state, row.attempt, row.report) == (
         "succeeded",
@@ -833,14 +835,14 @@ def test_a_run_of_before_a_retry_reports_nothing(
     key = ask(context, counted, steps)
 
     def retried(arguments: dict[str, Any], folder: Path) -> Outcome:
-        context.store.corrections.cancel(key)
-        assert context.store.corrections.retry(key)
+        context.store.corrections.cancel(key, ANY_OWNER)
+        assert context.store.corrections.retry(key, ANY_OWNER)
         return write_result(arguments, folder)
 
     sandbox.answers["correct"] = [retried]
     CorrectionWork(context).correction(key)
 
-    row = context.store.corrections.get(key)
+    row = context.store.corrections.get(key, ANY_OWNER)
     assert row is not None
     assert (row.state, row.epoch, row.result_key) == ("queued", 2, None)
 
@@ -883,3 +885,81 @@ def test_a_file_that_cannot_be_searched_is_processed_nevertheless(
     searched = remove_location(context, photo, lambda: True)
 
     assert (searched.location, searched.blob_key) == ("unknown", photo.blob_key)
+
+
+def spoilt(answer: Any, path: str, value: object) -> Any:
+    """Return an answer with another value at a place such as `metadata.lens.maker`."""
+    whole = json.loads(json.dumps(answer))
+    *inner, last = path.split(".")
+    part = whole
+    for name in inner:
+        part = part[int(name) if name.isdecimal() else name]
+    part[last] = value
+    return whole
+
+
+SELECTION = {"patches": [patch(0)], "rejected": [], "lateral": None}
+WINDOW = {"row": 0, "col": 0, "size": 64, "r": 0.1, "phi": 0.1, "reason": "flat"}
+
+
+@pytest.mark.parametrize(
+    ("task", "answer"),
+    [
+        ("inspect", []),
+        ("inspect", spoilt(INFO, "width", 2**40)),
+        ("inspect", spoilt(INFO, "width", "600")),
+        ("inspect", spoilt(INFO, "metadata.aperture", 1e300)),
+        ("inspect", spoilt(INFO, "metadata.taken_at", "yesterday")),
+        ("inspect", spoilt(INFO, "metadata.lens.serial_source", "x" * 60)),
+        ("select", spoilt(SELECTION, "patches", [patch(0)] * 2001)),
+        ("select", spoilt(SELECTION, "rejected", [WINDOW] * 100_001)),
+        ("select", spoilt(SELECTION, "rejected", [WINDOW | {"reason": "x" * 61}])),
+        ("select", spoilt(SELECTION, "patches.0.row", 2**70)),
+        ("select", spoilt(SELECTION, "lateral", {"red": [1.0]})),
+    ],
+)
+def test_an_answer_that_no_task_gives_ends_the_photo(
+    work: PhotoWork, sandbox: Scripted, photo: PhotoRow, steps: Any, task: str, answer: Any
+) -> None:
+    sandbox.answers[task] = [ok(answer)]
+
+    work.photo(photo.public_id, photo.epoch)
+
+    ended = steps.fresh(photo)
+    assert (ended.state, ended.error_code) == ("failed", "internal_error")
+    assert len(ended.error_detail) < 300
+
+
+@pytest.mark.parametrize(
+    "report",
+    [
+        {"zones": {"elsewhere": {}}},
+        {"zones": {"mid": {"reasons": ["x"] * 100}}},
+        {"zones": {}, "audit": {"zones": {}, "worst": [{"row": 1}]}},
+        {"zones": {}, "audit": {"zones": {"mid": {"tiles": "many"}}, "worst": []}},
+    ],
+)
+def test_a_report_that_no_correction_makes_ends_it(
+    context: JobContext, sandbox: Scripted, counted: PhotoRow, steps: Any, report: dict[str, Any]
+) -> None:
+    def write(arguments: dict[str, Any], folder: Path) -> Outcome:
+        return Outcome("ok", value=write_result(arguments, folder).value | {"report": report})
+
+    sandbox.answers["correct"] = [write]
+    key = ask(context, counted, steps)
+
+    CorrectionWork(context).correction(key)
+
+    row = context.store.corrections.get(key, ANY_OWNER)
+    assert row is not None
+    assert (row.state, row.error_code) == ("failed", "internal_error")
+
+
+def test_a_name_that_is_too_long_is_cut_and_its_photo_goes_on(
+    work: PhotoWork, sandbox: Scripted, photo: PhotoRow, steps: Any
+) -> None:
+    sandbox.answers["inspect"] = [ok(spoilt(INFO, "metadata.camera_model", "x" * 5000))]
+
+    work.photo(photo.public_id, photo.epoch)
+
+    assert (steps.fresh(photo).state, len(steps.fresh(photo).camera_model)) == ("counted", 200)

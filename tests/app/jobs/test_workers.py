@@ -25,6 +25,7 @@ from app.jobs.worker import Worker
 from app.runtime.settings import Settings
 from app.runtime.supervisor import environment
 from app.store import Store
+from app.store.access.owners import ANY_OWNER
 from app.store.tables import EventRow, GarbageRow, PatchRow, PhotoRow, SampleRow
 from app.store.upkeep.invariants import INVARIANTS
 
@@ -154,7 +155,7 @@ def test_a_worker_in_doubt_ends_what_broke_and_nothing_else(
     worker._reconcile()
 
     assert (steps.fresh(broken).state, steps.fresh(waiting).state) == ("failed", "needs_lens")
-    lens = store.lenses.get(lens_id)
+    lens = store.lenses.get(lens_id, ANY_OWNER)
     assert lens is not None
     assert [event.metrics for event in store.lenses.history(lens)] == [
         {"error": None, "coverage": None, "problem": "internal_error"}
@@ -228,7 +229,7 @@ def test_a_lens_changes_its_model_whenever_workers_die(
     assert before == {"quick-default-31"}
     assert seen == {frozenset(before)}  # nothing else counted meanwhile
     assert counting_estimators(store) == {"quick-michaeli-irani-55"}
-    lens = store.lenses.get(lens_id)
+    lens = store.lenses.get(lens_id, ANY_OWNER)
     assert lens is not None
     assert (lens.way, lens.answering_way, lens.sample_count) == ("paper", "paper", 2 * CELLS * 3)
     assert [event.kind for event in store.lenses.history(lens)][2:] == ["model_changed"]

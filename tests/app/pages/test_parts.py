@@ -24,6 +24,7 @@ from app.pages.pictures import in_sensor, upright_point
 from app.runtime.settings import Settings
 from app.schemas import Region
 from app.store import LensName, Store
+from app.store.access.owners import ANY_OWNER
 from app.store.corrections import Result
 from app.store.photo_steps import photo_folder
 from lensmodel.core.types import ignore_step
@@ -311,7 +312,7 @@ def test_the_page_of_a_lens_says_which_model_answers_and_how_far_a_change_is(
     for photo in photos:
         store.photos.fail(photo.public_id, 2, "no_usable_patches", "nothing there")
     assert "None of its photos could be measured for the model paper, so it answers" in shown()
-    assert store.photos.retry(photos[0].public_id)
+    assert store.photos.retry(photos[0].public_id, ANY_OWNER)
     again = steps.fresh(photos[0])
     steps.inspect(again)
     steps.plan(again)

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import hashlib
+from datetime import timedelta
 from typing import Any
 
 import pytest
+from sqlalchemy import update
 from starlette.testclient import TestClient
 
 from app.blobs.storage import Storage
+from app.main import create_app
 from app.routes.corrections import byte_range
 from app.runtime.settings import Settings
 from app.store import Store
+from app.store.access.owners import ANY_OWNER, now
 from app.store.corrections import Result
+from app.store.tables import OwnerRow
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
 FILE = bytes(range(256)) * 40
@@ -85,7 +90,7 @@ def test_bounds_make_another_correction_and_none_the_same_as_before_there_were_a
     bound = post(client, photo_id=photo.public_id, halo=0.2, denoise=0.5).json()["id"]
 
     assert unbound == plain != bound
-    rows = [store.corrections.get(key) for key in (plain, bound)]
+    rows = [store.corrections.get(key, ANY_OWNER) for key in (plain, bound)]
     assert [[row.params.get(name) for name in ("halo", "denoise")] for row in rows if row] == [
         [None, None],
         [0.2, 0.5],
@@ -137,7 +142,7 @@ def test_a_photo_with_other_settings_is_corrected_anew(
     again = post(client, photo_id=photo.public_id, lens_id=lens_id)
 
     assert (again.status_code, again.json()["id"] != first) == (202, True)
-    row = store.corrections.get(again.json()["id"])
+    row = store.corrections.get(again.json()["id"], ANY_OWNER)
     assert row is not None
     assert row.params["settings"]["aperture"] == 8.0
 
@@ -321,3 +326,30 @@ def test_a_running_correction_is_cancelled_once(client: TestClient, steps: Steps
     assert client.post(f"/v1/jobs/{made['id']}/cancel").json()["state"] == "cancelled"
     assert client.post(f"/v1/jobs/{made['id']}/cancel").status_code == 409
     assert client.get(made["links"]["self"]).json()["error"]["code"] == "cancelled"
+
+
+def test_results_count_for_the_quota_and_expire(
+    client: TestClient, finished: str, steps: Steps, store: Store, settings: Settings
+) -> None:
+    stored = client.get("/v1/account").json()["stored_bytes"]
+    assert stored == 1000 + len(FILE)  # the photo and its result
+    with store.database.writing() as session:
+        session.execute(update(OwnerRow).values(quota_bytes=stored))
+    refused = post(client, photo_id=steps.counted().public_id)
+    assert (refused.status_code, refused.json()["code"]) == (429, "quota_exceeded")
+
+    assert store.corrections.ended_before(now() - timedelta(days=1)) == []
+    assert store.corrections.ended_before(now() + timedelta(days=1)) == [finished]
+    assert store.corrections.delete(finished, ANY_OWNER) == f"corrections/{finished}/"
+    assert client.get(f"/v1/corrections/{finished}").status_code == 404
+
+
+def test_nobody_has_more_unfinished_corrections_than_unfinished_photos(
+    settings: Settings, store: Store, steps: Steps
+) -> None:
+    few = settings.model_copy(update={"max_queued_photos": 2})
+    with TestClient(create_app(few), raise_server_exceptions=False) as client:
+        photo = steps.counted().public_id
+        answers = [post(client, photo_id=photo, strength=strength) for strength in (1.0, 0.5, 0.25)]
+
+    assert [answer.status_code for answer in answers] == [202, 202, 429]

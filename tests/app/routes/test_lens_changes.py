@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import json
+import zipfile
 from typing import Any
 
 import pytest
 from starlette.testclient import TestClient
 
 from app.blobs.storage import Storage
+from app.routes import lens_profiles
 from app.runtime.settings import Settings
 from app.store import LensName, Store
+from app.store.access.owners import ANY_OWNER
 from app.store.versions import report_key
 from lensmodel.core.codec import to_json
 from lensmodel.model import LensModel
@@ -112,7 +116,7 @@ def reported(client: TestClient, steps: Steps, store: Store, settings: Settings)
     test = lens_report(
         LensModel.fit([one.sample for one in stored]), "A lens", draws=0, rows=5, size=15, channels=("g",)
     )
-    lens = store.lenses.get(lens_id)
+    lens = store.lenses.get(lens_id, ANY_OWNER)
     assert lens is not None
     key = report_key(lens_id, lens.version, lens.rebuild_epoch)
     Storage(settings.storage).put(key, json.dumps(to_json(test)).encode())
@@ -170,3 +174,19 @@ def test_photos_that_cannot_all_change_stay_as_they_are(client: TestClient, stor
     assert gone.public_id in answer.json()["detail"]
     assert [steps.fresh(photo).state for photo in (before, gone)] == ["counted", "counted"]
     assert steps.lens_id(before) == steps.lens_id(gone) != lens
+
+
+def test_a_profile_that_unpacks_to_more_than_a_lens_needs_is_not_unpacked(
+    client: TestClient, steps: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lens = steps.lens_id(steps.counted())
+    bomb = io.BytesIO()
+    with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("profile.json", bytes(lens_profiles.MAX_UNPACKED + 1))
+    read: list[str] = []
+    monkeypatch.setattr(lens_profiles, "read_profile", lambda *_: read.append("read"))
+
+    answer = client.put(f"/v1/lenses/{lens}/profile", content=bomb.getvalue())
+
+    assert (answer.status_code, read) == (413, [])
+    assert client.put(f"/v1/lenses/{lens}/profile", content=b"no archive").status_code == 400

@@ -15,6 +15,7 @@ from app.client_async import AsyncClient
 from app.http.model_cache import ModelCache
 from app.runtime.settings import Settings
 from app.store import Store
+from app.store.access.owners import ANY_OWNER
 from app.ways import configured_way
 from lensmodel.workflow.ways import WAYS
 
@@ -137,7 +138,7 @@ def test_a_lens_has_no_other_model(client: TestClient, steps: Steps, bad: Any) -
 def test_a_photo_asks_for_a_model(client: TestClient, steps: Steps, store: Store) -> None:
     sent = send(client, model="paper", lens_serial="77", lens_model="New")
     assert sent.status_code == 202, sent.text
-    photo = store.photos.get(sent.json()["id"])
+    photo = store.photos.get(sent.json()["id"], ANY_OWNER)
     learn(steps, photo)
     lens = steps.lens_id(photo)
     assert lens_of(client, lens) == ("paper", "paper")
@@ -155,7 +156,7 @@ def test_a_photo_asks_for_a_model(client: TestClient, steps: Steps, store: Store
 def test_a_form_asks_for_a_model_too(client: TestClient, store: Store) -> None:
     sent = client.post("/v1/photos", files={"file": ("a.tif", TIFF)}, data={"model": "paper"})
 
-    photo = store.photos.get(sent.json()["id"])
+    photo = store.photos.get(sent.json()["id"], ANY_OWNER)
     assert photo is not None
     assert photo.given == {"model": "paper"}
 
@@ -213,7 +214,7 @@ def test_both_clients_ask_for_a_model(client: TestClient, steps: Steps, store: S
     path.write_bytes(TIFF)
     api = Client(http=client)
     sent = api.upload(path, model="paper")
-    learn(steps, store.photos.get(sent.id))
+    learn(steps, store.photos.get(sent.id, ANY_OWNER))
     (lens,) = api.lenses()
     assert (lens.psf_model, lens.answering_model, lens.model) == ("paper", "paper", "EF24mm f/1.4L")
 

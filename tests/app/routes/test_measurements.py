@@ -18,6 +18,7 @@ from app.jobs.measurement_work import _checked
 from app.jobs.sample_files import write_samples
 from app.jobs.task_files import SAMPLES
 from app.store import Store
+from app.store.access.owners import ANY_OWNER
 from lensmodel.core.geometry import Frame
 from lensmodel.core.psf import PsfSample, gaussian
 from lensmodel.core.registry import Registry
@@ -137,7 +138,7 @@ def test_a_measurement_is_sent_to_its_lens(client: TestClient, steps: Steps, sto
     )
     assert answer.status_code == 202, answer.text
     assert answer.json()["kind"] == "target"
-    row = store.photos.get(answer.json()["id"])
+    row = store.photos.get(answer.json()["id"], ANY_OWNER)
     assert row is not None
     assert row.given["lens_id"] == lens
 

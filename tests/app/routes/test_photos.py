@@ -16,6 +16,7 @@ from app.routes import jobs
 from app.runtime.settings import Settings
 from app.schemas import JobOut
 from app.store import Store
+from app.store.access.owners import ANY_OWNER
 from app.store.photo_reads import PhotoReads
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
@@ -171,13 +172,13 @@ def test_a_photo_that_was_stored_can_still_teach_its_lens(
     begun = client.patch(path, json={"calibrate": True, "aperture": 2.8})
 
     assert (begun.status_code, begun.json()["state"], begun.json()["calibrate"]) == (200, "received", True)
-    row = store.photos.get(photo.public_id)
+    row = store.photos.get(photo.public_id, ANY_OWNER)
     assert row is not None
     assert row.epoch == photo.epoch + 1
     assert row.given["aperture"] == 2.8
     again = client.patch(path, json={"calibrate": True})  # nothing begins twice
     assert again.status_code == 200
-    row = store.photos.get(photo.public_id)
+    row = store.photos.get(photo.public_id, ANY_OWNER)
     assert row is not None
     assert row.epoch == photo.epoch + 1
     assert client.patch(path, json={"calibrate": False}).status_code == 422
@@ -423,7 +424,7 @@ def test_events_send_each_state_until_the_end(
     client: TestClient, steps: Steps, store: Store, after_first_read: Callable[[Callable[[], object]], None]
 ) -> None:
     photo = steps.receive()
-    after_first_read(lambda: store.photos.cancel(photo.public_id))
+    after_first_read(lambda: store.photos.cancel(photo.public_id, ANY_OWNER))
 
     text = client.get(f"/v1/jobs/{photo.public_id}/events").text
 

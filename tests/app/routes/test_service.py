@@ -7,6 +7,7 @@ import random
 import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
@@ -17,6 +18,7 @@ from starlette.testclient import TestClient
 
 from app.http.errors import CODE_OF_STATUS, STATUS_OF_CODE, status_of
 from app.main import create_app
+from app.routes import health
 from app.runtime.settings import Settings
 from app.store import Store
 from lensmodel.core import errors
@@ -26,7 +28,35 @@ def test_the_process_says_that_it_lives(client: TestClient) -> None:
     assert client.get("/healthz").json() == {"status": "ok"}
 
 
-def test_ready_needs_schema_storage_and_a_live_worker(client: TestClient, store: Store) -> None:
+def test_readiness_is_looked_up_once_and_changes_nothing(
+    client: TestClient, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    services = client.app.state.services  # type: ignore[attr-defined] # Starlette's own attribute
+    written: list[str] = []
+    monkeypatch.setattr(services.storage, "put", lambda key, _: written.append(key))
+    looks: list[str] = []
+    usable = services.storage.check_usable
+    monkeypatch.setattr(services.storage, "check_usable", lambda: looks.append("") or usable())
+
+    answers = [client.get("/readyz").json()["checks"]["storage"] for _ in range(5)]
+
+    assert (answers, written, len(looks)) == (["ok"] * 5, [], 1)
+    folder = Path(settings.storage.removeprefix("file://"))
+    folder.rename(folder.with_name("aside"))
+    services.readiness._until = 0.0
+    assert "away" in client.get("/readyz").json()["checks"]["storage"]
+    assert not folder.exists()
+
+
+def test_ready_needs_schema_storage_and_a_live_worker(
+    settings: Settings, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(health, "FRESH_S", 0.0)
+    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
+        ready_needs_all(client, store)
+
+
+def ready_needs_all(client: TestClient, store: Store) -> None:
     before = client.get("/readyz")
     assert before.status_code == 503
     assert before.json()["checks"]["schema"] == before.json()["checks"]["storage"] == "ok"

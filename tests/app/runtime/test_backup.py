@@ -18,6 +18,7 @@ from app.runtime import backup as copies
 from app.runtime.doctor import examine
 from app.runtime.settings import Settings
 from app.store import Store
+from app.store.access.owners import ANY_OWNER
 from app.store.tables import PhotoRow
 from lensmodel.cli.main import app
 from lensmodel.core.errors import InvalidInputError
@@ -86,7 +87,7 @@ def test_a_second_backup_brings_the_first_up_to_date(
     assert not (tmp_path / "backup" / copies.BLOBS / photos[0].blob_key).exists()
     with empty(tmp_path / "new") as (_, new, blobs):
         copies.restore(tmp_path / "backup", new.database, blobs)
-        assert new.photos.get(photos[0].public_id) is None
+        assert new.photos.get(photos[0].public_id, ANY_OWNER) is None
         assert blobs.get(more.blob_key) == b"m" * more.byte_size
 
 
@@ -189,7 +190,7 @@ def test_the_commands_back_up_restore_and_move(
     assert "give an empty database" in str(ran[3].exception)
     there = Settings(data_dir=moved, database_url=target, storage_url=f"file://{moved}/blobs")
     with closing(Store(there)) as opened:
-        found = opened.photos.get(photos[0].public_id)
+        found = opened.photos.get(photos[0].public_id, ANY_OWNER)
         assert found is not None
         assert found.state == "counted"
         assert Storage(there.storage).get(photos[0].blob_key).startswith(photos[0].public_id.encode())

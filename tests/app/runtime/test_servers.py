@@ -20,6 +20,7 @@ from app.runtime.doctor import examine
 from app.runtime.metrics import Tables
 from app.runtime.settings import Settings
 from app.store import Store
+from app.store.access.owners import ANY_OWNER
 from app.store.notices import Notices
 from app.store.tables import PhotoRow
 from app.store.upkeep.migrate import upgrade
@@ -118,7 +119,7 @@ def test_postgresql_tells_of_changes_by_itself_and_again_after_it_was_away(
     try:
         assert notified.wait(stretched(60))  # it listens
         photo = busy.receive()
-        assert hears_of(lambda: there.photos.cancel(photo.public_id))
+        assert hears_of(lambda: there.photos.cancel(photo.public_id, ANY_OWNER))
         notified.clear()
         servers[0].stop()
         servers[0].start()

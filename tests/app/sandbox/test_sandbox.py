@@ -20,6 +20,9 @@ import numpy as np
 import pytest
 from deadline import Deadline, stretched
 
+from app.commands.console.failure import UsageError
+from app.runtime import supervisor
+from app.runtime.settings import Settings
 from app.sandbox import confine
 from app.sandbox.budget import Budget
 from app.sandbox.child import NICENESS
@@ -199,7 +202,7 @@ def test_cancelling_kills_the_child(run: Run, tmp_path: Path) -> None:
 
     arguments = {"pid_file": str(pid_file)}
 
-    outcome = run("sleep", arguments=arguments, compiles=True, wanted=lambda: not pid_file.exists())
+    outcome = run("sleep", arguments=arguments, compiles="1", wanted=lambda: not pid_file.exists())
 
     assert outcome.ending == "cancelled"
     assert time.monotonic() - start < 20
@@ -229,7 +232,7 @@ def test_stopping_the_sandbox_ends_all_tasks(sandbox: Sandbox, run: Run, tmp_pat
 
     threading.Thread(target=stop_once_it_runs).start()
 
-    assert run("sleep", arguments={"pid_file": str(pid_file)}, compiles=True).ending == "cancelled"
+    assert run("sleep", arguments={"pid_file": str(pid_file)}, compiles="1").ending == "cancelled"
     assert run("add", arguments={"a": 1, "b": 1}).ending == "cancelled"
 
 
@@ -252,7 +255,7 @@ def test_a_child_dies_with_its_killed_parent(tmp_path: Path) -> None:
                     {{"pid_file": {str(pid_file)!r}}},
                     folder=folder,
                     limits=TaskLimits(512, 60),
-                    compiles=True,
+                    compiles="1",
                 )
         """
     )
@@ -290,6 +293,9 @@ PROBE = """
 import json, os, sys
 from pathlib import Path
 sys.path.insert(0, {here!r})
+from app.commands.console.failure import UsageError
+from app.runtime import supervisor
+from app.runtime.settings import Settings
 from app.sandbox import confine
 from app.sandbox.account import find
 from app.sandbox.budget import Budget
@@ -418,7 +424,7 @@ def test_another_account_alone_keeps_a_task_from_all_files_and_processes(
     )
 
     theirs = {"accounts of the machine", "connect", "send a datagram", "fork", "run a program"}
-    assert done(found) == ITS_WORK | theirs | {"change the cache"}  # the other measures are for these
+    assert done(found) == ITS_WORK | theirs  # the other measures are for these
 
 
 def test_another_account_and_the_other_measures_go_together(reachable: tuple[str, Path]) -> None:
@@ -550,3 +556,19 @@ def test_compiled_code_of_one_owner_is_out_of_reach_of_another(
     planted, own = run("compile_one", arguments={"theirs": str(theirs)}, compiles="2").value
 
     assert (planted, own) == ("refused", str(tmp_path / "shared" / "2"))
+
+
+@pytest.mark.parametrize("missing", ["account", "files"])
+def test_a_service_that_asks_for_keys_does_not_start_without_a_sandbox(
+    missing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(confine, "available", lambda *_: {name: name != missing for name in confine.MEASURES})
+    open_to_all = Settings(data_dir=tmp_path)
+    closed = open_to_all.model_copy(update={"auth": "keys"})
+
+    supervisor.require_sandbox(open_to_all)
+    supervisor.require_sandbox(closed.model_copy(update={"sandbox": "try"}))
+    with pytest.raises(UsageError, match="LENS_SANDBOX=try"):
+        supervisor.require_sandbox(closed)
+    with pytest.raises(UsageError, match="account" if missing == "account" else "Landlock"):
+        supervisor.require_sandbox(open_to_all.model_copy(update={"sandbox": "require"}))

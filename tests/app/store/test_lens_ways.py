@@ -11,6 +11,7 @@ from sqlalchemy import select, text
 from sqlalchemy.exc import IntegrityError
 
 from app.store import LensName, Store
+from app.store.access.owners import ANY_OWNER
 from app.store.tables import LensRow, PatchRow, PhotoRow, SampleRow
 from app.store.upkeep.invariants import INVARIANTS
 from app.store.upkeep.migrate import downgrade, upgrade
@@ -41,7 +42,7 @@ def choose(store: Store, lens_id: str, way: str = "paper") -> int | None:
 
 
 def lens_of(store: Store, lens_id: str) -> LensRow:
-    lens = store.lenses.get(lens_id)
+    lens = store.lenses.get(lens_id, ANY_OWNER)
     assert lens is not None
     return lens
 
@@ -207,7 +208,7 @@ def test_the_last_photo_need_not_succeed(
     if how == "fail":
         store.photos.fail(bad.public_id, 2, "no_usable_patches", "nothing there")
     elif how == "cancel":
-        store.photos.cancel(bad.public_id)
+        store.photos.cancel(bad.public_id, ANY_OWNER)
     elif how == "delete":
         store.photos.delete(bad.public_id, "local")
     else:
@@ -233,7 +234,7 @@ def test_a_lens_none_of_whose_photos_can_be_estimated_anew_keeps_what_it_has(
     assert widths(store, lens_id) == [BEFORE]
     assert lens_of(store, lens_id).answering_way == "default"
     sound()
-    assert store.photos.retry(photo.public_id)
+    assert store.photos.retry(photo.public_id, ANY_OWNER)
     assert widths(store, lens_id) == [BEFORE]
     assert learn(steps, photo) == 2
     assert widths(store, lens_id) == [AFTER]
@@ -340,7 +341,7 @@ def test_a_lens_that_is_deleted_while_it_changes_takes_both_epochs_with_it(
     choose(store, lens_id)
     learn(steps, photos[0])
 
-    assert store.removal.lens(lens_id)
+    assert store.removal.lens(lens_id, ANY_OWNER)
 
     with store.database.reading() as session:
         assert list(session.scalars(select(SampleRow.id))) == []
@@ -497,8 +498,8 @@ class Owner:
         photos, lenses = self.store.photos, self.store.lens_changes
         deeds: list[Callable[[], object]] = [
             *[lambda: choose(self.store, lens, self.chance.choice(["default", "paper"]))] * 3,
-            lambda: photos.retry(photo),
-            lambda: photos.cancel(photo),
+            lambda: photos.retry(photo, ANY_OWNER),
+            lambda: photos.cancel(photo, ANY_OWNER),
             lambda: photos.delete(photo, "local"),
             lambda: photos.change(photo, "local", {}, excluded=self.chance.random() < 0.5),
             lambda: photos.change(photo, "local", {"aperture": 2.0}),

@@ -17,6 +17,7 @@ from sqlalchemy.exc import DBAPIError, IntegrityError
 from app.errors import BusyError
 from app.runtime.settings import Settings
 from app.store import LensName, NewPatch, Store, corrections, lenses
+from app.store.access.owners import ANY_OWNER
 from app.store.corrections import Result
 from app.store.database import Database
 from app.store.tables import Base, EventRow, LensRow, OwnerRow, PatchRow, PhotoRow, SampleRow
@@ -110,9 +111,9 @@ def test_cancel_and_finish_exclude_each_other(store: Store, steps: Steps) -> Non
     steps.estimate(photo)
 
     lens = steps.lens_id(steps.counted())
-    assert store.photos.cancel(photo.public_id)
+    assert store.photos.cancel(photo.public_id, ANY_OWNER)
     assert store.photos.finish(photo.public_id, 1) is None
-    assert not store.photos.cancel(photo.public_id)
+    assert not store.photos.cancel(photo.public_id, ANY_OWNER)
     assert len(store.samples.of_lens(lens)[1]) == 6  # of the other photo alone
 
 
@@ -324,13 +325,13 @@ def test_deleting_a_photo_forgets_its_samples_and_names_its_blobs(store: Store, 
 
     assert store.photos.delete(photo.public_id, OWNER) == f"photos/{photo.public_id}/"
 
-    assert store.photos.get(photo.public_id) is None
+    assert store.photos.get(photo.public_id, ANY_OWNER) is None
     assert {stored.sample.photo for stored in store.samples.of_lens(lens)[1]} == {other.public_id}
     assert store.workers.garbage() == []  # a worker may still write: once more in a while
     late = datetime.now(UTC) + timedelta(hours=1)
     models = {f"models/{lens}/{version}-0/" for version in (1, 2)}
     assert set(store.workers.garbage(at=late)) == {f"photos/{photo.public_id}/"} | models
-    found = store.lenses.get(lens)
+    found = store.lenses.get(lens, ANY_OWNER)
     assert found is not None
     assert [event.kind for event in store.lenses.history(found)] == [
         *("photo_added", "photo_added", "photo_removed")

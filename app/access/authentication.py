@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import logging
 import secrets
 import threading
@@ -18,7 +17,7 @@ from starlette.requests import Request
 from app.access import keys
 from app.access.keys import SCOPES, Scope
 from app.access.rate_limits import Rates
-from app.errors import BusyError, ForbiddenError, NotSignedInError, QuotaError
+from app.errors import ForbiddenError, NotSignedInError, QuotaError
 from app.store.access.keys import Holder, KeyStore
 from app.store.access.owners import LOCAL
 
@@ -33,11 +32,6 @@ FRESH_S: Final = 1.0
 
 MAX_CACHED: Final = 10_000
 """Keys and sessions that a process remembers at most (chosen): some MiB, more than a service has users."""
-
-HASHES_AT_ONCE: Final = 2
-HASHES_WAIT_S: Final = 5.0
-"""Hashes computed at once, and seconds to wait for one before a request is refused (chosen): each takes
-19 MiB and some 20 ms."""
 
 HOW: Final = (
     "send a key in the header `Authorization: Bearer lpk_...`, or sign in at /sign-in; "
@@ -66,7 +60,7 @@ EVERYBODY: Final = Who(LOCAL, SCOPES)
 class Gate:
     """Identifies who asks, and refuses those who may not.
 
-    Blocking: it reads the database, and hashes keys that it does not know yet.
+    Blocking: it reads the database.
     """
 
     def __init__(self, settings: Settings, store: KeyStore) -> None:
@@ -75,9 +69,7 @@ class Gate:
         self._looked = -FRESH_S
         self._rates = Rates(settings.requests_per_minute)
         self._known: OrderedDict[str, tuple[float, Who | None]] = OrderedDict()
-        self._proven: OrderedDict[str, str] = OrderedDict()
         self._guard = threading.Lock()
-        self._hashing = threading.BoundedSemaphore(HASHES_AT_ONCE)
 
     def is_closed(self) -> bool:
         """Whether a key is required: always, or since one was created."""
@@ -94,7 +86,7 @@ class Gate:
             fresh = self._settings.auth == "none" or time.monotonic() - self._looked <= FRESH_S
             return EVERYBODY if fresh else None
         shown = shown_by(request)
-        return None if shown is None else self._remembered(_digest(shown))
+        return None if shown is None else self._remembered(keys.digest_of(shown))
 
     def who(self, request: Request) -> Who:
         """Return who asks."""
@@ -138,10 +130,9 @@ class Gate:
             entry = self._known.get(who.token)
         if entry is not None and time.monotonic() - entry[0] <= FRESH_S:
             return entry[1] is not None
-        # a session is stored by this digest; a key was verified when the response began
-        again = self._by_digest(who.token)
-        self._remember(who.token, again)
-        return again is not None
+        holder = self._store.by_hash(who.token) or self._store.by_session(who.token)
+        self._remember(who.token, None if holder is None else _who(holder, who.token))
+        return holder is not None
 
     def sign_in(self, text: str) -> tuple[Who, str]:
         """Begin a session with a key; return its owner, and the token for the browser."""
@@ -149,16 +140,16 @@ class Gate:
         if who is None or who.key_id is None:
             raise NotSignedInError("this key is not valid, or no longer: look for a blank or a missing end")
         token = secrets.token_urlsafe(32)
-        self._store.sign_in(who.key_id, _digest(token), timedelta(hours=self._settings.session_hours))
+        self._store.sign_in(who.key_id, keys.digest_of(token), timedelta(hours=self._settings.session_hours))
         return who, token
 
     def sign_out(self, request: Request) -> None:
         """End the session of a browser."""
         token = request.cookies.get(COOKIE)
         if token:
-            self._store.sign_out(_digest(token))
+            self._store.sign_out(keys.digest_of(token))
             with self._guard:
-                self._known.pop(_digest(token), None)
+                self._known.pop(keys.digest_of(token), None)
 
     def _remembered(self, digest: str) -> Who | None:
         with self._guard:
@@ -166,49 +157,19 @@ class Gate:
         return entry[1] if entry is not None and time.monotonic() - entry[0] <= FRESH_S else None
 
     def _look_up(self, shown: str) -> Who | None:
-        digest = _digest(shown)
+        digest = keys.digest_of(shown)
         known = self._remembered(digest)
         if known is not None:
             return known
-        prefix = keys.prefix_of(shown)
-        if prefix is None:
-            holder = self._store.by_session(digest)
-        else:
-            holder = self._store.by_prefix(prefix)
-            if holder is not None and not self._is_proven(shown, digest, holder):
-                return None
-        who = None if holder is None else Who(holder.owner, holder.scopes, holder.key_id, digest)
-        if holder is not None:
-            self._remember(digest, who)
-            with contextlib.suppress(Exception):  # a full disk or a busy database must not refuse access
-                self._store.note_use(holder)
+        find = self._store.by_session if keys.prefix_of(shown) is None else self._store.by_hash
+        holder = find(digest)
+        if holder is None:
+            return None
+        who = _who(holder, digest)
+        self._remember(digest, who)
+        with contextlib.suppress(Exception):  # a full disk or a busy database must not refuse access
+            self._store.note_use(holder)
         return who
-
-    def _is_proven(self, shown: str, digest: str, holder: Holder) -> bool:
-        """Verify a key against its hash, once per process: the hash is slow on purpose."""
-        with self._guard:
-            if self._proven.get(digest) == holder.key_hash:
-                return True
-        if not self._hashing.acquire(timeout=HASHES_WAIT_S):
-            raise BusyError(
-                "too many are signing in: try again in a few seconds", headers={"Retry-After": "5"}
-            )
-        try:
-            right = keys.matches(shown, holder.key_hash)
-        finally:
-            self._hashing.release()
-        if right:
-            with self._guard:
-                self._proven[digest] = holder.key_hash
-                while len(self._proven) > MAX_CACHED:
-                    self._proven.popitem(last=False)
-        return right
-
-    def _by_digest(self, digest: str) -> Who | None:
-        with self._guard:
-            key_hash = self._proven.get(digest)
-        holder = self._store.by_session(digest) if key_hash is None else self._store.by_hash(key_hash)
-        return None if holder is None else Who(holder.owner, holder.scopes, holder.key_id, digest)
 
     def _remember(self, digest: str, who: Who | None) -> None:
         with self._guard:
@@ -226,6 +187,5 @@ def shown_by(request: Request) -> str | None:
     return request.cookies.get(COOKIE) or None
 
 
-def _digest(shown: str) -> str:
-    # tokens have 256 random bits: a slow hash would add nothing
-    return hashlib.sha256(shown.encode("utf-8", "replace")).hexdigest()
+def _who(holder: Holder, digest: str) -> Who:
+    return Who(holder.owner, holder.scopes, holder.key_id, digest)

@@ -363,7 +363,6 @@ class Worker:
         for correction_id in self._store.corrections.ended_before(expired):
             self._do(partial(self._store.corrections.delete, correction_id, ANY_OWNER))
         self._do(self._store.accounts.purge)
-        self._do(self._store.idempotency.tidy)
         for prefix in self._store.workers.garbage():
             self._do(partial(self._delete, prefix))  # one failure does not prevent the others
         self._do(lambda: self._engine.forget(datetime.now(UTC) - KEEP_JOBS))

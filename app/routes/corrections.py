@@ -19,7 +19,6 @@ from app.errors import (
 )
 from app.http import views
 from app.http.dependencies import Call, CallDep
-from app.http.idempotency import OnceDep
 from app.http.middleware import ONLY_HEAD
 from app.http.model_cache import check_version
 from app.routes.common import Cursor, Limit, OnlyId, matches_tag, named_lens, next_link, problems
@@ -50,11 +49,9 @@ _RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.ASCII)
         also={200: {"model": CorrectionOut, "description": "The same correction is finished"}},
     ),
 )
-def create_correction(options: CorrectionIn, call: CallDep, once: OnceDep) -> CorrectionOut | Response:
+def create_correction(options: CorrectionIn, call: CallDep) -> CorrectionOut:
     """Correct a photo with the model of its lens, or of another."""
-    return once.answer(
-        options.model_dump_json(), lambda: create(options, call), status=202, resource=options.photo_id
-    )
+    return create(options, call)
 
 
 def create(options: CorrectionIn, call: Call) -> CorrectionOut:

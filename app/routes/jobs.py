@@ -14,7 +14,6 @@ from starlette.concurrency import run_in_threadpool
 from app.errors import ConflictError, UnknownJobError
 from app.http import views
 from app.http.dependencies import Call, CallDep
-from app.http.idempotency import OnceDep
 from app.routes.common import Cursor, Limit, next_link, problems
 from app.routes.photos import SEND_AGAIN, candidates
 from app.runtime.outage import CODE as OUTAGE
@@ -107,12 +106,8 @@ async def read_job(
     response_model=JobOut,
     responses=problems(404, 409, 422),
 )
-def cancel_job(job_id: str, call: CallDep, once: OnceDep) -> JobOut | Response:
+def cancel_job(job_id: str, call: CallDep) -> JobOut:
     """Cancel a job: running parts of it stop within a second, nothing of it counts."""
-    return once.answer("", lambda: _cancel(job_id, call), status=202)
-
-
-def _cancel(job_id: str, call: Call) -> JobOut:
     done = call.store.photos.cancel(job_id, call.owner) or call.store.corrections.cancel(job_id, call.owner)
     job = find_job(call, job_id)
     if not done:
@@ -127,12 +122,8 @@ def _cancel(job_id: str, call: Call) -> JobOut:
     response_model=JobOut,
     responses=problems(404, 409, 422),
 )
-def retry_job(job_id: str, call: CallDep, once: OnceDep) -> JobOut | Response:
+def retry_job(job_id: str, call: CallDep) -> JobOut:
     """Start a failed or cancelled job anew."""
-    return once.answer("", lambda: _retry(job_id, call), status=202)
-
-
-def _retry(job_id: str, call: Call) -> JobOut:
     photo = call.store.photos.get(job_id, call.owner)
     if photo is not None and photo.file_gone_at is not None:
         raise ConflictError(f"the file of photo {job_id} is no longer kept: {SEND_AGAIN}")
@@ -155,18 +146,13 @@ def _retry(job_id: str, call: Call) -> JobOut:
 )
 def retry_jobs(
     call: CallDep,
-    once: OnceDep,
     code: Annotated[str, Query(pattern="^[a-z_]{1,40}$", description="with which they failed")] = OUTAGE,
     limit: Annotated[int, Query(ge=1, le=1000, description="jobs at once")] = 1000,
-) -> RetriedOut | Response:
+) -> RetriedOut:
     """Start anew all jobs that failed with a code, the oldest first; by default those that an outage ended.
 
     Call it again until it says 0 where there are more than `limit`.
     """
-    return once.answer("", lambda: _retry_all(call, code, limit), status=202)
-
-
-def _retry_all(call: Call, code: str, limit: int) -> RetriedOut:
     photos, corrections = call.store.photos, call.store.corrections
     retried = sum(photos.retry(key, call.owner) for key in photos.failed_by(call.owner, code, limit))
     rest = corrections.failed_by(call.owner, code, limit - retried) if retried < limit else []

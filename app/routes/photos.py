@@ -7,7 +7,7 @@ from datetime import timedelta
 from functools import partial
 from typing import Any, Final
 
-from fastapi import APIRouter, Response, status
+from fastapi import APIRouter, status
 from starlette.concurrency import run_in_threadpool
 from structlog.contextvars import bind_contextvars
 
@@ -24,7 +24,6 @@ from app.errors import (
 from app.http import upload, views
 from app.http.bodies import CLOSE
 from app.http.dependencies import Call, CallDep
-from app.http.idempotency import Once, OnceDep
 from app.routes.common import Cursor, Limit, OnlyId, cut, named_lens, next_link, problems
 from app.routes.upload_checks import check_model, check_selector
 from app.runtime.settings import MIB, Settings
@@ -82,7 +81,7 @@ _RECEIVED: Final = problems(
     responses=_RECEIVED,
     openapi_extra={"requestBody": _UPLOAD_BODY},
 )
-async def create_photo(once: OnceDep) -> PhotoOut | Response:
+async def create_photo(call: CallDep) -> PhotoOut:
     """Store a photo, and calibrate its lens with it unless `calibrate=false`.
 
     The fields may stand in the form or in the query. The lens that they name goes before that of the file.
@@ -96,7 +95,7 @@ async def create_photo(once: OnceDep) -> PhotoOut | Response:
     `selector` names who chooses its patches, of those that `GET /v1/formats` lists; bytes that are known keep
     the patches they have.
     """
-    return await _received(once)
+    return await _received(call)
 
 
 @router.post(
@@ -107,16 +106,15 @@ async def create_photo(once: OnceDep) -> PhotoOut | Response:
     responses=_RECEIVED,
     openapi_extra={"requestBody": _UPLOAD_BODY},
 )
-async def create_measurement(lens_id: str, call: CallDep, once: OnceDep) -> PhotoOut | Response:
+async def create_measurement(lens_id: str, call: CallDep) -> PhotoOut:
     """Store a photo made to measure a lens that is known, and measure it; `kind` says what it shows."""
     if await run_in_threadpool(call.store.lenses.get, lens_id, call.owner) is None:
         raise UnknownLensError(f"there is no lens {lens_id[:60]}: GET /v1/lenses lists those there are")
-    return await _received(once, lens_id)
+    return await _received(call, lens_id)
 
 
-async def _received(once: Once, lens_id: str | None = None) -> PhotoOut | Response:
+async def _received(call: Call, lens_id: str | None = None) -> PhotoOut:
     """Receive an upload; with a lens, it must be a measurement of that lens."""
-    call = once.call
     limits = call.settings
     many = BusyError(
         f"{limits.max_uploads} photos are being received, more may not be: try again in a few seconds",
@@ -141,32 +139,21 @@ async def _received(once: Once, lens_id: str | None = None) -> PhotoOut | Respon
     if lens_id is not None:
         fields = uploaded.fields.model_copy(update={"lens_id": lens_id})
         uploaded = replace(uploaded, fields=fields)
-    return await run_in_threadpool(_take, once, public_id, uploaded, prefix, lens_id is not None)
+    return await run_in_threadpool(_take, call, public_id, uploaded, prefix, lens_id is not None)
 
 
-def _take(
-    once: Once, public_id: str, uploaded: upload.Uploaded, prefix: str, measured: bool
-) -> PhotoOut | Response:
-    """Create a photo from an upload, unless the same request was answered before."""
-    call = once.call
-
-    def record() -> PhotoOut:
+def _take(call: Call, public_id: str, uploaded: upload.Uploaded, prefix: str, measured: bool) -> PhotoOut:
+    """Create a photo from an upload."""
+    try:
         _check_kind(call, uploaded.fields, measured=measured)
         check_selector(uploaded.fields)
         photo, fresh = _record(call, public_id, uploaded, prefix)
-        call.response.status_code = status.HTTP_202_ACCEPTED if fresh else status.HTTP_200_OK
-        call.response.headers["Location"] = photo.links.self
-        return photo
-
-    request_body = f"{uploaded.sha256} {uploaded.filename} {uploaded.fields.model_dump_json()}"
-    try:
-        answer = once.answer(request_body, record, status=202)
     except ServiceError:
         call.storage.delete(prefix)  # refused before a photo was created; afterwards nothing is refused
         raise
-    if isinstance(answer, Response):
-        call.storage.delete(prefix)  # answered as before: the photo exists
-    return answer
+    call.response.status_code = status.HTTP_202_ACCEPTED if fresh else status.HTTP_200_OK
+    call.response.headers["Location"] = photo.links.self
+    return photo
 
 
 def _check_kind(call: Call, fields: UploadFields, *, measured: bool) -> None:

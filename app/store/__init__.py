@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from app.runtime.settings import Settings
 from app.store.access.accounts import AccountStore
-from app.store.access.idempotency import IdempotencyStore
 from app.store.access.keys import KeyStore
 from app.store.corrections import CorrectionStore
 from app.store.database import Database
@@ -43,7 +42,6 @@ class Store:
         self.removal = RemovalStore(self.database)
         self.keys = KeyStore(self.database)
         self.accounts = AccountStore(self.database)
-        self.idempotency = IdempotencyStore(self.database)
         self.workers = WorkerStore(self.database)
         self.operation = OperationStore(self.database)
 

@@ -12,7 +12,6 @@ from sqlalchemy.orm import Session
 
 from app.errors import BusyError, ConflictError, UnknownPhotoError
 from app.store import lens_ways, lenses, sample_moves
-from app.store.access.idempotency import forget_answers
 from app.store.access.owners import ANY_OWNER, LATE, Owner, ensure_owner, find_owned, find_to_change, now
 from app.store.database import insert_new
 from app.store.lenses import LensName
@@ -391,7 +390,6 @@ class PhotoStore(PhotoReads):
             lenses.delete_corrections(session, photo)
             photo.deleted_at = now()
             photo.state = "cancelled" if photo.state in UNFINISHED else photo.state
-            forget_answers(session, photo)
             erase_description(photo)
             photo.windows, photo.windows_rejected = None, 0
             forget_if_empty(session, photo)

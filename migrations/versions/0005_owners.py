@@ -53,24 +53,9 @@ def upgrade() -> None:
         sa.PrimaryKeyConstraint("token_hash", name=op.f("pk_session")),
     )
     op.create_index("ix_session_key_id", "session", ["key_id"])
-    op.create_table(
-        "idempotency_key",
-        sa.Column("owner_id", sa.Integer(), nullable=False),
-        sa.Column("key", sa.String(length=200), nullable=False),
-        sa.Column("request_hash", sa.String(length=64), nullable=False),
-        sa.Column("status", sa.Integer(), nullable=True),
-        sa.Column("location", sa.Text(), nullable=True),
-        sa.Column("response", sa.JSON(), nullable=True),
-        sa.Column("resource", sa.String(length=40), nullable=True),
-        sa.Column("created_at", TIME, nullable=False),
-        sa.ForeignKeyConstraint(["owner_id"], ["owner.id"], name=op.f("fk_idempotency_key_owner_id")),
-        sa.PrimaryKeyConstraint("owner_id", "key", name=op.f("pk_idempotency_key")),
-    )
-    op.create_index("ix_idempotency_key_created_at", "idempotency_key", ["created_at"])
 
 
 def downgrade() -> None:
-    op.drop_table("idempotency_key")
     op.drop_table("session")
     op.drop_table("api_key")
     with op.batch_alter_table("photo", schema=None) as batch_op:

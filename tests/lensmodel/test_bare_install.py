@@ -14,7 +14,7 @@ import lensmodel
 
 LIBRARY = Path(__file__).parents[2] / "docs" / "library.md"
 ABSENT = [
-    *("alembic", "argon2", "dbos", "fastapi", "httpx2", "jinja2", "obstore", "prometheus_client", "pydantic"),
+    *("alembic", "dbos", "fastapi", "httpx2", "jinja2", "obstore", "prometheus_client", "pydantic"),
     *("pydantic_settings", "sqlalchemy", "sse_starlette", "starlette", "structlog", "uvicorn"),
     *("astropy", "distributed", "matplotlib", "optiland", "sep", "skimage", "sklearn"),
 ]

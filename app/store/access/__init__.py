@@ -1,1 +1,1 @@
-"""Rows of owners, keys, sessions and answers that were given already."""
+"""Rows of owners, keys and sessions."""

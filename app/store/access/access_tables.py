@@ -1,9 +1,8 @@
-"""Access: keys, browser sessions, and stored answers by Idempotency-Key. See `app.store.tables`."""
+"""Access: keys and browser sessions. See `app.store.tables`."""
 
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any
 
 from sqlalchemy import ForeignKey, Index, String
 from sqlalchemy.orm import Mapped, mapped_column
@@ -41,23 +40,3 @@ class SessionRow(Base):
     key_id: Mapped[int] = mapped_column(ForeignKey("api_key.id", ondelete="CASCADE"))
     created_at: Mapped[datetime]
     expires_at: Mapped[datetime]
-
-
-class IdempotencyRow(Base):
-    """The answer to a request that may be sent again."""
-
-    __tablename__ = "idempotency_key"
-    __table_args__ = (Index("ix_idempotency_key_created_at", "created_at"),)
-
-    owner_id: Mapped[int] = mapped_column(ForeignKey("owner.id"), primary_key=True)
-    key: Mapped[str] = mapped_column(String(200), primary_key=True)
-    request_hash: Mapped[str] = mapped_column(String(64))
-    status: Mapped[int | None]
-    """None while the first request is being answered."""
-
-    location: Mapped[str | None]
-    response: Mapped[dict[str, Any] | None]
-    resource: Mapped[str | None] = mapped_column(String(40))
-    """The photo that the answer describes; both are deleted together."""
-
-    created_at: Mapped[datetime]

@@ -10,7 +10,7 @@ from typing import Any, Final
 from sqlalchemy import ColumnElement, Table, delete, func, select, update
 from sqlalchemy.orm import Session
 
-from app.store.access.access_tables import IdempotencyRow, KeyRow, SessionRow
+from app.store.access.access_tables import KeyRow, SessionRow
 from app.store.access.owners import LATE, now, owner_id
 from app.store.database import Database, insert_new
 from app.store.ids import new_id
@@ -126,7 +126,6 @@ class AccountStore:
                 .where(KeyRow.owner_id == row.id, KeyRow.revoked_at.is_(None))
                 .values(revoked_at=now())
             )
-            session.execute(delete(IdempotencyRow).where(IdempotencyRow.owner_id == row.id))
             return row.id
 
     def to_erase(self) -> list[int]:
@@ -152,7 +151,6 @@ class AccountStore:
             session.execute(delete(EventRow).where(EventRow.lens_id.in_(keys)))
             session.execute(delete(LensRow).where(LensRow.owner_id == owner_key))
             session.execute(delete(KeyRow).where(KeyRow.owner_id == owner_key))
-            session.execute(delete(IdempotencyRow).where(IdempotencyRow.owner_id == owner_key))
             session.execute(delete(OwnerRow).where(OwnerRow.id == owner_key))
             return _garbage(session, [f"models/{lens.public_id}/" for lens in lenses])
 

@@ -26,7 +26,6 @@ class Holder:
     """A key that may be used now, and whose it is."""
 
     key_id: int
-    key_hash: str
     owner: str
     scopes: tuple[str, ...]
     ends: datetime | None
@@ -114,10 +113,6 @@ class KeyStore:
         with self._db.reading() as session:
             return session.scalar(_holders().limit(1)) is not None
 
-    def by_prefix(self, prefix: str) -> Holder | None:
-        """Return the valid key of a prefix."""
-        return self._holder(_holders().where(KeyRow.prefix == prefix))
-
     def by_hash(self, key_hash: str) -> Holder | None:
         """Return the valid key of a hash."""
         return self._holder(_holders().where(KeyRow.key_hash == key_hash))
@@ -134,7 +129,7 @@ class KeyStore:
             return None
         key, owner = row[0], row[1]
         scopes = tuple(key.scopes.split())
-        return Holder(key.id, key.key_hash, owner, scopes, key.expires_at, key.last_used_at)
+        return Holder(key.id, owner, scopes, key.expires_at, key.last_used_at)
 
     def note_use(self, holder: Holder) -> None:
         """Record the time at which a key is used, to within `USE_PRECISION`."""

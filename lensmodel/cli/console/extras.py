@@ -7,7 +7,6 @@ from typing import Final
 EXTRAS: Final = {
     "service": (
         "alembic",
-        "argon2",
         "dbos",
         "fastapi",
         "httpx2",

@@ -16,7 +16,7 @@ from starlette.testclient import TestClient
 
 from app.blobs.erasure import erase
 from app.store import Store
-from app.store.access.access_tables import IdempotencyRow, KeyRow
+from app.store.access.access_tables import KeyRow
 from app.store.access.owners import ANY_OWNER, now
 from app.store.tables import (
     CorrectionRow,
@@ -48,93 +48,21 @@ def lines(archive: zipfile.ZipFile, name: str) -> list[dict[str, Any]]:
 # --- once -----------------------------------------------------------------------------------------
 
 
-def test_the_same_request_with_the_same_key_is_done_once(
+def test_a_request_that_is_sent_again_makes_nothing_twice(
     client: TestClient, store: Store, steps: Any
 ) -> None:
-    photo = steps.counted()
-    key = {"Idempotency-Key": "a-1"}
-    wish = {"photo_id": photo.public_id, "method": "fast"}
+    wish = {"photo_id": steps.counted().public_id, "method": "fast"}
+    key = {"Idempotency-Key": "any name, which is not needed"}
 
-    first = client.post("/v1/corrections", json=wish, headers=key)
-    client.delete(f"/v1/corrections/{first.json()['id']}")
-    again = client.post("/v1/corrections", json=wish, headers=key)
+    photos = [client.post("/v1/photos?filename=a.jpg", content=JPEG, headers=key) for _ in range(2)]
+    made = [client.post("/v1/corrections", json=wish, headers=key) for _ in range(2)]
 
-    assert (first.status_code, again.status_code) == (202, 202)
-    assert first.json() == again.json()
-    assert again.headers["Idempotency-Replayed"] == "true"
-    assert again.headers["Location"] == first.headers["Location"]
-    assert count(store, CorrectionRow) == 0  # not made again
-
-
-def test_a_key_belongs_to_one_request(client: TestClient, steps: Any) -> None:
-    photo = steps.counted()
-    key = {"Idempotency-Key": "a-1"}
-    wish = {"photo_id": photo.public_id, "method": "fast"}
-    client.post("/v1/corrections", json=wish, headers=key)
-
-    other_body = client.post("/v1/corrections", json={**wish, "strength": 0.5}, headers=key)
-    other_path = client.post("/v1/jobs/retry", headers=key)
-    malformed = client.post("/v1/jobs/retry", headers={"Idempotency-Key": "with blank"})
-
-    assert [a.status_code for a in (other_body, other_path, malformed)] == [422, 422, 422]
-    assert "another request" in other_body.json()["detail"]
-
-
-def test_an_upload_that_is_sent_again_leaves_one_photo_and_one_file(client: TestClient, store: Store) -> None:
-    key = {"Idempotency-Key": "up-1"}
-
-    first = client.post("/v1/photos?filename=a.jpg", content=JPEG, headers=key)
-    again = client.post("/v1/photos?filename=a.jpg", content=JPEG, headers=key)
-    other = client.post("/v1/photos?filename=a.jpg", content=JPEG + b"x", headers=key)
-
-    assert (first.status_code, again.status_code, other.status_code) == (202, 202, 422)
-    assert first.json() == again.json()
-    assert count(store, PhotoRow) == 1
+    assert [answer.status_code for answer in (*photos, *made)] == [202, 200, 202, 202]
+    assert photos[0].json()["id"] == photos[1].json()["id"]
+    assert made[0].json()["id"] == made[1].json()["id"]
+    assert (count(store, PhotoRow), count(store, CorrectionRow)) == (2, 1)
     kept = [path.parent.name for path in storage_of(client).folder.glob("photos/*/original")]
-    assert kept == [first.json()["id"]]
-
-
-def test_a_request_that_was_refused_may_be_sent_again(client: TestClient, store: Store, steps: Any) -> None:
-    photo = steps.receive()
-    steps.inspect(photo)
-    key = {"Idempotency-Key": "a-1"}
-    wish = {"photo_id": photo.public_id, "method": "fast"}
-
-    early = client.post("/v1/corrections", json=wish, headers=key)
-    steps.plan(photo)
-    steps.estimate(photo)
-    assert store.photos.finish(photo.public_id, photo.epoch) is not None
-    later = client.post("/v1/corrections", json=wish, headers=key)
-
-    assert (early.status_code, later.status_code) == (409, 202)
-
-
-def test_a_request_that_is_being_answered_is_not_begun_again_before_it_is_lost(store: Store) -> None:
-    answers = store.idempotency
-    store.keys.create("other", ["write"])
-    assert answers.begin("local", "k", "h") is None
-
-    with pytest.raises(Exception, match="is being answered"):
-        answers.begin("local", "k", "h")
-    with store.database.writing() as session:
-        session.execute(update(IdempotencyRow).values(created_at=now() - timedelta(minutes=2)))
-    assert answers.begin("local", "k", "h") is None
-    assert answers.begin("other", "k", "another") is None
-
-
-def test_an_answer_goes_with_the_photo_that_it_speaks_of_or_after_a_day(
-    client: TestClient, store: Store
-) -> None:
-    sent = client.post("/v1/photos", content=JPEG, headers={"Idempotency-Key": "one"})
-    client.post("/v1/jobs/retry", headers={"Idempotency-Key": "two"})
-
-    client.delete(f"/v1/photos/{sent.json()['id']}")
-    after_photo = count(store, IdempotencyRow)
-    with store.database.writing() as session:
-        session.execute(update(IdempotencyRow).values(created_at=now() - timedelta(hours=25)))
-    store.idempotency.tidy()
-
-    assert (after_photo, count(store, IdempotencyRow)) == (1, 0)
+    assert kept == [photos[0].json()["id"]]
 
 
 # --- taking it away -------------------------------------------------------------------------------
@@ -192,7 +120,7 @@ def test_an_erased_account_leaves_no_row_and_no_file(client: TestClient, store: 
 
     assert answer.status_code == 204
     assert [count(store, t) for t in (OwnerRow, PhotoRow, LensRow, EventRow)] == [1, 1, 1, 1]
-    assert [count(store, t) for t in (CorrectionRow, KeyRow, IdempotencyRow)] == [0, 0, 0]
+    assert [count(store, t) for t in (CorrectionRow, KeyRow)] == [0, 0]
     assert (count(store, PatchRow), count(store, SampleRow)) == (3, 6) or count(store, SampleRow) == 6
     assert store.photos.get(foreign.public_id, "other") is not None
     assert not (storage_of(client).folder / photo.blob_key).exists()

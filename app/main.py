@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from functools import cache, partial
+from functools import cache
 from importlib.metadata import version
 
 from fastapi import APIRouter, Depends, FastAPI
-from starlette.concurrency import run_in_threadpool
 from starlette.routing import BaseRoute
 
 from app import pages
@@ -19,12 +17,9 @@ from app.blobs.storage import Storage
 from app.http import errors
 from app.http.bodies import JsonBodies
 from app.http.dependencies import Fresh, Places, Services, call_of
-from app.http.job_watch import Watch
 from app.http.middleware import Heads, OwnNames, RequestLog, SameSite
 from app.http.model_cache import ModelCache
-from app.http.open_pages import LOOK_S, OpenPages
 from app.http.picture_cache import Drawn
-from app.pages import shown
 from app.routes import (
     account,
     corrections,
@@ -44,8 +39,6 @@ from app.runtime.disk_reserve import Reserve
 from app.runtime.outage import missable
 from app.runtime.settings import MIB, Settings
 from app.store import Store
-from app.store.jobs import JobStore
-from app.store.notices import Notices
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
@@ -64,18 +57,6 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             settle_folder(store, storage)
         cache = ModelCache(store, chosen.model_cache_mb * MIB)
         reserve = Reserve(store.database.path.with_name("reserve") if store.database.is_sqlite else None)
-        rows = JobStore(store.database)
-        loop = asyncio.get_running_loop()
-
-        def look_soon() -> None:
-            for each in (watch, owners):
-                loop.call_soon_threadsafe(each.nudge)
-
-        notices = Notices(store.database, look_soon)
-        watch = Watch(rows.marks, announced=notices.connected)
-        newest = partial(rows.marks_of_owners, newest=shown.PHOTOS)
-        owners = Watch(newest, every_s=LOOK_S, announced=notices.connected)
-        notices.start()
         app.state.services = Services(
             chosen,
             store,
@@ -84,15 +65,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             Places(chosen.max_uploads),
             reserve,
             Drawn(),
-            watch,
-            OpenPages(owners),
             Gate(chosen, store.keys),
             Fresh(health.FRESH_S),
         )
         yield
-        await run_in_threadpool(notices.stop)
-        watch.stop()
-        owners.stop()
         store.close()
 
     app = FastAPI(

@@ -16,9 +16,7 @@ from starlette.concurrency import run_in_threadpool
 
 from app.access.authentication import Gate, Who
 from app.blobs.storage import Storage
-from app.http.job_watch import Watch
 from app.http.model_cache import ModelCache
-from app.http.open_pages import OpenPages
 from app.http.picture_cache import Drawn
 from app.runtime.disk_reserve import Reserve
 from app.runtime.settings import Settings
@@ -39,8 +37,6 @@ class Services:
     uploads: Places
     reserve: Reserve
     pictures: Drawn
-    watch: Watch
-    pages: OpenPages
     gate: Gate
     readiness: Fresh[Readiness]
 

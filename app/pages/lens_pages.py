@@ -44,6 +44,7 @@ def lens_page(lens_id: str, call: CallDep) -> HTMLResponse:
     history = lens_routes.list_calibrations(lens_id, call, limit=SHOWN_VERSIONS, cursor=before).items
     photos, more = shown.photos(call, lens_id)
     positions = _positions(call, photos)
+    others = [other for other in shown.lenses(call) if other.id != lens_id]
     newest = next((event.coverage for event in reversed(history) if event.coverage), None)
     aspect = _aspect(call, row)
     test = _test(call, row)
@@ -62,8 +63,8 @@ def lens_page(lens_id: str, call: CallDep) -> HTMLResponse:
         spots=_spots(positions, aspect),
         photos=photos,
         more=more,
-        others=[other for other in shown.lenses(call) if other.id != lens_id],
-        comparable=[other for other in shown.lenses(call) if other.id != lens_id and other.samples],
+        others=others,
+        comparable=[other for other in others if other.samples],
         test=test,
         centring=None if test is None else test.tested[0].centring,
         **({} if test is None else _charts(test, None, "c/px")),
@@ -156,10 +157,4 @@ def _spots(positions: list[FieldPosition], aspect: float) -> list[tuple[float, f
 
 def _positions(call: Call, photos: list[PhotoOut]) -> list[FieldPosition]:
     """Return where patches of counted photos gave a PSF."""
-    return [
-        FieldPosition(patch.r, patch.phi)
-        for photo in photos
-        if photo.state == "counted"
-        for patch in call.store.patches.all_of(photo.id)
-        if patch.state == "done"
-    ]
+    return call.store.patches.places_of([photo.id for photo in photos if photo.state == "counted"])

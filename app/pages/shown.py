@@ -33,12 +33,9 @@ def lenses(call: Call) -> list[LensOut]:
 
 def lenses_with_photos(call: Call) -> list[LensOut]:
     """Return the newest lenses, except those without samples whose photos all failed or were cancelled."""
-    return [lens for lens in lenses(call) if lens.samples or _hopeful(call, lens)]
-
-
-def _hopeful(call: Call, lens: LensOut) -> bool:
-    rows = call.store.photos.page(call.owner, before=None, limit=PHOTOS, lens_id=lens.id)
-    return any(row.state not in HOPELESS for row in rows)
+    listed = lenses(call)
+    hopeful = call.store.lenses.with_photos_beyond(HOPELESS, [lens.id for lens in listed if not lens.samples])
+    return [lens for lens in listed if lens.samples or lens.id in hopeful]
 
 
 def counting(call: Call, lens_id: str) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -171,6 +171,18 @@ class LensStore:
             query = query.where(func.lower(LensRow.serial) == serial.lower())
         with self._db.reading() as session:
             return list(session.scalars(query))
+
+    def with_photos_beyond(self, states: Collection[str], lens_ids: Collection[str]) -> set[str]:
+        """Return which of these lenses have photos in other states."""
+        query = (
+            select(LensRow.public_id)
+            .join(PhotoRow, PhotoRow.lens_id == LensRow.id)
+            .where(LensRow.public_id.in_(lens_ids), PhotoRow.deleted_at.is_(None))
+            .where(PhotoRow.state.not_in(states))
+            .distinct()
+        )
+        with self._db.reading() as session:
+            return set(session.scalars(query))
 
     def candidates(self, photo: PhotoRow, limit: int = 10) -> list[LensRow]:
         """Return the owner's lenses that a photo without a serial may belong to."""

@@ -16,6 +16,7 @@ from app.store.sample_rows import columns_of
 from app.store.tables import PatchRow, PhotoRow, SampleRow
 from app.store.windows import NewPatch
 from lensmodel.core.psf import PsfSample
+from lensmodel.core.types import FieldPosition
 
 OPEN: Final = ("pending", "running")
 
@@ -72,6 +73,18 @@ class PatchStore:
         """Return the patches of a photo that were chosen for estimation, in the order of their numbers."""
         with self._db.reading() as session:
             return list(session.scalars(_of_photo(photo_id, epoch).order_by(PatchRow.idx)))
+
+    def places_of(self, photo_ids: Sequence[str]) -> list[FieldPosition]:
+        """Return where patches of photos gave a PSF."""
+        query = (
+            select(PatchRow.r, PatchRow.phi)
+            .join(PhotoRow, PhotoRow.id == PatchRow.photo_id)
+            .where(PhotoRow.public_id.in_(photo_ids), PatchRow.epoch == PhotoRow.epoch)
+            .where(PatchRow.state == "done")
+            .order_by(PatchRow.id)
+        )
+        with self._db.reading() as session:
+            return [FieldPosition(r, phi) for r, phi in session.execute(query)]
 
     def listed(self, photo_id: str) -> list[PatchRow]:
         """Return the patches of a photo, followed by the windows that were rejected before estimation."""

@@ -6,7 +6,7 @@ import { setUpMeasure } from "./measure.js";
 import { setUpPhoto } from "./photo.js";
 import { setUpPreview } from "./preview.js";
 import { setUpSignIn, setUpSignOut } from "./session.js";
-import { setUpStream } from "./stream.js";
+import { setUpPolling } from "./poll.js";
 import { setUpUpload } from "./upload.js";
 import { setUpViewer } from "./view_tools.js";
 
@@ -24,7 +24,7 @@ const parts = [
   setUpSignIn,
   setUpSignOut,
   () => setUpPreview(setUpViewer()),
-  () => setUpStream(setUpSettling()),
+  () => setUpPolling(setUpSettling()),
 ];
 for (const setUp of parts) {
   try {

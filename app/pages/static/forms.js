@@ -1,7 +1,7 @@
 // Forms and buttons that talk to the API, and pages that wait for work to end.
 
 import { byId, send } from "./common.js";
-import { removing } from "./stream.js";
+import { removing } from "./poll.js";
 
 function setUpForm(id, act) {
   const form = byId(id);
@@ -107,7 +107,7 @@ export function setUpSettling() {
   };
 }
 
-// Photos that do not say their lens, named group by group. The stream makes the groups anew at any moment,
+// Photos that do not say their lens, named group by group. They are made anew at any moment,
 // so one listener above them serves all, and a group whose answer is still to come takes no second wish.
 export function setUpGroups() {
   const underWay = new Set();

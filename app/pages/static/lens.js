@@ -1,7 +1,7 @@
 // The lens: its map of blur, the blur at a point, and how its error fell.
 
 import { byId, problemText, send } from "./common.js";
-import { removing } from "./stream.js";
+import { removing } from "./poll.js";
 
 const LEAST_VIEW = 0.02; // of the picture: the blur changes no more over less
 const ZONES = [

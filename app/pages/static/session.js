@@ -40,10 +40,6 @@ export async function setUpSignIn() {
 export async function setUpSignOut() {
   const button = byId("sign-out");
   if (!button) return;
-  // fragments that are asked for after the session's end say so with 401
-  document.addEventListener("htmx:after:request", (event) => {
-    if (event.detail?.ctx?.response?.status === 401) location.assign(`/sign-in?next=${encodeURIComponent(location.pathname)}`);
-  });
   const session = byId("sign-in") ? null : await known();
   button.hidden = !session?.needed;
   if (session?.needed) button.title = `Signed in as ${session.owner}`;

@@ -324,7 +324,7 @@ def test_a_stream_of_events_ends_with_the_key(
     guarded: TestClient, store: Store, steps: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("app.access.authentication.FRESH_S", 0.0)
-    monkeypatch.setattr("app.routes.jobs.LOOK_AGAIN_S", 0.1)
+    monkeypatch.setattr("app.routes.jobs.LOOK_S", 0.1)
     steps.owner = "anna"
     photo = steps.receive()
     made = store.keys.create("anna", ["read"])

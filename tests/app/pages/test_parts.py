@@ -12,6 +12,7 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 from PIL import Image
+from sqlalchemy import event
 from starlette.testclient import TestClient
 
 from app.blobs.storage import Storage
@@ -19,6 +20,7 @@ from app.blobs.tiles import tile, whole, write_tiles
 from app.jobs import tasks
 from app.jobs.body_keys import body_key
 from app.jobs.task_files import PREVIEW, R_MAP, SIDES, THUMBNAIL
+from app.main import create_app
 from app.pages.groups import grouped
 from app.pages.pictures import in_sensor, upright_point
 from app.runtime.settings import Settings
@@ -322,3 +324,59 @@ def test_the_page_of_a_lens_says_which_model_answers_and_how_far_a_change_is(
     assert "learned anew from all photos, model paper" in shown()
     photo_page = client.get(f"/photos/{photos[0].public_id}").text
     assert '<option value="paper" selected>Paper: Richardson-Lucy</option>' in photo_page
+
+
+def test_an_open_page_is_told_what_changed_and_when_its_session_is_over(
+    settings: Settings, store: Store, steps: Steps
+) -> None:
+    photo, key = steps.receive(), store.keys.create("local", ["write"])
+    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
+        mine = {"Authorization": f"Bearer {key.text}"}
+        asked = {"params": {"page": "photo", "id": photo.public_id}, "headers": mine}
+        first = client.get("/ui/parts", **asked)
+        known = {**mine, "If-None-Match": first.headers["ETag"]}
+        same = client.get("/ui/parts", params=asked["params"], headers=known)
+        steps.inspect(photo)
+        changed = client.get("/ui/parts", **asked)
+        store.photos.delete(photo.public_id, "local")
+        gone = client.get("/ui/parts", **asked)
+        store.keys.revoke(key.prefix)
+        ended = client.get("/ui/parts", params={"page": "home"})
+
+    assert [a.status_code for a in (first, same, changed, gone, ended)] == [200, 304, 200, 404, 401]
+    assert set(first.json()) == {"photo-state"}
+    assert first.json() != changed.json()
+
+
+@pytest.mark.parametrize(
+    "path", ["/", "/ui/parts?page=home", "/lenses/{lens}", "/v1/jobs", "/v1/lenses", "/v1/photos"]
+)
+def test_no_page_asks_the_tables_once_for_each_thing_on_it(
+    client: TestClient, store: Store, steps: Steps, path: str
+) -> None:
+    def statements() -> int:
+        seen: list[str] = []
+
+        def note(*arguments: Any) -> None:
+            if arguments[2].startswith("SELECT") and "api_key" not in arguments[2]:  # read again each second
+                seen.append(arguments[2])
+
+        engine = client.app.state.services.store.database.reader  # type: ignore[attr-defined] # Starlette's own
+        event.listen(engine, "before_cursor_execute", note)
+        assert client.get(path.replace("{lens}", lens)).status_code == 200
+        event.remove(engine, "before_cursor_execute", note)
+        return len(seen)
+
+    def furnish(number: int) -> None:
+        for each in range(number, number + 4):
+            steps.counted()
+            learning = steps.receive()  # its lens has no samples yet
+            steps.inspect(learning, serial=f"learning {each}")
+
+    lens = steps.lens_id(steps.counted())
+    furnish(0)
+    statements()
+    before = statements()
+    furnish(10)
+
+    assert statements() == before

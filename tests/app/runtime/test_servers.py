@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import itertools
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
-from deadline import stretched
 from servers import Moto, Postgres, moto, postgres
 from torture import Plan, in_environment, torture
 
@@ -20,10 +18,7 @@ from app.runtime.doctor import examine
 from app.runtime.metrics import Tables
 from app.runtime.settings import Settings
 from app.store import Store
-from app.store.access.owners import ANY_OWNER
-from app.store.notices import Notices
 from app.store.tables import PhotoRow
-from app.store.upkeep.migrate import upgrade
 
 pytestmark = pytest.mark.tools
 
@@ -100,31 +95,3 @@ def test_deaths_and_outages_lose_nothing_and_count_nothing_twice(servers_too: bo
     said = torture(tmp_path, 5, servers=servers_too, plan=Plan(photos=4, kills=6, outages=2))
 
     assert "4 of 4 photos counted once" in said
-
-
-def test_postgresql_tells_of_changes_by_itself_and_again_after_it_was_away(
-    servers: tuple[Postgres, Moto], far: tuple[Settings, Store, Storage], steps: Any
-) -> None:
-    _, there, _ = far
-    upgrade(there.database)
-    busy, notified = type(steps)(there), threading.Event()
-    notices = Notices(there.database, notified.set)
-
-    def hears_of(change: Callable[[], object]) -> bool:
-        notified.clear()
-        change()
-        return notified.wait(stretched(60))
-
-    notices.start()
-    try:
-        assert notified.wait(stretched(60))  # it listens
-        photo = busy.receive()
-        assert hears_of(lambda: there.photos.cancel(photo.public_id, ANY_OWNER))
-        notified.clear()
-        servers[0].stop()
-        servers[0].start()
-        assert notified.wait(stretched(60))
-        assert hears_of(busy.receive)
-    finally:
-        notices.stop()
-    assert not notices.connected()

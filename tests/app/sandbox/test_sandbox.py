@@ -197,7 +197,7 @@ def test_a_flood_of_text_is_cut(run: Run) -> None:
 
 
 def test_cancelling_kills_the_child(run: Run, tmp_path: Path) -> None:
-    pid_file = tmp_path / "shared" / "pid"
+    pid_file = tmp_path / "shared" / "1" / "pid"
     start = time.monotonic()
 
     arguments = {"pid_file": str(pid_file)}
@@ -211,9 +211,10 @@ def test_cancelling_kills_the_child(run: Run, tmp_path: Path) -> None:
 
 def test_cancelling_kills_what_the_child_started_too(sandbox: Sandbox, tmp_path: Path) -> None:
     sandbox._confined = False  # as where the kernel cannot keep it from starting programs
-    pid_file = tmp_path / "shared" / "pid"
+    pid_file = tmp_path / "shared" / "1" / "pid"
     arguments = {"pid_file": str(pid_file)}
 
+    pid_file.parent.mkdir()
     with sandbox.folder() as folder:
         outcome = sandbox.run(
             "spawn", arguments, folder=folder, limits=LIMITS, wanted=lambda: not pid_file.exists()
@@ -224,7 +225,7 @@ def test_cancelling_kills_what_the_child_started_too(sandbox: Sandbox, tmp_path:
 
 
 def test_stopping_the_sandbox_ends_all_tasks(sandbox: Sandbox, run: Run, tmp_path: Path) -> None:
-    pid_file = tmp_path / "shared" / "pid"
+    pid_file = tmp_path / "shared" / "1" / "pid"
 
     def stop_once_it_runs() -> None:
         read_pid(pid_file)
@@ -237,7 +238,7 @@ def test_stopping_the_sandbox_ends_all_tasks(sandbox: Sandbox, run: Run, tmp_pat
 
 
 def test_a_child_dies_with_its_killed_parent(tmp_path: Path) -> None:
-    pid_file = tmp_path / "shared" / "pid"
+    pid_file = tmp_path / "shared" / "1" / "pid"
     script = textwrap.dedent(
         f"""
         import sys
@@ -245,9 +246,9 @@ def test_a_child_dies_with_its_killed_parent(tmp_path: Path) -> None:
         sys.path.insert(0, {str(OWN)!r})
         from app.sandbox.budget import Budget
         from app.sandbox.outcome import TaskLimits
-        from app.sandbox.runner import MAX_SAID, Sandbox
+        from app.sandbox.runner import Sandbox
         if __name__ == "__main__":
-            scratch, shared = Path({str(tmp_path / "scratch")!r}), Path({str(pid_file.parent)!r})
+            scratch, shared = Path({str(tmp_path / "scratch")!r}), Path({str(pid_file.parents[1])!r})
             box = Sandbox(scratch, Budget(1, 1024), module="hostile_tasks", preload=[], cache=shared)
             with box.folder() as folder:
                 box.run(
@@ -276,7 +277,7 @@ def test_the_fork_server_listens_where_files_may_be_made(tmp_path: Path) -> None
         from multiprocessing import forkserver
         from pathlib import Path
         from app.sandbox.budget import Budget
-        from app.sandbox.runner import MAX_SAID, Sandbox
+        from app.sandbox.runner import Sandbox
         if __name__ == "__main__":
             Sandbox(Path({str(tmp_path)!r}), Budget(1, 64), preload=[])
             print(forkserver._forkserver._forkserver_address)

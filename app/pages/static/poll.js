@@ -1,11 +1,11 @@
-// One stream keeps the page current: the server sends a part of it whenever that part changes.
+// An open page asks every two seconds for its parts, and takes over what has changed.
 
 import { byId } from "./common.js";
 
-const PATIENCE_MS = 4000;
+const PAUSE_MS = 2000;
 
 let afterwards = "/"; // where to go when what the page shows is gone
-let leaving = false; // the answer and the stream both tell of it: the second going would break off the first
+let leaving = false; // the answer and the next look both tell of it: the second going would break off the first
 
 function leave() {
   if (leaving) return;
@@ -13,7 +13,7 @@ function leave() {
   location.assign(afterwards);
 }
 
-// Do what removes what the page shows, and go on at `url`: the stream may tell of it before the answer comes.
+// Do what removes what the page shows, and go on at `url`: the next look may tell of it before the answer comes.
 export async function removing(url, act) {
   afterwards = url;
   try {
@@ -62,44 +62,49 @@ function mergeNode(old, fresh) {
   merge(old, fresh);
 }
 
-export function setUpStream(onPart) {
+export function setUpPolling(onPart) {
   const { page, id } = document.body.dataset;
   if (!page) return;
   const away = byId("away");
-  let [source, timer] = [null, 0];
-  const open = () => {
-    source = new EventSource(`/ui/events?${new URLSearchParams({ page, id: id ?? "" })}`);
-    source.addEventListener("open", () => {
-      clearTimeout(timer);
-      timer = 0;
-      away.hidden = true;
-    });
-    source.addEventListener("error", () => {
-      timer ||= setTimeout(() => (away.hidden = false), navigator.onLine ? PATIENCE_MS : 0);
-      if (source.readyState === EventSource.CLOSED) setTimeout(reopen, PATIENCE_MS);
-    });
-    source.addEventListener("part", (event) => {
-      const target = byId(event.lastEventId);
-      if (!target) return;
+  const url = `/ui/parts?${new URLSearchParams({ page, id: id ?? "" })}`;
+  let [timer, tag] = [0, ""];
+  const take = (parts) => {
+    for (const [name, html] of Object.entries(parts)) {
+      const target = byId(name);
+      if (!target) continue;
       const fresh = document.createElement("template");
-      fresh.innerHTML = event.data;
+      fresh.innerHTML = html;
       merge(target, fresh.content);
-      onPart(event.lastEventId);
-    });
-    source.addEventListener("gone", () => {
-      source.close();
-      leave();
-    });
+      onPart(name);
+    }
   };
-  // a page in the background holds no connection; shown again it is brought up to date
-  const reopen = () => {
-    source?.close();
-    if (!document.hidden) open();
+  const look = async () => {
+    clearTimeout(timer);
+    if (document.hidden) return; // shown again it is brought up to date
+    try {
+      const response = await fetch(url, { headers: tag ? { "If-None-Match": tag } : {}, cache: "no-store" });
+      away.hidden = response.status < 500;
+      if (response.status === 401) {
+        location.assign(`/sign-in?next=${encodeURIComponent(location.pathname)}`);
+        return;
+      }
+      if (response.status === 404) {
+        leave();
+        return;
+      }
+      if (response.ok) {
+        tag = response.headers.get("ETag") ?? "";
+        take(await response.json());
+      }
+    } catch {
+      away.hidden = false;
+    }
+    clearTimeout(timer);
+    timer = setTimeout(look, PAUSE_MS);
   };
-  // a service on this very computer needs no network, and a connection of before says nothing: ask anew
-  for (const event of ["offline", "online"]) window.addEventListener(event, reopen);
-  document.addEventListener("visibilitychange", reopen);
-  window.addEventListener("pagehide", () => source?.close());
+  // a service on this very computer needs no network: ask it whether it is there
+  for (const event of ["offline", "online"]) window.addEventListener(event, look);
+  document.addEventListener("visibilitychange", look);
   window.addEventListener("pageshow", (event) => (leaving &&= !event.persisted)); // come back to
-  open();
+  timer = setTimeout(look, PAUSE_MS);
 }

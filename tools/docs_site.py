@@ -12,7 +12,7 @@ from mkdocs.structure.files import File, Files
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-CLIENTS = ("app.client.Client", "app.client_async.AsyncClient")
+CLIENTS = ("app.client.Client",)
 DEPTH = 4
 """How deep examples go into answers that hold answers (chosen)."""
 

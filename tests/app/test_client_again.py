@@ -1,9 +1,7 @@
-"""The client sends again what may be sent again, tells how far an upload is, and can be awaited."""
+"""The client sends again what may be sent again, and tells how far an upload is."""
 
 from __future__ import annotations
 
-import asyncio
-import inspect
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,8 +10,7 @@ import httpx2
 import pytest
 from starlette.testclient import TestClient
 
-from app.client import Client, JobPatienceError
-from app.client_async import AsyncClient
+from app.client import Client
 from app.client_retries import Retrying
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
@@ -84,33 +81,3 @@ def test_an_upload_says_how_far_it_is(client: TestClient, tmp_path: Path) -> Non
     Client(http=client).upload(path, calibrate=False, on_progress=lambda *far: progress.append(far))
 
     assert progress == [(600_004, 600_004)]
-
-
-def test_coroutines_do_what_the_client_does(client: TestClient, tmp_path: Path) -> None:
-    path = tmp_path / "a.tif"
-    path.write_bytes(b"II*\x00" + bytes(3_000))
-
-    async def journey() -> list[str]:
-        async with AsyncClient(http=client) as api:
-            photo = await api.upload(path, aperture=2.8, calibrate=False)
-            assert await api.photo(photo.id) == photo
-            return [one.id for one in await api.photos()]
-
-    assert len(asyncio.run(journey())) == 1
-
-
-def test_a_coroutine_waits_no_longer_than_it_should(client: TestClient, steps: Steps) -> None:
-    photo = steps.receive()
-
-    async def patient() -> None:
-        await AsyncClient(http=client).wait(photo.public_id, timeout=0.2)
-
-    with pytest.raises(JobPatienceError):
-        asyncio.run(patient())
-
-
-def test_both_clients_have_the_same_calls() -> None:
-    def calls(of: type) -> set[str]:
-        return {name for name, _ in inspect.getmembers(of, callable) if not name.startswith("_")}
-
-    assert calls(Client) - calls(AsyncClient) == {"close", "poll"}

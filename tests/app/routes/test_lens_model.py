@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ import pytest
 from starlette.testclient import TestClient
 
 from app.client import Client
-from app.client_async import AsyncClient
 from app.http.model_cache import ModelCache
 from app.runtime.settings import Settings
 from app.store import Store
@@ -209,7 +207,7 @@ def test_a_profile_joins_only_a_lens_of_its_model(client: TestClient, steps: Ste
     assert support(client, plain)["model"] == "paper"
 
 
-def test_both_clients_ask_for_a_model(client: TestClient, steps: Steps, store: Store, tmp_path: Path) -> None:
+def test_the_client_asks_for_a_model(client: TestClient, steps: Steps, store: Store, tmp_path: Path) -> None:
     path = tmp_path / "a.tif"
     path.write_bytes(TIFF)
     api = Client(http=client)
@@ -218,7 +216,7 @@ def test_both_clients_ask_for_a_model(client: TestClient, steps: Steps, store: S
     (lens,) = api.lenses()
     assert (lens.psf_model, lens.answering_model, lens.model) == ("paper", "paper", "EF24mm f/1.4L")
 
-    changed = asyncio.run(AsyncClient(http=client).choose_model(lens.id, "default"))
+    changed = api.choose_model(lens.id, "default")
 
     assert (changed.psf_model, changed.answering_model) == ("default", "paper")
     assert api.psf(lens.id, r=0.5, aperture=1.4, size=15).support.model == "paper"

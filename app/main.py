@@ -35,7 +35,6 @@ from app.routes import (
     session,
 )
 from app.routes.common import problems
-from app.runtime.disk_reserve import Reserve
 from app.runtime.outage import missable
 from app.runtime.settings import MIB, Settings
 from app.store import Store
@@ -56,14 +55,12 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         with missable():  # /readyz tries again
             settle_folder(store, storage)
         cache = ModelCache(store, chosen.model_cache_mb * MIB)
-        reserve = Reserve(store.database.path.with_name("reserve") if store.database.is_sqlite else None)
         app.state.services = Services(
             chosen,
             store,
             storage,
             cache,
             Places(chosen.max_uploads),
-            reserve,
             Drawn(),
             Gate(chosen, store.keys),
             Fresh(health.FRESH_S),

@@ -48,7 +48,7 @@ def settings_from(data: Path | None, host: str | None = None, port: int | None =
 
 
 def serve(port: Port = None, host: Host = None, data: Data = None) -> None:
-    """Run the whole service: the API, a worker, and a guard that restarts them.
+    """Run the whole service: the API and a worker.
 
     Open the printed address in a browser. Stop with Ctrl-C: running work resumes at the next start.
     Each LENS_ setting of `lensmodel config` can be given in the environment.

@@ -18,7 +18,6 @@ from app.access.authentication import Gate, Who
 from app.blobs.storage import Storage
 from app.http.model_cache import ModelCache
 from app.http.picture_cache import Drawn
-from app.runtime.disk_reserve import Reserve
 from app.runtime.settings import Settings
 from app.schemas import Readiness
 from app.store import Store
@@ -35,7 +34,6 @@ class Services:
     storage: Storage
     models: ModelCache
     uploads: Places
-    reserve: Reserve
     pictures: Drawn
     gate: Gate
     readiness: Fresh[Readiness]

@@ -32,8 +32,7 @@ from app.jobs.task_files import PREVIEW, R_MAP, SHOWN, THUMBNAIL
 from app.runtime import logs, metrics
 from app.runtime.outage import CODE as OUTAGE
 from app.runtime.outage import Patience, is_outage
-from app.runtime.parent_watch import on_parents_end
-from app.runtime.processes import is_running, started_at
+from app.runtime.processes import end_with_parent, is_running, started_at
 from app.runtime.settings import Settings
 from app.runtime.signals import on_signals
 from app.sandbox import account, confine
@@ -410,6 +409,7 @@ def _identity(path: Path) -> tuple[int, int]:
 
 def main() -> None:
     """Run a worker with the settings of the environment until SIGTERM or the supervisor's end."""
+    end_with_parent()
     settings = Settings()
     logs.begin("worker", settings.log_level, settings.log_format)
     confine.keep_private()
@@ -417,5 +417,4 @@ def main() -> None:
         metrics.publish(settings.metrics_port, settings.metrics_host, settings.data_dir.resolve())
     worker = Worker(settings)
     on_signals(lambda _: worker.stop())
-    on_parents_end(worker.stop)
     worker.run()

@@ -77,7 +77,7 @@ def erase_account(call: CallDep) -> None:
     """
     call.services.gate.require(call.who, "admin")
     accounts = call.store.accounts
-    key = call.services.reserve.spend(lambda: accounts.begin_erasing(call.owner))
+    key = accounts.begin_erasing(call.owner)
     if key is not None:
         erase(accounts, call.storage, key)
     call.response.delete_cookie(COOKIE)

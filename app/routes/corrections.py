@@ -179,7 +179,7 @@ def read_correction(correction_id: str, call: CallDep) -> CorrectionOut:
 )
 def delete_correction(correction_id: str, call: CallDep) -> None:
     """Delete a correction with its file; a running one stops."""
-    prefix = call.services.reserve.spend(lambda: call.store.corrections.delete(correction_id, call.owner))
+    prefix = call.store.corrections.delete(correction_id, call.owner)
     if prefix is None:
         raise UnknownCorrectionError(
             f"there is no correction {correction_id[:60]}: it may be deleted already"

@@ -57,7 +57,7 @@ def read_lens(lens_id: str, call: CallDep) -> LensOut:
 )
 def delete_lens(lens_id: str, call: CallDep) -> None:
     """Delete a lens with its serial and all that was learned of it; its photos stay and can be corrected."""
-    if not call.services.reserve.spend(lambda: call.store.removal.lens(lens_id, call.owner)):
+    if not call.store.removal.lens(lens_id, call.owner):
         raise UnknownLensError(f"there is no lens {lens_id[:60]}: it may be deleted already")
 
 

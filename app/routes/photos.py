@@ -303,7 +303,7 @@ def list_patches(photo_id: str, call: CallDep) -> PatchPage:
 )
 def delete_photo(photo_id: str, call: CallDep) -> None:
     """Delete a photo with its file, samples and corrections."""
-    prefix = call.services.reserve.spend(lambda: call.store.photos.delete(photo_id, call.owner))
+    prefix = call.store.photos.delete(photo_id, call.owner)
     if prefix is None:
         raise UnknownPhotoError(f"there is no photo {photo_id[:60]}: it may be deleted already")
     call.storage.delete(prefix)

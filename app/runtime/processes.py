@@ -1,9 +1,19 @@
-"""Identify a process by its id and start time."""
+"""Identify a process by its id and start time, and end it with its parent."""
 
 from __future__ import annotations
 
+import ctypes
 import os
+import signal
+import sys
 from pathlib import Path
+from typing import Final
+
+PARENT: Final = "LENSMODEL_PARENT"
+"""Environment variable with the process id of the supervisor."""
+
+_PR_SET_PDEATHSIG: Final = 1
+"""Of linux/prctl.h."""
 
 
 def started_at(pid: int) -> float:
@@ -27,3 +37,13 @@ def is_running(pid: int, began: float) -> bool:
     except PermissionError:
         return True
     return began == 0.0 or started_at(pid) == began
+
+
+def end_with_parent() -> None:
+    """Let the kernel stop this process once the supervisor has ended, however it ended."""
+    parent = os.environ.pop(PARENT, None)
+    if parent is None or sys.platform != "linux":
+        return
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != int(parent):
+        sys.exit("the supervisor has ended already")

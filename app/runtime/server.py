@@ -12,7 +12,7 @@ import uvicorn
 
 from app.runtime import logs
 from app.runtime.idle_connections import impatient
-from app.runtime.parent_watch import on_parents_end
+from app.runtime.processes import end_with_parent
 from app.runtime.settings import Settings
 from app.runtime.signals import on_signals
 from app.sandbox import confine
@@ -25,7 +25,7 @@ GRACE_S: Final = 5
 
 
 def run(settings: Settings, listener: socket.socket) -> None:
-    """Serve until SIGTERM, or until the supervisor is gone; log as a service does."""
+    """Serve until SIGTERM; log as a service does."""
     logs.begin("api", settings.log_level, settings.log_format)
     confine.keep_private()
     from app.main import create_app  # noqa: PLC0415 - the supervisor need not load the application
@@ -39,13 +39,7 @@ def run(settings: Settings, listener: socket.socket) -> None:
         limit_concurrency=settings.max_connections,
         http=impatient(settings.stall_seconds),
     )
-    server = _Server(config)
-
-    def stop() -> None:
-        server.should_exit = True
-
-    on_parents_end(stop)
-    server.run(sockets=[listener])
+    _Server(config).run(sockets=[listener])
 
 
 class _Server(uvicorn.Server):
@@ -74,6 +68,7 @@ def listen(host: str, port: int) -> socket.socket:
 
 def main() -> None:
     """Serve on the socket that the environment names."""
+    end_with_parent()
     settings = Settings()
     number = os.environ.pop(SOCKET, None)
     listener = listen(settings.host, settings.port) if number is None else socket.socket(fileno=int(number))

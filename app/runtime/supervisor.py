@@ -1,7 +1,7 @@
-"""`lensmodel serve`: one API process and one worker process, restarted whenever one dies.
+"""`lensmodel serve`: one API process and one worker process, which end together.
 
-The supervisor holds the listening socket, so that callers wait while the API restarts instead of
-being refused; and a pipe by which its children notice that it has ended, however it ended.
+Starting the service again after one of them died is left to whoever started it: systemd or a container engine
+(docs/topics/operating.md). Nothing is lost meanwhile: work goes on where the tables say.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
 from app.runtime import server
-from app.runtime.parent_watch import VARIABLE as PARENT_PIPE
+from app.runtime.processes import PARENT
 from app.runtime.settings import PREFIX, Settings
 from app.runtime.signals import on_signals
 from app.sandbox import confine
@@ -46,13 +46,6 @@ READY_POLL_S: Final = 0.25
 
 STOP_S: Final = 15.0
 """How long members may take to stop before they are killed (chosen): longer than `server.GRACE_S`."""
-
-STEADY_S: Final = 20.0
-"""A process that ran so long is restarted at once, and its earlier deaths are forgotten (chosen): one that
-cannot work ends within the few seconds of its start."""
-
-MAX_EARLY_DEATHS: Final = 6
-"""Deaths in a row before `STEADY_S` that end the service (chosen): the pauses between them grow to 8 s."""
 
 WORKER, API = "app.runtime.worker_main", "app.runtime.api_main"
 """Modules of the members; tests replace the worker."""
@@ -170,41 +163,31 @@ def alone(data_dir: Path) -> Iterator[None]:
 
 
 @dataclass
-class _Member:
-    """One process that is kept alive."""
-
-    name: str
-    module: str
-    process: subprocess.Popen[bytes] | None = None
-    started: float = 0.0
-    early_deaths: int = 0
-    due: float = 0.0
-
-
-@dataclass
 class _Supervisor:
-    """Starts, watches and stops the members."""
+    """Starts the members, waits, and stops them."""
 
     settings: Settings
     listener: socket.socket
     _stopping: threading.Event = field(default_factory=threading.Event)
 
     def run(self) -> int:
-        """Watch until stopped; return the exit status."""
-        members = [_Member("worker", WORKER), _Member("api", API)]
-        reading, writing = os.pipe()
+        """Run until stopped, or until one of the members ends; return the exit status."""
         on_signals(self._on_signal)
+        members = {name: self._start(module) for name, module in (("worker", WORKER), ("api", API))}
+        self._write(members)
         threading.Thread(target=self._announce, daemon=True).start()
         try:
-            while not self._stopping.is_set():
-                for member in members:
-                    if not self._keep(member, reading, members):
+            while not self._stopping.wait(POLL_S):
+                for name, process in members.items():
+                    status = process.poll()
+                    if status is not None:
+                        log.error(
+                            "the %s process ended with status %d, and with it the service", name, status
+                        )
                         return 1
-                self._stopping.wait(POLL_S)
         finally:
-            self._end(members)
-            os.close(writing)
-            os.close(reading)
+            self._stopping.set()
+            _end(list(members.values()))
             self._file.unlink(missing_ok=True)
         return 0
 
@@ -222,42 +205,19 @@ class _Supervisor:
         host, port = self.listener.getsockname()[:2]
         return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
-    def _keep(self, member: _Member, parent_pipe: int, members: list[_Member]) -> bool:
-        """Start a member that does not run; False if it keeps dying right after its start."""
-        now = time.monotonic()
-        if member.process is not None:
-            status = member.process.poll()
-            if status is None:
-                return True
-            member.process = None
-            steady = now - member.started > STEADY_S
-            member.early_deaths = 0 if steady else member.early_deaths + 1
-            log.warning("the %s process ended with status %d; it is started again", member.name, status)
-            if member.early_deaths >= MAX_EARLY_DEATHS:
-                log.error(
-                    "the %s process ended %d times right after its start", member.name, MAX_EARLY_DEATHS
-                )
-                return False
-            member.due = now + (0.0 if member.early_deaths <= 1 else 0.25 * 2**member.early_deaths)
-        if now >= member.due:
-            self._start(member, parent_pipe)
-            self._write(members)
-        return True
-
-    def _start(self, member: _Member, parent_pipe: int) -> None:
-        inherited = {PARENT_PIPE: str(parent_pipe), server.SOCKET: str(self.listener.fileno())}
-        member.process = subprocess.Popen(  # noqa: S603 - our own interpreter, our own modules
-            [sys.executable, "-m", member.module],
+    def _start(self, module: str) -> subprocess.Popen[bytes]:
+        inherited = {server.SOCKET: str(self.listener.fileno()), PARENT: str(os.getpid())}
+        return subprocess.Popen(  # noqa: S603 - our own interpreter, our own modules
+            [sys.executable, "-m", module],
             env=os.environ | environment(self.settings) | ONE_THREAD | inherited,
-            pass_fds=(parent_pipe, self.listener.fileno()),
+            pass_fds=(self.listener.fileno(),),
             stdin=subprocess.DEVNULL,
             start_new_session=True,  # a Ctrl-C reaches the supervisor alone, which stops them
         )
-        member.started = time.monotonic()
 
-    def _write(self, members: list[_Member]) -> None:
+    def _write(self, members: Mapping[str, subprocess.Popen[bytes]]) -> None:
         """Write the address of the service and the ids of its processes to a file."""
-        pids = {f"{m.name}_pid": m.process.pid if m.process else None for m in members}
+        pids = {f"{name}_pid": process.pid for name, process in members.items()}
         text = json.dumps({"url": self.url, "pid": os.getpid(), **pids}, indent=2)
         write_atomically(self._file, (text + "\n").encode())
 
@@ -276,15 +236,15 @@ class _Supervisor:
             return
         print(f"lensmodel is ready: {self.url}  (data in {self.settings.data_dir.resolve()})", flush=True)  # noqa: T201
 
-    def _end(self, members: list[_Member]) -> None:
-        """Terminate all members; kill those that do not stop in time."""
-        running = [m.process for m in members if m.process is not None and m.process.poll() is None]
-        for process in running:
-            process.terminate()
-        end = time.monotonic() + STOP_S
-        for process in running:
-            try:
-                process.wait(max(end - time.monotonic(), 0.1))
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+
+def _end(members: list[subprocess.Popen[bytes]]) -> None:
+    """Terminate all members; kill those that do not stop in time."""
+    for process in members:
+        process.terminate()
+    end = time.monotonic() + STOP_S
+    for process in members:
+        try:
+            process.wait(max(end - time.monotonic(), 0.1))
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()

@@ -56,7 +56,7 @@ class Commands(OnDemand):
         ),
         "serve": CommandEntry(
             "app.commands.service:serve",
-            "Run the whole service: the API, a worker, and a guard that restarts them.",
+            "Run the whole service: the API and a worker.",
         ),
         "api": CommandEntry(
             "app.commands.service:api",

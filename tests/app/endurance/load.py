@@ -116,11 +116,14 @@ class Load:
         self.ask(http, "POST", "/v1/corrections", json=body)
 
     def kill(self) -> None:
-        """Kill the API or the worker; the supervisor starts it again."""
+        """Kill the API or the worker, which ends the service, and start it again as systemd does."""
         name = self.rng.choice(["api_pid", "worker_pid"])
         with contextlib.suppress(OSError, ValueError, TypeError):  # between two lives
             os.kill(self.service.info()[name], signal.SIGKILL)
             self.answers[f"killed {name.removesuffix('_pid')}"] += 1
+        assert self.service.process is not None
+        self.service.process.wait()
+        self.service.start()
 
 
 def measured(load: Load, store: Store, minute: float) -> dict[str, Any]:

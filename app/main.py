@@ -77,7 +77,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         redoc_url=None,
     )
     app.add_middleware(Heads)
-    app.add_middleware(JsonBodies, patience_s=chosen.stall_seconds)
+    app.add_middleware(JsonBodies)
     app.add_middleware(SameSite, allowed=chosen.hosts)
     app.add_middleware(OwnNames, allowed=chosen.hosts)
     app.add_middleware(RequestLog)  # the last is the outermost

@@ -1,14 +1,14 @@
-"""Limits on the size and the speed of JSON bodies.
+"""The size of JSON bodies, and the time of every body; photos and profiles are bounded by their own routes.
 
-Photos are streamed by `app.http.upload`, with limits of their own.
+Clients that are slow on purpose are left to a proxy in front: docs/topics/operating.md has one.
 """
 
 from __future__ import annotations
 
 import asyncio
-import math
 import re
-import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from typing import Final
 
 from starlette.datastructures import Headers
@@ -21,104 +21,78 @@ from app.http.errors import respond
 MAX_JSON_BYTES: Final = 64 * 1024
 """Longest JSON body (chosen): far longer than any request; parsed, it takes some ten times as much memory."""
 
-FLOOR_BYTES_PER_S: Final = 4096
-"""Slowest body that is accepted (chosen): a bad mobile connection sends ten times as fast."""
+JSON_SECONDS: Final = 60.0
+"""Longest time that a JSON body may take (chosen): 64 KiB come within it by the slowest mobile connection."""
 
-UPLOADS: Final = re.compile(r"/v1/photos|/v1/lenses/[^/]+/measurements")
-PROFILES: Final = re.compile(r"/v1/lenses/[^/]+/profile")
-"""Paths of uploads by POST and of profiles by PUT: their routes read the body themselves, with a `Pace`."""
+UPLOADS: Final = {
+    "POST": re.compile(r"/v1/photos|/v1/lenses/[^/]+/measurements"),
+    "PUT": re.compile(r"/v1/lenses/[^/]+/profile"),
+}
+"""Paths whose routes read the body themselves, by method."""
 
 SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS", "TRACE"})
 CLOSE: Final = {"Connection": "close"}
 """Header of a refusal before the body is read: the rest of it is not waited for."""
 
+_TOO_LONG: Final = f"the body has more than {MAX_JSON_BYTES} bytes: no question needs as many"
 
-class Pace:
-    """Enforces the speed of a body; only the time spent waiting for it counts.
 
-    Parameters
-    ----------
-    patience_s : float
-        Longest pause within a body, and time before its average rate counts.
-    within_s : float
-        Longest time for the whole body, whatever its rate.
-    """
-
-    def __init__(self, patience_s: float, within_s: float = math.inf) -> None:
-        self._patience_s, self._within_s = patience_s, within_s
-        self._waited = 0.0
-        self._bytes = 0
-
-    async def next(self, receive: Receive) -> Message:
-        """Return the next message of a body."""
-        began = time.monotonic()
-        try:
-            message = await asyncio.wait_for(receive(), self._patience_s)
-        except TimeoutError:
-            self._refuse(f"nothing came for {self._patience_s:g} s")
-        self._waited += time.monotonic() - began
-        self._bytes += len(message.get("body", b""))
-        if self._waited > self._patience_s + self._bytes / FLOOR_BYTES_PER_S:
-            self._refuse(f"{self._bytes} bytes came within {self._waited:.0f} s")
-        if self._waited > self._within_s:
-            self._refuse(f"not all came within {self._within_s:g} s")
-        return message
-
-    def _refuse(self, what: str) -> None:
-        raise SlowBodyError(
-            f"the body came too slowly ({what}, {FLOOR_BYTES_PER_S} bytes/s are the least): send it again",
-            headers=CLOSE,
-        )
+@asynccontextmanager
+async def within(seconds: float) -> AsyncIterator[None]:
+    """Bound the time in which a body comes."""
+    try:
+        async with asyncio.timeout(seconds) as limit:
+            yield
+    except TimeoutError as error:
+        if not limit.expired():
+            raise
+        text = f"the body did not come within {seconds:g} s: send it again over a faster connection"
+        raise SlowBodyError(text, headers=CLOSE) from error
 
 
 class JsonBodies:
-    """Middleware that refuses bodies that are not JSON, too long or too slow."""
+    """Middleware that refuses bodies that are too long or not JSON."""
 
-    def __init__(self, app: ASGIApp, patience_s: float) -> None:
-        self._app, self._patience_s = app, patience_s
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on with its body complete, or refuse it."""
         if scope["type"] != "http" or scope["method"] in SAFE or _is_upload(scope):
             await self._app(scope, receive, send)
             return
-        request = Request(scope)
-        refusal = _refusal(Headers(scope=scope))
-        if refusal is not None:
-            status, code, detail = refusal
-            await respond(request, status, code, detail, headers=CLOSE)(scope, receive, send)
-            return
+        refusal, body = _refusal(Headers(scope=scope)), b""
         try:
-            body = await self._read(receive)
+            if refusal is None:
+                async with within(JSON_SECONDS):
+                    body = await _read(receive)
         except SlowBodyError as error:
-            answer = respond(request, error.status, error.code, str(error), headers=error.headers)
-            await answer(scope, receive, send)
-            return
+            refusal = (error.status, error.code, str(error))
         except ClientDisconnect:
-            return  # the client is gone
-        if body is None:
-            await respond(request, 413, "body_too_large", _TOO_LONG, headers=CLOSE)(scope, receive, send)
+            return
+        if refusal is None and len(body) > MAX_JSON_BYTES:
+            refusal = (413, "body_too_large", _TOO_LONG)
+        if refusal is not None:
+            await respond(Request(scope), *refusal, headers=CLOSE)(scope, receive, send)
             return
         await self._app(scope, _replayed(body, receive), send)
 
-    async def _read(self, receive: Receive) -> bytes | None:
-        pace, body = Pace(self._patience_s), bytearray()
-        while True:
-            message = await pace.next(receive)
-            if message["type"] == "http.disconnect":
-                raise ClientDisconnect
-            body += message.get("body", b"")
-            if len(body) > MAX_JSON_BYTES:
-                return None
-            if not message.get("more_body", False):
-                return bytes(body)
 
-
-_TOO_LONG: Final = f"the body has more than {MAX_JSON_BYTES} bytes: no question needs as many"
+async def _read(receive: Receive) -> bytes:
+    """Return the body, or of a longer one its beginning."""
+    body = bytearray()
+    while len(body) <= MAX_JSON_BYTES:
+        message = await receive()
+        if message["type"] == "http.disconnect":
+            raise ClientDisconnect
+        body += message.get("body", b"")
+        if not message.get("more_body", False):
+            break
+    return bytes(body)
 
 
 def _is_upload(scope: Scope) -> bool:
-    pattern = {"POST": UPLOADS, "PUT": PROFILES}.get(scope["method"])
+    pattern = UPLOADS.get(scope["method"])
     return pattern is not None and pattern.fullmatch(scope["path"]) is not None
 
 
@@ -130,21 +104,15 @@ def _refusal(headers: Headers) -> tuple[int, str, str] | None:
     if int(declared) > MAX_JSON_BYTES:
         return 413, "body_too_large", f"Content-Length {declared}: {_TOO_LONG}"
     kind = headers.get("content-type", "").partition(";")[0].strip().lower()
-    if int(declared) == 0 and "transfer-encoding" not in headers:
-        return None
-    if kind == "application/json":
+    if (int(declared) == 0 and "transfer-encoding" not in headers) or kind == "application/json":
         return None
     return 415, "unsupported_format", f"Content-Type {kind[:100]!r}: send application/json"
 
 
 def _replayed(body: bytes, receive: Receive) -> Receive:
-    handed_over = False
+    messages: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
 
     async def replay() -> Message:
-        nonlocal handed_over
-        if handed_over:
-            return await receive()
-        handed_over = True
-        return {"type": "http.request", "body": body, "more_body": False}
+        return messages.pop() if messages else await receive()
 
     return replay

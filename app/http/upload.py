@@ -7,7 +7,6 @@ determined by its first bytes; the name and the media type that the client sends
 from __future__ import annotations
 
 import hashlib
-import math
 import unicodedata
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
@@ -20,7 +19,6 @@ from starlette.requests import ClientDisconnect
 
 from app.blobs.storage import AsyncBlobWriter, Storage
 from app.errors import MalformedUploadError, TooLargeError
-from app.http.bodies import Pace
 from app.schemas import UploadFields
 from lensmodel import photo
 
@@ -201,8 +199,6 @@ async def receive(
     key: str,
     *,
     limit: int,
-    patience_s: float = 30.0,
-    within_s: float = math.inf,
 ) -> Uploaded:
     """Stream the body of a request into the blob `key`."""
     query = {name: value for name, value in request.query_params.items() if name != "filename"}
@@ -210,16 +206,15 @@ async def receive(
     if declared_length(request) > limit + 2 * MAX_FORM_BYTES:
         raise too_large(limit)
     media_type, options = parse_options_header(request.headers.get("content-type", ""))
-    pace = Pace(patience_s, within_s)
     async with storage.writer(key) as blob:
         sink = _Sink(blob, limit)
         if media_type == b"multipart/form-data":
-            form = await _receive_form(request, options.get(b"boundary", b""), sink, pace)
+            form = await _receive_form(request, options.get(b"boundary", b""), sink)
             name, fields = form.filename, form.fields
         elif media_type == b"application/x-www-form-urlencoded":
             raise MalformedUploadError(f"a form without a file: {REMEDY}")
         else:
-            async for piece in _body(request, pace):
+            async for piece in _body(request):
                 await sink.write(piece)
             name, fields = request.query_params.get("filename"), {}
         sha256, kind = sink.finish()
@@ -235,9 +230,9 @@ def declared_length(request: Request) -> int:
     return int(declared)
 
 
-async def _body(request: Request, pace: Pace) -> AsyncIterator[bytes]:
+async def _body(request: Request) -> AsyncIterator[bytes]:
     while True:
-        message = await pace.next(request.receive)
+        message = await request.receive()
         if message["type"] == "http.disconnect":
             raise ClientDisconnect
         if message.get("body"):
@@ -246,13 +241,13 @@ async def _body(request: Request, pace: Pace) -> AsyncIterator[bytes]:
             return
 
 
-async def _receive_form(request: Request, boundary: bytes, sink: _Sink, pace: Pace) -> _Form:
+async def _receive_form(request: Request, boundary: bytes, sink: _Sink) -> _Form:
     form = _Form()
     if not boundary:
         raise MalformedUploadError(f"multipart/form-data without a boundary: {REMEDY}")
     try:
         parser = form.parser(boundary)
-        async for piece in _body(request, pace):
+        async for piece in _body(request):
             parser.write(piece)
             for data in form.pending:
                 await sink.write(data)

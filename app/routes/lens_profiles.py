@@ -11,7 +11,7 @@ from fastapi import APIRouter, Response
 from starlette.concurrency import run_in_threadpool
 
 from app.errors import BusyError, ConflictError, MalformedUploadError, TooLargeError, UnknownLensError
-from app.http.bodies import CLOSE, Pace
+from app.http.bodies import CLOSE, within
 from app.http.dependencies import Call, CallDep
 from app.routes.common import problems
 from app.routes.lenses import find_lens, read_lens
@@ -78,15 +78,16 @@ async def add_lens_profile(lens_id: str, call: CallDep) -> LensOut:
     await run_in_threadpool(find_lens, call, lens_id)
     many = BusyError("too many files are being received: try again in a few seconds", headers=CLOSE)
     with call.services.uploads.take(many):
-        return await run_in_threadpool(_add, lens_id, await _received(call), call)
+        async with within(call.settings.upload_seconds):
+            data = await _received(call)
+        return await run_in_threadpool(_add, lens_id, data, call)
 
 
 async def _received(call: Call) -> bytes:
-    """Return the body, if it is neither too long nor too slow."""
+    """Return the body, if it is not too long."""
     data, more = bytearray(), True
-    pace = Pace(call.settings.stall_seconds, call.settings.upload_seconds)
     while more:
-        message = await pace.next(call.request.receive)
+        message = await call.request.receive()
         if message["type"] == "http.disconnect":
             raise MalformedUploadError("the profile ended too early: send it again")
         data += message.get("body", b"")

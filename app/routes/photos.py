@@ -21,7 +21,7 @@ from app.errors import (
     UnknownLensError,
     UnknownPhotoError,
 )
-from app.http import upload, views
+from app.http import bodies, upload, views
 from app.http.bodies import CLOSE
 from app.http.dependencies import Call, CallDep
 from app.routes.common import Cursor, Limit, OnlyId, cut, named_lens, next_link, problems
@@ -126,16 +126,10 @@ async def _received(call: Call, lens_id: str | None = None) -> PhotoOut:
         bind_contextvars(photo_id=public_id)
         prefix = f"photos/{public_id}/"
         key = f"{prefix}original"
-        within = timedelta(seconds=limits.upload_seconds)
-        await run_in_threadpool(partial(call.store.photos.expect, prefix, within=within))
-        uploaded = await upload.receive(
-            call.request,
-            call.storage,
-            key,
-            limit=limits.max_upload_bytes,
-            patience_s=limits.stall_seconds,
-            within_s=limits.upload_seconds,
-        )
+        span = timedelta(seconds=limits.upload_seconds)
+        await run_in_threadpool(partial(call.store.photos.expect, prefix, within=span))
+        async with bodies.within(limits.upload_seconds):
+            uploaded = await upload.receive(call.request, call.storage, key, limit=limits.max_upload_bytes)
     if lens_id is not None:
         fields = uploaded.fields.model_copy(update={"lens_id": lens_id})
         uploaded = replace(uploaded, fields=fields)

@@ -11,7 +11,6 @@ from typing import Final
 import uvicorn
 
 from app.runtime import logs
-from app.runtime.idle_connections import impatient
 from app.runtime.processes import end_with_parent
 from app.runtime.settings import Settings
 from app.runtime.signals import on_signals
@@ -37,7 +36,6 @@ def run(settings: Settings, listener: socket.socket) -> None:
         access_log=False,  # the application writes its own, without serials
         timeout_graceful_shutdown=GRACE_S,
         limit_concurrency=settings.max_connections,
-        http=impatient(settings.stall_seconds),
     )
     _Server(config).run(sockets=[listener])
 

@@ -75,9 +75,6 @@ class Settings(BaseSettings):
         default="",
         description="Names that the service answers to, besides addresses and local ones; by commas.",
     )
-    stall_seconds: float = Field(
-        default=30.0, gt=0, description="Longest that nothing of a request's head or body may come."
-    )
     upload_seconds: float = Field(
         default=3600.0, gt=0, description="Longest that a photo may be on its way to us."
     )

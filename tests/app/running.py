@@ -24,7 +24,6 @@ from scipy import ndimage
 
 from app.main import create_app
 from app.runtime import server
-from app.runtime.idle_connections import impatient
 from app.runtime.settings import Settings
 from lensmodel.photo.dng import ShotInfo, write_bayer_dng
 from lensmodel.simulate import demo_scene
@@ -158,9 +157,7 @@ def running(data: Path, program: Sequence[str] = PROGRAM, **settings: str) -> It
 def served(settings: Settings) -> Iterator[int]:
     """Serve on a real port, in a thread: slow clients need a real connection."""
     listener = server.listen("127.0.0.1", 0)
-    config = uvicorn.Config(
-        create_app(settings), access_log=False, log_config=None, http=impatient(settings.stall_seconds)
-    )
+    config = uvicorn.Config(create_app(settings), access_log=False, log_config=None)
     running = uvicorn.Server(config)
     thread = threading.Thread(target=running.run, kwargs={"sockets": [listener]})
     thread.start()

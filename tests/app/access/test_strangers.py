@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import re
 import socket
-import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from typing import Any
@@ -14,7 +13,7 @@ import pytest
 from running import served
 from starlette.testclient import TestClient
 
-from app.http import psf_formats
+from app.http import bodies, psf_formats
 from app.http.bodies import MAX_JSON_BYTES
 from app.http.picture_cache import DrawnPicture
 from app.main import create_app
@@ -96,9 +95,10 @@ def answer_of(port: int, sent: bytes, then: Callable[[socket.socket], None] = la
 
 
 @pytest.fixture
-def impatient_port(settings: Settings, store: Store) -> Iterator[int]:
-    with served(settings.model_copy(update={"stall_seconds": 0.5})) as port:
-        yield port
+def port(settings: Settings, store: Store, monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    monkeypatch.setattr(bodies, "JSON_SECONDS", 0.5)
+    with served(settings.model_copy(update={"upload_seconds": 0.5})) as opened:
+        yield opened
 
 
 @pytest.mark.parametrize(
@@ -107,42 +107,20 @@ def impatient_port(settings: Settings, store: Store) -> Iterator[int]:
         head("POST", "/v1/corrections", 100) + b'{"photo_id":',
         head("POST", "/v1/photos", 9004, "application/octet-stream") + TIFF[:500],
         head("POST", "/v1/photos", 9004, "multipart/form-data; boundary=b") + b"--b\r\n",
+        head("PUT", "/v1/lenses/LENS/profile", 9004, "application/octet-stream") + TIFF[:500],
     ],
 )
-def test_a_body_that_stalls_is_answered_and_the_connection_closed(impatient_port: int, sent: bytes) -> None:
-    said = answer_of(impatient_port, sent)
+def test_a_body_that_does_not_come_in_time_is_answered_and_the_connection_closed(
+    port: int, sent: bytes, steps: Any
+) -> None:
+    said = answer_of(port, sent.replace(b"LENS", steps.lens_id(steps.counted()).encode()))
 
     assert said.startswith(b"HTTP/1.1 408")
     assert b'"code":"too_slow"' in said
 
 
-def test_a_body_that_trickles_is_not_waited_for(settings: Settings, store: Store) -> None:
-    def trickle(opened: socket.socket) -> None:
-        for _ in range(40):  # each in time, all of them too slow
-            time.sleep(0.1)
-            try:
-                opened.sendall(b"x")
-            except OSError:
-                return
-
-    with served(settings.model_copy(update={"stall_seconds": 1.0})) as port:
-        sent = head("POST", "/v1/photos", 9004, "application/octet-stream")
-        with closing(socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S)) as opened:
-            opened.sendall(sent + TIFF[:10])
-            trickle(opened)
-            said = opened.recv(65536)
-
-    assert said.startswith(b"HTTP/1.1 408")
-    assert b"bytes came within" in said
-
-
-@pytest.mark.parametrize("sent", [b"", b"GET /healthz HTTP/1.1\r\nHost: loc"])
-def test_a_connection_without_a_request_is_closed(impatient_port: int, sent: bytes) -> None:
-    assert answer_of(impatient_port, sent) == b""
-
-
-def test_a_body_longer_than_its_length_ends_the_connection(impatient_port: int) -> None:
-    said = answer_of(impatient_port, head("POST", "/v1/corrections", 2) + b"{}" + b"\x00" * 1000)
+def test_a_body_longer_than_its_length_ends_the_connection(port: int) -> None:
+    said = answer_of(port, head("POST", "/v1/corrections", 2) + b"{}" + b"\x00" * 1000)
 
     assert said.count(b"HTTP/1.1 422") == 1
     assert said.count(b"HTTP/1.1") <= 2  # of the rest, at most that it is no request

@@ -263,7 +263,7 @@ class Worker:
         rows = self._store.patches.of_cell(photo_id, epoch, cell)
         self._store.patches.fail(photo_id, epoch, [row.idx for row in rows], ending.code)
 
-    def _correction_broke(self, ending: Ending, correction_id: str, epoch: int = 1) -> None:
+    def _correction_broke(self, ending: Ending, correction_id: str, epoch: int) -> None:
         self._store.corrections.fail(correction_id, ending.code, ending.detail, epoch=epoch)
 
     def _measure_broke(self, ending: Ending, lens_id: str, version: int, _again: int = 0) -> None:
@@ -277,7 +277,7 @@ class Worker:
         for photo_id, epoch, owner in self._store.photos.to_do():
             self._engine.enqueue(Job("photo", (photo_id, epoch), owner))
         for correction_id, epoch, owner in self._store.corrections.to_do():
-            self._engine.enqueue(_correction_job(correction_id, epoch, owner))
+            self._engine.enqueue(Job("correction", (correction_id, epoch), owner))
         for lens_id, version in self._store.lenses.unmeasured():
             self._engine.enqueue(Job("measure", (lens_id, version)))
 
@@ -334,7 +334,7 @@ class Worker:
             if ended:  # changes nothing if it has ended meanwhile
                 photos.fail(photo_id, epoch, ended.code, ended.detail)
         for correction_id, epoch, owner in [*corrections.to_do(), *corrections.running()]:
-            ended = self._lost(_correction_job(correction_id, epoch, owner))
+            ended = self._lost(Job("correction", (correction_id, epoch), owner))
             if ended:
                 corrections.fail(correction_id, ended.code, ended.detail, epoch=epoch)
         for lens_id, version in self._store.lenses.unmeasured():
@@ -392,11 +392,6 @@ class Worker:
         self._leave_metrics()
         logging.shutdown()
         os._exit(EXIT_FENCED)
-
-
-def _correction_job(correction_id: str, epoch: int, owner: str) -> Job:
-    """Return the job; the first epoch has no number, as in jobs of older versions of the program."""
-    return Job("correction", (correction_id,) if epoch == 1 else (correction_id, epoch), owner)
 
 
 def _identity(path: Path) -> tuple[int, int]:

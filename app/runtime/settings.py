@@ -197,11 +197,6 @@ class Settings(BaseSettings):
     def _no_unknown_names(cls, values: object) -> object:
         known = {PREFIX + name.upper() for name in cls.model_fields} | {CLIENT_KEY}
         for name in os.environ:
-            if name.upper() == "LENS_MODEL_MODE":
-                raise ValueError(
-                    "the setting LENS_MODEL_MODE is gone: leave it out; each lens has its model, default or "
-                    "paper: send photos with model=paper, or `lensmodel calibrate --model paper`"
-                )
             if name.upper().startswith(PREFIX) and name.upper() not in known:
                 near = difflib.get_close_matches(name.upper(), known, n=1)
                 hint = f"did you mean {near[0]}?" if near else "run `lensmodel config` to see all settings"

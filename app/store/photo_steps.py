@@ -26,8 +26,7 @@ GIVEN_SETTINGS = {
 
 FALLBACKS: Final = "fallbacks"
 """Key in `PhotoRow.given` of the settings that came with the file: the header's own go before them. Settings
-under their own names are corrections made since and go before the header. In rows of earlier versions those
-that came with the file stand there too, and keep their precedence."""
+under their own names are corrections made since and go before the header."""
 
 DESCRIPTION: Final = (
     *("lens_maker", "lens_model", "lens_serial", "lens_serial_source", "camera_maker", "camera_model"),

@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import event, update
+from sqlalchemy import event
 from starlette.testclient import TestClient
 
 from app.runtime.settings import Settings
 from app.store import LensName, NewPatch, NewSample, Store
-from app.store.tables import SampleRow
 from lensmodel.core.psf import PsfSample, gaussian, rms_width
 from lensmodel.core.types import FieldPosition
 
@@ -42,13 +41,6 @@ def test_an_answer_says_what_made_it(client: TestClient, lens: str) -> None:
 
     assert (support["model"], support["answered_by"], support["weights"]) == ("default", "regression", "")
     assert 0.0 < support["nearest"] < 2.5
-
-
-def test_the_setting_of_modes_is_refused_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("LENS_MODEL_MODE", "kernels")
-
-    with pytest.raises(ValueError, match=r"is gone: leave it out; .* --model paper"):
-        Settings()
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from servers import postgres
-from sqlalchemy import Text, cast, event, func, select, text
+from sqlalchemy import Text, cast, event, func, insert, select, text
 from sqlalchemy.exc import DBAPIError, IntegrityError
 
 from app.errors import BusyError
@@ -20,7 +20,7 @@ from app.store import LensName, NewPatch, Store, corrections, lenses
 from app.store.access.owners import ANY_OWNER
 from app.store.corrections import Result
 from app.store.database import Database
-from app.store.tables import Base, EventRow, LensRow, OwnerRow, PatchRow, PhotoRow, SampleRow
+from app.store.tables import Base, CorrectionRow, EventRow, LensRow, OwnerRow, PatchRow, PhotoRow, SampleRow
 from app.store.upkeep.migrate import current, downgrade, head, upgrade
 from lensmodel.core.errors import InvalidInputError
 from lensmodel.core.psf import gaussian
@@ -658,3 +658,79 @@ def test_what_is_written_after_a_deletion_is_deleted_later(store: Store, steps: 
 
     assert not set(prefixes) & set(store.workers.garbage())
     assert set(prefixes) <= set(store.workers.garbage(at=datetime.now(UTC) + timedelta(hours=1)))
+
+
+def many(store: Store, count: int = 10_000) -> None:
+    """Give each of two owners lenses with a photo and a correction each."""
+    with store.database.writing() as session:
+        for owner in (1, 2):
+            session.add(OwnerRow(id=owner, name=f"owner {owner}", created_at=datetime.now(UTC)))
+        session.flush()
+        numbers = range(count)
+        rows = [
+            (LensRow, {"identity_key": "k", "serial_source": "none", "created_at": datetime.now(UTC)}),
+            (
+                PhotoRow,
+                {
+                    "filename": "p",
+                    "kind": "dng",
+                    "byte_size": 1,
+                    "blob_key": "k",
+                    "calibrate": True,
+                    "given": {},
+                    "state": "stored",
+                    **dict.fromkeys(("received_at", "stage_at"), datetime.now(UTC)),
+                },
+            ),
+            (
+                CorrectionRow,
+                {
+                    "lens_version": 1,
+                    "params": {},
+                    "params_hash": "h",
+                    "state": "succeeded",
+                    "created_at": datetime.now(UTC),
+                },
+            ),
+        ]
+        for table, common in rows:
+            values = [
+                {**common, "id": k + 1, "public_id": f"{table.__tablename__}{k:08}", "owner_id": 1 + k % 2}
+                for k in numbers
+            ]
+            for k, value in enumerate(values):
+                if table is LensRow:
+                    value["identity_key"] = str(k)
+                elif table is PhotoRow:
+                    value |= {"sha256": f"{k:064}", "lens_id": k + 1}
+                else:
+                    value |= {"photo_id": k + 1, "lens_id": k + 1}
+            session.execute(insert(table), values)
+
+
+def test_a_page_of_ten_thousand_lenses_is_found_by_an_index(store: Store) -> None:
+    if not store.database.is_sqlite:
+        pytest.skip("reads SQLite's plans")
+    many(store)
+    seen: list[tuple[str, Any]] = []
+
+    def note(connection: object, cursor: object, statement: str, *rest: Any) -> None:
+        del connection, cursor
+        seen.append((statement, rest[0]))
+
+    event.listen(store.database.reader, "before_cursor_execute", note)
+    for part in (store.lenses, store.photos, store.corrections):
+        assert len(part.page("owner 1", before=None, limit=50)) == 50
+    event.remove(store.database.reader, "before_cursor_execute", note)
+
+    with store.database.reader.connect() as connection:
+        for (statement, values), index in zip(
+            [entry for entry in seen if entry[0].startswith("SELECT")],
+            ("ix_lens_page", "ix_photo_page", "ix_correction_page"),
+            strict=True,
+        ):
+            plan = [
+                row[-1] for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", values).all()
+            ]
+            assert any(index in step for step in plan), plan
+            assert not any(step.startswith(("SCAN", "USE TEMP B-TREE")) for step in plan), plan

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import event
+from sqlalchemy import event, update
 from starlette.testclient import TestClient
 
-from app.runtime.settings import Settings
 from app.store import LensName, NewPatch, NewSample, Store
+from app.store.tables import SampleRow
 from lensmodel.core.psf import PsfSample, gaussian, rms_width
 from lensmodel.core.types import FieldPosition
 

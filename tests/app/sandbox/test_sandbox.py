@@ -20,7 +20,6 @@ import numpy as np
 import pytest
 from deadline import Deadline, stretched
 
-from app.commands.console.failure import UsageError
 from app.runtime import supervisor
 from app.runtime.settings import Settings
 from app.sandbox import confine
@@ -28,6 +27,7 @@ from app.sandbox.budget import Budget
 from app.sandbox.child import NICENESS
 from app.sandbox.outcome import Outcome, TaskLimits
 from app.sandbox.runner import MAX_SAID, Sandbox
+from lensmodel.cli.console.failure import UsageError
 
 OWN = Path(__file__).parent
 HERE = OWN.parent
@@ -294,7 +294,6 @@ PROBE = """
 import json, os, sys
 from pathlib import Path
 sys.path.insert(0, {here!r})
-from app.commands.console.failure import UsageError
 from app.runtime import supervisor
 from app.runtime.settings import Settings
 from app.sandbox import confine

@@ -81,7 +81,7 @@ def taken(steps: Steps, store: Store) -> Callable[..., str]:
 def test_bodies_of_different_pitch_share_a_lens(client: TestClient, taken: Callable[..., str]) -> None:
     lens = taken(6.0, (6000, 4000), 1.5)
     assert taken(6.0, (6000, 4000), 1.5) == lens
-    assert taken(4.0, (6000, 4000), 2.25) == lens  # the same 9 um of blur
+    assert taken(4.0, (9000, 6000), 2.25) == lens  # the same 9 um of blur on a sensor of that size
 
     coarse, fine, usual = (
         psf(client, lens, pixel_pitch_um=6),

@@ -14,7 +14,6 @@ from app.store import LensName, Store
 from app.store.access.owners import ANY_OWNER
 from app.store.tables import LensRow, PatchRow, PhotoRow, SampleRow
 from app.store.upkeep.invariants import INVARIANTS
-from app.store.upkeep.migrate import downgrade, upgrade
 from lensmodel.core.psf import rms_width
 
 Steps = Any  # the fixture `steps` of conftest.py; test modules do not import each other
@@ -528,28 +527,7 @@ def test_no_lens_has_samples_of_two_ways_whatever_is_done_in_whatever_order(
     assert changed
 
 
-def test_a_schema_step_gives_lenses_that_are_there_the_default_way(store: Store, steps: Steps) -> None:
-    photo = steps.counted()
-    lens_id = steps.lens_id(photo)
-    downgrade(store.database, "0009")
-    with store.database.writing() as session:
-        assert "way" not in session.execute(text("SELECT * FROM lens")).mappings().one()
-    assert upgrade(store.database)
-
-    lens = lens_of(store, lens_id)
-    assert (lens.way, lens.answering_way) == ("default", "default")
-    assert (steps.fresh(photo).way, steps.fresh(photo).relearning) == ("default", False)
-    assert [event.way for event in store.lenses.history(lens)] == ["default"]
-    assert choose(store, lens_id) == 0
-    assert learn(steps, photo) == 2  # its event is one that the table did not take before
-
-    downgrade(store.database, "0009")
-    with store.database.reading() as session:
-        kinds = session.execute(text("SELECT kind FROM calibration_event ORDER BY version")).scalars().all()
-    assert kinds == ["photo_added", "photo_changed"]
-
-
-def test_a_schema_step_keeps_what_guards_the_history(store: Store, steps: Steps) -> None:
+def test_the_schema_guards_the_history(store: Store, steps: Steps) -> None:
     steps.counted()
     for statement in (
         "UPDATE calibration_event SET kind = 'nonsense'",

@@ -105,7 +105,6 @@ export function setUpField() {
       ["Seen in", `${support.photos} photo${support.photos === 1 ? "" : "s"}`],
       ["Based on", `about ${Math.round(support.effective_samples) || 1} sample${Math.round(support.effective_samples) > 1 ? "s" : ""}`],
       ["Expected error", error],
-      ...(support.family ? [["Leans on your other copies", `${Math.round(support.family.weight * 100)} %`]] : []),
     ]);
   };
   const showField = () => {

@@ -13,7 +13,8 @@ package costs nothing. docs/library.md shows them at work.
 Patches of photos become samples of a PSF in `estimation`, these a function of place and settings in `model`,
 both by the network of `neural`, and that is applied in `correction`; `workflow` joins the three. Photos come
 in and go out through `photo`; `quality` judges, `report` describes, `simulate` makes photos whose truth is
-known, `core` has what all share, `cli` is the command, `lab` measures it all. CONTRIBUTING.md says where a method is added.
+known, `core` has what all share, `cli` is the command, `lab` measures it all. CONTRIBUTING.md says
+where a method is added.
 """
 
 from __future__ import annotations

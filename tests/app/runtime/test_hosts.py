@@ -199,6 +199,7 @@ def installed(hosts: list[Host], tmp_path: Path) -> Iterator[Installation]:
                 "LENS_HOST": host.address,
                 "LENS_PORT": str(API_PORT),
                 "LENS_PUBLIC": "true",
+                "LENS_SANDBOX": "try",  # whatever this machine has
                 "LENS_ALLOWED_HOSTS": "localhost",
                 "PYTHONPATH": os.pathsep.join(
                     [str(STAND_INS), os.environ.get("PYTHONPATH", str(HERE.parents[1]))]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Final
@@ -53,6 +54,7 @@ def _arguments() -> argparse.Namespace:
     grid = commands.add_parser("grid", help="PSFs of a copy of a design, to take photos through")
     grid.add_argument("design", nargs="+", choices=sorted(PRESCRIPTIONS), metavar="DESIGN")
     grid.add_argument("--copy", type=int, default=0, help="seed of the copy")
+    grid.add_argument("--pitch", type=float, default=4.5, help="pixel pitch, micrometres")
     publish = commands.add_parser("publish", help="put trained weights into the package, with their figures")
     publish.add_argument("weights", type=Path)
     publish.add_argument(
@@ -84,6 +86,7 @@ def _describe(asked: argparse.Namespace) -> None:
 def _grid(asked: argparse.Namespace) -> None:
     for design in asked.design:
         lens = draw(np.random.default_rng([asked.copy, *design.encode()]), [design])
+        lens = replace(lens, pitch_um=asked.pitch)
         path = asked.folder / f"{design.replace('@', '-')}-f{lens.f_number:.2g}.npz"
         grid_of(lens).write(path)
         print(path, "held out" if design in HELD_OUT else "trained on")

@@ -114,9 +114,15 @@ def _develop_raw(path: Path, header: Header, info: PhotoInfo, demosaic: Demosaic
         grain=(1.0, 1.0, 1.0) if raw.sensor_noise is not None else _grain(raw.planes, raw.noise, raw.clip),
         remarks=(
             *(f"its {step.name} is for the mosaic only and is dropped" for step in lost),
-            *((f"{raw.defects} defective pixels of its sensor are replaced",) if raw.defects else ()),
+            *(_of_defects(raw.defects)),
         ),
     )
+
+
+def _of_defects(count: int) -> tuple[str, ...]:
+    if count < 2:
+        return ("1 defective pixel of its sensor is replaced",) * count
+    return (f"{count} defective pixels of its sensor are replaced",)
 
 
 def _coding_noise(planes: Planes, coarseness: float) -> NoiseModel | None:

@@ -72,6 +72,8 @@ class Service:
 
     def start(self) -> None:
         """Start, or start again, and wait until it says that it is ready."""
+        if self.process is not None and self.process.stdout is not None:
+            self.process.stdout.close()  # of a service that ended by itself
         with self.log.open("a") as log:
             self.process = subprocess.Popen(
                 [*self._program, "serve", "--port", "0", "--data", str(self.data)],

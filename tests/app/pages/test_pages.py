@@ -90,9 +90,7 @@ def browser() -> Iterator[Browser]:
 @pytest.fixture(scope="module")
 def service(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     # with the other lenses of these tests, each picture would wait for what all of them have in common
-    with running(
-        tmp_path_factory.mktemp("pages") / "data", BRIEF, **OWN_ACCOUNT, LENS_FAMILY="false"
-    ) as made:
+    with running(tmp_path_factory.mktemp("pages") / "data", BRIEF, **OWN_ACCOUNT) as made:
         yield made
 
 

@@ -208,12 +208,15 @@ def write_photo(
     serial: str = "L-42",
     aperture: float | None = 2.8,
     shape: tuple[int, int] = SHAPE,
+    blank: int = 0,
 ) -> Path:
     """Write a raw photo of a real scene in grey, taken through a round Gaussian blur.
 
     Each seed has noise of its own, but there are two scenes only: to read one takes a tenth of a second.
+    The last `blank` columns show nothing.
     """
     light = ndimage.gaussian_filter(_photographed(seed % 2, *shape), sigma)
+    light[:, shape[1] - blank :] = 0.4
     return write_light(path, light, seed, serial=serial, aperture=aperture)
 
 

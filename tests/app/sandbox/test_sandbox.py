@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import signal
 import site
@@ -530,8 +531,13 @@ def test_a_task_that_fills_its_folder_is_killed(run: Run, files: int, size: int)
 
 
 def test_what_a_task_prints_is_logged_and_looks_like_no_record_of_ours(
-    run: Run, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+    run: Run,
+    caplog: pytest.LogCaptureFixture,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    # a service that ran in this process before has left a handler whose stream is closed
+    monkeypatch.setattr(logging.getLogger(), "handlers", [caplog.handler])
     with caplog.at_level("INFO", "app.sandbox.runner"):
         assert run("forge").ending == "ok"
         assert run("forge", arguments={"bytes": 10_000_000}).ending == "ok"

@@ -78,6 +78,14 @@ class LateralColour(Protocol):
         """Shift (place, wavelength, 2) of the image in each wavelength against their mean."""
 
 
+def draw_pitch_um(rng: np.random.Generator) -> float:
+    """Pixel pitch: mostly of large sensors, some of small ones, a few of old cameras with large pixels."""
+    lot = rng.random()
+    if lot < 0.2:
+        return float(rng.uniform(1.0, 3.5))
+    return float(rng.uniform(6.6, 12.0) if lot > 0.88 else rng.uniform(3.3, 6.6))
+
+
 def radial(n: int, m: int, rho: NDArray[np.float64]) -> NDArray[np.float64]:
     """Radial polynomial of Zernike, scaled so that the term has unit r.m.s. on the disc."""
     total = np.zeros_like(rho)
@@ -197,7 +205,11 @@ class Renderer:
             tilt = (centre[0] * pupil.x + centre[1] * pupil.y) / np.float32(2.0 * self._f_number)
             phase = (path - tilt) * np.float32(2.0 * np.pi / wavelength_um)
             field = np.zeros((n, 2 * n), np.complex64)
-            field[pupil.rows, pupil.cols] = np.where(inside, np.exp(1j * phase), 0)
+            wave = np.empty(
+                phase.shape, np.complex64
+            )  # cosine and sine are quicker than a complex exponential
+            wave.real, wave.imag = inside * np.cos(phase), inside * np.sin(phase)
+            field[pupil.rows, pupil.cols] = wave
             # a ray at +2 N grad W: the transform with exp(-i) moves light towards the slope
             amplitude = scipy.fft.fft(scipy.fft.fft(field, axis=1).T.copy(), 2 * n, axis=1).T
             kernel = np.maximum(matrix @ (amplitude.real**2 + amplitude.imag**2) @ matrix.T, 0.0)
@@ -252,6 +264,35 @@ def kernels_of(
                 coefficients[p, w], circles[p], float(wavelength), offsets[p, w]
             )
     return out
+
+
+def behind_sensor(kernels: NDArray[np.float32], separation: float, diffusion: float) -> NDArray[np.float32]:
+    """Kernels (..., SIDE, SIDE) with what lies before the pixels; the same where there is nothing.
+
+    Parameters
+    ----------
+    kernels : ndarray of float32, shape (..., SIDE, SIDE)
+    separation : float
+        Pixels between the four spots of a birefringent low-pass filter: transfer cos(pi d fx) cos(pi d fy)
+        (J. E. Greivenkamp, "Color dependent optical prefilter for the suppression of aliasing artifacts",
+        Applied Optics 29, 1990).
+    diffusion : float
+        Standard deviation, in pixels, of the Gaussian by which charge spreads.
+
+    Returns
+    -------
+    ndarray of float32, shape (..., SIDE, SIDE)
+        Not negative, sum 1, centred as before.
+    """
+    if not separation and not diffusion:
+        return kernels
+    side = SIDE + 15  # nothing comes back from the other edge
+    fx, fy = np.fft.rfftfreq(side)[None], np.fft.fftfreq(side)[:, None]
+    transfer = np.cos(np.pi * separation * fx) * np.cos(np.pi * separation * fy)
+    transfer = transfer * np.exp(-2 * (np.pi * diffusion) ** 2 * (fx * fx + fy * fy))
+    spectrum = scipy.fft.rfft2(kernels, (side, side)) * transfer.astype(np.float32)
+    blurred = np.maximum(scipy.fft.irfft2(spectrum, (side, side))[..., :SIDE, :SIDE], 0.0)
+    return blurred / blurred.sum((-1, -2), keepdims=True)
 
 
 def coarse_of(kernels: NDArray[np.float32]) -> NDArray[np.float32]:

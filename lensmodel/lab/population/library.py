@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lensmodel.core.files import atomic
 from lensmodel.lab.population import traced
-from lensmodel.lab.population.kernels import PopulationLens, coarse_of, fine_of, kernels_of
+from lensmodel.lab.population.kernels import PopulationLens, behind_sensor, coarse_of, fine_of, kernels_of
 from lensmodel.lab.population.photos import KINDS, Camera, Kind, Scenes
 from lensmodel.lab.population.prescriptions import HELD_OUT, PRESCRIPTIONS
 from lensmodel.lab.population.wavefronts import RandomLens
@@ -42,14 +42,17 @@ class State:
     zoom: float  # 0..1 between the two fields of a zoom
 
 
-def places(rng: np.random.Generator) -> NDArray[np.float64]:
-    """24 places of a frame: the centre, three about it, a jittered grid, near the four corners."""
+def places(rng: np.random.Generator, cells: int = 4) -> NDArray[np.float64]:
+    """8 + cells^2 places of a frame: the centre, three about it, a jittered grid, near the four corners."""
     aspect = rng.choice([1.5, 1.5, 4 / 3, 16 / 9])
     hx, hy = aspect / np.hypot(aspect, 1), 1 / np.hypot(aspect, 1)
     at = [(0.001, 0.0005)]
     at += [tuple(rng.normal(0, 0.15, 2)) for _ in range(3)]
-    for i in range(4):
-        at += [(((i + rng.random()) / 2 - 1) * hx, ((j + rng.random()) / 2 - 1) * hy) for j in range(4)]
+    side = 2 / cells
+    for i in range(cells):
+        at += [
+            (((i + rng.random()) * side - 1) * hx, ((j + rng.random()) * side - 1) * hy) for j in range(cells)
+        ]
     for sx in (-1, 1):
         for sy in (-1, 1):
             t = rng.uniform(0.82, 0.98)
@@ -78,6 +81,18 @@ def draw_lens(
     ]
 
 
+def draw_sensor(rng: np.random.Generator) -> tuple[float, float]:
+    """Separation of the optical low-pass filter's spots and r.m.s. diffusion, both in pixels.
+
+    Of some sensors neither; a few lenses wear a softening filter, whose blur is that of a strong diffusion.
+    """
+    separation = rng.uniform(0.35, 1.0) if rng.random() < 0.35 else 0.0
+    diffusion = rng.uniform(0.1, 0.4) if rng.random() < 0.5 else 0.0
+    if rng.random() < 0.04:
+        diffusion = rng.uniform(0.4, 2.5)
+    return float(separation), float(diffusion)
+
+
 def make_lens(
     family: Family, number: int, scenes: Scenes, *, held_out: bool, plain: bool = False
 ) -> dict[str, Any] | None:
@@ -89,7 +104,7 @@ def make_lens(
     lens, states = draw_lens(family, rng, held_out=held_out)
     if plain:
         states = states[:1]
-    xy = places(rng)
+    xy = places(rng, 4 if held_out else 3)
     on_lens = xy
     if rng.random() < _OFF_CENTRE and not plain:
         size = rng.uniform(0.45, 0.95)
@@ -99,10 +114,12 @@ def make_lens(
         at = lens.at_state(state.zoom, 1.0) if isinstance(lens, RandomLens) and state.zoom else lens
         kernels.append(kernels_of(at, on_lens, state.f_number))
     stacked = np.array(kernels)
+    if not plain:
+        stacked = behind_sensor(stacked, *draw_sensor(rng))
     kind: Kind = "raw" if plain else KINDS[int(rng.choice(len(KINDS), p=_KIND_SHARES))]
     camera = Camera(rng, scenes, kind, xy, stacked, plain)
     photos = int(rng.choice(_PHOTO_COUNTS[0], p=_PHOTO_COUNTS[1]))
-    count = int(rng.choice([32, 56, 110], p=[0.5, 0.35, 0.15]))
+    count = int(rng.choice([32, 56, 110], p=[0.35, 0.4, 0.25]))
     patches = camera.take(5, 5 * _PLAIN_PATCHES) if plain else camera.take(photos, count)
     if len(patches.place) < 8:
         return None

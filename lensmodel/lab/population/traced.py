@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lensmodel.core.errors import InvalidInputError
-from lensmodel.lab.population.kernels import basis
+from lensmodel.lab.population.kernels import basis, draw_pitch_um
 from lensmodel.lab.population.prescriptions import PRESCRIPTIONS
 from lensmodel.lab.population.tracing import AIM_UM, Array, Crossing, Nominal, System, aimed
 
@@ -379,7 +379,7 @@ def _candidate(rng: np.random.Generator, design: str) -> TracedLens:
         half_diagonal,
         float(rng.uniform(0.7, 1.0)),
         f_number,
-        float(rng.uniform(2.4, 6.5)),
+        draw_pitch_um(rng),
         Faults(
             shift,
             tilt,

@@ -16,7 +16,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lensmodel.lab.population.kernels import COLUMNS, TERMS, spots, stopped_down
+from lensmodel.lab.population.kernels import COLUMNS, TERMS, draw_pitch_um, spots, stopped_down
 
 Family = Literal["wavefront", "third-order"]
 
@@ -144,7 +144,7 @@ class RandomLens:
         self.f_number = float(np.exp(rng.uniform(np.log(1.2), np.log(8.0))))
         if rng.random() < 0.6:
             self.f_number = float(rng.choice(_COMMON_STOPS))
-        self.pitch_um = float(rng.uniform(1.4, 3.5) if rng.random() < 0.2 else rng.uniform(3.3, 6.6))
+        self.pitch_um = draw_pitch_um(rng)
         self.focal_mm = float(np.exp(rng.uniform(np.log(10), np.log(300))))
         self.state = 0.0
         decentring = float(np.exp(rng.normal(np.log(0.06), 0.8))) if rng.random() > 0.15 else 0.0

@@ -10,6 +10,7 @@ from lensmodel.lab.population.kernels import (
     TERMS,
     Renderer,
     basis,
+    behind_sensor,
     kernels_of,
     spots,
     stopped_down,
@@ -77,3 +78,16 @@ def test_a_drawn_lens_has_centred_kernels_and_is_the_same_again(family: str) -> 
     assert (kernels >= 0).all()
     np.testing.assert_allclose(kernels.sum((-1, -2)), 1.0, atol=1e-5)
     assert np.abs(kernels.sum(-2) @ AT).max() < 0.1
+
+
+@pytest.mark.parametrize(("separation", "diffusion"), [(0.8, 0.0), (0.0, 1.3), (0.6, 0.7)])
+def test_a_sensor_adds_the_variances_of_its_filter_and_its_diffusion(
+    separation: float, diffusion: float
+) -> None:
+    kernel = np.exp(-0.5 * (AT[:, None] ** 2 + AT**2) / 2.0**2)[None].astype(np.float32)
+    kernel /= kernel.sum()
+    blurred = behind_sensor(kernel, separation, diffusion)
+    before, after = ((k[0].sum(0) * AT**2).sum() for k in (kernel, blurred))
+    assert after - before == pytest.approx(separation**2 / 4 + diffusion**2, abs=2e-3)
+    assert blurred.sum() == pytest.approx(1.0, abs=1e-5)
+    assert np.abs(blurred[0] - blurred[0, ::-1, ::-1]).max() < 1e-6
